@@ -26,7 +26,7 @@ LINE = (
 )
 BUDGETS = {
     "basics": 949,
-    "measurements": 6635,
+    "measurements": 6439,
     "noise": 614,
     "priors": 105,
     "states": 1170,

@@ -37,7 +37,7 @@ from ipe_bench.cli import words as w
 from ipe_bench.cli.search_path import extend
 from ipe_bench.cli.spec import DEFAULTS, KEYS, Spec, spec
 from ipe_bench.cli.words import Words
-from ipe_bench.measurements.nist import datasets
+from ipe_bench.measurements.nist import FORMULAS
 from ipe_bench.plugins import discovery as plugins
 
 
@@ -58,7 +58,7 @@ def session(folder: Path | None = None) -> Iterator[None]:
     print_problems(plugins.take_problems())
     store, registry = ConfigStore.instance(), Plugins.instance()
     store.store("schema", node=DEFAULTS, provider="ipe-bench")
-    for name in datasets():
+    for name in FORMULAS:
         node = {"_target_": "ipe_bench.measurements.Nist", "dataset": name}
         store.store(name.lower(), node, group="measurement/nist", package="measurement", provider="ipe-bench")
     if PluginConfigs not in registry.discover(SearchPathPlugin):

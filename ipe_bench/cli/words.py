@@ -22,7 +22,7 @@ from hydra.errors import HydraException
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.cli import refuse_blanks
 from ipe_bench.cli.spec import KEYS
-from ipe_bench.measurements.nist import datasets
+from ipe_bench.measurements.nist import FORMULAS
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.runs.provenance import TARGET, digest
 
@@ -134,7 +134,7 @@ def _groups(folder: Path | None) -> Groups:
     for path in [] if folder is None else sorted(folder.glob("*/**/*.yaml")):
         group, *name = path.relative_to(folder).with_suffix("").parts  # type: ignore[arg-type]
         found.setdefault(group, []).append("/".join(name))
-    found["measurement"] += [f"nist/{name.lower()}" for name in datasets()]
+    found["measurement"] += [f"nist/{name.lower()}" for name in FORMULAS]
     return found
 
 

@@ -1,14 +1,11 @@
-"""What a measurement model is: parameters in, readings out, with names, units and the order in which readings arrive.
-
-A new model is a frozen dataclass that derives from `Measurement` and writes `simulate`; everything else has a default.
-"""
+"""What a measurement model is: parameters in, readings out, with their names and units and their order of arrival."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partialmethod
 from operator import attrgetter
 from typing import Any, ClassVar
 
@@ -78,7 +75,7 @@ class Recorded:
 
 
 class Measurement(Component, ABC):
-    """A model z = h(x) + v, without the noise v.
+    """A model z = h(x) + v, without the noise v: a frozen dataclass that writes `parameters`, `index` and `simulate`.
 
     x is (trials, n) in multiples of the parameters' sizes, h(x) is (trials, m) in `reading_unit`, m >= n, and a trial's
     readings depend on that trial's x alone, bit for bit. Where m = n the readings can be met exactly, and no fit can be
@@ -161,12 +158,10 @@ class Measurement(Component, ABC):
 
     def remarks(self, x: Array) -> tuple[str, ...]:
         """Sentences that users should read of this model at x (n,), such as by which method it is computed."""
-        del x
         return ()
 
     def absent_input(self, heading: str, columns: Sequence[str]) -> str:
         """What to do where a file lacks that column, having others of the inputs."""
-        del heading, columns
         return f"give all of {', '.join(i.heading for i in self.inputs)}, or none"
 
     def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Measurement:
@@ -202,7 +197,6 @@ class Measurement(Component, ABC):
 
     def near_bounds(self, x: Array) -> Mapping[int, float]:
         """Which of the n parameters are next to a bound at x (n,), and that bound in their own unit."""
-        del x
         return {}
 
     def stating(self, key: str, values: Mapping[int, float]) -> Measurement:
@@ -302,12 +296,10 @@ class WrappedModel(Measurement):
 
     def own_readings(self, x: Array, z: Array) -> Array:
         """The readings at x, from those of the whole model."""
-        del x
         return z
 
     def own_jacobian(self, x: Array, J: Array) -> Array:
         """dh/dx at x, from that of the whole model."""
-        del x
         return J
 
     def linearization(self) -> Array:
@@ -320,13 +312,10 @@ class WrappedModel(Measurement):
         return self.whole.remarks(self.whole_x(x[None])[0])
 
     def stating(self, key: str, values: Mapping[int, float]) -> Measurement:
-        return self._around(self.whole.stating(key, values))
+        return replace(self, whole=self.whole.stating(key, values))  # type: ignore[type-var]
 
     def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Measurement:
-        return self._around(self.whole.with_inputs(columns, readings))
-
-    def _around(self, whole: Measurement) -> Measurement:
-        return replace(self, whole=whole)  # type: ignore[type-var]
+        return replace(self, whole=self.whole.with_inputs(columns, readings))  # type: ignore[type-var]
 
 
 @dataclass(frozen=True)
@@ -365,9 +354,7 @@ class SubsetModel(WrappedModel):
     def offset(self) -> Array:
         return self.whole.offset[self._rows]
 
-    @property
-    def m(self) -> int:
-        return len(self.kept)
+    m = property(lambda subset: len(subset.kept))  # type: ignore[assignment]
 
     @property
     def epochs(self) -> Epochs | None:
@@ -399,30 +386,11 @@ class SubsetModel(WrappedModel):
     def simulate(self, x: Array) -> Array:
         return self._computed("coarse_simulate" if self.coarse and self.stop is not None else "simulate", x)
 
-    def jacobian(self, x: Array) -> Array:
-        return self._computed("jacobian", x)
-
-    def coarse_jacobian(self, x: Array) -> Array:
-        return self._computed("coarse_jacobian", x)
+    jacobian = partialmethod(_computed, "jacobian")  # type: ignore[assignment]
+    coarse_jacobian = partialmethod(_computed, "coarse_jacobian")  # type: ignore[assignment]
 
     def linearization(self) -> Array:
         return self.whole.linearization()[self._rows]
-
-
-def _complex_step(h: Any, x: Array) -> Array:
-    """dh/dx (trials, m, n) by directions into the complex plane."""
-    # A few trials in a call: NumPy multiplies complex numbers with other rounding where it reuses a large temporary
-    # array for the product, so in one call of all trials the bits of each would depend on how many there are.
-    trials, n = x.shape
-    steps = np.eye(n) * _COMPLEX_STEP * 1j
-    parts, begun = [], 0
-    while begun < trials or not parts:
-        few = 1 if not parts else max(1, int(_SMALL / parts[0][:1].nbytes))
-        part = x[begun : begun + few, None, :] + steps
-        z = h(part.reshape(-1, n))
-        parts.append(np.imag(z).reshape(len(part), n, -1).swapaxes(1, 2))
-        begun += few
-    return np.ascontiguousarray(np.concatenate(parts)) / _COMPLEX_STEP
 
 
 def differentiate(h: Any, x: Array, *, analytic: bool) -> Array:
@@ -433,7 +401,14 @@ def differentiate(h: Any, x: Array, *, analytic: bool) -> Array:
     """
     trials, n = x.shape
     if analytic:
-        return _complex_step(h, x)
+        # A few trials in a call: NumPy multiplies complex numbers with other rounding where it reuses a large temporary
+        # array for the product, so in one call of all trials the bits of each would depend on how many there are.
+        parts, begun, few = [], 0, 1
+        while begun < trials or not parts:
+            part = x[begun : begun + few, None, :] + np.eye(n) * _COMPLEX_STEP * 1j
+            parts.append(np.imag(h(part.reshape(-1, n))).reshape(len(part), n, -1).swapaxes(1, 2))
+            begun, few = begun + few, max(1, int(_SMALL / max(parts[0][:1].nbytes, 1)))
+        return np.ascontiguousarray(np.concatenate(parts)) / _COMPLEX_STEP
     size = _CENTRAL_STEP * np.maximum(1.0, np.abs(x))
     above, below = x + size, x - size
     steps = np.eye(n)[None] * (above - below)[:, None, :] / 2

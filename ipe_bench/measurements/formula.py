@@ -1,8 +1,4 @@
-"""Measurement models that users write out: names with a start are parameters, other names are columns of a file.
-
-`Formula` is one formula: no plugin, no Python, only its text and the columns. `arithmetic` reads the text, and
-`ode.trace` records it, differentiates it exactly and computes it on arrays.
-"""
+"""Measurement models that users write out: names with a start are parameters, other names are columns of a file."""
 
 from __future__ import annotations
 
@@ -45,9 +41,7 @@ class WrittenModel(Measurement):
         """The parameters with their starts, in the order of x."""
         return {name: float(value) for name, value in self.start.items()}
 
-    @property
-    def parameter_units(self) -> Mapping[str, str]:
-        return self.units
+    parameter_units: Any = property(lambda model: model.units)
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -128,10 +122,8 @@ class Formula(WrittenModel):
                 wanted = ", ".join(self.arithmetic.names)
                 raise UserError(f"start.{name}: does not appear in the expression, whose names are {wanted}")
         if not self.start:
-            name = next(iter(self.arithmetic.names), "NAME")
-            raise UserError(
-                f"start: is empty, so nothing is to be estimated; give each parameter a start: start.{name}=1"
-            )
+            name = f"start.{next(iter(self.arithmetic.names), 'NAME')}"
+            raise UserError(f"start: is empty, so nothing is to be estimated; give each parameter a start: {name}=1")
         if self.reading in self.arithmetic.names:
             raise UserError(f"reading={self.reading}: stands in the expression too; what is measured cannot explain it")
         self.require_columns_and_parameters("own")
@@ -169,9 +161,8 @@ class Formula(WrittenModel):
                 value, one = graph.apply("add", self.arithmetic(known), 0.0), graph.constant(1.0)
                 slopes = [tangent([value], {known[name]: one})[0] for name in self.start]
         except (ArithmeticError, ValueError, TypeError) as error:
-            raise UserError(
-                f"measurement.expression: a part that is made of numbers alone has no real value ({error})"
-            ) from None
+            numbers = "a part that is made of numbers alone has no real value"
+            raise UserError(f"measurement.expression: {numbers} ({error})") from None
         return Program.of([value], list(known.values())), Program.of(slopes, list(known.values()))
 
     def _values(self, x: Array) -> list[Array]:
@@ -185,15 +176,13 @@ class Formula(WrittenModel):
             return tuple(never_switching([self.arithmetic], values))
 
     def simulate(self, x: Array) -> Array:
-        value, _ = self._recorded
         with np.errstate(all="ignore"):
-            z = value(self._values(x))[0]
+            (z,) = self._recorded[0](self._values(x))
         return np.array(np.broadcast_to(z, (len(x), self.m)))
 
     def jacobian(self, x: Array) -> Array:
-        _, slopes = self._recorded
         with np.errstate(all="ignore"):
-            columns = slopes(self._values(x))
+            columns = self._recorded[1](self._values(x))
         J = np.empty((len(x), self.m, self.n))
         for i, column in enumerate(columns):
             J[:, :, i] = column * self.sizes[i]

@@ -2,7 +2,7 @@
 
 A stabilised platform on a stationary bench; axes x east, y north, z up at the start, wander azimuth, spherical Earth.
 An injected initial velocity error swings the platform at the Schuler period, which makes scale-factor and
-mass-unbalance errors observable. `RicherGins` has more errors than that: a truth to measure model mismatch with.
+mass-unbalance errors observable.
 """
 
 from __future__ import annotations
@@ -27,8 +27,7 @@ from ipe_bench.measurements.ode.trace import tangent
 
 FOOT = 0.3048
 """Metres in a foot."""
-_DEGREE_PER_HOUR = np.pi / 180 / 3600
-_ARCSEC = np.pi / 180 / 3600
+_DEGREE_PER_HOUR = _ARCSEC = np.pi / 180 / 3600
 _DIRECTIONS = 12
 """Directions of the injected velocities that a design chooses among, over the whole circle."""
 _SENSED, _CONSTANT = 4, 7
@@ -83,10 +82,8 @@ class Gins(OdeMeasurement):
         tried = self.times[-1] <= 5400.0 and self.interval_min >= 3.0 and self._fastest <= 1500.0 * FOOT * (1 + 1e-9)
         return 0.32 if tried else 0.0
 
-    @cached_property
-    def _fastest(self) -> float:
-        """The largest injected velocity, m/s."""
-        return float(np.hypot(*self.cases.T).max())
+    _fastest = cached_property(lambda gins: float(np.hypot(*gins.cases.T).max()))
+    """The largest injected velocity, m/s."""
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -125,13 +122,11 @@ class Gins(OdeMeasurement):
         often. The cases of this set-up come first, under their own numbers."""
         top = self._fastest / FOOT
         turns = 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
-        rays = [(size * np.cos(turn), size * np.sin(turn)) for size in (top, top / 2) for turn in turns]
-        here = np.isclose([*rays, (0.0, 0.0)], np.array(self.injected)[:, None], atol=1e-6 * max(top, 1.0)).all(axis=2)
-        new = np.array([*rays, (0.0, 0.0)])[~here.any(axis=0)]
-        injected = (*self.injected, *((round(x, 3) + 0.0, round(y, 3) + 0.0) for x, y in new.tolist()))
-        return replace(
-            self, injected=injected, interval_min=self.interval_min / 2, readings_per_case=2 * self.readings_per_case
-        )
+        rays = [(size * np.cos(turn), size * np.sin(turn)) for size in (top, top / 2) for turn in turns] + [(0.0, 0.0)]
+        here = np.isclose(rays, np.array(self.injected)[:, None], atol=1e-6 * max(top, 1.0)).all(axis=2)
+        new = [(round(x, 3) + 0.0, round(y, 3) + 0.0) for x, y in np.array(rays)[~here.any(axis=0)].tolist()]
+        often = {"interval_min": self.interval_min / 2, "readings_per_case": 2 * self.readings_per_case}
+        return replace(self, injected=(*self.injected, *new), **often)
 
     @property
     def levels(self) -> Mapping[str, Mapping[Any, str]]:
@@ -154,8 +149,7 @@ class Gins(OdeMeasurement):
         """State: computed velocity (vx, vy); true up u and true Earth rate e in platform axes; c, the Earth rate as
         the computer believes, in computer axes."""
         (vx, vy), u, e, c = y[:2], y[2:5], y[5:8], y[8:11]
-        (ax, ay), rate = self.acceleration(u, p), self.platform_rate(y, p)
-        coriolis = c[2] + c[2]
+        (ax, ay), rate, coriolis = self.acceleration(u, p), self.platform_rate(y, p), c[2] + c[2]
         x, y_ = self._transport(vx, vy)
         return [
             coriolis * vy + ax,
@@ -216,9 +210,7 @@ class Gins(OdeMeasurement):
     def read(self, t: Any, y: Sequence[Any], p: Sequence[Any], c: Sequence[Any]) -> Sequence[Any]:
         return y[0], y[1]
 
-    @property
-    def _origin(self) -> Array:
-        return self.offset
+    _origin = property(lambda gins: gins.offset)  # type: ignore[assignment]
 
     @cached_property
     def offset(self) -> Array:
@@ -264,10 +256,8 @@ class RicherGins(Gins):
         ]
         return np.repeat(deviation, [2, 2, 3, len(self.cases) * self.readings_per_case * 3])
 
-    @property
-    def _drift(self) -> float:
-        """rad/s in a deg/h, as the parameters have them."""
-        return self.si_sizes[4] / self.parameters[4].size
+    _drift = property(lambda gins: gins.si_sizes[4] / gins.parameters[4].size)
+    """rad/s in a deg/h, as the parameters have them."""
 
     @property
     def nuisances(self) -> tuple[Parameter, ...]:
@@ -339,14 +329,8 @@ class RicherGins(Gins):
         """From one reading to the next: the parameters, the errors of the accelerometers and the state, as it was."""
         given = self.n + _SENSED
 
-        def start(p: Sequence[Any], c: Sequence[Any]) -> Sequence[Any]:
-            return p[given:]
-
-        def read(t: Any, y: Sequence[Any], p: Sequence[Any], c: Sequence[Any]) -> Sequence[Any]:
-            return y
-
-        equations = Equations(self.states, given + self.states, 0, self.states, start, self.rhs, read)
-        return Kernel(equations, DOP853)
+        arithmetic = (lambda p, c: p[given:]), self.rhs, (lambda t, y, p, c: y)
+        return Kernel(Equations(self.states, given + self.states, 0, self.states, *arithmetic), DOP853)
 
 
 def _turned(v: Sequence[Any], angles: Sequence[NDArray[Any]]) -> list[Any]:

@@ -3,8 +3,7 @@
 Exact readings at all times determine the Taylor coefficients of the outputs at t = 0 and nothing more. A parameter or
 an initial state is locally identifiable if its column of the Jacobian of these coefficients is no combination of the
 others. The rank is taken at a random point modulo a prime, so that no rounding blurs it (Sedoglavic, J. Symb. Comput.
-33, 2002); it is too small only where the point is a root of a polynomial, with a probability of about degree / prime,
-and a second prime repeats it. Global identifiability, such as two rates that may be swapped, is another question.
+33, 2002); it is too small with a probability of about degree / prime, and a second prime repeats it.
 """
 
 from __future__ import annotations
@@ -91,12 +90,11 @@ class _Free(dict[Any, int]):
 
     def power(self, base: int, exponent: int) -> int:
         """Exponents one apart, such as those of a power and its derivative, have powers that the base divides."""
-        key = ("pow", base, exponent)
         for apart in (1, -1):
             other = ("pow", base, (exponent + apart) % self.prime)
-            if key not in self and other in self:
-                self[key] = self[other] * pow(base, -apart, self.prime) % self.prime
-        return self[key]
+            if other in self:
+                self.setdefault(("pow", base, exponent), self[other] * pow(base, -apart, self.prime) % self.prime)
+        return self["pow", base, exponent]
 
 
 def _jacobian(
@@ -197,7 +195,7 @@ class _Series(dict[int, list[int]]):
 
     def _inverse(self, value: int) -> int:
         if value == 0:
-            raise ZeroDivisionError("a denominator, or what a root or a power is taken of, is 0 at the start")
+            raise ZeroDivisionError
         return pow(value, -1, self.p)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partialmethod
 from itertools import chain
 from typing import Any
 
@@ -39,10 +39,10 @@ class Joint(Measurement):
     @property
     def copies(self) -> dict[str, list[str]]:
         """What the parameters are called here of which every file has its own, by what the model calls them."""
-        return {
-            name: [f"{name}_{k}" for k, part in enumerate(self.parts, 1) if name in part.own_parameters]
-            for name in dict.fromkeys(name for part in self.parts for name in part.own_parameters)
-        }
+        found: dict[str, list[str]] = {}
+        for name, k in ((name, k) for k, part in enumerate(self.parts, 1) for name in part.own_parameters):
+            found.setdefault(name, []).append(f"{name}_{k}")
+        return found
 
     @cached_property
     def _places(self) -> list[NDArray[np.intp]]:
@@ -71,13 +71,8 @@ class Joint(Measurement):
             for k, i in self._first
         )
 
-    @cached_property
-    def parameters(self) -> tuple[Parameter, ...]:
-        return self._each("parameters")
-
-    @cached_property
-    def physical_parameters(self) -> tuple[Parameter, ...]:
-        return self._each("physical_parameters")
+    parameters = cached_property(lambda joint: joint._each("parameters"))  # type: ignore[assignment]
+    physical_parameters = cached_property(lambda joint: joint._each("physical_parameters"))  # type: ignore[assignment]
 
     @cached_property
     def nominal(self) -> Array:
@@ -96,20 +91,12 @@ class Joint(Measurement):
         values = self._of_parts(method, x)
         return np.stack([values[k][:, i] for k, i in self._first], axis=1)
 
-    def physical(self, x: Array) -> Array:
-        return self._columns("physical", x)
+    physical = partialmethod(_columns, "physical")  # type: ignore[assignment]
+    physical_slope = partialmethod(_columns, "physical_slope")  # type: ignore[assignment]
 
-    def physical_slope(self, x: Array) -> Array:
-        return self._columns("physical_slope", x)
-
-    @cached_property
-    def m(self) -> int:
-        return sum(part.m for part in self.parts)
-
-    @cached_property
-    def _starts(self) -> list[int]:
-        """Where the readings of each part begin."""
-        return np.cumsum([0, *(part.m for part in self.parts)]).tolist()
+    _starts = cached_property(lambda joint: np.cumsum([0, *(part.m for part in joint.parts)]).tolist())
+    """Where the readings of each part begin, and where the last one ends."""
+    m = property(lambda joint: joint._starts[-1])  # type: ignore[assignment]
 
     @property
     def index(self) -> Mapping[str, Sequence[Any]]:
@@ -160,11 +147,6 @@ class Joint(Measurement):
             J[:, start : start + slope.shape[1], places] = slope
         return J
 
-    @property
-    def jacobian_cost(self) -> float:
-        """The mean of the parts, whose simulations are taken to cost alike."""
-        return float(np.mean([part.jacobian_cost for part in self.parts]))
-
-    @property
-    def coarse_jacobian_cost(self) -> float:
-        return float(np.mean([part.coarse_jacobian_cost for part in self.parts]))
+    jacobian_cost = property(lambda joint: float(np.mean([part.jacobian_cost for part in joint.parts])))
+    """The mean of the parts, whose simulations are taken to cost alike."""
+    coarse_jacobian_cost = property(lambda joint: float(np.mean([part.coarse_jacobian_cost for part in joint.parts])))

@@ -1,8 +1,4 @@
-"""What is known of parameters before anything is measured: values, starts, bounds, and how far off they may be.
-
-A model in which that is so is the model in other coordinates: fixed parameters are gone, and bounded ones run over all
-numbers, so that no estimator and no draw can leave the bounds.
-"""
+"""What is known of parameters before anything is measured: values, starts, bounds, and how far off they may be."""
 
 from __future__ import annotations
 
@@ -81,7 +77,7 @@ def informed(model: Measurement, known: Sequence[ParameterInfo]) -> Measurement:
 
 @dataclass(frozen=True)
 class ConstrainedModel(WrappedModel):
-    """A model of which some parameters are fixed, bounded or start elsewhere.
+    """A model of which some parameters are fixed, bounded or start elsewhere: the model in other coordinates.
 
     x counts the parameters that are left. A bounded one is ln((v - lower) / (v0 - lower)), or
     ln((upper - v0) / (upper - v)), or the difference of the logits of v and its start v0, and is named accordingly; its
@@ -157,15 +153,10 @@ class ConstrainedModel(WrappedModel):
     def nominal(self) -> Array:
         return self.inner(self._coordinates.v0)
 
-    def physical(self, x: Array) -> Array:
-        return self._coordinates.value(x)
-
-    def physical_slope(self, x: Array) -> Array:
-        return self._coordinates.slope(x)
-
-    def inner(self, values: Array) -> Array:
-        """x (..., n) of values (..., n) in the parameters' own units."""
-        return self._coordinates.inner(values)
+    physical = property(lambda model: model._coordinates.value)  # type: ignore[assignment]
+    physical_slope = property(lambda model: model._coordinates.slope)  # type: ignore[assignment]
+    inner = property(lambda model: model._coordinates.inner)
+    """From values (..., n) in the parameters' own units to x (..., n)."""
 
     def near_bounds(self, x: Array) -> dict[int, float]:
         c, values = self._coordinates, self.physical(x[None])[0]
@@ -176,11 +167,9 @@ class ConstrainedModel(WrappedModel):
         return dict(sorted(found.items()))
 
     def stating(self, key: str, values: Mapping[int, float]) -> Measurement:
-        given = {one.name: one for one in self.known}
-        for k, value in values.items():
-            name = self.physical_parameters[k].name
-            given[name] = replace(ParameterInfo(name), **{key: value})
-        return replace(self, known=tuple(given.values()))
+        names = {self.physical_parameters[k].name: value for k, value in values.items()}
+        stated = {name: replace(ParameterInfo(name), **{key: value}) for name, value in names.items()}
+        return replace(self, known=tuple(({one.name: one for one in self.known} | stated).values()))
 
     def whole_x(self, x: Array) -> Array:
         """What comes behind the parameters, a truth's nuisances, stays there."""
@@ -202,9 +191,7 @@ class ConstrainedModel(WrappedModel):
     def recorded(self) -> Recorded | None:
         """The whole model's readings, and its answer in the parameters that are left."""
         found = self.whole.recorded
-        if found is None:
-            return None
-        return Recorded(found.z, found.R, self.inner((found.x * self.whole.sizes)[self._free]))
+        return found and Recorded(found.z, found.R, self.inner((found.x * self.whole.sizes)[self._free]))
 
 
 @dataclass(frozen=True)
@@ -230,9 +217,7 @@ class _Coordinates:
         """What one unit of x is, of the logarithm or logit."""
         return self.size / self._slope_at(self.v0)
 
-    @cached_property
-    def _origin(self) -> Array:
-        return self._coordinate(self.v0)
+    _origin = cached_property(lambda coordinates: coordinates._coordinate(coordinates.v0))
 
     def _slope_at(self, v: Array) -> Array:
         """The derivative of the value by its logarithm or logit."""

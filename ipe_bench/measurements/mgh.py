@@ -309,11 +309,6 @@ def chebyquad(x: Unknowns) -> Any:
     return _side_by_side(*f)
 
 
-def functions() -> tuple[str, ...]:
-    """The names of the 23 functions in the paper's order."""
-    return tuple(PROBLEMS)
-
-
 @dataclass(frozen=True)
 class Mgh(Measurement):
     """One test function of Moré, Garbow and Hillstrom, to be started at a multiple of its standard start.
@@ -324,7 +319,6 @@ class Mgh(Measurement):
     23 of the paper's 35 functions are here: all of fixed dimension (1 to 19), and of variable dimension those of its
     list of nonlinear least-squares problems (Watson's with n = 6, Brown's almost linear with 10, Chebyquad with 8) and
     the trigonometric one (10), known for its local minimum. Dimensions are those for which the paper states minima.
-
     Eight functions have as many residuals as parameters (m = n): they can be solved, but there no fit can be tested.
     At the least minimum of jennrich_sampson, powell_singular and chebyquad J has not full rank.
 
@@ -334,7 +328,7 @@ class Mgh(Measurement):
     """
 
     function: str = "kowalik_osborne"
-    """A name as in `functions()`, such as rosenbrock."""
+    """A key of `PROBLEMS`, such as rosenbrock."""
     start: Positive = 1.0
     """The multiple of the standard start; the paper uses 1, 10 and 100."""
 
@@ -349,9 +343,7 @@ class Mgh(Measurement):
     def start_values(self) -> Array:
         """The starting point (n,)."""
         standard = np.array(PROBLEMS[self.function].start)
-        if not standard.any() and self.start != 1.0:
-            return np.full_like(standard, self.start)
-        return self.start * standard
+        return self.start * standard if standard.any() or self.start == 1.0 else np.full_like(standard, self.start)
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -380,11 +372,9 @@ class Mgh(Measurement):
 
     @property
     def recorded(self) -> Recorded:
-        """Zeros, with the place of the lowest minimum f*, and R for independent readings.
-
-        Their standard deviation is sqrt(f* / (m - n)), m - n counted as 1 where it is 0, and 1e-3 where f* is 0. It
-        moves no least-squares estimate: it only says what a small gradient is.
-        """
+        """Zeros, with the place of the lowest minimum f*, and R for independent readings of standard deviation
+        sqrt(f* / (m - n)), m - n counted as 1 where it is 0, and 1e-3 where f* is 0: it only says what a small gradient
+        is."""
         least = self.minima[0]
         assert least.x is not None
         variance = least.sum_of_squares / max(self.m - self.n, 1)
@@ -401,10 +391,8 @@ class Attained:
     minimum: int | None
     """Which of the model's `minima` has this sum of squares, or a lower one than the least: 0; None: it is none."""
 
-    @property
-    def solved(self) -> bool:
-        """Whether that is the least there is."""
-        return self.minimum == 0
+    solved = property(lambda attained: attained.minimum == 0)
+    """Whether that is the least there is."""
 
 
 def score(model: Mgh, x: Array) -> Attained:

@@ -83,16 +83,8 @@ FORMULAS: dict[str, Callable[..., Any]] = {
     "Rat43": lambda b, x: b[0] / (1.0 + np.exp(b[1] - b[2] * x)) ** (1.0 / b[3]),
     "Bennett5": lambda b, x: b[0] * (b[1] + x) ** (-1.0 / b[2]),
 }
-"""The regression functions in NIST's order, by data set.
-
-Each takes the parameters b, a sequence of arrays (trials, 1), and the predictors x, arrays (m,), and returns
-(trials, m). All are analytic.
-"""
-
-
-def datasets() -> tuple[str, ...]:
-    """The names of the 27 problems in NIST's order: lower, average, higher difficulty."""
-    return tuple(FORMULAS)
+"""The 27 regression functions in NIST's order (lower, average, higher difficulty), by data set: from the parameters b,
+arrays (trials, 1), and the predictors x, arrays (m,), to (trials, m). All are analytic."""
 
 
 @cache
@@ -105,7 +97,7 @@ class CertifiedAnswer:
     """What NIST certifies of one data set, to eleven digits."""
 
     parameters: Array
-    """(n,), in the physical units of the problem."""
+    """(n,), in physical units."""
     deviations: Array
     """(n,): standard deviations of the parameters, with the residual variance estimated from the fit."""
     residual_sum_of_squares: float
@@ -124,7 +116,7 @@ class Nist(Measurement):
     """
 
     dataset: str = "Misra1a"
-    """A name as NIST writes it; see `datasets()`."""
+    """A name as NIST writes it, a key of `FORMULAS`."""
     start: Literal[1, 2] = 1
     """Which starting point: 1 is far from the solution, 2 is near."""
 
@@ -181,10 +173,8 @@ class Nist(Measurement):
 
     @property
     def recorded(self) -> Recorded:
-        """The readings with the certified answer, and R for independent readings of the certified residual deviation.
-
-        That deviation moves no least-squares estimate: it only says what a small gradient is.
-        """
+        """The readings with the certified answer, and R for independent readings of the certified residual deviation,
+        which moves no least-squares estimate: it only says what a small gradient is."""
         certified = self.certified
         R = Covariance(np.full(self.m, certified.residual_deviation))
         return Recorded(self.readings, R, certified.parameters / self.sizes)
@@ -200,9 +190,9 @@ class Digits:
 
 
 def digits(value: Array | float, certified: Array | float) -> float:
-    """The log relative error -log10(|value - certified| / |certified|), the smallest over the entries.
+    """The log relative error -log10(|value - certified| / |certified|), the smallest over the entries, at most 11.
 
-    Capped at 11 digits. Less than one digit, or a value that is not finite, counts as none (McCullough, Assessing the
+    Less than one digit, or a value that is not finite, counts as none (McCullough, Assessing the
     reliability of statistical software, The American Statistician 52, 1998).
     """
     value, certified = np.atleast_1d(value), np.atleast_1d(certified)
@@ -219,9 +209,8 @@ def score(model: Nist, x: Array, deviation: Array) -> Digits:
     An estimator is told R = sigma^2 I with NIST's residual deviation as sigma, and states its deviations for that R.
     NIST's rest on the residual variance of the fit, rss / (m - n), so that is put in the place of sigma^2.
     """
-    certified = model.certified
+    certified, residuals = model.certified, model.readings - model.simulate(x[None])[0]
     with np.errstate(all="ignore"):
-        residuals = model.readings - model.simulate(x[None])[0]
         rss = float(residuals @ residuals)
         scale = np.sqrt(rss / certified.degrees_of_freedom) / certified.residual_deviation
         deviations = deviation * model.sizes * scale

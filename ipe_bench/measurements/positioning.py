@@ -34,14 +34,9 @@ _SKY = (
 """Constellation, radius of the orbit in m, azimuth and elevation in degrees of the satellites that are the default."""
 
 _BEACONS = (
-    (1000.0, 0.0, 300.0),
-    (500.0, 866.0, 20.0),
-    (-500.0, 866.0, 300.0),
-    (-1000.0, 0.0, 20.0),
-    (-500.0, -866.0, 300.0),
-    (500.0, -866.0, 20.0),
-    (0.0, 0.0, 600.0),
-)
+    (1000.0, 0.0, 300.0), (500.0, 866.0, 20.0), (-500.0, 866.0, 300.0), (-1000.0, 0.0, 20.0), (-500.0, -866.0, 300.0),
+    (500.0, -866.0, 20.0), (0.0, 0.0, 600.0),
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -49,8 +44,7 @@ class Ranging(Measurement):
     """Pseudoranges |s_i - p| + b from a receiver at p with clock bias b to beacons at known places s_i.
 
     Parameters: east, north, up in m, and the clock bias as a length in m. Readings: pseudoranges in m, in `rounds` over
-    all beacons; each round is an epoch. A range of rho bends by d^2 / (2 rho) for a position error d across it: 0.05 m
-    at error scale 1 with the beacons given here, to be compared with a noise of 0.1 m.
+    all beacons; each round is an epoch.
 
     Source: Kaplan and Hegarty, Understanding GPS, 2nd ed., section 2.4. The problem has a closed form: Bancroft, An
     algebraic solution of the GPS equations, IEEE Transactions on Aerospace and Electronic Systems 21, 1985.
@@ -82,11 +76,8 @@ class Ranging(Measurement):
 
     @property
     def index(self) -> Mapping[str, Sequence[Any]]:
-        beacons = range(1, len(self.beacons) + 1)
-        return {
-            "round": [k for k in range(1, self.rounds + 1) for _ in beacons],
-            "beacon": [i for _ in range(self.rounds) for i in beacons],
-        }
+        rounds, beacons = np.indices((self.rounds, len(self.beacons))).reshape(2, -1) + 1
+        return {"round": rounds.tolist(), "beacon": beacons.tolist()}
 
     @cached_property
     def epochs(self) -> Epochs:
@@ -105,8 +96,7 @@ def east_north_up(position: Array) -> Array:
     The latitude is found by Bowring's formula, to better than 1e-9 rad at the surface (Survey Review 23, 1976).
     """
     x, y, z = position
-    minor, p = _SEMI_MAJOR * (1.0 - _FLATTENING), math.hypot(x, y)
-    e2 = _FLATTENING * (2.0 - _FLATTENING)
+    minor, p, e2 = _SEMI_MAJOR * (1.0 - _FLATTENING), math.hypot(x, y), _FLATTENING * (2.0 - _FLATTENING)
     reduced = math.atan2(z * _SEMI_MAJOR, p * minor)
     latitude = math.atan2(
         z + e2 / (1.0 - e2) * minor * math.sin(reduced) ** 3, p - e2 * _SEMI_MAJOR * math.cos(reduced) ** 3
@@ -201,10 +191,8 @@ class Gnss(Measurement):
 
     @cached_property
     def nominal(self) -> Array:
-        values = np.zeros(self.n)
-        if self.frame == "ecef":
-            values[:3] = self.position
-        return values / self.sizes
+        place = self.position if self.frame == "ecef" else (0.0, 0.0, 0.0)
+        return np.append(place, np.zeros(self.n - 3)) / self.sizes
 
     @cached_property
     def index(self) -> Mapping[str, Sequence[Any]]:
@@ -246,29 +234,20 @@ class Gnss(Measurement):
 
     def simulate(self, x: Array) -> Array:
         values = (x * self.sizes)[:, :, None]
-        z = self._travelled(self._place(values))
-        for k, carried in enumerate(self._biases):
-            z = z + values[:, 3 + k] * carried
-        return z
-
-    def _place(self, values: Array) -> list[Any]:
-        """The receiver's x, y, z in ECEF, each (trials, 1)."""
-        if self.frame == "ecef":
-            return [values[:, i] for i in range(3)]
-        axes = east_north_up(np.asarray(self.position))
-        return [self.position[i] + sum(values[:, k] * axes[k, i] for k in range(3)) for i in range(3)]
-
-    def _travelled(self, place: list[Any]) -> Array:
-        """The distance (trials, m) that light travels: the Earth turns meanwhile, by an angle that depends on it.
-
-        Each of the three passes takes the error down by the speed of the satellite's turning over that of light, 1e-5.
-        """
+        place: list[Any] = [values[:, i] for i in range(3)]
+        if self.frame == "enu":
+            axes = east_north_up(np.asarray(self.position))
+            place = [self.position[i] + sum(values[:, k] * axes[k, i] for k in range(3)) for i in range(3)]
         x, y, z = self._columns[2].T
+        # The Earth turns while light travels. Each pass takes the error of the distance down by the speed of the
+        # satellite's turning over that of light, 1e-5.
         distance: Any = 0.0
         for _ in range(3):
             angle = self.earth_rate / LIGHT * distance
             turned = np.cos(angle) * x + np.sin(angle) * y, np.cos(angle) * y - np.sin(angle) * x, z
             distance = np.sqrt(sum((s - p) ** 2 for s, p in zip(turned, place, strict=True)))
+        for k, carried in enumerate(self._biases):
+            distance = distance + values[:, 3 + k] * carried
         return distance
 
 
@@ -283,7 +262,7 @@ class Bearings(Measurement):
     On a single leg the range is not observable: every target whose relative motion is scaled by one factor has the same
     bearings. A turn makes it observable unless the observer's acceleration points along the line of sight (Nardone and
     Aidala, Observability criteria for bearings-only target motion analysis, IEEE Transactions on Aerospace and
-    Electronic Systems 17, 1981). Estimators that linearise at the nominal point then say that H lacks rank.
+    Electronic Systems 17, 1981).
     """
 
     legs: Annotated[tuple[tuple[float, float, float], ...], MinLen(1)] = ((900.0, 90.0, 6.0), (900.0, 330.0, 6.0))
@@ -310,14 +289,12 @@ class Bearings(Measurement):
     @cached_property
     def times(self) -> Array:
         """When bearings are taken (m,), in s."""
-        total = sum(leg[0] for leg in self.legs)
-        return self.interval * np.arange(int(total / self.interval + 1e-9) + 1)
+        return self.interval * np.arange(int(sum(leg[0] for leg in self.legs) / self.interval + 1e-9) + 1)
 
     @cached_property
     def observer(self) -> Array:
         """Where they are taken (m, 2), east and north in m."""
-        path = np.zeros((len(self.times), 2))
-        began = 0.0
+        path, began = np.zeros((len(self.times), 2)), 0.0
         for duration, course, speed in self.legs:
             sailed = np.clip(self.times - began, 0.0, duration)
             heading = np.deg2rad(course)

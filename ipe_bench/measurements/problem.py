@@ -80,12 +80,6 @@ class Problem:
         return replace(self, prior_deviation=None, prior_correlation=None)
 
 
-def recorded_problem(measurement: Measurement) -> Problem:
-    """What estimators are told of the readings that come with a model: no prior, since nothing was drawn from one."""
-    assert measurement.recorded is not None
-    return Problem(measurement, measurement.recorded.R)
-
-
 def require_nominal(model: Measurement) -> None:
     """Refuses a model whose nominal point is not (n,)."""
     if np.shape(model.nominal) != (model.n,):

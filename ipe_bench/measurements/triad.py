@@ -1,7 +1,4 @@
-"""Calibration of three accelerometers or magnetometers by the magnitude of what they measure.
-
-`Triad` is the symmetric form in errors, `Accelerometer` the triangular form in raw counts.
-"""
+"""Calibration of three accelerometers or magnetometers by the magnitude of what they measure."""
 
 from __future__ import annotations
 
@@ -9,7 +6,7 @@ from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import product
+from itertools import combinations, product
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
@@ -21,13 +18,10 @@ from ipe_bench.measurements.base import Input, Measurement, Parameter, UsualNois
 
 Vector = tuple[float, float, float]
 
-_PAIRS = ((0, 1), (0, 2), (1, 2))
-
 
 def attitudes() -> Array:
     """26 directions (26, 3): towards the faces, edges and corners of a cube."""
-    corners = [v for v in product((-1.0, 0.0, 1.0), repeat=3) if any(v)]
-    return np.array([np.array(v) / np.linalg.norm(v) for v in corners])
+    return np.array([np.array(v) / np.linalg.norm(v) for v in product((-1.0, 0.0, 1.0), repeat=3) if any(v)])
 
 
 class Magnitudes(Measurement):
@@ -83,8 +77,8 @@ class Magnitudes(Measurement):
         return {"attitude": list(range(1, len(self.measured) + 1))}
 
     def simulate(self, x: Array) -> Array:
-        a = self.corrected(x)
-        return np.sqrt(a[0] ** 2 + a[1] ** 2 + a[2] ** 2)
+        a, b, c = self.corrected(x)
+        return np.sqrt(a**2 + b**2 + c**2)
 
 
 @dataclass(frozen=True)
@@ -95,8 +89,8 @@ class Triad(Magnitudes):
     the whole triad does not change a magnitude, so it is not among the parameters. The reading of attitude k is the
     magnitude that a reference states: a scalar magnetometer, or the local gravity.
 
-    Parameters: three biases in `unit`, three scale-factor errors in ppm, three misalignments in mrad. A bias of b bends
-    the magnitude by b^2 / (2 field): 2e-6 of the field at error scale 1, to be compared with a noise of 1e-5.
+    Parameters: three biases in `unit`, three scale-factor errors in ppm, three misalignments in mrad. The usual noise
+    is 1e-5 of the field.
 
     Source: Merayo, Brauer, Primdahl, Petersen, Nielsen, Scalar calibration of vector magnetometers, Measurement Science
     and Technology 11, 2000.
@@ -120,10 +114,8 @@ class Triad(Magnitudes):
     usual_noise = property(lambda triad: UsualNoise(1e-5 * triad.field))  # type: ignore[assignment]
     error_sizes = property(lambda triad: (2e-3 * triad.field, 2e-3, 2e-3))  # type: ignore[assignment]
 
-    @cached_property
-    def _plain_sizes(self) -> Array:
-        """Sizes (9,) with scale factors and misalignments as plain numbers."""
-        return self.sizes * np.repeat([1.0, 1e-6, 1e-3], 3)
+    _plain_sizes = cached_property(lambda triad: triad.sizes * np.repeat([1.0, 1e-6, 1e-3], 3))
+    """Sizes (9,) with scale factors and misalignments as plain numbers."""
 
     @cached_property
     def nominal(self) -> Array:
@@ -137,7 +129,7 @@ class Triad(Magnitudes):
         p = (x * self._plain_sizes)[:, :, None]
         d = [self.measured[:, i] - p[:, i] for i in range(3)]
         a = [(1.0 + p[:, 3 + i]) * d[i] for i in range(3)]
-        for k, (i, j) in enumerate(_PAIRS):
+        for k, (i, j) in enumerate(combinations(range(3), 2)):
             a[i] = a[i] + p[:, 6 + k] * d[j]
             a[j] = a[j] + p[:, 6 + k] * d[i]
         return a

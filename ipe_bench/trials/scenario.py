@@ -12,7 +12,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, deviations, read_only
 from ipe_bench.basics.streams import numbered
 from ipe_bench.measurements.base import Measurement
-from ipe_bench.measurements.problem import Problem, recorded_problem, require_nominal
+from ipe_bench.measurements.problem import Problem, require_nominal
 from ipe_bench.noise.base import Certified, ModelNoise, Noise, resolved
 from ipe_bench.priors import GaussianPrior, Prior
 from ipe_bench.states.base import Paths, StateModel, require_sound
@@ -85,9 +85,9 @@ class Scenario:
     @cached_property
     def problem(self) -> Problem:
         """What the estimators are told."""
-        if self.noise.real:
-            return recorded_problem(self.measurement)
         model = self.measurement
+        if self.noise.real and model.recorded is not None:  # nothing was drawn from a prior
+            return Problem(model, model.recorded.R)
         deviation, correlation = self.prior.deviation(model.n, self.error_scale), self.prior.correlation(model.n)
         return Problem(model, self.noise.nominal_covariance(model), deviation, correlation)
 

@@ -14,7 +14,7 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.ipe import begin, starting_points
 from ipe_bench.measurements import Formula, Gins, Measurement, Mgh, Nist, Parameter
 from ipe_bench.measurements.counted import EvaluationCount
-from ipe_bench.measurements.nist import datasets
+from ipe_bench.measurements.nist import FORMULAS
 from ipe_bench.measurements.nist import score as nist_score
 from ipe_bench.measurements.problem import Problem, recorded_problem
 from ipe_bench.noise import Gaussian, Quantization
@@ -214,7 +214,7 @@ def test_the_hardest_certified_problems_are_solved_from_the_far_start(dataset):
 
 @pytest.mark.slow
 def test_all_27_certified_problems_are_solved_from_both_starts():
-    reached = [[certified_digits(dataset, start) for dataset in datasets()] for start in (1, 2)]
+    reached = [[certified_digits(dataset, start) for dataset in FORMULAS] for start in (1, 2)]
     parameters = np.array([[d.parameters for d in row] for row in reached])
     deviations = np.array([[d.deviations for d in row] for row in reached])
     assert (parameters >= 4).all()

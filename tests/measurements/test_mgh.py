@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from ipe_bench.measurements import Mgh
-from ipe_bench.measurements.mgh import PROBLEMS, functions, score
+from ipe_bench.measurements.mgh import PROBLEMS, score
 from ipe_bench.plugins.conformance import check_component
 
 # m and n, as the paper states them.
@@ -80,12 +80,11 @@ def sum_of_squares(model, values):
 
 
 def finite_minima():
-    return [(f, k) for f in functions() for k, m in enumerate(Mgh(f).minima) if m.x and np.isfinite(m.x).all()]
+    return [(f, k) for f in PROBLEMS for k, m in enumerate(Mgh(f).minima) if m.x and np.isfinite(m.x).all()]
 
 
 def test_23_functions_have_the_dimensions_of_the_paper():
-    assert {f: (Mgh(f).m, Mgh(f).n) for f in functions()} == SIZES
-    assert functions() == tuple(PROBLEMS)
+    assert {f: (Mgh(f).m, Mgh(f).n) for f in PROBLEMS} == SIZES
     assert len(SIZES) == 23
 
 
@@ -102,7 +101,7 @@ def test_sums_of_squares_at_the_standard_start(function):
     assert sum_of_squares(model, model.start_values) == pytest.approx(BY_HAND[function], rel=1e-13)
 
 
-@pytest.mark.parametrize("function", functions())
+@pytest.mark.parametrize("function", PROBLEMS)
 def test_minima_are_those_that_the_paper_prints(function):
     values = [m.sum_of_squares for m in Mgh(function).minima]
     printed = PRINTED.get(function, (0.0,))
@@ -121,7 +120,7 @@ def test_a_minimiser_has_its_sum_of_squares_and_no_gradient(function, which):
     assert (np.abs(J.T @ r) <= 1e-10 * np.linalg.norm(J, axis=0) * max(np.linalg.norm(r), 1e-2)).all()
 
 
-@pytest.mark.parametrize("function", functions())
+@pytest.mark.parametrize("function", PROBLEMS)
 def test_scipy_finds_nothing_lower_beside_the_least_minimum(function):
     model = Mgh(function)
     least = np.array(model.minima[0].x)
@@ -167,7 +166,7 @@ def test_starts_are_multiples_of_the_standard_start_and_watsons_as_in_minpack():
     assert [Mgh("watson", s).start_values[0] for s in (1.0, 10.0, 100.0)] == [0, 10, 100]
 
 
-@pytest.mark.parametrize("function", functions())
+@pytest.mark.parametrize("function", PROBLEMS)
 def test_models_keep_the_promises_of_models(function):
     complaints = [f.complaint for f in check_component("mgh", Mgh(function)) if f.complaint]
     square = SIZES[function][0] == SIZES[function][1]

@@ -14,7 +14,7 @@ from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.measurements import Formula, Gnss, Nist, Ode, Polynomial, Ranging
 from ipe_bench.measurements.joint import Joint
 from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo
-from ipe_bench.measurements.nist import datasets
+from ipe_bench.measurements.nist import FORMULAS
 from ipe_bench.noise import Colored, Gaussian, Quantization
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.conformance import check_component
@@ -52,7 +52,7 @@ def test_every_option_of_ours_keeps_its_promises(option):
     assert not complaints(component(option))
 
 
-@pytest.mark.parametrize("dataset", datasets())
+@pytest.mark.parametrize("dataset", FORMULAS)
 def test_every_certified_problem_keeps_its_promises(dataset):
     assert not complaints(Nist(dataset))
 

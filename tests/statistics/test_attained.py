@@ -6,7 +6,7 @@ from rich.console import Console
 from ipe_bench.api import report as write_report
 from ipe_bench.baselines import LeastSquares, LevenbergMarquardt
 from ipe_bench.measurements import Mgh
-from ipe_bench.measurements.mgh import functions
+from ipe_bench.measurements.mgh import PROBLEMS as FUNCTIONS
 from ipe_bench.noise import Certified
 from ipe_bench.report.table import terminal
 from ipe_bench.report.tables import certified_tables
@@ -95,7 +95,7 @@ def test_the_terminal_and_the_report_show_them(folder):
 @pytest.mark.campaign
 @pytest.mark.parametrize("estimator", [Progressive(), Auto()], ids=lambda e: type(e).__name__)
 def test_the_general_estimators_attain_all_minima_and_say_so(estimator, tmp_path):
-    scenarios = [Scenario(Mgh(f, start), Certified()) for f in functions() for start in (1.0, 10.0, 100.0)]
+    scenarios = [Scenario(Mgh(f, start), Certified()) for f in FUNCTIONS for start in (1.0, 10.0, 100.0)]
     assert compute(scenarios, {"it": estimator}, 1, tmp_path) == ()
     totals = attained_totals(attained_table(collect([tmp_path]))).iloc[0]
     assert totals["solved"] >= 67

@@ -301,7 +301,6 @@ class Ode(WrittenModel, WrappedModel):
         return f"{super().absent_input(heading, columns)}; {alike}"
 
     def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Measurement:
-        del readings
         heading, outputs = time_heading(self.time_unit), list(self.output_formulas)
         rows = list(zip(columns["case"], map(float, columns[heading]), columns["output"], strict=True))
         count = numbered_cases(columns["case"]) if self.constant_names or self.driven_by else 1

@@ -129,7 +129,7 @@ class Equations:
 
 
 class Recording:
-    """Equations as expressions of the time t, states y, parameters p and constants c, of which u, the last, change."""
+    """Equations as expressions of the time t, states y, parameters p and constants c; `moving` change."""
 
     def __init__(self, equations: Equations) -> None:
         self.equations = equations
@@ -137,7 +137,7 @@ class Recording:
         self.t = graph.input("t")
         self.y, self.p = graph.inputs("y", equations.states), graph.inputs("p", equations.parameters)
         self.c = graph.inputs("c", equations.constants)
-        self.u = self.c[equations.constants - equations.driven :]
+        self.moving = self.t, *self.y, *self.c[equations.constants - equations.driven :]
         self.start = self._values(equations.start(self.p, self.c), equations.states, "start")
         self.slope = self._values(equations.rhs(self.t, self.y, self.p, self.c), equations.states, "rhs")
         self.shown = self._values(equations.read(self.t, self.y, self.p, self.c), equations.outputs, "read")
@@ -175,11 +175,7 @@ class Recording:
 
     def fixed(self, *outputs: Expression) -> list[Expression]:
         """What is computed once for each lane: it depends on the parameters and the case alone."""
-        return border(outputs, dependent(outputs, (self.t, *self.y, *self.u)))
-
-    def along_the_way(self, outputs: Sequence[Expression], fixed: Sequence[Expression]) -> Program:
-        """From the time, the state, what is driven and what is fixed."""
-        return Program.of(outputs, [self.t, *self.y, *self.u, *fixed])
+        return border(outputs, dependent(outputs, self.moving))
 
 
 class _Linear:
@@ -194,7 +190,7 @@ class _Linear:
         """The value (n, sources) of each source along each parameter."""
         needed = border(outputs, dependent(outputs, (*d, *names)))
         values = [e for row in self.sources for e in row]
-        varying = dependent([*needed, *values], (tape.t, *tape.y, *tape.u))
+        varying = dependent([*needed, *values], tape.moving)
         self.fixed = [e for e in needed if e not in varying]
         self.saved = [e for e in needed if e in varying]
         self.driving = _distinct(e for e in values if e in varying and e not in self.saved)
@@ -202,7 +198,7 @@ class _Linear:
         self.inputs, self.outputs = [*d, *names, *self.saved], outputs
 
     def placed(self, at: range, fixed: Sequence[Expression]) -> Tangents:
-        """Where what is saved, driving and constant lies one behind the other from the beginning of `at`."""
+        """The program, where what is saved, driving and constant lies one after another from the start of `at`."""
         order = {e: at.start + i for i, e in enumerate([*self.saved, *self.driving, *self.constant])}
         sources = tuple(tuple(order[e] for e in row) for row in self.sources)
         return Tangents(Program.of(self.outputs, [*self.inputs, *fixed]), sources, at[: len(self.saved)])
@@ -255,13 +251,11 @@ class Plan:
     @property
     def operations(self) -> int:
         """Arithmetic operations of a step of one lane: what it costs, whatever the machine."""
-        moving = sum(self._operations(self.motion.program, len(tangent)) for tangent in self.tangents)
-        return self._operations(self.step, len(self.y)) + moving
-
-    def _operations(self, program: Program, numbers: int) -> int:
-        """Of the program in every stage, and of the weighted sums between them."""
-        counted = sum(name not in ("constant", "neg") for name, *_ in program.operations)
-        return self.tableau.stages * counted + numbers * sum(map(len, self.tableau.weights))
+        weighed, total = sum(map(len, self.tableau.weights)), 0
+        for program, place in [(self.step, self.y), *((self.motion.program, place) for place in self.tangents)]:
+            counted = sum(name not in ("constant", "neg") for name, *_ in program.operations)
+            total += self.tableau.stages * counted + len(place) * weighed
+        return total
 
 
 def jumps(equations: Equations) -> bool:
@@ -286,8 +280,8 @@ def jumps(equations: Equations) -> bool:
                     value, slope, *_ = program(point)
                     point[place] = point[place] - value / slope
                 value, _, *shown = program(point)
-                count = equations.states
-                a, b = (np.stack(np.broadcast_arrays(value, *side)) for side in (shown[:count], shown[count:]))
+                half = equations.states
+                a, b = (np.stack(np.broadcast_arrays(value, *side)) for side in (shown[:half], shown[half:]))
                 apart = np.abs(a - b) > 1e-6 * (1.0 + np.abs(a) + np.abs(b))
                 if (apart & (np.abs(value) < 1e-9)).any():
                     return True
@@ -312,7 +306,7 @@ def planned(equations: Equations, tableau: Tableau, *, sensitive: bool) -> Plan:
     saved = [*motion.saved, *motion.driving]
     noted = [*reading.saved, *reading.driving] if sensitive else tape.shown
     fixed = _distinct([*tape.fixed(*tape.slope, *saved, *noted), *motion.fixed, *reading.fixed])
-    step, read = tape.along_the_way([*tape.slope, *saved], fixed), tape.along_the_way(noted, fixed)
+    step, read = (Program.of(found, [*tape.moving, *fixed]) for found in ([*tape.slope, *saved], noted))
     k, r = len(saved), len(noted)
     x, constants, y, fixed_at = map(room, (equations.parameters, equations.constants, equations.states, len(fixed)))
     lie = tuple(room(len(d)) for _ in dp)

@@ -17,16 +17,12 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-
-def special(name: str) -> Callable[[Any], Any]:
-    """A function of scipy.special, which is imported where one is needed."""
-    return lambda a: getattr(importlib.import_module("scipy.special"), name)(a)
-
-
 FUNCTIONS: dict[str, Callable[[Any], Any]] = {
     name: getattr(np, name) for name in ("sin", "cos", "tan", "arctan", "exp", "log", "sqrt", "sinh", "cosh", "tanh")
 }
-FUNCTIONS |= {name: special(name) for name in ("erf", "erfc")}
+FUNCTIONS |= {
+    name: lambda a, name=name: getattr(importlib.import_module("scipy.special"), name)(a) for name in ("erf", "erfc")
+}
 """The elementary functions that can be recorded, of numbers, arrays and expressions; log is the natural logarithm."""
 _UFUNCS = {"add": "add", "subtract": "sub", "multiply": "mul", "divide": "div", "true_divide": "div", "power": "pow"}
 _UFUNCS |= {"negative": "neg", "less": "less", "less_equal": "less_equal"} | {name: name for name in FUNCTIONS}
@@ -416,20 +412,13 @@ class Program:
         return [values[i] for i in self.outputs]
 
 
-_Fusion: TypeAlias = "tuple[str, Expression, Expression]"
-"""The name of the fused operation, the product in it, and the other operand."""
-
-
-def _fusion(e: Expression, uses: Mapping[int, int], inputs: Collection[Expression]) -> _Fusion | None:
-    if e.operation not in ("add", "sub"):
-        return None
-    a, b = operands(e)
-
-    def is_product(v: Expression) -> bool:
-        return v.operation == "mul" and uses[v.order] == 1 and v not in inputs
-
-    if is_product(a):
-        return ("fma" if e.operation == "add" else "fms"), a, b
-    if is_product(b):
-        return ("fma" if e.operation == "add" else "fnma"), b, a
+def _fusion(
+    e: Expression, uses: Mapping[int, int], inputs: Collection[Expression]
+) -> tuple[str, Expression, Expression] | None:
+    """The name of the fused operation that an expression can be, the product in it, and the other operand."""
+    if e.operation in ("add", "sub"):
+        a, b = operands(e)
+        for product, other, subtracted in ((a, b, "fms"), (b, a, "fnma")):
+            if product.operation == "mul" and uses[product.order] == 1 and product not in inputs:
+                return "fma" if e.operation == "add" else subtracted, product, other
     return None
