@@ -99,22 +99,6 @@ def test_a_file_may_have_fewer_readings_than_the_model_has_parameters(tmp_path):
     assert of(result, result.x)["b1_1"] == pytest.approx(alone.x[0], rel=1e-7)
 
 
-MISTAKES = {
-    "no such file's": (
-        ParameterInfo("b1_3", fixed=1.0),
-        r"parameters.b1_3: there is no such parameter; did you mean b1_2",
-    ),
-    "start outside": (ParameterInfo("b1_2", upper=200.0), r"parameters.b1_2: its start, 250, is not inside"),
-}
-
-
-@pytest.mark.parametrize("case", MISTAKES)
-def test_mistakes_name_the_file_s_own_parameter(files, case):
-    known, expected = MISTAKES[case]
-    with pytest.raises(UserError, match=expected):
-        together(files[0], known)
-
-
 # What is left out on purpose
 
 
@@ -135,18 +119,19 @@ def test_columns_are_left_out_with_their_units_or_without(tmp_path):
     assert open_together([tmp_path / "a.csv"], line, without=("remark", "T [C]")).deviations is not None
 
 
-NOT_THERE = {
-    "a column": ("u", r"ignore_columns=u: there is no such column \(there are: sigma, t, y\)"),
-    "what is needed": ("t", r"column t is missing"),
-    "the readings": ("y", r"column y is missing, which holds the readings"),
-}
-
-
-@pytest.mark.parametrize("case", NOT_THERE)
-def test_what_is_not_there_cannot_be_left_out(files, case):
-    column, expected = NOT_THERE[case]
+@pytest.mark.parametrize(
+    ("known", "without", "expected"),
+    [
+        (ParameterInfo("b1_3", fixed=1.0), (), r"parameters.b1_3: there is no such parameter; did you mean b1_2"),
+        (ParameterInfo("b1_2", upper=200.0), (), r"parameters.b1_2: its start, 250, is not inside"),
+        (None, ("u",), r"ignore_columns=u: there is no such column \(there are: sigma, t, y\)"),
+        (None, ("t",), r"column t is missing"),
+        (None, ("y",), r"column y is missing, which holds the readings"),
+    ],
+)
+def test_what_is_not_there_is_neither_known_nor_left_out(files, known, without, expected):
     with pytest.raises(UserError, match=expected):
-        open_together(files[0][:1], OWN, without=(column,))
+        open_together(files[0], OWN, () if known is None else (known,), without)
 
 
 def test_fewer_readings_than_parameters_are_refused(tmp_path):

@@ -16,6 +16,17 @@ from ipe_bench.trials.scenario import Scenario
 
 Q = norm.isf(0.025)
 LM = {"lm": LevenbergMarquardt(tolerance=1e-10, max_iterations=300)}
+T = np.arange(10.0)
+A = np.column_stack([np.ones(10), T])
+LINE = Formula("a+b*t", {"a": 1.0, "b": 1.0}, {"t": tuple(T)})
+
+
+def examined(model, z, deviation: float, *known: ParameterInfo):
+    """The examination of readings z, with what is known of the parameters."""
+    problem = Scenario(ConstrainedModel(model, known), Gaussian(deviation)).problem
+    found = examine(problem, z, fit(problem, z, LM))
+    assert found is not None
+    return found
 
 
 @pytest.mark.parametrize("beyond", [0.0, 0.5, 3.0])
@@ -23,17 +34,10 @@ LM = {"lm": LevenbergMarquardt(tolerance=1e-10, max_iterations=300)}
 def test_the_interval_of_a_linear_parameter_on_its_bound_is_known(beyond, side):
     """Chi-square about an unbounded estimate e deviations beyond the bound has risen by q^2 at -e + sqrt(e^2 + q^2)
     inside of it."""
-    t = np.arange(10.0)
-    A = np.column_stack([np.ones(10), t])
     s = 0.7 * np.sqrt(np.linalg.inv(A.T @ A)[1, 1])
-    z = 2 + 5 * t  # the unbounded estimate is 5
-    bound = 5 - side * (beyond * s + 1e-9)
+    bound = 5 - side * (beyond * s + 1e-9)  # the unbounded estimate is 5
     known = ParameterInfo("b", nominal=5 - 9 * side, **{"upper" if side > 0 else "lower": bound})
-    model = ConstrainedModel(Formula("a+b*t", {"a": 1.0, "b": 1.0}, {"t": tuple(t)}), (known,))
-    problem = Scenario(model, Gaussian(0.7)).problem
-    found = examine(problem, z, fit(problem, z, LM))
-    assert found is not None
-    (one,) = found.on_bounds
+    (one,) = examined(LINE, 2 + 5 * T, 0.7, known).on_bounds
     assert (one.parameter.name, one.bound) == ("b", bound)
     expected = bound - side * s * (-beyond + np.sqrt(beyond**2 + Q**2))
     assert one.other == pytest.approx(expected, abs=1e-3 * s)
@@ -42,17 +46,11 @@ def test_the_interval_of_a_linear_parameter_on_its_bound_is_known(beyond, side):
 @pytest.mark.parametrize("side", [-1, 1])
 def test_profiles_of_the_others_let_a_parameter_leave_its_bound_inwards(side):
     """Of an intercept whose slope is on its bound, against the quadratic form: the bound acts to one side only."""
-    t = np.arange(10.0)
-    A = np.column_stack([np.ones(10), t])
     P = 0.49 * np.linalg.inv(A.T @ A)
     sa, sb, c = *np.sqrt(np.diag(P)), P[0, 1]
     bound = 5 - side * 0.8 * sb
     known = ParameterInfo("b", nominal=5 - 9 * side, **{"upper" if side > 0 else "lower": bound})
-    model = ConstrainedModel(Formula("a+b*t", {"a": 1.0, "b": 1.0}, {"t": tuple(t)}), (known,))
-    problem = Scenario(model, Gaussian(0.7)).problem
-    z = 2 + 5 * t
-    found = examine(problem, z, fit(problem, z, LM))
-    assert found is not None
+    found = examined(LINE, 2 + 5 * T, 0.7, known)
 
     def rise(a: float) -> float:
         b = 5 + c / sa**2 * (a - 2)
@@ -74,9 +72,7 @@ def test_the_interval_on_a_bound_is_where_scipys_profile_rises():
     t = np.linspace(50, 700, 14)
     z = -240 * np.expm1(-5.6e-4 * t) + 0.1 * rng.standard_normal(14)
     model = Formula("b1*(1-exp(-b2*t))", {"b1": 200.0, "b2": 5e-4}, {"t": tuple(t)})
-    problem = Scenario(ConstrainedModel(model, (ParameterInfo("b1", upper=235.0),)), Gaussian(0.1)).problem
-    found = examine(problem, z, fit(problem, z, LM))
-    assert found is not None
+    found = examined(model, z, 0.1, ParameterInfo("b1", upper=235.0))
 
     def chi_square(b1: float) -> float:
         def residuals(p):
@@ -90,13 +86,7 @@ def test_the_interval_on_a_bound_is_where_scipys_profile_rises():
 
 
 def test_an_interval_ends_at_the_other_bound_where_the_readings_say_nothing():
-    t = np.arange(6.0)
-    known = ParameterInfo("b", nominal=0.5, lower=0.0, upper=1.0)
-    model = ConstrainedModel(Formula("a+b*t", {"a": 1.0, "b": 1.0}, {"t": tuple(t)}), (known,))
-    problem = Scenario(model, Gaussian(30.0)).problem
-    z = 2 + 5 * t
-    found = examine(problem, z, fit(problem, z, LM))
-    assert found is not None
+    found = examined(LINE, 2 + 5 * T, 60.0, ParameterInfo("b", nominal=0.5, lower=0.0, upper=1.0))
     assert (found.on_bounds[0].bound, found.on_bounds[0].other) == (1.0, 0.0)
 
 

@@ -5,8 +5,10 @@ import gzip
 import io
 import itertools
 import re
+import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -82,106 +84,85 @@ def text(*rows: str) -> bytes:
     return "\n".join(rows).encode()
 
 
-def odd_cells() -> Iterator[Case]:
-    yield Case(
-        "signs and exponents", text("t,y,sigma", *(f"+{t},{y:.17e},{s:E}" for t, y, s in zip(T, Y, SIGMA, strict=True)))
-    )
-    yield Case(
-        "blanks about numbers",
-        text("t , y, sigma", *(f" {t} ,\t{y} ,{s} " for t, y, s in zip(T, Y, SIGMA, strict=True))),
-    )
-    yield Case("everything quoted", text(*('"' + line.replace(",", '","') + '"' for line in lines())))
-    yield Case("blank lines", text("", *itertools.chain.from_iterable((line, " ", ",,") for line in lines()), ""))
-    yield Case(
-        "points without zeros",
-        text(
-            "t,y,sigma",
-            *(f"{t},{y},{s}".replace("0.", ".").replace(".0,", ".,") for t, y, s in zip(T, Y, SIGMA, strict=True)),
-        ),
-    )
-    yield Case("rows numbered", text("row,t,y,sigma", *(f"{i},{line}" for i, line in enumerate(lines()[1:], 1))))
-    yield Case("units", text("t [s],y [V],sigma [V]", *lines()[1:]))
-    yield Case("no unit of sigma", text("t [s],y [V],sigma", *lines()[1:]))
-    yield Case("called reading", text("t,reading,sigma", *lines()[1:]))
-    yield Case("a reading missing", with_cell("y", ""), missing=(2,))
-    yield Case(
-        "a reading and its deviation missing",
-        text(*(line if i != 3 else "2.0,," for i, line in enumerate(lines()))),
-        missing=(2,),
-    )
-    yield Case("weight missing", with_cell("sigma", ""), r"row 4, column sigma: '' is not a standard deviation")
-    yield Case("weight zero", with_cell("sigma", "0"), r"row 4, column sigma: '0' is not a standard deviation")
-    yield Case("time missing", with_cell("t", ""), r"row 4, column t: is empty")
-    yield Case(
-        "rows numbered otherwise",
-        text("row,t,y,sigma", *(f"{i},{line}" for i, line in enumerate(lines()[1:]))),
+GOOD = lines()
+WHOLE = "\n".join(GOOD)
+ROWS = list(zip(T, Y, SIGMA, strict=True))
+READ = {
+    "signs and exponents": text("t,y,sigma", *(f"+{t},{y:.17e},{s:E}" for t, y, s in ROWS)),
+    "blanks about numbers": text("t , y, sigma", *(f" {t} ,\t{y} ,{s} " for t, y, s in ROWS)),
+    "everything quoted": text(*('"' + line.replace(",", '","') + '"' for line in GOOD)),
+    "blank lines": text("", *itertools.chain.from_iterable((line, " ", ",,") for line in GOOD), ""),
+    "points without zeros": re.sub(r"\.0\b", ".", re.sub(r"\b0\.", ".", WHOLE)).encode(),
+    "rows numbered": text("row,t,y,sigma", *(f"{i},{line}" for i, line in enumerate(GOOD[1:], 1))),
+    "units": text("t [s],y [V],sigma [V]", *GOOD[1:]),
+    "no unit of sigma": text("t [s],y [V],sigma", *GOOD[1:]),
+    "called reading": text("t,reading,sigma", *GOOD[1:]),
+    "tabs": WHOLE.replace(",", "\t").encode(),
+}
+WITHOUT_THE_THIRD = {
+    "a reading missing": with_cell("y", ""),
+    "a reading and its deviation missing": text(*GOOD[:3], "2.0,,", *GOOD[4:]),
+}
+NO_HEADER = "row 2: looks like the header, which must be the first row"
+REFUSED = {
+    "weight missing": (with_cell("sigma", ""), r"row 4, column sigma: '' is not a standard deviation"),
+    "weight zero": (with_cell("sigma", "0"), r"row 4, column sigma: '0' is not a standard deviation"),
+    "time missing": (with_cell("t", ""), r"row 4, column t: is empty"),
+    "rows numbered otherwise": (
+        text("row,t,y,sigma", *(f"{i},{line}" for i, line in enumerate(GOOD[1:]))),
         r"row 2, column row: '0' stands where the order of the rows says 1",
-    )
-
-
-def odd_tables() -> Iterator[Case]:
-    good = lines()
-    as_text = "\n".join(good)
-    yield Case("empty", b"", "is empty")
-    yield Case("a mark and nothing else", "\ufeff".encode(), "is empty")
-    yield Case("no header", text(*good[1:]), "the first row has only numbers and is no header; write")
-    yield Case("two readings", text(*good[:2]), "1 readings are too few for 2 parameters")
-    yield Case("tabs", as_text.replace(",", "\t").encode())
-    yield Case(
-        "tabs and decimal commas",
-        as_text.replace(",", "\t").replace(".", ",").encode(),
+    ),
+    "empty": (b"", "is empty"),
+    "a mark and nothing else": ("\ufeff".encode(), "is empty"),
+    "no header": (text(*GOOD[1:]), "the first row has only numbers and is no header; write"),
+    "two readings": (text(*GOOD[:2]), "1 readings are too few for 2 parameters"),
+    "tabs and decimal commas": (
+        WHOLE.replace(",", "\t").replace(".", ",").encode(),
         "row 2, column y: '-1,25' is not a number",
-    )
-    yield Case("blanks between", as_text.replace(",", "  ").encode(), "column t is missing")
-    yield Case(
-        "a separator declared", text("sep=,", *good), "row 2: looks like the header, which must be the first row"
-    )
-    yield Case("a remark first", text("# voltmeter 3", *good), "row 2: looks like the header, which")
-    yield Case("a remark within", text(*good[:3], "# pause", *good[3:]), "row 4: has 1 cells and the header 3")
-    yield Case("two headers", text(*good[:4], *good), r"row 5, column .: '.' is not a number")
-    yield Case("units in a row", text(good[0], "s,V,V", *good[1:]), r"row 2, column .: '.' is not a number")
-    yield Case("a sum below", text(*good, ",999,"), r"row 8, column t: is empty")
-    yield Case(
-        "decimal commas between commas",
-        text(good[0], *(line.replace(".", ",") for line in good[1:])),
+    ),
+    "blanks between": (WHOLE.replace(",", "  ").encode(), "column t is missing"),
+    "a separator declared": (text("sep=,", *GOOD), NO_HEADER),
+    "a remark first": (text("# voltmeter 3", *GOOD), NO_HEADER),
+    "a remark within": (text(*GOOD[:3], "# pause", *GOOD[3:]), "row 4: has 1 cells and the header 3"),
+    "two headers": (text(*GOOD[:4], *GOOD), r"row 5, column .: '.' is not a number"),
+    "units in a row": (text(GOOD[0], "s,V,V", *GOOD[1:]), r"row 2, column .: '.' is not a number"),
+    "a sum below": (text(*GOOD, ",999,"), r"row 8, column t: is empty"),
+    "decimal commas between commas": (
+        text(GOOD[0], *(line.replace(".", ",") for line in GOOD[1:])),
         "row 2: has 6 cells and the header 3; with decimal commas, separate the cells by semicolons",
-    )
-    yield Case("thousands", text(good[0], '1,"1,017.5",1', *good[1:]), r"row 2, column y: '1,017.5' is not a number")
-    yield Case(
-        "thousands of Germany", text("t;y;sigma", "1,5;1.017,5;1", "2;3;1", "3;4;1"), r"row 2, column y: '1.017,5'"
-    )
-    yield Case("a cell too few", text(*good[:2], "1.25,2.5", *good[3:]), "row 3: has 2 cells and the header 3")
-    yield Case("a cell too many", text(*good[:2], good[2] + ",7", *good[3:]), "row 3: has 4 cells and the header 3")
-    yield Case("a comma behind each row", text(*(line + "," for line in good)), "column 4, which has no name, is not")
-    yield Case("two columns of one name", text("t,y,y", *good[1:]), "column y stands there twice")
-    yield Case(
-        "two columns without a name", text("t,y,sigma,,", *(line + ",," for line in good[1:])), "without a name stand"
-    )
-    yield Case("weight", text("t,y,weight", *good[1:]), "column weight is not understood; remove it")
-    yield Case(
-        "a note",
-        text("t,y,note", *(",".join(line.split(",")[:2]) + ",fine" for line in good[1:])),
-        "column note is not",
-    )
-    for name in ("sigm", "Sigma"):
-        yield Case(name, text(f"t,y,{name}", *good[1:]), f"column {name} is not understood; did you mean sigma")
-    yield Case("T", text("T,y,sigma", *good[1:]), "column t is missing; there are T, y, sigma; did you mean T")
-    yield Case("Y", text("t,Y,sigma", *good[1:]), "column y is missing, .* there are t, Y, sigma; set measurement.read")
-    yield Case("x", text("x,y,sigma", *good[1:]), "column t is missing.*If t is a parameter")
-    yield Case(
-        "another unit of sigma",
-        text("t,y [V],sigma [mV]", *good[1:]),
+    ),
+    "thousands": (text(GOOD[0], '1,"1,017.5",1', *GOOD[1:]), r"row 2, column y: '1,017.5' is not a number"),
+    "thousands of Germany": (text("t;y;sigma", "1,5;1.017,5;1", "2;3;1", "3;4;1"), r"row 2, column y: '1.017,5'"),
+    "a cell too few": (text(*GOOD[:2], "1.25,2.5", *GOOD[3:]), "row 3: has 2 cells and the header 3"),
+    "a cell too many": (text(*GOOD[:2], GOOD[2] + ",7", *GOOD[3:]), "row 3: has 4 cells and the header 3"),
+    "a comma behind each row": (text(*(line + "," for line in GOOD)), "column 4, which has no name, is not"),
+    "two columns of one name": (text("t,y,y", *GOOD[1:]), "column y stands there twice"),
+    "two columns without a name": (text("t,y,sigma,,", *(f"{line},," for line in GOOD[1:])), "without a name stand"),
+    "weight": (text("t,y,weight", *GOOD[1:]), "column weight is not understood; remove it"),
+    "a note": (text("t,y,note", *(f"{t},{y},fine" for t, y, _ in ROWS)), "column note is not"),
+    "sigm": (text("t,y,sigm", *GOOD[1:]), "column sigm is not understood; did you mean sigma"),
+    "Sigma": (text("t,y,Sigma", *GOOD[1:]), "column Sigma is not understood; did you mean sigma"),
+    "T": (text("T,y,sigma", *GOOD[1:]), "column t is missing; there are T, y, sigma; did you mean T"),
+    "Y": (text("t,Y,sigma", *GOOD[1:]), "column y is missing, .* there are t, Y, sigma; set measurement.read"),
+    "x": (text("x,y,sigma", *GOOD[1:]), "column t is missing.*If t is a parameter"),
+    "another unit of sigma": (
+        text("t,y [V],sigma [mV]", *GOOD[1:]),
         r"column sigma \[mV\]: the unit must be that of y",
-    )
-    yield Case("a quote left open", text(*good[:4], '3.5,"0.001,2.0', *good[5:]), r"row \d: is not a readable CSV file")
-    yield Case("a quote within", text(*good[:4], '3.5,"0."001,2.0', *good[5:]), r"row 5: is not a readable CSV file")
-    yield Case("latin-1", text("t,y [µV],sigma", *good[1:]).decode().encode("latin-1"), "row 1: is not a readable CSV")
-    yield Case("UTF-16", as_text.encode("utf-16"), "row 1: is not a readable CSV file")
-    yield Case("compressed", gzip.compress(as_text.encode(), mtime=0), "is not a readable CSV file")
-    yield Case("a page", b"<html><body>404 not found</body></html>", "column t is missing")
-    yield Case("JSON", b'{"t": [1, 2], "y": [1, 2]}', "is not a readable CSV|column t is missing")
-    yield Case("text called Parquet", as_text.encode(), "is not a readable Parquet file", ".parquet")
-    yield Case("Parquet called text", parquet(COLUMNS), "is not a readable CSV file")
+    ),
+    "a quote left open": (text(*GOOD[:4], '3.5,"0.001,2.0', *GOOD[5:]), r"row \d: is not a readable CSV file"),
+    "a quote within": (text(*GOOD[:4], '3.5,"0."001,2.0', *GOOD[5:]), r"row 5: is not a readable CSV file"),
+    "latin-1": (text("t,y [µV],sigma", *GOOD[1:]).decode().encode("latin-1"), "row 1: is not a readable CSV"),
+    "UTF-16": (WHOLE.encode("utf-16"), "row 1: is not a readable CSV file"),
+    "compressed": (gzip.compress(WHOLE.encode(), mtime=0), "is not a readable CSV file"),
+    "a page": (b"<html><body>404 not found</body></html>", "column t is missing"),
+    "JSON": (b'{"t": [1, 2], "y": [1, 2]}', "is not a readable CSV|column t is missing"),
+}
+
+
+def odd_files() -> Iterator[Case]:
+    yield from itertools.starmap(Case, READ.items())
+    yield from (Case(name, content, missing=(2,)) for name, content in WITHOUT_THE_THIRD.items())
+    yield from (Case(name, *case) for name, case in REFUSED.items())
 
 
 def parquet(columns) -> bytes:
@@ -193,6 +174,8 @@ def parquet(columns) -> bytes:
 
 
 def tables_of_programs() -> Iterator[Case]:
+    yield Case("text called Parquet", WHOLE.encode(), "is not a readable Parquet file", ".parquet")
+    yield Case("Parquet called text", parquet(COLUMNS), "is not a readable CSV file")
     yield Case("Parquet", parquet(COLUMNS), suffix=".parquet")
     yield Case("Parquet of texts", parquet({k: [repr(v) for v in c] for k, c in COLUMNS.items()}), suffix=".parquet")
     yield Case("Parquet in another order", parquet(dict(reversed(COLUMNS.items()))), suffix=".parquet")
@@ -212,9 +195,6 @@ def tables_of_programs() -> Iterator[Case]:
 
 def written(model: Measurement, change=lambda rows: rows) -> bytes:
     """The file that a model writes of its own readings, changed."""
-    import tempfile
-    from pathlib import Path
-
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "a.csv"
         write_readings(path, model, model.simulate(model.nominal[None])[0])
@@ -229,66 +209,49 @@ def replaced(row: int, old: str, new: str):
     return change
 
 
+MEANT = (
+    ("ranging in reverse", Ranging(), lambda rows: [rows[0], *reversed(rows[1:])]),
+    ("sir in reverse", Sir(), lambda rows: [rows[0], *reversed(rows[1:])]),
+    ("a beacon as 1.0", Ranging(), replaced(2, "1,1,", "1.0,1e0,")),
+    ("a beacon with weights", Ranging(), lambda rows: with_weights(rows)),
+)
+MISTAKEN = (
+    ("a beacon twice", Ranging(), lambda r: [*r, r[1]], r"row \d+: round=1, beacon=1 stands in row 2 already"),
+    ("a beacon too few", Ranging(), lambda rows: rows[:-1], r"rows; the first absent one is"),
+    ("an unknown beacon", Ranging(), replaced(2, "1,1,", "1,99,"), "row 2: ranging has no reading round=1, beacon=99"),
+    ("a day before the start", Sir(), replaced(2, "1,1.0,", "1,-1.0,"), "comes before the start"),
+    ("an unknown output", Sir(), replaced(3, "infected", "healed"), "output=healed"),
+    ("no first epidemic", Sir(), replaced(3, "1,", "3,"), "case=3: cases are numbered"),
+    ("half an epoch", Gnss(), replaced(2, "1,", "1.5,"), "row 2, column epoch: '1.5' is not a whole"),
+    (
+        "an attitude out of order",
+        Accelerometer(),
+        lambda rows: [rows[0], rows[2], rows[1], *rows[3:]],
+        "row 2, column attitude: '2' stands where the order of the rows says 1",
+    ),
+)
+
+
 def files_of_models() -> Iterator[Case]:
     for model in (Ranging(), Sir(), Gnss(), Accelerometer()):
+        other_unit = replaced(1, "[day]", "[week]") if model.name == "sir" else replaced(1, "[m", "[km")
         yield Case(f"{model.name} as written", written(model), model=model)
-        swapped = {"ranging": True, "sir": True}.get(model.name, False)
-        if swapped:
-            yield Case(f"{model.name} in reverse", written(model, lambda r: [r[0], *reversed(r[1:])]), model=model)
-        another_unit = written(
-            model, replaced(1, "[day]", "[week]") if model.name == "sir" else replaced(1, "[m", "[km")
-        )
-        yield Case(f"{model.name} in another unit", another_unit, r"unit must be|is missing", model=model)
+        yield Case(f"{model.name} in another unit", written(model, other_unit), r"unit must be|is missing", model=model)
         yield Case(f"{model.name} with its first reading gone", written(model, emptied), model=model, missing=(0,))
-    yield Case(
-        "a beacon twice",
-        written(Ranging(), lambda r: [*r, r[1]]),
-        r"row \d+: round=1, beacon=1 stands in row 2 already",
-        model=Ranging(),
-    )
-    yield Case(
-        "a beacon too few", written(Ranging(), lambda r: r[:-1]), r"rows; the first absent one is", model=Ranging()
-    )
-    yield Case(
-        "an unknown beacon",
-        written(Ranging(), replaced(2, "1,1,", "1,99,")),
-        "row 2: ranging has no reading round=1, beacon=99",
-        model=Ranging(),
-    )
-    yield Case("a beacon as 1.0", written(Ranging(), replaced(2, "1,1,", "1.0,1e0,")), model=Ranging())
-    yield Case("a beacon with weights", written(Ranging(), with_weights), model=Ranging())
-    yield Case(
-        "a day before the start",
-        written(Sir(), replaced(2, "1,1.0,", "1,-1.0,")),
-        "comes before the start",
-        model=Sir(),
-    )
-    yield Case("an unknown output", written(Sir(), replaced(3, "infected", "healed")), "output=healed", model=Sir())
-    yield Case("no first epidemic", written(Sir(), replaced(3, "1,", "3,")), "case=3: cases are numbered", model=Sir())
-    yield Case(
-        "half an epoch",
-        written(Gnss(), replaced(2, "1,", "1.5,")),
-        "row 2, column epoch: '1.5' is not a whole",
-        model=Gnss(),
-    )
-    yield Case(
-        "an attitude out of order",
-        written(Accelerometer(), lambda r: [r[0], r[2], r[1], *r[3:]]),
-        "row 2, column attitude: '2' stands where the order of the rows says 1",
-        model=Accelerometer(),
-    )
+    yield from (Case(name, written(model, change), model=model) for name, model, change in MEANT)
+    yield from (Case(name, written(model, change), refusal, model=model) for name, model, change, refusal in MISTAKEN)
 
 
 def emptied(rows: list[str]) -> list[str]:
     return [rows[0], rows[1].rpartition(",")[0] + ",", *rows[2:]]
 
 
-def with_weights(rows: list[str], heading: str = "sigma") -> list[str]:
-    return [f"{rows[0]},{heading}", *(f"{row},{0.5 + i}" for i, row in enumerate(rows[1:]))]
+def with_weights(rows: list[str]) -> list[str]:
+    return [f"{rows[0]},sigma", *(f"{row},{0.5 + i}" for i, row in enumerate(rows[1:]))]
 
 
 CASES = [
-    *ways_of_writing(), *wrong_cells(), *odd_cells(), *odd_tables(), *tables_of_programs(), *files_of_models()
+    *ways_of_writing(), *wrong_cells(), *odd_files(), *tables_of_programs(), *files_of_models()
 ]  # fmt: skip
 
 
