@@ -24,7 +24,7 @@ from ipe_bench.runs.run import compute, validate
 from ipe_bench.runs.schedule import Watcher
 from ipe_bench.states.base import StateModel
 from ipe_bench.states.trackers import Tracker
-from ipe_bench.trials.scenario import TRIALS, AnyScenario, Scenario, Tracking
+from ipe_bench.trials.scenario import AnyScenario, Scenario, Tracking
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -87,7 +87,7 @@ def run(
     from ipe_bench.plugins.extensions import use_statistics
     from ipe_bench.report.summary import Stored, Summary
     from ipe_bench.statistics import summarize
-    from ipe_bench.statistics.stopping import check_time_limit, compute_until
+    from ipe_bench.statistics.stopping import compute_until
 
     stated = {"noise": noise, "prior": prior, "error_scale": error_scale}
     if isinstance(scenarios, Sequence):
@@ -96,13 +96,8 @@ def run(
         scenarios = [_tracking(scenarios) or _scenario(scenarios, **stated)]
     estimators, stored = _labelled(estimators), Stored(output)
     options: dict[str, Any] = {"execution": execution, "block_size": block_size, "watch": watch}
-    stops: list[Any] = []
-    if precision is None:
-        check_time_limit(time_limit)
-        failures = compute(scenarios, estimators, TRIALS if trials is None else trials, stored.folder, **options)
-    else:
-        options |= {"precision": precision, "time_limit": time_limit}
-        failures, stops = compute_until(scenarios, estimators, trials, stored.folder, **options)
+    options |= {"precision": precision, "time_limit": time_limit}
+    failures, stops = compute_until(scenarios, estimators, trials, stored.folder, **options)
     _warn([*(f"failed: {failure}" for failure in failures), *use_statistics()])
     table = Summary.of(summarize([stored.folder]), stored)
     if precision is not None:

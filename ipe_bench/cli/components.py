@@ -30,10 +30,7 @@ if TYPE_CHECKING:
 RECORDS = {"statistic": "STATISTIC", "figure": "FIGURE", "table": "table", "section": "SECTION"}
 """What reports are made of, and what each is called in its module."""
 ALONE = {
-    "function": (
-        "{name}.py",
-        'measurement=function measurement.of={name}:{name} "measurement.columns.t=[0,1,2,3,4]"',
-    ),
+    "function": ("{name}.py", 'measurement=function measurement.of={name}:{name} "measurement.columns.t=[0,1,2,3,4]"'),
     "ode": ("{name}.yaml", "measurement=ode measurement.file={name}.yaml"),
 }
 """Models that are one file and no plugin, and how to choose them."""

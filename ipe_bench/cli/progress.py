@@ -42,24 +42,15 @@ def shown_progress(title: str) -> Iterator[Watcher]:
             spoken = time.monotonic()
             console.print(f"{title}: {state}", markup=False, soft_wrap=True)
 
-    logger, handler = logging.getLogger("ipe_bench"), _Lines(console)
+    logger, handler = logging.getLogger("ipe_bench"), logging.Handler(logging.WARNING)
+    # Through the console that draws the bar, so that neither spoils the other.
+    handler.emit = lambda record: console.print(f"ipe-bench: {record.getMessage()}", markup=False, soft_wrap=True)
     logger.addHandler(handler)
     try:
         with bar:
             yield watch
     finally:
         logger.removeHandler(handler)
-
-
-class _Lines(logging.Handler):
-    """Prints warnings through the console that also draws the bar, so that neither spoils the other."""
-
-    def __init__(self, console: Console) -> None:
-        super().__init__(logging.WARNING)
-        self.console = console
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self.console.print(f"ipe-bench: {record.getMessage()}", markup=False, soft_wrap=True)
 
 
 def _state(progress: Progress) -> str:
@@ -69,10 +60,10 @@ def _state(progress: Progress) -> str:
     state = f"block {progress.done}/{progress.tasks}"
     if progress.failures:
         state += f", {len(progress.failures)} failed"
-    if progress.preparing:
+    if progress.began is None:
         return f"{state}, compiling, once"
-    seconds = progress.seconds
-    if rate := progress.trials / seconds if seconds else 0.0:
+    seconds = time.monotonic() - progress.began
+    if rate := progress.trials / max(seconds, 1e-9):
         state += f", {rate:.0f} estimates/s" if rate >= 10 else f", {rate:.2g} estimates/s"
     if 0 < progress.done < progress.tasks:
         state += f", {timedelta(seconds=round(seconds * (progress.tasks / progress.done - 1)))} left"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from ipe_bench.cli.session import Jobs, complete, jobs_of, session, show, spec_o
 from ipe_bench.cli.spec import STANDARD_FILTERS, Spec
 from ipe_bench.runs.execution import Serial, end_idle
 from ipe_bench.runs.results import Results
-from ipe_bench.runs.run import accept, compute, record_refusal, result_keys, validate
+from ipe_bench.runs.run import accept, record_refusal, result_keys, validate
 from ipe_bench.runs.store import describe_names
 
 _NOT_TELLING = {*w.NO_PART_OF_A_NAME, "default_name", "experiment", "solver", "baseline", "tracker"} - {"seed"}
@@ -92,7 +92,7 @@ def run_command(arguments: Sequence[str]) -> int:
             return 0
         if words.standard_baselines:
             say(*_left_out(jobs.specs))
-        task = Task(shlex.join(["ipe-bench", "run", *arguments]), words)
+        task = Task(shlex.join(["ipe-bench", "run", *arguments]), words.files, words.standard_baselines)
         for told, spec in zip(jobs.told, jobs.specs, strict=False):
             task.compute(told, spec)
         outcomes = task.outcomes if jobs.told else jobs.launch(task) or task.outcomes
@@ -137,17 +137,18 @@ def _flags(arguments: Sequence[str]) -> Namespace:
     return flags
 
 
+@dataclass(frozen=True)
 class Task:
     """Computes jobs; a mistake in one stops no other."""
 
-    def __init__(self, command: str, words: w.Words) -> None:
-        self.command = command
-        """As it was typed."""
-        self.files = words.files
-        self.standard = words.standard_baselines
-        """Whether the baselines are those of a plain run."""
-        self.outcomes: list[Outcome] = []
-        """Of the jobs in this process: a sweeper that optimises keeps to itself what they return."""
+    command: str
+    """As it was typed."""
+    files: Mapping[str, str]
+    """By an override that a file holds, the word that names the file."""
+    standard: bool
+    """Whether the baselines are those of a plain run."""
+    outcomes: list[Outcome] = field(default_factory=list)
+    """Of the jobs in this process: a sweeper that optimises keeps to itself what they return."""
 
     def __call__(self, config: DictConfig) -> Outcome:
         """Computes a job that Hydra has composed and launched."""
@@ -179,27 +180,23 @@ def _computed(job: Spec, begun: Outcome, command: str) -> Outcome:
     if job.write_readings is not None:
         write_trial(job, Path(job.write_readings), job.write_readings_trial)
         return begun
+    from ipe_bench.statistics.stopping import NARROW, compute_until, objective
+
     asked: Any = ([job.scenario], job.estimators, job.count, job.output)
     options: dict[str, Any] = {"execution": job.execution, "block_size": job.block_size, "command": command}
+    options |= {"precision": job.precision, "time_limit": job.time_limit}
     with shown_progress(begun.job) as watch:
-        if job.precision is None:
-            done = replace(begun, failures=compute(*asked, **options, watch=watch))
-        else:
-            from ipe_bench.statistics.stopping import NARROW, compute_until
-
-            options |= {"precision": job.precision, "time_limit": job.time_limit}
-            failures, (stop,) = compute_until(*asked, **options, watch=watch)
-            missed = stop["reason"] != NARROW
-            verdict = "the precision is not reached: " if missed else ""
-            said = f"{begun.job}: {stop['trials']} trials; {verdict}{stop['reason']} ({stop['widest']})"
-            done = replace(begun, failures=failures, stop=said, precision_missed=missed)
-    value = None
+        failures, stops = compute_until(*asked, **options, watch=watch)
+    done = replace(begun, failures=failures, remarks=job.measurement.remarks(job.measurement.nominal))
+    for stop in stops:
+        missed = stop["reason"] != NARROW
+        verdict = "the precision is not reached: " if missed else ""
+        said = f"{done.job}: {stop['trials']} trials; {verdict}{stop['reason']} ({stop['widest']})"
+        done = replace(done, stop=said, precision_missed=missed)
     if job.objective is not None:
-        from ipe_bench.statistics.stopping import objective
-
-        value = objective(job.scenario, job.estimators, *job.aim, job.output)
+        done = replace(done, objective=objective(job.scenario, job.estimators, *job.aim, job.output))
     cells = {one.key: describe_names(one.names) for one in result_keys(job.scenario, job.estimators)}
-    return replace(done, cells=cells, objective=value, remarks=job.measurement.remarks(job.measurement.nominal))
+    return replace(done, cells=cells)
 
 
 def _conclude(jobs: Jobs, outcomes: list[Outcome]) -> int:

@@ -26,7 +26,7 @@ from ipe_bench.noise import Gaussian, ModelNoise
 from ipe_bench.noise.base import Noise
 from ipe_bench.plugins.construct import construct, find_class
 from ipe_bench.plugins.discovery import COMPONENT_GROUPS, Option, blame, composed
-from ipe_bench.priors import GaussianPrior, Prior
+from ipe_bench.priors import Prior
 from ipe_bench.runs.execution import Execution, Serial
 from ipe_bench.runs.provenance import TARGET, describe
 from ipe_bench.states import Formulas
@@ -142,8 +142,8 @@ def _shaped(what: str, value: Any, wanted: tuple[int, ...], meaning: str = "") -
 def _scenario(estimator: Estimator, strength: float = 0.005) -> Scenario:
     """A mildly bent polynomial model; for estimators that need differential equations a short epidemic."""
     if "differential equations" in estimator.needs:
-        return Scenario(Sir(), Gaussian(5.0), GaussianPrior(), error_scale=0.5, seed=5)
-    return Scenario(Polynomial(strength=strength), Gaussian(0.01), GaussianPrior(), error_scale=1.0, seed=5)
+        return Scenario(Sir(), Gaussian(5.0), error_scale=0.5, seed=5)
+    return Scenario(Polynomial(strength=strength), Gaussian(0.01), seed=5)
 
 
 def _readings(estimator: Estimator) -> tuple[Problem, Array]:
@@ -159,8 +159,8 @@ def steps_to_a_state(estimator: Estimator) -> None:
         return
     x, system = begin(*_readings(estimator), "linear_lse")
     after = estimator.step(system, estimator.begin(system, x))
-    noun = type(after).__name__
-    assert isinstance(after, State), f"step returns {noun}, and not a State: return State(x, system.F(x))"
+    remedy = "return State(x, system.F(x))"
+    assert isinstance(after, State), f"step returns {type(after).__name__}, and not a State: {remedy}"
     for name in ("x", "F"):
         _shaped(f"step returns a State whose {name}", getattr(after, name), x.shape)
 
@@ -177,12 +177,11 @@ def finds_the_parameters(estimator: Estimator) -> None:
     worst = float((np.abs(error) / bound).max())
     assert worst < 8, f"the largest error is {worst:.1f} standard deviations of the bound"
     P = estimates.covariance
-    if P is None:
-        return
-    _shaped("covariance", P, (SCATTERED, n, n), "(trials, n, n)")
-    known = (estimates.status == Status.CONVERGED) & np.isfinite(P).all(axis=(1, 2))
-    if known.sum() >= SCATTERED // 2:
-        _agrees("the reported variances are", nees(error, P)[known], n)
+    if P is not None:
+        _shaped("covariance", P, (SCATTERED, n, n), "(trials, n, n)")
+        known = (estimates.status == Status.CONVERGED) & np.isfinite(P).all(axis=(1, 2))
+        if known.sum() >= SCATTERED // 2:
+            _agrees("the reported variances are", nees(error, P)[known], n)
 
 
 def _agrees(what: str, squared: Array, n: int) -> None:
@@ -237,12 +236,10 @@ def accounts_for_itself(estimator: Estimator) -> None:
 
 def keeps_a_history_if_asked(estimator: Estimator) -> None:
     """Returns the iterates that lead to the estimate, where it keeps any."""
-    problem, z = _readings(estimator)
-    estimates = estimator.estimate(problem, z, history=True)
-    if estimates.history is None:
-        return
-    assert len(estimates.history) == len(z), "history has not one entry per trial"
-    for x, iterates in zip(estimates.x, estimates.history, strict=True):
+    estimates = estimator.estimate(*_readings(estimator), history=True)
+    history = estimates.x[:, None] if estimates.history is None else estimates.history
+    assert len(history) == len(estimates.x), "history has not one entry per trial"
+    for x, iterates in zip(estimates.x, history, strict=True):
         assert iterates.ndim == 2, "an entry of history is not (iterations + 1, n)"
         assert np.array_equal(iterates[-1], x, equal_nan=True), "the last iterate is not the estimate"
 
@@ -331,12 +328,9 @@ def orders_its_epochs(model: Measurement) -> None:
     assert np.array_equal(rows, np.arange(model.m)), "the epochs do not hold every reading once"
     x, stop = _points(model), max(1, len(model.epochs or ()) // 2)
     whole = model.simulate(x)[:, model.rows(stop)]
-    for name, simulate, error in (
-        ("a prefix differs", model.simulate_until, 1e-12),
-        ("a coarse prefix is far", model.coarse_simulate_until, 1e-3),
-    ):
-        close = np.allclose(simulate(x, stop), whole, rtol=error, atol=error * np.abs(whole).max())
-        assert close, f"{name} from the whole"
+    prefix, coarse, largest = model.simulate_until(x, stop), model.coarse_simulate_until(x, stop), np.abs(whole).max()
+    assert np.allclose(prefix, whole, rtol=1e-12, atol=1e-12 * largest), "a prefix differs from the whole"
+    assert np.allclose(coarse, whole, rtol=1e-3, atol=1e-3 * largest), "a coarse prefix is far from the whole"
 
 
 # Noises and priors
@@ -526,8 +520,8 @@ def _work(task: Any) -> Iterator[int]:
 
 def does_every_task(execution: Execution) -> None:
     """Tells of every step of every task in order, once of its end, and of a task that raises as a failure."""
-    told, serial = _told(execution), _told(Serial())
-    for i, right in serial.items():
+    told = _told(execution)
+    for i, right in _told(Serial()).items():
         assert told[i] == right, f"of task {i} it tells {', '.join(told[i]) or 'nothing'}; right is {', '.join(right)}"
 
 
@@ -542,11 +536,8 @@ def _told(execution: Execution) -> dict[int, list[str]]:
 
 def ends_with_the_run(execution: Execution) -> None:
     """Hands on what ends the whole run, a UserError or StorageError, and can be closed before its end."""
-    try:
+    with suppress(UserError):
         list(execution.run(_work, (UserError("wrong"), range(3))))
-    except UserError:
-        pass
-    else:
         raise AssertionError("a UserError does not end the run; raise what is in ipe_bench.runs.execution.FATAL")
     events = execution.run(_work, (range(3), range(3)))
     next(iter(events))

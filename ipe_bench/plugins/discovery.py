@@ -118,7 +118,7 @@ class Option:
 
     @functools.cached_property
     def text(self) -> str:
-        """What stands in the file; what is not UTF-8 is replaced, and told by `fault`."""
+        """What the file says; what is not UTF-8 is replaced, and told by `fault`."""
         return self.path.read_text(encoding="utf-8", errors="replace")
 
     @property
@@ -127,7 +127,7 @@ class Option:
         comments = (line for line in self.text.splitlines() if line.startswith("#"))
         return next((line.lstrip("# ").strip() for line in comments if not _PACKAGE_HEADER.match(line)), "")
 
-    @property
+    @functools.cached_property
     def config(self) -> Any:
         """What the file says, as plain data."""
         return read_yaml(self.text)
@@ -135,14 +135,12 @@ class Option:
     @property
     def package(self) -> str | None:
         """Where in the config the option lands, where its header says so."""
-        found = _PACKAGE_HEADER.search(self.text)
-        return found.group(1) if found else None
+        return found[1] if (found := _PACKAGE_HEADER.search(self.text)) else None
 
     @property
     def target(self) -> str | None:
         """The class that it names."""
-        found = _TARGET_LINE.search(self.text)
-        return found.group(1) if found else None
+        return found[1] if (found := _TARGET_LINE.search(self.text)) else None
 
     @property
     def comments(self) -> dict[str, str]:
@@ -159,14 +157,9 @@ class Option:
         if (key := PACKAGES.get(self.group)) is not None and self.package != f"{key}.{self.label}":
             return f"{self.path}: its first line must be '# @package {key}.{self.label}', or it never runs"
         try:
-            return None if _is_mapping(self.text) else f"{self.path}: holds no keys; write KEY: VALUE lines"
+            return None if isinstance(self.config, dict) else f"{self.path}: holds no keys; write KEY: VALUE lines"
         except yaml.YAMLError as error:
             return explain_yaml(error, self.path)
-
-
-@functools.lru_cache(maxsize=1024)
-def _is_mapping(text: str) -> bool:
-    return isinstance(read_yaml(text), dict)
 
 
 packages = {"ipe_bench"}
@@ -219,18 +212,12 @@ def installed_sources() -> list[Source]:
 def _in_folder(folder: Path) -> Iterator[Source]:
     for conf in sorted(folder.glob("*/conf")):
         if (conf.parent / "__init__.py").is_file():
-            _make_importable(str(folder.resolve()))
+            # On the import path of this process and of the workers it starts.
+            path, inherited = str(folder.resolve()), os.environ.get("PYTHONPATH", "").split(os.pathsep)
+            sys.path += [] if path in sys.path else [path]
+            os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys([*filter(None, inherited), path]))
             packages.add(conf.parent.name)
             yield Source(conf.parent.name, conf, f"{folder.parent.name}/{folder.name}")
-
-
-def _make_importable(path: str) -> None:
-    """Puts the folder on the import path of this process and of the workers it starts."""
-    if path not in sys.path:
-        sys.path.append(path)
-    inherited = [p for p in os.environ.get("PYTHONPATH", "").split(os.pathsep) if p]
-    if path not in inherited:
-        os.environ["PYTHONPATH"] = os.pathsep.join([*inherited, path])
 
 
 def options(group: str | None = None) -> list[Option]:

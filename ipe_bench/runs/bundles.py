@@ -53,12 +53,7 @@ def is_bundle(path: Path | str) -> bool:
 
 
 def write_bundle(directories: Sequence[Path | str], path: Path, further: Mapping[str, Any] | None = None) -> Bundle:
-    """Puts the results of the directories into one archive, with `further` facts in its manifest.
-
-    Raises:
-        UserError: a directory holds no results, two have one name, nothing is whole, or the archive is there and
-            holds something else.
-    """
+    """Puts the results of the directories into one archive, with `further` facts in its manifest."""
     contents: dict[str, bytes] = {}
     for directory in map(Path, directories):
         _require_results(directory)
@@ -102,11 +97,7 @@ def _contents(directory: Path) -> dict[str, bytes]:
 
 
 def read_bundle(path: Path) -> Bundle:
-    """The bundle, all of whose files were read and are as its manifest says.
-
-    Raises:
-        UserError: it is none, or was damaged or changed.
-    """
+    """The bundle, all of whose files were read and are as its manifest says, or a UserError."""
     try:
         with zipfile.ZipFile(path) as archive:
             manifest = archive.read(MANIFEST)
@@ -130,8 +121,7 @@ def read_bundle(path: Path) -> Bundle:
 def opened(paths: Sequence[Path | str], into: Path | None = None) -> Iterator[list[Path]]:
     """Folders of results, with those of every bundle in its place: below `into`, or for as long as this lasts.
 
-    Raises:
-        UserError: one is a file and not a whole bundle, or a folder that no run ever wrote to.
+    Raises UserError if one is a file and not a whole bundle, or a folder that no run ever wrote to.
     """
     with contextlib.ExitStack() as stack:
         found: list[Path] = []

@@ -69,9 +69,7 @@ class Part:
     def read(self, columns: Keys[str] | None = None) -> tuple[Mapping[str, Any], pa.Table]:
         """What the rows belong to, and the rows, without metadata: all columns, or those of `columns` that are there.
 
-        Raises:
-            FileNotFoundError: there is no such file any more.
-            Unusable: the file is damaged, or not one of ours.
+        Raises FileNotFoundError if there is no such file any more, and Unusable if it is damaged, or not one of ours.
         """
         with _opened(self.path) as file:
             footer = _parsed(file.metadata.metadata[FOOTER])
@@ -84,11 +82,7 @@ class Part:
         return footer, table.replace_schema_metadata(None)
 
     def history(self) -> dict[str, Array] | None:
-        """The iterates of its first trials, by column; None if there are none.
-
-        Raises:
-            FileNotFoundError, Unusable: as `read`.
-        """
+        """The iterates of its first trials, by column; None if there are none. Raises what `read` does."""
         with _opened(self.path) as file:
             text = file.metadata.metadata.get(HISTORY)
         return None if text is None else {name: np.array(x, dtype=float) for name, x in json.loads(text).items()}
@@ -139,11 +133,8 @@ def write(
     *,
     lasting: bool = False,
 ) -> None:
-    """Writes a file that appears complete or not at all; if `lasting`, not in a buffer of the system only.
-
-    Raises:
-        StorageError: the disk is full, or the folder cannot be written to any more.
-    """
+    """Writes a file that appears complete or not at all (see `write_atomically`); if `lasting`, not in a buffer of the
+    system only."""
     # Texts are few different ones, numbers are all different and alike in their first bytes.
     texts = [field.name for field in table.schema if pa.types.is_string(field.type)]
     floats = [field.name for field in table.schema if pa.types.is_floating(field.type)]
@@ -208,11 +199,7 @@ def write_record(path: Path, record: Mapping[str, Any]) -> None:
 
 
 def read_record(path: Path) -> dict[str, Any]:
-    """A JSON record that says what was written.
-
-    Raises:
-        Unusable: it is damaged, or not one of ours.
-    """
+    """A JSON record that says what was written; raises Unusable if it is damaged, or not one of ours."""
     try:
         record = json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError) as error:

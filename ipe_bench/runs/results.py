@@ -150,11 +150,7 @@ class Results:
 
     @classmethod
     def read(cls, directories: Sequence[Path | str], keys: Keys[str] | None = None) -> Self:
-        """What is stored under the directories, or the trials of the cells with these keys alone.
-
-        Raises:
-            UserError: a directory does not exist.
-        """
+        """What is stored under the directories, or the trials of the cells with these keys alone."""
         results = cls(tuple(map(Path, directories)))
         for path in results.directories:
             if not path.is_dir():

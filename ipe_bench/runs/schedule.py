@@ -61,14 +61,10 @@ class Progress:
         self.trials = 0
         """Trials times estimators that are done."""
         self.failures: list[str] = []
+        self.began: float | None = None
+        """When the first estimator began, by the monotonic clock: code is imported and compiled before."""
         self._left = Counter((id(cell.scenario), task.start, task.stop) for task, cell in cells)
         """Cells of each task that are not done."""
-        self._began: float | None = None
-
-    def begin(self) -> bool:
-        """Notes that an estimator begins; returns whether it is the first, after imports and compilation."""
-        first, self._began = self._began is None, self._began or time.monotonic()
-        return first
 
     def close(self, task: Task, cell: ResultKey, failure: Failure | None) -> None:
         """Notes that a cell of a task is stored, or has failed for good."""
@@ -85,16 +81,6 @@ class Progress:
     def done(self) -> int:
         """Tasks that have ended."""
         return sum(left == 0 for left in self._left.values())
-
-    @property
-    def preparing(self) -> bool:
-        """Whether nothing has been estimated yet, as code is imported and compiled first."""
-        return self._began is None and bool(self._left)
-
-    @property
-    def seconds(self) -> float:
-        """Since the first estimator began."""
-        return 0.0 if self._began is None else time.monotonic() - self._began
 
 
 Watcher = Callable[[Progress], None]
@@ -207,11 +193,7 @@ def _compute_cell(store: Store, block: Any, cell: ResultKey) -> None:
 
 
 def run_tasks(tasks: Sequence[Task], execution: Execution, store: Store, watch: Watcher) -> tuple[str, ...]:
-    """Runs tasks until each of their cells is stored or has failed; returns the messages of those that failed.
-
-    Raises:
-        StorageError: nothing can be stored any more.
-    """
+    """Runs tasks until each of their cells is stored or has failed; returns the messages of those that failed."""
     progress, tries = Progress(tasks), Counter[tuple[str, int]]()
     watch(progress)
 
@@ -227,7 +209,8 @@ def run_tasks(tasks: Sequence[Task], execution: Execution, store: Store, watch: 
         for event in execution.run(run_task, tasks):
             task = tasks[event.index]
             if event.step == PREPARED:
-                if progress.begin():
+                if progress.began is None:
+                    progress.began = time.monotonic()
                     watch(progress)
             elif event.step is not None:
                 index, failure = event.step

@@ -93,6 +93,10 @@ class ResultKey:
     def footer(self) -> dict[str, Any]:
         """All that a reader of the file needs to know."""
         scenario, model = self.scenario, self.scenario.measurement
+        needs = () if self.estimator is None else self.estimator.needs
+        docstring = " ".join((type(model).__doc__ or "").split())
+        # What a dataclass writes where there is no docstring says nothing.
+        about = "" if docstring.startswith(f"{type(model).__name__}(") else docstring.partition(". ")[0].rstrip(".")
         return {
             "schema": SCHEMA,
             "key": self.key,
@@ -101,14 +105,14 @@ class ResultKey:
             **self.made_by,
             "libraries": library_versions(),
             "names": self.names,
-            "bound": "bayes" if self.estimator is not None and "prior" in self.estimator.needs else "crlb",
-            "equation": None if self.estimator is None else self.estimator.equation,
-            "family": None if self.estimator is None else self.estimator.family,
-            "sequential": self.estimator is not None and "epochs" in self.estimator.needs,
+            "bound": "bayes" if "prior" in needs else "crlb",
+            "equation": getattr(self.estimator, "equation", None),
+            "family": getattr(self.estimator, "family", None),
+            "sequential": "epochs" in needs,
             "jacobian_cost": float(getattr(model, "jacobian_cost", model.n)),
             "parameters": [describe(p) for p in model.parameters],
             "readings": model.m,
-            "about": _first_sentence(model),
+            "about": about,
             "linear_bound": scenario.linear_bound.tolist(),
             **(
                 {"times": scenario.model.times.tolist()}
@@ -116,13 +120,6 @@ class ResultKey:
                 else {"linear_correlation": linear_correlation(scenario.problem).round(4).tolist()}
             ),
         }
-
-
-def _first_sentence(component: Any) -> str:
-    """The first sentence of the docstring of a component's class; empty where it has none of its own."""
-    kind = type(component)
-    words = " ".join((kind.__doc__ or "").split())
-    return "" if words.startswith(f"{kind.__name__}(") else words.partition(". ")[0].rstrip(".")
 
 
 class Store:
@@ -135,11 +132,7 @@ class Store:
         self.failed = self.directory / "failed"
 
     def prepare(self) -> None:
-        """Makes sure that results can be written, and clears away what writers that were killed left half done.
-
-        Raises:
-            UserError: they cannot.
-        """
+        """Refuses a folder that cannot be written to, and clears away what writers that were killed left half done."""
         try:
             self.trials.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=self.trials):
@@ -201,11 +194,7 @@ class Store:
 
         It may be stopped, or done twice, at any moment, while others read and write in the folder: a merged part is on
         the disk and was read back before those go whose rows it holds, and until they do, a reader takes each trial
-        once.
-
-        Raises:
-            Unusable: a part is damaged; all stay as they are.
-            StorageError: the folder cannot be written to any more; everything that was there is there.
+        once. If a part is damaged (Unusable) or nothing can be written any more (StorageError), all stay as they are.
         """
         found, gone, reached = self.parts({key}), 0, 0
         groups: list[tuple[Mapping[str, Any], list[Part], list[pa.Table]]] = []
@@ -256,18 +245,11 @@ def gaps(covered: Iterable[tuple[int, int]], start: int, stop: int) -> list[tupl
 
 def title(names: Mapping[str, Any]) -> str:
     """The scenario of a result in a line for people."""
-    scale, truth = names.get("error_scale"), names.get("truth_measurement")
-    words = [
-        names.get("measurement"),
-        None if truth is None else f"truth {truth}",
-        names.get("noise"),
-        None if scale is None else f"error scale {scale:g}",
-        f"seed {names.get('seed')}",
-    ]
-    return ", ".join(str(word) for word in words if word is not None)
+    truth = [f"truth {names['truth_measurement']}"] if "truth_measurement" in names else []
+    settings = names["noise"], f"error scale {names['error_scale']:g}", f"seed {names['seed']}"
+    return ", ".join([names["measurement"], *truth, *settings])
 
 
 def describe_names(names: Mapping[str, Any]) -> str:
     """A result in a line for people."""
-    estimator = "the truth" if names.get("estimator") == TRUTH else str(names.get("estimator"))
-    return f"{estimator} on {title(names)}"
+    return f"{'the truth' if names['estimator'] == TRUTH else names['estimator']} on {title(names)}"

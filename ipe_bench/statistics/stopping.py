@@ -21,7 +21,7 @@ from ipe_bench.statistics.formulas import rmse_ends_anytime
 from ipe_bench.statistics.intervals import share_sequence
 from ipe_bench.statistics.records import SCORES, rows_of, summary_rows
 from ipe_bench.statistics.sample import Sample, samples
-from ipe_bench.trials.scenario import MOST_TRIALS, AnyScenario
+from ipe_bench.trials.scenario import MOST_TRIALS, TRIALS, AnyScenario
 
 NARROW = "every interval is narrow enough"
 """Why a scenario stops that has come to the precision that was asked for."""
@@ -71,7 +71,7 @@ def compute_until(
     most: int | None,
     output: Path | str,
     *,
-    precision: float | Mapping[str, float],
+    precision: float | Mapping[str, float] | None,
     time_limit: float | None = None,
     execution: Execution | None = None,
     block_size: int | None = None,
@@ -79,23 +79,31 @@ def compute_until(
     command: str | None = None,
 ) -> tuple[tuple[str, ...], list[dict[str, Any]]]:
     """Adds blocks to what is stored under `output` until every interval is narrow enough, there are `most` trials
-    (`MOST_TRIALS` where None), or `time_limit` seconds are over, which is looked at between rounds of blocks.
+    (`MOST_TRIALS` where None), or `time_limit` seconds are over, which is looked at between rounds of blocks; without a
+    precision until there are `most` trials (`TRIALS` where None).
 
-    Returns the messages of what failed, and a row per scenario: its names, how many `trials` it took, the `reason` why
-    it took no more, `NARROW` if the precision is reached, and the `widest` statistic, which is farthest from it.
+    Returns the messages of what failed, and a row per scenario that has a precision: its names, how many `trials` it
+    took, the `reason` why it took no more, `NARROW` if the precision is reached, and the `widest` statistic, which is
+    farthest from it.
 
     Raises:
         UserError: what was asked for cannot be computed; nothing is computed then.
         StorageError: nothing can be stored any more.
     """
+    options: dict[str, Any] = {"execution": execution, "watch": watch, "command": command}
+    if precision is None:
+        if time_limit is not None:
+            raise UserError(f"time_limit={time_limit}: goes with precision; give that, or leave it out")
+        trials = TRIALS if most is None else most
+        return compute(scenarios, estimators, trials, output, block_size=block_size, **options), []
     wanted, budget, began = precision_of(precision), MOST_TRIALS if most is None else most, time.monotonic()
-    check_time_limit(time_limit, precision)
+    if time_limit is not None and not time_limit > 0:
+        raise UserError(f"time_limit={time_limit}: give a number of seconds above 0")
     if any(scenario.noise.real for scenario in scenarios):
         raise UserError(f"precision={precision}: certified readings are one trial; leave it out")
     validate(scenarios, estimators, budget, block_size)
     block_size = BLOCK_SIZE if block_size is None else block_size
-    options: dict[str, Any] = {"execution": execution, "block_size": block_size, "watch": watch}
-    options |= {"further": {"precision": wanted}, "command": command}
+    options |= {"block_size": block_size, "further": {"precision": wanted}}
     at = [_first_trials(s, estimators, Path(output), block_size, budget) for s in scenarios]
     names, failures = [new_name() for _ in scenarios], []
     stops: dict[int, dict[str, Any]] = {}
@@ -141,14 +149,6 @@ def _stored(scenario: AnyScenario, estimators: Mapping[str, Any], output: Path |
     """The stored trials of every estimator that has some."""
     collection = collect([output], {cell.key for cell in result_keys(scenario, estimators)})
     return samples(collection, collection.groups)
-
-
-def check_time_limit(time_limit: float | None, precision: Any = None) -> None:
-    """Raises UserError if a time limit is not above 0, or comes without a precision."""
-    if time_limit is not None and precision is None:
-        raise UserError(f"time_limit={time_limit}: goes with precision; give that, or leave it out")
-    if time_limit is not None and not time_limit > 0:
-        raise UserError(f"time_limit={time_limit}: give a number of seconds above 0")
 
 
 def objective(

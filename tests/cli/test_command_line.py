@@ -68,10 +68,7 @@ MISTAKES = {
     "a group for a place": (["run", "baseline.ekf.process_noise=1"], "write estimators.ekf.process_noise=1"),
     "not chosen": (["run", "estimators.newton.max_iterations=9"], "newton is not chosen; add it to solver="),
     "an address": (["run", "output=s3://bucket/x"], "output=s3://bucket/x: is an address; name a folder"),
-    "a label that is misspelt": (
-        ["run", "estimators.newtn.max_iterations=9"],
-        "did you mean newton?",
-    ),
+    "a label that is misspelt": (["run", "estimators.newtn.max_iterations=9"], "did you mean newton?"),
     "a file for its key": (["estimate", "my.csv"], "my.csv: is not KEY=VALUE; write readings=my.csv"),
     "a file for another command": (["run", "my.csv"], "write ipe-bench estimate readings=my.csv"),
     "an option without its group": (["run", "newton"], "newton: is not KEY=VALUE; write solver=newton"),
@@ -137,10 +134,7 @@ OF_STATES = [
     (["model=pendulum", "tracker=[newton]"], "tracker=newton: newton is no tracker but a solver"),
     (["model=pendulum", "trackers.ukf.iterations=0"], "trackers.ukf.iterations=0: give a whole number above 0"),
     (["model=pendulum", "trackers.bootstrap.particles=5"], "trackers.bootstrap.particles: is set, but bootstrap"),
-    (
-        ["model=pendulum", "tracker=[grid]"],
-        "trackers.grid: is exact for one state, and pendulum has 2; leave it out",
-    ),
+    (["model=pendulum", "tracker=[grid]"], "trackers.grid: is exact for one state, and pendulum has 2; leave it out"),
     (["model=growth", "model.next.state=x"], "model.next.state: there is no such name"),
     (["+experiment=polynomial", "model=growth"], "+experiment=polynomial: sets measurement, which is of a measur"),
     (["+experiment=headline", "model=growth"], "+experiment=headline: sets noise, which is of a measurement"),

@@ -180,10 +180,7 @@ FOUND = [
         altered(Gaussian(1.0), corrupt=lambda self, h, *_: h + np.random.default_rng().standard_normal(h.shape)),
         "besides the stream",
     ),
-    (
-        altered(TURN, observe=lambda self, x, k: TURN.observe(x, k) + np.abs(x[..., :1])),
-        "observe is not analytic",
-    ),
+    (altered(TURN, observe=lambda self, x, k: TURN.observe(x, k) + np.abs(x[..., :1])), "observe is not analytic"),
     (
         altered(TURN, transition=lambda self, x, k: TURN.transition(x, k) + 1e-9 * len(x)),
         "transition gives a state alone other bits",
