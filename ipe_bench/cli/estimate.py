@@ -40,6 +40,11 @@ OF_STATES = ("model", "tracker", "trackers")
 OF_CONSTANTS = ("measurement", "truth_measurement", "noise", "prior", "error_scale", "solver", "baseline")
 OF_CONSTANTS += ("estimators", "parameters", "write_readings")
 """Keys of parameters that stand still."""
+OF_CONSTANTS_ALONE = {
+    "design": "the bounds of states are those of `ipe-bench run model=NAME`",
+    "posterior": "use `ipe-bench run model=NAME`, with tracker=[grid] for one state, or tracker=[bootstrap]",
+}
+"""Commands on parameters that stand still, with what serves for states that move."""
 OF_FILES = ("readings", "ignore_columns", "find")
 """Keys of estimates from real readings."""
 _TRIALS, _MOST_TRIALS = 3, 100
@@ -84,6 +89,10 @@ def single(command: str, arguments: Sequence[str], standard: Sequence[str] = (),
         given = w.read(command, [one for one in standard if one.partition("=")[0] not in words.keys])
         jobs = jobs_of(Words(given.overrides + words.overrides), multirun=False)
         require_one_kind(words, jobs.specs[0])
+        if command in OF_CONSTANTS_ALONE and (model := jobs.specs[0].model):
+            raise UserError(
+                f"model={model.name}: states move, and {command} is of constants; {OF_CONSTANTS_ALONE[command]}"
+            )
         return Single(command, words, jobs.specs[0], composed(jobs.words))
 
 
@@ -176,7 +185,7 @@ def design_command(
 
     if any(word.lstrip("+").startswith("readings=") for word in arguments):
         raise UserError("readings: is for `ipe-bench estimate`; the number to choose is --readings NUMBER")
-    of_runs = (*OF_MANY_TRIALS, *OF_STATES, "figures", "trials", "solver", "baseline", "estimators")
+    of_runs = (*OF_MANY_TRIALS, "figures", "trials", "solver", "baseline", "estimators")
     asked = single("design", arguments, run=of_runs, estimate=OF_FILES)
     scenario = asked.spec.scenario
     if scenario.noise.real:
@@ -199,7 +208,7 @@ def posterior_command(arguments: Sequence[str], particles: int) -> int:
     """Samples, prints a table and writes files; exit code 1 where the populations of a trial do not agree."""
     from ipe_bench.report.questions import posterior_parts, write_posteriors
 
-    asked = single("posterior", arguments, run=(*OF_MANY_TRIALS, *OF_STATES, "figures"), estimate=OF_FILES)
+    asked = single("posterior", arguments, run=(*OF_MANY_TRIALS, "figures"), estimate=OF_FILES)
     job, name, scenario = asked.spec, asked.measurement, asked.spec.scenario
     trials = job.count if "trials" in asked.words.keys else _TRIALS
     if trials > _MOST_TRIALS:

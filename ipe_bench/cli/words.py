@@ -36,7 +36,7 @@ _FORMULA = re.compile(
     re.DOTALL,
 )
 """Texts that the shell has taken the quotes from; a list of units is none."""
-_FILE = re.compile(rf"\+*(?:(measurement|{TRUTH})\.file|(parameters))=(?![{{$]|null$)(.*)", re.DOTALL)
+_FILE = re.compile(rf"\+*(?:(measurement|model|{TRUTH})\.file|(parameters))=(?![{{$]|null$)(.*)", re.DOTALL)
 
 _GONE = {
     "ignore_rows": "empty the cells of these readings in the file",

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtrc, ndtri
+from scipy.special import ndtri
 
 from ipe_bench.basics.linalg import Array, Covariance
-from ipe_bench.trials.whiteness import lags_of, ljung_box
+from ipe_bench.trials.whiteness import ljung_box, white_p
 
 OUTLIER_LEVEL = 0.01
 """Chance that good readings of a whole file give an outlier somewhere."""
@@ -69,18 +69,18 @@ def whiteness(w: Array, Q: Array, series: NDArray[np.intp], draws: int = DRAWS) 
     same ones (Davison and Hinkley, Bootstrap Methods and their Application, 1997, section 4.2).
     """
 
-    def statistic(w: Array) -> Array:
-        return ljung_box(np.where(series >= 0, w[:, series], np.nan))
+    def placed(w: Array) -> Array:
+        return np.where(series >= 0, w[:, series], np.nan)
 
-    observed = float(statistic(w[None])[0])
+    observed = float(ljung_box(placed(w[None]))[0][0])
     # A single degree of freedom leaves one direction: its residuals differ in size alone, which Q does not see.
     if Q.shape[1] >= len(w) - 1 or not (np.isfinite(w).all() and np.isfinite(observed)):
         return np.nan
     if len(w) > _MANY:
-        return float(chdtrc(lags_of(series.shape[1]), observed))
+        return float(white_p(placed(w[None]))[0])
     rng = np.random.Generator(np.random.Philox(0))
     as_large = 0
     for start in range(0, draws, _DRAWS_AT_ONCE):
         noise = rng.standard_normal((min(_DRAWS_AT_ONCE, draws - start), len(w)))
-        as_large += int(np.sum(statistic(noise - (noise @ Q) @ Q.T) >= observed * (1 - 1e-9)))
+        as_large += int(np.sum(ljung_box(placed(noise - (noise @ Q) @ Q.T))[0] >= observed * (1 - 1e-9)))
     return (1 + as_large) / (1 + draws)

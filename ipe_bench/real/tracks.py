@@ -20,7 +20,7 @@ from ipe_bench.states.trackers import Bootstrap, Tracker
 from ipe_bench.statistics.intervals import mean_limits
 from ipe_bench.trials.thresholds import FIT_LEVEL
 from ipe_bench.trials.tracking import track_safely
-from ipe_bench.trials.whiteness import lags_of, ljung_box
+from ipe_bench.trials.whiteness import white_p
 
 _SAME_TIME = 1e-3
 """Part of the shortest step by which a time of a log may differ from that of its epoch."""
@@ -156,7 +156,7 @@ class Tracked:
             nis,
             mean_nis=total / m if m else np.nan,
             limits=mean_limits(m, 1),
-            white_p=float(chdtrc(lags_of(log.model.epochs), ljung_box(innovations)[0])),
+            white_p=float(white_p(innovations)[0]),
             log_likelihood=float(tracks.log_likelihood[0]) if tracks.degrees.any() else np.nan,
             passes=bool(np.isfinite([mean, deviation]).all() and not chdtrc(max(m, 1), total) < FIT_LEVEL),
             message=messages.get(0, ""),
@@ -184,6 +184,8 @@ def found_and_tracked(log: Log, label: str, tracker: Tracker, find: Sequence[str
     if not isinstance(model, Formulas):
         raise UserError(f"find: is for models by formulas; {model.name} is written in Python")
     places = [_place(model, name) for name in find]
+    if twice := next((name for name, place in zip(find, places, strict=True) if places.count(place) > 1), None):
+        raise UserError(f"find={twice}: is named twice; name it once")
     start = np.array([getattr(model, key)[name] for key, name in places])
     positive = np.array([key != "constants" for key, _ in places])
     if (positive & ~(start > 0)).any():

@@ -50,9 +50,11 @@ class Formulas(StateModel):
     period: Mapping[str, NonNegative] = field(default_factory=dict)
     """Periods of readings that come round, such as 6.283185307 of a bearing in rad."""
     count: Count = 100
-    """K, the number of epochs, the first of them a step after the prior."""
+    """K, the number of epochs."""
     step: Positive = 1.0
     """Seconds between epochs."""
+    moved_first: bool = True
+    """Whether the first reading is taken a step after the prior and time 0; if not, it is taken at time 0."""
     title: str = "formulas"
     """The name of the model in tables."""
 
@@ -113,7 +115,7 @@ class Formulas(StateModel):
 
     @property
     def times(self) -> Array:
-        return self.step * np.arange(1, self.count + 1)
+        return self.step * (np.arange(self.count) + self.moved_first)
 
     @property
     def states(self) -> tuple[Parameter, ...]:
@@ -158,7 +160,7 @@ class Formulas(StateModel):
         """Those formulas (..., number) at states x (..., n) at epoch k."""
         known = dict(zip(self.next, np.moveaxis(x, -1, 0), strict=True)) | dict(noise)
         known |= {name: float(values[k]) for name, values in self._inputs.items()}
-        known |= {**self.constants, "k": k + 1.0, "t": self.step * (k + 1.0)}
+        known |= {**self.constants, "k": k + 1.0, "t": self.step * (k + self.moved_first)}
         with np.errstate(all="ignore"):
             values = np.broadcast_arrays(x[..., 0], *(formula(known) for formula in formulas.values()))[1:]
         return np.stack(np.broadcast_arrays(*values), axis=-1)

@@ -112,8 +112,11 @@ class Unscented(SigmaPoints):
     beta: Finite = 0.0
     """Further weight of the central point in covariances: 2 is best for a square of normal numbers."""
 
+    def kappa_of(self, n: int) -> float:
+        return max(3.0 - n, 0.0) if self.kappa is None else self.kappa
+
     def points(self, n: int) -> tuple[Array, Array]:
-        c = self.alpha**2 * (n + (max(3.0 - n, 0.0) if self.kappa is None else self.kappa))
+        c = self.alpha**2 * (n + self.kappa_of(n))
         s = np.sqrt(c) * np.concatenate([np.zeros((1, n)), np.eye(n), -np.eye(n)])
         return s, np.concatenate([[1 - n / c], np.full(2 * n, 0.5 / c)])
 

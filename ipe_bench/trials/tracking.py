@@ -27,7 +27,7 @@ from ipe_bench.states.trackers import Tracker, Tracks
 from ipe_bench.trials.scenario import AnyScenario, Tracking
 from ipe_bench.trials.scoring import Block, Columns, by_parameter, nees
 from ipe_bench.trials.thresholds import EXPECTED, gate
-from ipe_bench.trials.whiteness import lags_of, ljung_box
+from ipe_bench.trials.whiteness import white_p
 
 _PARTS = 10
 """Groups of paths by whose scatter the standard error of the posterior bound is known."""
@@ -118,7 +118,6 @@ class PathBlock:
             return self._scored(tracks, messages, seconds)
 
     def _scored(self, tracks: Tracks, messages: dict[int, str], seconds: Array) -> tuple[Estimates, Columns]:
-        from scipy.special import chdtrc
 
         trials, K, n = tracks.mean.shape
         e, P = tracks.mean - self.paths.x, tracks.covariance
@@ -164,7 +163,7 @@ class PathBlock:
             "path_nees": each.mean(axis=1),
             "extra_nis": np.where(read > 0, tracks.nis.sum(axis=1) / np.maximum(read, 1), np.nan),
             "log_likelihood": np.where(read > 0, tracks.log_likelihood, np.nan),
-            "white_p": chdtrc(lags_of(K), ljung_box(tracks.innovations.swapaxes(1, 2))),
+            "white_p": white_p(tracks.innovations.swapaxes(1, 2)),
             "first_bad_epoch": np.where(lost.any(axis=1), lost.argmax(axis=1) + 1.0, np.nan),
             "curves": packed(trials, [*sums, np.full((K, 1), converged.sum())]),
         }

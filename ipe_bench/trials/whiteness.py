@@ -9,22 +9,26 @@ from ipe_bench.basics.linalg import Array
 _LONGEST_LAG = 10
 
 
-def lags_of(length: int) -> int:
-    """The longest lag that is tested in series of that length."""
-    return min(_LONGEST_LAG, max(1, length // 5))
+def white_p(e: Array) -> Array:
+    """The p-value (trials,) of the test that series e (trials, series, length) are white."""
+    from scipy.special import chdtrc
+
+    Q, lags = ljung_box(e)
+    return chdtrc(lags, Q)
 
 
-def ljung_box(e: Array) -> Array:
-    """Q (trials,) of series e (trials, series, length), pooled over the series of a trial: chi-square with `lags_of`
-    degrees of freedom if they are white. A NaN is missing; Q is NaN if no number has a neighbour or all are 0."""
+def ljung_box(e: Array) -> tuple[Array, Array]:
+    """Q (trials,) of series e (trials, series, length), pooled over the series of a trial, and the number (trials,) of
+    lags at which there are two numbers: the degrees of freedom of Q, a chi-square if the series are white. A NaN is
+    missing; Q is NaN if there is no such lag or all numbers are 0."""
     exists = np.isfinite(e)
     placed = np.where(exists, e, 0.0)
     count, total = exists.sum(axis=(1, 2)), np.sum(placed**2, axis=(1, 2))
-    Q, pairs = np.zeros(len(e)), np.zeros(len(e), dtype=int)
+    Q, lags = np.zeros(len(e)), np.zeros(len(e))
     with np.errstate(invalid="ignore"):
-        for k in range(1, lags_of(e.shape[2]) + 1):
+        for k in range(1, min(_LONGEST_LAG, max(1, e.shape[2] // 5)) + 1):
             number = np.sum(exists[:, :, :-k] & exists[:, :, k:], axis=(1, 2))
             r = np.sum(placed[:, :, :-k] * placed[:, :, k:], axis=(1, 2)) / total
             Q += np.where(number > 0, count * (count + 2) * r**2 / np.maximum(number, 1), 0.0)
-            pairs += number
-    return np.where(pairs > 0, Q, np.nan)
+            lags += number > 0
+    return np.where(lags > 0, Q, np.nan), lags

@@ -129,6 +129,7 @@ IN_A_SWEEP = [
 """No job begins where one would be refused."""
 OF_STATES = [
     (["model=pendulum", "baseline=[ekf]"], "baseline: is of a measurement, and model= chooses states that move"),
+    (["model=pendulum", "write_readings=a.csv"], "write_readings: is of a measurement, and model= chooses states"),
     (["model=pendulum", "error_scale=3"], "error_scale: is of a measurement, and model= chooses states that move"),
     (["measurement=polynomial", "tracker=[ekf]"], "tracker: goes with model=NAME"),
     (["model=pendulum", "tracker=[newton]"], "tracker=newton: newton is no tracker but a solver"),
@@ -140,6 +141,17 @@ OF_STATES = [
     (["+experiment=headline", "model=growth"], "+experiment=headline: sets noise, which is of a measurement"),
     (["model=pendulum_book", "trials=2"], "trials=2: certified readings are one trial"),
 ]
+MISTAKES |= {
+    f"{command} of states, {word}": (
+        [command, word],
+        f"ipe-bench: model={word.rpartition('=')[2]}: states move, and {why}",
+    )
+    for command, why in (
+        ("design", "design is of constants; the bounds"),
+        ("posterior", "posterior is of constants; use"),
+    )
+    for word in ("model=growth", "+experiment=pendulum_book")
+}
 COMMON = ("measurement=polynomial", "noise=gaussian", "execution=serial", "output=out", "trials=5")
 MISTAKES |= {" ".join(words): (["run", "-m", *COMMON, *words], f"ipe-bench: {said}") for words, said in IN_A_SWEEP}
 MISTAKES |= {" ".join(words): (["run", *words, "output=out"], f"ipe-bench: {said}") for words, said in OF_STATES}

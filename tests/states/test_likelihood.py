@@ -96,6 +96,7 @@ def test_a_log_without_noise_determines_no_noise():
     ("trackers", "find", "complaint"),
     [
         ({"kf": ekf()}, "b", "find=b: there is no such constant"),
+        ({"kf": ekf()}, ["w", "noise.w"], "find=w: is named twice"),
         ({"kf": ekf()}, "noise.z", r"find=noise\.z: there is no such constant"),
         ({"rts": Smoother(ekf())}, "a", "find: trackers.rts has no likelihood that can be maximised"),
         ({"particles": Bootstrap(20)}, "a", "find: trackers.particles has no likelihood that can be maximised"),

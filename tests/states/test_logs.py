@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 import pytest
-from scipy.stats import chi2
+from scipy.stats import chi2, multivariate_normal
 from state_models import ConstantVelocity, CoordinatedTurn
 
 import ipe_bench as ib
@@ -90,6 +91,21 @@ def test_known_inputs_and_unequal_steps_of_a_log_give_the_closed_form(tmp_path):
     assert one.mean_nis == pytest.approx(np.nansum(one.nis) / 38, rel=1e-12)
 
 
+def test_a_first_reading_at_the_time_of_the_prior_gives_the_closed_form(tmp_path):
+    """x grows by t and w at each step: the mean and covariance of all readings at once."""
+    model = replace(DRIVEN, next={"x": "x + t + k*w"}, inputs={}, count=6, step=0.5, moved_first=False)
+    z = np.array([0.3, -0.2, 1.4, 2.0, 5.0, 6.0])
+    written(tmp_path / "log.csv", model, z[:, None], time=0.5 * np.arange(6))
+    (one,) = ib.estimate(model, tmp_path / "log.csv", {"ekf": ekf()})
+    moved = np.array([0, 0.5, 1, 1.5, 2, 2.5]).cumsum()
+    C = np.tril(np.ones((6, 6))) @ np.diag([1.0, *(0.25 * np.arange(2, 7) ** 2)]) @ np.triu(np.ones((6, 6)))
+    S = C + 0.04 * np.eye(6)
+    assert one.log_likelihood == pytest.approx(multivariate_normal(moved, S).logpdf(z), rel=1e-12)
+    assert one.mean[-1, 0] == pytest.approx(moved[-1] + C[-1] @ np.linalg.solve(S, z - moved), rel=1e-12)
+    with pytest.raises(ib.UserError, match=r"column time: 0\.5 belongs here"):
+        ib.estimate(replace(model, moved_first=True), tmp_path / "log.csv", {"ekf": ekf()})
+
+
 def test_the_command_leaves_the_track_and_says_whether_the_filter_is_right(tmp_path, estimate):
     model = construct(next(o for o in options("model") if o.name == "constant_velocity").config, "model")
     z = model.draw(3, 4).z[0]
@@ -108,6 +124,20 @@ def test_the_command_leaves_the_track_and_says_whether_the_filter_is_right(tmp_p
     assert code == 1
     assert "optimistic" in out
     assert estimate("model=pendulum_book", "tracker=[ukf]", "output=book")[0] == 0
+
+
+def test_a_model_of_formulas_may_stand_in_a_file(tmp_path, estimate):
+    keys = ("next", "readings", "noise", "deviation", "spread", "inputs", "units")
+    (tmp_path / "mine.yaml").write_text(json.dumps({key: getattr(DRIVEN, key) for key in keys}))
+    columns = {"h": [0.5, 2.0, 1.0], "u": [0.1, 0.0, -0.3]}
+    z = np.array([[0.4], [0.1], [0.9]])
+    written(tmp_path / "log.csv", DRIVEN, z, **columns)
+    code, _, err = estimate("model=formulas", "model.file=mine.yaml", "readings=log.csv", "tracker=[ekf]", "output=one")
+    assert (code, err) == (0, "")
+    model = replace(DRIVEN, count=3, inputs={name: tuple(values) for name, values in columns.items()})
+    np.testing.assert_array_equal(
+        pd.read_csv(tmp_path / "one" / "track.csv")["x [m]"], ekf().track(model, z[None]).mean[0, :, 0]
+    )
 
 
 @pytest.mark.parametrize(

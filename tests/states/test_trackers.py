@@ -294,6 +294,30 @@ class Sharp(Scalar):
         return 1e-8 * np.eye(2)
 
 
+@pytest.mark.parametrize("rule", [Taylor(), Unscented(), Unscented(0.0, 0.5, 2.0)], ids=["ekf", "ukf", "scaled"])
+@pytest.mark.parametrize(
+    "model", [NEAR, ConstantVelocity(count=40), CoordinatedTurn(count=50), Scalar(False)], ids=lambda m: m.name
+)
+def test_both_engines_have_the_same_tracks(model, rule):
+    z = model.draw(0, 4).z
+    z[1, 3:6], z[2, 20, 0] = np.nan, np.nan
+    batched, filterpy = Filter(rule), Filter(rule, engine="filterpy")
+    for ours, theirs in ((batched, filterpy), (Smoother(batched), Smoother(filterpy))):
+        one, other = ours.track(model, z), theirs.track(model, z)
+        size = np.sqrt(np.einsum("tkii->tki", one.covariance))
+        np.testing.assert_allclose((other.mean - one.mean) / size, 0.0, atol=1e-10)
+        scaled = (other.covariance - one.covariance) / (size[..., None] * size[..., None, :])
+        np.testing.assert_allclose(scaled, 0.0, atol=1e-10)
+        for name in ("nis", "innovations", "degrees", "log_likelihood", "calls"):
+            np.testing.assert_allclose(getattr(other, name), getattr(one, name), rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("options", [{"rule": Cubature()}, {"rule": Taylor(), "iterations": 2}])
+def test_filterpy_steps_the_extended_and_the_unscented_filter_alone(options):
+    with pytest.raises(ib.UserError, match="engine=filterpy: is for ekf and ukf, with one iteration"):
+        Filter(**options, engine="filterpy")
+
+
 @pytest.mark.parametrize("moved_first", [True, False])
 def test_a_grid_gives_the_kalman_filter_and_its_smoother_of_a_linear_model(moved_first):
     model = Scalar(moved_first)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
+from scipy.stats import chi2, kstest
 from state_models import ConstantVelocity, CoordinatedTurn, Growth, Pendulum
 from walking_gins import WalkingGins
 
@@ -20,7 +20,7 @@ from ipe_bench.statistics.certified import published_table
 from ipe_bench.statistics.collect import collect
 from ipe_bench.trials.scenario import Tracking
 from ipe_bench.trials.tracking import PathBlock
-from ipe_bench.trials.whiteness import ljung_box
+from ipe_bench.trials.whiteness import white_p
 
 LINEAR = ConstantVelocity(count=30, spread=3.0)
 
@@ -108,7 +108,7 @@ def test_a_missing_reading_has_no_innovation_and_breaks_no_neighbours():
     e = tracks.innovations
     assert np.array_equal(np.isnan(e), np.isnan(z))
     np.testing.assert_allclose(np.nansum(e**2, axis=2), tracks.nis, rtol=1e-12)
-    assert np.isfinite(ljung_box(e.swapaxes(1, 2))).all()
+    assert np.isfinite(white_p(e.swapaxes(1, 2))).all()
 
 
 def test_blocks_and_further_trials_change_no_trial(tmp_path):
@@ -121,6 +121,14 @@ def test_blocks_and_further_trials_change_no_trial(tmp_path):
     assert "log_likelihood" in parts.columns
     assert not [name for name in parts.columns if "curves" in name]
     assert parts.sort_values(order).reset_index(drop=True).equals(whole.sort_values(order).reset_index(drop=True))
+
+
+@pytest.mark.parametrize("every", [1, 4])
+def test_white_innovations_are_white_at_any_rate_of_readings(every):
+    """Readings at every fourth epoch have neighbours at the lags 4 and 8 alone: two degrees of freedom."""
+    e = np.full((4000, 1, 200), np.nan)
+    e[..., ::every] = np.random.default_rng(3).standard_normal((4000, 1, 200 // every))
+    assert kstest(white_p(e), "uniform").pvalue > 1e-3
 
 
 @dataclass(frozen=True)
