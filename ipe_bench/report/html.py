@@ -15,7 +15,6 @@ from ipe_bench.report.figures.views import View, views
 from ipe_bench.report.headline import about, headline
 from ipe_bench.report.style import ON_DARK
 from ipe_bench.report.table import Table, environment
-from ipe_bench.report.tables import without_certified
 from ipe_bench.report.words import CITATION
 from ipe_bench.statistics.comparisons import TIE
 from ipe_bench.statistics.records import SCORES, STATISTICS, all_statistics
@@ -57,7 +56,7 @@ def render_page(
         written=written,
         appendix=[table for table in tables if table.appendix],
         figures=[vars(one) | {"data": base64.b64encode(one.files[0].read_bytes()).decode()} for one in figures],
-        charts=list(charts(views(without_certified(analysis))[0])),
+        charts=list(charts(views(analysis)[0])),
         nothing_failed=analysis.endings.empty and not analysis.summary.empty,
         runs=runs[:MOST_RUNS],
         older_runs=max(0, len(runs) - MOST_RUNS),

@@ -11,7 +11,6 @@ from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.files import write_text
 from ipe_bench.report.sections import report_tables
 from ipe_bench.report.table import COLUMN, PAGE, Column, Table, latex
-from ipe_bench.report.tables import without_certified
 from ipe_bench.statistics.analysis import Analysis
 
 
@@ -59,7 +58,7 @@ def _figures(analysis: Analysis, folder: Path, names: Sequence[str], width: floa
     files: list[Path] = []
     captions: dict[str, str] = {}
     with print_style(width):
-        for drawing in drawings(without_certified(analysis)) if names else ():
+        for drawing in drawings(analysis) if names else ():
             captions[drawing.name] = f"**{drawing.name}.** {drawing.title}. {drawing.caption}"
             files += drawing.save(folder) if drawing.name in names else ()
             if set(names) <= captions.keys():

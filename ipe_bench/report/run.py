@@ -95,7 +95,7 @@ class Pending:
             if len(frame):
                 files.append(output / "tables" / f"{name}.csv")
                 write_text(files[-1], frame.to_csv(index=False))
-        drawn = draw_all(simulated, output / "figures", which=self.figures, formats=self.formats)
+        drawn = draw_all(analysis, output / "figures", which=self.figures, formats=self.formats)
         write_text(output / "report.html", render_page(analysis, tables, drawn, sections))
         result = ReportResult(
             summary=analysis.summary,

@@ -15,7 +15,7 @@ from ipe_bench.report.figures import drawings
 from ipe_bench.report.run import ReportResult, begin_report
 from ipe_bench.report.style import PAGE, house_style
 from ipe_bench.report.table import html, plain_text
-from ipe_bench.report.tables import certified_tables, without_certified
+from ipe_bench.report.tables import certified_tables
 from ipe_bench.report.terminal import summary_tables
 from ipe_bench.statistics.analysis import analyse
 from ipe_bench.statistics.collect import collect, trials_frame
@@ -61,7 +61,7 @@ class Summary(pd.DataFrame):
     def figures(self) -> dict[str, Figure]:
         """The figures of `ib.report` by their names, as Matplotlib's figures."""
         with house_style():
-            drawn = drawings(without_certified(analyse([self._folder])))
+            drawn = drawings(analyse([self._folder]))
             return {drawing.name: drawing.shown() for drawing in drawn}
 
     def report(self, output: Path | str | None = None, *, figures: Any = "main", formats: Any = PAGE) -> ReportResult:

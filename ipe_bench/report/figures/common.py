@@ -165,12 +165,16 @@ def seaborn_style(look: Mapping[str, Look], by: str = "estimator") -> dict[str, 
 
 
 def lines(ax: Axes, rows: pd.DataFrame, x: str, y: str, look: Mapping[str, Look], **style: Any) -> None:
-    """A line per estimator through points that are already dense."""
+    """A line per estimator through points that are already dense, with a few markers, whose places differ so that
+    lines that coincide are seen."""
     import seaborn as sns
 
-    dashes = {label: one.dash for label, one in look.items()}
-    style = {**seaborn_style(look), "markers": False, "dashes": dashes, "estimator": None, "sort": False, **style}
+    dashes, before = {label: one.dash for label, one in look.items()}, len(ax.lines)
+    style = {**seaborn_style(look), "dashes": dashes, "estimator": None, "sort": False, **style}
     sns.lineplot(rows, x=x, y=y, ax=ax, **style)
+    drawn = ax.lines[before:]
+    for i, line in enumerate(drawn):
+        line.set_markevery([] if line.get_color() == GREY else (0.05 + 0.25 * i / len(drawn), 0.25))
     ax.set(xlabel="", ylabel="")
 
 
@@ -236,4 +240,5 @@ def legend(fig: Figure, axes: Sequence[Axes], look: Mapping[str, Look] | None = 
     # The most columns that fit side by side, each as wide as its longest label.
     lengths, room = np.array([7 + len(label) for label in handles]), _letters(fig.get_figwidth(), "legend.fontsize")
     fitting = [n for n in range(1, len(handles) + 1) if sum(p.max() for p in np.array_split(lengths, n)) <= room]
-    fig.legend(list(handles.values()), list(handles), loc="outside upper center", ncols=max(fitting, default=1))
+    rows = -(-len(handles) // max(fitting, default=1))
+    fig.legend(list(handles.values()), list(handles), loc="outside upper center", ncols=-(-len(handles) // rows))

@@ -12,8 +12,8 @@ from scipy.special import chdtri
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing, Figure
 from ipe_bench.report.figures.views import View
-from ipe_bench.report.style import GREY, MARKERS, Look, looks
-from ipe_bench.report.words import enumerate_few, plain
+from ipe_bench.report.style import GREY, MARKERS, Look
+from ipe_bench.report.words import enumerate_few, plain, short
 from ipe_bench.statistics.certified import data_profile
 from ipe_bench.statistics.sample import CLOSE
 
@@ -36,9 +36,9 @@ def draw_costs(view: View) -> Iterator[Drawing]:
     shown = {"cost": rows["simulations_median"].clip(lower=LEAST_COST), "error": rows["error_q95"].clip(upper=_HIGHEST)}
     rows, look = rows.assign(**shown), view.with_look(rows["estimator"])
     fig, panels = common.panels_of_scales(rows, look)
-    style = {**common.seaborn_style(look), "edgecolor": "white", "linewidth": 0.6, "zorder": 3}
+    style = {**common.seaborn_style(look), "edgecolor": "white", "linewidth": 0.6, "zorder": 3, "clip_on": False}
     # Equal points lie upon each other: the later ones are smaller, so that all are seen.
-    areas = zip(style["hue_order"], np.linspace(80, 30, len(look)), strict=True)
+    areas = zip(style["hue_order"], np.linspace(110, 30, len(look)), strict=True)
     sizes = {label: area if look[label].color != GREY else 20.0 for label, area in areas}
     efficient = float(np.sqrt(chdtri(view.n, 0.05) / view.n))  # the 95 % quantile of chi, over its root mean square
     for ax, here in panels:
@@ -60,7 +60,7 @@ def draw_costs(view: View) -> Iterator[Drawing]:
         " all trials; down and left is better.",
         f"Errors beyond {common.number(_HIGHEST)} stand at the edge." * bool((rows["error"] == _HIGHEST).any()),
         f"The cheapest within 5 % of the least error at scale {plain(view.scales[-1])}: {good['estimator']}"
-        f" ({good['simulations_median']:g} simulations).",
+        f" ({short(good['simulations_median'])} simulations).",
     )
 
 
@@ -127,7 +127,7 @@ def draw_known_minima(view: View) -> Iterator[Drawing]:
     final = rows.groupby("estimator", sort=False, as_index=False)["share"].max().assign(at=end)
     final = final.sort_values("share", ascending=False, kind="stable")
     best = list(final.loc[final["share"] == final["share"].max(), "estimator"])
-    look = looks(list(dict.fromkeys(table["estimator"])), chosen=list(final["estimator"][:10]))
+    look = view.with_look(table["estimator"])
     rows = pd.concat([final.assign(share=0.0, at=low), rows, final], ignore_index=True)
     fig, (ax,) = common.panels(1, look, height=3.4)
     common.lines(ax, rows, "at", "share", look, drawstyle="steps-post")

@@ -131,7 +131,7 @@ def draw_calibration(view: View) -> Iterator[Drawing]:
     common.axis_labels(fig, "nominal probability", "observed − nominal")
     common.legend(fig, fig.axes, look)
     each = view.totals.set_index(["error_scale", "estimator"])["calibration"]
-    last = [f"{label}: {each[top, label]}" for label in look if (top, label) in each.index]
+    last = [f"{label} ({each[top, label]})" for label in look if each.get((top, label), "-") != "-"]
     yield view.drawing(
         fig,
         "calibration",
@@ -140,7 +140,7 @@ def draw_calibration(view: View) -> Iterator[Drawing]:
         " grey bands are simultaneous: all parameters and NEES stay inside them in 95 % of cases if the covariance is"
         " right; they are light where fewer trials converged. A curve below 0 in the middle means standard deviations"
         f" that are too small, one above 0 too large. The vertical axis is logarithmic beyond ±{LINEAR / 2:g}.",
-        f"At scale {plain(top)}, parameters included, {enumerate_few(last, 4)}.",
+        f"At scale {plain(top)}, parameters included: {enumerate_few(last, 4)}.",
     )
 
 

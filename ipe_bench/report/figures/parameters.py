@@ -12,7 +12,7 @@ from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing, Figure
 from ipe_bench.report.figures.views import View
 from ipe_bench.report.style import BLACK, BOUND_COLOR, BOUND_DASH, COLORS, GREY, MARKERS, REFERENCE, Look
-from ipe_bench.report.words import enumerate_few, plain
+from ipe_bench.report.words import brief, enumerate_few, plain
 from ipe_bench.statistics.records import ALL
 
 MOST_GROUPS = 8
@@ -65,7 +65,7 @@ def _of_one(view: View, estimator: str) -> Drawing:
     for ax, unit in zip(axes, [*(inside[0]["unit"] for inside in groups.values()), "bounds"], strict=True):
         ax.set_ylabel(common.text(f"[{unit}]" if unit else ""))
     common.legend(fig, axes[-1:], {"all parameters together": together})
-    at = [f"{v:.3g} at scale {plain(s)}" for s, v in totals[["error_scale", "rmse"]].dropna().to_numpy()]
+    at = [f"{brief(v)} at scale {plain(s)}" for s, v in totals[["error_scale", "rmse"]].dropna().to_numpy()]
     number = 2 if estimator == REFERENCE else 3
     of_paper = f"Figure {number} of the paper: " if view.paper else ""
     return view.drawing(
@@ -73,8 +73,8 @@ def _of_one(view: View, estimator: str) -> Drawing:
         f"figure_{number}" if view.paper else f"parameter_errors_{estimator}",
         f"{of_paper}error of {estimator}, solved trials",
         f"Root mean square error of {estimator} over the trials that it solved ({_missing(totals)}), with 95 %"
-        " bootstrap intervals; dotted: the linear bound. Last panel: the same over the bounds, and all together",
-        f"at {'; '.join(at) or 'no scale'}.",
+        " bootstrap intervals; dotted: the linear bound. Last panel: the same over the bounds.",
+        f"All parameters together: {'; '.join(at)}." if at else "",
     )
 
 

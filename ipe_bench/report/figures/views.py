@@ -12,6 +12,7 @@ import pandas as pd
 
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.style import MOST_FACES, Look, looks
+from ipe_bench.report.tables import without_certified
 from ipe_bench.report.words import plain
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.records import ALL
@@ -82,7 +83,8 @@ class View:
 
 
 def views(analysis: Analysis) -> tuple[list[View], View]:
-    """The settings of an analysis, at most `MOST_SETTINGS`, and all of them together."""
+    """The settings of the simulated trials, at most `MOST_SETTINGS`, and all of them together with every estimator."""
+    every, analysis = _looks(analysis), without_certified(analysis)
     look, columns = _looks(analysis), analysis.setting_columns
     equations = {g.estimator: g.footer.get("equation") for g in analysis.collection.groups}
     whole: dict[str, Any] = {name: getattr(analysis, name) for name in FRAMES}
@@ -107,7 +109,7 @@ def views(analysis: Analysis) -> tuple[list[View], View]:
         paper = (setting.get("measurement"), setting.get("noise")) == ("gins", "quantization")
         known = footers[key]["parameters"], paper
         parts.append(View(f"_{suffix}" * bool(varying), label, frames, seen, {e: equations[e] for e in seen}, *known))
-    return parts, View("", "", whole, look, equations)
+    return parts, View("", "", whole, every, equations)
 
 
 def _split(frame: pd.DataFrame, columns: Sequence[str]) -> dict[tuple[str, ...], Any]:
