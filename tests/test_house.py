@@ -35,7 +35,7 @@ BUDGETS = {
     "baselines": 1957,
     "trials": 1950,
     "runs": 1987,
-    "statistics": 4019,
+    "statistics": 4075,
     "real": 2311,
     "plugins": 1107,
     "report": 4111,

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.special import bdtr, bdtrc, chdtri, gammaln, ndtri
 
 from ipe_bench.basics.linalg import Array
+from ipe_bench.trials.thresholds import FEW, GATE, gate
 
 LEVEL = 0.95
 POINTS = np.arange(1, 100) / 100
@@ -141,21 +142,41 @@ class Calibration:
         return self.size.p if self.place is None else min(1.0, 2 * min(self.place.p, self.size.p))
 
     @property
+    def excursion(self) -> float:
+        """How far off the farther curve is anywhere."""
+        return max(curve.excursion for curve in (self.place, self.size) if curve is not None)
+
+    @property
     def words(self) -> str:
-        """What is wrong, by the curve that is farther off, and by medians, which no outlier moves: an estimate that is
-        shifted by +1 deviations lies above the truth."""
+        """What is surely wrong: shift, scale and tails, each by order statistics, which no outlier moves. An estimate
+        that is shifted by +1 deviations lies above the truth."""
         if self.p >= 1 - self.level:
             return INSIDE
-        farther = max((self.size, self.place or self.size), key=lambda curve: curve.excursion)
-        if not farther.leans:
+        z, faults, middle = self.z, [], float(np.median(self.z))
+        if self.place is not None and not _holds(median_limits(z, self.level), 0.0):
+            faults.append(_shifted(middle))
+            z = z - middle
+        sizes = np.abs(z) / np.sqrt(chdtri(self.degrees, 0.5))
+        scale = float(np.median(sizes))
+        if not np.isfinite(scale):
+            return "; ".join([*faults, "most reported covariances are void"])
+        if not _holds(median_limits(sizes, self.level), 1.0):
+            faults.append(_scaled(scale))
+        outside = int((np.abs(z) / max(scale, 1.0) > np.sqrt(gate(self.degrees))).sum())
+        if outside and bdtrc(outside - 1, len(z), GATE) < 1 - self.level:
+            faults.append(f"{100 * outside / len(z):.2g} % far outside")
+        if faults:
+            return "; ".join(faults)
+        # No order statistic is sure by itself: the curve as a whole may still lie to one side.
+        place = self.place if self.place is not None and self.place.p < self.size.p else None
+        if not (place or self.size).leans:
             return "of another shape"
-        if farther is self.place:
-            return f"shifted by {float(f'{np.median(self.z):.2g}'):+,g} deviations".replace("-", "\N{MINUS SIGN}")
-        scale = float(np.median(np.abs(self.z)) / np.sqrt(chdtri(self.degrees, 0.5)))
-        if not 0 < scale < np.inf:
-            return "errors of 0" if scale == 0 else "most reported covariances are void"
-        times = float(f"{max(scale, 1 / scale):.3g}")
-        return f"deviations {times:,g} times too {'small' if scale > 1 else 'large'}"
+        at = POINTS[np.argmax(np.abs(self.size.difference))]
+        return (
+            _shifted(middle)
+            if place
+            else _scaled(float(np.quantile(np.abs(self.z), at) / np.sqrt(chdtri(self.degrees, 1 - at))))
+        )
 
 
 def calibrations(error: Array, deviation: Array, nees: Array, claimed: Array) -> list[Calibration]:
@@ -187,7 +208,41 @@ def overall_words(parts: Sequence[Calibration], names: Sequence[str]) -> str:
     """The verdict on an estimator: what is wrong with NEES, and with the parameter that is farthest off."""
     if not parts:
         return "-"
-    *each, together = parts
-    worst, name = min(zip(each, names, strict=True), key=lambda pair: (pair[0].p, -pair[0].size.excursion))
-    said = [together.words] if worst.words == INSIDE else [together.words, f"{name}: {worst.words}"]
-    return "; ".join(words for words in said if words != INSIDE) or INSIDE
+    *said, together = [part.words for part in parts]
+    outside = [k for k, words in enumerate(said) if words != INSIDE]
+    if not outside:
+        return together
+    worst = min(outside, key=lambda k: (parts[k].p, -parts[k].excursion, names[k]))
+    who = (
+        names[worst] if len(outside) == 1 else f"{len(outside)} of {len(names)} parameters outside, most {names[worst]}"
+    )
+    return f"{'' if together == INSIDE else together + '; '}{who}: {said[worst]}"
+
+
+def _holds(interval: tuple[float, float], value: float) -> bool:
+    return interval[0] <= value <= interval[1]
+
+
+def median_limits(values: Array, level: float = LEVEL) -> tuple[float, float]:
+    """Interval of the median by order statistics, whatever the distribution; without ends below `FEW` values."""
+    count = len(values)
+    k = int(least_count(count, np.array([0.5]), np.array([(1 - level) / 2]))[0]) if count >= FEW else 0
+    if k == 0:
+        return -np.inf, np.inf
+    ordered = np.partition(values, (k - 1, count - k))
+    return float(ordered[k - 1]), float(ordered[count - k])
+
+
+def _scaled(scale: float) -> str:
+    """Errors that are `scale` times what is reported: two figures, three just above 1; of very many times the order."""
+    if scale == 0:
+        return "errors of 0"
+    times, fault = (scale, "small") if scale > 1 else (1 / scale, "large")
+    shown = f"{times:.1e}".replace("e+0", "e").replace("e+", "e")
+    if times < 1e6:
+        shown = f"{times:.2f}" if times < 1.095 else f"{times:.1f}" if times < 9.95 else f"{float(f'{times:.2g}'):,.0f}"
+    return f"deviations {shown} times too {fault}"
+
+
+def _shifted(middle: float) -> str:
+    return f"shifted by {float(f'{middle:.2g}'):+,g} deviations".replace("-", "\N{MINUS SIGN}")

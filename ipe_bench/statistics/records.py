@@ -572,7 +572,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "the same trials",
         "The largest difference between these distribution functions and the uniform one; over all parameters, that of"
         " NEES.",
-        lambda s: [max(c.excursion for c in (one.size, one.place) if c) for one in s.calibrations] or np.nan,
+        lambda s: [part.excursion for part in s.calibrations] or np.nan,
         where=("calibration",),
     ),
     Statistic(
@@ -581,8 +581,9 @@ STATISTICS: tuple[Statistic, ...] = (
         "the same trials",
         "How the reported covariance lies, where it surely does, at 5 % for an estimator and all its parameters"
         " together: shifted is the median of error over reported deviation (estimate less truth); deviations too small"
-        " or too large, the median of its size over that of an honest one. Of all, what is said of NEES and of the"
-        " parameter that is farthest off.",
+        " or too large, the median of its size over that of an honest one; far outside, the share beyond the quantile"
+        f" that {GATE:g} should lie beyond, after that factor. Of all, what is said of NEES and of the parameter that"
+        " is farthest off.",
         f.calibration,
         kind="word",
         where=("calibration", "parameters"),
