@@ -371,9 +371,7 @@ def estimate(
     if estimators is None:
         estimators = {"linear_lse": LinearLSE(), "levenberg_marquardt": LevenbergMarquardt(), "auto": Auto()}
     estimators = _labelled(estimators, Estimator)
-    if isinstance(readings, str | Path):
-        readings = [readings]
-    given = readings if readings is None or isinstance(readings, np.ndarray) else tuple(map(Path, readings))
+    given = readings if readings is None or isinstance(readings, np.ndarray) else tuple(_paths(readings))
     stated: dict[str, Any] = {"noise": noise, "prior": prior, "error_scale": error_scale}
     stated |= {"known": known_parameters(parameters or {}), "ignored": tuple(ignore_columns)}
     return Answer.to(Question(model=model, readings=given, estimators=estimators, **stated).opened())
@@ -397,10 +395,10 @@ def _tracked(
     trackers = {"ekf": ekf(), "ukf": ukf(), "ckf": ckf()} if trackers is None else _labelled(trackers)
     log = Log.of(model, Path(readings) if isinstance(readings, str) else readings, ignored)
     validate([Tracking(log.model)], trackers, 1)
-    if find:
-        names = [find] if isinstance(find, str) else list(find)
-        return TrackAnswer(log, [found_and_tracked(log, label, tracker, names) for label, tracker in trackers.items()])
-    return TrackAnswer(log, [Tracked.of(log, label, tracker) for label, tracker in trackers.items()])
+    names = [find] if isinstance(find, str) else list(find)
+    return TrackAnswer(
+        log, [found_and_tracked(log, *one, names) if names else Tracked.of(log, *one) for one in trackers.items()]
+    )
 
 
 def design(
@@ -530,9 +528,9 @@ def _check_records(options: Sequence[Option]) -> list[Finding]:
     scenarios = [Scenario(Polynomial(), Gaussian(0.01), error_scale=scale) for scale in (1.0, 10.0, 100.0)]
     estimators = {"linear_lse": LinearLSE(), "fixed_point": FixedPoint(), "newton": Newton(), "ekf": EKF()}
     with tempfile.TemporaryDirectory(prefix="ipe-bench-") as folder, house_style():
-        compute(scenarios, estimators, 25, f"{folder}/sweep")
-        compute(scenarios[-1:], estimators, 1, f"{folder}/single")
-        for analysis in (analyse([f"{folder}/{name}"]) for name in ("sweep", "single")):
+        for name, some, trials in (("sweep", scenarios, 25), ("single", scenarios[-1:], 1)):
+            compute(some, estimators, trials, f"{folder}/{name}")
+            analysis = analyse([f"{folder}/{name}"])
             written("section", analysis, report_tables(analysis))
             for number, drawing in enumerate(added_drawings(analysis, views(analysis))):
                 drawing.save(Path(folder, str(number)))

@@ -54,10 +54,7 @@ _GONE = {"keys": "`ipe-bench run --help` explains every key of a run"}
 
 
 def list_command(names: Sequence[str], verbose: bool) -> int:
-    """One line per option of each group; of an option itself, GROUP/NAME, what it may be told.
-
-    Where verbose, groups come with all of that.
-    """
+    """One line per option of each group, with all that it may be told if `verbose`; of an option, GROUP/NAME, that."""
     print_problems(plugins.take_problems())
     known = plugins.groups()
     for name in names or known:
@@ -263,10 +260,7 @@ def _check_name(group: str, name: str) -> None:
 
 
 def _write_skill(folder: Path) -> list[Path]:
-    """Writes SKILL.md and a page for each kind into a new folder, by which a coding agent writes plugins.
-
-    Options come from `list`, skeletons from `new`, and what a component must pass from `check`.
-    """
+    """Writes SKILL.md and a page for each kind into a new folder, by which a coding agent writes plugins."""
     _require_absent(folder)
     folder = folder.resolve()
     with tempfile.TemporaryDirectory(prefix="ipe-bench-") as place, contextlib.chdir(place):

@@ -27,7 +27,6 @@ from ipe_bench.runs.run import validate
 from ipe_bench.states.base import StateModel
 
 if TYPE_CHECKING:
-    from ipe_bench.real.estimation import Opened
     from ipe_bench.trials.design import Criterion
 
 STANDARD_ESTIMATORS = ("solver=[auto]", "baseline=[linear_lse,levenberg_marquardt]")
@@ -70,10 +69,8 @@ class Single:
         return self.words.chosen(group) or model.name
 
     def folder(self, name: str, identity: Any, files: Sequence[str] = ()) -> Path:
-        """Reserves the folder that was named, or one that is named after the command and the model.
-
-        `identity` tells this command from others, as NAME.json says it; `files` are further files of the command.
-        """
+        """Reserves the folder that was named, or one that is named after the command and the model, for a command that
+        `identity` tells from others, as NAME.json says it, and for its further `files`."""
         output, named = Path(self.spec.output), not {"name", "output"}.isdisjoint(self.words.keys)
         folder = output if named else output.with_name(f"{self.command}-{self.measurement.replace('/', '-')}")
         return reserve_output_folder(folder, name, identity, elsewhere=not named, files=files)
@@ -129,10 +126,17 @@ def estimate_command(arguments: Sequence[str]) -> int:
     if asked.spec.model is not None:
         return _track(asked, asked.spec.model)
     opened = asked.spec.question(asked.words.keys).opened()
-    command = _command(opened)
+    question, files = opened.question, opened.question.readings
+    command = {  # what was asked for, not what the file holds today
+        "readings": [str(path.resolve()) for path in files] if isinstance(files, tuple) else None,
+        "scenario": describe(opened.scenario),
+        "prior": question.has_prior,
+        "estimators": _described(question.estimators),
+        **({"left_out": list(question.ignored)} if question.ignored else {}),
+    }
     folder = asked.folder(NAME, command, FILES)
     answer = Answer.to(opened, asked.measurement)
-    parts = [opened.scenario, *opened.question.estimators.values()]
+    parts = [opened.scenario, *question.estimators.values()]
     provenance = _provenance(asked, opened.readings.files, parts)
     files = write_answer(folder, answer, command, provenance, figures=asked.spec.figures != "none")
     _show(contents(answer), files)
@@ -161,19 +165,6 @@ def _provenance(asked: Single, files: Sequence[tuple[str, str]], parts: Sequence
         "readings": [{"file": file, "sha256": digest} for file, digest in files] or None,
         "libraries": library_versions(),
         **fingerprint(parts),
-    }
-
-
-def _command(opened: Opened) -> dict[str, Any]:
-    """What tells this command from others: what was asked for, not what the file holds today."""
-    question = opened.question
-    files = question.readings
-    return {
-        "readings": [str(path.resolve()) for path in files] if isinstance(files, tuple) else None,
-        "scenario": describe(opened.scenario),
-        "prior": question.has_prior,
-        "estimators": _described(question.estimators),
-        **({"left_out": list(question.ignored)} if question.ignored else {}),
     }
 
 

@@ -19,16 +19,8 @@ from ipe_bench.runs.results import CellState, Results
 _REPORT = {"output": str, "figures": str, "formats": str}
 _PAPER = {"output": str, "paper": NAMES, "columns": NAMES, "width": float}
 """Keys of tables and figures for a paper."""
-_COMPARE = {
-    "first": str,
-    "second": str,
-    "alpha": float,
-    "anytime": bool,
-    "fail_on": NAMES,
-    "power": float,
-    "difference": float,
-    "output": str,
-}
+_COMPARE = {"first": str, "second": str, "alpha": float, "anytime": bool, "fail_on": NAMES}
+_COMPARE |= {"power": float, "difference": float, "output": str}
 
 
 def audit_command(arguments: Sequence[str]) -> int:
@@ -81,8 +73,7 @@ def compare_command(arguments: Sequence[str]) -> int:
     show(comparison_parts(frame, keys.get("alpha", 0.05)))
     print_problems([*frame.attrs["problems"], *frame.attrs["stale"], *frame.attrs["notes"]])
     if "output" in keys:
-        say(f"\nTable   {Path(keys['output']) / 'comparison.csv'}")
-        say(f"Page    {Path(keys['output']) / 'comparison.html'}")
+        say(f"\nTable   {keys['output']}/comparison.csv", f"Page    {keys['output']}/comparison.html")
     say(*(f"worse: {line}" for line in frame.attrs["worse"]))
     return 1 if frame.attrs["worse"] or frame.attrs["problems"] else 0
 
@@ -140,10 +131,8 @@ def report_command(arguments: Sequence[str]) -> int:
 def show_report(
     folders: Sequence[Path], output: Path, figures: Which, formats: Any, cells: Mapping[str, str] | None = None
 ) -> int:
-    """Writes the report on all that folders hold, and prints it, or what belongs to these cells; the exit code.
-
-    `cells` has a line for people by key.
-    """
+    """Writes the report on all that folders hold, and prints it, or what belongs to the `cells`, whose keys have a line
+    for people each; returns the exit code."""
     from ipe_bench.report.run import begin_report
     from ipe_bench.statistics.analysis import Begun
     from ipe_bench.statistics.collect import collect

@@ -84,11 +84,8 @@ class Jobs:
     multirun: bool
     maximises: bool = False
     told: list[list[str]] = field(default_factory=list)
-    """The words of each job that this process runs; empty where Hydra's sweepers and launchers are to run them.
-
-    Hydra's own launcher would compose each job twice again, which takes longer than a job of a few trials
-    (`hydra/launcher=basic` shows it).
-    """
+    """The words of each job that this process runs; empty where Hydra's sweepers and launchers are to run them. Hydra's
+    own launcher composes each job twice again, longer than a job of a few trials takes (`hydra/launcher=basic`)."""
 
     def launch(self, task: Callable[[DictConfig], Any]) -> list[Any]:
         """What each job returned, run by the launcher and the sweeper that the words choose; nothing from a sweeper

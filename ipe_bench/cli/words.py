@@ -375,10 +375,8 @@ _LONGEST_NAME = 80
 
 
 def default_name(words: Words) -> str:
-    """What a command asks for, in a name for its folder: ranging-gaussian-deviation=0.1.
-
-    The same for the same settings in any order. What changes no setting, or adds trials to it, is no part of it.
-    """
+    """A name for the folder of a command, such as ranging-gaussian-deviation=0.1, the same for the same settings in any
+    order; what changes no setting, or adds trials to it, is no part of it."""
     parts: dict[str, str] = {}
     held = ""
     for override in words.overrides:

@@ -59,10 +59,8 @@ class Finding:
 
 
 def check_component(name: str, component: Any) -> Iterator[Finding]:
-    """Runs the checks of the component's kind; a component of no kind is a finding itself.
-
-    A model that takes inputs from a file is tried with columns that are made up.
-    """
+    """Runs the checks of the component's kind; a component of no kind is a finding itself. A model that takes inputs
+    from a file is tried with columns that are made up."""
     checks = next((c for kind, c in _CHECKS.items() if isinstance(component, kind)), None)
     if checks is None:
         yield Finding(name, "is a component", "it is neither measurement, noise, prior, solver, baseline nor execution")

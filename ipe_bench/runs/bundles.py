@@ -119,10 +119,8 @@ def read_bundle(path: Path) -> Bundle:
 
 @contextlib.contextmanager
 def opened(paths: Sequence[Path | str], into: Path | None = None) -> Iterator[list[Path]]:
-    """Folders of results, with those of every bundle in its place: below `into`, or for as long as this lasts.
-
-    Raises UserError if one is a file and not a whole bundle, or a folder that no run ever wrote to.
-    """
+    """Folders of results, with those of every bundle in its place: below `into`, or for as long as this lasts. Refuses
+    a file that is not a whole bundle, and a folder that no run ever wrote to."""
     with contextlib.ExitStack() as stack:
         found: list[Path] = []
         for path in map(Path, paths):

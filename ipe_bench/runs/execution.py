@@ -75,10 +75,8 @@ class Execution(Component, ABC):
 
     @abstractmethod
     def run(self, work: Work, tasks: Sequence[Any]) -> Iterator[Event]:
-        """Yields an event per step, and one with `ended` per task; an exception in `work` fails its task alone.
-
-        Closing the iterator, or an exception of `FATAL`, stops what is under way.
-        """
+        """Yields an event per step, and one with `ended` per task; an exception in `work` fails its task alone, and one
+        of `FATAL`, or closing the iterator, stops what is under way."""
 
 
 @dataclass(frozen=True)
@@ -148,10 +146,8 @@ def supervise(
     timeout_s: float | None = None,
     memory_gb: float | None = None,
 ) -> Iterator[Event]:
-    """Runs tasks in at most `workers` processes with `threads` threads each; see `Execution.run`.
-
-    A worker whose task takes longer than `timeout_s` between two steps is ended. The first step has a minute in any
-    case: a new worker has to load compiled code.
+    """Runs tasks in at most `workers` processes with `threads` threads each; see `Execution.run`. A worker whose task
+    takes longer than `timeout_s` between two steps is ended, after a minute for the first, which loads compiled code.
     """
     waiting = deque(range(len(tasks)))
     busy: dict[Connection, _Worker] = {}

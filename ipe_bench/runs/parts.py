@@ -68,7 +68,6 @@ class Part:
 
     def read(self, columns: Keys[str] | None = None) -> tuple[Mapping[str, Any], pa.Table]:
         """What the rows belong to, and the rows, without metadata: all columns, or those of `columns` that are there.
-
         Raises FileNotFoundError if there is no such file any more, and Unusable if it is damaged, or not one of ours.
         """
         with _opened(self.path) as file:

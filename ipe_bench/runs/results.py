@@ -253,10 +253,8 @@ class Results:
 
     @cached_property
     def _rivals(self) -> dict[str, tuple[StoredCell | None, list[StoredCell]]]:
-        """By identity: the stored cell that counts, if it is stored, and the stale ones.
-
-        The one that counts is the one that the newest run expects, else the one that was written last.
-        """
+        """By identity: the cell that the newest run expects, or else the one that was written last, if it is stored;
+        and the stale ones."""
         rivals: dict[str, list[StoredCell]] = {}
         for cell in self.stored.values():
             rivals.setdefault(cell.footer["identity_key"], []).append(cell)
@@ -308,11 +306,9 @@ class Results:
         return gaps(self._covered(key), 0, trials)
 
     def load(self, cell: StoredCell, columns: Sequence[str] | None, optional: Sequence[str] = ()) -> dict[str, Array]:
-        """The rows of a cell as arrays, by ascending trial, each trial once; all columns if `columns` is None.
-
-        A part that cannot be used any more, or lacks one of the `columns`, is named in `problems`, and left out. What
-        some parts lack of the `optional` columns is NaN or None there.
-        """
+        """The rows of a cell as arrays, by ascending trial, each trial once; all columns if `columns` is None. A part
+        that cannot be used any more, or lacks one of the `columns`, is named in `problems`, and left out. What some
+        parts lack of the `optional` columns is NaN or None there."""
         names = None if columns is None else list(dict.fromkeys(["trial", *columns, *optional]))
         tables = self._of_parts(cell, lambda parts: list(self._tables(parts, names, columns or ())))
         if sum(map(len, tables)) < cell.trials and self.damaged.keys().isdisjoint(p.path for p in cell.parts):

@@ -50,16 +50,12 @@ def compute(
     further: Mapping[str, Any] | None = None,
     command: str | None = None,
 ) -> tuple[str, ...]:
-    """Computes and stores what is missing under `output`; returns the messages of what failed.
-
-    Trials are computed in blocks of `block_size`, which changes no number; None: the quickest size.
+    """Computes and stores what is missing under `output`, in blocks of `block_size` trials, which changes no number;
+    returns the messages of what failed.
 
     The run is recorded, unless nothing is missing and the same was asked for before: under a new name, or under
-    `record_as`, in place of what is there; with `further` facts, and the `command` as it was typed.
-
-    Raises:
-        UserError: what was asked for cannot be computed, or the folder cannot be written to; nothing is computed then.
-        StorageError: nothing can be stored any more.
+    `record_as`, in place of what is there; with `further` facts, and the `command` as it was typed. Raises UserError,
+    before anything is computed, if that is impossible, and StorageError if nothing can be stored any more.
     """
     # Absolute: workers may have another working folder.
     store = Store(Path(output).absolute())
@@ -99,10 +95,8 @@ def validate(
     *,
     untried: Sequence[AnyScenario] | None = None,
 ) -> None:
-    """Raises one UserError with everything that stands in the way of this run.
-
-    Trials are drawn of the scenarios `untried` (all where it is None), to see whether numbers hold what is asked for.
-    """
+    """Raises one UserError with everything that stands in the way of this run; trials are drawn of the scenarios
+    `untried` (all if None), to see whether numbers hold what is asked for."""
     size = block_size_for(trials) if block_size is None else block_size
     mistakes = [
         f"{name}={value}: give a whole number above 0"
@@ -192,11 +186,8 @@ def record_refusal(
     estimators: Mapping[str, Any] = MappingProxyType({}),
     trials: int = 1,
 ) -> None:
-    """Notes in a folder that a job of a sweep was asked for and refused, if the folder holds results.
-
-    `job` tells it from the others; `accept` takes the note back. Scenario and estimators are given if the job came to
-    them.
-    """
+    """Notes in a folder of results that a job of a sweep, which `job` tells from the others, was asked for and refused;
+    scenario and estimators are given if the job came to them."""
     store = Store(Path(output))
     if store.trials.is_dir():
         store.prepare()

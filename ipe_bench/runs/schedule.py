@@ -104,11 +104,8 @@ def plan(directory: Path, cells: Sequence[ResultKey], results: Results, trials: 
 
 def run_task(task: Task) -> Iterator[str | tuple[int, Failure | None]]:
     """Computes one task and stores each cell's rows as soon as they are there; then yields the cell's place in the
-    task, and its failure if there was one. Runs wherever the execution has it run.
-
-    An exception in one cell fails that cell alone. What an estimator does for the first time in a process, such as to
-    import a library or to compile a model, it does before its time is taken.
-    """
+    task, and its failure if there was one: an exception fails its cell alone. What an estimator does for the first time
+    in a process, such as to import a library or to compile a model, it does before its time is taken."""
     store, cells = Store(task.directory), _recalled(task)
     if any(fingerprint(cell.components) != cell.made_by for cell in cells):
         raise RuntimeError(

@@ -11,30 +11,25 @@ SMALL = ("measurement=polynomial", "noise=gaussian", "noise.deviation=0.01", "ex
 SMALL += ("figures=none",)
 
 
-@pytest.fixture
-def command(ipe_bench):
-    return ipe_bench
-
-
 def rows_of(text: str, name: str) -> int:
     """How many rows of tables are about the estimator of that name."""
     return sum(name in line.split() for line in text.splitlines())
 
 
-def test_run_shows_what_it_asked_for_and_counts_the_rest(command):
+def test_run_shows_what_it_asked_for_and_counts_the_rest(ipe_bench):
     for solver in ("newton", "fixed_point"):
-        code, out, _ = command("run", *SMALL, f"solver=[{solver}]", "trials=8", "output=both")
+        code, out, _ = ipe_bench("run", *SMALL, f"solver=[{solver}]", "trials=8", "output=both")
         assert code == 0
         assert rows_of(out, solver) == 1
     assert rows_of(out, "newton") == 0
     assert "1 result of other commands; `ipe-bench report both` shows all" in out
     # Another setting of one label gives the label no other name, and it is not shown with this one.
-    _, out, _ = command(
+    _, out, _ = ipe_bench(
         "run", *SMALL, "solver=[newton]", "estimators.newton.max_iterations=50", "trials=8", "output=both"
     )
     assert rows_of(out, "newton") == 1
     assert "max_iterations" not in out
-    _, out, _ = command("report", "both", "figures=none")
+    _, out, _ = ipe_bench("report", "both", "figures=none")
     assert rows_of(out, "fixed_point") == 1
     assert "max_iterations" in out
 
@@ -62,17 +57,17 @@ def test_a_folder_is_named_after_what_was_asked(words):
     assert default_name(read("run", words.split())) == NAMES[words]
 
 
-def test_a_model_of_a_file_is_told_by_the_name_of_the_file(command):
-    assert command("new", "ode", "decay")[0] == 0
+def test_a_model_of_a_file_is_told_by_the_name_of_the_file(ipe_bench):
+    assert ipe_bench("new", "ode", "decay")[0] == 0
     words = ("run", "measurement=ode", "measurement.file=decay.yaml", "baseline=[]", "trials=4", "figures=none")
-    code, _, error = command(*words)
+    code, _, error = ipe_bench(*words)
     assert code == 0
     assert "measurement.file=decay.yaml" in error
     assert "rates" not in error
     (folder,) = Path("outputs").iterdir()
     assert folder.name.startswith("ode-no_baseline-file=decay.yaml-")
     Path("decay.yaml").write_text(Path("decay.yaml").read_text().replace("0.4", "0.5"))
-    assert command(*words)[0] == 0
+    assert ipe_bench(*words)[0] == 0
     assert len(list(Path("outputs").iterdir())) == 2
 
 
@@ -82,56 +77,55 @@ def test_a_long_name_is_cut_and_stays_one_of_a_kind():
     assert all(len(name) <= 80 for name in names)
 
 
-def test_unnamed_commands_have_folders_of_their_own_and_the_same_one_goes_on(command):
+def test_unnamed_commands_have_folders_of_their_own_and_the_same_one_goes_on(ipe_bench):
     for solver in ("newton", "fixed_point", "newton"):
-        assert command("run", *SMALL, f"solver=[{solver}]", "trials=8")[0] == 0
+        assert ipe_bench("run", *SMALL, f"solver=[{solver}]", "trials=8")[0] == 0
     folders = sorted(path.name for path in Path("outputs").iterdir())
     common = "polynomial-gaussian-{}-no_baseline-noise.deviation=0.01"
     assert folders == [common.format(solver) for solver in ("fixed_point", "newton")]
     assert all(len(list((Path("outputs") / f / "trials").iterdir())) == 2 for f in folders)
 
 
-def test_a_dry_run_says_what_is_missing_and_computes_nothing(command):
+def test_a_dry_run_says_what_is_missing_and_computes_nothing(ipe_bench):
     words = ("run", *SMALL, "solver=[newton]", "-m", "error_scale=1,3", "output=dry")
-    code, out, _ = command(*words, "trials=8", "--dry-run")
+    code, out, _ = ipe_bench(*words, "trials=8", "--dry-run")
     assert code == 0
     assert "0 estimates are stored, 16 would be computed" in out
     assert not Path("dry").exists()
-    assert command(*words, "trials=8")[0] == 0
+    assert ipe_bench(*words, "trials=8")[0] == 0
     stored = set(Path("dry").rglob("*"))
-    _, out, _ = command(*words, "trials=8", "--dry-run")
+    _, out, _ = ipe_bench(*words, "trials=8", "--dry-run")
     assert "16 estimates are stored, 0 would be computed" in out
-    _, out, _ = command(*words, "trials=20", "--dry-run")
+    _, out, _ = ipe_bench(*words, "trials=20", "--dry-run")
     assert "16 estimates are stored, 24 would be computed" in out
     assert set(Path("dry").rglob("*")) == stored
-
-
-def test_each_job_of_a_dry_run_is_told_from_the_others(command):
-    _, out, _ = command("run", *SMALL, "solver=[newton]", "-m", "noise.deviation=0.01,0.02", "trials=8", "--dry-run")
+    # Each job is told from the others.
+    _, out, _ = ipe_bench("run", *SMALL, "solver=[newton]", "-m", "noise.deviation=0.01,0.02", "trials=8", "--dry-run")
     lines = out.splitlines()[:-1]
     assert [line.split("noise.deviation=")[1].split(":")[0] for line in lines] == ["0.01", "0.02"]
 
 
-def test_status_says_complete_in_a_line(command):
-    assert command("run", *SMALL, "solver=[newton]", "trials=8", "output=whole")[0] == 0
-    code, out, _ = command("status", "whole")
+def test_status_says_complete_in_a_line(ipe_bench):
+    assert ipe_bench("run", *SMALL, "solver=[newton]", "trials=8", "output=whole")[0] == 0
+    code, out, _ = ipe_bench("status", "whole")
     assert (code, out) == (0, "whole: complete: 1 scenarios under an estimator, 8 trials\n")
-    assert rows_of(command("status", "whole", "-v")[1], "newton") == 1
+    assert rows_of(ipe_bench("status", "whole", "-v")[1], "newton") == 1
     next(Path("whole/trials").glob("*-0-8.parquet")).unlink()
-    code, out, _ = command("status", "whole")
+    code, out, _ = ipe_bench("status", "whole")
     assert code == 1
     assert "missing" in out
 
 
-def test_a_report_on_two_folders_needs_a_third(command):
+def test_a_report_on_two_folders_needs_a_third(ipe_bench):
     for scale in (1, 3):
-        assert command("run", *SMALL, "solver=[newton]", "trials=8", f"error_scale={scale}", f"output=s{scale}")[0] == 0
+        words = (*SMALL, "solver=[newton]", "trials=8", f"error_scale={scale}", f"output=s{scale}")
+        assert ipe_bench("run", *words)[0] == 0
     before = Path("s1/summary.csv").read_bytes()
-    code, _, error = command("report", "s1", "s3", "figures=none")
+    code, _, error = ipe_bench("report", "s1", "s3", "figures=none")
     assert code == 2
     assert "need output=DIR" in error
     assert Path("s1/summary.csv").read_bytes() == before
-    assert command("report", "s1", "s3", "output=both", "figures=none")[0] == 0
+    assert ipe_bench("report", "s1", "s3", "output=both", "figures=none")[0] == 0
     assert set(pd.read_csv("both/summary.csv")["error_scale"]) == {1.0, 3.0}
 
 
@@ -150,11 +144,11 @@ hydra:
 """
 
 
-def test_an_experiment_of_ones_own_sweeps_as_ours_do(command):
+def test_an_experiment_of_ones_own_sweeps_as_ours_do(ipe_bench):
     folder = Path("conf/experiment")
     folder.mkdir(parents=True)
     (folder / "mine.yaml").write_text(EXPERIMENT)
-    code, out, _ = command("run", "--config-dir", "conf", "+experiment=mine", "execution=serial", "figures=none")
+    code, out, _ = ipe_bench("run", "--config-dir", "conf", "+experiment=mine", "execution=serial", "figures=none")
     assert code == 0
     assert rows_of(out, "newton") == 3
     assert [path.name for path in Path("outputs").iterdir()] == ["mine"]
