@@ -38,7 +38,7 @@ BUDGETS = {
     "statistics": 4075,
     "real": 2311,
     "plugins": 1105,
-    "report": 4111,
+    "report": 4115,
     "cli": 2457,
 }
 """Lines of Python that a room may hold: who raises one lowers another in the same commit."""

@@ -107,8 +107,11 @@ def _honesty(rows: pd.DataFrame) -> Iterator[str]:
     claims = rows[rows["nees_median"].notna()]
     sure = claims[claims["verdict"].isin(["optimistic", "diverged but confident"])]
     parts = _from_scale(sure, lambda row: brief(row["nees_median"]))
-    honest = [label for label in dict.fromkeys(claims["estimator"]) if label not in set(sure["estimator"])]
+    others = claims[~claims["estimator"].isin(sure["estimator"])]
+    open_ = others[others["verdict"].isin(["undecided", "-"])]["estimator"].unique()
+    honest = [label for label in others["estimator"].unique() if label not in open_]
     parts += [f"{enumerate_few(honest)} never"] if honest else []
+    parts += [f"undecided for {enumerate_few(list(open_))}"] if len(open_) else []
     if len(claims):
         yield f"Overconfident (NEES, 1 is honest): {'; '.join(parts)}."
 
@@ -118,9 +121,10 @@ def _reach(rows: pd.DataFrame, scales: Sequence[float]) -> Iterator[str]:
     broken = rows[rows["success_high"] < BROKEN]
     parts = _from_scale(broken, lambda row: percent(row["success"]))
     top = rows[(rows["error_scale"] == scales[-1]) & ~rows["estimator"].isin(broken["estimator"])]
-    if len(top):
-        who = _listed(top, lambda row: percent(row["success"]))
-        parts.append(f"{who} hold{'s' * (len(top) == 1)} to {plain(scales[-1])}")
+    for part, verb in ((top[top["success"] >= BROKEN], "hold"), (top[top["success"] < BROKEN], "may hold")):
+        if len(part):
+            who, ending = _listed(part, lambda row: percent(row["success"])), "s" * (len(part) == 1 and verb == "hold")
+            parts.append(f"{who} {verb}{ending} to {plain(scales[-1])}")
     yield f"Success falls surely below {100 * BROKEN:.0f} %: {'; '.join(parts)}."
     silent = rows.sort_values("failed_silent", kind="stable").iloc[-1]
     if silent["failed_silent"] > 0:
