@@ -46,6 +46,13 @@ def read_sigma(text: str) -> Arithmetic:
             f"noise.sigma={text}: can be negative ({values[wrong[0]]:.3g} where {where}); give a formula that is"
             f" positive for all positive levels, such as a + b*{READING}, where {READING} is the reading's magnitude"
         )
+    levels = Levels(formula, np.ones(_PROBES), ("",), np.zeros(_PROBES, dtype=np.intp))
+    slopes = levels.at(np.geomspace(1e-6, 1e6, _PROBES)[None], np.log(points[None, :-1, 0]))[2][0]
+    if np.linalg.matrix_rank(slopes[np.isfinite(slopes).all(axis=1)]) < len(names):
+        raise UserError(
+            f"noise.sigma={text}: no readings tell its levels {', '.join(names)} apart; leave some out"
+            f" ({READING} is the reading's magnitude, all other names are levels)"
+        )
     return formula
 
 

@@ -227,6 +227,8 @@ def _notes(answer: Answer) -> Iterator[str]:
         )
     if told := [one.label for one in fits if one.with_prior]:
         yield f"{', '.join(told)}: with a prior, which counts in the standard errors as further readings would."
+    elif stated := [one.name for one in getattr(answer.model, "known", ()) if one.deviation is not None]:
+        yield f"The prior of {', '.join(stated)} counts in no estimate here; add one with a prior, such as map_lm."
     if answer.model.fixed:
         yield f"Fixed: {_values(answer.model.fixed)}"
     if answer.left_out:

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import norm
 
 import ipe_bench as ib
-from ipe_bench.baselines import LevenbergMarquardt, LinearLSE
+from ipe_bench.baselines import LevenbergMarquardt, LinearLSE, MapLM
 from ipe_bench.measurements import Formula, Mgh, Polynomial, Sir
 from ipe_bench.measurements.known import ParameterInfo, informed
 from ipe_bench.measurements.problem import Problem
@@ -179,6 +179,13 @@ def test_with_as_many_readings_as_parameters_nothing_is_tested_but_a_worse_answe
     assert (good.fits, bad.fits) == (None, False)
     assert np.isnan(good.p_value)
     assert np.isnan(good.white_p)
+
+
+def test_a_prior_that_counts_in_no_estimate_is_told():
+    known, z, said = {"a": {"deviation": 0.1}}, SATURATION.simulate(np.ones((1, 2)))[0], "prior of a counts in no"
+    assert said in str(ib.estimate(SATURATION, z, LM, noise=Gaussian(0.4), parameters=known))
+    assert said not in str(ib.estimate(SATURATION, z, LM, noise=Gaussian(0.4), error_scale=1.0))
+    assert said not in str(ib.estimate(SATURATION, z, {"map": MapLM()}, noise=Gaussian(0.4), parameters=known))
 
 
 def test_an_answer_is_a_frame_too():

@@ -100,12 +100,12 @@ def test_the_headline_says_who_agrees_who_is_honest_who_breaks_and_what_it_costs
 def test_few_trials_leave_open_who_is_honest_and_who_holds(synthetic):
     for scale in (1.0, 10.0):
         e, scenario = 0.1 * np.random.default_rng(1).normal(size=(10, 3)), synthetic.scenario(error_scale=scale)
-        wrong = np.where(np.arange(10)[:, None] < 4, 9.0, e)
+        wrong = np.where(np.arange(10)[:, None] < 3, 9.0, e)
         for label, error in (("liar", 100 * e), ("solver", e), ("loser", wrong)):
             synthetic.add(scenario, label, error, deviation=np.full(3, 0.1))
     honest, reach, *_ = [s.replace("\u00a0", " ") for s in headline(analyse([synthetic.directory]))]
     assert honest == "Overconfident (NEES, 1 is honest): undecided for liar, loser, solver."
-    assert reach.endswith("solver (100 %) holds to 10; loser (60.0 %) may hold to 10.")
+    assert reach.endswith("solver (100 %) holds to 10; loser (70.0 %) may hold to 10.")
 
 
 def test_one_scale_or_several_settings_are_ranked(synthetic):
