@@ -12,7 +12,7 @@ import hashlib
 import io
 import math
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -267,13 +267,13 @@ def _together(paths: Sequence[Path], found: Sequence[Readings]) -> Readings:
     first = found[0]
     if len(found) == 1:
         return first
-    units = {name.split(" [")[0]: _unit(name) for name in first.columns}
+    units = {_quantity(name): _unit(name) for name in first.columns}
     for one, path in zip(found, paths, strict=True):
         if (one.deviations is None) != (first.deviations is None):
             with_sigma, without = (paths[0], path) if one.deviations is None else (path, paths[0])
             raise UserError(f"readings={without}: has no column {SIGMA}, as {with_sigma} has; give it one, too")
         for name in one.columns:  # one formula is made of all files
-            other = units.get(name.split(" [")[0])
+            other = units.get(_quantity(name))
             if other and _unit(name) and _unit(name) != other:
                 raise UserError(f"readings={path}: column {name}: {paths[0]} has it in {other}; convert the values")
     deviations = [one.deviations for one in found if one.deviations is not None]
@@ -315,7 +315,7 @@ def _readings_in(table: Table, model: Measurement) -> Readings:
     for name, values in sampled.index.items():
         if name not in headings and name in table.heading:
             for (text, where), label in zip(table.column(name), values, strict=True):
-                if _label(text, table.number(text)) != _label_of(label):
+                if _label(text, table.number) != _label(str(label)):
                     said = f"'{text}' stands where the order of the rows says {label}; leave the column out"
                     raise table.error(f"{where}: {said}")
     return Readings(sampled, z, _sigmas(table, sigma, range(len(z)), z, shown), used)
@@ -330,11 +330,11 @@ def _rows_of(table: Table, model: Measurement, also: Sequence[str]) -> list[int]
             raise table.error(f"column {name} is missing; the header must be {','.join(wanted)}")
     table.require_known((*wanted, *also), wanted)
     every = list(zip(*model.index.values(), strict=True))
-    places = {tuple(map(_label_of, label)): i for i, label in enumerate(every)}
+    places = {tuple(_label(str(value)) for value in label): i for i, label in enumerate(every)}
     columns = [table.heading.index(name) for name in model.index]
     found: dict[int, int] = {}
     for k, (number, row) in enumerate(table.rows):
-        place = places.get(tuple(_label(row[at], table.number(row[at])) for at in columns))
+        place = places.get(tuple(_label(row[at], table.number) for at in columns))
         if place is None or place in found:
             said = ", ".join(f"{table.heading[at]}={row[at].strip()}" for at in columns)
             if place is None:
@@ -352,13 +352,10 @@ def _rows_of(table: Table, model: Measurement, also: Sequence[str]) -> list[int]
     return [found[i] for i in range(model.m)]
 
 
-def _label(text: str, number: float | None) -> Any:
-    """Labels are compared as numbers where they are numbers: 3 and 3.0 are one."""
-    return text.strip() if number is None else round(number, 9)
-
-
-def _label_of(value: Any) -> Any:
-    return _label(str(value), _number(str(value)))
+def _label(text: str, number: Callable[[str], float | None] = _number) -> Any:
+    """A label, as a number if it is one: 3 and 3.0 are one."""
+    value = number(text)
+    return text.strip() if value is None else round(value, 9)
 
 
 def _shown_as(model: Measurement) -> list[str]:
@@ -373,8 +370,8 @@ def _reading_column(table: Table, model: Measurement) -> str:
         return found
     for name in names:
         table.refuse_other_unit(name)
-    known = [_quantity(wanted.heading) for wanted in model.inputs] + [SIGMA]
-    free = [_quantity(name) for name in table.heading if _quantity(name) not in known]
+    known = {SIGMA, *(_quantity(wanted.heading) for wanted in model.inputs)}
+    free = [name for name in map(_quantity, table.heading) if name not in known]
     other = free[0] if len(free) == 1 else "COLUMN"
     remedy = f"set measurement.reading={other}" if hasattr(model, "reading") else f"rename {other}"
     there = ", ".join(table.heading)
@@ -396,7 +393,7 @@ def _sigmas(table: Table, column: str | None, rows: Sequence[int], z: Array, sho
     """The standard deviations (m,) in `rows` of that column, `shown` being that of the readings; None without one."""
     if column is None:
         return None
-    if _unit(column) and _unit(column) != _unit(shown):
+    if _unit(column) not in ("", _unit(shown)):
         raise table.error(f"column {column}: the unit must be that of {shown}; convert the values")
     cells, values = table.column(column), []
     for row, reading in zip(rows, z, strict=True):

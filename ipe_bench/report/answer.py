@@ -310,11 +310,11 @@ def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator
         )
     for one in found.ambiguous[:_MOST_MINIMA]:
         yield f"AMBIGUOUS: the readings fit as well at {at(one.x)} (chi-square {one.chi_square:.5g})."
-    if bent := list(compress(names, found.bent.tolist())):
+    if bent := list(compress(names, found.bent)):
         yield f"Profiles that are no parabola: {', '.join(bent)}; trust their profile intervals."
-    if unlimited := list(compress(names, np.isinf(found.profiles).any(axis=0).tolist())):
+    if unlimited := list(compress(names, np.any(np.isinf(found.profiles), axis=0))):
         yield f"The readings set no limit to one side of {', '.join(unlimited)}."
-    if lost := list(compress(names, np.isnan(found.profiles).any(axis=0).tolist())):
+    if lost := list(compress(names, np.any(np.isnan(found.profiles), axis=0))):
         yield f"The profile could not be followed to its end: {', '.join(lost)}."
     for one in found.on_bounds:
         yield (

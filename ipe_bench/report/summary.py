@@ -78,7 +78,6 @@ class Summary(pd.DataFrame):
 
     @property
     def _is_whole(self) -> bool:
-        """Whether it has all that the terminal's table is made of."""
         return {"parameter", "noise", *summary_columns()} <= set(self.columns) and ALL in set(self["parameter"])
 
     def _tables(self, width: int) -> list[Any]:

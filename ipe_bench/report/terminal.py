@@ -48,8 +48,7 @@ _VERDICTS |= {"diverged but confident": ("diverged", "!"), "-": ("", "")}
 
 
 def summary_tables(listed: Sequence[Mapping[str, Any]], totals: Sequence[Table], width: int) -> list[Part]:
-    """A table per setting (measurement, noise, and every option that differs) behind the totals of runs on certified
-    readings and on problems of known minimum, which are not shown otherwise."""
+    """A table per setting (measurement, noise, and every option that differs), behind the totals of certified runs."""
     # Models whose own readings are certified, without being of a collection, have no totals.
     rows = [row for row in listed if row["parameter"] == ALL and not (totals and row["noise"] == "certified")]
     known = {*summary_columns(), "parameter", "unit", "estimator", "error_scale"}
@@ -67,7 +66,6 @@ def summary_tables(listed: Sequence[Mapping[str, Any]], totals: Sequence[Table],
 
 
 def _setting(title: str, rows: Sequence[Mapping[str, Any]], width: int) -> Table:
-    """The table of one setting."""
     scales = column("scale", [row["error_scale"] for row in rows], lambda v: f"{v:g}")
     columns = [scales, *overview_columns(rows, leading(rows, ["error_scale"]), narrow=width < _WIDE_ENOUGH)]
     # The number of trials stands in the title if it is the same for all.
@@ -144,8 +142,7 @@ def statistics(where: Where, rows: Sequence[Mapping[str, Any]]) -> list[Column]:
 
 
 def reported(record: Statistic, rows: Sequence[Mapping[str, Any]]) -> bool:
-    """Whether a table has the column of a statistic; a rare one needs a finite value in some row, a rare count one
-    above 0."""
+    """Whether a table has the column of a statistic; a rare one needs a finite value, a rare count one above 0."""
     values = [row[record.name] for row in rows]
     return not record.rare or any(math.isfinite(v) and (v > 0 or record.kind != "count") for v in values)
 

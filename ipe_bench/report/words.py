@@ -91,8 +91,7 @@ def _decimals(value: float, figures: int) -> int:
 
 
 def p_value(p: float, least: float = 0.0) -> str:
-    """A probability; very small ones by their order. One that was counted among simulations cannot be less than
-    `least`: at that it is a limit, not a value."""
+    """A probability, a very small one by its order; `least` is the limit of one that is counted among simulations."""
     if not math.isfinite(p):
         return "-"
     if p <= least and least > 0:

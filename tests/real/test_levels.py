@@ -1,5 +1,7 @@
 """Levels of the noise that are estimated with the parameters: the likelihood, its intervals, and what is refused."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize as nelder_mead
@@ -245,28 +247,33 @@ def test_a_noise_that_cannot_be_is_refused_in_one_line(options, words):
     assert "\n" not in str(raised.value)
 
 
-def test_too_few_readings_for_a_level_are_refused():
+@pytest.mark.parametrize(
+    ("formula", "noise", "rows", "value", "words"),
+    [
+        (
+            DECAY.expression,
+            NOISES["by output"][0],
+            slice(32, 60),
+            np.nan,
+            "the 2 readings of 1 are too few to tell sigma",
+        ),
+        (
+            "second*(a + k*t) + 0*l",
+            NOISES["by output"][0],
+            slice(30),
+            0.0,
+            "the level of 0 cannot be .* residuals of zero",
+        ),
+        (DECAY.expression, Unknown(sigma="share*h"), slice(1), 0.0, r"noise.sigma=share\*h: is 0 at 1 of 60 readings"),
+    ],
+    ids=["too few readings", "residuals of zero", "a standard deviation of zero"],
+)
+def test_what_would_make_the_likelihood_infinite_is_refused(formula, noise, rows, value, words):
     z = readings("by output", 1)
-    z[32:] = np.nan
-    with pytest.raises(ib.UserError, match="the 2 readings of 1 are too few to tell sigma beside 2 parameters"):
-        fitted("by output", z)
-
-
-def test_residuals_of_zero_are_refused():
-    """The likelihood is infinite where an output is met exactly."""
-    z = readings("by output", 1)
-    z[:30] = 0.0
-    model = Formula("second*(a + b*t)", {"a": 1.0, "b": 1.0}, dict(DECAY.columns))
-    with pytest.raises(ib.UserError, match="the level of 0 cannot be estimated from residuals of zero"):
-        fit(Problem(model, Covariance(np.ones(60))), z, LM, Unknown(by="second"))
-
-
-def test_a_standard_deviation_of_zero_is_refused():
-    """The likelihood of a reading of zero is infinite if its standard deviation is a share of it."""
-    z = readings("a + b h", 1)
-    z[5] = 0.0
-    with pytest.raises(ib.UserError, match=r"noise.sigma=share\*h: is 0 at 1 of 60 readings"):
-        fit(Problem(DECAY, Covariance(np.ones(60))), z, LM, Unknown(sigma="share*h"))
+    z[rows] = value
+    model = replace(DECAY, expression=formula)
+    with pytest.raises(ib.UserError, match=words):
+        fit(Problem(model, Covariance(np.ones(60))), z, LM, noise)
 
 
 def test_a_formula_of_the_standard_deviation_has_exact_slopes():

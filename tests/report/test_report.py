@@ -45,6 +45,13 @@ def fill(
     store.record(trials)
 
 
+def shown_at(width: int, *parts) -> list[str]:
+    """The lines of tables and sentences in a terminal."""
+    out = io.StringIO()
+    Console(file=out, width=width).print(terminal(parts, width))
+    return [line.rstrip() for line in out.getvalue().splitlines()]
+
+
 @pytest.fixture(scope="module")
 def result(tmp_path_factory):
     store = Synthetic(tmp_path_factory.mktemp("report") / "store")
@@ -178,16 +185,15 @@ def test_a_record_is_all_that_a_statistic_needs(result):
     """Its column, its definition, and its heading in every table that it names, the terminal's among them."""
     page = result.report.read_text(encoding="utf-8")
     tables = {t.name: t for t in all_tables(analyse([result.report.parent]))}
-    out = io.StringIO()
-    Console(file=out, width=300).print(terminal(summary_tables(result.summary.to_dict("records"), [], 300), 300))
     rows = result.summary.to_dict("records")
+    shown = "\n".join(shown_at(300, *summary_tables(rows, [], 300)))
     for record in (*STATISTICS, *SCORES):
         assert (record.title, record.definition) in DEFINITIONS
         assert str(escape(record.definition)) in page
         for where in record.where if record in SCORES or reported(record, rows) else ():
             headings = [record.titles.get(where, record.title), record.limits_titles.get(where, "")]
             if where == "terminal":
-                assert all(h in out.getvalue() for h in headings)
+                assert all(h in shown for h in headings)
             elif where in tables:
                 assert {*headings, ""} <= {*(c.title for c in tables[where].columns), ""}
     assert set(frame_columns(STATISTICS)) <= set(result.summary.columns)
@@ -216,13 +222,6 @@ def test_settings_that_differ_have_figures_of_their_own(synthetic, tmp_path, mon
         assert settings == {"gaussian-0.2", "gaussian-0.4", "quantization"}
     page = re.sub(r'base64,[^"]*', "", result.report.read_text(encoding="utf-8"))
     assert not re.search(r"\bnan\b", page)
-
-
-def shown_at(width: int, *parts) -> list[str]:
-    """The lines of tables and sentences in a terminal."""
-    out = io.StringIO()
-    Console(file=out, width=width).print(terminal(parts, width))
-    return [line.rstrip() for line in out.getvalue().splitlines()]
 
 
 def test_every_renderer_has_every_cell():
