@@ -25,20 +25,20 @@ LINE = (
     ("cli",),
 )
 BUDGETS = {
-    "basics": 949,
+    "basics": 916,
     "measurements": 6439,
     "noise": 621,
     "priors": 105,
     "states": 1247,
-    "estimators": 1178,
+    "estimators": 1150,
     "solvers": 1184,
     "baselines": 1957,
-    "trials": 1950,
+    "trials": 1941,
     "runs": 1964,
     "statistics": 4075,
     "real": 2308,
     "plugins": 1105,
-    "report": 4111,
+    "report": 4112,
     "cli": 2457,
 }
 """Lines of Python that a room may hold: who raises one lowers another in the same commit."""

@@ -15,7 +15,7 @@ from annotated_types import Gt, Le
 from ipe_bench.baselines.sequential import LARGEST, Sequential, Track
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Finite, NonNegative, Positive, Whole
-from ipe_bench.basics.streams import own_bits
+from ipe_bench.basics.streams import own_generators
 from ipe_bench.states.algebra import symmetric
 from ipe_bench.states.linearisation import Cubature, Rule, Taylor, Unscented
 
@@ -230,7 +230,7 @@ class EnKF(Sequential):
     family = "ensembles"
 
     def track(self, P0: Array, Q: Array, z: Array) -> Track:
-        return _EnKFTrack(P0, Q, self.members, own_bits(self.seed, z))
+        return _EnKFTrack(P0, Q, self.members, own_generators(self.seed, z[None])[0].bit_generator)
 
 
 class _EnKFTrack(_PointsTrack):

@@ -53,11 +53,6 @@ def write_text(path: Path, text: str) -> None:
     write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
 
 
-def write_bytes(path: Path, content: bytes) -> None:
-    """Writes a file in one piece; see `write_atomically`."""
-    write_atomically(path, lambda temporary: temporary.write_bytes(content))
-
-
 def cache_folder() -> Path:
     """Where what is compiled or parsed once is kept between processes: `IPE_BENCH_CACHE`, or the user's cache."""
     chosen = os.environ.get("IPE_BENCH_CACHE")

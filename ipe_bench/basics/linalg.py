@@ -65,11 +65,6 @@ def inverse(A: Array) -> tuple[Array, Mask]:
     return solve(A, np.broadcast_to(np.eye(A.shape[-1]), A.shape))
 
 
-def cholesky(P: Array) -> Array:
-    """The upper factors U with U' U = P of each P (trials, n, n); NaN where P is not positive definite."""
-    return _of_each(np.linalg.cholesky, P).swapaxes(1, 2)
-
-
 def _of_each(function: Callable[..., Array], *batches: Array) -> Array:
     """What a function of NumPy makes of each matrix; NaN where it refuses one."""
     try:
@@ -177,7 +172,7 @@ def definite_factor(G: Array) -> tuple[Array, Array, Mask]:
         size = np.sqrt(np.diagonal(G, axis1=1, axis2=2))
         scaled = G / (size[:, :, None] * size[:, None, :])
         usable = finite(scaled)
-        U = cholesky(np.where(usable[:, None, None], scaled, np.eye(n)))
+        U = _of_each(np.linalg.cholesky, np.where(usable[:, None, None], scaled, np.eye(n))).swapaxes(1, 2)
         inverse_U = _inverse_of_upper(U)
         well = usable & (np.linalg.norm(inverse_U, axis=(1, 2)) * np.sqrt(n) <= _WELL_CONDITIONED)
         return U * size[:, None, :], inverse_U / size[:, :, None], well

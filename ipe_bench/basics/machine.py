@@ -7,17 +7,7 @@ import importlib.metadata
 import os
 import platform
 
-_LIBRARIES = (
-    "numpy",
-    "scipy",
-    "llvmlite",
-    "filterpy",
-    "hydra-core",
-    "pandas",
-    "pyarrow",
-    "seaborn",
-    "matplotlib",
-)
+_LIBRARIES = ("numpy", "scipy", "llvmlite", "filterpy", "hydra-core", "pandas", "pyarrow", "seaborn", "matplotlib")
 
 
 def cores() -> int:

@@ -143,9 +143,11 @@ def checked(value: Any, hint: Any, key: str) -> Any:
     if issubclass(plain, Mapping) and isinstance(value, Mapping) and arguments:
         entries = {name: checked(entry, arguments[1], f"{key}.{name}") for name, entry in value.items()}
         return value if all(entries[name] is entry for name, entry in value.items()) else entries
-    if plain in (int, float):
-        return _number(value, plain, key)
-    if isinstance(value, plain):
+    # True and false are not numbers; NumPy's are.
+    abstract = {int: numbers.Integral, float: numbers.Real}.get(plain)
+    if abstract and isinstance(value, abstract) and not isinstance(value, bool):
+        return value if type(value) is plain else typing.cast(Any, plain)(value)
+    if isinstance(value, plain) and not abstract:
         return value
     raise _refusal(value, describe_type(hint), key)
 
@@ -155,26 +157,15 @@ def _refusal(value: Any, wanted: str, key: str) -> UserError:
     return UserError(f"{key}={shortened(text, 60)}: give {wanted}")
 
 
-def _number(value: Any, kind: Any, key: str) -> Any:
-    """True and false are not numbers; NumPy's are."""
-    if type(value) is kind:
-        return value
-    accepted: type = numbers.Integral if kind is int else numbers.Real
-    if issubclass(type(value), accepted) and not isinstance(value, bool):
-        return kind(value)
-    raise _refusal(value, _NOUNS[kind], key)
-
-
 def _constrained(value: Any, kind: Any, metadata: Sequence[Any], key: str) -> Any:
     try:
         value = checked(value, kind, key)
+        if all(_COMPARISONS[type(bound)](value, dataclasses.astuple(bound)[0]) for bound in _bounds(metadata)):
+            return value
     except UserError:
         if typing.get_origin(kind) is tuple:
             raise  # it says which entry is wrong
-        raise _refusal(value, describe_type(Annotated[kind, *metadata]), key) from None
-    if not all(_COMPARISONS[type(bound)](value, dataclasses.astuple(bound)[0]) for bound in _bounds(metadata)):
-        raise _refusal(value, describe_type(Annotated[kind, *metadata]), key)
-    return value
+    raise _refusal(value, describe_type(Annotated[kind, *metadata]), key)
 
 
 def _bounds(metadata: Sequence[Any]) -> list[Any]:

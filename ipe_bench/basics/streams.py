@@ -10,15 +10,11 @@ import numpy as np
 from ipe_bench.basics.linalg import Array
 
 
-def own_bits(seed: int, z: Array) -> np.random.Philox:
-    """The bits of one trial, which depend on `seed` and its readings z (m,), and on nothing else in the batch."""
-    digest = hashlib.sha256(np.ascontiguousarray(z, dtype=float).tobytes()).digest()
-    return np.random.Philox(np.random.SeedSequence([seed, *np.frombuffer(digest, dtype=np.uint32).tolist()]))
-
-
 def own_generators(seed: int, z: Array) -> list[np.random.Generator]:
-    """A generator for each trial of readings z (trials, m); see `own_bits`."""
-    return [np.random.Generator(own_bits(seed, row)) for row in z]
+    """A generator for each trial of readings z (trials, m), which depends on `seed` and on these readings alone."""
+    digests = [hashlib.sha256(np.ascontiguousarray(row, dtype=float).tobytes()).digest() for row in z]
+    entropy = [[seed, *np.frombuffer(digest, dtype=np.uint32).tolist()] for digest in digests]
+    return [np.random.Generator(np.random.Philox(np.random.SeedSequence(words))) for words in entropy]
 
 
 def normals(generators: Sequence[np.random.Generator], *shape: int) -> Array:

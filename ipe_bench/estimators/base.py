@@ -72,8 +72,8 @@ class Estimates:
             """NaN where a part has none, and None where no part has any."""
             if all(value is None for value in values):
                 return None
-            blanks = (np.full((size, *shape), np.nan) for size in sizes)
-            return np.concatenate([b if v is None else v for v, b in zip(values, blanks, strict=True)])
+            pairs = zip(values, sizes, strict=True)
+            return np.concatenate([np.full((size, *shape), np.nan) if v is None else v for v, size in pairs])
 
         whole = ("x", "status", "iterations", "simulations", "jacobians", "seconds")
         found: dict[str, Any] = {name: joined([getattr(part, name) for part in parts]) for name in whole}

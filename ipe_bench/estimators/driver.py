@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,35 +13,15 @@ from ipe_bench.basics.batches import gather, take
 from ipe_bench.basics.linalg import Array, Mask
 from ipe_bench.basics.statuses import Status
 
-if TYPE_CHECKING:
-    from ipe_bench.measurements.counted import CountingModel
-
 FAR = 1e8
 """Where the residual is this many times larger than at the start, the iteration has diverged."""
 TINY_STEP = 1e-3
 """Steps below this share of the tolerance, while the equation does not hold within it, mean a stall."""
 
 
-class HasX(Protocol):
-    """A state: a frozen dataclass whose fields are arrays with the trials in front, x (trials, n) among them."""
-
-    @property
-    def x(self) -> Array: ...
-
-
-S = TypeVar("S", bound=HasX)
+S = TypeVar("S", bound=Any)
+"""A state: a frozen dataclass whose fields are arrays with the trials in front, x (trials, n) among them."""
 R = TypeVar("R")
-
-
-class Equations(Protocol):
-    """What is solved for the trials `rows` of a batch."""
-
-    @property
-    def model(self) -> CountingModel: ...
-    @property
-    def rows(self) -> NDArray[np.intp]: ...
-    def subset(self, kept: Mask) -> Any:
-        """The same for some of the trials."""
 
 
 @dataclass(frozen=True)
@@ -108,8 +88,11 @@ class SolveResult(Generic[S]):
         return self.status == Status.CONVERGED
 
 
-def iterate(equations: Equations, solver: Solver[S], start: Array | S, limits: Limits) -> SolveResult[S]:
-    """Iterates from `start`, which is x (trials, n) or a state, until every trial has ended; those leave the batch."""
+def iterate(equations: Any, solver: Solver[S], start: Array | S, limits: Limits) -> SolveResult[S]:
+    """Iterates from `start`, which is x (trials, n) or a state, until every trial has ended; those leave the batch.
+
+    `equations` have a counting `model`, the `rows` of the trials in its tally, and a `subset` for some of them.
+    """
     state = solver.begin(equations, start) if isinstance(start, np.ndarray) else start
     trials, n = state.x.shape
     tally, active = equations.model.tally, np.arange(trials)

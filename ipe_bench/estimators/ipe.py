@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from abc import abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Generic, Literal, Protocol, TypeVar
 
@@ -32,10 +31,7 @@ if TYPE_CHECKING:
     from ipe_bench.measurements.problem import Problem
 
 Start = Literal["linear_lse", "nominal", "best"]
-"""Where an iteration begins: at the linear LSE, eq. (16), at the nominal point, or at that of the two where the
-readings fit better."""
-
-
+"""Where an iteration begins: at the linear LSE, eq. (16), at the nominal point, or at the better fit of the two."""
 _NEAR = 0.03
 """Where F is larger, in standard deviations of the linear bound, a step is as good with a coarse Jacobian."""
 
@@ -142,11 +138,9 @@ class FrozenSystem:
 
         Not counted as cost: it is part of the report, not of the search.
         """
-        model = self.model.measurement
-        usable = finite(x)
         inverse_slope = np.full((len(x), x.shape[1], x.shape[1]), np.nan)
-        if usable.any():
-            report = CountingModel.uncounted(model, int(self.rows.max()) + 1)
+        if (usable := finite(x)).any():
+            report = CountingModel.uncounted(self.model.measurement, int(self.rows.max()) + 1)
             part = self.subset(usable)
             inverse_slope[usable], _ = inverse(np.matmul(part.H_plus, report.jacobian(x[usable], part.rows)))
         return np.matmul(np.matmul(inverse_slope, self.covariance()), inverse_slope.swapaxes(1, 2))
@@ -212,10 +206,6 @@ class IPE(Solver[S], Estimator, Generic[S]):
         """The state at the start x (trials, n), where the residual is F."""
         return State(x, F)  # type: ignore[return-value]
 
-    @abstractmethod
-    def step(self, system: System, state: S) -> S:
-        """The state after one more iteration."""
-
     def begin(self, system: Any, x: Array) -> S:
         return self.init(system, x, system.F(x))
 
@@ -232,6 +222,7 @@ class IPE(Solver[S], Estimator, Generic[S]):
 def root_check(deviation: Array, before: State | None, state: State) -> ConvergenceCheck:
     """How far F is from zero, and how long the last step was, in standard deviations (1, n) or (trials, n)."""
     residual = np.abs(state.F / deviation).max(axis=1)
-    first = before is None
-    moved = np.full(len(residual), np.inf) if first else np.abs((state.x - before.x) / deviation).max(axis=1)
+    moved = np.full(len(residual), np.inf)
+    if before is not None:
+        moved = np.abs((state.x - before.x) / deviation).max(axis=1)
     return ConvergenceCheck(residual, residual, moved)

@@ -79,8 +79,7 @@ class Minima:
 
     def estimates(self, tally: EvaluationCount, readings: int) -> Estimates:
         """What an estimator hands back."""
-        extras = {"fit_p": self.fit_probability(readings)}
-        return Estimates.of(self, tally, covariance=self.covariance, extras=extras)
+        return Estimates.of(self, tally, covariance=self.covariance, extras={"fit_p": self.fit_probability(readings)})
 
 
 def minimize(objective: Objective, method: Solver[LeastSquaresSystem], x: Array, limits: Limits) -> Minima:
@@ -98,9 +97,8 @@ def minimize(objective: Objective, method: Solver[LeastSquaresSystem], x: Array,
 def minima_of(ended: SolveResult[Any], slope: NormalEquations, readings: int) -> Minima:
     """What is known of the objective where an iteration of it ended with that slope."""
     # U^-1 U^-T: inverting U'U would lose twice the digits, and with them the sign of a variance.
-    inverse_U, lost = slope.inverse_U, ~finite(slope.inverse_U)
-    if lost.any():
-        inverse_U = put(inverse_U, lost, inverse(slope.U[lost])[0])
+    lost = ~finite(slope.inverse_U)
+    inverse_U = put(slope.inverse_U, lost, inverse(slope.U[lost])[0]) if lost.any() else slope.inverse_U
     return Minima.of(ended, np.matmul(inverse_U, inverse_U.swapaxes(1, 2)), ended.state.r[:, :readings])
 
 

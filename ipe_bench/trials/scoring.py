@@ -285,7 +285,7 @@ def _squared(rows: Array) -> Array:
 
 def _below(rows: Array, prior: Covariance) -> Array:
     """The rows (trials, k, n) of each trial, and below them those of the prior."""
-    more = prior.whiten_jacobian(np.eye(prior.m))
+    more = prior.whiten_jacobian(np.eye(rows.shape[2]))
     return np.concatenate([rows, np.broadcast_to(more, (len(rows), *more.shape))], axis=1)
 
 

@@ -8,16 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from ipe_bench.basics.batches import put
-from ipe_bench.basics.linalg import (
-    Array,
-    Covariance,
-    definite_factor,
-    deviations,
-    finite,
-    inverse,
-    multiply,
-    solve,
-)
+from ipe_bench.basics.linalg import Array, Covariance, definite_factor, deviations, finite, inverse, multiply, solve
 from ipe_bench.estimators.ipe import frozen_covariance
 from ipe_bench.estimators.least_squares import inverse_factor
 from ipe_bench.measurements.base import Measurement

@@ -6,10 +6,11 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from io import BytesIO
+from operator import methodcaller
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ipe_bench.basics.files import write_bytes
+from ipe_bench.basics.files import write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -53,7 +54,7 @@ class Drawing:
         paths = []
         for kind in formats:
             paths.append(folder / f"{self.name}.{kind}")
-            write_bytes(paths[-1], self._content(kind))
+            write_atomically(paths[-1], methodcaller("write_bytes", self._content(kind)))
         return tuple(paths)
 
     def _content(self, kind: str) -> bytes:
