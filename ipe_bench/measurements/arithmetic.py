@@ -1,7 +1,7 @@
 """The language of formulas: numbers, names, + - * / ** ( ), elementary functions, comparisons and `A if C else B`.
 
-Text becomes a tree, and a tree is evaluated on whatever numbers, arrays or recorded expressions it is given. Python's
-grammar reads the text, and nothing of it is executed.
+Python's grammar reads the text, and nothing of it is executed: it becomes a tree, which is evaluated on numbers, arrays
+or recorded expressions.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def read(text: str, where: str) -> Arithmetic:
         raise UserError(f"{where}: {text[:60]!r} is not a formula {place}: {reason}; {known}") from None
     except NameError as error:
         raise UserError(f"{where}: {error.name}(...): {unknown(str(error.name), _CALLED, 'function')}") from None
-    names = dict.fromkeys(names_in(tree))
+    names = dict.fromkeys(part[1] for part in parts(tree) if part[0] == "name")
     return Arithmetic(text, tree, tuple(name for name in names if name not in CONSTANTS), where)
 
 
@@ -131,10 +131,8 @@ def _tree(node: ast.expr, source: str) -> Tree:
         case ast.Compare(left, signs, others) if all(type(sign) in _SIGNS for sign in signs):
             held = []
             for a, sign, b in zip([left, *others], map(_SIGNS.get, map(type, signs)), others, strict=False):
-                text = re.sub(
-                    r"\b_", "", f"{ast.get_source_segment(source, a)} {sign} {ast.get_source_segment(source, b)}"
-                )
-                held.append((sign, _tree(a, source), _tree(b, source), text))
+                sides = (re.sub(r"\b_", "", ast.get_source_segment(source, side) or "") for side in (a, b))
+                held.append((sign, _tree(a, source), _tree(b, source), f" {sign} ".join(sides)))
             return _in_a_row("and", held)
         case ast.Call(ast.Name(name), arguments, []):
             if name[1:] not in _CALLED:
@@ -162,10 +160,6 @@ def parts(tree: Tree) -> list[Tree]:
     return found
 
 
-def names_in(tree: Tree) -> list[str]:
-    return [part[1] for part in parts(tree) if part[0] == "name"]
-
-
 def never_switching(formulas: Iterable[Arithmetic], values: Mapping[str, Any]) -> list[str]:
     """A sentence for each comparison in some formulas that holds for all readings, or for none, at these values."""
     where = {part: one.where for one in formulas for part in parts(one.tree) if part[0] in COMPARISONS}
@@ -176,14 +170,6 @@ def never_switching(formulas: Iterable[Arithmetic], values: Mapping[str, Any]) -
         for one, held in met.items()
         if held.all() or not held.any()
     ]
-
-
-def rewritten(tree: Tree, new: Callable[[Tree], Tree | None]) -> Tree:
-    """The tree with every tree in it replaced for which `new` has another."""
-    other = new(tree)
-    if other is not None:
-        return other
-    return tuple(rewritten(part, new) if isinstance(part, tuple) else part for part in tree)
 
 
 def _height(tree: Tree) -> int:

@@ -76,10 +76,9 @@ class Function(WrittenModel):
             if default is inspect.Parameter.empty and name not in self.constants:
                 raise UserError(f"constants.{name}: {self.of} needs it; give constants.{name}=VALUE")
         if not self.starts:
-            raise UserError(
-                f"start: {self.of} has no parameter; give an argument a number as default, or start.NAME=VALUE "
-                f"(its arguments are {', '.join(arguments) or 'none'})"
-            )
+            given = f"(its arguments are {', '.join(arguments) or 'none'})"
+            remedy = f"give an argument a number as default, or start.NAME=VALUE {given}"
+            raise UserError(f"start: {self.of} has no parameter; {remedy}")
         if self.time and self.time not in self.headings:
             raise UserError(f"time={self.time}: {unknown(self.time, self.headings, 'column')}")
         for name in self.headings if self.columns else ():
@@ -108,10 +107,8 @@ class Function(WrittenModel):
             raise UserError(f"of={self.of}: {unknown(name, functions, 'function')}")
         return getattr(found, name)
 
-    @property
-    def functions(self) -> tuple[Callable[..., Any], ...]:
-        """What the model computes with beside its class: a change of its source makes results stale."""
-        return (self.function,)
+    functions = property(lambda model: (model.function,))
+    """What the model computes with beside its class: a change of its source makes results stale."""
 
     @cached_property
     def _signature(self) -> Mapping[str, inspect.Parameter]:
@@ -174,10 +171,8 @@ class Function(WrittenModel):
         times = self.column(chosen)
         return tuple(np.flatnonzero(times == time) for time in np.unique(times))
 
-    @cached_property
-    def _known(self) -> dict[str, Any]:
-        """The arguments that are not parameters: columns as arrays (m,), and constants."""
-        return {name: self.column(name) for name in self.headings} | dict(self.constants)
+    _known = cached_property(lambda model: {name: model.column(name) for name in model.headings} | {**model.constants})
+    """The arguments that are not parameters: columns as arrays (m,), and constants."""
 
     def _at(self, values: Any) -> Any:
         """h where the parameters have these values (n,), in their own units; at their real parts if h does not take
@@ -194,17 +189,14 @@ class Function(WrittenModel):
     def _checked(self, z: Any, m: int | None) -> Any:
         if np.ndim(z) != 1 or m not in (None, len(z)):
             wanted = "one number per reading" + ("" if m is None else f", ({m},)")
-            raise UserError(
-                f"measurement.of={self.of}: returns an array of shape {np.shape(z)}; let it return {wanted}"
-            )
+            shape = f"an array of shape {np.shape(z)}"
+            raise UserError(f"measurement.of={self.of}: returns {shape}; let it return {wanted}")
         return z
 
     def _rows(self, x: Array) -> Array:
         """h of every trial, by one call of the function each; x may be complex."""
         with np.errstate(all="ignore"):
-            rows = [self._at(row) for row in x * self.sizes]
-        if any(np.shape(row) != (self.m,) for row in rows):
-            rows = [self._checked(row, self.m) for row in rows]
+            rows = [self._checked(self._at(row), self.m) for row in x * self.sizes]
         return np.array(rows) if rows else np.empty((0, self.m))
 
     @cached_property

@@ -15,7 +15,7 @@ from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.files import own_conf
 from ipe_bench.basics.linalg import Array, Covariance, own
 from ipe_bench.basics.options import Count, Finite, Positive
-from ipe_bench.measurements.arithmetic import COMPARISONS, Arithmetic, Tree, evaluate, never_switching, parts, read
+from ipe_bench.measurements.arithmetic import COMPARISONS, Arithmetic, evaluate, never_switching, parts, read
 from ipe_bench.measurements.base import Input, Measurement, Recorded, SubsetModel, UsualNoise, WrappedModel
 from ipe_bench.measurements.formula import WrittenModel
 from ipe_bench.measurements.ode.driven import (
@@ -58,9 +58,8 @@ class Ode(WrittenModel, WrappedModel):
         outputs  prey: prey
         start    a: 0.5  b: 0.03  c: 0.8  d: 0.02  y0: 6
 
-    A parameter is a name with a start; unless told otherwise its size is the magnitude of its start, and it has no unit
-    but that which the formulas give it. `initial` may hold parameters and constants, but neither states nor t; a state
-    that is absent there starts at 0.
+    A parameter is a name with a start; unless told otherwise its size is the magnitude of its start. `initial` may hold
+    parameters and constants, but neither states nor t; a state that is absent there starts at 0.
     Every other name is a constant of a case, such as a dose, a temperature or an initial state: cases are experiments
     that share the parameters. A readings file has the columns time, reading, one for every such constant, with several
     cases `case` (1, 2, ...), and with several outputs `output`.
@@ -128,9 +127,8 @@ class Ode(WrittenModel, WrappedModel):
         for name in self.initial:
             if name not in self.rates:
                 raise UserError(f"initial.{name}: there is no such state; these have rates: {', '.join(self.rates)}")
-        changing = {*self.rates, *self.driven_by, "t"}
         for name, formula in self.initial_formulas.items():
-            if used := [used for used in formula.names if used in changing]:
+            if used := [used for used in formula.names if used in {*self.rates, *self.driven_by, "t"}]:
                 raise UserError(f"initial.{name}: {used[0]} changes with time, and a start cannot depend on it")
         taken = {"start": (*self.rates, "t"), "driven_by": (*self.start, *self.rates, *_COLUMNS, "t")}
         for key, others in taken.items():
@@ -186,38 +184,23 @@ class Ode(WrittenModel, WrappedModel):
             raise UserError(f"columns.case: numbers {len(self.courses)} cases, and the constants have {count}")
         return np.array([np.broadcast_to(column, count) for column in columns], dtype=float).reshape(-1, count).T
 
-    @cached_property
-    def rate_formulas(self) -> dict[str, Arithmetic]:
-        return _read_all("rates", self.rates)
-
-    @cached_property
-    def initial_formulas(self) -> dict[str, Arithmetic]:
-        return _read_all("initial", {name: self.initial.get(name, 0.0) for name in self.rates})
-
-    @cached_property
-    def output_formulas(self) -> dict[str, Arithmetic]:
-        return _read_all("outputs", self.outputs or {name: name for name in self.rates})
-
-    @cached_property
-    def courses(self) -> list[dict[str, Array]]:
-        """The inputs of `driven_by` over time in each case; of one where all are alike."""
-        return courses(self.columns, self.driven_by) if self.driven_by else []
-
-    @cached_property
-    def piecewise_rates(self) -> tuple[dict[str, Arithmetic], dict[str, Tree]]:
-        """The rates with a name in place of every comparison of t with constants, and these comparisons."""
-        return separated(self.rate_formulas, self.constant_names)
+    rate_formulas = cached_property(lambda model: _read_all("rates", model.rates))
+    initial_formulas = cached_property(
+        lambda model: _read_all("initial", {name: model.initial.get(name, 0.0) for name in model.rates})
+    )
+    output_formulas = cached_property(lambda model: _read_all("outputs", model.outputs or {y: y for y in model.rates}))
+    courses = cached_property(lambda model: courses(model.columns, model.driven_by) if model.driven_by else [])
+    """The inputs of `driven_by` over time in each case; of one where all are alike."""
+    piecewise_rates = cached_property(lambda model: separated(model.rate_formulas, model.constant_names))
+    """The rates with a name in place of every comparison of t with constants, and these comparisons."""
+    engine = cached_property(lambda model: _Engine(model))
+    """The equations as the integrator takes them, with readings wherever an input or a rate changes, too."""
 
     @cached_property
     def reading_times(self) -> Array:
         if not (self.times or self.readings):
             raise UserError("measurement.times: is empty; give the times of the readings, or readings=FILE")
         return np.asarray(self.times) if self.times else self.interval * np.arange(1.0, (self.readings or 0) + 1)
-
-    @cached_property
-    def engine(self) -> _Engine:
-        """The equations as the integrator takes them, with readings wherever an input or a rate changes, too."""
-        return _Engine(self)
 
     @cached_property
     def whole(self) -> Measurement:  # type: ignore[override]
@@ -230,13 +213,12 @@ class Ode(WrittenModel, WrappedModel):
     @property
     def inputs(self) -> tuple[Input, ...]:
         stated = {name: values for name, values in self.constants.items() if not isinstance(values, tuple | list)}
-        constants = (Input(name, default=stated.get(name)) for name in self.constant_names)
         outputs = tuple(self.output_formulas)
         return (
             Input("case", int, label=True, default=1),
             Input(time_heading(self.time_unit)),
             Input("output", str, label=True, default=outputs[0] if len(outputs) == 1 else None),
-            *constants,
+            *(Input(name, default=stated.get(name)) for name in self.constant_names),
             *map(Input, self.driven_by),
         )
 
@@ -291,12 +273,11 @@ class Ode(WrittenModel, WrappedModel):
             return f"measurement.driven_by.{heading} takes it from the file, in every row"
         if heading == time_heading(self.time_unit):
             return f"there are {', '.join(columns)}; call the times `{heading}`"
+        if heading == "output" and self.outputs:
+            return f"it says which of {', '.join(self.outputs)} a row reads"
         if heading == "output":
-            names = tuple(self.output_formulas)
-            if self.outputs:
-                return f"it says which of {', '.join(names)} a row reads"
-            named = f"measurement.outputs.{names[0]}={names[0]}"
-            return f"{len(names)} states are read; name the one that is: {named}, or give the column"
+            named = "measurement.outputs.{0}={0}".format(*self.rates)
+            return f"{len(self.rates)} states are read; name the one that is: {named}, or give the column"
         alike = f"if it is the same in all cases, measurement.constants.{heading}=VALUE"
         return f"{super().absent_input(heading, columns)}; {alike}"
 
@@ -332,7 +313,7 @@ class Ode(WrittenModel, WrappedModel):
             return None
         formulas = _read_all("exact", {name: self.exact[name] for name in self.output_formulas}).values()
         known = self.known(self.reading_times)
-        z = np.concatenate([[formula({**self.answer, **one}) for formula in formulas] for one in known])
+        z = np.array([formula({**self.answer, **one}) for one in known for formula in formulas])
         x = np.array([self.answer[name] for name in self.start]) / self.sizes
         return Recorded(z, Covariance(np.full(self.m, self.deviation)), x)
 
@@ -378,8 +359,7 @@ class _Engine(OdeMeasurement):
     @cached_property
     def driven(self) -> Array | None:
         """The comparisons of t and the inputs, of each interval."""
-        described, at = self.described, middles(self.times)
-        _, switches = described.piecewise_rates
+        described, at, switches = self.described, middles(self.times), self.described.piecewise_rates[1]
         if not (switches or described.driven_by):
             return None
         tables = []
@@ -398,11 +378,8 @@ class _Engine(OdeMeasurement):
 
     @cached_property
     def stiff(self) -> bool:
-        """Whether every trial is integrated by the implicit method.
-
-        It is if stability alone costs more than `_STIFF` times as many explicit steps along the nominal solution: the
-        integral of the Jacobian's spectral radius, over what a step may cover.
-        """
+        """Whether every trial is integrated by the implicit method: if stability alone takes more than `_STIFF` times
+        as many explicit steps along the nominal solution."""
         if self.described.method != "auto":
             return self.described.method == "implicit"
         if self.step is not None or self._ladder[self._nominal_place] <= _EASY:
@@ -472,8 +449,7 @@ class _Engine(OdeMeasurement):
     def _values(self, t: Any, y: Sequence[Any], p: Sequence[Any], c: Sequence[Any]) -> dict[str, Any]:
         """What the names in the formulas stand for."""
         described = self.described
-        values = dict(zip((*described.rates, *described.start), (*y, *p), strict=True)) | {"t": t}
-        constants = iter(c)
+        values, constants = dict(zip((*described.rates, *described.start), (*y, *p), strict=True)) | {"t": t}, iter(c)
         for name in (*described.constant_names, *described.piecewise_rates[1]):
             values[name] = next(constants)
         for name, kind in described.driven_by.items():
@@ -496,10 +472,8 @@ class _Engine(OdeMeasurement):
 
 
 def packaged(name: str) -> Callable[..., Ode]:
-    """The model that `conf/measurement/NAME.yaml` describes, with other options where given.
-
-    They are those of `Ode`, and entries of `constants` and `start` by their own names: `Bock(mu=10.0)`.
-    """
+    """The model that `conf/measurement/NAME.yaml` describes, with other options of `Ode` where given, and entries of
+    `constants` and `start` by their own names: `Bock(mu=10.0)`."""
 
     def model(**options: Any) -> Ode:
         config = dict(_description(name))

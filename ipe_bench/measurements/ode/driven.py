@@ -14,18 +14,8 @@ import numpy as np
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
-from ipe_bench.measurements.arithmetic import (
-    COMPARISONS,
-    CONSTANTS,
-    Arithmetic,
-    Tree,
-    evaluate,
-    names_in,
-    parts,
-    rewritten,
-)
-from ipe_bench.measurements.ode.trace import COMPARISONS as OF_COMPARISON
-from ipe_bench.measurements.ode.trace import Graph, Program, in_order, tangent
+from ipe_bench.measurements.arithmetic import COMPARISONS, CONSTANTS, Arithmetic, Tree, evaluate, parts
+from ipe_bench.measurements.ode import trace
 
 PIECEWISE = ("min", "max", "abs", *COMPARISONS)
 _SAME = 1e-12
@@ -38,20 +28,20 @@ def separated(
     """The formulas with a name in place of every comparison of t with constants, and the comparisons by those names."""
     switches: dict[Tree, str] = {}
 
-    def new(tree: Tree) -> Tree | None:
-        names = set(names_in(tree)) if tree[0] in PIECEWISE else set()
+    def rewritten(tree: Tree) -> Tree:
+        names = {part[1] for part in parts(tree) if part[0] == "name"} if tree[0] in PIECEWISE else set()
         if "t" not in names or not names <= {"t", *constants, *CONSTANTS}:
-            return None
+            return tuple(rewritten(part) if isinstance(part, tuple) else part for part in tree)
         if tree[0] in COMPARISONS:
             return ("name", switches.setdefault(tree, f"switch {len(switches)}"))
         operation, a, *other = tree
         b = other[0] if other else ("negative", a)
-        return rewritten(("if", ("<" if operation == "min" else ">", a, b, f"the {operation} of t"), a, b), new)
+        return rewritten(("if", ("<" if operation == "min" else ">", a, b, f"the {operation} of t"), a, b))
 
     found = dict(formulas)
     for key, formula in formulas.items():
         if any(part[0] in PIECEWISE for part in parts(formula.tree)):
-            found[key] = replace(formula, tree=rewritten(formula.tree, new))
+            found[key] = replace(formula, tree=rewritten(formula.tree))
     return found, {name: tree for tree, name in switches.items()}
 
 
@@ -60,14 +50,14 @@ def switching_times(comparison: Tree, cases: Sequence[Mapping[str, float]]) -> l
     _, left, right, text = comparison
     found = []
     for case in cases:
-        t = Graph().input("t")
+        t = trace.Graph().input("t")
         gap = t.graph.apply("add", evaluate(("-", left, right), {**case, "t": t}), 0.0)
-        slope = tangent([gap], {t: t.graph.constant(1.0)})[0].value
-        if slope is None or any(e.operation in OF_COMPARISON for e in in_order([gap])):
+        slope = trace.tangent([gap], {t: t.graph.constant(1.0)})[0].value
+        if slope is None or any(e.operation in trace.COMPARISONS for e in trace.in_order([gap])):
             remedy = "compare t itself with a constant, so that the moment of the switch is known"
             raise UserError(f"rates: {text}: {remedy}")
         if slope:
-            found.append(-float(Program.of([gap], [t])([0.0])[0]) / slope)
+            found.append(-float(trace.Program.of([gap], [t])([0.0])[0]) / slope)
     return found
 
 

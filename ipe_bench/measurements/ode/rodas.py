@@ -2,11 +2,8 @@
 
 A Rosenbrock method of order 5 with 8 stages, stiffly accurate and L-stable: one Jacobian and one LU decomposition a
 step, no Newton iteration. Coefficients: Steinebach, BIT Numerical Mathematics 63:27, 2023, in the transformed form of
-Hairer and Wanner, Solving Ordinary Differential Equations II, section IV.7, which needs no product with the Jacobian.
-
-Sensitivities are the derivatives of the discrete steps with their lengths held: the method applied to the equations
-joined with their variational equations, with the derivative of the Jacobian times each stage taken along. One
-decomposition serves both.
+Hairer and Wanner, Solving Ordinary Differential Equations II, section IV.7. Sensitivities are the derivatives of the
+discrete steps with their lengths held.
 
 A lane is one trial of one case, with its own time, step and order of pivots. Operations act on lanes one by one, and
 the error norm is a maximum, so bits do not depend on the batch.
@@ -63,10 +60,9 @@ TIME_WEIGHTS = (
     *(0.21193756319429014, -0.42387512638858027, -0.3384627126235924, 1.8046452872882734, 2.325825639765069),
     *(0.0, 0.0, 0.0),
 )
-_REACH = 6.0
-"""About where the stability region of DOP853 ends on the negative real axis."""
-_STABLE = 5.0
-"""The formula of eighth order is stable to a step of about this over the fastest rate."""
+_REACH, _STABLE = 6.0, 5.0
+"""About where the stability region of DOP853 ends on the negative real axis, and a step over the fastest rate to which
+it is stable."""
 MOST_STEPS = 4000
 SHAPE = 1e-4
 """A relative tolerance that shows the shape of a solution."""
@@ -164,12 +160,7 @@ class _Run:
             if sensitive:
                 self.S = self._values("dstart", [*self.p, *c, *self.directions], self.q, lanes)
             self._integrate()
-
-    @property
-    def readings(self) -> Array:
-        outputs, stop, lanes = self.z.shape
-        cases = len(self.model.cases)
-        return self.z.transpose(2, 1, 0).reshape(lanes // cases, cases * stop * outputs)
+        self.readings = self.z.transpose(2, 1, 0).reshape(len(x), -1)
 
     def _values(self, name: str, inputs: Sequence[Any], *shape: int) -> Array:
         """The outputs of a program, of which some may be numbers, as one array."""
@@ -241,9 +232,7 @@ class _Run:
         ft = self._values("ft", at, lanes)
         ways = (*S, *self.directions)
         dft = self._values("dft", [*at, *ways], q, lanes) if q else 0.0
-        K: list[Array] = []
-        D: list[Array] = []
-        u, V = y, S
+        K, D, u, V = list[Array](), list[Array](), y, S
         for a, b, node, weight in zip(A, C, NODES, TIME_WEIGHTS, strict=True):
             u = y + sum(w * k for w, k in zip(a, K, strict=True))
             inside = (t + node * h, *u, *p, *c)
