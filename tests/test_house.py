@@ -26,7 +26,7 @@ LINE = (
 )
 BUDGETS = {
     "basics": 916,
-    "measurements": 6439,
+    "measurements": 6322,
     "noise": 621,
     "priors": 105,
     "states": 1247,
