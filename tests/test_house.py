@@ -37,9 +37,9 @@ BUDGETS = {
     "runs": 1964,
     "statistics": 4075,
     "real": 2308,
-    "plugins": 1105,
+    "plugins": 1102,
     "report": 4112,
-    "cli": 2457,
+    "cli": 2437,
 }
 """Lines of Python that a room may hold: who raises one lowers another in the same commit."""
 PLACE = {room: place for place, rooms in enumerate(LINE) for room in rooms}

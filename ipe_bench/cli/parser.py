@@ -30,18 +30,15 @@ KINDS += ("statistic", "figure", "table", "section", "experiment")
 INFO_TOPICS = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
 _MISSING = "0 done; 1 done, but something that was asked for is missing"
 
-Argument = tuple[tuple[str, ...], dict[str, Any]]
+Arguments = dict[str, dict[str, Any]]
+"""What argparse is told of each argument, by its names."""
 
 
-def _argument(*names: str, **options: Any) -> Argument:
-    return names, options
+def _several(metavar: str, what: str) -> dict[str, Any]:
+    return {"metavar": metavar, "nargs": "*", "help": what}
 
 
-def _several(name: str, metavar: str, what: str) -> Argument:
-    return _argument(name, metavar=metavar, nargs="*", help=what)
-
-
-COMMANDS: dict[str, tuple[str, str, str, tuple[Argument, ...]]] = {
+COMMANDS: dict[str, tuple[str, str, str, Arguments]] = {
     "run": (
         "simulate, estimate, store and report",
         "0 done; 1 done, but something failed",
@@ -78,19 +75,17 @@ write_readings=FILE    writes the simulated readings of trial write_readings_tri
 readings=FILE          is for `ipe-bench estimate`, as are ignore_columns= and find=
 +experiment=NAME       an experiment of `ipe-bench list experiment`, which sets some of these keys
 """,
-        (
-            _several("overrides", "KEY=VALUE", "see above"),
-            _argument(
-                "--dry-run", action="store_true", help="say what is stored, what is missing and how long it takes"
-            ),
-            _argument("-m", "--multirun", action="store_true", help="run all jobs of a sweep"),
-            _argument("-c", "--cfg", choices=("job", "hydra", "all"), help="print the config, and run nothing"),
-            _argument("-p", "--package", help="with --cfg: the part of the config to print"),
-            _argument("--resolve", action="store_true", help="with --cfg: replace interpolations"),
-            _argument("-i", "--info", nargs="?", const="all", choices=INFO_TOPICS, help="what Hydra finds where"),
-            _argument("-cd", "--config-dir", metavar="DIR", help="a folder with options and experiments of your own"),
-            _argument("-sc", "--shell-completion", action="store_true", help="install=SHELL or uninstall=SHELL"),
-        ),
+        {
+            "overrides": _several("KEY=VALUE", "see above"),
+            "--dry-run": {"action": "store_true", "help": "say what is stored, what is missing and how long it takes"},
+            "-m --multirun": {"action": "store_true", "help": "run all jobs of a sweep"},
+            "-c --cfg": {"choices": ("job", "hydra", "all"), "help": "print the config, and run nothing"},
+            "-p --package": {"help": "with --cfg: the part of the config to print"},
+            "--resolve": {"action": "store_true", "help": "with --cfg: replace interpolations"},
+            "-i --info": {"nargs": "?", "const": "all", "choices": INFO_TOPICS, "help": "what Hydra finds where"},
+            "-cd --config-dir": {"metavar": "DIR", "help": "a folder with options and experiments of your own"},
+            "-sc --shell-completion": {"action": "store_true", "help": "install=SHELL or uninstall=SHELL"},
+        },
     ),
     "estimate": (
         "parameters or states from real readings, and whether the model fits them",
@@ -118,7 +113,7 @@ figures=none        draws nothing.
 output=DIR          where the files go, which are named at the end: outputs/estimate-MODEL unless given, or
                     outputs/estimate-MODEL-2 and so on. Nothing of another command is overwritten.
 """,
-        (_several("arguments", "KEY=VALUE", "any key of `ipe-bench run`"),),
+        {"arguments": _several("KEY=VALUE", "any key of `ipe-bench run`")},
     ),
     "design": (
         "what the readings will say of each parameter, and which to take instead",
@@ -132,17 +127,16 @@ Nothing is simulated with noise and nothing estimated: all follows from the mode
 prior. Errors that the model leaves out are those of truth_measurement=, or of every option of measurement= that is the
 same model with more errors. output=DIR says where files go.
 """,
-        (
-            _several("arguments", "KEY=VALUE", "the scenario, as for `ipe-bench run`"),
-            _argument("--by", metavar="COLUMN", action="append", help="choose by this column of the readings alone"),
-            _argument("--readings", metavar="NUMBER", type=int, help="how many there may be; as many as now"),
-            _argument(
-                "--criterion",
-                choices=("A", "D"),
-                default="A",
-                help="mean squared bound (A) or volume of the ellipsoid (D)",
-            ),
-        ),
+        {
+            "arguments": _several("KEY=VALUE", "the scenario, as for `ipe-bench run`"),
+            "--by": {"metavar": "COLUMN", "action": "append", "help": "choose by this column of the readings alone"},
+            "--readings": {"metavar": "NUMBER", "type": int, "help": "how many there may be; as many as now"},
+            "--criterion": {
+                "choices": ("A", "D"),
+                "default": "A",
+                "help": "mean squared bound (A) or volume of the ellipsoid (D)",
+            },
+        },
     ),
     "posterior": (
         "what the readings of a few trials really say, and how far estimators are from it",
@@ -155,10 +149,10 @@ For the first trials of a scenario (trials=3 unless given), the posterior itself
 by sequential Monte Carlo: particles go from the prior to the posterior as the likelihood is let in. Each estimator's
 estimate and covariance are then held against it. It takes seconds to a minute a trial. output=DIR says where files go.
 """,
-        (
-            _several("arguments", "KEY=VALUE", "any key of `ipe-bench run`"),
-            _argument("--particles", metavar="NUMBER", type=int, default=1000, help="1000 unless given"),
-        ),
+        {
+            "arguments": _several("KEY=VALUE", "any key of `ipe-bench run`"),
+            "--particles": {"metavar": "NUMBER", "type": int, "default": 1000, "help": "1000 unless given"},
+        },
     ),
     "report": (
         "tables, figures and report of what is stored",
@@ -177,7 +171,7 @@ width=INCHES         of a figure or table: 3.5 for one column, 7.16 for two
 figures=all          which to draw: all, main (the few that answer the question; unless told otherwise) or none
 formats=pdf,svg      as these as well; figures are PNG files, and others are written when they are asked for
 """,
-        (_several("arguments", "DIR", "folders of results, such as outputs/paper"),),
+        {"arguments": _several("DIR", "folders of results, such as outputs/paper")},
     ),
     "compare": (
         "whether a second version, setting or estimator is better or worse than a first",
@@ -195,7 +189,7 @@ fail_on=success,error  what the second may not be worse in: success, error, cost
 power=0.9            how many trials find a difference of success, such as difference=0.05, with this probability
 output=DIR           writes comparison.csv and comparison.html there
 """,
-        (_several("arguments", "DIR", "one or two folders of results"),),
+        {"arguments": _several("DIR", "one or two folders of results")},
     ),
     "audit": (
         "whether the covariance that another program reports describes its errors",
@@ -207,7 +201,7 @@ output=DIR           writes comparison.csv and comparison.html there
 A row per run, with columns NAME_true and NAME (or NAME_error), NAME_std (or NAME_var), and cov_A_B as far as there are
 any; or long: run, parameter, true, estimate, std. Rows of one run have its number in the column run.
 """,
-        (_several("arguments", "FILE", "a table of truths, estimates and what was claimed of them"),),
+        {"arguments": _several("FILE", "a table of truths, estimates and what was claimed of them")},
     ),
     "bundle": (
         "results in one archive to share, or whether such an archive is whole",
@@ -222,31 +216,31 @@ The same results give the same file, so that the digest may stand in a paper. Ot
   ipe-bench report outputs/mine both.zip output=outputs/together
   ipe-bench compare outputs/mine both.zip
 """,
-        (_several("arguments", "DIR", "folders of results, or one bundle to check"),),
+        {"arguments": _several("DIR", "folders of results, or one bundle to check")},
     ),
     "status": (
         "what is done, missing, failed and stale in folders of results",
         "0 complete; 1 not complete",
         "",
-        (
-            _several("arguments", "DIR", "folders of results, such as outputs/paper"),
-            _argument("-v", "--verbose", action="store_true", help="with what is complete, too"),
-        ),
+        {
+            "arguments": _several("DIR", "folders of results, such as outputs/paper"),
+            "-v --verbose": {"action": "store_true", "help": "with what is complete, too"},
+        },
     ),
     "list": (
         "what there is to choose from, and where it comes from",
         "",
         "",
-        (
-            _several("names", "GROUP", "solver, measurement, ... or keys; solver/newton: its options"),
-            _argument("-v", "--verbose", action="store_true", help="with the options of each, and the files of models"),
-        ),
+        {
+            "names": _several("GROUP", "solver, measurement, ... or keys; solver/newton: its options"),
+            "-v --verbose": {"action": "store_true", "help": "with the options of each, and the files of models"},
+        },
     ),
     "check": (
         "whether a plugin keeps the promises that every component makes",
         "0 all checks passed; 1 some failed",
         "",
-        (_several("words", "DIR", "folders of plugins, or KEY=VALUE: measurement=ode measurement.file=my.yaml"),),
+        {"words": _several("DIR", "folders of plugins, or KEY=VALUE: measurement=ode measurement.file=my.yaml")},
     ),
     "new": (
         "a working model of one file, or a plugin in plugins/NAME, to start from",
@@ -259,10 +253,10 @@ The same results give the same file, so that the digest may stand in a paper. Ot
   ipe-bench new function my_model                 my_model.py, a function of parameters and columns
   ipe-bench new skill DIR                         pages by which a coding agent writes plugins, into a new folder DIR
 """,
-        (
-            _argument("kind", metavar="KIND", help=f"{', '.join((*MODELS, *KINDS))} or skill"),
-            _argument("name", metavar="NAME", help="small letters, digits and underscores"),
-        ),
+        {
+            "kind": {"metavar": "KIND", "help": f"{', '.join((*MODELS, *KINDS))} or skill"},
+            "name": {"metavar": "NAME", "help": "small letters, digits and underscores"},
+        },
     ),
 }
 """Each command's line, its exit codes besides 2, what its help says more, and its arguments."""
@@ -314,6 +308,6 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
         found[name] = commands.add_parser(
             name, help=what, description=f"ipe-bench {name}: {what}\n{more}", epilog=epilog
         )
-        for names, options in arguments:
-            found[name].add_argument(*names, **options)
+        for names, options in arguments.items():
+            found[name].add_argument(*names.split(), **options)
     return program, found

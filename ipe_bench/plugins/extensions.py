@@ -68,22 +68,19 @@ def added(group: str, problems: list[str], make: Callable[[Any], Any]) -> Iterat
             yield option.name, made
 
 
-def require_type(thing: Any, kind: type, says: str = "gives") -> None:
-    """Raises UserError if what a plugin gives is of another type."""
+def require_type(thing: Any, kind: type, says: str = "gives") -> Any:
+    """What a plugin gives, or a UserError if it is of another type."""
     if not isinstance(thing, kind):
         raise UserError(f"{says} a {type(thing).__name__} and not a {kind.__name__}")
+    return thing
 
 
 def use_statistics() -> list[str]:
     """Has the statistics of all plugins computed beside ours; returns a line for each that cannot be."""
     from ipe_bench.statistics.records import Statistic, add_statistics
 
-    def make(record: Any) -> Statistic:
-        require_type(record, Statistic, "is")
-        return record
-
     problems: list[str] = []
-    found = [record for _, record in added("statistic", problems, make)]
+    found = [one for _, one in added("statistic", problems, lambda record: require_type(record, Statistic, "is"))]
     return problems + add_statistics(found)
 
 

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,6 @@ import pytest
 from scipy.optimize import curve_fit
 
 import ipe_bench as ib
-from ipe_bench.cli.main import main
 from ipe_bench.measurements import Nist
 from ipe_bench.real.estimation import Opened
 from ipe_bench.real.readings import write_readings
@@ -26,20 +24,16 @@ LM = ("solver=[]", "baseline=[levenberg_marquardt]")
 
 
 @pytest.fixture
-def estimate(tmp_path, monkeypatch, capsys):
+def estimate(ipe_bench):
     """Runs `estimate` in an empty folder; the exit code, what it printed, and its JSON file where it left one.
 
     Figures are drawn where the command says so.
     """
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["ipe-bench"])
 
     def run(*words: str) -> tuple[int, str, dict]:
-        code = main(["estimate", *([] if "figures=all" in words else ["figures=none"]), *words])
-        printed = capsys.readouterr()
-        found = Path(tmp_path / "outputs")
-        files = sorted(found.rglob("estimate.json"), key=lambda path: path.stat().st_mtime_ns) if found.is_dir() else []
-        return code, printed.out + printed.err, json.loads(files[-1].read_text()) if files and code != 2 else {}
+        code, out, error = ipe_bench("estimate", *([] if "figures=all" in words else ["figures=none"]), *words)
+        files = sorted(Path().glob("outputs/*/estimate.json"), key=lambda path: path.stat().st_mtime_ns)
+        return code, out + error, json.loads(files[-1].read_text()) if files and code != 2 else {}
 
     return run
 
