@@ -34,7 +34,7 @@ BUDGETS = {
     "solvers": 1184,
     "baselines": 1957,
     "trials": 1941,
-    "runs": 1964,
+    "runs": 1976,
     "statistics": 4075,
     "real": 2308,
     "plugins": 1102,

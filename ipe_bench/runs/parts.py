@@ -14,7 +14,7 @@ import json
 import os
 import re
 from collections.abc import Collection as Keys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -85,6 +85,15 @@ class Part:
         with _opened(self.path) as file:
             text = file.metadata.metadata.get(HISTORY)
         return None if text is None else {name: np.array(x, dtype=float) for name, x in json.loads(text).items()}
+
+
+def join_histories(several: Iterable[Mapping[str, Array] | None]) -> dict[str, Array] | None:
+    """The iterates that parts have in the order of reading, by column, each trial once; None if none has any."""
+    found: dict[str, Array] = {}
+    for one in several:
+        new = None if one is None else ~np.isin(one["trial"], found.get("trial", ()))
+        found = {name: np.append(found.get(name, ()), values[new]) for name, values in (one or found).items()}
+    return found or None
 
 
 @contextlib.contextmanager

@@ -22,9 +22,10 @@ import pyarrow as pa
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
-from ipe_bench.runs.parts import TRUTH, Outdated, Part, Unusable, as_array, read_record
+from ipe_bench.runs.parts import TRUTH, Outdated, Part, Unusable, as_array, join_histories, read_record
 from ipe_bench.runs.provenance import canonical_json
 from ipe_bench.runs.store import ResultKey, Store, describe_names, gaps, title
+from ipe_bench.trials.thresholds import HISTORIES
 
 T = TypeVar("T")
 _AGAIN = "run the same command again, which computes it anew"
@@ -320,12 +321,12 @@ class Results:
 
     def load_history(self, cell: StoredCell) -> dict[str, Array] | None:
         """The iterates of a cell's first trials, by column; None if none are stored."""
-        return self._of_parts(cell, self._first_history)
+        return self._of_parts(cell, lambda parts: join_histories(self._histories(parts)))
 
-    def _first_history(self, parts: Sequence[Part]) -> dict[str, Array] | None:
-        for part in (part for part in parts[:1] if part.start == 0):
+    def _histories(self, parts: Sequence[Part]) -> Iterator[dict[str, Array] | None]:
+        for part in (part for part in parts if part.start < HISTORIES):
             with self._naming(part.path):
-                return part.history()
+                yield part.history()
 
     def _of_parts(self, cell: StoredCell, read: Callable[[Sequence[Part]], T]) -> T:
         """What `read` makes of the parts of a cell; of those that are there now, if some were merged meanwhile."""

@@ -25,7 +25,7 @@ from ipe_bench.runs.execution import FATAL, Execution, Failure
 from ipe_bench.runs.provenance import describe, digest, fingerprint
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.store import ResultKey, Store, describe_names
-from ipe_bench.trials.scoring import HISTORIES
+from ipe_bench.trials.thresholds import HISTORIES
 from ipe_bench.trials.tracking import block_of
 
 log = logging.getLogger(__name__)
@@ -176,10 +176,10 @@ def _compute_cell(store: Store, block: Any, cell: ResultKey) -> None:
         columns = block.truth_columns()
     else:
         estimates, columns = block.estimate(cell.estimator)
-        if start == 0 and estimates.history is not None:
-            paths = estimates.history[:HISTORIES]
+        if start < HISTORIES and estimates.history is not None:
+            paths = estimates.history[: HISTORIES - start]
             history = {
-                "trial": np.repeat(np.arange(len(paths)), [len(path) for path in paths]),
+                "trial": np.repeat(start + np.arange(len(paths)), [len(path) for path in paths]),
                 "iteration": np.concatenate([np.arange(len(path)) for path in paths]),
             }
             names = (f"x_{parameter.name}" for parameter in cell.scenario.measurement.parameters)

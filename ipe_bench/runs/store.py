@@ -36,6 +36,7 @@ from ipe_bench.runs.provenance import describe, digest, fingerprint
 from ipe_bench.states.trackers import Tracker
 from ipe_bench.trials.scenario import AnyScenario, Tracking
 from ipe_bench.trials.theory import linear_correlation
+from ipe_bench.trials.thresholds import HISTORIES
 
 _ABANDONED_S = 3600.0
 """Age in s from which a temporary file counts as abandoned."""
@@ -224,7 +225,8 @@ def _join(footer: Mapping[str, Any], group: Sequence[Part], tables: Sequence[pa.
     whole = replace(first, path=first.path.with_name(f"{first.key}-{first.start}-{stop}.parquet"), stop=stop)
     if whole not in group:
         table = pa.concat_tables(tables, promote_options="default")
-        parts.write(whole.path, table, footer, first.history(), lasting=True)
+        history = parts.join_histories(part.history() for part in group if part.start < HISTORIES)
+        parts.write(whole.path, table, footer, history, lasting=True)
     whole.read()
     others = [part.path for part in group if part != whole]
     for path in others:

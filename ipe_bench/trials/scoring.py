@@ -40,10 +40,7 @@ from ipe_bench.trials.theory import (
     relative_curvatures,
     second_derivatives,
 )
-from ipe_bench.trials.thresholds import EXPECTED, SAME_ROOT, gate
-
-HISTORIES = 20
-"""Trials whose iterates are kept: the first ones of a scenario."""
+from ipe_bench.trials.thresholds import EXPECTED, HISTORIES, SAME_ROOT, gate
 
 CURVED = 20
 """Trials in which second derivatives are taken, which takes 2 n Jacobians each: the first ones of a scenario."""

@@ -9,6 +9,8 @@ FIT_LEVEL = 1e-3
 """A model fits where residuals as large as these are no less probable than this."""
 FEW = 20
 """Below this many trials a figure that is conditional on them has no interval, and no place on a curve unmarked."""
+HISTORIES = 20
+"""Trials whose iterates are kept: the first ones of a scenario, in whatever blocks they are computed."""
 EXPECTED = 50
 """Truths over which Van Trees's bound takes the mean of the information."""
 

@@ -31,8 +31,10 @@ def scenario(**changes) -> Scenario:
 
 
 def rows(store: Store, cell: ResultKey) -> dict:
+    """All columns but that of the clock, and the iterates of the first trials."""
     results = Results.read([store.directory])
-    found = results.load(results.stored[cell.key], None)
+    found, paths = (load(results.stored[cell.key]) for load in (lambda c: results.load(c, None), results.load_history))
+    found |= {f"path_{name}": values for name, values in (paths or {}).items()}
     return {name: values for name, values in found.items() if name != "time_s"}
 
 
@@ -57,6 +59,7 @@ def test_trials_are_the_same_bits_for_any_block_size(tmp_path, block_size):
     compute([scenario()], estimators, 23, tmp_path / "cut", block_size=block_size)
     cell = ResultKey(scenario(), "newton", Newton())
     whole, cut = (rows(Store(tmp_path / name), cell) for name in ("whole", "cut"))
+    assert set(whole["path_trial"]) == set(range(20))
     for name in whole:
         np.testing.assert_array_equal(whole[name], cut[name])
 
