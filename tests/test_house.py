@@ -29,7 +29,7 @@ BUDGETS = {
     "measurements": 6322,
     "noise": 621,
     "priors": 105,
-    "states": 1247,
+    "states": 1244,
     "estimators": 1150,
     "solvers": 1184,
     "baselines": 1957,

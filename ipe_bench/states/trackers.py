@@ -175,7 +175,7 @@ class Filter(Tracker):
     iterations: Count = 1
     """Linearisations of each reading."""
     engine: Literal["filterpy", "batched"] = "batched"
-    """Who computes the filter's equations: filterpy, trial by trial, in 25 to 100 times the time, or this package, for
+    """Who computes the filter's equations: filterpy, trial by trial, in some 100 times the time, or this package, for
     all trials at once."""
 
     def __post_init__(self) -> None:
@@ -217,9 +217,9 @@ def _stepped(model: StateModel, z: Array, rule: Rule) -> Tracks:
         f.x, f.P = mean, covariance
     for k in range(model.epochs):
         if model.moves(k):
-            move = rule.linearise(lambda at, k=k: model.transition(at, k), *x)
+            move, Q = rule.linearise(lambda at, k=k: model.transition(at, k), *x), model.Q(k)
             for f, F, moved in zip(filters, move.A, model.transition(x.mean, k), strict=True):
-                f.Q, f.F = model.Q(k), F
+                f.Q, f.F = Q, F
                 if isinstance(rule, Taylor):
                     f.predict()
                     f.x = moved
@@ -228,8 +228,9 @@ def _stepped(model: StateModel, z: Array, rule: Rule) -> Tracks:
             x = Gaussian(np.array([f.x for f in filters]), np.array([f.P for f in filters]))
             out.moves.append(move)
             out.predicted.append(x)
-        for f, reading in zip(filters, z[:, k], strict=True):
-            _take_in(f, model, k, reading)
+        (h, H), R = slope(lambda at, k=k: model.observe(at, k), x.mean), model.R(k)
+        for f, *read in zip(filters, z[:, k], h, H, strict=True):
+            _take_in(f, model, k, R, *read)
         mean, P, y, S = (np.array([getattr(f, name) for f in filters]) for name in ("x", "P", "y", "S"))
         x = out.note(k, Update.of(Gaussian(mean, P), y, factor(S), np.isfinite(z[:, k])))
     out.calls = float(rule.calls(model.n) * (len(out.moves) + model.epochs))
@@ -245,20 +246,16 @@ def _of_filterpy(rule: Rule, n: int, m: int) -> Any:
     return UnscentedKalmanFilter(n, m, dt=1.0, hx=None, fx=None, points=points)
 
 
-def _take_in(f: Any, model: StateModel, k: int, z: Array) -> None:
-    """Updates a filter of filterpy by readings z (m,); a missing one reads 0, with no slope and unit variance."""
-    seen, about = np.isfinite(z), model.observe(f.x, k)
-    z, R = np.where(seen, model.nearest(z, about), 0.0), np.where(seen[:, None] & seen, model.R(k), np.eye(len(z)))
-
-    def observe(x: Array) -> Array:
-        return np.where(seen, model.nearest(model.observe(x, k), about), 0.0)
-
+def _take_in(f: Any, model: StateModel, k: int, R: Array, z: Array, h: Array, H: Array) -> None:
+    """Updates a filter of filterpy by readings z (m,) near h (m,); a missing one reads 0, with no slope and unit
+    variance."""
+    seen = np.isfinite(z)
+    z, R = np.where(seen, model.nearest(z, h), 0.0), np.where(seen[:, None] & seen, R, np.eye(len(z)))
     if hasattr(f, "points_fn"):
         f.sigmas_f = f.points_fn.sigma_points(f.x, f.P)
-        f.update(z, R, hx=observe)
+        f.update(z, R, hx=lambda x: np.where(seen, model.nearest(model.observe(x, k), h), 0.0))
     else:
-        H = slope(lambda at: model.observe(at, k), f.x[None])[1][0]
-        f.update(z, lambda _: np.where(seen[:, None], H, 0.0), observe, R)
+        f.update(z, lambda _: np.where(seen[:, None], H, 0.0), lambda _: np.where(seen, h, 0.0), R)
 
 
 @dataclass(frozen=True)
