@@ -1,6 +1,8 @@
 """Small models with known answers, shared by the tests."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -38,6 +40,36 @@ class Bent(Measurement):
     def simulate(self, x: Array) -> Array:
         y = np.matmul(self.A, x[..., None])[..., 0]
         return y + self.bend * y**2
+
+
+@dataclass(frozen=True)
+class Written(Measurement):
+    """Readings (trials, count) by a function of the parameters, each (trials,)."""
+
+    function: Callable[..., tuple[Any, ...]]
+    unknowns: int = 1
+    count: int = 2
+    first: float = 0.0
+    """The first parameter at the nominal point; the others are 0 there."""
+    analytic = True
+
+    def __post_init__(self) -> None:
+        """No options."""
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return tuple(Parameter(f"p{i}") for i in range(self.unknowns))
+
+    @property
+    def index(self):
+        return {"number": list(range(self.count))}
+
+    @property
+    def nominal(self) -> Array:
+        return self.first * np.eye(self.unknowns)[0]
+
+    def simulate(self, x: Array) -> Array:
+        return np.stack(self.function(*x.T), axis=1)
 
 
 def bock(mu: float) -> Ode:

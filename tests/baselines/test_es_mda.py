@@ -22,19 +22,6 @@ def linear(trials: int):
     return (problem, z, *linear_map(problem, model.matrix, z))
 
 
-@pytest.mark.parametrize("steps", [1, 4])
-def test_ensemble_tends_to_the_kalman_filter(steps):
-    problem, z, x, P = linear(6)
-    apart, spread = [], []
-    for members in (100, 6400):
-        found = EsMda(members, steps, first=1e-2, polish=0).estimate(problem, z)
-        apart.append(np.sqrt(np.mean(((found.x - x) / deviations(P)) ** 2)))
-        spread.append(np.abs(deviations(found.covariance) / deviations(P) - 1).max())
-    assert apart[1] < 5 / np.sqrt(6400)
-    assert apart[1] < apart[0] / 2
-    assert spread[1] < 0.1
-
-
 @pytest.mark.parametrize("members", [20, 5])
 def test_gain_is_that_of_the_paper(members):
     """C_sh (C_hh + alpha R)^-1 (z - h), Emerick and Reynolds (2013), eq. (12), by inverting a matrix of readings."""

@@ -11,7 +11,7 @@ from linear_models import Linear, LinearGins, linear_map
 from scipy.optimize import least_squares
 from small_models import Bent
 
-from ipe_bench.baselines import CKF, EKF, IPLF, LMIEKF, UKF, EnKF, IteratedEKF, RecursiveUpdate
+from ipe_bench.baselines import CKF, EKF, IPLF, LMIEKF, UKF, EnKF, EsMda, IteratedEKF, RecursiveUpdate
 from ipe_bench.baselines.information import InformationFilter
 from ipe_bench.baselines.sequential import Sequential
 from ipe_bench.basics.errors import UserError
@@ -73,16 +73,18 @@ def test_on_a_linear_model_a_filter_is_the_batch_map(model, estimator, apart, sc
     assert np.abs((found.covariance - P) / np.outer(deviations(P), deviations(P))).max() < apart
 
 
-def test_ensemble_tends_to_the_kalman_filter():
-    scenario = Scenario(Linear(), Gaussian(1.0), GaussianPrior(), 1.0)
-    problem, trials = scenario.problem, scenario.draw(0, 4)
+@pytest.mark.parametrize(
+    "ensemble", [EnKF(), EsMda(steps=1, first=1e-2, polish=0), EsMda(steps=4, first=1e-2, polish=0)]
+)
+def test_ensemble_tends_to_the_kalman_filter(ensemble):
+    scenario = Scenario(Linear(), Gaussian(0.5), GaussianPrior(), 1.0)
+    problem, trials = scenario.problem, scenario.draw(0, 6)
     x, P = linear_map(problem, Linear().matrix, trials.z)
-    apart = []
-    for members in (100, 6400):
-        found = EnKF(members=members).estimate(problem, trials.z)
-        apart.append(np.sqrt(np.mean(((found.x - x) / deviations(P)) ** 2)))
+    few, many = (replace(ensemble, members=members).estimate(problem, trials.z) for members in (100, 6400))
+    apart = [np.sqrt(np.mean(((found.x - x) / deviations(P)) ** 2)) for found in (few, many)]
     assert apart[1] < 5 / np.sqrt(6400)
     assert apart[1] < apart[0] / 2
+    assert np.abs(deviations(many.covariance) / deviations(P) - 1).max() < 0.1
 
 
 @pytest.mark.parametrize("estimator", [*FILTERS, *INFORMATION], ids=label)

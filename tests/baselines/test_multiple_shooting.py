@@ -11,7 +11,7 @@ from ipe_bench.basics.linalg import Covariance
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements import Bock, Gins, LotkaVolterra, Sir
 from ipe_bench.measurements.base import SubsetModel
-from ipe_bench.measurements.problem import Problem, recorded_problem
+from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.trials.scenario import Scenario
@@ -40,7 +40,7 @@ def test_its_minimum_is_that_of_single_shooting(name):
 def test_bocks_problem_is_solved_where_single_shooting_is_lost(initial):
     """Solutions grow by exp(60) = 1e26; p = pi in closed form."""
     model = bock(60.0) if initial else Bock(mu=60.0)
-    problem, z = recorded_problem(model), model.recorded.z[None]
+    problem, z = Problem(model, model.recorded.R), model.recorded.z[None]
     with np.errstate(all="ignore"):
         single = LevenbergMarquardt().estimate(problem, z)
     assert not abs(single.x[0, 0] * 0.1 - np.pi) < 1e-6 or single.status[0] != Status.CONVERGED

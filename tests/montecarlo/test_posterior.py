@@ -4,13 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from small_models import Bent
+from small_models import Bent, Written
 
 import ipe_bench as ib
 from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates
-from ipe_bench.measurements import Gins, Measurement, Parameter
+from ipe_bench.measurements import Gins
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.report.questions import honesty
 from ipe_bench.trials.posterior import Divergence, Posterior, divergence, reference, sample_posterior
@@ -80,29 +80,15 @@ def test_the_exact_gaussian_does_not_diverge_and_a_wrong_one_does_as_computed(li
     assert honesty(shifted, found) == "NO"
 
 
-@dataclass(frozen=True)
-class Square(Measurement):
+def square(tilt: float = 0.0) -> Written:
     """Readings x^2 and `tilt` x: two modes where tilt is 0, of unequal weight where it is small."""
-
-    tilt: float = 0.0
-    analytic = True
-
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        return (Parameter("x"),)
-
-    @property
-    def index(self):
-        return {"number": [0, 1]}
-
-    def simulate(self, x: Array) -> Array:
-        return np.concatenate([x**2, self.tilt * x], axis=1)
+    return Written(lambda x: (x**2, tilt * x))
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.01])
 def test_two_modes_are_found_with_their_weights(tilt):
     """Beside integration on a grid."""
-    model = Square(tilt)
+    model = square(tilt)
     problem = Problem(model, Covariance(np.full(2, 0.05)), np.array([2.0]))
     z = model.simulate(np.array([[1.5]]))[0]
     found = sample_posterior(problem, z, particles=4000)
@@ -120,8 +106,8 @@ def test_two_modes_are_found_with_their_weights(tilt):
 
 
 def test_one_gaussian_cannot_stand_for_two_modes():
-    problem = Problem(Square(), Covariance(np.full(2, 0.05)), np.array([2.0]))
-    found = sample_posterior(problem, Square().simulate(np.array([[1.5]]))[0], particles=1000)
+    problem = Problem(square(), Covariance(np.full(2, 0.05)), np.array([2.0]))
+    found = sample_posterior(problem, square().simulate(np.array([[1.5]]))[0], particles=1000)
     at_one = held(found, np.array([1.5]), np.array([[(0.05 / 3) ** 2]]))
     over_both = held(found, found.mean, found.covariance)
     assert at_one.kl > 100

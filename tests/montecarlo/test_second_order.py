@@ -1,15 +1,14 @@
 """Theory beside experiment: closed forms of curvature, bias and error under a wrong model, and Monte Carlo."""
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_models import Bent
+from small_models import Bent, Written
 
 import ipe_bench as ib
 from ipe_bench.basics.linalg import Array, Covariance, information
-from ipe_bench.measurements import Gins, Measurement, Parameter, RicherGins
+from ipe_bench.measurements import Gins, Measurement, RicherGins
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.report.tables import all_tables
 from ipe_bench.runs.run import compute
@@ -22,44 +21,20 @@ RADIUS = 1.959964
 """The 95 % region of one parameter, in deviations."""
 
 
-@dataclass(frozen=True)
-class Formula(Measurement):
-    """Readings by a formula of x (trials, n)."""
-
-    formula: Any = None
-    n_: int = 1
-    m_: int = 2
-    analytic = True
-
-    def __post_init__(self) -> None:
-        """No options."""
-
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        return tuple(Parameter(f"p{i}") for i in range(self.n_))
-
-    @property
-    def index(self):
-        return {"number": list(range(self.m_))}
-
-    def simulate(self, x: Array) -> Array:
-        return np.stack(self.formula(*x.T), axis=1)
-
-
 def curvatures(model: Measurement, x: Array, sigma: float = 1.0) -> tuple[Array, Array]:
     R = Covariance(np.full(model.m, sigma))
     return relative_curvatures(model.jacobian(x), second_derivatives(model, x), R)
 
 
 def test_a_circle_bends_by_its_radius_and_runs_evenly():
-    model = Formula(formula=lambda t: (5 * np.cos(t), 5 * np.sin(t)))
+    model = Written(lambda t: (5 * np.cos(t), 5 * np.sin(t)))
     intrinsic, parametric = curvatures(model, np.array([[0.3], [2.0]]), sigma=0.5)
     np.testing.assert_allclose(intrinsic, RADIUS * 0.5 / 5, rtol=1e-5)
     np.testing.assert_allclose(parametric, 0.0, atol=1e-6)
 
 
 def test_a_bent_scale_on_a_straight_line_is_all_parameter_effects():
-    model = Formula(formula=lambda t: (3 * t**3, 4 * t**3))
+    model = Written(lambda t: (3 * t**3, 4 * t**3))
     intrinsic, parametric = curvatures(model, np.array([[2.0]]))
     # h = 5 t^3 along a line: h'' / h'^2.
     np.testing.assert_allclose(parametric, RADIUS * 30 * 2 / (15 * 4) ** 2, rtol=1e-5)
@@ -67,16 +42,14 @@ def test_a_bent_scale_on_a_straight_line_is_all_parameter_effects():
 
 
 def test_a_sphere_bends_alike_in_all_directions():
-    model = Formula(
-        formula=lambda a, b: (7 * np.cos(a) * np.cos(b), 7 * np.sin(a) * np.cos(b), 7 * np.sin(b)), n_=2, m_=3
-    )
+    model = Written(lambda a, b: (7 * np.cos(a) * np.cos(b), 7 * np.sin(a) * np.cos(b), 7 * np.sin(b)), 2, 3)
     intrinsic, _ = curvatures(model, np.array([[0.4, 0.3]]))
     np.testing.assert_allclose(intrinsic, np.sqrt(5.991465) / 7, rtol=1e-4)
 
 
 def test_the_bias_of_a_logarithm_is_half_its_variance():
     """z = exp(t) + v is fitted by log z: -sigma^2 exp(-2 t) / 2 to second order."""
-    model = Formula(formula=lambda t: (np.exp(t),), m_=1)
+    model = Written(lambda t: (np.exp(t),), count=1)
     x = np.array([[0.0], [1.0]])
     found = box_bias(model.jacobian(x), second_derivatives(model, x), Covariance(np.array([0.1])))
     np.testing.assert_allclose(found[:, 0], -(0.1**2) * np.exp(-2 * x[:, 0]) / 2, rtol=1e-5)

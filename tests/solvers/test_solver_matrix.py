@@ -2,18 +2,46 @@
 
 import numpy as np
 import pytest
-from square_systems import BurdenFaires, Cubic, NoRoot, Rosenbrock, system_of
+from small_models import Written
 
-from ipe_bench.basics.linalg import deviations
+from ipe_bench.basics.linalg import Covariance, deviations
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.driver import Limits, iterate
-from ipe_bench.measurements import Gins, Polynomial
+from ipe_bench.estimators.ipe import FrozenSystem
+from ipe_bench.measurements import Gins, Measurement, Polynomial
+from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.noise import Gaussian, Quantization
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.solvers import Anderson, Broyden, DampedNewton, FixedPoint, Newton, SteepestDescent
 from ipe_bench.statistics.sample import orders_of
 from ipe_bench.trials.roots import frozen_root
 from ipe_bench.trials.scenario import Scenario
+
+BURDEN_FAIRES = Written(
+    lambda a, b, c: (
+        3 * a - np.cos(b * c) - 0.5,
+        a**2 - 81 * (b + 0.1) ** 2 + np.sin(c) + 1.06,
+        np.exp(-a * b) + 20 * c + (10 * np.pi - 3) / 3,
+    ),
+    unknowns=3,
+    count=3,
+)
+"""Burden and Faires, Numerical Analysis, section 10.2, example 2: root (1/2, 0, -pi/6)."""
+ROSENBROCK = Written(lambda a, b: (10 * (b - a**2), 1 - a), 2)
+"""10 (b - a^2), 1 - a: root (1, 1), from the customary start (-1.2, 1)."""
+CUBIC = Written(lambda a, b: (1.2 * a + 0.3 * b + (a + b) ** 3 / 20, -0.2 * a + 0.9 * b + (a - b) ** 3 / 20), 2)
+"""A x and a cubic: root 0, a contraction of the fixed-point iteration around it."""
+NO_ROOT = Written(lambda a, b: (a**2 + 1, b), 2)
+"""a^2 + 1, b: |F| has its minimum 1 at 0, where the Jacobian is singular."""
+
+
+def system_of(model: Measurement, trials: int) -> FrozenSystem:
+    """h(x) = 0 for each trial, with H+ = I."""
+    unit = np.eye(model.n)[None]
+    R = Covariance(np.ones(model.m))
+    counted = CountingModel(model, EvaluationCount.zeros(trials))
+    return FrozenSystem(counted, unit, np.ones((1, model.n)), R, np.zeros((trials, model.m)), np.arange(trials))
+
 
 ALL = [FixedPoint(), Newton(), Broyden(), Broyden("identity"), SteepestDescent(), Anderson(2), DampedNewton()]
 WITH_SLOPE = [Newton(), Broyden(), DampedNewton(), SteepestDescent()]
@@ -30,7 +58,7 @@ def roots_of(model, solver, starts, *, tolerance=1e-9, max_iterations=2000, hist
 @pytest.mark.parametrize("solver", ALL, ids=repr)
 def test_every_solver_finds_the_root_of_a_contraction(solver):
     starts = np.random.default_rng(0).uniform(-1, 1, (20, 2))
-    roots, _ = roots_of(Cubic(), solver, starts)
+    roots, _ = roots_of(CUBIC, solver, starts)
     assert (roots.status == Status.CONVERGED).all()
     np.testing.assert_allclose(roots.x, 0.0, atol=1e-8)
 
@@ -38,7 +66,7 @@ def test_every_solver_finds_the_root_of_a_contraction(solver):
 @pytest.mark.parametrize("solver", WITH_SLOPE, ids=repr)
 @pytest.mark.parametrize(
     ("model", "start", "root"),
-    [(BurdenFaires(), (0.1, 0.1, -0.1), (0.5, 0.0, -np.pi / 6)), (Rosenbrock(), (-1.2, 1.0), (1.0, 1.0))],
+    [(BURDEN_FAIRES, (0.1, 0.1, -0.1), (0.5, 0.0, -np.pi / 6)), (ROSENBROCK, (-1.2, 1.0), (1.0, 1.0))],
     ids=["burden_faires", "rosenbrock"],
 )
 def test_textbook_systems_have_their_roots(solver, model, start, root):
@@ -49,8 +77,8 @@ def test_textbook_systems_have_their_roots(solver, model, start, root):
 
 
 def test_newton_and_broyden_reproduce_the_tables_of_burden_and_faires():
-    newton, _ = roots_of(BurdenFaires(), Newton(), (0.1, 0.1, -0.1), history=True)
-    broyden, _ = roots_of(BurdenFaires(), Broyden(), (0.1, 0.1, -0.1), history=True)
+    newton, _ = roots_of(BURDEN_FAIRES, Newton(), (0.1, 0.1, -0.1), history=True)
+    broyden, _ = roots_of(BURDEN_FAIRES, Broyden(), (0.1, 0.1, -0.1), history=True)
     # Tables 10.3 and 10.4 (ninth edition).
     np.testing.assert_allclose(newton.history[0][1], [0.4998696728, 0.0194668485, -0.5215204718], atol=5e-10)
     np.testing.assert_allclose(newton.history[0][2], [0.5000142403, 0.0015885914, -0.5235569638], atol=5e-10)
@@ -74,7 +102,7 @@ def _errors(solver, model, start, root, **options):
 
 
 def test_fixed_point_is_linear_with_the_spectral_radius_as_rate():
-    errors = _errors(FixedPoint(), Cubic(), (0.5, -0.3), (0.0, 0.0), max_iterations=60)
+    errors = _errors(FixedPoint(), CUBIC, (0.5, -0.3), (0.0, 0.0), max_iterations=60)
     slope = np.eye(2) - np.array([[1.2, 0.3], [-0.2, 0.9]])
     radius = np.abs(np.linalg.eigvals(slope)).max()
     used = errors[errors > 1e-13]
@@ -84,7 +112,7 @@ def test_fixed_point_is_linear_with_the_spectral_radius_as_rate():
 
 @pytest.mark.parametrize("solver", [Newton(), DampedNewton()], ids=repr)
 def test_newton_is_quadratic(solver):
-    errors = _errors(solver, BurdenFaires(), (0.1, 0.1, -0.1), (0.5, 0.0, -np.pi / 6))
+    errors = _errors(solver, BURDEN_FAIRES, (0.1, 0.1, -0.1), (0.5, 0.0, -np.pi / 6))
     assert 1.9 < orders_of(errors, floor=1e-14)[-1] < 2.1
 
 
@@ -92,7 +120,7 @@ def test_newton_is_quadratic(solver):
 def test_quasi_newton_is_superlinear(solver):
     """Ratios of successive errors go to zero, those of fixed-point iteration stay where they are."""
     start, root = (0.8, -0.5), (0.0, 0.0)
-    fast, slow = (_errors(s, Cubic(), start, root, max_iterations=60) for s in (solver, FixedPoint()))
+    fast, slow = (_errors(s, CUBIC, start, root, max_iterations=60) for s in (solver, FixedPoint()))
     fast, slow = fast[fast > 1e-14], slow[slow > 1e-14]
     assert fast[-1] / fast[-2] < 0.1 * slow[-1] / slow[-2]
     assert len(fast) < len(slow) / 1.5
@@ -100,24 +128,24 @@ def test_quasi_newton_is_superlinear(solver):
 
 @pytest.mark.parametrize("solver", [DampedNewton(), SteepestDescent()], ids=repr)
 def test_where_f_only_has_a_minimum_descent_stalls(solver):
-    roots, _ = roots_of(NoRoot(), solver, [(2.0, 1.0)], max_iterations=5000)
+    roots, _ = roots_of(NO_ROOT, solver, [(2.0, 1.0)], max_iterations=5000)
     assert roots.status[0] in (Status.STALLED, Status.SINGULAR)
     assert abs(roots.x[0, 0]) < 1e-3
 
 
 def test_a_steepest_descent_that_still_descends_has_not_stalled():
-    roots, _ = roots_of(Rosenbrock(), SteepestDescent(), [(-1.2, 1.0)], max_iterations=50)
+    roots, _ = roots_of(ROSENBROCK, SteepestDescent(), [(-1.2, 1.0)], max_iterations=50)
     assert roots.status[0] == Status.MAX_ITERATIONS
 
 
 @pytest.mark.parametrize("solver", [Newton(), Broyden(), DampedNewton()], ids=repr)
 def test_a_singular_slope_is_named(solver):
-    roots, _ = roots_of(NoRoot(), solver, [(0.0, 1.0)])
+    roots, _ = roots_of(NO_ROOT, solver, [(0.0, 1.0)])
     assert roots.status[0] == Status.SINGULAR
 
 
 def test_an_expansion_has_diverged_before_it_overflows():
-    roots, _ = roots_of(Rosenbrock(), FixedPoint(), [(-1.2, 1.0)])
+    roots, _ = roots_of(ROSENBROCK, FixedPoint(), [(-1.2, 1.0)])
     assert roots.status[0] == Status.DIVERGED
 
 
