@@ -374,7 +374,7 @@ def estimate(
     given = readings if readings is None or isinstance(readings, np.ndarray) else tuple(_paths(readings))
     stated: dict[str, Any] = {"noise": noise, "prior": prior, "error_scale": error_scale}
     stated |= {"known": known_parameters(parameters or {}), "ignored": tuple(ignore_columns)}
-    return Answer.to(Question(model=model, readings=given, estimators=estimators, **stated).opened())
+    return Answer.to(Question(model=model, readings=given, estimators=estimators, **stated).checked())
 
 
 def _tracked(

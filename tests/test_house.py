@@ -33,12 +33,12 @@ BUDGETS = {
     "estimators": 1150,
     "solvers": 1184,
     "baselines": 1957,
-    "trials": 1941,
+    "trials": 1940,
     "runs": 1976,
     "statistics": 4075,
-    "real": 2308,
+    "real": 2300,
     "plugins": 1102,
-    "report": 4112,
+    "report": 4103,
     "cli": 2437,
 }
 """Lines of Python that a room may hold: who raises one lowers another in the same commit."""

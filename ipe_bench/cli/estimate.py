@@ -125,19 +125,19 @@ def estimate_command(arguments: Sequence[str]) -> int:
     asked = single("estimate", arguments, STANDARD_ESTIMATORS, run=(*OF_MANY_TRIALS, "trials", "seed", w.TRUTH))
     if asked.spec.model is not None:
         return _track(asked, asked.spec.model)
-    opened = asked.spec.question(asked.words.keys).opened()
-    question, files = opened.question, opened.question.readings
+    question = asked.spec.question(asked.words.keys).checked()
+    files = question.readings
     command = {  # what was asked for, not what the file holds today
         "readings": [str(path.resolve()) for path in files] if isinstance(files, tuple) else None,
-        "scenario": describe(opened.scenario),
+        "scenario": describe(question.scenario),
         "prior": question.has_prior,
         "estimators": _described(question.estimators),
         **({"left_out": list(question.ignored)} if question.ignored else {}),
     }
     folder = asked.folder(NAME, command, FILES)
-    answer = Answer.to(opened, asked.measurement)
-    parts = [opened.scenario, *question.estimators.values()]
-    provenance = _provenance(asked, opened.readings.files, parts)
+    answer = Answer.to(question, asked.measurement)
+    parts = [question.scenario, *question.estimators.values()]
+    provenance = _provenance(asked, question.found.files, parts)
     files = write_answer(folder, answer, command, provenance, figures=asked.spec.figures != "none")
     _show(contents(answer), files)
     return 0 if answer.passes else 1

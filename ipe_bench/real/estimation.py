@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -37,33 +38,15 @@ class Question:
     ignored: tuple[str, ...] = ()
     """Columns of the files that are left out on purpose."""
 
-    def opened(self) -> Opened:
-        """The readings, with the scenario and the problem that estimators are told.
-
-        Raises:
-            UserError: a file does not hold the model's readings, or an estimator needs what is not stated.
-        """
-        found = self._readings()
-        model = found.model
-        prior = prior_stated(self.prior or GaussianPrior(), model)
-        scale = 1.0 if self.error_scale is None else self.error_scale
-        require_repeatable(model)
-        if hindrance := model.hindrance(model.nominal):
-            raise UserError(f"measurement={model.name}: cannot be computed where estimation starts: {hindrance}")
-        opened = Opened(self, found, Scenario(model, self._noise(found), prior, scale))
-        if not self.estimators:
-            raise UserError("there is no estimator; choose with solver= and baseline=")
-        if lacking := list(opened.lacking()):
-            raise UserError("; ".join(lacking))
-        return opened
-
     @property
     def has_prior(self) -> bool:
         """Whether anything says how far the parameters may lie from the nominal point."""
         deviating = any(one.deviation is not None for one in self.known)
         return deviating or self.prior is not None or self.error_scale is not None
 
-    def _readings(self) -> Readings:
+    @cached_property
+    def found(self) -> Readings:
+        """The readings, of a model with the inputs of the files, and with what is known of parameters."""
         model, given = self.model, self.readings
         if isinstance(given, tuple):
             names = [str(path) for path in given]
@@ -82,8 +65,50 @@ class Question:
             )
         return Readings(informed(model, self.known), np.array(given, dtype=float))
 
-    def _noise(self, found: Readings) -> Noise:
+    @cached_property
+    def scenario(self) -> Scenario:
+        model = self.found.model
+        prior = prior_stated(self.prior or GaussianPrior(), model)
+        require_repeatable(model)
+        if hindrance := model.hindrance(model.nominal):
+            raise UserError(f"measurement={model.name}: cannot be computed where estimation starts: {hindrance}")
+        return Scenario(model, self._noise(), prior, 1.0 if self.error_scale is None else self.error_scale)
+
+    @cached_property
+    def problem(self) -> Problem:
+        """What estimators are told, a prior only if one is stated."""
+        return self.scenario.problem if self.has_prior else self.scenario.problem.without_prior()
+
+    def checked(self) -> Question:
+        """This question, if it can be answered.
+
+        Raises:
+            UserError: a file does not hold the model's readings, or an estimator needs what is not stated.
+        """
+        scenario, lacking = self.scenario, []
+        if not self.estimators:
+            raise UserError("there is no estimator; choose with solver= and baseline=")
+        for label, estimator in self.estimators.items():
+            for need in estimator.missing(self.problem):
+                why = f"measurement={scenario.measurement.name} does not have; leave it out"
+                if need == "prior" and not scenario.noise.real:
+                    why = (
+                        "is not stated; give error_scale=X, the standard deviation of the parameters in multiples of"
+                        " their sizes"
+                    )
+                lacking.append(f"estimators.{label}: needs {need}, which {why}")
+        if lacking:
+            raise UserError("; ".join(lacking))
+        return self
+
+    def fitted(self) -> tuple[list[Fit], Examination | None]:
+        """A fit by every estimator, and what is to be said of the least minimum."""
+        fits = fit(self.problem, self.found.z, self.estimators, self.scenario.noise)
+        return fits, examine(self.problem, self.found.z, fits)
+
+    def _noise(self) -> Noise:
         """What is stated, or a file's column of standard deviations, or the model's own; else its level is unknown."""
+        found = self.found
         stated = self.noise.of(found.model) if isinstance(self.noise, ModelNoise) else self.noise
         if self.readings is None and stated is None:
             return Certified()
@@ -98,39 +123,6 @@ class Question:
                 " noise=unknown to take the column for relative weights"
             )
         return Gaussian(deviations)
-
-
-@dataclass(frozen=True)
-class Opened:
-    """A question with its readings."""
-
-    question: Question
-    readings: Readings
-    """Their model has the inputs of the files, and what is known of parameters."""
-    scenario: Scenario
-
-    @property
-    def problem(self) -> Problem:
-        """What estimators are told: a prior only where one is stated."""
-        return self.scenario.problem if self.question.has_prior else self.scenario.problem.without_prior()
-
-    def lacking(self) -> Iterator[str]:
-        """What estimators need and the problem lacks, each with its remedy."""
-        for label, estimator in self.question.estimators.items():
-            for need in estimator.missing(self.problem):
-                why = f"measurement={self.scenario.measurement.name} does not have; leave it out"
-                if need == "prior" and not self.scenario.noise.real:
-                    why = (
-                        "is not stated; give error_scale=X, the standard deviation of the parameters in multiples of"
-                        " their sizes"
-                    )
-                yield f"estimators.{label}: needs {need}, which {why}"
-
-    def fitted(self) -> tuple[list[Fit], Examination | None]:
-        """A fit by every estimator, and what is to be said of the least minimum."""
-        z = self.readings.z
-        fits = fit(self.problem, z, self.question.estimators, self.scenario.noise)
-        return fits, examine(self.problem, z, fits)
 
 
 def prior_stated(prior: Prior, model: Measurement) -> Prior:

@@ -17,7 +17,7 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.identifiability import structure
-from ipe_bench.real.estimation import Opened
+from ipe_bench.real.estimation import Question
 from ipe_bench.real.examination import CONFIDENCE, Examination
 from ipe_bench.real.fits import Fit
 from ipe_bench.real.residuals import LEAST_P
@@ -62,10 +62,10 @@ class Answer:
     """The columns of the files that were left out on purpose."""
 
     @classmethod
-    def to(cls, opened: Opened, name: str = "") -> Answer:
+    def to(cls, question: Question, name: str = "") -> Answer:
         """The answer to a question, by its model's name or another `name`."""
-        model, left_out = opened.scenario.measurement, ", ".join(opened.question.ignored)
-        return cls(name or model.name, model, opened.readings.z, *opened.fitted(), left_out)
+        model, z = question.found.model, question.found.z
+        return cls(name or model.name, model, z, *question.fitted(), ", ".join(question.ignored))
 
     @property
     def passes(self) -> bool:

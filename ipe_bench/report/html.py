@@ -6,7 +6,6 @@ import base64
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
@@ -97,31 +96,23 @@ def _minute(started: str) -> str:
 # Charts --------------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Axis:
-    """A column that an axis may show, with the ends of its interval and a line at what is best."""
-
-    column: str
-    title: str
-    log: bool = False
-    share: bool = False
-    low: str = ""
-    high: str = ""
-    reference: float | None = None
-    reference_title: str = ""
+def _axis(column: str, title: str, **more: Any) -> dict[str, Any]:
+    """A column that an axis may show, with the columns of its interval's ends, and a line at what is best."""
+    plain = {"log": False, "share": False, "low": "", "high": "", "reference": None, "reference_title": ""}
+    return {"column": column, "title": title, **plain, **more}
 
 
-_SCALE = Axis("error_scale", "error scale", log=True)
-_COST = Axis("simulations_median", "simulations per trial (median)", log=True)
+_SCALE = _axis("error_scale", "error scale", log=True)
+_COST = _axis("simulations_median", "simulations per trial (median)", log=True)
 _BOUND = {"log": True, "reference": 1.0, "reference_title": "the bound"}
 _AXES = (
-    Axis("success", "success", share=True, low="success_low", high="success_high"),
-    Axis("error_median", "median error / bound", **_BOUND),
-    Axis("error_q95", "95 % error / bound", **_BOUND),
-    Axis("efficiency_capped", "efficiency", low="efficiency_capped_low", high="efficiency_capped_high"),
-    Axis("nees_median", "NEES, median", log=True, reference=1.0, reference_title="honest covariance"),
-    Axis("coverage95", "truth in the 95 % ellipsoid", share=True, reference=0.95, reference_title="honest covariance"),
-    Axis("failed_silent", "failed silently", share=True),
+    _axis("success", "success", share=True, low="success_low", high="success_high"),
+    _axis("error_median", "median error / bound", **_BOUND),
+    _axis("error_q95", "95 % error / bound", **_BOUND),
+    _axis("efficiency_capped", "efficiency", low="efficiency_capped_low", high="efficiency_capped_high"),
+    _axis("nees_median", "NEES, median", log=True, reference=1.0, reference_title="honest covariance"),
+    _axis("coverage95", "truth in the 95 % ellipsoid", share=True, reference=0.95, reference_title="honest covariance"),
+    _axis("failed_silent", "failed silently", share=True),
 )
 
 
@@ -129,11 +120,11 @@ def charts(views: Sequence[View]) -> Iterator[dict[str, str]]:
     """The chart of each setting: its name, title and caption, and as JSON what the script draws."""
     for view in views:
         rows = view.totals
-        shown = [axis for axis in _AXES if len(rows) and rows[axis.column].map(math.isfinite).any()]
+        shown = [axis for axis in _AXES if len(rows) and rows[axis["column"]].map(math.isfinite).any()]
         if not shown:
             continue
         across = (_SCALE, _COST) if len(view.scales) > 1 else (_COST, _SCALE)
-        columns = {name for axis in (*across, *shown) for name in (axis.column, axis.low, axis.high) if name}
+        columns = {axis[key] for axis in (*across, *shown) for key in ("column", "low", "high") if axis[key]}
         series = [
             {
                 "name": label,
@@ -146,7 +137,7 @@ def charts(views: Sequence[View]) -> Iterator[dict[str, str]]:
             for label, look in view.look.items()
             for part in (rows[rows["estimator"] == label],)
         ]
-        data = {"x": [asdict(a) for a in across], "y": [asdict(a) for a in shown], "few": FEW, "series": series}
+        data = {"x": across, "y": shown, "few": FEW, "series": series}
         caption = f"{view.label}. Bars: 95 % intervals, where they are known. Hollow: fewer than {FEW} trials."
         text = json.dumps(data, ensure_ascii=False, separators=(",", ":"))
         title = "All trials, by any two columns"

@@ -10,7 +10,7 @@ from scipy.optimize import curve_fit
 
 import ipe_bench as ib
 from ipe_bench.measurements import Nist
-from ipe_bench.real.estimation import Opened
+from ipe_bench.real.estimation import Question
 from ipe_bench.real.readings import write_readings
 
 MISRA = Nist("Misra1a")
@@ -242,13 +242,13 @@ def test_a_prior_that_nobody_states_is_refused_by_command_and_python_alike(estim
 def test_the_digest_is_of_the_bytes_that_were_estimated(estimate, misra, tmp_path, monkeypatch):
     """A file that changes while the estimators are at work is not what they saw."""
     before = hashlib.sha256((tmp_path / "my.csv").read_bytes()).hexdigest()
-    fitted = Opened.fitted
+    fitted = Question.fitted
 
     def changed(self):
         (tmp_path / "my.csv").write_text("t,y\n1,2\n")
         return fitted(self)
 
-    monkeypatch.setattr(Opened, "fitted", changed)
+    monkeypatch.setattr(Question, "fitted", changed)
     code, printed, answer = estimate(*SATURATION, *LM, "readings=my.csv")
     assert code == 0, printed
     assert answer["readings"] == [{"file": "my.csv", "sha256": before}]

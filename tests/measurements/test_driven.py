@@ -174,8 +174,8 @@ def test_a_row_without_a_reading_only_changes_the_input(tmp_path):
     z = np.where(np.arange(len(T)) % 3 == 0, np.nan, z)
     path = file(tmp_path / "a.csv", [(t, c, "" if np.isnan(v) else v) for t, c, v in zip(T, CURRENT, z, strict=True)])
     model = replace(BATTERY, times=(), columns={}, tolerance=None)
-    opened = Question(model=model, readings=(path,), estimators=LM, noise=Gaussian(1e-4)).opened()
-    (found,) = fit(opened.problem, opened.readings.z, LM, Gaussian(1e-4))
+    question = Question(model=model, readings=(path,), estimators=LM, noise=Gaussian(1e-4)).checked()
+    (found,) = fit(question.problem, question.found.z, LM, Gaussian(1e-4))
     assert np.abs((found.x - [0.022, 0.013, 2100.0]) / found.standard_errors).max() < 3.5
     assert list(found.values) == ["r0", "r1", "c1"]
     shooting = MultipleShooting(segments=3).estimate(

@@ -31,7 +31,7 @@ def test_stiff_equations_are_told_of_with_the_step_that_they_need():
     with pytest.raises(UserError, match=expected):
         validate([Scenario(stiff(1e4), Gaussian(0.1), error_scale=1e-3)], LM, 10)
     with pytest.raises(UserError, match=expected):
-        Question(model=stiff(1e4), readings=np.zeros(len(TIMES)), estimators=LM, noise=Gaussian(0.1)).opened()
+        Question(model=stiff(1e4), readings=np.zeros(len(TIMES)), estimators=LM, noise=Gaussian(0.1)).checked()
     followed = replace(stiff(1e4), method="auto")
     assert followed.hindrance(followed.nominal) == ""
     np.testing.assert_allclose(followed.simulate(followed.nominal[None])[0, 1:], np.cos(TIMES[1:]), atol=2e-4)
@@ -82,4 +82,4 @@ def test_readings_that_hang_on_more_than_x_are_refused_by_name(model, way):
     with pytest.raises(UserError, match=rf"^measurement={model().name}: simulate\(x\) has other bits .*{way}"):
         validate([Scenario(model(), Gaussian(0.1))], LM, 10)
     with pytest.raises(UserError, match=rf"^measurement={model().name}: simulate\(x\) has other bits .*{way}"):
-        Question(model=model(), readings=np.zeros(model().m), estimators=LM, noise=Gaussian(0.1)).opened()
+        Question(model=model(), readings=np.zeros(model().m), estimators=LM, noise=Gaussian(0.1)).checked()

@@ -247,31 +247,21 @@ def test_a_noise_that_cannot_be_is_refused_in_one_line(options, words):
     assert "\n" not in str(raised.value)
 
 
+BY = Unknown(by="second")
+FLAT = replace(DECAY, expression="second*(a + k*t) + 0*l")
+
+
 @pytest.mark.parametrize(
-    ("formula", "noise", "rows", "value", "words"),
+    ("model", "noise", "rows", "value", "words"),
     [
-        (
-            DECAY.expression,
-            NOISES["by output"][0],
-            slice(32, 60),
-            np.nan,
-            "the 2 readings of 1 are too few to tell sigma",
-        ),
-        (
-            "second*(a + k*t) + 0*l",
-            NOISES["by output"][0],
-            slice(30),
-            0.0,
-            "the level of 0 cannot be .* residuals of zero",
-        ),
-        (DECAY.expression, Unknown(sigma="share*h"), slice(1), 0.0, r"noise.sigma=share\*h: is 0 at 1 of 60 readings"),
+        (DECAY, BY, np.s_[32:], np.nan, "the 2 readings of 1 are too few to tell sigma beside 2 parameters"),
+        (FLAT, BY, np.s_[:30], 0.0, "the level of 0 cannot be estimated from residuals of zero"),
+        (DECAY, Unknown(sigma="share*h"), np.s_[:1], 0.0, r"noise.sigma=share\*h: is 0 at 1 of 60 readings"),
     ],
-    ids=["too few readings", "residuals of zero", "a standard deviation of zero"],
 )
-def test_what_would_make_the_likelihood_infinite_is_refused(formula, noise, rows, value, words):
+def test_what_would_make_the_likelihood_infinite_is_refused(model, noise, rows, value, words):
     z = readings("by output", 1)
     z[rows] = value
-    model = replace(DECAY, expression=formula)
     with pytest.raises(ib.UserError, match=words):
         fit(Problem(model, Covariance(np.ones(60))), z, LM, noise)
 
