@@ -17,6 +17,7 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.identifiability import structure
+from ipe_bench.measurements.known import ConstrainedModel
 from ipe_bench.real.estimation import Question
 from ipe_bench.real.examination import CONFIDENCE, Examination
 from ipe_bench.real.fits import Fit
@@ -227,7 +228,9 @@ def _notes(answer: Answer) -> Iterator[str]:
         )
     if told := [one.label for one in fits if one.with_prior]:
         yield f"{', '.join(told)}: with a prior, which counts in the standard errors as further readings would."
-    elif stated := [one.name for one in getattr(answer.model, "known", ()) if one.deviation is not None]:
+    elif isinstance(answer.model, ConstrainedModel) and (
+        stated := [one.name for one in answer.model.known if one.deviation is not None]
+    ):
         yield f"The prior of {', '.join(stated)} counts in no estimate here; add one with a prior, such as map_lm."
     if answer.model.fixed:
         yield f"Fixed: {_values(answer.model.fixed)}"
