@@ -147,6 +147,8 @@ def checked(value: Any, hint: Any, key: str) -> Any:
     abstract = {int: numbers.Integral, float: numbers.Real}.get(plain)
     if abstract and isinstance(value, abstract) and not isinstance(value, bool):
         return value if type(value) is plain else typing.cast(Any, plain)(value)
+    if plain is Sequence and isinstance(value, np.ndarray):
+        return tuple(value.tolist())
     if isinstance(value, plain) and not abstract:
         return value
     raise _refusal(value, describe_type(hint), key)
