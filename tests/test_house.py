@@ -34,7 +34,7 @@ BUDGETS = {
     "solvers": 1184,
     "baselines": 1957,
     "trials": 1940,
-    "runs": 1976,
+    "runs": 1975,
     "statistics": 4075,
     "real": 2300,
     "plugins": 1102,

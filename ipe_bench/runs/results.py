@@ -273,15 +273,14 @@ class Results:
     @cached_property
     def cells(self) -> tuple[CellState, ...]:
         """How far every cell is: those that runs asked for in their order, then others that are there."""
-        found = {identity: cell for identity, (cell, _) in self._rivals.items() if cell is not None}
-        asked = {identity: _Asked(cell.key, 0, cell.names, "") for identity, cell in found.items()}
-        asked, states = self._asked_for | {i: of for i, of in asked.items() if i not in self._asked_for}, []
-        for identity, (key, trials, names, refused) in asked.items():
+        others, states = [cell for cell in self.current if cell.footer["identity_key"] not in self._asked_for], []
+        unasked = {cell.footer["identity_key"]: _Asked(cell.key, 0, cell.names, "") for cell in others}
+        for identity, (key, trials, names, refused) in (self._asked_for | unasked).items():
             covered, tried = self._covered(key), [f for f in self.attempts if f["key"] == key]
             lost = [f for f in tried if gaps(covered, f["start"], f["stop"])]
             missing = _count(gaps([*covered, *((f["start"], f["stop"]) for f in lost)], 0, trials))
             lacking = _count(gaps(covered, 0, trials))
-            done = trials - lacking if trials else found[identity].trials
+            done = trials - lacking if trials else self.stored[key].trials
             stale = sum(cell.trials for cell in self._rivals.get(identity, (None, []))[1])
             messages = tuple(dict.fromkeys(f"{f['status']}: {f['message']}" for f in lost))
             counts = trials, done, lacking - missing, missing, stale

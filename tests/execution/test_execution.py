@@ -17,7 +17,6 @@ from ipe_bench import Scenario
 from ipe_bench.baselines import LinearLSE
 from ipe_bench.basics.errors import UserError
 from ipe_bench.noise import Gaussian
-from ipe_bench.priors import GaussianPrior
 from ipe_bench.runs.execution import Auto, Processes, Serial
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.run import compute
@@ -27,7 +26,7 @@ GOOD = {"linear_lse": LinearLSE(), "newton": Newton()}
 
 
 def scenario(**changes) -> Scenario:
-    return Scenario(Bent(0.02), Gaussian(0.1), GaussianPrior(), **{"error_scale": 1.0, **changes})
+    return Scenario(Bent(0.02), Gaussian(0.1), **changes)
 
 
 def stored(directory: Path) -> dict[str, np.ndarray]:
