@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array, Mask
@@ -108,9 +107,7 @@ class ConstrainedModel(WrappedModel):
         given = {one.name: one for one in self.known}
         return tuple(given.get(p.name, ParameterInfo(p.name)) for p in self.whole.parameters)
 
-    @cached_property
-    def _free(self) -> NDArray[np.intp]:
-        return np.flatnonzero([one.fixed is None for one in self._known])
+    _free = cached_property(lambda model: np.flatnonzero([one.fixed is None for one in model._known]))
 
     @cached_property
     def _v0(self) -> Array:

@@ -8,7 +8,7 @@ and the minima that it does not list, come from Newton's method on the gradient 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -301,22 +301,11 @@ class Mgh(Measurement):
     def parameters(self) -> tuple[Parameter, ...]:
         return tuple(Parameter(f"x{i + 1}", size=float(abs(a)) or 1.0) for i, a in enumerate(self.start_values))
 
-    @property
-    def nominal(self) -> Array:
-        return np.sign(self.start_values)
-
-    @cached_property
-    def m(self) -> int:
-        return self.simulate(self.nominal[None]).shape[1]
-
-    @property
-    def index(self) -> Mapping[str, Sequence[Any]]:
-        return {"residual": list(range(1, self.m + 1))}
-
-    @property
-    def minima(self) -> tuple[Minimum, ...]:
-        """The known minima of the sum of squares, the lowest first."""
-        return PROBLEMS[self.function].minima
+    nominal = property(lambda model: np.sign(model.start_values))  # type: ignore[assignment]
+    m = cached_property(lambda model: model.simulate(model.nominal[None]).shape[1])  # type: ignore[assignment]
+    index = property(lambda model: {"residual": list(range(1, model.m + 1))})  # type: ignore[assignment]
+    minima = property(lambda model: PROBLEMS[model.function].minima)
+    """The known minima of the sum of squares, the lowest first."""
 
     def simulate(self, x: Array) -> Array:
         with np.errstate(all="ignore"):

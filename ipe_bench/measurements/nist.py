@@ -111,8 +111,8 @@ class Nist(Measurement):
     """One regression problem of NIST, to be started at one of its two certified starting points.
 
     The nominal point is that start, and each parameter's size is its magnitude there, so x0 consists of ones and minus
-    ones. There is no order of arrival and no prior: a start is where to begin, not what is believed. A reading is one
-    observation y; for Nelson it is log(y), as NIST fits it.
+    ones. There is no order of arrival and no prior. A reading is one observation y; for Nelson it is log(y), as NIST
+    fits it.
     """
 
     dataset: str = "Misra1a"
@@ -130,23 +130,16 @@ class Nist(Measurement):
     def _numbers(self, key: str) -> Array:
         return np.array(_tables()[self.dataset][key], dtype=float)
 
-    @cached_property
-    def start_values(self) -> Array:
-        """The starting point (n,) in physical units."""
-        return self._numbers(f"start_{self.start}")
+    start_values = cached_property(lambda model: model._numbers(f"start_{model.start}"))
+    """The starting point (n,) in physical units."""
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
         return tuple(Parameter(f"b{i + 1}", size=float(abs(b))) for i, b in enumerate(self.start_values))
 
-    @property
-    def nominal(self) -> Array:
-        return np.sign(self.start_values)
-
-    @cached_property
-    def predictors(self) -> Array:
-        """The predictor variables (k, m)."""
-        return self._numbers("predictors")
+    nominal = property(lambda model: np.sign(model.start_values))  # type: ignore[assignment]
+    predictors = cached_property(lambda model: model._numbers("predictors"))
+    """The predictor variables (k, m)."""
 
     @property
     def index(self) -> Mapping[str, Sequence[Any]]:

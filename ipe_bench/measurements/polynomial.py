@@ -45,15 +45,10 @@ class Polynomial(Measurement):
     def parameters(self) -> tuple[Parameter, ...]:
         return tuple(Parameter(f"c{i}", group="coefficients") for i in range(self.unknowns))
 
-    @cached_property
-    def times(self) -> Array:
-        """Where the polynomials are read (m,)."""
-        return np.linspace(-1.0, 1.0, self.count)
-
-    @cached_property
-    def matrix(self) -> Array:
-        """H (m, n)."""
-        return chebvander(self.times, self.unknowns - 1)
+    times = cached_property(lambda model: np.linspace(-1.0, 1.0, model.count))
+    """Where the polynomials are read (m,)."""
+    matrix = cached_property(lambda model: chebvander(model.times, model.unknowns - 1))
+    """H (m, n)."""
 
     @property
     def index(self) -> Mapping[str, Sequence[Any]]:

@@ -170,14 +170,9 @@ class Gnss(Measurement):
         along = float(here @ towards)
         return here + (math.sqrt(along**2 + radius**2 - float(here @ here)) - along) * towards
 
-    @cached_property
-    def _systems(self) -> tuple[str, ...]:
-        """Each constellation once, in order of appearance."""
-        return tuple(dict.fromkeys(self._columns[1]))
-
-    @cached_property
-    def _times(self) -> tuple[int, ...]:
-        return tuple(sorted(set(self._columns[0])))
+    _systems = cached_property(lambda gnss: tuple(dict.fromkeys(gnss._columns[1])))
+    """Each constellation once, in order of appearance."""
+    _times = cached_property(lambda gnss: tuple(sorted(set(gnss._columns[0]))))
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:

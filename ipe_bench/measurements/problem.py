@@ -54,10 +54,8 @@ class Problem:
         """H+ (n, m) = (H' R^-1 H)^-1 H' R^-1; NaN where H has not full column rank."""
         return read_only(pseudo_inverse(self.H[None], self.R)[0][0])
 
-    @property
-    def rankless(self) -> bool:
-        """Whether H has not full column rank, so that there is no linear estimate."""
-        return bool(np.isnan(self.H_plus).all())
+    rankless = property(lambda problem: bool(np.isnan(problem.H_plus).all()))
+    """Whether H has not full column rank, so that there is no linear estimate."""
 
     def prior_used(self, inflation: float = 1.0) -> Array | None:
         """The prior's standard deviations (n,) times `inflation`; a parameter that the prior fixes is nearly fixed."""
@@ -83,11 +81,9 @@ class Problem:
 def require_nominal(model: Measurement) -> None:
     """Refuses a model whose nominal point is not (n,)."""
     if np.shape(model.nominal) != (model.n,):
-        parameters = ", ".join(p.name for p in model.parameters)
-        raise UserError(
-            f"measurement={model.name}: nominal has shape {np.shape(model.nominal)}; let it return ({model.n},), one "
-            f"number for each of {parameters}"
-        )
+        wanted = f"({model.n},), one number for each of {', '.join(p.name for p in model.parameters)}"
+        shape = np.shape(model.nominal)
+        raise UserError(f"measurement={model.name}: nominal has shape {shape}; let it return {wanted}")
 
 
 def require_repeatable(model: Measurement) -> None:

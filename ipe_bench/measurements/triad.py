@@ -59,10 +59,8 @@ class Magnitudes(Measurement):
             (self.angles, "mrad", 1e3 * angle, "misalignment"),
         )
 
-    @property
-    def inputs(self) -> tuple[Input, ...]:
-        """What the triad shows in each attitude."""
-        return tuple(Input(f"{axis} [{self.output_unit}]") for axis in "xyz")
+    inputs = property(lambda triad: tuple(Input(f"{axis} [{triad.output_unit}]") for axis in "xyz"))  # type: ignore
+    """What the triad shows in each attitude."""
 
     @property
     def input_columns(self) -> Mapping[str, Sequence[Any]]:
@@ -85,9 +83,8 @@ class Magnitudes(Measurement):
 class Triad(Magnitudes):
     """The magnitude |(I + E)(r_k - b)| of the vector that a triad with outputs r_k was exposed to in attitude k.
 
-    b is the bias; E is symmetric, with scale-factor errors on its diagonal and misalignments beside it. A rotation of
-    the whole triad does not change a magnitude, so it is not among the parameters. The reading of attitude k is the
-    magnitude that a reference states: a scalar magnetometer, or the local gravity.
+    b is the bias; E is symmetric, with scale-factor errors on its diagonal and misalignments beside it. The reading of
+    attitude k is the magnitude that a reference states: a scalar magnetometer, or the local gravity.
 
     Parameters: three biases in `unit`, three scale-factor errors in ppm, three misalignments in mrad. The usual noise
     is 1e-5 of the field.
@@ -143,8 +140,7 @@ class Accelerometer(Magnitudes):
 
     b is the bias in counts, K the scale in m/s^2 per count, T leads from the axes of the sensors to orthogonal ones, of
     which x is the first sensor's (small angles, as in the source). The reading of every attitude is the local gravity
-    `gravity`, in m/s^2: it does not tell how the triad was held, and need not. At least 10 attitudes, spread over the
-    sphere.
+    `gravity`, in m/s^2. At least 10 attitudes, spread over the sphere.
 
     Parameters: three biases in counts, three scale factors in ppm of the presumed ones, three angles in mrad. The
     usual noise is 5e-3 m/s^2 for the averages of an attitude with consumer sensors.

@@ -1,13 +1,13 @@
 """Runs plans: in machine code on every core, or step by step in NumPy where no machine code can be made.
 
 One lane is one initial value problem, a trial in a case; the lanes of a vector register advance together. The bits of a
-lane depend on its own numbers alone: neither on its neighbours, nor on how many threads. Which steps a trial takes is
-left to `levels`.
+lane depend on its own numbers alone: neither on its neighbours, nor on how many threads.
 """
 
 from __future__ import annotations
 
 import functools
+import importlib
 import itertools
 import os
 from collections.abc import Callable, Sequence
@@ -54,9 +54,7 @@ def _compiled(name: str, source: Plan | Program, width: int, arguments: tuple[An
     """The function of `emit` by that name."""
 
     def write() -> str:
-        from ipe_bench.measurements.ode import emit
-
-        return getattr(emit, name)(source, width)
+        return getattr(importlib.import_module("ipe_bench.measurements.ode.emit"), name)(source, width)
 
     return compiled.load(f"{source} {width} {compiled.digest_of(_EMIT)}", write, name, arguments)
 
@@ -127,11 +125,8 @@ class Kernel:
         d, dp, slopes, shown, starts = tape.tangents if self.sensitive else ([], [], [], tape.shown, [])
         stays = [*tape.p, *tape.c, *dp]
         at = [tape.t, *tape.y, *d, *stays]
-        return (
-            Program.of([*tape.start, *starts], stays),
-            Program.of([*tape.slope, *slopes], at),
-            Program.of(shown, at),
-        )
+        moving = Program.of([*tape.slope, *slopes], at)
+        return Program.of([*tape.start, *starts], stays), moving, Program.of(shown, at)
 
     def _interpret(
         self, x: Array, si: Array, cases: Array, rows: Whole, times: Array, steps: Whole, *more: Array

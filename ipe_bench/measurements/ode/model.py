@@ -1,8 +1,4 @@
-"""Measurement models whose readings are taken from the solution of ordinary differential equations.
-
-The author writes the right-hand side once, in plain arithmetic; the batched compiled integrator and the exact Jacobian
-come from it. Recording is in `trace` and `plan`, integration in `integrator`, the choice of steps in `steps`.
-"""
+"""Measurement models whose readings are taken from the solution of ordinary differential equations."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""What an integrator of recorded equations computes: formulas, programs, and where their numbers lie.
-
-What is recorded is said by `Equations`; a `Plan` is run by `integrator`.
-"""
+"""What an integrator of recorded equations computes: formulas, programs, and where their numbers lie."""
 
 from __future__ import annotations
 
@@ -260,10 +257,8 @@ class Plan:
 
 def jumps(equations: Equations) -> bool:
     """Whether the rates jump at a moment that the solution decides: it is no end of a step, and slopes would lack what
-    they owe to it. A kink, where both sides of a comparison agree, is no jump.
-
-    Both sides are evaluated at points that are moved to where the operands of the comparison are equal.
-    """
+    they owe to it. Both sides of a comparison are evaluated at points that are moved to where its operands are equal;
+    if they agree there, it is a kink and no jump."""
     tape = Recording(equations)
     graph, inputs = tape.graph, [tape.t, *tape.y, *tape.p, *tape.c]
     moving = dependent(tape.slope, (tape.t, *tape.y))
@@ -289,11 +284,8 @@ def jumps(equations: Equations) -> bool:
 
 
 def planned(equations: Equations, tableau: Tableau, *, sensitive: bool) -> Plan:
-    """How readings are computed, or their Jacobians: the state once, and beside it one tangent for each parameter.
-
-    The variational equations go through the stages of the state's own steps, so the derivative is that of the
-    numerical solution, exact to round-off; or of the model's own equations of small deviations, to the tolerance.
-    """
+    """How readings are computed, or their Jacobians: the state once, and beside it one tangent for each parameter, by
+    the variational equations in the stages of the state's own steps."""
     tape, size = Recording(equations), 0
 
     def room(count: int) -> range:

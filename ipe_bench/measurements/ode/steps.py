@@ -2,8 +2,7 @@
 
 A level is the number of equal steps between two readings. It is accepted if half of it shows, by step doubling, that it
 holds the tolerance on the whole span. Tangents inside iterations may be coarser: a Gauss-Newton step with a Jacobian J~
-in place of J leaves |I - J~+ J| of the error that it set out to remove, which is measured at the nominal parameters and
-carried over to a trial by its level. Integrating is left to `model`.
+in place of J leaves |I - J~+ J| of the error, measured at the nominal parameters and carried over by the level.
 """
 
 from __future__ import annotations

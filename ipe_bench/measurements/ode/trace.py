@@ -1,8 +1,7 @@
 """Records plain arithmetic as an expression graph, and differentiates it.
 
-A right-hand side written once in ordinary Python arithmetic is called with `Expression` objects instead of numbers.
-What comes back knows every operation, so it can be listed as a straight-line program (`Program`), which runs on NumPy
-arrays, or differentiated exactly in forward mode (`tangent`). Machine code is left to `integrator`.
+A function that is called with an `Expression` in place of every number returns all its operations, which can be listed
+as a straight-line program (`Program`) or differentiated exactly in forward mode (`tangent`).
 """
 
 from __future__ import annotations
@@ -10,6 +9,7 @@ from __future__ import annotations
 import importlib
 import math
 import operator
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -59,10 +59,6 @@ class Graph:
         values = [a.value for a in args]
         if all(v is not None for v in values):
             return self.constant(float(_NUMBERS[operation](*values)))
-        simpler = self._simplify(operation, args, values)
-        return simpler if simpler is not None else self._node(operation, *args)
-
-    def _simplify(self, operation: str, args: list[Expression], values: list[float | None]) -> Expression | None:
         match operation, values:
             case ("add", [0.0, _]) | ("mul", [1.0, _]):
                 return args[1]
@@ -90,7 +86,7 @@ class Graph:
                 return args[0]
             case ("where", _) if args[1] is args[2]:
                 return args[1]
-        return None
+        return self._node(operation, *args)
 
 
 def _operator(name: str, *, reflected: bool = False) -> Any:
@@ -99,16 +95,14 @@ def _operator(name: str, *, reflected: bool = False) -> Any:
     return lambda self, other: self.graph.apply(name, self, other)
 
 
+@dataclass(eq=False, repr=False, slots=True)
 class Expression:
     """A quantity that is not known yet: supports + - * / **, NumPy's elementary functions, comparisons and np.where."""
 
-    __slots__ = ("graph", "operands", "operation", "order")
-
-    def __init__(self, graph: Graph, operation: str, operands: tuple[Any, ...], order: int) -> None:
-        self.graph = graph
-        self.operation = operation
-        self.operands = operands
-        self.order = order
+    graph: Graph
+    operation: str
+    operands: tuple[Any, ...]
+    order: int
 
     @property
     def value(self) -> float | None:
@@ -261,15 +255,11 @@ def border(outputs: Sequence[Expression], varying: Collection[Expression]) -> li
 
 def substitute(e: Expression, values: Mapping[Expression, Expression]) -> Expression:
     """The expression with some inputs replaced, and simplified."""
-    known: dict[int, Expression] = {}
+    known: dict[Expression, Expression] = {}
     for a in in_order([e]):
-        if a in values:
-            known[a.order] = values[a]
-        elif a.operation in ("input", "constant"):
-            known[a.order] = a
-        else:
-            known[a.order] = a.graph.apply(a.operation, *(known[o.order] for o in operands(a)))
-    return known[e.order]
+        given = [known[o] for o in operands(a)]
+        known[a] = values[a] if a in values else a.graph.apply(a.operation, *given) if given else a
+    return known[e]
 
 
 def tangent(outputs: Sequence[Expression], direction: Mapping[Expression, Expression]) -> list[Expression]:
@@ -282,19 +272,17 @@ def tangent(outputs: Sequence[Expression], direction: Mapping[Expression, Expres
         if e.operation in ("input", "constant"):
             along[e.order] = direction.get(e, zero)
             continue
+        along[e.order] = zero
         moving = [(along[a.order], i) for i, a in enumerate(e.operands) if along[a.order] is not zero]
         if not moving or e.operation in COMPARISONS:
-            along[e.order] = zero
             continue
         if e.operation == "where":  # a branch that is not taken may have no slope
             condition, *branches = operands(e)
             along[e.order] = e.graph.apply("where", condition, *(along[a.order] for a in branches))
             continue
         partials = _PARTIALS[e.operation](e, e.graph.constant(1.0), e.operands[0], e.operands[-1])
-        total = zero
         for da, i in moving:
-            total = total + partials[i] * da
-        along[e.order] = total
+            along[e.order] = along[e.order] + partials[i] * da
     return [along[e.order] for e in outputs]
 
 
@@ -371,9 +359,7 @@ class Program:
         """Computes the outputs from the inputs, which may be expressions that are computed elsewhere."""
         given = set(inputs)
         needed = [e for e in in_order(outputs, inputs) if e not in given]
-        uses: dict[int, int] = {}
-        for used in [*(a for e in needed for a in operands(e)), *outputs]:
-            uses[used.order] = uses.get(used.order, 0) + 1
+        uses = Counter(used.order for used in [*(a for e in needed for a in operands(e)), *outputs])
         fused = {e.order: found for e in needed if (found := _fusion(e, uses, given))}
         inside = {product.order for _, product, _ in fused.values()}
         number = {e.order: i for i, e in enumerate(inputs)}
