@@ -204,14 +204,3 @@ def test_two_readings_of_one_thing_at_one_time_both_count(tmp_path):
     x = found.model.nominal[None]
     np.testing.assert_allclose(found.model.simulate(x)[0], np.exp(-0.5 * np.array([1, 1, 2, 3, 2])), atol=1e-7)
     assert [rows.tolist() for rows in found.model.epochs or ()] == [[0, 1], [2, 4], [3]]
-
-
-@pytest.mark.slow
-def test_intervals_of_the_battery_cover_as_they_say():
-    truth = np.array([1.1, 0.9, 1.05])
-    model, rng, deviation = replace(BATTERY, tolerance=1e-7), np.random.default_rng(5), 1e-3
-    z = model.simulate(truth[None]) + deviation * rng.standard_normal((300, len(T)))
-    found = LevenbergMarquardt().estimate(Problem(model, Gaussian(deviation).covariance(len(T))), z)
-    assert found.covariance is not None
-    within = np.abs(found.x - truth) < 1.96 * np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
-    assert (within.mean(axis=0) >= 0.93).all()

@@ -194,11 +194,7 @@ def test_readings_of_a_file_give_the_parameters_back(laws):
         ("some_laws:text", {}, "the default of k is no number"),
         ("some_laws:starred", {}, "takes *rest; give every argument a name"),
         ("some_laws:needs", {}, "constants.g: some_laws:needs needs it"),
-        (
-            "some_laws:swing",
-            {"start": {"lenght": 1.0}},
-            "start.lenght: there is no such argument; did you mean len",
-        ),
+        ("some_laws:swing", {"start": {"lenght": 1.0}}, "start.lenght: there is no such argument; did you mean len"),
         ("some_laws:swing", {"size": {"lenght": 1.0}}, "size: lenght is not a parameter; did you mean length?"),
         ("some_laws:swing", {"constants": {"h": 1.0}}, "constants.h: "),
         ("some_laws:swing", {"time": "s"}, "time=s: "),

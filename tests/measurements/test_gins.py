@@ -2,11 +2,7 @@
 
 import csv
 import json
-import os
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,12 +12,12 @@ from scipy.stats import chi2
 
 from ipe_bench.baselines import GaussNewton
 from ipe_bench.basics.errors import UserError
+from ipe_bench.cli.main import main
 from ipe_bench.measurements import Gins, Polynomial, RicherGins, SubsetModel
 from ipe_bench.noise import NoNoise, Quantization
 from ipe_bench.solvers import Progressive
 from ipe_bench.trials.scenario import Scenario
 
-ROOT = Path(__file__).parents[2]
 NOISE = Quantization(0.02286)
 STEP = 0.075 * 0.3048
 LINEAR_BOUND = [
@@ -64,8 +60,7 @@ SLOW = [(scale, 60, 2e-6 if scale == 10000.0 else 1e-6) for scale in (300.0, 100
 
 
 @pytest.mark.parametrize(
-    ("scale", "trials", "limit"),
-    [*QUICK, *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW)],
+    ("scale", "trials", "limit"), [*QUICK, *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW)]
 )
 def test_every_step_keeps_its_promise_whatever_the_scale(scale, trials, limit):
     assert errors_beside_scipy(scale, trials).max() < limit
@@ -144,14 +139,6 @@ def test_a_jacobian_costs_what_the_kernel_computes():
     assert Gins(step=60.0).coarse_jacobian_cost == Gins().jacobian_cost
 
 
-@pytest.mark.parametrize("scale", [33.0, 300.0, 1000.0, 3000.0])
-def test_steps_with_a_coarse_jacobian_contract(scale):
-    model, x = Gins(), draw(scale, 40, seed=13)
-    J, coarse = model.jacobian(x), model.coarse_jacobian(x)
-    left = [np.linalg.norm(np.eye(11) - np.linalg.pinv(c) @ j, 2) for c, j in zip(coarse, J, strict=True)]
-    assert max(left) < 0.01
-
-
 def test_bits_of_a_coarse_jacobian_depend_on_the_trial_alone():
     x = np.concatenate([draw(scale, 5, seed=14) for scale in (33.0, 1000.0, 3000.0)])
     model = Gins()
@@ -164,10 +151,13 @@ def test_bits_of_a_coarse_jacobian_depend_on_the_trial_alone():
     assert (SubsetModel.until(model, 4).coarse_jacobian(x) == part).all()
 
 
-@pytest.mark.parametrize("scale", [300.0, 3000.0, 10000.0])
-def test_steps_with_a_coarse_jacobian_of_a_window_contract(scale):
-    model, x = Gins(), draw(scale, 20, seed=13)
-    for stop in (4, 16):
+@pytest.mark.parametrize(
+    ("scale", "stops"),
+    [(33.0, (30,)), (300.0, (4, 16, 30)), (1000.0, (30,)), (3000.0, (4, 16, 30)), (10000.0, (4, 16))],
+)
+def test_steps_with_a_coarse_jacobian_contract(scale, stops):
+    model, x = Gins(), draw(scale, 40, seed=13)
+    for stop in stops:
         J, coarse = model.jacobian_until(x, stop), model.coarse_jacobian_until(x, stop)
         size = np.linalg.norm(J, axis=1, keepdims=True)
         left = [np.eye(11) - np.linalg.lstsq(c, j)[0] for c, j in zip(coarse / size, J / size, strict=True)]
@@ -207,27 +197,14 @@ def test_readings_of_a_window_are_near_enough_and_the_same_bits_in_any_batch():
 # Readings in a file, whose command is not told how far the parameters lie
 
 
-def ipe_bench(*arguments, folder):
-    return subprocess.run(
-        [sys.executable, "-m", "ipe_bench", *arguments],
-        cwd=folder,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=True,
-    )
-
-
 @pytest.mark.slow
-def test_an_estimate_that_fits_is_right_at_large_errors(tmp_path):
-    """A step chosen by `error_scale`, which is 1 here, gave p = .5 and errors of ten standard errors."""
-    ipe_bench("run", "error_scale=3000", "seed=3", "write_readings=t.csv", folder=tmp_path)
-    ipe_bench("estimate", "readings=t.csv", "solver=[progressive]", "baseline=[]", folder=tmp_path)
-    truth = {
-        row["parameter"]: float(row["value"])
-        for row in csv.DictReader((tmp_path / "t.truth.csv").read_text().splitlines())
-    }
+def test_an_estimate_that_fits_is_right_at_large_errors(tmp_path, monkeypatch):
+    """The command is not told the error scale: the step follows from the parameters."""
+    monkeypatch.chdir(tmp_path)
+    assert main(["run", "error_scale=3000", "seed=3", "write_readings=t.csv"]) == 0
+    assert main(["estimate", "readings=t.csv", "solver=[progressive]", "baseline=[]"]) == 0
+    rows = csv.DictReader((tmp_path / "t.truth.csv").read_text().splitlines())
+    truth = {row["parameter"]: float(row["value"]) for row in rows}
     found = json.loads(next(tmp_path.glob("outputs/*/estimate.json")).read_text())["estimators"]["progressive"]
     assert found["status"] == "converged"
     assert found["fits"]

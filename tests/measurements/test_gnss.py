@@ -1,7 +1,6 @@
 """Pseudo-ranges against the flight of light in inertial axes, the ellipsoid's formulas, SciPy and Bancroft."""
 
 import numpy as np
-import pytest
 from scipy.optimize import brentq, least_squares
 
 from ipe_bench.baselines import GaussNewton
@@ -152,25 +151,14 @@ def bancroft(beacons, pseudoranges):
     return min(solutions, key=misfit)
 
 
-@pytest.fixture
-def trials():
+def test_the_iterated_estimate_is_bancrofts_and_the_truth_where_readings_are_exact():
     model = Ranging(rounds=1)
     x = model.nominal + 3.0 * np.random.default_rng(4).normal(size=(20, 4))
-    return model, x, model.simulate(x)
-
-
-def test_bancrofts_closed_form_inverts_the_model(trials):
-    model, x, z = trials
-    for truth, ranges in zip(x, z, strict=True):
-        solution = bancroft(np.array(model.beacons), ranges)
-        np.testing.assert_allclose(solution, truth * model.sizes, atol=1e-6)
-
-
-def test_the_iterated_estimate_is_bancrofts_where_readings_are_exact(trials):
-    model, _, z = trials
+    z = model.simulate(x)
     estimates = Newton(tolerance=1e-9).estimate(Problem(model, Covariance(np.full(model.m, 0.1))), z)
     assert (estimates.status == 0).all()
     closed = np.stack([bancroft(np.array(model.beacons), ranges) for ranges in z])
+    np.testing.assert_allclose(closed, x * model.sizes, atol=1e-6)
     np.testing.assert_allclose(estimates.x * model.sizes, closed, atol=1e-6)
 
 

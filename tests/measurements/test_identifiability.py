@@ -9,13 +9,7 @@ from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo
 
 CASES = {
     # Lotka-Volterra with the prey alone: b and the predators only as a product.
-    "prey": (
-        {"u": "a*u-b*u*v", "v": "-c*v+d*u*v"},
-        {"u": "u0", "v": "v0"},
-        {"y": "u"},
-        {},
-        {"b", "v0"},
-    ),
+    "prey": ({"u": "a*u-b*u*v", "v": "-c*v+d*u*v"}, {"u": "u0", "v": "v0"}, {"y": "u"}, {}, {"b", "v0"}),
     # SIR in fractions, y = K I (Tuncer and Le, Math. Biosci. 299, 2018).
     "sir": (
         {"S": "-beta*S*I", "I": "beta*S*I-gamma*I"},
@@ -26,12 +20,7 @@ CASES = {
     ),
     # SIWR with y1 = k I, y2 = S + I + R: all (Lee et al. 2017).
     "siwr": (
-        {
-            "S": "mu-bi*S*I-bw*S*W-mu*S+a*R",
-            "I": "bw*S*W+bi*S*I-(gam+mu)*I",
-            "W": "xi*(I-W)",
-            "R": "gam*I-(mu+a)*R",
-        },
+        {"S": "mu-bi*S*I-bw*S*W-mu*S+a*R", "I": "bw*S*W+bi*S*I-(gam+mu)*I", "W": "xi*(I-W)", "R": "gam*I-(mu+a)*R"},
         {"S": "S0", "I": "I0", "W": "W0", "R": "R0"},
         {"y1": "k*I", "y2": "S+I+R"},
         {},

@@ -1,4 +1,4 @@
-"""The compiled integrator: order, exact tangents, and bits that depend on nothing but the trial."""
+"""The compiled integrator: coefficients, levels, and bits that depend on nothing but the trial."""
 
 from dataclasses import dataclass
 
@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.integrate import DOP853
 
-from ipe_bench.basics import compiled
 from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import OdeMeasurement, Parameter, ode
 from ipe_bench.measurements.base import differentiate
 from ipe_bench.measurements.ode import plan
 from ipe_bench.measurements.ode.steps import contraction
+from ipe_bench.measurements.ode.trace import Graph
 
 
 @dataclass(frozen=True)
@@ -62,22 +62,6 @@ def test_the_coefficients_are_those_of_scipy():
         assert mine == tuple(theirs)
     for s, row in enumerate(plan.DOP853.A):
         assert row == tuple(DOP853.A[s, :s])
-
-
-def test_the_solution_is_of_eighth_order():
-    x = np.array([[4.0, 0.7]])
-    errors = [np.abs(Pulse(step).simulate(x) - Pulse().solution(x)).max() for step in (0.5, 0.25, 0.125)]
-    orders = np.log2(np.divide(errors[:-1], errors[1:]))
-    assert ((orders > 7.5) & (orders < 9.5)).all()
-
-
-@pytest.mark.parametrize("model", [Pulse(0.5), Cases(0.5)], ids=str)
-def test_numpy_computes_what_machine_code_does(model, monkeypatch):
-    x = np.random.default_rng(1).normal(size=(3, 2))
-    z, J = model.simulate(x), model.jacobian(x)
-    monkeypatch.setattr(compiled, "available", lambda: False)
-    np.testing.assert_allclose(model.simulate(x), z, rtol=1e-13, atol=1e-14)
-    np.testing.assert_allclose(model.jacobian(x), J, rtol=1e-12, atol=1e-13)
 
 
 @pytest.mark.parametrize("cases", [1, 4, 5, 9])
@@ -167,6 +151,14 @@ def test_a_stiff_start_read_unevenly_holds_the_tolerance():
     a, t = x, Transient().times
     exact = a / (1 + a * a) * (a * np.cos(t) + np.sin(t) - a * np.exp(-a * t))
     assert np.abs(Transient().simulate(x) - exact).max() < 1e-8
+
+
+def test_what_cannot_be_recorded_is_refused_with_the_remedy():
+    a = Graph().input("a")
+    with pytest.raises(TypeError, match=r"without if"):
+        _ = 1.0 if a > 0 else 0.0
+    with pytest.raises(TypeError, match=r"floor"):
+        np.floor(a)
 
 
 def test_without_a_tolerance_or_a_step_the_model_says_what_is_missing():
