@@ -28,7 +28,7 @@ def panels(count: int, look: Mapping[str, Look] | None = None, *, height: float 
     """A figure with that many panels, and room for the legend of the estimators."""
     from matplotlib.figure import Figure
 
-    down = -(-count // (max(2, int(column() / 1.7)) if column() else 4))
+    down = -(-count // _across())
     across = -(-count // down)
     width = column() or min(2.0 + 3.2 * across, 11.0)
     size = width, min(height, 0.85 * width / across) * down + 0.4 + 0.05 * len(look or ())
@@ -39,10 +39,20 @@ def panels(count: int, look: Mapping[str, Look] | None = None, *, height: float 
     return fig, axes[:count]
 
 
+def _across() -> int:
+    """The most panels side by side."""
+    return max(2, int(column() / 1.7)) if column() else 4
+
+
+def most_panels() -> int:
+    """The most panels of a kind that a figure has, which are no more than two rows."""
+    return min(MOST_PANELS, 2 * _across())
+
+
 def panels_of_scales(rows: pd.DataFrame, look: Mapping[str, Look]) -> tuple[Figure, list[tuple[Axes, pd.DataFrame]]]:
     """A figure with a panel for each error scale, or for some with both ends, and the panels, each with its rows."""
     every = sorted(set(rows["error_scale"]))
-    scales = [every[round(i)] for i in np.linspace(0, len(every) - 1, min(MOST_PANELS, len(every)))]
+    scales = [every[round(i)] for i in np.linspace(0, len(every) - 1, min(most_panels(), len(every)))]
     fig, axes = panels(len(scales), look)
     for scale, ax in zip(scales, axes, strict=True):
         title(ax, f"error scale {plain(scale)}")

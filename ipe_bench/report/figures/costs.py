@@ -29,6 +29,7 @@ LONG = 60
 
 def draw_costs(view: View) -> Iterator[Drawing]:
     import seaborn as sns
+    from matplotlib import rcParams
 
     rows = view.totals[np.isfinite(view.totals["simulations_median"])]
     if rows.empty:
@@ -37,13 +38,13 @@ def draw_costs(view: View) -> Iterator[Drawing]:
     rows, look = rows.assign(**shown), view.with_look(rows["estimator"])
     fig, panels = common.panels_of_scales(rows, look)
     style = {**common.seaborn_style(look), "edgecolor": "white", "linewidth": 0.6, "zorder": 3, "clip_on": False}
-    # Equal points lie upon each other: the later ones are smaller, so that all are seen.
-    areas = zip(style["hue_order"], np.linspace(110, 30, len(look)), strict=True)
-    sizes = {label: area if look[label].color != GREY else 20.0 for label, area in areas}
+    # In the order of the legend about their cost, so that equal points are seen.
+    beside = (rows["estimator"].map({label: i for i, label in enumerate(look)}) + 0.5) / len(look) - 0.5
+    rows["cost"] *= (rows["cost"].max() / rows["cost"].min()) ** (0.06 * beside)
     efficient = float(np.sqrt(chdtri(view.n, 0.05) / view.n))  # the 95 % quantile of chi, over its root mean square
     for ax, here in panels:
         common.decades(ax, [*rows["error"], efficient])
-        sns.scatterplot(here, x="cost", y="error", ax=ax, size="estimator", sizes=sizes, **style)
+        sns.scatterplot(here, x="cost", y="error", ax=ax, s=(1.4 * rcParams["lines.markersize"]) ** 2, **style)
         common.bound_line(ax, efficient, "efficient estimator")
         ax.set_xscale("log")
         ax.set_xlim(rows["cost"].min() / 1.5, rows["cost"].max() * 1.5)
@@ -51,13 +52,13 @@ def draw_costs(view: View) -> Iterator[Drawing]:
     common.axis_labels(fig, "simulations per trial (median)", "95 % error / bound")
     common.legend(fig, fig.axes, look)
     last = rows[rows["error_scale"] == view.scales[-1]]
-    good = last[last["error"] <= last["error"].min() * 1.05].sort_values("cost", kind="stable").iloc[0]
+    good = last[last["error"] <= last["error"].min() * 1.05].sort_values("simulations_median", kind="stable").iloc[0]
     yield view.drawing(
         fig,
         "cost_against_accuracy",
         "Cost against accuracy, all trials",
         "Median cost of a trial in simulations against the 95 % quantile of the error over the bound at the truth, over"
-        " all trials; down and left is better.",
+        " all trials; down and left is better. Points of equal cost stand side by side.",
         f"Errors beyond {common.number(_HIGHEST)} stand at the edge." * bool((rows["error"] == _HIGHEST).any()),
         f"The cheapest within 5 % of the least error at scale {plain(view.scales[-1])}: {good['estimator']}"
         f" ({short(good['simulations_median'])} simulations).",
@@ -76,7 +77,7 @@ def draw_convergence(view: View) -> Iterator[Drawing]:
     # An estimate that is had at once has a start and an end, and nothing between.
     rows = rows[rows.groupby("estimator")["iteration"].transform("max") > 0]
     look, scales = view.with_look(rows["estimator"]), sorted(set(rows["error_scale"]))
-    shown = sorted(look, key=lambda label: look[label].color == GREY)[: common.MOST_PANELS]
+    shown = sorted(look, key=lambda label: look[label].color == GREY)[: common.most_panels()]
     names = {scale: f"error scale {plain(scale)}" for scale in scales}
     colors = sns.color_palette("crest", len(scales)).as_hex()
     by_scale = {name: Look(colors[i], MARKERS[i % len(MARKERS)]) for i, name in enumerate(names.values())}

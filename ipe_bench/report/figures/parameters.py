@@ -64,7 +64,7 @@ def _of_one(view: View, estimator: str) -> Drawing:
     common.axis_labels(fig, "error scale" if several else "", "rms error")
     for ax, unit in zip(axes, [*(inside[0]["unit"] for inside in groups.values()), "bounds"], strict=True):
         ax.set_ylabel(common.text(f"[{unit}]" if unit else ""))
-    common.legend(fig, axes[-1:], {"all parameters together": together})
+    common.legend(fig, axes[-1:], {"all together": together})
     at = [f"{brief(v)} at scale {plain(s)}" for s, v in totals[["error_scale", "rmse"]].dropna().to_numpy()]
     number = 2 if estimator == REFERENCE else 3
     of_paper = f"Figure {number} of the paper: " if view.paper else ""
