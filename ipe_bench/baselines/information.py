@@ -20,6 +20,7 @@ from ipe_bench.basics.options import Count, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator, Need
 from ipe_bench.estimators.driver import ConvergenceCheck, Limits, Solver, iterate
+from ipe_bench.estimators.least_squares import Objective
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
 from ipe_bench.measurements.counted import CountingModel
 from ipe_bench.measurements.problem import Problem
@@ -202,7 +203,7 @@ class LMIEKF(InformationFilter):
     name = "lm_iekf"
 
     def update(self, readings: EpochReadings) -> tuple[Belief, Array]:
-        problem, mean = _Standardized(readings, readings.belief.root()), readings.belief.mean
+        problem, mean = _Standardized.of_epoch(readings, readings.belief.root()), readings.belief.mean
         method = LevenbergMarquardtMethod(self.damping, np.ones(mean.shape[1]))
         start = method.begin(problem, np.zeros_like(mean))
         ended = iterate(problem, method, start, Limits(self.tolerance, self.max_iterations))
@@ -214,39 +215,28 @@ class LMIEKF(InformationFilter):
         return found, start.cost - squared(start.slope.gradient)
 
 
-@dataclass(frozen=True)
-class _Standardized:
-    """An epoch's readings and its prior in terms of y = U (x - mean), which is N(0, I) before them."""
+@dataclass(frozen=True, kw_only=True)
+class _Standardized(Objective):
+    """An epoch's readings and its prior in terms of U (x - mean), which is N(0, I) before them."""
 
-    readings: EpochReadings
+    given: EpochReadings
     root: Array
     """U^-1 (trials, n, n)."""
-    exact_within: float = np.inf
 
-    @property
-    def model(self) -> CountingModel:
-        return self.readings.model
+    @classmethod
+    def of_epoch(cls, given: EpochReadings, root: Array) -> _Standardized:
+        return cls(given.model, given.epoch.R, given.z, given.rows, given.belief.mean, given=given, root=root)
 
-    @property
-    def rows(self) -> Rows:
-        return self.readings.rows
+    def residual(self, x: Array) -> Array:
+        """The whitened residuals, followed by x: the maximum a posteriori has the least squares of these."""
+        return np.concatenate([self.given.misfit(self.x0 + multiply(self.root, x)), x], axis=1)
 
-    def residual(self, y: Array) -> Array:
-        """The whitened residuals, followed by y: the maximum a posteriori has the least squares of these."""
-        return np.concatenate([self.readings.misfit(self._x(y)), y], axis=1)
-
-    def cost(self, y: Array, r: Array) -> Array:
-        return squared(r)
-
-    def jacobian(self, y: Array, *, coarse: Mask | bool) -> Array:
-        J = np.matmul(self.readings.slope(self._x(y)), self.root)
+    def jacobian(self, x: Array, *, coarse: Mask | bool = False) -> Array:
+        J = np.matmul(self.given.slope(self.x0 + multiply(self.root, x)), self.root)
         return np.concatenate([J, np.broadcast_to(np.eye(self.root.shape[1]), self.root.shape)], axis=1)
 
     def subset(self, kept: Mask) -> _Standardized:
-        return _Standardized(self.readings.subset(kept), self.root[kept])
-
-    def _x(self, y: Array) -> Array:
-        return self.readings.belief.mean + multiply(self.root, y)
+        return _Standardized.of_epoch(self.given.subset(kept), self.root[kept])
 
 
 def regressed(readings: EpochReadings, x: Array, U: Array) -> tuple[Array, Array, Array]:

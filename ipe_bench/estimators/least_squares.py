@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,17 +24,6 @@ _FLAT = 30
 """Steps without a visible decrease after which a nearly stationary point is as good as it gets."""
 _STATIONARY = 1e-3
 """The part of a deviation, along every column of J, within which a point is nearly stationary."""
-
-
-class Residuals(Protocol):
-    """What is minimised, for the trials of a batch; `Objective` says what each of these is."""
-
-    @property
-    def exact_within(self) -> float: ...
-    def residual(self, x: Array, /) -> Array: ...
-    def jacobian(self, x: Array, /, *, coarse: Mask | bool) -> Array: ...
-    def cost(self, x: Array, r: Array, /) -> Array: ...
-    def subset(self, kept: Mask, /) -> Residuals: ...
 
 
 @dataclass(frozen=True)
@@ -192,7 +181,7 @@ def inverse_factor(J: Array) -> Array:
 
 
 def slope_at(
-    objective: Residuals, x: Array, r: Array, exact: Mask, *, keep_Q: bool = False
+    objective: Objective, x: Array, r: Array, exact: Mask, *, keep_Q: bool = False
 ) -> tuple[NormalEquations, Mask]:
     """The slope at x, where the residuals are r, and where it is that of an exact Jacobian: where `exact` (trials,)
     says so, and where a coarse one has not full rank."""
@@ -232,7 +221,7 @@ class LeastSquaresSystem:
     """Where Jacobians are exact from now on, since the minimum is near."""
 
     @classmethod
-    def at(cls, objective: Residuals, x: Array, lam: float = 0.0, *, keep_Q: bool = False) -> LeastSquaresSystem:
+    def at(cls, objective: Objective, x: Array, lam: float = 0.0, *, keep_Q: bool = False) -> LeastSquaresSystem:
         """The state at the start."""
         r = objective.residual(x)
         trials = len(x)
@@ -244,7 +233,7 @@ class LeastSquaresSystem:
         damping, growth = np.full(trials, lam), np.full(trials, 2.0)
         return cls(x, r, cost, slope, far, damping, growth, scale, regular, cost, idle, exact, near)
 
-    def nearly(self, objective: Residuals) -> Mask:
+    def nearly(self, objective: Objective) -> Mask:
         """Where the next Jacobian is to be exact, and all after it."""
         return self.near | (self.slope.size < objective.exact_within)
 
@@ -262,7 +251,7 @@ class LeastSquaresSystem:
         """Where J has not full rank (trials,)."""
         return ~np.isfinite(self.slope.size)
 
-    def check(self, objective: Residuals, stuck: Mask) -> ConvergenceCheck:
+    def check(self, objective: Objective, stuck: Mask) -> ConvergenceCheck:
         """The Gauss-Newton step still to go says how far the gradient is from zero, where J is good enough to end with;
         the cost says what diverges."""
         known = np.isfinite(self.cost) & finite(self.slope.gradient)

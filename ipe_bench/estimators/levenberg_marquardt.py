@@ -9,7 +9,7 @@ import numpy as np
 from ipe_bench.basics.batches import put
 from ipe_bench.basics.linalg import Array, finite, multiply
 from ipe_bench.estimators.driver import ConvergenceCheck, Solver
-from ipe_bench.estimators.least_squares import LeastSquaresSystem, Residuals, slope_at
+from ipe_bench.estimators.least_squares import LeastSquaresSystem, Objective, slope_at
 
 _SMALL = 1e-10
 """Singular values of J below this share of the largest are taken for zero where J lacks rank."""
@@ -26,25 +26,23 @@ _MOST_BENT = 0.75
 class GaussNewtonMethod(Solver[LeastSquaresSystem]):
     """x <- x - (J' R^-1 J)^-1 J' R^-1 (h(x) - z), undamped; where J lacks rank, the shortest of all such steps."""
 
-    def begin(self, objective: Residuals, x: Array) -> LeastSquaresSystem:
+    def begin(self, objective: Objective, x: Array) -> LeastSquaresSystem:
         return LeastSquaresSystem.at(objective, x)
 
-    def step(self, objective: Residuals, state: LeastSquaresSystem) -> LeastSquaresSystem:
+    def step(self, objective: Objective, state: LeastSquaresSystem) -> LeastSquaresSystem:
         slope, lost = state.slope, state.rankless & finite(state.slope.U) & finite(state.slope.gradient)
         step = slope.newton.copy()
         if lost.any():
             step[lost] = -multiply(np.linalg.pinv(slope.U[lost], rcond=_SMALL), slope.gradient[lost])
         x = state.x + step
-        r = objective.residual(x)
-        near = state.nearly(objective)
+        r, near = objective.residual(x), state.nearly(objective)
         slope, exact = slope_at(objective, x, r, near)
-        moved = state.reach(step)
-        regular = state.regular | np.isfinite(slope.size)
+        regular, moved = state.regular | np.isfinite(slope.size), state.reach(step)
         cost = objective.cost(x, r)
         return replace(state, x=x, r=r, cost=cost, slope=slope, moved=moved, regular=regular, exact=exact, near=near)
 
     def check(
-        self, objective: Residuals, before: LeastSquaresSystem | None, state: LeastSquaresSystem
+        self, objective: Objective, before: LeastSquaresSystem | None, state: LeastSquaresSystem
     ) -> ConvergenceCheck:
         """Where J lacks rank and no step leads on, the trial ends as singular."""
         return state.check(objective, stuck=state.rankless & (state.moved == 0))
@@ -71,7 +69,7 @@ class LevenbergMarquardtMethod(Solver[LeastSquaresSystem]):
     """Bends each step along the curvature of the readings, for one more simulation (Transtrum and Sethna, 2012,
     arXiv 1201.5885)."""
 
-    def begin(self, objective: Residuals, x: Array) -> LeastSquaresSystem:
+    def begin(self, objective: Objective, x: Array) -> LeastSquaresSystem:
         state = LeastSquaresSystem.at(objective, x, self.damping, keep_Q=self.geodesic)
         if self.deviation is not None:
             state = replace(state, scale=np.broadcast_to(1.0 / self.deviation, state.scale.shape))
@@ -84,7 +82,7 @@ class LevenbergMarquardtMethod(Solver[LeastSquaresSystem]):
         far = np.nan_to_num(state.cost / state.r.shape[1], nan=1.0, posinf=1.0)
         return replace(state, lam=np.maximum(state.lam, far))
 
-    def step(self, objective: Residuals, state: LeastSquaresSystem) -> LeastSquaresSystem:
+    def step(self, objective: Objective, state: LeastSquaresSystem) -> LeastSquaresSystem:
         weights = np.sqrt(state.lam)[:, None] * state.scale
         step, predicted = state.slope.damped(weights)
         bent, believed = self._bend(objective, state, weights, step)
@@ -123,13 +121,13 @@ class LevenbergMarquardtMethod(Solver[LeastSquaresSystem]):
         )
 
     def check(
-        self, objective: Residuals, before: LeastSquaresSystem | None, state: LeastSquaresSystem
+        self, objective: Objective, before: LeastSquaresSystem | None, state: LeastSquaresSystem
     ) -> ConvergenceCheck:
         """Damping goes on where J lacks rank, until it can gain nothing more."""
         return state.check(objective, stuck=state.lam > _LARGEST_DAMPING)
 
     def _bend(
-        self, objective: Residuals, state: LeastSquaresSystem, weights: Array, step: Array
+        self, objective: Objective, state: LeastSquaresSystem, weights: Array, step: Array
     ) -> tuple[Array, Array]:
         """The step v + a / 2 with the geodesic acceleration a, and where a is small enough beside v to be believed."""
         if not self.geodesic:

@@ -103,8 +103,8 @@ class Progressive(Estimator):
             cost, draws = tally.cost(n), attempts.draws(k)
             first = np.where(best.converged, np.minimum(first, cost), np.inf)
             going = ~accepted(best, m, level) & finite(z) & ~tally.failed(everyone)
-            going &= (cost < _WORTH * first) | (drawn == 0)
-            going &= (cost < (np.inf if self.budget is None else self.budget)) & (repeats < attempts.repeats)
+            going &= ((cost < _WORTH * first) | (drawn == 0)) & (repeats < attempts.repeats)
+            going &= self.budget is None or cost < self.budget
             rows = np.flatnonzero(going)
             if not len(rows):
                 break

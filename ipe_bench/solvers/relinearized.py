@@ -23,7 +23,8 @@ from ipe_bench.solvers.fixed_point import FixedPoint
 _ONLY_A_STEP = ("start", "max_iterations", "tolerance", "budget")
 _NO_ROOT = 1e300
 """Stands for F where a round has failed."""
-_ROUND_ENDS = (Status.CONVERGED, Status.STALLED, Status.MAX_ITERATIONS)
+_ROUND_ENDS = (Status.RUNNING, Status.CONVERGED, Status.STALLED, Status.MAX_ITERATIONS)
+"""After these the next round goes on."""
 
 
 @dataclass(frozen=True)
@@ -87,26 +88,21 @@ class Relinearized(Solver[Round], Estimator):
     def check(self, system: FrozenSystem, before: Round | None, state: Round) -> ConvergenceCheck:
         """F at its own linearisation; an inner root, stall or limit is only the end of a round."""
         check = root_check(state.deviation, None, state)
-        stuck = ~np.isin(state.inner, [Status.RUNNING, *_ROUND_ENDS])
+        stuck = ~np.isin(state.inner, _ROUND_ENDS)
         return ConvergenceCheck(check.size, check.level, check.moved, stuck, state.inner)
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         x, system = begin(problem, z, self.start)
         ended = iterate(system, self, x, Limits(self.tolerance, self.max_iterations, self.budget))
-        return Estimates.of(
-            ended,
-            system.model.tally,
-            iterations=ended.state.steps,
-            history=ended.state.path if history else None,
-            covariance=_bound(problem, ended.state),
-        )
+        state, P = ended.state, _bound(problem, ended.state)
+        path = state.path if history else None
+        return Estimates.of(ended, system.model.tally, iterations=state.steps, history=path, covariance=P)
 
     def _relinearize(
         self, system: FrozenSystem, x: Array, inner: NDArray[np.int8], steps: NDArray[np.int64], path: list[Array]
     ) -> Round:
         """The state at x with a new H; a trial whose round failed keeps its x, and has no F any more."""
-        n, m = x.shape[1], system.z.shape[1]
-        going = np.isin(inner, [Status.RUNNING, *_ROUND_ENDS]) & finite(x)
+        going, (n, m) = np.isin(inner, _ROUND_ENDS) & finite(x), (x.shape[1], system.z.shape[1])
         F, H_plus, deviation = np.full(x.shape, _NO_ROOT), np.zeros((len(x), n, m)), np.ones(x.shape)
         if going.any():
             part = system.subset(going).relinearized(x[going])
