@@ -38,7 +38,7 @@ BUDGETS = {
     "statistics": 4075,
     "real": 2300,
     "plugins": 1102,
-    "report": 4117,
+    "report": 4096,
     "cli": 2437,
 }
 """Lines of Python that a room may hold: who raises one lowers another in the same commit."""

@@ -188,7 +188,7 @@ def test_a_record_is_all_that_a_statistic_needs(result):
     rows = result.summary.to_dict("records")
     shown = "\n".join(shown_at(300, *summary_tables(rows, [], 300)))
     for record in (*STATISTICS, *SCORES):
-        assert (record.title, record.definition) in DEFINITIONS
+        assert DEFINITIONS[record.title] == record.definition
         assert str(escape(record.definition)) in page
         for where in record.where if record in SCORES or reported(record, rows) else ():
             headings = [record.titles.get(where, record.title), record.limits_titles.get(where, "")]

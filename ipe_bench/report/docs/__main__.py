@@ -128,7 +128,7 @@ def write_reference(folder: Path) -> None:
         write_page(folder / f"{group}.md", "options", group=group, title=title, key=key, options=rows)
     statuses = [status for status in Status if status is not Status.RUNNING]
     write_page(folder / "statuses.md", "statuses", statuses=statuses)
-    write_page(folder / "statistics.md", "statistics", records=STATISTICS, definitions=DEFINITIONS)
+    write_page(folder / "statistics.md", "statistics", records=STATISTICS, definitions=DEFINITIONS.items())
     summary = printed_by(["--help"], columns=100).rstrip()
     names = re.findall(r"^    (\w+)(?:  |$)", summary, re.MULTILINE)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
