@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.stats import binom, chi2, kstest
+from scipy.stats import binom, chi2, kstest, norm
 
 from ipe_bench.basics.linalg import Covariance
 from ipe_bench.real.residuals import DRAWS, explained, normalised, outlier_limit, whiteness
@@ -132,3 +132,9 @@ def test_what_is_explained_does_not_depend_on_units_nor_on_surplus_parameters():
     scaled = explained(np.column_stack([J * np.logspace(-9, 9, N), J[:, 0]]), covariance)
     assert scaled.shape == Q.shape
     assert np.allclose(Q @ Q.T, scaled @ scaled.T, atol=1e-12)
+
+
+@pytest.mark.parametrize("m", [1, 60, 10_000])
+def test_one_of_many_good_readings_is_an_outlier_as_often_as_the_level_says(m):
+    """To either side, by Bonferroni."""
+    assert 2 * m * norm.sf(outlier_limit(m)) == pytest.approx(0.01, rel=1e-9)
