@@ -26,12 +26,11 @@ def console() -> Console:
     """Where tables are printed: as wide as the terminal, or wide enough for a table in a file."""
     from rich.console import Console
 
-    class Shown(Console):
-        def on_broken_pipe(self) -> None:
-            discard_output()
-
-    shown = Shown(highlight=False)
-    return shown if shown.is_terminal else Shown(highlight=False, width=_WIDTH_WITHOUT_TERMINAL)
+    out = Console(highlight=False)
+    out.on_broken_pipe = discard_output
+    if not out.is_terminal:
+        out.width = _WIDTH_WITHOUT_TERMINAL
+    return out
 
 
 def discard_output() -> None:

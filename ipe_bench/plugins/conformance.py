@@ -509,11 +509,9 @@ def tracks_its_trials(tracker: Tracker) -> None:
 
 def _work(task: Any) -> Iterator[int]:
     """Takes the steps of the task, or two of one that ends in an error."""
-    if not isinstance(task, Exception):
-        yield from task
-        return
-    yield from (0, 1)
-    raise task
+    yield from (0, 1) if isinstance(task, Exception) else task
+    if isinstance(task, Exception):
+        raise task
 
 
 def does_every_task(execution: Execution) -> None:

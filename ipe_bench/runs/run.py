@@ -10,7 +10,6 @@ import subprocess
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -183,7 +182,7 @@ def record_refusal(
     job: str,
     reason: str,
     scenario: AnyScenario | None = None,
-    estimators: Mapping[str, Any] = MappingProxyType({}),
+    estimators: Mapping[str, Any] | None = None,
     trials: int = 1,
 ) -> None:
     """Notes in a folder of results that a job of a sweep, which `job` tells from the others, was asked for and refused;
@@ -191,7 +190,7 @@ def record_refusal(
     store = Store(Path(output))
     if store.trials.is_dir():
         store.prepare()
-        record = _record([scenario] if scenario else [], estimators, trials)
+        record = _record([scenario] if scenario else [], estimators or {}, trials)
         store.write_run(_refusal(job), {**record, "job": job, "refused": reason})
 
 

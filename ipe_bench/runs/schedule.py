@@ -158,16 +158,14 @@ def _prepare(block: Any, cell: ResultKey) -> None:
         block.warm(cell.estimator)
 
 
+_blas = functools.cache(ThreadpoolController)
+
+
 @contextlib.contextmanager
 def _alone() -> Iterator[None]:
     """One thread in BLAS and no warnings of NumPy."""
     with _blas().limit(limits=1, user_api="blas"), np.errstate(all="ignore"):
         yield
-
-
-@functools.cache
-def _blas() -> ThreadpoolController:
-    return ThreadpoolController()
 
 
 def _compute_cell(store: Store, block: Any, cell: ResultKey) -> None:
