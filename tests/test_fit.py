@@ -21,13 +21,7 @@ def test_missing_readings_are_no_obstacle_to_any_estimator():
     trial = scenario.draw(0, 1)
     z = trial.z[0].copy()
     z[np.random.default_rng(0).choice(len(z), 10, replace=False)] = np.nan
-    estimators = {
-        "newton": Newton(),
-        "gauss_newton": GaussNewton(),
-        "progressive": Progressive(),
-        "ekf": EKF(),
-        "ukf": UKF(),
-    }
+    estimators = {type(e).__name__: e for e in (Newton(), GaussNewton(), Progressive(), EKF(), UKF())}
     for one in fit(scenario.problem, z, estimators):
         assert one.status is Status.CONVERGED, one.label
         assert one.degrees_of_freedom == 230 - 11

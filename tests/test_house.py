@@ -32,7 +32,7 @@ BUDGETS = {
     "states": 1244,
     "estimators": 1137,
     "solvers": 1180,
-    "baselines": 1947,
+    "baselines": 1944,
     "trials": 1940,
     "runs": 1972,
     "statistics": 4075,

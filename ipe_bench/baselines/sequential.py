@@ -1,8 +1,5 @@
 """Filters epoch by epoch, the parameters as a random constant: a filter of a library's own for each trial, or a
-linearisation rule whose equations are computed for all trials at once.
-
-What the model would read at every trial's points of an epoch is one batched call in either case.
-"""
+linearisation rule whose equations are computed for all trials at once."""
 
 from __future__ import annotations
 

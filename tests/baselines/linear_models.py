@@ -9,6 +9,10 @@ from ipe_bench.basics.linalg import Array, multiply
 from ipe_bench.measurements.base import Measurement, Parameter
 from ipe_bench.measurements.gins import Gins
 from ipe_bench.measurements.problem import Problem
+from ipe_bench.noise import Quantization
+from ipe_bench.priors import GaussianPrior
+from ipe_bench.trials.scenario import Scenario
+from ipe_bench.trials.scoring import Block
 
 
 @dataclass(frozen=True)
@@ -64,6 +68,10 @@ class LinearGins(Gins):
 
     def jacobian_until(self, x, stop):
         return np.repeat(self.matrix[None, self.rows(stop)], len(x), axis=0)
+
+
+def block_of_gins(scale: float, trials: int, seed: int = 0) -> Block:
+    return Block.draw(Scenario(Gins(), Quantization(0.02286), GaussianPrior(), scale, seed), 0, trials)
 
 
 def linear_map(problem: Problem, matrix: Array, z: Array, inflation: float = 1.0) -> tuple[Array, Array]:

@@ -2,17 +2,15 @@
 
 import numpy as np
 import pytest
-from linear_models import Linear, linear_map
+from linear_models import Linear, block_of_gins, linear_map
 
 from ipe_bench.baselines import EsMda, MapLM
 from ipe_bench.baselines.es_mda import assimilated
 from ipe_bench.basics.linalg import deviations
 from ipe_bench.basics.statuses import Status
-from ipe_bench.measurements import Gins
-from ipe_bench.noise import Gaussian, Quantization
+from ipe_bench.noise import Gaussian
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.trials.scenario import Scenario
-from ipe_bench.trials.scoring import Block
 
 
 def linear(trials: int):
@@ -62,12 +60,8 @@ def test_inflation_widens_the_prior():
     assert np.abs(deviations(wide.covariance) / deviations(P) - 1).max() < 0.1
 
 
-def gins(scale: float, trials: int):
-    return Block.draw(Scenario(Gins(), Quantization(0.02286), GaussianPrior(), scale, 91), 0, trials)
-
-
 def test_gins_at_scale_300_is_solved_from_the_seed_given():
-    block = gins(300.0, 6)
+    block = block_of_gins(300.0, 6, 91)
     found, score = block.estimate(EsMda())
     assert score["success"].all()
     assert score["solved"].all()
@@ -81,7 +75,7 @@ def test_gins_at_scale_300_is_solved_from_the_seed_given():
 
 def test_equal_steps_fail_where_the_noise_is_far_below_the_prior():
     """Why the information grows geometrically."""
-    block = gins(1000.0, 12)
+    block = block_of_gins(1000.0, 12, 91)
     even, geometric = (block.estimate(EsMda(polish=0, first=first))[1]["success"].mean() for first in (1.0, 1e-12))
     assert even < 0.3
     assert geometric > 0.7

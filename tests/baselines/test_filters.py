@@ -7,7 +7,7 @@ import filterpy.stats
 import numpy as np
 import pytest
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
-from linear_models import Linear, LinearGins, linear_map
+from linear_models import Linear, LinearGins, block_of_gins, linear_map
 from scipy.optimize import least_squares
 from small_models import Bent
 
@@ -23,7 +23,7 @@ from ipe_bench.noise import Gaussian, Quantization
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.statistics.intervals import mean_limits
 from ipe_bench.trials.scenario import Scenario
-from ipe_bench.trials.scoring import Block, nees
+from ipe_bench.trials.scoring import nees
 
 KALMAN: list[Sequential] = [EKF(), IteratedEKF(), UKF(), CKF()]
 BATCHED = [replace(f, engine="batched") for f in KALMAN]
@@ -33,10 +33,6 @@ INFORMATION: list[InformationFilter] = [RecursiveUpdate(), LMIEKF(), IPLF()]
 
 def label(estimator: object) -> str:
     return type(estimator).__name__
-
-
-def block_of_gins(scale: float, trials: int, seed: int = 0) -> Block:
-    return Block.draw(Scenario(Gins(), Quantization(0.02286), GaussianPrior(), scale, seed), 0, trials)
 
 
 def maximum_a_posteriori(problem: Problem, z, x):
