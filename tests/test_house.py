@@ -36,7 +36,7 @@ BUDGETS = {
     "trials": 1940,
     "runs": 1972,
     "statistics": 4075,
-    "real": 2300,
+    "real": 2296,
     "plugins": 1100,
     "report": 4096,
     "cli": 2436,

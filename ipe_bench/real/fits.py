@@ -236,13 +236,6 @@ class Fit:
         return self.status is Status.CONVERGED and self.fits is not False
 
     @property
-    def _freedom(self) -> float | Array | None:
-        """Degrees of freedom behind the level of the noise, or (n,) behind each variance; None if R is known."""
-        if self.estimated is not None:
-            return self.estimated.freedom
-        return None if self.level is None else self.degrees_of_freedom
-
-    @property
     def deviance(self) -> float:
         """The sum of squares, whitened by R as it was stated; with several levels, -2 times the log likelihood."""
         if self.estimated is not None:
@@ -257,9 +250,12 @@ class Fit:
 
     def interval(self, confidence: float = 0.95) -> tuple[Array, Array]:
         """Confidence intervals (n,), (n,) from the standard errors; inside of its bounds if a parameter has some."""
+        freedom = None if self.level is None else self.degrees_of_freedom
+        if self.estimated is not None:
+            freedom = self.estimated.freedom
         with np.errstate(invalid="ignore"):
             deviation = np.sqrt(np.diagonal(self.inner_covariance))
-        low, high = wald_interval(self._free, self.inner, deviation, half_width(confidence, self._freedom))
+        low, high = wald_interval(self._free, self.inner, deviation, half_width(confidence, freedom))
         return self._all(low), self._all(high)
 
     @property

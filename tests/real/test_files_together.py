@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
-from test_instruments import SATURATION, START, estimate, simulated, solution
+from test_instruments import EXACT, SATURATION, START, estimate, simulated, solution
 
 import ipe_bench as ib
 from ipe_bench.baselines import LevenbergMarquardt
@@ -63,9 +63,7 @@ def test_a_bound_acts_in_the_file_that_it_is_of(files):
         lambda p: residuals(data, 100 * p[0], 100 * p[1], 1e-4 * p[2]),
         [2.0, 1.6, 5.0],
         bounds=([1, 1, 0], [3, 1.76, np.inf]),
-        ftol=1e-15,
-        xtol=1e-15,
-        gtol=1e-15,
+        **EXACT,
     )
     expected = dict(zip(("b1_1", "b1_2", "b2"), bounded.x * [100, 100, 1e-4], strict=True))
     assert of(result, result.x) == pytest.approx(expected, rel=1e-5)

@@ -23,6 +23,7 @@ from ipe_bench.trials.scenario import Scenario
 SATURATION = "b1*(1-exp(-b2*t))"
 START = {"b1": 250.0, "b2": 5e-4}
 ESTIMATORS = {"lm": LevenbergMarquardt(tolerance=1e-10, max_iterations=300)}
+EXACT = {"ftol": 1e-15, "xtol": 1e-15, "gtol": 1e-15}
 
 
 def write(path: Path, **columns: list[float]) -> Path:
@@ -41,7 +42,7 @@ def simulated(path: Path, b1: float, seed: int, readings: int = 16) -> tuple[Pat
 
 def solution(residuals, start) -> tuple[np.ndarray, np.ndarray]:
     """SciPy's minimum, polished by Gauss-Newton steps with complex-step slopes, and the deviations there."""
-    found = least_squares(residuals, start, x_scale=np.abs(start), ftol=1e-15, xtol=1e-15, gtol=1e-15).x
+    found = least_squares(residuals, start, x_scale=np.abs(start), **EXACT).x
     for _ in range(4):
         steps = np.eye(len(found)) * 1e-100j
         J = np.column_stack([np.imag(residuals(found + step)) * 1e100 for step in steps])
@@ -90,9 +91,7 @@ def test_an_estimate_on_its_bound_is_the_minimum_within_the_bounds(tmp_path, upp
         lambda p: (p[0] * 100 * (1 - np.exp(-p[1] * 1e-4 * t)) - y) / sigma,
         [2.0, 5.0],
         bounds=([1, 0], [upper / 100, np.inf]),
-        ftol=1e-15,
-        xtol=1e-15,
-        gtol=1e-15,
+        **EXACT,
     )
     assert result.status is Status.CONVERGED
     assert result.held_at == {0: upper}
