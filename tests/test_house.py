@@ -26,7 +26,7 @@ LINE = (
 )
 BUDGETS = {
     "basics": 918,
-    "measurements": 6244,
+    "measurements": 6149,
     "noise": 621,
     "priors": 105,
     "states": 1244,

@@ -218,9 +218,7 @@ class Measurement(Component, ABC):
         """What a Jacobian costs, in simulations of the same trial."""
         return float(self.n if self.analytic else 2 * self.n)
 
-    @property
-    def coarse_jacobian_cost(self) -> float:
-        return self.jacobian_cost
+    coarse_jacobian_cost: Any = property(attrgetter("jacobian_cost"))
 
     def linearization(self) -> Array:
         """The matrix H (m, n) of eq. (1) about the nominal point."""
@@ -350,10 +348,7 @@ class SubsetModel(WrappedModel):
     def index(self) -> Mapping[str, Sequence[Any]]:
         return {name: [column[i] for i in self.kept] for name, column in self.whole.index.items()}
 
-    @property
-    def offset(self) -> Array:
-        return self.whole.offset[self._rows]
-
+    offset = property(lambda subset: subset.whole.offset[subset._rows])  # type: ignore[assignment]
     m = property(lambda subset: len(subset.kept))  # type: ignore[assignment]
 
     @property
@@ -367,9 +362,7 @@ class SubsetModel(WrappedModel):
         order = np.argsort(place[self._rows], kind="stable")
         return tuple(np.split(order, np.flatnonzero(np.diff(place[self._rows][order])) + 1)) if len(order) else ()
 
-    @cached_property
-    def _rows(self) -> NDArray[np.intp]:
-        return np.array(self.kept, dtype=np.intp)
+    _rows = cached_property(lambda subset: np.array(subset.kept, dtype=np.intp))
 
     @cached_property
     def _among_arrived(self) -> NDArray[np.intp] | slice:

@@ -246,11 +246,8 @@ class Function(WrittenModel):
 
 
 def function(h: Callable[..., Any], start: Mapping[str, float] | None = None, **options: Any) -> Function:
-    """The measurement model of a function that a module holds by name; the options are those of `Function`.
-
-    Raises:
-        UserError: the function has no name of its own in a module, as a lambda or an inner function.
-    """
+    """The measurement model of a function that a module holds by name, with the options of `Function`; UserError for a
+    lambda or an inner function."""
     module, name = getattr(h, "__module__", ""), getattr(h, "__qualname__", "")
     if not name.isidentifier() or getattr(sys.modules.get(module), name, None) is not h:
         raise UserError(f"{name or h!r}: give a function that stands in a module by its own name, not inside another")

@@ -170,11 +170,8 @@ class Gins(OdeMeasurement):
         dx, dy, dz, Dxx, Dxy, Dyx, Dyy = p[4:11]
         u, c = y[2:4], y[8:11]
         x, y_ = self._transport(y[0], y[1])
-        return (
-            Dxx * u[0] + (Dxy * u[1] + (c[0] + x + dx)),
-            Dyx * u[0] + (Dyy * u[1] + (c[1] + y_ + dy)),
-            c[2] + dz,
-        )
+        about_x = Dxx * u[0] + (Dxy * u[1] + (c[0] + x + dx))
+        return about_x, Dyx * u[0] + (Dyy * u[1] + (c[1] + y_ + dy)), c[2] + dz
 
     def acceleration(self, u: Sequence[Any], p: Sequence[Any]) -> tuple[Any, Any]:
         """What the accelerometers x and y show, m/s^2."""

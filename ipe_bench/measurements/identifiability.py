@@ -63,7 +63,7 @@ def structure(model: Measurement) -> Structure | None:
     else:
         return None
     try:
-        bases = [_echelon(_jacobian(_Free(prime), unknowns, *formulas, cases), prime) for prime in _PRIMES]
+        bases = [_echelon(_jacobian(_Free(prime), unknowns, formulas, cases), prime) for prime in _PRIMES]
     except (NotImplementedError, ZeroDivisionError):
         return None
     rows, pivots = max(bases, key=lambda basis: len(basis[1]))
@@ -81,7 +81,6 @@ class _Free(dict[Any, int]):
     them: the same argument has the same exponential in all."""
 
     def __init__(self, prime: int) -> None:
-        super().__init__()
         self.prime, self._random = prime, random.Random(prime)
 
     def __missing__(self, key: Any) -> int:
@@ -100,14 +99,12 @@ class _Free(dict[Any, int]):
 def _jacobian(
     free: _Free,
     unknowns: Sequence[str],
-    rates: Mapping[str, Arithmetic],
-    initial: Mapping[str, Arithmetic],
-    outputs: Mapping[str, Arithmetic],
-    cases: Sequence[Mapping[str, float]],
+    formulas: Iterable[Mapping[str, Arithmetic]],
+    cases: list[dict[str, float]],
 ) -> list[list[int]]:
-    """The derivatives (cases x outputs x orders, unknowns) of the outputs' Taylor coefficients, modulo the prime; as
-    many coefficients as unknowns suffice."""
-    graph = Graph()
+    """The derivatives (cases x outputs x orders, unknowns) of the outputs' Taylor coefficients, modulo the prime, where
+    the formulas are rates, initial states and outputs; as many coefficients as unknowns suffice."""
+    graph, (rates, initial, outputs) = Graph(), formulas
     names = {name: graph.input(name) for name in [*unknowns, *rates, *cases[0], "t"]}
 
     def record(formulas: Iterable[Arithmetic]) -> list[Expression]:
@@ -143,7 +140,6 @@ class _Series(dict[int, list[int]]):
     exp, log, sqrt and powers enter by their differential equations (u = exp(v): u' = u v')."""
 
     def __init__(self, free: _Free, given: dict[int, list[int]]) -> None:
-        super().__init__()
         self.free, self.p, self.given = free, free.prime, given
 
     def extend(self, expressions: Sequence[Expression], k: int) -> None:

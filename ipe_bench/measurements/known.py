@@ -146,9 +146,7 @@ class ConstrainedModel(WrappedModel):
     def fixed(self) -> dict[str, float]:
         return {one.name: one.fixed for one in self._known if one.fixed is not None}
 
-    @cached_property
-    def nominal(self) -> Array:
-        return self.inner(self._coordinates.v0)
+    nominal = cached_property(lambda model: model.inner(model._coordinates.v0))  # type: ignore[assignment]
 
     physical = property(lambda model: model._coordinates.value)  # type: ignore[assignment]
     physical_slope = property(lambda model: model._coordinates.slope)  # type: ignore[assignment]

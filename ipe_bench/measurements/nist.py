@@ -19,8 +19,6 @@ from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.measurements.base import Measurement, Parameter, Recorded
 
-_CERTIFIED_DIGITS = 11.0
-
 
 def _gauss(b: Sequence[Any], x: Any) -> Any:
     peaks = b[2] * np.exp(-(((x - b[3]) / b[4]) ** 2)) + b[5] * np.exp(-(((x - b[6]) / b[7]) ** 2))
@@ -193,7 +191,7 @@ def digits(value: Array | float, certified: Array | float) -> float:
         return 0.0
     with np.errstate(divide="ignore"):
         lre = float(np.min(-np.log10(np.abs(value - certified) / np.abs(certified))))
-    return min(lre, _CERTIFIED_DIGITS) if lre >= 1.0 else 0.0
+    return min(lre, 11.0) if lre >= 1.0 else 0.0
 
 
 def score(model: Nist, x: Array, deviation: Array) -> Digits:

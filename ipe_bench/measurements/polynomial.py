@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.polynomial.chebyshev import chebvander
@@ -50,9 +48,7 @@ class Polynomial(Measurement):
     matrix = cached_property(lambda model: chebvander(model.times, model.unknowns - 1))
     """H (m, n)."""
 
-    @property
-    def index(self) -> Mapping[str, Sequence[Any]]:
-        return {"time": self.times.tolist()}
+    index = property(lambda model: {"time": model.times.tolist()})  # type: ignore[assignment]
 
     def simulate(self, x: Array) -> Array:
         u = np.einsum("kj,tj->tk", self.matrix, x)

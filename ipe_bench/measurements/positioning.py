@@ -70,18 +70,14 @@ class Ranging(Measurement):
         place = ("east", "north", "up"), "m", 10.0, "position"
         return parameter_table(place, (("clock",), "m", 10.0, "clock bias"))
 
-    @cached_property
-    def nominal(self) -> Array:
-        return np.append(np.asarray(self.position, dtype=float), 0.0) / self.sizes
+    nominal = cached_property(lambda ranging: np.append(ranging.position, 0.0) / ranging.sizes)  # type: ignore[assignment]
 
     @property
     def index(self) -> Mapping[str, Sequence[Any]]:
         rounds, beacons = np.indices((self.rounds, len(self.beacons))).reshape(2, -1) + 1
         return {"round": rounds.tolist(), "beacon": beacons.tolist()}
 
-    @cached_property
-    def epochs(self) -> Epochs:
-        return tuple(np.arange(self.m).reshape(self.rounds, -1))
+    epochs = cached_property(lambda ranging: tuple(np.arange(ranging.m).reshape(ranging.rounds, -1)))  # type: ignore
 
     def simulate(self, x: Array) -> Array:
         p = x * self.sizes
@@ -277,9 +273,8 @@ class Bearings(Measurement):
         place = ("east", "north"), "m", 250.0, "position"
         return parameter_table(place, (("v_east", "v_north"), "m/s", 0.25, "velocity"))
 
-    @cached_property
-    def nominal(self) -> Array:
-        return np.asarray(self.target, dtype=float) / self.sizes
+    nominal = cached_property(lambda bearings: np.array(bearings.target) / bearings.sizes)  # type: ignore[assignment]
+    index = property(lambda bearings: {"time [s]": bearings.times.tolist()})  # type: ignore[assignment]
 
     @cached_property
     def times(self) -> Array:
@@ -296,10 +291,6 @@ class Bearings(Measurement):
             path += speed * sailed[:, None] * np.array([np.sin(heading), np.cos(heading)])
             began += duration
         return path
-
-    @property
-    def index(self) -> Mapping[str, Sequence[Any]]:
-        return {"time [s]": self.times.tolist()}
 
     def _sight(self, x: Array) -> Array:
         """The vectors (trials, m, 2) from the observer to the target."""

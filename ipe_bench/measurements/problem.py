@@ -40,9 +40,7 @@ class Problem:
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, read_only(getattr(self, name)))
 
-    @property
-    def x0(self) -> Array:
-        return read_only(self.measurement.nominal)
+    x0 = property(lambda problem: read_only(problem.measurement.nominal))
 
     @cached_property
     def H(self) -> Array:

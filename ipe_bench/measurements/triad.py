@@ -70,9 +70,7 @@ class Magnitudes(Measurement):
         outputs = tuple(zip(*(columns[i.heading] for i in self.inputs), strict=True))
         return replace(self, **{self.outputs_option: outputs})  # type: ignore[type-var]
 
-    @property
-    def index(self) -> Mapping[str, Sequence[Any]]:
-        return {"attitude": list(range(1, len(self.measured) + 1))}
+    index = property(lambda triad: {"attitude": list(range(1, len(triad.measured) + 1))})  # type: ignore[assignment]
 
     def simulate(self, x: Array) -> Array:
         a, b, c = self.corrected(x)

@@ -18,17 +18,7 @@ from ipe_bench.basics.options import Count, Finite, Positive
 from ipe_bench.measurements.arithmetic import COMPARISONS, Arithmetic, evaluate, never_switching, parts, read
 from ipe_bench.measurements.base import Input, Measurement, Recorded, SubsetModel, UsualNoise, WrappedModel
 from ipe_bench.measurements.formula import WrittenModel
-from ipe_bench.measurements.ode.driven import (
-    PIECEWISE,
-    agreed,
-    course,
-    courses,
-    grid,
-    middles,
-    numbered_cases,
-    separated,
-    switching_times,
-)
+from ipe_bench.measurements.ode import driven
 from ipe_bench.measurements.ode.model import OdeMeasurement, time_heading
 from ipe_bench.measurements.ode.rodas import SHAPE, Rodas5P, Work
 
@@ -189,9 +179,9 @@ class Ode(WrittenModel, WrappedModel):
         lambda model: _read_all("initial", {name: model.initial.get(name, 0.0) for name in model.rates})
     )
     output_formulas = cached_property(lambda model: _read_all("outputs", model.outputs or {y: y for y in model.rates}))
-    courses = cached_property(lambda model: courses(model.columns, model.driven_by) if model.driven_by else [])
+    courses = cached_property(lambda model: driven.courses(model.columns, model.driven_by) if model.driven_by else [])
     """The inputs of `driven_by` over time in each case; of one where all are alike."""
-    piecewise_rates = cached_property(lambda model: separated(model.rate_formulas, model.constant_names))
+    piecewise_rates = cached_property(lambda model: driven.separated(model.rate_formulas, model.constant_names))
     """The rates with a name in place of every comparison of t with constants, and these comparisons."""
     engine = cached_property(lambda model: _Engine(model))
     """The equations as the integrator takes them, with readings wherever an input or a rate changes, too."""
@@ -255,8 +245,8 @@ class Ode(WrittenModel, WrappedModel):
                 f"the solution needs {work.steps}; they are integrated by the implicit method "
                 "(measurement.method=explicit or implicit fixes it)"
             )
-        kinked = any(part[0] in PIECEWISE for one in self.piecewise_rates[0].values() for part in parts(one.tree))
-        if kinked and (off := engine.off(x)) > _KINKED:
+        operations = {part[0] for one in self.piecewise_rates[0].values() for part in parts(one.tree)}
+        if not operations.isdisjoint(driven.PIECEWISE) and (off := engine.off(x)) > _KINKED:
             found.append(
                 f"the explicit method leaves readings off by about {off:.0f} times the tolerance, as it does where "
                 "rates have kinks, and slopes right to two or three digits; measurement.method=implicit brings the "
@@ -264,7 +254,7 @@ class Ode(WrittenModel, WrappedModel):
             )
         if any(part[0] in COMPARISONS for one in (*rates, *outputs) for part in parts(one.tree)):
             known = engine.along(x)
-            found += never_switching(rates, known | {"t": middles(engine.times)[None, :-1]})
+            found += never_switching(rates, known | {"t": driven.middles(engine.times)[None, :-1]})
             found += never_switching(outputs, known)
         return tuple(found)
 
@@ -284,7 +274,7 @@ class Ode(WrittenModel, WrappedModel):
     def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Measurement:
         heading, outputs = time_heading(self.time_unit), list(self.output_formulas)
         rows = list(zip(columns["case"], map(float, columns[heading]), columns["output"], strict=True))
-        count = numbered_cases(columns["case"]) if self.constant_names or self.driven_by else 1
+        count = driven.numbered_cases(columns["case"]) if self.constant_names or self.driven_by else 1
         for case, time, output in rows:
             if output not in outputs:
                 raise UserError(f"output={output}: {unknown(str(output), outputs, 'output')}")
@@ -294,9 +284,9 @@ class Ode(WrittenModel, WrappedModel):
                 raise UserError(f"{heading}={time}: comes before the start, which is at 0")
         remedy = "" if count > 1 else "; number the cases in a column case"
         in_cases = [(case,) for case, *_ in rows]
-        constants = {n: tuple(agreed(n, columns[n], in_cases, remedy).values()) for n in self.constant_names}
+        constants = {n: tuple(driven.agreed(n, columns[n], in_cases, remedy).values()) for n in self.constant_names}
         changes = sorted({(case, time) for case, time, _ in rows})
-        inputs = {n: list(agreed(n, columns[n], [row[:2] for row in rows]).values()) for n in self.driven_by}
+        inputs = {n: list(driven.agreed(n, columns[n], [row[:2] for row in rows]).values()) for n in self.driven_by}
         if inputs:
             inputs |= {"case": [case for case, _ in changes], "time": [time for _, time in changes]}
         times = sorted({time for _, time, _ in rows})
@@ -353,13 +343,13 @@ class _Engine(OdeMeasurement):
         described = self.described
         changes = [float(time) for one in described.courses for time in one["time"]]
         for comparison in described.piecewise_rates[1].values():
-            changes += switching_times(comparison, described.known_of_cases)
-        return grid(described.reading_times, changes)
+            changes += driven.switching_times(comparison, described.known_of_cases)
+        return driven.grid(described.reading_times, changes)
 
     @cached_property
     def driven(self) -> Array | None:
         """The comparisons of t and the inputs, of each interval."""
-        described, at, switches = self.described, middles(self.times), self.described.piecewise_rates[1]
+        described, at, switches = self.described, driven.middles(self.times), self.described.piecewise_rates[1]
         if not (switches or described.driven_by):
             return None
         tables = []
@@ -367,7 +357,7 @@ class _Engine(OdeMeasurement):
             columns = [evaluate(tree, {**case, "t": at}) for tree in switches.values()]
             for name, kind in described.driven_by.items():
                 one = described.courses[min(k, len(described.courses) - 1)]
-                columns += course(kind, one["time"], one[name], at)
+                columns += driven.course(kind, one["time"], one[name], at)
             tables.append(np.stack([np.broadcast_to(column, at.shape) for column in columns], axis=1))
         return np.stack(tables, axis=1)
 

@@ -259,14 +259,11 @@ class _Vectors:
             values.append(self.constant(*numbers) if constant else self.apply(name, *[values[i] for i in numbers]))
         return [values[i] for i in program.outputs]
 
-    def combine(
-        self, start: Sequence[Value], weights: Sequence[Value], slopes: Sequence[Sequence[Value]]
-    ) -> list[Value]:
+    def combine(self, start: list[Value], weights: list[Value], slopes: list[list[Value]]) -> list[Value]:
         """start + sum of weight times slope."""
-        result = list(start)
         for weight, slope in zip(weights, slopes, strict=True):
-            result = [self.call("fma", weight, k, y) for k, y in zip(slope, result, strict=True)]
-        return result
+            start = [self.call("fma", weight, k, y) for k, y in zip(slope, start, strict=True)]
+        return start
 
     def apply(self, name: str, *args: Value) -> Value:
         """One operation of a recorded program."""

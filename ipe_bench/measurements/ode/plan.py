@@ -9,18 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ipe_bench.measurements.ode.trace import (
-    COMPARISONS,
-    Expression,
-    Graph,
-    Program,
-    border,
-    dependent,
-    in_order,
-    separate,
-    substitute,
-    tangent,
-)
+from ipe_bench.measurements.ode import trace
+from ipe_bench.measurements.ode.trace import Expression, Graph, Program
 
 Arithmetic = Callable[..., Sequence[Any]]
 _POINTS, _NEWTON = 64, 30
@@ -150,10 +140,10 @@ class Recording:
         """A deviation d, a direction dp of the parameters, and how slope, readings and start move along them."""
         graph, variation = self.graph, self.equations.variation
         dp = graph.inputs("dp", self.equations.parameters)
-        starts = tangent(self.start, dict(zip(self.p, dp, strict=True)))
+        starts = trace.tangent(self.start, dict(zip(self.p, dp, strict=True)))
         if variation is None:
             dy = d = graph.inputs("d", self.equations.states)
-            slopes = tangent(self.slope, dict(zip(self.y + self.p, (*dy, *dp), strict=True)))
+            slopes = trace.tangent(self.slope, dict(zip(self.y + self.p, (*dy, *dp), strict=True)))
         else:
             d = graph.inputs("d", variation.freedoms)
             if any(e.value != 0.0 for e in starts):
@@ -162,17 +152,17 @@ class Recording:
             slopes = self._values(variation.slope(self.t, self.y, self.p, self.c, d, dp), variation.freedoms, "slope")
             starts = [graph.constant(0.0)] * variation.freedoms
         along = dict(zip(self.y + self.p, (*(graph.apply("add", v, 0.0) for v in dy), *dp), strict=True))
-        return d, dp, slopes, tangent(self.shown, along), starts
+        return d, dp, slopes, trace.tangent(self.shown, along), starts
 
     def along_each(self, directions: Sequence[Expression], tangents: Sequence[Expression]) -> list[list[Expression]]:
         """The tangents along each direction alone."""
         one, zero = self.graph.constant(1.0), self.graph.constant(0.0)
         units = [{other: one if other is along else zero for other in directions} for along in directions]
-        return [[substitute(e, unit) for e in tangents] for unit in units]
+        return [[trace.substitute(e, unit) for e in tangents] for unit in units]
 
     def fixed(self, *outputs: Expression) -> list[Expression]:
         """What is computed once for each lane: it depends on the parameters and the case alone."""
-        return border(outputs, dependent(outputs, self.moving))
+        return trace.border(outputs, trace.dependent(outputs, self.moving))
 
 
 class _Linear:
@@ -181,13 +171,13 @@ class _Linear:
     def __init__(
         self, tape: Recording, d: Sequence[Expression], dp: Sequence[Expression], tangents: Sequence[Expression]
     ) -> None:
-        outputs, sources = separate(tangents, d, dp)
+        outputs, sources = trace.separate(tangents, d, dp)
         names = [tape.graph.input(f"source{i}") for i in range(len(sources))]
         self.sources = tape.along_each(dp, sources)
         """The value (n, sources) of each source along each parameter."""
-        needed = border(outputs, dependent(outputs, (*d, *names)))
+        needed = trace.border(outputs, trace.dependent(outputs, (*d, *names)))
         values = [e for row in self.sources for e in row]
-        varying = dependent([*needed, *values], tape.moving)
+        varying = trace.dependent([*needed, *values], tape.moving)
         self.fixed = [e for e in needed if e not in varying]
         self.saved = [e for e in needed if e in varying]
         self.driving = _distinct(e for e in values if e in varying and e not in self.saved)
@@ -261,14 +251,14 @@ def jumps(equations: Equations) -> bool:
     if they agree there, it is a kink and no jump."""
     tape = Recording(equations)
     graph, inputs = tape.graph, [tape.t, *tape.y, *tape.p, *tape.c]
-    moving = dependent(tape.slope, (tape.t, *tape.y))
-    for e in (e for e in in_order(tape.slope) if e.operation in COMPARISONS and e in moving):
+    moving = trace.dependent(tape.slope, (tape.t, *tape.y))
+    for e in (e for e in trace.in_order(tape.slope) if e.operation in trace.COMPARISONS and e in moving):
         if e.operands[0] is e.operands[1]:  # asks whether it is a number
             continue
         gap = graph.apply("sub", *e.operands)
-        sides = [substitute(f, {e: graph.constant(side)}) for side in (1.0, 0.0) for f in tape.slope]
+        sides = [trace.substitute(f, {e: graph.constant(side)}) for side in (1.0, 0.0) for f in tape.slope]
         for place, along in enumerate(inputs[: 1 + equations.states]):
-            program = Program.of([gap, *tangent([gap], {along: graph.constant(1.0)}), *sides], inputs)
+            program = Program.of([gap, *trace.tangent([gap], {along: graph.constant(1.0)}), *sides], inputs)
             point = list(np.random.default_rng(1).uniform(-2.0, 2.0, (len(inputs), _POINTS)))
             with np.errstate(all="ignore"):
                 for _ in range(_NEWTON):

@@ -56,10 +56,7 @@ C: tuple[tuple[float, ...], ...] = (
 )
 # fmt: on
 NODES = (0.0, 0.6358126895828704, 0.4095798393397535, 0.9769306725060716, 0.4288403609558664, 1.0, 1.0, 1.0)
-TIME_WEIGHTS = (
-    *(0.21193756319429014, -0.42387512638858027, -0.3384627126235924, 1.8046452872882734, 2.325825639765069),
-    *(0.0, 0.0, 0.0),
-)
+TIME_WEIGHTS = (GAMMA, -0.42387512638858027, -0.3384627126235924, 1.8046452872882734, 2.325825639765069, 0.0, 0.0, 0.0)
 _REACH, _STABLE = 6.0, 5.0
 """About where the stability region of DOP853 ends on the negative real axis, and a step over the fastest rate to which
 it is stable."""

@@ -167,14 +167,8 @@ def _first_if(apply: Callable[..., Any], condition: Any, a: Any, b: Any) -> Any:
     return apply("where", condition, a, apply("where", apply("less_equal", a, a), b, a))
 
 
-_SIGNS: dict[str, Callable[..., Any]] = {
-    "add": operator.add,
-    "sub": operator.sub,
-    "mul": operator.mul,
-    "div": operator.truediv,
-    "pow": operator.pow,
-    "neg": operator.neg,
-}
+_SIGNS: dict[str, Callable[..., Any]] = {name: getattr(operator, name) for name in ("add", "sub", "mul", "pow", "neg")}
+_SIGNS["div"] = operator.truediv
 _NUMBERS: dict[str, Callable[..., Any]] = _SIGNS | {
     "arctan": math.atan,
     "less": operator.lt,
