@@ -183,7 +183,7 @@ def _from_file(group: str, name: str, word: str) -> list[str]:
         example = "NAME: {nominal: 1}" if group == "parameters" else "rates, start, outputs"
         raise UserError(f"{word}: holds no keys; write a YAML file of options such as {example}")
     if TARGET in content:
-        raise UserError(f"{word}: has a {TARGET}; the model is chosen by measurement=, so leave it out")
+        raise UserError(f"{word}: has a {TARGET}; the model is chosen by {group}=, so leave it out")
     return [f"{group}.{key}={_literal(value, word)}" for key, value in content.items()]
 
 

@@ -138,6 +138,10 @@ def test_a_model_of_formulas_may_stand_in_a_file(tmp_path, estimate):
     np.testing.assert_array_equal(
         pd.read_csv(tmp_path / "one" / "track.csv")["x [m]"], ekf().track(model, z[None]).mean[0, :, 0]
     )
+    (tmp_path / "copied.yaml").write_text("_target_: ipe_bench.states.Formulas")
+    code, _, err = estimate("model=formulas", "model.file=copied.yaml", "readings=log.csv")
+    assert code == 2
+    assert "model.file=copied.yaml: has a _target_; the model is chosen by model=, so leave it out" in err
 
 
 @pytest.mark.parametrize(
