@@ -92,6 +92,10 @@ def test_costs_and_errors_stand_at_quantiles_of_all_trials(synthetic):
     assert (cost, at) == pytest.approx((7.0, distance[189]), rel=0.05)
     simulated = np.sqrt((np.random.default_rng(0).normal(size=(200_000, 3)) ** 2).mean(axis=1))
     assert panel.lines[0].get_ydata()[0] == pytest.approx(np.quantile(simulated, 0.95), rel=0.01)
+    synthetic.add(synthetic.scenario(error_scale=SCALES[0]), "same", error, estimator=Seeker(), simulations=7.0)
+    (panel, *_) = drawn(costs, only_view(synthetic))["cost_against_accuracy"].figure.axes
+    beside = sorted(float(cost) for marks in panel.collections for cost, _ in marks.get_offsets())
+    assert beside == pytest.approx([7.0, 7.0 * 10**0.04])
     median = drawn(errors, view)["headline"].figure.axes[1]
     shown = points(median, view.look["one"].color)
     assert [shown[s][0] for s in SCALES] == pytest.approx([distance[99:101].mean()] * 3, rel=0.05)

@@ -36,11 +36,12 @@ def draw_costs(view: View) -> Iterator[Drawing]:
         return
     shown = {"cost": rows["simulations_median"].clip(lower=LEAST_COST), "error": rows["error_q95"].clip(upper=_HIGHEST)}
     rows, look = rows.assign(**shown), view.with_look(rows["estimator"])
+    # Points of about the same cost stand side by side, so that all are seen.
+    step = 0.04 * np.log(max(10.0, rows["cost"].max() / rows["cost"].min()))
+    place = (np.log(rows["cost"]) / step).round()
+    rows["cost"] *= np.exp(step * rows.groupby(["error_scale", place]).cumcount())
     fig, panels = common.panels_of_scales(rows, look)
     style = {**common.seaborn_style(look), "edgecolor": "white", "linewidth": 0.6, "zorder": 3, "clip_on": False}
-    # In the order of the legend about their cost, so that equal points are seen.
-    beside = (rows["estimator"].map({label: i for i, label in enumerate(look)}) + 0.5) / len(look) - 0.5
-    rows["cost"] *= (rows["cost"].max() / rows["cost"].min()) ** (0.06 * beside)
     efficient = float(np.sqrt(chdtri(view.n, 0.05) / view.n))  # the 95 % quantile of chi, over its root mean square
     for ax, here in panels:
         common.decades(ax, [*rows["error"], efficient])
@@ -58,7 +59,7 @@ def draw_costs(view: View) -> Iterator[Drawing]:
         "cost_against_accuracy",
         "Cost against accuracy, all trials",
         "Median cost of a trial in simulations against the 95 % quantile of the error over the bound at the truth, over"
-        " all trials; down and left is better. Points of equal cost stand side by side.",
+        " all trials; down and left is better. Of points of about the same cost, later ones are shifted to the right.",
         f"Errors beyond {common.number(_HIGHEST)} stand at the edge." * bool((rows["error"] == _HIGHEST).any()),
         f"The cheapest within 5 % of the least error at scale {plain(view.scales[-1])}: {good['estimator']}"
         f" ({short(good['simulations_median'])} simulations).",
