@@ -81,7 +81,6 @@ class Pending:
         from ipe_bench.report.html import render_page
         from ipe_bench.report.sections import CURVES, report_tables, written
         from ipe_bench.report.table import write_table
-        from ipe_bench.report.tables import without_certified
 
         analysis, output = self.begun.finish(), self.output
         problems = analysis.collection.extra_problems
@@ -90,7 +89,7 @@ class Pending:
         added = [table for section in sections for table in section.tables]
         write_text(output / "summary.csv", analysis.summary.to_csv(index=False))
         files = [path for table in (*tables, *added) for path in write_table(table, output / "tables")]
-        simulated = without_certified(analysis)
+        simulated = analysis.simulated
         for name, frame in {n: getattr(simulated, n) for n in CURVES}.items():
             if len(frame):
                 files.append(output / "tables" / f"{name}.csv")

@@ -9,7 +9,7 @@ from typing import Any
 from ipe_bench.basics.errors import UserError
 from ipe_bench.plugins.extensions import added, require_type
 from ipe_bench.report.table import Part, Table
-from ipe_bench.report.tables import all_tables, certified_tables, without_certified
+from ipe_bench.report.tables import all_tables, certified_tables
 from ipe_bench.statistics.analysis import Analysis
 
 CURVES = ("profiles", "distributions")
@@ -40,7 +40,7 @@ class Written:
 
 def report_tables(analysis: Analysis) -> list[Table]:
     """Every table of the report: those on certified readings, ours on simulated trials, and those of plugins."""
-    shown = certified_tables(analysis.collection) + all_tables(without_certified(analysis), analysis)
+    shown = certified_tables(analysis.collection) + all_tables(analysis.simulated, analysis)
     return [*shown, *(table for one in written("table", analysis, shown) for table in one.tables)]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import pandas as pd
@@ -311,15 +311,3 @@ def _problems(minima: pd.DataFrame) -> Table:
         "The number of the minimum whose sum of squares the estimate has, where 1 is the lowest; a dash means none."
     )
     return Table("attained_problems", "Known minima, problem by problem", caption, columns, rows)
-
-
-def without_certified(analysis: Analysis) -> Analysis:
-    """The analysis of the simulated trials alone."""
-    groups = tuple(g for g in analysis.collection.groups if g.columns["noise"] != "certified")
-    if len(groups) == len(analysis.collection.groups):
-        return analysis
-    held: dict[str, Any] = {f.name: getattr(analysis, f.name) for f in fields(analysis)}
-    held = {k: v[v["noise"] != "certified"] for k, v in held.items() if isinstance(v, pd.DataFrame) and "noise" in v}
-    if not groups:
-        held["profiles"] = analysis.profiles.iloc[:0]
-    return replace(analysis, **held | {"collection": replace(analysis.collection, groups=groups)})

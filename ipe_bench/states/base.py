@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -13,7 +12,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, multiply
 from ipe_bench.basics.options import Component
 from ipe_bench.basics.streams import numbered
-from ipe_bench.measurements.base import Parameter, differentiate
+from ipe_bench.measurements.base import Parameter
 from ipe_bench.states.algebra import factor, root
 
 _START, _PROCESS, _READINGS = range(3)
@@ -188,11 +187,3 @@ def require_sound(model: StateModel) -> None:
             raise UserError(f"{name}: {what} has a negative eigenvalue; give a covariance")
     if not np.isfinite(factor(model.R(0))).all():
         raise UserError(f"{name}: R is singular; give every reading a standard deviation above 0")
-
-
-def slope(function: Callable[[Array], Array], x: Array) -> tuple[Array, Array]:
-    """Value (trials, m) and Jacobian (trials, m, n) of a function at x (trials, n), by its own `slope` if it has one,
-    else by complex steps."""
-    if (own := getattr(function, "slope", None)) is not None:
-        return own(x)
-    return function(x), differentiate(function, x, analytic=True)

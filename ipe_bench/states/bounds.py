@@ -7,8 +7,8 @@ import numpy as np
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.states.algebra import symmetric, transposed
-from ipe_bench.states.base import Gaussian, Paths, StateModel, slope
-from ipe_bench.states.linearisation import Taylor
+from ipe_bench.states.base import Gaussian, Paths, StateModel
+from ipe_bench.states.linearisation import Taylor, slope
 from ipe_bench.states.trackers import Tracks, filtered
 
 

@@ -18,8 +18,8 @@ import numpy as np
 
 from ipe_bench.basics.linalg import Array, multiply
 from ipe_bench.basics.options import Component, Count, Finite, Positive
+from ipe_bench.measurements.base import differentiate
 from ipe_bench.states.algebra import factor, symmetric, transposed, upper_solve
-from ipe_bench.states.base import slope
 
 Function = Callable[[Array], Array]
 Nearest = Callable[[Array, Array], Array]
@@ -138,3 +138,11 @@ class GaussHermite(SigmaPoints):
     def _line(self) -> tuple[Array, Array]:
         s, w = np.polynomial.hermite_e.hermegauss(self.order)
         return s, w / w.sum()
+
+
+def slope(function: Callable[[Array], Array], x: Array) -> tuple[Array, Array]:
+    """Value (trials, m) and Jacobian (trials, m, n) of a function at x (trials, n), by its own `slope` if it has one,
+    else by complex steps."""
+    if (own := getattr(function, "slope", None)) is not None:
+        return own(x)
+    return function(x), differentiate(function, x, analytic=True)

@@ -18,8 +18,8 @@ from ipe_bench.basics.linalg import Array, Mask, multiply
 from ipe_bench.basics.options import Component, Count, NonNegative
 from ipe_bench.basics.streams import own_generators
 from ipe_bench.states.algebra import divide, factor, lower_solve, mahalanobis, root, symmetric, transposed, upper_solve
-from ipe_bench.states.base import Gaussian, StateModel, slope
-from ipe_bench.states.linearisation import Affine, Cubature, Rule, Taylor, Unscented
+from ipe_bench.states.base import Gaussian, StateModel
+from ipe_bench.states.linearisation import Affine, Cubature, Rule, Taylor, Unscented, slope
 
 _HALVINGS = 12
 """Halvings of a damped step."""

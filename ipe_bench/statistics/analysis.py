@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -76,6 +77,20 @@ class Analysis:
         """The columns that tell scenarios apart, but for the error scale."""
         first = self.collection.groups[0].columns if self.collection.groups else {}
         return [c for c in first if c != "error_scale"]
+
+    @cached_property
+    def simulated(self) -> Analysis:
+        """The analysis of the simulated trials alone, without those of certified readings."""
+        groups = tuple(g for g in self.collection.groups if g.columns["noise"] != "certified")
+        if len(groups) == len(self.collection.groups):
+            return self
+        held: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
+        held = {
+            name: v[v["noise"] != "certified"] for name, v in held.items() if hasattr(v, "columns") and "noise" in v
+        }
+        if not groups:
+            held["profiles"] = self.profiles.iloc[:0]
+        return replace(self, **held | {"collection": replace(self.collection, groups=groups)})
 
 
 def analyse(directories: Sequence[Path | str]) -> Analysis:

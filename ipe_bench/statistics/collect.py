@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 NAMES = ("measurement", "noise", "prior", "error_scale", "seed", "estimator")
 _LONGEST = 34
 """Letters of a value in a table or a heading."""
-ALWAYS_COLUMNS = ("measurement", "noise", "error_scale", "estimator")
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,6 @@ import ipe_bench.statistics.formulas as f
 import ipe_bench.statistics.intervals as intervals
 import ipe_bench.statistics.tracks as t
 from ipe_bench.basics.errors import UserError, place_of
-from ipe_bench.statistics.collect import ALWAYS_COLUMNS
 from ipe_bench.statistics.intervals import clopper_pearson, quantile, share_sequence, verdict
 from ipe_bench.statistics.sample import CLOSE, NIS, Sample, iterations_to_limit, orders_of
 from ipe_bench.trials.thresholds import EXPECTED, FEW, GATE, SAME_ROOT
@@ -949,7 +948,7 @@ def to_frame(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
 
     frame, known = pd.DataFrame(list(rows)), summary_columns()
     if frame.empty:
-        return pd.DataFrame(columns=[*ALWAYS_COLUMNS, "parameter", "unit", *known])
+        return pd.DataFrame(columns=["measurement", "noise", "error_scale", "estimator", "parameter", "unit", *known])
     keys = [c for c in frame.columns if c not in (*known, "parameter", "unit")]
     first = [c for c in ("measurement", "noise") if c in keys]
     last = ["error_scale", "estimator"]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -29,7 +29,6 @@ from ipe_bench.measurements.counted import CountingModel
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.trials.fit_test import Spread, fit_probability, inflation_of, spread_of
 from ipe_bench.trials.roots import frozen_root, least_squares_root
-from ipe_bench.trials.scenario import Scenario, Trials
 from ipe_bench.trials.theory import (
     bound_deviations,
     box_bias,
@@ -41,6 +40,9 @@ from ipe_bench.trials.theory import (
     second_derivatives,
 )
 from ipe_bench.trials.thresholds import EXPECTED, HISTORIES, SAME_ROOT, gate
+
+if TYPE_CHECKING:
+    from ipe_bench.trials.scenario import Scenario, Trials
 
 CURVED = 20
 """Trials in which second derivatives are taken, which takes 2 n Jacobians each: the first ones of a scenario."""

@@ -12,7 +12,6 @@ import pandas as pd
 
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.style import MOST_FACES, Look, looks
-from ipe_bench.report.tables import without_certified
 from ipe_bench.report.words import plain
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.records import ALL
@@ -84,7 +83,7 @@ class View:
 
 def views(analysis: Analysis) -> tuple[list[View], View]:
     """The settings of the simulated trials, at most `MOST_SETTINGS`, and all of them together with every estimator."""
-    every, analysis = _looks(analysis), without_certified(analysis)
+    every, analysis = _looks(analysis), analysis.simulated
     look, columns = _looks(analysis), analysis.setting_columns
     equations = {g.estimator: g.footer.get("equation") for g in analysis.collection.groups}
     whole: dict[str, Any] = {name: getattr(analysis, name) for name in FRAMES}

@@ -22,7 +22,7 @@ from walking_gins import KINEMATIC, WalkingGins
 import ipe_bench as ib
 from ipe_bench.basics.linalg import Covariance
 from ipe_bench.states import bound_at_truth, ekf
-from ipe_bench.states.base import slope
+from ipe_bench.states.linearisation import slope
 
 WALKS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
 """Multiples of a drift's size (0.01 deg/h about x and y, 0.1 deg/h about z) in an hour."""

@@ -19,7 +19,7 @@ from stonesoup.updater.kalman import CubatureKalmanUpdater, ExtendedKalmanUpdate
 from ipe_bench.plugins.construct import construct
 from ipe_bench.plugins.discovery import options
 from ipe_bench.states import ckf, ekf, ukf
-from ipe_bench.states.base import slope
+from ipe_bench.states.linearisation import slope
 
 pytestmark = pytest.mark.plugin
 JULIER = {"alpha": 1.0, "beta": 0.0, "kappa": 1.0}
