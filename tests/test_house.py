@@ -27,7 +27,7 @@ LINE = (
 )
 BUDGETS = {
     "basics": 918,
-    "measurements": 6149,
+    "measurements": 6150,
     "noise": 621,
     "priors": 105,
     "states": 1243,

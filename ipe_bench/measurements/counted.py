@@ -41,8 +41,6 @@ class EvaluationCount:
 
     def failed(self, rows: NDArray[np.intp]) -> Mask:
         """Which of the trials `rows` an exception has ended."""
-        if not self.messages:
-            return np.zeros(len(rows), dtype=bool)
         return np.isin(rows, list(self.messages))
 
 

@@ -137,6 +137,9 @@ class OdeMeasurement(Measurement):
         x = own(x)
         cases, outputs = len(self._cases), len(self.outputs)
         z = np.empty((len(x), cases * stop * outputs))
+        if self._trusted(x).all():
+            self._simulate(x, np.arange(len(x)), self._parts, offset, z)
+            return z
         found, rows = self._levels(x, offset, guess=guess), np.arange(len(x))
         if len(found.computed):
             readings = found.z.reshape(-1, cases, len(self.times), outputs)[:, :, :stop]
