@@ -260,9 +260,9 @@ class Trajectory:
     """Whitened residuals (trials, m)."""
     linear: Linear
     step: Array
-    """The next one (trials, unknowns)."""
+    """The next step (trials, unknowns)."""
     share: Array
-    """Of it that is tried."""
+    """The share of that step that is tried."""
     moved: Array
 
 

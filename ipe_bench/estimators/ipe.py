@@ -1,4 +1,4 @@
-"""Iterative parameter estimation: the nonlinear system of eq. (11), and IPE, from which every solver derives."""
+"""Iterative parameter estimation: the nonlinear system of eq. (11), and IPE, from which solvers of it derive."""
 
 from __future__ import annotations
 

@@ -140,7 +140,7 @@ class Tracked:
     message: str
     """Why there is no track, or no constant; empty if there is one."""
     constants: Sequence[Constant] = ()
-    """Those that were asked for."""
+    """The constants that were asked for."""
 
     @classmethod
     def of(cls, log: Log, label: str, tracker: Tracker) -> Tracked:

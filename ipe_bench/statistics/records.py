@@ -195,7 +195,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "error_q95",
         "95 % error",
         "all trials",
-        "95 % quantile of the same.",
+        "95 % quantile of the error over the bound.",
         lambda s: quantile(f.over_bound(s), 0.95),
     ),
     Statistic(

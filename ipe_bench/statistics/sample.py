@@ -48,11 +48,11 @@ class History:
     distances: Array
     """(iterates,) from the last iterate, in deviations of the bound."""
     cost: float
-    """Of the whole trial."""
+    """The cost of the whole trial, in simulations."""
     K: float
-    """Of eq. (15) at the truth."""
+    """K of eq. (15) at the truth."""
     M: float
-    """Of eq. (23) at the truth; NaN where it is not stored."""
+    """M of eq. (23) at the truth; NaN where it is not stored."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -118,7 +118,7 @@ class PathBlock:
             return self._scored(tracks, messages, seconds)
 
     def _scored(self, tracks: Tracks, messages: dict[int, str], seconds: Array) -> tuple[Estimates, Columns]:
-
+        """The tracks as estimates of the last epoch, with what is stored of each trial."""
         trials, K, n = tracks.mean.shape
         e, P = tracks.mean - self.paths.x, tracks.covariance
         known: Mask = np.asarray(np.isfinite(e).all(axis=2) & np.isfinite(P).all(axis=(2, 3)))
