@@ -6,6 +6,7 @@ from scipy.stats import binom, chi2, kstest, norm
 
 from ipe_bench.basics.linalg import Covariance
 from ipe_bench.real.residuals import DRAWS, explained, normalised, outlier_limit, whiteness
+from ipe_bench.trials.whiteness import ljung_box
 
 M, N = 60, 5
 # Smooth columns take low frequencies out of the residuals, which a test with chi-square limits would call coloured.
@@ -138,3 +139,12 @@ def test_what_is_explained_does_not_depend_on_units_nor_on_surplus_parameters():
 def test_one_of_many_good_readings_is_an_outlier_as_often_as_the_level_says(m):
     """To either side, by Bonferroni."""
     assert 2 * m * norm.sf(outlier_limit(m)) == pytest.approx(0.01, rel=1e-9)
+
+
+def test_the_statistic_of_whiteness_is_ljung_and_boxs():
+    """n (n + 2) sum_k r_k^2 / (n - k), with the autocorrelations r_k to lag 10, about a mean of 0."""
+    e, n = np.random.default_rng(4).standard_normal(60), 60
+    r = [e[k:] @ e[: n - k] / (e @ e) for k in range(1, 11)]
+    Q = n * (n + 2) * sum(one**2 / (n - k) for k, one in enumerate(r, 1))
+    found, lags = ljung_box(e[None, None])
+    assert (found[0], lags[0]) == (pytest.approx(Q, rel=1e-12), 10)

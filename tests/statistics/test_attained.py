@@ -9,7 +9,7 @@ from ipe_bench.measurements import Mgh
 from ipe_bench.measurements.mgh import PROBLEMS as FUNCTIONS
 from ipe_bench.noise import Certified
 from ipe_bench.report.table import terminal
-from ipe_bench.report.tables import certified_tables
+from ipe_bench.report.tables import attained_totals_table, certified_tables
 from ipe_bench.runs.run import compute
 from ipe_bench.solvers import Auto, Progressive
 from ipe_bench.statistics.certified import attained_table, attained_totals, data_profile
@@ -101,3 +101,12 @@ def test_the_general_estimators_attain_all_minima_and_say_so(estimator, tmp_path
     assert totals["solved"] >= 67
     assert totals["solved_1"] == 23
     assert totals["converged"] == totals["solved"]
+
+
+def test_those_that_solve_most_are_marked_and_stand_first(folder):
+    totals = attained_totals(attained_table(collect([folder])))
+    solved = next(c for c in attained_totals_table(totals).columns if c.title == "solved")
+    numbers = [int(cell.text) for cell in solved.cells]
+    assert numbers == sorted(numbers, reverse=True)
+    assert [cell.best for cell in solved.cells] == [number == numbers[0] for number in numbers]
+    assert len(set(numbers)) > 1
