@@ -28,8 +28,10 @@ from ipe_bench.real.levels import objective_of
 CONFIDENCE = 0.95
 _FARTHEST = 1e6
 """Half-widths from standard errors beyond which no end is searched for."""
-_STRETCHES = 24
+_STRETCHES = 27
 """The most steps outwards."""
+_STRAIGHT = 0.02
+"""The share by which a rise differs at most from that of a linear model where steps may be large."""
 _PRECISION = 1e-8
 """The precision of an end, as a share of the half-width."""
 _JUMP = 0.01
@@ -179,7 +181,7 @@ class _Side:
     def end(self) -> float:
         """The distance to the end; infinite if there is none, NaN if minima cannot be followed to it."""
         half = self.q * float(np.sqrt(self.P[self.place, self.place]))
-        near, far = 0.0, half
+        near, far = 0.0, half / 8
         for _ in range(_STRETCHES):
             if (risen := self.rise(far)) >= self.q:
                 found = brentq(lambda distance: self.rise(distance) - self.q, near, far, xtol=_PRECISION * half)
@@ -187,7 +189,9 @@ class _Side:
                 if (risen := self.rise(far, around=True)) >= (1 - _JUMP) * self.q:
                     return far if self.rise((1 - _STEP) * far) >= (1 - _JUMP) * self.q else np.nan
                 self.seen = {far: self.seen[far]}
-            near, far = far, far * float(np.clip(1.05 * self.q / max(risen, 1e-3), 1.1, 2.0))
+            # Small steps where the profile bends, since it may rise beyond q and fall again within a large one.
+            straight = abs(risen * half / (far * self.q) - 1) < _STRAIGHT
+            near, far = far, far * float(np.clip(1.05 * self.q / max(risen, 1e-3), 1.1, 9.0 if straight else 2.0))
             if far > _FARTHEST * half:
                 break
         return np.inf
