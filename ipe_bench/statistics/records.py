@@ -18,7 +18,7 @@ import ipe_bench.statistics.tracks as t
 from ipe_bench.basics.errors import UserError, place_of
 from ipe_bench.statistics.intervals import clopper_pearson, quantile, share_sequence, verdict
 from ipe_bench.statistics.sample import CLOSE, NIS, Sample, iterations_to_limit, orders_of
-from ipe_bench.trials.thresholds import EXPECTED, FEW, GATE, SAME_ROOT
+from ipe_bench.trials.thresholds import EVEN, EXPECTED, FEW, GATE, SAME_ROOT
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -372,8 +372,9 @@ STATISTICS: tuple[Statistic, ...] = (
         "truths drawn from the prior",
         "(E[J' R⁻¹ J] + P₀⁻¹)⁻¹, which no estimator can beat on average over the prior, biased or not (Van Trees,"
         " Detection, Estimation, and Modulation Theory I, 1968, sec. 2.4): standard deviation. The mean E is over"
-        f" {EXPECTED} truths of each seed; its interval, 95 %, is that of this mean. Of states that move: the posterior"
-        " Cramér-Rao bound (Tichavský, Muravchik and Nehorai, IEEE TSP 46, 1998).",
+        f" {EXPECTED} truths of each seed; its interval, 95 %, is that of this mean, and none where few of them carry"
+        f" it: where their effective number (Kish, Survey Sampling, 1965) is less than {EVEN:g} of them. Of states that"
+        " move: the posterior Cramér-Rao bound (Tichavský, Muravchik and Nehorai, IEEE TSP 46, 1998).",
         f.of_each(lambda s: f.van_trees(s)[0]),
         limits=f.van_trees_limits,
         kind="physical",

@@ -39,7 +39,7 @@ from ipe_bench.trials.theory import (
     relative_curvatures,
     second_derivatives,
 )
-from ipe_bench.trials.thresholds import EXPECTED, HISTORIES, SAME_ROOT, gate
+from ipe_bench.trials.thresholds import EVEN, EXPECTED, HISTORIES, SAME_ROOT, gate
 
 if TYPE_CHECKING:
     from ipe_bench.trials.scenario import Scenario, Trials
@@ -134,8 +134,8 @@ class Block:
     def _van_trees(self) -> tuple[Array, Array]:
         """Deviations (trials, n) of Van Trees's bound (E[J' R^-1 J] + P0^-1)^-1 (Detection, Estimation, and Modulation
         Theory I, 1968, sec. 2.4), the mean taken over the first `EXPECTED` truths of the scenario, and their standard
-        errors by the scatter of the information among these, to first order: in its first trial, and NaN in the
-        others."""
+        errors by the scatter of the information among these, to first order: in its first trial, and NaN in the others.
+        No errors are known where few of the truths carry the mean."""
         bound, error = np.full((2, *self.trials.x.shape), np.nan)
         prior = self.problem.prior_covariance()
         if self.trials.start == 0 and len(bound) and prior is not None and not self.scenario.noise.real:
@@ -149,8 +149,9 @@ class Block:
                 together = rows.reshape(1, -1, x.shape[1]) / np.sqrt(len(x))
                 bound[0] = bound_deviations(expected, _below(together, prior))[0]
                 P = inverse(expected)[0][0]
-                variances = np.einsum("ij,tjk,ki->ti", P, each - mean, P)
-                error[0] = variances.std(axis=0, ddof=1) / np.sqrt(EXPECTED) / (2 * bound[0])
+                variances = np.einsum("ij,tjk,ki->ti", P, each, P)
+                if (variances.sum(axis=0) ** 2 >= EVEN * EXPECTED * (variances**2).sum(axis=0)).all():
+                    error[0] = variances.std(axis=0, ddof=1) / np.sqrt(EXPECTED) / (2 * bound[0])
         return bound, error
 
     def readings_at(self, x: Array) -> Array:

@@ -13,6 +13,8 @@ HISTORIES = 20
 """Trials whose iterates are kept: the first ones of a scenario, in whatever blocks they are computed."""
 EXPECTED = 50
 """Truths over which Van Trees's bound takes the mean of the information."""
+EVEN = 0.3
+"""A mean is carried by few if their effective number is less than this share of them."""
 
 
 def gate(n: int) -> float:
