@@ -15,9 +15,9 @@ from ipe_bench.statistics.records import ALL, BEST, SCORES, Kind, Statistic, Whe
 _WIDE_ENOUGH = 100
 """Letters of a screen that has room for failures, and for verdicts in words."""
 LEGEND = (
-    "success is the percentage of all trials, with its 95 % interval; bold marks estimators that may be the best,"
-    " since no rival succeeds significantly more often. failed (on wide screens) gives known / silent failures: the"
-    " status or the test of fit reports a known one.",
+    "success is the percentage of all trials, with its 95 % interval; bold marks estimators that may be the best where"
+    " others are beaten: no rival succeeds significantly more often. failed (on wide screens) gives known / silent"
+    " failures: the status or the test of fit reports a known one.",
     "error is the median / 95 % quantile over all trials, in multiples of the bound at the truth; 1 is the best"
     f" possible. efficiency is the reciprocal of its root mean square, where a trial counts as at most {CAP:g}.",
     "NEES is the median of the squared error over the variance that the estimator claims; 1 is right. The word or sign"

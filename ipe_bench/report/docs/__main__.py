@@ -67,8 +67,8 @@ GROUPS = {
     "tracker": "Filters and smoothers of states",
     "execution": "Executions",
 }
-FIGURES = 5
-"""Pictures of an experiment that its page shows."""
+FIGURES = 8
+"""Most pictures of an experiment that its page shows."""
 ORDINARY, LEAST = 1000, 3
 """Trials of an ordinary experiment, and the least number that a costly one is cut to."""
 _PARTS = {
