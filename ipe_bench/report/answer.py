@@ -318,7 +318,7 @@ def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator
     if unlimited := list(compress(names, np.any(np.isinf(found.profiles), axis=0))):
         yield f"The readings set no limit to one side of {', '.join(unlimited)}."
     if lost := list(compress(names, np.any(np.isnan(found.profiles), axis=0))):
-        yield f"The profile could not be followed to its end: {', '.join(lost)}."
+        yield f"An end of the profile is missing: {', '.join(lost)}; a better fit, or no minimum, was met on the way."
     for one in found.on_bounds:
         yield (
             f"{one.parameter.name}: its estimate is on the bound {one.bound:g}, which is one end of its interval; the"

@@ -267,4 +267,7 @@ def test_noise_that_is_overstated_is_said_and_rounded_intervals_hold_the_estimat
     assert "the residuals are up to 1.1e+02 times smaller than the stated noise" in printed
     # A straight line, with b near zero and a as large as one likes to both sides, is within the stated noise.
     assert "a -2.35 … 6.37 −∞ … ∞" in printed
+    # Towards growth at any rate, of an a of 1e-155 and less, numbers end before the readings set a limit.
+    assert "b -3.12 … 4.55 - … ∞" in printed
+    assert "An end of the profile is missing: b;" in printed
     assert "c -2.30 … 2.90 −∞ … ∞ -10.0 … 1.57" in printed  # to tens, as the width is, the upper end would be 0
