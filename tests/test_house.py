@@ -28,7 +28,7 @@ LINE = (
 BUDGETS = {
     "basics": 920,
     "measurements": 6150,
-    "noise": 630,
+    "noise": 621,
     "priors": 110,
     "states": 1250,
     "estimators": 1140,
@@ -37,7 +37,7 @@ BUDGETS = {
     "trials": 1950,
     "runs": 1980,
     "statistics": 4090,
-    "real": 2300,
+    "real": 2310,
     "plugins": 1100,
     "report": 4090,
     "cli": 2440,

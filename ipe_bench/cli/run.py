@@ -102,8 +102,9 @@ def run_command(arguments: Sequence[str]) -> int:
         if words.standard_baselines:
             say(*_left_out(jobs.specs))
         task = Task(shlex.join(["ipe-bench", "run", *arguments]), words.files, words.standard_baselines)
-        for told, spec in zip(jobs.told, jobs.specs, strict=False):
-            task.compute(told, spec)
+        if jobs.told:
+            for told, spec in zip(jobs.told, jobs.specs, strict=True):
+                task.compute(told, spec)
         outcomes = task.outcomes if jobs.told else jobs.launch(task) or task.outcomes
     return _conclude(jobs, outcomes)
 

@@ -229,7 +229,7 @@ class _Side:
         gain = self.P[:, self.place] / self.P[self.place, self.place]
         sizes, axes = np.linalg.eigh(self.P - np.outer(gain, self.P[self.place]))
         steps = 2.0 * np.sqrt(np.maximum(sizes, 0.0))[:, None] * axes.T
-        return self.x + gain * (at - self.x[self.place]) + np.vstack([steps, -steps])
+        return _along(self.x, self.P, self.place, at) + np.vstack([steps, -steps])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -247,6 +247,12 @@ class _Pinned(CountingModel):
 
     def whole(self, x: Array) -> Array:
         return np.insert(x, self.place, self.value, axis=1)
+
+
+def _along(x: Array, P: Array, place: int, at: float) -> Array:
+    """Where a linear model of covariance P (n, n) leads from its minimum x (n,), when the parameter of a place has a
+    value."""
+    return x + P[:, place] / P[place, place] * (at - x[place])
 
 
 def _ahead(objective: Objective, near: Array, place: int, at: float) -> Array:
@@ -278,7 +284,7 @@ def _least_at(
     total = float(totals[best])
     if released is not None:
         free = int(np.setdiff1d(np.arange(len(released.x)), released.places)[place])
-        start = _ahead(objective_of(released.problem, z[None]), released.x, free, at)
+        start = _along(released.x, released.P, free, at)
         freed, less = _least_at(released.problem, z, free, at, start[None], None)
         total = float(np.fmin(total, less)) if released.inside(freed[None]).all() else total
     return model.whole(x)[best], total

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -146,7 +146,7 @@ class Calibration:
         """How far off the farther curve is anywhere."""
         return max(curve.excursion for curve in (self.place, self.size) if curve is not None)
 
-    @property
+    @cached_property
     def words(self) -> str:
         """What is surely wrong: shift, scale and tails, each by order statistics, which no outlier moves. An estimate
         that is shifted by +1 deviations lies above the truth."""
@@ -172,11 +172,8 @@ class Calibration:
         if not (place or self.size).leans:
             return "of another shape"
         at = POINTS[np.argmax(np.abs(self.size.difference))]
-        return (
-            _shifted(middle)
-            if place
-            else _scaled(float(np.quantile(np.abs(self.z), at) / np.sqrt(chdtri(self.degrees, 1 - at))))
-        )
+        usual = float(np.sqrt(chdtri(self.degrees, 1 - at)))
+        return _shifted(middle) if place else _scaled(float(np.quantile(np.abs(self.z), at)) / usual)
 
 
 def calibrations(error: Array, deviation: Array, nees: Array, claimed: Array) -> list[Calibration]:
@@ -213,10 +210,8 @@ def overall_words(parts: Sequence[Calibration], names: Sequence[str]) -> str:
     if not outside:
         return together
     worst = min(outside, key=lambda k: (parts[k].p, -parts[k].excursion, names[k]))
-    who = (
-        names[worst] if len(outside) == 1 else f"{len(outside)} of {len(names)} parameters outside, most {names[worst]}"
-    )
-    return f"{'' if together == INSIDE else together + '; '}{who}: {said[worst]}"
+    others = "" if len(outside) == 1 else f"{len(outside)} of {len(names)} parameters outside, most "
+    return f"{'' if together == INSIDE else together + '; '}{others}{names[worst]}: {said[worst]}"
 
 
 def _holds(interval: tuple[float, float], value: float) -> bool:
