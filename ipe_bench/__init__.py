@@ -29,7 +29,8 @@ if TYPE_CHECKING:
     from ipe_bench.measurements.ode.model import OdeMeasurement
     from ipe_bench.measurements.problem import Problem
     from ipe_bench.noise.base import Noise
-    from ipe_bench.trials.scenario import Scenario, Tracking
+    from ipe_bench.trials.scenario import Scenario
+    from ipe_bench.trials.tracking import Tracking
 
 _HOMES = {
     "api": ("audit", "check", "compare", "design", "estimate", "load", "posterior", "report", "run", "status"),

@@ -24,7 +24,8 @@ from ipe_bench.runs.run import compute, validate
 from ipe_bench.runs.schedule import Watcher
 from ipe_bench.states.base import StateModel
 from ipe_bench.states.trackers import Tracker
-from ipe_bench.trials.scenario import AnyScenario, Scenario, Tracking
+from ipe_bench.trials.scenario import Scenario
+from ipe_bench.trials.tracking import AnyScenario, Tracking
 
 if TYPE_CHECKING:
     import pandas as pd

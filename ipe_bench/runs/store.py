@@ -20,7 +20,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
@@ -34,9 +34,12 @@ from ipe_bench.runs.execution import Failure
 from ipe_bench.runs.parts import SCHEMA, TRUTH, Part
 from ipe_bench.runs.provenance import describe, digest, fingerprint
 from ipe_bench.states.trackers import Tracker
-from ipe_bench.trials.scenario import AnyScenario, Tracking
+from ipe_bench.trials.scenario import Scenario
 from ipe_bench.trials.theory import linear_correlation
 from ipe_bench.trials.thresholds import HISTORIES
+
+if TYPE_CHECKING:
+    from ipe_bench.trials.tracking import AnyScenario
 
 _ABANDONED_S = 3600.0
 """Age in s from which a temporary file counts as abandoned."""
@@ -116,9 +119,9 @@ class ResultKey:
             "about": about,
             "linear_bound": scenario.linear_bound.tolist(),
             **(
-                {"times": scenario.model.times.tolist()}
-                if isinstance(scenario, Tracking)
-                else {"linear_correlation": linear_correlation(scenario.problem).round(4).tolist()}
+                {"linear_correlation": linear_correlation(scenario.problem).round(4).tolist()}
+                if isinstance(scenario, Scenario)
+                else {"times": scenario.model.times.tolist()}
             ),
         }
 

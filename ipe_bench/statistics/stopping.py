@@ -21,7 +21,8 @@ from ipe_bench.statistics.formulas import rmse_ends_anytime
 from ipe_bench.statistics.intervals import share_sequence
 from ipe_bench.statistics.records import SCORES, rows_of, summary_rows
 from ipe_bench.statistics.sample import Sample, samples
-from ipe_bench.trials.scenario import MOST_TRIALS, TRIALS, AnyScenario
+from ipe_bench.trials.scenario import MOST_TRIALS, TRIALS
+from ipe_bench.trials.tracking import AnyScenario
 
 NARROW = "every interval is narrow enough"
 """Why a scenario stops that has come to the precision that was asked for."""

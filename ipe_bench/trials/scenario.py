@@ -4,20 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import ClassVar
 
 import numpy as np
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.linalg import Array, deviations, read_only
+from ipe_bench.basics.linalg import Array, read_only
 from ipe_bench.basics.streams import numbered
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.problem import Problem, require_nominal
-from ipe_bench.noise.base import Certified, ModelNoise, Noise, resolved
+from ipe_bench.noise.base import ModelNoise, Noise, resolved
 from ipe_bench.priors import GaussianPrior, Prior
-from ipe_bench.states.base import Paths, StateModel, require_sound
-from ipe_bench.states.bounds import bound_at_truth
-from ipe_bench.states.formulas import Recorded
 from ipe_bench.trials.theory import linear_bound
 
 TRIALS = 1000
@@ -142,48 +138,3 @@ def check_seed(seed: int) -> None:
     """Raises UserError unless the seed can be one."""
     if not 0 <= seed < _SEEDS:
         raise UserError(f"seed={seed}: give a whole number from 0 to {_SEEDS - 1}")
-
-
-@dataclass(frozen=True)
-class Tracking:
-    """Everything that determines the trials of a state model. Paths and readings are drawn by the model's own prior, Q
-    and R; trial t is the same in whatever block it is drawn."""
-
-    model: StateModel
-    seed: int = 0
-
-    error_scale: ClassVar[float] = 1.0
-    truth: ClassVar[None] = None
-    prior: ClassVar[Prior] = GaussianPrior()
-
-    def __post_init__(self) -> None:
-        check_seed(self.seed)
-        require_sound(self.model)
-
-    @property
-    def noise(self) -> Noise:
-        return Certified() if isinstance(self.model, Recorded) else ModelNoise()
-
-    @property
-    def measurement(self) -> StateModel:
-        """The model, as the other scenario calls it."""
-        return self.model
-
-    @cached_property
-    def linear_bound(self) -> Array:
-        """Standard deviations (n,) of the states at the last epoch in a filter that is linearised along the path
-        without process noise from the mean of the prior."""
-        model = self.model
-        start = x = model.prior.mean[None]
-        path = np.empty((1, model.epochs, model.n))
-        for k in range(model.epochs):
-            x = path[:, k] = model.transition(x, k) if model.moves(k) else x
-        with np.errstate(all="ignore"):
-            return deviations(bound_at_truth(model, Paths(start, path, np.empty(0)))[0, -1])
-
-    def draw(self, start: int, stop: int) -> Paths:
-        """Paths of trials start to stop."""
-        return self.model.draw(start, stop, self.seed)
-
-
-AnyScenario = Scenario | Tracking

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -21,10 +21,13 @@ from ipe_bench.basics.errors import UserError, describe_exception
 from ipe_bench.basics.linalg import Array, Mask, deviations, finite, read_only
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates
-from ipe_bench.states.base import Paths, StateModel
+from ipe_bench.noise.base import Certified, ModelNoise, Noise
+from ipe_bench.priors import GaussianPrior, Prior
+from ipe_bench.states.base import Paths, StateModel, require_sound
 from ipe_bench.states.bounds import bound_at_truth, posterior_bounds
+from ipe_bench.states.formulas import Recorded
 from ipe_bench.states.trackers import Tracker, Tracks
-from ipe_bench.trials.scenario import AnyScenario, Tracking
+from ipe_bench.trials.scenario import Scenario, check_seed
 from ipe_bench.trials.scoring import Block, Columns, by_parameter, nees
 from ipe_bench.trials.thresholds import EXPECTED, gate
 from ipe_bench.trials.whiteness import white_p
@@ -33,6 +36,51 @@ _PARTS = 10
 """Groups of paths by whose scatter the standard error of the posterior bound is known."""
 _INDEFINITE = 1e-10
 """A covariance of which an eigenvalue is below this, in its own deviations, has no inverse."""
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """Everything that determines the trials of a state model. Paths and readings are drawn by the model's own prior, Q
+    and R; trial t is the same in whatever block it is drawn."""
+
+    model: StateModel
+    seed: int = 0
+
+    error_scale: ClassVar[float] = 1.0
+    truth: ClassVar[None] = None
+    prior: ClassVar[Prior] = GaussianPrior()
+
+    def __post_init__(self) -> None:
+        check_seed(self.seed)
+        require_sound(self.model)
+
+    @property
+    def noise(self) -> Noise:
+        return Certified() if isinstance(self.model, Recorded) else ModelNoise()
+
+    @property
+    def measurement(self) -> StateModel:
+        """The model, as the other scenario calls it."""
+        return self.model
+
+    @cached_property
+    def linear_bound(self) -> Array:
+        """Standard deviations (n,) of the states at the last epoch in a filter that is linearised along the path
+        without process noise from the mean of the prior."""
+        model = self.model
+        start = x = model.prior.mean[None]
+        path = np.empty((1, model.epochs, model.n))
+        for k in range(model.epochs):
+            x = path[:, k] = model.transition(x, k) if model.moves(k) else x
+        with np.errstate(all="ignore"):
+            return deviations(bound_at_truth(model, Paths(start, path, np.empty(0)))[0, -1])
+
+    def draw(self, start: int, stop: int) -> Paths:
+        """Paths of trials start to stop."""
+        return self.model.draw(start, stop, self.seed)
+
+
+AnyScenario = Scenario | Tracking
 
 
 @dataclass(frozen=True)

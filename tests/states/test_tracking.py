@@ -18,8 +18,7 @@ from ipe_bench.states import Bootstrap, Formulas, Smoother, Tracker, ckf, ekf, u
 from ipe_bench.statistics import analyse
 from ipe_bench.statistics.certified import published_table
 from ipe_bench.statistics.collect import collect
-from ipe_bench.trials.scenario import Tracking
-from ipe_bench.trials.tracking import PathBlock
+from ipe_bench.trials.tracking import PathBlock, Tracking
 from ipe_bench.trials.whiteness import white_p
 
 LINEAR = ConstantVelocity(count=30, spread=3.0)

@@ -11,7 +11,12 @@ from pathlib import Path
 import pytest
 
 import ipe_bench
+from ipe_bench.basics.options import component_classes
+from ipe_bench.measurements.polynomial import Polynomial
+from ipe_bench.noise.base import Gaussian
+from ipe_bench.runs import provenance
 from ipe_bench.runs.provenance import numerical_code
+from ipe_bench.trials.scenario import Scenario
 
 KEYS = """
 import ipe_bench as ib
@@ -19,6 +24,10 @@ from ipe_bench.runs.store import ResultKey
 bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01))
 for name, estimator in {"ukf": ib.baselines.UKF(), "newton": ib.solvers.Newton(), "truth": None}.items():
     print(name, ResultKey(bench, name, estimator).key)
+walk = {"next": {"p": "p + w"}, "readings": {"z": "p"}, "noise": {"w": 1.0}}
+track = ib.Tracking(ib.states.Formulas(**walk, deviation={"z": 0.5}, spread={"p": 3.0}, count=20))
+for name, tracker in {"track": ib.states.ekf(), "path": None}.items():
+    print(name, ResultKey(track, name, tracker).key)
 """
 
 
@@ -74,6 +83,25 @@ def test_a_changed_constant_makes_stale_what_was_computed_with_it_and_nothing_el
     edit(copy / "ipe_bench/trials/thresholds.py", "SAME_ROOT = 1e-3", "SAME_ROOT = 2e-3")
     after = keys(copy)
     assert all(before[name] != after[name] for name in before)
+
+
+def test_a_change_to_states_that_move_makes_stale_what_is_computed_with_them_and_no_constants(copy):
+    before = keys(copy)
+    # Filters of constants update as trackers do.
+    changed = {"states/trackers.py": {"track", "path", "ukf"}, "trials/tracking.py": {"track", "path"}}
+    for module, stale in changed.items():
+        edit(copy / "ipe_bench" / module, "import numpy as np\n", "import numpy as np\nFACTOR = 2\n")
+        after = keys(copy)
+        assert {name for name in before if before[name] != after[name]} == stale
+        before = after
+
+
+def test_the_source_of_a_result_is_in_the_rooms_that_draw_estimate_and_score():
+    modules = {cls.__module__ for cls in component_classes(Scenario(Polynomial(), Gaussian(0.01)))}
+    covered = set[str]().union(*map(provenance._import_closure, ["ipe_bench.trials.scoring", *modules]))
+    rooms = {module.split(".")[1] for module in covered}
+    assert rooms == {"basics", "measurements", "noise", "priors", "estimators", "solvers", "trials"}
+    assert {"ipe_bench.trials.scenario", "ipe_bench.measurements.polynomial"} <= covered
 
 
 def code(source: str) -> str:
