@@ -45,10 +45,13 @@ _SIGNS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.Pow: "**"
 _SIGNS |= {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
 _MOST_IN_A_ROW = 400
 """Operations that build on one another, as in a sum of so many terms."""
+_MOST_OPERATIONS = 10_000
+"""Numbers, names and operations of a formula, where the middle of 0 < a < 1 counts twice."""
+_IN_PYTHON = "write the model in Python (`ipe-bench new measurement`)"
 _ALPHABET = re.compile(r"[\w\s.,+\-*/^()<>=!]*", re.ASCII)
 _NAME = re.compile(r"(?<![\w.])(?!(?:if|else|and|or|not)\b)(?=[A-Za-z_])")
 """The place before a name."""
-_NUMBER = re.compile(r"[\d.]+(e[-+]?\d+)?", re.IGNORECASE)
+_NUMBER = re.compile(r"(\d+\.?\d*|\.\d+)(e[-+]?\d+)?", re.IGNORECASE)
 
 Tree = tuple[Any, ...]
 
@@ -86,10 +89,11 @@ def read(text: str, where: str) -> Arithmetic:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             tree = _tree(ast.parse(source, mode="eval").body, source)
-        if _height(tree) > _MOST_IN_A_ROW:
+        size, height = _extent(tree, {})
+        if height > _MOST_IN_A_ROW:
             raise RecursionError
     except (RecursionError, MemoryError):
-        remedy = "group terms by parentheses, or write the model in Python (`ipe-bench new measurement`)"
+        remedy = f"group terms by parentheses, or {_IN_PYTHON}"
         raise UserError(f"{where}: has more than {_MOST_IN_A_ROW} operations one after another; {remedy}") from None
     except SyntaxError as error:
         rest = re.sub(r"\b_", "", source[(error.offset or 1) - 1 :].strip())
@@ -99,6 +103,8 @@ def read(text: str, where: str) -> Arithmetic:
         raise UserError(f"{where}: {text[:60]!r} is not a formula {place}: {reason}; {known}") from None
     except NameError as error:
         raise UserError(f"{where}: {error.name}(...): {unknown(str(error.name), _CALLED, 'function')}") from None
+    if size > _MOST_OPERATIONS:
+        raise UserError(f"{where}: has more than {_MOST_OPERATIONS} numbers, names and operations; {_IN_PYTHON}")
     names = dict.fromkeys(part[1] for part in parts(tree) if part[0] == "name")
     return Arithmetic(text, tree, tuple(name for name in names if name not in CONSTANTS), where)
 
@@ -112,7 +118,7 @@ def _tree(node: ast.expr, source: str) -> Tree:
     """
     reason = "this is Python, and not of this language"
     match node:
-        case ast.Constant() if _NUMBER.fullmatch(number := ast.get_source_segment(source, node) or ""):
+        case ast.Constant() if _NUMBER.fullmatch(number := source[node.col_offset : node.end_col_offset]):
             return ("number", float(number))
         case ast.Name(name):
             return ("name", name[1:])
@@ -129,11 +135,11 @@ def _tree(node: ast.expr, source: str) -> Tree:
         case ast.BoolOp(sign, values):
             return _in_a_row(_SIGNS[type(sign)], [_tree(value, source) for value in values])
         case ast.Compare(left, signs, others) if all(type(sign) in _SIGNS for sign in signs):
-            held = []
-            for a, sign, b in zip([left, *others], map(_SIGNS.get, map(type, signs)), others, strict=False):
-                sides = (re.sub(r"\b_", "", ast.get_source_segment(source, side) or "") for side in (a, b))
-                held.append((sign, _tree(a, source), _tree(b, source), f" {sign} ".join(sides)))
-            return _in_a_row("and", held)
+            operands = [left, *others]
+            texts = [re.sub(r"\b_", "", source[one.col_offset : one.end_col_offset]) for one in operands]
+            sides = list(zip([_tree(one, source) for one in operands], texts, strict=True))
+            signed = zip(sides, [_SIGNS[type(sign)] for sign in signs], sides[1:], strict=False)
+            return _in_a_row("and", [(sign, a, b, f"{left} {sign} {right}") for (a, left), sign, (b, right) in signed])
         case ast.Call(ast.Name(name), arguments, []):
             if name[1:] not in _CALLED:
                 raise NameError(name=name[1:])
@@ -172,12 +178,16 @@ def never_switching(formulas: Iterable[Arithmetic], values: Mapping[str, Any]) -
     ]
 
 
-def _height(tree: Tree) -> int:
-    """The most operations that build on one another."""
-    level, height = [tree], 0
-    while level:
-        level, height = [part for node in level for part in node[1:] if isinstance(part, tuple)], height + 1
-    return height
+def _extent(tree: Tree, known: dict[int, tuple[int, int]]) -> tuple[int, int]:
+    """The size of a tree, and the most operations that build on one another; an operand that two share is met once."""
+    if id(tree) not in known:
+        size, height = 1, 1
+        for part in tree:
+            if isinstance(part, tuple):
+                inner, below = _extent(part, known)
+                size, height = size + inner, max(height, below + 1)
+        known[id(tree)] = size, height
+    return known[id(tree)]
 
 
 _BINARY: dict[str, Callable[[Any, Any], Any]] = {

@@ -12,6 +12,7 @@ import hashlib
 import io
 import math
 import re
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -152,8 +153,8 @@ def _read_table(path: Path) -> Table:
     table = (_with_parquet if path.suffix == ".parquet" else _with_text)(table, data)
     if all(table.number(name) is not None for name in table.heading):
         raise table.error("the first row has only numbers and is no header; write the names of the columns above it")
-    for name in table.heading:
-        if table.heading.count(name) > 1:
+    for name, count in Counter(table.heading).items():
+        if count > 1:
             what = f"column {name} stands there" if name else "columns without a name stand there"
             raise table.error(f"{what} twice; keep one")
     for number, row in table.rows:

@@ -127,6 +127,7 @@ def test_rates_in_pieces_of_time_have_their_exact_solution(method):
         ("-k*y if sin(t) > 0 else 0", "sin.t. > 0: compare t itself with a constant"),
         ("-k*y if sin(2*pi*t) > 0.5 else 0", "compare t itself with a constant"),
         ("-k*y if (1 if t < 3 else 2) > 1.5 else 0", "compare t itself with a constant"),
+        ("-k*y*" + "abs(" * 40 + "t - 1" + ")" * 40, "the abs of t: compare t itself with a constant"),
     ],
 )
 @pytest.mark.parametrize("method", ["auto", "implicit"])

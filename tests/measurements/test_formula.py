@@ -107,7 +107,7 @@ REFUSED = [
     "exp(b1,t)",
     "b1%t", "{b1}", "b1\\n", "0x10", "1e", "1_000*b1", "1j*b1", "b1!", "é*t", "sin t", "None*b1", "exp(a=b1)",
     "(" * 300 + "b1" + ")" * 300, "-" * 500 + "b1", "not " * 500 + "b1", "1 if t else " * 500 + "b1",
-    "b1*" * 4000 + "t", "9**9**9*b1", "b1*log(0)", "b1/(1-1)", "b1*sqrt(-1)",
+    "b1*" * 4000 + "t", "9**9**9*b1", "b1*log(0)", "b1/(1-1)", "b1*sqrt(-1)", "...*b1",
 ]  # fmt: skip
 
 
@@ -152,6 +152,19 @@ def test_a_formula_is_evaluated_or_refused_however_long():
     for text in ("+".join(["b1*t"] * 900), "b1" + "*t" * 2000, "b1" + "**b1" * 2000):
         with pytest.raises(UserError, match=r"^expression: .* one after another; group"):
             read(text, "expression")
+
+
+def test_comparisons_within_comparisons_are_evaluated_or_refused_however_deep():
+    """The middle of a < b < c counts twice, so the size doubles with each level; at 100 it would exceed 1e30."""
+    text, value = "t*b1", 0.25
+    for level in range(100):
+        text, value = f"0.5<1-({text})<2", float(0.5 < 1 - value < 2)
+        if level < 6:
+            assert read(text, "expression")({"t": 0.5, "b1": 0.5}) == value
+    with pytest.raises(UserError, match=r"^expression: has more than 10000 numbers, names and operations; write"):
+        read(text, "expression")
+    with pytest.raises(UserError, match=r"^expression: has more than 400 operations one after another"):
+        read("<".join(["b1"] * 5000), "expression")
 
 
 numbers = st.sampled_from(["t", "p", "q", "0.5", "-1.5", "2"])

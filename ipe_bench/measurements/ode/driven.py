@@ -18,6 +18,7 @@ from ipe_bench.measurements.arithmetic import COMPARISONS, CONSTANTS, Arithmetic
 from ipe_bench.measurements.ode import trace
 
 PIECEWISE = ("min", "max", "abs", *COMPARISONS)
+_REMEDY = "compare t itself with a constant, so that the moment of the switch is known"
 _SAME = 1e-12
 """Of the whole span: times this close are one."""
 
@@ -28,13 +29,18 @@ def separated(
     """The formulas with a name in place of every comparison of t with constants, and the comparisons by those names."""
     switches: dict[Tree, str] = {}
 
-    def rewritten(tree: Tree) -> Tree:
+    def switching(tree: Tree) -> bool:
         names = {part[1] for part in parts(tree) if part[0] == "name"} if tree[0] in PIECEWISE else set()
-        if "t" not in names or not names <= {"t", *constants, *CONSTANTS}:
+        return "t" in names and names <= {"t", *constants, *CONSTANTS}
+
+    def rewritten(tree: Tree) -> Tree:
+        if not switching(tree):
             return tuple(rewritten(part) if isinstance(part, tuple) else part for part in tree)
         if tree[0] in COMPARISONS:
             return ("name", switches.setdefault(tree, f"switch {len(switches)}"))
         operation, a, *other = tree
+        if any(switching(part) for operand in (a, *other) for part in parts(operand)):
+            raise UserError(f"rates: the {operation} of t: {_REMEDY}")
         b = other[0] if other else ("negative", a)
         return rewritten(("if", ("<" if operation == "min" else ">", a, b, f"the {operation} of t"), a, b))
 
@@ -54,8 +60,7 @@ def switching_times(comparison: Tree, cases: Sequence[Mapping[str, float]]) -> l
         gap = t.graph.apply("add", evaluate(("-", left, right), {**case, "t": t}), 0.0)
         slope = trace.tangent([gap], {t: t.graph.constant(1.0)})[0].value
         if slope is None or any(e.operation in trace.COMPARISONS for e in trace.in_order([gap])):
-            remedy = "compare t itself with a constant, so that the moment of the switch is known"
-            raise UserError(f"rates: {text}: {remedy}")
+            raise UserError(f"rates: {text}: {_REMEDY}")
         if slope:
             found.append(-float(trace.Program.of([gap], [t])([0.0])[0]) / slope)
     return found
