@@ -207,12 +207,12 @@ def compare(
     if wrong := [name for name in fail_on if name not in JUDGED]:
         raise UserError(f"fail_on={wrong[0]}: {unknown(wrong[0], JUDGED, 'quantity')}")
     paths = [_paths(first_directory), _paths(first_directory if second_directory is None else second_directory)]
-    if second_directory is None and (first is None or second is None):
-        raise UserError("compare: one folder is given; name another, or first=LABEL and second=LABEL")
-    if first == second and {path.resolve() for path in paths[0]} == {path.resolve() for path in paths[1]}:
-        label = "one folder" if first is None else f"{first} of one folder"
-        raise UserError(f"compare: {label} is compared with itself; name another, or first=LABEL and second=LABEL")
     with opened(paths[0]) as one, opened(paths[1]) as other:
+        if second_directory is None and (first is None or second is None):
+            raise UserError("compare: one folder is given; name another, or first=LABEL and second=LABEL")
+        if first == second and {path.resolve() for path in paths[0]} == {path.resolve() for path in paths[1]}:
+            label = "one folder" if first is None else f"{first} of one folder"
+            raise UserError(f"compare: {label} is compared with itself; name another, or first=LABEL and second=LABEL")
         collections = collect(one), collect(other)
         frame = pd.DataFrame(compared(*collections, (first, second), alpha=alpha, anytime=anytime, plan=plan))
     if plan is not None:

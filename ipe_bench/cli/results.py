@@ -153,13 +153,13 @@ def show_report(
         elsewhere = [line for line in of_cells if not any(cell in line for cell in cells.values())]
         told = [line for line in told if line not in elsewhere]
         if elsewhere:
-            counted = _counted(len(elsewhere), "problem")
-            told.append(f"{output}: {counted} of other commands; `ipe-bench status {output}` lists them")
+            number = counted(len(elsewhere), "problem")
+            told.append(f"{output}: {number} of other commands; `ipe-bench status {output}` lists them")
     print_problems(told)
     drawn = f"\nFigures  {output / 'figures'}" if any(output.glob("figures/*.png")) else ""
     say(f"\nSummary  {output / 'summary.csv'}\nTables   {output / 'tables'}{drawn}\nReport   {output / 'report.html'}")
     if others:
-        print(f"Here too  {_counted(others, 'result')} of other commands; `ipe-bench report {output}` shows all")
+        print(f"Here too  {counted(others, 'result')} of other commands; `ipe-bench report {output}` shows all")
     return 1 if collection.problems else 0
 
 
@@ -177,7 +177,7 @@ def _print_table(rows: Sequence[Mapping[str, Any]], collection: Any) -> None:
     sys.stdout.flush()
 
 
-def _counted(number: int, noun: str) -> str:
+def counted(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 

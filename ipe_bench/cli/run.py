@@ -26,10 +26,12 @@ from ipe_bench.cli import say
 from ipe_bench.cli import words as w
 from ipe_bench.cli.estimate import OF_FILES, require_one_kind
 from ipe_bench.cli.parser import parsers
-from ipe_bench.cli.results import show_report
+from ipe_bench.cli.results import counted, show_report
 from ipe_bench.cli.session import Jobs, complete, jobs_of, session, show, spec_of
 from ipe_bench.cli.spec import STANDARD_FILTERS, Spec
+from ipe_bench.plugins.discovery import options
 from ipe_bench.runs.execution import Serial, end_idle
+from ipe_bench.runs.parts import TRUTH
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.run import accept, record_refusal, result_keys, validate
 from ipe_bench.runs.schedule import Progress, Watcher
@@ -99,6 +101,7 @@ def run_command(arguments: Sequence[str]) -> int:
         if flags.dry_run:
             say(*_missing(jobs))
             return 0
+        say(*_there_already(jobs))
         if words.standard_baselines:
             say(*_left_out(jobs.specs))
         task = Task(shlex.join(["ipe-bench", "run", *arguments]), words.files, words.standard_baselines)
@@ -125,6 +128,23 @@ def _missing(jobs: Jobs) -> list[str]:
         lines.append(f"{name}: {asked - lacking} of {asked} estimates are stored{more}")
         stored, missing = stored + asked - lacking, missing + lacking
     return [*lines, f"{stored} estimates are stored, {missing} would be computed; nothing was computed now"]
+
+
+def _there_already(jobs: Jobs) -> list[str]:
+    """A line for each folder that holds what other commands computed; refuses the name of another experiment."""
+    lines = []
+    for output in dict.fromkeys(job.output for job in jobs.specs if job.write_readings is None):
+        found = Results.read([output], keys=()).runs if (Path(output) / "runs").is_dir() else ()
+        there = {one["identity_key"] for run in found for one in run["cells"] if one["names"]["estimator"] != TRUTH}
+        for job in jobs.specs:
+            there -= {cell.identity_key for cell in result_keys(job.scenario, job.estimators)}
+        if there:
+            lines.append(f"{output}: holds {counted(len(there), 'result')} of other settings; they stay beside the new")
+    name, own = jobs.words.chosen("name"), jobs.words.chosen("experiment")
+    if name != own and name in [option.name for option in options("experiment")]:
+        remedy = f"choose another, or write output=outputs/{name} in its place to mix them"
+        raise UserError(f"name={name}: is that of an experiment, whose results these would join; {remedy}")
+    return lines
 
 
 def _left_out(jobs: Sequence[Spec]) -> list[str]:

@@ -108,7 +108,9 @@ def jobs_of(words: Words, *, multirun: bool) -> Jobs:
     optimises = not hydra.sweeper["_target_"].endswith(".BasicSweeper")
     for one in words.overrides:
         if one.is_sweep_override() and not multirun:
-            raise UserError(f"{w.said(one)}: is a sweep; add -m, or put a list in brackets")
+            listed = "." in one.key_or_group or one.key_or_group in plugins.PACKAGES
+            remedy = ", or put a list in brackets" if listed else f" for a job of each {one.key_or_group}"
+            raise UserError(f"{w.said(one)}: is a sweep; add -m{remedy}")
         if one.is_interval_sweep() and not optimises:
             raise UserError(
                 f"{w.said(one)}: interval() is for sweepers that optimise (hydra/sweeper=optuna); give the values, "

@@ -236,6 +236,9 @@ def _parse(command: str, word: str, groups: Groups) -> Override:
 
 def _check(override: Override, groups: Groups) -> None:
     group, word = override.key_or_group, said(override)
+    if group.startswith("hydra.sweeper.params"):
+        key = group.removeprefix("hydra.sweeper.params").lstrip(".") or "error_scale"
+        raise UserError(f"{word}: belongs in an experiment file; on the command line write -m {key}=VALUE,VALUE")
     if re.split("[./]", group)[0] == "hydra":
         return
     if group in groups and not override.is_delete():

@@ -105,9 +105,11 @@ class Table:
                 raise self.error(f"{what} is not understood{hint} {remedy} (the header must be {','.join(wanted)})")
 
     def refuse_other_unit(self, name: str) -> None:
-        """Refuses a column that is there with another unit."""
+        """Refuses a column that is there with another unit, or with none."""
         for other in self.heading:
             if _quantity(other) == _quantity(name):
+                if not _unit(other):
+                    raise self.error(f"column {other}: has no unit; call it {name} if that is the unit of its values")
                 raise self.error(f"column {other}: the unit must be that of {name}; convert the values")
 
 
@@ -287,13 +289,16 @@ def _readings_in(table: Table, model: Measurement) -> Readings:
     sigma = table.find(SIGMA)
     columns = [table.find(wanted.heading) for wanted in model.inputs]
     there = [c for i, c in zip(model.inputs, columns, strict=True) if c is not None and not i.label]
-    if not model.inputs or (model.input_columns_known and not there):
+    known = bool(model.inputs) and model.input_columns_known and not there
+    # An input that tells readings apart, such as the time, is in every file.
+    if not model.inputs or (known and not any(i.heading in model.index for i in model.inputs if not i.label)):
         rows, shown = _rows_of(table, model, [sigma] if sigma else []), header(model)[-1]
         cells = table.column(shown)
         z = np.array([table.value(*cells[row]) for row in rows], dtype=float)
         return Readings(model, z, _sigmas(table, sigma, rows, z, shown))
     for wanted, column in zip(model.inputs, columns, strict=True):
         if column is None and wanted.default is None:
+            table.refuse_other_unit(wanted.heading)
             absent = model.absent_input(wanted.heading, list(table.heading))
             raise table.error(f"column {wanted.heading} is missing; {absent}")
     if not table.rows:

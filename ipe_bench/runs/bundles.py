@@ -141,7 +141,8 @@ def opened(paths: Sequence[Path | str], into: Path | None = None) -> Iterator[li
 def _require_results(folder: Path) -> None:
     store = Store(folder)
     if not (store.runs.is_dir() or store.trials.is_dir()):
-        raise UserError(f"{folder}: holds no results of ipe-bench; give the output folder of a run")
+        what = "holds no results of ipe-bench" if folder.exists() else "there is no such folder"
+        raise UserError(f"{folder}: {what}; give the output folder of a run")
 
 
 def _digest(content: bytes) -> str:

@@ -236,6 +236,22 @@ def stored(folder: Path) -> list[Path]:
     return list(folder.rglob("*.parquet"))
 
 
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        ("error_scale=100,1000", "error_scale=100,1000: is a sweep; add -m for a job of each error_scale"),
+        ("solver=newton,auto", "solver=newton,auto: is a sweep; add -m, or put a list in brackets"),
+        ("-m hydra.sweeper.params.error_scale=1,2", "write -m error_scale=VALUE,VALUE"),
+        ("-m +hydra.sweeper.params.error_scale='1,2'", "write -m error_scale=VALUE,VALUE"),
+        ("-m hydra.sweeper.params={error_scale:1}", "belongs in an experiment file"),
+    ],
+)
+def test_a_sweep_in_a_wrong_place_is_told_a_right_one(answer, words, line):
+    code, (said,) = answer("run", *words.split())
+    assert code == 2
+    assert line in said
+
+
 def test_there_are_four_hundred_wrong_command_lines():
     assert len(LINES) >= 400
 

@@ -34,6 +34,27 @@ def test_run_shows_what_it_asked_for_and_counts_the_rest(ipe_bench):
     assert "max_iterations" in out
 
 
+def test_a_folder_with_results_of_other_settings_is_said_to_hold_them(ipe_bench):
+    words = (*SMALL, "solver=[newton]", "output=mixed")
+    assert "holds" not in ipe_bench("run", *words, "trials=4")[1]
+    # More trials, and a sweep that includes what is there, have nothing beside them.
+    assert "holds" not in ipe_bench("run", *words, "trials=8")[1]
+    assert "holds" not in ipe_bench("run", "-m", *words, "trials=8", "error_scale=1,3")[1]
+    _, out, _ = ipe_bench("run", *words, "trials=8", "seed=5")
+    assert "mixed: holds 2 results of other settings; they stay beside the new" in out
+
+
+def test_the_name_of_an_experiment_is_for_the_experiment(ipe_bench):
+    code, _, error = ipe_bench("run", *SMALL, "name=headline", "trials=8")
+    assert code == 2
+    assert "name=headline: is that of an experiment" in error
+    assert "write output=outputs/headline" in error
+    assert not Path("outputs/headline").exists()
+    for words in (["+experiment=polynomial", "name=polynomial"], ["+experiment=polynomial", "name=mine"], ["name=b"]):
+        code, out, _ = ipe_bench("run", *words, "--dry-run")
+        assert (code, "nothing was computed" in out) == (0, True)
+
+
 NAMES = {
     "": "gins",
     "trials=50 seed=3 execution=serial block_size=10": "gins",

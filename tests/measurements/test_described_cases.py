@@ -1,5 +1,7 @@
 """Differential equations of several cases that a file describes, against their solution in closed form."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import curve_fit
@@ -8,6 +10,7 @@ from ipe_bench.baselines import LevenbergMarquardt
 from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Ode
 from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo
+from ipe_bench.measurements.ode.described import packaged
 from ipe_bench.noise import Gaussian
 from ipe_bench.plugins.conformance import check_component
 from ipe_bench.real.fits import fit
@@ -144,3 +147,35 @@ def test_a_misspelt_parameter_is_told_of_with_both_remedies():
     model = Ode({"y": "-kk*y"}, {"y0": 1.0}, {"y": "y0"}, times=(1.0, 2.0))
     with pytest.raises(UserError, match=r"kk is not known; give it a start, measurement.start.kk=1, .*constants.kk"):
         model.simulate(np.ones((1, 1)))
+
+
+EPIDEMIC = "1,3\n2,8\n3,26\n4,76\n5,225\n6,298\n7,258\n"
+
+
+def test_one_case_needs_times_and_readings_alone(tmp_path):
+    """What a packaged model knows of its case is in no file, and a heading without its unit is no other unit."""
+    path, model = tmp_path / "flu.csv", packaged("sir")()
+    for heading, remedy in {
+        "time,reading [people]": "column time: has no unit; call it time .day. if that is the unit",
+        "time [day],reading": "column reading: has no unit; call it reading .people. if",
+        "time [h],reading [people]": "column time .h.: the unit must be that of time .day.; convert",
+        "t,reading [people]": "there are t, reading .people.; call the times `time .day.`",
+    }.items():
+        path.write_text(f"{heading}\n{EPIDEMIC}")
+        with pytest.raises(UserError, match=remedy):
+            open_together([path], model)
+    path.write_text(f"time [day],reading [people]\n{EPIDEMIC}")
+    found = open_together([path], model)
+    assert found.model.index["time [day]"] == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0]
+    assert found.z.tolist() == [3.0, 8.0, 26.0, 76.0, 225.0, 298.0, 258.0]
+
+
+def test_the_column_of_the_readings_has_the_name_that_is_stated(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("time,conc\n1,.9\n2,.8\n3,.73\n")
+    decay = Ode({"y": "-k*y"}, {"k": 0.1}, {"y": 1.0})
+    with pytest.raises(UserError, match=r"column reading is missing.*set measurement.reading=conc"):
+        open_together([path], decay)
+    assert open_together([path], replace(decay, reading="conc")).z.tolist() == [0.9, 0.8, 0.73]
+    with pytest.raises(UserError, match="conc: is a column of every readings file"):
+        Ode({"y": "-k*y*conc"}, {"k": 0.1}, {"y": 1.0}, reading="conc")

@@ -101,10 +101,12 @@ class Ode(WrittenModel, WrappedModel):
     the next row of the case; `linear` is straight between rows. A row without a reading only changes them."""
     columns: Mapping[str, Sequence[float]] = field(default_factory=dict)
     """The inputs of `driven_by`, where no file brings them: time, one column each, and `case` where cases differ."""
+    reading: str = "reading"
+    """What the column of the readings is called in a file; `reading` is understood too."""
 
     name = property(lambda model: model.title)  # type: ignore[assignment]
     index = WrappedModel.index
-    reading_name = Measurement.reading_name
+    reading_name = WrittenModel.reading_name
     own_parameters = property(lambda model: model.own)  # type: ignore[assignment]
     usual_noise = property(lambda model: model.deviation and UsualNoise(model.deviation))  # type: ignore[assignment]
 
@@ -120,7 +122,7 @@ class Ode(WrittenModel, WrappedModel):
         for name, formula in self.initial_formulas.items():
             if used := [used for used in formula.names if used in {*self.rates, *self.driven_by, "t"}]:
                 raise UserError(f"initial.{name}: {used[0]} changes with time, and a start cannot depend on it")
-        taken = {"start": (*self.rates, "t"), "driven_by": (*self.start, *self.rates, *_COLUMNS, "t")}
+        taken = {"start": (*self.rates, "t"), "driven_by": (*self.start, *self.rates, *_COLUMNS, self.reading, "t")}
         for key, others in taken.items():
             for name in getattr(self, key):
                 if name in others:
@@ -134,7 +136,7 @@ class Ode(WrittenModel, WrappedModel):
                 if name != "t" and name not in self.constant_names:
                     raise UserError(f"tolerance: {name} is neither a constant nor t")
         for name in self.constant_names:
-            if name in _COLUMNS:
+            if name in (*_COLUMNS, self.reading):
                 remedy = "the time is t" if name == "time" else "rename it"
                 raise UserError(f"{name}: is a column of every readings file, and not known in a formula; {remedy}")
         for name in self.constants:
