@@ -3,13 +3,16 @@
 import numpy as np
 import pytest
 from scipy.stats import binom, chi2, kstest
+from state_models import ConstantVelocity
 
+import ipe_bench as ib
 from ipe_bench.baselines import EKF, UKF, GaussNewton
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements import Gins, Polynomial
 from ipe_bench.noise import Gaussian, Quantization
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.real.fits import fit
+from ipe_bench.real.tracks import Log
 from ipe_bench.report.answer import with_error
 from ipe_bench.solvers import Newton, Progressive
 from ipe_bench.trials.scenario import Scenario
@@ -31,6 +34,22 @@ def test_missing_readings_are_no_obstacle_to_any_estimator():
         assert not one.outliers.any()
         assert one.fits
         assert np.allclose(np.diagonal(one.correlation), 1.0)
+
+
+def test_masked_readings_are_missing_whatever_lies_under_the_mask():
+    scenario = Scenario(Polynomial(), Gaussian(0.01))
+    z = scenario.draw(0, 1).z[0]
+    masked, missing = np.ma.masked_array(z.copy(), mask=np.arange(len(z)) == 3), z.copy()
+    masked.data[3], missing[3] = 1e3, np.nan
+    (one,), (other,) = (
+        ib.estimate(scenario.measurement, given, {"gn": GaussNewton()}, noise=Gaussian(0.01))
+        for given in (masked, missing)
+    )
+    assert one.fits
+    assert np.array_equal(one.x, other.x)
+    model = ConstantVelocity(count=12)
+    log = np.ma.masked_array(model.draw(0, 1).z[0], mask=np.arange(12)[:, None] == 3)
+    assert np.array_equal(Log.of(model, log).z, log.filled(np.nan), equal_nan=True)
 
 
 def test_the_chi_square_test_rejects_a_true_model_as_often_as_it_says_and_a_wrong_deviation_always():

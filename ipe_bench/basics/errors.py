@@ -23,10 +23,16 @@ class StorageError(Exception):
     """
 
 
+def one_line(text: Any) -> str:
+    """The first line of a text, at most 1000 letters of it, with ? for what no file can hold."""
+    lines = str(text)[:1000].encode("utf-8", "replace").decode().splitlines()
+    return lines[0] if lines else ""
+
+
 def describe_exception(error: BaseException) -> str:
     """One line for a table: the type and the first line of the message."""
-    lines = str(error).splitlines()
-    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
+    line = one_line(error)
+    return f"{type(error).__name__}: {line}" if line else type(error).__name__
 
 
 def place_of(error: BaseException, within: str | None = None) -> str:

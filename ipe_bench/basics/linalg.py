@@ -43,6 +43,25 @@ def read_only(a: Array) -> Array:
     return view
 
 
+def unmasked(values: Any) -> Array:
+    """The values as an ordinary array of floats, in which masked entries are NaN."""
+    return np.asarray(np.ma.asarray(values, dtype=float).filled(np.nan))
+
+
+def plain_numbers(what: str, values: Any, shape: tuple[int, ...]) -> Array:
+    """The values as an ordinary array of floats of this shape, in which masked entries are NaN.
+
+    Raises:
+        ValueError: they have another shape, or are no real numbers.
+    """
+    array = np.ma.asarray(values)  # not np.asarray, which keeps what lies under a mask
+    if array.dtype.kind not in "fiub":
+        raise ValueError(f"{what} of type {array.dtype}, where numbers belong")
+    if array.shape != shape:
+        raise ValueError(f"{what} of shape {array.shape}, where {shape} belongs")
+    return unmasked(array)
+
+
 def multiply(A: Array, x: Array) -> Array:
     """A x for each trial: A (..., p, q), x (trials, q) -> (trials, p)."""
     return np.matmul(A, x[..., None])[..., 0]

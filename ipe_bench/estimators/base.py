@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.basics.errors import UserError, describe_exception
-from ipe_bench.basics.linalg import Array, read_only
+from ipe_bench.basics.errors import UserError, describe_exception, one_line
+from ipe_bench.basics.linalg import Array, plain_numbers, read_only
 from ipe_bench.basics.options import Component
 from ipe_bench.basics.statuses import Status
 
@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 Need = Literal["differential equations", "epochs", "prior"]
 Family = Literal["IPE", "filters", "least squares", "ensembles"]
 Equation = Literal["frozen", "least_squares", "map"]
+_ENDED = [status.value for status in Status if status != Status.RUNNING]
+_MOST = 1e15
+"""More iterations than any clock allows, and fewer than where floats skip whole numbers."""
 
 
 @dataclass
@@ -73,7 +76,9 @@ class Estimates:
             if all(value is None for value in values):
                 return None
             pairs = zip(values, sizes, strict=True)
-            return np.concatenate([np.full((size, *shape), np.nan) if v is None else v for v, size in pairs])
+            # Filled first: np.concatenate takes masks off, and keeps what lies under them.
+            blank = (np.full((size, *shape), np.nan) if v is None else np.ma.filled(v, np.nan) for v, size in pairs)
+            return np.concatenate(list(blank))
 
         whole = ("x", "status", "iterations", "simulations", "jacobians", "seconds")
         found: dict[str, Any] = {name: joined([getattr(part, name) for part in parts]) for name in whole}
@@ -145,26 +150,40 @@ def estimate_safely(estimator: Estimator, problem: Problem, z: Array, *, history
         if len(z) == 1:
             return Estimates.failed(1, problem.measurement.n, describe_exception(error))
         return Estimates.join([estimate_safely(estimator, problem, row[None], history=history) for row in z])
-    _require_shapes(estimator, estimates, len(z), problem.measurement.n)
+    _make_plain(estimator, estimates, len(z), problem.measurement.n)
     if not estimates.seconds.any():
         estimates.seconds = np.full(len(z), (time.perf_counter() - began) / max(1, len(z)))
     return estimates
 
 
-def _require_shapes(estimator: Estimator, estimates: Any, trials: int, n: int) -> None:
-    """Raises ValueError unless an estimator returned what is asked for: nothing is broadcast over trials."""
-    name, costs = f"{type(estimator).__name__}.estimate", ("iterations", "simulations", "jacobians", "seconds")
+def _make_plain(estimator: Estimator, estimates: Any, trials: int, n: int) -> None:
+    """Replaces what an estimator returned by ordinary arrays of floats and lines of text.
+
+    Raises:
+        ValueError: it is not what is asked for; nothing is broadcast over trials.
+    """
+    name = f"{type(estimator).__name__}.estimate returns"
     if not isinstance(estimates, Estimates):
-        raise ValueError(f"{name} returns {type(estimates).__name__}, where Estimates are asked for")
-    shapes = {"x": (trials, n), "covariance": (trials, n, n), "status": (trials,), **dict.fromkeys(costs, (trials,))}
-    for part, values in ({part: getattr(estimates, part) for part in shapes} | estimates.extras).items():
-        values, shape = np.asarray(0.0 if values is None else values), shapes.get(part, (trials,))
-        if values.dtype.kind not in "fiub":
-            raise ValueError(f"{name} returns {part} of type {values.dtype}, where numbers belong")
-        if values.shape != shape and getattr(estimates, part, values) is not None:
-            raise ValueError(f"{name} returns {part} of shape {values.shape}, where {shape} belongs")
-        if part in costs and not (np.isfinite(values) & (values >= 0)).all():
-            raise ValueError(f"{name} returns {part} that are not finite numbers from 0 up")
+        raise ValueError(f"{name} {type(estimates).__name__}, where Estimates are asked for")
+    estimates.x = plain_numbers(f"{name} x", estimates.x, (trials, n))
+    if estimates.covariance is not None:
+        estimates.covariance = plain_numbers(f"{name} covariance", estimates.covariance, (trials, n, n))
+    for part in ("status", "iterations", "simulations", "jacobians", "seconds"):
+        values = plain_numbers(f"{name} {part}", getattr(estimates, part), (trials,))
+        if part == "status" and not np.isin(values, _ENDED).all():
+            raise ValueError(f"{name} a status that is not one of ipe_bench.Status, or means that it has not ended")
+        if not (np.isfinite(values) & (values >= 0)).all():
+            raise ValueError(f"{name} {part} that are not finite numbers from 0 up")
+        if part == "iterations" and ((values != np.rint(values)) | (values > _MOST)).any():
+            raise ValueError(f"{name} iterations that are not whole numbers up to {_MOST:g}")
+        setattr(estimates, part, values.astype({"status": np.int8, "iterations": np.int64}.get(part, float)))
+    estimates.extras = {k: plain_numbers(f"{name} {k}", values, (trials,)) for k, values in estimates.extras.items()}
+    for part in ("history", "alternatives"):
+        if (each := getattr(estimates, part)) is not None:
+            if len(each) != trials:
+                raise ValueError(f"{name} {part} of {len(each)} trials, where {trials} belong")
+            setattr(estimates, part, [plain_numbers(f"{name} {part}", x, (len(x), n)) for x in each])
+    estimates.messages = {trial: one_line(message) for trial, message in estimates.messages.items()}
 
 
 def one_by_one(trials: Iterable[Any], estimate: Any, n: int) -> Estimates:

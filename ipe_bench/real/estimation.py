@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.linalg import Array, unmasked
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo, informed
@@ -63,7 +63,7 @@ class Question:
             raise UserError(
                 f"readings: has shape {given.shape}; give the {model.m} readings of {model.name}, NaN where missing"
             )
-        return Readings(informed(model, self.known), np.array(given, dtype=float))
+        return Readings(informed(model, self.known), unmasked(given).copy())
 
     @cached_property
     def scenario(self) -> Scenario:

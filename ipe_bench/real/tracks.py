@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import chdtrc, ndtri
 
 from ipe_bench.basics.errors import UserError, unknown
-from ipe_bench.basics.linalg import Array, deviations
+from ipe_bench.basics.linalg import Array, deviations, unmasked
 from ipe_bench.real.readings import Table, read_tables
 from ipe_bench.states.base import StateModel
 from ipe_bench.states.formulas import Formulas, Recorded
@@ -57,7 +57,7 @@ class Log:
             return _read(read_tables([readings], ignored)[0], model)
         if readings is None and not isinstance(model, Recorded):
             raise UserError(f"readings: is not given; write readings=FILE, with the columns {','.join(_wanted(model))}")
-        z = model.draw(0, 1).z[0] if readings is None else np.array(readings, dtype=float)
+        z = model.draw(0, 1).z[0] if readings is None else unmasked(readings).copy()
         if z.shape != (shape := (model.epochs, len(model.reading_names))):
             raise UserError(
                 f"readings: has shape {z.shape}, where {shape} belongs: epochs and readings of {model.name}"

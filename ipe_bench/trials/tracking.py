@@ -18,7 +18,7 @@ import numpy as np
 
 from ipe_bench.basics.batches import take
 from ipe_bench.basics.errors import UserError, describe_exception
-from ipe_bench.basics.linalg import Array, Mask, deviations, finite, read_only
+from ipe_bench.basics.linalg import Array, Mask, deviations, finite, plain_numbers, read_only
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates
 from ipe_bench.noise.base import Certified, ModelNoise, Noise
@@ -228,14 +228,27 @@ def track_safely(tracker: Tracker, model: StateModel, z: Array) -> tuple[Tracks,
     and one that raises alone is NaN."""
     try:
         with np.errstate(all="ignore"):
-            return tracker.track(model, read_only(z)), {}
+            tracks = tracker.track(model, read_only(z))
     except MemoryError:
         raise
     except Exception as error:
         if len(z) == 1:
             return Tracks.lost(model, 1), {0: describe_exception(error)}
+    else:
+        _make_plain(tracker, tracks, len(z), model)
+        return tracks, {}
     parts = [track_safely(tracker, model, row[None]) for row in z]
     return Tracks.join([part for part, _ in parts]), {i: m[0] for i, (_, m) in enumerate(parts) if m}
+
+
+def _make_plain(tracker: Tracker, tracks: Any, trials: int, model: StateModel) -> None:
+    """Replaces what a tracker returned by ordinary arrays of floats, as of an estimator; ValueError if it cannot be."""
+    name, (K, n) = f"{type(tracker).__name__}.track returns", (model.epochs, model.n)
+    if not isinstance(tracks, Tracks):
+        raise ValueError(f"{name} {type(tracks).__name__}, where Tracks are asked for")
+    shapes = {"mean": (K, n), "covariance": (K, n, n), "nis": (K,), "degrees": (K,), "log_likelihood": ()}
+    for part, shape in {**shapes, "innovations": (K, len(model.R(0)))}.items():
+        setattr(tracks, part, plain_numbers(f"{name} {part}", getattr(tracks, part), (trials, *shape)))
 
 
 def packed(trials: int, sums: Sequence[Array]) -> Array:

@@ -34,8 +34,19 @@ class Rogue(Estimator):
         estimates = Estimates(np.zeros((len(z), n)), np.zeros(len(z), dtype=np.int8))
         if self.does == "boast":
             estimates.x[0] = np.nan
-        if self.does.startswith("simulations"):
-            estimates.simulations = np.full(len(z), float(self.does.split()[1]))
+        if self.does.startswith(("simulations", "iterations", "status")):
+            name, value = self.does.split()
+            setattr(estimates, name, None if value == "None" else np.full(len(z), float(value)))
+        if self.does.startswith("masked"):
+            mask = np.zeros((len(z), n), dtype=bool)
+            mask[0, :1] = mask[:, -1] = self.does == "masked"
+            mask[0, 1] = True
+            estimates.x = np.ma.masked_array(estimates.x, mask)
+            estimates.covariance = np.ma.masked_array(np.broadcast_to(np.eye(n), (len(z), n, n)), mask=True)
+        if self.does == "matrix":
+            estimates.x = np.matrix(estimates.x)
+        if self.does == "history":
+            estimates.history = [np.zeros((2, n))]
         return estimates
 
     def misbehave(self, problem, z):
@@ -58,6 +69,8 @@ class Rogue(Estimator):
                     time.sleep(0.5)
             case "raise":
                 raise ArithmeticError("rogue")
+            case "surrogate":
+                raise ArithmeticError("\ud800" + 10_000_000 * "x")
             case "stop":  # the user presses Ctrl-C
                 os.kill(os.getpid(), signal.SIGINT)
                 time.sleep(0.01)

@@ -93,6 +93,10 @@ def test_a_run_completes_when_a_worker_is_killed(tmp_path, reference):
             (f"simulations {value}", {}, "simulations that are not finite numbers from 0 up")
             for value in (-1, "nan", "inf")
         ),
+        *((f"iterations {value}", {}, "iterations that are not whole numbers") for value in (1.5, 1e300)),
+        *((f"status {value}", {}, "a status that is not one of") for value in (-1, 0.5, 99)),
+        ("status None", {}, "status of type object"),
+        ("history", {}, "history of 1 trials, where 10 belong"),
         ("sleep", {"block_timeout_s": 3.0}, "block_timeout_s=3"),
         pytest.param(
             *("memory", {"memory_limit_gb": 1.0}, "MemoryError"),
@@ -117,13 +121,25 @@ def rows_of(directory: Path, label: str) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize(
     ("does", "statuses", "message"),
-    [("raise", ["error"] * 5, "ArithmeticError: rogue"), ("boast", ["nonfinite", *["converged"] * 4], "")],
+    [
+        ("raise", ["error"] * 5, "ArithmeticError: rogue"),
+        ("surrogate", ["error"] * 5, "ArithmeticError: ?" + 999 * "x"),
+        ("boast", ["nonfinite", *["converged"] * 4], ""),
+        ("masked", ["nonfinite"] * 5, ""),
+        ("masked in one", ["nonfinite", *["converged"] * 4], ""),
+        pytest.param("matrix", ["converged"] * 5, "", marks=pytest.mark.filterwarnings("ignore:the matrix subclass")),
+    ],
 )
 def test_an_exception_or_an_infinite_estimate_is_a_status_and_no_failure(tmp_path, does, statuses, message):
     assert compute([scenario()], {"rogue": Rogue(does)}, 5, tmp_path, execution=Processes(1)) == ()
     rows = rows_of(tmp_path, "rogue")
     assert rows["status"].tolist() == statuses
     assert set(rows["message"]) == {message}
+    if does.startswith("masked"):  # what lies under a mask is no answer
+        assert not rows["success"][0]
+        assert np.isnan(
+            [rows["crlb_distance"][0], rows["nees"][0], *(v[0] for k, v in rows.items() if k.startswith("deviation_"))]
+        ).all()
 
 
 def test_an_estimator_cannot_change_the_readings_and_the_problem_of_the_others(tmp_path, reference):

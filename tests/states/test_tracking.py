@@ -290,3 +290,29 @@ def test_published_errors_stand_beside_those_found(tmp_path):
     assert table["difference"].abs().max() < 1e-10
     with pytest.raises(ib.UserError, match="has one path; set trials=1"):
         Tracking(model).draw(0, 2)
+
+
+@dataclass(frozen=True)
+class Masking(Tracker):
+    """A filter whose first trial is masked, or all of it at the last epoch."""
+
+    where: tuple = (0,)
+    degrees: int = 1
+
+    def track(self, model, z):
+        tracks, mask = ekf().track(model, z), np.zeros(z.shape[:2], dtype=bool)
+        mask[self.where] = True
+        tracks.mean = np.ma.masked_array(tracks.mean, np.broadcast_to(mask[:, :, None], tracks.mean.shape))
+        tracks.degrees = tracks.degrees[:, : model.epochs // self.degrees]
+        return tracks
+
+
+def test_masked_states_are_unknown_and_a_wrong_shape_is_refused():
+    block = PathBlock.draw(Tracking(LINEAR), 0, 3)
+    estimates, columns = block.estimate(Masking((0,)))
+    assert columns["status"].tolist() == ["nonfinite", "converged", "converged"]
+    assert np.isnan(estimates.x[0]).all()
+    assert np.isfinite(estimates.x[1:]).all()
+    assert not block.estimate(Masking((slice(None), -1)))[1]["success"].any()
+    with pytest.raises(ValueError, match=r"Masking.track returns degrees of shape \(3, 15\), where \(3, 30\) belongs"):
+        block.estimate(Masking((0,), degrees=2))
