@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import socket
+import stat
 import tempfile
 import uuid
 from collections.abc import Callable
@@ -34,6 +36,17 @@ def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def regular(path: Path) -> Path:
+    """The path of a regular file; a pipe or a device may be read without end.
+
+    Raises:
+        OSError: something else is there, or nothing (FileNotFoundError).
+    """
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise OSError(errno.EINVAL, "is no regular file")
+    return path
 
 
 def make_folder(path: Path) -> None:

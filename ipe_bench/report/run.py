@@ -12,7 +12,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ipe_bench.basics.files import write_text
+from ipe_bench.basics.files import regular, write_text
 from ipe_bench.plugins.extensions import files_of_records, use_statistics
 from ipe_bench.report.style import PAGE, Which, file_formats, which_figures
 from ipe_bench.runs.store import Store
@@ -145,15 +145,15 @@ def _made_from(directories: Sequence[Path], output: Path, *choices: object) -> s
 def _is_current(output: Path, made: str) -> bool:
     """Whether the report under `output` was made from this, and its files are as written."""
     with contextlib.suppress(OSError, ValueError):
-        known = json.loads((output / STAMP).read_text(encoding="utf-8"))
+        known = json.loads(regular(output / STAMP).read_text(encoding="utf-8"))
         return known == {"from": made, "files": _digests(map(Path, known["files"]))}
     return False
 
 
 def _digests(paths: Iterable[Path]) -> dict[str, str]:
-    """SHA-256 by absolute path, without files that another command removes at this moment."""
+    """SHA-256 by absolute path, without what cannot be read, or is removed by another command at this moment."""
     found = {}
     for path in sorted(paths):
-        with contextlib.suppress(FileNotFoundError):
-            found[str(path.absolute())] = hashlib.sha256(path.read_bytes()).hexdigest()
+        with contextlib.suppress(OSError):
+            found[str(path.absolute())] = hashlib.sha256(regular(path).read_bytes()).hexdigest()
     return found

@@ -91,7 +91,7 @@ def _contents(directory: Path) -> dict[str, bytes]:
     while True:
         damaged = Results.read([directory]).damaged
         files = [p for folder in (store.trials, store.runs, store.failed) for p in folder.glob("[!.]*.*")]
-        kept = [file for file in files if file.suffix in (".parquet", ".json") and file not in damaged]
+        kept = [p for p in files if p.suffix in (".parquet", ".json") and p not in damaged and p.is_file()]
         with contextlib.suppress(FileNotFoundError):
             return {f"{file.parent.name}/{file.name}": file.read_bytes() for file in kept}
 

@@ -23,7 +23,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from ipe_bench.basics.files import write_atomically, write_text
+from ipe_bench.basics.files import regular, write_atomically, write_text
 from ipe_bench.basics.linalg import Array
 from ipe_bench.runs.provenance import canonical_json
 
@@ -36,6 +36,16 @@ _TAIL = 8
 _DIGEST = 32
 _NAME = re.compile(r"([0-9a-f]+)-(\d+)-(\d+)\.parquet")
 _OLDER = tuple(f'"schema":{number},'.encode() for number in range(1, SCHEMA))
+
+
+_NUMBER = (int, float)
+_NAMES = {"measurement": str, "noise": str, "prior": str, "error_scale": _NUMBER, "seed": int, "estimator": str}
+RUN = {"started": str, "trials": int, "cells": [{"key": str, "identity_key": str, "names": _NAMES}]}
+FAILED = {"key": str, "start": int, "stop": int, "status": str, "message": str}
+_FOOTER = {"key": str, "identity_key": str, "names": _NAMES, "versions": dict, "source": str, "bound": str}
+_FOOTER |= {"identity": {"scenario": dict, "estimator": (dict, type(None))}, "linear_bound": list}
+_FOOTER |= {"parameters": [{"name": str, "unit": str, "size": _NUMBER}]}
+"""What readers take for granted: keys, and the types of their values."""
 
 
 class Unusable(Exception):
@@ -100,7 +110,7 @@ def join_histories(several: Iterable[Mapping[str, Array] | None]) -> dict[str, A
 def _opened(path: Path) -> Iterator[pq.ParquetFile]:
     """A file whose footer was held against its digest, and whose pages will be held against their checksums."""
     try:
-        with pa.OSFile(str(path)) as source:
+        with pa.OSFile(str(regular(path))) as source:
             _require_footer(source)
             with pq.ParquetFile(source, page_checksum_verification=True) as file:
                 yield file
@@ -130,7 +140,7 @@ def _require_footer(source: pa.NativeFile) -> None:
 @functools.lru_cache(maxsize=4096)
 def _parsed(footer: bytes) -> Mapping[str, Any]:
     """The footer that all files of one result share."""
-    return json.loads(footer)
+    return _shaped(json.loads(footer), _FOOTER)
 
 
 def write(
@@ -206,19 +216,37 @@ def write_record(path: Path, record: Mapping[str, Any]) -> None:
     write_text(path, json.dumps({**said, "digest": _digest(said)}, indent=1))
 
 
-def read_record(path: Path) -> dict[str, Any]:
-    """A JSON record that says what was written; raises Unusable if it is damaged, or not one of ours."""
+def read_record(path: Path, shape: Any) -> dict[str, Any]:
+    """A JSON record of this shape that says what was written; raises Unusable if it is damaged, or not one of ours."""
     try:
-        record = json.loads(path.read_bytes())
+        record = json.loads(regular(path).read_bytes())
     except (OSError, ValueError, RecursionError) as error:
-        raise Unusable(f"damaged: cannot be read ({type(error).__name__})") from None
+        reason = getattr(error, "strerror", None) or type(error).__name__
+        raise Unusable(f"damaged: cannot be read ({reason})") from None
     if not isinstance(record, dict):
         raise Unusable("damaged: is no record of ipe-bench")
     if record.get("schema") in range(1, SCHEMA):
         raise Outdated
     if record.pop("digest", None) != _digest(record) or record.get("file") != path.stem:
         raise Unusable("damaged: is not a whole record of ipe-bench, or that of another file")
-    return record
+    return _shaped(record, shape)
+
+
+def _shaped(value: Any, shape: Any) -> Any:
+    """The value, if it has what a shape asks for; raises Unusable otherwise."""
+    if not _fits(value, shape):
+        raise Unusable("damaged: lacks what ipe-bench writes")
+    return value
+
+
+def _fits(value: Any, shape: Any) -> bool:
+    """Whether a value is of a type, a list of values that fit, or a mapping with such values under the same keys."""
+    if isinstance(shape, dict):
+        there = isinstance(value, dict) and shape.keys() <= value.keys()
+        return there and all(_fits(value[key], inner) for key, inner in shape.items())
+    if isinstance(shape, list):
+        return isinstance(value, list) and all(_fits(one, shape[0]) for one in value)
+    return isinstance(value, shape)
 
 
 def _digest(record: Mapping[str, Any]) -> str:

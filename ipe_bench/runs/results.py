@@ -22,7 +22,7 @@ import pyarrow as pa
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
-from ipe_bench.runs.parts import TRUTH, Outdated, Part, Unusable, as_array, join_histories, read_record
+from ipe_bench.runs.parts import FAILED, RUN, TRUTH, Outdated, Part, Unusable, as_array, join_histories, read_record
 from ipe_bench.runs.provenance import canonical_json
 from ipe_bench.runs.store import ResultKey, Store, describe_names, gaps, title
 from ipe_bench.trials.thresholds import HISTORIES
@@ -164,7 +164,6 @@ class Results:
         for folder in (store.trials, store.runs, store.failed):
             if os.path.lexists(folder) and not (folder.is_dir() and os.access(folder, os.R_OK | os.X_OK)):
                 self.extra_problems.append(f"{folder}: cannot be listed; what is in it is left out")
-                return
         listed: set[Path] = set()
         # What is gone before it is read is in a larger file, which may not have been there when these were listed.
         while fresh := [part for part in store.parts(keys) if part.path not in listed]:
@@ -174,17 +173,17 @@ class Results:
                     footer, _ = part.read()
                     known = self.stored[part.key].parts if part.key in self.stored else ()
                     self.stored[part.key] = StoredCell(footer, tuple(sorted([*known, part], key=lambda p: p.order)))
-        self.runs += tuple(self._records(store.runs))
-        self.attempts += self._records(store.failed)
+        self.runs += tuple(self._records(store.runs, RUN))
+        self.attempts += self._records(store.failed, FAILED)
         if keys is None and not listed and not self.runs:
             self.extra_problems.append(f"{store.directory}: holds no results of ipe-bench")
         if self.outdated and not self.stored and keys is None:
             self.extra_problems.append(f"{store.directory}: was written by an older version of ipe-bench; {_AGAIN}")
 
-    def _records(self, folder: Path) -> Iterator[dict[str, Any]]:
+    def _records(self, folder: Path, shape: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
         for path in sorted(folder.glob("[!.]*.json")):
             with self._naming(path):
-                yield read_record(path)
+                yield read_record(path, shape)
 
     @contextlib.contextmanager
     def _naming(self, path: Path) -> Iterator[None]:

@@ -1,5 +1,6 @@
 """Whatever is done to stored files, no number changes: what is damaged is named, left out, and computed again."""
 
+import json
 import os
 import random
 import shutil
@@ -103,8 +104,22 @@ def directory(path: Path, rng: random.Random) -> None:
     (path / "x").touch()
 
 
+def pipe(path: Path, rng: random.Random) -> None:
+    path.unlink()
+    os.mkfifo(path)
+
+
+def without_a_key(path: Path, rng: random.Random) -> None:
+    """As a whole record that says less."""
+    if path.suffix != ".json":
+        return truncate(path, rng)
+    record = json.loads(path.read_text())
+    del record[rng.choice(sorted({"key", "start", "message", "cells", "started", "trials"} & record.keys()))]
+    parts.write_record(path, {name: value for name, value in record.items() if name not in ("digest", "schema")})
+
+
 Harm = Callable[[Path, random.Random], None]
-HARMS: tuple[Harm, ...] = (truncate, swap, zeros, other_text, directory)
+HARMS: tuple[Harm, ...] = (truncate, swap, zeros, other_text, directory, pipe, without_a_key)
 SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.campaign) for seed in range(1, 8))]
 
 
@@ -126,6 +141,24 @@ def test_whatever_is_done_to_a_file_is_named_and_healed(folder, expected, kind, 
     pd.testing.assert_frame_equal(summary(folder), table)
 
 
+@pytest.mark.parametrize("name", ["trials/0123456789abcdef-0-8.parquet", "trials/x.parquet", "failed/x.json"])
+def test_a_pipe_among_the_results_stops_no_command(folder, expected, capsys, name):
+    """Whoever opens one waits until something is written into it."""
+    os.mkfifo(folder / name)
+    (folder / "runs" / "x.json").symlink_to("/dev/zero")
+    pd.testing.assert_frame_equal(summary(folder), expected[0])
+    for words in (["status"], ["report", "figures=none"], ["bundle", f"output={folder}.zip"]):
+        assert main([words[0], str(folder), *words[1:]]) == 1
+        assert "is no regular file" in "".join(capsys.readouterr()).replace("\n", "")
+
+
+def test_trials_are_read_although_their_failures_cannot_be(folder, expected):
+    shutil.rmtree(folder / "failed")
+    (folder / "failed").touch()
+    pd.testing.assert_frame_equal(summary(folder), expected[0])
+    assert any("failed: cannot be listed" in line for line in said(folder))
+
+
 def test_one_bit_in_29_of_a_part_and_every_bit_of_a_record_is_told_or_without_effect(tmp_path):
     """Page checksums cover pages and neither their headers nor the footer, which has a digest."""
     compute(SCENARIOS[:1], {"newton": Newton()}, 30, tmp_path)
@@ -139,7 +172,7 @@ def test_one_bit_in_29_of_a_part_and_every_bit_of_a_record_is_told_or_without_ef
 
     stored = [(part.path, partial(whole, part), 29) for part in Store(tmp_path).parts()]
     assert len(stored) == 2  # the truth and an estimator
-    for path, read, step in (*stored, (record, partial(parts.read_record, record), 1)):
+    for path, read, step in (*stored, (record, partial(parts.read_record, record, parts.RUN), 1)):
         content, right = path.read_bytes(), read()
         places, told = range(0, 8 * len(content), step), 0
         for bit in places:
