@@ -27,16 +27,36 @@ def choose(condition: Any, a: Any, b: Any) -> Any:
     return (a if condition else b) if isinstance(condition, float) else np.where(condition, a, b)
 
 
+def _real(a: Any) -> Any:
+    """The real part of a complex step; expressions are real."""
+    return getattr(a, "real", a)
+
+
+def _angle(y: Any, x: Any) -> Any:
+    """arctan2, which NumPy has not of complex numbers, with its slope by a complex step."""
+    b, a = _real(y), _real(x)
+    angle = np.arctan2(b, a)
+    if isinstance(angle, trace.Expression) or not (np.iscomplexobj(y) or np.iscomplexobj(x)):
+        return angle
+    return angle + 1j * (a * np.imag(y) - b * np.imag(x)) / (a * a + b * b)
+
+
 FUNCTIONS: dict[str, Callable[[Any], Any]] = trace.FUNCTIONS | {
     "atan": np.arctan,
     "ln": np.log,
     "log10": lambda a: np.log(a) / math.log(10.0),
+    "floor": lambda a: np.floor(_real(a)),
+    "sign": lambda a: np.sign(_real(a)),
     "abs": lambda a: choose(np.less(a, 0.0) * 1.0, -a, a),  # NumPy's drops the imaginary part of a complex step
 }
 """Functions of one argument."""
 SEVERAL: dict[str, Callable[[Any, Any], Any]] = {"min": np.minimum, "max": np.maximum}
+SEVERAL |= {"hypot": lambda a, b: np.sqrt(a * a + b * b)}
 """Functions of two arguments or more."""
-_CALLED = (*FUNCTIONS, *SEVERAL)
+PAIRS: dict[str, Callable[[Any, Any], Any]] = {"arctan2": _angle, "atan2": _angle}
+PAIRS |= {"mod": lambda a, b: a - b * np.floor(_real(a / b))}
+"""Functions of two arguments; the remainder of `mod` has the sign of what divides."""
+_CALLED = (*FUNCTIONS, *SEVERAL, *PAIRS)
 COMPARISONS = {"<": np.less, "<=": np.less_equal, ">": np.greater, ">=": np.greater_equal}
 COMPARISONS |= {"==": np.equal, "!=": np.not_equal}
 """They are 1 where they hold and 0 elsewhere."""
@@ -144,11 +164,12 @@ def _tree(node: ast.expr, source: str) -> Tree:
             if name[1:] not in _CALLED:
                 raise NameError(name=name[1:])
             inner = [_tree(argument, source) for argument in arguments]
-            if name[1:] in SEVERAL and len(inner) > 1:
+            if (name[1:] in SEVERAL and len(inner) > 1) or (name[1:] in PAIRS and len(inner) == 2):
                 return _in_a_row(name[1:], inner)
             if name[1:] in FUNCTIONS and len(inner) == 1:
                 return (name[1:], *inner)
-            reason = f"{name[1:]} takes {'two arguments or more' if name[1:] in SEVERAL else 'one argument'}"
+            several = "two arguments or more" if name[1:] in SEVERAL else "two arguments"
+            reason = f"{name[1:]} takes {'one argument' if name[1:] in FUNCTIONS else several}"
     raise SyntaxError(reason, (None, 1, node.col_offset + 1, source))
 
 
@@ -199,6 +220,7 @@ _BINARY: dict[str, Callable[[Any, Any], Any]] = {
     "and": lambda a, b: choose(a, b, a),
     "or": lambda a, b: choose(a, a, b),
     **SEVERAL,
+    **PAIRS,
     **{sign: lambda a, b, holds=holds: holds(a, b) * 1.0 for sign, holds in COMPARISONS.items()},
 }
 

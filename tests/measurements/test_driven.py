@@ -100,10 +100,14 @@ def test_readings_are_written_with_their_inputs_and_read_again(tmp_path):
 
 
 @pytest.mark.parametrize("method", ["explicit", "implicit"])
-def test_rates_in_pieces_of_time_have_their_exact_solution(method):
+@pytest.mark.parametrize(
+    "dose",
+    ["(dose if 1 <= t and not begin + 1.3 <= t else 0)", "dose*(sign(t - 1) - sign(t - begin - 1.3))/2"],
+)
+def test_rates_in_pieces_of_time_have_their_exact_solution(method, dose):
     """y' = dose - k y within [1, 2.3) and -k y outside, then with a ramp q (t - 3)."""
     model = Ode(
-        {"y": "(dose if 1 <= t and not begin + 1.3 <= t else 0) - k*y + q*max(0, t-3)"}, {"k": 0.7, "q": 0.2},
+        {"y": f"{dose} - k*y + q*max(0, t-3)"}, {"k": 0.7, "q": 0.2},
         times=(0.5, 1.5, 2.5, 6.0), constants={"dose": (2.0, 3.0), "begin": 1.0}, tolerance=1e-11, method=method,
     )  # fmt: skip
     k, q = 0.7, 0.2
@@ -127,6 +131,11 @@ def test_rates_in_pieces_of_time_have_their_exact_solution(method):
         ("-k*y if sin(t) > 0 else 0", "sin.t. > 0: compare t itself with a constant"),
         ("-k*y if sin(2*pi*t) > 0.5 else 0", "compare t itself with a constant"),
         ("-k*y if (1 if t < 3 else 2) > 1.5 else 0", "compare t itself with a constant"),
+        ("-k*y*sign(y - 0.5)", "a rate jumps at a moment"),
+        ("-k*y*floor(t)", "a rate jumps at a moment.*write comparisons of t where floor or mod is taken"),
+        ("-k*mod(y, 0.1)", "a rate jumps at a moment"),
+        ("-k*y if mod(t, 2) < 1 else 0", "compare t itself with a constant"),
+        ("-k*y*sign(sin(t))", "the sign of t: compare t itself with a constant"),
         ("-k*y*" + "abs(" * 40 + "t - 1" + ")" * 40, "the abs of t: compare t itself with a constant"),
     ],
 )
@@ -137,7 +146,43 @@ def test_a_jump_at_an_unknown_moment_is_refused(rate, message, method):
         model.simulate(model.nominal[None])
 
 
-@pytest.mark.parametrize("rate", ["-k*sqrt(y) if y > 0 else 0", "-k*min(y, 0.5) - 0*abs(y)", "-k*y if k > 0.1 else 0"])
+@pytest.mark.parametrize("method", ["explicit", "implicit"])
+def test_angles_lengths_and_steps_are_read_of_a_solution_with_their_slopes(method):
+    """A wheel of radius r that turns at a steady rate, more than once; readings on the whole plane and over its cut."""
+    shown = {
+        "bearing": "arctan2(r*sin(a), r*cos(a) - 0.5)",
+        "range": "hypot(r*sin(a), r*cos(a) - 0.5)",
+        "turn": "mod(a + pi, 2*pi) - pi",
+        "side": "r*sign(sin(a))",
+        "turns": "r*floor(a/(2*pi))",
+    }
+    times = tuple(np.arange(0.25, 9.0, 0.5))
+    model = Ode({"a": "w"}, {"w": 1.7, "r": 2.0}, {"a": 0.3}, shown, times, tolerance=1e-11, method=method)
+    x = np.array([[1.0, 1.0], [0.83, 1.2], [-1.3, 0.7]])
+    w, r = (x * model.sizes).T[:, :, None]
+    a = 0.3 + w * np.array(times)
+    east, north, level = r * np.cos(a) - 0.5, r * np.sin(a), np.zeros_like(a)
+    exact = np.arctan2(north, east), np.hypot(north, east), (a + np.pi) % (2 * np.pi) - np.pi
+    exact += r * np.sign(np.sin(a)), r * np.floor(a / (2 * np.pi))
+    assert model.simulate(x).reshape(3, -1, 5) == pytest.approx(np.stack(exact, axis=2), abs=1e-9)
+    turning = (r**2 - r * np.cos(a) / 2) / (east**2 + north**2) * np.array(times)
+    slopes = model.jacobian(x).reshape(3, -1, 5, 2) / model.sizes
+    assert slopes[:, :, 0, 0] == pytest.approx(turning, abs=1e-7)
+    assert slopes[:, :, 1, 0] == pytest.approx(0.5 * north / np.hypot(north, east) * np.array(times), abs=1e-7)
+    assert slopes[:, :, 2] == pytest.approx(np.stack([level + np.array(times), level], axis=2), abs=1e-7)
+    assert slopes[:, :, 3] == pytest.approx(np.stack([level, np.sign(np.sin(a))], axis=2), abs=1e-7)
+    assert slopes[:, :, 4] == pytest.approx(np.stack([level, np.floor(a / (2 * np.pi))], axis=2), abs=1e-7)
+
+
+@pytest.mark.parametrize(
+    "rate",
+    [
+        "-k*sqrt(y) if y > 0 else 0",
+        "-k*min(y, 0.5) - 0*abs(y)",
+        "-k*y if k > 0.1 else 0",
+        "-k*y*(y - 0.5)*sign(y - 0.5)",
+    ],
+)
 def test_a_kink_is_integrated(rate):
     model = Ode({"y": rate}, {"k": 0.3}, {"y": 1.0}, times=(1.0, 2.0, 5.0))
     x = model.nominal[None]

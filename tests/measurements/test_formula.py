@@ -87,6 +87,10 @@ def test_nist_answers_come_from_the_formula_with_an_unknown_noise(dataset, tmp_p
         ("min(a, 5, c) + max(1, b)", 4.0),
         ("abs(a-c) + abs(1)", 2.0),
         ("erf(0.5) + erfc(0.5)", 1.0),
+        ("arctan2(-1, -c)", -math.pi + math.atan(1 / 3)),
+        ("atan2(a, 0) - pi/2 + hypot(3, 4) + hypot(1, a, 2)", 8.0),
+        ("mod(-1, c) + 10*mod(7.5, 2) + 100*floor(-0.5)", 2.0 + 15.0 - 100.0),
+        ("sign(a - 5) + 10*sign(a - b) + 100*sign(c)", 99.0),
         ("(1 < a <= 2) + (c != 3) + (a == b)", 2.0),
         ("1 if a > 2 else 2 if c > 2 else 3", 2.0),
         ("not a > 1 or c > 2 and b < 3", 1.0),
@@ -103,6 +107,7 @@ REFUSED = [
     "__import__('os')", "b1.real", "b1[0]", "b1 if t", "b1 else t", "lambda: 1", "b1; b2", "b1=2", "open(b1)",
     "eval(b1)", "b1*(t",
     "b1*t)", "2t", "b1 b2", "", "()", "b1**", "*b1", "1,5*t", "b1 and", "not", "b1 < ", "min(b1)", "abs(b1,t)",
+    "arctan2(b1)", "arctan2(b1,t,2)", "mod(b1)", "hypot(b1)", "sign(b1,t)", "b1*mod(1,0)",
     "'b1'", "b1@t", "b1//t*", "exp", "exp()",
     "exp(b1,t)",
     "b1%t", "{b1}", "b1\\n", "0x10", "1e", "1_000*b1", "1j*b1", "b1!", "é*t", "sin t", "None*b1", "exp(a=b1)",
@@ -143,6 +148,26 @@ def test_derivatives_are_exact_and_those_of_a_power_of_zero_are_zero():
     power = Formula("a*t**b", {"a": 2.0, "b": 1.5}, {"t": (0.0, 4.0)})
     assert power.jacobian(np.ones((1, 2)))[0, 0].tolist() == [0.0, 0.0]
     assert power.jacobian(np.ones((1, 2)))[0, 1, 1] == pytest.approx(2.0 * 8.0 * math.log(4.0) * 1.5)
+
+
+_PLANE = "hypot(b1*t - 1, b2, t) + arctan2(b1 - t, b2 - t) + b1*floor(3*b2*t) + b2*sign(b1 - t) + mod(b1*t, b2 - 0.4)"
+
+
+def test_slopes_of_angles_lengths_and_steps_are_exact_on_the_whole_plane():
+    """By a complex step, which NumPy's own arctan2, hypot and floor refuse, and by differences."""
+    model = Formula(_PLANE, {"b1": 0.7, "b2": 1.3}, {"t": (0.31, 1.13, 2.4, -0.83)})
+    x = np.array([[1.0, 1.0], [1.2, 0.7], [-1.1, -0.53]])
+    z = [_PLANE.replace("mod", "np.mod").replace("hypot", "math.hypot").replace("arctan2", "math.atan2")]
+    names = {"math": math, "np": np, "floor": math.floor, "sign": np.sign}
+    expected = [[eval(z[0], names, {"b1": 0.7 * a, "b2": 1.3 * b, "t": t}) for t in model.columns["t"]] for a, b in x]
+    assert model.simulate(x) == pytest.approx(np.array(expected), rel=1e-14)
+    formula = read(_PLANE, "expression")
+
+    def h(x):
+        return formula({"b1": 0.7 * x[:, :1], "b2": 1.3 * x[:, 1:], "t": np.array(model.columns["t"])})
+
+    assert model.jacobian(x) == pytest.approx(differentiate(h, x, analytic=True), rel=1e-13, abs=1e-14)
+    assert model.jacobian(x) == pytest.approx(differentiate(h, x, analytic=False), rel=1e-7, abs=1e-8)
 
 
 def test_a_formula_is_evaluated_or_refused_however_long():

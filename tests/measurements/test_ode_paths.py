@@ -17,6 +17,7 @@ from scipy.special import erf, erfc
 
 from ipe_bench.basics import compiled
 from ipe_bench.measurements import LotkaVolterra, Ode, OdeMeasurement, Parameter, SubsetModel
+from ipe_bench.measurements.arithmetic import FUNCTIONS, PAIRS, SEVERAL
 from ipe_bench.measurements.joint import Joint
 from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo
 from ipe_bench.measurements.ode.interval import Interval
@@ -306,12 +307,15 @@ OPERATIONS = {
     "arctan": lambda a, b: np.arctan(a) * b,
     "hyperbolic": lambda a, b: np.sinh(np.sin(a)) - np.cosh(np.cos(b)),
     "tan": lambda a, b: np.tan(np.sin(a) / 2.0) - b,
+    "arctan2": lambda a, b: PAIRS["arctan2"](a, np.sin(b) + 1.5),
+    "hypot": lambda a, b: SEVERAL["hypot"](a, 2.0 + np.sin(b)),
 }
 PIECES = {
     "least": lambda a, b: np.minimum(a, b),
     "most": lambda a, b: np.maximum(a, b),
     "size": lambda a, b: np.where(np.less(a, 0.0), -a, a) - b,
     "root of what is positive": lambda a, b: np.where(np.less_equal(a, 0.0), 0.0 * b, a * np.sqrt(a)) + b,
+    "sign": lambda a, b: FUNCTIONS["sign"](a) * (a - b) * a,
     "erf": lambda a, b: erf(a) * b,
     "erfc": lambda a, b: erfc(b) - a,
 }

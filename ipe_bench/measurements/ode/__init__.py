@@ -30,10 +30,10 @@ A model is one class, here a pendulum of unknown length and damping that is rele
             return (y[0],)
 
 `start`, `rhs` and `read` are called with unknown quantities in place of numbers, once, and what they do is recorded:
-they may use + - * / **, NumPy's sin cos tan arctan exp log sqrt sinh cosh tanh, comparisons, np.where, np.minimum and
-np.maximum, loops of fixed length, and anything else that does not ask for a value (no if, no array of floats that is
-filled with results). From the recording come machine code for whole batches and the exact Jacobian; nothing else is to
-be written.
+they may use + - * / **, NumPy's sin cos tan arctan exp log sqrt sinh cosh tanh, arctan2 hypot sign floor mod,
+comparisons, np.where, np.minimum and np.maximum, loops of fixed length, and anything else that does not ask for a value
+(no if, no array of floats that is filled with results). From the recording come machine code for whole batches and the
+exact Jacobian; nothing else is to be written.
 `cases` adds experiments that share the parameters and differ in constants c, `driven` constants that change with time,
 and `si_sizes` the sizes of parameters that are shown in other units.
 

@@ -17,7 +17,7 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.arithmetic import COMPARISONS, CONSTANTS, Arithmetic, Tree, evaluate, parts
 from ipe_bench.measurements.ode import trace
 
-PIECEWISE = ("min", "max", "abs", *COMPARISONS)
+PIECEWISE = ("min", "max", "abs", "sign", *COMPARISONS)
 _REMEDY = "compare t itself with a constant, so that the moment of the switch is known"
 _SAME = 1e-12
 """Of the whole span: times this close are one."""
@@ -41,6 +41,9 @@ def separated(
         operation, a, *other = tree
         if any(switching(part) for operand in (a, *other) for part in parts(operand)):
             raise UserError(f"rates: the {operation} of t: {_REMEDY}")
+        if operation == "sign":
+            text, zero = "the sign of t", ("number", 0.0)
+            return rewritten(("-", (">", a, zero, text), ("<", a, zero, text)))
         b = other[0] if other else ("negative", a)
         return rewritten(("if", ("<" if operation == "min" else ">", a, b, f"the {operation} of t"), a, b))
 
@@ -59,7 +62,7 @@ def switching_times(comparison: Tree, cases: Sequence[Mapping[str, float]]) -> l
         t = trace.Graph().input("t")
         gap = t.graph.apply("add", evaluate(("-", left, right), {**case, "t": t}), 0.0)
         slope = trace.tangent([gap], {t: t.graph.constant(1.0)})[0].value
-        if slope is None or any(e.operation in trace.COMPARISONS for e in trace.in_order([gap])):
+        if slope is None or any(e.operation in trace.LEVEL for e in trace.in_order([gap])):
             raise UserError(f"rates: {text}: {_REMEDY}")
         if slope:
             found.append(-float(trace.Program.of([gap], [t])([0.0])[0]) / slope)

@@ -277,17 +277,17 @@ class _Vectors:
                 return self.call("fma", a, b, builder.fneg(c))
             case "fnma", [a, b, c]:
                 return self.call("fma", builder.fneg(a), b, c)
-            case (("fma" | "sqrt"), _):
+            case (("fma" | "sqrt" | "floor"), _):
                 return self.call(name, *args)
             case (("less" | "less_equal"), [a, b]):
                 holds = builder.fcmp_ordered("<" if name == "less" else "<=", a, b)
                 return builder.select(holds, self.constant(1.0), self.constant(0.0))
             case "where", [condition, a, b]:
                 return builder.select(builder.fcmp_unordered("!=", condition, self.constant(0.0)), a, b)
-        return self._each("atan" if name == "arctan" else name, *args)
+        return self._each(name.replace("arctan", "atan"), *args)
 
     def call(self, name: str, *args: Value) -> Value:
-        """An instruction of the processor: fma (rounded once) or sqrt."""
+        """An instruction of the processor: fma (rounded once), sqrt or floor."""
         return self.builder.call(self._declared(f"llvm.{name}.v{self.width}f64", self.type, len(args)), args)
 
     def _each(self, name: str, *args: Value) -> Value:

@@ -366,6 +366,7 @@ class OdeMeasurement(Measurement):
         if jumps(equations):
             what = "a rate jumps at a moment that a state or a parameter decides, which no step can end at"
             remedy = "let both sides agree there, or blend them, as by 1/(1+exp((b-a)/width)) for a > b"
+            remedy += ", and write comparisons of t where floor or mod is taken of it"
             raise UserError(f"measurement={self.name}: {what}; {remedy}")
         return equations
 

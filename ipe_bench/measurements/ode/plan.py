@@ -248,10 +248,12 @@ class Plan:
 def jumps(equations: Equations) -> bool:
     """Whether the rates jump at a moment that the solution decides: it is no end of a step, and slopes would lack what
     they owe to it. Both sides of a comparison are evaluated at points that are moved to where its operands are equal;
-    if they agree there, it is a kink and no jump."""
+    if they agree there, it is a kink and no jump. `floor`, and `mod` by it, jumps whatever it is taken of."""
     tape = Recording(equations)
     graph, inputs = tape.graph, [tape.t, *tape.y, *tape.p, *tape.c]
     moving = trace.dependent(tape.slope, (tape.t, *tape.y))
+    if any(e.operation == "floor" for e in moving):
+        return True
     for e in (e for e in trace.in_order(tape.slope) if e.operation in trace.COMPARISONS and e in moving):
         if e.operands[0] is e.operands[1]:  # asks whether it is a number
             continue

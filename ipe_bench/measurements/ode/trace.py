@@ -25,9 +25,11 @@ FUNCTIONS |= {
 }
 """The elementary functions that can be recorded, of numbers, arrays and expressions; log is the natural logarithm."""
 _UFUNCS = {"add": "add", "subtract": "sub", "multiply": "mul", "divide": "div", "true_divide": "div", "power": "pow"}
-_UFUNCS |= {"negative": "neg", "less": "less", "less_equal": "less_equal"} | {name: name for name in FUNCTIONS}
+_UFUNCS |= {"negative": "neg"} | {name: name for name in ("less", "less_equal", "floor", "arctan2", *FUNCTIONS)}
 COMPARISONS = ("less", "less_equal")
 """Operations that are 1 where they hold and 0 elsewhere."""
+LEVEL = (*COMPARISONS, "floor")
+"""Operations whose slope is 0 between jumps."""
 
 
 class Graph:
@@ -134,7 +136,7 @@ class Expression:
         if ufunc.__name__ in _COMPOSED:
             return _COMPOSED[ufunc.__name__](self.graph.apply, *inputs)
         if ufunc.__name__ not in _UFUNCS:
-            known = ", ".join((*FUNCTIONS, *_COMPOSED))
+            known = ", ".join((*FUNCTIONS, "arctan2", "floor", *_COMPOSED))
             raise TypeError(f"np.{ufunc.__name__} cannot be recorded; use + - * / **, np.where and {known}")
         return self.graph.apply(_UFUNCS[ufunc.__name__], *inputs)
 
@@ -156,6 +158,11 @@ _COMPOSED: dict[str, Callable[..., Any]] = {
     "equal": lambda apply, a, b: apply("mul", apply("less_equal", a, b), apply("less_equal", b, a)),
     "not_equal": lambda apply, a, b: apply("add", apply("less", a, b), apply("less", b, a)),
     "absolute": lambda apply, a: apply("where", apply("less", a, 0.0), apply("neg", a), a),
+    "sign": lambda apply, a: apply(
+        "where", apply("less_equal", a, a), apply("sub", apply("less", 0.0, a), apply("less", a, 0.0)), a
+    ),
+    "remainder": lambda apply, a, b: apply("sub", a, apply("mul", b, apply("floor", apply("div", a, b)))),
+    "hypot": lambda apply, a, b: apply("sqrt", apply("add", apply("mul", a, a), apply("mul", b, b))),
     "minimum": lambda apply, a, b: _first_if(apply, apply("less", a, b), a, b),
     "maximum": lambda apply, a, b: _first_if(apply, apply("less", b, a), a, b),
 }
@@ -171,6 +178,8 @@ _SIGNS: dict[str, Callable[..., Any]] = {name: getattr(operator, name) for name 
 _SIGNS["div"] = operator.truediv
 _NUMBERS: dict[str, Callable[..., Any]] = _SIGNS | {
     "arctan": math.atan,
+    "arctan2": math.atan2,
+    "floor": math.floor,
     "less": operator.lt,
     "less_equal": operator.le,
     "where": lambda condition, a, b: a if condition else b,
@@ -180,6 +189,8 @@ _ARRAYS: dict[str, Callable[..., Any]] = _SIGNS | {
     "less": lambda a, b: np.less(a, b) * 1.0,
     "less_equal": lambda a, b: np.less_equal(a, b) * 1.0,
     "where": lambda condition, a, b: np.where(condition, a, b)[()],
+    "arctan2": np.arctan2,
+    "floor": np.floor,
     "fma": lambda a, b, c: a * b + c,
     "fms": lambda a, b, c: a * b - c,
     "fnma": lambda a, b, c: c - a * b,
@@ -201,6 +212,7 @@ _PARTIALS: dict[str, Callable[[Any, Any, Any, Any], list[Any]]] = {
     "sin": lambda e, one, a, _: [np.cos(a)],
     "cos": lambda e, one, a, _: [-np.sin(a)],
     "arctan": lambda e, one, a, _: [one / (one + a * a)],
+    "arctan2": lambda e, one, a, b: [b / (a * a + b * b), -(a / (a * a + b * b))],
     "exp": lambda e, one, a, _: [e],
     "log": lambda e, one, a, _: [one / a],
     "sqrt": lambda e, one, a, _: [0.5 / e],
@@ -268,7 +280,7 @@ def tangent(outputs: Sequence[Expression], direction: Mapping[Expression, Expres
             continue
         along[e.order] = zero
         moving = [(along[a.order], i) for i, a in enumerate(e.operands) if along[a.order] is not zero]
-        if not moving or e.operation in COMPARISONS:
+        if not moving or e.operation in LEVEL:
             continue
         if e.operation == "where":  # a branch that is not taken may have no slope
             condition, *branches = operands(e)
