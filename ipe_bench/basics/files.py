@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import getpass
 import os
 import socket
 import stat
@@ -67,15 +68,32 @@ def write_text(path: Path, text: str) -> None:
 
 
 def cache_folder() -> Path:
-    """Where what is compiled or parsed once is kept between processes: `IPE_BENCH_CACHE`, or the user's cache."""
-    chosen = os.environ.get("IPE_BENCH_CACHE")
-    base = Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "ipe-bench"
-    try:
-        base.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=base):
-            return base
-    except OSError:
-        return Path(tempfile.mkdtemp(prefix="ipe-bench-"))
+    """Where what is compiled once is kept between processes: `IPE_BENCH_CACHE`, or the user's cache; if that cannot be
+    written to, a folder of the user's own among temporary files."""
+    for place in (_chosen_cache, _spare_cache):
+        with contextlib.suppress(OSError, KeyError, RuntimeError):  # of homes that are not known, too
+            folder = place()
+            with tempfile.TemporaryFile(dir=folder):
+                return folder
+    return Path(os.devnull)  # below which nothing can be kept
+
+
+def _chosen_cache() -> Path:
+    chosen, caches = os.environ.get("IPE_BENCH_CACHE"), os.environ.get("XDG_CACHE_HOME")
+    home = "~" if os.environ.get("HOME", "~") else f"~{getpass.getuser()}"
+    folder = Path(chosen or Path(caches or f"{home}/.cache") / "ipe-bench").expanduser()
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def _spare_cache() -> Path:
+    """A folder that belongs to this user alone, whoever may write to the folder of temporary files."""
+    folder = Path(tempfile.gettempdir()) / f"ipe-bench-{os.geteuid() if os.name == 'posix' else 'cache'}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    about = folder.lstat()
+    if os.name == "posix" and (about.st_uid != os.geteuid() or about.st_mode & 0o77 or not stat.S_ISDIR(about.st_mode)):
+        raise OSError(errno.EPERM, "belongs to others")
+    return folder
 
 
 def own_conf() -> Path:

@@ -9,6 +9,7 @@ import pytest
 
 from ipe_bench.basics import compiled
 from ipe_bench.basics.compiled import POINTER, at
+from ipe_bench.basics.files import cache_folder
 from ipe_bench.measurements import LotkaVolterra
 from ipe_bench.runs import provenance
 
@@ -85,6 +86,39 @@ def test_machine_code_that_others_may_have_written_is_not_run(folder, caplog):
             caplog.clear()
             times(2.0)
             assert "compiling" in caplog.text
+
+
+@pytest.mark.skipif(os.name != "posix", reason="files have owners otherwise there")
+def test_where_the_cache_cannot_be_written_to_one_folder_per_user_is_used(tmp_path, monkeypatch, caplog):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("IPE_BENCH_CACHE", str(tmp_path / "file"))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with caplog.at_level("INFO"):
+        assert (times(2.0), times(2.0), times(3.0)) == (6.0, 6.0, 9.0)
+    assert len(caplog.records) == 2
+    (spare,) = (path for path in tmp_path.iterdir() if path.is_dir())
+    assert len(list(spare.iterdir())) == 2
+    assert spare.stat().st_mode & 0o777 == 0o700
+    spare.chmod(0o777)
+    assert cache_folder() != spare
+    spare.rename(tmp_path / "moved")
+    spare.symlink_to(tmp_path / "moved")
+    assert times(2.0) == 6.0
+    assert set(tmp_path.iterdir()) == {tmp_path / "file", tmp_path / "moved", spare}
+
+
+@pytest.mark.skipif(os.name != "posix", reason="homes are found otherwise there")
+def test_an_empty_home_is_none_and_a_tilde_is_the_home(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("IPE_BENCH_CACHE", "~/kept")
+    assert cache_folder() == tmp_path / "home" / "kept"
+    monkeypatch.setenv("IPE_BENCH_CACHE", "")
+    monkeypatch.setenv("XDG_CACHE_HOME", "")
+    assert cache_folder() == tmp_path / "home" / ".cache" / "ipe-bench"
+    monkeypatch.setenv("HOME", "")
+    assert cache_folder().is_absolute()
+    assert [path.name for path in tmp_path.iterdir()] == ["home"]
 
 
 def test_what_is_compiled_already_needs_no_compiler(tmp_path):
