@@ -13,7 +13,14 @@ import slurm
 
 import ipe_bench as ib
 
-COMMON = ("measurement=polynomial", "noise=gaussian", "noise.deviation=0.01", "figures=none", "block_size=10")
+COMMON = (
+    "measurement=polynomial",
+    "noise=gaussian",
+    "noise.deviation=0.01",
+    "solver=fixed_point",
+    "baseline=linear_lse",
+)
+COMMON += ("figures=none", "block_size=10")
 DASK = ("execution=dask", "execution.jobqueue=SLURMCluster", "execution.workers=2")
 OPTIONS = 'execution.options={cores:1,memory:1GB,walltime:"00:10:00"}'
 SUBMITIT = ("hydra/launcher=submitit_slurm", "hydra.launcher.timeout_min=10", "hydra.launcher.mem_gb=1")
