@@ -264,9 +264,17 @@ class RicherGins(Gins):
             ([f"walk d{a} {case}.{k}" for case, k, a in steps], "deg/h", 1 / self._drift, "gyro random walk"),
         )
 
-    def _simulate(self, x: Array, rows: NDArray[np.intp], steps: NDArray[np.int64], offset: Array, z: Array) -> None:
+    def _simulate(
+        self,
+        x: Array,
+        rows: NDArray[np.intp],
+        steps: NDArray[np.int64],
+        offset: Array,
+        z: Array,
+        y: Array | None = None,
+    ) -> None:
         if x.shape[1] == self.n:
-            super()._simulate(x, rows, steps, offset, z)
+            super()._simulate(x, rows, steps, offset, z, y)
         else:
             stop = z.shape[1] // (2 * len(self.cases))
             z[rows] = self._walked(x[rows], steps, stop) - offset[self.rows(stop)]

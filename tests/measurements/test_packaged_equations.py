@@ -126,14 +126,10 @@ def test_bocks_readings_are_those_of_the_closed_form_to_round_off_that_has_grown
 
 
 def test_forward_integration_keeps_bocks_true_trajectory_for_a_mild_rate_and_loses_it_for_the_classic_one():
-    lost = {}
-    for mu in (10.0, 60.0):
-        model = Bock(mu=mu)
-        lost[mu] = np.abs(model.simulate(model.recorded.x[None])[0] - model.recorded.z).max()
-    assert lost[10.0] < 1e-9
-    # Whatever arithmetic does, errors of 1e-17 have grown by exp(60) = 1e26.
-    assert 1e4 < lost[60.0] < 1e14
-    mild = Bock(mu=10.0)
+    mild, classic = Bock(mu=10.0), Bock(mu=60.0)
+    assert np.abs(mild.simulate(mild.recorded.x[None])[0] - mild.recorded.z).max() < 1e-9
+    # Errors of 1e-17 grow by exp(60) = 1e26, and no two steps agree on them.
+    assert np.isnan(classic.simulate(classic.recorded.x[None])).all()
     estimates = MultiscaleLM().estimate(Problem(mild, mild.recorded.R), mild.recorded.z[None])
     assert (estimates.x[0] * mild.sizes)[0] == pytest.approx(np.pi, abs=1e-9)
 

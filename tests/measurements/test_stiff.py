@@ -1,7 +1,7 @@
 """Stiff equations: published digits, exact solutions, SciPy's Radau, and which method a model is given."""
 
 import pickle
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 
 import ipe_bench as ib
 from ipe_bench.baselines import LinearLSE
-from ipe_bench.measurements import Ode
+from ipe_bench.measurements import Ode, OdeMeasurement, Parameter
 from ipe_bench.measurements.base import differentiate
 from ipe_bench.measurements.ode.rodas import Rodas5P
 from ipe_bench.noise import Gaussian
@@ -126,3 +126,106 @@ def test_a_stiff_model_that_was_used_goes_to_worker_processes(tmp_path):
         tables.append(ib.load(folder)["error_k"].to_numpy())
     assert len(tables[0]) == 4
     np.testing.assert_array_equal(*tables)
+
+
+SHOWN = {
+    "y": lambda y: y,
+    "y/(0.5+y)": lambda y: y / (0.5 + y),
+    "tanh(y)": np.tanh,
+    "exp(-y)": lambda y: np.exp(-y),
+    "1/(1+exp(-y))": lambda y: 1 / (1 + np.exp(-y)),
+    "max(y,0)": lambda y: np.maximum(y, 0.0),
+    "y**4/(0.5**4+y**4)": lambda y: y**4 / (0.5**4 + y**4),
+    "exp(0.2*y)": lambda y: np.exp(0.2 * y),
+    "1/(1+y**2)": lambda y: 1 / (1 + y * y),
+    "sin(y)": np.sin,
+}
+GRIDS = (tuple(np.arange(0.5, 6.5, 0.5)), (2.0,), (0.0, 0.1, 0.7, 3.0, 10.0))
+FAST = [(shown, rate, times) for shown in SHOWN for rate in (60.0, 300.0, 3e3, 1e5) for times in GRIDS]
+
+
+def check_fast(shown, rate, times):
+    """y follows k (1.2 + sin t) with a time constant of 1 / rate, which an explicit step leaves for 1e30; where a
+    reading saturates, one such state reads as another."""
+    model = Ode({"y": "-L*(y-(1.2+sin(t))*k)"}, {"k": 0.5}, {"y": 0.2}, {"z": shown}, times, constants={"L": rate})
+    assert not model.hindrance(model.nominal)
+    x = model.nominal + np.array([[0.0], [0.3], [-0.3], [1.0], [3.0]])
+    k, t = 0.5 * x, np.array(times)
+    mean, left = 1.2 + rate * (rate * np.sin(t) - np.cos(t)) / (rate**2 + 1), np.exp(-rate * t)
+    slope = 0.5 * (mean - (1.2 - rate / (rate**2 + 1)) * left)
+    y = 2 * k * slope + 0.2 * left
+    np.testing.assert_allclose(model.simulate(x), SHOWN[shown](y), atol=1e-7)
+    turned = (SHOWN[shown](y + 1e-6) - SHOWN[shown](y - 1e-6)) / 2e-6
+    np.testing.assert_allclose(model.jacobian(x)[:, :, 0], turned * slope, atol=1e-6)
+
+
+@pytest.mark.parametrize(("shown", "rate", "times"), FAST[::9])
+def test_a_reading_that_saturates_is_that_of_the_solution(shown, rate, times):
+    check_fast(shown, rate, times)
+
+
+@pytest.mark.slow
+def test_every_reading_that_saturates_is_that_of_the_solution():
+    assert len(FAST) == 120
+    for case in FAST:
+        check_fast(*case)
+
+
+@dataclass(frozen=True)
+class Saturating(OdeMeasurement):
+    """A fast state in a reading that saturates, without a second method to fall back on."""
+
+    rate: float
+    tolerance = 1e-8
+    states, outputs = 1, ("z",)
+    parameters, nominal = (Parameter("k"),), np.ones(1)  # type: ignore[assignment]
+    times = np.array([1.0, 2.0])  # type: ignore[assignment]
+
+    def start(self, p, c):
+        return (0.2,)
+
+    def rhs(self, t, y, p, c):
+        return (-self.rate * (y[0] - p[0]),)
+
+    def read(self, t, y, p, c):
+        return (np.tanh(y[0]),)
+
+
+def test_a_solution_that_no_step_follows_has_no_readings_however_they_saturate():
+    x = np.array([[1.0], [0.5]])
+    followed, lost = Saturating(300.0), Saturating(1e5)
+    np.testing.assert_allclose(followed.simulate(x), np.tanh(x) * np.ones(2), atol=1e-8)
+    assert not followed.hindrance(x[0])
+    for _ in range(2):  # found, then remembered
+        assert np.isnan(lost.simulate(x)).all()
+    assert "the equations need steps of 5e-05 s" in lost.hindrance(x[0])
+
+
+def test_a_fast_state_that_saturates_in_another_rate_leaves_no_error_there():
+    rates = {"fast": "-300*(fast-k*t)", "slow": "1/(1+fast**2)"}
+    model = Ode(rates, {"k": 1.0}, outputs={"slow": "slow"}, times=(1.0, 2.0, 3.0))
+    solved = solve_ivp(
+        lambda t, y: (-300 * (y[0] - t), 1 / (1 + y[0] ** 2)),
+        *((0, 3), [0.0, 0.0], "Radau", model.times),
+        rtol=1e-11,
+        atol=1e-13,
+    )
+    np.testing.assert_allclose(model.simulate(model.nominal[None])[0], solved.y[1], atol=2e-8)
+
+
+def test_two_levels_that_agree_on_what_is_wrong_are_found_out_by_the_implicit_method():
+    """Beside 6e23 molecules, both leave the fast state at what may be rounding."""
+    rates = {"n": "-0.001*n", "y": "-60*(y-(1.2+sin(t))*k)"}
+    model = Ode(rates, {"k": 0.5}, {"n": 6e23, "y": 0.2}, {"z": "tanh(y)"}, times=(0.5,))
+    mean = 0.5 * (1.2 + 60 * (60 * np.sin(0.5) - np.cos(0.5)) / 3601)
+    assert model.simulate(model.nominal[None])[0, 0] == pytest.approx(np.tanh(mean), abs=1e-8)
+    (said,) = model.remarks(model.nominal)
+    assert said.startswith("the steps of the explicit method miss what happens: ")
+    assert abs(replace(model, method="explicit").simulate(model.nominal[None])[0, 0] - np.tanh(mean)) > 0.1
+
+
+def test_readings_at_the_start_alone_need_no_step():
+    model = Ode({"y": "-k*y"}, {"k": 0.5}, {"y": "2*k"}, times=(0.0,))
+    np.testing.assert_array_equal(model.simulate(np.array([[1.0], [3.0]])), [[1.0], [3.0]])
+    np.testing.assert_array_equal(model.jacobian(model.nominal[None]), [[[1.0]]])
+    assert not model.hindrance(model.nominal)

@@ -32,6 +32,11 @@ _EASY = 16
 """Explicit steps between two readings up to which nominal equations are not asked whether they are stiff."""
 _STIFF = 10.0
 """Explicit steps, for each implicit one, from which on equations are called stiff."""
+_ASKED = 3000
+"""Implicit steps times states and 4 that hold explicit readings against implicit ones, in a quarter of a second."""
+_APART, _FAR = 0.05, 1e3
+"""Of the largest reading of an output, what explicit readings may differ by from a rough solution without being held
+against an accurate one; and by how many tolerances they may differ from that."""
 _IN_HAND = 0.3
 """Of the tolerance, what a step of the implicit method may leave."""
 _COLUMNS = ("case", "time", "output", "reading", "sigma")
@@ -242,9 +247,14 @@ class Ode(WrittenModel, WrappedModel):
         rates, outputs = self.rate_formulas.values(), self.output_formulas.values()
         if self.method == "auto" and engine.stiff:
             work = engine.shape[1]
-            found.append(
+            reason = (
                 f"the equations are stiff: an explicit method would need {work.explicit:.1e} steps for stability where "
-                f"the solution needs {work.steps}; they are integrated by the implicit method "
+                f"the solution needs {work.steps}"
+            )
+            if work.explicit <= _STIFF * work.steps:
+                reason = f"the steps of the explicit method miss what happens: it is {engine.missed:.1e} tolerances off"
+            found.append(
+                f"{reason}; they are integrated by the implicit method "
                 "(measurement.method=explicit or implicit fixes it)"
             )
         operations = {part[0] for one in self.piecewise_rates[0].values() for part in parts(one.tree)}
@@ -374,10 +384,36 @@ class _Engine(OdeMeasurement):
         as many explicit steps along the nominal solution."""
         if self.described.method != "auto":
             return self.described.method == "implicit"
-        if self.step is not None or self._ladder[self._nominal_place] <= _EASY:
+        if self.step is not None:
             return False
+        if self._ladder[self._nominal_place] <= _EASY:
+            return self.missed > 0
         z, work = self.shape
         return bool(np.isfinite(z).all() and work.explicit > _STIFF * work.steps)
+
+    @cached_property
+    def missed(self) -> float:
+        """The largest difference of nominal readings by few explicit steps from those by the implicit method, in
+        tolerances; 0 where the explicit ones are near, nearer than rough implicit ones, or those of the finest level.
+        Two levels may agree though none of their steps met a short pulse."""
+        x, here, every = own(self.nominal[None]), self._ladder[self._nominal_place], len(self.times)
+        explicit, finest = np.empty((2, 1, self.m))
+        most = int(_ASKED / (4 + self.states) / max(1.0, len(self.cases) * self.states**2 / 2000))
+        rough = Rodas5P(self, SHAPE).simulate(x, every, most)
+        self._simulate(x, np.arange(1), here * self._parts, self._zeros, explicit)
+        with np.errstate(all="ignore"):
+            outputs = np.abs(rough).reshape(-1, len(self.outputs))
+            largest = np.tile(np.nanmax(outputs, axis=0, initial=0.0), self.m // len(self.outputs))
+            if not (np.abs(explicit - rough) > _APART * largest).any():
+                return 0.0
+            self._simulate(x, np.arange(1), self._ladder[-1] * self._parts, self._zeros, finest)
+            if (np.abs(explicit - finest) <= _FAR * self._tolerances).all():
+                return 0.0
+            accurate = self._implicit.simulate(x, every)
+            off, rough_off = (
+                float(np.nanmax(np.abs(z - accurate) / self._tolerances, initial=0.0)) for z in (explicit, rough)
+            )
+        return off if off > max(_FAR, rough_off) else 0.0
 
     def off(self, x: Array) -> float:
         """By how many tolerances the explicit method differs from the implicit one in a reading at x (n,); 0 where few
@@ -423,7 +459,8 @@ class _Engine(OdeMeasurement):
         if isinstance(self.described.tolerance, float):
             return self.described.tolerance
         intervals = np.diff(self.times, prepend=0.0)
-        step = float(intervals[intervals > 0].min(initial=np.inf)) / _TRIAL_STEPS
+        # Readings at the start alone take no step.
+        step = float(min(intervals[intervals > 0], default=1.0)) / _TRIAL_STEPS
         nominal = own(self.nominal[None])
         trials = [replace(self.described, step=h, method="explicit").simulate(nominal) for h in (step, step / 2)]
         first, largest = (float(np.abs(z).max()) for z in trials)

@@ -1,10 +1,12 @@
 """Writes the integrator of a plan as a module of LLVM's intermediate representation.
 
     void integrate(double *x, double *si, double *cases, int64 n_cases, int64 *rows, int64 first, int64 last,
-                   double *times, int64 *steps, int64 n_times, double *offset, int64 stride, double *out, double *frame)
+                   double *times, int64 *steps, int64 n_times, double *offset, int64 stride, double *out,
+                   double *states, double *frame)
 
 Lane l is the problem of trial rows[l / n_cases] in case l % n_cases, for first <= l < last; a group that is not full
 repeats its last lane. Where constants are driven, `cases` holds those of every interval, and those after the last time.
+`states` takes those of every lane at the start and at each time, unless it is null.
 Every operation is IEEE arithmetic in a fixed order, so the bits of a lane do not depend on the number of lanes.
 `basics.compiled` makes machine code of such modules; this file is imported only where something is compiled.
 """
@@ -74,7 +76,7 @@ class _Writer:
             self.sources = self._constant("sources", I64, [i for row in plan.motion.sources for i in row] or [0], 8)
             shown = [i for row in plan.reading.sources for i in row] or [0]
             self.show_sources = self._constant("show_sources", I64, shown, 8)
-        kinds = [PTR, PTR, PTR, I64, PTR, I64, I64, PTR, PTR, I64, PTR, I64, PTR, PTR]
+        kinds = [PTR, PTR, PTR, I64, PTR, I64, I64, PTR, PTR, I64, PTR, I64, PTR, PTR, PTR]
         self._integrate(ir.Function(self.module, ir.FunctionType(VOID, kinds), "integrate"))
 
     def _constant(self, name: str, kind: ir.Type, values: Sequence[Any], align: int) -> Value:
@@ -151,11 +153,11 @@ class _Writer:
         v.store(v.run(show.program, given), frame, plan.shown)
 
     def _integrate(self, made: Any) -> None:
-        x, si, cases, n_cases, rows, first, last, times, steps, n_times, offset, stride, out, frame = made.args
+        x, si, cases, n_cases, rows, first, last, times, steps, n_times, offset, stride, out, states, frame = made.args
         b, plan, width = ir.IRBuilder(made.append_basic_block()), self.plan, self.width
         n, nc, no = len(plan.x), len(plan.constants), len(plan.shown)
         columns = n if plan.tangents else 1
-        target, shift, own = (room(b, I64, width) for _ in range(3))
+        target, shift, own, kept = (room(b, I64, width) for _ in range(4))
         t, taken = room(b, F64), room(b, F64)
 
         def at(place: int, lane: Value) -> Value:
@@ -167,6 +169,15 @@ class _Writer:
             lies = b.add(integer(plan.tangents[0].start), b.mul(j, integer(len(plan.tangents[0]))))
             place = _Vectors(b, width).place(frame, lies)
             return place, b.gep(table, [b.mul(j, integer(len(sources[0])))], source_etype=I64)
+
+        def keep(k: Value) -> None:
+            """The state at the time k, the start being 0, if it is asked for."""
+            asked = b.icmp_signed("!=", b.ptrtoint(states, I64), integer(0))
+            with b.if_then(asked), loop(b, integer(0), integer(width)) as lane:
+                row = b.add(number_at(b, kept, lane, I64), k)
+                for place in plan.y:
+                    put(b, number_at(b, frame, at(place, lane)), states, row)
+                    row = b.add(row, b.add(n_times, integer(1)))
 
         with loop(b, first, last, width) as group:
             with loop(b, integer(0), integer(width)) as lane:
@@ -183,7 +194,9 @@ class _Writer:
                 put(b, b.mul(b.mul(place, n_times), integer(no * columns)), target, lane)
                 put(b, b.mul(case, stride), shift, lane)
                 put(b, constants, own, lane)
+                put(b, b.mul(b.mul(place, b.add(n_times, integer(1))), integer(len(plan.y))), kept, lane)
             b.call(self.begin, [frame])
+            keep(integer(0))
             b.store(ir.Constant(F64, 0.0), t)
             b.store(ir.Constant(F64, float("nan")), taken)  # unlike any step, so that the weights are always written
             with loop(b, integer(0), n_times) as k:
@@ -200,6 +213,7 @@ class _Writer:
                         with loop(b, integer(begin), integer(end), by) as j:
                             b.call(self.move[by], [frame, *tangent(j, self.sources, plan.motion.sources)])
                 b.store(to, t)
+                keep(b.add(k, integer(1)))
                 if plan.driven:
                     later = b.mul(b.add(k, integer(1)), b.mul(n_cases, integer(nc)))
                     with loop(b, integer(0), integer(width)) as lane:

@@ -36,7 +36,7 @@ _NARROW = 4
 """Lanes up to which half of the usual vectors do: one simulation of GINS in two thirds of the time."""
 Whole = NDArray[np.integer[Any]]
 _EMIT = Path(__file__).with_name("emit.py")
-_ARGUMENTS = tuple(INTEGER if i in (3, 5, 6, 9, 11) else POINTER for i in range(14))
+_ARGUMENTS = tuple(INTEGER if i in (3, 5, 6, 9, 11) else POINTER for i in range(15))
 
 
 def threads() -> int:
@@ -79,28 +79,40 @@ class Kernel:
         weights = -(-sum(map(len, self.plan.tableau.weights)) // width)
         return _compiled("integrate", self.plan, width, _ARGUMENTS), (self.plan.size + weights) * width
 
-    def run(self, x: Array, si: Array, cases: Array, rows: Whole, times: Array, steps: Whole, *more: Array) -> None:
+    def run(
+        self,
+        x: Array,
+        si: Array,
+        cases: Array,
+        rows: Whole,
+        times: Array,
+        steps: Whole,
+        *more: Array,
+        states: Array | None = None,
+    ) -> None:
         """Integrates the trials in these rows of x (trials, n) from time 0, in every case, `steps[k]` equal steps to
         `times[k]`. `cases` has the constants (cases, constants), or where some are driven those of every interval and
         those after the last time (times + 1, cases, constants). The last of `more` takes the results, C-contiguous, in
-        the same rows; before it, for simulations, what is subtracted from the readings."""
+        the same rows; before it, for simulations, what is subtracted from the readings. `states` (trials, cases,
+        states, times + 1) takes those at the start and at each time."""
         count = cases.shape[-2]
         lanes = len(rows) * count
         *offset, out = more
         if not lanes:
             return
         if not compiled.available():
-            self._interpret(x, si, cases, rows, times, steps, *more)
+            self._interpret(x, si, cases, rows, times, steps, *more, states=states)
             return
         function, size = self._narrow if lanes <= _NARROW else self._wide
         given = (at(x), at(si), at(cases), count, at(rows, WHOLE))
         stride = len(offset[0]) // count if offset else 0
         taken = (at(times), at(steps, WHOLE), len(times), at(offset[0]) if offset else None, stride, at(out))
+        kept = None if states is None else at(states)
 
         def work_on(pieces: Sequence[tuple[int, int]] | Any) -> None:
             memory, frame = aligned(size)
             for first, last in pieces:
-                function(*given, first, last, *taken, frame)
+                function(*given, first, last, *taken, kept, frame)
             del memory
 
         width = compiled.width()
@@ -129,7 +141,15 @@ class Kernel:
         return Program.of([*tape.start, *starts], stays), moving, Program.of(shown, at)
 
     def _interpret(
-        self, x: Array, si: Array, cases: Array, rows: Whole, times: Array, steps: Whole, *more: Array
+        self,
+        x: Array,
+        si: Array,
+        cases: Array,
+        rows: Whole,
+        times: Array,
+        steps: Whole,
+        *more: Array,
+        states: Array | None = None,
     ) -> None:
         """`run` in NumPy, all lanes at once; products are rounded before they are added."""
         begin, slope, read = self._programs
@@ -145,6 +165,7 @@ class Kernel:
 
         with np.errstate(all="ignore"):
             y, t = begin(stays(0)), np.float64(0.0)
+            kept = [y]
             for k, to in enumerate(times):
                 h = (to - t) / max(int(steps[k]), 1)
                 for s in range(int(steps[k]) if to != t else 0):
@@ -158,11 +179,15 @@ class Kernel:
                             slopes.append(slope([t + s * h + node * h, *at, *stays(k)]))
                     y = at
                 t = to
+                kept.append(y)
                 for i, value in enumerate(read([t, *y, *stays(k + 1)])):
                     if self.sensitive:
                         out[trial, case, k, i] = np.broadcast_to(value, (n, len(trial))).T * si
                     else:
                         out[trial, case, k, i, 0] = value - more[0].reshape(count, -1, out.shape[3])[case, k, i]
+            if states is not None:
+                for k, i in np.ndindex(len(kept), len(kept[0])):
+                    states[trial, case, i, k] = kept[k][i]
 
 
 def rates(program: Program) -> Callable[[Array, Array, Array], None]:

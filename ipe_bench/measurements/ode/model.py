@@ -147,6 +147,7 @@ class OdeMeasurement(Measurement):
             rows = np.delete(rows, found.computed)
         for place, group in levels.grouped(found.places[rows], rows):
             self._simulate(x, group, self._ladder[place] * self._parts, offset, z)
+        z[found.lost] = np.nan
         return z
 
     def hindrance(self, x: Array) -> str:
@@ -155,24 +156,40 @@ class OdeMeasurement(Measurement):
             shortest, held = self.step, bool(np.isfinite(self.simulate(x)).all())
         else:
             top = len(self._ladder) - 1
-            z = np.empty((2, 1, self.m))
-            for place, readings in zip((top, levels.coarser(top)), z, strict=True):
-                self._simulate(x, np.arange(1), self._ladder[place] * self._parts, self._zeros, readings)
+            z, y = np.empty((2, 1, self.m)), np.empty((2, 1, *self._kept))
+            for i, place in enumerate((top, levels.coarser(top))):
+                self._simulate(x, np.arange(1), self._ladder[place] * self._parts, self._zeros, z[i], y[i])
             with np.errstate(all="ignore"):
                 left = levels.SAFETY * np.abs(z[0] - z[1]) / (2.0**levels.ORDER - 1.0)
-            shortest, held = self._usual_interval / self._ladder[top], bool((left <= _FAR * self._tolerances).all())
+            held = bool((left <= _FAR * self._tolerances).all() and levels.apart(*y)[0] <= levels.LOST)
+            shortest = self._usual_interval / self._ladder[top]
         return "" if held else diagnose(self, x[0], float(shortest))
 
-    def _simulate(self, x: Array, rows: levels.Indices, steps: NDArray[np.int64], offset: Array, z: Array) -> None:
-        """Fills these rows of z (trials, readings), as many times as it has room for, with so many steps to each."""
-        times = self._times[: z.shape[1] // (len(self._cases) * len(self.outputs))]
-        self._readings_kernel.run(x, self._si_sizes, self.tables, rows, times, steps, offset, z.reshape(-1))
+    def _simulate(
+        self,
+        x: Array,
+        rows: levels.Indices,
+        steps: NDArray[np.int64],
+        offset: Array,
+        z: Array,
+        y: Array | None = None,
+    ) -> None:
+        """Fills these rows of z (trials, readings), as many times as it has room for, with so many steps to each, and
+        of y (trials, cases, states, times + 1), if it has room for any."""
+        times, y = self._times[: z.shape[1] // (len(self._cases) * len(self.outputs))], y if self._kept[1] else None
+        self._readings_kernel.run(x, self._si_sizes, self.tables, rows, times, steps, offset, z.reshape(-1), states=y)
 
     _zeros = cached_property(lambda self: np.zeros(self.m))
     _si_sizes = cached_property(lambda self: own(self.si_sizes))
     _cases = cached_property(lambda self: own(self.cases))
     _times = cached_property(lambda self: own(self.times))
-    _remembered = cached_property(lambda self: dict[bytes, int]())
+
+    @property
+    def _kept(self) -> tuple[int, int, int]:
+        """Cases, states and times that are held against each other. A stated rate needs none: no step is unstable."""
+        return len(self._cases), self.states if self.fastest_rate is None else 0, len(self._times) + 1
+
+    _remembered = cached_property(lambda self: dict[bytes, tuple[int, bool]]())
 
     def _levels(self, x: Array, offset: Array, *, guess: bool = False) -> levels.Found:
         """The level of each trial, and the readings of those whose level had to be looked for; with `guess` the rates
@@ -182,23 +199,26 @@ class OdeMeasurement(Measurement):
         if guess and len(unknown) and self.trusted_angle > 0 and self._rate_function is not None:
             places[unknown], unknown = self._first_guess(x[unknown]), unknown[:0]
         bits = [row.tobytes() for row in x[unknown]]
-        places[unknown] = [remembered.get(key, -1) for key in bits]
+        lost = np.zeros(len(x), dtype=bool)
+        for row, key in zip(unknown, bits, strict=True):
+            places[row], lost[row] = remembered.get(key, (-1, False))
         new = np.flatnonzero(places[unknown] < 0)
         unknown = unknown[new]
         if not len(unknown):
-            return levels.Found(places, unknown, np.empty((0, self.m)))
+            return levels.Found(places, unknown, np.empty((0, self.m)), lost)
         found = self._find(x[unknown], self._first_guess(x[unknown]), offset)
         if len(remembered) + len(unknown) > _REMEMBERED:
             remembered.clear()
-        remembered.update(zip([bits[i] for i in new], found.places.tolist(), strict=True))
-        places[unknown] = found.places
-        return levels.Found(places, unknown[found.computed], found.z)
+        known = zip(found.places.tolist(), found.lost.tolist(), strict=True)
+        remembered.update(zip([bits[i] for i in new], known, strict=True))
+        places[unknown], lost[unknown] = found.places, found.lost
+        return levels.Found(places, unknown[found.computed], found.z, lost)
 
     def _find(self, x: Array, start: levels.Indices, offset: Array) -> levels.Found:
-        def simulate(rows: levels.Indices, level: int, z: Array) -> None:
-            self._simulate(x, rows, level * self._parts, offset, z)
+        def simulate(rows: levels.Indices, level: int, z: Array, y: Array) -> None:
+            self._simulate(x, rows, level * self._parts, offset, z, y)
 
-        return levels.search(self._ladder, self._tolerances, simulate, start)
+        return levels.search(self._ladder, self._tolerances, self._kept, simulate, start)
 
     def _trusted(self, x: Array) -> Mask:
         """The trials whose steps are fixed, or of which the coarsest level is known to do."""
@@ -227,7 +247,7 @@ class OdeMeasurement(Measurement):
         """Where on the ladder the search begins: steps of half a radian, or what the nominal parameters need."""
         top = len(self._ladder) - 1
         if self._rate_function is None:
-            return np.where(np.isfinite(x).all(axis=1), self._nominal_place, top)
+            return np.where(np.isfinite(x).all(axis=1), min(self._nominal_place, top - 1), top)
         wanted = np.nan_to_num(self._rates(x) * self._longest / _ANGLE_AT_START, nan=np.inf)
         return np.clip(np.searchsorted(self._ladder, wanted), 1, top)
 

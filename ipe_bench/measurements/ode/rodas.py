@@ -122,9 +122,10 @@ class Rodas5P:
         explicit, fastest, met = (float(a[k]) for a in (run.stretch, run.fastest, run.met))
         return run.readings, Work(int(run.steps.max()), explicit, fastest, met, float(run.t.min()))
 
-    def simulate(self, x: Array, stop: int) -> Array:
-        """Readings (trials, cases x stop x outputs) at the first `stop` times; NaN from where a trial breaks down."""
-        return _Run(self, x, stop).readings
+    def simulate(self, x: Array, stop: int, most: int = MOST_STEPS) -> Array:
+        """Readings (trials, cases x stop x outputs) at the first `stop` times; NaN from where a trial breaks down, or
+        takes more than so many steps."""
+        return _Run(self, x, stop, most).readings
 
     def jacobian(self, x: Array, stop: int) -> Array:
         """Their derivatives by x (trials, cases x stop x outputs, n)."""
@@ -137,11 +138,18 @@ class _Run:
     """The lanes of one integration to the last time; arrays are (..., lanes)."""
 
     def __init__(
-        self, method: Rodas5P, x: Array, stop: int, *, sensitive: bool = False, stretched: bool = False
+        self,
+        method: Rodas5P,
+        x: Array,
+        stop: int,
+        most: int = MOST_STEPS,
+        *,
+        sensitive: bool = False,
+        stretched: bool = False,
     ) -> None:
         model = self.model = method.model
         self.do, self.rtol, self.atol = method._programs, method.rtol, _SMALLEST * method.rtol
-        self.times, self.stretched = np.asarray(model.times, dtype=float)[:stop], stretched
+        self.times, self.most, self.stretched = np.asarray(model.times, dtype=float)[:stop], most, stretched
         cases, self.q = len(model.cases), model.n if sensitive else 0
         lanes = len(x) * cases
         self.p = np.repeat(x * model.si_sizes, cases, axis=0).T.copy()
@@ -172,7 +180,7 @@ class _Run:
         live = np.arange(len(self.t))
         while True:
             self._read(live)
-            going = (self.place[live] < len(self.times)) & (self.steps[live] < MOST_STEPS) & np.isfinite(h[live])
+            going = (self.place[live] < len(self.times)) & (self.steps[live] < self.most) & np.isfinite(h[live])
             live = live[going]
             if not len(live):
                 return

@@ -1,8 +1,9 @@
 """How finely each trial is integrated, a pure function of its parameters, and how coarsely its tangents may be.
 
 A level is the number of equal steps between two readings. It is accepted if half of it shows, by step doubling, that it
-holds the tolerance on the whole span. Tangents inside iterations may be coarser: a Gauss-Newton step with a Jacobian J~
-in place of J leaves |I - J~+ J| of the error, measured at the nominal parameters and carried over by the level.
+holds the tolerance on the whole span, and that the states converge: a reading that saturates is the same for any state
+that an unstable step leaves. Tangents inside iterations may be coarser: a Gauss-Newton step with a Jacobian J~ in place
+of J leaves |I - J~+ J| of the error, measured at the nominal parameters and carried over by the level.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.linalg import Array, Mask
 
 Indices = NDArray[np.intp]
 
@@ -28,6 +29,12 @@ MOST_RK4 = 3
 """Steps of the formula of fourth order, in place of one of eighth order, beyond which it gains nothing."""
 LONGEST = 5
 """Times that the steps of tangents may be longer than those of the readings."""
+STATES = 1e-4
+"""Of a state's largest magnitude in a trial: what the states may be off by."""
+LOST = 0.1
+"""Of the same: the move between the two finest levels from which on the solution is not followed at all."""
+_ROUNDING = 1e-12
+"""Of the largest state: what is held for the rounding errors of another one that should be 0."""
 _LARGEST_CLIMB = 4.0
 """A level grows by no more at once: far from convergence the estimate says nothing."""
 
@@ -51,38 +58,56 @@ def grouped(places: Indices, rows: Indices) -> Iterator[tuple[int, Indices]]:
 
 
 class Found(NamedTuple):
-    """Places on the ladder (trials,), and the readings (trials, m) that the search has computed there: those of the
-    trials `computed`, in their order."""
+    """Places on the ladder (trials,), the readings (trials, m) that the search has computed there, those of the trials
+    `computed` in their order, and whether a trial is `lost`: the finest level does not follow its states."""
 
     places: Indices
     computed: Indices
     z: Array
+    lost: Mask
+
+
+def apart(fine: Array, coarse: Array) -> Array:
+    """How far states (trials, cases, states, times) are from others, in units of the largest of each (trials,)."""
+    with np.errstate(all="ignore"):
+        largest, gap = (np.abs(y).max(axis=3).max(axis=1) for y in (fine, fine - coarse))
+        scale = np.maximum(largest, _ROUNDING * largest.max(axis=1, keepdims=True, initial=0.0))
+        return np.nan_to_num(np.where(gap == 0.0, 0.0, gap / scale), nan=np.inf).max(axis=1, initial=0.0)
 
 
 def search(
-    levels: NDArray[np.int64], tolerance: Array, simulate: Callable[[Indices, int, Array], None], start: Indices
+    levels: NDArray[np.int64],
+    tolerance: Array,
+    states: tuple[int, ...],
+    simulate: Callable[[Indices, int, Array, Array], None],
+    start: Indices,
 ) -> Found:
-    """The coarsest level at which readings hold `tolerance` (m,), by comparing levels n and n/2.
+    """The coarsest level at which readings hold `tolerance` (m,) and states `STATES`, by comparing levels n and n/2.
 
-    Where d is how far the readings move between them, n/2 is accepted if 16 d is within the tolerance, n if the error
-    that an eighth-order formula then has left, 16 d / (2^8 - 1), is; else n grows as that formula says. Trials that
-    do not get there end at the top of the ladder. The search begins at the places `start` (trials,), and those at the
-    top are accepted as they are; `simulate` fills these rows of an array (trials, m) with readings at one level.
+    Where d is how far they move between them, n/2 is accepted if 16 d is within the tolerance, n if the error that an
+    eighth-order formula then has left, 16 d / (2^8 - 1), is; else n grows as that formula says. Trials that do not get
+    there end at the top of the ladder. The search begins at the places `start` (trials,), and those at the top are
+    accepted as they are; `simulate` fills these rows of arrays (trials, m) and (trials, *states) with readings and
+    states (cases, states, times) at one level.
     """
     places, final, top = start.copy(), start.copy(), len(levels) - 1
+    lost = np.zeros(len(start), dtype=bool)
     fine, coarse = (np.empty((len(start), len(tolerance))) for _ in range(2))
+    y, near = (np.empty((len(start), *states)) for _ in range(2))
     held = np.full(len(start), -1)  # the place whose readings are in `fine`
     pending = computed = np.flatnonzero(start < top)
     while len(pending):
         still = []
         for place, rows in grouped(places[pending], pending):
             below, known = coarser(place), held[rows] == coarser(place)
-            coarse[rows[known]] = fine[rows[known]]
+            coarse[rows[known]], near[rows[known]] = fine[rows[known]], y[rows[known]]
             if not known.all():
-                simulate(rows[~known], int(levels[below]), coarse)
-            simulate(rows, int(levels[place]), fine)
+                simulate(rows[~known], int(levels[below]), coarse, near)
+            simulate(rows, int(levels[place]), fine, y)
+            astray = apart(y[rows], near[rows])
             with np.errstate(all="ignore"):
-                moved = SAFETY * (np.abs(fine[rows] - coarse[rows]) / tolerance).max(axis=1)
+                moved = (np.abs(fine[rows] - coarse[rows]) / tolerance).max(axis=1)
+                moved = SAFETY * np.maximum(moved, astray / STATES)
                 left = moved / ((levels[place] / levels[below]) ** ORDER - 1.0)
                 # Not a number where an iterate overflows: such a trial climbs to the top, in bounded time.
                 moved, left = np.nan_to_num(moved, nan=np.inf), np.nan_to_num(left, nan=np.inf)
@@ -90,11 +115,12 @@ def search(
             enough, good = moved <= 1.0, (left <= 1.0) | (place == top)
             fine[rows[enough]] = coarse[rows[enough]]
             final[rows] = np.where(enough, below, place)
+            lost[rows] = (place == top) & ~(astray <= LOST)
             held[rows] = place
             places[rows] = np.clip(np.searchsorted(levels, wanted), place + 1, top)
             still.append(rows[~(enough | good)])
         pending = np.concatenate(still)
-    return Found(final, computed, fine[computed])
+    return Found(final, computed, fine[computed], lost)
 
 
 def contraction(coarse: Array, J: Array) -> float:
