@@ -1,165 +1,240 @@
-"""The headline: what the data say, in a few sentences that are computed from them."""
+"""The headline: what the data say, in a few facts that are computed from them; `templates/headline.j2` words each."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pandas as pd
 
 from ipe_bench.report.figures.views import family_of
-from ipe_bench.report.words import brief, duration, enumerate_few, percent, plain, short
+from ipe_bench.report.table import environment
+from ipe_bench.report.words import enumerate_few, plain, short
 from ipe_bench.statistics.analysis import Analysis
-from ipe_bench.statistics.certified import attained_totals, certified_averages, certified_table
+from ipe_bench.statistics.certified import attained_totals, certified_averages, certified_table, published_table
 from ipe_bench.statistics.records import ALL, BEST
+
+if TYPE_CHECKING:
+    from ipe_bench.statistics.collect import Collection
 
 ALIKE = 0.05
 """Efficiencies within this part of each other count as equal."""
 BROKEN = 0.9
 """Share of success that an estimator holds as long as it is not surely below."""
+MET = 1e-9
+"""Difference up to which a published number is met."""
+OVERCONFIDENT, UNDECIDED = ("optimistic", "diverged but confident"), ("undecided", "-")
+"""Verdicts on the reported covariance."""
+SHARED = ("shared_trials", "shared_success", "shared_silent")
+Fact = tuple[str, dict[str, Any]]
+"""What a rule found: the macro that words it, and its arguments."""
 
 
 def headline(analysis: Analysis) -> list[str]:
     """Who solves most certified problems; of simulated trials, who agrees, is honest, breaks where, at what cost."""
-    found = [*_certified(analysis), *_attained(analysis), *_simulated(analysis.simulated)]
+    module: Any = environment().overlay(autoescape=False).get_template("headline.j2").module
+    found = (" ".join(getattr(module, name)(**values).split()) for name, values in facts(analysis))
     # A number and its sign stay on one line.
-    return [s.replace(" %", "\u00a0%") for s in found] or ["Nothing is stored yet, so there is nothing to find."]
+    return [sentence.replace(" %", "\u00a0%") for sentence in found]
 
 
-def _certified(analysis: Analysis) -> Iterator[str]:
-    each = certified_averages(certified_table(analysis.collection))
+def facts(analysis: Analysis) -> list[Fact]:
+    """What the rules find; at least one fact, if only that nothing is stored."""
+    rows = analysis.summary[analysis.summary["parameter"] == ALL].reset_index(drop=True)
+    if rows.empty:
+        return [("nothing", {})]
+    # Both have a row per scenario and estimator, in the same order.
+    rows = rows.join(analysis.scores.reset_index(drop=True)[["scenario", *SHARED]])
+    certified, moving = rows["noise"] == "certified", rows["noise"] == "model"
+    collected = [*_certified(analysis), *_attained(analysis), *_published(analysis.collection)]
+    own = [] if collected else _ranking(rows[certified], "certified")
+    constants = _constants(rows[~certified & ~moving], analysis.collection)
+    return [*collected, *own, *constants, *_moving(rows[moving])]
+
+
+def in_common(rows: pd.DataFrame, key: str | list[str]) -> pd.DataFrame:
+    """The rows of the scenarios or problems that every estimator has: only there may estimators be ranked."""
+    return rows[rows.groupby(key)["estimator"].transform("nunique") == rows["estimator"].nunique()]
+
+
+def _unranked(what: str, rows: pd.DataFrame) -> Iterator[Fact]:
+    yield "unranked", {"what": what, "labels": list(rows["estimator"].unique())}
+
+
+# Certified readings, known minima, published numbers ------------------------------------------------------------------
+
+
+def _certified(analysis: Analysis) -> Iterator[Fact]:
+    rows = certified_table(analysis.collection)
+    each = certified_averages(in_common(rows, ["dataset", "start"]))
     if each.empty:
+        yield from _unranked("data set", rows) if len(rows) else ()
         return
     each["digits"] = each["mean_lre_parameters"] * each["datasets"]
     totals = each.groupby("estimator", sort=False)[["solved", "datasets", "digits"]].sum()
     best = totals[totals["solved"] == totals["solved"].max()].sort_values("digits", ascending=False, kind="stable")
     first = best.iloc[0]
-    yield (
-        f"Of {first['datasets']:.0f} certified problems, {enumerate_few(list(best.index))} solve"
-        f"{'s' * (len(best) == 1)} most, {first['solved']:.0f}, with four digits or more of every parameter;"
-        f" {best.index[0]} has {first['digits'] / first['datasets']:.1f} of 11 digits on average."
-    )
+    found = {"problems": int(first["datasets"]), "solved": int(first["solved"]), "labels": list(best.index)}
+    yield "certified", found | {"digits": first["digits"] / first["datasets"]}
 
 
-def _attained(analysis: Analysis) -> Iterator[str]:
-    if analysis.attained.empty or (totals := attained_totals(analysis.attained)).empty:
+def _attained(analysis: Analysis) -> Iterator[Fact]:
+    rows = analysis.attained
+    totals = attained_totals(in_common(rows, ["function", "start"]))
+    if totals.empty:
+        yield from _unranked("problem", rows) if len(rows) else ()
         return
     best = totals[totals["solved"] == totals["solved"].max()]
-    yield (
-        f"Of {best['problems'].iloc[0]} problems of known minimum, {enumerate_few(list(best['estimator']))} attain"
-        f"{'s' * (len(best) == 1)} most, {best['solved'].iloc[0]}."
-    )
+    problems, solved = best[["problems", "solved"]].iloc[0]
+    yield "attained", {"problems": int(problems), "solved": int(solved), "labels": list(best["estimator"])}
 
 
-def _simulated(analysis: Analysis) -> Iterator[str]:
+def _published(collection: Collection) -> Iterator[Fact]:
+    rows = published_table(collection)
+    if len(rows):
+        difference = rows["difference"].abs().fillna(np.inf)
+        worst = rows.iloc[int(difference.argmax())]
+        found = {"number": len(rows), "met": int((difference <= MET).sum()), "most": difference.max(), "limit": MET}
+        yield "published", found | {"where": f"{worst['estimator']}, {worst['state']}"}
+
+
+# Simulated trials -----------------------------------------------------------------------------------------------------
+
+
+def _constants(rows: pd.DataFrame, collection: Collection) -> Iterator[Fact]:
     """What a sweep over error scales says of one setting; of several, or of one scale, who succeeds how often."""
-    rows = analysis.summary[analysis.summary["parameter"] == ALL]
     if rows.empty:
         return
     scales = sorted(rows["error_scale"].unique())
     several = rows.groupby(["error_scale", "estimator"]).size().max() > 1
     if several or len(scales) < 2 or rows["estimator"].nunique() < 2:
-        yield _ranked(analysis, rows, scales)
+        yield from _ranking(rows, "constants")
         return
-    yield from _agreement(rows, scales, {one.estimator: family_of(one.footer) for one in analysis.collection.groups})
-    yield from _honesty(rows)
-    yield from _reach(rows, scales)
+    yield from _agreement(rows, scales, {one.estimator: family_of(one.footer) for one in collection.groups})
+    yield from honesty(rows)
+    yield from reach(rows)
+    yield from _silent(rows)
     yield _costs(rows, scales)
 
 
-def _agreement(rows: pd.DataFrame, scales: Sequence[float], kinds: Mapping[str, str]) -> Iterator[str]:
-    """Up to which scale IPE and filters attain the same."""
+def _moving(rows: pd.DataFrame) -> Iterator[Fact]:
+    """Who keeps the track how often, and, of one model, how large the errors are."""
+    if rows.empty:
+        return
+    yield from _ranking(rows, "moving")
+    one = rows["scenario"].min() == rows["scenario"].max()
+    if one and (rows["trials"] == rows["shared_trials"]).all():
+        listed = rows.sort_values("error_median", kind="stable")[["estimator", "error_median"]]
+        yield "errors", {"errors": list(listed.itertuples(index=False, name=None))}
+
+
+def _agreement(rows: pd.DataFrame, scales: Sequence[float], kinds: Mapping[str, str]) -> Iterator[Fact]:
+    """Up to which scale IPE and filters attain the same in the same trials."""
     compared = rows[rows["estimator"].map(kinds).isin(["IPE", "filters"])]
-    named = {kind: [e for e, k in kinds.items() if k == kind] for kind in ("IPE", "filters")}
+    named = {kind: [e for e in compared["estimator"].unique() if kinds[e] == kind] for kind in ("IPE", "filters")}
     if not all(named.values()):
         return
-    who = " and ".join(f"{kind} ({enumerate_few(names)})" for kind, names in named.items())
-    last = None
+    same = compared[compared["trials"] == compared["shared_trials"]]
+    agreed, differ = [], None
     for scale in scales:
-        here = compared[compared["error_scale"] == scale]
+        here = same[same["error_scale"] == scale]
+        if here["estimator"].nunique() < compared["estimator"].nunique():
+            break  # not all of them have these trials
         efficiency = here["efficiency_capped"]
-        if not here[BEST].all() or efficiency.max() > efficiency.min() * (1 + ALIKE):
+        if not here[BEST].all() or not efficiency.max() <= efficiency.min() * (1 + ALIKE):
+            differ = scale
             break
-        last = here
-    if last is None:
-        yield f"{who} differ already at error scale {plain(scales[0])}."
-        return
-    low, high = (f"{v:.2f}" for v in (last["efficiency_capped"].min(), last["efficiency_capped"].max()))
-    success, scale = last["success"].min(), last["error_scale"].iloc[0]
-    succeed = "all their trials succeed" if success == 1 else f"at least {percent(success)} of their trials succeed"
-    reach = "at every error scale" if scale == scales[-1] else f"up to error scale {plain(scale)}"
-    yield f"{who} agree {reach}: {succeed} there, with an efficiency of {low if low == high else f'{low} to {high}'}."
+        agreed.append(here)
+    if agreed:
+        whole = pd.concat(agreed)
+        found = {"last": whole["error_scale"].max(), "everywhere": len(agreed) == len(scales)}
+        found |= {"success": whole["success"].min()}
+        found |= {"low": whole["efficiency_capped"].min(), "high": whole["efficiency_capped"].max()}
+        yield "agreement", {"named": named, **found}
+    elif differ is not None:
+        yield "difference", {"named": named, "scale": differ}
 
 
-def _listed(rows: pd.DataFrame, value: Callable[[Any], str]) -> str:
-    return enumerate_few([f"{row['estimator']} ({value(row)})" for _, row in rows.iterrows()])
-
-
-def _from_scale(rows: pd.DataFrame, value: Callable[[Any], str]) -> list[str]:
-    """The estimators of the rows, by the smallest scale at which each is there."""
+def _by_scale(rows: pd.DataFrame, column: str) -> list[tuple[float, list[tuple[str, float]]]]:
+    """The estimators of these rows with a column's value, by the smallest error scale at which each is there."""
     first = rows.sort_values("error_scale", kind="stable").drop_duplicates("estimator")
-    return [f"{_listed(part, value)} from scale {plain(scale)}" for scale, part in first.groupby("error_scale")]
+    parts: Any = first.groupby("error_scale")
+    return [
+        (float(scale), list(part[["estimator", column]].itertuples(index=False, name=None))) for scale, part in parts
+    ]
 
 
-def _honesty(rows: pd.DataFrame) -> Iterator[str]:
-    """From which scale on who claims smaller errors than it makes."""
+def honesty(rows: pd.DataFrame) -> Iterator[Fact]:
+    """At which scale who first claims smaller errors than it makes, who never does, and of whom it is undecided."""
     claims = rows[rows["nees_median"].notna()]
-    sure = claims[claims["verdict"].isin(["optimistic", "diverged but confident"])]
-    parts = _from_scale(sure, lambda row: brief(row["nees_median"]))
+    sure = claims[claims["verdict"].isin(OVERCONFIDENT)]
     others = claims[~claims["estimator"].isin(sure["estimator"])]
-    open_ = others[others["verdict"].isin(["undecided", "-"])]["estimator"].unique()
-    honest = [label for label in others["estimator"].unique() if label not in open_]
-    parts += [f"{enumerate_few(honest)} never"] if honest else []
-    parts += [f"undecided for {enumerate_few(list(open_))}"] if len(open_) else []
+    undecided = list(others[others["verdict"].isin(UNDECIDED)]["estimator"].unique())
+    never = [label for label in others["estimator"].unique() if label not in undecided]
     if len(claims):
-        yield f"Overconfident (NEES, 1 is honest): {'; '.join(parts)}."
+        yield "honesty", {"first": _by_scale(sure, "nees_median"), "never": never, "undecided": undecided}
 
 
-def _reach(rows: pd.DataFrame, scales: Sequence[float]) -> Iterator[str]:
-    """From which scale on who surely fails in more than a tenth of the trials, and who never does."""
+def reach(rows: pd.DataFrame) -> Iterator[Fact]:
+    """At which scale who first surely fails in more than a tenth of the trials, and who does so at none of its own."""
     broken = rows[rows["success_high"] < BROKEN]
-    parts = _from_scale(broken, lambda row: percent(row["success"]))
-    top = rows[(rows["error_scale"] == scales[-1]) & ~rows["estimator"].isin(broken["estimator"])]
-    for part, verb in ((top[top["success"] >= BROKEN], "hold"), (top[top["success"] < BROKEN], "may hold")):
-        if len(part):
-            who, ending = _listed(part, lambda row: percent(row["success"])), "s" * (len(part) == 1 and verb == "hold")
-            parts.append(f"{who} {verb}{ending} to {plain(scales[-1])}")
-    yield f"Success falls surely below {100 * BROKEN:.0f} %: {'; '.join(parts)}."
-    silent = rows.sort_values("failed_silent", kind="stable").iloc[-1]
-    if silent["failed_silent"] > 0:
-        worst = f"{silent['estimator']} at scale {plain(silent['error_scale'])}"
-        yield f"Failures that look right: at most {percent(silent['failed_silent'])} of the trials ({worst})."
+    rest = rows[~rows["estimator"].isin(broken["estimator"])]
+    of_each = rest.groupby("estimator", sort=False)
+    ends = of_each.agg(error_scale=("error_scale", "max"), least=("success", "min")).reset_index()
+    kept = ends["least"] >= BROKEN
+    found = {"first": _by_scale(broken, "success"), "held": _by_scale(ends[kept], "least")}
+    yield "reach", found | {"open": _by_scale(ends[~kept], "least"), "limit": BROKEN}
 
 
-def _costs(rows: pd.DataFrame, scales: Sequence[float]) -> str:
+def _silent(rows: pd.DataFrame) -> Iterator[Fact]:
+    worst = rows.sort_values("failed_silent", kind="stable").iloc[-1]
+    if worst["failed_silent"] > 0:
+        where = f"{worst['estimator']} at scale {plain(worst['error_scale'])}"
+        yield "silent", {"share": worst["failed_silent"], "where": where}
+
+
+def _costs(rows: pd.DataFrame, scales: Sequence[float]) -> Fact:
     """What a trial costs at the largest scale at which most hold, and at the largest for those that still do."""
     holding = rows[rows["success_high"] >= BROKEN]
     number = holding.groupby("error_scale")["estimator"].nunique()
     most = number.index[number > rows["estimator"].nunique() / 2]
-    parts = []
+    found = []
     for scale in dict.fromkeys([*most[-1:], number.index.max() if len(number) else scales[-1]]):
         part = (holding if len(number) else rows).query("error_scale == @scale")
         part = part.sort_values("simulations_median", kind="stable")
-        costs = zip(part["estimator"], part["simulations_median"], part["time_median_s"], strict=True)
-        listed = enumerate_few([f"{e} {brief(cost)} ({duration(time, 2)})" for e, cost, time in costs])
-        parts.append(f"at scale {plain(scale)} {listed}")
-    return f"A trial costs, in simulations: {'; '.join(parts)}."
+        listed = part[["estimator", "simulations_median", "time_median_s"]].itertuples(index=False, name=None)
+        found.append((scale, list(listed)))
+    return "costs", {"scales": found}
 
 
-def _ranked(analysis: Analysis, rows: pd.DataFrame, scales: Sequence[float]) -> str:
-    """Who succeeds in how many of the trials, pooled over all scenarios, and who fails silently."""
-    rows = rows.assign(**{name: rows[name] * rows["trials"] for name in ("success", "failed_silent")})
-    sums = rows.groupby("estimator", sort=False)[["success", "failed_silent", "trials"]].sum()
-    sums = sums.assign(share=sums["success"] / sums["trials"], silent=sums["failed_silent"] / sums["trials"])
-    sums = sums.sort_values("share", ascending=False, kind="stable")
-    listed = [f"{label} in {percent(row['share'])}" for label, row in sums.iterrows()]
-    reach = f"scale{'s' * (len(scales) > 1)} {' to '.join(dict.fromkeys(plain(s) for s in (scales[0], scales[-1])))}"
-    scenarios = len(set(analysis.scores["scenario"]))
-    number = f"{int(sums['trials'].max()):,} trials" + (f" in {scenarios} scenarios" if scenarios > 1 else "")
-    sentence = f"At error {reach}, of {number} succeed: {enumerate_few(listed)}."
-    if (worst := sums.sort_values("silent").iloc[-1])["silent"] > 0:
-        sentence += f" Failures that look right: {percent(worst['silent'])} at most ({worst.name})."
-    return sentence
+def _ranking(rows: pd.DataFrame, kind: str) -> Iterator[Fact]:
+    """Who succeeds in how many of the trials that all have, pooled over all scenarios, and who fails silently."""
+    if rows.empty:
+        return
+    common = in_common(rows[rows["shared_trials"] > 0], "scenario")
+    if common.empty or common["estimator"].nunique() < rows["estimator"].nunique():
+        yield from _unranked("trial", rows)
+        return
+    weights = common["shared_trials"]
+    counts = common.assign(success=common["shared_success"] * weights, silent=common["shared_silent"] * weights)
+    sums = counts.groupby("estimator", sort=False)[["success", "silent", "shared_trials"]].sum()
+    shares = sums[["success", "silent"]].div(sums["shared_trials"], axis=0)
+    ranked = shares.sort_values("success", ascending=False, kind="stable")
+    worst = shares.sort_values("silent", kind="stable").iloc[-1]
+    scenarios = common["scenario"].nunique()
+    yield (
+        "ranking",
+        {
+            "kind": kind,
+            "ranked": list(ranked["success"].items()),
+            "trials": int(sums["shared_trials"].iloc[0]),
+            "scenarios": scenarios,
+            "left_out": rows["scenario"].nunique() - scenarios,
+            "scales": list(dict.fromkeys((common["error_scale"].min(), common["error_scale"].max()))),
+            "silent": (worst.name, worst["silent"]) if worst["silent"] > 0 else None,
+        },
+    )
 
 
 def about(analysis: Analysis) -> list[str]:
@@ -169,14 +244,28 @@ def about(analysis: Analysis) -> list[str]:
         footer, name = group.footer, str(group.columns["measurement"])
         if name in found or group.columns["noise"] == "certified":
             continue
-        groups: dict[str, Mapping[str, Any]] = {}
-        for parameter in footer["parameters"]:
-            groups.setdefault(parameter.get("group") or parameter["name"], parameter)
-        sizes = [f"{label} {short(p['size'])} {p['unit']}".strip() for label, p in groups.items()]
-        words = str(footer.get("about") or "").rstrip(".")
-        readings = f"{footer['readings']} readings" if "readings" in footer else "Its readings"
-        found[name] = (
-            f"{name}{': ' * bool(words)}{words}. {readings} determine {len(footer['parameters'])} parameters; at error"
-            f" scale s the true ones scatter about the nominal ones by s times {enumerate_few(sizes, 8)}."
-        )
+        found[name] = (_about_states if "times" in footer else _about_constants)(name, footer)
     return list(found.values())
+
+
+def _about_constants(name: str, footer: Mapping[str, Any]) -> str:
+    groups: dict[str, Mapping[str, Any]] = {}
+    for parameter in footer["parameters"]:
+        groups.setdefault(parameter.get("group") or parameter["name"], parameter)
+    sizes = [f"{label} {short(p['size'])} {p['unit']}".strip() for label, p in groups.items()]
+    words = str(footer.get("about") or "").rstrip(".")
+    readings = f"{footer['readings']} readings" if "readings" in footer else "Its readings"
+    return (
+        f"{name}{': ' * bool(words)}{words}. {readings} determine {len(footer['parameters'])} parameters; at error"
+        f" scale s the true ones scatter about the nominal ones by s times {enumerate_few(sizes, 8)}."
+    )
+
+
+def _about_states(name: str, footer: Mapping[str, Any]) -> str:
+    """The docstring of a model that is given by formulas is that of all such models, and is left out."""
+    states = [f"{p['name']} in {p['unit']}" if p["unit"] else p["name"] for p in footer["parameters"]]
+    words = "" if "next" in footer["identity"]["scenario"].get("model", {}) else str(footer.get("about") or "")
+    return (
+        f"{name}{': ' * bool(words)}{words.rstrip('.')}. {footer['readings']} readings at {len(footer['times'])} epochs"
+        f" tell {len(states)} states that move: {enumerate_few(states, 8)}."
+    )

@@ -107,11 +107,11 @@ def _axis(column: str, title: str, **more: Any) -> dict[str, Any]:
 
 _SCALE = _axis("error_scale", "error scale", log=True)
 _COST = _axis("simulations_median", "simulations per trial (median)", log=True)
-_BOUND = {"log": True, "reference": 1.0, "reference_title": "the bound"}
+_OVER = {"log": True, "reference": 1.0, "reference_title": "the bound"}
 _AXES = (
     _axis("success", "success", share=True, low="success_low", high="success_high"),
-    _axis("error_median", "median error / bound", **_BOUND),
-    _axis("error_q95", "95 % error / bound", **_BOUND),
+    _axis("error_median", "median error over the bound", **_OVER),
+    _axis("error_q95", "95 % error over the bound", **_OVER),
     _axis("efficiency_capped", "efficiency", low="efficiency_capped_low", high="efficiency_capped_high"),
     _axis("nees_median", "NEES, median", log=True, reference=1.0, reference_title="honest covariance"),
     _axis("coverage95", "truth in the 95 % ellipsoid", share=True, reference=0.95, reference_title="honest covariance"),
@@ -123,7 +123,11 @@ def charts(views: Sequence[View]) -> Iterator[dict[str, str]]:
     """The chart of each setting: its name, title and caption, and as JSON what the script draws."""
     for view in views:
         rows = view.totals
-        shown = [axis for axis in _AXES if len(rows) and rows[axis["column"]].map(math.isfinite).any()]
+        shown = [
+            {key: v.replace("the bound", view.reference) if isinstance(v, str) else v for key, v in axis.items()}
+            for axis in _AXES
+            if len(rows) and rows[axis["column"]].map(math.isfinite).any()
+        ]
         if not shown:
             continue
         across = (_SCALE, _COST) if len(view.scales) > 1 else (_COST, _SCALE)

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ipe_bench.basics.files import write_text
+from ipe_bench.report.words import brief, duration, enumerate_few, percent, plain
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -226,6 +227,8 @@ def environment() -> Environment:
     )
     made.tests["strong"] = lambda part: isinstance(part, Strong)
     made.globals["MOST_ROWS"] = MOST_ROWS
+    made.globals |= (written := {one.__name__: one for one in (brief, duration, enumerate_few, percent, plain)})
+    made.filters |= written
     return made
 
 

@@ -26,7 +26,7 @@ from ipe_bench.statistics.records import ALL, SCORES, Where, all_statistics, fra
 _RECORDED: dict[Where, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
     "tracks": (
         "States over all epochs",
-        f"{TRACKED} all: over the bound at the truth, root mean square over the states.",
+        f"{TRACKED} all: root mean square over the states, each over that of this filter.",
         lambda rows: rows["path_rmse"].notna(),
     ),
     "costs": (

@@ -14,33 +14,42 @@ from ipe_bench.statistics.records import ALL, BEST, SCORES, Kind, Statistic, Whe
 
 _WIDE_ENOUGH = 100
 """Letters of a screen that has room for failures, and for verdicts in words."""
-LEGEND = (
+_SUCCESS = (
     "success is the percentage of all trials, with its 95 % interval; bold marks estimators that may be the best where"
     " others are beaten: no rival succeeds significantly more often. failed (on wide screens) gives known / silent"
-    " failures: the status or the test of fit reports a known one.",
+    " failures: the status or the test of fit reports a known one."
+)
+_CAPPED = f"efficiency is the reciprocal of its root mean square, where a trial counts as at most {CAP:g}."
+_ERROR = (
     "error is the median / 95 % quantile over all trials, in multiples of the bound at the truth; 1 is the best"
-    f" possible. efficiency is the reciprocal of its root mean square, where a trial counts as at most {CAP:g}.",
+    f" possible. {_CAPPED}"
+)
+_NEES = (
     "NEES is the median of the squared error over the variance that the estimator claims; 1 is right. The word or sign"
     " is the verdict on the converged trials: optimistic (+) claims too small a variance, pessimistic (-) too large a"
-    " one, diverged (!) is lost without reporting it. cost counts simulations.",
+    " one, diverged (!) is lost without reporting it. cost counts simulations."
 )
+LEGEND = (_SUCCESS, _ERROR, _NEES)
 """What the columns of the overview mean."""
 _TOLD = (
     "With noise=unknown every estimator here is given R, that of the true levels at the nominal readings; bounds and"
     " success are those of parameters that are estimated together with the levels."
 )
 TRACKED = (
-    "For states that move, success is the share of trials that keep the track, and the error is a root mean square"
-    " over all epochs. Both are in units of the filter that is linearised at the true path, because the posterior"
-    " bound is far below what can be attained. NEES and the statistics of single states refer to the last epoch. Cost"
-    " counts evaluations of transition and reading."
+    "For states that move, success is the share of trials that keep the track, and the error is the root mean square"
+    " over all epochs divided by that of the filter linearised at the true path: about 1 for a good filter, below 1 for"
+    " a smoother, which uses later readings too. NEES and the statistics of single states refer to the last epoch."
+    " Cost counts evaluations of transition and reading."
 )
 """What a track is held against."""
+_TRACKED_ERROR = f"error is the median / 95 % quantile over all trials. {_CAPPED}"
 
 
 def legend(noises: Collection[str]) -> tuple[str, ...]:
     """What the columns of the overview mean, and what estimators are told of these noises."""
-    return (*LEGEND, *(words for noise, words in (("unknown", _TOLD), ("model", TRACKED)) if noise in noises))
+    error = _TRACKED_ERROR if set(noises) == {"model"} else _ERROR
+    added = (words for noise, words in (("unknown", _TOLD), ("model", TRACKED)) if noise in noises)
+    return (_SUCCESS, error, _NEES, *added)
 
 
 _VERDICTS = {"consistent": ("", ""), "optimistic": ("optimistic", "+"), "pessimistic": ("pessimistic", "-")}

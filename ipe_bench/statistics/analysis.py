@@ -23,7 +23,7 @@ from ipe_bench.statistics.comparisons import (
     profiles,
     rank_over_replicates,
 )
-from ipe_bench.statistics.formulas import capped_error
+from ipe_bench.statistics.formulas import capped_error, failed, share
 from ipe_bench.statistics.intervals import quantile
 from ipe_bench.statistics.records import BEST, SCORES, rows_of, summary_rows, to_frame
 from ipe_bench.statistics.sample import CONTRACTION, Sample, label_of, median_distances, samples
@@ -50,7 +50,8 @@ class Analysis:
     pairs: pd.DataFrame
     """Every pair of estimators on every scenario; see `comparisons.compare_pairs`."""
     scores: pd.DataFrame
-    """Per scenario and estimator: capped mean error, and median costs."""
+    """Per scenario and estimator: capped mean error, median costs, and, over the trials that every estimator of the
+    scenario has, their number `shared_trials` and the shares `shared_success` and `shared_silent`."""
     ranks: pd.DataFrame
     """Mean ranks over seeds; see `comparisons.rank_over_replicates`."""
     profiles: pd.DataFrame
@@ -86,7 +87,9 @@ class Analysis:
             return self
         held: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
         held = {
-            name: v[v["noise"] != "certified"] for name, v in held.items() if hasattr(v, "columns") and "noise" in v
+            name: v[v["noise"] != "certified"].reset_index(drop=True)
+            for name, v in held.items()
+            if hasattr(v, "columns") and "noise" in v
         }
         if not groups:
             held["profiles"] = self.profiles.iloc[:0]
@@ -133,7 +136,7 @@ class Begun:
             numbers = sample.distance[present], sample.inside_gate[present], sample.cost[present]
             outcomes[sample.group.estimator] = Outcomes(*numbers)
             found["endings"] += [dict(sample.group.columns) | label | row for row in _ending_rows(sample)]
-            found["scores"].append(numbered | rows_of(SCORES, sample)[-1])
+            found["scores"].append(numbered | rows_of(SCORES, sample)[-1] | _shared(sample))
             found["replicates"] += [
                 numbered | {"seed": seed, "error": capped_error(sample, sample.seeds == seed)}
                 for seed in np.unique(sample.seeds).tolist()
@@ -188,6 +191,14 @@ def _joined(parts: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
         return pd.DataFrame()
     arrays = [name for name, value in parts[0].items() if isinstance(value, np.ndarray)]
     return pd.DataFrame(list(parts)).explode(arrays, ignore_index=True).infer_objects()
+
+
+def _shared(sample: Sample) -> dict[str, Any]:
+    """Success and silent failure in the trials that every estimator of the scenario has."""
+    among = sample.present
+    silent = failed(sample, known=False, among=among)
+    success = share(sample.scalars["success"][among])
+    return {"shared_trials": int(among.sum()), "shared_success": success, "shared_silent": silent}
 
 
 def _contraction_rows(collection: Collection, group: Group) -> list[dict[str, Any]]:

@@ -53,7 +53,7 @@ def _chosen(rows: Array, used: Array | None) -> Array:
 
 
 def share(mask: Array) -> float:
-    return float(mask.mean())
+    return float(mask.mean()) if mask.size else np.nan
 
 
 def ratio(a: Any, b: Any) -> Array:
@@ -196,14 +196,14 @@ def capped_error(s: Sample, among: Array | bool = True) -> float:
     return float(np.minimum(s.distance[used], np.sqrt(gate(s.n))).mean()) if used.any() else np.nan
 
 
-def failed(s: Sample, *, known: bool) -> float:
+def failed(s: Sample, *, known: bool, among: Array | slice = slice(None)) -> float:
     """Share that fails, by whether the estimator itself gives notice of it."""
     noticed = ~s.converged
     if FIT in s.scalars and np.isfinite(s.scalars[FIT]).any():
         noticed = noticed | ~(s.scalars[FIT] >= FIT_LEVEL)
     if AMBIGUOUS in s.scalars:
         noticed = noticed | (s.scalars[AMBIGUOUS] > 0)
-    return share(~s.scalars["success"] & (noticed == known))
+    return share((~s.scalars["success"] & (noticed == known))[among])
 
 
 def misfit(s: Sample) -> float:

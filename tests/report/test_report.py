@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 from markupsafe import escape
 from rich.console import Console
-from synthetic_store import Filter, Seeker, Synthetic
+from synthetic_store import Seeker, Synthetic
 
 from ipe_bench.api import report as write_report
 from ipe_bench.noise import Quantization
@@ -77,53 +77,6 @@ def test_what_is_written_is_whole_and_the_page_stands_alone(result):
     assert "http" not in re.sub(r"base64,[^\"]*|http-equiv|http://www.w3.org/2000/svg", "", page)
     analysis, shown = analyse([result.report.parent]), page.replace("&#39;", "'")
     assert all(sentence in shown for sentence in (*headline(analysis), *about(analysis)))
-
-
-def test_the_headline_says_who_agrees_who_is_honest_who_breaks_and_what_it_costs(synthetic):
-    """A filter that is as good as its rival to scale 10, where it claims half its errors, and lost at 100."""
-    rng = np.random.default_rng(1)
-    for scale in (1.0, 10.0, 100.0):
-        e = 0.1 * rng.normal(size=(100, 3))
-        scenario = synthetic.scenario(error_scale=scale)
-        synthetic.add(scenario, "solver", e, estimator=Seeker(), simulations=4.0)
-        claimed = np.full(3, 0.1 if scale == 1 else 0.05)
-        wrong = e + (9.0 if scale == 100 else 0.0)
-        sure = {"deviation": claimed, "fit_p": np.where(np.arange(100) < 25, 0.5, 0.0) if scale == 100 else 0.5}
-        synthetic.add(scenario, "filter", wrong, estimator=Filter(), simulations=187.0, **sure)
-    analysis = analyse([synthetic.directory])
-    nees = analysis.summary.set_index(["error_scale", "estimator", "parameter"])["nees_median"][10.0, "filter", "all"]
-    agree, honest, reach, silent, costs = [s.replace("\u00a0", " ") for s in headline(analysis)]
-    assert "IPE (solver) and filters (filter) agree up to error scale 10: all their trials succeed there" in agree
-    assert honest == f"Overconfident (NEES, 1 is honest): filter ({nees:.2f}) from scale 10; solver never."
-    assert reach.endswith(": filter (0 %) from scale 100; solver (100 %) holds to 100.")
-    assert silent == "Failures that look right: at most 25.0 % of the trials (filter at scale 100)."
-    assert "at scale 10 solver 4 (1.0 ms), filter 187 (1.0 ms); at scale 100 solver 4" in costs
-    (model,) = about(analysis)
-    assert model.startswith("repeated: Each parameter read `repeats` times directly")
-    assert "12 readings determine 3 parameters" in model
-    assert "s times group 0 1 m, group 1 0.100 m" in model
-
-
-def test_few_trials_leave_open_who_is_honest_and_who_holds(synthetic):
-    for scale in (1.0, 10.0):
-        e, scenario = 0.1 * np.random.default_rng(1).normal(size=(10, 3)), synthetic.scenario(error_scale=scale)
-        wrong = np.where(np.arange(10)[:, None] < 3, 9.0, e)
-        for label, error in (("liar", 100 * e), ("solver", e), ("loser", wrong)):
-            synthetic.add(scenario, label, error, deviation=np.full(3, 0.1))
-    honest, reach, *_ = [s.replace("\u00a0", " ") for s in headline(analyse([synthetic.directory]))]
-    assert honest == "Overconfident (NEES, 1 is honest): undecided for liar, loser, solver."
-    assert reach.endswith("solver (100 %) holds to 10; loser (70.0 %) may hold to 10.")
-
-
-def test_one_scale_or_several_settings_are_ranked(synthetic):
-    e = 0.1 * np.random.default_rng(2).normal(size=(50, 3))
-    for sigma in (0.2, 0.4):
-        synthetic.add(synthetic.scenario(sigma=sigma), "good", e)
-        synthetic.add(synthetic.scenario(sigma=sigma), "bad", np.where(np.arange(50)[:, None] < 20, 50.0, e))
-    (sentence,) = headline(analyse([synthetic.directory]))
-    sentence = sentence.replace("\u00a0", " ")
-    assert sentence.startswith("At error scale 1, of 100 trials in 2 scenarios succeed: good in 100 %, bad in 60.0 %.")
-    assert sentence.endswith("Failures that look right: 40.0 % at most (bad).")
 
 
 def test_survivors_are_shown_as_survivors(synthetic):

@@ -43,6 +43,13 @@ class View:
     """Name, unit, size and group of each; empty for all settings."""
     paper: bool = False
     """Whether this is the setting of the paper: the gimballed INS with quantised readings."""
+    moving: bool = False
+    """Whether it is of states that move."""
+
+    @property
+    def reference(self) -> str:
+        """What errors are multiples of."""
+        return "the linearised filter" if self.moving else "the bound"
 
     def __getitem__(self, frame: str) -> pd.DataFrame:
         return self.frames[frame]
@@ -106,7 +113,7 @@ def views(analysis: Analysis) -> tuple[list[View], View]:
         if varying and (len(suffix) > MOST_LETTERS or f"_{suffix}" in ("_", *(part.suffix for part in parts))):
             suffix = f"{suffix[:MOST_LETTERS]}-{len(parts) + 1}"
         paper = (setting.get("measurement"), setting.get("noise")) == ("gins", "quantization")
-        known = footers[key]["parameters"], paper
+        known = footers[key]["parameters"], paper, setting.get("noise") == "model"
         parts.append(View(f"_{suffix}" * bool(varying), label, frames, seen, {e: equations[e] for e in seen}, *known))
     return parts, View("", "", whole, every, equations)
 

@@ -1,0 +1,432 @@
+"""The sentences that open a page are true of what is stored, also where estimators have different trials."""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.stats import beta, chi2
+from state_models import ConstantVelocity
+from synthetic_store import Filter, Pretender, Repeated, Seeker, Synthetic
+
+import ipe_bench as ib
+from ipe_bench.api import report as write_report
+from ipe_bench.api import run
+from ipe_bench.basics.files import make_folder
+from ipe_bench.basics.linalg import Covariance
+from ipe_bench.cli.session import jobs_of, session
+from ipe_bench.cli.words import read
+from ipe_bench.measurements import Recorded
+from ipe_bench.noise import Certified
+from ipe_bench.plugins import discovery
+from ipe_bench.report.headline import about, headline, honesty, in_common
+from ipe_bench.report.tables import all_tables
+from ipe_bench.report.words import percent
+from ipe_bench.states import Smoother, ekf
+from ipe_bench.statistics import analyse
+from ipe_bench.trials.scenario import Scenario
+from ipe_bench.trials.thresholds import GATE
+from ipe_bench.trials.tracking import Tracking
+
+IPE, FILTERS, OTHER = ("newton", "chord"), ("ekf",), ("direct",)
+KINDS = {**dict.fromkeys(IPE, Seeker()), **dict.fromkeys(FILTERS, Filter()), **dict.fromkeys(OTHER, Pretender())}
+
+
+def said(directory: Path) -> list[str]:
+    return [sentence.replace("\u00a0", " ") for sentence in headline(analyse([directory]))]
+
+
+def test_the_headline_says_who_agrees_who_is_honest_who_breaks_and_what_it_costs(synthetic):
+    """A filter that is as good as its rival to scale 10, where it claims half its errors, and lost at 100."""
+    rng = np.random.default_rng(1)
+    for scale in (1.0, 10.0, 100.0):
+        e = 0.1 * rng.normal(size=(100, 3))
+        scenario = synthetic.scenario(error_scale=scale)
+        synthetic.add(scenario, "solver", e, estimator=Seeker(), simulations=4.0)
+        claimed = np.full(3, 0.1 if scale == 1 else 0.05)
+        wrong = e + (9.0 if scale == 100 else 0.0)
+        sure = {"deviation": claimed, "fit_p": np.where(np.arange(100) < 25, 0.5, 0.0) if scale == 100 else 0.5}
+        synthetic.add(scenario, "filter", wrong, estimator=Filter(), simulations=187.0, **sure)
+    analysis = analyse([synthetic.directory])
+    nees = analysis.summary.set_index(["error_scale", "estimator", "parameter"])["nees_median"][10.0, "filter", "all"]
+    agree, honest, reach, silent, costs = [s.replace("\u00a0", " ") for s in headline(analysis)]
+    assert "IPE (solver) and filters (filter) agree up to error scale 10: all their trials succeed there" in agree
+    assert honest == f"Overconfident (NEES, 1 is honest) first at scale 10: filter ({nees:.2f}); never: solver."
+    assert reach == "Success is surely below 90 % first at scale 100: filter (0 %). solver (100 %) holds to 100."
+    assert silent == "Failures that look right: at most 25.0 % of the trials (filter at scale 100)."
+    assert "at scale 10 solver 4 (1.0 ms), filter 187 (1.0 ms); at scale 100 solver 4" in costs
+    (model,) = about(analysis)
+    assert model.startswith("repeated: Each parameter read `repeats` times directly")
+    assert "12 readings determine 3 parameters" in model
+    assert "s times group 0 1 m, group 1 0.100 m" in model
+
+
+def test_few_trials_leave_open_who_is_honest_and_who_holds(synthetic):
+    for scale in (1.0, 10.0):
+        e, scenario = 0.1 * np.random.default_rng(1).normal(size=(10, 3)), synthetic.scenario(error_scale=scale)
+        wrong = np.where(np.arange(10)[:, None] < 3, 9.0, e)
+        for label, error in (("liar", 100 * e), ("solver", e), ("loser", wrong)):
+            synthetic.add(scenario, label, error, deviation=np.full(3, 0.1))
+    honest, reach, *_ = [s.replace("\u00a0", " ") for s in headline(analyse([synthetic.directory]))]
+    assert honest == "Whether a claimed variance is too small (NEES) is undecided: liar, loser, solver."
+    assert reach.endswith(": liar (0 %). solver (100 %) holds to 10; loser (70.0 %) may hold to 10.")
+
+
+def test_one_scale_or_several_settings_are_ranked(synthetic):
+    e = 0.1 * np.random.default_rng(2).normal(size=(50, 3))
+    for sigma in (0.2, 0.4):
+        synthetic.add(synthetic.scenario(sigma=sigma), "good", e)
+        synthetic.add(synthetic.scenario(sigma=sigma), "bad", np.where(np.arange(50)[:, None] < 20, 50.0, e))
+    (sentence,) = headline(analyse([synthetic.directory]))
+    sentence = sentence.replace("\u00a0", " ")
+    assert sentence.startswith("At error scale 1, good succeeds in 100 % of 100 trials in 2 scenarios, bad in 60.0 %.")
+    assert sentence.endswith("Failures that look right: 40.0 % at most (bad).")
+
+
+# Random results -------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Results:
+    """What was stored, by scenario (sigma, scale), estimator and trial."""
+
+    success: dict[tuple[float, float], dict[str, dict[int, bool]]] = field(default_factory=lambda: defaultdict(dict))
+    silent: dict[tuple[float, float], dict[str, dict[int, bool]]] = field(default_factory=lambda: defaultdict(dict))
+    cost: dict[tuple[float, str], float] = field(default_factory=dict)
+
+    @property
+    def labels(self) -> set[str]:
+        return {label for each in self.success.values() for label in each}
+
+    def common(self) -> dict[tuple[float, float], set[int]]:
+        """The trials that all estimators have, of the scenarios where there are any."""
+        found = {
+            where: set.intersection(*(set(trials) for trials in each.values()))
+            for where, each in self.success.items()
+            if set(each) == self.labels
+        }
+        return {where: trials for where, trials in found.items() if trials}
+
+    def share(self, kind: str, label: str) -> float:
+        held = getattr(self, kind)
+        values = [held[where][label][t] for where, trials in self.common().items() for t in trials]
+        return sum(values) / len(values)
+
+    def of_scales(self, label: str) -> dict[float, list[bool]]:
+        return {where[1]: list(each[label].values()) for where, each in sorted(self.success.items()) if label in each}
+
+
+def filled(store: Synthetic, seed: int) -> Results:
+    """Estimators of random merit, each in random trials of most of the scenarios."""
+    rng, found = np.random.default_rng(seed), Results()
+    labels = rng.permutation(list(KINDS))[: rng.integers(2, 5)].tolist()
+    sigmas, scales = (0.2, 0.4)[: rng.integers(1, 3)], (1.0, 10.0, 100.0)[: rng.integers(1, 4)]
+    everywhere = rng.random() < 0.3
+    for scenario in (store.scenario(error_scale=scale, sigma=sigma) for sigma in sigmas for scale in scales):
+        sigma, scale = scenario.noise.deviation, scenario.error_scale
+        for label in labels:
+            if not everywhere and rng.random() < 0.25:
+                continue
+            start, trials = (0, 60) if everywhere else (20 * rng.integers(3), 20 * rng.integers(1, 4))
+            lost = rng.random(trials) < rng.choice([0.0, 0.03, 0.15, 0.5, 1.0], p=[0.5, 0.2, 0.1, 0.1, 0.1])
+            e = np.where(lost[:, None], 9.0, sigma / 2 * rng.normal(size=(trials, 3)))
+            fits = rng.random(trials) < rng.choice([0.0, 0.5])
+            claimed, spent = np.full(3, sigma / 2 * rng.choice([0.3, 1.0, 3.0])), float(rng.integers(1, 200))
+            columns: dict[str, Any] = {"deviation": claimed, "fit_p": np.where(lost & ~fits, 0.0, 0.5)}
+            store.add(scenario, label, e, start=start, block=20, estimator=KINDS[label], simulations=spent, **columns)
+            good = ((e / (sigma / 2)) ** 2).sum(axis=1) <= chi2.isf(GATE, 3)
+            numbers = range(int(start), int(start) + int(trials))
+            found.success[sigma, scale][label] = dict(zip(numbers, good.tolist(), strict=True))
+            found.silent[sigma, scale][label] = dict(zip(numbers, (~good & (fits | ~lost)).tolist(), strict=True))
+            found.cost[scale, label] = spent
+    return found
+
+
+def pairs(text: str) -> dict[str, float]:
+    """Of "one (98.0 %), other (50 %)"."""
+    return {label: float(number) for label, number in re.findall(r"(\w+) \((?:<|>)?([\d.]+)(?: %)?\)", text)}
+
+
+def ranking_is_so(sentence: str, results: Results) -> None:
+    common = results.common()
+    trials, labels = sum(map(len, common.values())), results.labels
+    assert trials == int(re.search(r"([\d,]+) trials", sentence)[1])  # type: ignore[index]
+    assert (len(common) > 1) == (f"{trials} trials in {len(common)} scenarios" in sentence)
+    out = len(results.success) - len(common)
+    assert (out > 0) == (f"{out} other scenario" in sentence)
+    scales = sorted({scale for _, scale in common})
+    assert re.match(
+        rf"At error scales? {' to '.join(f'{s:g}' for s in dict.fromkeys((scales[0], scales[-1])))}, ", sentence
+    )
+    shares = {label: results.share("success", label) for label in labels}
+    if found := re.findall(r"(\w+)(?: succeeds)? in ([\d.]+) %", sentence.partition("Failures")[0]):
+        assert {label: float(share) for label, share in found} == pytest.approx(
+            {label: 100 * share for label, share in shares.items()}, abs=0.051
+        )
+        assert [shares[label] for label, _ in found] == sorted(shares.values(), reverse=True)
+    else:
+        assert set(shares.values()) == {1.0}
+        assert all(label in sentence for label in labels)
+    silent = {label: results.share("silent", label) for label in labels}
+    if told := re.search(r"look right: <?([\d.]+) % at most \((\w+)\)", sentence):
+        assert float(told[1]) == pytest.approx(100 * max(silent.values()), abs=0.051)
+        assert silent[told[2]] == max(silent.values())
+    else:
+        assert max(silent.values()) == 0
+
+
+def reach_is_so(sentence: str, results: Results) -> None:
+    told: set[str] = set()
+    scales = {label: results.of_scales(label) for label in results.labels}
+    least = {label: min(np.mean(v) for v in own.values()) for label, own in scales.items()}
+
+    def surely_below(values: list[bool]) -> bool:
+        k, n = sum(values), len(values)
+        return k < n and beta.ppf(0.975, k + 1, n - k) < 0.9
+
+    below = {label: [s for s, v in own.items() if surely_below(v)] for label, own in scales.items()}
+    for scale, text in re.findall(r"at scale (\d+): ([^;]*?)(?=[;.](?: |$))", sentence):
+        for label, share in pairs(text).items():
+            assert min(below[label]) == float(scale)
+            assert share == pytest.approx(100 * np.mean(scales[label][float(scale)]), abs=0.051)
+            told.add(label)
+    for text, verb, scale in re.findall(r"(\w+ \([^;.]*?(?:\.\d[^;.]*?)*\)) (may hold|holds?) to (\d+)", sentence):
+        for label, share in pairs(text.rpartition(": ")[2]).items():
+            assert not below[label]
+            assert max(scales[label]) == float(scale)
+            assert (least[label] >= 0.9) == (verb != "may hold")
+            assert share == pytest.approx(100 * least[label], abs=0.051)
+            told.add(label)
+    if match := re.match(
+        r"Everywhere to scale (\d+) all succeed in (all|at least ([\d.]+) %) of their trials", sentence
+    ):
+        assert not any(below.values())
+        assert {max(own) for own in scales.values()} == {float(match[1])}
+        assert float(match[3] or 100) == pytest.approx(100 * min(least.values()), abs=0.051)
+        told = results.labels
+    assert told == results.labels
+    assert ("surely below 90 % first" in sentence) == any(below.values())
+
+
+def honesty_is_so(sentence: str, results: Results, summary: pd.DataFrame) -> None:
+    verdicts: dict[str, dict[float, str]] = defaultdict(dict)
+    for row in summary[summary["parameter"] == "all"].to_dict("records"):
+        verdicts[row["estimator"]][row["error_scale"]] = row["verdict"]
+    told: dict[str, str] = {}
+    first = sentence.partition("never:")[0].partition("undecided:")[0]
+    for scale, text in re.findall(r"at scale (\d+): ([^;]*)", first):
+        for label in re.findall(r"(\w+) \(", text):
+            wrong = [s for s, v in verdicts[label].items() if v in ("optimistic", "diverged but confident")]
+            assert min(wrong) == float(scale)
+            told[label] = "wrong"
+    for word, text in re.findall(r"(never|undecided|too small \(NEES\)): ([\w, ]+)", sentence):
+        for label in text.split(", "):
+            assert not {"optimistic", "diverged but confident"} & set(verdicts[label].values())
+            assert (word == "undecided") == bool({"undecided", "-"} & set(verdicts[label].values()))
+            told[label] = word
+    assert told.keys() == results.labels
+
+
+def agreement_is_so(sentence: str, results: Results, summary: pd.DataFrame) -> None:
+    labels = [label for label in results.labels if label in (*IPE, *FILTERS)]
+    scales = sorted({scale for _, scale in results.success})
+    if match := re.search(r"differ already at error scale (\d+)", sentence):
+        last = float(match[1])
+        assert last == scales[0]
+    else:
+        match = re.search(r"agree (?:up to error scale (\d+)|at every error scale)", sentence)
+        assert match
+        last = float(match[1] or scales[-1])
+    totals = summary[(summary["parameter"] == "all") & summary["estimator"].isin(labels)]
+    for scale in (scale for scale in scales if scale <= last):
+        (each,) = (each for where, each in results.success.items() if where[1] == scale)
+        assert set(labels) <= set(each)
+        assert len({tuple(each[label]) for label in labels}) == 1, "ranked over different trials"
+        efficiency = totals[totals["error_scale"] == scale]["efficiency_capped"]
+        alike = efficiency.max() <= 1.05 * efficiency.min()
+        assert alike or "differ" in sentence
+    here = totals[totals["error_scale"] <= last]
+    if told := re.search(r"efficiency of ([\d.]+\d)(?: to ([\d.]+\d))?", sentence):
+        low, high = float(told[1]), float(told[2] or told[1])
+        ends = here["efficiency_capped"].min(), here["efficiency_capped"].max()
+        assert (low, high) == pytest.approx(ends, abs=0.0051)
+        assert ("all their trials succeed" in sentence) == bool((here["success"] == 1).all())
+
+
+@pytest.mark.parametrize("seed", range(24))
+def test_sentences_are_true_of_random_results(synthetic, seed):
+    results = filled(synthetic, seed)
+    analysis = analyse([synthetic.directory])
+    sentences = [sentence.replace("\u00a0", " ") for sentence in headline(analysis)]
+    seen = set()
+    for sentence in sentences:
+        if sentence.startswith("At error scale"):
+            ranking_is_so(sentence, results)
+        elif sentence.startswith("No trial is common to"):
+            assert not results.common()
+        elif sentence.startswith(("Success is", "Everywhere")):
+            reach_is_so(sentence, results)
+        elif sentence.startswith(("Overconfident", "No claimed", "Whether")):
+            honesty_is_so(sentence, results, analysis.summary)
+        elif sentence.startswith("IPE ("):
+            agreement_is_so(sentence, results, analysis.summary)
+        elif sentence.startswith("Failures that look right"):
+            most = max(np.mean([*v.values()]) for each in results.silent.values() for v in each.values())
+            assert percent(most) in sentence
+        else:
+            assert sentence.startswith("A trial costs, in simulations (median): at scale ")
+            for scale, text in re.findall(r"at scale (\d+) ([^;]*)", sentence):
+                for label, cost in re.findall(r"(\w+) (\d+) \(", text):
+                    assert results.cost[float(scale), label] == float(cost)
+        seen.add(sentence)
+    assert len(seen) == len(sentences) > 0
+
+
+def test_what_only_some_have_ranks_nobody_elsewhere(synthetic):
+    """On 100 trials in common one is better; 1000 more of the other alone, all of which succeed, do not turn that."""
+    rng = np.random.default_rng(0)
+    for scale, good, poor in ((1.0, 50, 48), (300.0, 41, 28)):
+        scenario = synthetic.scenario(error_scale=scale)
+        for label, number in (("newton", good), ("chord", poor)):
+            e = 0.1 * rng.normal(size=(50, 3)).clip(-1, 1)
+            synthetic.add(scenario, label, np.where(np.arange(50)[:, None] < number, e, 9.0), estimator=Seeker())
+    alone = synthetic.scenario(sigma=0.4)
+    synthetic.add(alone, "chord", np.zeros((1000, 3)), estimator=Seeker())
+    (sentence,) = said(synthetic.directory)
+    assert sentence.startswith(
+        "At error scales 1 to 300, newton succeeds in 91.0 % of 100 trials in 2 scenarios, chord in 76.0 %."
+    )
+    assert "1 other scenario is left out, which not all of them have." in sentence
+
+
+def test_trials_in_common_alone_are_ranked(synthetic):
+    scenario = synthetic.scenario()
+    wrong = np.where(np.arange(40)[:, None] < 20, np.zeros(3), 9.0)
+    synthetic.add(scenario, "newton", wrong[:20], estimator=Seeker())
+    synthetic.add(scenario, "chord", wrong, block=20, estimator=Seeker())
+    assert said(synthetic.directory) == ["At error scale 1, chord, newton succeed in all of 20 trials."]
+    other = synthetic.scenario(seed=1)
+    synthetic.add(other, "ekf", wrong, estimator=Filter())
+    assert said(synthetic.directory) == ["No trial is common to chord, ekf, newton, so they are not ranked."]
+
+
+@pytest.mark.parametrize(
+    "verdict", ["undecided", "-", "consistent", "pessimistic", "optimistic", "diverged but confident"]
+)
+def test_only_a_sure_verdict_calls_an_estimator_overconfident(verdict):
+    rows = pd.DataFrame({"estimator": "one", "error_scale": [1.0, 10.0], "nees_median": [1.0, 2.5]})
+    ((name, found),) = honesty(rows.assign(verdict=["consistent", verdict]))
+    assert name == "honesty"
+    expected: dict[str, Any] = {"first": [], "never": [], "undecided": []}
+    if verdict in ("undecided", "-"):
+        expected["undecided"] = ["one"]
+    elif verdict in ("consistent", "pessimistic"):
+        expected["never"] = ["one"]
+    else:
+        expected["first"] = [(10.0, [("one", 2.5)])]
+    assert found == expected
+
+
+def test_problems_in_common_alone_are_counted():
+    rows = pd.DataFrame({"problem": ["a", "b", "a"], "estimator": ["one", "one", "two"]})
+    assert in_common(rows, "problem")["problem"].tolist() == ["a", "a"]
+    assert in_common(rows.iloc[:2], "problem")["problem"].tolist() == ["a", "b"]
+    assert in_common(rows.iloc[1:], "problem").empty
+
+
+# Experiments ----------------------------------------------------------------------------------------------------------
+
+SWEEP = (r"(Overconfident|No claimed|Whether) ", r"(Success is|Everywhere) ", r"A trial costs, in simulations ")
+RIVALS = (r"IPE \(.*\) and filters \(.*\) agree ", *SWEEP)
+PAGES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "nist": (("measurement.dataset=Misra1a,BoxBOD", "measurement.start=2"), (r"Of 2 certified problems, .* solve",)),
+    "mgh": (("measurement.function=wood,bard", "measurement.start=1"), (r"Of 2 problems of known minimum, ",)),
+    "pendulum_book": ((), (r"The published error is met, to \d\.\de-1\d at worst\.",)),
+    "mismatch": ((), (r"At error scale 33, .* succeed in all of 100 trials in 5 scenarios\.",)),
+    **dict.fromkeys(("headline", "filters", "beyond"), (("error_scale=1,300",), RIVALS)),
+    **dict.fromkeys(("paper", "bearings", "ranging", "triad", "polynomial"), (("error_scale=0.1,1",), SWEEP)),
+    "lotka_volterra": (("error_scale=0.1,1",), SWEEP),
+}
+"""For each experiment the part of it that is stored here, with errors as large as their bound, and what its page says
+first."""
+
+
+@pytest.mark.parametrize("option", [o for o in discovery.options("experiment") if o.source.name == "ipe-bench"])
+def test_the_page_of_every_experiment_opens_with_what_fits_it(option, synthetic):
+    words, patterns = PAGES[option.name]
+    with session():
+        specs = jobs_of(read("run", [f"+experiment={option.name}", *words]), multirun=True).specs
+    if option.name == "pendulum_book":
+        run(specs[0].scenario, {"ekf": specs[0].estimators["ekf"]}, 1, output=synthetic.directory)
+    else:
+        fill(synthetic, specs)
+    sentences = said(synthetic.directory)
+    assert len(sentences) == len(patterns)
+    for sentence, pattern in zip(sentences, patterns, strict=True):
+        assert re.match(pattern, sentence), sentence
+
+
+def fill(store: Synthetic, specs: list[Any]) -> None:
+    for spec in specs:
+        scenario = spec.scenario
+        trials = 1 if scenario.noise.name == "certified" else 20
+        e = 0.0 if trials == 1 else np.random.default_rng(0).normal(size=(trials, scenario.measurement.n))
+        error = e * scenario.linear_bound if trials > 1 else np.zeros((1, scenario.measurement.n))
+        store.bound = lambda scenario: scenario.linear_bound  # type: ignore[method-assign]
+        for label, estimator in spec.estimators.items():
+            store.add(scenario, label, error, estimator=estimator)
+
+
+@dataclass(frozen=True)
+class Measured(Repeated):
+    """Readings that come with a model of no collection."""
+
+    @property
+    def recorded(self) -> Recorded:  # type: ignore[override]
+        return Recorded(np.zeros(self.m), Covariance(np.ones(self.m)), np.zeros(self.n))
+
+
+def test_certified_readings_of_no_collection_are_found_too_and_an_empty_folder_is_said_to_be(tmp_path, synthetic):
+    make_folder(tmp_path / "empty" / "runs")
+    assert said(tmp_path / "empty") == ["Nothing is stored yet, so there is nothing to find."]
+    scenario = Scenario(Measured(), Certified())
+    synthetic.bound = lambda scenario: np.full(3, 0.1)  # type: ignore[method-assign]
+    synthetic.add(scenario, "newton", np.zeros((1, 3)))
+    synthetic.add(scenario, "chord", np.full((1, 3), 9.0))
+    (sentence,) = said(synthetic.directory)
+    assert sentence.startswith("With certified readings, newton succeeds in 100 % of 1 trial, chord in 0 %.")
+    synthetic.add(synthetic.scenario(sigma=0.1), "newton", np.zeros((20, 3)))
+    assert said(synthetic.directory) == [sentence, "At error scale 1, newton succeeds in 100 % of 20 trials."]
+    tables = {table.name: table for table in all_tables(analyse([synthetic.directory]).simulated)}
+    assert tables["all_trials"].data["capped_error"].tolist() == [0.0]
+
+
+def test_states_that_move_have_words_of_their_own(tmp_path):
+    """A smoother, which uses later readings too, is held against a filter and not against a bound of its own."""
+    model = ConstantVelocity(count=30, spread=3.0)
+    table = ib.run(Tracking(model), {"kf": ekf(), "rts": Smoother(ekf())}, 20, output=tmp_path)
+    kept, errors = said(tmp_path)
+    assert kept == "kf, rts keep the track in all of 20 trials."
+    median = table[table["parameter"] == "all"].set_index("estimator")["error_median"]
+    assert median["rts"] < 0.9 < median["kf"]
+    assert errors.endswith(f": rts ({median['rts']:.2f}), kf ({median['kf']:.2f}).")
+    page = write_report([tmp_path], tmp_path / "out").report.read_text(encoding="utf-8")
+    body = page.partition("</main>")[0].partition('id="definitions"')[0]
+    assert "30 readings at 30 epochs tell 2 states that move: " in body
+    shown = re.sub(r"base64,[^\"]*", "", body)
+    for words in (
+        "1 is the best",
+        "multiples of the bound",
+        "parameters; at error scale",
+        "error / bound",
+        "the bound at the truth",
+    ):
+        assert words not in shown, words
+    assert "the filter linearised at the true path" in shown
+    assert "median error over the linearised filter" in shown
