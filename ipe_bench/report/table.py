@@ -109,9 +109,14 @@ def words(title: str, values: Iterable[Any], best: Iterable[bool] = ()) -> Colum
 
 
 def interval(title: str, low: Iterable[float], high: Iterable[float], show: Callable[[float], str]) -> Column:
-    """A column of intervals, sorted by their lower ends."""
-    pairs = zip(low, high, strict=True)
-    return Column(title, [Cell(f"{show(a)} to {show(b)}" if math.isfinite(a) else "-", sort_key(a)) for a, b in pairs])
+    """A column of intervals, sorted by their lower ends; one end alone has a sign before it."""
+
+    def cell(a: float, b: float) -> str:
+        if math.isnan(b):
+            return f"> {show(a)}" if math.isfinite(a) else "-"
+        return f"{show(a)} to {show(b)}" if math.isfinite(a) else f"< {show(b)}" if math.isnan(a) else "-"
+
+    return Column(title, [Cell(cell(a, b), sort_key(a)) for a, b in zip(low, high, strict=True)])
 
 
 def texts(title: str, values: Iterable[str]) -> Column:

@@ -23,10 +23,14 @@ from ipe_bench.statistics.certified import (
 from ipe_bench.statistics.collect import Collection
 from ipe_bench.statistics.records import ALL, SCORES, Where, all_statistics, frame_columns
 
+_OPEN = (
+    " An interval of one end (> or <) stands where larger errors may be unseen, in 3 of N trials or fewer; rmse_unseen"
+    " in summary.csv is that share."
+)
 _RECORDED: dict[Where, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
     "tracks": (
         "States over all epochs",
-        f"{TRACKED} all: root mean square over the states, each over that of this filter.",
+        f"{TRACKED} all: root mean square over the states, each over that of this filter.{_OPEN}",
         lambda rows: rows["path_rmse"].notna(),
     ),
     "costs": (
@@ -38,7 +42,7 @@ _RECORDED: dict[Where, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
     "parameters": (
         "Parameters",
         "In each parameter's own unit. Bias, std, rmse, bounds and NEES are over solved trials; median and 95 % of the"
-        " absolute error, and coverage, over all trials.",
+        f" absolute error, and coverage, over all trials.{_OPEN}",
         lambda rows: rows["parameter"] != ALL,
     ),
     "calibration": (
@@ -58,7 +62,7 @@ _RECORDED: dict[Where, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
         "Solved trials",
         "This table diagnoses estimators that solve an equation and does not compare them with others: each row is"
         " over the trials in which the estimator found the root that belongs to the truth. Their number stands in"
-        " brackets if it is not all.",
+        f" brackets if it is not all.{_OPEN}",
         lambda rows: rows["equation"] != "-",
     ),
     "covariances": (
@@ -74,7 +78,7 @@ _RECORDED: dict[Where, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
         "Estimators that minimise the sum of squares, over solved trials, in the parameters' own units; all: over the"
         " linear bound, root mean square over parameters. The theory uses the Jacobians of the models and no draw of"
         " noise; if readings come from another model than the assumed one, it uses those of both. Linear theory holds"
-        " if the relative curvatures are below 0.3.",
+        f" if the relative curvatures are below 0.3.{_OPEN}",
         lambda rows: rows["predicted_rmse"].notna(),
     ),
     "iterations": (

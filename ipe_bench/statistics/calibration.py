@@ -229,14 +229,15 @@ def median_limits(values: Array, level: float = LEVEL) -> tuple[float, float]:
 
 
 def _scaled(scale: float) -> str:
-    """Errors that are `scale` times what is reported: two figures, three just above 1; of very many times the order."""
+    """Errors whose median is `scale` times what is reported: two figures, three just above 1; of very many times the
+    order. Where tails are heavy most are smaller though the variance is right."""
     if scale == 0:
         return "errors of 0"
-    times, fault = (scale, "small") if scale > 1 else (1 / scale, "large")
+    times, fault = (scale, "larger") if scale > 1 else (1 / scale, "smaller")
     shown = f"{times:.1e}".replace("e+0", "e").replace("e+", "e")
     if times < 1e6:
         shown = f"{times:.2f}" if times < 1.095 else f"{times:.1f}" if times < 9.95 else f"{float(f'{times:.2g}'):,.0f}"
-    return f"deviations {shown} times too {fault}"
+    return f"most errors {shown} times {fault} than claimed"
 
 
 def _shifted(middle: float) -> str:

@@ -14,7 +14,16 @@ from scipy.special import betaincinv, gammaincinv, ndtri
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics.calibration import overall_words
-from ipe_bench.statistics.intervals import Squares, few_carry, mean_limits, quantile, rms_interval, rms_sequence
+from ipe_bench.statistics.intervals import (
+    Squares,
+    capped_interval,
+    few_carry,
+    mean_limits,
+    quantile,
+    rms_interval,
+    rms_sequence,
+    unseen,
+)
 from ipe_bench.statistics.sample import AMBIGUOUS, FIT, FLOOR, NIS, Sample
 from ipe_bench.trials.thresholds import FIT_LEVEL, gate
 
@@ -146,18 +155,33 @@ def degrees(s: Sample) -> Array:
 
 
 @once
-def rmse_ends(s: Sample) -> tuple[Array, Array]:
-    """Ends (n + 1,) of the intervals of rmse: per parameter, and of all over the linear bound; NaN where few trials
-    carry it, see `intervals.few_carry`."""
-    low, high = rms_interval(_all_squares(s).T, s.solved)
-    few = few_carry(squares(s), degrees(s))
-    return np.where(few, np.nan, low), np.where(few, np.nan, high)
+def rmse_unseen(s: Sample) -> Array:
+    """Shares (n + 1,) of trials that may have larger errors than those seen; see `intervals.unseen`."""
+    return unseen(_chosen(_all_squares(s), s.solved), degrees(s))
 
 
 @once
-def rmse_ends_anytime(s: Sample) -> tuple[Array, Array]:
-    """Such ends that are valid at all numbers of trials."""
+def rmse_ends(s: Sample) -> tuple[Array, Array]:
+    """Ends (n + 1,) of the intervals of rmse: per parameter, and of all over the linear bound; the upper one is NaN
+    where larger errors may be unseen, and where few trials carry the sum, see `intervals.few_carry`."""
+    low, high = rms_interval(_all_squares(s).T, s.solved)
+    return low, np.where(few_carry(squares(s), degrees(s)), np.nan, _unless_unseen(s, high))
+
+
+def _unless_unseen(s: Sample, high: Array) -> Array:
+    return np.where(rmse_unseen(s) > 0, np.nan, high)
+
+
+@once
+def rmse_sequence(s: Sample) -> tuple[Array, Array]:
+    """Ends (n + 1,) of such intervals at all numbers of trials at once, as far as the errors that were seen tell."""
     return rms_sequence(squares(s), degrees(s))
+
+
+def rmse_ends_anytime(s: Sample) -> tuple[Array, Array]:
+    """The same, without the upper end where larger errors may be unseen."""
+    low, high = rmse_sequence(s)
+    return low, _unless_unseen(s, high)
 
 
 def ends_in_units(ends: Callable[[Sample], tuple[Array, Array]]) -> Callable[[Sample], Limits]:
@@ -183,11 +207,8 @@ def efficiency_capped(s: Sample) -> float:
 
 
 def efficiency_capped_limits(s: Sample) -> Limits:
-    square = _capped(s) ** 2
-    if few_carry(Squares.of(square[None]), np.array([s.n]))[0]:
-        return np.nan, np.nan
-    low, high = rms_interval(square[:, None])
-    return float(ratio(1.0, high[0])), float(ratio(1.0, low[0]))
+    (low,), (high,) = capped_interval(over_bound(s)[None] ** 2, np.array([s.n]), CAP)
+    return float(ratio(1.0, high)), float(ratio(1.0, low))
 
 
 def capped_error(s: Sample, among: Array | bool = True) -> float:

@@ -15,15 +15,13 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics.calibration import least_count
 from ipe_bench.statistics.comparisons import ALPHA, mcnemar
-from ipe_bench.statistics.intervals import clopper_pearson, first_that, grouped
+from ipe_bench.statistics.intervals import RARE, clopper_pearson, first_that, grouped
 from ipe_bench.trials.thresholds import FEW
 
 FLIPS = 4999
 """Random assignments of signs."""
 LARGEST_SAMPLE = 1000
 """Of more trials, groups of consecutive ones share a sign: as good, since trials are independent."""
-RARE = 10
-"""Number of trials from which a sample shows well enough what an unusual trial is like."""
 _TILTS = np.concatenate([-(2.0 ** np.arange(-12, 5)), 2.0 ** np.arange(-12, 5)])
 """Multiples of the inverse unit by which differences are tilted, to either side."""
 LIMIT = 0.8

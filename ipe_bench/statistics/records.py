@@ -203,8 +203,9 @@ STATISTICS: tuple[Statistic, ...] = (
         "efficiency",
         "all trials",
         f"One over the root mean square of the same, each trial counting at most {f.CAP:g}, so that no single trial"
-        f" decides; {1 / f.CAP:g} where all count that. Interval: as that of rmse, so none where a few trials carry the"
-        " sum.",
+        f" decides; {1 / f.CAP:g} where all count that. Interval: as that of rmse, but its lower end is where it would"
+        f" be if a share of trials (95 %) that may be unusual beyond those seen counted {f.CAP:g} each; 0 from"
+        f" {intervals.RARE} unusual ones on. Unusual is what {intervals.UNUSUAL:g} of normal errors exceed.",
         f.efficiency_capped,
         limits=f.efficiency_capped_limits,
         where=("all_trials",),
@@ -293,9 +294,9 @@ STATISTICS: tuple[Statistic, ...] = (
         "Root mean square error. Interval: 95 %, by the studentised bootstrap of its logarithm over trials (Efron and"
         f" Tibshirani, An Introduction to the Bootstrap, 1993, ch. 12), {intervals.RESAMPLES} resamples, the same for"
         f" every estimator; above {intervals.LARGEST_SAMPLE} trials, groups of consecutive trials are resampled. None"
-        f" for fewer than {FEW} trials, and none where a few trials carry the sum of squares: where its effective"
-        " number of trials, (Σ e²)² / Σ e⁴ (Kish, Survey Sampling, 1965), is less than that of normal errors in all but"
-        f" {100 * intervals.HEAVY:g} % of cases.",
+        f" for fewer than {FEW} trials. No upper end where larger errors may be unseen (rmse_unseen above 0), and where"
+        " a few trials carry the sum of squares: where its effective number of trials, (Σ e²)² / Σ e⁴ (Kish, Survey"
+        f" Sampling, 1965), is less than that of normal errors in all but {100 * intervals.HEAVY:g} % of cases.",
         f.of_each(f.rmse),
         limits=f.ends_in_units(f.rmse_ends),
         given="solved",
@@ -309,11 +310,24 @@ STATISTICS: tuple[Statistic, ...] = (
         "solved trials",
         "The same root mean square error, with an asymptotic interval of 95 % that stays valid however often one looks"
         " and whenever one stops (Waudby-Smith et al., Ann. Statist. 52, 2024); none for fewer than"
-        f" {intervals.FIRST} trials, nor where a few trials carry the sum of squares.",
+        f" {intervals.FIRST} trials, nor where a few trials carry the sum of squares, and no upper end where larger"
+        " errors may be unseen.",
         f.of_each(f.rmse),
         limits=f.ends_in_units(f.rmse_ends_anytime),
         given="solved",
         kind="physical",
+    ),
+    Statistic(
+        "rmse_unseen",
+        "unseen",
+        "solved trials",
+        "Share of trials that may have larger errors than those seen: the upper limit (95 %, Clopper and Pearson) of"
+        f" the share of errors that {intervals.UNUSUAL:g} of normal ones with the same median exceed, less the share"
+        f" seen; about 3 / N where none of N trials has one, and 0 from {intervals.RARE} on. No interval of the root"
+        " mean square knows of errors that are so rare.",
+        f.rmse_unseen,
+        given="solved",
+        kind="share",
     ),
     Statistic(
         "effective_trials",
@@ -538,9 +552,10 @@ STATISTICS: tuple[Statistic, ...] = (
         "converged trials with a reported covariance: a trial that the estimator itself gives up on claims nothing",
         "Whether the reported covariance is honest. Diverged but confident: surely more than 1 % of the trials lie"
         f" where it says that a share of {GATE:g} should, and the mean NEES is surely above n; optimistic, pessimistic:"
-        " the mean NEES lies surely (95 %, for errors of any law) above or below n; undecided: a few trials carry that"
-        f" mean, or it seems to lie below n and there are fewer than {intervals.SEEN} trials, which rare large errors"
-        f" may be missing from. None for fewer than {FEW} trials.",
+        " the mean NEES lies surely (95 %, for errors of any law) above or below n, and below it also with a NEES of"
+        f" {intervals.UNSEEN_NEES:g} n in as many trials as may be unusual and unseen; undecided: a few trials carry"
+        f" that mean, or it seems to lie below n and rare large errors may be missing. None for fewer than {FEW}"
+        " trials.",
         lambda s: verdict(s.scalars["nees"][s.converged], s.n),
         kind="word",
         where=("calibration",),
@@ -580,10 +595,10 @@ STATISTICS: tuple[Statistic, ...] = (
         "calibration",
         "the same trials",
         "How the reported covariance lies, where it surely does, at 5 % for an estimator and all its parameters"
-        " together: shifted is the median of error over reported deviation (estimate less truth); deviations too small"
-        " or too large, the median of its size over that of an honest one; far outside, the share beyond the quantile"
-        f" that {GATE:g} should lie beyond, after that factor. Of all, what is said of NEES and of the parameter that"
-        " is farthest off.",
+        " together: shifted is the median of error over reported deviation (estimate less truth); most errors larger"
+        " or smaller, the median of its size over that of an honest one, which says nothing of rare large errors; far"
+        f" outside, the share beyond the quantile that {GATE:g} should lie beyond, after that factor if it is above 1."
+        " Of all, what is said of NEES and of the parameter that is farthest off.",
         f.calibration,
         kind="word",
         where=("calibration", "parameters"),

@@ -17,7 +17,7 @@ from ipe_bench.runs.run import compute, new_name, result_keys, validate
 from ipe_bench.runs.schedule import BLOCK_SIZE, Watcher
 from ipe_bench.runs.store import ResultKey, describe_names
 from ipe_bench.statistics.collect import collect
-from ipe_bench.statistics.formulas import rmse_ends_anytime
+from ipe_bench.statistics.formulas import rmse_sequence, rmse_unseen
 from ipe_bench.statistics.intervals import share_sequence
 from ipe_bench.statistics.records import SCORES, rows_of, summary_rows
 from ipe_bench.statistics.sample import Sample, samples
@@ -59,10 +59,12 @@ def _distances(sample: Sample, wanted: Mapping[str, float]) -> Iterator[tuple[fl
             low, high = share_sequence(int(sample.scalars["success"].sum()), len(sample))
             width = max(high - share, share - low)
         else:
-            low, high = (float(end[sample.n]) for end in rmse_ends_anytime(sample))
+            low, high = (float(end[sample.n]) for end in rmse_sequence(sample))
             width = float(np.sqrt(high / low)) - 1 if low > 0 else np.inf
         known = math.isfinite(width)
         shown = f"{100 * width:.2g} %" if known else "anything, since a few trials carry it or there are too few"
+        if known and statistic == "rmse" and (rare := float(rmse_unseen(sample)[sample.n])) > 0:
+            shown += f", unless errors are larger in 1 of {1 / rare:.0f} trials or fewer"
         yield width / precision if known else np.inf, f"{sample.group.estimator}: {statistic} ± {shown}"
 
 

@@ -75,7 +75,7 @@ def test_the_reader_refuses_what_latex_would():
 
 
 def test_intervals_and_signs_read_as_they_are_meant():
-    shares = interval("95 % of it", [0.996, 1.0, float("nan")], [1.0, 1.0, 1.0], percent)
+    shares = interval("95 % of it", [0.996, 1.0, float("nan")], [1.0, float("nan"), float("nan")], percent)
     numbers = interval("twice", [1.5e-7, -1.25, 0.0], [14520.0, 2.0, 0.00004], short)
     names = words("a & b_c", ["a_b & 50 %", "$x$ {y} #1 ~ ^ \\", "< > µ 中"])
     text = latex(Table("t", "T", "C", [shares, numbers, numbers, names], pd.DataFrame()), COLUMN)
@@ -83,7 +83,7 @@ def test_intervals_and_signs_read_as_they_are_meant():
     assert [row[:2] for row in rows] == [
         ["95 % of it", "twice"],
         ["99.6 % to 100 %", "1.5e-07 to 14520"],
-        ["100 % to 100 %", "-1.250 to 2"],
+        ["\\textgreater{} 100 %", "-1.250 to 2"],
         ["-", "0 to 4.0e-05"],
     ]
     assert [row[3] for row in rows[:2]] == ["a & b_c", "a_b & 50 %"]

@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 from scipy.stats import binom, chi2
 
-from ipe_bench.statistics.intervals import Squares, clopper_pearson, few_carry, quantile, rms_interval
+from ipe_bench.statistics.intervals import (
+    Squares,
+    capped_interval,
+    clopper_pearson,
+    few_carry,
+    quantile,
+    rms_interval,
+    unseen,
+)
 
 
 @pytest.mark.parametrize("p", [0.01, 0.3, 0.5, 0.97])
@@ -158,6 +166,76 @@ def test_1000_studies_of_a_root_mean_square(law):
         if law == "normal":
             assert width <= 1.3
             assert none <= 0.02
+
+
+# What no trial has shown ----------------------------------------------------------------------------------------------
+
+
+def test_what_may_be_unseen_is_the_upper_limit_of_unusual_errors_less_those_seen():
+    """Of none in N, 1 - .05^(1/N); of k the share whose binomial law gives k or fewer with .05, less k / N; of ten or
+    more nothing. Unusual is 3.29 normal deviations, and the median absolute deviation is .6745 of them."""
+    squares = (np.full(200, 0.67449 * 7) * np.tile([0.5, 1.0, 1.5, 1.0], 50)) ** 2
+    seen = {}
+    for k in (0, 1, 9, 10):
+        squares[:k], squares[k] = (3.292 * 7) ** 2, (3.289 * 7) ** 2
+        seen[k] = float(unseen(squares[None], np.array([1]))[0])
+    assert seen[0] == pytest.approx(1 - 0.05 ** (1 / 200), rel=1e-12)
+    for k in (1, 9):
+        assert binom.cdf(k, 200, seen[k] + k / 200) == pytest.approx(0.05, rel=1e-9)
+    assert seen[10] == 0.0
+    # In a unit of at least 10 none is unusual.
+    assert unseen(squares[None], np.array([1]), least=100.0)[0] == pytest.approx(seen[0])
+    assert np.isnan(unseen(np.empty((2, 0)), np.ones(2))).all()
+
+
+RARELY = {
+    "normal": (0.0, 1.0),
+    "5 % ten times larger": (0.05, 10.0),
+    "1 % ten times larger": (0.01, 10.0),
+    "2 % ten thousand times larger": (0.02, 1e4),
+}
+"""Shares of trials whose errors are so many times larger."""
+
+
+def missed_capped(law: str, n: int, trials: int, studies: int, size: float = 1.0) -> float:
+    """How often the interval does not hold the root mean square of errors of n parameters that count 5 at most."""
+    share, times = RARELY[law]
+    rng = np.random.default_rng([n, trials])
+
+    def mean_square(scale: float) -> float:
+        """E min(scale^2 c / n, 25) for c of the chi-square law with n degrees."""
+        edge = 25 * n / scale**2
+        return scale**2 * chi2.cdf(edge, n + 2) + 25 * chi2.sf(edge, n)
+
+    true = np.sqrt((1 - share) * mean_square(size) + share * mean_square(size * times))
+    factor = np.where(rng.random((studies, trials)) < share, times, 1.0) * size
+    low, high = capped_interval(factor**2 * rng.chisquare(n, (studies, trials)) / n, np.full(studies, n), 5.0)
+    return float(np.mean((low > true) | (high < true)))
+
+
+@pytest.mark.parametrize("law", RARELY)
+@pytest.mark.parametrize("n", [1, 11])
+def test_efficiency_has_an_interval_that_allows_for_errors_that_no_trial_shows(law, n):
+    """Of the intervals made of trials alone .57 miss if one error in a hundred is ten times larger, n is 11 and there
+    are 50 trials."""
+    for trials in (20, 50, 200):
+        assert missed_capped(law, n, trials, 200) <= 0.05 + 3 * np.sqrt(0.05 * 0.95 / 200)
+
+
+def test_an_error_is_unusual_beside_those_of_the_same_estimator():
+    """Of errors that are all twice the bound, more than ten of 100 lie far outside the law of an efficient one; .10 of
+    the intervals miss if that is taken for having seen the rare ones."""
+    assert missed_capped("1 % ten times larger", 11, 100, 400, size=2.0) <= 0.05
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("law", RARELY)
+@pytest.mark.parametrize("n", [1, 4, 11])
+def test_1000_studies_of_an_efficiency(law, n):
+    for trials in (20, 50, 100, 200, 1000):
+        miss = [missed_capped(law, n, trials, 1000, size) for size in (0.5, 1.0, 2.0, 3.0)]
+        print(f"{law}, n {n}, {trials} trials: missed {miss}")
+        assert max(miss) <= 0.05 + 3 * np.sqrt(0.05 * 0.95 / 1000)
 
 
 def test_quantiles_are_numpys_where_all_is_finite_and_infinite_where_it_is_not():

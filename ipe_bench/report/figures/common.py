@@ -206,7 +206,7 @@ def curves(
 
     Labels stand side by side about their scale, so that points and intervals that coincide are seen. A line is broken
     where a value is missing; a point that some of the trials or fewer than `FEW` carry is hollow, and without an
-    interval if they are fewer than `FEW`.
+    interval if they are fewer than `FEW`. Of an interval that lacks an end the other is drawn.
     """
     scale_axis(ax, scales, list(look))
     gap = float(np.diff(np.log10(scales)).min(initial=1.0))
@@ -220,7 +220,8 @@ def curves(
         ends = None
         if interval and one.color != GREY:
             sizes = np.array([values - part[interval[0]], part[interval[1]] - values]).clip(min=0)
-            ends = np.where(np.isfinite(sizes).all(axis=0) & ~few.to_numpy(), sizes, np.nan)
+            known = np.isfinite(sizes) & ~few.to_numpy()
+            ends = np.where(known, sizes, np.where(known.any(axis=0), 0.0, np.nan))
         line: dict[str, Any] = {**one.line, "zorder": 2 - (one.color == GREY)}
         line |= {"linestyle": "none"} if len(scales) == 1 else {}
         ax.errorbar(x, values.where(np.isfinite(values)), ends, elinewidth=0.8, **line)

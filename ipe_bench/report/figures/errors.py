@@ -143,8 +143,9 @@ def draw_calibration(view: View) -> Iterator[Drawing]:
         "Calibration of NEES, converged trials",
         "Share of converged trials whose NEES is below each quantile of chi-square, less its nominal probability. The"
         " grey bands are simultaneous: all parameters and NEES stay inside them in 95 % of cases if the covariance is"
-        " right; they are light where fewer trials converged. A curve below 0 in the middle means standard deviations"
-        f" that are too small, one above 0 too large. The vertical axis is logarithmic beyond ±{LINEAR / 2:g}.",
+        " right; they are light where fewer trials converged. A curve below 0 in the middle means that most errors"
+        " are larger than claimed, one above 0 that they are smaller. The vertical axis is logarithmic beyond"
+        f" ±{LINEAR / 2:g}.",
         f"At scale {plain(top)}, parameters included: {enumerate_few(last, 4)}.",
     )
 

@@ -73,7 +73,8 @@ def _of_one(view: View, estimator: str) -> Drawing:
         f"figure_{number}" if view.paper else f"parameter_errors_{estimator}",
         f"{of_paper}error of {estimator}, solved trials",
         f"Root mean square error of {estimator} over the trials that it solved ({_missing(totals)}), with 95 %"
-        " bootstrap intervals; dotted: the linear bound. Last panel: the same over the bounds.",
+        " bootstrap intervals, whose upper ends are drawn where no larger errors may be unseen; dotted: the linear"
+        " bound. Last panel: the same over the bounds.",
         f"All parameters together: {'; '.join(at)}." if at else "",
     )
 
