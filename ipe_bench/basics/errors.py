@@ -1,6 +1,7 @@
 """The exceptions that are meant for users; everything else that is raised is a bug."""
 
 import difflib
+import inspect
 import os
 import sys
 import traceback
@@ -32,6 +33,8 @@ def one_line(text: Any) -> str:
 def describe_exception(error: BaseException) -> str:
     """One line for a table: the type and the first line of the message."""
     line = one_line(error)
+    if "read-only" in line:
+        line += " (it writes into what it is given: work on a copy)"
     return f"{type(error).__name__}: {line}" if line else type(error).__name__
 
 
@@ -41,7 +44,20 @@ def place_of(error: BaseException, within: str | None = None) -> str:
         return f"{error.filename}, line {error.lineno}: {type(error).__name__}: {error.msg}"
     frames = traceback.extract_tb(error.__traceback__)
     frame = [*frames[-1:], *(frame for frame in frames if frame.filename == within)][-1]
-    return f"{frame.filename.removeprefix(os.getcwd() + os.sep)}, line {frame.lineno}: {describe_exception(error)}"
+    return f"{_shown(frame.filename)}, line {frame.lineno}: {describe_exception(error)}"
+
+
+def _shown(filename: str) -> str:
+    return filename.removeprefix(os.getcwd() + os.sep)
+
+
+def definition(function: Any) -> str:
+    """The file and line in which a function or method is written, if they are known, and its name."""
+    function = inspect.unwrap(getattr(function, "__func__", function))
+    code, name = getattr(function, "__code__", None), getattr(function, "__qualname__", str(function))
+    return (
+        f"{code.co_filename.removeprefix(os.getcwd() + os.sep)}, line {code.co_firstlineno}: {name}" if code else name
+    )
 
 
 def shortened(text: str, length: int = 120) -> str:

@@ -53,7 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         discard_output()
         return 0
-    except (Exception, KeyboardInterrupt) as error:
+    except (Exception, KeyboardInterrupt, SystemExit) as error:  # a model may call sys.exit
         code, line = _explain(error)
         print(f"ipe-bench: {line}", file=sys.stderr)
         return code

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.basics.linalg import Array, Covariance
+from ipe_bench.basics.linalg import Array, Covariance, read_only
 from ipe_bench.basics.options import Component
 
 _COMPLEX_STEP = 1e-100
@@ -399,14 +399,14 @@ def differentiate(h: Any, x: Array, *, analytic: bool) -> Array:
         parts, begun, few = [], 0, 1
         while begun < trials or not parts:
             part = x[begun : begun + few, None, :] + np.eye(n) * _COMPLEX_STEP * 1j
-            parts.append(np.imag(h(part.reshape(-1, n))).reshape(len(part), n, -1).swapaxes(1, 2))
+            parts.append(np.imag(h(read_only(part.reshape(-1, n)))).reshape(len(part), n, -1).swapaxes(1, 2))
             begun, few = begun + few, max(1, int(_SMALL / max(parts[0][:1].nbytes, 1)))
         return np.ascontiguousarray(np.concatenate(parts)) / _COMPLEX_STEP
     size = _CENTRAL_STEP * np.maximum(1.0, np.abs(x))
     above, below = x + size, x - size
     steps = np.eye(n)[None] * (above - below)[:, None, :] / 2
     points = np.stack([x[:, None] + steps, x[:, None] - steps])
-    z = h(points.reshape(-1, n)).reshape(2, trials, n, -1)
+    z = h(read_only(points.reshape(-1, n))).reshape(2, trials, n, -1)
     width = (np.diagonal(points[0], axis1=1, axis2=2) - np.diagonal(points[1], axis1=1, axis2=2))[:, :, None]
     return np.ascontiguousarray(((z[0] - z[1]) / width).swapaxes(1, 2))
 
@@ -423,7 +423,7 @@ def contradicted(h: Any, x: Array, J: Array) -> NDArray[np.bool_]:
     weight = 1.0 / np.maximum(size, 1e-4 * size.max(axis=1, keepdims=True))
     weight *= np.random.default_rng(1).uniform(0.5, 1.0, n) / weight.max(axis=1, keepdims=True)
     above, below = x + _CENTRAL_STEP * unit * weight, x - _CENTRAL_STEP * unit * weight
-    z = h(np.concatenate([above, below]))
+    z = h(read_only(np.concatenate([above, below])))
     with np.errstate(all="ignore"):
         change, expected = z[:trials] - z[trials:], (J * (above - below)[:, None]).sum(axis=2)
         rounding = 100 * np.finfo(float).eps * np.fmax.reduce(np.abs(z[:trials]), axis=1)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import describe_exception
-from ipe_bench.basics.linalg import Array, Mask, finite
+from ipe_bench.basics.linalg import Array, Mask, finite, read_only
 
 if TYPE_CHECKING:
     from ipe_bench.measurements.base import Measurement
@@ -90,6 +90,7 @@ class CountingModel:
     def _each_if_raising(
         self, function: Callable[[Array], Array], x: Array, rows: NDArray[np.intp], shape: tuple[int, ...]
     ) -> Array:
+        x = read_only(x)
         try:
             return function(x)
         except MemoryError:

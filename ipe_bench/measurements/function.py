@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError, place_of, unknown
-from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.linalg import Array, read_only
 from ipe_bench.basics.options import Finite, Positive
 from ipe_bench.measurements.base import contradicted, differentiate
 from ipe_bench.measurements.formula import WrittenModel
@@ -171,7 +171,9 @@ class Function(WrittenModel):
         times = self.column(chosen)
         return tuple(np.flatnonzero(times == time) for time in np.unique(times))
 
-    _known = cached_property(lambda model: {name: model.column(name) for name in model.headings} | {**model.constants})
+    _known = cached_property(
+        lambda model: {n: read_only(model.column(n)) for n in model.headings} | {**model.constants}
+    )
     """The arguments that are not parameters: columns as arrays (m,), and constants."""
 
     def _at(self, values: Any) -> Any:
@@ -180,7 +182,7 @@ class Function(WrittenModel):
         known = self._known
         try:
             return self.function(**dict(zip(self.starts, values, strict=True)), **known)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             if np.iscomplexobj(values):  # functions of `math` refuse them
                 return self._at(values.real)
             file = getattr(sys.modules.get(self.function.__module__), "__file__", None)

@@ -6,10 +6,11 @@ import copy
 import time
 from dataclasses import dataclass, is_dataclass, replace
 from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 
-from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.errors import UserError, definition, place_of
 from ipe_bench.basics.linalg import Array, Covariance, pseudo_inverse, read_only
 from ipe_bench.basics.options import component_classes
 from ipe_bench.measurements.base import Measurement
@@ -84,9 +85,30 @@ def require_nominal(model: Measurement) -> None:
         raise UserError(f"measurement={model.name}: nominal has shape {shape}; let it return {wanted}")
 
 
-def require_repeatable(model: Measurement) -> None:
-    """Refuses a model from outside of this package that gives one x other readings or other slopes after another x, in
-    another batch, or on a fresh object: they are to be a function of x alone."""
+def require_numbers(owner: str, method: Any, values: Any, shape: tuple[int, ...]) -> None:
+    """Refuses what a method of a part from outside returned unless it is an ordinary array of numbers of this shape."""
+    if complaint := _unfit(method, values, shape):
+        raise UserError(f"{owner}: {complaint}")
+
+
+def _unfit(method: Any, values: Any, shape: tuple[int, ...]) -> str:
+    """What is wrong with what a method returned, and where it is written; empty if nothing is."""
+    array = np.asarray(values)
+    if isinstance(values, np.ndarray) and type(values) is not np.ndarray:
+        found, remedy = f"a {type(values).__name__}", "return an ordinary array, with NaN for what is masked"
+    elif array.shape != shape or array.dtype.kind not in "fiub":
+        numbers = array.dtype.kind in "fiub"
+        found = f"an array of shape {array.shape}" if numbers and array.ndim else f"{type(values).__name__}"
+        remedy = f"let it return numbers of shape {shape}"
+    else:
+        return ""
+    return f"{definition(method)} returns {found}; {remedy}"
+
+
+def require_function(model: Measurement) -> None:
+    """Refuses a model from outside of this package that is no function of x alone: one that gives one x other readings
+    or other slopes after another x, in another batch, or on a fresh object, returns other shapes than (trials, m) and
+    (trials, m, n), writes into x, or ends the process."""
     if all(cls.__module__.startswith("ipe_bench.") for cls in component_classes(model)):
         return
     try:
@@ -94,19 +116,20 @@ def require_repeatable(model: Measurement) -> None:
     except TypeError:  # options that cannot be hashed
         complaint = _irregularity.__wrapped__(model)
     if complaint:
-        raise UserError(f"measurement={model.name}: {complaint}; let h(x) depend on x and the options alone")
+        raise UserError(f"measurement={model.name}: {complaint}")
 
 
 @lru_cache(maxsize=256)
 def _irregularity(model: Measurement) -> str:
-    """What differs; empty where nothing does, and where a call raises, which is told of by the trials that it ends."""
+    """What is wrong; empty where nothing is, and where a call raises, which is told of by the trials that it ends."""
     rng = np.random.default_rng(11)
-    x, other = (model.nominal + 0.1 * rng.standard_normal((trials, model.n)) for trials in (4, 7))
+    x, other = (read_only(model.nominal + 0.1 * rng.standard_normal((trials, model.n))) for trials in (4, 7))
     fresh = replace(model) if is_dataclass(model) else copy.copy(model)  # type: ignore[type-var]
-    for method in ("simulate", "jacobian"):
+    for method, shape in (("simulate", (len(x), model.m)), ("jacobian", (len(x), model.m, model.n))):
         call = getattr(model, method)
         try:
-            call(x)  # the first call may compile
+            if wrong := _unfit(call, call(x), shape):  # the first call may compile
+                return wrong
             began = time.perf_counter()
             first = call(x)
             if time.perf_counter() - began > _PATIENCE_S:
@@ -117,9 +140,11 @@ def _irregularity(model: Measurement) -> str:
                 "in another batch": np.concatenate([call(x[:1]), call(x[1:])]),
                 "on a fresh object": getattr(fresh, method)(x),
             }
-        except Exception:
-            return ""
+        except SystemExit as error:
+            return f"{place_of(error)}; raise an exception where there are no readings"
+        except Exception as error:
+            return place_of(error) if isinstance(error, ValueError) and "read-only" in str(error) else ""
         differing = [way for way, z in ways.items() if not np.array_equal(z, first, equal_nan=True)]
         if differing:
-            return f"{method}(x) has other bits {' and '.join(differing)}"
+            return f"{method}(x) has other bits {' and '.join(differing)}; let h(x) depend on x and the options alone"
     return ""

@@ -82,7 +82,7 @@ def check_component(name: str, component: Any) -> Iterator[Finding]:
         except Exception as error:
             complaint = f"it raises {describe_exception(error)}"
             if "read-only" in complaint:
-                complaint = f"it writes into what it is given: work on a copy ({place_of(error)})"
+                complaint = f"it raises {place_of(error)}"
         yield Finding(name, (check.__doc__ or "").splitlines()[0].rstrip("."), complaint)
 
 

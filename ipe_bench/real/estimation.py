@@ -14,7 +14,7 @@ from ipe_bench.basics.linalg import Array, unmasked
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo, informed
-from ipe_bench.measurements.problem import Problem, require_repeatable
+from ipe_bench.measurements.problem import Problem, require_function
 from ipe_bench.noise import Certified, Gaussian, ModelNoise, Noise, Unknown
 from ipe_bench.priors import GaussianPrior, Prior
 from ipe_bench.real.examination import Examination, examine
@@ -69,7 +69,7 @@ class Question:
     def scenario(self) -> Scenario:
         model = self.found.model
         prior = prior_stated(self.prior or GaussianPrior(), model)
-        require_repeatable(model)
+        require_function(model)
         if hindrance := model.hindrance(model.nominal):
             raise UserError(f"measurement={model.name}: cannot be computed where estimation starts: {hindrance}")
         return Scenario(model, self._noise(), prior, 1.0 if self.error_scale is None else self.error_scale)

@@ -17,7 +17,7 @@ import numpy as np
 from ipe_bench.basics.errors import StorageError, UserError
 from ipe_bench.basics.machine import cores, library_versions
 from ipe_bench.estimators.base import Estimator
-from ipe_bench.measurements.problem import require_repeatable
+from ipe_bench.measurements.problem import require_function
 from ipe_bench.noise.unknown import NO_LEVEL
 from ipe_bench.runs.execution import Execution, Serial
 from ipe_bench.runs.parts import TRUTH, Unusable
@@ -127,9 +127,9 @@ def validate(
         if scenario.noise.estimated and scenario.noise.true_levels(scenario.measurement.m) is None:
             mistakes.append(NO_LEVEL)
         elif untried is None or scenario in untried:
+            require_function(scenario.measurement)
             mistakes += _beyond_numbers(scenario)
-            require_repeatable(scenario.measurement)
-            require_repeatable(scenario.simulator)
+            require_function(scenario.simulator)
         model = scenario.measurement.name
         mistakes += [
             f"estimators.{label}: needs {need}, which measurement={model} does not have; leave it out"
@@ -161,6 +161,14 @@ def _beyond_numbers(scenario: Scenario) -> Iterator[str]:
     beyond = ~((bound >= 1 / LARGEST) & (bound <= LARGEST) | (bound == 0))
     if real and np.isnan(bound).any():
         return  # J lacks rank at the start, or is not finite there: that is a hard start, and no mistake
+    if np.isnan(bound).any():
+        still = [p.name for p, moves in zip(model.parameters, scenario.problem.H.any(axis=0), strict=True) if not moves]
+        where = f"no reading changes with {', '.join(still)}" if still else "its Jacobian has not full column rank"
+        yield (
+            f"measurement={model.name}: {where} at the nominal point, so that readings do not determine its "
+            "parameters; choose another nominal point, or try `ipe-bench check` if the slopes are wrong"
+        )
+        return
     for i in np.flatnonzero(beyond)[:1]:
         yield (
             f"noise={scenario.noise.name}: {model.parameters[i].name} has a linear bound of {bound[i]:g} of its size, "

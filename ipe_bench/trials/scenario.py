@@ -7,11 +7,11 @@ from functools import cached_property
 
 import numpy as np
 
-from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.linalg import Array, read_only
+from ipe_bench.basics.errors import UserError, definition
+from ipe_bench.basics.linalg import Array, Covariance, read_only
 from ipe_bench.basics.streams import numbered
 from ipe_bench.measurements.base import Measurement
-from ipe_bench.measurements.problem import Problem, require_nominal
+from ipe_bench.measurements.problem import Problem, require_nominal, require_numbers
 from ipe_bench.noise.base import ModelNoise, Noise, resolved
 from ipe_bench.priors import GaussianPrior, Prior
 from ipe_bench.trials.theory import linear_bound
@@ -85,7 +85,13 @@ class Scenario:
         if self.noise.real and model.recorded is not None:  # nothing was drawn from a prior
             return Problem(model, model.recorded.R)
         deviation, correlation = self.prior.deviation(model.n, self.error_scale), self.prior.correlation(model.n)
-        return Problem(model, self.noise.nominal_covariance(model), deviation, correlation)
+        require_numbers(f"prior={self.prior.name}", self.prior.deviation, deviation, (model.n,))
+        R = self.noise.nominal_covariance(model)
+        if not isinstance(R, Covariance) or R.m != model.m:
+            found = f"that of {R.m} readings" if isinstance(R, Covariance) else type(R).__name__
+            complaint = f"{definition(self.noise.covariance)} returns {found}"
+            raise UserError(f"noise={self.noise.name}: {complaint}; let it return a Covariance of {model.m} readings")
+        return Problem(model, R, deviation, correlation)
 
     @cached_property
     def linear_bound(self) -> Array:
@@ -110,25 +116,38 @@ class Scenario:
             if (start, stop) != (0, 1):
                 raise UserError("noise=certified: has one trial; set trials=1")
             return Trials(0, recorded.x[None], recorded.z[None])
-        drawn, offset = self._drawn(start, stop), self.simulator.offset
-        h = self.simulator.simulate(read_only(drawn))
-        kept = read_only(h.copy()) if self.truth is None else None  # a noise may write into what it is given
-        streams = numbered(self.seed, start, stop, _NOISE)
-        z = np.stack([self.noise.corrupt(row, offset, rng) for row, rng in zip(h, streams, strict=True)])
+        drawn, offset = self._drawn(start, stop), read_only(self.simulator.offset)
+        h, z = self._simulated(drawn), np.empty((len(drawn), self.simulator.m))
+        for row, given, rng in zip(z, h, numbered(self.seed, start, stop, _NOISE), strict=True):
+            noisy = self.noise.corrupt(given, offset, rng)
+            if type(noisy) is not np.ndarray or noisy.shape != row.shape or noisy.dtype != float:
+                require_numbers(f"noise={self.noise.name}", self.noise.corrupt, noisy, row.shape)
+            row[:] = noisy
         x = np.ascontiguousarray(drawn[:, : self.simulator.n])
-        return Trials(start, x, z, kept)
+        return Trials(start, x, z, h if self.truth is None else None)
 
     def error_free(self, start: int, stop: int) -> Array:
         """The readings (trials, m) of trials start to stop before noise is added; those of a richer truth with what
         else acts on them."""
-        return self.simulator.simulate(read_only(self._drawn(start, stop)))
+        return self._simulated(self._drawn(start, stop))
+
+    def _simulated(self, drawn: Array) -> Array:
+        """The readings (trials, m) at x and nuisances (trials, n + k)."""
+        h = self.simulator.simulate(read_only(drawn))
+        require_numbers(
+            f"measurement={self.simulator.name}", self.simulator.simulate, h, (len(drawn), self.simulator.m)
+        )
+        return read_only(h)
 
     def _drawn(self, start: int, stop: int) -> Array:
         """x (trials, n), and behind it the nuisances (trials, k), drawn from each trial's stream of parameters."""
         n, deviation = self.simulator.n, self.simulator.nuisance_deviation
         nominal, drawn = read_only(self.simulator.nominal), np.empty((stop - start, n + len(deviation)))
         for row, rng in zip(drawn, numbered(self.seed, start, stop, _PARAMETERS), strict=True):
-            row[:n] = self.prior.draw(nominal, self.error_scale, rng)
+            x = self.prior.draw(nominal, self.error_scale, rng)
+            if type(x) is not np.ndarray or x.shape != (n,):
+                require_numbers(f"prior={self.prior.name}", self.prior.draw, x, (n,))
+            row[:n] = x
             # After the parameters, from the same stream: a richer truth keeps the parameters of the trial.
             row[n:] = deviation * rng.standard_normal(len(deviation))
         return drawn

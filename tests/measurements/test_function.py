@@ -57,6 +57,15 @@ def two_columns(t, k=1.0):
 def shrinking(t, k=1.0):
     return np.exp(-k * t)[: None if k == 1.0 else 5]
 
+def scribbling(t, k=1.0):
+    t *= k.real
+    return np.exp(-t)
+
+def leaving(t, k=1.0):
+    if k != 1.0:
+        raise SystemExit(3)
+    return k * t
+
 def no_parameter(t):
     return t
 
@@ -221,6 +230,24 @@ def test_what_the_function_raises_is_one_line_with_its_place(laws, capsys):
     assert capsys.readouterr().err.startswith(f"ipe-bench: {said} 'expp'")
     assert main(["check", *words[:2]]) == 2
     assert capsys.readouterr().err.startswith(f"ipe-bench: {said} 'expp'")
+
+
+@pytest.mark.parametrize(
+    ("name", "line", "said"),
+    [
+        ("scribbling", "t *= k.real", "ValueError: output array is read-only (it writes into what it is given"),
+        ("leaving", "raise SystemExit(3)", "SystemExit: 3"),
+    ],
+)
+def test_a_function_that_writes_into_a_column_or_ends_the_process_is_refused_with_its_place(
+    laws, capsys, tmp_path, name, line, said
+):
+    (tmp_path / "some.csv").write_text("t,reading\n0,1.0\n1,0.4\n2,0.1\n", encoding="utf-8")
+    words = ["measurement=function", f"measurement.of=some_laws:{name}", "readings=some.csv", "noise.deviation=0.1"]
+    assert main(["estimate", *words]) == 2
+    (number,) = (i for i, text in enumerate(LAW.splitlines(), 1) if text.strip() == line)
+    expected = f"ipe-bench: measurement.of=some_laws:{name}: some_laws.py, line {number}: {said}"
+    assert capsys.readouterr().err.startswith(expected)
 
 
 def test_a_function_inside_another_is_refused():
