@@ -162,7 +162,8 @@ def _beyond_numbers(scenario: Scenario) -> Iterator[str]:
     if real and np.isnan(bound).any():
         return  # J lacks rank at the start, or is not finite there: that is a hard start, and no mistake
     if np.isnan(bound).any():
-        still = [p.name for p, moves in zip(model.parameters, scenario.problem.H.any(axis=0), strict=True) if not moves]
+        H = scenario.problem.H
+        still = [parameter.name for i, parameter in enumerate(model.parameters) if not H[:, i].any()]
         where = f"no reading changes with {', '.join(still)}" if still else "its Jacobian has not full column rank"
         yield (
             f"measurement={model.name}: {where} at the nominal point, so that readings do not determine its "
