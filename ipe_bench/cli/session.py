@@ -28,7 +28,7 @@ from hydra.core.plugins import Plugins
 from hydra.errors import HydraException
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from ipe_bench.basics.errors import UserError, describe_exception, unknown
@@ -146,9 +146,37 @@ def _spec(job: Sequence[Override]) -> Spec:
 @functools.lru_cache(maxsize=64)
 def _composed(words: tuple[str, ...], *, whole: bool = False) -> DictConfig:
     try:
-        return compose("config", list(words), return_hydra_config=whole)
+        config = compose("config", list(words), return_hydra_config=True)
     except Exception as error:  # what Hydra makes of overrides raises nearly anything
         raise explain(error) from error
+    _require_own_calls(config.hydra, "hydra")
+    if not whole:
+        with open_dict(config):
+            del config["hydra"]
+    return config
+
+
+_CALLS = ("_target_", "class", "()")
+"""Keys whose value Hydra or the module logging calls, with the keys beside it as arguments."""
+_OWN_CALL = re.compile(
+    r"hydra\._internal\.core_plugins\.\w+\.[A-Z]\w*|hydra\.experimental\.callbacks\.[A-Z]\w*"
+    r"|hydra_plugins\.(\w+\.){1,2}[A-Z]\w*|optuna\.(samplers|pruners)\.[A-Z]\w*"
+    r"|(logging|logging\.handlers|colorlog)\.[A-Z]\w*"
+)
+
+
+def _require_own_calls(node: Any, where: str) -> None:
+    """Refuses a config of Hydra that names something to be called besides Hydra's own classes, those of launchers and
+    sweepers, and those of logging."""
+    for key in node if isinstance(node, DictConfig) else range(len(node)) if isinstance(node, ListConfig) else ():
+        value = None
+        with contextlib.suppress(OmegaConfBaseException):  # what is not known before a job begins
+            value = node[key]
+        if key not in _CALLS:
+            _require_own_calls(value, f"{where}.{key}")
+        elif not _OWN_CALL.fullmatch(str(value)):
+            known = "only classes of Hydra, of launchers and sweepers, and of logging"
+            raise UserError(f"{where}.{key}={value}: {known} may be named here; remove it, or write a plugin")
 
 
 def spec_of(config: DictConfig) -> Spec:

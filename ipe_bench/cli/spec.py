@@ -84,6 +84,8 @@ class Spec(Component):
         for key in ("name", "output"):
             if Path(getattr(self, key)).name in ("", ".."):
                 raise UserError(f"{key}={getattr(self, key)}: name a folder")
+        if ".." in Path(self.name).parts:
+            raise UserError(f"name={self.name}: leaves the folder outputs; give another name, or the folder as output=")
         if "://" in self.output or self.output.startswith("file:"):
             raise UserError(f"output={self.output}: is an address; name a folder of this machine")
         if self.time_limit is not None and self.precision is None:

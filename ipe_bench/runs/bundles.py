@@ -28,7 +28,11 @@ MANIFEST = "manifest.json"
 SUFFIX = ".zip"
 BUNDLES = "bundles"
 """Where bundles are unpacked below a report on them."""
-_NAME = re.compile(r"(?!\.\.?/)[^/\\\x00-\x1f]{1,200}/(trials|runs|failed)/[A-Za-z0-9][A-Za-z0-9._-]*")
+_FILE = re.compile(r"(trials|runs|failed)/[A-Za-z0-9][A-Za-z0-9._-]{0,150}\.(parquet|json)")
+_FOLDER = re.compile(r"(?!(?i:con|prn|aux|nul|com\d|lpt\d)(\.|$))[A-Za-z0-9]([A-Za-z0-9._=,+-]{0,98}[A-Za-z0-9])?")
+"""Names that every system takes for what they are."""
+_MOST_COMPRESSED = 100
+"""Bytes that a byte of a bundle may stand for; records come to 10, and tables are compressed already."""
 
 
 @dataclass(frozen=True)
@@ -57,14 +61,16 @@ def write_bundle(directories: Sequence[Path | str], path: Path, further: Mapping
     contents: dict[str, bytes] = {}
     for directory in map(Path, directories):
         _require_results(directory)
-        name = directory.resolve().name
+        name = re.sub(r"[^A-Za-z0-9._=,+-]+", "_", directory.resolve().name)[:100].strip("._=,+-") or "results"
         if any(known.startswith(f"{name}/") for known in contents):
             raise UserError(f"{directory}: another folder has the name {name} too; bundle them apart, or rename one")
         contents |= {f"{name}/{file}": content for file, content in _contents(directory).items()}
     if not contents:
         raise UserError(f"{', '.join(map(str, directories))}: holds no whole results to bundle; run something first")
     digests = {name: _digest(content) for name, content in sorted(contents.items())}
-    record = {"bundle": "ipe-bench", "schema": SCHEMA, "version": __version__, **(further or {}), "files": digests}
+    sizes = {name: len(contents[name]) for name in digests}
+    record = {"bundle": "ipe-bench", "schema": SCHEMA, "version": __version__, **(further or {})}
+    record |= {"files": digests, "sizes": sizes}
     manifest = json.dumps(record, indent=1, ensure_ascii=False).encode()
     if path.exists():
         found = read_bundle(path)
@@ -91,24 +97,30 @@ def _contents(directory: Path) -> dict[str, bytes]:
     while True:
         damaged = Results.read([directory]).damaged
         files = [p for folder in (store.trials, store.runs, store.failed) for p in folder.glob("[!.]*.*")]
-        kept = [p for p in files if p.suffix in (".parquet", ".json") and p not in damaged and p.is_file()]
+        names = {f"{file.parent.name}/{file.name}": file for file in files if file not in damaged and file.is_file()}
         with contextlib.suppress(FileNotFoundError):
-            return {f"{file.parent.name}/{file.name}": file.read_bytes() for file in kept}
+            return {name: file.read_bytes() for name, file in names.items() if _FILE.fullmatch(name)}
 
 
 def read_bundle(path: Path) -> Bundle:
     """The bundle, all of whose files were read and are as its manifest says, or a UserError."""
     try:
         with zipfile.ZipFile(path) as archive:
+            if sum(one.file_size for one in archive.infolist()) > _MOST_COMPRESSED * path.stat().st_size:
+                raise UserError(
+                    f"{path}: would unpack to over {_MOST_COMPRESSED} times its size; nothing of it is read"
+                )
             manifest = archive.read(MANIFEST)
             record = json.loads(manifest)
             if record["bundle"] != "ipe-bench" or record["schema"] != SCHEMA:
                 raise UserError(f"{path}: is a bundle of another version of ipe-bench; read it with that one")
-            digests, there = dict(record["files"]), {*archive.namelist()} - {MANIFEST}
+            there = {one.filename: one.file_size for one in archive.infolist() if one.filename != MANIFEST}
+            digests, sizes = dict(record["files"]), dict(record.get("sizes", there))  # version 0.2 states no sizes
             for name in sorted({*digests, *there}):
-                if not _NAME.fullmatch(name):
+                folder, _, file = name.partition("/")
+                if not (_FOLDER.fullmatch(folder) and _FILE.fullmatch(file)):
                     raise UserError(f"{path}: {name!r} is no name of a result; nothing of it is read")
-                if name not in there or digests.get(name) != _digest(archive.read(name)):
+                if there.get(name, -1) != sizes.get(name) or digests.get(name) != _digest_of(archive, name):
                     raise UserError(f"{path}: was damaged or changed: {name} is not as its manifest says; get it anew")
     except UserError:
         raise
@@ -143,6 +155,15 @@ def _require_results(folder: Path) -> None:
     if not (store.runs.is_dir() or store.trials.is_dir()):
         what = "holds no results of ipe-bench" if folder.exists() else "there is no such folder"
         raise UserError(f"{folder}: {what}; give the output folder of a run")
+
+
+def _digest_of(archive: zipfile.ZipFile, name: str) -> str:
+    """The digest of a file in an archive, which is read in pieces."""
+    digest = hashlib.sha256()
+    with archive.open(name) as file:
+        while piece := file.read(1 << 20):
+            digest.update(piece)
+    return digest.hexdigest()
 
 
 def _digest(content: bytes) -> str:

@@ -41,6 +41,8 @@ Limit = Annotated[float, Gt(0), Lt(_LONGEST), doc(f"a number above 0 and below {
 FATAL = (UserError, StorageError)
 """Exceptions that concern the whole run: they end it, where any other is a failure of one task."""
 _THREADED = ("OMP", "OPENBLAS", "MKL", "BLIS", "VECLIB", "NUMEXPR")
+PREPARED = "prepared"
+"""The step of a task after which time counts: what is imported and compiled once is there."""
 _PREPARATION_S = 60.0
 
 
@@ -110,7 +112,8 @@ class Processes(Execution):
     workers: Count | None = None
     """How many processes; None: one per core."""
     block_timeout_s: Limit | None = None
-    """Seconds that one estimator may take for one block; None: no limit."""
+    """Seconds that one estimator may take for one block, besides a minute for imports and compilation; None: no
+    limit."""
     memory_limit_gb: Limit | None = None
     """Memory that one worker may use, in 1e9 bytes; None: no limit. Linux only."""
 
@@ -147,8 +150,9 @@ def supervise(
     memory_gb: float | None = None,
 ) -> Iterator[Event]:
     """Runs tasks in at most `workers` processes with `threads` threads each; see `Execution.run`. A worker whose task
-    takes longer than `timeout_s` between two steps is ended, after a minute for the first, which loads compiled code.
-    """
+    takes longer than `timeout_s` from the step `PREPARED` to the next one is ended, and one that takes longer than a
+    minute, too, to get there."""
+    prepares_s = None if timeout_s is None else max(timeout_s, _PREPARATION_S)
     waiting = deque(range(len(tasks)))
     busy: dict[Connection, _Worker] = {}
     try:
@@ -163,9 +167,9 @@ def supervise(
                 worker = busy[connection]  # pyright: ignore[reportArgumentType]
                 kind, value = worker.receive()
                 if kind == "started":
-                    worker.extend(None if timeout_s is None else max(timeout_s, _PREPARATION_S))
+                    worker.extend(prepares_s)
                 elif kind == "step":
-                    worker.extend(timeout_s)
+                    worker.extend(timeout_s if value == PREPARED else prepares_s)
                     yield Event(worker.index, value)
                 else:
                     del busy[worker.connection]

@@ -21,7 +21,7 @@ import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from ipe_bench.basics.errors import StorageError
-from ipe_bench.runs.execution import FATAL, Execution, Failure
+from ipe_bench.runs.execution import FATAL, PREPARED, Execution, Failure
 from ipe_bench.runs.provenance import describe, digest, fingerprint
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.store import ResultKey, Store, describe_names
@@ -37,8 +37,6 @@ LARGEST_BLOCK = 1000
 _WORTH_BLOCKS = 100
 TRIES = 2
 """How often a cell of a block may take its process with it before it counts as failed."""
-PREPARED = "prepared"
-"""The step of a task after which an estimator begins: what is imported and compiled once is there."""
 
 
 @dataclass(frozen=True)

@@ -67,6 +67,7 @@ MISTAKES = {
     "a baseline among solvers": (["run", "solver=[gauss_newton]"], "is no solver but a baseline; write baseline"),
     "a group for a place": (["run", "baseline.ekf.process_noise=1"], "write estimators.ekf.process_noise=1"),
     "not chosen": (["run", "estimators.newton.max_iterations=9"], "newton is not chosen; add it to solver="),
+    "a name that leaves": (["run", "name=../../x"], "name=../../x: leaves the folder outputs"),
     "an address": (["run", "output=s3://bucket/x"], "output=s3://bucket/x: is an address; name a folder"),
     "a label that is misspelt": (["run", "estimators.newtn.max_iterations=9"], "did you mean newton?"),
     "a file for its key": (["estimate", "my.csv"], "my.csv: is not KEY=VALUE; write readings=my.csv"),

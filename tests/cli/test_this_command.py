@@ -173,3 +173,27 @@ def test_an_experiment_of_ones_own_sweeps_as_ours_do(ipe_bench):
     assert code == 0
     assert rows_of(out, "newton") == 3
     assert [path.name for path in Path("outputs").iterdir()] == ["mine"]
+
+
+COPY = "{_target_: shutil.copyfile, src: conf/experiment/mine.yaml, dst: copy}"
+CALLED = {
+    "a callback": ("", f"callbacks: {{mine: {COPY}}}", "hydra.callbacks.mine._target_"),
+    "one from elsewhere": (f"parameters: {{a: {COPY}}}", "callbacks: ${parameters}", "hydra.callbacks.a._target_"),
+    "a handler of logs": (
+        "",
+        f"job_logging: {{handlers: {{mine: {COPY.replace('_target_', 'class')}}}}}",
+        "hydra.job_logging.handlers.mine.class",
+    ),
+}
+
+
+@pytest.mark.parametrize(("before", "below_hydra", "where"), CALLED.values(), ids=CALLED)
+@pytest.mark.parametrize("flag", [(), ("-m",)])
+def test_an_experiment_has_no_function_called(ipe_bench, before, below_hydra, where, flag):
+    folder = Path("conf/experiment")
+    folder.mkdir(parents=True)
+    (folder / "mine.yaml").write_text(f"# @package _global_\n{before}\nhydra:\n  {below_hydra}\n")
+    code, _, err = ipe_bench("run", *flag, "--config-dir", "conf", "+experiment=mine", *SMALL, "seed=1", "trials=2")
+    assert code == 2
+    assert where in err
+    assert not Path("copy").exists()

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ipe_bench.estimators.base import Estimates, Estimator
+from ipe_bench.runs.execution import PREPARED
 
 _begun: set[int] = set()
 
@@ -51,8 +52,10 @@ class Rogue(Estimator):
 
     def misbehave(self, problem, z):
         match self.does:
-            case "sleep":
+            case "sleep" if len(z) > 1:  # not while it is prepared
                 time.sleep(3600)
+            case "compile" if len(z) == 1:
+                time.sleep(3)
             case "exit":
                 os._exit(7)
             case "sys_exit":
@@ -96,6 +99,7 @@ def square(task):
 
 def leave_a_child(task):
     yield subprocess.Popen(["sleep", "3600"]).pid
+    yield PREPARED
     time.sleep(3600)
 
 

@@ -114,6 +114,11 @@ def test_one_estimator_that_fails_loses_nothing_but_itself(tmp_path, reference, 
     assert (rogue.done, rogue.failed, rogue.missing) == (0, 10, 0)
 
 
+def test_the_time_limit_does_not_count_what_any_estimator_compiles(tmp_path):
+    estimators = {**GOOD, "rogue": Rogue("compile")}
+    assert compute([scenario()], estimators, 10, tmp_path, execution=Processes(1, block_timeout_s=2.5)) == ()
+
+
 def rows_of(directory: Path, label: str) -> dict[str, np.ndarray]:
     results = Results.read([directory])
     return results.load(next(cell for cell in results.stored.values() if cell.label == label), None)
@@ -225,7 +230,6 @@ def test_stopping_a_run_ends_its_workers():
 
 @pytest.mark.skipif(sys.platform == "win32", reason="ends sessions with POSIX means")
 def test_what_an_estimator_started_ends_with_its_worker():
-    # The first step has a minute in any case, for loading compiled code; those after it have what was asked for.
     events = list(Processes(1, block_timeout_s=0.3).run(rogues.leave_a_child, [0]))
     assert events[-1].failure is not None
     assert events[-1].failure.status == "timeout"

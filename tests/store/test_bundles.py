@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 import shutil
 import zipfile
 from pathlib import Path
@@ -76,6 +77,7 @@ CHANGES = {
     "a file less": lambda name, content: [] if "runs/" in name else [(name, content)],
     "a file more": lambda name, content: [(name, content), *([("theirs/trials/x.parquet", b"")] * (name == MANIFEST))],
     "a digest": lambda name, content: [(name, content.replace(b'": "', b'": "0') if name == MANIFEST else content)],
+    "a size": lambda name, content: [(name, re.sub(rb'n": (?=\d)', b'n": 1', content) if name == MANIFEST else content)],
     "no manifest": lambda name, content: [] if name == MANIFEST else [(name, content)],
 }  # fmt: skip
 
@@ -107,7 +109,14 @@ def test_any_byte_that_is_changed_is_noticed(bundle, tmp_path):
     assert noticed > 45
 
 
-@pytest.mark.parametrize("name", ["../evil.json", "/runs/evil.json", "theirs/../../runs/x.json", "theirs/log/x.json"])
+ODD = ["../evil.json", "/runs/evil.json", "theirs/../../runs/x.json", "theirs/log/x.json", "theirs/runs/x.py"]
+ODD += [
+    f"{folder}/runs/x.json" for folder in ("C:", "CON", "nul.x", "-rf", " ", "~", ".git", "a:b", "a\u202eb", "base.")
+]
+ODD += [f"theirs/runs/{300 * 'x'}.json", f"{300 * 'x'}/runs/x.json"]
+
+
+@pytest.mark.parametrize("name", ODD)
 def test_a_manifest_cannot_write_elsewhere(bundle, tmp_path, name):
     def change(entry, content):
         if entry == MANIFEST:
@@ -123,6 +132,30 @@ def test_a_manifest_cannot_write_elsewhere(bundle, tmp_path, name):
     with pytest.raises(UserError, match="is no name of a result"), opened([bad], tmp_path / "a" / "b"):
         pass
     assert set(tmp_path.rglob("*")) == before
+
+
+def test_a_small_archive_that_unpacks_to_much_is_refused_before_it_is_unpacked(bundle, tmp_path):
+    bomb, name = tmp_path / "bomb.zip", "theirs/runs/x.json"
+    with zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as archive:
+        zeros = bytes(10_000_000)
+        files = {name: hashlib.sha256(zeros).hexdigest()}
+        record = {"bundle": "ipe-bench", "schema": 3, "files": files, "sizes": {name: len(zeros)}}
+        archive.writestr(MANIFEST, json.dumps(record))
+        archive.writestr(name, zeros)
+    with pytest.raises(UserError, match="would unpack to over 100 times its size"):
+        read_bundle(bomb)
+
+
+def test_a_folder_of_any_name_and_a_bundle_without_sizes_are_read(tmp_path):
+    made = write_bundle([fill(tmp_path / "größte (2)")], tmp_path / "named.zip")
+    assert made.folders == ("gr_te_2",)
+
+    def without_sizes(entry, content):
+        record = json.loads(content) if entry == MANIFEST else {}
+        yield entry, json.dumps({k: v for k, v in record.items() if k != "sizes"}) if record else content
+
+    older = rewritten(made.path, tmp_path / "older.zip", without_sizes)
+    pd.testing.assert_frame_equal(ib.load(older), ib.load(made.path))
 
 
 def test_commands_make_and_check_bundles(tmp_path, capsys):
