@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from linear_models import Linear, block_of_gins, linear_map
+from shared.linear_models import Linear, block_of_gins, linear_map
 
 from ipe_bench.baselines import EsMda, MapLM
 from ipe_bench.baselines.es_mda import assimilated

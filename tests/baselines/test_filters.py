@@ -7,9 +7,9 @@ import filterpy.stats
 import numpy as np
 import pytest
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
-from linear_models import Linear, LinearGins, block_of_gins, linear_map
 from scipy.optimize import least_squares
-from small_models import Bent
+from shared.linear_models import Linear, LinearGins, block_of_gins, linear_map
+from shared.small_models import Bent
 
 from ipe_bench.baselines import CKF, EKF, IPLF, LMIEKF, UKF, EnKF, EsMda, IteratedEKF, RecursiveUpdate
 from ipe_bench.baselines.information import InformationFilter

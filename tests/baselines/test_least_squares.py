@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from scipy.optimize import curve_fit
-from small_models import Bent, Written
+from shared.small_models import Bent, Written
 
 from ipe_bench.baselines import GaussNewton, LeastSquares, LevenbergMarquardt, MultiscaleLM, Multistart
 from ipe_bench.basics.errors import UserError

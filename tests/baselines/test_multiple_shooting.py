@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from linear_models import Linear
-from small_models import bock
+from shared.linear_models import Linear
+from shared.small_models import bock
 
 from ipe_bench.baselines import LevenbergMarquardt, MultipleShooting
 from ipe_bench.basics.errors import UserError

@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy.stats import binom, binomtest, chi2
-from synthetic_store import Pretender, Synthetic
+from shared.synthetic_store import Pretender, Synthetic
 
 import ipe_bench as ib
 from ipe_bench.cli.main import main

@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 from rich.console import Console
-from synthetic_store import Synthetic
+from shared.synthetic_store import Synthetic
 
 import ipe_bench as ib
 import ipe_bench.cli

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from gins_reference import velocities
 from scipy.integrate import DOP853
 from scipy.stats import chi2
+from shared.gins_reference import velocities
 
 from ipe_bench.baselines import GaussNewton
 from ipe_bench.basics.errors import UserError

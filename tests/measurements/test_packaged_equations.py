@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, curve_fit
 from scipy.special import expi
-from small_models import bock
+from shared.small_models import bock
 
 from ipe_bench.baselines import MultiscaleLM
 from ipe_bench.basics.linalg import Covariance

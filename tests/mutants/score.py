@@ -30,12 +30,12 @@ LEFT_OUT = ("RemoveDecorator", "ExceptionReplacer", "Variable", "_Eq_Is", "_Is_E
 ROOMS = {
     "scoring": (
         ("trials/*.py", "estimators/base.py"),
-        ("tests/test_fit.py", "tests/statistics/test_theory.py", "tests/test_scenario.py", "tests/montecarlo"),
+        ("tests/trials", "tests/real/test_fit.py", "tests/statistics/test_theory.py"),
     ),
     "statistics": (("statistics/*.py",), ("tests/statistics", "tests/report/test_report.py")),
     "noise": (
         ("noise/*.py",),
-        ("tests/noise", "tests/plugins/test_options.py", "tests/test_fit.py", "tests/montecarlo/test_fit_test.py"),
+        ("tests/noise", "tests/plugins/test_options.py", "tests/real/test_fit.py", "tests/trials/test_fit_test.py"),
     ),
     "filters": (
         tuple(f"baselines/{name}.py" for name in ("kalman", "epochs", "sequential", "information")),

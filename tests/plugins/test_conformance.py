@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from state_models import CoordinatedTurn
+from shared.state_models import CoordinatedTurn
 
 from ipe_bench.basics.linalg import Covariance
 from ipe_bench.basics.statuses import Status

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from small_models import Bent
+from shared.small_models import Bent
 
 from ipe_bench import Scenario, check
 from ipe_bench.cli.components import KINDS, RECORDS

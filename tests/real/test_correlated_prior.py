@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from small_models import Bent
+from shared.small_models import Bent
 
 from ipe_bench.baselines import CKF, EKF, IPLF, LMIEKF, UKF, EnKF, EsMda, IteratedEKF, MapLM
 from ipe_bench.basics.errors import UserError

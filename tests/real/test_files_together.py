@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
-from test_instruments import EXACT, SATURATION, START, estimate, simulated, solution
+from shared.instruments import EXACT, SATURATION, START, estimate, simulated, solution
 
 import ipe_bench as ib
 from ipe_bench.baselines import LevenbergMarquardt

@@ -9,7 +9,7 @@ from html import unescape
 
 import numpy as np
 import pytest
-from test_report import HOSTILE, fill
+from shared.reports import HOSTILE, fill
 
 from ipe_bench.report.figures.views import views
 from ipe_bench.report.html import charts, render_page

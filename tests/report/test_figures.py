@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PathCollection
-from synthetic_store import Filter, Pretender, Seeker, Synthetic
+from shared.synthetic_store import Filter, Pretender, Seeker, Synthetic
 
 from ipe_bench.baselines import EnKF, EsMda
 from ipe_bench.report import figures

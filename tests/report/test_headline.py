@@ -12,8 +12,8 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy.stats import beta, chi2
-from state_models import ConstantVelocity
-from synthetic_store import Filter, Pretender, Repeated, Seeker, Synthetic
+from shared.state_models import ConstantVelocity
+from shared.synthetic_store import Filter, Pretender, Repeated, Seeker, Synthetic
 
 import ipe_bench as ib
 from ipe_bench.api import report as write_report

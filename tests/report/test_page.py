@@ -7,8 +7,8 @@ import re
 import numpy as np
 import pandas as pd
 import pytest
-from synthetic_store import Synthetic
-from test_report import HOSTILE, fill
+from shared.reports import HOSTILE, fill
+from shared.synthetic_store import Synthetic
 
 from ipe_bench.api import report as write_report
 

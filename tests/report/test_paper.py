@@ -6,7 +6,7 @@ import re
 
 import pandas as pd
 import pytest
-from test_report import HOSTILE, fill
+from shared.reports import HOSTILE, fill
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.report import figures

@@ -13,7 +13,8 @@ import pandas as pd
 import pytest
 from markupsafe import escape
 from rich.console import Console
-from synthetic_store import Seeker, Synthetic
+from shared.reports import HOSTILE, fill
+from shared.synthetic_store import Seeker, Synthetic
 
 from ipe_bench.api import report as write_report
 from ipe_bench.noise import Quantization
@@ -26,23 +27,6 @@ from ipe_bench.report.terminal import LEGEND, reported, summary_tables
 from ipe_bench.report.words import compact, duration, percent, short
 from ipe_bench.statistics import analyse
 from ipe_bench.statistics.records import SCORES, STATISTICS, frame_columns
-
-HOSTILE = "<script>alert(1)</script>"
-
-
-def fill(
-    store: Synthetic, labels=("linear_lse", "one", "two"), scales=(1.0, 10.0, 100.0), trials=80, seeds=1, **model
-) -> None:
-    """A linear estimate that is worse the larger the scale, and others that reach the bound."""
-    rng = np.random.default_rng(0)
-    for scale in scales:
-        for seed in range(seeds):
-            scenario = store.scenario(error_scale=scale, seed=seed, **model)
-            base = 0.1 * rng.normal(size=(trials, scenario.measurement.n))
-            for i, label in enumerate(labels):
-                factor = scale if label == "linear_lse" else 1.0 + 0.05 * i
-                store.add(scenario, label, factor * base, simulations=1.0 + 3 * i, iterations=i)
-    store.record(trials)
 
 
 def shown_at(width: int, *parts) -> list[str]:

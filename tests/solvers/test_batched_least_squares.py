@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 from scipy.stats import chi2
-from small_models import Bent
+from shared.small_models import Bent
 
 from ipe_bench.baselines import GaussNewton, LevenbergMarquardt, MapLM
 from ipe_bench.basics.linalg import Array, Covariance, deviations, information, inverse, quadratic_form

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from small_models import Written
+from shared.small_models import Written
 
 from ipe_bench.basics.linalg import Covariance, deviations
 from ipe_bench.basics.statuses import Status

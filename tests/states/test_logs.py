@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy.stats import chi2, multivariate_normal
-from state_models import ConstantVelocity, CoordinatedTurn
+from shared.state_models import ConstantVelocity, CoordinatedTurn
 
 import ipe_bench as ib
 from ipe_bench.cli.main import main

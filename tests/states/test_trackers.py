@@ -16,12 +16,11 @@ from filterpy.kalman import (
 )
 from scipy.optimize import least_squares
 from scipy.optimize._numdiff import approx_derivative
-from state_models import ConstantVelocity, CoordinatedTurn, Growth, Pendulum
-from walking_gins import WalkingGins
+from shared.state_models import ConstantVelocity, CoordinatedTurn, Growth, Pendulum
 
 import ipe_bench as ib
 import ipe_bench.states
-from ipe_bench.measurements import Gins, Parameter
+from ipe_bench.measurements import Parameter
 from ipe_bench.states import (
     Bootstrap,
     Cubature,
@@ -416,23 +415,3 @@ def test_nees_and_nis_of_the_kalman_filter_are_chi_square():
     assert tracks.nis.mean() == pytest.approx(1.0, abs=4 * np.sqrt(2 / (400 * 50)))
     white = tracks.nis - tracks.nis.mean()
     assert abs((white[:, 1:] * white[:, :-1]).mean() / white.var()) < 4 / np.sqrt(400 * 49)
-
-
-def test_the_inertial_system_with_drifts_that_stand_still_reads_what_gins_does():
-    """Four Runge-Kutta steps of 45 s leave 2e-4 m/s of 450 m/s at error scale 10."""
-    model = WalkingGins(walk=0.0, error_scale=10.0)
-    p = 10.0 * np.random.default_rng(0).standard_normal((3, 11))
-    x, z = np.hstack([np.zeros((3, 11)), p]), []
-    for k in range(model.epochs):
-        x = model.transition(x, k)
-        z.append(model.observe(x, k))
-    np.testing.assert_allclose(np.stack(z, axis=1).reshape(3, -1), model.gins.simulate(p), atol=5e-4)
-
-
-def test_drifts_walk_as_fast_as_is_said_and_nothing_else_does():
-    model = replace(WalkingGins(walk=0.5), gins=Gins(readings_per_case=5))
-    paths = model.draw(0, 300)
-    moved = paths.x[:, -1, 11:] - paths.start[:, 11:]
-    hours = model.times[-1] / 3600.0
-    np.testing.assert_allclose(moved[:, 4:7].std(axis=0), 0.5 * np.sqrt(hours), rtol=0.15)
-    assert np.abs(np.delete(moved, [4, 5, 6], axis=1)).max() == 0.0

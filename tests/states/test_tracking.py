@@ -7,11 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from scipy.stats import chi2, kstest
-from state_models import ConstantVelocity, CoordinatedTurn, Growth, Pendulum
-from walking_gins import WalkingGins
+from shared.state_models import ConstantVelocity, CoordinatedTurn, Growth, Pendulum
 
 import ipe_bench as ib
-from ipe_bench.measurements import Gins
 from ipe_bench.plugins.construct import construct
 from ipe_bench.plugins.discovery import composed, options
 from ipe_bench.states import Bootstrap, Formulas, Smoother, Tracker, ckf, ekf, ukf
@@ -154,16 +152,6 @@ def test_a_tracker_that_fails_in_one_trial_fails_in_that_alone():
     np.testing.assert_array_equal(estimates.x[[0, 1, 3, 5]], alone.mean[[0, 1, 3, 5], -1])
     assert columns["success"].tolist() == [True, True, False, True, False, True]
     np.testing.assert_array_equal(columns["first_bad_epoch"], [np.nan, np.nan, 1, np.nan, 6, np.nan])
-
-
-def test_a_singular_covariance_has_neither_nees_nor_posterior_bound():
-    table = ib.run(Tracking(WalkingGins(gins=Gins(readings_per_case=2))), {"ekf": ekf()}, 8)
-    found = row(table, "ekf")
-    assert np.isnan(found["path_nees"])
-    assert np.isnan(found["nees"])
-    assert np.isnan(found["van_trees"])
-    assert found["path_verdict"] == "-"
-    assert found["path_rmse"] > 0
 
 
 def test_the_growth_model_loses_the_extended_filter_and_keeps_what_knows_both_signs():

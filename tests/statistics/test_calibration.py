@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 from scipy.stats import binom, kstest, norm, t
-from synthetic_store import Seeker
+from shared.synthetic_store import Seeker
 
 import ipe_bench as ib
 from ipe_bench.report.figures import errors as figure

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy import stats
-from synthetic_store import Pretender
+from shared.synthetic_store import Pretender
 
 from ipe_bench.report.tables import all_tables
 from ipe_bench.statistics import analyse

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
-from synthetic_store import Pretender, Repeated
+from shared.synthetic_store import Pretender, Repeated
 
 import ipe_bench as ib
 from ipe_bench.cli.main import main
@@ -119,7 +119,7 @@ OPTIONS = st.fixed_dictionaries(
 @given(st.lists(OPTIONS, min_size=2, max_size=4, unique_by=lambda m: str(sorted(m.items()))))
 @settings(max_examples=15, deadline=None)
 def test_different_models_are_never_pooled_and_always_told_apart(tmp_path_factory, models):
-    from synthetic_store import Synthetic
+    from shared.synthetic_store import Synthetic
 
     store = Synthetic(tmp_path_factory.mktemp("store"))
     for model in models:

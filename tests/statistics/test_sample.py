@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy.stats import norm
-from synthetic_store import Pretender, Seeker, Synthetic
+from shared.synthetic_store import Pretender, Seeker, Synthetic
 
 import ipe_bench as ib
 from ipe_bench.runs.store import ResultKey

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy.stats import beta, chi2
-from synthetic_store import Filter, Pretender, Repeated, Synthetic, forge
+from shared.synthetic_store import Filter, Pretender, Repeated, Synthetic, forge
 
 from ipe_bench.statistics import analyse, summarize
 from ipe_bench.statistics.intervals import clopper_pearson

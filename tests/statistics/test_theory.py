@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from small_models import Bent
+from shared.small_models import Bent
 
 from ipe_bench.baselines import LinearLSE
 from ipe_bench.basics.linalg import Covariance, information, inverse, pseudo_inverse

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from small_models import Bent
+from shared.small_models import Bent
 
 import ipe_bench as ib
 from ipe_bench import Scenario

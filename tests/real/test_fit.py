@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from scipy.stats import binom, chi2, kstest
-from state_models import ConstantVelocity
+from shared.state_models import ConstantVelocity
 
 import ipe_bench as ib
 from ipe_bench.baselines import EKF, UKF, GaussNewton

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import rogues
-from rogues import Rogue
-from small_models import Bent
+from shared import rogues
+from shared.rogues import Rogue
+from shared.small_models import Bent
 
 from ipe_bench import Scenario
 from ipe_bench.baselines import LinearLSE
@@ -250,7 +250,7 @@ def test_a_worker_that_dies_between_two_runs_is_replaced():
 def test_a_script_needs_no_guard_against_being_imported_by_its_workers(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
-        "import rogues\nfrom ipe_bench.runs.execution import Processes\nprint('begins')\n"
+        "from shared import rogues\nfrom ipe_bench.runs.execution import Processes\nprint('begins')\n"
         "print([event.step for event in Processes(2).run(rogues.square, [1]) if not event.ended])\n"
     )
     ran = subprocess.run([sys.executable, script], env=environment(), capture_output=True, text=True, check=True)
@@ -258,7 +258,7 @@ def test_a_script_needs_no_guard_against_being_imported_by_its_workers(tmp_path)
 
 
 def test_workers_end_when_their_parent_is_killed(tmp_path):
-    code = "import rogues; from ipe_bench.runs.execution import Processes\n"
+    code = "from shared import rogues; from ipe_bench.runs.execution import Processes\n"
     code += "for event in Processes(1).run(rogues.doze, [0]): print(event.step, flush=True)"
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, env=environment(), text=True) as parent:
         assert parent.stdout is not None

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from small_models import Bent, bock
-from synthetic_store import Repeated
+from shared.small_models import Bent, bock
+from shared.synthetic_store import Repeated
 
 import ipe_bench as ib
 from ipe_bench import Scenario, run

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from synthetic_store import Synthetic
+from shared.synthetic_store import Synthetic
 
 import ipe_bench as ib
 from ipe_bench.basics.errors import UserError

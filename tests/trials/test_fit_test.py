@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from scipy.stats import chi2, kstest
-from small_models import Bent
+from shared.small_models import Bent
 
 from ipe_bench.baselines import EKF, GaussNewton, MapLM
 from ipe_bench.basics.linalg import Covariance, information

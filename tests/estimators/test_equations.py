@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from small_models import Bent
+from shared.small_models import Bent
 
 from ipe_bench.baselines import LinearLSE
 from ipe_bench.basics.errors import UserError

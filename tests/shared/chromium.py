@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from synthetic_store import Synthetic
 
 FLAGS = [
     *("--headless=new", "--no-sandbox", "--remote-debugging-pipe", "--hide-scrollbars", "--no-first-run"),
@@ -109,9 +108,3 @@ def browser() -> Iterator[Page]:
             process.terminate()
             process.wait(timeout=30)
             os.close(to_write)
-
-
-@pytest.fixture
-def synthetic(tmp_path: Path) -> Synthetic:
-    """An empty store to fill."""
-    return Synthetic(tmp_path / "store")

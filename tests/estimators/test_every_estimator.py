@@ -3,7 +3,7 @@ checked. The conformance checks hold the same on mild problems; here problems ar
 
 import numpy as np
 import pytest
-from small_models import Bent
+from shared.small_models import Bent
 
 from ipe_bench import baselines, solvers
 from ipe_bench.baselines import (

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from small_models import Bent, Written
+from shared.small_models import Bent, Written
 
 import ipe_bench as ib
 from ipe_bench.basics.linalg import Array, Covariance

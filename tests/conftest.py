@@ -1,8 +1,11 @@
-"""Commands in this process."""
+"""What tests of several rooms begin with: commands in this process, an empty store, a browser."""
 
 import sys
+from pathlib import Path
 
 import pytest
+from shared.chromium import browser  # noqa: F401
+from shared.synthetic_store import Synthetic
 
 from ipe_bench.cli.main import main
 from ipe_bench.plugins import discovery
@@ -26,3 +29,9 @@ def ipe_bench(monkeypatch, capsys, tmp_path):
 
     yield run
     discovery.sources.cache_clear()
+
+
+@pytest.fixture
+def synthetic(tmp_path: Path) -> Synthetic:
+    """An empty store to fill."""
+    return Synthetic(tmp_path / "store")

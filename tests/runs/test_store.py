@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from small_models import Bent
-from synthetic_store import Synthetic
+from shared.small_models import Bent
+from shared.synthetic_store import Synthetic
 
 from ipe_bench import Scenario, report
 from ipe_bench.baselines import LinearLSE

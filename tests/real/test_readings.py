@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-from small_models import Bent
+from shared.small_models import Bent
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Bearings, Gins, Ranging

@@ -1,0 +1,45 @@
+"""The inertial system whose drifts walk: against GINS where they stand still, and by how far they walk."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+import ipe_bench as ib
+from ipe_bench.measurements import Gins
+from ipe_bench.states import ekf
+from ipe_bench.trials.tracking import Tracking
+
+sys.path.append(str(Path(__file__).parents[1]))
+from walking_gins import WalkingGins
+
+
+def test_the_inertial_system_with_drifts_that_stand_still_reads_what_gins_does():
+    """Four Runge-Kutta steps of 45 s leave 2e-4 m/s of 450 m/s at error scale 10."""
+    model = WalkingGins(walk=0.0, error_scale=10.0)
+    p = 10.0 * np.random.default_rng(0).standard_normal((3, 11))
+    x, z = np.hstack([np.zeros((3, 11)), p]), []
+    for k in range(model.epochs):
+        x = model.transition(x, k)
+        z.append(model.observe(x, k))
+    np.testing.assert_allclose(np.stack(z, axis=1).reshape(3, -1), model.gins.simulate(p), atol=5e-4)
+
+
+def test_drifts_walk_as_fast_as_is_said_and_nothing_else_does():
+    model = replace(WalkingGins(walk=0.5), gins=Gins(readings_per_case=5))
+    paths = model.draw(0, 300)
+    moved = paths.x[:, -1, 11:] - paths.start[:, 11:]
+    hours = model.times[-1] / 3600.0
+    np.testing.assert_allclose(moved[:, 4:7].std(axis=0), 0.5 * np.sqrt(hours), rtol=0.15)
+    assert np.abs(np.delete(moved, [4, 5, 6], axis=1)).max() == 0.0
+
+
+def test_a_singular_covariance_has_neither_nees_nor_posterior_bound():
+    table = ib.run(Tracking(WalkingGins(gins=Gins(readings_per_case=2))), {"ekf": ekf()}, 8)
+    (found,) = table[table["parameter"] == "all"].to_dict("records")
+    assert np.isnan(found["path_nees"])
+    assert np.isnan(found["nees"])
+    assert np.isnan(found["van_trees"])
+    assert found["path_verdict"] == "-"
+    assert found["path_rmse"] > 0
