@@ -56,23 +56,29 @@ _GONE = {"keys": "`ipe-bench run --help` explains every key of a run"}
 def list_command(names: Sequence[str], verbose: bool) -> int:
     """One line per option of each group, with all that it may be told if `verbose`; of an option, GROUP/NAME, that."""
     print_problems(plugins.take_problems())
-    known = plugins.groups()
-    for name in names or known:
+    known = [*plugins.groups(), *({"statistic", "figure"} - set(plugins.groups()))]
+    for name in names or plugins.groups():
         group, slash, option = name.partition("/")
         if group not in known:
             homes = " or ".join(f"{o.group}/{o.name}" for o in plugins.options() if o.name == name)
             remedy = f"write {homes}" if homes else unknown(group, known, "group")
             raise UserError(f"{name}: {_GONE.get(name, remedy)}")
-        options = {o.name: o for o in plugins.options(group)}
-        if slash and option not in options:
-            raise UserError(f"{name}: {unknown(option, options, 'option')}")
+        options, ours = {o.name: o for o in plugins.options(group)}, _ours(group)
+        if slash and option not in {**options, **ours}:
+            raise UserError(f"{name}: {unknown(option, [*options, *ours], 'option')}")
+        if slash and option in ours:
+            say(f"{name}  {ours[option]}")
+            continue
         if slash:
             _describe(options[option])
             continue
         columns = {
-            "option": list(options),
-            "what it is": [o.summary for o in options.values()],
-            "from": [o.source.origin for o in options.values()],
+            "option": [*ours, *options],
+            "what it is": [
+                *(text.partition(". ")[0] for text in ours.values()),
+                *(o.summary for o in options.values()),
+            ],
+            "from": [*["ipe-bench"] * len(ours), *(o.source.origin for o in options.values())],
         }
         _show(group, columns)
         print()
@@ -82,6 +88,19 @@ def list_command(names: Sequence[str], verbose: bool) -> int:
             except UserError as error:
                 print_problems([str(error)])
     return 0
+
+
+def _ours(group: str) -> dict[str, str]:
+    """Statistics and figures that come with the bench, which are no options, with what they are."""
+    if group == "statistic":
+        from ipe_bench.statistics.records import SCORES, STATISTICS
+
+        return {one.name: one.definition for one in (*STATISTICS, *SCORES)}
+    if group == "figure":
+        from ipe_bench.report.figures import NAMES
+
+        return NAMES
+    return {}
 
 
 def _show(title: str, columns: Mapping[str, Sequence[str]]) -> None:

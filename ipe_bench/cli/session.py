@@ -235,11 +235,16 @@ def explain(error: BaseException) -> UserError:
     return UserError(f"{full_key.group(1) + ': ' if full_key else ''}{' '.join(kept) or describe_exception(error)}")
 
 
+_EXTRAS = ("joblib", "submitit", "optuna")
+"""Launchers and sweepers that are extras of our own distribution."""
+
+
 def _no_such_option(name: str) -> str:
     group, _, option = name.rpartition("/") if name.startswith("hydra/") else name.partition("/")
     if group in ("hydra/launcher", "hydra/sweeper"):
-        kind = group.partition("/")[2]
-        return f"{group}={option}: this {kind} is not installed; pip install hydra-{option}-{kind}, or choose basic"
+        kind, first = group.partition("/")[2], option.partition("_")[0]  # submitit_local is submitit's
+        package = f'"ipe-bench[{first}]"' if first in _EXTRAS else f"hydra-{first}-{kind}"
+        return f"{group}={option}: this {kind} is not installed; pip install {package}, or choose basic"
     return f"{group}={option}: {unknown(option, [o.name for o in plugins.options(group)], 'option')}"
 
 

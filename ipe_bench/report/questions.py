@@ -33,6 +33,9 @@ HONEST = 0.1
 ALIKE = 0.05
 """Energy distance up to which draws may come from one law: of Gaussians in few dimensions, some tenths of a nat."""
 _MOST_SUSPECTS = 12
+_TITLES = {"error": "mean length", "cost": "mean cost", "time": "median time"}
+"""What the quantities of a comparison are called, as the table of a run has other statistics of error and cost."""
+_MOST_EVIDENCE = 1000
 _UNSEEN = 0.05
 """Share of trials below which an error goes unnoticed by any test of residuals."""
 
@@ -221,10 +224,11 @@ def comparison_parts(frame: pd.DataFrame, alpha: float) -> Iterator[Part]:
         needed = [_needed(row) for row in rows if row.get("power", math.nan) > 0]
         yield Table("comparison", title, "", columns, notes=needed)
     yield (
-        "error is the mean Mahalanobis error, where a trial counts as at most the radius of the gate of success; cost"
-        " counts simulations. p comes from McNemar's exact test for success and from random signs for ratios, with"
-        " Holm's correction over all rows. e is evidence that may be looked at repeatedly; e = 20 is as rare as p ="
-        " 0.05. Each interval is that of its row alone. Times are not tested."
+        "length is that of the error in standard deviations of the bound (Mahalanobis), where a trial counts as at most"
+        " the radius of the gate of success; cost counts simulations. Both are means over the common trials, where the"
+        " table of a run has medians, and errors over the bound. p comes from McNemar's exact test for success and from"
+        " random signs for ratios, with Holm's correction over all rows. e is evidence that may be looked at"
+        " repeatedly; e = 20 is as rare as p = 0.05. Each interval is that of its row alone. Times are not tested."
     )
     if (frame["matched_by"] == "order").any():
         yield "Without common trials nothing is gained from pairing: the intervals are wider."
@@ -259,10 +263,10 @@ def _cells(row: dict[str, Any]) -> tuple[str, ...]:
         change, ends = _ratio(row["change"]), f"{_ratio(row['low'])} to {_ratio(row['high'])}"
     p, e = row["p"], row["e"]
     return (
-        *(quantity, show(row["first_value"]), show(row["second_value"]), change),
+        *(_TITLES.get(quantity, quantity), show(row["first_value"]), show(row["second_value"]), change),
         ends if math.isfinite(row["low"]) else "-",
         p_value(p) if math.isfinite(p) else "",
-        compact(e) if math.isfinite(e) else "",
+        (compact(e) if e <= _MOST_EVIDENCE else f">{_MOST_EVIDENCE}") if math.isfinite(e) else "",
         row["finding"] or ("-" if quantity != "time" else ""),
     )
 

@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+from importlib.metadata import distributions
 from pathlib import Path
 
 import pandas as pd
@@ -15,6 +16,7 @@ import ipe_bench as ib
 from ipe_bench.cli.main import COMMANDS, main
 from ipe_bench.cli.spec import KEYS
 from ipe_bench.report import figures
+from ipe_bench.statistics.records import SCORES, STATISTICS
 
 ROOT = Path(__file__).parents[2]
 
@@ -379,3 +381,24 @@ def test_a_model_that_brings_its_own_certified_readings_has_a_table(ipe_bench):
     assert code == 0
     assert "gauss_newton" in out
     assert "nothing is stored" not in out
+
+
+def test_the_list_names_our_statistics_and_figures_too(capsys):
+    """Also where no plugin adds any; without a name they are left out, since they are no options."""
+    for group, names in (("statistic", [one.name for one in (*STATISTICS, *SCORES)]), ("figure", list(figures.NAMES))):
+        assert main(["list", group]) == 0
+        assert set(names) <= set(capsys.readouterr().out.split())
+    assert main(["list", "statistic/success"]) == 0
+    assert "Clopper and Pearson" in capsys.readouterr().out
+    assert main(["list"]) == 0
+    assert "error_median" not in capsys.readouterr().out.split()
+
+
+@pytest.mark.parametrize(
+    ("launcher", "package"), [("submitit_local", '"ipe-bench[submitit]"'), ("rq", "hydra-rq-launcher")]
+)
+def test_a_launcher_that_is_missing_is_installed_under_the_name_that_it_has(launcher, package, capsys):
+    if any(file.name == f"{launcher}.yaml" for found in distributions() for file in found.files or ()):
+        pytest.skip(f"{launcher} is installed")
+    assert main(["run", "-m", f"hydra/launcher={launcher}", "error_scale=1,2"]) == 2
+    assert f"is not installed; pip install {package}, or choose basic" in capsys.readouterr().err

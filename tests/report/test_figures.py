@@ -319,3 +319,12 @@ def test_nothing_is_clipped_on_the_page_or_in_print(synthetic, width):
                 fig = drawing.figure
                 assert width is None or fig.get_figwidth() == width
                 assert not overlaps(fig), drawing.name
+
+
+def test_every_figure_has_a_name_that_the_list_gives(synthetic):
+    """Those of the paper's setting have the paper's numbers, of which the list speaks."""
+    fill(synthetic)
+    with house_style():
+        drawn = {drawing.name for drawing in figures.drawings(analyse([synthetic.directory]))}
+    assert len(drawn) >= 4
+    assert all(name.startswith(tuple(figures.NAMES)) for name in drawn)

@@ -19,6 +19,17 @@ from ipe_bench.statistics.analysis import Analysis
 
 FIGURES = ("errors", "costs", "parameters")
 """The modules in the order of the report; each holds its kinds of figures in FIGURES."""
+NAMES = {
+    "headline": "success, error and reported covariance of all trials",
+    "distributions": "distribution functions of the error, a panel per error scale",
+    "calibration": "distribution of NEES beside that of an honest covariance",
+    "cost_against_accuracy": "median cost against the error that 95 % of trials stay below",
+    "convergence": "how iterates approach their limit, a panel per estimator",
+    "data_profile": "share of problems of known minimum solved within a budget",
+    "parameter_errors": "root mean square error of each parameter and its bound; figure_2 and 3 of the paper's setting",
+    "tracks": "error of each state at each epoch beside its bounds, and NEES",
+}
+"""What our figures are called and show; the names of files go on with the setting."""
 INDEX = "index.json"
 
 
