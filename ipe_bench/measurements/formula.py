@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -15,6 +16,11 @@ from ipe_bench.basics.options import Count, Finite
 from ipe_bench.measurements.arithmetic import never_switching, read
 from ipe_bench.measurements.base import Input, Measurement, Parameter
 from ipe_bench.measurements.ode.trace import Graph, Program, tangent
+
+_FARTHER = (0.3, -0.3, 1.0, -1.0)
+"""Changes of a parameter without a slope, in multiples of its magnitude, at which readings are looked at again."""
+_FARTHER_BY = 1e-12
+"""Of the largest reading: what rounding errors may change."""
 
 
 class WrittenModel(Measurement):
@@ -75,6 +81,22 @@ class WrittenModel(Measurement):
     def absent_input(self, heading: str, columns: Sequence[str]) -> str:
         remedy = f"If {heading} is a parameter, give it a start: measurement.start.{heading}=VALUE"
         return f"there are {', '.join(columns)}{did_you_mean(heading, columns) or '.'} {remedy}"
+
+    def flat(self, x: Array) -> tuple[str, ...]:
+        """That readings are constant in pieces at x (n,): some parameters have no slope there, yet change readings."""
+        x = x[None, : self.n]
+        z, still = self.simulate(x), np.flatnonzero((self.jacobian(x)[0] == 0.0).all(axis=0))
+        names = []
+        for i in still:
+            steps = np.outer(_FARTHER, np.eye(self.n)[i]) * np.maximum(1.0, np.abs(x))
+            with contextlib.suppress(UserError):  # where a function cannot be called
+                moved = np.nan_to_num(np.abs(self.simulate(x + steps) - z))
+                names += [self.parameters[i].name] if (moved > _FARTHER_BY * np.abs(z).max(initial=0.0)).any() else []
+        if not names:
+            return ()
+        found = f"readings do not change with small changes of {', '.join(names)}, but with larger ones"
+        why = "they are constant in pieces, as by floor, round, sign or a comparison, where every slope is 0"
+        return (f"{found}: {why}, and no estimator that follows slopes moves from there; blend the pieces, as by tanh",)
 
     def require_columns_and_parameters(self, *keys: str) -> None:
         """Refuses columns of different lengths, and names in the options `keys` that are no parameters."""
@@ -167,10 +189,10 @@ class Formula(WrittenModel):
         return [p[name] if name in p else self.column(name)[None] for name in self.arithmetic.names]
 
     def remarks(self, x: Array) -> tuple[str, ...]:
-        """Which conditionals never switch at x."""
+        """Which conditionals never switch at x, or else which parameters have no slope there."""
         values = dict(zip(self.arithmetic.names, (value[0] for value in self._values(x[None, : self.n])), strict=True))
         with np.errstate(all="ignore"):
-            return tuple(never_switching([self.arithmetic], values))
+            return tuple(never_switching([self.arithmetic], values)) or self.flat(x)
 
     def simulate(self, x: Array) -> Array:
         with np.errstate(all="ignore"):

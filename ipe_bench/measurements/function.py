@@ -227,6 +227,9 @@ class Function(WrittenModel):
             warnings.simplefilter("ignore", np.exceptions.ComplexWarning)
             return differentiate(self._rows, x, analytic=True)
 
+    def remarks(self, x: Array) -> tuple[str, ...]:
+        return self.flat(x)
+
     def simulate(self, x: Array) -> Array:
         return self._rows(x) if self._jax is None else self._jax[0](x)
 

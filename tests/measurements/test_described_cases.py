@@ -179,3 +179,10 @@ def test_the_column_of_the_readings_has_the_name_that_is_stated(tmp_path):
     assert open_together([path], replace(decay, reading="conc")).z.tolist() == [0.9, 0.8, 0.73]
     with pytest.raises(UserError, match="conc: is a column of every readings file"):
         Ode({"y": "-k*y*conc"}, {"k": 0.1}, {"y": 1.0}, reading="conc")
+
+
+@pytest.mark.parametrize(("shown", "named"), [("y if t < q else 0", "q"), ("floor(4*y)+q", "k"), ("max(y,0.4)+q", "")])
+def test_parameters_of_which_outputs_are_constant_in_pieces_are_named(shown, named):
+    model = Ode({"y": "-k*y"}, {"k": 0.5, "q": 3.3}, {"y": "1"}, {"z": shown}, (1.0, 2.0, 3.0, 4.0))
+    said = [text.partition(", but")[0] for text in model.remarks(model.nominal)]
+    assert said == ([f"readings do not change with small changes of {named}"] if named else [])

@@ -254,3 +254,22 @@ def test_python_takes_what_is_known_of_parameters_and_has_estimates_by_name():
     assert found.values == {"a": pytest.approx(2.0, rel=1e-6)}
     with pytest.raises(UserError, match=r"parameters.k.fixd"):
         ib.estimate(model, z, lm, parameters={"k": {"fixd": 0.5}})
+
+
+def test_parameters_of_which_readings_are_constant_in_pieces_are_named():
+    columns = {"t": tuple(np.linspace(0.0, 4.0, 9))}
+    for expression, named in {
+        "floor(a*t)+b*t": "a",
+        "sign(a-t)+b": "a",
+        "b*t+floor(a)*floor(b)": "a",
+        "floor(a*b*t)": "a, b",
+        "b*t if t < a else 0": "a",
+        "floor(a*t)+a*t+b": None,
+        "b*abs(a)+a*t": None,
+        "b*exp(-a*t)": None,
+    }.items():
+        model = Formula(expression, {"a": 2.3, "b": 1.5}, columns)
+        said = model.remarks(model.nominal)
+        assert [text.partition(", but")[0] for text in said] == (
+            [f"readings do not change with small changes of {named}"] if named else []
+        )

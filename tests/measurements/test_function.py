@@ -51,6 +51,9 @@ def high_by_array(t, height=2.0, centre=1.5, width=0.5, base=0.3):
 def faint(t, height=2e-6, base=0.0):
     return base + np.exp(-t) * (height if height.real < 2.5e-6 else np.abs(height))
 
+def rounded(t, a=2.3, b=1.5):
+    return np.round(a * t) + b * t
+
 def two_columns(t, k=1.0):
     return np.outer(t, [k, k])
 
@@ -275,3 +278,9 @@ def test_a_new_model_of_one_file_runs_as_it_stands(laws, capsys, kind, file, cho
     noise = ["noise=gaussian", "noise.deviation=0.01"]
     assert main(["run", *choice, *noise, "error_scale=0.1", "trials=5", "figures=none", "execution=serial"]) == 0
     sys.modules.pop("decay", None)
+
+
+def test_parameters_of_which_readings_are_constant_in_pieces_are_named(laws):
+    (said,) = model("rounded").remarks(model("rounded").nominal)
+    assert said.startswith("readings do not change with small changes of a, but with larger ones")
+    assert model("swing").remarks(model("swing").nominal) == ()

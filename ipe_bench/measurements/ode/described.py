@@ -268,6 +268,9 @@ class Ode(WrittenModel, WrappedModel):
             known = engine.along(x)
             found += never_switching(rates, known | {"t": driven.middles(engine.times)[None, :-1]})
             found += never_switching(outputs, known)
+        stepping = (*COMPARISONS, "floor", "sign", "mod")
+        if not found and any(part[0] in stepping for one in (*rates, *outputs) for part in parts(one.tree)):
+            found += self.flat(x)
         return tuple(found)
 
     def absent_input(self, heading: str, columns: Sequence[str]) -> str:
@@ -426,8 +429,10 @@ class _Engine(OdeMeasurement):
 
     def along(self, x: Array) -> dict[str, Any]:
         """What the names in the formulas stand for at x (n,), at the times of each case: (cases, times)."""
-        shown = replace(self.described, outputs={}, exact={}, answer={}).engine
-        y = shown.simulate(x[None]).reshape(len(self.cases), len(self.times), self.states)
+        shown = {y: y for y in self.described.rates}
+        shown |= {f"output {k}": formula for k, formula in enumerate(self.described.outputs.values())}
+        engine = replace(self.described, outputs=shown, exact={}, answer={}).engine
+        y = engine.simulate(x[None]).reshape(len(self.cases), len(self.times), -1)[:, :, : self.states]
         return self.at_times(list(np.moveaxis(y, 2, 0)), list(x[: self.n] * self.si_sizes))
 
     def at_times(self, y: Sequence[Any], p: Sequence[float]) -> dict[str, Any]:
