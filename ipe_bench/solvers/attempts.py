@@ -25,6 +25,8 @@ Rows = NDArray[np.intp]
 
 _LONG = 600
 """Iterations of an attempt from the nominal point, and of one from elsewhere that promises something."""
+_PROMISING = 1e-3
+"""The share by which a fit that has not converged must be better than the best one so far to promise something."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,10 @@ class Attempts(ABC):
     planned: ClassVar[int]
     """The number of attempts."""
     repeats: ClassVar[int] = 1
-    """How many attempts from independent draws must lead to a minimum again for it to be believed."""
+    """How many attempts must lead to a minimum again for it to be believed, one of them at least from independent
+    draws."""
+    most: ClassVar[float] = np.inf
+    """What a search that has tried draws may cost, times the cost of a simulation and a Jacobian."""
 
     @property
     def last(self) -> int:
@@ -113,12 +118,11 @@ _APART = 0.6
 """Two starts on one ray are different where their sizes are, by this power of ten."""
 _LOOKS = 20
 """Random points of which the best is a start."""
-_PROMISING = 1e-3
 _RANDOM = 4
 """The first attempt from a random start."""
 _HALVING = (6, 13, 14, 15)
 """The attempts that begin from several random starts."""
-_HALVINGS = ((5, 5), (15, 2), (_LONG, 1))
+_HALVINGS = ((5, 5), (15, 2), (_SHORT, 1))
 """Steps from each of these starts, and how many of them are kept."""
 
 
@@ -129,6 +133,7 @@ class Stages(Attempts):
 
     planned = 16
     repeats = 3
+    most = 1400.0
 
     def draws(self, k: int) -> int:
         return _LOOKS if k >= _RANDOM else 0
@@ -136,10 +141,11 @@ class Stages(Attempts):
     def attempt(self, k: int, rows: Rows, before: Minima | None) -> Minima:
         if k < 2:
             return self.plain(k, rows)
-        if k in _HALVING:
-            return self._halved(k, rows)
         assert before is not None
-        found = self.minimize(rows, _FROM_AFAR, self._start(k, rows), max(_SHORT, self.limits.max_iterations))
+        if k in _HALVING:
+            found = self._halved(k, rows)
+        else:
+            found = self.minimize(rows, _FROM_AFAR, self._start(k, rows), max(_SHORT, self.limits.max_iterations))
         promising = ~found.converged & (found.chi_square < before.chi_square * (1 - _PROMISING))
         if promising.any():
             first = take(found, promising)

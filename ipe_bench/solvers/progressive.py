@@ -43,8 +43,8 @@ class Progressive(Estimator):
     residuals is large too, is tried again: carefully from the nominal point (windows that grow slowly, damping by the
     residual, steps bent along the curvature), by Levenberg-Marquardt on all data, and from 16, 32, ... draws of the
     prior, which the first windows keep apart and the later ones thin out to those that fit best. The best fit counts.
-    A minimum that independent draws lead to again ends the search; so does 20 times the cost of the first fit, once
-    draws were tried. The message of such a trial says how far the search went.
+    A minimum that other attempts lead to again, some from independent draws, ends the search; so does 20 times the cost
+    of the first fit, once draws were tried. The message of such a trial says how far the search went.
 
     Sources: the incremental single shooting of Michalik, Hannemann and Marquardt (Comput. Chem. Eng. 33, 2009); with a
     prior, the recursive iterative batch smoother of Stepanov et al. (Sensors 25, 2025); data-tempered Monte Carlo
@@ -95,15 +95,16 @@ class Progressive(Estimator):
         if before is not None:
             worse = before.converged & ~best.better_than(before)
             best = put(best, worse, take(before, worse))
-        # Of each trial: attempts after the first one, independent draws among their starts, attempts from draws that
-        # have led to the best minimum again, and the cost of the first fit.
-        tried, drawn, repeats = np.zeros((3, len(z)), np.int64)
+        # Of each trial: attempts after the first one, independent draws among their starts, attempts that have led to
+        # the best minimum again, those of them from draws, and the cost of the first fit.
+        tried, drawn, repeats, independent = np.zeros((4, len(z)), np.int64)
         first = np.full(len(z), np.inf)
         for k in range(1, attempts.last + 1):
             cost, draws = tally.cost(n), attempts.draws(k)
             first = np.where(best.converged, np.minimum(first, cost), np.inf)
             going = ~accepted(best, m, level) & finite(z) & ~tally.failed(everyone)
-            going &= ((cost < _WORTH * first) | (drawn == 0)) & (repeats < attempts.repeats)
+            going &= (cost < np.minimum(_WORTH * first, attempts.most * (1 + n))) | (drawn == 0)
+            going &= (repeats < attempts.repeats) | (independent == 0)
             going &= self.budget is None or cost < self.budget
             rows = np.flatnonzero(going)
             if not len(rows):
@@ -113,7 +114,8 @@ class Progressive(Estimator):
             better, same = again.better_than(known), _same(again, known)
             tried[rows] += 1
             drawn[rows] += draws
-            repeats[rows] = np.where(better & ~same, 0, repeats[rows] + (same & (draws > 0)))
+            for count, led in ((repeats, same), (independent, same & (draws > 0))):
+                count[rows] = np.where(better & ~same, 0, count[rows] + led)
             best = put(best, rows[better], take(again, better))
         raised = tally.failed(everyone) & ~best.converged
         for i in np.flatnonzero(best.converged & ~accepted(best, m, level) & (tried > 0)).tolist():

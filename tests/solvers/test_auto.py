@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 
 from ipe_bench.baselines import GaussNewton, LevenbergMarquardt
 from ipe_bench.basics.linalg import Covariance, deviations
+from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements import Bearings, Formula, Gins, LotkaVolterra, Mgh, Polynomial, Ranging, Sir, Triad
 from ipe_bench.measurements.mgh import score
 from ipe_bench.measurements.problem import Problem
@@ -230,6 +231,41 @@ def test_noise_that_is_understated_is_no_reason_for_a_long_search(model, true, t
     for i in range(4):
         assert "independent draws" in found.messages[i]
         assert "this minimum again" in found.messages[i]
+
+
+UNDERSTATED = {
+    "decay": ("a*exp(-b*t)+c", (5.0, 0.1, 1.0), (8.0, 0.5, 2.0), 0.1),
+    "two decays": ("a*exp(-b*t)+c*exp(-d*t)", (5.0, 1.0, 1.0, 0.2), (8.0, 1.5, 2.0, 0.15), 0.05),
+    "saturation": ("a*(1-exp(-b*t))", (20.0, 0.02), (9.0, 0.2), 0.1),
+    "growth": ("a*exp(-b*exp(-c*t))", (10.0, 2.0, 0.1), (20.0, 5.0, 0.4), 0.4),
+    "weibull": ("a-b*exp(-c*t**d)", (9.0, 8.0, 0.1, 1.5), (7.0, 6.0, 0.02, 2.4), 0.1),
+}
+
+
+@pytest.mark.parametrize("noise", [Gaussian(1.0), Unknown()], ids=["understated", "unknown"])
+@pytest.mark.parametrize("name", UNDERSTATED)
+def test_a_search_ends_where_restarts_land_on_one_point(name, noise):
+    """Of noise stated ten times too small, nothing ever fits."""
+    expression, start, true, deviation = UNDERSTATED[name]
+    t = np.linspace(0.2, 10, 25)
+    there = Formula(expression, dict(zip("abcd", true, strict=False)), {"t": t.tolist()})
+    z = there.simulate(there.nominal[None])[0] + deviation * np.random.default_rng(3).standard_normal(25)
+    noise = noise if noise.estimated else Gaussian(deviation / 10)
+    best = fits(there, z, noise, LevenbergMarquardt(max_iterations=500))
+    found = fits(Formula(expression, dict(zip("abcd", start, strict=False)), {"t": t.tolist()}), z, noise, Auto())
+    assert found.x == pytest.approx(best.x, rel=1e-3)
+    assert found.simulations < 2000
+    assert "this minimum again" in found.message
+
+
+def test_a_search_without_an_answer_ends():
+    """A sigmoid has no best fit to a growth without end: its ceiling and its middle leave for infinity."""
+    t = np.linspace(0.2, 8, 20)
+    z = np.exp(0.4 * t) + 0.05 * np.random.default_rng(5).standard_normal(20)
+    model = Formula("a/(1+exp(b-c*t))", {"a": 10.0, "b": 2.0, "c": 0.5}, {"t": t.tolist()})
+    found = fits(model, z, Gaussian(0.005), Auto())
+    assert found.status != Status.CONVERGED
+    assert found.simulations < 10_000
 
 
 def test_what_fits_is_not_looked_for_again():
