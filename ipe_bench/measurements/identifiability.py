@@ -89,6 +89,8 @@ class _Free(dict[Any, int]):
 
     def power(self, base: int, exponent: int) -> int:
         """Exponents one apart, such as those of a power and its derivative, have powers that the base divides."""
+        if exponent == 0:
+            return 1
         for apart in (1, -1):
             other = ("pow", base, (exponent + apart) % self.prime)
             if other in self:
@@ -164,6 +166,10 @@ class _Series(dict[int, list[int]]):
             case "mul":
                 return _product(a, b, k)
             case "div":
+                if e.operands[1].operation == "sqrt" and e.operands[0].value == 0.5:
+                    # The derivative of u = sqrt(v) as u / (2 v), since a random number u is no root of v.
+                    a = [_product(a, b, i) for i in range(k + 1)]
+                    b = self[e.operands[1].operands[0].order]
                 return (a[k] - _product(b[1:], u, k - 1)) * self._inverse(b[0])
             case "exp":
                 return _product(_derivative(a), u, k - 1) * pow(k, -1, self.p) if k else self.free["exp", a[0]]

@@ -104,6 +104,12 @@ def test_what_is_fixed_is_known():
         ("a*exp(-b*t)+c", set()),
         ("a*t**n", set()),
         ("sqrt(a*b)*t", {"a", "b"}),
+        ("a*sqrt(b*t)+c", {"a", "b"}),
+        ("a*(b*t)**0.5+c", {"a", "b"}),
+        ("a*sqrt(b+t)+c", set()),
+        ("a/sqrt(b*t)+c", {"a", "b"}),
+        ("a+b*t**0", {"a", "b"}),
+        ("a+b*t**0+c*t", {"a", "b"}),
         ("c*a**2.5*t + c*a*a**1.5*t**2", {"a", "c"}),
     ],
 )
