@@ -5,7 +5,7 @@ import pytest
 
 import ipe_bench as ib
 from ipe_bench.basics.errors import UserError
-from ipe_bench.noise import Colored, Correlated, Gaussian, NoNoise, Outliers, Quantization, StudentT
+from ipe_bench.noise import Colored, Correlated, Gaussian, NoNoise, Outliers, Quantization, StudentT, Unknown
 
 TRIALS = 4000
 
@@ -162,3 +162,11 @@ def test_estimate_asks_for_a_deviation_that_nobody_has_stated(tmp_path):
     model = ib.measurements.Formula("a*t", {"a": 1.0})
     with pytest.raises(UserError, match=r"noise.deviation: is not given for noise=gaussian"):
         ib.estimate(model, tmp_path / "z.csv", noise=ib.noise.Gaussian())
+
+
+def test_noise_with_true_levels_grows_with_the_reading_as_its_formula_says():
+    """With the reading itself, in whatever place the read-out begins."""
+    h = np.array([0.0, 1.0, -10.0, 100.0])
+    for offset in (np.zeros(4), np.array([50.0, 0.0, 7.0, -100.0])):
+        v = errors(Unknown(sigma="a + b*h", levels=(0.1, 0.02)), h=h, offset=offset)
+        assert v.std(axis=0) == pytest.approx(0.1 + 0.02 * np.abs(h), rel=5 / np.sqrt(2 * TRIALS))

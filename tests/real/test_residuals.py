@@ -6,7 +6,7 @@ from scipy.stats import binom, chi2, kstest, norm
 
 from ipe_bench.basics.linalg import Covariance
 from ipe_bench.real.residuals import DRAWS, explained, normalised, outlier_limit, whiteness
-from ipe_bench.trials.whiteness import ljung_box
+from ipe_bench.trials.whiteness import ljung_box, white_p
 
 M, N = 60, 5
 # Smooth columns take low frequencies out of the residuals, which a test with chi-square limits would call coloured.
@@ -148,3 +148,13 @@ def test_the_statistic_of_whiteness_is_ljung_and_boxs():
     Q = n * (n + 2) * sum(one**2 / (n - k) for k, one in enumerate(r, 1))
     found, lags = ljung_box(e[None, None])
     assert (found[0], lags[0]) == (pytest.approx(Q, rel=1e-12), 10)
+
+
+def test_a_lag_without_two_readings_is_no_degree_of_freedom():
+    """With every other reading missing, five of ten lags are left: those of the readings that are present."""
+    e = np.random.default_rng(5).standard_normal((20, 1, 30))
+    apart = np.full((20, 1, 60), np.nan)
+    apart[:, :, ::2] = e
+    assert ljung_box(apart)[1].tolist() == [5.0] * 20
+    Q = [30 * 32 * sum((s[k:] @ s[:-k] / (s @ s)) ** 2 / (30 - k) for k in range(1, 6)) for s in e[:, 0]]
+    assert white_p(apart) == pytest.approx(chi2.sf(Q, 5), rel=1e-10)
