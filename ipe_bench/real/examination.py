@@ -38,6 +38,10 @@ _FEWEST = 4
 """The least number of draws or starts."""
 _SAME = 1e-2
 """Minima closer than this, in standard errors of either, are one."""
+_LOWER = 1e-6
+"""Sums of squares that differ by less than this share, or number, are those of one minimum."""
+_SAME_READINGS = 1e-4
+"""Answers whose readings differ by less than this, in standard deviations, are of one curve."""
 _BENT = 0.1
 """Share of the half-width by which the ends of a bent profile differ from those of the standard error."""
 
@@ -51,6 +55,8 @@ class Minimum:
     chi_square: float
     as_good: bool
     """Whether the readings do not tell it from the least one: their joint confidence region holds it."""
+    same_readings: bool = False
+    """Whether its readings are those of the estimate, so that no readings at all tell it from that."""
 
 
 @dataclass(frozen=True)
@@ -135,8 +141,15 @@ class Examination:
 
     @cached_property
     def wald(self) -> tuple[Array, Array]:
-        """The intervals (n,), (n,) from the standard errors."""
-        return wald_interval(self.model, self.inner, np.sqrt(np.diag(self.P)), half_width(CONFIDENCE, self.freedom))
+        """The intervals (n,), (n,) from the standard errors; NaN for levels of the noise."""
+        q = half_width(CONFIDENCE, self.freedom)
+        return self._without_levels(*wald_interval(self.model, self.inner, np.sqrt(np.diag(self.P)), q))
+
+    def _without_levels(self, low: Array, high: Array) -> tuple[Array, Array]:
+        """Intervals (n,), (n,) without those of levels of the noise: only a profile holds a level as often as it
+        says."""
+        levels = np.arange(len(low)) >= self._mean.n
+        return np.where(levels, np.nan, low), np.where(levels, np.nan, high)
 
     @cached_property
     def profiles(self) -> tuple[Array, Array]:
@@ -152,7 +165,7 @@ class Examination:
         (low, high), (low_wald, high_wald) = self.profiles, self.wald
         with np.errstate(invalid="ignore"):
             apart = np.maximum(np.abs(low - low_wald), np.abs(high - high_wald))
-            return ~(apart <= _BENT * (high_wald - low_wald) / 2)
+            return ~(apart <= _BENT * (high_wald - low_wald) / 2) & (np.arange(len(low)) < self._mean.n)
 
     @cached_property
     def fitted(self) -> Array:
@@ -207,7 +220,7 @@ class Examination:
             unknown = np.full(len(self.x), np.nan)
             return Bootstrap(unknown, unknown, len(values), draws)
         tail = (1 - CONFIDENCE) / 2
-        low, high = np.quantile(values, [tail, 1 - tail], axis=0)
+        low, high = self._without_levels(*np.quantile(values, [tail, 1 - tail], axis=0))
         return Bootstrap(low, high, len(values), draws)
 
     def _affordable(self, wanted: int) -> int:
@@ -234,13 +247,16 @@ class Examination:
             chi_square = float(minima.chi_square[i])
             least = found[0].chi_square if found else chi_square
             places.append((x, deviation))
-            found.append(Minimum(self.model.physical(x[None])[0], chi_square, chi_square - least <= limit))
+            with np.errstate(all="ignore"):
+                moved = self._mean.simulate(x[None, : self._mean.n])[0] - self._present
+            same = bool((np.abs(self.problem.R.whiten(moved)) < _SAME_READINGS).all())
+            found.append(Minimum(self.model.physical(x[None])[0], chi_square, chi_square - least <= limit, same))
         return found or [Minimum(self.x, self.chi_square, True)]
 
     @property
     def least(self) -> bool:
         """Whether the estimate is the least minimum that was found."""
-        return self.chi_square <= self.minima[0].chi_square + 1e-6 * max(1.0, self.chi_square)
+        return self.chi_square <= self.minima[0].chi_square + _LOWER * max(1.0, self.chi_square)
 
     @property
     def ambiguous(self) -> list[Minimum]:
@@ -250,11 +266,16 @@ class Examination:
 
 
 def examine(problem: Problem, z: Array, fits: list[Fit], *, bootstraps: int = BOOTSTRAPS) -> Examination | None:
-    """Examines the least of the minima that estimators without a prior found; None if none of them found one."""
-    told = [one for one in fits if one.status is Status.CONVERGED and np.isfinite(one.chi_square)]
-    best = min((one for one in told if not one.with_prior), key=lambda one: one.deviance, default=None)
+    """Examines the least of the minima that estimators without a prior found, of several that found it the first that
+    passes; None if none of them found one."""
+    told = [
+        one for one in fits if one.status is Status.CONVERGED and np.isfinite(one.chi_square) and not one.with_prior
+    ]
+    best = min(told, key=lambda one: one.deviance, default=None)
     if best is None:
         return None
+    near = best.deviance + _LOWER * max(1.0, abs(best.deviance))
+    best = next((one for one in told if one.passes and one.deviance <= near and _least_squares(one)), best)
     values, rows = best.held_at, np.flatnonzero(np.isfinite(z))
     if values:
         problem = holding(problem, values)
@@ -291,6 +312,10 @@ def examine(problem: Problem, z: Array, fits: list[Fit], *, bootstraps: int = BO
         return found
     outer = Problem(best.model, best.assumed.R)
     return replace(found, released=_released(outer, found, values), on_bounds=tuple(_on_bounds(outer, found, values)))
+
+
+def _least_squares(one: Fit) -> bool:
+    return one.estimator.equation == "least_squares"
 
 
 def _released(problem: Problem, found: Examination, values: Mapping[int, float]) -> Released | None:

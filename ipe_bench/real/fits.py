@@ -225,7 +225,7 @@ class Fit:
     @property
     def fits(self) -> bool | None:
         """Whether the residuals are as small as R says, or as small as they can be; None if neither can be told."""
-        if self.beaten_by:
+        if self.beaten_by or (np.isfinite(self.x).all() and not np.isfinite(self.residual).all()):
             return False
         # The size of the residuals says nothing of the model where it made R, nor without any degrees of freedom.
         return self.p_value >= FIT_LEVEL if self.level is None and self.degrees_of_freedom > 0 else None
@@ -249,14 +249,18 @@ class Fit:
         return dict(zip(names, self.x[len(self.x) - len(names) :].tolist(), strict=True))
 
     def interval(self, confidence: float = 0.95) -> tuple[Array, Array]:
-        """Confidence intervals (n,), (n,) from the standard errors; inside of its bounds if a parameter has some."""
+        """Confidence intervals (n,), (n,) from the standard errors, inside of bounds; NaN for levels of the noise: only
+        profiles hold them as often as they say."""
         freedom = None if self.level is None else self.degrees_of_freedom
         if self.estimated is not None:
             freedom = self.estimated.freedom
         with np.errstate(invalid="ignore"):
             deviation = np.sqrt(np.diagonal(self.inner_covariance))
         low, high = wald_interval(self._free, self.inner, deviation, half_width(confidence, freedom))
-        return self._all(low), self._all(high)
+        low, high = self._all(low), self._all(high)
+        for ends in (low, high):
+            ends[len(ends) - len(self.levels) :] = np.nan
+        return low, high
 
     @property
     def outlier_limit(self) -> float:
@@ -420,12 +424,15 @@ def falls_beyond(
 
 def _fit_inside(given: Given, label: str, estimator: Estimator, problem: Problem) -> Fit:
     estimates, model, n = estimate_safely(estimator, problem, given.z[None]), problem.measurement, problem.measurement.n
-    tally, residual = EvaluationCount.zeros(1), np.full(len(given.z), np.nan)
+    tally, residual, refused = EvaluationCount.zeros(1), np.full(len(given.z), np.nan), ""
     if np.isfinite(estimates.x).all():
         # Far from the truth a model may overflow or refuse: then nothing is known of the residuals.
         with np.errstate(all="ignore"):
             residual = given.z - CountingModel(model, tally).simulate(estimates.x, np.arange(1))[0]
-    refused = f"the residuals are unknown: {tally.messages[0]}" if tally.messages else ""
+            if not np.isfinite(residual).all():
+                refused = "the model has no finite readings at this estimate"
+    if tally.messages:
+        refused = f"the residuals are unknown: {tally.messages[0]}"
     return Fit(
         label=label,
         estimator=estimator,

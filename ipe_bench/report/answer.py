@@ -107,6 +107,8 @@ def contents(answer: Answer) -> Iterator[Part]:
     """The tables and sentences of an answer, in order."""
     found, one = structure(answer.model), answer.examination
     yield from (Strong(f"No data can tell: {sentence}.") for sentence in (found.sentences if found else ()))
+    if lacking := next((f"{'; '.join(f.undetermined)} (at {f.label})" for f in answer.fits if f.undetermined), ""):
+        yield Strong(f"The readings do not determine {lacking}; fix parameters, or give prior, until they do.")
     # Without the parameters that are held on bounds, and the levels.
     model = one.whole.measurement if one else answer.model
     yield from (f"Note: {sentence}." for sentence in model.remarks(one.inner[: model.n] if one else model.nominal))
@@ -190,9 +192,6 @@ def _notes(answer: Answer) -> Iterator[str]:
     for one in fits:
         if one.beaten_by:
             yield f"{one.label}: {one.beaten_by} found a better fit, by more than chance explains; this is no answer."
-        if one.undetermined:
-            lacking = "; ".join(one.undetermined)
-            yield f"{one.label}: the readings do not determine {lacking}; fix parameters, or give prior, until they do."
         if one.held_at:
             at = {one.model.physical_parameters[k].name: value for k, value in one.held_at.items()}
             yield (
@@ -284,7 +283,7 @@ def _intervals(found: Examination) -> Table:
         texts("profile", [_interval(low, high, at) for (low, high), at in zip(ends, middle, strict=True)]),
         texts("bootstrap", [*map(_interval, found.bootstrap.low, found.bootstrap.high, found.x), *absent]),
     ]
-    title = f"{100 * CONFIDENCE:.0f} % intervals of {found.label}, by three ways"
+    title = f"{100 * CONFIDENCE:.0f} % intervals of {found.label}, in three ways"
     return Table("intervals", title, "", columns)
 
 
@@ -311,7 +310,12 @@ def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator
             f"NOT THE GLOBAL MINIMUM: chi-square is {best.chi_square:.5g} at {at(best.x)}; start there, or choose an"
             " estimator that searches, such as multiscale_lm."
         )
-    for one in found.ambiguous[:_MOST_MINIMA]:
+    equal = [one for one in found.ambiguous if one.same_readings]
+    if equal:
+        ways = dict.fromkeys(_changed(names, found.x, one.x, found.standard_errors) or at(one.x) for one in equal)
+        listed = "; with ".join(list(ways)[:_MOST_MINIMA])
+        yield f"The readings are exactly the same with {listed}: choose one of these answers."
+    for one in [one for one in found.ambiguous if not one.same_readings][:_MOST_MINIMA]:
         yield f"AMBIGUOUS: the readings fit as well at {at(one.x)} (chi-square {one.chi_square:.5g})."
     if bent := list(compress(names, found.bent)):
         yield f"Profiles that are no parabola: {', '.join(bent)}; trust their profile intervals."
@@ -332,6 +336,23 @@ def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator
     drawn, converged = found.bootstrap.drawn, found.bootstrap.converged
     if converged < drawn:
         yield f"Bootstrap: {drawn - converged} of {drawn} simulated sets of readings have no answer."
+
+
+def _changed(names: Sequence[str], x: Array, y: Array, errors: Array) -> str:
+    """In words, the signs and exchanges of parameters that lead from x to y; empty if others are needed."""
+    near = 0.01 * errors
+    words, left = [], [i for i in range(len(x)) if abs(y[i] - x[i]) > near[i]]
+    while left:
+        i = left.pop(0)
+        if abs(x[i] + y[i]) <= near[i]:
+            words.append(f"{names[i]} of the other sign")
+            continue
+        other = next((j for j in left if abs(y[i] - x[j]) <= near[j] and abs(y[j] - x[i]) <= near[i]), None)
+        if other is None:
+            return ""
+        left.remove(other)
+        words.append(f"{names[i]} and {names[other]} exchanged")
+    return ", ".join(words)
 
 
 def write_answer(

@@ -43,7 +43,7 @@ def test_parameters_that_the_readings_do_not_tell_apart_are_named():
     for one in answer:
         assert set(one.undetermined) == {"d2 - d3", "k"}
     for text in (str(answer), answer._repr_html_()):
-        assert "the readings do not determine" in text
+        assert "The readings do not determine" in text
         assert "k" in text
     sure = Formula("d2*cos(t)+a*sin(t)", {"d2": 0.4, "a": 1.0}, {"t": T.tolist()})
     answer = ib.estimate(sure, z, {"lm": LevenbergMarquardt()}, noise=Gaussian(0.01))
@@ -112,3 +112,54 @@ def test_with_an_unknown_level_another_minimum_is_as_good_within_snedecors_regio
     assert other.chi_square - found.minima[0].chi_square == pytest.approx(excess, rel=0.02)
     assert 2 * f_law.isf(0.05, 2, 21) == pytest.approx(6.93, abs=0.01)
     assert other.as_good == as_good
+
+
+def test_an_estimate_at_which_the_model_has_no_readings_is_in_brackets():
+    model = Formula("sqrt(a - t)", {"a": 20.0}, {"t": T.tolist()})
+    z = np.sqrt(10.5 - T) + 0.01 * np.random.default_rng(1).standard_normal(41)
+    for noise in (Unknown(), Gaussian(0.01)):
+        answer = ib.estimate(model, z, {"bad": Stating(answer=(0.1,)), "lm": LevenbergMarquardt()}, noise=noise)
+        assert not answer["bad"].passes
+        assert answer["bad"].fits is False
+        assert "bad: the model has no finite readings at this estimate" in str(answer)
+        assert "(2)" in str(answer)
+
+
+def test_intervals_are_those_of_the_first_column_that_passes():
+    z = A @ [1.0, 2.0, 3.0] + 0.1 * np.random.default_rng(1).standard_normal(12)
+    columns = {"stated": Stating(answer=(9.0, 9.0, 9.0)), "gn": GaussNewton(), "lm": LevenbergMarquardt()}
+    for order in (["stated", "gn", "lm"], ["lm", "stated", "gn"]):
+        found = ib.estimate(LINE, z, {label: columns[label] for label in order}, noise=Gaussian(0.1)).examination
+        assert found.label == next(label for label in order if label != "stated")
+
+
+EXCHANGED = "The readings are exactly the same with a and b exchanged"
+MIRRORED = "The readings are exactly the same with w of the other sign"
+
+
+@pytest.mark.parametrize(
+    ("expression", "truth", "said"),
+    [
+        ("exp(-a*t)+exp(-b*t)", {"a": 0.3, "b": 2.0}, EXCHANGED),
+        ("exp(-(t-c)**2/(2*w**2))", {"c": 4.0, "w": 1.2}, MIRRORED),
+    ],
+)
+def test_answers_of_one_curve_are_told_apart_from_ambiguous_ones(expression, truth, said):
+    model = Formula(expression, truth, {"t": T.tolist()})
+    z = model.simulate(model.nominal[None])[0] + 0.01 * np.random.default_rng(2).standard_normal(41)
+    answer = ib.estimate(model, z, {"lm": LevenbergMarquardt()}, noise=Gaussian(0.01))
+    assert answer.passes
+    assert str(answer).count("exactly the same") == 1
+    assert said in str(answer)
+    assert "AMBIGUOUS" not in str(answer)
+
+
+def test_answers_of_different_curves_are_ambiguous():
+    """Readings at whole numbers do not tell a frequency from one that is 2 pi larger but for a short interval."""
+    t = np.arange(12.0)
+    t[3] += 0.02
+    model = Formula("sin(w*t)", {"w": 1.0}, {"t": t.tolist()})
+    z = model.simulate(model.nominal[None])[0] + 0.1 * np.random.default_rng(2).standard_normal(12)
+    answer = ib.estimate(model, z, {"lm": LevenbergMarquardt()}, noise=Gaussian(0.1), error_scale=6.0)
+    assert "AMBIGUOUS: the readings fit as well" in str(answer)
+    assert "exactly the same" not in str(answer)

@@ -11,7 +11,7 @@ from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo
 from ipe_bench.noise import Gaussian
 from ipe_bench.real.examination import examine
 from ipe_bench.real.fits import fit
-from ipe_bench.real.profiles import profiles
+from ipe_bench.real.profiles import profiles, wald_interval
 from ipe_bench.trials.scenario import Scenario
 
 Q = norm.isf(0.025)
@@ -137,6 +137,19 @@ def test_intervals_end_on_the_bound_that_they_reach():
     for ends in (found.wald, one.interval()):
         assert [end[2] for end in ends] == pytest.approx([0.0, reach])
     assert high == pytest.approx(reach, rel=0.1)
+
+
+@pytest.mark.parametrize(("error", "symmetric"), [(0.6, True), (0.9, True), (1.1, True), (0.3, False)])
+def test_an_interval_is_symmetric_in_the_parameter_if_three_half_widths_reach_its_bound(error, symmetric):
+    """The estimate is 2 above 0, and 1.96 standard errors are the half-width."""
+    model = ConstrainedModel(LINE, (ParameterInfo("a", lower=0.0),))
+    x = model.nominal + np.array([np.log(2.0), 0.0])
+    assert model.physical(x[None])[0, 0] == pytest.approx(2.0)
+    low, high = (end[0] for end in wald_interval(model, x, np.array([error / 2.0, 1.0]), Q))
+    if symmetric:
+        assert (low, high) == (pytest.approx(max(0.0, 2.0 - Q * error)), pytest.approx(2.0 + Q * error))
+    else:
+        assert np.log([low / 2.0, high / 2.0]) == pytest.approx([-Q * error / 2.0, Q * error / 2.0])
 
 
 def test_standard_errors_of_what_is_far_from_its_bound_are_of_its_logarithm():
