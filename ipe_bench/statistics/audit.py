@@ -8,7 +8,7 @@ errors of Student's law with the stated covariance are honest, and chi-square li
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -36,6 +36,8 @@ _SCALE, _DIRECTION, _BIAS, _TAILS = 5.0, 2.0, 1.0, 1.0
 """Shares of the level that the questions have: the first one is asked most."""
 _MANY = 1000
 """Rows above which the null distribution of the fourth moment is taken for normal."""
+_FARTHEST = 1e12
+"""Reported deviations beyond which an error counts as infinite, and whose inverse is 0."""
 _LARGEST = 10.0
 """Ends of an interval more than so many times its middle are not shown."""
 
@@ -159,16 +161,22 @@ class Audit:
 def audit(claims: Claims) -> Audit:
     """Examines what a program said.
 
-    A fault is said where its question (scale, direction, tails, bias) is refused at 5 % over all of them together
-    (Holm), so an honest report meets any false sentence in at most 5 % of cases.
+    No covariance allows for an infinite error, so one is enough for "too small"; the rest is of the other runs. A fault
+    is said where its question (scale, direction, tails, bias) is refused at 5 % over all of them together (Holm), so an
+    honest report meets any false sentence in at most 5 % of cases.
 
     Raises:
         UserError: there are too few runs, or errors and deviations differ by the factor of degrees and radians.
     """
+    with np.errstate(over="ignore"):
+        lost = ~(np.abs(claims.z) < _FARTHEST)
+    if lost.any():
+        return _with_infinite_errors(claims, lost)
     if claims.runs < FEWEST_RUNS:
         one = "one log of dependent rows says too little; " if claims.runs == 1 and len(claims.run) > 1 else ""
         raise UserError(f"audit: there are {claims.runs} independent runs; {one}give at least {FEWEST_RUNS}")
-    if any(np.linalg.matrix_rank(part) < part.shape[1] for part in claims.parts):
+    none = (np.abs(claims.z).max(axis=0) < 1 / _FARTHEST).any()
+    if none or any(np.linalg.matrix_rank(part) < part.shape[1] for part in claims.parts):
         raise UserError(
             f"audit: the errors of {', '.join(claims.names)} are 0 in every run, or follow from one another; leave out"
             " the parameters that are known or are made of others"
@@ -196,6 +204,31 @@ def audit(claims: Claims) -> Audit:
     weights, p, sentences = zip(*asked, strict=True)
     faults = [said for said, q in zip(sentences[1:], holm(p, weights)[1:], strict=True) if q <= ALPHA]
     return Audit(claims, scale, each, bias, (sentences[0], *faults[:2]))
+
+
+def _with_infinite_errors(claims: Claims, lost: NDArray[np.bool_]) -> Audit:
+    """What is found where some errors (rows, n) are `lost`, with what is said of the runs that have none."""
+    kept = ~np.isin(claims.run, claims.run[np.asarray(lost.any(axis=1))])
+    correlation, infinite = claims.correlation, np.asarray(lost.any(axis=0))
+    others = replace(
+        claims,
+        error=claims.error[kept],
+        deviation=claims.deviation[kept],
+        correlation=None if correlation is None else correlation[kept],
+        run=claims.run[kept],
+    )
+    gone, endless = claims.runs - others.runs, Factor(np.inf, np.inf, np.inf)
+    said = (
+        f"The error is infinite, or beyond {_FARTHEST:g} reported deviations, in {gone} of {claims.runs} runs: the"
+        " covariance is too small."
+    )
+    if others.runs < FEWEST_RUNS:
+        each, bias, more = (Factor(np.nan, np.nan, np.nan),) * claims.n, np.full((claims.n, 3), np.nan), ()
+    else:
+        rest = audit(others)
+        each, bias, more = rest.each, rest.bias, (f"In the others: {rest.sentences[0]}", *rest.sentences[1:2])
+    each = tuple(endless if bad else factor for bad, factor in zip(infinite, each, strict=True))
+    return Audit(claims, endless, each, np.where(infinite[:, None], np.nan, bias), (said, *more))
 
 
 def _of_scale(claims: Claims, scale: Factor, nees: Array) -> str:
@@ -307,6 +340,7 @@ def read_claims(table: Path | str | pd.DataFrame) -> Claims:
     import pandas as pd
 
     name, frame = ("the frame", table) if isinstance(table, pd.DataFrame) else (str(table), _read(Path(table)))
+    _refuse_twice(frame, name)
     if "parameter" in frame:
         frame = _widened(frame, name)
     ends = ("_true", "_error")
@@ -316,7 +350,9 @@ def read_claims(table: Path | str | pd.DataFrame) -> Claims:
     error, deviation = np.array([_error_and_deviation(frame, parameter, name) for parameter in names]).transpose(
         1, 2, 0
     )
-    there = np.isfinite(error).all(axis=1) & np.isfinite(deviation).all(axis=1)
+    there = ~np.isnan(error).any(axis=1) & np.isfinite(deviation).all(axis=1)
+    if not there.any():
+        raise UserError(f"{name}: no row has an estimate with finite deviations of {', '.join(names)}; give some")
     if len(bad := np.argwhere(there[:, None] & ~(deviation > 0))):
         raise UserError(f"{name}: row {bad[0, 0] + 2}: the deviation of {names[bad[0, 1]]} is not above 0")
     rows, correlation = np.flatnonzero(there), _correlation(frame, names, deviation, name)
@@ -340,6 +376,16 @@ def _read(path: Path) -> pd.DataFrame:
         return pd.read_parquet(path) if path.suffix == ".parquet" else pd.read_csv(path, sep=None, engine="python")
     except (ValueError, OSError) as error:
         raise UserError(f"{path}: cannot be read as a table ({str(error).splitlines()[0]})") from None
+
+
+def _refuse_twice(frame: pd.DataFrame, name: str) -> None:
+    """Refuses a column that stands there twice; a file's second one has been given the ending .1."""
+    columns = list(map(str, frame.columns))
+    for i, column in enumerate(columns):
+        base = column.removesuffix(".1")
+        again = base != column and base in columns and not {f"{column}_true", f"{column}_error"} & set(columns)
+        if column in columns[:i] or again:
+            raise UserError(f"{name}: column {base} stands there twice; leave one of them out")
 
 
 def _numbers(frame: pd.DataFrame, column: str, name: str) -> Array:
@@ -379,15 +425,22 @@ def _error_and_deviation(frame: pd.DataFrame, parameter: str, name: str) -> tupl
         error = _numbers(frame, parameter, name) - _numbers(frame, f"{parameter}_true", name)
     else:
         raise UserError(f"{name}: has {parameter}_true, but no column {parameter} with the estimates")
-    if f"{parameter}_std" in frame:
-        return error, _numbers(frame, f"{parameter}_std", name)
-    for variance in (f"{parameter}_var", f"cov_{parameter}_{parameter}"):
-        if variance in frame:
-            return error, np.sqrt(np.maximum(_numbers(frame, variance, name), 0.0))
-    raise UserError(
-        f"{name}: does not say how sure {parameter} is; give {parameter}_std, {parameter}_var or "
-        f"cov_{parameter}_{parameter}"
-    )
+    stated = {}
+    for column in (f"{parameter}_std", f"{parameter}_var", f"cov_{parameter}_{parameter}"):
+        if column in frame:
+            values = _numbers(frame, column, name)
+            stated[column] = values if column.endswith("_std") else np.sqrt(np.maximum(values, 0.0))
+    if not stated:
+        raise UserError(
+            f"{name}: does not say how sure {parameter} is; give {parameter}_std, {parameter}_var or "
+            f"cov_{parameter}_{parameter}"
+        )
+    (first, deviation), *others = stated.items()
+    for column, other in others:
+        # Rounded to three digits they agree.
+        if len(bad := np.flatnonzero(np.abs(other - deviation) > 0.01 * np.abs(deviation))):
+            raise UserError(f"{name}: row {bad[0] + 2}: {first} and {column} differ; give one of them")
+    return error, deviation
 
 
 def _correlation(frame: pd.DataFrame, names: Sequence[str], deviation: Array, name: str) -> Array | None:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli.results import audit_command
-from ipe_bench.statistics.audit import Claims, audit, read_claims
+from ipe_bench.statistics.audit import Claims, _tails, _worst_direction, audit, read_claims
 
 
 def claims(rng, runs=200, n=4, *, factor=1.0, law="normal", stretched=1.0):
@@ -136,6 +136,14 @@ def changed(**columns):
         (changed(y=frame()["y_true"]), "x, y are 0 in every run, or follow from one another"),
         (changed(run=1), "one log of dependent rows says too little"),
         (frame(5), "there are 5 independent runs"),
+        (changed(x_var=0.05), "row 2: x_std and x_var differ"),
+        (changed(cov_y_y=[0.09] * 49 + [0.1]), "row 51: y_var and cov_y_y differ"),
+        (pd.concat([frame(), frame()[["x_std"]]], axis=1), "column x_std stands there twice"),
+        (changed(x_std=np.inf, y_var=np.inf), "no row has an estimate with finite deviations of x, y"),
+        (
+            pd.DataFrame({"x_error": np.linspace(-1, 1, 50) * 1e-300, "x_std": 0.2}),
+            "errors of x are 0",
+        ),
         (frame(200).drop(columns="cov_x_y").assign(x_std=0.2 * np.pi / 180), "the factor between degrees and radians"),
     ],
 )
@@ -144,6 +152,67 @@ def test_wrong_tables_are_refused_in_one_line(table, said):
         audit(read_claims(table))
     assert said in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+def test_a_column_that_a_file_has_twice_is_refused(tmp_path):
+    table = pd.concat([frame(), frame()[["x"]]], axis=1)
+    table.to_csv(tmp_path / "runs.csv", index=False)
+    with pytest.raises(UserError, match="column x stands there twice"):
+        read_claims(tmp_path / "runs.csv")
+    named = pd.DataFrame({"x_error": [0.1, 0.2], "x_std": 1.0, "x.1_error": [0.1, 0.3], "x.1_std": 1.0})
+    named.to_csv(tmp_path / "runs.csv", index=False)
+    assert read_claims(tmp_path / "runs.csv").names == ("x", "x.1")
+
+
+@pytest.mark.parametrize("far", [np.inf, -np.inf, 1e200, 1e307])
+def test_an_infinite_error_is_the_worst_there_is(far, tmp_path):
+    """Of 50 runs one: the covariance is too small, however well it suits the others."""
+    table = frame()
+    table.loc[3, "x"] = far
+    found = audit(read_claims(table))
+    assert found.verdict == "too small"
+    assert "in 1 of 50 runs: the covariance is too small" in found.sentences[0]
+    whole = audit(read_claims(table.drop(index=3)))
+    assert found.sentences[1] == f"In the others: {whole.sentences[0]}"
+    assert found.table()["covariance"].tolist() == ["too small", whole.each[1].verdict]
+    assert found.claims.left_out == 0
+    table.to_csv(tmp_path / "runs.csv", index=False)
+    assert audit_command([str(tmp_path / "runs.csv")]) == 1
+    assert audit(read_claims(table.head(15))).sentences[0].endswith("in 1 of 15 runs: the covariance is too small.")
+
+
+@pytest.mark.parametrize("far", [1e6, 1e11])
+def test_errors_of_any_finite_size_have_a_factor(far):
+    table = frame()
+    table["x"] = table["x_true"] + far * np.linspace(-1, 1, 50) ** 3
+    found = audit(read_claims(table))
+    assert found.verdict == "too small"
+    assert np.isfinite(found.each[0].value)
+
+
+def test_the_farther_of_two_directions_counts_the_other_one():
+    """Twice the share of own draws whose least eigenvalue is smaller, or whose largest is larger, than that found."""
+    rng = np.random.default_rng(7)
+
+    def ends(w):
+        u = w / np.linalg.norm(w, axis=-1, keepdims=True)
+        return np.linalg.eigvalsh(4 * np.swapaxes(u, -1, -2) @ u / 60)[..., [0, -1]]
+
+    drawn = ends(rng.standard_normal((4000, 60, 4)))
+    for _ in range(3):
+        one = claims(rng, 60, 4)
+        least, most = ends(one.w)
+        share = min(np.mean(drawn[:, 0] <= least), np.mean(drawn[:, 1] >= most))
+        assert 0.02 < share < 0.45
+        assert _worst_direction(one)[0] == pytest.approx(2 * share, abs=8 * np.sqrt(share / 1999))
+
+
+def test_tails_of_any_of_eight_parameters_are_found_by_chance_as_often_as_those_of_one():
+    """Of eight parameters without covariances one has a p below .1 in .57 of cases."""
+    rng, ones = np.random.default_rng(8), np.ones((60, 8))
+    drawn = [Claims(tuple("abcdefgh"), rng.standard_normal((60, 8)), ones, None, np.arange(60)) for _ in range(100)]
+    p = np.array([_tails(one)[0] for one in drawn])
+    assert np.mean(p <= 0.1) <= 0.1 + 3 * np.sqrt(0.1 * 0.9 / 100)
 
 
 # One verdict ---------------------------------------------------------------------------------------------------------

@@ -154,6 +154,17 @@ def test_the_ends_of_an_interval_of_success_have_the_score_of_the_quantile(count
             assert score(end) == pytest.approx(side * norm.isf(0.025), rel=1e-3)
 
 
+@pytest.mark.parametrize(("gains", "widened"), [(5, True), (6, False)])
+def test_an_interval_of_success_holds_0_where_the_exact_test_does_not_reject(gains, widened):
+    """Of 5 trials that differ, all to one side, the exact p is 2 / 32, of 6 it is 2 / 64; the score rejects both."""
+    effect = success_effect(*successes(200, 0, gains, 0))
+    assert effect.p == pytest.approx(2 / 2**gains)
+    assert (effect.low == 0.0) == widened
+    assert effect.low >= 0.0
+    turned = success_effect(*successes(200, gains, 0, 0))
+    assert (turned.high == 0.0) == widened
+
+
 def test_no_trial_that_differs_is_no_evidence_and_a_p_of_1():
     effect = success_effect(*successes(40, 0, 0, 10))
     assert (effect.p, effect.e, effect.change) == (1.0, 1.0, 0.0)
