@@ -199,12 +199,14 @@ def test_the_farther_of_two_directions_counts_the_other_one():
         return np.linalg.eigvalsh(4 * np.swapaxes(u, -1, -2) @ u / 60)[..., [0, -1]]
 
     drawn = ends(rng.standard_normal((4000, 60, 4)))
-    for _ in range(3):
+    shares = []
+    for _ in range(8):
         one = claims(rng, 60, 4)
         least, most = ends(one.w)
         share = min(np.mean(drawn[:, 0] <= least), np.mean(drawn[:, 1] >= most))
-        assert 0.02 < share < 0.45
-        assert _worst_direction(one)[0] == pytest.approx(2 * share, abs=8 * np.sqrt(share / 1999))
+        assert _worst_direction(one)[0] == pytest.approx(min(1.0, 2 * share), abs=0.1)
+        shares.append(share)
+    assert min(shares) < 0.4
 
 
 def test_tails_of_any_of_eight_parameters_are_found_by_chance_as_often_as_those_of_one():
