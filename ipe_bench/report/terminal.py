@@ -49,7 +49,8 @@ def legend(noises: Collection[str]) -> tuple[str, ...]:
     """What the columns of the overview mean, and what estimators are told of these noises."""
     error = _TRACKED_ERROR if set(noises) == {"model"} else _ERROR
     added = (words for noise, words in (("unknown", _TOLD), ("model", TRACKED)) if noise in noises)
-    return (_SUCCESS, error, _NEES, *added)
+    nees = _NEES.removesuffix(" cost counts simulations.") if error is _TRACKED_ERROR else _NEES
+    return (_SUCCESS, error, nees, *added)
 
 
 _VERDICTS = {"consistent": ("", ""), "optimistic": ("optimistic", "+"), "pessimistic": ("pessimistic", "-")}

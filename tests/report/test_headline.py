@@ -422,6 +422,7 @@ def test_states_that_move_have_words_of_their_own(tmp_path):
     shown = re.sub(r"base64,[^\"]*", "", body)
     for words in (
         "1 is the best",
+        "cost counts simulations",
         "multiples of the bound",
         "parameters; at error scale",
         "error / bound",
