@@ -12,6 +12,7 @@ from ipe_bench.basics import compiled
 from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Ode
 from ipe_bench.measurements.base import differentiate
+from ipe_bench.measurements.ode.driven import course
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian
 from ipe_bench.plugins.conformance import check_component
@@ -250,3 +251,13 @@ def test_two_readings_of_one_thing_at_one_time_both_count(tmp_path):
     x = found.model.nominal[None]
     np.testing.assert_allclose(found.model.simulate(x)[0], np.exp(-0.5 * np.array([1, 1, 2, 3, 2])), atol=1e-7)
     assert [rows.tolist() for rows in found.model.epochs or ()] == [[0, 1], [2, 4], [3]]
+
+
+def test_an_input_is_that_of_its_last_row_and_level_before_the_first_and_after_the_last():
+    """Rows at 1, 2 and 4 with 10, 30 and 20, asked for at rows, between and outside them."""
+    times, values = np.array([1.0, 2.0, 4.0]), np.array([10.0, 30.0, 20.0])
+    at = np.array([0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0])
+    (held,) = course("hold", times, values, at)
+    np.testing.assert_array_equal(held, [10, 10, 10, 30, 30, 20, 20])
+    u, slope, since = course("linear", times, values, at)
+    np.testing.assert_allclose(u + slope * (at - since), np.interp(at, times, values))

@@ -331,6 +331,14 @@ def test_a_grid_gives_the_kalman_filter_and_its_smoother_of_a_linear_model(moved
         np.testing.assert_array_equal(found.mean[26:], grid.track(model, z[26:]).mean)
 
 
+def test_particles_have_the_likelihood_of_the_kalman_filter_of_a_linear_model():
+    """Within what 2000 of them scatter; the logarithm of their number, once an epoch, is 7.6."""
+    model = Scalar(True)
+    z = model.draw(0, 5).z
+    exact = ekf().track(model, z).log_likelihood
+    np.testing.assert_allclose(Bootstrap(2000).track(model, z).log_likelihood, exact, atol=1.5)
+
+
 def test_a_grid_refuses_what_it_cannot_be_exact_for():
     growth = Growth(count=20)
     assert "is exact for one state, and pendulum has 2" in Grid().hindrance(NEAR)

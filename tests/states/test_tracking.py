@@ -51,6 +51,16 @@ def test_a_run_says_what_direct_computation_says(tmp_path):
     assert np.isnan(row(table, "rts")["path_nis"])
 
 
+def test_the_mean_nis_of_several_readings_an_epoch_is_that_of_one():
+    model, scenario = CoordinatedTurn(), Tracking(CoordinatedTurn(), seed=3)
+    z = model.draw(0, 20, 3).z
+    tracks = ckf().track(model, z)
+    each = tracks.nis.sum(axis=1) / np.isfinite(z).sum(axis=(1, 2))
+    found = row(ib.run(scenario, {"ckf": ckf()}, 20), "ckf")
+    assert found["path_nis"] == pytest.approx(each.mean(), rel=1e-9)
+    assert z.shape[2] == 2
+
+
 def test_the_kalman_filter_attains_both_bounds_on_its_own_model():
     table = ib.run(Tracking(LINEAR), {"kf": ekf()}, 400)
     found = row(table, "kf")
