@@ -207,7 +207,7 @@ def as_array(column: pa.ChunkedArray) -> Array:
         return column.to_numpy()
     if pa.types.is_boolean(column.type):
         return as_array(column.cast(pa.uint8())).astype(bool)
-    return np.concatenate([np.empty(0, column.type.to_pandas_dtype()), *map(np.from_dlpack, column.chunks)])
+    return np.concatenate([np.empty(0, str(column.type)), *map(np.from_dlpack, column.chunks)])
 
 
 def write_record(path: Path, record: Mapping[str, Any]) -> None:
