@@ -133,7 +133,7 @@ class Stages(Attempts):
 
     planned = 16
     repeats = 3
-    most = 1400.0
+    most = 1500.0
 
     def draws(self, k: int) -> int:
         return _LOOKS if k >= _RANDOM else 0
