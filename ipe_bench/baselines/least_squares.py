@@ -206,7 +206,7 @@ class Multistart(Estimator):
         best = minimize(objective, method, np.repeat(x0[None], trials, axis=0), limits)
         confirmed = np.where(believed(best, np.arange(trials)), 0, -1)
         for k in range(self.starts - 1):
-            affordable = tally.cost(len(x0)) < (np.inf if self.budget is None else self.budget)
+            affordable = tally.of_search(len(x0)) < (np.inf if self.budget is None else self.budget)
             hopeless = ~finite(z) | tally.failed(np.arange(trials))
             rows = np.flatnonzero((confirmed < self.confirmations) & affordable & ~hopeless)
             if not len(rows):

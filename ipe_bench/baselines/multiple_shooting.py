@@ -39,8 +39,8 @@ class MultipleShooting(Estimator):
 
     Segments begin where the readings put them, so what a trajectory from far-off parameters would do later does no
     harm. The conditions are eliminated by an orthogonal basis of their null space. Steps are halved by Deuflhard's
-    natural monotonicity test (Newton Methods for Nonlinear Problems, 2004, section 4.3.4). A simulation integrates all
-    segments once; a Jacobian counts 1 + states/n.
+    natural monotonicity test (Newton Methods for Nonlinear Problems, 2004, section 4.3.4). Integrating all segments
+    once counts as a simulation, and derivatives as what they cost beside it.
     """
 
     segments: Count = 10
@@ -290,7 +290,9 @@ class Shooting:
     def linear(self, x: Array, nodes: Array, size: Array) -> Linear:
         """The gaps' and residuals' derivatives along the parameters and the nodes in multiples of `size`."""
         pieces, n, (lanes, states) = self.pieces, x.shape[1], nodes.shape[1:]
-        self.model.tally.jacobians[self.rows] += 1.0 + states / n
+        # The states in between are simulated beside the derivatives.
+        self.model.tally.simulations[self.rows] += 1.0
+        self.model.tally.jacobians[self.rows] += pieces.interval.jacobian_cost / self.model.measurement.jacobian_cost
         start, S = pieces.start(x)
         M, Jh = pieces.slopes(x, np.concatenate([start, nodes], axis=1))
         C = np.zeros((len(x), lanes, states, n + lanes * states))
@@ -322,7 +324,8 @@ class CondensedGaussNewton(Solver[Trajectory]):
         largest = np.abs(nodes).max(axis=1)
         size = np.where((largest > 0) & np.isfinite(largest), largest, 1.0)
         nodes = nodes[:, system.pieces.cases :]
-        system.model.tally.simulations[system.rows] += 1.0
+        cuts = system.pieces.cuts  # the guess simulates all segments but the last
+        system.model.tally.simulations[system.rows] += cuts[-2] / cuts[-1]
         d, r = system.gaps(x, nodes, size)
         linear = system.linear(x, nodes, size)
         return Trajectory(x, nodes, size, d, r, linear, linear.step(d, r), np.ones(len(x)), np.full(len(x), np.inf))

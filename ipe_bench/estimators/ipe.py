@@ -134,15 +134,12 @@ class FrozenSystem:
         return frozen_covariance(self.H_plus, self.R)
 
     def sandwich(self, x: Array) -> Array:
-        """(H+ J)^-1 H+ R H+' (H+ J)^-T at x: the first-order covariance (trials, n, n) of the root of eq. (11).
-
-        Not counted as cost: it is part of the report, not of the search.
-        """
+        """(H+ J)^-1 H+ R H+' (H+ J)^-T at x: the first-order covariance (trials, n, n) of the root of eq. (11)."""
         inverse_slope = np.full((len(x), x.shape[1], x.shape[1]), np.nan)
         if (usable := finite(x)).any():
-            report = CountingModel.uncounted(self.model.measurement, int(self.rows.max()) + 1)
             part = self.subset(usable)
-            inverse_slope[usable], _ = inverse(np.matmul(part.H_plus, report.jacobian(x[usable], part.rows)))
+            J = self.model.reporting().jacobian(x[usable], part.rows)
+            inverse_slope[usable], _ = inverse(np.matmul(part.H_plus, J))
         return np.matmul(np.matmul(inverse_slope, self.covariance()), inverse_slope.swapaxes(1, 2))
 
 

@@ -103,12 +103,11 @@ def minima_of(ended: SolveResult[Any], slope: NormalEquations, readings: int) ->
 
 
 def _exact_slope(objective: Objective, state: LeastSquaresSystem) -> NormalEquations:
-    """The slope where an iteration has ended; for the report alone where it ended on a coarse one, so not counted."""
+    """The slope where an iteration has ended; evaluated for the report where it ended on a coarse one."""
     coarse = ~state.exact & finite(state.x)
     if objective.exact_within == 0 or not coarse.any():
         return state.slope
-    tally = EvaluationCount.zeros(len(objective.model.tally.simulations))
-    report = replace(objective, model=replace(objective.model, tally=tally)).subset(coarse)
+    report = replace(objective, model=objective.model.reporting()).subset(coarse)
     x, r, keep_Q = state.x[coarse], state.r[coarse], state.slope.Q is not None
     return put(state.slope, coarse, slope_at(report, x, r, np.ones(len(x), dtype=bool), keep_Q=keep_Q)[0])
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -28,16 +28,25 @@ class EvaluationCount:
 
     simulations: Array
     jacobians: Array
+    reported: Array
+    """Those of the Jacobians (trials,) that only a reported covariance needs."""
     singular: Mask
     messages: dict[int, str] = field(default_factory=dict)
 
     @classmethod
     def zeros(cls, trials: int) -> EvaluationCount:
-        return cls(np.zeros(trials), np.zeros(trials), np.zeros(trials, dtype=bool))
+        simulations, jacobians, reported = np.zeros((3, trials))
+        return cls(simulations, jacobians, reported, np.zeros(trials, dtype=bool))
 
-    def cost(self, n: int) -> Array:
-        """Simulations (trials,), a Jacobian counting n."""
-        return cost(self.simulations, self.jacobians, n)
+    def of_search(self, n: int) -> Array:
+        """What a search has cost (trials,), which its limits hold against: simulations, a Jacobian counting n, without
+        those that are reported only."""
+        return cost(self.simulations, self.jacobians - self.reported, n)
+
+    def copied(self, rows: NDArray[np.intp]) -> EvaluationCount:
+        """The counts of the trials `rows`, of which nothing has failed yet."""
+        counts = (self.simulations[rows], self.jacobians[rows], self.reported[rows])
+        return EvaluationCount(*counts, np.zeros(len(rows), dtype=bool))
 
     def failed(self, rows: NDArray[np.intp]) -> Mask:
         """Which of the trials `rows` an exception has ended."""
@@ -52,11 +61,17 @@ class CountingModel:
     tally: EvaluationCount
     share: float = 1.0
     """The cost of one evaluation: below 1 for a model restricted to the first epochs."""
+    for_report: bool = False
+    """Whether its Jacobians are evaluated for a reported covariance alone."""
 
     @classmethod
     def uncounted(cls, measurement: Measurement, trials: int) -> CountingModel:
-        """For what is part of a report and not of a search: a tally that nobody reads."""
+        """For what no estimator evaluates: a tally that is not read."""
         return cls(measurement, EvaluationCount.zeros(trials))
+
+    def reporting(self) -> CountingModel:
+        """The same model for what is reported of an answer: counted, but no exception there ends a trial."""
+        return replace(self, tally=replace(self.tally, messages={}), for_report=True)
 
     def simulate(self, x: Array, rows: NDArray[np.intp]) -> Array:
         """h(x) (trials, m) for the trials `rows` of the tally."""
@@ -79,6 +94,8 @@ class CountingModel:
 
     def _jacobian(self, method: Callable[[Array], Array], cost: float, x: Array, rows: NDArray[np.intp]) -> Array:
         self.tally.jacobians[rows] += self.share * cost
+        if self.for_report:
+            self.tally.reported[rows] += self.share * cost
         return self._each_if_raising(method, x, rows, (self.measurement.m, self.measurement.n))
 
     @cached_property

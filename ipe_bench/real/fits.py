@@ -445,7 +445,7 @@ def _fit_inside(given: Given, label: str, estimator: Estimator, problem: Problem
         inner_covariance=np.full((n, n), np.nan) if estimates.covariance is None else estimates.covariance[0],
         residual=residual,
         iterations=int(estimates.iterations[0]),
-        simulations=float(estimates.simulations[0] + n * estimates.jacobians[0]),
+        simulations=float(estimates.simulations[0] + model.jacobian_cost * estimates.jacobians[0]),
     )
 
 

@@ -99,13 +99,13 @@ class Attempts(ABC):
 
     def counted(self, measurement: Measurement, owner: Rows, share: float = 1.0) -> CountingModel:
         """A model for candidates of the trials `owner`, whose tally begins at what each trial has cost so far."""
-        spent = self.tally.simulations[owner], self.tally.jacobians[owner], np.zeros(len(owner), dtype=bool)
-        return CountingModel(measurement, EvaluationCount(*spent), share)
+        return CountingModel(measurement, self.tally.copied(owner), share)
 
     def charge(self, owner: Rows, tally: EvaluationCount) -> None:
         """Adds to each trial what its candidates have cost since they were `counted`."""
-        for total, now in ((self.tally.simulations, tally.simulations), (self.tally.jacobians, tally.jacobians)):
-            np.add.at(total, owner, now - total[owner])
+        for name in ("simulations", "jacobians", "reported"):
+            total = getattr(self.tally, name)
+            np.add.at(total, owner, getattr(tally, name) - total[owner])
         for candidate, message in tally.messages.items():
             self.tally.messages.setdefault(int(owner[candidate]), message)
 

@@ -16,7 +16,7 @@ from ipe_bench.estimators.driver import ConvergenceCheck, Limits, Solver, SolveR
 from ipe_bench.estimators.least_squares import NormalEquations, Objective
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
 from ipe_bench.estimators.minima import WRONG_MINIMUM, Fitting, Minima, minima_of, minimize, spread_of_starts
-from ipe_bench.measurements.counted import CountingModel, EvaluationCount
+from ipe_bench.measurements.counted import CountingModel
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.solvers.anderson import accelerated, push
 from ipe_bench.solvers.progressive import Progressive, accepted
@@ -67,8 +67,7 @@ class Auto(Estimator):
         fitting = Fitting.none(len(z), m)
         fits = fitting.note(best, everyone)
         answered = accepted(best, m, max(WRONG_MINIMUM, problem.doubted))
-        spent = objective.model.tally
-        tally = EvaluationCount(spent.simulations, spent.jacobians - answered, np.zeros(len(z), dtype=bool))
+        tally = objective.model.tally.copied(everyone)
         left = np.flatnonzero(~answered)
         if len(left):
             thorough = Progressive(tolerance=self.tolerance, budget=self.budget)
@@ -76,6 +75,7 @@ class Auto(Estimator):
             best = put(best, left, found)
             tally.simulations[left] += spent.simulations
             tally.jacobians[left] += spent.jacobians
+            tally.reported[left] += spent.reported
             tally.messages.update({int(left[i]): message for i, message in spent.messages.items()})
         fits[left] = fitting.note(take(best, left), left)
         dear = problem.measurement.by_differential_equations or problem.prior_deviation is None

@@ -100,7 +100,7 @@ class Progressive(Estimator):
         tried, drawn, repeats, independent = np.zeros((4, len(z)), np.int64)
         first = np.full(len(z), np.inf)
         for k in range(1, attempts.last + 1):
-            cost, draws = tally.cost(n), attempts.draws(k)
+            cost, draws = tally.of_search(n), attempts.draws(k)
             first = np.where(best.converged, np.minimum(first, cost), np.inf)
             going = ~accepted(best, m, level) & finite(z) & ~tally.failed(everyone)
             going &= (cost < np.minimum(_WORTH * first, attempts.most * (1 + n))) | (drawn == 0)

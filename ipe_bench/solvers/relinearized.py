@@ -16,7 +16,6 @@ from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.estimators.driver import ConvergenceCheck, Limits, Solver, iterate
 from ipe_bench.estimators.ipe import IPE, FrozenSystem, Start, State, begin, frozen_covariance, root_check
 from ipe_bench.estimators.least_squares import inverse_factor
-from ipe_bench.measurements.counted import CountingModel
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.solvers.fixed_point import FixedPoint
 
@@ -94,7 +93,7 @@ class Relinearized(Solver[Round], Estimator):
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         x, system = begin(problem, z, self.start)
         ended = iterate(system, self, x, Limits(self.tolerance, self.max_iterations, self.budget))
-        state, P = ended.state, _bound(problem, ended.state)
+        state, P = ended.state, _bound(system, ended.state)
         path = state.path if history else None
         return Estimates.of(ended, system.model.tally, iterations=state.steps, history=path, covariance=P)
 
@@ -110,14 +109,14 @@ class Relinearized(Solver[Round], Estimator):
         return Round(x, F, H_plus, deviation, inner, steps, path)
 
 
-def _bound(problem: Problem, state: Round) -> Array:
-    """(J' R^-1 J)^-1 (trials, n, n) at the end: H+ R H+', where the last round has found H+ there; else computed anew,
-    for the report alone, so not counted. The model may raise at a bad end."""
-    P = frozen_covariance(state.H_plus, problem.R)
+def _bound(system: FrozenSystem, state: Round) -> Array:
+    """(J' R^-1 J)^-1 (trials, n, n) at the end: H+ R H+', where the last round has found H+ there; else computed
+    anew. The model may raise at a bad end."""
+    P = frozen_covariance(state.H_plus, system.R)
     failed = (state.H_plus == 0).all(axis=(1, 2))
     P[failed], lost = np.nan, np.flatnonzero(failed & finite(state.x))
     if len(lost):
-        J = CountingModel.uncounted(problem.measurement, len(P)).jacobian(state.x[lost], lost)
-        inverse_U = inverse_factor(problem.R.whiten_jacobian(J))
+        J = system.model.reporting().jacobian(state.x[lost], lost)
+        inverse_U = inverse_factor(system.R.whiten_jacobian(J))
         P[lost] = np.matmul(inverse_U, inverse_U.swapaxes(1, 2))
     return P

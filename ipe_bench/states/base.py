@@ -118,6 +118,11 @@ class StateModel(Component, ABC):
         """Whether a transition leads into epoch k."""
         return k > 0 or self.moved_first
 
+    @property
+    def evaluations(self) -> int:
+        """Evaluations of f and of h along a path."""
+        return 2 * self.epochs - (not self.moved_first)
+
     def Q(self, k: int) -> Array:
         """Covariance (n, n) of the process noise of the step into epoch k."""
         G = self.gain(k)

@@ -51,7 +51,8 @@ class Grid(Tracker):
             return Tracks.join([self.track(model, z[i : i + _AT_ONCE]) for i in range(0, len(z), _AT_ONCE)])
         out, grids = Tracks.empty(model, len(z)), self._grids(model)
         out.nis[:] = np.nan  # a density has no innovation
-        out.calls = 2.0 * self.points * model.epochs
+        again = (model.epochs - 1) * self.smooths  # transitions on the way back
+        out.calls += (self.points + _PATHS) * model.evaluations + self.points * again
         m, P = model.prior.mean[0], model.prior.covariance[0, 0]
         p = np.exp(-0.5 * (grids[0] - m) ** 2 / (P or 1.0))
         p = np.repeat(p[None] / p.sum(), len(z), axis=0)

@@ -45,8 +45,8 @@ class Rule(Component, ABC):
         are periodic next to others: the mean of points on both sides of a bearing's jump would lie opposite."""
 
     @abstractmethod
-    def calls(self, n: int) -> int:
-        """Evaluations of g per trial, a slope in one direction counted as one."""
+    def calls(self, n: int, periodic: bool = False) -> int:
+        """Evaluations of g per trial, a slope in one direction counted as one; `periodic` where values are shifted."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Taylor(Rule):
         y, J = slope(g, m)
         return Affine(J, y - multiply(J, m), np.zeros((*y.shape, y.shape[-1])))
 
-    def calls(self, n: int) -> int:
+    def calls(self, n: int, periodic: bool = False) -> int:
         return 1 + n
 
 
@@ -88,8 +88,8 @@ class SigmaPoints(Rule):
         A = transposed(upper_solve(L, M))
         return Affine(A, mean - multiply(A, m), symmetric(W))
 
-    def calls(self, n: int) -> int:
-        return len(self.points(n)[1])
+    def calls(self, n: int, periodic: bool = False) -> int:
+        return len(self.points(n)[1]) + periodic
 
 
 @dataclass(frozen=True)

@@ -43,8 +43,8 @@ class Tracks:
     """Readings that were there (trials, K)."""
     log_likelihood: Array
     """Of the readings by the innovations (trials,)."""
-    calls: float
-    """Evaluations of f and of h per trial."""
+    calls: Array
+    """Evaluations of f and of h (trials,): as many as if the trial were alone."""
     start: Gaussian
     """The states before the first transition."""
     moves: list[Affine] = field(default_factory=list)
@@ -58,8 +58,9 @@ class Tracks:
         nis, degrees = np.zeros((trials, K)), np.zeros((trials, K))
         innovations = np.full((trials, K, len(model.R(0))), np.nan)
         means, covariances = np.empty((trials, K, n)), np.empty((trials, K, n, n))
+        likelihood, calls = np.zeros((2, trials))
         start = spread_prior(model, trials)
-        return cls(means, covariances, nis, innovations, degrees, np.zeros(trials), 0.0, start)
+        return cls(means, covariances, nis, innovations, degrees, likelihood, calls, start)
 
     def at(self, k: int) -> Gaussian:
         """The states at epoch k; before the first transition if that is -1."""
@@ -82,10 +83,10 @@ class Tracks:
     @classmethod
     def join(cls, parts: Sequence[Tracks]) -> Tracks:
         """The trials of several batches one after another, without what smoothers need."""
-        names = ("mean", "covariance", "nis", "innovations", "degrees", "log_likelihood")
+        names = ("mean", "covariance", "nis", "innovations", "degrees", "log_likelihood", "calls")
         arrays: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
         start = Gaussian(*[np.concatenate(several) for several in zip(*(part.start for part in parts), strict=True)])
-        return cls(**arrays, calls=max(part.calls for part in parts), start=start)
+        return cls(**arrays, start=start)
 
 
 class Tracker(Component, ABC):
@@ -205,7 +206,8 @@ def filtered(model: StateModel, z: Array, rule: Rule, iterations: int = 1, path:
             at = found.x
         assert found is not None
         x = out.note(k, found)
-    out.calls = float(rule.calls(model.n) * (len(out.moves) + iterations * model.epochs))
+    read = rule.calls(model.n, bool(model.periods))
+    out.calls += rule.calls(model.n) * len(out.moves) + read * iterations * model.epochs
     return out
 
 
@@ -218,12 +220,14 @@ def _stepped(model: StateModel, z: Array, rule: Rule) -> Tracks:
     for k in range(model.epochs):
         if model.moves(k):
             move, Q = rule.linearise(lambda at, k=k: model.transition(at, k), *x), model.Q(k)
-            for f, F, moved in zip(filters, move.A, model.transition(x.mean, k), strict=True):
-                f.Q, f.F = Q, F
-                if isinstance(rule, Taylor):
+            if isinstance(rule, Taylor):
+                for f, F, moved in zip(filters, move.A, model.transition(x.mean, k), strict=True):
+                    f.Q, f.F = Q, F
                     f.predict()
                     f.x = moved
-                else:
+            else:
+                for f in filters:
+                    f.Q = Q
                     f.predict(fx=lambda at, _, k=k: model.transition(at, k))
             x = Gaussian(np.array([f.x for f in filters]), np.array([f.P for f in filters]))
             out.moves.append(move)
@@ -233,7 +237,10 @@ def _stepped(model: StateModel, z: Array, rule: Rule) -> Tracks:
             _take_in(f, model, k, R, *read)
         mean, P, y, S = (np.array([getattr(f, name) for f in filters]) for name in ("x", "P", "y", "S"))
         x = out.note(k, Update.of(Gaussian(mean, P), y, factor(S), np.isfinite(z[:, k])))
-    out.calls = float(rule.calls(model.n) * (len(out.moves) + model.epochs))
+    # What the smoother needs, and filterpy's own; unscented readings besides the slope, by which they are told apart.
+    points = rule.calls(model.n)
+    moved, read = (1, 0) if isinstance(rule, Taylor) else (points, points)
+    out.calls += (points + moved) * len(out.moves) + (1 + model.n + read) * model.epochs
     return out
 
 
@@ -291,15 +298,16 @@ class IteratedSmoother(Tracker):
 
     def track(self, model: StateModel, z: Array) -> Tracks:
         path = self.first.track(model, z)
-        calls = path.calls
+        calls, going = path.calls, np.ones(len(z), dtype=bool)
         for _ in range(self.iterations):
             new = smoothed(model, filtered(model, z, self.rule, path=path))
-            calls += new.calls
             if self.damped:
                 new = _shortened(model, z, path, new)
+            calls = calls + np.where(going, new.calls, 0.0)
             moved = np.abs(new.mean - path.mean) / np.sqrt(np.diagonal(new.covariance, axis1=-2, axis2=-1))
-            path = new
-            if not (moved > self.tolerance).any():
+            path, on = new, (moved > self.tolerance).any(axis=(1, 2))
+            going &= on
+            if not on.any():
                 break
         path.calls = calls
         return path
@@ -344,22 +352,25 @@ def misfit(model: StateModel, z: Array, x: Array, k: int) -> tuple[Array, Array]
     return np.sum(lower_solve(L, transposed(r)) ** 2, axis=1), size
 
 
-def _halved(old: Array, new: Array, cost: Callable[[Array], Array]) -> Array:
+def _halved(old: Array, new: Array, cost: Callable[[Array], Array]) -> tuple[Array, Array]:
     """The step from `old` to `new` (trials, ...), halved in each trial until the cost (trials,) is not above that of
-    `old`."""
+    `old`; and how many costs (trials,) that took."""
     best, share = cost(old), np.ones((len(old),) + (1,) * (old.ndim - 1))
+    worse, taken = np.ones(len(old), dtype=bool), np.ones(len(old))
     for _ in range(_HALVINGS):
+        taken += worse
         worse = ~(cost(old + share * (new - old)) <= best * (1 + 1e-12))
         if not worse.any():
             break
         share[worse] /= 2
-    return old + share * (new - old)
+    return old + share * (new - old), taken
 
 
 def _shortened(model: StateModel, z: Array, old: Tracks, new: Tracks) -> Tracks:
     """The step from one path to the next, halved where it raises the path's cost."""
     first, last = (np.concatenate([path.start.mean[:, None], path.mean], axis=1) for path in (old, new))
-    path = _halved(first, last, lambda x: path_cost(model, z, x[:, 0], x[:, 1:]))
+    path, costs = _halved(first, last, lambda x: path_cost(model, z, x[:, 0], x[:, 1:]))
+    new.calls = new.calls + costs * model.evaluations
     new.mean, new.start = path[:, 1:], Gaussian(path[:, 0], new.start.covariance)
     return new
 
@@ -395,7 +406,7 @@ class Bootstrap(Tracker):
             out.mean[:, k], out.covariance[:, k] = mean, np.matmul(transposed(d * w[..., None]), d)
             x = _resampled(x, w, np.array([g.random() for g in generators]))
         out.log_likelihood -= model.epochs * np.log(N)
-        out.calls = float(N * 2 * model.epochs)
+        out.calls += N * model.evaluations
         return out
 
 

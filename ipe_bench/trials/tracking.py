@@ -181,7 +181,7 @@ class PathBlock:
             status=status,
             covariance=P[:, -1],
             iterations=np.full(trials, K),
-            simulations=np.full(trials, tracks.calls),
+            simulations=tracks.calls,
             messages=messages,
             seconds=seconds,
         )

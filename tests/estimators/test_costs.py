@@ -1,0 +1,176 @@
+"""What is booked is what is evaluated: calls of the model, counted from outside, of every estimator and tracker."""
+
+from collections import Counter
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+from shared.small_models import Bent
+from shared.state_models import ConstantVelocity, CoordinatedTurn, Growth
+
+from ipe_bench.baselines import MultipleShooting
+from ipe_bench.baselines.multiple_shooting import Pieces
+from ipe_bench.estimators.base import Estimator
+from ipe_bench.measurements import Gins, LotkaVolterra
+from ipe_bench.measurements.base import Measurement, WrappedModel
+from ipe_bench.measurements.ode.interval import Interval
+from ipe_bench.noise import Gaussian, Quantization
+from ipe_bench.plugins.construct import construct
+from ipe_bench.plugins.discovery import composed, options
+from ipe_bench.states import Filter, Grid, IteratedSmoother, StateModel, Taylor, Unscented
+from ipe_bench.trials.scenario import Scenario
+
+
+def registered(*groups):
+    found = [o for group in groups for o in options(group) if o.source.name == "ipe-bench"]
+    return {o.name: construct(composed(o), o.package or o.group) for o in found}
+
+
+@dataclass(frozen=True)
+class Watched(WrappedModel):
+    """A model that notes what its evaluations cost: a Jacobian what the model says, the first epochs their share."""
+
+    whole: Measurement
+    seen: Counter[str] = field(default_factory=Counter, compare=False)
+
+    def __post_init__(self) -> None:
+        """No options."""
+
+    @property
+    def cost(self) -> float:
+        price = {"jacobian": self.whole.jacobian_cost, "coarse_jacobian": self.whole.coarse_jacobian_cost}
+        return sum(count * price.get(name, 1.0) for name, count in self.seen.items())
+
+
+def _watch(name):
+    inner = getattr(WrappedModel, name)
+
+    def method(model, x, *stop):
+        share = stop[0] / len(model.whole.epochs) if stop else 1.0
+        model.seen[name.removesuffix("_until")] += len(x) * share
+        return inner(model, x, *stop)
+
+    setattr(Watched, name, method)
+
+
+for _name in ("simulate", "coarse_simulate", "jacobian", "coarse_jacobian"):
+    for _method in (_name, f"{_name}_until"):
+        if _method != "coarse_simulate":
+            _watch(_method)
+
+
+def check(estimator: Estimator, scenario: Scenario, trials: int) -> None:
+    model = Watched(scenario.measurement)
+    problem = replace(scenario.problem, measurement=model)
+    _ = problem.H_plus  # of the problem, and the same for all trials
+    for z in scenario.draw(0, trials).z:
+        model.seen.clear()
+        with np.errstate(all="ignore"):
+            found = estimator.estimate(problem, z[None])
+        booked = found.simulations[0] + model.jacobian_cost * found.jacobians[0]
+        assert booked == pytest.approx(model.cost, rel=1e-9)
+
+
+ESTIMATORS = registered("solver", "baseline")
+NOISE = Quantization(0.02286)
+SMALL = Scenario(Bent(0.05), Gaussian(0.1))
+SCENARIOS = {
+    "gins-1": (Scenario(Gins(), NOISE), 2),
+    "gins-100": (Scenario(Gins(), NOISE, error_scale=100.0), 2),
+    "small-1": (SMALL, 4),
+    "small-100": (replace(SMALL, error_scale=100.0), 4),
+}
+
+
+@pytest.mark.parametrize("scenario", SCENARIOS)
+@pytest.mark.parametrize("name", [name for name in ESTIMATORS if name != "multiple_shooting"])
+def test_the_cost_of_an_estimator_is_what_it_evaluates(name, scenario):
+    check(ESTIMATORS[name], *SCENARIOS[scenario])
+
+
+@pytest.mark.parametrize("name", ["auto", "progressive", "relinearized", "levenberg_marquardt", "multistart"])
+def test_failures_cost_what_they_evaluate(name):
+    """Where a search ends far from a minimum, the Jacobian for the covariance there is an evaluation of its own."""
+    check(ESTIMATORS[name], Scenario(Gins(readings_per_case=6), NOISE, error_scale=1e4), 6)
+
+
+def test_a_budget_ends_a_search_and_not_the_report_of_it():
+    scenario = Scenario(Gins(readings_per_case=6), NOISE, error_scale=100.0)
+    problem, z = scenario.problem, scenario.draw(0, 3).z
+    for solver in (ESTIMATORS["fixed_point"], ESTIMATORS["newton"]):
+        free = solver.estimate(problem, z)
+        least = free.simulations + problem.measurement.n * (free.jacobians - 1)
+        found = replace(solver, budget=float(least.max())).estimate(problem, z)
+        np.testing.assert_array_equal(found.x, free.x)
+        np.testing.assert_array_equal(found.status, free.status)
+
+
+def test_the_cost_of_multiple_shooting_is_what_its_intervals_take(monkeypatch):
+    scenario, seen = Scenario(LotkaVolterra(), Gaussian(0.5)), Counter()
+
+    def watch(name, price):
+        inner = getattr(Interval, name)
+
+        def method(model, x):
+            seen["cost"] += price(model) * len(x)
+            return inner(model, x)
+
+        monkeypatch.setattr(Interval, name, method)
+
+    watch("simulate", lambda model: 1.0)
+    watch("jacobian", lambda model: model.jacobian_cost)
+    model = scenario.measurement
+    whole = len(Pieces.of(scenario.problem, 7, 0.125).grid) - 1  # intervals, of the one case
+    for z in scenario.draw(0, 3).z:
+        seen.clear()
+        found = MultipleShooting(segments=7).estimate(scenario.problem, z[None])
+        booked = found.simulations[0] + model.jacobian_cost * found.jacobians[0]
+        assert booked == pytest.approx(seen["cost"] / whole, rel=1e-9)
+
+
+TRACKERS = registered("tracker") | {
+    "ekf, filterpy": Filter(Taylor(), engine="filterpy"),
+    "ukf, filterpy": Filter(Unscented(), engine="filterpy"),
+    "ieks, damped": IteratedSmoother(Filter(Unscented()), damped=True),
+    "ieks, till it stays": IteratedSmoother(Filter(Unscented()), tolerance=1e-3),
+    "grid, smoothing": Grid(smooths=True),
+}
+MODELS = {model.name: model for model in (Growth(), CoordinatedTurn(), ConstantVelocity())}
+
+
+def watched(model: StateModel, seen: Counter[str], first: bool) -> StateModel:
+    """The model, counting the states of which it evaluates f and h; `first`: read before they move or after."""
+
+    class Watching(type(model)):
+        moved_first = first
+
+        def transition(self, x, k):
+            seen["calls"] += int(np.prod(np.shape(x)[:-1]))
+            return super().transition(x, k)
+
+        def observe(self, x, k):
+            seen["calls"] += int(np.prod(np.shape(x)[:-1]))
+            return super().observe(x, k)
+
+    copy = object.__new__(Watching)
+    vars(copy).update(vars(model))
+    return copy
+
+
+@pytest.mark.parametrize("moved_first", [True, False])
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("name", TRACKERS)
+def test_the_cost_of_a_tracker_is_what_it_evaluates(name, model, moved_first):
+    tracker, seen = TRACKERS[name], Counter()
+    model = watched(replace(MODELS[model], count=20), seen, moved_first)
+    if tracker.hindrance(model):
+        pytest.skip("is for other models")
+    z, alone = model.draw(0, 3).z, []
+    with np.errstate(all="ignore"):
+        together = tracker.track(model, z).calls
+        for trial in z:
+            seen.clear()
+            alone.append(tracker.track(model, trial[None]).calls[0])
+            assert alone[-1] == seen["calls"]
+    if tracker != TRACKERS["ieks, till it stays"]:  # it goes on until the paths of all trials stay
+        np.testing.assert_array_equal(together, alone)
