@@ -26,13 +26,25 @@ POINTS_AT_ONCE = 8192
 """Points of one call of the model: bounds the memory that a large ensemble takes."""
 
 
-def read_members(model: CountingModel, R: Covariance, x: Array, rows: Rows) -> Array:
-    """Whitened h (trials, members, m) at x (trials, members, n), for the trials `rows` of the model's tally."""
+def read_members(model: CountingModel, R: Covariance, x: Array, rows: Rows, z: Array) -> Array:
+    """Whitened h (trials, members, m) at x (trials, members, n), for the trials `rows` of the model's tally, with
+    readings z (trials, m); angles of a trial are next to one another, and their mean is next to that of z."""
     trials, members, n = x.shape
     counted = CountingModel(model.measurement, model.tally, model.share * members)
     count = min(trials, -(-trials * members // POINTS_AT_ONCE))
     pieces = np.array_split(np.arange(trials), count)
-    h = [R.whiten(counted.simulate(x[p].reshape(-1, n), np.repeat(rows[p], members))) for p in pieces]
+
+    def read(p: Rows) -> Array:
+        h = counted.simulate(x[p].reshape(-1, n), np.repeat(rows[p], members))
+        if not len(model.measurement.periods):
+            return R.whiten(h)
+        near, to, h = model.measurement.near, z[p, None], h.reshape(len(p), members, -1)
+        first = np.where(np.isfinite(h[:, :1]), h[:, :1], to)
+        h = near(h, first)
+        centre = np.where(np.isfinite(h), h, first).mean(axis=1, keepdims=True)
+        return R.whiten((h - (centre - near(centre, to))).reshape(len(p) * members, -1))
+
+    h = [read(p) for p in pieces]
     # In C order whatever the model returned: BLAS rounds otherwise where the strides are other.
     return np.ascontiguousarray(np.concatenate(h)).reshape(trials, members, -1)
 
@@ -128,7 +140,7 @@ class Walk(ABC):
         """Whitened h (trials, points, m) at the states s (trials, points, n) of the trials `at`, and dh/dx (trials, m,
         n), for those that the model does not end."""
         model, x = epoch.counted(self.tally), self.problem.x0 + s * self.d
-        h, H = read_members(model, epoch.R, x, at), None
+        h, H = read_members(model, epoch.R, x, at, self.z[at][:, epoch.rows]), None
         kept = finite(h)
         if slopes:
             H = np.ascontiguousarray(epoch.R.whiten_jacobian(model.jacobian(x[:, 0], at))) * self.d

@@ -78,7 +78,8 @@ class EsMda(Estimator):
         for weight in geometric_weights(np.array([1.0 / self.first]), self.steps)[0]:
             going = np.flatnonzero(finite(z) & finite(s) & ~tally.failed(objective.rows))
             if len(going):
-                h = read_members(objective.model, objective.R, objective.x0 + s[going] * d, objective.rows[going])
+                x, rows = objective.x0 + s[going] * d, objective.rows[going]
+                h = read_members(objective.model, objective.R, x, rows, objective.z[going])
                 noise = normals([generators[i] for i in going], *h.shape[1:]) / np.sqrt(weight)
                 lost: Mask = ~np.asarray(np.isfinite(h).all(axis=2))
                 s[going] = assimilated(s[going], h, z[going, None] + noise, 1.0 / weight)

@@ -61,7 +61,7 @@ class Belief:
 
 @dataclass(frozen=True)
 class EpochReadings:
-    """The whitened readings z (trials, m) of an epoch, for the trials `rows`, and what was believed before them.
+    """The readings z (trials, m) of an epoch, for the trials `rows`, and what was believed before them.
 
     x is in prior deviations from the nominal point.
     """
@@ -77,7 +77,8 @@ class EpochReadings:
 
     def misfit(self, x: Array) -> Array:
         """h(x) - z (trials, m), whitened."""
-        return self.epoch.R.whiten(self.model.simulate(self.physical(x), self.rows)) - self.z
+        h = self.model.simulate(self.physical(x), self.rows)
+        return self.epoch.R.whiten(self.epoch.model.near(h, self.z)) - self.epoch.R.whiten(self.z)
 
     def slope(self, x: Array) -> Array:
         """dh/dx (trials, m, n), whitened."""
@@ -85,7 +86,8 @@ class EpochReadings:
 
     def misfits(self, points: Array) -> Array:
         """h - z (trials, points, m) at points (trials, points, n), whitened."""
-        return read_members(self.model, self.epoch.R, self.physical(points), self.rows) - self.z[:, None]
+        h = read_members(self.model, self.epoch.R, self.physical(points), self.rows, self.z)
+        return h - self.epoch.R.whiten(self.z)[:, None]
 
     def physical(self, x: Array) -> Array:
         """In multiples of the parameters' units."""
@@ -129,7 +131,7 @@ class _Beliefs(Walk):
         self.belief = Belief(np.zeros((len(z), len(U0))), np.repeat(U0[None], len(z), axis=0))
 
     def take_in(self, epoch: Epoch, at: Rows) -> None:
-        z, model = epoch.whitened(self.z[at]), epoch.counted(self.tally)
+        z, model = self.z[at][:, epoch.rows], epoch.counted(self.tally)
         readings = EpochReadings(epoch, model, self.problem.x0, self.d, z, at, take(self.belief, at))
         after, nis = self.filter.update(readings)
         raised, singular = self.tally.failed(at), ~finite(after.root()) & after.usable

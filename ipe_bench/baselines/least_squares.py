@@ -325,7 +325,8 @@ class _Residuals:
     def r(self, x: Array) -> Array:
         if self._last is None or not np.array_equal(x, self._last[0]):
             self.simulations += 1
-            h = self.problem.measurement.simulate(x[None])[0]
+            model = self.problem.measurement
+            h = model.near(model.simulate(x[None])[0], self.z)
             self._last = x.copy(), self.problem.R.whiten(h - self.z)
         return self._last[1].copy()
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import put, take
-from ipe_bench.basics.linalg import Array, Mask, deviations, finite, inverse, multiply, solve
+from ipe_bench.basics.linalg import Array, Mask, deviations, finite, inverse, multiply, nearest, solve
 from ipe_bench.basics.options import Count, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator, Need
@@ -177,13 +177,15 @@ class Pieces:
 
     def _moved(self, x: Array, y: Array, k: int, z: Array) -> Array:
         """States y (trials, cases, states) moved to where they show the readings z taken at times[k]."""
+        shape = (self.cases, len(self.grid) - 1, len(self.model.outputs))
         whole = np.full((len(z), self.model.m), np.nan)
         whole[:, self.kept] = z + self.model.offset[self.kept]
-        shown = whole.reshape(len(z), self.cases, len(self.grid) - 1, -1)[:, :, k]
+        shown = whole.reshape(len(z), *shape)[:, :, k]
+        turns = np.reshape(self.model.periods, shape)[:, k] if len(self.model.periods) else ()
         y = np.where(np.isfinite(y), y, 0.0)
         for _ in range(3):  # the readings are nearly always linear in the state
             h, B = self.read(x, y, k)
-            gap = np.where(np.isfinite(shown), shown - h, 0.0)
+            gap = np.where(np.isfinite(shown), shown - nearest(h, shown, turns), 0.0)
             B = np.where(np.isfinite(shown)[..., None] & np.isfinite(B), B, 0.0)
             y = y + multiply(np.linalg.pinv(B), gap)
         return y
@@ -285,7 +287,7 @@ class Shooting:
         ends, h = pieces.follow(x, np.concatenate([pieces.start(x)[0], nodes], axis=1))
         d = (ends[:, : nodes.shape[1]] - nodes) / size[:, None]
         h = h.reshape(len(x), -1)[:, pieces.kept] - pieces.model.offset[pieces.kept]
-        return d.reshape(len(x), -1), pieces.problem.R.whiten(h - self.z)
+        return d.reshape(len(x), -1), pieces.problem.R.whiten(pieces.problem.measurement.near(h, self.z) - self.z)
 
     def linear(self, x: Array, nodes: Array, size: Array) -> Linear:
         """The gaps' and residuals' derivatives along the parameters and the nodes in multiples of `size`."""

@@ -7,7 +7,7 @@ the batch. A singular matrix spoils its own trial only.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -60,6 +60,15 @@ def plain_numbers(what: str, values: Any, shape: tuple[int, ...]) -> Array:
     if array.shape != shape:
         raise ValueError(f"{what} of shape {array.shape}, where {shape} belongs")
     return unmasked(array)
+
+
+def nearest(z: Array, to: Array, periods: Array | Sequence[float]) -> Array:
+    """z (..., m) shifted by whole periods next to `to` (..., m); a period of 0, or of none at all, shifts nothing."""
+    if not len(periods):
+        return z
+    period = np.asarray(periods)
+    turns = np.round(np.real(z - to) / np.where(period > 0, period, np.inf))
+    return z - np.where(period > 0, period * turns, 0.0)
 
 
 def multiply(A: Array, x: Array) -> Array:

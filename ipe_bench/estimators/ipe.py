@@ -106,7 +106,7 @@ class FrozenSystem:
         return cls(model, H_plus, deviation, problem.R, z, np.arange(len(z)))
 
     def F(self, x: Array) -> Array:
-        return multiply(self.H_plus, self.model.simulate(x, self.rows) - self.z)
+        return multiply(self.H_plus, self.model.residual(x, self.rows, self.z))
 
     def J(self, x: Array, F: Array | None = None) -> Array:
         coarse = False if F is None else np.abs(F / self.deviation).max(axis=1) > _NEAR
@@ -158,11 +158,11 @@ def begin(problem: Problem, z: Array, start: Start) -> tuple[Array, FrozenSystem
     x0 = np.repeat(problem.x0[None], len(z), axis=0)
     if start == "nominal":
         return x0, system
-    r0 = system.model.simulate(x0, system.rows) - system.z
+    r0 = system.model.residual(x0, system.rows, system.z)
     lse = x0 - multiply(system.H_plus, r0)
     if start == "linear_lse":
         return lse, system
-    r = system.model.simulate(lse, system.rows) - system.z
+    r = system.model.residual(lse, system.rows, system.z)
     better = squared(system.R.whiten(r)) < squared(system.R.whiten(r0))
     return np.where(better[:, None], lse, x0), system
 

@@ -55,7 +55,7 @@ class Objective:
 
     def residual(self, x: Array) -> Array:
         """Whitened residuals (trials, m), followed by those of the prior (trials, n) where it counts."""
-        r = self.R.whiten(self.model.simulate(x, self.rows) - self.z)
+        r = self.R.whiten(self.model.residual(x, self.rows, self.z))
         if self.prior is None:
             return r
         return np.concatenate([r, self.prior.whiten(x - self.x0)], axis=1)

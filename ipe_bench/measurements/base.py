@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.basics.linalg import Array, Covariance, read_only
+from ipe_bench.basics.linalg import Array, Covariance, nearest, read_only
 from ipe_bench.basics.options import Component
 
 _COMPLEX_STEP = 1e-100
@@ -95,6 +95,8 @@ class Measurement(Component, ABC):
     """Words for entries of `index` that do not speak for themselves, by column: the numbers of cases, say."""
     own_parameters: Sequence[str] = ()
     """Names of parameters of which every file of readings has its own, where several are estimated together."""
+    periods: Array | Sequence[float] = ()
+    """The period (m,) of each reading that is an angle, such as 2 pi, and 0 of others; empty: none is an angle."""
     fixed: Mapping[str, float] = {}
     """Values of parameters that are known and not estimated, by name."""
     inputs: tuple[Input, ...] = ()
@@ -121,6 +123,10 @@ class Measurement(Component, ABC):
     @abstractmethod
     def simulate(self, x: Array) -> Array:
         """The error-free readings h(x): (trials, n) -> (trials, m)."""
+
+    def near(self, h: Array, z: Array) -> Array:
+        """h (..., m), each angle shifted by whole turns next to the reading z: residuals are within half a turn."""
+        return nearest(h, z, self.periods)
 
     @property
     def nominal(self) -> Array:
@@ -206,7 +212,7 @@ class Measurement(Component, ABC):
 
     def jacobian(self, x: Array) -> Array:
         """dh/dx at each trial: (trials, n) -> (trials, m, n); complex step where analytic, else central differences."""
-        return differentiate(self.simulate, x, analytic=self.analytic)
+        return differentiate(self.simulate, x, analytic=self.analytic, near=self.near)
 
     def coarse_jacobian(self, x: Array) -> Array:
         """dh/dx near enough for the steps of an iteration, `|I - J~+ J|` below 0.01, where that is cheaper; else exact.
@@ -260,7 +266,7 @@ def _delegating(cls: type[WrappedModel]) -> type[WrappedModel]:
 
     for name in (
         *("name", "physical_parameters", "nominal", "nuisance_deviation", "nuisances", "fixed"),
-        *("levels", "epochs", "offset", "m", "recorded", "reading_unit", "reading_name", "usual_noise"),
+        *("levels", "epochs", "offset", "m", "periods", "recorded", "reading_unit", "reading_name", "usual_noise"),
         *("inputs", "input_columns", "input_columns_known", "absent_input", "own_parameters"),
         *("by_differential_equations", "physical", "physical_slope", "near_bounds"),
         *("jacobian_cost", "coarse_jacobian_cost"),
@@ -350,6 +356,7 @@ class SubsetModel(WrappedModel):
 
     offset = property(lambda subset: subset.whole.offset[subset._rows])  # type: ignore[assignment]
     m = property(lambda subset: len(subset.kept))  # type: ignore[assignment]
+    periods = property(lambda s: np.asarray(s.whole.periods)[s._rows] if len(s.whole.periods) else ())  # type: ignore[assignment]
 
     @property
     def epochs(self) -> Epochs | None:
@@ -386,8 +393,9 @@ class SubsetModel(WrappedModel):
         return self.whole.linearization()[self._rows]
 
 
-def differentiate(h: Any, x: Array, *, analytic: bool) -> Array:
-    """dh/dx (trials, m, n) of a batched function h at x (trials, n), all directions in one call of h.
+def differentiate(h: Any, x: Array, *, analytic: bool, near: Any = lambda h, z: h) -> Array:
+    """dh/dx (trials, m, n) of a batched function h at x (trials, n), all directions in one call of h; `near` shifts
+    angles by whole turns next to others.
 
     Analytic functions: complex step, exact to round-off (Squire and Trapp, SIAM Review 40, 1998). Others: central
     differences with a step of eps^(1/3) in units of the parameter, or of its value where that is larger.
@@ -408,10 +416,10 @@ def differentiate(h: Any, x: Array, *, analytic: bool) -> Array:
     points = np.stack([x[:, None] + steps, x[:, None] - steps])
     z = h(read_only(points.reshape(-1, n))).reshape(2, trials, n, -1)
     width = (np.diagonal(points[0], axis1=1, axis2=2) - np.diagonal(points[1], axis1=1, axis2=2))[:, :, None]
-    return np.ascontiguousarray(((z[0] - z[1]) / width).swapaxes(1, 2))
+    return np.ascontiguousarray(((near(z[0], z[1]) - z[1]) / width).swapaxes(1, 2))
 
 
-def contradicted(h: Any, x: Array, J: Array) -> NDArray[np.bool_]:
+def contradicted(h: Any, x: Array, J: Array, near: Any) -> NDArray[np.bool_]:
     """The trials (trials,) in which central differences of h along one direction contradict J = dh/dx (trials, m, n).
 
     Two calls per trial, whatever n is. Every parameter changes the readings by about as much, none by a multiple of
@@ -425,7 +433,7 @@ def contradicted(h: Any, x: Array, J: Array) -> NDArray[np.bool_]:
     above, below = x + _CENTRAL_STEP * unit * weight, x - _CENTRAL_STEP * unit * weight
     z = h(read_only(np.concatenate([above, below])))
     with np.errstate(all="ignore"):
-        change, expected = z[:trials] - z[trials:], (J * (above - below)[:, None]).sum(axis=2)
+        change, expected = near(z[:trials], z[trials:]) - z[trials:], (J * (above - below)[:, None]).sum(axis=2)
         rounding = 100 * np.finfo(float).eps * np.fmax.reduce(np.abs(z[:trials]), axis=1)
         tolerated = 1e-5 * _CENTRAL_STEP * (size * weight).sum(axis=1) + rounding
         return (np.isfinite(change) & ~(np.abs(change - expected) <= tolerated[:, None])).any(axis=1)

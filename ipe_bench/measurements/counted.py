@@ -78,6 +78,10 @@ class CountingModel:
         self.tally.simulations[rows] += self.share
         return self._each_if_raising(self.measurement.simulate, x, rows, (self.measurement.m,))
 
+    def residual(self, x: Array, rows: NDArray[np.intp], z: Array) -> Array:
+        """h(x) - z (trials, m) for readings z of the trials `rows`, angles within half a turn."""
+        return self.measurement.near(self.simulate(x, rows), z) - z
+
     def jacobian(self, x: Array, rows: NDArray[np.intp], *, coarse: Mask | bool = False) -> Array:
         """dh/dx (trials, m, n) for the trials `rows` of the tally; of the trials `coarse` by `coarse_jacobian`,
         counted as what it costs beside an exact one."""

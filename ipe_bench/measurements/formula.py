@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ipe_bench.basics.errors import UserError, did_you_mean
+from ipe_bench.basics.errors import UserError, did_you_mean, unknown
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Finite
 from ipe_bench.measurements.arithmetic import never_switching, read
@@ -38,6 +38,7 @@ class WrittenModel(Measurement):
     headings: tuple[str, ...]
     """The names of the columns that it takes from the readings."""
     reading: str
+    circular: tuple[str, ...] = ()
 
     reading_unit = property(lambda model: model.unit)  # type: ignore[assignment]
     reading_name = property(lambda model: model.reading)  # type: ignore[assignment]
@@ -65,6 +66,15 @@ class WrittenModel(Measurement):
     @property
     def input_columns(self) -> Mapping[str, Sequence[Any]]:
         return {name: self.column(name).tolist() for name in self.headings}
+
+    @property
+    def periods(self) -> Array | Sequence[float]:
+        return np.full(self.m, self.turn) if self.circular else ()
+
+    @property
+    def turn(self) -> float:
+        """A whole turn in the unit of the readings."""
+        return {"deg": 360.0, "°": 360.0}.get(self.unit, 2 * np.pi)
 
     def column(self, name: str) -> Array:
         if name not in self.columns:
@@ -98,8 +108,14 @@ class WrittenModel(Measurement):
         why = "they are constant in pieces, as by floor, round, sign or a comparison, where every slope is 0"
         return (f"{found}: {why}, and no estimator that follows slopes moves from there; blend the pieces, as by tanh",)
 
-    def require_columns_and_parameters(self, *keys: str) -> None:
-        """Refuses columns of different lengths, and names in the options `keys` that are no parameters."""
+    def require_columns_and_parameters(self, *keys: str, readings: Sequence[str] = ()) -> None:
+        """Refuses columns of different lengths, names in the options `keys` that are no parameters, and angles that are
+        none of the `readings` or have another unit."""
+        for name in self.circular:
+            if name not in (known := [*readings, self.reading]):
+                raise UserError(f"circular={name}: {unknown(name, known, 'reading')}")
+            if self.unit not in ("", "rad", "deg", "°"):
+                raise UserError(f"unit={self.unit}: circular={name} is an angle, in rad or deg; give one of these")
         lengths = {name: len(column) for name, column in self.columns.items()}
         if len(set(lengths.values())) > 1:
             raise UserError(f"columns: have different lengths: {lengths}")
@@ -136,6 +152,8 @@ class Formula(WrittenModel):
     """Unit of the readings."""
     own: tuple[str, ...] = ()
     """Parameters of which every file of readings has its own, where there are several."""
+    circular: tuple[str, ...] = ()
+    """The readings' name if they are angles, in rad, or in deg by their unit: residuals are within half a turn."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

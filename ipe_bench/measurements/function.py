@@ -62,6 +62,8 @@ class Function(WrittenModel):
     """Name of the readings' column in a file."""
     unit: str = ""
     """Unit of the readings."""
+    circular: tuple[str, ...] = ()
+    """The readings' name if they are angles, in rad, or in deg by their unit: residuals are within half a turn."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -220,7 +222,7 @@ class Function(WrittenModel):
         """Whether complex steps give the slopes that differences give, near the start and away from it."""
         offsets = np.random.default_rng(1).uniform(-0.3, 0.3, (4, self.n))
         x = self.nominal + np.vstack([np.zeros(self.n), offsets])
-        return not contradicted(self._rows, x, self._by_complex_step(x)).any()
+        return not contradicted(self._rows, x, self._by_complex_step(x), self.near).any()
 
     def _by_complex_step(self, x: Array) -> Array:
         with warnings.catch_warnings():
@@ -237,10 +239,10 @@ class Function(WrittenModel):
         if self._jax is not None:
             return self._jax[1](x)
         if not self._is_analytic:
-            return differentiate(self._rows, x, analytic=False)
+            return differentiate(self._rows, x, analytic=False, near=self.near)
         J = self._by_complex_step(x)
-        if (wrong := contradicted(self._rows, x, J)).any():  # in a branch that is not analytic
-            J[wrong] = differentiate(self._rows, x[wrong], analytic=False)
+        if (wrong := contradicted(self._rows, x, J, self.near)).any():  # in a branch that is not analytic
+            J[wrong] = differentiate(self._rows, x[wrong], analytic=False, near=self.near)
         return J
 
     @property

@@ -107,6 +107,11 @@ class Joint(Measurement):
             joined[name] = list(chain.from_iterable(each))
         return joined
 
+    @property
+    def periods(self) -> Array | Sequence[float]:
+        each = [part.periods if len(part.periods) else np.zeros(part.m) for part in self.parts]
+        return np.concatenate(each) if any(len(part.periods) for part in self.parts) else ()
+
     @cached_property
     def epochs(self) -> Epochs | None:
         """Those of the files after one another; None where a file has none."""

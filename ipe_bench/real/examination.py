@@ -123,7 +123,7 @@ class Examination:
     @cached_property
     def _present(self) -> Array:
         """h (m,) of the readings that are present."""
-        return self._mean.simulate(self._place)[0]
+        return self._mean.near(self._mean.simulate(self._place)[0], self.z)
 
     @cached_property
     def _J(self) -> Array:
@@ -283,7 +283,7 @@ def examine(problem: Problem, z: Array, fits: list[Fit], *, bootstraps: int = BO
         levelled = maximum(best.estimated, z[rows])
         inner, assumed, P, freedom = levelled.x, levelled.problem, levelled.P, levelled.freedom
         converged = levelled.converged
-        chi_square = float(np.sum(assumed.R.whiten(z[rows] - levelled.fitted) ** 2))
+        chi_square = float(np.sum(assumed.R.whiten(z[rows] - levelled.model.near(levelled.fitted, z[rows])) ** 2))
     else:
         assumed = best.assumed
         minima = minimise(assumed, z[None, rows], best.inner[None])

@@ -375,7 +375,7 @@ def _fit_with_levels(given: Given, label: str, estimator: Estimator, levels: Lev
         assumed=replace(again.assumed, R=known.problem.R),
         inner=known.x,
         inner_covariance=P,
-        residual=z - known.fitted,
+        residual=z - known.model.near(known.fitted, z),
         level=1.0,
         estimated=known,
     )
@@ -428,7 +428,8 @@ def _fit_inside(given: Given, label: str, estimator: Estimator, problem: Problem
     if np.isfinite(estimates.x).all():
         # Far from the truth a model may overflow or refuse: then nothing is known of the residuals.
         with np.errstate(all="ignore"):
-            residual = given.z - CountingModel(model, tally).simulate(estimates.x, np.arange(1))[0]
+            h = CountingModel(model, tally).simulate(estimates.x, np.arange(1))[0]
+            residual = given.z - model.near(h, given.z)
             if not np.isfinite(residual).all():
                 refused = "the model has no finite readings at this estimate"
     if tally.messages:

@@ -134,7 +134,7 @@ class Likelihood(Objective):
     def _split(self, x: Array) -> tuple[Array, Array, Array]:
         """Whitened residuals (trials, m), log sigma, and how far the levels' logarithms are from their start."""
         h, log, theta = np.split(self.model.simulate(x, self.rows), [self.readings, 2 * self.readings], axis=1)
-        return (h - self.z) * np.exp(-log), log, theta - self.levelled.theta
+        return (self.levelled.near(h, self.z) - self.z) * np.exp(-log), log, theta - self.levelled.theta
 
     def residual(self, x: Array) -> Array:
         w, _, moved = self._split(x)
@@ -216,7 +216,7 @@ def levels_at(problem: Problem, levels: Levels, theta: Array, z: Array, x: Array
     Raises:
         UserError: a group has too few readings for its levels, or residuals of zero.
     """
-    h = CountingModel.uncounted(problem.measurement, 1).simulate(x[None], np.arange(1))[0]
+    h = problem.measurement.near(CountingModel.uncounted(problem.measurement, 1).simulate(x[None], np.arange(1))[0], z)
     if not np.isfinite(h).all():
         none = np.full_like(theta, np.nan)
         joint = replace(problem, measurement=Levelled(problem.measurement, levels, none, np.ones(len(z))))
@@ -243,7 +243,7 @@ def maximum(start: Estimated, z: Array) -> Estimated:
         if not np.isfinite(x).all():
             return replace(found, converged=False)
         J = model.whole.jacobian(x[None, :n])[0]
-        _require_residuals(model.noise, z, z - model.whole.simulate(x[None, :n])[0], J)
+        _require_residuals(model.noise, z, z - model.near(model.whole.simulate(x[None, :n])[0], z), J)
         R = _covariance(model.noise, model.whole, x)
         spare = _spare(J, R)
         found = _estimated(replace(problem, R=R), model.noise, spare, z, x, bool(minima.converged[0]))
@@ -268,7 +268,7 @@ def _estimated(problem: Problem, levels: Levels, spare: Array, z: Array, x: Arra
     deviation = problem.prior_deviation
     starts = None if deviation is None else np.concatenate([deviation[:n], np.ones(len(x) - n)])
     joint = replace(problem, measurement=model, R=R, prior_deviation=starts, prior_correlation=None)
-    w, slopes = R.whiten(z - whole.simulate(x[None, :n])[0]), model.jacobian(x[None])[0]
+    w, slopes = R.whiten(z - whole.near(whole.simulate(x[None, :n])[0], z)), model.jacobian(x[None])[0]
     J, L = R.whiten_jacobian(slopes[: len(z)]), slopes[len(z) : 2 * len(z)]
     with np.errstate(all="ignore"):
         inverse_U = inverse_factor(np.concatenate([J, np.sqrt(2 * spare)[:, None] * L])[None])[0]

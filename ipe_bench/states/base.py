@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.linalg import Array, multiply
+from ipe_bench.basics.linalg import Array, multiply, nearest
 from ipe_bench.basics.options import Component
 from ipe_bench.basics.streams import numbered
 from ipe_bench.measurements.base import Parameter
@@ -130,11 +130,7 @@ class StateModel(Component, ABC):
 
     def nearest(self, z: Array, to: Array) -> Array:
         """z (..., m), each periodic reading shifted by whole periods next to that of `to` (..., m)."""
-        if not self.periods:
-            return z
-        period = np.array(self.periods)
-        turns = np.round(np.real(z - to) / np.where(period > 0, period, np.inf))
-        return z - np.where(period > 0, period * turns, 0.0)
+        return nearest(z, to, self.periods)
 
     def observe_near(self, x: Array, k: int, to: Array) -> Array:
         """h without jumps around readings `to` (trials, m), for x (trials, ..., n)."""

@@ -220,7 +220,8 @@ class _Population:
     def _log_likelihood(self, x: Array) -> Array:
         """The logarithm of the likelihood of each, less its constant."""
         with np.errstate(all="ignore"):
-            r = self.problem.R.whiten(self.z - self.problem.measurement.simulate(x))
+            model = self.problem.measurement
+            r = self.problem.R.whiten(self.z - model.near(model.simulate(x), self.z))
             squares = np.sum(r**2, axis=1)
         return np.where(np.isfinite(squares), -0.5 * squares, -np.inf)
 

@@ -123,7 +123,7 @@ class Block:
             **by_parameter("bayes", names, self.bayes_deviation),
             **by_parameter("van_trees", names, van_trees),
             **by_parameter("van_trees_error", names, van_trees_error),
-            **by_parameter("linear_error", names, multiply(H_plus, self.trials.z - self.readings)),
+            **by_parameter("linear_error", names, multiply(H_plus, self.errors(self.readings))),
             "contraction_K": K,
             "contraction_norm": norm,
             "contraction_radius": radius,
@@ -157,6 +157,10 @@ class Block:
     def readings_at(self, x: Array) -> Array:
         """h(x) (trials, m) for x (trials, n); NaN where the model fails."""
         return CountingModel.uncounted(self.problem.measurement, len(x)).simulate(read_only(x), np.arange(len(x)))
+
+    def errors(self, h: Array) -> Array:
+        """The readings (trials, m) less the error-free h, angles within half a turn."""
+        return self.trials.z - self.problem.measurement.near(h, self.trials.z)
 
     def _curvature_columns(self, names: list[str]) -> Columns:
         """What second derivatives at the truth say, for the first trials and NaN for the others: M of
@@ -235,7 +239,7 @@ class Block:
         problem, key = self.problem, (estimator.equation, "prior" in estimator.needs, inflation_of(estimator))
         if key not in self._spreads:
             self._spreads[key] = spread_of(estimator, problem, self.jacobian)
-        r = problem.R.whiten(self.trials.z - self.readings_at(x))
+        r = problem.R.whiten(self.errors(self.readings_at(x)))
         with np.errstate(all="ignore"):
             squares = np.sum(r**2, axis=1)
         return fit_probability(squares, self._spreads[key], self.scenario.noise, problem.H, problem.R)

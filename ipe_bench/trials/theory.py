@@ -156,7 +156,7 @@ def misspecified(problem: Problem, h: Array, x: Array, root: Array) -> tuple[Arr
     bias, deviation = root - x, np.full(x.shape, np.nan)
     if found.any():
         model, R, at = problem.measurement, problem.R, root[found]
-        Jw, r = R.whiten_jacobian(model.jacobian(at)), R.whiten(h[found] - model.simulate(at))
+        Jw, r = R.whiten_jacobian(model.jacobian(at)), R.whiten(h[found] - model.near(model.simulate(at), h[found]))
         B = np.matmul(Jw.swapaxes(1, 2), Jw)
         bent = np.stack([np.einsum("tmi,tm->ti", R.whiten_jacobian(one), r) for one in _bends(model, at)], axis=2)
         inverted = inverse(B - (bent + bent.swapaxes(1, 2)) / 2)[0]

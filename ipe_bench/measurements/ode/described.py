@@ -108,9 +108,12 @@ class Ode(WrittenModel, WrappedModel):
     """The inputs of `driven_by`, where no file brings them: time, one column each, and `case` where cases differ."""
     reading: str = "reading"
     """What the column of the readings is called in a file; `reading` is understood too."""
+    circular: tuple[str, ...] = ()
+    """Outputs that are angles, in rad, or in deg by their unit: their residuals are within half a turn."""
 
     name = property(lambda model: model.title)  # type: ignore[assignment]
     index = WrappedModel.index
+    periods = WrappedModel.periods  # type: ignore[assignment]
     reading_name = WrittenModel.reading_name
     own_parameters = property(lambda model: model.own)  # type: ignore[assignment]
     usual_noise = property(lambda model: model.deviation and UsualNoise(model.deviation))  # type: ignore[assignment]
@@ -154,7 +157,7 @@ class Ode(WrittenModel, WrappedModel):
         for name in self.columns:
             if name not in ("case", "time", *self.driven_by):
                 raise UserError(f"columns.{name}: {unknown(name, ['case', 'time', *self.driven_by], 'input')}")
-        self.require_columns_and_parameters("size", "units", "answer", "own")
+        self.require_columns_and_parameters("size", "units", "answer", "own", readings=list(self.output_formulas))
 
     @cached_property
     def constant_names(self) -> tuple[str, ...]:
@@ -352,6 +355,12 @@ class _Engine(OdeMeasurement):
     parameters = property(lambda engine: engine.described.parameters)  # type: ignore[assignment]
     nominal = property(lambda engine: engine.described.nominal)  # type: ignore[assignment]
     _coarsens = property(lambda engine: engine.step is None and not engine.stiff)  # type: ignore[assignment]
+
+    @property
+    def periods(self) -> Array | Sequence[float]:
+        described = self.described
+        turns = [described.turn if {name, described.reading} & {*described.circular} else 0.0 for name in self.outputs]
+        return np.tile(turns, self.m // len(turns)) if described.circular else ()
 
     @cached_property
     def times(self) -> Array:

@@ -147,7 +147,8 @@ class _Residuals:
 
     def r(self, x: Array, trial: int) -> Array:
         self.tally.simulations[trial] += 1
-        return self.problem.R.whiten(self.problem.measurement.simulate(x[None])[0] - self.z[trial])
+        model, z = self.problem.measurement, self.z[trial]
+        return self.problem.R.whiten(model.near(model.simulate(x[None])[0], z) - z)
 
     def J(self, x: Array, trial: int) -> Array:
         self.tally.jacobians[trial] += 1
