@@ -416,15 +416,14 @@ class _Engine(OdeMeasurement):
         with np.errstate(all="ignore"):
             outputs = np.abs(rough).reshape(-1, len(self.outputs))
             largest = np.tile(np.nanmax(outputs, axis=0, initial=0.0), self.m // len(self.outputs))
-            if not (np.abs(explicit - rough) > _APART * largest).any():
+            if not (np.abs(explicit - self.near(rough, explicit)) > _APART * largest).any():
                 return 0.0
             self._simulate(x, np.arange(1), self._ladder[-1] * self._parts, self._zeros, finest)
-            if (np.abs(explicit - finest) <= _FAR * self._tolerances).all():
+            if (np.abs(explicit - self.near(finest, explicit)) <= _FAR * self._tolerances).all():
                 return 0.0
             accurate = self._implicit.simulate(x, every)
-            off, rough_off = (
-                float(np.nanmax(np.abs(z - accurate) / self._tolerances, initial=0.0)) for z in (explicit, rough)
-            )
+            apart = (np.abs(z - self.near(accurate, z)) for z in (explicit, rough))
+            off, rough_off = (float(np.nanmax(one / self._tolerances, initial=0.0)) for one in apart)
         return off if off > max(_FAR, rough_off) else 0.0
 
     def off(self, x: Array) -> float:
@@ -433,14 +432,15 @@ class _Engine(OdeMeasurement):
         x = own(x[None, : self.n])
         if self.stiff or self.step is not None or self._ladder[self._levels(x, self._zeros).places[0]] <= _EASY:
             return 0.0
-        difference = np.abs(self.simulate(x) - self._implicit.simulate(x, len(self.times)))
+        z, accurate = self.simulate(x), self._implicit.simulate(x, len(self.times))
+        difference = np.abs(z - self.near(accurate, z))
         return float(np.nan_to_num(difference / self._tolerances, nan=0.0, posinf=0.0).max())
 
     def along(self, x: Array) -> dict[str, Any]:
         """What the names in the formulas stand for at x (n,), at the times of each case: (cases, times)."""
         shown = {y: y for y in self.described.rates}
         shown |= {f"output {k}": formula for k, formula in enumerate(self.described.outputs.values())}
-        engine = replace(self.described, outputs=shown, exact={}, answer={}).engine
+        engine = replace(self.described, outputs=shown, circular=(), exact={}, answer={}).engine
         y = engine.simulate(x[None]).reshape(len(self.cases), len(self.times), -1)[:, :, : self.states]
         return self.at_times(list(np.moveaxis(y, 2, 0)), list(x[: self.n] * self.si_sizes))
 

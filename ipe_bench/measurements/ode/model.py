@@ -160,7 +160,7 @@ class OdeMeasurement(Measurement):
             for i, place in enumerate((top, levels.coarser(top))):
                 self._simulate(x, np.arange(1), self._ladder[place] * self._parts, self._zeros, z[i], y[i])
             with np.errstate(all="ignore"):
-                left = levels.SAFETY * np.abs(z[0] - z[1]) / (2.0**levels.ORDER - 1.0)
+                left = levels.SAFETY * np.abs(z[0] - self.near(z[1], z[0])) / (2.0**levels.ORDER - 1.0)
             held = bool((left <= _FAR * self._tolerances).all() and levels.apart(*y)[0] <= levels.LOST)
             shortest = self._usual_interval / self._ladder[top]
         return "" if held else diagnose(self, x[0], float(shortest))
@@ -218,7 +218,7 @@ class OdeMeasurement(Measurement):
         def simulate(rows: levels.Indices, level: int, z: Array, y: Array) -> None:
             self._simulate(x, rows, level * self._parts, offset, z, y)
 
-        return levels.search(self._ladder, self._tolerances, self._kept, simulate, start)
+        return levels.search(self._ladder, self._tolerances, self._kept, simulate, start, self.near)
 
     def _trusted(self, x: Array) -> Mask:
         """The trials whose steps are fixed, or of which the coarsest level is known to do."""

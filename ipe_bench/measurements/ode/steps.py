@@ -81,6 +81,7 @@ def search(
     states: tuple[int, ...],
     simulate: Callable[[Indices, int, Array, Array], None],
     start: Indices,
+    unturned: Callable[[Array, Array], Array] = lambda h, z: h,
 ) -> Found:
     """The coarsest level at which readings hold `tolerance` (m,) and states `STATES`, by comparing levels n and n/2.
 
@@ -88,7 +89,7 @@ def search(
     eighth-order formula then has left, 16 d / (2^8 - 1), is; else n grows as that formula says. Trials that do not get
     there end at the top of the ladder. The search begins at the places `start` (trials,), and those at the top are
     accepted as they are; `simulate` fills these rows of arrays (trials, m) and (trials, *states) with readings and
-    states (cases, states, times) at one level.
+    states (cases, states, times) at one level, and `unturned` shifts readings that are angles next to others.
     """
     places, final, top = start.copy(), start.copy(), len(levels) - 1
     lost = np.zeros(len(start), dtype=bool)
@@ -106,7 +107,7 @@ def search(
             simulate(rows, int(levels[place]), fine, y)
             astray = apart(y[rows], near[rows])
             with np.errstate(all="ignore"):
-                moved = (np.abs(fine[rows] - coarse[rows]) / tolerance).max(axis=1)
+                moved = (np.abs(fine[rows] - unturned(coarse[rows], fine[rows])) / tolerance).max(axis=1)
                 moved = SAFETY * np.maximum(moved, astray / STATES)
                 left = moved / ((levels[place] / levels[below]) ** ORDER - 1.0)
                 # Not a number where an iterate overflows: such a trial climbs to the top, in bounded time.

@@ -172,3 +172,18 @@ def test_what_is_no_angle_is_refused(options, message):
         replace(PASSING, **options)
     with pytest.raises(UserError, match="circular=z: there is no such reading"):
         Formula("a*t", {"a": 1.0}, {"t": (1.0,)}, circular=("z",))
+
+
+def test_angles_and_conditionals_are_remarked_on_together():
+    found = replace(PASSING, rates={"x": "u", "y": "v if t < 50 else 2*v"}).remarks(PASSING.nominal)
+    assert any("t < 50 holds at every reading" in text for text in found)
+
+
+def test_a_reading_at_the_very_jump_takes_no_finer_steps():
+    """At half time the target is due west to the last digit, so levels of steps differ by a whole turn there."""
+    apart = replace(PASSING, start=START | {"b": -6.1})
+    assert PASSING.engine._nominal_place == apart.engine._nominal_place
+    assert not PASSING.hindrance(PASSING.nominal)
+    by_rodas = replace(PASSING, method="implicit")
+    z = PASSING.simulate(PASSING.nominal[None])
+    assert np.abs(z - PASSING.near(by_rodas.simulate(by_rodas.nominal[None]), z)).max() < 1e-7
