@@ -92,7 +92,7 @@ _RECORDED: dict[Where, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
 """Title, caption and rows of the tables that are made of recorded statistics alone."""
 _OF_PARAMETERS = ("tracks", "parameters", "theory")
 """Those of them that have a row per parameter."""
-_MAIN = ("overview", "tracks", "costs", "comparisons", "ranks", "parameters", "calibration", "endings")
+_MAIN = ("overview", "tracks", "costs", "comparisons", "parameters", "calibration", "endings")
 _APPENDIX = ("all_trials", "solved_trials", "contraction", "covariances", "theory", "iterations")
 
 
@@ -103,7 +103,7 @@ def all_tables(analysis: Analysis, whole: Analysis | None = None) -> list[Table]
         rows = analysis.summary[analysis.summary["parameter"] == ALL].reset_index(drop=True)
         totals = pd.concat([rows, analysis.scores[list(frame_columns(SCORES))]], axis=1)
         found |= {where: _recorded(analysis, where, totals) for where in _RECORDED}
-        found |= {"overview": overview(analysis), "comparisons": comparisons(analysis), "ranks": ranks(analysis)}
+        found |= {"overview": overview(analysis), "comparisons": comparisons(analysis)}
         found["contraction"] = contraction(analysis)
     listed = [(found.get(name), name in _APPENDIX) for name in (*_MAIN, *_APPENDIX)]
     return [replace(table, appendix=late) for table, late in listed if table is not None]
@@ -184,22 +184,6 @@ def comparisons(analysis: Analysis) -> Table | None:
         " pairs of all scenarios."
     )
     return Table("comparisons", "Paired comparisons", caption, columns, rows)
-
-
-def ranks(analysis: Analysis) -> Table | None:
-    """Mean ranks over independent seeds."""
-    rows = analysis.ranks
-    if rows.empty:
-        return None
-    columns = [words("estimator", rows["estimator"]), column("mean rank", rows["mean_rank"], short)]
-    columns.append(words("apart from the first", rows["apart_from_first"]))
-    first = rows.iloc[0]
-    caption = (
-        f"Ranks are by capped mean error over all scenarios and over {first['replicates']} seeds. Friedman's test that"
-        f" all rank alike: p = {p_value(first['friedman_p'])}. Nemenyi's critical difference at 5 %:"
-        f" {first['critical_difference']:.2f}."
-    )
-    return Table("ranks", "Ranks over seeds", caption, columns, rows)
 
 
 def endings(analysis: Analysis) -> Table | None:

@@ -21,9 +21,8 @@ from ipe_bench.statistics.comparisons import (
     corrected,
     may_be_best,
     profiles,
-    rank_over_replicates,
 )
-from ipe_bench.statistics.formulas import capped_error, failed, share
+from ipe_bench.statistics.formulas import failed, share
 from ipe_bench.statistics.intervals import quantile
 from ipe_bench.statistics.records import BEST, SCORES, rows_of, summary_rows, to_frame
 from ipe_bench.statistics.sample import CONTRACTION, Sample, label_of, median_distances, samples
@@ -52,8 +51,6 @@ class Analysis:
     scores: pd.DataFrame
     """Per scenario and estimator: capped mean error, median costs, and, over the trials that every estimator of the
     scenario has, their number `shared_trials` and the shares `shared_success` and `shared_silent`."""
-    ranks: pd.DataFrame
-    """Mean ranks over seeds; see `comparisons.rank_over_replicates`."""
     profiles: pd.DataFrame
     """Estimator, profile (performance or data), `at` (cost ratio or budget) and share, over all scenarios."""
     distributions: pd.DataFrame
@@ -137,10 +134,6 @@ class Begun:
             outcomes[sample.group.estimator] = Outcomes(*numbers)
             found["endings"] += [dict(sample.group.columns) | label | row for row in _ending_rows(sample)]
             found["scores"].append(numbered | rows_of(SCORES, sample)[-1] | _shared(sample))
-            found["replicates"] += [
-                numbered | {"seed": seed, "error": capped_error(sample, sample.seeds == seed)}
-                for seed in np.unique(sample.seeds).tolist()
-            ]
             distances = np.array([quantile(sample.distance, p) for p in PROBABILITIES])
             found["distributions"].append(numbered | {"probability": PROBABILITIES, "distance": distances})
             if sample.histories and sample.group.footer.get("equation") is not None:
@@ -170,9 +163,6 @@ class Begun:
             endings=pd.DataFrame(rows["endings"]),
             pairs=pd.DataFrame(corrected(pairs)),
             scores=pd.DataFrame(rows["scores"]),
-            ranks=rank_over_replicates(
-                pd.DataFrame(rows["replicates"], columns=["scenario", "seed", "estimator", "error"])
-            ),
             profiles=profiles([outcomes for _, outcomes in self._compared]),
             distributions=_joined(rows["distributions"]),
             convergence=_joined(rows["convergence"]),

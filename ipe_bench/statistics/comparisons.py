@@ -1,5 +1,4 @@
-"""Comparisons of estimators on the same trials: differences of error and of success, ranks over seeds, and what success
-costs.
+"""Comparisons of estimators on the same trials: differences of error and of success, and what success costs.
 
 The error of a trial is its Mahalanobis distance sqrt(e' J' R^-1 J e) from the truth, in standard deviations of the
 Cramér-Rao bound: about sqrt(n) for an efficient estimator. An estimate that is not finite is infinitely wrong.
@@ -26,8 +25,6 @@ ALPHA = 0.05
 RATIOS = np.unique(np.round(np.geomspace(1, 1000, 181), 6))
 BUDGETS = np.unique(np.round(np.geomspace(1, 100_000, 301)))
 """Costs at which performance and data profiles are tabulated: over the cheapest success, and in simulations."""
-REPLICATES = 5
-"""Fewer seeds than this are not ranked: the distribution of Friedman's statistic is not known well enough."""
 
 
 @dataclass(frozen=True)
@@ -113,47 +110,6 @@ def may_be_best(success: Array, level: float = ALPHA) -> Array:
     won = (success.astype(float).T @ (~success).astype(float)).astype(int)
     p = bdtr(won, won + won.T, 0.5)
     return p.min(axis=1, initial=1.0) > level / max(k - 1, 1)
-
-
-def rank_over_replicates(errors: pd.DataFrame) -> pd.DataFrame:
-    """Mean ranks of the estimators over seeds, the best first, from rows of scenario, seed, estimator and `error`.
-
-    A seed is one observation, since it gives the same draws at every error scale. It ranks the estimators of every
-    scenario by their mean error over the scenarios of every seed. With two such estimators and `REPLICATES` seeds or
-    more, `friedman_p` is that of Friedman's test that all rank alike (J. Amer. Statist. Assoc. 32, 1937), of two
-    estimators that of the sign test, and `critical_difference` Nemenyi's, q_0.05 sqrt(k (k + 1) / (6 N)) (Demšar,
-    J. Mach. Learn. Res. 7, 2006, section 3.2.2); with fewer the frame is empty.
-    """
-    import pandas as pd
-    from scipy.stats import friedmanchisquare, rankdata, studentized_range  # late: they take long to load
-
-    errors = errors.dropna()
-    wide = errors.pivot_table("error", ["scenario", "seed"], "estimator")[errors["estimator"].unique()]
-    wide = wide.loc[:, wide.notna().groupby("scenario").any().all()].dropna()
-    seeds = wide.groupby("scenario").size()
-    scores = wide.loc[seeds.index[seeds == errors["seed"].nunique()]].groupby("seed").mean()
-    count, k = scores.shape
-    if k < 2 or count < REPLICATES:
-        return pd.DataFrame()
-    # Scores closer than a tie to the next one share their mean rank.
-    order = np.argsort(scores, axis=1, kind="stable")
-    ordered: Array = np.take_along_axis(scores.to_numpy(), order, axis=1)
-    apart = np.diff(ordered, axis=1, prepend=-np.inf) >= TIE
-    groups = np.empty(scores.shape)
-    np.put_along_axis(groups, order, apart.cumsum(axis=1), axis=1)
-    ranks = rankdata(groups, axis=1)
-    if k == 2:
-        friedman = mcnemar(*(int((d > 0).sum()) for d in (np.diff(ranks), -np.diff(ranks))))
-    else:
-        friedman = float(friedmanchisquare(*ranks.T).pvalue) if np.ptp(ranks, axis=1).any() else 1.0
-    q = float(studentized_range.ppf(1 - ALPHA, k, np.inf)) / np.sqrt(2)
-    difference = q * float(np.sqrt(k * (k + 1) / (6 * count)))
-    found = pd.DataFrame({"estimator": scores.columns, "mean_rank": ranks.mean(axis=0)})
-    found = found.sort_values("mean_rank", kind="stable", ignore_index=True)
-    # Nemenyi's test is a follow-up: without a rejection by Friedman's it says nothing.
-    far = (found["mean_rank"] - found["mean_rank"].min() >= difference) & (friedman < ALPHA)
-    found["apart_from_first"] = far.map({True: "yes", False: "no"})
-    return found.assign(replicates=count, friedman_p=friedman, critical_difference=difference)
 
 
 def profiles(scenarios: Sequence[Mapping[str, Outcomes]]) -> pd.DataFrame:

@@ -211,10 +211,10 @@ def efficiency_capped_limits(s: Sample) -> Limits:
     return float(ratio(1.0, high)), float(ratio(1.0, low))
 
 
-def capped_error(s: Sample, among: Array | bool = True) -> float:
-    """Mean Mahalanobis error of the trials that all have, or of those `among` them, each at most the gate's radius."""
-    used = s.present & among
-    return float(np.minimum(s.distance[used], np.sqrt(gate(s.n))).mean()) if used.any() else np.nan
+def capped_error(s: Sample) -> float:
+    """Mean Mahalanobis error of the trials that all estimators have, each at most the gate's radius."""
+    error = np.minimum(s.distance[s.present], np.sqrt(gate(s.n)))
+    return float(error.mean()) if len(error) else np.nan
 
 
 def failed(s: Sample, *, known: bool, among: Array | slice = slice(None)) -> float:

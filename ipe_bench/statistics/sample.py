@@ -138,11 +138,6 @@ class Sample:
         return cost(self.scalars["simulations"], self.scalars["jacobians"], jacobian_cost)
 
     @property
-    def seeds(self) -> Array:
-        """(trials,)"""
-        return self.number // _SEED
-
-    @property
     def iterates(self) -> bool:
         """Whether the estimator approaches a limit step by step; the epochs of a filter are not such steps."""
         return not self.group.footer.get("sequential", False)

@@ -3,7 +3,6 @@
 import itertools
 
 import numpy as np
-import pandas as pd
 import pytest
 from scipy import stats
 from shared.synthetic_store import Pretender
@@ -21,7 +20,6 @@ from ipe_bench.statistics.comparisons import (
     may_be_best,
     mcnemar,
     profiles,
-    rank_over_replicates,
 )
 from ipe_bench.statistics.sample import distances_to_limit, iterations_to_limit
 
@@ -152,11 +150,6 @@ def test_known_differences_are_found_in_a_store(synthetic):
     assert best["good"].all()
     assert best["same"].all()
     assert not best["bad"].any()
-    ranks = analysis.ranks.set_index("estimator")
-    assert ranks["mean_rank"].to_dict() == {"good": 1.7, "same": 1.7, "bad": 2.6}
-    assert set(ranks["replicates"]) == {5}
-    (shown,) = (t for t in all_tables(analysis) if t.name == "ranks")
-    assert "5 seeds" in shown.caption
     # A Jacobian counts as three simulations here.
     assert set(analysis.scores[analysis.scores["estimator"] == "bad"]["cost_median"]) == {4.0}
 
@@ -185,51 +178,6 @@ def test_closer_is_said_of_errors_and_bold_of_success(synthetic):
     finding = tables["comparisons"].columns[-1].cells[0].text
     bold = {cells[1].text for cells in tables["overview"].rows if any(cell.best for cell in cells)}
     assert (finding, bold) == ("B is closer", {"A"})
-
-
-def ranked(scores):
-    """The ranks from the scores (seeds, scenarios, estimators) of a, b, c and so on."""
-    seeds, scenarios, labels = (axis.ravel() for axis in np.indices(np.shape(scores)))
-    rows = {"scenario": scenarios, "seed": seeds, "estimator": np.array([*"abcd"])[labels]}
-    found = rank_over_replicates(pd.DataFrame(rows | {"error": np.ravel(scores)}))
-    return found if found.empty else found.set_index("estimator")
-
-
-def test_ranks_are_tested_by_friedman_and_nemenyi():
-    # Demšar 2006, section 3.2.2: four classifiers, 14 data sets, q = 2.569, a critical difference of 1.25.
-    scores = np.random.default_rng(3).normal([0, 30, 200, 300], 100, size=(14, 1, 4))
-    found = ranked(scores)
-    assert found["critical_difference"].to_numpy() == pytest.approx(1.25, abs=0.005)
-    assert found["friedman_p"].to_numpy() == pytest.approx(stats.friedmanchisquare(*scores[:, 0].T).pvalue)
-    assert found["mean_rank"].to_dict() == dict(zip("abcd", stats.rankdata(scores[:, 0], axis=1).mean(0), strict=True))
-    assert ((found["apart_from_first"] == "yes") == (found["mean_rank"] >= found["mean_rank"].min() + 1.25)).all()
-    assert set(found["apart_from_first"]) == {"no", "yes"}
-    # A scenario that a seed lacks is left out, and so is an estimator that lacks a scenario.
-    twice = np.concatenate([scores, -scores], axis=1)
-    twice[0, 1] = np.nan
-    pd.testing.assert_frame_equal(ranked(twice), found)
-    twice[:, 1, 3] = np.nan
-    assert set(ranked(twice).index) == {*"abc"}
-    assert ranked(scores[:4]).empty
-    assert set(ranked(np.random.default_rng(3).normal(size=(14, 1, 4)))["apart_from_first"]) == {"no"}
-
-
-def test_friedmans_test_of_two_is_the_sign_test():
-    found = ranked(np.array([[1, 2]] * 9 + [[2, 1]] + [[1, 1 + 1e-9]] * 2)[:, None])
-    assert found["friedman_p"].to_numpy() == pytest.approx(stats.binomtest(9, 10).pvalue)
-    assert found.loc["a", "mean_rank"] == pytest.approx((9 * 1 + 2 + 2 * 1.5) / 12)
-    # Five of five have a p of 2/32: no follow-up, though the ranks are farther apart than the critical difference.
-    found = ranked(np.array([[1, 2]] * 5)[:, None])
-    assert found["friedman_p"].to_list() == [0.0625, 0.0625]
-    assert found["critical_difference"].max() < 1.0
-    assert set(found["apart_from_first"]) == {"no"}
-
-
-def test_seeds_that_tell_equal_estimators_apart_are_one_in_twenty():
-    """A seed gives the same draws at every error scale: were each an observation, the test would reject always."""
-    draws = np.random.default_rng(10).normal(size=(100, 12, 1, 3)) + 0.001 * np.arange(5)[:, None]
-    rejected = np.mean([ranked(scores)["friedman_p"].iloc[0] < 0.05 for scores in draws])
-    assert rejected <= 0.05 + 4 * np.sqrt(0.05 * 0.95 / 100)
 
 
 def test_profiles_of_two_estimators_by_hand():
