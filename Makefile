@@ -4,6 +4,7 @@ BIN := .venv/bin
 
 .PHONY: run test slow cluster campaigns plugins mutants lint bench docs clean
 
+# Draws README's figure too: cp outputs/headline/figures/headline.png .assets
 run: .venv/ready
 	$(BIN)/ipe-bench run +experiment=headline
 

@@ -11,12 +11,14 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from PIL import Image
 from scipy.stats import chi2
 
 import ipe_bench as ib
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+DRAWN = "outputs/headline/figures/headline.png"
 LINES = [line.removeprefix("    ") for line in README.splitlines() if line.startswith("    ") or not line]
 
 
@@ -83,6 +85,7 @@ def test_every_line_runs_in_order_and_the_table_comes_out(tmp_path):
     )
     script = "\n".join(LINES).replace("make run\n", f"{command}\n").replace(". .venv/bin/activate\n", "")
     assert script.count("ipe-bench ") >= 9
+    assert DRAWN in README
     environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
     done = subprocess.run(
         ["bash", "-euo", "pipefail", "-c", script], cwd=tmp_path, env=environment, capture_output=True, text=True
@@ -91,11 +94,21 @@ def test_every_line_runs_in_order_and_the_table_comes_out(tmp_path):
     found = check(tmp_path / "outputs/headline")
     scales = [0.1, 1, 10, 33, 100, 300, 1000]
     table = [line.replace("*", "").strip("| ").split(" | ") for line in README.splitlines() if line.startswith("| `")]
-    assert len(table) == 6
+    assert len(table) == 8
+    trials = ib.load(tmp_path / "outputs/headline")
     for name, *cells in table:
         own = found.xs(name.strip("`"), level="estimator")
         assert [float(cell) for cell in cells[:7]] == pytest.approx([100 * own["success"][s] for s in scales])
         assert float(cells[7].replace("M", "e6")) == pytest.approx(own["nees"][100.0], rel=0.005)
-        cost = ib.load(tmp_path / "outputs/headline").query("error_scale == 100 and estimator == @name.strip('`')")
+        cost = trials.query("error_scale == 100 and estimator == @name.strip('`')")
         paid = np.median(cost["simulations"] + cost["jacobians"] * 11.08695652173913)
         assert float(cells[8]) == pytest.approx(paid, abs=0.5)
+    answered = trials.query("estimator == 'auto' and extra_stage == 2").groupby("error_scale").size() / 200
+    said = re.search(r"At 300 `progressive` answers ([\d.]+) % of\s+the trials, at 1000 ([\d.]+) %", README)
+    assert said
+    assert [100 * answered[300.0], 100 * answered[1000.0]] == [float(share) for share in said.groups()]
+    with Image.open(ROOT / ".assets/headline.png") as shown, Image.open(tmp_path / DRAWN) as drawn:
+        assert shown.size == drawn.size, f"{DRAWN} is not .assets/headline.png: copy it"
+        off = np.abs(np.asarray(shown.convert("L"), float) - np.asarray(drawn.convert("L"), float)) > 64
+    # Another label of one tick changes twice as much.
+    assert off.mean() < 2e-5, f"{DRAWN} is not .assets/headline.png: copy it"
