@@ -20,7 +20,7 @@ __version__ = "0.3.0"
 if TYPE_CHECKING:
     from ipe_bench import baselines, measurements, noise, priors, solvers, states
     from ipe_bench.api import audit, check, compare, design, estimate, load, posterior, report, run, status
-    from ipe_bench.baselines.sequential import Sequential, Track
+    from ipe_bench.baselines.sequential import ConstantFilter, Sequential
     from ipe_bench.basics.errors import UserError
     from ipe_bench.basics.statuses import Status
     from ipe_bench.estimators.base import Estimates, Estimator
@@ -30,11 +30,11 @@ if TYPE_CHECKING:
     from ipe_bench.measurements.problem import Problem
     from ipe_bench.noise.base import Noise
     from ipe_bench.trials.scenario import Scenario
-    from ipe_bench.trials.tracking import Tracking
+    from ipe_bench.trials.tracking import StateScenario
 
 _HOMES = {
     "api": ("audit", "check", "compare", "design", "estimate", "load", "posterior", "report", "run", "status"),
-    "baselines.sequential": ("Sequential", "Track"),
+    "baselines.sequential": ("Sequential", "ConstantFilter"),
     "basics.errors": ("UserError",),
     "basics.statuses": ("Status",),
     "estimators.base": ("Estimates", "Estimator"),
@@ -44,9 +44,10 @@ _HOMES = {
     "measurements.problem": ("Problem",),
     "noise.base": ("Noise",),
     "trials.scenario": ("Scenario",),
-    "trials.tracking": ("Tracking",),
+    "trials.tracking": ("StateScenario",),
 }
 """Public names, by the module that they are in."""
+_RENAMED = {"Track": "ConstantFilter", "Tracking": "StateScenario"}
 _ROOMS = ("baselines", "measurements", "noise", "priors", "solvers", "states")
 __all__ = sorted(["__version__", *_ROOMS, *itertools.chain(*_HOMES.values())])  # pyright: ignore[reportUnsupportedDunderAll]
 
@@ -58,6 +59,10 @@ del globals()["report"]
 def __getattr__(name: str) -> Any:
     if name in _ROOMS:
         return importlib.import_module(f"{__name__}.{name}")
+    if name in _RENAMED:
+        from ipe_bench.basics.errors import renamed
+
+        return renamed(__name__, name, _RENAMED[name])
     for module, names in _HOMES.items():
         if name in names:
             return getattr(importlib.import_module(f"{__name__}.{module}"), name)

@@ -25,7 +25,7 @@ from ipe_bench.runs.schedule import Watcher
 from ipe_bench.states.base import StateModel
 from ipe_bench.states.trackers import Tracker
 from ipe_bench.trials.scenario import Scenario
-from ipe_bench.trials.tracking import AnyScenario, Tracking
+from ipe_bench.trials.tracking import AnyScenario, StateScenario
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from ipe_bench.report.run import ReportResult
     from ipe_bench.report.style import Which
     from ipe_bench.report.summary import Summary
-    from ipe_bench.report.tracked import TrackAnswer
+    from ipe_bench.report.tracked import LogAnswer
     from ipe_bench.statistics.audit import Audit
     from ipe_bench.trials.design import Criterion, Design
     from ipe_bench.trials.posterior import Reference
@@ -62,9 +62,9 @@ def run(
 ) -> Summary:
     """Runs every estimator on the same trials of every scenario and summarises what is known of them.
 
-    A model with its `noise`, `prior` and `error_scale` stands for a scenario, a state model for its `Tracking`, whose
-    estimators are trackers. What `output` holds already is not computed again; without `output` nothing is kept. The
-    result is a frame with a row per scenario, estimator and parameter, in the parameter's own unit, and one of the
+    A model with its `noise`, `prior` and `error_scale` stands for a scenario, a state model for its `StateScenario`,
+    whose estimators are trackers. What `output` holds already is not computed again; without `output` nothing is kept.
+    The result is a frame with a row per scenario, estimator and parameter, in the parameter's own unit, and one of the
     parameter `all`, the root mean square over parameters of error over bound. It shows the table of the terminal,
     `.trials` has a row per trial, `.figures` has Matplotlib's figures by name, and `.report(output)` writes the report.
     What could not be computed is left out, with a warning that says why.
@@ -294,7 +294,7 @@ def estimate(
     *,
     ignore_columns: Sequence[str] = (),
     find: str | Sequence[str] = (),
-) -> TrackAnswer: ...
+) -> LogAnswer: ...
 
 
 @overload
@@ -322,7 +322,7 @@ def estimate(
     parameters: Mapping[str, Mapping[str, Any]] | None = None,
     ignore_columns: Sequence[str] = (),
     find: str | Sequence[str] = (),
-) -> Answer | TrackAnswer:
+) -> Answer | LogAnswer:
     """Parameters from real readings, by every estimator: estimates, standard errors, residuals and a test of the fit.
 
     A scenario stands for its model with its noise, prior and error scale. `readings` is a CSV or Parquet file, several
@@ -384,9 +384,9 @@ def _tracked(
     trackers: Mapping[str, Any] | None,
     ignored: Sequence[str],
     find: str | Sequence[str],
-) -> TrackAnswer:
-    from ipe_bench.real.tracks import Log, Tracked, found_and_tracked
-    from ipe_bench.report.tracked import TrackAnswer
+) -> LogAnswer:
+    from ipe_bench.real.tracks import Log, LogTracks, found_and_tracked
+    from ipe_bench.report.tracked import LogAnswer
     from ipe_bench.states.trackers import ckf, ekf, ukf
 
     if isinstance(readings, Sequence) and not isinstance(readings, str):
@@ -395,10 +395,10 @@ def _tracked(
         (readings,) = readings
     trackers = {"ekf": ekf(), "ukf": ukf(), "ckf": ckf()} if trackers is None else _labelled(trackers)
     log = Log.of(model, Path(readings) if isinstance(readings, str) else readings, ignored)
-    validate([Tracking(log.model)], trackers, 1)
+    validate([StateScenario(log.model)], trackers, 1)
     names = [find] if isinstance(find, str) else list(find)
-    return TrackAnswer(
-        log, [found_and_tracked(log, *one, names) if names else Tracked.of(log, *one) for one in trackers.items()]
+    return LogAnswer(
+        log, [found_and_tracked(log, *one, names) if names else LogTracks.of(log, *one) for one in trackers.items()]
     )
 
 
@@ -555,9 +555,11 @@ def _scenario(given: Any, **stated: Any) -> Scenario:
     return Scenario(given, **stated)
 
 
-def _tracking(given: Any) -> Tracking | None:
+def _tracking(given: Any) -> StateScenario | None:
     """The scenario of a state model; None if the given is of constants."""
-    return given if isinstance(given, Tracking) else Tracking(given) if isinstance(given, StateModel) else None
+    if isinstance(given, StateModel):
+        return StateScenario(given)
+    return given if isinstance(given, StateScenario) else None
 
 
 def _labelled(estimators: Any, kind: Any = Estimator | Tracker) -> Mapping[str, Any]:

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import numpy as np
 from annotated_types import Gt, Le
 
-from ipe_bench.baselines.sequential import LARGEST, Sequential, Track
+from ipe_bench.baselines.sequential import LARGEST, ConstantFilter, Sequential
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Finite, NonNegative, Positive, Whole
 from ipe_bench.basics.streams import own_generators
@@ -20,7 +20,7 @@ from ipe_bench.states.algebra import symmetric
 from ipe_bench.states.linearisation import Cubature, Rule, Taylor, Unscented
 
 
-class _Filterpy(Track):
+class _Filterpy(ConstantFilter):
     """One of filterpy's filters on one trial."""
 
     filter: Any
@@ -41,7 +41,7 @@ class EKF(Sequential):
 
     slopes = True
 
-    def track(self, P0: Array, Q: Array, z: Array) -> Track:
+    def track(self, P0: Array, Q: Array, z: Array) -> ConstantFilter:
         return _EKFTrack(P0, Q, *self.relinearisations)
 
     def rule(self) -> Rule:
@@ -136,7 +136,7 @@ class UKF(Sequential):
     """2 is best for Gaussian parameters."""
     kappa: NonNegative = 0.0
 
-    def track(self, P0: Array, Q: Array, z: Array) -> Track:
+    def track(self, P0: Array, Q: Array, z: Array) -> ConstantFilter:
         from filterpy.kalman import MerweScaledSigmaPoints
 
         return _UKFTrack(P0, Q, MerweScaledSigmaPoints(len(P0), self.alpha, self.beta, self.kappa))
@@ -170,7 +170,7 @@ class _UKFTrack(_PointsTrack):
 class CKF(Sequential):
     """Readings at 2n cubature points, sqrt(n) deviations out (Arasaratnam and Haykin, IEEE TAC 54, 2009)."""
 
-    def track(self, P0: Array, Q: Array, z: Array) -> Track:
+    def track(self, P0: Array, Q: Array, z: Array) -> ConstantFilter:
         return _CKFTrack(P0, Q)
 
     def rule(self) -> Rule:
@@ -229,7 +229,7 @@ class EnKF(Sequential):
 
     family = "ensembles"
 
-    def track(self, P0: Array, Q: Array, z: Array) -> Track:
+    def track(self, P0: Array, Q: Array, z: Array) -> ConstantFilter:
         return _EnKFTrack(P0, Q, self.members, own_generators(self.seed, z[None])[0].bit_generator)
 
 

@@ -18,7 +18,7 @@ from ipe_bench.basics.options import NonNegative, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator, Need
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.states.base import Gaussian
+from ipe_bench.states.base import Normal
 from ipe_bench.states.linearisation import Rule
 from ipe_bench.states.trackers import update
 
@@ -26,7 +26,7 @@ LARGEST = 1e150
 """What a filter is given must have squares."""
 
 
-class Track(ABC):
+class ConstantFilter(ABC):
     """One trial's filter. The state x is the parameters' distance from the nominal point in prior deviations, and the
     readings are whitened (R = I)."""
 
@@ -61,8 +61,8 @@ class Track(ABC):
 
 @dataclass(frozen=True)
 class Sequential(Estimator):
-    """What all filters have in common. A new filter is a frozen dataclass that says how a trial's `Track` begins, or by
-    which `rule` readings are linearised.
+    """What all filters have in common. A new filter is a frozen dataclass that says how the `ConstantFilter` of a trial
+    begins, or by which `rule` readings are linearised.
 
     Reports the filter's P, and as `extras["nis"]` the trial's squared innovations over their number: 1 on average where
     the filter is consistent (`ipe_bench.statistics.intervals.mean_limits` has the limits).
@@ -78,7 +78,7 @@ class Sequential(Estimator):
 
     needs: ClassVar[frozenset[Need]] = frozenset({"epochs", "prior"})
     slopes: ClassVar[bool] = False
-    """True where `Track.update` wants dh/dx; then there is one point per trial."""
+    """True where `ConstantFilter.update` wants dh/dx; then there is one point per trial."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -86,7 +86,7 @@ class Sequential(Estimator):
             if self.engine == engine and getattr(type(self), method) is getattr(Sequential, method):
                 raise UserError(f"engine={engine}: this filter has no {method}; choose the other engine")
 
-    def track(self, P0: Array, Q: Array, z: Array) -> Track:
+    def track(self, P0: Array, Q: Array, z: Array) -> ConstantFilter:
         """The filter of one trial before its first reading, at x = 0 with covariance P0 (n, n) and process noise Q
         (n, n) per epoch. z (m,) are all readings of the trial, for the seed of a random stream."""
         raise NotImplementedError
@@ -108,7 +108,7 @@ class Sequential(Estimator):
 
             # SciPy warns of an ill-conditioned S, which R's smallness beside a wide prior explains.
             warnings.simplefilter("ignore", LinAlgWarning)
-            engine = _Tracks if self.engine == "filterpy" else _Stack
+            engine = _OneByOne if self.engine == "filterpy" else _Stack
             return engine(self, problem, z).estimates(history=history)
 
 
@@ -122,12 +122,12 @@ class _Filters(Walk):
         self.Q = filter.process_noise**2 * np.eye(problem.measurement.n)
 
 
-class _Tracks(_Filters):
-    """A `Track` for each trial; an exception ends the trial that raises it and no other."""
+class _OneByOne(_Filters):
+    """A `ConstantFilter` for each trial; an exception ends the trial that raises it and no other."""
 
     def __init__(self, filter: Sequential, problem: Problem, z: Array) -> None:
         super().__init__(filter, problem, z)
-        self.tracks: dict[int, Track] = {}
+        self.tracks: dict[int, ConstantFilter] = {}
         for t in self.going.tolist():
             self.tracks[t] = self.attempt(t, lambda t=t: filter.track(self.P[t].copy(), self.Q.copy(), z[t]))
 
@@ -170,7 +170,7 @@ class _Stack(_Filters):
             before = self.x[at]
             readings = _TurnedReadings(self, epoch, at, P[at])
             read = rule.linearise(readings, before, self.P[at])
-            found = update(Gaussian(x[at], P[at]), read, np.eye(read.b.shape[-1]), readings.z)
+            found = update(Normal(x[at], P[at]), read, np.eye(read.b.shape[-1]), readings.z)
             self.x[at], self.P[at] = found.x
             if iteration == 0:
                 self.nis[at] += found.nis  # the innovation of the prediction; later ones have seen z

@@ -25,7 +25,7 @@ from ipe_bench.runs.provenance import TARGET, canonical_json, describe
 from ipe_bench.states.base import StateModel
 from ipe_bench.states.trackers import Tracker
 from ipe_bench.trials.scenario import MOST_TRIALS, TRIALS, Scenario
-from ipe_bench.trials.tracking import Tracking
+from ipe_bench.trials.tracking import StateScenario
 
 if TYPE_CHECKING:
     from ipe_bench.real.estimation import Question
@@ -126,9 +126,9 @@ class Spec(Component):
 
     @cached_property
     def scenario(self) -> Any:
-        """The trials that are simulated: a `Scenario`, or a `Tracking` if there is a state model."""
+        """The trials that are simulated: a `Scenario`, or a `StateScenario` if there is a state model."""
         if self.model is not None:
-            return Tracking(self.model, self.seed)
+            return StateScenario(self.model, self.seed)
         measurement, truth = (m and informed(m, self.known) for m in (self.measurement, self.truth_measurement))
         assert measurement is not None
         prior = self.prior
@@ -140,7 +140,7 @@ class Spec(Component):
 
     def suited(self) -> Spec:
         """The job without the standard filters if its model lacks what they need."""
-        if isinstance(self.scenario, Tracking):
+        if isinstance(self.scenario, StateScenario):
             return self
         problem = self.scenario.problem
         unsuited = {label for label in STANDARD_FILTERS if (e := self.estimators.get(label)) and e.missing(problem)}

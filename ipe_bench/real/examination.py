@@ -60,7 +60,7 @@ class Minimum:
 
 
 @dataclass(frozen=True)
-class Bootstrap:
+class BootstrapIntervals:
     """Answers to simulated readings of the model as estimated."""
 
     low: Array
@@ -200,7 +200,7 @@ class Examination:
             return at_rows(self.rows, np.abs(moved / np.sqrt(np.diag(P))[:, None]).max(axis=0), self.whole.R.m)
 
     @cached_property
-    def bootstrap(self) -> Bootstrap:
+    def bootstrap(self) -> BootstrapIntervals:
         """Estimates within the bounds from readings simulated at the estimate with noise of R, always the same draws
         (Efron and Tibshirani, An Introduction to the Bootstrap, 1993, section 6.5).
 
@@ -218,10 +218,10 @@ class Examination:
         values = np.delete(values, [] if free is None else free.places, axis=1)[answered]
         if len(values) < draws / 2:
             unknown = np.full(len(self.x), np.nan)
-            return Bootstrap(unknown, unknown, len(values), draws)
+            return BootstrapIntervals(unknown, unknown, len(values), draws)
         tail = (1 - CONFIDENCE) / 2
         low, high = self._without_levels(*np.quantile(values, [tail, 1 - tail], axis=0))
-        return Bootstrap(low, high, len(values), draws)
+        return BootstrapIntervals(low, high, len(values), draws)
 
     def _affordable(self, wanted: int) -> int:
         return min(wanted, max(_FEWEST, _WORK // self._J.size))

@@ -15,7 +15,7 @@ from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array, deviations, unmasked
 from ipe_bench.real.readings import Table, read_tables
 from ipe_bench.states.base import StateModel
-from ipe_bench.states.formulas import Formulas, Recorded
+from ipe_bench.states.formulas import Formulas, RecordedFormulas
 from ipe_bench.states.trackers import Bootstrap, Tracker
 from ipe_bench.statistics.intervals import mean_limits
 from ipe_bench.trials.thresholds import FIT_LEVEL
@@ -55,7 +55,7 @@ class Log:
         """
         if isinstance(readings, Path):
             return _read(read_tables([readings], ignored)[0], model)
-        if readings is None and not isinstance(model, Recorded):
+        if readings is None and not isinstance(model, RecordedFormulas):
             raise UserError(f"readings: is not given; write readings=FILE, with the columns {','.join(_wanted(model))}")
         z = model.draw(0, 1).z[0] if readings is None else unmasked(readings).copy()
         if z.shape != (shape := (model.epochs, len(model.reading_names))):
@@ -117,7 +117,7 @@ class Constant:
 
 
 @dataclass(frozen=True)
-class Tracked:
+class LogTracks:
     """What one tracker makes of a log, in the units of the states."""
 
     label: str
@@ -143,7 +143,7 @@ class Tracked:
     """The constants that were asked for."""
 
     @classmethod
-    def of(cls, log: Log, label: str, tracker: Tracker) -> Tracked:
+    def of(cls, log: Log, label: str, tracker: Tracker) -> LogTracks:
         tracks, messages = track_safely(tracker, log.model, log.z[None])
         sizes, innovations = np.array([state.size for state in log.model.states]), tracks.innovations.swapaxes(1, 2)
         mean, deviation = tracks.mean[0] * sizes, deviations(tracks.covariance[0]) * sizes
@@ -174,7 +174,7 @@ class Tracked:
 # Constants -----------------------------------------------------------------------------------------------------------
 
 
-def found_and_tracked(log: Log, label: str, tracker: Tracker, find: Sequence[str]) -> Tracked:
+def found_and_tracked(log: Log, label: str, tracker: Tracker, find: Sequence[str]) -> LogTracks:
     """The constants `find` under which a tracker finds the log most likely, and its track with them.
 
     Raises:
@@ -215,11 +215,11 @@ def found_and_tracked(log: Log, label: str, tracker: Tracker, find: Sequence[str
         u, error = _minimum(cost, u)
     if not (np.isfinite(error).all() and (error[positive] < _VAGUE).all()):
         message = f"the likelihood has no maximum in {', '.join(find)}: the log does not determine them"
-        return replace(Tracked.of(log, label, tracker), message=message, passes=False)
+        return replace(LogTracks.of(log, label, tracker), message=message, passes=False)
     ends = [values(u + sign * float(ndtri(0.975)) * error) for sign in (-1, 1)]
     rows = zip(find, values(u), np.where(positive, values(u), size) * error, *ends, strict=True)
     constants = [Constant(name, *map(float, numbers)) for name, *numbers in rows]
-    return replace(Tracked.of(replace(log, model=model_at(u)), label, tracker), constants=constants)
+    return replace(LogTracks.of(replace(log, model=model_at(u)), label, tracker), constants=constants)
 
 
 def _place(model: Formulas, name: str) -> tuple[str, str]:

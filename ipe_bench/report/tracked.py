@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ipe_bench.basics.files import write_text
-from ipe_bench.real.tracks import Log, Tracked
+from ipe_bench.real.tracks import Log, LogTracks
 from ipe_bench.report.answer import as_json, with_error
 from ipe_bench.report.table import Part, Strong, Table, html, interval, plain_text, texts, words
 from ipe_bench.report.words import p_value, short
@@ -24,21 +24,21 @@ NAME, TABLE, SCHEMA = "track", "track.csv", 1
 
 
 @dataclass(frozen=True)
-class TrackAnswer:
+class LogAnswer:
     """The tracks of one log, one for each tracker."""
 
     log: Log
-    tracks: Sequence[Tracked]
+    tracks: Sequence[LogTracks]
 
     @property
     def passes(self) -> bool:
         """Whether any tracker has a track that nothing speaks against."""
         return any(one.passes for one in self.tracks)
 
-    def __iter__(self) -> Iterator[Tracked]:
+    def __iter__(self) -> Iterator[LogTracks]:
         return iter(self.tracks)
 
-    def __getitem__(self, label: str) -> Tracked:
+    def __getitem__(self, label: str) -> LogTracks:
         return next(one for one in self.tracks if one.label == label)
 
     def table(self) -> pd.DataFrame:
@@ -61,7 +61,7 @@ class TrackAnswer:
         return html(contents(self))
 
 
-def contents(answer: TrackAnswer) -> list[Part]:
+def contents(answer: LogAnswer) -> list[Part]:
     """What the innovations say of each tracker, and the states at the last epoch."""
     found, states = answer.tracks, answer.log.model.states
     limits = [one.limits[0] for one in found], [one.limits[1] for one in found]
@@ -98,7 +98,7 @@ def contents(answer: TrackAnswer) -> list[Part]:
     ]
 
 
-def write_tracks(folder: Path, answer: TrackAnswer, command: Any, provenance: Mapping[str, Any]) -> list[Path]:
+def write_tracks(folder: Path, answer: LogAnswer, command: Any, provenance: Mapping[str, Any]) -> list[Path]:
     """Writes track.json, track.csv and track.html, and returns them."""
     log, rows = answer.log, ("message", "mean_nis", "limits", "verdict", "white_p", "log_likelihood", "passes")
     trackers = {one.label: {name: as_json(getattr(one, name)) for name in rows} for one in answer}

@@ -57,7 +57,7 @@ class Outdated(Unusable):
 
 
 @dataclass(frozen=True)
-class Part:
+class StoredPart:
     """A stored file with the rows of trials start to stop of one result."""
 
     path: Path
@@ -66,7 +66,7 @@ class Part:
     stop: int
 
     @classmethod
-    def parse(cls, path: Path) -> Part | None:
+    def parse(cls, path: Path) -> StoredPart | None:
         """The part that a file name states; None if it states none."""
         match = _NAME.fullmatch(path.name)
         return None if match is None else cls(path, match[1], int(match[2]), int(match[3]))

@@ -22,7 +22,17 @@ import pyarrow as pa
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
-from ipe_bench.runs.parts import FAILED, RUN, TRUTH, Outdated, Part, Unusable, as_array, join_histories, read_record
+from ipe_bench.runs.parts import (
+    FAILED,
+    RUN,
+    TRUTH,
+    Outdated,
+    StoredPart,
+    Unusable,
+    as_array,
+    join_histories,
+    read_record,
+)
 from ipe_bench.runs.provenance import canonical_json
 from ipe_bench.runs.store import ResultKey, Store, describe_names, gaps, title
 from ipe_bench.trials.thresholds import HISTORIES
@@ -36,7 +46,7 @@ class StoredCell:
     """One scenario (one seed) under one estimator, or its truth, with all its parts from all directories."""
 
     footer: Mapping[str, Any]
-    parts: tuple[Part, ...]
+    parts: tuple[StoredPart, ...]
 
     @property
     def key(self) -> str:
@@ -321,14 +331,14 @@ class Results:
         """The iterates of a cell's first trials, by column; None if none are stored."""
         return self._of_parts(cell, lambda parts: join_histories(self._histories(parts)))
 
-    def _histories(self, parts: Sequence[Part]) -> Iterator[dict[str, Array] | None]:
+    def _histories(self, parts: Sequence[StoredPart]) -> Iterator[dict[str, Array] | None]:
         for part in (part for part in parts if part.start < HISTORIES):
             with self._naming(part.path):
                 yield part.history()
 
-    def _of_parts(self, cell: StoredCell, read: Callable[[Sequence[Part]], T]) -> T:
+    def _of_parts(self, cell: StoredCell, read: Callable[[Sequence[StoredPart]], T]) -> T:
         """What `read` makes of the parts of a cell; of those that are there now, if some were merged meanwhile."""
-        parts: Sequence[Part] = cell.parts
+        parts: Sequence[StoredPart] = cell.parts
         while True:
             try:
                 return read(parts)
@@ -336,7 +346,9 @@ class Results:
                 found = [part for directory in self.directories for part in Store(directory).parts({cell.key})]
                 parts = sorted((part for part in found if part.path not in self.damaged), key=lambda p: p.order)
 
-    def _tables(self, parts: Sequence[Part], names: Sequence[str] | None, needed: Sequence[str]) -> Iterator[pa.Table]:
+    def _tables(
+        self, parts: Sequence[StoredPart], names: Sequence[str] | None, needed: Sequence[str]
+    ) -> Iterator[pa.Table]:
         """The rows of one part after another, without the trials that an earlier one had."""
         reached = 0
         for part in parts:

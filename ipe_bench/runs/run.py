@@ -27,7 +27,7 @@ from ipe_bench.runs.schedule import Watcher, block_size_for, plan, run_tasks
 from ipe_bench.runs.store import ResultKey, Store
 from ipe_bench.states.trackers import Tracker
 from ipe_bench.trials.scenario import Scenario
-from ipe_bench.trials.tracking import AnyScenario, Tracking
+from ipe_bench.trials.tracking import AnyScenario, StateScenario
 
 log = logging.getLogger(__name__)
 
@@ -115,14 +115,14 @@ def validate(
         if scenario.noise.real and trials != 1:
             mistakes.append(f"trials={trials}: certified readings are one trial; set trials=1")
         kind, what = Tracker, "estimates constants; a state model takes trackers"
-        if not isinstance(scenario, Tracking):
+        if not isinstance(scenario, StateScenario):
             kind, what = Estimator, "tracks states that move; a measurement model takes estimators"
         other = [f"estimators.{label}: {what}" for label, one in estimators.items() if not isinstance(one, kind)]
         mistakes += other
-        if isinstance(scenario, Tracking) and not other:
+        if isinstance(scenario, StateScenario) and not other:
             found = {label: tracker.hindrance(scenario.model) for label, tracker in estimators.items()}
             mistakes += [f"trackers.{label}: {why}" for label, why in found.items() if why]
-        if isinstance(scenario, Tracking) or other:
+        if isinstance(scenario, StateScenario) or other:
             continue
         if scenario.noise.estimated and scenario.noise.true_levels(scenario.measurement.m) is None:
             mistakes.append(NO_LEVEL)

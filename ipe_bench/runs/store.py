@@ -31,7 +31,7 @@ from ipe_bench.basics.machine import library_versions
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.runs import parts
 from ipe_bench.runs.execution import Failure
-from ipe_bench.runs.parts import SCHEMA, TRUTH, Part
+from ipe_bench.runs.parts import SCHEMA, TRUTH, StoredPart
 from ipe_bench.runs.provenance import describe, digest, fingerprint
 from ipe_bench.states.trackers import Tracker
 from ipe_bench.trials.scenario import Scenario
@@ -151,9 +151,9 @@ class Store:
                 if time.time() - path.stat().st_mtime > _ABANDONED_S:
                     path.unlink()
 
-    def parts(self, keys: Keys[str] | None = None) -> list[Part]:
+    def parts(self, keys: Keys[str] | None = None) -> list[StoredPart]:
         """The parts that lie here, or those of these keys, by key and in the order of reading."""
-        found = [part for path in self.trials.glob("*.parquet") if (part := Part.parse(path)) is not None]
+        found = [part for path in self.trials.glob("*.parquet") if (part := StoredPart.parse(path)) is not None]
         return sorted((p for p in found if keys is None or p.key in keys), key=lambda part: (part.key, part.order))
 
     def write(
@@ -201,7 +201,7 @@ class Store:
         once. If a part is damaged (Unusable) or nothing can be written any more (StorageError), all stay as they are.
         """
         found, gone, reached = self.parts({key}), 0, 0
-        groups: list[tuple[Mapping[str, Any], list[Part], list[pa.Table]]] = []
+        groups: list[tuple[Mapping[str, Any], list[StoredPart], list[pa.Table]]] = []
         with contextlib.suppress(FileNotFoundError):  # another run merges the same
             for part in found if len(found) > 1 else ():
                 footer, table = part.read()
@@ -222,7 +222,7 @@ def _typed(name: str, values: Array) -> Array:
     return values.astype(np.int64) if values.dtype.kind in "iu" else values
 
 
-def _join(footer: Mapping[str, Any], group: Sequence[Part], tables: Sequence[pa.Table]) -> int:
+def _join(footer: Mapping[str, Any], group: Sequence[StoredPart], tables: Sequence[pa.Table]) -> int:
     """Writes one part with the rows of a group, unless there is one, and removes the others; returns their number."""
     first, stop = group[0], max(part.stop for part in group)
     whole = replace(first, path=first.path.with_name(f"{first.key}-{first.start}-{stop}.parquet"), stop=stop)

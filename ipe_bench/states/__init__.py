@@ -1,8 +1,11 @@
 """States that move: models with process noise, their filters and smoothers, and bounds."""
 
-from ipe_bench.states.base import Gaussian, Paths, StateModel
+from typing import Any
+
+from ipe_bench.basics.errors import renamed, unknown
+from ipe_bench.states.base import Normal, Paths, StateModel
 from ipe_bench.states.bounds import bound_at_truth, posterior_bounds
-from ipe_bench.states.formulas import Formulas, Recorded
+from ipe_bench.states.formulas import Formulas, RecordedFormulas
 from ipe_bench.states.grid import Grid
 from ipe_bench.states.linearisation import Cubature, GaussHermite, SigmaPoints, Taylor, Unscented
 from ipe_bench.states.trackers import (
@@ -23,11 +26,11 @@ __all__ = [
     "Filter",
     "Formulas",
     "GaussHermite",
-    "Gaussian",
     "Grid",
     "IteratedSmoother",
+    "Normal",
     "Paths",
-    "Recorded",
+    "RecordedFormulas",
     "SigmaPoints",
     "Smoother",
     "StateModel",
@@ -41,3 +44,10 @@ __all__ = [
     "posterior_bounds",
     "ukf",
 ]
+_RENAMED = {"Gaussian": "Normal", "Recorded": "RecordedFormulas"}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _RENAMED:
+        return renamed(__name__, name, _RENAMED[name])
+    raise AttributeError(f"{__name__}.{name}: {unknown(name, __all__, 'name')}")

@@ -19,7 +19,7 @@ _START, _PROCESS, _READINGS = range(3)
 """The random streams of a trial: its start, its process noise and the noise of its readings."""
 
 
-class Gaussian(NamedTuple):
+class Normal(NamedTuple):
     """Normal distributions, one per trial or one for all."""
 
     mean: Array
@@ -64,7 +64,7 @@ class StateModel(Component, ABC):
 
     @property
     @abstractmethod
-    def prior(self) -> Gaussian:
+    def prior(self) -> Normal:
         """Mean (n,) and covariance (n, n) before the first transition, or at the first reading if `moved_first` is
         false."""
 

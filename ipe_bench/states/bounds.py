@@ -7,7 +7,7 @@ import numpy as np
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.states.algebra import symmetric, transposed
-from ipe_bench.states.base import Gaussian, Paths, StateModel
+from ipe_bench.states.base import Normal, Paths, StateModel
 from ipe_bench.states.linearisation import Taylor, slope
 from ipe_bench.states.trackers import Tracks, filtered
 
@@ -62,5 +62,5 @@ def bound_at_truth(model: StateModel, paths: Paths) -> Array:
     errors averaged over paths."""
     path = Tracks.empty(model, len(paths.x))
     path.mean, path.covariance[:] = paths.x, model.prior.covariance
-    path.start = Gaussian(paths.start, path.start.covariance)
+    path.start = Normal(paths.start, path.start.covariance)
     return filtered(model, np.zeros((*paths.x.shape[:2], len(model.R(0)))), Taylor(), path=path).covariance

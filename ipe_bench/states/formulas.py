@@ -15,7 +15,7 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Finite, NonNegative, Positive
 from ipe_bench.measurements.arithmetic import Arithmetic, read
 from ipe_bench.measurements.base import Parameter, differentiate
-from ipe_bench.states.base import Gaussian, Paths, StateModel
+from ipe_bench.states.base import Normal, Paths, StateModel
 
 _OTHER_PLACES = 0.0, 0.7, -1.3
 """Multiples of the prior's deviations at which the gain of the process noise has to be the same."""
@@ -126,9 +126,9 @@ class Formulas(StateModel):
         return tuple(self.period.get(name, 0.0) for name in self.readings) if self.period else ()
 
     @property
-    def prior(self) -> Gaussian:
+    def prior(self) -> Normal:
         mean = np.array([self.start.get(name, 0.0) for name in self.next], dtype=float)
-        return Gaussian(mean, np.diag([float(self.spread[name]) ** 2 for name in self.next]))
+        return Normal(mean, np.diag([float(self.spread[name]) ** 2 for name in self.next]))
 
     def transition(self, x: Array, k: int) -> Array:
         return self._moved(x, np.zeros(len(self.noise)), k)
@@ -167,7 +167,7 @@ class Formulas(StateModel):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Recorded(Formulas):
+class RecordedFormulas(Formulas):
     """A model with one path and its readings that somebody has stored, and what is published of trackers on them."""
 
     recorded: str

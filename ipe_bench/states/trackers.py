@@ -18,7 +18,7 @@ from ipe_bench.basics.linalg import Array, Mask, multiply
 from ipe_bench.basics.options import Component, Count, NonNegative
 from ipe_bench.basics.streams import own_generators
 from ipe_bench.states.algebra import divide, factor, lower_solve, mahalanobis, root, symmetric, transposed, upper_solve
-from ipe_bench.states.base import Gaussian, StateModel
+from ipe_bench.states.base import Normal, StateModel
 from ipe_bench.states.linearisation import Affine, Cubature, Rule, Taylor, Unscented, slope
 
 _HALVINGS = 12
@@ -45,11 +45,11 @@ class Tracks:
     """Of the readings by the innovations (trials,)."""
     calls: Array
     """Evaluations of f and of h (trials,): as many as if the trial were alone."""
-    start: Gaussian
+    start: Normal
     """The states before the first transition."""
     moves: list[Affine] = field(default_factory=list)
     """The transitions as they were linearised."""
-    predicted: list[Gaussian] = field(default_factory=list)
+    predicted: list[Normal] = field(default_factory=list)
     """The states after each transition, before the reading."""
 
     @classmethod
@@ -62,11 +62,11 @@ class Tracks:
         start = spread_prior(model, trials)
         return cls(means, covariances, nis, innovations, degrees, likelihood, calls, start)
 
-    def at(self, k: int) -> Gaussian:
+    def at(self, k: int) -> Normal:
         """The states at epoch k; before the first transition if that is -1."""
-        return self.start if k < 0 else Gaussian(self.mean[:, k], self.covariance[:, k])
+        return self.start if k < 0 else Normal(self.mean[:, k], self.covariance[:, k])
 
-    def note(self, k: int, found: Update) -> Gaussian:
+    def note(self, k: int, found: Update) -> Normal:
         """The states after the readings of epoch k, which the tracks keep with what the innovation says."""
         self.mean[:, k], self.covariance[:, k] = found.x
         self.nis[:, k], self.innovations[:, k], self.degrees[:, k] = found.nis, found.innovation, found.degrees
@@ -85,7 +85,7 @@ class Tracks:
         """The trials of several batches one after another, without what smoothers need."""
         names = ("mean", "covariance", "nis", "innovations", "degrees", "log_likelihood", "calls")
         arrays: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-        start = Gaussian(*[np.concatenate(several) for several in zip(*(part.start for part in parts), strict=True)])
+        start = Normal(*[np.concatenate(several) for several in zip(*(part.start for part in parts), strict=True)])
         return cls(**arrays, start=start)
 
 
@@ -105,18 +105,18 @@ class Tracker(Component, ABC):
         """The states that readings z (trials, K, m) tell of."""
 
 
-def spread_prior(model: StateModel, trials: int) -> Gaussian:
+def spread_prior(model: StateModel, trials: int) -> Normal:
     m, P = model.prior
-    return Gaussian(np.repeat(m[None], trials, 0), np.repeat(P[None], trials, 0))
+    return Normal(np.repeat(m[None], trials, 0), np.repeat(P[None], trials, 0))
 
 
-def predict(x: Gaussian, move: Affine, Q: Array) -> Gaussian:
+def predict(x: Normal, move: Affine, Q: Array) -> Normal:
     """The states after a linearised transition with process noise of covariance Q (n, n)."""
     P = np.matmul(np.matmul(move.A, x.covariance), transposed(move.A)) + move.W + Q
-    return Gaussian(multiply(move.A, x.mean) + move.b, symmetric(P))
+    return Normal(multiply(move.A, x.mean) + move.b, symmetric(P))
 
 
-def linearised_reading(model: StateModel, rule: Rule, k: int, z: Array, x: Gaussian) -> Affine:
+def linearised_reading(model: StateModel, rule: Rule, k: int, z: Array, x: Normal) -> Affine:
     """h linearised about the states x, periodic readings next to the readings z (trials, m)."""
     A, b, W = rule.linearise(lambda at: model.observe(at, k), *x, model.nearest if model.periods else None)
     value = multiply(A, x.mean) + b
@@ -126,14 +126,14 @@ def linearised_reading(model: StateModel, rule: Rule, k: int, z: Array, x: Gauss
 class Update(NamedTuple):
     """The states after a reading, and what the innovation says of the filter."""
 
-    x: Gaussian
+    x: Normal
     innovation: Array
     nis: Array
     degrees: Array
     log_likelihood: Array
 
     @classmethod
-    def of(cls, x: Gaussian, y: Array, L: Array, seen: Mask) -> Update:
+    def of(cls, x: Normal, y: Array, L: Array, seen: Mask) -> Update:
         """The states x after an innovation y (trials, m) of covariance L L'; only readings that are `seen` count."""
         e = lower_solve(L, y[..., None])[..., 0]
         nis, degrees = np.sum(e**2, axis=-1), seen.sum(axis=-1)
@@ -142,7 +142,7 @@ class Update(NamedTuple):
         return cls(x, np.where(seen, e, np.nan), nis, degrees, log_likelihood)
 
 
-def update(x: Gaussian, read: Affine, R: Array, z: Array) -> Update:
+def update(x: Normal, read: Affine, R: Array, z: Array) -> Update:
     """Takes in the readings z (trials, m) of covariance R (m, m). A missing reading has no slope and unit variance.
 
     P is updated in Joseph's form, (I - K H) P (I - K H)' + K R K', which stays positive definite where the prior is
@@ -159,7 +159,7 @@ def update(x: Gaussian, read: Affine, R: Array, z: Array) -> Update:
     K = transposed(upper_solve(L, lower_solve(L, transposed(PH))))
     rest = np.eye(m.shape[-1]) - np.matmul(K, H)
     covariance = np.matmul(np.matmul(rest, P), transposed(rest)) + np.matmul(np.matmul(K, noise), transposed(K))
-    return Update.of(Gaussian(m + multiply(K, y), symmetric(covariance)), y, L, seen)
+    return Update.of(Normal(m + multiply(K, y), symmetric(covariance)), y, L, seen)
 
 
 @dataclass(frozen=True)
@@ -229,14 +229,14 @@ def _stepped(model: StateModel, z: Array, rule: Rule) -> Tracks:
                 for f in filters:
                     f.Q = Q
                     f.predict(fx=lambda at, _, k=k: model.transition(at, k))
-            x = Gaussian(np.array([f.x for f in filters]), np.array([f.P for f in filters]))
+            x = Normal(np.array([f.x for f in filters]), np.array([f.P for f in filters]))
             out.moves.append(move)
             out.predicted.append(x)
         (h, H), R = slope(lambda at, k=k: model.observe(at, k), x.mean), model.R(k)
         for f, *read in zip(filters, z[:, k], h, H, strict=True):
             _take_in(f, model, k, R, *read)
         mean, P, y, S = (np.array([getattr(f, name) for f in filters]) for name in ("x", "P", "y", "S"))
-        x = out.note(k, Update.of(Gaussian(mean, P), y, factor(S), np.isfinite(z[:, k])))
+        x = out.note(k, Update.of(Normal(mean, P), y, factor(S), np.isfinite(z[:, k])))
     # What the smoother needs, and filterpy's own; unscented readings besides the slope, by which they are told apart.
     points = rule.calls(model.n)
     moved, read = (1, 0) if isinstance(rule, Taylor) else (points, points)
@@ -323,7 +323,7 @@ def smoothed(model: StateModel, tracks: Tracks) -> Tracks:
         move, predicted = tracks.moves[k - first], tracks.predicted[k - first]
         G = divide(np.matmul(before.covariance, transposed(move.A)), predicted.covariance)
         P = np.matmul(np.matmul(G, x.covariance - predicted.covariance), transposed(G))
-        x = Gaussian(before.mean + multiply(G, x.mean - predicted.mean), symmetric(before.covariance + P))
+        x = Normal(before.mean + multiply(G, x.mean - predicted.mean), symmetric(before.covariance + P))
         if k:
             out.mean[:, k - 1], out.covariance[:, k - 1] = x
     out.start = x
@@ -371,7 +371,7 @@ def _shortened(model: StateModel, z: Array, old: Tracks, new: Tracks) -> Tracks:
     first, last = (np.concatenate([path.start.mean[:, None], path.mean], axis=1) for path in (old, new))
     path, costs = _halved(first, last, lambda x: path_cost(model, z, x[:, 0], x[:, 1:]))
     new.calls = new.calls + costs * model.evaluations
-    new.mean, new.start = path[:, 1:], Gaussian(path[:, 0], new.start.covariance)
+    new.mean, new.start = path[:, 1:], Normal(path[:, 0], new.start.covariance)
     return new
 
 

@@ -28,7 +28,7 @@ from ipe_bench.statistics.sample import AMBIGUOUS, FIT, FLOOR, NIS, Sample
 from ipe_bench.trials.thresholds import FIT_LEVEL, gate
 
 T = TypeVar("T")
-Limits = tuple[Any, ...]
+Ends = tuple[Any, ...]
 """Both ends of an interval."""
 CAP = 5.0
 """What a trial's error over the bound counts as at most in `efficiency_capped`: an efficient estimate lies beyond it in
@@ -184,7 +184,7 @@ def rmse_ends_anytime(s: Sample) -> tuple[Array, Array]:
     return low, _unless_unseen(s, high)
 
 
-def ends_in_units(ends: Callable[[Sample], tuple[Array, Array]]) -> Callable[[Sample], Limits]:
+def ends_in_units(ends: Callable[[Sample], tuple[Array, Array]]) -> Callable[[Sample], Ends]:
     return lambda s: tuple(end * np.append(s.sizes, 1.0) for end in ends(s))
 
 
@@ -206,7 +206,7 @@ def efficiency_capped(s: Sample) -> float:
     return float(ratio(1.0, rms(_capped(s))))
 
 
-def efficiency_capped_limits(s: Sample) -> Limits:
+def efficiency_capped_limits(s: Sample) -> Ends:
     (low,), (high,) = capped_interval(over_bound(s)[None] ** 2, np.array([s.n]), CAP)
     return float(ratio(1.0, high)), float(ratio(1.0, low))
 
@@ -273,7 +273,7 @@ def efficiency(s: Sample) -> Array:
     return ratio(in_units(applying_bound(s), s), in_units(rmse(s), s))
 
 
-def efficiency_limits(s: Sample) -> Limits:
+def efficiency_limits(s: Sample) -> Ends:
     bound, (low, high) = in_units(applying_bound(s), s), ends_in_units(rmse_ends)(s)
     return ratio(bound, high), ratio(bound, low)
 
@@ -293,7 +293,7 @@ def van_trees(s: Sample) -> tuple[Array, Array]:
     return middle, np.sqrt(mean((2 * bound * error) ** 2, drawn) / max(1, int(drawn.sum()))) / (2 * middle)
 
 
-def van_trees_limits(s: Sample) -> Limits:
+def van_trees_limits(s: Sample) -> Ends:
     """Where the bound lies for truths without end, by the scatter of the information among those it is from."""
     bound, error = van_trees(s)
     return in_units(np.maximum(bound - NORMAL_95 * error, 0.0), s), in_units(bound + NORMAL_95 * error, s)
@@ -346,7 +346,7 @@ def nees(s: Sample) -> Array:
     return np.append(each, np.mean(s.scalars["nees"][s.solved]) / s.n)
 
 
-def nees_limits(s: Sample) -> Limits:
+def nees_limits(s: Sample) -> Ends:
     if not reports_covariance(s):
         return np.nan, np.nan
     each, whole = (mean_limits(degrees, int(s.solved.sum())) for degrees in (1, s.n))
@@ -357,7 +357,7 @@ def nees_median(s: Sample) -> float:
     return quantile(s.scalars["nees"], 0.5) / (2 * gammaincinv(s.n / 2, 0.5)) if reports_covariance(s) else np.nan
 
 
-def nees_median_limits(s: Sample) -> Limits:
+def nees_median_limits(s: Sample) -> Ends:
     """The median of N independent values lies at a beta-distributed probability of their law."""
     if not reports_covariance(s):
         return np.nan, np.nan

@@ -45,7 +45,7 @@ ALL = "all"
 """The row of the summary over all parameters."""
 BEST = "may_be_best"
 """Whether no rival surely succeeds more often in the same trials; see `comparisons.may_be_best`."""
-Limits = f.Limits
+Ends = f.Ends
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Statistic:
     """The trials that count."""
     meaning: str
     values: Callable[[Sample], Any]
-    limits: Callable[[Sample], Limits] | None = None
+    limits: Callable[[Sample], Ends] | None = None
     given: Given = ""
     """The trials that it is conditional on: their number is the column `count`."""
     kind: Kind = "number"

@@ -25,7 +25,7 @@ from ipe_bench.noise.base import Certified, ModelNoise, Noise
 from ipe_bench.priors import GaussianPrior, Prior
 from ipe_bench.states.base import Paths, StateModel, require_sound
 from ipe_bench.states.bounds import bound_at_truth, posterior_bounds
-from ipe_bench.states.formulas import Recorded
+from ipe_bench.states.formulas import RecordedFormulas
 from ipe_bench.states.trackers import Tracker, Tracks
 from ipe_bench.trials.scenario import Scenario, check_seed
 from ipe_bench.trials.scoring import Block, Columns, by_parameter, nees
@@ -39,7 +39,7 @@ _INDEFINITE = 1e-10
 
 
 @dataclass(frozen=True)
-class Tracking:
+class StateScenario:
     """Everything that determines the trials of a state model. Paths and readings are drawn by the model's own prior, Q
     and R; trial t is the same in whatever block it is drawn."""
 
@@ -56,7 +56,7 @@ class Tracking:
 
     @property
     def noise(self) -> Noise:
-        return Certified() if isinstance(self.model, Recorded) else ModelNoise()
+        return Certified() if isinstance(self.model, RecordedFormulas) else ModelNoise()
 
     @property
     def measurement(self) -> StateModel:
@@ -80,19 +80,19 @@ class Tracking:
         return self.model.draw(start, stop, self.seed)
 
 
-AnyScenario = Scenario | Tracking
+AnyScenario = Scenario | StateScenario
 
 
 @dataclass(frozen=True)
 class PathBlock:
     """Trials of a state model with what the truth says of them."""
 
-    scenario: Tracking
+    scenario: StateScenario
     start: int
     paths: Paths
 
     @classmethod
-    def draw(cls, scenario: Tracking, start: int, stop: int) -> PathBlock:
+    def draw(cls, scenario: StateScenario, start: int, stop: int) -> PathBlock:
         with np.errstate(all="ignore"):
             return cls(scenario, start, scenario.draw(start, stop))
 
@@ -220,7 +220,7 @@ class PathBlock:
 
 def block_of(scenario: AnyScenario, start: int, stop: int) -> Any:
     """Trials start to stop of a scenario: a `PathBlock` or a `Block`."""
-    return (PathBlock if isinstance(scenario, Tracking) else Block).draw(scenario, start, stop)  # type: ignore[arg-type]
+    return (PathBlock if isinstance(scenario, StateScenario) else Block).draw(scenario, start, stop)  # type: ignore[arg-type]
 
 
 def track_safely(tracker: Tracker, model: StateModel, z: Array) -> tuple[Tracks, dict[int, str]]:

@@ -182,7 +182,7 @@ def test_an_import_that_fails_is_named_by_its_line(tmp_path, monkeypatch):
         construct({"_target_": "my_library.Model"}, "part")
 
 
-DESCRIBED = "_target_: ipe_bench.measurements.Ode", "_target_: ipe_bench.states.Formulas", "ipe_bench.states.Recorded"
+DESCRIBED = "_target_: ipe_bench.measurements.Ode", "_target_: ipe_bench.states.Formulas", "states.RecordedFormulas"
 """Of models that are nothing but their config."""
 
 

@@ -32,7 +32,7 @@ from ipe_bench.states import Smoother, ekf
 from ipe_bench.statistics import analyse
 from ipe_bench.trials.scenario import Scenario
 from ipe_bench.trials.thresholds import GATE
-from ipe_bench.trials.tracking import Tracking
+from ipe_bench.trials.tracking import StateScenario
 
 IPE, FILTERS, OTHER = ("newton", "chord"), ("ekf",), ("direct",)
 KINDS = {**dict.fromkeys(IPE, Seeker()), **dict.fromkeys(FILTERS, Filter()), **dict.fromkeys(OTHER, Pretender())}
@@ -410,7 +410,7 @@ def test_certified_readings_of_no_collection_are_found_too_and_an_empty_folder_i
 def test_states_that_move_have_words_of_their_own(tmp_path):
     """A smoother, which uses later readings too, is held against a filter and not against a bound of its own."""
     model = ConstantVelocity(count=30, spread=3.0)
-    table = ib.run(Tracking(model), {"kf": ekf(), "rts": Smoother(ekf())}, 20, output=tmp_path)
+    table = ib.run(StateScenario(model), {"kf": ekf(), "rts": Smoother(ekf())}, 20, output=tmp_path)
     kept, errors = said(tmp_path)
     assert kept == "kf, rts keep the track in all of 20 trials."
     median = table[table["parameter"] == "all"].set_index("estimator")["error_median"]

@@ -164,7 +164,7 @@ def test_one_bit_in_29_of_a_part_and_every_bit_of_a_record_is_told_or_without_ef
     compute(SCENARIOS[:1], {"newton": Newton()}, 30, tmp_path)
     (record,) = (tmp_path / "runs").iterdir()
 
-    def whole(part: parts.Part) -> str:
+    def whole(part: parts.StoredPart) -> str:
         """As text, in which what is not a number equals itself."""
         footer, table = part.read()
         history = {name: values.tolist() for name, values in (part.history() or {}).items()}

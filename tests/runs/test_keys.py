@@ -25,7 +25,7 @@ bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01))
 for name, estimator in {"ukf": ib.baselines.UKF(), "newton": ib.solvers.Newton(), "truth": None}.items():
     print(name, ResultKey(bench, name, estimator).key)
 walk = {"next": {"p": "p + w"}, "readings": {"z": "p"}, "noise": {"w": 1.0}}
-track = ib.Tracking(ib.states.Formulas(**walk, deviation={"z": 0.5}, spread={"p": 3.0}, count=20))
+track = ib.StateScenario(ib.states.Formulas(**walk, deviation={"z": 0.5}, spread={"p": 3.0}, count=20))
 for name, tracker in {"track": ib.states.ekf(), "path": None}.items():
     print(name, ResultKey(track, name, tracker).key)
 """

@@ -9,7 +9,7 @@ import numpy as np
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Finite, NonNegative, Positive
 from ipe_bench.measurements import Parameter
-from ipe_bench.states import Gaussian, StateModel
+from ipe_bench.states import Normal, StateModel
 from ipe_bench.states.algebra import root
 
 
@@ -56,9 +56,9 @@ class CoordinatedTurn(Steady):
         return (0.0, 2 * np.pi)
 
     @property
-    def prior(self) -> Gaussian:
+    def prior(self) -> Normal:
         mean = np.array([1000.0, 300.0, 1000.0, 0.0, np.radians(-3.0)])
-        return Gaussian(mean, np.diag([100.0, 10.0, 100.0, 10.0, 1e-4]))
+        return Normal(mean, np.diag([100.0, 10.0, 100.0, 10.0, 1e-4]))
 
     def transition(self, x: Array, k: int) -> Array:
         px, vx, py, vy, rate = np.moveaxis(x, -1, 0)
@@ -114,8 +114,8 @@ class Pendulum(Steady):
         return Parameter("angle", "rad"), Parameter("rate", "rad/s")
 
     @property
-    def prior(self) -> Gaussian:
-        return Gaussian(np.array(self.start), self.spread**2 * np.eye(2))
+    def prior(self) -> Normal:
+        return Normal(np.array(self.start), self.spread**2 * np.eye(2))
 
     def transition(self, x: Array, k: int) -> Array:
         angle, rate = x[..., 0], x[..., 1]
@@ -144,8 +144,8 @@ class Growth(Steady):
         return (Parameter("state"),)
 
     @property
-    def prior(self) -> Gaussian:
-        return Gaussian(np.zeros(1), np.array([[2.0]]))
+    def prior(self) -> Normal:
+        return Normal(np.zeros(1), np.array([[2.0]]))
 
     def transition(self, x: Array, k: int) -> Array:
         return x / 2 + 25 * x / (1 + x * x) + 8 * np.cos(1.2 * (k + 1))
@@ -176,8 +176,8 @@ class ConstantVelocity(Steady):
         return Parameter("position", "m"), Parameter("velocity", "m/s")
 
     @property
-    def prior(self) -> Gaussian:
-        return Gaussian(np.zeros(2), self.spread**2 * np.eye(2))
+    def prior(self) -> Normal:
+        return Normal(np.zeros(2), self.spread**2 * np.eye(2))
 
     def transition(self, x: Array, k: int) -> Array:
         return np.stack([x[..., 0] + self.step * x[..., 1], x[..., 1]], axis=-1)

@@ -16,7 +16,7 @@ from ipe_bench.states import Bootstrap, Formulas, Smoother, Tracker, ckf, ekf, u
 from ipe_bench.statistics import analyse
 from ipe_bench.statistics.certified import published_table
 from ipe_bench.statistics.collect import collect
-from ipe_bench.trials.tracking import PathBlock, Tracking
+from ipe_bench.trials.tracking import PathBlock, StateScenario
 from ipe_bench.trials.whiteness import white_p
 
 LINEAR = ConstantVelocity(count=30, spread=3.0)
@@ -30,7 +30,7 @@ def row(table, estimator, parameter="all"):
 def test_a_run_says_what_direct_computation_says(tmp_path):
     model = Pendulum(count=40, start=(0.5, 0.0), spread=0.2)
     trackers = {"ekf": ekf(), "rts": Smoother(ukf())}
-    table = ib.run(Tracking(model, seed=3), trackers, 60, block_size=25, output=tmp_path)
+    table = ib.run(StateScenario(model, seed=3), trackers, 60, block_size=25, output=tmp_path)
     paths = model.draw(0, 60, 3)
     for label, tracker in trackers.items():
         tracks = tracker.track(model, paths.z)
@@ -52,7 +52,7 @@ def test_a_run_says_what_direct_computation_says(tmp_path):
 
 
 def test_the_mean_nis_of_several_readings_an_epoch_is_that_of_one():
-    model, scenario = CoordinatedTurn(), Tracking(CoordinatedTurn(), seed=3)
+    model, scenario = CoordinatedTurn(), StateScenario(CoordinatedTurn(), seed=3)
     z = model.draw(0, 20, 3).z
     tracks = ckf().track(model, z)
     each = tracks.nis.sum(axis=1) / np.isfinite(z).sum(axis=(1, 2))
@@ -62,7 +62,7 @@ def test_the_mean_nis_of_several_readings_an_epoch_is_that_of_one():
 
 
 def test_the_kalman_filter_attains_both_bounds_on_its_own_model():
-    table = ib.run(Tracking(LINEAR), {"kf": ekf()}, 400)
+    table = ib.run(StateScenario(LINEAR), {"kf": ekf()}, 400)
     found = row(table, "kf")
     assert found["success"] == 1.0
     assert found["path_rmse"] == pytest.approx(1.0, abs=0.06)
@@ -90,7 +90,7 @@ class Deceived(Tracker):
 
 def test_innovations_are_white_where_the_filter_is_right_and_nowhere_else(tmp_path):
     table = ib.run(
-        Tracking(LINEAR),
+        StateScenario(LINEAR),
         {"kf": ekf(), "told": Deceived(replace(LINEAR, density=0.05 * LINEAR.density)), "rts": Smoother(ekf())},
         600,
         output=tmp_path,
@@ -119,7 +119,7 @@ def test_a_missing_reading_has_no_innovation_and_breaks_no_neighbours():
 
 
 def test_blocks_and_further_trials_change_no_trial(tmp_path):
-    scenario, trackers = Tracking(LINEAR, seed=1), {"ckf": ckf(), "particles": Bootstrap(50)}
+    scenario, trackers = StateScenario(LINEAR, seed=1), {"ckf": ckf(), "particles": Bootstrap(50)}
     for trials, size in ((7, 3), (20, 50)):
         ib.run(scenario, trackers, trials, block_size=size, output=tmp_path / "parts")
     ib.run(scenario, trackers, 20, output=tmp_path / "whole")
@@ -153,7 +153,7 @@ class Brittle(Tracker):
 def test_a_tracker_that_fails_in_one_trial_fails_in_that_alone():
     paths = LINEAR.draw(0, 6)
     paths.z[2, 9], paths.z[4, 9] = 1e6, -1e6
-    block = PathBlock(Tracking(LINEAR), 0, paths)
+    block = PathBlock(StateScenario(LINEAR), 0, paths)
     estimates, columns = block.estimate(Brittle())
     assert columns["status"].tolist() == ["converged"] * 2 + ["error", "converged", "nonfinite", "converged"]
     assert "a reading is beyond 1e5" in columns["message"][2]
@@ -165,7 +165,7 @@ def test_a_tracker_that_fails_in_one_trial_fails_in_that_alone():
 
 
 def test_the_growth_model_loses_the_extended_filter_and_keeps_what_knows_both_signs():
-    table = ib.run(Tracking(Growth()), {"ekf": ekf(), "particles": Bootstrap(1000)}, 60)
+    table = ib.run(StateScenario(Growth()), {"ekf": ekf(), "particles": Bootstrap(1000)}, 60)
     assert row(table, "ekf", "state")["rmse"] > 10
     assert row(table, "ekf", "state")["path_rmse"] == pytest.approx(22.0, abs=2.5)
     assert row(table, "particles", "state")["path_rmse"] == pytest.approx(4.7, abs=0.3)
@@ -175,7 +175,7 @@ def test_the_growth_model_loses_the_extended_filter_and_keeps_what_knows_both_si
 
 def test_filters_of_constants_and_of_states_are_told_apart():
     with pytest.raises(ib.UserError, match=r"estimators\.ekf: estimates constants; a state model takes trackers"):
-        ib.run(Tracking(LINEAR), {"ekf": ib.baselines.EKF()}, 3)
+        ib.run(StateScenario(LINEAR), {"ekf": ib.baselines.EKF()}, 3)
     constant = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01))
     with pytest.raises(ib.UserError, match=r"estimators\.ekf: tracks states that move"):
         ib.run(constant, {"ekf": ekf()}, 3)
@@ -214,15 +214,15 @@ class Odd(ConstantVelocity):
     ],
 )
 def test_a_model_whose_parts_do_not_suit_one_another_is_refused(part, complaint):
-    Tracking(Odd())
+    StateScenario(Odd())
     with pytest.raises(ib.UserError, match=f"model=odd: {complaint}"):
-        Tracking(Odd(part=part))
+        StateScenario(Odd(part=part))
 
 
 @pytest.mark.slow
 def test_nees_of_the_kalman_filter_lies_within_its_limits_as_often_as_is_said():
     """1,000 studies of 40 trials: the mean NEES at the last epoch, and the verdict on the whole path."""
-    table = ib.run([Tracking(LINEAR, seed=s) for s in range(2)], {"kf": ekf()}, 20)
+    table = ib.run([StateScenario(LINEAR, seed=s) for s in range(2)], {"kf": ekf()}, 20)
     low, high = row(table, "kf")["nees_low"], row(table, "kf")["nees_high"]
     paths = LINEAR.draw(0, 40_000)
     tracks = ekf().track(LINEAR, paths.z)
@@ -273,7 +273,7 @@ WALK = {
     ],
 )
 def test_formulas_that_make_no_model_are_refused(changes, complaint):
-    Tracking(Formulas(**WALK))
+    StateScenario(Formulas(**WALK))
     with pytest.raises(ib.UserError, match=complaint):
         Formulas(**WALK | changes)
 
@@ -282,12 +282,12 @@ def test_published_errors_stand_beside_those_found(tmp_path):
     """Four of the twelve; the others take the same path through +experiment=pendulum_book."""
     model = construct(composed(next(o for o in options("model") if o.name == "pendulum_book")), "model")
     trackers = {"ekf": ekf(), "ukf": ukf(), "ckf": ckf(), "ckf_rts": Smoother(ckf())}
-    ib.run(Tracking(model), trackers, 1, output=tmp_path)
+    ib.run(StateScenario(model), trackers, 1, output=tmp_path)
     table = published_table(collect([tmp_path]))
     assert table["estimator"].tolist() == list(trackers)
     assert table["difference"].abs().max() < 1e-10
     with pytest.raises(ib.UserError, match="has one path; set trials=1"):
-        Tracking(model).draw(0, 2)
+        StateScenario(model).draw(0, 2)
 
 
 @dataclass(frozen=True)
@@ -306,7 +306,7 @@ class Masking(Tracker):
 
 
 def test_masked_states_are_unknown_and_a_wrong_shape_is_refused():
-    block = PathBlock.draw(Tracking(LINEAR), 0, 3)
+    block = PathBlock.draw(StateScenario(LINEAR), 0, 3)
     estimates, columns = block.estimate(Masking((0,)))
     assert columns["status"].tolist() == ["nonfinite", "converged", "converged"]
     assert np.isnan(estimates.x[0]).all()

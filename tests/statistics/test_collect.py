@@ -73,7 +73,7 @@ def test_foreign_files_under_our_names_are_named_and_skipped(filled):
 
 def test_a_file_with_fewer_rows_than_its_name_says_is_damaged(filled):
     path = pieces(filled)[0]
-    footer, table = parts.Part.parse(path).read()
+    footer, table = parts.StoredPart.parse(path).read()
     parts.write(path, table.slice(0, 5), footer)
     assert any("does not count from 0 to 20" in line for line in collect([filled.directory]).problems)
 
@@ -81,7 +81,7 @@ def test_a_file_with_fewer_rows_than_its_name_says_is_damaged(filled):
 def test_stale_results_are_named_and_never_mixed_in(filled):
     # The same identity under the key of another source, as older code would have stored it.
     for path in pieces(filled):
-        footer, table = parts.Part.parse(path).read()
+        footer, table = parts.StoredPart.parse(path).read()
         footer = {**footer, "key": digest("of older code"), "source": "old"}
         table = table.set_column(table.column_names.index("error_a"), "error_a", [np.full(20, 1e9)])
         parts.write(path.with_name(path.name.replace(path.name[:16], footer["key"])), table, footer)

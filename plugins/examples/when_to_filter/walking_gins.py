@@ -10,7 +10,7 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, NonNegative, Positive
 from ipe_bench.measurements.base import Parameter
 from ipe_bench.measurements.gins import Gins
-from ipe_bench.states.base import Gaussian, StateModel
+from ipe_bench.states.base import Normal, StateModel
 
 KINEMATIC = 11
 """States of the motion; the parameters follow."""
@@ -47,9 +47,9 @@ class WalkingGins(StateModel):
         return interval * np.arange(1, runs * self.gins.readings_per_case + 1)
 
     @property
-    def prior(self) -> Gaussian:
+    def prior(self) -> Normal:
         variances = np.r_[np.zeros(KINEMATIC), np.full(self.gins.n, self.error_scale**2)]
-        return Gaussian(np.zeros(len(variances)), np.diag(variances))
+        return Normal(np.zeros(len(variances)), np.diag(variances))
 
     def transition(self, x: Array, k: int) -> Array:
         g = self.gins

@@ -20,7 +20,7 @@ from stonesoup.types.hypothesis import SingleHypothesis
 from stonesoup.types.prediction import GaussianStatePrediction
 from stonesoup.updater.kalman import ExtendedKalmanUpdater, UnscentedKalmanUpdater
 
-from ipe_bench.baselines.sequential import Sequential, Track
+from ipe_bench.baselines.sequential import ConstantFilter, Sequential
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Finite, NonNegative
 
@@ -45,7 +45,7 @@ class _Known(NonLinearGaussianMeasurement):
         return self.H
 
 
-class _Track(Track):
+class _OfTrial(ConstantFilter):
     """One trial's filter."""
 
     def __init__(self, P0: Array, Q: Array, updater: Any) -> None:
@@ -84,8 +84,8 @@ class StoneSoupEKF(Sequential):
 
     slopes = True
 
-    def track(self, P0: Array, Q: Array, z: Array) -> Track:
-        return _Track(P0, Q, ExtendedKalmanUpdater(measurement_model=None, use_joseph_cov=True))
+    def track(self, P0: Array, Q: Array, z: Array) -> ConstantFilter:
+        return _OfTrial(P0, Q, ExtendedKalmanUpdater(measurement_model=None, use_joseph_cov=True))
 
 
 @dataclass(frozen=True)
@@ -99,13 +99,13 @@ class StoneSoupUKF(Sequential):
     kappa: NonNegative = 0.0
     """Secondary spread of the points."""
 
-    def track(self, P0: Array, Q: Array, z: Array) -> Track:
+    def track(self, P0: Array, Q: Array, z: Array) -> ConstantFilter:
         spread = {"alpha": self.alpha, "beta": self.beta, "kappa": self.kappa}
         updater = UnscentedKalmanUpdater(measurement_model=None, force_symmetric_covariance=True, **spread)
         return _Unscented(P0, Q, updater)
 
 
-class _Unscented(_Track):
+class _Unscented(_OfTrial):
     def points(self) -> Array:
         """Where the updater will want to be read, in its order."""
         updater = self.updater

@@ -9,7 +9,7 @@ import numpy as np
 import ipe_bench as ib
 from ipe_bench.measurements import Gins
 from ipe_bench.states import ekf
-from ipe_bench.trials.tracking import Tracking
+from ipe_bench.trials.tracking import StateScenario
 
 sys.path.append(str(Path(__file__).parents[1]))
 from walking_gins import WalkingGins
@@ -36,7 +36,7 @@ def test_drifts_walk_as_fast_as_is_said_and_nothing_else_does():
 
 
 def test_a_singular_covariance_has_neither_nees_nor_posterior_bound():
-    table = ib.run(Tracking(WalkingGins(gins=Gins(readings_per_case=2))), {"ekf": ekf()}, 8)
+    table = ib.run(StateScenario(WalkingGins(gins=Gins(readings_per_case=2))), {"ekf": ekf()}, 8)
     (found,) = table[table["parameter"] == "all"].to_dict("records")
     assert np.isnan(found["path_nees"])
     assert np.isnan(found["nees"])
