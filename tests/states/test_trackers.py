@@ -26,9 +26,9 @@ from ipe_bench.states import (
     Cubature,
     Filter,
     GaussHermite,
-    Gaussian,
     Grid,
     IteratedSmoother,
+    Normal,
     Smoother,
     StateModel,
     Taylor,
@@ -154,7 +154,7 @@ class Walk(StateModel):
 
     @property
     def prior(self):
-        return Gaussian(np.zeros(2), np.eye(2))
+        return Normal(np.zeros(2), np.eye(2))
 
     def transition(self, x, k):
         return np.stack([x[..., 0] + x[..., 1], x[..., 1]], axis=-1)
@@ -232,10 +232,10 @@ def test_missing_readings_are_as_if_they_had_never_been_taken(rule):
     ahead = replace(blind, count=20, start=tuple(before.mean[0, -1].tolist()))
     assert tracks.degrees[0].sum() == 40
     assert tracks.nis[0, 10:30].max() == 0.0
-    x = Gaussian(before.mean[0, -1], before.covariance[0, -1])
+    x = Normal(before.mean[0, -1], before.covariance[0, -1])
     for k in range(10, 30):  # the prediction alone
         move = rule.linearise(lambda at, k=k: ahead.transition(at, k), x.mean[None], x.covariance[None])
-        x = Gaussian(
+        x = Normal(
             (move.A @ x.mean + move.b)[0], (move.A @ x.covariance @ move.A.swapaxes(1, 2) + move.W)[0] + NEAR.Q(k)
         )
     np.testing.assert_allclose(tracks.mean[0, 29], x.mean, atol=1e-12)
@@ -270,7 +270,7 @@ class Scalar(StateModel):
 
     @property
     def prior(self):
-        return Gaussian(np.array([2.0]), np.array([[9.0]]))
+        return Normal(np.array([2.0]), np.array([[9.0]]))
 
     def transition(self, x, k):
         return 0.9 * x + 0.5 * np.cos(k)
