@@ -1,23 +1,19 @@
-"""The page report.html: one file that is readable on a phone, on paper and without a network, and its charts."""
+"""The page report.html: one file that is readable on a phone, on paper and without a network."""
 
 from __future__ import annotations
 
 import base64
 import json
-import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
 from ipe_bench import __version__
-from ipe_bench.report.figures.views import View, views
 from ipe_bench.report.headline import about, headline
-from ipe_bench.report.style import ON_DARK
 from ipe_bench.report.table import Table, environment
 from ipe_bench.report.words import CITATION
 from ipe_bench.statistics.comparisons import TIE
 from ipe_bench.statistics.records import SCORES, STATISTICS, all_statistics
-from ipe_bench.trials.thresholds import FEW
 
 if TYPE_CHECKING:
     from ipe_bench.report.figures import Drawn
@@ -27,15 +23,13 @@ if TYPE_CHECKING:
 MOST_RUNS = 20
 MOST_COMMANDS = 3
 """At the head of the page; all stand with the provenance."""
-FIGURES = 5
-"""Number of significant figures of a number in a chart."""
 _PYTHON, _UNKNOWN = "from Python", "a command that was not recorded"
 
 
 def render_page(
     analysis: Analysis, tables: Sequence[Table], figures: Sequence[Drawn], written: Sequence[Written] = ()
 ) -> str:
-    """The page as text, with the charts of simulated trials; what plugins have written stands behind our tables."""
+    """Renders the page as text; what plugins have written stands behind our tables."""
     from markupsafe import Markup
 
     collection, runs = analysis.collection, _runs(analysis.collection.runs)
@@ -55,7 +49,6 @@ def render_page(
         written=written,
         appendix=[table for table in tables if table.appendix],
         figures=[vars(one) | {"data": base64.b64encode(one.files[0].read_bytes()).decode()} for one in figures],
-        charts=list(charts(views(analysis)[0])),
         nothing_failed=analysis.endings.empty and not analysis.summary.empty,
         runs=runs[:MOST_RUNS],
         older_runs=max(0, len(runs) - MOST_RUNS),
@@ -94,68 +87,6 @@ def _runs(runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 def _minute(started: str) -> str:
     return started[:16].replace("T", " ")
-
-
-# Charts --------------------------------------------------------------------------------------------------------------
-
-
-def _axis(column: str, title: str, **more: Any) -> dict[str, Any]:
-    """A column that an axis may show, with the columns of its interval's ends, and a line at what is best."""
-    plain = {"log": False, "share": False, "low": "", "high": "", "reference": None, "reference_title": ""}
-    return {"column": column, "title": title, **plain, **more}
-
-
-_SCALE = _axis("error_scale", "error scale", log=True)
-_COST = _axis("simulations_median", "simulations per trial (median)", log=True)
-_OVER = {"log": True, "reference": 1.0, "reference_title": "the bound"}
-_AXES = (
-    _axis("success", "success", share=True, low="success_low", high="success_high"),
-    _axis("error_median", "median error over the bound", **_OVER),
-    _axis("error_q95", "95 % error over the bound", **_OVER),
-    _axis("efficiency_capped", "efficiency", low="efficiency_capped_low", high="efficiency_capped_high"),
-    _axis("nees_median", "NEES, median", log=True, reference=1.0, reference_title="honest covariance"),
-    _axis("coverage95", "truth in the 95 % ellipsoid", share=True, reference=0.95, reference_title="honest covariance"),
-    _axis("failed_silent", "failed silently", share=True),
-)
-
-
-def charts(views: Sequence[View]) -> Iterator[dict[str, str]]:
-    """The chart of each setting: its name, title and caption, and as JSON what the script draws."""
-    for view in views:
-        rows = view.totals
-        shown = [
-            {key: v.replace("the bound", view.reference) if isinstance(v, str) else v for key, v in axis.items()}
-            for axis in _AXES
-            if len(rows) and rows[axis["column"]].map(math.isfinite).any()
-        ]
-        if not shown:
-            continue
-        across = (_SCALE, _COST) if len(view.scales) > 1 else (_COST, _SCALE)
-        columns = {axis[key] for axis in (*across, *shown) for key in ("column", "low", "high") if axis[key]}
-        series = [
-            {
-                "name": label,
-                "color": look.color,
-                "on_dark": ON_DARK.get(look.color, look.color),
-                "marker": look.marker,
-                "dash": list(look.dash or ()),
-                "values": {c: [_short(v) for v in part[c]] for c in sorted(columns | {"trials"})},
-            }
-            for label, look in view.look.items()
-            for part in (rows[rows["estimator"] == label],)
-        ]
-        data = {"x": across, "y": shown, "few": FEW, "series": series}
-        caption = f"{view.label}. Bars: 95 % intervals, where they are known. Hollow: fewer than {FEW} trials."
-        text = json.dumps(data, ensure_ascii=False, separators=(",", ":"))
-        title = "All trials, by any two columns"
-        yield {"name": f"explore{view.suffix}", "title": title, "caption": caption, "data": text}
-
-
-def _short(value: float) -> float | int | None:
-    """A number as it stands on the page; None for what is not there, and for what JSON cannot say."""
-    if not math.isfinite(value):
-        return None
-    return int(value) if value == int(value) and abs(value) < 1e15 else float(f"{value:.{FIGURES}g}")
 
 
 # Definitions ---------------------------------------------------------------------------------------------------------

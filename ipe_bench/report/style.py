@@ -26,13 +26,6 @@ FAMILIES: dict[str, tuple[str, ...]] = {
 COLORS = tuple(family[i] for i in range(5) for family in FAMILIES.values() if i < len(family))
 """The same with the families by turns, for what is no estimator: parameters, settings."""
 BLACK, GREY = "#000000", "#b0b0b0"
-
-
-ON_DARK: dict[str, str] = {BLACK: "#ffffff"} | {
-    color: "#" + "".join(f"{round(102 + 0.6 * int(color[i : i + 2], 16)):02x}" for i in (1, 3, 5))
-    for color in (*COLORS, GREY)
-}
-"""The colours on a dark ground, mixed with white by two fifths."""
 MARKERS = ("o", "s", "D", "^", "v", "P", "d", "<", ">", "p", "h")
 DASHES: tuple[Any, ...] = ("", (5, 2), (1, 1.5), (5, 2, 1, 2))
 """As seaborn and matplotlib take them: lengths on and off, nothing for a solid line."""

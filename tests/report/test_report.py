@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import re
 from dataclasses import replace
 from html import unescape
@@ -20,7 +21,7 @@ from ipe_bench.api import report as write_report
 from ipe_bench.noise import Quantization
 from ipe_bench.report import figures
 from ipe_bench.report.headline import about, headline
-from ipe_bench.report.html import DEFINITIONS
+from ipe_bench.report.html import DEFINITIONS, render_page
 from ipe_bench.report.table import Strong, Table, column, comma_separated, html, latex, markdown, terminal, texts, words
 from ipe_bench.report.tables import all_tables
 from ipe_bench.report.terminal import LEGEND, reported, summary_tables
@@ -57,8 +58,7 @@ def test_what_is_written_is_whole_and_the_page_stands_alone(result):
     assert not re.search(r"""src\s*=\s*["'](?!data:)""", page)
     led_to = set(re.findall(r"""href\s*=\s*["'](?!data:|#)([^"']*)""", page))
     assert led_to == {f"figures/{path.name}" for path in result.figures}
-    # The name of SVG's namespace is no address that anything is fetched from.
-    assert "http" not in re.sub(r"base64,[^\"]*|http-equiv|http://www.w3.org/2000/svg", "", page)
+    assert "http" not in re.sub(r"base64,[^\"]*|http-equiv", "", page)
     analysis, shown = analyse([result.report.parent]), page.replace("&#39;", "'")
     assert all(sentence in shown for sentence in (*headline(analysis), *about(analysis)))
 
@@ -197,3 +197,40 @@ def test_what_a_terminal_has_no_room_for_is_named_with_its_file_or_goes_below():
 
 def test_the_legend_says_at_what_a_trial_is_capped():
     assert "where a trial counts as at most 5." in " ".join(LEGEND)
+
+
+def _luminance(color: str) -> float:
+    """Relative luminance (WCAG 2.1)."""
+    rgb = np.array([int(color[i : i + 2], 16) for i in (1, 3, 5)]) / 255
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    return float(linear @ [0.2126, 0.7152, 0.0722])
+
+
+def test_words_show_on_the_dark_ground(synthetic):
+    """A contrast of 4.5 at least, as WCAG 2.1 asks of text; the ground is the one that the page has."""
+    fill(synthetic)
+    analysis = analyse([synthetic.directory])
+    style = render_page(analysis, all_tables(analysis), []).partition("</style>")[0]
+    dark = style[style.index("prefers-color-scheme: dark") :]
+    ground, *words = (_luminance(re.search(rf"--{name}: (#\w+)", dark)[1]) for name in ("ground", "ink", "soft"))
+    assert (min(words) + 0.05) / (ground + 0.05) > 4.5
+
+
+def test_the_page_says_which_commands_computed_what_it_shows(synthetic):
+    """One entry for the jobs of a sweep; none for a run that found everything stored."""
+    fill(synthetic)
+    record = json.loads(next((synthetic.directory / "runs").glob("*.json")).read_text(encoding="utf-8"))
+    record = {k: v for k, v in record.items() if k not in ("schema", "file", "run", "digest")}
+    for name, command, blocks in (
+        ("b", "ipe-bench run -m error_scale=1,10", 2),
+        ("c", "ipe-bench run -m error_scale=1,10", 1),
+        ("d", "ipe-bench run that finds it all", 0),
+        ("e", None, 3),
+    ):
+        synthetic.store.write_run(name, record | {"command": command, "blocks": blocks})
+    analysis = analyse([synthetic.directory])
+    page = render_page(analysis, all_tables(analysis), [])
+    assert page.count('<details class="run">') == 3
+    assert page.count("<code>ipe-bench run -m error_scale=1,10</code>") == 2
+    assert "finds it all" not in page
+    assert page.count("from Python") == 1
