@@ -19,7 +19,7 @@ from ipe_bench.basics.linalg import Array, Mask, finite, inverse, multiply, squa
 from ipe_bench.basics.options import Count, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator, Need
-from ipe_bench.estimators.driver import ConvergenceCheck, Limits, Solver, iterate
+from ipe_bench.estimators.driver import ConvergenceCheck, Limits, Method, iterate
 from ipe_bench.estimators.least_squares import Objective
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
 from ipe_bench.measurements.counted import CountingModel
@@ -289,7 +289,7 @@ class Linearized:
 
 
 @dataclass(frozen=True)
-class IPLF(InformationFilter, Solver[Linearized]):
+class IPLF(InformationFilter, Method[Linearized]):
     """Readings linearised by regression over the posterior itself, again and again (García-Fernández, Svensson,
     Morelande, Särkkä, IEEE TSP 63(20), 2015), the mean damped as in Raitoharju, Svensson, García-Fernández and Piché
     (IEEE SPL 25(4), 2018; arXiv 1704.01113).
@@ -349,8 +349,8 @@ class IPLF(InformationFilter, Solver[Linearized]):
 
     def check(self, system: EpochReadings, before: Linearized | None, state: Linearized) -> ConvergenceCheck:
         """Done where bringing the covariance up to date has changed neither it nor the mean."""
-        level = np.where(np.isfinite(state.cost) & state.proposal.usable, 1.0, np.nan)
-        return ConvergenceCheck(state.change, level, np.full(len(state.x), np.inf))
+        growth = np.where(np.isfinite(state.cost) & state.proposal.usable, 1.0, np.nan)
+        return ConvergenceCheck(state.change, growth, np.full(len(state.x), np.inf))
 
 
 def _cost(readings: EpochReadings, W: Array, r: Array, x: Array) -> Array:

@@ -15,7 +15,7 @@ from ipe_bench.basics.linalg import Array, Mask, deviations, finite, inverse, mu
 from ipe_bench.basics.options import Count, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator, Need
-from ipe_bench.estimators.driver import ConvergenceCheck, Limits, Solver, iterate
+from ipe_bench.estimators.driver import ConvergenceCheck, Limits, Method, iterate
 from ipe_bench.estimators.minima import Minima
 from ipe_bench.measurements.base import SubsetModel
 from ipe_bench.measurements.counted import CountingModel, EvaluationCount
@@ -318,7 +318,7 @@ class Shooting:
 
 
 @dataclass(frozen=True)
-class CondensedGaussNewton(Solver[Trajectory]):
+class CondensedGaussNewton(Method[Trajectory]):
     """Gauss-Newton under the linearised conditions, halved by the natural monotonicity test."""
 
     def begin(self, system: Shooting, x: Array) -> Trajectory:
@@ -351,9 +351,9 @@ class CondensedGaussNewton(Solver[Trajectory]):
         """The step still to go, the gaps, and whether a step can still be shortened."""
         unknown, gap = ~finite(state.step), np.abs(state.d).max(axis=1, initial=0.0)
         size = np.where(unknown, np.inf, np.fmax(_reach(state, state.step), gap))
-        level = np.where(finite(state.r) & finite(state.d), 1.0, np.nan)
+        growth = np.where(finite(state.r) & finite(state.d), 1.0, np.nan)
         ending = np.where(unknown, Status.SINGULAR, Status.STALLED)
-        return ConvergenceCheck(size, level, state.moved, unknown | (state.share < _SHORTEST), ending)
+        return ConvergenceCheck(size, growth, state.moved, unknown | (state.share < _SHORTEST), ending)
 
 
 def _reach(state: Trajectory, change: Array) -> Array:

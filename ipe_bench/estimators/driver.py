@@ -30,7 +30,7 @@ class ConvergenceCheck:
 
     size: Array
     """How far the equation is from holding, in standard deviations: converged where it is within the tolerance."""
-    level: Array
+    growth: Array
     """What grows where the iteration diverges; not finite where the model or the algebra has overflowed."""
     moved: Array
     """The last step, in standard deviations; infinite before the first."""
@@ -40,7 +40,7 @@ class ConvergenceCheck:
     """What it is called where a trial is stuck, or its steps have become tiny."""
 
 
-class Solver(ABC, Generic[S]):
+class Method(ABC, Generic[S]):
     """A method that the driver iterates: where it begins, one step of it, and how far it has come."""
 
     @abstractmethod
@@ -88,23 +88,23 @@ class SolveResult(Generic[S]):
         return self.status == Status.CONVERGED
 
 
-def iterate(equations: Any, solver: Solver[S], start: Array | S, limits: Limits) -> SolveResult[S]:
+def iterate(equations: Any, method: Method[S], start: Array | S, limits: Limits) -> SolveResult[S]:
     """Iterates from `start`, which is x (trials, n) or a state, until every trial has ended; those leave the batch.
 
     `equations` have a counting `model`, the `rows` of the trials in its tally, and a `subset` for some of them.
     """
-    state = solver.begin(equations, start) if isinstance(start, np.ndarray) else start
+    state = method.begin(equations, start) if isinstance(start, np.ndarray) else start
     trials, n = state.x.shape
     tally, active = equations.model.tally, np.arange(trials)
     status, iterations = np.full(trials, Status.RUNNING, np.int8), np.zeros(trials, np.int64)
     iterates = [[row] for row in state.x] if limits.history else None
     ended: list[tuple[NDArray[np.intp], S]] = []
-    check = solver.check(equations, None, state)
-    begun = np.maximum(check.level, 1.0)
+    check = method.check(equations, None, state)
+    begun = np.maximum(check.growth, 1.0)
     for iteration in range(limits.max_iterations + 1):
         if iteration:
-            before, state = state, solver.step(equations, state)
-            check = solver.check(equations, before, state)
+            before, state = state, method.step(equations, state)
+            check = method.check(equations, before, state)
             iterations[active] = iteration
             if iterates is not None:
                 for row, x in zip(active, state.x, strict=True):
@@ -114,10 +114,10 @@ def iterate(equations: Any, solver: Solver[S], start: Array | S, limits: Limits)
         endings: tuple[tuple[Any, Any], ...] = (
             (tally.failed(rows), Status.ERROR),
             (tally.singular[rows], Status.SINGULAR),
-            (~np.isfinite(check.level), Status.NONFINITE),
+            (~np.isfinite(check.growth), Status.NONFINITE),
             (check.size <= limits.tolerance, Status.CONVERGED),
             (check.stuck, check.ending),
-            (check.level > FAR * begun, Status.DIVERGED),
+            (check.growth > FAR * begun, Status.DIVERGED),
             (check.moved < TINY_STEP * limits.tolerance, check.ending),
             (limits.budget is not None and tally.of_search(n)[rows] >= limits.budget, Status.BUDGET),
             (iteration == limits.max_iterations, Status.MAX_ITERATIONS),

@@ -24,7 +24,7 @@ from ipe_bench.basics.linalg import (
 )
 from ipe_bench.basics.options import Count, Positive
 from ipe_bench.estimators.base import Estimates, Estimator
-from ipe_bench.estimators.driver import ConvergenceCheck, Limits, Solver, iterate
+from ipe_bench.estimators.driver import ConvergenceCheck, Limits, Method, iterate
 from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 Start = Literal["linear_lse", "nominal", "best"]
 """Where an iteration begins: at the linear LSE, eq. (16), at the nominal point, or at the better fit of the two."""
-_NEAR = 0.03
+_COARSE_BEYOND = 0.03
 """Where F is larger, in standard deviations of the linear bound, a step is as good with a coarse Jacobian."""
 
 
@@ -109,7 +109,7 @@ class FrozenSystem:
         return multiply(self.H_plus, self.model.residual(x, self.rows, self.z))
 
     def J(self, x: Array, F: Array | None = None) -> Array:
-        coarse = False if F is None else np.abs(F / self.deviation).max(axis=1) > _NEAR
+        coarse = False if F is None else np.abs(F / self.deviation).max(axis=1) > _COARSE_BEYOND
         return np.matmul(self.H_plus, self.model.jacobian(x, self.rows, coarse=coarse))
 
     def solve(self, A: Array, b: Array) -> Array:
@@ -179,7 +179,7 @@ def starting_points(problem: Problem, z: Array, start: Start, tally: EvaluationC
 
 
 @dataclass(frozen=True, kw_only=True)
-class IPE(Solver[S], Estimator, Generic[S]):
+class IPE(Method[S], Estimator, Generic[S]):
     """The paper's estimator: a solver iterated on the system of eq. (11), H frozen at the nominal point.
 
     Reports the sandwich covariance (H+ J)^-1 H+ R H+' (H+ J)^-T at the estimate. A new solver is a frozen dataclass

@@ -255,7 +255,7 @@ class LeastSquaresSystem:
         """The Gauss-Newton step still to go says how far the gradient is from zero, where J is good enough to end with;
         the cost says what diverges."""
         known = np.isfinite(self.cost) & finite(self.slope.gradient)
-        level = np.where(known, np.sqrt(self.cost), np.nan)
+        growth = np.where(known, np.sqrt(self.cost), np.nan)
         ending = np.where(self.rankless, Status.SINGULAR, Status.STALLED)
         size = np.where(self.rankless & self.regular, self.slope.stationary, self.slope.size)
         # Where nothing can be gained the answer is there, however badly the Jacobian or round-off behaves.
@@ -263,4 +263,4 @@ class LeastSquaresSystem:
         size = np.where(settled, 0.0, size)
         if objective.exact_within > 0:
             size = np.where(self.exact, size, np.inf)
-        return ConvergenceCheck(size, level, self.moved, stuck, ending)
+        return ConvergenceCheck(size, growth, self.moved, stuck, ending)

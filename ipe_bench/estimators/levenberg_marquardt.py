@@ -8,7 +8,7 @@ import numpy as np
 
 from ipe_bench.basics.batches import put
 from ipe_bench.basics.linalg import Array, finite, multiply
-from ipe_bench.estimators.driver import ConvergenceCheck, Solver
+from ipe_bench.estimators.driver import ConvergenceCheck, Method
 from ipe_bench.estimators.least_squares import LeastSquaresSystem, Objective, slope_at
 
 _SMALL = 1e-10
@@ -23,7 +23,7 @@ _MOST_BENT = 0.75
 
 
 @dataclass(frozen=True)
-class GaussNewtonMethod(Solver[LeastSquaresSystem]):
+class GaussNewtonMethod(Method[LeastSquaresSystem]):
     """x <- x - (J' R^-1 J)^-1 J' R^-1 (h(x) - z), undamped; where J lacks rank, the shortest of all such steps."""
 
     def begin(self, objective: Objective, x: Array) -> LeastSquaresSystem:
@@ -49,7 +49,7 @@ class GaussNewtonMethod(Solver[LeastSquaresSystem]):
 
 
 @dataclass(frozen=True)
-class LevenbergMarquardtMethod(Solver[LeastSquaresSystem]):
+class LevenbergMarquardtMethod(Method[LeastSquaresSystem]):
     """The step minimises |r + J s|^2 + lambda |D s|^2, and lambda follows the gain ratio.
 
     D = 1 / `deviation` (n,), the metric of a prior covariance; None: Marquardt's, the column norms of J, which only

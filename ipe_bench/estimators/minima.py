@@ -12,12 +12,12 @@ from ipe_bench.basics.batches import put, take
 from ipe_bench.basics.linalg import Array, Mask, deviations, finite, inverse, squared
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates
-from ipe_bench.estimators.driver import Limits, Solver, SolveResult, iterate
+from ipe_bench.estimators.driver import Limits, Method, SolveResult, iterate
 from ipe_bench.estimators.least_squares import LeastSquaresSystem, NormalEquations, Objective, slope_at
 from ipe_bench.measurements.counted import EvaluationCount
 from ipe_bench.measurements.problem import Problem
 
-_NEAR = 0.03
+_EXACT_WITHIN = 0.03
 """Steps still to go of fewer deviations are computed from exact Jacobians: a coarse one leaves the gradient about a
 hundredth of a deviation from zero."""
 WRONG_MINIMUM = 1e-6
@@ -82,14 +82,14 @@ class Minima:
         return Estimates.of(self, tally, covariance=self.covariance, extras={"fit_p": self.fit_probability(readings)})
 
 
-def minimize(objective: Objective, method: Solver[LeastSquaresSystem], x: Array, limits: Limits) -> Minima:
+def minimize(objective: Objective, method: Method[LeastSquaresSystem], x: Array, limits: Limits) -> Minima:
     """Minimises the objective from x (trials, n), by coarse Jacobians on the way if the model has any that are cheaper.
 
     Converged is where the Gauss-Newton step, which is the gradient in whitened units, is at most `limits.tolerance`
     standard deviations of the local bound in every parameter. An iteration is a step tried, taken or not.
     """
     if np.isinf(objective.exact_within):
-        objective = objective.coarsened(_NEAR)
+        objective = objective.coarsened(_EXACT_WITHIN)
     ended = iterate(objective, method, x, limits)
     return minima_of(ended, _exact_slope(objective, ended.state), objective.readings)
 
@@ -148,9 +148,9 @@ class Fitting:
         return estimates
 
 
-def passes(found: Minima, readings: int, level: float) -> Mask:
-    """Which minima (trials,) pass the test of the fit at a level; none at 1, where their residuals say nothing."""
-    return (found.fit_probability(readings) >= level) & (level < 1)
+def passes(found: Minima, readings: int, significance: float) -> Mask:
+    """Which minima (trials,) pass the test of the fit; none at a significance of 1: their residuals say nothing."""
+    return (found.fit_probability(readings) >= significance) & (significance < 1)
 
 
 def spread_of_starts(problem: Problem) -> Array:

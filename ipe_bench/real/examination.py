@@ -15,7 +15,7 @@ from ipe_bench.estimators.least_squares import inverse_factor
 from ipe_bench.measurements.base import Measurement, Parameter
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.real.fits import Fit, at_rows, falls_beyond, holding, scaled
-from ipe_bench.real.levels import Levelled, maximum, minimise, objective_of
+from ipe_bench.real.levels import Levelled, maximise_likelihood, maximum, objective_of
 from ipe_bench.real.profiles import (
     CONFIDENCE,
     Released,
@@ -235,7 +235,7 @@ class Examination:
         reach = np.repeat(_SPREADS, self._affordable(STARTS) // len(_SPREADS))[:, None]
         drawn = problem.x0 + reach * spread * rng.standard_normal((len(reach), n))
         starts = np.concatenate([self.inner[None], drawn])
-        minima = minimise(problem, np.repeat(self.z[None], len(starts), axis=0), starts)
+        minima = maximise_likelihood(problem, np.repeat(self.z[None], len(starts), axis=0), starts)
         limit = joint_region(n, CONFIDENCE, self.freedom if isinstance(self.freedom, int) else None)
         usable = minima.converged & np.isfinite(minima.chi_square) & np.isfinite(minima.covariance).all(axis=(1, 2))
         found: list[Minimum] = []
@@ -286,7 +286,7 @@ def examine(problem: Problem, z: Array, fits: list[Fit], *, bootstraps: int = BO
         chi_square = float(np.sum(assumed.R.whiten(z[rows] - levelled.model.near(levelled.fitted, z[rows])) ** 2))
     else:
         assumed = best.assumed
-        minima = minimise(assumed, z[None, rows], best.inner[None])
+        minima = maximise_likelihood(assumed, z[None, rows], best.inner[None])
         inner, P, chi_square = minima.x[0], minima.covariance[0], float(minima.chi_square[0])
         converged, freedom = bool(minima.converged[0]), None
         if best.level is not None:
@@ -351,7 +351,7 @@ def _on_bounds(problem: Problem, found: Examination, values: Mapping[int, float]
 def answers(problem: Problem, z: Array, x: Array, released: Released | None = None) -> tuple[Array, Mask]:
     """The least-squares estimates (sets, n) within the bounds, in the parameters' own units, for readings z (sets, m)
     from x (sets, n), and the sets that have one; `released` are parameters whose bounds are where they stood."""
-    minima, model = minimise(problem, z, x), problem.measurement
+    minima, model = maximise_likelihood(problem, z, x), problem.measurement
     values, found = model.physical(minima.x), minima.converged.copy()
     outside, bounds = np.zeros((len(x), 0), dtype=bool), np.zeros(0)
     if released is not None:
@@ -368,7 +368,7 @@ def answers(problem: Problem, z: Array, x: Array, released: Released | None = No
         near = dict(key)
         free = [k for k in range(model.n) if k not in near]
         held = holding(problem, near)
-        there = minimise(held, z[sets], np.ascontiguousarray(minima.x[sets][:, free]))
+        there = maximise_likelihood(held, z[sets], np.ascontiguousarray(minima.x[sets][:, free]))
         found[sets] = there.converged & falls_beyond(problem, there.x, near, z[sets], released)
         values[sets] = np.array([near.get(k, np.nan) for k in range(model.n)])
         values[np.ix_(sets, free)] = held.measurement.physical(there.x)

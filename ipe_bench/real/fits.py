@@ -283,8 +283,8 @@ def fit(problem: Problem, z: Array, estimators: Mapping[str, Estimator], noise: 
     given = Given(present, problem.measurement, rows, z[rows], noise)
     if (levels := noise.levels_of(problem.measurement)) is not None:
         levels = levels.restricted(rows)
-        return _compared([_fit_with_levels(given, *one, levels) for one in estimators.items()])
-    fitted = _fit_with_level if noise.estimated else _fit_one
+        return _compared([_fit_reml(given, *one, levels) for one in estimators.items()])
+    fitted = _fit_scaled if noise.estimated else _fit_one
     return _compared([fitted(given, *one, present) for one in estimators.items()])
 
 
@@ -304,7 +304,7 @@ def _compared(fits: list[Fit]) -> list[Fit]:
     return [replace(one, beaten_by=label) if one.deviance > limit else one for one in fits]
 
 
-def _fit_with_level(given: Given, label: str, estimator: Estimator, problem: Problem) -> Fit:
+def _fit_scaled(given: Given, label: str, estimator: Estimator, problem: Problem) -> Fit:
     """The fit at which the level that R assumes is that of the residuals."""
     spread = float(np.sqrt(np.mean(problem.R.whiten(given.z) ** 2)))
     level, found = spread or 1.0, None
@@ -346,7 +346,7 @@ def _deviates(r: Array, free: Array | int) -> Array:
         return np.where(np.isinf(deviates), np.sign(r) * _FARTHEST, deviates)
 
 
-def _fit_with_levels(given: Given, label: str, estimator: Estimator, levels: Levels) -> Fit:
+def _fit_reml(given: Given, label: str, estimator: Estimator, levels: Levels) -> Fit:
     """The fit at which the levels that R assumes are those of the residuals; of least squares, the maximum of the
     restricted likelihood near there."""
     theta, h, z = first_levels(levels, given.z), given.z, given.z

@@ -162,7 +162,7 @@ def objective_of(problem: Problem, z: Array, model: CountingModel | None = None)
     return Likelihood(*given, levelled=whole) if isinstance(whole, Levelled) else Objective(*given)
 
 
-def minimise(problem: Problem, z: Array, x: Array) -> Minima:
+def maximise_likelihood(problem: Problem, z: Array, x: Array) -> Minima:
     """The minima of `objective_of` for readings z (trials, m) from x (trials, n), with its values as `chi_square`."""
     with np.errstate(all="ignore"):
         objective = objective_of(problem, z)
@@ -228,7 +228,7 @@ def levels_at(problem: Problem, levels: Levels, theta: Array, z: Array, x: Array
     w = levels.covariance(h, theta).whiten(z - h)
     theta = theta + first_levels(levels, w * levels.weights)
     known = Levelled(_Known(h), levels, theta, spare)
-    found = minimise(Problem(known, _covariance(levels, known.whole, theta)), z[None], theta[None])
+    found = maximise_likelihood(Problem(known, _covariance(levels, known.whole, theta)), z[None], theta[None])
     return _estimated(problem, levels, spare, z, np.concatenate([x, found.x[0]]), bool(found.converged[0]))
 
 
@@ -236,7 +236,7 @@ def maximum(start: Estimated, z: Array) -> Estimated:
     """The maximum of the restricted likelihood of readings z (m,) near a start."""
     found = start
     for _ in range(_MOST_ROUNDS):
-        minima = minimise(found.problem, z[None], found.x[None])
+        minima = maximise_likelihood(found.problem, z[None], found.x[None])
         model, n = found.model, found.model.whole.n
         problem = replace(found.problem, measurement=model.whole)
         x, last = minima.x[0], found.model.spare

@@ -45,18 +45,18 @@ _ON_BOUND = 1e-9
 """A value nearer to a bound than this share of the start's distance is on the bound, but for round-off."""
 
 
-def half_width(level: float, freedom: float | Array | None) -> float | Array:
+def half_width(confidence: float, freedom: float | Array | None) -> float | Array:
     """The normal quantile of a two-sided interval; Student's t if the level of the noise is estimated from `freedom`
     degrees of freedom, or (n,) of them."""
-    return stdtrit(np.inf if freedom is None else freedom, (1 + level) / 2)
+    return stdtrit(np.inf if freedom is None else freedom, (1 + confidence) / 2)
 
 
-def joint_region(parameters: int, level: float, freedom: float | None) -> float:
+def joint_region(parameters: int, confidence: float, freedom: float | None) -> float:
     """The squared distance, in standard errors, to the edge of the joint confidence region of some parameters:
     chi-square, or F if the level of the noise is estimated from `freedom` degrees of freedom."""
     if freedom is None:
-        return float(chdtri(parameters, 1 - level))
-    return float(parameters * fdtri(parameters, freedom, level))
+        return float(chdtri(parameters, 1 - confidence))
+    return float(parameters * fdtri(parameters, freedom, confidence))
 
 
 def natural_limits(model: Measurement) -> tuple[Array, Array]:

@@ -54,10 +54,10 @@ def normalised(w: Array, Q: Array, R: Covariance) -> Array:
     return statistic / np.sqrt(variance)
 
 
-def outlier_limit(m: int, level: float = OUTLIER_LEVEL) -> float:
-    """Normalised residuals beyond this are outliers: by chance, one among m readings with probability `level` at most
-    (Bonferroni)."""
-    return -float(ndtri(level / (2 * max(m, 1))))
+def outlier_limit(m: int, significance: float = OUTLIER_LEVEL) -> float:
+    """Normalised residuals beyond this are outliers: by chance, one among m readings with probability `significance`
+    at most (Bonferroni)."""
+    return -float(ndtri(significance / (2 * max(m, 1))))
 
 
 def whiteness(w: Array, Q: Array, series: NDArray[np.intp], draws: int = DRAWS) -> float:

@@ -12,7 +12,7 @@ from ipe_bench.basics.options import Positive, Whole
 from ipe_bench.basics.statuses import Status
 from ipe_bench.basics.streams import normals, own_generators
 from ipe_bench.estimators.base import Estimates, Estimator
-from ipe_bench.estimators.driver import ConvergenceCheck, Limits, Solver, SolveResult, continued, iterate
+from ipe_bench.estimators.driver import ConvergenceCheck, Limits, Method, SolveResult, continued, iterate
 from ipe_bench.estimators.least_squares import NormalEquations, Objective
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
 from ipe_bench.estimators.minima import WRONG_MINIMUM, Fitting, Minima, minima_of, minimize, spread_of_starts
@@ -121,7 +121,7 @@ _ITERATIONS = 25
 _TRIED, _PER_DECADE = 6, 3
 """After `_TRIED` steps from the linear estimate, each decade by which the remaining step has shrunk may have taken at
 most `_PER_DECADE` steps, the first three aside: far from the root the steps wander."""
-_NEAR = 1e-2
+_NEAR_ROOT = 1e-2
 """How near to the root of eq. (11), in deviations, they bring a trial before the Jacobian there takes over."""
 _CHORDS = 8
 """Steps with one Jacobian from then on."""
@@ -182,7 +182,7 @@ class OnChord:
 
 
 @dataclass(frozen=True)
-class Chord(Solver[OnChord]):
+class Chord(Method[OnChord]):
     """Gauss-Newton steps with the Jacobian of the start, and Anderson's acceleration.
 
     With H, the Jacobian of the nominal point, these are the fixed-point steps of eq. (17).
@@ -236,7 +236,7 @@ def by_chords(
         return minima, contracts
     frozen = take(nominal, np.zeros(len(x0), np.intp))
     start = OnChord.at(x0, objective.residual(x0), frozen, np.zeros((len(x0), *H.shape)))
-    ended = iterate(objective, Chord(), start, Limits(_NEAR, _ITERATIONS, budget, history))
+    ended = iterate(objective, Chord(), start, Limits(_NEAR_ROOT, _ITERATIONS, budget, history))
     near = np.flatnonzero(ended.converged)
     if len(near):
         limits = Limits(tolerance, _CHORDS, budget, history)

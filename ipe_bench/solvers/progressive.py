@@ -26,7 +26,8 @@ _BULK = 1.0
 _READINGS = 4
 """The least number of readings per parameter for which the median says so."""
 _TRUSTED = 1e-3
-"""A level of the test of fit from which on a large bulk of residuals is asked for no longer: R is known, or unknown."""
+"""A significance of the test of fit from which on a large bulk of residuals is asked for no longer: R is known, or
+unknown."""
 _WORTH = 20.0
 """What a search for a better fit may cost, in costs of the first fit."""
 
@@ -90,7 +91,7 @@ class Progressive(Estimator):
             self.window_tolerance,
             self.restarts,
         )
-        tally, level = attempts.tally, max(WRONG_MINIMUM, problem.doubted)
+        tally, significance = attempts.tally, max(WRONG_MINIMUM, problem.doubted)
         best = attempts.attempt(0, everyone, None)
         if before is not None:
             worse = before.converged & ~best.better_than(before)
@@ -102,7 +103,7 @@ class Progressive(Estimator):
         for k in range(1, attempts.last + 1):
             cost, draws = tally.of_search(n), attempts.draws(k)
             first = np.where(best.converged, np.minimum(first, cost), np.inf)
-            going = ~accepted(best, m, level) & finite(z) & ~tally.failed(everyone)
+            going = ~accepted(best, m, significance) & finite(z) & ~tally.failed(everyone)
             going &= (cost < np.minimum(_WORTH * first, attempts.most * (1 + n))) | (drawn == 0)
             going &= (repeats < attempts.repeats) | (independent == 0)
             going &= self.budget is None or cost < self.budget
@@ -118,7 +119,7 @@ class Progressive(Estimator):
                 count[rows] = np.where(better & ~same, 0, count[rows] + led)
             best = put(best, rows[better], take(again, better))
         raised = tally.failed(everyone) & ~best.converged
-        for i in np.flatnonzero(best.converged & ~accepted(best, m, level) & (tried > 0)).tolist():
+        for i in np.flatnonzero(best.converged & ~accepted(best, m, significance) & (tried > 0)).tolist():
             tally.messages[i] = _words(tried[i], drawn[i], repeats[i])
         return replace(best, status=np.where(raised, Status.ERROR, best.status).astype(np.int8)), tally
 
@@ -138,8 +139,8 @@ def _words(tried: int, drawn: int, repeats: int) -> str:
     return f"a better fit was looked for by {count}{draws}: {led}"
 
 
-def accepted(minima: Minima, readings: int, level: float) -> Mask:
+def accepted(minima: Minima, readings: int, significance: float) -> Mask:
     """Which minima (trials,) are taken for the least: those that fit, and those whose bulk of residuals does."""
     gross_errors_only = (minima.bulk <= _BULK) & (readings >= _READINGS * minima.x.shape[1])
-    fits = passes(minima, readings, level)
-    return minima.converged & (fits | (gross_errors_only & (level < _TRUSTED)))
+    fits = passes(minima, readings, significance)
+    return minima.converged & (fits | (gross_errors_only & (significance < _TRUSTED)))

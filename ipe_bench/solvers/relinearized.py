@@ -13,7 +13,7 @@ from ipe_bench.basics.linalg import Array, finite
 from ipe_bench.basics.options import Count, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator
-from ipe_bench.estimators.driver import ConvergenceCheck, Limits, Solver, iterate
+from ipe_bench.estimators.driver import ConvergenceCheck, Limits, Method, iterate
 from ipe_bench.estimators.ipe import IPE, FrozenSystem, Start, State, begin, frozen_covariance, root_check
 from ipe_bench.estimators.least_squares import inverse_factor
 from ipe_bench.measurements.problem import Problem
@@ -42,7 +42,7 @@ class Round(State):
 
 
 @dataclass(frozen=True)
-class Relinearized(Solver[Round], Estimator):
+class Relinearized(Method[Round], Estimator):
     """Any solver on F(x) = H_k+ (h(x) - z), with H_k = dh/dx at the estimate x_k that the round before has reached.
 
     Where F(x_k) = 0 at its own linearisation, the gradient J' R^-1 (h - z) of least squares vanishes: the estimate is
@@ -88,7 +88,7 @@ class Relinearized(Solver[Round], Estimator):
         """F at its own linearisation; an inner root, stall or limit is only the end of a round."""
         check = root_check(state.deviation, None, state)
         stuck = ~np.isin(state.inner, _ROUND_ENDS)
-        return ConvergenceCheck(check.size, check.level, check.moved, stuck, state.inner)
+        return ConvergenceCheck(check.size, check.growth, check.moved, stuck, state.inner)
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         x, system = begin(problem, z, self.start)

@@ -17,7 +17,7 @@ from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian, Unknown
 from ipe_bench.real.examination import examine
 from ipe_bench.real.fits import fit
-from ipe_bench.real.levels import Levelled, minimise
+from ipe_bench.real.levels import Levelled, maximise_likelihood
 from ipe_bench.real.profiles import CONFIDENCE, half_width
 
 LM = {"lm": LevenbergMarquardt(tolerance=1e-10, max_iterations=500)}
@@ -76,7 +76,7 @@ def test_the_maximum_of_the_likelihood_is_that_of_a_direct_search(case):
     found = start
     for _ in range(2):  # the second from the first, since the logarithm of a level is held a little at its start
         model = Levelled(DECAY, levels, found[3:], np.ones(60))
-        found = minimise(Problem(model, Covariance(np.full(60, 0.2))), z[None], found[None]).x[0]
+        found = maximise_likelihood(Problem(model, Covariance(np.full(60, 0.2))), z[None], found[None]).x[0]
     assert found == pytest.approx(direct, abs=1e-8)
 
 
