@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: run test slow cluster campaigns plugins mutants lint bench docs clean
+.PHONY: run test slow cluster campaigns plugins lowest newest mutants lint dist bench docs clean
 
 # Draws README's figure too: cp outputs/headline/figures/headline.png .assets
 run: .venv/ready
@@ -32,6 +32,13 @@ plugins: .venv/ready
 		--editable plugins/dask
 	outputs/plugins/.venv/bin/python -m pytest -m plugin plugins
 
+# The quick tests with the lowest versions of all libraries that pyproject.toml allows, and with the newest and their pre-releases.
+lowest newest: .venv/ready
+	$(BIN)/uv venv --quiet --clear --python $(BIN)/python outputs/$@/.venv
+	$(BIN)/uv pip install --quiet --python outputs/$@/.venv/bin/python --editable ".[test]" \
+		$(if $(filter lowest,$@),--resolution lowest-direct,--upgrade --prerelease allow)
+	outputs/$@/.venv/bin/python -m pytest -n auto --dist worksteal -W default
+
 # Whether the tests notice changes on purpose, room by room, as a table in outputs/mutants. SAMPLE=40 draws that many.
 mutants: .venv/ready
 	$(BIN)/uv pip install --quiet --python $(BIN)/python --editable ".[mutants]"
@@ -41,6 +48,13 @@ lint: .venv/ready
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/pyright --pythonpath $(BIN)/python
+	@$(BIN)/python tests/sizes.py
+
+# What a release publishes, in dist.
+dist: .venv/ready
+	rm -rf dist
+	$(BIN)/uv build --quiet
+	$(BIN)/uvx --quiet twine check --strict dist/*
 
 # What everything costs beside its rivals, as a table in outputs/bench. PEERS=1 installs other people's libraries first.
 # PARTS=scale runs a million trials with their report instead, which takes minutes; SCALE=100000 that many.
