@@ -109,8 +109,4 @@ DEFINITIONS: dict[str, str] = {
     " Cramér-Rao bound for all: McNemar's exact one-sided test against every rival at 5 % over their number, which"
     " leaves a true best out in at most 5 % of scenarios (Hsu, Annals of Statistics 9, 1981). Nothing is bold if no"
     " estimator is beaten.",
-    "performance profile": "Share of trials in which an estimator succeeds at a cost of at most τ times that of the"
-    " cheapest success (Dolan and Moré, Mathematical Programming 91, 2002).",
-    "data profile": "Share of trials in which it succeeds within a budget (Moré and Wild, SIAM Journal on Optimization"
-    " 20, 2009).",
 }

@@ -12,7 +12,7 @@ from ipe_bench.report.table import Part, Table
 from ipe_bench.report.tables import all_tables, certified_tables
 from ipe_bench.statistics.analysis import Analysis
 
-CURVES = ("profiles", "distributions")
+CURVES = ("distributions",)
 """Frames of an analysis that are files beside the tables, and too long to be read on a page."""
 
 

@@ -20,7 +20,6 @@ from ipe_bench.statistics.comparisons import (
     compare_pairs,
     corrected,
     may_be_best,
-    profiles,
 )
 from ipe_bench.statistics.formulas import failed, share
 from ipe_bench.statistics.intervals import quantile
@@ -51,8 +50,6 @@ class Analysis:
     scores: pd.DataFrame
     """Per scenario and estimator: capped mean error, median costs, and, over the trials that every estimator of the
     scenario has, their number `shared_trials` and the shares `shared_success` and `shared_silent`."""
-    profiles: pd.DataFrame
-    """Estimator, profile (performance or data), `at` (cost ratio or budget) and share, over all scenarios."""
     distributions: pd.DataFrame
     """Quantiles of the Mahalanobis error over all trials: `probability` (of `PROBABILITIES`) and `distance`."""
     convergence: pd.DataFrame
@@ -88,8 +85,6 @@ class Analysis:
             for name, v in held.items()
             if hasattr(v, "columns") and "noise" in v
         }
-        if not groups:
-            held["profiles"] = self.profiles.iloc[:0]
         return replace(self, **held | {"collection": replace(self.collection, groups=groups)})
 
 
@@ -130,8 +125,7 @@ class Begun:
             label, present = {"estimator": sample.group.estimator}, sample.present
             numbered = where | label
             summary += summary_rows(sample)
-            numbers = sample.distance[present], sample.inside_gate[present], sample.cost[present]
-            outcomes[sample.group.estimator] = Outcomes(*numbers)
+            outcomes[sample.group.estimator] = Outcomes(sample.distance[present], sample.inside_gate[present])
             found["endings"] += [dict(sample.group.columns) | label | row for row in _ending_rows(sample)]
             found["scores"].append(numbered | rows_of(SCORES, sample)[-1] | _shared(sample))
             distances = np.array([quantile(sample.distance, p) for p in PROBABILITIES])
@@ -163,7 +157,6 @@ class Begun:
             endings=pd.DataFrame(rows["endings"]),
             pairs=pd.DataFrame(corrected(pairs)),
             scores=pd.DataFrame(rows["scores"]),
-            profiles=profiles([outcomes for _, outcomes in self._compared]),
             distributions=_joined(rows["distributions"]),
             convergence=_joined(rows["convergence"]),
             calibration=_joined(rows["calibration"]),

@@ -1,4 +1,4 @@
-"""Comparisons of estimators on the same trials: differences of error and of success, and what success costs.
+"""Comparisons of estimators on the same trials: differences of error and of success.
 
 The error of a trial is its Mahalanobis distance sqrt(e' J' R^-1 J e) from the truth, in standard deviations of the
 Cramér-Rao bound: about sqrt(n) for an efficient estimator. An estimate that is not finite is infinitely wrong.
@@ -9,22 +9,16 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.special import bdtr
 
 from ipe_bench.basics.linalg import Array
 
-if TYPE_CHECKING:
-    import pandas as pd
-
 TIE = 1e-3
 """Errors closer than this, in standard deviations, are equal: round-off is never a difference."""
 ALPHA = 0.05
-RATIOS = np.unique(np.round(np.geomspace(1, 1000, 181), 6))
-BUDGETS = np.unique(np.round(np.geomspace(1, 100_000, 301)))
-"""Costs at which performance and data profiles are tabulated: over the cheapest success, and in simulations."""
 
 
 @dataclass(frozen=True)
@@ -35,8 +29,6 @@ class Outcomes:
     """(trials,) Mahalanobis errors, infinite where the estimate is not finite."""
     success: Array
     """(trials,) whether the error lies inside the gate of the Cramér-Rao bound: one gate for all, prior or not."""
-    cost: Array
-    """(trials,) in simulations."""
 
 
 def compare_pairs(outcomes: Mapping[str, Outcomes]) -> list[dict[str, Any]]:
@@ -110,30 +102,3 @@ def may_be_best(success: Array, level: float = ALPHA) -> Array:
     won = (success.astype(float).T @ (~success).astype(float)).astype(int)
     p = bdtr(won, won + won.T, 0.5)
     return p.min(axis=1, initial=1.0) > level / max(k - 1, 1)
-
-
-def profiles(scenarios: Sequence[Mapping[str, Outcomes]]) -> pd.DataFrame:
-    """Which share of all trials the estimators of every scenario solve at what cost: columns estimator, profile, `at`
-    and share.
-
-    `performance`: at a cost of at most `RATIOS` times the cheapest estimator's (Dolan and Moré, Math. Program. 91,
-    2002). `data`: within `BUDGETS` simulations (Moré and Wild, SIAM J. Optim. 20, 2009). A trial without success costs
-    infinitely much.
-    """
-    import pandas as pd
-
-    everywhere = [label for label in (scenarios[0] if scenarios else ()) if all(label in one for one in scenarios)]
-    spent = {
-        label: np.concatenate([np.where(one[label].success, one[label].cost, np.inf) for one in scenarios])
-        for label in everywhere
-    }
-    best = np.min(list(spent.values()), axis=0, initial=np.inf)
-    parts = [pd.DataFrame(columns=["estimator", "profile", "at", "share"])] if not spent else []
-    for label, cost in spent.items():
-        solved = np.isfinite(cost)
-        # A cost of nothing, without any simulation, is the best there is.
-        ratio = np.divide(cost, best, out=np.where(solved, 1.0, np.inf), where=solved & (best > 0))
-        for profile, at, values, slack in (("performance", RATIOS, ratio, 1e-9), ("data", BUDGETS, cost, 0.0)):
-            share = np.searchsorted(np.sort(values), at * (1 + slack), side="right") / max(1, len(values))
-            parts.append(pd.DataFrame({"estimator": label, "profile": profile, "at": at, "share": share}))
-    return pd.concat(parts, ignore_index=True)

@@ -55,7 +55,7 @@ def test_the_report_writes_the_table_and_draws_nothing_over_error_scales(folder)
     assert result.figures == ()
     # One trial without noise has no error to compare with a bound, and no covariance to calibrate.
     shown = {p.stem for p in result.tables}
-    assert not shown & {"overview", "calibration", "costs", "comparisons", "parameters", "profiles"}
+    assert not shown & {"overview", "calibration", "costs", "comparisons", "parameters"}
     page = result.report.read_text(encoding="utf-8")
     assert page.index('id="certified_averages"') < page.index('<details class="part"') < page.index('id="certified"')
     # The linear estimate has no digits, the fixed point not all of them.

@@ -10,8 +10,6 @@ from shared.synthetic_store import Pretender
 from ipe_bench.report.tables import all_tables
 from ipe_bench.statistics import analyse
 from ipe_bench.statistics.comparisons import (
-    BUDGETS,
-    RATIOS,
     Outcomes,
     compare_pairs,
     corrected,
@@ -19,14 +17,13 @@ from ipe_bench.statistics.comparisons import (
     holm,
     may_be_best,
     mcnemar,
-    profiles,
 )
 from ipe_bench.statistics.sample import distances_to_limit, iterations_to_limit
 
 
-def outcomes(distance, success=True, cost=1.0):
+def outcomes(distance, success=True):
     distance = np.asarray(distance, dtype=float)
-    return Outcomes(distance, np.broadcast_to(success, distance.shape) == 1, np.broadcast_to(cost, distance.shape))
+    return Outcomes(distance, np.broadcast_to(success, distance.shape) == 1)
 
 
 def test_two_failures_are_a_tie_and_one_is_a_loss():
@@ -180,25 +177,8 @@ def test_closer_is_said_of_errors_and_bold_of_success(synthetic):
     assert (finding, bold) == ("B is closer", {"A"})
 
 
-def test_profiles_of_two_estimators_by_hand():
-    # Costs: a 1, 4, fails, fails; b 2, 2, 8, fails.
-    a = outcomes(np.ones(4), [1, 1, 0, 0], [1, 4, 1, 1])
-    b = outcomes(np.ones(4), [1, 1, 1, 0], [2, 2, 8, 1])
-    tables = profiles([{"a": a, "b": b}]).set_index(["profile", "estimator"])["share"]
-
-    def share(profile, label, at):
-        grid = {"performance": RATIOS, "data": BUDGETS}[profile]
-        return tables.loc[profile, label].to_numpy()[np.searchsorted(grid, at, side="right") - 1]
-
-    assert [share("performance", "a", r) for r in (1, 2.5)] == [0.25, 0.5]
-    assert [share("performance", "b", r) for r in (1, 2.5)] == [0.5, 0.75]
-    assert [share("data", "a", c) for c in (1, 3, 4, 100)] == [0.25, 0.25, 0.5, 0.5]
-    assert [share("data", "b", c) for c in (1, 2, 8, 100)] == [0, 0.5, 0.75, 0.75]
-
-
-def test_profiles_compare_on_the_same_scenarios_and_by_the_same_gate(synthetic):
-    """An estimator that was spared the hard scenario has no part in the profile; users of a prior have no easier or
-    harder gate than the others."""
+def test_success_of_all_estimators_is_by_the_same_gate(synthetic):
+    """Users of a prior have no easier or harder gate than the others."""
     easy, hard = (synthetic.scenario(error_scale=s) for s in (1.0, 2.0))
     e = 0.1 * np.random.default_rng(9).normal(size=(50, 3))
     bayes = Pretender(knows_prior=True)
@@ -206,10 +186,7 @@ def test_profiles_compare_on_the_same_scenarios_and_by_the_same_gate(synthetic):
     synthetic.add(hard, "both", np.full((50, 3), 9.0))
     synthetic.add(easy, "map", e, estimator=bayes, success=False)
     synthetic.add(hard, "map", e, estimator=bayes, success=False)
-    synthetic.add(easy, "spared", e)
     analysis = analyse([synthetic.directory])
-    last = analysis.profiles[analysis.profiles["profile"] == "data"].groupby("estimator")["share"].last()
-    assert last.to_dict() == {"both": 0.5, "map": 1.0}
     pairs = analysis.pairs.set_index(["first", "second", "error_scale"])
     assert pairs.loc[("both", "map", 1.0), "only_first"] == 0
     assert pairs.loc[("both", "map", 2.0), "only_second"] == 50
