@@ -5,29 +5,23 @@ from ipe_bench.measurements.base import Input, Measurement, Parameter, Recorded,
 from ipe_bench.measurements.formula import Formula
 from ipe_bench.measurements.function import Function, function
 from ipe_bench.measurements.gins import Gins, RicherGins
-from ipe_bench.measurements.mgh import Mgh
 from ipe_bench.measurements.nist import Nist
 from ipe_bench.measurements.ode.described import Ode, packaged
 from ipe_bench.measurements.ode.model import OdeMeasurement
 from ipe_bench.measurements.polynomial import Polynomial
-from ipe_bench.measurements.positioning import Bearings, Gnss, Ranging
-from ipe_bench.measurements.triad import Accelerometer, Triad
+from ipe_bench.measurements.positioning import Bearings, Ranging
 
-Bock, FallingBody, LotkaVolterra, Sir = map(packaged, ("bock", "falling_body", "lotka_volterra", "sir"))
+FallingBody, LotkaVolterra, Sir = map(packaged, ("falling_body", "lotka_volterra", "sir"))
 
 __all__ = [
-    "Accelerometer",
     "Bearings",
-    "Bock",
     "FallingBody",
     "Formula",
     "Function",
     "Gins",
-    "Gnss",
     "Input",
     "LotkaVolterra",
     "Measurement",
-    "Mgh",
     "Nist",
     "Ode",
     "OdeMeasurement",
@@ -38,7 +32,6 @@ __all__ = [
     "RicherGins",
     "Sir",
     "SubsetModel",
-    "Triad",
     "UsualNoise",
     "function",
 ]

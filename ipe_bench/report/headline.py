@@ -12,7 +12,7 @@ from ipe_bench.report.figures.views import family_of
 from ipe_bench.report.table import environment
 from ipe_bench.report.words import enumerate_few, plain, short
 from ipe_bench.statistics.analysis import Analysis
-from ipe_bench.statistics.certified import attained_totals, certified_averages, certified_table, published_table
+from ipe_bench.statistics.certified import certified_averages, certified_table, published_table
 from ipe_bench.statistics.records import ALL, BEST
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def facts(analysis: Analysis) -> list[Fact]:
     # Both have a row per scenario and estimator, in the same order.
     rows = rows.join(analysis.scores.reset_index(drop=True)[["scenario", *SHARED]])
     certified, moving = rows["noise"] == "certified", rows["noise"] == "model"
-    collected = [*_certified(analysis), *_attained(analysis), *_published(analysis.collection)]
+    collected = [*_certified(analysis), *_published(analysis.collection)]
     own = [] if collected else _ranking(rows[certified], "certified")
     constants = _constants(rows[~certified & ~moving], analysis.collection)
     return [*collected, *own, *constants, *_moving(rows[moving])]
@@ -62,7 +62,7 @@ def _unranked(what: str, rows: pd.DataFrame) -> Iterator[Fact]:
     yield "unranked", {"what": what, "labels": list(rows["estimator"].unique())}
 
 
-# Certified readings, known minima, published numbers ------------------------------------------------------------------
+# Certified readings, published numbers --------------------------------------------------------------------------
 
 
 def _certified(analysis: Analysis) -> Iterator[Fact]:
@@ -77,17 +77,6 @@ def _certified(analysis: Analysis) -> Iterator[Fact]:
     first = best.iloc[0]
     found = {"problems": int(first["datasets"]), "solved": int(first["solved"]), "labels": list(best.index)}
     yield "certified", found | {"digits": first["digits"] / first["datasets"]}
-
-
-def _attained(analysis: Analysis) -> Iterator[Fact]:
-    rows = analysis.attained
-    totals = attained_totals(in_common(rows, ["function", "start"]))
-    if totals.empty:
-        yield from _unranked("problem", rows) if len(rows) else ()
-        return
-    best = totals[totals["solved"] == totals["solved"].max()]
-    problems, solved = best[["problems", "solved"]].iloc[0]
-    yield "attained", {"problems": int(problems), "solved": int(solved), "labels": list(best["estimator"])}
 
 
 def _published(collection: Collection) -> Iterator[Fact]:

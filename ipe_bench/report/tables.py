@@ -13,9 +13,6 @@ from ipe_bench.report.terminal import TRACKED, leading, legend, overview_columns
 from ipe_bench.report.words import p_value, percent, plain, short
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.certified import (
-    BUDGETS,
-    attained_table,
-    attained_totals,
     certified_averages,
     certified_table,
     published_table,
@@ -203,13 +200,13 @@ def endings(analysis: Analysis) -> Table | None:
 
 
 def certified_tables(collection: Collection) -> list[Table]:
-    """Digits per data set and their averages, published errors, and who attains known minima, as far as there are data;
-    a terminal shows those that name the file with the `whole`."""
-    digits, minima = certified_table(collection), attained_table(collection)
+    """Digits per data set and their averages, and published errors, as far as there are data; a terminal shows those
+    that name the file with the `whole`."""
+    digits = certified_table(collection)
     found = [] if digits.empty else _digits(digits)
     if len(rows := published_table(collection)):
         found.append(_published(rows, collection))
-    return found if minima.empty else [*found, attained_totals_table(attained_totals(minima)), _problems(minima)]
+    return found
 
 
 def _digits(digits: pd.DataFrame) -> list[Table]:
@@ -256,46 +253,3 @@ def _published(rows: pd.DataFrame, collection: Collection) -> Table:
 def _lre(rows: pd.DataFrame, prefix: str) -> list[Column]:
     titles = {"parameters": "digits", "deviations": "of deviations", "rss": "of residuals"}
     return [column(title, rows[f"{prefix}lre_{name}"], lambda v: f"{v:.2f}") for name, title in titles.items()]
-
-
-def attained_totals_table(totals: pd.DataFrame) -> Table:
-    """How many problems of known minimum each estimator solves, the most first."""
-    rows = totals.sort_values("solved", ascending=False, kind="stable", ignore_index=True)
-    most = list(rows["solved"] == rows["solved"].max())
-    starts = [str(name) for name in rows if str(name).startswith("solved_")]
-    columns = [
-        words("estimator", rows["estimator"], most),
-        column("problems", rows["problems"], str),
-        column("solved", rows["solved"], str, most),
-        *(column(f"{name.removeprefix('solved_')} x", rows[name], str) for name in starts),
-        column("converged", rows["converged"], str),
-        column("elsewhere", rows["elsewhere"], str),
-        column("median cost", rows["cost_median"], short),
-        *(column(f"in {b}", rows[f"within_{b}"], str) for b in BUDGETS),
-    ]
-    caption = (
-        "A problem is solved if the estimate attains its global minimum, f at most f* (1 + 1e-6) + 1e-12. 1 x and 10 x"
-        " are multiples of the standard start. Converged counts solved problems whose status says so; elsewhere counts"
-        " unsolved problems whose status says converged. Median cost counts simulations over all problems, a Jacobian"
-        " as n, and is infinite for unsolved ones. In 10, 100, 1000 counts problems solved within that number of"
-        " simplex gradients of n + 1 simulations."
-    )
-    return Table("attained", "Known minima", caption, columns, rows, whole="tables/attained.csv")
-
-
-def _problems(minima: pd.DataFrame) -> Table:
-    rows = minima.sort_values(["function", "start"], kind="stable", ignore_index=True)
-    columns = [
-        words("function", rows["function"]),
-        column("start", rows["start"], plain),
-        words("estimator", rows["estimator"]),
-        words("solved", rows["solved"].map({True: "yes", False: "no"})),
-        words("minimum", ["-" if pd.isna(v) else f"{int(v) + 1}" for v in rows["minimum"]]),
-        column("sum of squares", rows["sum_of_squares"], lambda v: f"{v:.6g}"),
-        words("status", rows["status"]),
-        column("cost", rows["cost"], short),
-    ]
-    caption = (
-        "The number of the minimum whose sum of squares the estimate has, where 1 is the lowest; a dash means none."
-    )
-    return Table("attained_problems", "Known minima, problem by problem", caption, columns, rows)

@@ -12,6 +12,8 @@ from ipe_bench.report.words import brief, duration, p_value, percent, plain, sho
 from ipe_bench.statistics.formulas import CAP
 from ipe_bench.statistics.records import ALL, BEST, SCORES, Kind, Statistic, Where, all_statistics, summary_columns
 
+_MOST_TABLES = 12
+"""Settings that a terminal shows."""
 _WIDE_ENOUGH = 100
 """Letters of a screen that has room for failures, and for verdicts in words."""
 _SUCCESS = (
@@ -69,10 +71,11 @@ def summary_tables(listed: Sequence[Mapping[str, Any]], totals: Sequence[Table],
         named = {k: plain(row.get(k)) for k in columns if plain(row.get(k)) != "-"}
         title = ", ".join(v if k in ("measurement", "noise") else f"{k}={v}" for k, v in named.items())
         settings.setdefault(title, []).append(row)
-    tables = [_setting(title, part, width) for title, part in settings.items()]
+    tables = [_setting(title, part, width) for title, part in list(settings.items())[:_MOST_TABLES]]
     if tables:
         tables[-1] = replace(tables[-1], notes=legend({row["noise"] for row in rows}))
-    return [*totals, *tables] or ["nothing is stored yet"]
+    further = [f"{len(settings) - _MOST_TABLES} further settings are in summary.csv and report.html."]
+    return [*totals, *tables, *further[: len(settings) > _MOST_TABLES]] or ["nothing is stored yet"]
 
 
 def _setting(title: str, rows: Sequence[Mapping[str, Any]], width: int) -> Table:

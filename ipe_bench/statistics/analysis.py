@@ -13,7 +13,6 @@ import numpy as np
 
 from ipe_bench.basics.statuses import Status
 from ipe_bench.statistics.calibration import POINTS, band
-from ipe_bench.statistics.certified import attained_table
 from ipe_bench.statistics.collect import Collection, Group, collect
 from ipe_bench.statistics.comparisons import (
     Outcomes,
@@ -64,8 +63,6 @@ class Analysis:
     tracks: pd.DataFrame
     """Of each state of a tracker: time `at` of each epoch, `rmse`, `bound` at the truth, `posterior` and
     `posterior_smoothed` Cramér-Rao bounds, and `nees` over n with the ends of its limits."""
-    attained: pd.DataFrame
-    """Which estimator attains known minima, over all scenarios; see `certified.attained_table`."""
 
     @property
     def setting_columns(self) -> list[str]:
@@ -162,7 +159,6 @@ class Begun:
             calibration=_joined(rows["calibration"]),
             contraction=pd.DataFrame(rows["contraction"]),
             tracks=_joined(rows["tracks"]),
-            attained=attained_table(self.collection),
         )
 
 

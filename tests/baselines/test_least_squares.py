@@ -8,12 +8,10 @@ from scipy.optimize import curve_fit
 from shared.small_models import Bent, Written
 
 from ipe_bench.baselines import GaussNewton, LeastSquares, LevenbergMarquardt, MultiscaleLM, Multistart
-from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance, deviations
 from ipe_bench.basics.statuses import Status
-from ipe_bench.estimators.ipe import begin, starting_points
-from ipe_bench.measurements import Formula, Gins, Measurement, Mgh, Nist, Parameter
-from ipe_bench.measurements.counted import EvaluationCount
+from ipe_bench.estimators.ipe import begin
+from ipe_bench.measurements import Formula, Gins, Measurement, Nist, Parameter
 from ipe_bench.measurements.nist import FORMULAS
 from ipe_bench.measurements.nist import score as nist_score
 from ipe_bench.measurements.problem import Problem
@@ -149,22 +147,6 @@ def test_an_estimator_that_starts_at_the_best_is_one_of_its_two_selves(estimator
     np.testing.assert_array_equal(best.simulations[5], alone.simulations[0])
 
 
-def test_a_singular_start_is_not_a_problem_without_an_answer():
-    """Beale's function has a J of rank 1 at its standard start, and its minimum of zero at (3, 1/2)."""
-    model = Mgh("beale")
-    problem = Problem(model, model.recorded.R)
-    z = model.recorded.z[None]
-    with pytest.raises(UserError, match=r"cannot be told apart there.*start=nominal or best"):
-        Newton().estimate(problem, z)
-    for estimator in (LeastSquares(), LevenbergMarquardt(start="best")):
-        found = estimator.estimate(problem, z)
-        assert found.status[0] == Status.CONVERGED
-        np.testing.assert_allclose(found.x * model.sizes, [[3.0, 0.5]], rtol=1e-5)
-    tally = EvaluationCount.zeros(1)
-    np.testing.assert_array_equal(starting_points(problem, z, "best", tally), model.nominal[None])
-    assert tally.simulations[0] == 0
-
-
 def test_gauss_newton_leaves_a_start_at_which_a_column_of_j_is_zero():
     """A peak of height 0 has neither a place nor a width: the shortest step gives it a height, and then they count."""
     t = np.linspace(0, 10, 40)
@@ -176,16 +158,6 @@ def test_gauss_newton_leaves_a_start_at_which_a_column_of_j_is_zero():
         found = GaussNewton(start=start).estimate(problem, z)
         assert found.status[0] == Status.CONVERGED
         np.testing.assert_allclose(model.physical(found.x), [[1.5, 2.0, 5.3]], rtol=1e-6)
-
-
-def test_geodesic_acceleration_finds_the_same_minimum_in_fewer_jacobians():
-    """Rosenbrock's valley from its standard start, the example of Transtrum and Sethna's paper."""
-    model = Mgh("rosenbrock")
-    problem, z = Problem(model, model.recorded.R), model.recorded.z[None]
-    plain, bent = (LevenbergMarquardt(geodesic=g).estimate(problem, z) for g in (False, True))
-    for found in (plain, bent):
-        np.testing.assert_allclose(found.x * model.sizes, [[1.0, 1.0]], atol=1e-6)
-    assert bent.jacobians[0] < plain.jacobians[0]
 
 
 # Certified problems

@@ -194,7 +194,7 @@ def test_a_mistake_is_one_line_with_exit_code_2(tmp_path, ipe_bench, case):
             "noise._target_=ipe_bench.noise.StudentT",
             "+noise.degrees_of_freedom=5",
         ],
-        ["+experiment=triad", "measurement.field=5"],
+        ["+experiment=ranging", "measurement.rounds=5"],
         ["solver=[newton]", "+solver@estimators.b=broyden", "estimators.b.tolerance=1e-3"],
         ["measurement=nist/misra1a", "measurement.start=2"],
         ["estimators.fixed_point.budget=null"],
@@ -376,7 +376,7 @@ def test_a_model_of_one_case_or_one_reading_warns_of_nothing(ipe_bench, case):
 
 
 def test_a_model_that_brings_its_own_certified_readings_has_a_table(ipe_bench):
-    words = ("measurement=bock", "noise=certified", "trials=1", "figures=none", "output=out", "solver=[]")
+    words = ("measurement=nist", "noise=certified", "trials=1", "figures=none", "output=out", "solver=[]")
     code, out, _ = ipe_bench("run", *words, "baseline=[gauss_newton]")
     assert code == 0
     assert "gauss_newton" in out

@@ -93,7 +93,7 @@ def test_a_comparison_names_who_and_which_setting(screen, folders):
 
 def test_lists_name_every_option(screen):
     lines = screen("list", "baseline")
-    for name in ("linear_lse", "levenberg_marquardt", "multiple_shooting", "recursive_update"):
+    for name in ("linear_lse", "levenberg_marquardt", "multiscale_lm", "iterated_ekf"):
         assert rows(lines, name) == 1
 
 

@@ -7,13 +7,12 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from ipe_bench.baselines import LevenbergMarquardt, MultipleShooting
+from ipe_bench.baselines import LevenbergMarquardt
 from ipe_bench.basics import compiled
 from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Ode
 from ipe_bench.measurements.base import differentiate
 from ipe_bench.measurements.ode.driven import course
-from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian
 from ipe_bench.plugins.conformance import check_component
 from ipe_bench.real.estimation import Question
@@ -225,10 +224,6 @@ def test_a_row_without_a_reading_only_changes_the_input(tmp_path):
     (found,) = fit(question.problem, question.found.z, LM, Gaussian(1e-4))
     assert np.abs((found.x - [0.022, 0.013, 2100.0]) / found.standard_errors).max() < 3.5
     assert list(found.values) == ["r0", "r1", "c1"]
-    shooting = MultipleShooting(segments=3).estimate(
-        Problem(found.model, Gaussian(1e-4).covariance(40)), z[np.isfinite(z)][None]
-    )
-    np.testing.assert_allclose(shooting.x[0] * model.sizes, found.x, rtol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.construct import construct
 from ipe_bench.trials.scenario import Scenario
 
-EXPERIMENTS = ("paper", "ranging", "bearings", "triad", "polynomial", "lotka_volterra")
+EXPERIMENTS = ("paper", "ranging", "bearings", "polynomial", "lotka_volterra")
 TRIALS = 200
 EFFICIENT = ("least_squares", "map")
 """Estimating equations whose root reaches the bound at first order whatever the error scale."""

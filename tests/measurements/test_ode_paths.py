@@ -20,7 +20,6 @@ from ipe_bench.measurements import LotkaVolterra, Ode, OdeMeasurement, Parameter
 from ipe_bench.measurements.arithmetic import FUNCTIONS, PAIRS, SEVERAL
 from ipe_bench.measurements.joint import Joint
 from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo
-from ipe_bench.measurements.ode.interval import Interval
 from ipe_bench.measurements.ode.plan import DOP853
 from ipe_bench.measurements.ode.steps import contraction
 
@@ -263,21 +262,6 @@ def check(law, gaps, given, batch, seed):
         found = described.simulate(x)[-1]
         whole = exact[: len(found)]  # one case alone where there is nothing that tells cases apart
         assert np.abs(found - whole).max() < TOLERANCE * max(1.0, np.abs(exact).max())
-    if max(gaps) <= 0.5:
-        walk(model, x[-1], exact)
-
-
-def walk(model, p, exact):
-    """From reading to reading, each interval a model of its own."""
-    pieces = Interval(model)
-    for k, c in enumerate(model.given):
-        y, t, z = np.array(model.start(p, (c,)), dtype=float), 0.0, []
-        for to in model.at:
-            (found,) = pieces.simulate(np.concatenate([p, y, [c, t, to - t]])[None])
-            y, t = found[: model.states], to
-            z.append(found[model.states :])
-        m = model.states * len(model.at)
-        np.testing.assert_allclose(np.ravel(z), exact[k * m : (k + 1) * m], rtol=1e-7, atol=1e-7)
 
 
 @settings(max_examples=100, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))

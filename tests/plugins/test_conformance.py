@@ -11,7 +11,7 @@ from shared.state_models import CoordinatedTurn
 from ipe_bench.basics.linalg import Covariance
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator
-from ipe_bench.measurements import Formula, Gnss, Nist, Ode, Polynomial, Ranging
+from ipe_bench.measurements import Formula, Nist, Ode, Polynomial, Ranging
 from ipe_bench.measurements.joint import Joint
 from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo
 from ipe_bench.measurements.nist import FORMULAS
@@ -39,7 +39,7 @@ def complaints(component) -> str:
     return "; ".join(f.complaint for f in check_component("mine", component) if f.complaint)
 
 
-DEAR = ("enkf", "ukf_wide", "iplf", "recursive_update", "lm_iekf")
+DEAR = ("enkf", "ukf_wide", "iplf")
 """Ensembles and iterations for every reading take seconds; ukf_wide is of the same class as another option."""
 
 
@@ -210,7 +210,7 @@ def test_a_fault_is_found(faulty, complaint):
             (0.5, 2.0, 3.0),
         ),
         ConstrainedModel(Ranging(), (ParameterInfo("clock", fixed=3.0), ParameterInfo("up", lower=-50.0, upper=90.0))),
-        Joint((Gnss(), Gnss(rounds=2))),
+        Joint((Ranging(), Ranging(rounds=2))),
     ],
     ids=["formula", "ode", "informed", "joint"],
 )

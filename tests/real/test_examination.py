@@ -5,8 +5,8 @@ import pytest
 from scipy.stats import norm
 
 import ipe_bench as ib
-from ipe_bench.baselines import LevenbergMarquardt, LinearLSE, MapLM
-from ipe_bench.measurements import Formula, Mgh, Polynomial, Sir
+from ipe_bench.baselines import LevenbergMarquardt, MapLM
+from ipe_bench.measurements import Formula, Polynomial, Sir
 from ipe_bench.measurements.known import ParameterInfo, informed
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Correlated, Gaussian, Unknown
@@ -170,15 +170,6 @@ def test_a_profile_that_comes_upon_a_better_fit_is_no_interval():
     assert np.isnan(found.profiles).all()
     assert not found.least
     assert found.minima[0].x == pytest.approx([1.0], abs=1e-3)
-
-
-def test_with_as_many_readings_as_parameters_nothing_is_tested_but_a_worse_answer_is_none():
-    model = Mgh("rosenbrock")
-    problem = Problem(model, model.recorded.R)
-    good, bad = fit(problem, model.recorded.z, {**LM, "linear": LinearLSE()})
-    assert (good.fits, bad.fits) == (None, False)
-    assert np.isnan(good.p_value)
-    assert np.isnan(good.white_p)
 
 
 def test_a_prior_that_counts_in_no_estimate_is_told():

@@ -5,17 +5,13 @@ import pytest
 from scipy.optimize import least_squares
 from shared.instruments import EXACT, SATURATION, START, estimate, simulated, solution
 
-from ipe_bench.baselines import GaussNewton
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.statuses import Status
-from ipe_bench.measurements import Formula, Gins, Gnss, LotkaVolterra, Sir
+from ipe_bench.measurements import Formula, Gins, LotkaVolterra, Sir
 from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo
-from ipe_bench.measurements.positioning import east_north_up
-from ipe_bench.measurements.problem import Problem
-from ipe_bench.noise import Gaussian, ModelNoise, Quantization, Unknown
+from ipe_bench.noise import Gaussian, Quantization, Unknown
 from ipe_bench.priors import GaussianPrior
-from ipe_bench.real.fits import fit
-from ipe_bench.real.readings import open_together, write_readings
+from ipe_bench.real.readings import open_together
 from ipe_bench.trials.scenario import Scenario
 
 
@@ -104,34 +100,6 @@ def test_every_coordinate_of_a_known_parameter_leads_back_to_its_value():
         step = h * np.eye(2)[k]
         difference = (model.physical(x + step) - model.physical(x - step))[:, k] / (2 * h)
         assert model.physical_slope(x)[:, k] == pytest.approx(difference, rel=1e-6, abs=1e-6)
-
-
-def test_a_satellite_file_brings_its_own_sky(tmp_path):
-    """Position and clock of a file with a sky, an order and an epoch of its own, within their intervals, at the answer
-    of an independent solution."""
-    rng = np.random.default_rng(5)
-    places = Gnss(rounds=1)._columns[2][[3, 0, 5, 1, 2, 4]] + rng.normal(0, 3e5, (6, 3))
-    sky = tuple((1, "gps", *place) for place in places.tolist())
-    truth = Gnss(sky, earth_rate=0.0)
-    p = np.array([120.0, -40.0, 30.0, 2500.0])
-    z = truth.simulate((p / truth.sizes)[None])[0] + rng.normal(size=6)
-    write_readings(tmp_path / "g.csv", truth, z)
-    found = open_together([tmp_path / "g.csv"], Gnss(earth_rate=0.0))
-    assert found.model.m == 6
-    result = fit(Problem(found.model, ModelNoise().of(found.model).covariance(6)), found.z, {"gn": GaussNewton()})[0]
-    low, high = result.interval(0.9999)
-    assert ((low < p) & (p < high)).all()
-    here = np.asarray(truth.position)
-    axes = east_north_up(here)
-
-    def residuals(q):
-        place = here + axes.T @ q[:3]
-        ranges = np.array([np.sqrt(np.sum((np.array(s[2:]) - place) ** 2)) for s in sky])
-        return ranges + q[3] - z
-
-    expected, deviations = solution(residuals, [1.0, 1.0, 1.0, 1000.0])
-    assert result.x == pytest.approx(expected, abs=1e-5)
-    assert result.standard_errors == pytest.approx(deviations, rel=1e-6)
 
 
 def test_every_model_with_a_noise_of_its_own_is_simulated_with_it():

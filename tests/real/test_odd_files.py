@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.measurements import Accelerometer, Formula, Gnss, Measurement, Ranging, Sir
+from ipe_bench.measurements import Formula, Measurement, Ranging, Sir
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian
 from ipe_bench.real.fits import fit
@@ -222,18 +222,11 @@ MISTAKEN = (
     ("a day before the start", Sir(), replaced(2, "1,1.0,", "1,-1.0,"), "comes before the start"),
     ("an unknown output", Sir(), replaced(3, "infected", "healed"), "output=healed"),
     ("no first epidemic", Sir(), replaced(3, "1,", "3,"), "case=3: cases are numbered"),
-    ("half an epoch", Gnss(), replaced(2, "1,", "1.5,"), "row 2, column epoch: '1.5' is not a whole"),
-    (
-        "an attitude out of order",
-        Accelerometer(),
-        lambda rows: [rows[0], rows[2], rows[1], *rows[3:]],
-        "row 2, column attitude: '2' stands where the order of the rows says 1",
-    ),
 )
 
 
 def files_of_models() -> Iterator[Case]:
-    for model in (Ranging(), Sir(), Gnss(), Accelerometer()):
+    for model in (Ranging(), Sir()):
         other_unit = replaced(1, "[day]", "[week]") if model.name == "sir" else replaced(1, "[m", "[km")
         yield Case(f"{model.name} as written", written(model), model=model)
         yield Case(f"{model.name} in another unit", written(model, other_unit), r"unit must be|is missing", model=model)

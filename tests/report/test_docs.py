@@ -132,7 +132,7 @@ def test_the_whole_site_builds_without_a_warning_and_fetches_nothing(tmp_path):
     assert done.returncode == 0, done.stderr
     html = tmp_path / "html"
     ours = [option.name for option in discovery.options("experiment") if option.source.name == "ipe-bench"]
-    assert {"nist", "mgh", "polynomial"} <= set(ours)
+    assert {"nist", "polynomial"} <= set(ours)
     assert 'href="gallery/ranging.html"' in (html / "choosing.html").read_text(encoding="utf-8")
     assert "100 trials per row" in (html / "howto" / "notebook.html").read_text(encoding="utf-8")
     for name in ours:

@@ -13,7 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PathCollection
 from shared.synthetic_store import Filter, Pretender, Seeker, Synthetic
 
-from ipe_bench.baselines import EnKF, EsMda
+from ipe_bench.baselines import EnKF
 from ipe_bench.report import figures
 from ipe_bench.report.figures import (
     common,
@@ -180,7 +180,7 @@ def test_looks_are_told_apart_without_colour_and_families_by_colour():
 
 def test_an_estimator_is_in_the_colours_of_its_family_and_of_many_the_best_are_in_color(synthetic):
     """The family that it declares, else by what it takes and solves."""
-    kinds = {"a": (EnKF(), "ensembles"), "b": (EsMda(), "ensembles"), "c": (Auto(), "IPE"), "d": (Seeker(), "IPE")}
+    kinds = {"a": (EnKF(), "ensembles"), "c": (Auto(), "IPE"), "d": (Seeker(), "IPE")}
     kinds |= {"e": (Filter(), "filters"), "f": (Pretender(), "least squares")}
     scenario = synthetic.scenario()
     for label, (estimator, _) in kinds.items():

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ipe_bench.basics.linalg import Array
-from ipe_bench.measurements import Bock, Measurement, Ode, Parameter
+from ipe_bench.measurements import Measurement, Ode, Parameter
 
 
 @dataclass(frozen=True)
@@ -73,9 +73,17 @@ class Written(Measurement):
 
 
 def bock(mu: float) -> Ode:
-    """Bock's problem with unknown initial values, presumed to be (0, pi)."""
-    return Bock(
-        mu=mu,
+    """Bock's notorious problem with unknown initial values, presumed to be (0, pi): x grows like exp(mu t)."""
+    return Ode(
+        title="bock",
+        rates={"x1": "x2", "x2": "mu**2*x1 - (mu**2 + p**2)*sin(p*t)"},
+        constants={"mu": mu},
+        outputs={"x1": "x1", "x2": "x2"},
+        readings=10,
+        interval=0.1,
+        tolerance="1e-13*cosh(mu*t)",
+        deviation=0.05,
+        exact={"x1": "sin(p*t)", "x2": "p*cos(p*t)"},
         start={"p": 1.0, "a": 0.0, "b": np.pi},
         size={"p": 0.1, "a": 0.1, "b": 0.1},
         initial={"x1": "a", "x2": "b"},

@@ -7,10 +7,9 @@ from numpy.typing import NDArray
 from ipe_bench.baselines import GaussNewton, LevenbergMarquardt
 from ipe_bench.basics.linalg import Covariance, deviations
 from ipe_bench.basics.statuses import Status
-from ipe_bench.measurements import Bearings, Formula, Gins, LotkaVolterra, Mgh, Polynomial, Ranging, Sir, Triad
-from ipe_bench.measurements.mgh import score
+from ipe_bench.measurements import Bearings, Formula, Gins, LotkaVolterra, Polynomial, Ranging, Sir
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.noise import Certified, Gaussian, Quantization, Unknown
+from ipe_bench.noise import Gaussian, Quantization, Unknown
 from ipe_bench.real.fits import Fit, fit
 from ipe_bench.solvers import Auto, FixedPoint, Newton, Progressive
 from ipe_bench.solvers.auto import CHORDS, PROGRESSIVE
@@ -76,48 +75,12 @@ def test_a_jacobian_that_changes_on_the_way_is_renewed(model, scale):
     assert off[first].max() < 1e-3
 
 
-def test_a_root_of_a_passed_jacobian_is_no_minimum():
-    """Watson's function from zero, where the first stage is quick and its first Jacobian too old."""
-    scenario = Scenario(Mgh("watson", 1.0), Certified())
-    estimates = Auto().estimate(scenario.problem, scenario.draw(0, 1).z)
-    assert score(scenario.measurement, estimates.x[0]).solved
-
-
-def test_minima_that_fit_alike_are_found_flagged_and_listed():
-    """|M (r - b)|^2 is r'Ar - 2 r'Ab + b'Ab with A = M^2, which has eight symmetric square roots M; and since every r
-    has the length 1, a multiple of I in A can stand for another b'Ab."""
-    block = Block.draw(Scenario(Triad(), Gaussian(1e-5), error_scale=300.0), 0, 6)
-    with np.errstate(all="ignore"):
-        estimates, scored = block.estimate(Auto(confirmations=6))
-
-    def squared(x):
-        a, b, c, d, e, f = x[3:] * 0.002
-        M = np.eye(3) + np.array([[a, d, e], [d, b, f], [e, f, c]])
-        return M @ M
-
-    assert estimates.extras["ambiguous"].mean() >= 0.8
-    np.testing.assert_array_equal(scored["extra_ambiguous"], estimates.extras["minima"] > 1)
-    for x, others in zip(estimates.x, estimates.alternatives, strict=True):
-        A, bias = squared(x), 0.002 * x[:3]
-        for other in others:
-            A_other, bias_other = squared(other), 0.002 * other[:3]
-            tolerance = 2e-3 * np.abs(A).max()
-            np.testing.assert_allclose(A_other @ bias_other, A @ bias, atol=tolerance)
-            shift = A_other - A
-            np.testing.assert_allclose(shift, shift[0, 0] * np.eye(3), atol=tolerance)
-            gained = bias_other @ A_other @ bias_other - bias @ A @ bias
-            np.testing.assert_allclose(shift[0, 0], -gained, atol=tolerance)
-            # The most probable one counts.
-            assert np.linalg.norm(x) <= np.linalg.norm(other) + 0.1
-
-
 CASES = {
     "polynomial": (Polynomial(), Gaussian(0.01), (0.1, 1.0, 10.0)),
     "ranging": (Ranging(), Gaussian(0.1), (0.1, 1.0, 10.0)),
     "bearings": (Bearings(), Gaussian(0.5), (0.1, 1.0, 3.0)),
     "lotka_volterra": (LotkaVolterra(), Gaussian(0.5), (0.1, 1.0, 3.0)),
     "sir": (Sir(), Gaussian(50.0), (1.0,)),
-    "triad": (Triad(), Gaussian(1e-5), (0.1, 1.0, 10.0, 100.0)),
     "gins": (Gins(), Quantization(0.02286), (1.0, 33.0, 100.0, 300.0, 1000.0, 3000.0)),
 }
 OTHERS = (FixedPoint(), Newton(), GaussNewton(), LevenbergMarquardt(), Progressive())
@@ -138,15 +101,6 @@ def test_it_succeeds_as_often_as_the_best_and_costs_little_more_than_the_cheapes
     others = [figures(other) for other in OTHERS]
     assert success >= max(share for share, _ in others) - 0.01
     assert cost <= 1.5 * min((c for share, c in others if share >= success), default=np.inf)
-
-
-@pytest.mark.slow
-def test_most_failures_among_equal_minima_are_flagged():
-    block = Block.draw(Scenario(Triad(), Gaussian(1e-5), error_scale=1000.0), 0, 60)
-    estimates, scored = block.estimate(Auto())
-    failed = ~scored["success"]
-    assert failed.mean() > 0.5
-    assert (estimates.extras["ambiguous"][failed] == 1).mean() > 0.5
 
 
 @pytest.mark.slow

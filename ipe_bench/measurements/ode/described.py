@@ -7,6 +7,7 @@ import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -514,12 +515,14 @@ class _Engine(OdeMeasurement):
         return self._computed(self.described.output_formulas, t, y, p, c)
 
 
-def packaged(name: str) -> Callable[..., Ode]:
-    """The model that `conf/measurement/NAME.yaml` describes, with other options of `Ode` where given, and entries of
-    `constants` and `start` by their own names: `Bock(mu=10.0)`."""
+def packaged(name: str, conf: Path | None = None) -> Callable[..., Ode]:
+    """Returns the maker of the model that `measurement/NAME.yaml` in a folder `conf` describes, ours by default.
+
+    It takes other options of `Ode`, and entries of `constants` and `start` by their own names: `Sir(population=500)`.
+    """
 
     def model(**options: Any) -> Ode:
-        config = dict(_description(name))
+        config = dict(_description(name, conf or own_conf()))
         for key in ("constants", "start"):
             config[key] = {entry: options.pop(entry, value) for entry, value in config[key].items()}
         return Ode(**(config | options))
@@ -529,8 +532,8 @@ def packaged(name: str) -> Callable[..., Ode]:
 
 
 @functools.cache
-def _description(name: str) -> dict[str, Any]:
+def _description(name: str, conf: Path) -> dict[str, Any]:
     import yaml
 
-    config = yaml.safe_load((own_conf() / "measurement" / f"{name}.yaml").read_text(encoding="utf-8"))
+    config = yaml.safe_load((conf / "measurement" / f"{name}.yaml").read_text(encoding="utf-8"))
     return {key: value for key, value in config.items() if key != "_target_"}

@@ -68,7 +68,7 @@ def draw_all(
 
 def drawings(analysis: Analysis, which: Which = "all") -> Iterator[Drawing]:
     """Figures of every setting, or of all of them together, ours first."""
-    if which == "none" or (not analysis.collection.groups and analysis.attained.empty):
+    if which == "none" or not analysis.collection.groups:
         return
     parts, whole = views(analysis)
     taken: set[str] = set()

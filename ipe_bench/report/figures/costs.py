@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-import pandas as pd
 from scipy.special import chdtri
 
 from ipe_bench.report.figures import common
@@ -14,7 +13,6 @@ from ipe_bench.report.figures.drawing import Drawing, Figure
 from ipe_bench.report.figures.views import View
 from ipe_bench.report.style import GREY, MARKERS, Look
 from ipe_bench.report.words import enumerate_few, plain, short
-from ipe_bench.statistics.certified import data_profile
 from ipe_bench.statistics.sample import CLOSE
 
 LEAST_COST = 0.5
@@ -120,40 +118,7 @@ def draw_convergence(view: View) -> Iterator[Drawing]:
     )
 
 
-def draw_known_minima(view: View) -> Iterator[Drawing]:
-    table = view["attained"]
-    rows = data_profile(table)
-    if rows.empty:
-        return
-    problems = len(table[["function", "start"]].drop_duplicates())
-    low, end = 0.9 * float(rows["at"].min()), 1.5 * float(rows["at"].max())
-    # Each curve rises from none, and goes on to the end of the axis.
-    final = rows.groupby("estimator", sort=False, as_index=False)["share"].max().assign(at=end)
-    final = final.sort_values("share", ascending=False, kind="stable")
-    best = list(final.loc[final["share"] == final["share"].max(), "estimator"])
-    look = view.with_look(table["estimator"])
-    rows = pd.concat([final.assign(share=0.0, at=low), rows, final], ignore_index=True)
-    fig, (ax,) = common.panels(1, look, height=3.4)
-    common.lines(ax, rows, "at", "share", look, drawstyle="steps-post")
-    ax.set_xscale("log")
-    ax.set_xlim(low, end)
-    common.log_ticks(ax.xaxis, low, end)
-    common.shares(ax)
-    common.legend(fig, [ax], look)
-    ax.set(xlabel="simplex gradients, n + 1 simulations each", ylabel="share of problems solved")
-    yield view.drawing(
-        fig,
-        "data_profile",
-        "Data profile on known minima",
-        f"{problems} problems: functions of Moré, Garbow and Hillstrom from their starts. Solved: the sum of squares is"
-        " the least known one. Data profile of Moré and Wild: the share solved within that cost, a Jacobian counting n"
-        " simulations.",
-        f"Most, {round(final['share'].max() * problems)}, are solved by {enumerate_few(best)}.",
-    )
-
-
 FIGURES = (
     Figure(draw_costs, ("summary",), main=True),
     Figure(draw_convergence, ("convergence",)),
-    Figure(draw_known_minima, ("attained",), together=True, main=True),
 )

@@ -19,6 +19,8 @@ from ipe_bench.statistics.records import ALL
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
+    from ipe_bench.statistics.collect import Collection
+
 MOST_SETTINGS = 6
 """Settings that have figures of their own; the tables have all."""
 MOST_LETTERS = 70
@@ -45,6 +47,8 @@ class View:
     """Whether this is the setting of the paper: the gimballed INS with quantised readings."""
     moving: bool = False
     """Whether it is of states that move."""
+    collection: Collection | None = None
+    """What is stored; the view of all settings alone has it."""
 
     @property
     def reference(self) -> str:
@@ -90,7 +94,7 @@ class View:
 
 def views(analysis: Analysis) -> tuple[list[View], View]:
     """The settings of the simulated trials, at most `MOST_SETTINGS`, and all of them together with every estimator."""
-    every, analysis = _looks(analysis), analysis.simulated
+    every, collection, analysis = _looks(analysis), analysis.collection, analysis.simulated
     look, columns = _looks(analysis), analysis.setting_columns
     equations = {g.estimator: g.footer.get("equation") for g in analysis.collection.groups}
     whole: dict[str, Any] = {name: getattr(analysis, name) for name in FRAMES}
@@ -115,7 +119,7 @@ def views(analysis: Analysis) -> tuple[list[View], View]:
         paper = (setting.get("measurement"), setting.get("noise")) == ("gins", "quantization")
         known = footers[key]["parameters"], paper, setting.get("noise") == "model"
         parts.append(View(f"_{suffix}" * bool(varying), label, frames, seen, {e: equations[e] for e in seen}, *known))
-    return parts, View("", "", whole, every, equations)
+    return parts, View("", "", whole, every, equations, collection=collection)
 
 
 def _split(frame: pd.DataFrame, columns: Sequence[str]) -> dict[tuple[str, ...], Any]:

@@ -2,14 +2,15 @@
 
 import numpy as np
 import pytest
+from ipe_bench_zoo import Bock, MultipleShooting
 from shared.linear_models import Linear
 from shared.small_models import bock
 
-from ipe_bench.baselines import LevenbergMarquardt, MultipleShooting
+from ipe_bench.baselines import LevenbergMarquardt
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Covariance
 from ipe_bench.basics.statuses import Status
-from ipe_bench.measurements import Bock, Gins, LotkaVolterra, Sir
+from ipe_bench.measurements import Gins, LotkaVolterra, Sir
 from ipe_bench.measurements.base import SubsetModel
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from ipe_bench_zoo import Accelerometer, Triad
 from scipy.linalg import polar
 from scipy.optimize import least_squares
 
 from ipe_bench.baselines import GaussNewton
 from ipe_bench.basics.linalg import Covariance
-from ipe_bench.measurements import Accelerometer, Triad
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.solvers import Newton
 

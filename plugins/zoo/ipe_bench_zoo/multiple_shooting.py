@@ -20,9 +20,9 @@ from ipe_bench.estimators.minima import Minima
 from ipe_bench.measurements.base import SubsetModel
 from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.measurements.ode.described import Ode
-from ipe_bench.measurements.ode.interval import Interval
 from ipe_bench.measurements.ode.model import OdeMeasurement
 from ipe_bench.measurements.problem import Problem
+from ipe_bench_zoo.interval import Interval
 
 _COMPLEX_STEP = 1e-100
 _ROUND_OFF = 1e-11

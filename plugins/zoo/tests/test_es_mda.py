@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from ipe_bench_zoo import EsMda
+from ipe_bench_zoo.es_mda import assimilated
 from shared.linear_models import Linear, block_of_gins, linear_map
 
-from ipe_bench.baselines import EsMda, MapLM
-from ipe_bench.baselines.es_mda import assimilated
+from ipe_bench.baselines import MapLM
 from ipe_bench.basics.linalg import deviations
 from ipe_bench.basics.statuses import Status
 from ipe_bench.noise import Gaussian

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from ipe_bench_zoo import Triad
 
 import ipe_bench as ib
 from ipe_bench.baselines import LevenbergMarquardt, Multistart
-from ipe_bench.measurements import Triad
 from ipe_bench.noise import Gaussian
 from ipe_bench.report.tables import all_tables
 from ipe_bench.runs.run import compute

@@ -9,7 +9,6 @@ import numpy as np
 from annotated_types import Gt, Le
 
 from ipe_bench.baselines.epochs import read_members
-from ipe_bench.baselines.information import geometric_weights
 from ipe_bench.basics.linalg import Array, Mask, finite, solve
 from ipe_bench.basics.options import Count, Positive, Whole
 from ipe_bench.basics.statuses import Status
@@ -20,6 +19,7 @@ from ipe_bench.estimators.least_squares import Objective
 from ipe_bench.estimators.levenberg_marquardt import GaussNewtonMethod
 from ipe_bench.estimators.minima import minimize
 from ipe_bench.measurements.problem import Problem
+from ipe_bench_zoo.iterated_filters import geometric_weights
 
 
 @dataclass(frozen=True)

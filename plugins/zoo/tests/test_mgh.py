@@ -5,11 +5,14 @@ from math import exp, sqrt
 
 import numpy as np
 import pytest
+from ipe_bench_zoo import Mgh
+from ipe_bench_zoo.mgh import PROBLEMS, score
 from scipy.optimize import least_squares
 
-from ipe_bench.measurements import Mgh
-from ipe_bench.measurements.mgh import PROBLEMS, score
+from ipe_bench.baselines import LevenbergMarquardt, LinearLSE
+from ipe_bench.measurements.problem import Problem
 from ipe_bench.plugins.conformance import check_component
+from ipe_bench.real.fits import fit
 
 # m and n, as the paper states them.
 SIZES = {
@@ -178,3 +181,14 @@ def test_what_is_no_minimum_is_none():
     assert not score(model, nearly).solved
     local = Mgh("freudenstein_roth")
     assert score(local, np.array(local.minima[1].x) / local.sizes).minimum == 1
+
+
+def test_with_as_many_readings_as_parameters_nothing_is_tested_but_a_worse_answer_is_none():
+    model = Mgh("rosenbrock")
+    problem = Problem(model, model.recorded.R)
+    good, bad = fit(
+        problem, model.recorded.z, {"lm": LevenbergMarquardt(tolerance=1e-9, max_iterations=500), "linear": LinearLSE()}
+    )
+    assert (good.fits, bad.fits) == (None, False)
+    assert np.isnan(good.p_value)
+    assert np.isnan(good.white_p)
