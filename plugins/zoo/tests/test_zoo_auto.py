@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from ipe_bench.measurements.mgh import score
 from ipe_bench_zoo import Mgh, Triad
+from ipe_bench_zoo.mgh import score
 
 from ipe_bench.baselines import LeastSquares, LevenbergMarquardt
 from ipe_bench.basics.errors import UserError
