@@ -1,19 +1,15 @@
 """What is booked is what is evaluated: calls of the model, counted from outside, of every estimator and tracker."""
 
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from shared.small_models import Bent
 from shared.state_models import ConstantVelocity, CoordinatedTurn, Growth
+from shared.watched import check_cost
 
-from ipe_bench.baselines import MultipleShooting
-from ipe_bench.baselines.multiple_shooting import Pieces
-from ipe_bench.estimators.base import Estimator
-from ipe_bench.measurements import Gins, LotkaVolterra
-from ipe_bench.measurements.base import Measurement, WrappedModel
-from ipe_bench.measurements.ode.interval import Interval
+from ipe_bench.measurements import Gins
 from ipe_bench.noise import Gaussian, Quantization
 from ipe_bench.plugins.construct import construct
 from ipe_bench.plugins.discovery import composed, options
@@ -24,51 +20,6 @@ from ipe_bench.trials.scenario import Scenario
 def registered(*groups):
     found = [o for group in groups for o in options(group) if o.source.name == "ipe-bench"]
     return {o.name: construct(composed(o), o.package or o.group) for o in found}
-
-
-@dataclass(frozen=True)
-class Watched(WrappedModel):
-    """A model that notes what its evaluations cost: a Jacobian what the model says, the first epochs their share."""
-
-    whole: Measurement
-    seen: Counter[str] = field(default_factory=Counter, compare=False)
-
-    def __post_init__(self) -> None:
-        """No options."""
-
-    @property
-    def cost(self) -> float:
-        price = {"jacobian": self.whole.jacobian_cost, "coarse_jacobian": self.whole.coarse_jacobian_cost}
-        return sum(count * price.get(name, 1.0) for name, count in self.seen.items())
-
-
-def _watch(name):
-    inner = getattr(WrappedModel, name)
-
-    def method(model, x, *stop):
-        share = stop[0] / len(model.whole.epochs) if stop else 1.0
-        model.seen[name.removesuffix("_until")] += len(x) * share
-        return inner(model, x, *stop)
-
-    setattr(Watched, name, method)
-
-
-for _name in ("simulate", "coarse_simulate", "jacobian", "coarse_jacobian"):
-    for _method in (_name, f"{_name}_until"):
-        if _method != "coarse_simulate":
-            _watch(_method)
-
-
-def check(estimator: Estimator, scenario: Scenario, trials: int) -> None:
-    model = Watched(scenario.measurement)
-    problem = replace(scenario.problem, measurement=model)
-    _ = problem.H_plus  # of the problem, and the same for all trials
-    for z in scenario.draw(0, trials).z:
-        model.seen.clear()
-        with np.errstate(all="ignore"):
-            found = estimator.estimate(problem, z[None])
-        booked = found.simulations[0] + model.jacobian_cost * found.jacobians[0]
-        assert booked == pytest.approx(model.cost, rel=1e-9)
 
 
 ESTIMATORS = registered("solver", "baseline")
@@ -83,15 +34,15 @@ SCENARIOS = {
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS)
-@pytest.mark.parametrize("name", [name for name in ESTIMATORS if name != "multiple_shooting"])
+@pytest.mark.parametrize("name", ESTIMATORS)
 def test_the_cost_of_an_estimator_is_what_it_evaluates(name, scenario):
-    check(ESTIMATORS[name], *SCENARIOS[scenario])
+    check_cost(ESTIMATORS[name], *SCENARIOS[scenario])
 
 
 @pytest.mark.parametrize("name", ["auto", "progressive", "relinearized", "levenberg_marquardt", "multistart"])
 def test_failures_cost_what_they_evaluate(name):
     """Where a search ends far from a minimum, the Jacobian for the covariance there is an evaluation of its own."""
-    check(ESTIMATORS[name], Scenario(Gins(readings_per_case=6), NOISE, error_scale=1e4), 6)
+    check_cost(ESTIMATORS[name], Scenario(Gins(readings_per_case=6), NOISE, error_scale=1e4), 6)
 
 
 def test_a_budget_ends_a_search_and_not_the_report_of_it():
@@ -103,29 +54,6 @@ def test_a_budget_ends_a_search_and_not_the_report_of_it():
         found = replace(solver, budget=float(least.max())).estimate(problem, z)
         np.testing.assert_array_equal(found.x, free.x)
         np.testing.assert_array_equal(found.status, free.status)
-
-
-def test_the_cost_of_multiple_shooting_is_what_its_intervals_take(monkeypatch):
-    scenario, seen = Scenario(LotkaVolterra(), Gaussian(0.5)), Counter()
-
-    def watch(name, price):
-        inner = getattr(Interval, name)
-
-        def method(model, x):
-            seen["cost"] += price(model) * len(x)
-            return inner(model, x)
-
-        monkeypatch.setattr(Interval, name, method)
-
-    watch("simulate", lambda model: 1.0)
-    watch("jacobian", lambda model: model.jacobian_cost)
-    model = scenario.measurement
-    whole = len(Pieces.of(scenario.problem, 7, 0.125).grid) - 1  # intervals, of the one case
-    for z in scenario.draw(0, 3).z:
-        seen.clear()
-        found = MultipleShooting(segments=7).estimate(scenario.problem, z[None])
-        booked = found.simulations[0] + model.jacobian_cost * found.jacobians[0]
-        assert booked == pytest.approx(seen["cost"] / whole, rel=1e-9)
 
 
 TRACKERS = registered("tracker") | {

@@ -3,48 +3,19 @@ checked. The conformance checks hold the same on mild problems; here problems ar
 
 import numpy as np
 import pytest
-from shared.estimator_checks import check_bits, check_failures
+from shared.estimator_checks import ALL, FILTERS, check_bits, check_failures
 from shared.small_models import Bent
 
 from ipe_bench import baselines, solvers
-from ipe_bench.baselines import (
-    CKF,
-    EKF,
-    IPLF,
-    UKF,
-    EnKF,
-    GaussNewton,
-    IteratedEKF,
-    LeastSquares,
-    LevenbergMarquardt,
-    MapLM,
-    MultiscaleLM,
-    Multistart,
-)
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Covariance
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements import Gins, Polynomial
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian, Quantization
-from ipe_bench.solvers import IPE, Anderson, Auto, Broyden, DampedNewton, FixedPoint, Newton, Progressive, Relinearized
+from ipe_bench.solvers import IPE
 from ipe_bench.trials.scenario import Scenario
 
-SOLVERS: list[Estimator] = [
-    *(FixedPoint(), Newton(), Broyden(), Broyden("identity"), Anderson(2), DampedNewton(), solvers.SteepestDescent()),
-    *(Relinearized(), Relinearized(Newton()), Progressive(), Progressive(use_prior=False), Auto()),
-]
-LEAST_SQUARES: list[Estimator] = [
-    *(GaussNewton(), GaussNewton(damping=1e-3), LevenbergMarquardt(), LevenbergMarquardt(geodesic=True), MapLM()),
-    *(LeastSquares(method=method) for method in ("trf", "lm", "dogbox")),
-    *(Multistart(starts=4), MultiscaleLM()),
-]
-FILTERS: list[Estimator] = [
-    *(kind(engine=e) for kind in (EKF, IteratedEKF, UKF, CKF) for e in ("filterpy", "batched")),
-    EnKF(members=30),
-    IPLF(),
-]
-ALL = [*SOLVERS, *LEAST_SQUARES, *FILTERS]
 SCENARIOS = {
     "gins": Scenario(Gins(readings_per_case=6), Quantization(0.02286), error_scale=100.0),
     "polynomial": Scenario(Polynomial(strength=0.05), Gaussian(0.1), error_scale=10.0),

@@ -1,13 +1,45 @@
-"""Checks that every estimator passes, those of the zoo too."""
+"""Every estimator of the package, and checks that all pass, those of the zoo too."""
 
 import numpy as np
 from shared.small_models import Bent
 
+from ipe_bench import solvers
+from ipe_bench.baselines import (
+    CKF,
+    EKF,
+    IPLF,
+    UKF,
+    EnKF,
+    GaussNewton,
+    IteratedEKF,
+    LeastSquares,
+    LevenbergMarquardt,
+    MapLM,
+    MultiscaleLM,
+    Multistart,
+)
 from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.problem import Problem
+from ipe_bench.solvers import Anderson, Auto, Broyden, DampedNewton, FixedPoint, Newton, Progressive, Relinearized
 from ipe_bench.trials.scenario import Scenario
+
+SOLVERS: list[Estimator] = [
+    *(FixedPoint(), Newton(), Broyden(), Broyden("identity"), Anderson(2), DampedNewton(), solvers.SteepestDescent()),
+    *(Relinearized(), Relinearized(Newton()), Progressive(), Progressive(use_prior=False), Auto()),
+]
+LEAST_SQUARES: list[Estimator] = [
+    *(GaussNewton(), GaussNewton(damping=1e-3), LevenbergMarquardt(), LevenbergMarquardt(geodesic=True), MapLM()),
+    *(LeastSquares(method=method) for method in ("trf", "lm", "dogbox")),
+    *(Multistart(starts=4), MultiscaleLM()),
+]
+FILTERS: list[Estimator] = [
+    *(kind(engine=e) for kind in (EKF, IteratedEKF, UKF, CKF) for e in ("filterpy", "batched")),
+    EnKF(members=30),
+    IPLF(),
+]
+ALL = [*SOLVERS, *LEAST_SQUARES, *FILTERS]
 
 
 def check_bits(estimator: Estimator, scenario: Scenario, trials: int) -> None:
