@@ -1,13 +1,13 @@
 """Noise: adds errors to readings, and knows the covariance that estimators assume. Config group `noise`."""
 
 from ipe_bench.basics.errors import without_modules
-from ipe_bench.noise.base import (
+from ipe_bench.noise.base import Noise
+from ipe_bench.noise.kinds import (
     Certified,
     Colored,
     Correlated,
     Gaussian,
     ModelNoise,
-    Noise,
     NoNoise,
     Outliers,
     Quantization,

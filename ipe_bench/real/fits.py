@@ -19,7 +19,7 @@ from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian
 from ipe_bench.noise.base import Noise
-from ipe_bench.noise.unknown import Levels
+from ipe_bench.noise.levels import Levels
 from ipe_bench.real.levels import Estimated, first_levels, levels_at, maximum, objective_of
 from ipe_bench.real.profiles import Released, half_width, joint_region, wald_interval
 from ipe_bench.real.residuals import explained, normalised, outlier_limit, whiteness

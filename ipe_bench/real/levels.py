@@ -26,7 +26,7 @@ from ipe_bench.estimators.minima import Minima, minimize
 from ipe_bench.measurements.base import Measurement, Parameter, WrappedModel
 from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.noise.unknown import Levels
+from ipe_bench.noise.levels import Levels
 from ipe_bench.real.residuals import explained
 
 _TOLERANCE = 1e-8

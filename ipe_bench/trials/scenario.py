@@ -12,7 +12,8 @@ from ipe_bench.basics.linalg import Array, Covariance, read_only
 from ipe_bench.basics.streams import numbered
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.problem import Problem, require_nominal, require_numbers
-from ipe_bench.noise.base import ModelNoise, Noise, resolved
+from ipe_bench.noise.base import Noise
+from ipe_bench.noise.kinds import ModelNoise, resolved
 from ipe_bench.priors import GaussianPrior, Prior
 from ipe_bench.trials.theory import linear_bound
 

@@ -21,7 +21,8 @@ from ipe_bench.basics.errors import UserError, describe_exception
 from ipe_bench.basics.linalg import Array, Mask, deviations, finite, plain_numbers, read_only
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates
-from ipe_bench.noise.base import Certified, ModelNoise, Noise
+from ipe_bench.noise.base import Noise
+from ipe_bench.noise.kinds import Certified, ModelNoise
 from ipe_bench.priors import GaussianPrior, Prior
 from ipe_bench.states.base import Paths, StateModel, require_sound
 from ipe_bench.states.bounds import bound_at_truth, posterior_bounds

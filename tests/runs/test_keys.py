@@ -13,7 +13,7 @@ import pytest
 import ipe_bench
 from ipe_bench.basics.options import component_classes
 from ipe_bench.measurements.polynomial import Polynomial
-from ipe_bench.noise.base import Gaussian
+from ipe_bench.noise.kinds import Gaussian
 from ipe_bench.runs import provenance
 from ipe_bench.runs.provenance import numerical_code
 from ipe_bench.trials.scenario import Scenario

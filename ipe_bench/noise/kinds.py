@@ -1,0 +1,331 @@
+"""The kinds of noise whose R is known."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from annotated_types import Ge, Gt, Lt
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Array, Covariance
+from ipe_bench.basics.options import Count, Positive, Share
+from ipe_bench.measurements.base import Measurement, UsualNoise
+from ipe_bench.noise.base import Noise
+
+UNIFORM_DEVIATION = 1 / np.sqrt(12)
+"""The standard deviation of a uniform number between 0 and 1."""
+
+
+@dataclass(frozen=True)
+class ScaledNoise(Noise):
+    """A noise whose size is one standard deviation; R is white unless a subclass says otherwise."""
+
+    deviation: Positive | None = None
+    """Standard deviation of a reading, in the unit of the readings; None: that of the model's usual noise."""
+
+    def completed(self, usual: UsualNoise | None) -> Self:
+        if self.deviation is None and usual is not None:
+            return replace(self, deviation=usual.deviation or usual.step * UNIFORM_DEVIATION)  # type: ignore[operator]
+        _ = self.stated
+        return self
+
+    @property
+    def stated(self) -> float:
+        """The standard deviation.
+
+        Raises:
+            UserError: none is given.
+        """
+        if self.deviation is None:
+            raise UserError(
+                f"noise.deviation: is not given for noise={self.name}, and the measurement model names no noise of its"
+                " own; give the standard deviation of a reading in its unit, noise.deviation=X"
+            )
+        return self.deviation
+
+    def covariance(self, m: int) -> Covariance:
+        return Covariance(np.full(m, self.stated))
+
+
+@dataclass(frozen=True)
+class Gaussian(ScaledNoise):
+    """z = h + v with independent normal v."""
+
+    deviation: Positive | tuple[Positive, ...] | None = None
+    """One standard deviation in the unit of the readings, or one for each; None: that of the model's usual noise."""
+
+    def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
+        return h + self.covariance(len(h)).factor * rng.standard_normal(h.shape)
+
+    def covariance(self, m: int) -> Covariance:
+        if not isinstance(self.deviation, tuple):
+            return super().covariance(m)
+        if len(self.deviation) != m:
+            raise UserError(f"noise.deviation: has {len(self.deviation)} numbers; give one for each of {m} readings")
+        return Covariance(np.asarray(self.deviation))
+
+
+@dataclass(frozen=True)
+class NoNoise(ScaledNoise):
+    """z = h exactly, while estimators assume readings of the nominal standard deviation."""
+
+    name = "none"
+    true_covariance = False
+
+    def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
+        return h
+
+
+@dataclass(frozen=True)
+class StudentT(ScaledNoise):
+    """z = h + v with independent v of Student's t distribution, scaled to the given standard deviation.
+
+    Estimators are told the true covariance R = deviation^2 I; what they do not know is the shape.
+    """
+
+    degrees_of_freedom: Annotated[float, Gt(2)] = 3.0
+    """Above 2, for a finite variance; the smaller, the heavier the tails."""
+
+    def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
+        return h + self.stated * self.whitened(h.shape, rng)
+
+    def whitened(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
+        # The variance of Student's t is nu / (nu - 2).
+        scale = np.sqrt((self.degrees_of_freedom - 2) / self.degrees_of_freedom)
+        return scale * rng.standard_t(self.degrees_of_freedom, shape)
+
+
+@dataclass(frozen=True)
+class Outliers(ScaledNoise):
+    """Tukey's contaminated normal: each reading is, with probability `share`, `factor` times as noisy as it should be.
+
+    `deviation` is that of a good reading. `assumed` is what estimators are told: `nominal`, the variance of the good
+    readings, as if there were no outliers; or `total`, that of the mixture, deviation^2 (1 - share + share factor^2).
+    """
+
+    share: Share = 0.05
+    factor: Positive = 10.0
+    assumed: Literal["nominal", "total"] = "nominal"
+
+    @property
+    def true_covariance(self) -> bool:
+        return self.assumed == "total"
+
+    def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
+        return h + self.stated * self._mixture(h.shape, rng)
+
+    def _mixture(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
+        """Errors over the deviation of a good reading."""
+        gross = rng.random(shape) < self.share
+        return np.where(gross, self.factor, 1.0) * rng.standard_normal(shape)
+
+    def whitened(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array | None:
+        """The mixture where estimators are told of it; otherwise R is that of good readings, which are normal."""
+        return None if self.assumed == "nominal" else self._mixture(shape, rng) / self._excess
+
+    @property
+    def _excess(self) -> float:
+        """The standard deviation that R states over that of a good reading."""
+        return 1.0 if self.assumed == "nominal" else float(np.sqrt(1 - self.share + self.share * self.factor**2))
+
+    def covariance(self, m: int) -> Covariance:
+        return Covariance(np.full(m, self.stated * self._excess))
+
+
+@dataclass(frozen=True)
+class Quantization(Noise):
+    """z = step * round((offset + h) / step) - offset: the instruments' whole read-out is rounded, not its error.
+
+    Rounding the difference instead would give equal errors in cases that differ in sign alone. The error is taken to be
+    uniform, R = step^2 / 12, unless `deviation` states it. With `dither` a uniform error of one step is added before
+    rounding and taken off again: then the error is uniform and independent of h, which at small h it otherwise is not.
+    """
+
+    step: Positive | None = None
+    """In the unit of the readings; None: that of the model's usual noise."""
+    deviation: Positive | None = None
+    dither: bool = False
+
+    def completed(self, usual: UsualNoise | None) -> Quantization:
+        return self if self.step or usual is None else replace(self, step=usual.step)
+
+    @property
+    def _size(self) -> float:
+        if self.step is None:
+            raise UserError(
+                "noise.step: is not given for noise=quantization, and the measurement model names no step of its own; "
+                "give the step of the read-out in the unit of the readings, noise.step=X"
+            )
+        return self.step
+
+    @property
+    def true_covariance(self) -> bool:
+        return self.deviation is None
+
+    def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
+        shift = self._size * (rng.random(h.shape) - 0.5) if self.dither else 0.0
+        return self._size * np.rint((offset + h + shift) / self._size) - offset - shift
+
+    def whitened(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
+        return (rng.random(shape) - 0.5) / UNIFORM_DEVIATION
+
+    def covariance(self, m: int) -> Covariance:
+        return Covariance(np.full(m, self.deviation or self._size * UNIFORM_DEVIATION))
+
+
+@dataclass(frozen=True)
+class Colored(ScaledNoise):
+    """First-order autoregressive noise, stationary: v_k = correlation v_(k-1) + sqrt(1 - correlation^2) deviation e_k.
+
+    The readings are `channels` instruments in turn, each with a series of its own; after `length` readings of each the
+    series start anew. GINS has 2 channels (the axes) and a length of 30 (the times of a case). `assumed` is what
+    estimators are told: `white`, R = deviation^2 I, which is the mistake that the paper warns of; or `full`, the truth.
+    """
+
+    correlation: Annotated[float, Gt(-1), Lt(1)] = 0.5
+    """Of successive readings of one instrument."""
+    channels: Count = 1
+    length: Count | None = None
+    """Readings per instrument in one series; None: all of them."""
+    assumed: Literal["white", "full"] = "white"
+
+    def _series(self, m: int) -> tuple[int, int, int]:
+        """How m readings divide: (series after one another, length, channels)."""
+        length = m // self.channels if self.length is None else self.length
+        if length == 0 or m % (length * self.channels):
+            raise UserError(f"channels={self.channels}, length={self.length}: {m} readings do not divide into these")
+        return m // (length * self.channels), length, self.channels
+
+    @property
+    def true_covariance(self) -> bool:
+        return self.assumed == "full" or self.correlation == 0
+
+    def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
+        e = rng.standard_normal(self._series(len(h)))
+        v = np.empty_like(e)
+        v[:, 0] = e[:, 0]
+        fresh = np.sqrt(1 - self.correlation**2)
+        for k in range(1, e.shape[1]):
+            v[:, k] = self.correlation * v[:, k - 1] + fresh * e[:, k]
+        return h + self.stated * v.ravel()
+
+    def covariance(self, m: int) -> Covariance:
+        repeats, length, channels = self._series(m)
+        if self.assumed == "white":
+            return super().covariance(m)
+        apart = np.abs(np.subtract.outer(np.arange(length), np.arange(length)))
+        series = np.kron(self.correlation**apart, np.eye(channels))
+        return Covariance(np.linalg.cholesky(self.stated**2 * np.kron(np.eye(repeats), series)))
+
+
+@dataclass(frozen=True)
+class Correlated(ScaledNoise):
+    """Gaussian errors of any covariance R.
+
+    Either `matrix` is R, in squared units of the readings; or readings of one standard deviation come in blocks of
+    `block` that follow one another and share an error, such that two of a block have the given correlation. `assumed`
+    is what estimators are told: `full`, R itself; or `white`, its diagonal.
+    """
+
+    correlation: Annotated[float, Ge(0), Lt(1)] = 0.5
+    """Of two readings of one block."""
+    block: Count | None = None
+    """Readings per block; None: all are one."""
+    matrix: tuple[tuple[float, ...], ...] | None = None
+    """R (m, m); where it is given, the three options above play no part."""
+    assumed: Literal["white", "full"] = "full"
+
+    def completed(self, usual: UsualNoise | None) -> Correlated:
+        return self if self.matrix is not None else super().completed(usual)
+
+    @property
+    def true_covariance(self) -> bool:
+        return self.assumed == "full"
+
+    def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
+        return h + _factor(self, len(h)) @ rng.standard_normal(len(h))
+
+    def covariance(self, m: int) -> Covariance:
+        full = Covariance(_factor(self, m))
+        return full if self.assumed == "full" else Covariance(full.deviations)
+
+
+@functools.lru_cache(maxsize=8)
+def _factor(noise: Correlated, m: int) -> Array:
+    """The lower Cholesky factor (m, m) of R."""
+    if noise.matrix is None:
+        block = m if noise.block is None else noise.block
+        if m % block:
+            raise UserError(f"block={block}: {m} readings do not divide into such blocks")
+        within = (1 - noise.correlation) * np.eye(block) + noise.correlation
+        R = noise.stated**2 * np.kron(np.eye(m // block), within)
+    else:
+        R = np.array(noise.matrix, dtype=float)
+        if R.shape != (m, m) or not np.allclose(R, R.T):
+            raise UserError(f"matrix: give a symmetric matrix of {m} x {m} numbers")
+    try:
+        return np.linalg.cholesky(R)
+    except np.linalg.LinAlgError:
+        raise UserError("matrix: is not a covariance: it is not positive definite") from None
+
+
+class _StandIn(Noise):
+    """A noise that draws no errors itself."""
+
+    def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
+        raise UserError(f"noise={self.name}: simulates no readings of its own; choose another noise")
+
+    def covariance(self, m: int) -> Covariance:
+        raise UserError(f"noise={self.name}: knows no R of its own; choose another noise")
+
+
+@dataclass(frozen=True)
+class Certified(_StandIn):
+    """Readings are those that come with the measurement model, its certified answer stands for the truth, and no prior.
+
+    A scenario with it has one trial. R is what the model states of its readings.
+    """
+
+    real = True
+
+
+@dataclass(frozen=True)
+class ModelNoise(_StandIn):
+    """Stands for the noise that the measurement model names, with its deviation or step replaced where given.
+
+    A scenario never holds it: it holds what it stands for.
+    """
+
+    name = "model"
+
+    deviation: Positive | tuple[Positive, ...] | None = None
+    """Standard deviation of the readings in their unit, or one for each."""
+    step: Positive | None = None
+    """The step of a read-out that is rounded."""
+
+    def of(self, model: Measurement) -> Noise | None:
+        """The noise meant for this model; None where neither the model nor an option says what it is."""
+        usual = model.usual_noise or UsualNoise()
+        step, deviation = self.step or usual.step, self.deviation or usual.deviation
+        if step is not None and not isinstance(self.deviation, tuple):
+            return Quantization(step, self.deviation)
+        return None if deviation is None else Gaussian(deviation)
+
+
+def resolved(noise: Noise, model: Measurement) -> Noise:
+    """The noise itself, or what it stands for with this model.
+
+    Raises:
+        UserError: the model names no noise and none is given.
+    """
+    if not isinstance(noise, ModelNoise):
+        return noise.completed(model.usual_noise)
+    if (own := noise.of(model)) is None:
+        raise UserError(
+            f"noise: is not given, and measurement={model.name} names no noise of its own; set noise.deviation=X, the "
+            "standard deviation of a reading, or choose a noise"
+        )
+    return own

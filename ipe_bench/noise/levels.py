@@ -1,0 +1,125 @@
+"""Levels of the noise: standard deviations as a formula of levels, one set of levels for each group of readings."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Array, Covariance
+from ipe_bench.measurements.arithmetic import Arithmetic, read
+from ipe_bench.measurements.base import Parameter
+from ipe_bench.measurements.ode.trace import Graph, Program, tangent
+
+READING = "h"
+"""Name of the error-free reading's magnitude in a formula of the standard deviation."""
+_PROBES = 1000
+"""Points at which a formula of the standard deviation is asked for its sign."""
+
+
+@functools.cache
+def read_sigma(text: str) -> Arithmetic:
+    """The formula of a standard deviation.
+
+    Raises:
+        UserError: it is no formula, has no level, or is negative at some levels and readings, all of them positive.
+    """
+    formula = read(text, "noise.sigma")
+    names = level_names(formula)
+    if not names:
+        raise UserError(f"noise.sigma={text}: has no level to estimate; give one, as in a + b*{READING}")
+    points = 10.0 ** np.random.default_rng(0).uniform(-2, 2, (len(names) + 1, _PROBES))
+    with np.errstate(all="ignore"):
+        values = np.broadcast_to(formula(dict(zip((*names, READING), points, strict=True))), _PROBES)
+    if len(wrong := np.flatnonzero(~(values >= 0))):
+        where = ", ".join(f"{n} = {v:.3g}" for n, v in zip((*names, READING), points[:, wrong[0]], strict=True))
+        raise UserError(
+            f"noise.sigma={text}: can be negative ({values[wrong[0]]:.3g} where {where}); give a formula that is"
+            f" positive for all positive levels, such as a + b*{READING}, where {READING} is the reading's magnitude"
+        )
+    levels = Levels(formula, np.ones(_PROBES), ("",), np.zeros(_PROBES, dtype=np.intp))
+    slopes = levels.at(np.geomspace(1e-6, 1e6, _PROBES)[None], np.log(points[None, :-1, 0]))[2][0]
+    if np.linalg.matrix_rank(slopes[np.isfinite(slopes).all(axis=1)]) < len(names):
+        raise UserError(
+            f"noise.sigma={text}: no readings tell its levels {', '.join(names)} apart; leave some out"
+            f" ({READING} is the reading's magnitude, all other names are levels)"
+        )
+    return formula
+
+
+def level_names(formula: Arithmetic) -> tuple[str, ...]:
+    """The names of the levels of a group of readings."""
+    return tuple(name for name in formula.names if name != READING)
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Standard deviations sigma_i = w_i s(|h_i|, levels of the group of i), as functions of the levels' logarithms."""
+
+    formula: Arithmetic
+    weights: Array
+    """w (m,)."""
+    groups: tuple[str, ...]
+    """Names of the groups; a single one has none."""
+    group: NDArray[np.intp]
+    """Place (m,) of each reading's group among these."""
+    unit: str = ""
+    """Unit of the readings."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return level_names(self.formula)
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The levels, group by group."""
+        alone = len(self.formula.names) == 1
+        named = [f"{name}_{group}" if group else name for group in self.groups for name in self.names]
+        return tuple(Parameter(name, self.unit if alone else "") for name in named)
+
+    def restricted(self, rows: NDArray[np.intp]) -> Levels:
+        """Those of some of the readings."""
+        kept, group = np.unique(self.group[rows], return_inverse=True)
+        groups = tuple(self.groups[k] for k in kept)
+        return replace(self, weights=self.weights[rows], groups=groups, group=group)
+
+    def covariance(self, h: Array, theta: Array) -> Covariance:
+        """R of readings h (m,) for logarithms theta (k,) of the levels.
+
+        Raises:
+            UserError: the standard deviation of a reading is zero, which makes its likelihood infinite.
+        """
+        sigma = np.exp(self.at(h[None], theta[None])[0][0])
+        if none := int(np.sum(sigma == 0)):
+            raise UserError(
+                f"noise.sigma={self.formula.text}: is 0 at {none} of {len(h)} readings, where {READING} is 0; add a"
+                f" level, as in a + b*{READING}"
+            )
+        return Covariance(sigma)
+
+    def at(self, h: Array, theta: Array) -> tuple[Array, Array, Array]:
+        """log sigma (trials, m) for readings h (trials, m) and logarithms theta (trials, k) of the levels, and its
+        derivatives by h (trials, m) and by theta (trials, m, k); not finite where sigma is not positive."""
+        trials, m = h.shape
+        levels = np.exp(theta).reshape(trials, len(self.groups), -1)[:, self.group]
+        values = [np.abs(h), *(levels[:, :, i] for i in range(len(self.names)))]
+        with np.errstate(all="ignore"):
+            s, by_h, *by_level = (np.broadcast_to(a, h.shape) for a in _recorded(self.formula)(values))
+            slopes = np.zeros((trials, m, len(self.groups), len(self.names)))
+            for i, slope in enumerate(by_level):
+                slopes[:, np.arange(m), self.group, i] = slope * levels[:, :, i] / s
+            return np.log(self.weights * s), by_h * np.sign(h) / s, slopes.reshape(trials, m, -1)
+
+
+@functools.cache
+def _recorded(formula: Arithmetic) -> Program:
+    """The formula and its derivatives by the reading and by each level."""
+    graph = Graph()
+    known = {name: graph.input(name) for name in (READING, *level_names(formula))}
+    value, one = graph.apply("add", formula(known), 0.0), graph.constant(1.0)
+    slopes = [tangent([value], {place: one})[0] for place in known.values()]
+    return Program.of([value, *slopes], list(known.values()))
