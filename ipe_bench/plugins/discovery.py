@@ -13,6 +13,7 @@ import importlib.util
 import os
 import re
 import sys
+import tomllib
 import traceback
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -99,6 +100,8 @@ class Source:
     conf: Path
     origin: str
     """For people: the distribution or the folder."""
+    distribution: str | None = None
+    """The name of the distribution, without case and punctuation, if it states one."""
 
 
 @dataclass(frozen=True)
@@ -180,16 +183,56 @@ def take_problems() -> list[str]:
 
 @functools.cache
 def sources() -> tuple[Source, ...]:
-    """Ours first, then the installed plugins, then the folders `plugins/*/`; their packages become importable."""
+    """Ours first, then the installed plugins, then the folders `plugins/*/`; their packages become importable.
+
+    A plugin that is installed and lies in a folder as well is the folder's: its author edits what runs.
+    """
     found: dict[str, Source] = {}
     folders = sorted(Path("plugins").resolve().iterdir()) if Path("plugins").is_dir() else []
-    of_folders = [source for folder in dict.fromkeys([*folders, *_added]) for source in _in_folder(folder)]
-    for source in [*installed_sources(), *of_folders]:
-        known = found.setdefault(source.name, source)
-        if known.conf.resolve() != source.conf.resolve():  # one that is installed from its folder is found twice
-            home, other = source.conf.parent, known.conf.parent
-            _problems[f"plugin {home}: {other} is called {source.name} too; it is left out"] = None
+    for source in installed_sources():
+        _take(found, source)
+    installed = dict(found)
+    for source in (source for folder in dict.fromkeys([*folders, *_added]) for source in _in_folder(folder)):
+        twin = installed.pop(source.name, None)
+        if (
+            twin is not None
+            and twin.distribution == source.distribution is not None
+            and not _imported_elsewhere(source)
+        ):
+            found[source.name] = source
+            _make_importable(source, before=twin)
+        elif _take(found, source):
+            _make_importable(source)
     return tuple(found.values())
+
+
+def _take(found: dict[str, Source], source: Source) -> bool:
+    """Whether a source is added; another one of its name that is there already is kept, and named as a problem."""
+    known = found.setdefault(source.name, source)
+    if known.conf.resolve() != source.conf.resolve():
+        home, other = source.conf.parent, known.conf.parent
+        _problems[f"plugin {home}: {other} is called {source.name} too; it is left out"] = None
+    return known is source
+
+
+def _imported_elsewhere(source: Source) -> bool:
+    """Whether this process has imported the package from another place, which is what runs then."""
+    file = getattr(sys.modules.get(source.name), "__file__", None)
+    return file is not None and Path(file).resolve().parent != source.conf.parent.resolve()
+
+
+def _make_importable(source: Source, before: Source | None = None) -> None:
+    """Puts a plugin's folder on the import path of this process and of the workers that it starts, at its end or before
+    the place of another source."""
+    path, other = (None if one is None else str(one.conf.parents[1]) for one in (source, before))
+
+    def placed(paths: list[str]) -> list[str]:
+        at = paths.index(other) if other in paths else len(paths)
+        return paths if path in paths[: at + 1] else [*paths[:at], str(path), *paths[at:]]
+
+    sys.path[:] = placed(sys.path)
+    inherited = filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))
+    os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys(placed(list(inherited))))
 
 
 def installed_sources() -> list[Source]:
@@ -206,19 +249,31 @@ def installed_sources() -> list[Source]:
             continue
         packages.add(entry.value.split(".")[0])
         origin = f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.name
-        found.append(Source(entry.value, Path(spec.submodule_search_locations[0]) / "conf", origin))
+        name = _normal(entry.dist.name) if entry.dist else None
+        found.append(Source(entry.value, Path(spec.submodule_search_locations[0]) / "conf", origin, name))
     return found
 
 
 def _in_folder(folder: Path) -> Iterator[Source]:
-    for conf in sorted(folder.glob("*/conf")):
+    for conf in sorted(folder.resolve().glob("*/conf")):
         if (conf.parent / "__init__.py").is_file():
-            # On the import path of this process and of the workers it starts.
-            path, inherited = str(folder.resolve()), os.environ.get("PYTHONPATH", "").split(os.pathsep)
-            sys.path += [] if path in sys.path else [path]
-            os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys([*filter(None, inherited), path]))
             packages.add(conf.parent.name)
-            yield Source(conf.parent.name, conf, f"{folder.parent.name}/{folder.name}")
+            yield Source(conf.parent.name, conf, f"{folder.parent.name}/{folder.name}", _stated_name(folder))
+
+
+def _stated_name(folder: Path) -> str | None:
+    """The name of the distribution that a folder's pyproject.toml describes."""
+    try:
+        project = tomllib.loads((folder / "pyproject.toml").read_text(encoding="utf-8")).get("project")
+    except (OSError, ValueError):  # none, or none that can be read
+        return None
+    name = project.get("name") if isinstance(project, Mapping) else None
+    return _normal(name) if isinstance(name, str) else None
+
+
+def _normal(name: str) -> str:
+    """Names of distributions that differ in case or punctuation alone are one name."""
+    return re.sub(r"[-_.]+", "-", name).lower()
 
 
 def options(group: str | None = None) -> list[Option]:
