@@ -73,9 +73,34 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     return f"; did you mean {cases[close[0]]}?" if close else ""
 
 
+ZOO = {
+    "accelerometer": "Accelerometer",
+    "bock": "Bock",
+    "es_mda": "EsMda",
+    "gnss": "Gnss",
+    "lm_iekf": "LMIEKF",
+    "mgh": "Mgh",
+    "multiple_shooting": "MultipleShooting",
+    "recursive_update": "RecursiveUpdate",
+    "triad": "Triad",
+}
+"""Options and classes that earlier versions had and the plugin zoo has now."""
+
+
+def moved(name: str) -> str:
+    """Where an option or a class of an earlier version is now; empty if it has not moved."""
+    if name not in (*ZOO, *ZOO.values()):
+        return ""
+    what = "" if name in ZOO else f"ipe_bench_zoo.{name} "
+    place = "in the plugin zoo now; work in a clone of ipe-bench, or `pip install CLONE/plugins/zoo`"
+    return f"is {what}{place}"
+
+
 def unknown(name: str, known: Iterable[str], noun: str) -> str:
-    """'there is no such option; did you mean ...', with everything there is."""
+    """'there is no such option; did you mean ...', with everything there is, or where it is now."""
     known = sorted(known)
+    if noun in ("option", "estimator", "group") and (place := moved(name)):
+        return place
     return f"there is no such {noun}{did_you_mean(name, known)} (there are: {', '.join(known) or 'none'})"
 
 
@@ -86,7 +111,7 @@ def without_modules(room: str, names: Sequence[str]) -> None:
         del content[name]
 
     def missing(name: str) -> Any:
-        raise AttributeError(f"{room}.{name}: {unknown(name, names, 'name')}")
+        raise AttributeError(f"{room}.{name}: {moved(name) or unknown(name, names, 'name')}")
 
     content["__getattr__"] = missing
 

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import MISSING, dataclass
 from typing import Any
 
-from ipe_bench.basics.errors import UserError, did_you_mean, place_of, unknown
+from ipe_bench.basics.errors import UserError, did_you_mean, moved, place_of, unknown
 from ipe_bench.basics.options import checked, describe_type, option_types
 from ipe_bench.measurements.known import ParameterInfo
 from ipe_bench.plugins import discovery
@@ -45,6 +45,8 @@ def find_object(target: Any, where: str) -> Any:
     """What has that dotted name in a registered package."""
     where = f"{where}.{TARGET}={target}"
     module_name, _, name = str(target).rpartition(".")
+    if module_name.startswith("ipe_bench.") and (place := moved(name)):
+        raise UserError(f"{where}: {place}")
     if module_name.split(".")[0] not in discovery.packages:
         known = ", ".join(sorted(discovery.packages))
         raise UserError(f"{where}: only classes of these packages are constructed: {known}")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import uuid
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -20,7 +21,7 @@ from typing import Any, NamedTuple, Self, TypeVar
 import numpy as np
 import pyarrow as pa
 
-from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.errors import ZOO, UserError, moved
 from ipe_bench.basics.linalg import Array
 from ipe_bench.runs.parts import (
     FAILED,
@@ -39,6 +40,7 @@ from ipe_bench.trials.thresholds import HISTORIES
 
 T = TypeVar("T")
 _AGAIN = "run the same command again, which computes it anew"
+_OF_ZOO = re.compile(rf"ipe_bench\.(measurements|baselines)\.[\w.]*\.({'|'.join(ZOO.values())})")
 
 
 @dataclass(frozen=True)
@@ -156,6 +158,8 @@ class Results:
     """What is wrong with each file that is left out."""
     outdated: list[Path] = field(default_factory=list)
     """Files in the format of an older version."""
+    moved: dict[str, str] = field(default_factory=dict)
+    """The class that is called otherwise now, by the identity of each result that is of one."""
     extra_problems: list[str] = field(default_factory=list)
     """Problems that are not one file's: a line for each."""
 
@@ -182,12 +186,15 @@ class Results:
                 with self._naming(part.path), contextlib.suppress(FileNotFoundError):
                     footer, _ = part.read()
                     known = self.stored[part.key].parts if part.key in self.stored else ()
+                    if not known and (found := _OF_ZOO.search(canonical_json(footer["identity"]))):
+                        self.moved[footer["identity_key"]] = found[0]
+                        continue
                     self.stored[part.key] = StoredCell(footer, tuple(sorted([*known, part], key=lambda p: p.order)))
         self.runs += tuple(self._records(store.runs, RUN))
         self.attempts += self._records(store.failed, FAILED)
         if keys is None and not listed and not self.runs:
             self.extra_problems.append(f"{store.directory}: holds no results of ipe-bench")
-        if self.outdated and not self.stored and keys is None:
+        if (self.outdated or self.moved) and not self.stored and keys is None:
             self.extra_problems.append(f"{store.directory}: was written by an older version of ipe-bench; {_AGAIN}")
 
     def _records(self, folder: Path, shape: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
@@ -222,7 +229,10 @@ class Results:
     @property
     def stale(self) -> list[str]:
         """A line for what older code computed: left out, and no problem if the present code has computed it."""
-        lines = []
+        lines = [
+            f"stale: {name} {moved(name.rpartition('.')[2])}; left out: its results ({count})"
+            for name, count in Counter(self.moved.values()).items()
+        ]
         for cell in (cell for _, stale in self._rivals.values() for cell in stale):
             versions = ", ".join(f"{package} {version}" for package, version in cell.footer["versions"].items())
             made_by = f"({versions}, source {cell.footer['source']}, key {cell.key})"
@@ -254,7 +264,7 @@ class Results:
         """What runs asked for, by identity: the newest decides on the key, the largest number of trials counts."""
         asked: dict[str, _Asked] = {}
         for run in self.runs:
-            for cell in run["cells"]:
+            for cell in (one for one in run["cells"] if one["identity_key"] not in self.moved):
                 new = _Asked(cell["key"], run["trials"], cell["names"], run.get("refused", ""))
                 known = asked.get(cell["identity_key"], new)
                 trials = max(new.trials, known.trials) if known.key == new.key else new.trials

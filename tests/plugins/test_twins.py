@@ -57,8 +57,8 @@ def test_another_distribution_of_that_package_is_named_and_left_out(site, tmp_pa
     project = tmp_path / "plugins/twin/pyproject.toml"
     project.write_text(project.read_text().replace('name = "ipe-bench-twin"', 'name = "somebody-elses"'))
     done = run("run", *CHOSEN, "trials=4", "output=out", site=site)
-    said = f"plugin {tmp_path}/plugins/twin/ipe_bench_twin: {site}/ipe_bench_twin is called ipe_bench_twin too; it is left out"
-    assert said in done.stderr
+    installed, left_out = site / "ipe_bench_twin", tmp_path / "plugins/twin/ipe_bench_twin"
+    assert f"plugin {left_out}: {installed} is called ipe_bench_twin too; it is left out" in done.stderr
     assert done.returncode == 2
     assert "this is the installed copy" in done.stderr
 
