@@ -16,7 +16,8 @@ from ipe_bench.basics.linalg import Array, deviations, unmasked
 from ipe_bench.real.readings import Table, read_tables
 from ipe_bench.states.base import StateModel
 from ipe_bench.states.formulas import Formulas, RecordedFormulas
-from ipe_bench.states.trackers import Bootstrap, Tracker
+from ipe_bench.states.particles import Bootstrap
+from ipe_bench.states.trackers import Tracker
 from ipe_bench.statistics.intervals import mean_limits
 from ipe_bench.trials.thresholds import FIT_LEVEL
 from ipe_bench.trials.tracking import track_safely

@@ -1,8 +1,9 @@
 """Where tasks run: one after another in this process, or in worker processes. Config group `execution`.
 
 A pool of joblib or concurrent.futures breaks as a whole when one worker dies, does not say which task it died of, and
-cannot stop one task. Here each worker has a pipe of its own: the task of a dead worker is known, a task that exceeds
-its time is ended with its worker and the processes that it started, and the others never notice.
+cannot stop one task; pebble can, but has no steps within a task, by which a limit on time begins after compilation, and
+leaves alive the processes that a task has started. Here each worker has a pipe and a session of its own: the task of a
+dead worker is known, and a task that exceeds its time is ended with all that it started, while the others go on.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ Work = Callable[[Any], Iterable[Any]]
 _LONGEST = 1e9
 """Seconds, and 1e9 bytes, beyond which no limit is meant: thirty years, and more memory than there is."""
 Limit = Annotated[float, Gt(0), Lt(_LONGEST), doc(f"a number above 0 and below {_LONGEST:g}")]
-"""Of time or memory."""
+"""A limit on seconds or gigabytes."""
 FATAL = (UserError, StorageError)
 """Exceptions that concern the whole run: they end it, where any other is a failure of one task."""
 _THREADED = ("OMP", "OPENBLAS", "MKL", "BLIS", "VECLIB", "NUMEXPR")
@@ -48,7 +49,7 @@ _PREPARATION_S = 60.0
 
 @dataclass(frozen=True)
 class Failure:
-    """Why a task did not end well."""
+    """Says why a task did not end well."""
 
     status: Literal["error", "timeout", "died"]
     """It raised; it exceeded a time limit; or it never began, or the process that it ran in ended."""
@@ -63,7 +64,7 @@ class Failure:
 
 @dataclass(frozen=True)
 class Event:
-    """News of one task: a step was done, or it ended."""
+    """Says of one task that a step was done, or that it ended."""
 
     index: int
     """The task's place in the sequence that was given."""
@@ -73,12 +74,26 @@ class Event:
 
 
 class Execution(Component, ABC):
-    """Where tasks run. A new execution is a frozen dataclass that writes `run`."""
+    """Runs the tasks of a bench. A new execution is a frozen dataclass whose fields are its options.
+
+    Required: `run(work, tasks)`, which yields an event per step of `work(task)`, and one with `ended` per task.
+    Optional: nothing else. Tasks, and `work`, can be pickled, and may run in any order, process or machine.
+    Promised: an exception in `work` fails its task alone, with `Failure.of`; one of `FATAL`, or closing the iterator,
+    stops what is under way.
+
+    >>> @dataclass(frozen=True)
+    ... class LastFirst(Execution):
+    ...     def run(self, work, tasks):
+    ...         for index in reversed(range(len(tasks))):
+    ...             yield from (Event(index, step) for step in work(tasks[index]))
+    ...             yield Event(index, ended=True)
+    >>> [(event.index, event.step) for event in LastFirst().run(lambda word: word.split(), ["one", "two three"])]
+    [(1, 'two'), (1, 'three'), (1, None), (0, 'one'), (0, None)]
+    """
 
     @abstractmethod
     def run(self, work: Work, tasks: Sequence[Any]) -> Iterator[Event]:
-        """Yields an event per step, and one with `ended` per task; an exception in `work` fails its task alone, and one
-        of `FATAL`, or closing the iterator, stops what is under way."""
+        """Yields the events of all tasks."""
 
 
 @dataclass(frozen=True)
@@ -190,7 +205,7 @@ def supervise(
 
 
 class _Worker:
-    """One worker process, and what it is doing."""
+    """Holds one worker process, and what it is doing."""
 
     def __init__(self) -> None:
         self.connection, there = Pipe()
@@ -213,11 +228,11 @@ class _Worker:
         self.index, self.deadline = -1, math.inf
 
     def extend(self, seconds: float | None) -> None:
-        """Gives it that long for its next step."""
+        """Resets the deadline of the next step; None: there is none."""
         self.deadline = math.inf if seconds is None else time.monotonic() + seconds
 
     def receive(self) -> tuple[str, Any]:
-        """Its next message; 'died' where there will be none."""
+        """Receives the next message; 'died' if there will be none."""
         try:
             return self.connection.recv()
         except (EOFError, OSError, pickle.UnpicklingError):
@@ -225,7 +240,7 @@ class _Worker:
             return "died", Failure("died", f"the worker process {_describe_exit(self.process.returncode)}")
 
     def end(self) -> None:
-        """Ends the process without asking it, and those that it started: its session is of its own."""
+        """Ends the process, and those that it started in its session, without waiting for the task."""
         with contextlib.suppress(OSError):
             self.connection.close()
         # One that has closed its pipe is on its way out: give it the time to leave its own exit code.
@@ -247,11 +262,11 @@ def _describe_exit(code: int) -> str:
 
 
 _idle: dict[int, list[_Worker]] = {}
-"""By process: workers of another one, that this one was forked from, are not ours."""
+"""Idle workers by the process that started them, since a forked process does not own those of its parent."""
 
 
 def _begun(index: int, message: Any) -> _Worker:
-    """An idle worker, else a new one, that was handed a task."""
+    """Hands a task to an idle worker, else to a new one."""
     kept = _idle.setdefault(os.getpid(), [])
     while True:
         worker = kept.pop() if kept else _Worker()

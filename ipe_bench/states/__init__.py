@@ -8,17 +8,9 @@ from ipe_bench.states.bounds import bound_at_truth, posterior_bounds
 from ipe_bench.states.formulas import Formulas, RecordedFormulas
 from ipe_bench.states.grid import Grid
 from ipe_bench.states.linearisation import Cubature, GaussHermite, SigmaPoints, Taylor, Unscented
-from ipe_bench.states.trackers import (
-    Bootstrap,
-    Filter,
-    IteratedSmoother,
-    Smoother,
-    Tracker,
-    Tracks,
-    ckf,
-    ekf,
-    ukf,
-)
+from ipe_bench.states.particles import Bootstrap
+from ipe_bench.states.smoothers import IteratedSmoother, Smoother
+from ipe_bench.states.trackers import Filter, Tracker, Tracks, ckf, ekf, ukf
 
 __all__ = [
     "Bootstrap",

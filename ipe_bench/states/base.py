@@ -1,4 +1,4 @@
-"""State models: x[k] = f(x[k-1], k) + G[k] w[k] and z[k] = h(x[k], k) + v[k] with w ~ N(0, I) and v ~ N(0, R[k])."""
+"""State models, and the true paths and readings that are drawn from them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _START, _PROCESS, _READINGS = range(3)
 
 
 class Normal(NamedTuple):
-    """Normal distributions, one per trial or one for all."""
+    """Holds normal distributions, one per trial or one for all."""
 
     mean: Array
     """(..., n)"""
@@ -30,7 +30,7 @@ class Normal(NamedTuple):
 
 @dataclass(frozen=True)
 class Paths:
-    """True paths and their readings, drawn from a state model."""
+    """Holds true paths and their readings, drawn from a state model."""
 
     start: Array
     """The states before the first transition (trials, n)."""
@@ -41,12 +41,41 @@ class Paths:
 
 
 class StateModel(Component, ABC):
-    """States that move, and what is read of them at K epochs k = 0 ... K-1.
+    """Describes states that move, and what is read of them at K epochs k = 0 ... K-1:
 
-    A model writes `states`, `times`, `prior`, `transition`, `observe`, `gain` and `R`. `transition` and `observe` take
-    stacks of states (..., n), real or complex, and are analytic in them: slopes are complex steps. Process noise enters
-    by its gain G, so a singular Q = G G' needs no special case. Known inputs and unequal steps are the model's own: it
-    is told k. A measurement model with epochs is the state model whose states stand still.
+        x[k] = f(x[k-1], k) + G[k] w[k],   w[k] ~ N(0, I)
+        z[k] = h(x[k], k) + v[k],          v[k] ~ N(0, R[k])
+
+    Required: `states`, `times`, `prior`, `transition` (f), `observe` (h), `gain` (G) and `R`.
+    Optional: `moved_first`, `periods` and `reading_names`; `draw`, if paths are stored.
+    Promised: f and h take stacks of states (..., n), real or complex, and are analytic in them, since slopes are
+    complex steps; a trial has the same bits alone and in any batch; `require_sound` finds nothing to refuse.
+
+    Process noise enters by its gain, so that a singular Q = G G' needs no special case. Known inputs and unequal steps
+    follow from k. A measurement model with epochs is the state model whose states stand still.
+
+    >>> from ipe_bench.states import ekf
+    >>> @dataclass(frozen=True)
+    ... class RandomWalk(StateModel):
+    ...     states = (Parameter("p", "m"),)
+    ...     times = np.arange(1.0, 21.0)
+    ...     prior = Normal(np.zeros(1), np.eye(1))
+    ...
+    ...     def transition(self, x, k):
+    ...         return x
+    ...
+    ...     def observe(self, x, k):
+    ...         return x
+    ...
+    ...     def gain(self, k):
+    ...         return np.eye(1)
+    ...
+    ...     def R(self, k):
+    ...         return 4.0 * np.eye(1)
+    >>> model = RandomWalk()
+    >>> P = ekf().track(model, model.draw(0, 5).z).covariance[:, -1, 0, 0]
+    >>> bool(np.allclose(P**2 + P, 4.0))  # the steady state P^2 + P Q = Q R
+    True
     """
 
     moved_first: bool = True

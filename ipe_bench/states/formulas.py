@@ -58,10 +58,9 @@ class Formulas(StateModel):
     title: str = "formulas"
     """The name of the model in tables."""
 
-    name = property(lambda model: model.title)  # type: ignore[assignment]
-
     def __post_init__(self) -> None:
         super().__post_init__()
+        object.__setattr__(self, "name", self.title)
         names = [*self.next, *self.noise, *self.constants, *self.inputs, "k", "t"]
         if twice := next((name for name in names if names.count(name) > 1), None):
             raise UserError(

@@ -9,7 +9,8 @@ import numpy as np
 from ipe_bench.basics.linalg import Array, multiply
 from ipe_bench.basics.options import Count
 from ipe_bench.states.base import StateModel
-from ipe_bench.states.trackers import Tracker, Tracks, weighed
+from ipe_bench.states.particles import weighed
+from ipe_bench.states.trackers import Tracker, Tracks
 
 _PATHS = 1000
 """Drawn paths by which the grid of an epoch is as wide as the states are."""
@@ -31,9 +32,9 @@ class Grid(Tracker):
     points: Count = 1000
     """Points of the grid of an epoch."""
     smooths: bool = False
-    """Whether each epoch is told all readings instead of those up to it."""
+    """Whether each epoch is estimated from all readings instead of those up to it."""
 
-    def hindrance(self, model: StateModel) -> str:
+    def hindrance(self, model: StateModel) -> str | None:
         if model.n > 1:
             return f"is exact for one state, and {model.name} has {model.n}; leave it out"
         grids, epochs = self._grids(model), [k for k in range(model.epochs) if model.moves(k)]
@@ -44,7 +45,7 @@ class Grid(Tracker):
         if (excess := np.max(steps / noise)) > 1:
             needed = np.ceil(1.1 * self.points * excess)
             return f"its points are farther apart than process noise reaches; set points={needed:.0f}"
-        return ""
+        return None
 
     def track(self, model: StateModel, z: Array) -> Tracks:
         if self.smooths and len(z) > _AT_ONCE:  # whose densities are kept for all epochs
@@ -89,7 +90,7 @@ def _kernel(model: StateModel, grids: Array, k: int) -> Array:
 
 
 def _moved(model: StateModel, grids: Array, k: int) -> Array:
-    """Where the points before epoch k are moved to without process noise (points,)."""
+    """Returns the points before epoch k, moved to it without process noise (points,)."""
     return model.transition(grids[k][:, None], k)[:, 0]
 
 

@@ -1,4 +1,4 @@
-"""Filters and smoothers of state models: readings (trials, K, m) in, means and covariances of the states out.
+"""Trackers of state models, readings (trials, K, m) in, means and covariances of the states out: Gaussian filters.
 
 All trials advance together. A reading that is NaN is missing; a trial whose covariance is no longer positive definite
 is NaN from then on and disturbs no other.
@@ -7,27 +7,22 @@ is NaN from then on and disturbs no other.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Mask, multiply
-from ipe_bench.basics.options import Component, Count, NonNegative
-from ipe_bench.basics.streams import own_generators
-from ipe_bench.states.algebra import divide, factor, lower_solve, mahalanobis, root, symmetric, transposed, upper_solve
+from ipe_bench.basics.options import Component, Count
+from ipe_bench.states.algebra import factor, lower_solve, symmetric, transposed, upper_solve
 from ipe_bench.states.base import Normal, StateModel
-from ipe_bench.states.linearisation import Affine, Cubature, Rule, Taylor, Unscented, slope
-
-_HALVINGS = 12
-"""Halvings of a damped step."""
+from ipe_bench.states.linearisation import Affine, Cubature, Rule, Taylor, Unscented
 
 
 @dataclass
 class Tracks:
-    """What a tracker says of the states at K epochs, and what its smoother needs."""
+    """Holds what a tracker says of the states at K epochs, and what its smoother needs."""
 
     mean: Array
     """(trials, K, n)"""
@@ -75,7 +70,7 @@ class Tracks:
 
     @classmethod
     def lost(cls, model: StateModel, trials: int) -> Tracks:
-        """Tracks of which nothing is known."""
+        """Returns tracks of which nothing is known."""
         tracks = cls.empty(model, trials)
         tracks.mean[:], tracks.covariance[:] = np.nan, np.nan
         return tracks
@@ -90,19 +85,36 @@ class Tracks:
 
 
 class Tracker(Component, ABC):
-    """Estimates the states of every trial from its readings."""
+    """Estimates the states of every trial from its readings. A new tracker is a frozen dataclass whose fields are its
+    options, and the identity of its results.
+
+    Required: `track(model, z)`, which returns `Tracks`. `Tracks.empty(model, trials)` has the arrays to be filled.
+    Optional: `hindrance(model)`, which is asked before any work. A filter of a new `Rule` needs no tracker of its own.
+    Promised: readings that are NaN are missing; a trial has the same bits alone and in any batch, its random numbers
+    included; a trial that breaks down is NaN, or raises if it is alone, and disturbs no other.
+
+    >>> from ipe_bench.states import Formulas
+    >>> @dataclass(frozen=True)
+    ... class DeadReckoning(Tracker):
+    ...     def track(self, model, z):
+    ...         return filtered(model, np.full_like(z, np.nan), Taylor())
+    >>> drift = {"next": {"p": "p + w"}, "readings": {"z": "p"}, "noise": {"w": 1}, "deviation": {"z": 2}}
+    >>> model = Formulas(**drift, spread={"p": 1}, count=3)
+    >>> print(DeadReckoning().track(model, model.draw(0, 5).z).covariance[4, :, 0, 0])
+    [2. 3. 4.]
+    """
 
     needs: ClassVar[frozenset[str]] = frozenset({"epochs", "prior"})
     equation: ClassVar[None] = None
     family: ClassVar[str] = "filters"
 
-    def hindrance(self, model: StateModel) -> str:
-        """Why the tracker does not suit the model; empty if it does."""
-        return ""
+    def hindrance(self, model: StateModel) -> str | None:
+        """Says, in words that follow the tracker's label, why it does not suit the model; None if it does."""
+        return None
 
     @abstractmethod
     def track(self, model: StateModel, z: Array) -> Tracks:
-        """The states that readings z (trials, K, m) tell of."""
+        """Estimates the states from readings z (trials, K, m)."""
 
 
 def spread_prior(model: StateModel, trials: int) -> Normal:
@@ -111,20 +123,24 @@ def spread_prior(model: StateModel, trials: int) -> Normal:
 
 
 def predict(x: Normal, move: Affine, Q: Array) -> Normal:
-    """The states after a linearised transition with process noise of covariance Q (n, n)."""
+    """Moves the states by A x + b + e + w, with e ~ N(0, W) of the rule and process noise w ~ N(0, Q (n, n)):
+
+    m <- A m + b
+    P <- A P A' + W + Q
+    """
     P = np.matmul(np.matmul(move.A, x.covariance), transposed(move.A)) + move.W + Q
     return Normal(multiply(move.A, x.mean) + move.b, symmetric(P))
 
 
 def linearised_reading(model: StateModel, rule: Rule, k: int, z: Array, x: Normal) -> Affine:
-    """h linearised about the states x, periodic readings next to the readings z (trials, m)."""
+    """Linearises h about the states x, periodic readings next to the readings z (trials, m)."""
     A, b, W = rule.linearise(lambda at: model.observe(at, k), *x, model.nearest if model.periods else None)
     value = multiply(A, x.mean) + b
     return Affine(A, b + model.nearest(value, np.where(np.isfinite(z), z, value)) - value, W)
 
 
 class Update(NamedTuple):
-    """The states after a reading, and what the innovation says of the filter."""
+    """Holds the states after a reading, and what the innovation says of the filter."""
 
     x: Normal
     innovation: Array
@@ -143,10 +159,14 @@ class Update(NamedTuple):
 
 
 def update(x: Normal, read: Affine, R: Array, z: Array) -> Update:
-    """Takes in the readings z (trials, m) of covariance R (m, m). A missing reading has no slope and unit variance.
+    """Takes in the readings z = H x + b + e + v (trials, m), e ~ N(0, W) of the rule and v ~ N(0, R (m, m)):
 
-    P is updated in Joseph's form, (I - K H) P (I - K H)' + K R K', which stays positive definite where the prior is
-    much wider than R.
+        y = z - H m - b,   S = H P H' + W + R,   K = P H' S^-1
+        m <- m + K y
+        P <- (I - K H) P (I - K H)' + K (W + R) K'
+
+    This form of P, Joseph's, stays positive definite where the prior is much wider than R. A missing reading has no
+    slope and unit variance.
     """
     m, P = x
     seen = np.isfinite(z)
@@ -175,18 +195,8 @@ class Filter(Tracker):
     """How transition and reading are linearised."""
     iterations: Count = 1
     """Linearisations of each reading."""
-    engine: Literal["filterpy", "batched"] = "batched"
-    """Who computes the filter's equations: filterpy, trial by trial, in some 100 times the time, or this package, for
-    all trials at once."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.engine == "filterpy" and (self.iterations > 1 or type(self.rule) not in (Taylor, Unscented)):
-            raise UserError("engine=filterpy: is for ekf and ukf, with one iteration; choose engine=batched")
 
     def track(self, model: StateModel, z: Array) -> Tracks:
-        if self.engine == "filterpy":
-            return _stepped(model, z, self.rule)
         return filtered(model, z, self.rule, self.iterations)
 
 
@@ -211,137 +221,6 @@ def filtered(model: StateModel, z: Array, rule: Rule, iterations: int = 1, path:
     return out
 
 
-def _stepped(model: StateModel, z: Array, rule: Rule) -> Tracks:
-    """The tracks by filterpy's filter of Taylor's rule or of the unscented one, a filter for each trial."""
-    out = Tracks.empty(model, len(z))
-    x, filters = out.start, [_of_filterpy(rule, model.n, z.shape[2]) for _ in z]
-    for f, mean, covariance in zip(filters, *x, strict=True):
-        f.x, f.P = mean, covariance
-    for k in range(model.epochs):
-        if model.moves(k):
-            move, Q = rule.linearise(lambda at, k=k: model.transition(at, k), *x), model.Q(k)
-            if isinstance(rule, Taylor):
-                for f, F, moved in zip(filters, move.A, model.transition(x.mean, k), strict=True):
-                    f.Q, f.F = Q, F
-                    f.predict()
-                    f.x = moved
-            else:
-                for f in filters:
-                    f.Q = Q
-                    f.predict(fx=lambda at, _, k=k: model.transition(at, k))
-            x = Normal(np.array([f.x for f in filters]), np.array([f.P for f in filters]))
-            out.moves.append(move)
-            out.predicted.append(x)
-        (h, H), R = slope(lambda at, k=k: model.observe(at, k), x.mean), model.R(k)
-        for f, *read in zip(filters, z[:, k], h, H, strict=True):
-            _take_in(f, model, k, R, *read)
-        mean, P, y, S = (np.array([getattr(f, name) for f in filters]) for name in ("x", "P", "y", "S"))
-        x = out.note(k, Update.of(Normal(mean, P), y, factor(S), np.isfinite(z[:, k])))
-    # What the smoother needs, and filterpy's own; unscented readings besides the slope, by which they are told apart.
-    points = rule.calls(model.n)
-    moved, read = (1, 0) if isinstance(rule, Taylor) else (points, points)
-    out.calls += (points + moved) * len(out.moves) + (1 + model.n + read) * model.epochs
-    return out
-
-
-def _of_filterpy(rule: Rule, n: int, m: int) -> Any:
-    from filterpy.kalman import ExtendedKalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
-
-    if not isinstance(rule, Unscented):
-        return ExtendedKalmanFilter(n, m)
-    points = MerweScaledSigmaPoints(n, rule.alpha, rule.beta, rule.kappa_of(n))
-    return UnscentedKalmanFilter(n, m, dt=1.0, hx=None, fx=None, points=points)
-
-
-def _take_in(f: Any, model: StateModel, k: int, R: Array, z: Array, h: Array, H: Array) -> None:
-    """Updates a filter of filterpy by readings z (m,) near h (m,); a missing one reads 0, with no slope and unit
-    variance."""
-    seen = np.isfinite(z)
-    z, R = np.where(seen, model.nearest(z, h), 0.0), np.where(seen[:, None] & seen, R, np.eye(len(z)))
-    if hasattr(f, "points_fn"):
-        f.sigmas_f = f.points_fn.sigma_points(f.x, f.P)
-        f.update(z, R, hx=lambda x: np.where(seen, model.nearest(model.observe(x, k), h), 0.0))
-    else:
-        f.update(z, lambda _: np.where(seen[:, None], H, 0.0), lambda _: np.where(seen, h, 0.0), R)
-
-
-@dataclass(frozen=True)
-class Smoother(Tracker):
-    """The smoother of Rauch, Tung and Striebel (AIAA J. 3, 1965) behind a filter."""
-
-    filter: Filter = field(default_factory=Filter)
-    """The filter whose tracks are smoothed."""
-
-    def track(self, model: StateModel, z: Array) -> Tracks:
-        return smoothed(model, self.filter.track(model, z))
-
-
-@dataclass(frozen=True)
-class IteratedSmoother(Tracker):
-    """Linearises everything about the last smoothed path and solves that affine problem exactly, again and again.
-
-    By Taylor's rule these are Gauss-Newton steps to the path of largest posterior density (Bell, SIAM J. Optim. 4,
-    1994), with `damped` halved while they raise its cost; by sigma points it is the iterated posterior linearisation
-    smoother (García-Fernández, Svensson, Särkkä, IEEE TSP 65, 2017). The first path is that of `first`, smoothed.
-    """
-
-    first: Filter = field(default_factory=Filter)
-    """The filter whose smoothed tracks are the first path."""
-    rule: Rule = field(default_factory=Taylor)
-    """How transition and reading are linearised about a path."""
-    iterations: Count = 10
-    """Paths at most, after the first."""
-    damped: bool = False
-    """Whether steps that raise the cost of the path are halved; for Taylor's rule."""
-    tolerance: NonNegative = 0.0
-    """Ends where no trial's path moves by more than so many of its own standard deviations."""
-
-    def track(self, model: StateModel, z: Array) -> Tracks:
-        path = self.first.track(model, z)
-        calls, going = path.calls, np.ones(len(z), dtype=bool)
-        for _ in range(self.iterations):
-            new = smoothed(model, filtered(model, z, self.rule, path=path))
-            if self.damped:
-                new = _shortened(model, z, path, new)
-            calls = calls + np.where(going, new.calls, 0.0)
-            moved = np.abs(new.mean - path.mean) / np.sqrt(np.diagonal(new.covariance, axis1=-2, axis2=-1))
-            path, on = new, (moved > self.tolerance).any(axis=(1, 2))
-            going &= on
-            if not on.any():
-                break
-        path.calls = calls
-        return path
-
-
-def smoothed(model: StateModel, tracks: Tracks) -> Tracks:
-    """The backward pass of Rauch, Tung and Striebel through a filter's tracks, to before the first transition."""
-    out = Tracks.empty(model, len(tracks.mean))
-    out.mean[:, -1], out.covariance[:, -1] = x = tracks.at(model.epochs - 1)
-    first = 0 if model.moved_first else 1
-    for k in range(model.epochs - 1, first - 1, -1):
-        before = tracks.at(k - 1)
-        move, predicted = tracks.moves[k - first], tracks.predicted[k - first]
-        G = divide(np.matmul(before.covariance, transposed(move.A)), predicted.covariance)
-        P = np.matmul(np.matmul(G, x.covariance - predicted.covariance), transposed(G))
-        x = Normal(before.mean + multiply(G, x.mean - predicted.mean), symmetric(before.covariance + P))
-        if k:
-            out.mean[:, k - 1], out.covariance[:, k - 1] = x
-    out.start = x
-    out.moves, out.predicted, out.calls = tracks.moves, tracks.predicted, tracks.calls
-    return out
-
-
-def path_cost(model: StateModel, z: Array, start: Array, mean: Array) -> Array:
-    """-2 log p(path | readings) (trials,) up to a constant; disturbances count by the pseudo-inverse of the gain."""
-    total, before = mahalanobis(start - model.prior.mean, model.prior.covariance), start
-    for k in range(model.epochs):
-        if model.moves(k):
-            w = multiply(np.linalg.pinv(model.gain(k)), mean[:, k] - model.transition(before, k))
-            total = total + np.sum(w**2, axis=-1)
-        total, before = total + misfit(model, z[:, k], mean[:, k, None], k)[0][:, 0], mean[:, k]
-    return total
-
-
 def misfit(model: StateModel, z: Array, x: Array, k: int) -> tuple[Array, Array]:
     """(z - h)' R^-1 (z - h) (trials, N) of states x (trials, N, n) over the readings z (trials, m) of epoch k that are
     there, and log det 2 pi R (trials,) of these."""
@@ -350,86 +229,6 @@ def misfit(model: StateModel, z: Array, x: Array, k: int) -> tuple[Array, Array]
     L = factor(np.where(seen[:, :, None] & seen[:, None, :], model.R(k), np.eye(z.shape[1])))
     size = 2 * np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1) + np.log(2 * np.pi) * seen.sum(axis=1)
     return np.sum(lower_solve(L, transposed(r)) ** 2, axis=1), size
-
-
-def _halved(old: Array, new: Array, cost: Callable[[Array], Array]) -> tuple[Array, Array]:
-    """The step from `old` to `new` (trials, ...), halved in each trial until the cost (trials,) is not above that of
-    `old`; and how many costs (trials,) that took."""
-    best, share = cost(old), np.ones((len(old),) + (1,) * (old.ndim - 1))
-    worse, taken = np.ones(len(old), dtype=bool), np.ones(len(old))
-    for _ in range(_HALVINGS):
-        taken += worse
-        worse = ~(cost(old + share * (new - old)) <= best * (1 + 1e-12))
-        if not worse.any():
-            break
-        share[worse] /= 2
-    return old + share * (new - old), taken
-
-
-def _shortened(model: StateModel, z: Array, old: Tracks, new: Tracks) -> Tracks:
-    """The step from one path to the next, halved where it raises the path's cost."""
-    first, last = (np.concatenate([path.start.mean[:, None], path.mean], axis=1) for path in (old, new))
-    path, costs = _halved(first, last, lambda x: path_cost(model, z, x[:, 0], x[:, 1:]))
-    new.calls = new.calls + costs * model.evaluations
-    new.mean, new.start = path[:, 1:], Normal(path[:, 0], new.start.covariance)
-    return new
-
-
-@dataclass(frozen=True)
-class Bootstrap(Tracker):
-    """The bootstrap particle filter (Gordon, Salmond, Smith, IEE Proc. F 140, 1993), with systematic resampling at
-    every epoch. Each trial's random numbers are those of its readings, in whatever batch."""
-
-    particles: Count = 1000
-    """States that stand for the density of a trial."""
-    seed: int = 0
-    """A trial's random numbers depend on this and on its readings: on nothing else in the batch."""
-
-    def track(self, model: StateModel, z: Array) -> Tracks:
-        trials, N = len(z), self.particles
-        generators = own_generators(self.seed, z.reshape(trials, -1))
-
-        def normals(columns: int) -> Array:
-            return np.stack([g.standard_normal((N, columns)) for g in generators])
-
-        out = Tracks.empty(model, trials)
-        out.nis[:] = np.nan  # a weighted sample has no innovation
-        spread = root(model.prior.covariance)
-        x = model.prior.mean + np.matmul(normals(spread.shape[1]), spread.T)
-        for k in range(model.epochs):
-            if model.moves(k):
-                G = model.gain(k)
-                x = model.transition(x, k) + np.matmul(normals(G.shape[1]), G.T)
-            w = weighed(model, x, k, z[:, k], 1.0, out)
-            mean = np.sum(w[..., None] * x, axis=1)
-            d = x - mean[:, None]
-            out.mean[:, k], out.covariance[:, k] = mean, np.matmul(transposed(d * w[..., None]), d)
-            x = _resampled(x, w, np.array([g.random() for g in generators]))
-        out.log_likelihood -= model.epochs * np.log(N)
-        out.calls += N * model.evaluations
-        return out
-
-
-def weighed(model: StateModel, x: Array, k: int, z: Array, before: Array | float, out: Tracks) -> Array:
-    """The weights `before` (trials, N) of states x (trials, N, n) times the likelihood of readings z (trials, m), with
-    sum 1; the logarithm of their sum is added to the log likelihood of the track."""
-    square, size = misfit(model, z, x, k)
-    least = square.min(axis=1, keepdims=True)
-    w = before * np.exp(-0.5 * (square - least))
-    total = w.sum(axis=1, keepdims=True)
-    out.log_likelihood += np.log(total[:, 0]) - 0.5 * (least[:, 0] + size)
-    out.degrees[:, k] = np.isfinite(z).sum(axis=1)
-    return w / total
-
-
-def _resampled(x: Array, w: Array, offset: Array) -> Array:
-    """Particles x (trials, N, n) copied in proportion to their weights w (trials, N), systematically from an offset
-    (trials,) in [0, 1)."""
-    trials, N, n = x.shape
-    upto = np.ceil(N * np.cumsum(w, axis=1) - offset[:, None]).clip(0, N)
-    upto[:, -1] = N
-    counts = np.diff(upto, axis=1, prepend=0.0).astype(int)
-    return x.reshape(trials * N, n)[np.repeat(np.arange(trials * N), counts.ravel())].reshape(trials, N, n)
 
 
 def ekf(iterations: int = 1) -> Filter:

@@ -13,7 +13,7 @@ from ipe_bench.measurements import Gins
 from ipe_bench.noise import Gaussian, Quantization
 from ipe_bench.plugins.construct import construct
 from ipe_bench.plugins.discovery import composed, options
-from ipe_bench.states import Filter, Grid, IteratedSmoother, StateModel, Taylor, Unscented
+from ipe_bench.states import Filter, Grid, IteratedSmoother, StateModel, Unscented
 from ipe_bench.trials.scenario import Scenario
 
 
@@ -57,8 +57,6 @@ def test_a_budget_ends_a_search_and_not_the_report_of_it():
 
 
 TRACKERS = registered("tracker") | {
-    "ekf, filterpy": Filter(Taylor(), engine="filterpy"),
-    "ukf, filterpy": Filter(Unscented(), engine="filterpy"),
     "ieks, damped": IteratedSmoother(Filter(Unscented()), damped=True),
     "ieks, till it stays": IteratedSmoother(Filter(Unscented()), tolerance=1e-3),
     "grid, smoothing": Grid(smooths=True),

@@ -16,6 +16,7 @@ from filterpy.kalman import (
 )
 from scipy.optimize import least_squares
 from scipy.optimize._numdiff import approx_derivative
+from shared.filterpy_tracks import Filterpy
 from shared.state_models import ConstantVelocity, CoordinatedTurn, Growth, Pendulum
 
 import ipe_bench as ib
@@ -39,7 +40,7 @@ from ipe_bench.states import (
     posterior_bounds,
     ukf,
 )
-from ipe_bench.states.trackers import path_cost
+from ipe_bench.states.smoothers import path_cost
 
 BOOK = {
     "EKF": (Taylor(), 1, 0.16830859061153763, 0.057446202494837),
@@ -297,10 +298,10 @@ class Sharp(Scalar):
 @pytest.mark.parametrize(
     "model", [NEAR, ConstantVelocity(count=40), CoordinatedTurn(count=50), Scalar(False)], ids=lambda m: m.name
 )
-def test_both_engines_have_the_same_tracks(model, rule):
+def test_filterpy_has_the_same_tracks(model, rule):
     z = model.draw(0, 4).z
     z[1, 3:6], z[2, 20, 0] = np.nan, np.nan
-    batched, filterpy = Filter(rule), Filter(rule, engine="filterpy")
+    batched, filterpy = Filter(rule), Filterpy(rule)
     for ours, theirs in ((batched, filterpy), (Smoother(batched), Smoother(filterpy))):
         one, other = ours.track(model, z), theirs.track(model, z)
         size = np.sqrt(np.einsum("tkii->tki", one.covariance))
@@ -309,12 +310,6 @@ def test_both_engines_have_the_same_tracks(model, rule):
         np.testing.assert_allclose(scaled, 0.0, atol=1e-10)
         for name in ("nis", "innovations", "degrees", "log_likelihood"):
             np.testing.assert_allclose(getattr(other, name), getattr(one, name), rtol=1e-10, atol=1e-10)
-
-
-@pytest.mark.parametrize("options", [{"rule": Cubature()}, {"rule": Taylor(), "iterations": 2}])
-def test_filterpy_steps_the_extended_and_the_unscented_filter_alone(options):
-    with pytest.raises(ib.UserError, match="engine=filterpy: is for ekf and ukf, with one iteration"):
-        Filter(**options, engine="filterpy")
 
 
 @pytest.mark.parametrize("moved_first", [True, False])
@@ -347,7 +342,7 @@ def test_a_grid_refuses_what_it_cannot_be_exact_for():
     ) as refused:
         ib.run(growth, {"grid": Grid(300)}, 3)
     needed = int(str(refused.value).rpartition("=")[2])
-    assert Grid(needed).hindrance(growth) == ""
+    assert Grid(needed).hindrance(growth) is None
     z = growth.draw(0, 3).z
     z[1, 7] = 400.0  # a state of 90, as none is
     table = ib.run(growth, {"grid": Grid(needed)}, 3)

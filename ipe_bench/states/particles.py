@@ -1,0 +1,71 @@
+"""Particle filters of state models: the density of a trial's states is a weighted sample of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.options import Count
+from ipe_bench.basics.streams import own_generators
+from ipe_bench.states.algebra import root, transposed
+from ipe_bench.states.base import StateModel
+from ipe_bench.states.trackers import Tracker, Tracks, misfit
+
+
+@dataclass(frozen=True)
+class Bootstrap(Tracker):
+    """The bootstrap particle filter (Gordon, Salmond, Smith, IEE Proc. F 140, 1993), with systematic resampling at
+    every epoch. Each trial's random numbers are those of its readings, in whatever batch."""
+
+    particles: Count = 1000
+    """States that stand for the density of a trial."""
+    seed: int = 0
+    """A trial's random numbers depend on this and on its readings: on nothing else in the batch."""
+
+    def track(self, model: StateModel, z: Array) -> Tracks:
+        trials, N = len(z), self.particles
+        generators = own_generators(self.seed, z.reshape(trials, -1))
+
+        def normals(columns: int) -> Array:
+            return np.stack([g.standard_normal((N, columns)) for g in generators])
+
+        out = Tracks.empty(model, trials)
+        out.nis[:] = np.nan  # a weighted sample has no innovation
+        spread = root(model.prior.covariance)
+        x = model.prior.mean + np.matmul(normals(spread.shape[1]), spread.T)
+        for k in range(model.epochs):
+            if model.moves(k):
+                G = model.gain(k)
+                x = model.transition(x, k) + np.matmul(normals(G.shape[1]), G.T)
+            w = weighed(model, x, k, z[:, k], 1.0, out)
+            mean = np.sum(w[..., None] * x, axis=1)
+            d = x - mean[:, None]
+            out.mean[:, k], out.covariance[:, k] = mean, np.matmul(transposed(d * w[..., None]), d)
+            x = _resampled(x, w, np.array([g.random() for g in generators]))
+        out.log_likelihood -= model.epochs * np.log(N)
+        out.calls += N * model.evaluations
+        return out
+
+
+def weighed(model: StateModel, x: Array, k: int, z: Array, before: Array | float, out: Tracks) -> Array:
+    """The weights `before` (trials, N) of states x (trials, N, n) times the likelihood of readings z (trials, m), with
+    sum 1; the logarithm of their sum is added to the log likelihood of the track."""
+    square, size = misfit(model, z, x, k)
+    least = square.min(axis=1, keepdims=True)
+    w = before * np.exp(-0.5 * (square - least))
+    total = w.sum(axis=1, keepdims=True)
+    out.log_likelihood += np.log(total[:, 0]) - 0.5 * (least[:, 0] + size)
+    out.degrees[:, k] = np.isfinite(z).sum(axis=1)
+    return w / total
+
+
+def _resampled(x: Array, w: Array, offset: Array) -> Array:
+    """Particles x (trials, N, n) copied in proportion to their weights w (trials, N), systematically from an offset
+    (trials,) in [0, 1)."""
+    trials, N, n = x.shape
+    upto = np.ceil(N * np.cumsum(w, axis=1) - offset[:, None]).clip(0, N)
+    upto[:, -1] = N
+    counts = np.diff(upto, axis=1, prepend=0.0).astype(int)
+    return x.reshape(trials * N, n)[np.repeat(np.arange(trials * N), counts.ravel())].reshape(trials, N, n)
