@@ -217,6 +217,11 @@ class Formula(WrittenModel):
             (z,) = self._recorded[0](self._values(x))
         return np.array(np.broadcast_to(z, (len(x), self.m)))
 
+    @property
+    def jacobian_cost(self) -> float:
+        """The derivative along each parameter, by the rules of differentiation, counts as a simulation."""
+        return float(self.n)
+
     def jacobian(self, x: Array) -> Array:
         with np.errstate(all="ignore"):
             columns = self._recorded[1](self._values(x))

@@ -145,6 +145,7 @@ def test_derivatives_are_exact_and_those_of_a_power_of_zero_are_zero():
     x = np.array([[1.0, 1.0], [1.2, 0.7]])
     stepped = differentiate(model.simulate, x, analytic=True)
     assert model.jacobian(x) == pytest.approx(stepped, rel=1e-12, abs=1e-13)
+    assert model.jacobian_cost == 2.0  # a simulation for each direction
     power = Formula("a*t**b", {"a": 2.0, "b": 1.5}, {"t": (0.0, 4.0)})
     assert power.jacobian(np.ones((1, 2)))[0, 0].tolist() == [0.0, 0.0]
     assert power.jacobian(np.ones((1, 2)))[0, 1, 1] == pytest.approx(2.0 * 8.0 * math.log(4.0) * 1.5)
