@@ -26,8 +26,8 @@ from ipe_bench.basics.files import cache_folder, write_atomically
 
 _LOG = logging.getLogger(__name__)
 
-_CALLED = ("sin", "cos", "tan", "atan", "exp", "log", "sinh", "cosh", "tanh", "erf", "erfc", "pow")
-_CALLED += ("fma", "memset", "memcpy")
+_IN_LIBRARY = ("sin", "cos", "tan", "atan", "exp", "log", "sinh", "cosh", "tanh", "erf", "erfc", "pow")
+_IN_LIBRARY += ("fma", "memset", "memcpy")
 """Functions of the C library that machine code may call: those of recorded programs, and those LLVM puts in place of
 an instruction that the processor lacks or of a loop."""
 _DIGEST = 32
@@ -65,7 +65,7 @@ def _addresses() -> dict[str, int]:
     library = ctypes.CDLL(None if sys.platform != "win32" else "ucrtbase")
     mathematics = ctypes.CDLL(find_library("m")) if sys.platform.startswith("linux") else library
     found = {}
-    for name in _CALLED:
+    for name in _IN_LIBRARY:
         function = getattr(mathematics, name, None) or getattr(library, name, None)
         if function is None:
             raise OSError(f"the C library has no function {name}")

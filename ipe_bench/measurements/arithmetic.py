@@ -91,7 +91,7 @@ class Arithmetic:
         return evaluate(self.tree, values)
 
 
-def read(text: str, where: str) -> Arithmetic:
+def parse(text: str, where: str) -> Arithmetic:
     """Reads a formula; `where` is the config key, for messages.
 
     ** (or ^) binds from the right and before a minus in front: -x**2 is -(x**2). Comparisons, `and`, `or`, `not` and

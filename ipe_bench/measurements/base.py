@@ -91,7 +91,7 @@ class Measurement(Component, ABC):
     """The noise of the readings unless told otherwise; None: the model does not know any."""
     epochs: Epochs | None = None
     """The rows of z by epoch, in order of arrival; None where readings have no order."""
-    levels: Mapping[str, Mapping[Any, str]] = {}
+    entry_words: Mapping[str, Mapping[Any, str]] = {}
     """Words for entries of `index` that do not speak for themselves, by column: the numbers of cases, say."""
     own_parameters: Sequence[str] = ()
     """Names of parameters of which every file of readings has its own, where several are estimated together."""
@@ -253,7 +253,7 @@ class Measurement(Component, ABC):
         return self.coarse_jacobian(x)[:, self.rows(stop)]
 
 
-def one_by_one(model: Measurement) -> Epochs:
+def single_epochs(model: Measurement) -> Epochs:
     """Epochs of a single reading each."""
     return tuple(np.arange(model.m)[:, None])
 
@@ -266,7 +266,7 @@ def _delegating(cls: type[WrappedModel]) -> type[WrappedModel]:
 
     for name in (
         *("name", "physical_parameters", "nominal", "nuisance_deviation", "nuisances", "fixed"),
-        *("levels", "epochs", "offset", "m", "periods", "recorded", "reading_unit", "reading_name", "usual_noise"),
+        *("entry_words", "epochs", "offset", "m", "periods", "recorded", "reading_unit", "reading_name", "usual_noise"),
         *("inputs", "input_columns", "input_columns_known", "absent_input", "own_parameters"),
         *("by_differential_equations", "physical", "physical_slope", "near_bounds"),
         *("jacobian_cost", "coarse_jacobian_cost"),

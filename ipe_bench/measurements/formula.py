@@ -13,7 +13,7 @@ import numpy as np
 from ipe_bench.basics.errors import UserError, did_you_mean, unknown
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Finite
-from ipe_bench.measurements.arithmetic import never_switching, read
+from ipe_bench.measurements.arithmetic import never_switching, parse
 from ipe_bench.measurements.base import Input, Measurement, Parameter
 from ipe_bench.measurements.ode.trace import Graph, Program, tangent
 
@@ -168,7 +168,7 @@ class Formula(WrittenModel):
             raise UserError(f"reading={self.reading}: stands in the expression too; what is measured cannot explain it")
         self.require_columns_and_parameters("own")
 
-    arithmetic = cached_property(lambda model: read(model.expression, "expression"))
+    arithmetic = cached_property(lambda model: parse(model.expression, "expression"))
     own_parameters = property(lambda model: model.own)  # type: ignore[assignment]
 
     @cached_property

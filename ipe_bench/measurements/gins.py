@@ -129,7 +129,7 @@ class Gins(OdeMeasurement):
         return replace(self, injected=(*self.injected, *new), **often)
 
     @property
-    def levels(self) -> Mapping[str, Mapping[Any, str]]:
+    def entry_words(self) -> Mapping[str, Mapping[Any, str]]:
         """The injected velocity of each case."""
         return {"case": {k: f"{x:.0f}, {y:.0f} ft/s" for k, (x, y) in enumerate(self.injected, start=1)}}
 

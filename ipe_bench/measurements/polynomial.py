@@ -11,7 +11,7 @@ from numpy.polynomial.chebyshev import chebvander
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Finite
-from ipe_bench.measurements.base import Measurement, Parameter, UsualNoise, one_by_one
+from ipe_bench.measurements.base import Measurement, Parameter, UsualNoise, single_epochs
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Polynomial(Measurement):
 
     analytic = True
     usual_noise = UsualNoise(0.01)
-    epochs = cached_property(one_by_one)  # type: ignore[assignment]
+    epochs = cached_property(single_epochs)  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         super().__post_init__()

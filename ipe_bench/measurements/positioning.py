@@ -13,7 +13,7 @@ from annotated_types import MinLen
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Positive
-from ipe_bench.measurements.base import Measurement, Parameter, UsualNoise, one_by_one, parameter_table
+from ipe_bench.measurements.base import Measurement, Parameter, UsualNoise, parameter_table, single_epochs
 
 _BEACONS = (
     (1000.0, 0.0, 300.0), (500.0, 866.0, 20.0), (-500.0, 866.0, 300.0), (-1000.0, 0.0, 20.0), (-500.0, -866.0, 300.0),
@@ -92,7 +92,7 @@ class Bearings(Measurement):
     reading_unit = "deg"
     usual_noise = UsualNoise(0.5)
     analytic = True
-    epochs = cached_property(one_by_one)  # type: ignore[assignment]
+    epochs = cached_property(single_epochs)  # type: ignore[assignment]
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:

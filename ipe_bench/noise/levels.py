@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance
-from ipe_bench.measurements.arithmetic import Arithmetic, read
+from ipe_bench.measurements.arithmetic import Arithmetic, parse
 from ipe_bench.measurements.base import Parameter
 from ipe_bench.measurements.ode.trace import Graph, Program, tangent
 
@@ -28,7 +28,7 @@ def read_sigma(text: str) -> Arithmetic:
     Raises:
         UserError: it is no formula, has no level, or is negative at some levels and readings, all of them positive.
     """
-    formula = read(text, "noise.sigma")
+    formula = parse(text, "noise.sigma")
     names = level_names(formula)
     if not names:
         raise UserError(f"noise.sigma={text}: has no level to estimate; give one, as in a + b*{READING}")

@@ -16,7 +16,7 @@ from ipe_bench.report.table import Part, Strong, Table, texts, words
 from ipe_bench.report.words import compact, duration, enumerate_few, p_value, percent, plain
 from ipe_bench.report.writer import write
 from ipe_bench.statistics.between import NOT_SETTINGS, described
-from ipe_bench.trials.design import Design, levels_of
+from ipe_bench.trials.design import Design, entry_in_words
 from ipe_bench.trials.thresholds import FIT_LEVEL
 
 if TYPE_CHECKING:
@@ -128,7 +128,7 @@ def _ways(design: Design) -> Iterator[Part]:
     for way in design.ways:
         if way.saving and len(way.units.by) == 1:
             entries = [way.units.entries[u][0] for u in way.saving.taken]
-            levels = ", ".join(levels_of(design.candidates, way.units.by[0], entry) for entry in entries)
+            levels = ", ".join(entry_in_words(design.candidates, way.units.by[0], entry) for entry in entries)
             yield f"{way.saving.readings} readings {way.title}: {levels}"
 
 

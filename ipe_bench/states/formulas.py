@@ -13,7 +13,7 @@ import numpy as np
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Finite, NonNegative, Positive
-from ipe_bench.measurements.arithmetic import Arithmetic, read
+from ipe_bench.measurements.arithmetic import Arithmetic, parse
 from ipe_bench.measurements.base import Parameter, differentiate
 from ipe_bench.states.base import Normal, Paths, StateModel
 
@@ -97,11 +97,11 @@ class Formulas(StateModel):
 
     @cached_property
     def _transitions(self) -> dict[str, Arithmetic]:
-        return {name: read(text, f"next.{name}") for name, text in self.next.items()}
+        return {name: parse(text, f"next.{name}") for name, text in self.next.items()}
 
     @cached_property
     def _readings(self) -> dict[str, Arithmetic]:
-        return {name: read(text, f"readings.{name}") for name, text in self.readings.items()}
+        return {name: parse(text, f"readings.{name}") for name, text in self.readings.items()}
 
     @cached_property
     def _inputs(self) -> dict[str, Array]:

@@ -260,8 +260,8 @@ def _choice(judge: _Judge, units: Units, taken: Mask) -> Choice:
     return Choice(tuple(places), tuple(rows.tolist()), judge.value(units.information(taken)))
 
 
-def levels_of(model: Measurement, column: str, entry: Any) -> str:
+def entry_in_words(model: Measurement, column: str, entry: Any) -> str:
     """An entry of the index with what it stands for, if the model has words for it."""
-    words = model.levels.get(column, {})
+    words = model.entry_words.get(column, {})
     shown = f"{entry:g}" if isinstance(entry, float) else str(entry)
     return f"{shown} ({words[entry]})" if entry in words else shown

@@ -14,7 +14,7 @@ import ipe_bench as ib
 from ipe_bench.baselines import LeastSquares, LevenbergMarquardt
 from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Formula, Nist
-from ipe_bench.measurements.arithmetic import read
+from ipe_bench.measurements.arithmetic import parse
 from ipe_bench.measurements.base import differentiate
 from ipe_bench.measurements.nist import digits
 from ipe_bench.measurements.problem import Problem
@@ -100,7 +100,7 @@ def test_nist_answers_come_from_the_formula_with_an_unknown_noise(dataset, tmp_p
 )
 def test_the_language_is_that_of_algebra(text, value):
     values = {"a": 2.0, "b": 2.0, "c": 3.0 if "a-b-c" not in text else 1.0, "lambda": 2.0, "is": 1.0}
-    assert float(read(text, "expression")(values)) == pytest.approx(value, abs=1e-12)
+    assert float(parse(text, "expression")(values)) == pytest.approx(value, abs=1e-12)
 
 
 REFUSED = [
@@ -129,7 +129,7 @@ def test_nothing_that_looks_like_a_formula_reaches_the_interpreter():
     @given(st.text(alphabet="abt12.e+-*/^() ,_'\"[]{}:=<>!%\\\nsincoexplgifmn", max_size=40))
     def check(text):
         with contextlib.suppress(UserError):
-            read(text, "expression")
+            parse(text, "expression")
 
     check()
 
@@ -162,7 +162,7 @@ def test_slopes_of_angles_lengths_and_steps_are_exact_on_the_whole_plane():
     names = {"math": math, "np": np, "floor": math.floor, "sign": np.sign}
     expected = [[eval(z[0], names, {"b1": 0.7 * a, "b2": 1.3 * b, "t": t}) for t in model.columns["t"]] for a, b in x]
     assert model.simulate(x) == pytest.approx(np.array(expected), rel=1e-14)
-    formula = read(_PLANE, "expression")
+    formula = parse(_PLANE, "expression")
 
     def h(x):
         return formula({"b1": 0.7 * x[:, :1], "b2": 1.3 * x[:, 1:], "t": np.array(model.columns["t"])})
@@ -172,12 +172,12 @@ def test_slopes_of_angles_lengths_and_steps_are_exact_on_the_whole_plane():
 
 
 def test_a_formula_is_evaluated_or_refused_however_long():
-    formula = read("+".join(["b1*t"] * 399), "expression")
+    formula = parse("+".join(["b1*t"] * 399), "expression")
     assert formula({"b1": 2.0, "t": 0.5}) == 399.0
     assert pickle.loads(pickle.dumps(formula)).names == ("b1", "t")
     for text in ("+".join(["b1*t"] * 900), "b1" + "*t" * 2000, "b1" + "**b1" * 2000):
         with pytest.raises(UserError, match=r"^expression: .* one after another; group"):
-            read(text, "expression")
+            parse(text, "expression")
 
 
 def test_comparisons_within_comparisons_are_evaluated_or_refused_however_deep():
@@ -186,11 +186,11 @@ def test_comparisons_within_comparisons_are_evaluated_or_refused_however_deep():
     for level in range(100):
         text, value = f"0.5<1-({text})<2", float(0.5 < 1 - value < 2)
         if level < 6:
-            assert read(text, "expression")({"t": 0.5, "b1": 0.5}) == value
+            assert parse(text, "expression")({"t": 0.5, "b1": 0.5}) == value
     with pytest.raises(UserError, match=r"^expression: has more than 10000 numbers, names and operations; write"):
-        read(text, "expression")
+        parse(text, "expression")
     with pytest.raises(UserError, match=r"^expression: has more than 400 operations one after another"):
-        read("<".join(["b1"] * 5000), "expression")
+        parse("<".join(["b1"] * 5000), "expression")
 
 
 numbers = st.sampled_from(["t", "p", "q", "0.5", "-1.5", "2"])

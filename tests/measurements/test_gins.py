@@ -87,7 +87,7 @@ def test_bits_of_a_trial_depend_on_itself_alone_where_steps_differ(monkeypatch):
     x = np.concatenate([draw(scale, 8, seed=9) for scale in (33.0, 1000.0, 3000.0, 10000.0)])
     model = Gins()
     z, J = model.simulate(x), model.jacobian(x)
-    assert len(set(model._levels(x, model.offset).places.tolist())) >= 5
+    assert len(set(model._rungs_of(x, model.offset).places.tolist())) >= 5
     for threads in ("1", "2"):
         monkeypatch.setenv("IPE_BENCH_THREADS", threads)
         assert (Gins().jacobian(x[::-1]) == J[::-1]).all()

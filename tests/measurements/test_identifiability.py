@@ -3,7 +3,7 @@
 import pytest
 
 from ipe_bench.measurements import Formula, Gins, Ode
-from ipe_bench.measurements.arithmetic import read
+from ipe_bench.measurements.arithmetic import parse
 from ipe_bench.measurements.identifiability import structure
 from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo
 
@@ -74,7 +74,7 @@ CASES = {
 
 def model(rates, initial, outputs, constants):
     formulas = [*rates.values(), *initial.values(), *outputs.values()]
-    names = sorted({name for text in formulas for name in read(text, "formula").names} - {*rates, *constants, "t"})
+    names = sorted({name for text in formulas for name in parse(text, "formula").names} - {*rates, *constants, "t"})
     start = dict.fromkeys(names, 1.0)
     return Ode(rates=rates, start=start, initial=initial, outputs=outputs, times=(1.0, 2.0), constants=constants)
 

@@ -10,7 +10,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Ode, OdeMeasurement, Parameter, ode
 from ipe_bench.measurements.base import differentiate
 from ipe_bench.measurements.ode import plan
-from ipe_bench.measurements.ode.steps import contraction
+from ipe_bench.measurements.ode.ladder import tangent_contraction
 from ipe_bench.measurements.ode.trace import Graph
 
 
@@ -108,14 +108,14 @@ def test_steps_that_follow_the_parameters_hold_the_tolerance_of_each_output():
     off = np.abs(model.simulate(x) - Cases(1 / 64).simulate(x)).reshape(60, -1, 2)
     assert off[..., 0].max() < 1e-9
     assert off[..., 1].max() < 1e-6
-    assert len(set(model._levels(x, np.zeros(12)).places.tolist())) >= 3
+    assert len(set(model._rungs_of(x, np.zeros(12)).places.tolist())) >= 3
 
 
 def test_a_coarse_jacobian_contracts_where_it_was_measured_and_beyond():
     model = Chosen()
     x = model.nominal + np.random.default_rng(7).normal(size=(30, 2))
     J, coarse = model.jacobian(x), model.coarse_jacobian(x)
-    assert max(contraction(c, j) for c, j in zip(coarse, J, strict=True)) < 0.01
+    assert max(tangent_contraction(c, j) for c, j in zip(coarse, J, strict=True)) < 0.01
     fixed = Cases(0.5)
     assert (fixed.coarse_jacobian(x) == fixed.jacobian(x)).all()
 

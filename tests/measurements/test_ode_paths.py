@@ -20,8 +20,8 @@ from ipe_bench.measurements import LotkaVolterra, Ode, OdeMeasurement, Parameter
 from ipe_bench.measurements.arithmetic import FUNCTIONS, PAIRS, SEVERAL
 from ipe_bench.measurements.joint import Joint
 from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo
+from ipe_bench.measurements.ode.ladder import tangent_contraction
 from ipe_bench.measurements.ode.plan import DOP853
-from ipe_bench.measurements.ode.steps import contraction
 
 BATCHES = (1, 7, 8, 9, 64, 250)
 TOLERANCE = 1e-8
@@ -239,7 +239,7 @@ def check(law, gaps, given, batch, seed):
     # Tangents with longer steps are tangents too, where there is enough to be told apart.
     coarse = model.coarse_jacobian(x)[-1]
     if model.m >= model.n and np.linalg.cond(slope) < 1e3:
-        assert contraction(coarse, J[-1]) < 0.05
+        assert tangent_contraction(coarse, J[-1]) < 0.05
 
     # A fixed step, the same equations as formulas, other coordinates: the same readings.
     longest = max([*gaps, 1e-3])

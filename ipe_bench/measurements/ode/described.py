@@ -16,12 +16,12 @@ from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.files import own_conf
 from ipe_bench.basics.linalg import Array, Covariance, own
 from ipe_bench.basics.options import Count, Finite, Positive
-from ipe_bench.measurements.arithmetic import COMPARISONS, Arithmetic, evaluate, never_switching, parts, read
+from ipe_bench.measurements.arithmetic import COMPARISONS, Arithmetic, evaluate, never_switching, parse, parts
 from ipe_bench.measurements.base import Input, Measurement, Recorded, SubsetModel, UsualNoise, WrappedModel
 from ipe_bench.measurements.formula import WrittenModel
 from ipe_bench.measurements.ode import driven
 from ipe_bench.measurements.ode.model import OdeMeasurement, time_heading
-from ipe_bench.measurements.ode.rodas import SHAPE, Rodas5P, Work
+from ipe_bench.measurements.ode.rodas import SHAPE, Effort, Rodas5P
 
 _SHARE = 1e-8
 """Of the largest reading, what the integration may leave unless told otherwise."""
@@ -35,7 +35,7 @@ _STIFF = 10.0
 """Explicit steps, for each implicit one, from which on equations are called stiff."""
 _ASKED = 3000
 """Implicit steps times states and 4 that hold explicit readings against implicit ones, in a quarter of a second."""
-_APART, _FAR = 0.05, 1e3
+_APART, _MISSED = 0.05, 1e3
 """Of the largest reading of an output, what explicit readings may differ by from a rough solution without being held
 against an accurate one; and by how many tolerances they may differ from that."""
 _IN_HAND = 0.3
@@ -141,7 +141,7 @@ class Ode(WrittenModel, WrappedModel):
         if any(time < 0 for time in self.times) or any(b <= a for a, b in itertools.pairwise(self.times)):
             raise UserError(f"times={list(self.times)}: give ascending numbers from 0 on")
         if isinstance(self.tolerance, str):
-            for name in read(self.tolerance, "tolerance").names:
+            for name in parse(self.tolerance, "tolerance").names:
                 if name != "t" and name not in self.constant_names:
                     raise UserError(f"tolerance: {name} is neither a constant nor t")
         for name in self.constant_names:
@@ -337,7 +337,7 @@ class Ode(WrittenModel, WrappedModel):
 
 
 def _read_all(key: str, texts: Mapping[str, str | float]) -> dict[str, Arithmetic]:
-    return {name: read(str(text), f"{key}.{name}") for name, text in texts.items()}
+    return {name: parse(str(text), f"{key}.{name}") for name, text in texts.items()}
 
 
 @dataclass(frozen=True)
@@ -387,7 +387,7 @@ class _Engine(OdeMeasurement):
         return np.stack(tables, axis=1)
 
     @cached_property
-    def shape(self) -> tuple[Array, Work]:
+    def shape(self) -> tuple[Array, Effort]:
         """The nominal readings (1, m) by the implicit method, near enough to show their size, and what they took."""
         return Rodas5P(self, SHAPE).measured(own(self.nominal[None]))
 
@@ -399,7 +399,7 @@ class _Engine(OdeMeasurement):
             return self.described.method == "implicit"
         if self.step is not None:
             return False
-        if self._ladder[self._nominal_place] <= _EASY:
+        if self._rungs[self._nominal_place] <= _EASY:
             return self.missed > 0
         z, work = self.shape
         return bool(np.isfinite(z).all() and work.explicit > _STIFF * work.steps)
@@ -407,9 +407,9 @@ class _Engine(OdeMeasurement):
     @cached_property
     def missed(self) -> float:
         """The largest difference of nominal readings by few explicit steps from those by the implicit method, in
-        tolerances; 0 where the explicit ones are near, nearer than rough implicit ones, or those of the finest level.
-        Two levels may agree though none of their steps met a short pulse."""
-        x, here, every = own(self.nominal[None]), self._ladder[self._nominal_place], len(self.times)
+        tolerances; 0 where the explicit ones are near, nearer than rough implicit ones, or those of the finest rung.
+        Two rungs may agree though none of their steps met a short pulse."""
+        x, here, every = own(self.nominal[None]), self._rungs[self._nominal_place], len(self.times)
         explicit, finest = np.empty((2, 1, self.m))
         most = int(_ASKED / (4 + self.states) / max(1.0, len(self.cases) * self.states**2 / 2000))
         rough = Rodas5P(self, SHAPE).simulate(x, every, most)
@@ -419,19 +419,19 @@ class _Engine(OdeMeasurement):
             largest = np.tile(np.nanmax(outputs, axis=0, initial=0.0), self.m // len(self.outputs))
             if not (np.abs(explicit - self.near(rough, explicit)) > _APART * largest).any():
                 return 0.0
-            self._simulate(x, np.arange(1), self._ladder[-1] * self._parts, self._zeros, finest)
-            if (np.abs(explicit - self.near(finest, explicit)) <= _FAR * self._tolerances).all():
+            self._simulate(x, np.arange(1), self._rungs[-1] * self._parts, self._zeros, finest)
+            if (np.abs(explicit - self.near(finest, explicit)) <= _MISSED * self._tolerances).all():
                 return 0.0
             accurate = self._implicit.simulate(x, every)
             apart = (np.abs(z - self.near(accurate, z)) for z in (explicit, rough))
             off, rough_off = (float(np.nanmax(one / self._tolerances, initial=0.0)) for one in apart)
-        return off if off > max(_FAR, rough_off) else 0.0
+        return off if off > max(_MISSED, rough_off) else 0.0
 
     def off(self, x: Array) -> float:
         """By how many tolerances the explicit method differs from the implicit one in a reading at x (n,); 0 where few
         explicit steps do."""
         x = own(x[None, : self.n])
-        if self.stiff or self.step is not None or self._ladder[self._levels(x, self._zeros).places[0]] <= _EASY:
+        if self.stiff or self.step is not None or self._rungs[self._rungs_of(x, self._zeros).places[0]] <= _EASY:
             return 0.0
         z, accurate = self.simulate(x), self._implicit.simulate(x, len(self.times))
         difference = np.abs(z - self.near(accurate, z))
@@ -487,7 +487,7 @@ class _Engine(OdeMeasurement):
     def _tolerances(self) -> Array:
         if not isinstance(self.described.tolerance, str):
             return super()._tolerances
-        formula = read(self.described.tolerance, "tolerance")
+        formula = parse(self.described.tolerance, "tolerance")
         return np.repeat([float(formula(known)) for known in self.described.known(self.times)], len(self.outputs))
 
     def _values(self, t: Any, y: Sequence[Any], p: Sequence[Any], c: Sequence[Any]) -> dict[str, Any]:

@@ -62,7 +62,7 @@ def switching_times(comparison: Tree, cases: Sequence[Mapping[str, float]]) -> l
         t = trace.Graph().input("t")
         gap = t.graph.apply("add", evaluate(("-", left, right), {**case, "t": t}), 0.0)
         slope = trace.tangent([gap], {t: t.graph.constant(1.0)})[0].value
-        if slope is None or any(e.operation in trace.LEVEL for e in trace.in_order([gap])):
+        if slope is None or any(e.operation in trace.FLAT for e in trace.in_order([gap])):
             raise UserError(f"rates: {text}: {_REMEDY}")
         if slope:
             found.append(-float(trace.Program.of([gap], [t])([0.0])[0]) / slope)

@@ -21,7 +21,7 @@ from typing import Any
 
 from llvmlite import ir
 
-from ipe_bench.measurements.ode.plan import Plan
+from ipe_bench.measurements.ode.plan import StepPlan
 from ipe_bench.measurements.ode.trace import Program
 
 F64, I32, I64, PTR, VOID = ir.DoubleType(), ir.IntType(32), ir.IntType(64), ir.PointerType(), ir.VoidType()
@@ -33,7 +33,7 @@ Value = Any
 """A value of LLVM's intermediate representation."""
 
 
-def integrate(plan: Plan, width: int) -> str:
+def integrate(plan: StepPlan, width: int) -> str:
     """For groups of `width` lanes."""
     return str(_Writer(plan, width).module)
 
@@ -57,7 +57,7 @@ def rates(program: Program, width: int) -> str:
 class _Writer:
     """Writes the module of one plan."""
 
-    def __init__(self, plan: Plan, width: int) -> None:
+    def __init__(self, plan: StepPlan, width: int) -> None:
         self.plan, self.width, self.module = plan, width, ir.Module("integrate")
         weights = [weight for row in plan.tableau.weights for _, weight in row]
         self.count = -(-len(weights) // width)

@@ -23,7 +23,7 @@ from ipe_bench.basics import compiled
 from ipe_bench.basics.compiled import INTEGER, POINTER, WHOLE, aligned, at
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.machine import cores
-from ipe_bench.measurements.ode.plan import Equations, Plan, Recording, Tableau, planned
+from ipe_bench.measurements.ode.plan import Equations, Recording, StepPlan, Tableau, planned
 from ipe_bench.measurements.ode.trace import Program
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ _WORTH_THREADS = 40_000
 """Steps times lanes times states from which a second thread gains more than it costs, some 150 microseconds."""
 _NARROW = 4
 """Lanes up to which half of the usual vectors do: one simulation of GINS in two thirds of the time."""
-Whole = NDArray[np.integer[Any]]
+Integers = NDArray[np.integer[Any]]
 _EMIT = Path(__file__).with_name("emit.py")
 _ARGUMENTS = tuple(INTEGER if i in (3, 5, 6, 9, 11) else POINTER for i in range(15))
 
@@ -50,7 +50,7 @@ def _pool(workers: int, process: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(workers, thread_name_prefix="ode")
 
 
-def _compiled(name: str, source: Plan | Program, width: int, arguments: tuple[Any, ...]) -> Callable[..., None]:
+def _compiled(name: str, source: StepPlan | Program, width: int, arguments: tuple[Any, ...]) -> Callable[..., None]:
     """The function of `emit` by that name."""
 
     def write() -> str:
@@ -68,7 +68,7 @@ class Kernel:
     sensitive: bool = False
 
     @functools.cached_property
-    def plan(self) -> Plan:
+    def plan(self) -> StepPlan:
         return planned(self.equations, self.tableau, sensitive=self.sensitive)
 
     _narrow = functools.cached_property(lambda self: self._machine_code(_NARROW))
@@ -84,9 +84,9 @@ class Kernel:
         x: Array,
         si: Array,
         cases: Array,
-        rows: Whole,
+        rows: Integers,
         times: Array,
-        steps: Whole,
+        steps: Integers,
         *more: Array,
         states: Array | None = None,
     ) -> None:
@@ -145,9 +145,9 @@ class Kernel:
         x: Array,
         si: Array,
         cases: Array,
-        rows: Whole,
+        rows: Integers,
         times: Array,
-        steps: Whole,
+        steps: Integers,
         *more: Array,
         states: Array | None = None,
     ) -> None:
@@ -190,7 +190,7 @@ class Kernel:
                     states[trial, case, i, k] = kept[k][i]
 
 
-def rates(program: Program) -> Callable[[Array, Array, Array], None]:
+def compiled_rates(program: Program) -> Callable[[Array, Array, Array], None]:
     """A function that fills its third argument (trials,) with the number that a recorded program computes of the
     parameters x (trials, n), times their sizes (n,)."""
     if compiled.available():

@@ -14,18 +14,18 @@ from numpy.typing import NDArray
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Mask, own
 from ipe_bench.measurements.base import Measurement
-from ipe_bench.measurements.ode import steps as levels
-from ipe_bench.measurements.ode.integrator import Kernel, rates
+from ipe_bench.measurements.ode import ladder
+from ipe_bench.measurements.ode.integrator import Kernel, compiled_rates
 from ipe_bench.measurements.ode.plan import DOP853, RK4, Equations, Variation, jumps
 from ipe_bench.measurements.ode.rodas import diagnose
 from ipe_bench.measurements.ode.trace import Graph, Program
 
-_FAR = 1e3
+_NOT_FOLLOWED = 1e3
 """Tolerances by which readings with the shortest steps are off where the integrator cannot follow the equations."""
 _ANGLE_AT_START = 0.7
 """Radians over which the first step that is tried lets the solution turn."""
 _REMEMBERED = 100_000
-"""Trials whose levels are remembered: a simulation and a Jacobian share one search, and what is forgotten is found
+"""Trials whose rungs are remembered: a simulation and a Jacobian share one search, and what is forgotten is found
 again, the same."""
 
 
@@ -125,7 +125,7 @@ class OdeMeasurement(Measurement):
         return self._shown(x, stop, self._origin)
 
     def coarse_simulate_until(self, x: Array, stop: int) -> Array:
-        """`simulate_until` without the search for the level, if a rate says it well: GINS at an error scale of 2,000 is
+        """`simulate_until` without the search for the rung, if a rate says it well: GINS at an error scale of 2,000 is
         off by 1e-4 m/s at most in 100 trials, at 30,000 by 4e-7 in the median and 7e-3 in the worst."""
         return self._shown(x, stop, self._origin, guess=True)
 
@@ -140,13 +140,13 @@ class OdeMeasurement(Measurement):
         if self._trusted(x).all():
             self._simulate(x, np.arange(len(x)), self._parts, offset, z)
             return z
-        found, rows = self._levels(x, offset, guess=guess), np.arange(len(x))
+        found, rows = self._rungs_of(x, offset, guess=guess), np.arange(len(x))
         if len(found.computed):
             readings = found.z.reshape(-1, cases, len(self.times), outputs)[:, :, :stop]
             z[found.computed] = readings.reshape(len(readings), -1)
             rows = np.delete(rows, found.computed)
-        for place, group in levels.grouped(found.places[rows], rows):
-            self._simulate(x, group, self._ladder[place] * self._parts, offset, z)
+        for place, group in ladder.by_rung(found.places[rows], rows):
+            self._simulate(x, group, self._rungs[place] * self._parts, offset, z)
         z[found.lost] = np.nan
         return z
 
@@ -155,20 +155,20 @@ class OdeMeasurement(Measurement):
         if self.step is not None:
             shortest, held = self.step, bool(np.isfinite(self.simulate(x)).all())
         else:
-            top = len(self._ladder) - 1
+            top = len(self._rungs) - 1
             z, y = np.empty((2, 1, self.m)), np.empty((2, 1, *self._kept))
-            for i, place in enumerate((top, levels.coarser(top))):
-                self._simulate(x, np.arange(1), self._ladder[place] * self._parts, self._zeros, z[i], y[i])
+            for i, place in enumerate((top, ladder.coarser(top))):
+                self._simulate(x, np.arange(1), self._rungs[place] * self._parts, self._zeros, z[i], y[i])
             with np.errstate(all="ignore"):
-                left = levels.SAFETY * np.abs(z[0] - self.near(z[1], z[0])) / (2.0**levels.ORDER - 1.0)
-            held = bool((left <= _FAR * self._tolerances).all() and levels.apart(*y)[0] <= levels.LOST)
-            shortest = self._usual_interval / self._ladder[top]
+                left = ladder.SAFETY * np.abs(z[0] - self.near(z[1], z[0])) / (2.0**ladder.ORDER - 1.0)
+            held = bool((left <= _NOT_FOLLOWED * self._tolerances).all() and ladder.apart(*y)[0] <= ladder.LOST)
+            shortest = self._usual_interval / self._rungs[top]
         return "" if held else diagnose(self, x[0], float(shortest))
 
     def _simulate(
         self,
         x: Array,
-        rows: levels.Indices,
+        rows: ladder.Indices,
         steps: NDArray[np.int64],
         offset: Array,
         z: Array,
@@ -191,9 +191,9 @@ class OdeMeasurement(Measurement):
 
     _remembered = cached_property(lambda self: dict[bytes, tuple[int, bool]]())
 
-    def _levels(self, x: Array, offset: Array, *, guess: bool = False) -> levels.Found:
-        """The level of each trial, and the readings of those whose level had to be looked for; with `guess` the rates
-        say the level, where the model has them."""
+    def _rungs_of(self, x: Array, offset: Array, *, guess: bool = False) -> ladder.Found:
+        """The rung of each trial, and the readings of those whose rung had to be looked for; with `guess` the rates
+        say the rung, where the model has them."""
         trusted, remembered = self._trusted(x), self._remembered
         places, unknown = trusted.astype(np.intp) - 1, np.flatnonzero(~trusted)
         if guess and len(unknown) and self.trusted_angle > 0 and self._rate_function is not None:
@@ -205,23 +205,23 @@ class OdeMeasurement(Measurement):
         new = np.flatnonzero(places[unknown] < 0)
         unknown = unknown[new]
         if not len(unknown):
-            return levels.Found(places, unknown, np.empty((0, self.m)), lost)
+            return ladder.Found(places, unknown, np.empty((0, self.m)), lost)
         found = self._find(x[unknown], self._first_guess(x[unknown]), offset)
         if len(remembered) + len(unknown) > _REMEMBERED:
             remembered.clear()
         known = zip(found.places.tolist(), found.lost.tolist(), strict=True)
         remembered.update(zip([bits[i] for i in new], known, strict=True))
         places[unknown], lost[unknown] = found.places, found.lost
-        return levels.Found(places, unknown[found.computed], found.z, lost)
+        return ladder.Found(places, unknown[found.computed], found.z, lost)
 
-    def _find(self, x: Array, start: levels.Indices, offset: Array) -> levels.Found:
-        def simulate(rows: levels.Indices, level: int, z: Array, y: Array) -> None:
-            self._simulate(x, rows, level * self._parts, offset, z, y)
+    def _find(self, x: Array, start: ladder.Indices, offset: Array) -> ladder.Found:
+        def simulate(rows: ladder.Indices, rung: int, z: Array, y: Array) -> None:
+            self._simulate(x, rows, rung * self._parts, offset, z, y)
 
-        return levels.search(self._ladder, self._tolerances, self._kept, simulate, start, self.near)
+        return ladder.search(self._rungs, self._tolerances, self._kept, simulate, start, self.near)
 
     def _trusted(self, x: Array) -> Mask:
-        """The trials whose steps are fixed, or of which the coarsest level is known to do."""
+        """The trials whose steps are fixed, or of which the coarsest rung is known to do."""
         if self.step is not None or self.trusted_angle == 0:
             return np.full(len(x), self.step is not None)
         return self._rates(x) * self._longest <= self.trusted_angle
@@ -236,20 +236,20 @@ class OdeMeasurement(Measurement):
     @cached_property
     def _rate_function(self) -> Callable[[Array, Array, Array], None] | None:
         p = Graph().inputs("p", self.n)
-        return self.fastest_rate and rates(Program.of([self.fastest_rate(p)], p))
+        return self.fastest_rate and compiled_rates(Program.of([self.fastest_rate(p)], p))
 
     @cached_property
     def _longest(self) -> float:
-        """The longest step of the coarsest level."""
+        """The longest step of the coarsest rung."""
         return float(np.max(np.diff(self.times, prepend=0.0) / np.maximum(self._parts, 1)))
 
-    def _first_guess(self, x: Array) -> levels.Indices:
+    def _first_guess(self, x: Array) -> ladder.Indices:
         """Where on the ladder the search begins: steps of half a radian, or what the nominal parameters need."""
-        top = len(self._ladder) - 1
+        top = len(self._rungs) - 1
         if self._rate_function is None:
             return np.where(np.isfinite(x).all(axis=1), min(self._nominal_place, top - 1), top)
         wanted = np.nan_to_num(self._rates(x) * self._longest / _ANGLE_AT_START, nan=np.inf)
-        return np.clip(np.searchsorted(self._ladder, wanted), 1, top)
+        return np.clip(np.searchsorted(self._rungs, wanted), 1, top)
 
     @cached_property
     def _nominal_place(self) -> int:
@@ -257,7 +257,7 @@ class OdeMeasurement(Measurement):
 
     @cached_property
     def _parts(self) -> NDArray[np.int64]:
-        """Steps to each time at level 1: equal ones, none longer than `step` or the usual interval, none over none."""
+        """Steps to each time at rung 1: equal ones, none longer than `step` or the usual interval, none over none."""
         intervals, longest = np.diff(self.times, prepend=0.0), self.step or self._usual_interval
         return np.where(intervals > 0.0, np.maximum(np.ceil(intervals / longest - 1e-9), 1), 0).astype(np.int64)
 
@@ -268,9 +268,9 @@ class OdeMeasurement(Measurement):
         return max(float(np.median(np.diff(self.times, prepend=0.0))), span / (8 * len(self.times))) if span else 1.0
 
     @cached_property
-    def _ladder(self) -> NDArray[np.int64]:
+    def _rungs(self) -> NDArray[np.int64]:
         finest = 1024.0 if self.shortest_step <= 0 else self._usual_interval / self.shortest_step
-        return levels.ladder(min(finest + 1e-9, 1024.0))
+        return ladder.rungs_up_to(min(finest + 1e-9, 1024.0))
 
     @cached_property
     def _tolerances(self) -> Array:
@@ -290,8 +290,8 @@ class OdeMeasurement(Measurement):
     def jacobian_until(self, x: Array, stop: int) -> Array:
         """dh/dx by the variational equations, integrated by the same formula and steps as the readings of that x."""
         x = own(x)
-        groups = levels.grouped(self._levels(x, self._zeros).places, np.arange(len(x)))
-        given = ((self._jacobian_kernel, int(self._ladder[place]), rows) for place, rows in groups)
+        groups = ladder.by_rung(self._rungs_of(x, self._zeros).places, np.arange(len(x)))
+        given = ((self._jacobian_kernel, int(self._rungs[place]), rows) for place, rows in groups)
         return self._tangents(x, stop, given)
 
     def coarse_jacobian_until(self, x: Array, stop: int) -> Array:
@@ -299,8 +299,8 @@ class OdeMeasurement(Measurement):
         if not self._coarsens:
             return self.jacobian_until(x, stop)
         x = own(x)
-        places = self._levels(x, self._zeros, guess=stop < len(self.times)).places
-        groups = levels.grouped(np.where(self._trusted(x), -1, places), np.arange(len(x)))
+        places = self._rungs_of(x, self._zeros, guess=stop < len(self.times)).places
+        groups = ladder.by_rung(np.where(self._trusted(x), -1, places), np.arange(len(x)))
         return self._tangents(x, stop, ((*self._coarsened(place), rows) for place, rows in groups))
 
     @property
@@ -308,51 +308,51 @@ class OdeMeasurement(Measurement):
         """Whether there are longer steps for tangents."""
         return self.step is None
 
-    def _tangents(self, x: Array, stop: int, groups: Iterable[tuple[Kernel, int, levels.Indices]]) -> Array:
-        """J (trials, readings, n) at the first times, each group of trials by its kernel at its level."""
+    def _tangents(self, x: Array, stop: int, groups: Iterable[tuple[Kernel, int, ladder.Indices]]) -> Array:
+        """J (trials, readings, n) at the first times, each group of trials by its kernel at its rung."""
         J = np.empty((len(x), len(self._cases) * stop * len(self.outputs), self.n))
-        for kernel, level, rows in groups:
-            kernel.run(x, self._si_sizes, self.tables, rows, self._times[:stop], level * self._parts, J.reshape(-1))
+        for kernel, rung, rows in groups:
+            kernel.run(x, self._si_sizes, self.tables, rows, self._times[:stop], rung * self._parts, J.reshape(-1))
         return J
 
     def _coarsened(self, place: int) -> tuple[Kernel, int]:
-        """The formula and the level for the tangents of trials at this place; -1 for those that are trusted."""
-        level, (rk4, longer) = 1 if place < 0 else int(self._ladder[place]), self._coarseness
-        if level > 2 or rk4 is None:
-            return self._jacobian_kernel, max(1, int(np.ceil(level / longer)))
+        """The formula and the rung for the tangents of trials at this place; -1 for those that are trusted."""
+        rung, (rk4, longer) = 1 if place < 0 else int(self._rungs[place]), self._coarseness
+        if rung > 2 or rk4 is None:
+            return self._jacobian_kernel, max(1, int(np.ceil(rung / longer)))
         # The formula of fourth order loses more by what a trial turns faster than the nominal one: 2^4 and 3^4 in hand.
-        return self._rk4_kernel, rk4 * (1 if place < 0 else level + 1)
+        return self._rk4_kernel, rk4 * (1 if place < 0 else rung + 1)
 
     @cached_property
     def _coarseness(self) -> tuple[int | None, float]:
         """How coarse tangents may be, as measured at the nominal parameters: steps of the formula of fourth order that
-        contract enough at the coarsest level, None if none do; and how many times longer steps of that of eighth order
+        contract enough at the coarsest rung, None if none do; and how many times longer steps of that of eighth order
         may be where readings are within a sixteenth of the tolerance."""
         x, everything = own(self.nominal[None]), len(self.times)
-        level, J = int(self._ladder[self._levels(x, self._zeros).places[0]]), self.jacobian(x)
+        rung, J = int(self._rungs[self._rungs_of(x, self._zeros).places[0]]), self.jacobian(x)
         tried = (
             (k, self._tangents(x, everything, [(self._rk4_kernel, k, np.arange(1))]))
-            for k in range(1, levels.MOST_RK4 + 1)
+            for k in range(1, ladder.MOST_RK4 + 1)
         )
-        enough = (k for k, tangents in tried if levels.contraction(tangents[0], J[0]) <= levels.CONTRACTION)
-        rk4 = next(enough, None) if level <= 2 else None
-        # Half the level; where that is half a step, every second reading.
-        if level == 1 and (len(self._times) == 1 or self.driven is not None):
+        enough = (k for k, tangents in tried if ladder.tangent_contraction(tangents[0], J[0]) <= ladder.AIM)
+        rk4 = next(enough, None) if rung <= 2 else None
+        # Half the rung; where that is half a step, every second reading.
+        if rung == 1 and (len(self._times) == 1 or self.driven is not None):
             return rk4, 1.0
-        every = slice(None) if level > 1 else slice(1, None, 2)
+        every = slice(None) if rung > 1 else slice(1, None, 2)
         rows = np.arange(self.m).reshape(len(self._cases), everything, -1)[:, every].ravel()
-        times, steps = self._times[every], max(1, level // 2) * self._parts[every]
+        times, steps = self._times[every], max(1, rung // 2) * self._parts[every]
         z, coarse = np.empty((1, len(rows))), np.empty((1, len(rows), self.n))
         given = (x, self._si_sizes, self.tables, np.arange(1), np.ascontiguousarray(times), steps)
         self._readings_kernel.run(*given, np.zeros(len(rows)), z.reshape(-1))
         self._jacobian_kernel.run(*given, coarse.reshape(-1))
         with np.errstate(all="ignore"):
             off = np.abs(z - self._shown(x, everything, self._zeros)[:, rows]) / self._tolerances[rows]
-            sensitivity = levels.contraction(coarse[0], J[0, rows]) / off.max()
+            sensitivity = ladder.tangent_contraction(coarse[0], J[0, rows]) / off.max()
         if not np.isfinite(sensitivity):
             return rk4, 1.0
-        longer = (16 * levels.CONTRACTION / sensitivity) ** (1 / levels.ORDER) if sensitivity > 0 else np.inf
-        return rk4, float(np.clip(longer, 1.0, levels.LONGEST))
+        longer = (16 * ladder.AIM / sensitivity) ** (1 / ladder.ORDER) if sensitivity > 0 else np.inf
+        return rk4, float(np.clip(longer, 1.0, ladder.LONGEST))
 
     @cached_property
     def jacobian_cost(self) -> float:  # type: ignore[override]
@@ -361,13 +361,13 @@ class OdeMeasurement(Measurement):
 
     @cached_property
     def coarse_jacobian_cost(self) -> float:  # type: ignore[override]
-        """At the nominal parameters, or where they are at a level above 2; in simulations at the trial's level."""
+        """At the nominal parameters, or where they are at a rung above 2; in simulations at the trial's rung."""
         if not self._coarsens:
             return self.jacobian_cost
         x = own(self.nominal[None])
-        place = int(self._levels(x, self._zeros).places[0])
-        kernel, level = self._coarsened(-1 if self._trusted(x)[0] else place)
-        return kernel.plan.operations * level / (self._readings_kernel.plan.operations * int(self._ladder[place]))
+        place = int(self._rungs_of(x, self._zeros).places[0])
+        kernel, rung = self._coarsened(-1 if self._trusted(x)[0] else place)
+        return kernel.plan.operations * rung / (self._readings_kernel.plan.operations * int(self._rungs[place]))
 
     def __getstate__(self) -> dict[str, Any]:
         """Without what is compiled and remembered, which stays with a process."""

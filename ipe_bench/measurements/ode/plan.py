@@ -12,7 +12,7 @@ import numpy as np
 from ipe_bench.measurements.ode import trace
 from ipe_bench.measurements.ode.trace import Expression, Graph, Program
 
-Arithmetic = Callable[..., Sequence[Any]]
+Recordable = Callable[..., Sequence[Any]]
 _POINTS, _NEWTON = 64, 30
 """Points at which a comparison is examined, and the steps that move them to where it changes."""
 
@@ -93,9 +93,9 @@ class Variation:
     """The equations of small deviations, where fewer numbers than the state has describe them."""
 
     freedoms: int
-    slope: Arithmetic
+    slope: Recordable
     """(t, y, p, c, d, dp): the time derivative of a deviation d (freedoms,) along the direction dp (n,)."""
-    moved: Arithmetic
+    moved: Recordable
     """(y, d): by how much the state (states,) deviates, linear in d."""
 
 
@@ -107,9 +107,9 @@ class Equations:
     parameters: int
     constants: int
     outputs: int
-    start: Arithmetic
-    rhs: Arithmetic
-    read: Arithmetic
+    start: Recordable
+    rhs: Recordable
+    read: Recordable
     variation: Variation | None = None
     driven: int = 0
     """How many of the constants, the last ones, change from one interval between readings to the next."""
@@ -207,7 +207,7 @@ class Tangents:
 
 
 @dataclass(frozen=True)
-class Plan:
+class StepPlan:
     """Programs, and the places of their inputs and outputs in a frame."""
 
     tableau: Tableau
@@ -254,7 +254,7 @@ def jumps(equations: Equations) -> bool:
     moving = trace.dependent(tape.slope, (tape.t, *tape.y))
     if any(e.operation == "floor" for e in moving):
         return True
-    for e in (e for e in trace.in_order(tape.slope) if e.operation in trace.COMPARISONS and e in moving):
+    for e in (e for e in trace.in_order(tape.slope) if e.operation in trace.COMPARING and e in moving):
         if e.operands[0] is e.operands[1]:  # asks whether it is a number
             continue
         gap = graph.apply("sub", *e.operands)
@@ -275,7 +275,7 @@ def jumps(equations: Equations) -> bool:
     return False
 
 
-def planned(equations: Equations, tableau: Tableau, *, sensitive: bool) -> Plan:
+def planned(equations: Equations, tableau: Tableau, *, sensitive: bool) -> StepPlan:
     """How readings are computed, or their Jacobians: the state once, and beside it one tangent for each parameter, by
     the variational equations in the stages of the state's own steps."""
     tape, size = Recording(equations), 0
@@ -300,7 +300,7 @@ def planned(equations: Equations, tableau: Tableau, *, sensitive: bool) -> Plan:
     begun = [i for place in (y, fixed_at, *lie, *(stage[k:] for stage in stages), noted_at[r:]) for i in place]
     started = [*tape.start, *fixed, *(e for row in tape.along_each(dp, starts) for e in row)]
     started += [*motion.constant * tableau.stages, *reading.constant]
-    return Plan(
+    return StepPlan(
         tableau, x, constants, Program.of(started, [*tape.p, *tape.c]), tuple(begun), y,
         constants[len(constants) - equations.driven :], fixed_at, step, tuple(stage[:k] for stage in stages),
         len(stages[0]), read, noted_at[:r], shown_at, size, lie, motion.placed(stages[0], fixed),

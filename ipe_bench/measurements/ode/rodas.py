@@ -69,7 +69,7 @@ _SAFETY, _SHRINK, _GROW = 0.9, 0.2, 6.0
 
 
 @dataclass(frozen=True)
-class Work:
+class Effort:
     """What the integration of a trial took in its hardest case."""
 
     steps: int
@@ -115,12 +115,12 @@ class Rodas5P:
         }
         return {name: Program.of(outputs, inputs) for name, (outputs, inputs) in recorded.items()}
 
-    def measured(self, x: Array) -> tuple[Array, Work]:
+    def measured(self, x: Array) -> tuple[Array, Effort]:
         """The readings (1, m) at x (1, n), and what they take; a tolerance that shows the shape will do."""
         run = _Run(self, x, len(self.model.times), stretched=True)
         k = int(np.argmax(run.stretch))
         explicit, fastest, met = (float(a[k]) for a in (run.stretch, run.fastest, run.met))
-        return run.readings, Work(int(run.steps.max()), explicit, fastest, met, float(run.t.min()))
+        return run.readings, Effort(int(run.steps.max()), explicit, fastest, met, float(run.t.min()))
 
     def simulate(self, x: Array, stop: int, most: int = MOST_STEPS) -> Array:
         """Readings (trials, cases x stop x outputs) at the first `stop` times; NaN from where a trial breaks down, or

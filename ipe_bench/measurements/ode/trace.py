@@ -26,9 +26,9 @@ FUNCTIONS |= {
 """The elementary functions that can be recorded, of numbers, arrays and expressions; log is the natural logarithm."""
 _UFUNCS = {"add": "add", "subtract": "sub", "multiply": "mul", "divide": "div", "true_divide": "div", "power": "pow"}
 _UFUNCS |= {"negative": "neg"} | {name: name for name in ("less", "less_equal", "floor", "arctan2", *FUNCTIONS)}
-COMPARISONS = ("less", "less_equal")
+COMPARING = ("less", "less_equal")
 """Operations that are 1 where they hold and 0 elsewhere."""
-LEVEL = (*COMPARISONS, "floor")
+FLAT = (*COMPARING, "floor")
 """Operations whose slope is 0 between jumps."""
 
 
@@ -84,7 +84,7 @@ class Graph:
                 return self.apply("add", args[0], args[1].operands[0])
             case ("where", [float(condition), _, _]):
                 return args[1] if condition else args[2]
-            case ("where", [None, 1.0, 0.0]) if args[0].operation in COMPARISONS:
+            case ("where", [None, 1.0, 0.0]) if args[0].operation in COMPARING:
                 return args[0]
             case ("where", _) if args[1] is args[2]:
                 return args[1]
@@ -174,9 +174,11 @@ def _first_if(apply: Callable[..., Any], condition: Any, a: Any, b: Any) -> Any:
     return apply("where", condition, a, apply("where", apply("less_equal", a, a), b, a))
 
 
-_SIGNS: dict[str, Callable[..., Any]] = {name: getattr(operator, name) for name in ("add", "sub", "mul", "pow", "neg")}
-_SIGNS["div"] = operator.truediv
-_NUMBERS: dict[str, Callable[..., Any]] = _SIGNS | {
+_OPERATORS: dict[str, Callable[..., Any]] = {
+    name: getattr(operator, name) for name in ("add", "sub", "mul", "pow", "neg")
+}
+_OPERATORS["div"] = operator.truediv
+_NUMBERS: dict[str, Callable[..., Any]] = _OPERATORS | {
     "arctan": math.atan,
     "arctan2": math.atan2,
     "floor": math.floor,
@@ -185,7 +187,7 @@ _NUMBERS: dict[str, Callable[..., Any]] = _SIGNS | {
     "where": lambda condition, a, b: a if condition else b,
     **{name: getattr(math, name) for name in FUNCTIONS if name != "arctan"},
 }
-_ARRAYS: dict[str, Callable[..., Any]] = _SIGNS | {
+_ARRAYS: dict[str, Callable[..., Any]] = _OPERATORS | {
     "less": lambda a, b: np.less(a, b) * 1.0,
     "less_equal": lambda a, b: np.less_equal(a, b) * 1.0,
     "where": lambda condition, a, b: np.where(condition, a, b)[()],
@@ -280,7 +282,7 @@ def tangent(outputs: Sequence[Expression], direction: Mapping[Expression, Expres
             continue
         along[e.order] = zero
         moving = [(along[a.order], i) for i, a in enumerate(e.operands) if along[a.order] is not zero]
-        if not moving or e.operation in LEVEL:
+        if not moving or e.operation in FLAT:
             continue
         if e.operation == "where":  # a branch that is not taken may have no slope
             condition, *branches = operands(e)

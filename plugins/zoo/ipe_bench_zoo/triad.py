@@ -14,7 +14,7 @@ from annotated_types import MinLen
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Positive
-from ipe_bench.measurements.base import Input, Measurement, Parameter, UsualNoise, one_by_one, parameter_table
+from ipe_bench.measurements.base import Input, Measurement, Parameter, UsualNoise, parameter_table, single_epochs
 
 Vector = tuple[float, float, float]
 
@@ -32,7 +32,7 @@ class Magnitudes(Measurement):
     """
 
     analytic = True
-    epochs = cached_property(one_by_one)  # type: ignore[assignment]
+    epochs = cached_property(single_epochs)  # type: ignore[assignment]
     outputs_option: ClassVar[str]
     """The name of the option that holds the outputs."""
     angles: ClassVar[tuple[str, str, str]]

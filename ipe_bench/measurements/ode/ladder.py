@@ -1,9 +1,9 @@
 """How finely each trial is integrated, a pure function of its parameters, and how coarsely its tangents may be.
 
-A level is the number of equal steps between two readings. It is accepted if half of it shows, by step doubling, that it
+A rung is the number of equal steps between two readings. It is accepted if half of it shows, by step doubling, that it
 holds the tolerance on the whole span, and that the states converge: a reading that saturates is the same for any state
 that an unstable step leaves. Tangents inside iterations may be coarser: a Gauss-Newton step with a Jacobian J~ in place
-of J leaves |I - J~+ J| of the error, measured at the nominal parameters and carried over by the level.
+of J leaves |I - J~+ J| of the error, measured at the nominal parameters and carried over by the rung.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ ORDER = 8
 """Of the integration formula: half the step leaves 2^-8 of the error."""
 SAFETY = 16.0
 """The estimate of an error may be this many times too small."""
-CONTRACTION = 1e-3
+AIM = 1e-3
 """The contraction of coarse tangents that is aimed at where it is measured or predicted; elsewhere it may be some times
 larger."""
 MOST_RK4 = 3
@@ -32,26 +32,26 @@ LONGEST = 5
 STATES = 1e-4
 """Of a state's largest magnitude in a trial: what the states may be off by."""
 LOST = 0.1
-"""Of the same: the move between the two finest levels from which on the solution is not followed at all."""
+"""Of the same: the move between the two finest rungs from which on the solution is not followed at all."""
 _ROUNDING = 1e-12
 """Of the largest state: what is held for the rounding errors of another one that should be 0."""
 _LARGEST_CLIMB = 4.0
-"""A level grows by no more at once: far from convergence the estimate says nothing."""
+"""A rung grows by no more at once: far from convergence the estimate says nothing."""
 
 
-def ladder(finest: float) -> NDArray[np.int64]:
-    """The levels 1, 2, 3, 4, 6, 8, 12, 16, ... up to `finest`, and at least 1, 2."""
+def rungs_up_to(finest: float) -> NDArray[np.int64]:
+    """The rungs 1, 2, 3, 4, 6, 8, 12, 16, ... up to `finest`, and at least 1, 2."""
     powers = 2 ** np.arange(int(np.log2(max(finest, 2.0))) + 1)
-    levels = np.union1d(powers, 3 * powers // 2)
-    return levels[levels <= max(finest, 2.0)].astype(np.int64)
+    rungs = np.union1d(powers, 3 * powers // 2)
+    return rungs[rungs <= max(finest, 2.0)].astype(np.int64)
 
 
 def coarser(place: int) -> int:
-    """The place on the ladder of half the level; of 2 for the level 3, which has no half there."""
+    """The place on the ladder of half the rung; of 2 for the rung 3, which has no half there."""
     return 1 if place == 2 else max(place - 2, 0)
 
 
-def grouped(places: Indices, rows: Indices) -> Iterator[tuple[int, Indices]]:
+def by_rung(places: Indices, rows: Indices) -> Iterator[tuple[int, Indices]]:
     """The rows at each place, in order."""
     for place in sorted(set(places.tolist())):
         yield place, rows[places == place]
@@ -59,7 +59,7 @@ def grouped(places: Indices, rows: Indices) -> Iterator[tuple[int, Indices]]:
 
 class Found(NamedTuple):
     """Places on the ladder (trials,), the readings (trials, m) that the search has computed there, those of the trials
-    `computed` in their order, and whether a trial is `lost`: the finest level does not follow its states."""
+    `computed` in their order, and whether a trial is `lost`: the finest rung does not follow its states."""
 
     places: Indices
     computed: Indices
@@ -76,22 +76,22 @@ def apart(fine: Array, coarse: Array) -> Array:
 
 
 def search(
-    levels: NDArray[np.int64],
+    rungs: NDArray[np.int64],
     tolerance: Array,
     states: tuple[int, ...],
     simulate: Callable[[Indices, int, Array, Array], None],
     start: Indices,
     unturned: Callable[[Array, Array], Array] = lambda h, z: h,
 ) -> Found:
-    """The coarsest level at which readings hold `tolerance` (m,) and states `STATES`, by comparing levels n and n/2.
+    """The coarsest rung at which readings hold `tolerance` (m,) and states `STATES`, by comparing rungs n and n/2.
 
     Where d is how far they move between them, n/2 is accepted if 16 d is within the tolerance, n if the error that an
     eighth-order formula then has left, 16 d / (2^8 - 1), is; else n grows as that formula says. Trials that do not get
     there end at the top of the ladder. The search begins at the places `start` (trials,), and those at the top are
     accepted as they are; `simulate` fills these rows of arrays (trials, m) and (trials, *states) with readings and
-    states (cases, states, times) at one level, and `unturned` shifts readings that are angles next to others.
+    states (cases, states, times) at one rung, and `unturned` shifts readings that are angles next to others.
     """
-    places, final, top = start.copy(), start.copy(), len(levels) - 1
+    places, final, top = start.copy(), start.copy(), len(rungs) - 1
     lost = np.zeros(len(start), dtype=bool)
     fine, coarse = (np.empty((len(start), len(tolerance))) for _ in range(2))
     y, near = (np.empty((len(start), *states)) for _ in range(2))
@@ -99,32 +99,32 @@ def search(
     pending = computed = np.flatnonzero(start < top)
     while len(pending):
         still = []
-        for place, rows in grouped(places[pending], pending):
+        for place, rows in by_rung(places[pending], pending):
             below, known = coarser(place), held[rows] == coarser(place)
             coarse[rows[known]], near[rows[known]] = fine[rows[known]], y[rows[known]]
             if not known.all():
-                simulate(rows[~known], int(levels[below]), coarse, near)
-            simulate(rows, int(levels[place]), fine, y)
+                simulate(rows[~known], int(rungs[below]), coarse, near)
+            simulate(rows, int(rungs[place]), fine, y)
             astray = apart(y[rows], near[rows])
             with np.errstate(all="ignore"):
                 moved = (np.abs(fine[rows] - unturned(coarse[rows], fine[rows])) / tolerance).max(axis=1)
                 moved = SAFETY * np.maximum(moved, astray / STATES)
-                left = moved / ((levels[place] / levels[below]) ** ORDER - 1.0)
+                left = moved / ((rungs[place] / rungs[below]) ** ORDER - 1.0)
                 # Not a number where an iterate overflows: such a trial climbs to the top, in bounded time.
                 moved, left = np.nan_to_num(moved, nan=np.inf), np.nan_to_num(left, nan=np.inf)
-                wanted = levels[place] * np.minimum(left ** (1.0 / ORDER), _LARGEST_CLIMB)
+                wanted = rungs[place] * np.minimum(left ** (1.0 / ORDER), _LARGEST_CLIMB)
             enough, good = moved <= 1.0, (left <= 1.0) | (place == top)
             fine[rows[enough]] = coarse[rows[enough]]
             final[rows] = np.where(enough, below, place)
             lost[rows] = (place == top) & ~(astray <= LOST)
             held[rows] = place
-            places[rows] = np.clip(np.searchsorted(levels, wanted), place + 1, top)
+            places[rows] = np.clip(np.searchsorted(rungs, wanted), place + 1, top)
             still.append(rows[~(enough | good)])
         pending = np.concatenate(still)
     return Found(final, computed, fine[computed], lost)
 
 
-def contraction(coarse: Array, J: Array) -> float:
+def tangent_contraction(coarse: Array, J: Array) -> float:
     """|I - J~+ J| in the spectral norm: what is left of an error after a step with J~ (m, n) in place of J."""
     if not (np.isfinite(coarse).all() and np.isfinite(J).all()):
         return np.inf
