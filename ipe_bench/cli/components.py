@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import ipe_bench as ib
 from ipe_bench.basics.errors import UserError, unknown
-from ipe_bench.cli import print_problems, say, show
+from ipe_bench.cli import print_problems, renamed, say, show
 from ipe_bench.cli.main import main
 from ipe_bench.cli.parser import KINDS, MODELS
 from ipe_bench.measurements.base import Measurement
@@ -44,7 +44,7 @@ PAGES = {
     "function": "run measurement=function measurement.of=my_function:my_function "
     f"measurement.columns.t=[0,1,2,3,4,5,6,7] error_scale=0.1 {SMALL}",
     "ode": "run measurement=ode measurement.file=my_ode.yaml error_scale=0.1 trials=50 figures=none",
-    "model": "run model=my_model trials=50 figures=none",
+    "state_model": "run state_model=my_state_model trials=50 figures=none",
     "noise": "run measurement=polynomial noise=my_noise trials=50 figures=none",
     "statistic": f"run {BENT}",
 }
@@ -57,7 +57,7 @@ def list_command(names: Sequence[str], verbose: bool) -> int:
     """One line per option of each group, with all that it may be told if `verbose`; of an option, GROUP/NAME, that."""
     print_problems(plugins.take_problems())
     known = [*plugins.groups(), *({"statistic", "figure"} - set(plugins.groups()))]
-    for name in names or plugins.groups():
+    for name in renamed(names) or plugins.groups():
         group, slash, option = name.partition("/")
         if group not in known:
             homes = " or ".join(f"{o.group}/{o.name}" for o in plugins.options() if o.name == name)
@@ -216,6 +216,7 @@ def new_command(kind: str, name: str) -> int:
         written = _write_skill(Path(name))
         print(f"{name} is ready: {', '.join(path.name for path in written)}")
         return 0
+    (kind,) = renamed([kind])
     if kind not in (*MODELS, *KINDS):
         raise UserError(f"{kind}: {unknown(kind, (*MODELS, *KINDS, 'skill'), 'kind')}")
     group = "baseline" if kind == "filter" else kind

@@ -34,14 +34,14 @@ STANDARD_ESTIMATORS = ("solver=[auto]", "baseline=[linear_lse,levenberg_marquard
 OF_MANY_TRIALS = ("precision", "time_limit", "block_size", "formats", "execution", "write_readings")
 OF_MANY_TRIALS += ("write_readings_trial", "objective")
 """Keys of runs."""
-OF_STATES = ("model", "tracker", "trackers")
+OF_STATES = ("state_model", "tracker", "trackers")
 """Keys of states that move."""
 OF_CONSTANTS = ("measurement", "truth_measurement", "noise", "prior", "error_scale", "solver", "baseline")
 OF_CONSTANTS += ("estimators", "parameters", "write_readings")
 """Keys of parameters that stand still."""
 OF_CONSTANTS_ALONE = {
-    "design": "the bounds of states are those of `ipe-bench run model=NAME`",
-    "posterior": "use `ipe-bench run model=NAME`, with tracker=[grid] for one state, or tracker=[bootstrap]",
+    "design": "the bounds of states are those of `ipe-bench run state_model=NAME`",
+    "posterior": "use `ipe-bench run state_model=NAME`, with tracker=[grid] for one state, or tracker=[bootstrap]",
 }
 """Commands on parameters that stand still, with what serves for states that move."""
 OF_FILES = ("readings", "ignore_columns", "find")
@@ -63,7 +63,8 @@ class Single:
     @property
     def measurement(self) -> str:
         """The model, as it was asked for."""
-        group, model = ("measurement", self.spec.measurement) if self.spec.model is None else ("model", self.spec.model)
+        spec, group = self.spec, "measurement" if self.spec.state_model is None else "state_model"
+        model = spec.measurement if spec.state_model is None else spec.state_model
         if isinstance(model, Nist):
             return f"nist/{model.dataset.lower()}"
         return self.words.chosen(group) or model.name
@@ -86,9 +87,9 @@ def single(command: str, arguments: Sequence[str], standard: Sequence[str] = (),
         given = w.read(command, [one for one in standard if one.partition("=")[0] not in words.keys])
         jobs = jobs_of(Words(given.overrides + words.overrides), multirun=False)
         require_one_kind(words, jobs.specs[0])
-        if command in OF_CONSTANTS_ALONE and (model := jobs.specs[0].model):
+        if command in OF_CONSTANTS_ALONE and (model := jobs.specs[0].state_model):
             raise UserError(
-                f"model={model.name}: states move, and {command} is of constants; {OF_CONSTANTS_ALONE[command]}"
+                f"state_model={model.name}: states move, and {command} is of constants; {OF_CONSTANTS_ALONE[command]}"
             )
         return Single(command, words, jobs.specs[0], composed(jobs.words))
 
@@ -96,10 +97,10 @@ def single(command: str, arguments: Sequence[str], standard: Sequence[str] = (),
 def require_one_kind(words: Words, spec: Spec) -> None:
     """Refuses a tracker without a state model, and a state model together with a key of measurements, typed or from an
     experiment."""
-    if spec.model is None:
-        words.refuse((*OF_STATES[1:], "find"), "goes with model=NAME")
+    if spec.state_model is None:
+        words.refuse((*OF_STATES[1:], "find"), "goes with state_model=NAME")
         return
-    why = "is of a measurement, and model= chooses states that move"
+    why = "is of a measurement, and state_model= chooses states that move"
     words.refuse(OF_CONSTANTS, why)
     for one in (one for one in words.overrides if one.key_or_group == "experiment"):
         config, without = composed(Words((one,))), composed(Words(()))
@@ -123,8 +124,8 @@ def estimate_command(arguments: Sequence[str]) -> int:
     from ipe_bench.report.answer import FILES, NAME, Answer, contents, write_answer
 
     asked = single("estimate", arguments, STANDARD_ESTIMATORS, run=(*OF_MANY_TRIALS, "trials", "seed", w.TRUTH))
-    if asked.spec.model is not None:
-        return _track(asked, asked.spec.model)
+    if asked.spec.state_model is not None:
+        return _track(asked, asked.spec.state_model)
     question = asked.spec.question(asked.words.keys).checked()
     files = question.readings
     command = {  # what was asked for, not what the file holds today

@@ -24,7 +24,7 @@ Exit codes: 0 done; 1 done, but some pieces failed or are missing; 2 a mistake i
 """
 MODELS = ("function", "ode")
 """Models of one file."""
-KINDS = ("solver", "baseline", "filter", "measurement", "model", "noise", "prior", "execution")
+KINDS = ("solver", "baseline", "filter", "measurement", "state_model", "noise", "prior", "execution")
 KINDS += ("statistic", "figure", "table", "section", "experiment")
 """Of plugins that `new` makes."""
 INFO_TOPICS = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
@@ -53,7 +53,7 @@ noise=NAME             the errors of the readings
 prior=NAME             the distribution of the true parameters about the nominal point
 solver=[A,B]           iterative solvers of the estimating equation
 baseline=[A,B]         other estimators, on the same trials
-model=NAME             states that move, in place of a measurement
+state_model=NAME       states that move, in place of a measurement
 tracker=[A,B]          filters and smoothers of such states; trackers.NAME.KEY=X sets an option of one
 execution=NAME         where blocks of trials are computed: in this process, or in several at once
 GROUP.KEY=VALUE        an option of one of these; `ipe-bench list GROUP/NAME` shows its type and default
@@ -96,17 +96,17 @@ readings=FILE          is for `ipe-bench estimate`, as are ignore_columns= and f
   ipe-bench estimate measurement=nist/misra1a                   readings that come with the model
   ipe-bench estimate measurement=formula "measurement.expression=a*(1-exp(-b*t))" measurement.start.a=5 \\
       measurement.start.b=0.3 readings=FILE.csv                 your own formula of parameters and columns
-  ipe-bench estimate model=pendulum readings=LOG.csv "tracker=[ekf,ukf_rts]"    states that move, epoch by epoch
+  ipe-bench estimate state_model=pendulum readings=LOG.csv "tracker=[ekf,ukf_rts]"    states that move, epoch by epoch
 
 readings=FILE       CSV or Parquet; `ipe-bench list measurement -v` says which rows and columns a model wants.
                     A missing reading keeps its row, with an empty cell. A column sigma has standard deviations.
-                    With model=, a row per epoch and a column per reading.
+                    With state_model=, a row per epoch and a column per reading.
 readings=[A,B]      several files, which share all parameters but those in measurement.own=[NAME].
 noise.deviation=X   the standard deviation of a reading; standard errors and tests rest on it.
 noise=unknown       it is estimated, so the size of residuals tests nothing; noise.by=COLUMN: a level for each entry;
                     "noise.sigma=a + b*h": a formula of the reading's magnitude h and of levels a and b.
 ignore_columns=[A]  columns to leave out.
-find=[A,B]          constants, noises or readings of model=, whose numbers are those of largest likelihood.
+find=[A,B]          constants, noises or readings of state_model=, whose numbers are those of largest likelihood.
 parameters.NAME.fixed=X, .lower=X, .upper=X   what is known of a parameter; parameters=FILE.yaml has that of many.
 error_scale=X       how far the parameters may lie from the nominal point: the prior of filters and map_lm.
 figures=none        draws nothing.
@@ -248,7 +248,7 @@ The same results give the same file, so that the digest may stand in a paper. Ot
         """
   ipe-bench new solver my_solver                  plugins/my_solver
   ipe-bench new filter my_filter                  plugins/my_filter, a baseline that takes readings epoch by epoch
-  ipe-bench new model my_model                    plugins/my_model, states that move
+  ipe-bench new state_model my_model              plugins/my_model, states that move
   ipe-bench new ode my_model                      my_model.yaml, differential equations
   ipe-bench new function my_model                 my_model.py, a function of parameters and columns
   ipe-bench new skill DIR                         pages by which a coding agent writes plugins, into a new folder DIR

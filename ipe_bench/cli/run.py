@@ -149,7 +149,7 @@ def _there_already(jobs: Jobs) -> list[str]:
 
 def _left_out(jobs: Sequence[Spec]) -> list[str]:
     """A line on the standard filters that do not suit every job."""
-    lacking = [job for job in jobs if job.model is None and not set(STANDARD_FILTERS) <= job.estimators.keys()]
+    lacking = [job for job in jobs if job.state_model is None and not set(STANDARD_FILTERS) <= job.estimators.keys()]
     models = dict.fromkeys(job.measurement.name for job in lacking)
     filters = " and ".join(STANDARD_FILTERS)
     return [f"{filters} are left out for {', '.join(models)}: filters need epochs and a prior"] if models else []

@@ -61,6 +61,11 @@ def session(folder: Path | None = None) -> Iterator[None]:
     for name in FORMULAS:
         node = {"_target_": "ipe_bench.measurements.Nist", "dataset": name}
         store.store(name.lower(), node, group="measurement/nist", package="measurement", provider="ipe-bench")
+    for option in plugins.options("state_model"):  # which earlier versions call model, in experiments and plugins
+        home = option.path.relative_to(option.source.conf).parts[0]
+        for group in {"model", "state_model"} - {home}:
+            node = {"defaults": [f"/{home}/{option.name}@_here_"]}
+            store.store(option.name, node, group=group, package="state_model", provider="ipe-bench")
     if PluginConfigs not in registry.discover(SearchPathPlugin):
         registry.register(PluginConfigs)
     PluginConfigs.folder = folder
@@ -103,6 +108,8 @@ def jobs_of(words: Words, *, multirun: bool) -> Jobs:
     """The jobs of a command; an experiment that sweeps needs no flag for it."""
     config = _composed(tuple(map(w.forced, w.settled(words.overrides))), whole=True)
     hydra = config.hydra
+    if hydra.runtime.choices.get("model"):
+        print_problems([f"+experiment={words.chosen('experiment')}: model is called state_model now; write that there"])
     params = [f"{key}={value}" for key, value in (hydra.sweeper.get("params") or {}).items()]
     multirun = multirun or hydra.mode == RunMode.MULTIRUN or bool(params)
     optimises = not hydra.sweeper["_target_"].endswith(".BasicSweeper")
@@ -147,9 +154,17 @@ def _spec(job: Sequence[Override]) -> Spec:
 def _composed(words: tuple[str, ...], *, whole: bool = False) -> DictConfig:
     try:
         config = compose("config", list(words), return_hydra_config=True)
+        if "model" in config:  # the key of state_model in experiments of earlier versions
+            old = w.options_of("state_model", OmegaConf.to_container(config.model), "model")
+            config = compose("config", [*(f"++{word}" for word in old), *words], return_hydra_config=True)
+            with open_dict(config):
+                del config["model"]
     except Exception as error:  # what Hydra makes of overrides raises nearly anything
         raise explain(error) from error
     _require_own_calls(config.hydra, "hydra")
+    chosen = config.hydra.runtime.choices
+    if chosen.get("model") and chosen.state_model:
+        raise UserError(f"state_model={chosen.state_model}: the experiment overrides /model; write /state_model there")
     if not whole:
         with open_dict(config):
             del config["hydra"]

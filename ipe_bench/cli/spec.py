@@ -35,11 +35,11 @@ PARTS: dict[str, type] = {
     "truth_measurement": Measurement,
     "noise": Noise,
     "prior": Prior,
-    "model": StateModel,
+    "state_model": StateModel,
     "execution": Execution,
 }
 """Keys that hold a component, with its kind."""
-OPTIONAL = ("truth_measurement", "model")
+OPTIONAL = ("truth_measurement", "state_model")
 """Those that may be null."""
 STANDARD_FILTERS = ("ekf", "ukf")
 """Baselines of a plain run that suit only models with epochs and a prior."""
@@ -55,7 +55,7 @@ class Spec(Component):
     execution: Execution
     estimators: Mapping[str, Any]
     output: str
-    model: StateModel | None = None
+    state_model: StateModel | None = None
     trackers: Mapping[str, Any] = field(default_factory=dict)
     name: str = "${default_name}"
     default_name: str = "gins"
@@ -127,8 +127,8 @@ class Spec(Component):
     @cached_property
     def scenario(self) -> Any:
         """The trials that are simulated: a `Scenario`, or a `StateScenario` if there is a state model."""
-        if self.model is not None:
-            return StateScenario(self.model, self.seed)
+        if self.state_model is not None:
+            return StateScenario(self.state_model, self.seed)
         measurement, truth = (m and informed(m, self.known) for m in (self.measurement, self.truth_measurement))
         assert measurement is not None
         prior = self.prior
@@ -193,7 +193,7 @@ def spec(plain: Mapping[Any, Any]) -> Spec:
         else:
             made[key] = _of_kind(construct(config, key), key, kind)
     made["trackers"] = {}
-    chosen = "estimators" if made["model"] is None else "trackers"
+    chosen = "estimators" if made["state_model"] is None else "trackers"
     known = [option for option in plugins.options() if plugins.PACKAGES.get(option.group) == chosen]
     made["estimators"] = {str(k): _labelled(chosen, str(k), one, known) for k, one in (plain[chosen] or {}).items()}
     return instantiate(Spec, made, "")

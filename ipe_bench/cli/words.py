@@ -20,7 +20,7 @@ from hydra.core.override_parser.types import ChoiceSweep, Glob, Override, Overri
 from hydra.errors import HydraException
 
 from ipe_bench.basics.errors import UserError, unknown
-from ipe_bench.cli import refuse_blanks
+from ipe_bench.cli import refuse_blanks, renamed
 from ipe_bench.cli.spec import KEYS
 from ipe_bench.measurements.nist import FORMULAS
 from ipe_bench.plugins import discovery as plugins
@@ -32,11 +32,11 @@ TRUTH = "truth_measurement"
 HYDRAS_TRUTH = f"measurement@{TRUTH}"
 _FORMULA = re.compile(
     rf"(\+*(?:(?:measurement|{TRUTH})\.(?:expression|(?:time_)?unit|(?:initial|rates|outputs)\.\w+)"
-    r"|model\.(?:next|readings)\.\w+))=([^'\"].*)",
+    r"|state_model\.(?:next|readings)\.\w+))=([^'\"].*)",
     re.DOTALL,
 )
 """Texts that the shell has taken the quotes from; a list of units is none."""
-_FILE = re.compile(rf"\+*(?:(measurement|model|{TRUTH})\.file|(parameters))=(?![{{$]|null$)(.*)", re.DOTALL)
+_FILE = re.compile(rf"\+*(?:(measurement|state_model|{TRUTH})\.file|(parameters))=(?![{{$]|null$)(.*)", re.DOTALL)
 
 _GONE = {
     "ignore_rows": "empty the cells of these readings in the file",
@@ -113,7 +113,7 @@ def read(command: str, words: Sequence[str], folder: Path | None = None) -> Word
     groups = _groups(folder)
     found: list[Override] = []
     files: dict[str, str] = {}
-    for word in words:
+    for word in renamed(words):
         parts = [_parse(command, part, groups) for part in _expanded(word)]
         found += parts
         if _FILE.fullmatch(word):
@@ -184,7 +184,12 @@ def _from_file(group: str, name: str, word: str) -> list[str]:
         raise UserError(f"{word}: holds no keys; write a YAML file of options such as {example}")
     if TARGET in content:
         raise UserError(f"{word}: has a {TARGET}; the model is chosen by {group}=, so leave it out")
-    return [f"{group}.{key}={_literal(value, word)}" for key, value in content.items()]
+    return options_of(group, content, word)
+
+
+def options_of(group: str, content: Mapping[str, Any], where: str) -> list[str]:
+    """The words by which one would type options that stand in a file."""
+    return [f"{group}.{key}={_literal(value, where)}" for key, value in content.items()]
 
 
 def _literal(value: Any, where: str) -> str:
@@ -298,7 +303,7 @@ def _check_choice(override: Override, groups: Groups) -> None:
     if override.is_range_sweep() or override.is_interval_sweep():
         raise UserError(f"{word}: write the names of options of {group}")
     for value in values(override):
-        if value is None and (override.package == TRUTH or group == "model"):
+        if value is None and (override.package == TRUTH or group == "state_model"):
             continue
         if isinstance(value, list) and not several:
             raise UserError(f"{word}: choose one: {group}=NAME")
@@ -372,7 +377,7 @@ def settled(overrides: Sequence[Override]) -> list[Override]:
 NO_PART_OF_A_NAME = ("name", "output", "trials", "block_size", "seed", "execution", "hydra", "readings", "figures")
 NO_PART_OF_A_NAME += ("precision", "time_limit", "write_readings", "write_readings_trial", "objective", "formats")
 """Keys that change no setting, or add trials to it."""
-_BARE = ("measurement.dataset", "truth", "model", "noise", *plugins.PACKAGES)
+_BARE = ("measurement.dataset", "truth", "state_model", "noise", *plugins.PACKAGES)
 """Keys that come first in a name; the values of most speak for themselves."""
 _LONGEST_NAME = 80
 
@@ -392,7 +397,7 @@ def default_name(words: Words) -> str:
         if _first(override) not in NO_PART_OF_A_NAME:
             parts[key] = text or f"no_{key}"
     experiment = parts.pop("experiment", None)
-    names = [parts.pop("measurement", None) or parts.pop("model", None) or experiment or "gins"]
+    names = [parts.pop("measurement", None) or parts.pop("state_model", None) or experiment or "gins"]
     for key in (*(key for key in _BARE if key in parts), *sorted(parts.keys() - set(_BARE))):
         bare = key in _BARE and key != "truth"
         names.append(parts[key] if bare else f"{re.sub('^(estimators|trackers)[.]', '', key)}={parts[key]}")

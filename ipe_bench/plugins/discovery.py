@@ -29,7 +29,7 @@ ENTRY_POINTS = "ipe_bench.plugins"
 ESTIMATOR_GROUPS = ("solver", "baseline")
 PACKAGES = {**dict.fromkeys(ESTIMATOR_GROUPS, "estimators"), "tracker": "trackers"}
 """Groups of which several options are chosen, each under a label of its own, by the key that holds them."""
-COMPONENT_GROUPS = ("measurement", "noise", "prior", *ESTIMATOR_GROUPS, "model", "tracker", "execution")
+COMPONENT_GROUPS = ("measurement", "noise", "prior", *ESTIMATOR_GROUPS, "state_model", "tracker", "execution")
 RECORD_GROUPS = ("statistic", "figure", "table", "section")
 """What a report is made of."""
 CHECKED_GROUPS = (*COMPONENT_GROUPS, *RECORD_GROUPS, "experiment")
@@ -282,6 +282,9 @@ def options(group: str | None = None) -> list[Option]:
     for source in sources():
         for path in sorted(source.conf.glob("*/**/*.yaml")):
             folder, *name = path.relative_to(source.conf).with_suffix("").parts
+            if folder == "model":  # its name in earlier versions
+                folder = "state_model"
+                _problems[f"plugin {path.parent}: model is called state_model now; rename the folder"] = None
             option = Option(folder, "/".join(name), path, source)
             # Solvers and baselines share their labels: of two with one label, only one would run.
             place = ("estimator", option.label) if folder in ESTIMATOR_GROUPS else (folder, option.name)

@@ -190,7 +190,7 @@ class StateModel(Component, ABC):
 
 def require_sound(model: StateModel) -> None:
     """Raises UserError unless the parts of a model suit one another: times, prior, Q, R, f and h."""
-    n, name = model.n, f"model={model.name}"
+    n, name = model.n, f"state_model={model.name}"
     if not model.epochs or not (np.diff(model.times) > 0).all():
         raise UserError(f"{name}: its times do not increase from epoch to epoch; give epochs in order")
     m, x = len(model.R(0)), model.prior.mean

@@ -179,7 +179,7 @@ class RecordedFormulas(Formulas):
     def draw(self, start: int, stop: int, seed: int = 0) -> Paths:
         """The stored path; its state before the first epoch is not stored, and the first one stands for it."""
         if (start, stop) != (0, 1):
-            raise UserError(f"model={self.name}: has one path; set trials=1")
+            raise UserError(f"state_model={self.name}: has one path; set trials=1")
         rows = np.loadtxt(Path(__file__).with_name(f"{self.recorded}.csv"), delimiter=",", skiprows=1)[None]
         x = np.ascontiguousarray(rows[..., 1 : 1 + self.n])
         return Paths(x[:, 0], x, np.ascontiguousarray(rows[..., 1 + self.n :]))

@@ -16,6 +16,7 @@ import ipe_bench as ib
 from ipe_bench.cli.main import COMMANDS, main
 from ipe_bench.cli.spec import KEYS
 from ipe_bench.report import figures
+from ipe_bench.statistics.collect import collect
 from ipe_bench.statistics.records import SCORES, STATISTICS
 
 ROOT = Path(__file__).parents[2]
@@ -131,29 +132,29 @@ IN_A_SWEEP = [
 ]
 """No job begins where one would be refused."""
 OF_STATES = [
-    (["model=pendulum", "baseline=[ekf]"], "baseline: is of a measurement, and model= chooses states that move"),
-    (["model=pendulum", "write_readings=a.csv"], "write_readings: is of a measurement, and model= chooses states"),
-    (["model=pendulum", "error_scale=3"], "error_scale: is of a measurement, and model= chooses states that move"),
-    (["measurement=polynomial", "tracker=[ekf]"], "tracker: goes with model=NAME"),
-    (["model=pendulum", "tracker=[newton]"], "tracker=newton: newton is no tracker but a solver"),
-    (["model=pendulum", "trackers.ukf.iterations=0"], "trackers.ukf.iterations=0: give a whole number above 0"),
-    (["model=pendulum", "trackers.bootstrap.particles=5"], "trackers.bootstrap.particles: is set, but bootstrap"),
-    (["model=pendulum", "tracker=[grid]"], "trackers.grid: is exact for one state, and pendulum has 2; leave it out"),
-    (["model=growth", "model.next.state=x"], "model.next.state: there is no such name"),
-    (["+experiment=polynomial", "model=growth"], "+experiment=polynomial: sets measurement, which is of a measur"),
-    (["+experiment=headline", "model=growth"], "+experiment=headline: sets noise, which is of a measurement"),
-    (["model=pendulum_book", "trials=2"], "trials=2: certified readings are one trial"),
+    (["state_model=pendulum", "baseline=[ekf]"], "baseline: is of a measurement, and state_model= chooses"),
+    (["state_model=pendulum", "write_readings=a.csv"], "write_readings: is of a measurement, and state_model="),
+    (["state_model=pendulum", "error_scale=3"], "error_scale: is of a measurement, and state_model= chooses"),
+    (["measurement=polynomial", "tracker=[ekf]"], "tracker: goes with state_model=NAME"),
+    (["state_model=pendulum", "tracker=[newton]"], "tracker=newton: newton is no tracker but a solver"),
+    (["state_model=pendulum", "trackers.ukf.iterations=0"], "trackers.ukf.iterations=0: give a whole number above 0"),
+    (["state_model=pendulum", "trackers.bootstrap.particles=5"], "trackers.bootstrap.particles: is set, but bootstrap"),
+    (["state_model=pendulum", "tracker=[grid]"], "trackers.grid: is exact for one state, and pendulum has 2"),
+    (["state_model=growth", "state_model.next.state=x"], "state_model.next.state: there is no such name"),
+    (["+experiment=polynomial", "state_model=growth"], "+experiment=polynomial: sets measurement, which is of"),
+    (["+experiment=headline", "state_model=growth"], "+experiment=headline: sets noise, which is of a measurement"),
+    (["state_model=pendulum_book", "trials=2"], "trials=2: certified readings are one trial"),
 ]
 MISTAKES |= {
     f"{command} of states, {word}": (
         [command, word],
-        f"ipe-bench: model={word.rpartition('=')[2]}: states move, and {why}",
+        f"ipe-bench: state_model={word.rpartition('=')[2]}: states move, and {why}",
     )
     for command, why in (
         ("design", "design is of constants; the bounds"),
         ("posterior", "posterior is of constants; use"),
     )
-    for word in ("model=growth", "+experiment=pendulum_book")
+    for word in ("state_model=growth", "+experiment=pendulum_book")
 }
 COMMON = ("measurement=polynomial", "noise=gaussian", "execution=serial", "output=out", "trials=5")
 MISTAKES |= {" ".join(words): (["run", "-m", *COMMON, *words], f"ipe-bench: {said}") for words, said in IN_A_SWEEP}
@@ -253,6 +254,26 @@ def test_help_is_quick_to_load_and_names_the_commands():
     result = subprocess.run([sys.executable, "-c", LOADED], capture_output=True, text=True, check=True)
     assert "ipe-bench estimate" in result.stdout
     assert result.stdout.strip().endswith("[]")
+
+
+def test_the_word_model_of_earlier_versions_chooses_and_sets_a_state_model_still(tmp_path, ipe_bench):
+    _, now, _ = ipe_bench("run", "state_model=pendulum", "state_model.count=9", "tracker=[ekf]", "--cfg=job")
+    code, old, err = ipe_bench("run", "model=pendulum", "model.count=9", "tracker=[ekf]", "--cfg=job")
+    assert (code, old) == (0, now)
+    assert err.endswith("model is called state_model now; write state_model=pendulum state_model.count=9\n")
+    (tmp_path / "experiment").mkdir()
+    text = "# @package _global_\ndefaults: [override /model: pendulum]\nname: old\nmodel: {count: 9, start: {angle: 1}}"
+    (tmp_path / "experiment" / "old.yaml").write_text(text)
+    words = ("+experiment=old", "state_model.start.angle=2", "tracker=[ekf]", "trials=2", "figures=none")
+    code, _, err = ipe_bench("run", "-cd", str(tmp_path), *words)
+    assert code == 0
+    assert err.startswith("ipe-bench: +experiment=old: model is called state_model now; write that there\n")
+    (group,) = collect([tmp_path / "outputs" / "old"]).groups
+    model = group.footer["identity"]["scenario"]["model"]
+    assert (model["count"], model["start"]["angle"]) == (9, 2)
+    code, _, err = ipe_bench("run", "-cd", str(tmp_path), "+experiment=old", "state_model=growth")
+    assert code == 2
+    assert "state_model=growth: the experiment overrides /model; write /state_model there" in err
 
 
 def test_a_plugin_without_its_header_or_with_a_taken_name_is_refused(tmp_path):

@@ -22,7 +22,7 @@ from ipe_bench.plugins.construct import construct
 from ipe_bench.solvers import Newton, State
 from ipe_bench.states import Filter
 
-GROUPS = ("measurement", "noise", "prior", "solver", "baseline", "model", "tracker")
+GROUPS = ("measurement", "noise", "prior", "solver", "baseline", "state_model", "tracker")
 OURS = [
     o
     for o in plugins.options()

@@ -1,4 +1,4 @@
-"""Models of the literature in Python: what those of conf/model, by formulas, are held against."""
+"""Models of the literature in Python: what those of conf/state_model, by formulas, are held against."""
 
 from __future__ import annotations
 

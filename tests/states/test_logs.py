@@ -107,11 +107,11 @@ def test_a_first_reading_at_the_time_of_the_prior_gives_the_closed_form(tmp_path
 
 
 def test_the_command_leaves_the_track_and_says_whether_the_filter_is_right(tmp_path, estimate):
-    model = construct(next(o for o in options("model") if o.name == "constant_velocity").config, "model")
+    model = construct(next(o for o in options("state_model") if o.name == "constant_velocity").config, "state_model")
     z = model.draw(3, 4).z[0]
     z[11] = np.nan
     written(tmp_path / "log.csv", model, z, epoch=range(1, 101))
-    code, out, err = estimate("model=constant_velocity", "readings=log.csv", "tracker=[ekf,ekf_rts]")
+    code, out, err = estimate("state_model=constant_velocity", "readings=log.csv", "tracker=[ekf,ekf_rts]")
     assert (code, err) == (0, "")
     assert all(words in out for words in ("consistent", "NIS / m", "white p", "position"))
     folder = tmp_path / "outputs" / "estimate-constant_velocity"
@@ -120,10 +120,12 @@ def test_the_command_leaves_the_track_and_says_whether_the_filter_is_right(tmp_p
     np.testing.assert_array_equal(table["velocity [m/s]"], track.mean[0, :, 1])
     np.testing.assert_array_equal(table["nis"].dropna(), np.delete(track.nis[0], 11))
     assert json.loads((folder / "track.json").read_text())["trackers"]["ekf"]["verdict"] == "consistent"
-    code, out, _ = estimate("model=constant_velocity", "readings=log.csv", "model.deviation.seen=0.3", "output=two")
+    code, out, _ = estimate(
+        "state_model=constant_velocity", "readings=log.csv", "state_model.deviation.seen=0.3", "output=two"
+    )
     assert code == 1
     assert "optimistic" in out
-    assert estimate("model=pendulum_book", "tracker=[ukf]", "output=book")[0] == 0
+    assert estimate("state_model=pendulum_book", "tracker=[ukf]", "output=book")[0] == 0
 
 
 def test_a_model_of_formulas_may_stand_in_a_file(tmp_path, estimate):
@@ -132,16 +134,17 @@ def test_a_model_of_formulas_may_stand_in_a_file(tmp_path, estimate):
     columns = {"h": [0.5, 2.0, 1.0], "u": [0.1, 0.0, -0.3]}
     z = np.array([[0.4], [0.1], [0.9]])
     written(tmp_path / "log.csv", DRIVEN, z, **columns)
-    code, _, err = estimate("model=formulas", "model.file=mine.yaml", "readings=log.csv", "tracker=[ekf]", "output=one")
+    mine = ("state_model=formulas", "state_model.file=mine.yaml")
+    code, _, err = estimate(*mine, "readings=log.csv", "tracker=[ekf]", "output=one")
     assert (code, err) == (0, "")
     model = replace(DRIVEN, count=3, inputs={name: tuple(values) for name, values in columns.items()})
     np.testing.assert_array_equal(
         pd.read_csv(tmp_path / "one" / "track.csv")["x [m]"], ekf().track(model, z[None]).mean[0, :, 0]
     )
     (tmp_path / "copied.yaml").write_text("_target_: ipe_bench.states.Formulas")
-    code, _, err = estimate("model=formulas", "model.file=copied.yaml", "readings=log.csv")
+    code, _, err = estimate("state_model=formulas", "state_model.file=copied.yaml", "readings=log.csv")
     assert code == 2
-    assert "model.file=copied.yaml: has a _target_; the model is chosen by model=, so leave it out" in err
+    assert "state_model.file=copied.yaml: has a _target_; the model is chosen by state_model=, so leave it out" in err
 
 
 @pytest.mark.parametrize(
@@ -159,11 +162,14 @@ def test_a_model_of_formulas_may_stand_in_a_file(tmp_path, estimate):
         (["readings=[good.csv,more.csv]"], "readings=[good.csv,more.csv]: a track has one log; name one file"),
         (["readings=good.csv", "tracker=[nothing]"], "tracker=nothing: there is no such option"),
         (["readings=good.csv", "tracker=[newton]"], "tracker=newton: newton is no tracker but a solver"),
-        (["readings=good.csv", "baseline=[ekf]"], "baseline: is of a measurement, and model= chooses states that move"),
-        (["readings=good.csv", "measurement=gins"], "measurement: is of a measurement, and model= chooses states that"),
+        (["readings=good.csv", "baseline=[ekf]"], "baseline: is of a measurement, and state_model= chooses"),
+        (["readings=good.csv", "measurement=gins"], "measurement: is of a measurement, and state_model= chooses"),
         (["readings=good.csv", "ignore_rows=[2]"], "ignore_rows=[2]: is no key any more; empty the cells"),
         (["readings=good.csv", "ignore_columns=[v]"], "ignore_columns=v: there is no such column"),
-        (["readings=good.csv", "model.inputs.u=[1,2]"], "model.inputs.u: has 2 numbers; give one, or one for each of"),
+        (
+            ["readings=good.csv", "state_model.inputs.u=[1,2]"],
+            "state_model.inputs.u: has 2 numbers; give one",
+        ),
     ],
 )
 def test_what_is_no_log_of_the_model_is_refused(words, complaint, tmp_path, estimate):
@@ -174,8 +180,8 @@ def test_what_is_no_log_of_the_model_is_refused(words, complaint, tmp_path, esti
     for name, change in changes.items():
         columns = {key: value for key, value in {**good, **change}.items() if value is not None}
         pd.DataFrame(columns).to_csv(tmp_path / f"{name}.csv", index=False)
-    model = ["model=formulas", "model.next.x=x+h*u+w", "model.noise.w=1", "model.readings.z=x", "model.deviation.z=1"]
-    code, _, err = estimate(*model, "model.spread.x=1", "model.inputs={u:0,h:1}", *words)
+    options = ("next.x=x+h*u+w", "noise.w=1", "readings.z=x", "deviation.z=1", "spread.x=1", "inputs={u:0,h:1}")
+    code, _, err = estimate("state_model=formulas", *(f"state_model.{one}" for one in options), *words)
     assert code == 2
     assert err.splitlines()[-1].startswith(f"ipe-bench: {complaint}")
     assert not list(tmp_path.rglob("track.csv"))

@@ -215,7 +215,7 @@ class Odd(ConstantVelocity):
 )
 def test_a_model_whose_parts_do_not_suit_one_another_is_refused(part, complaint):
     StateScenario(Odd())
-    with pytest.raises(ib.UserError, match=f"model=odd: {complaint}"):
+    with pytest.raises(ib.UserError, match=f"state_model=odd: {complaint}"):
         StateScenario(Odd(part=part))
 
 
@@ -235,7 +235,7 @@ def test_nees_of_the_kalman_filter_lies_within_its_limits_as_often_as_is_said():
     "ours", [Pendulum(), Growth(), ConstantVelocity(), CoordinatedTurn()], ids=lambda model: model.name
 )
 def test_models_by_formulas_are_those_written_in_python(ours):
-    theirs = construct(next(o for o in options("model") if o.name == ours.name).config, "model")
+    theirs = construct(next(o for o in options("state_model") if o.name == ours.name).config, "state_model")
     x = ours.draw(0, 6).x[:, 50]
     for k in (0, 7):
         np.testing.assert_allclose(theirs.transition(x, k), ours.transition(x, k), rtol=1e-12)
@@ -280,7 +280,7 @@ def test_formulas_that_make_no_model_are_refused(changes, complaint):
 
 def test_published_errors_stand_beside_those_found(tmp_path):
     """Four of the twelve; the others take the same path through +experiment=pendulum_book."""
-    model = construct(composed(next(o for o in options("model") if o.name == "pendulum_book")), "model")
+    model = construct(composed(next(o for o in options("state_model") if o.name == "pendulum_book")), "state_model")
     trackers = {"ekf": ekf(), "ukf": ukf(), "ckf": ckf(), "ckf_rts": Smoother(ckf())}
     ib.run(StateScenario(model), trackers, 1, output=tmp_path)
     table = published_table(collect([tmp_path]))

@@ -63,7 +63,7 @@ GROUPS = {
     "prior": "Priors",
     "solver": "Solvers",
     "baseline": "Baseline estimators",
-    "model": "State models",
+    "state_model": "State models",
     "tracker": "Filters and smoothers of states",
     "execution": "Executions",
 }

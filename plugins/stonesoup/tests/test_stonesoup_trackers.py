@@ -75,7 +75,7 @@ def their_track(model, z, predictor, updater, spread):
 @pytest.mark.parametrize("name", FILTERS)
 @pytest.mark.parametrize("model", ["pendulum", "constant_velocity"])
 def test_tracks_are_those_of_stone_soup(name, model):
-    model = construct(next(o for o in options("model") if o.name == model).config, "model")
+    model = construct(next(o for o in options("state_model") if o.name == model).config, "state_model")
     ours, *theirs = FILTERS[name]
     z = model.draw(0, 1).z
     means, covariances = their_track(model, z[0], *theirs)
