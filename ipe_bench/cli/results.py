@@ -39,8 +39,6 @@ def audit_command(arguments: Sequence[str]) -> int:
 
 def bundle_command(arguments: Sequence[str]) -> int:
     """Writes the archive, or checks one; exit code 1 where the folders lack something that was asked for."""
-    from ipe_bench.report.words import CITATION
-
     places, keys = places_and_keys("bundle", arguments, {"output": str})
     paths = [Path(place) for place in places]
     if not paths:
@@ -53,7 +51,7 @@ def bundle_command(arguments: Sequence[str]) -> int:
         found = read_bundle(paths[0])
     else:
         path = Path(keys.get("output", paths[0].with_name(paths[0].resolve().name)))
-        found = write_bundle(paths, path.with_name(path.name.removesuffix(SUFFIX) + SUFFIX), {"citation": CITATION})
+        found = write_bundle(paths, path.with_name(path.name.removesuffix(SUFFIX) + SUFFIX))
         problems = Results.read(paths).problems
         print_problems(problems)
     held = f"{len(found.files)} files of {', '.join(found.folders)}; {found.path.stat().st_size:,} bytes"

@@ -1,4 +1,4 @@
-"""Bundles: results of one or several folders in one archive, with a manifest that has a digest of every file.
+"""Bundles: results of one or several folders in a plain zip, whose manifest is what `sha256sum --check` reads.
 
 The same results give the same bytes, so that the digest of the manifest stands for all of them and can be printed in a
 paper. A reader gets nothing unless everything is as the manifest says.
@@ -15,33 +15,32 @@ import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from ipe_bench import __version__
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.files import write_atomically
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.store import Store
 
-SCHEMA = 3
-MANIFEST = "manifest.json"
+MANIFEST = "SHA256SUMS"
+_OLDER = "manifest.json"
+"""The manifest of bundles of version 0.2, in JSON."""
 SUFFIX = ".zip"
 BUNDLES = "bundles"
 """Where bundles are unpacked below a report on them."""
 _FILE = re.compile(r"(trials|runs|failed)/[A-Za-z0-9][A-Za-z0-9._-]{0,150}\.(parquet|json)")
 _FOLDER = re.compile(r"(?!(?i:con|prn|aux|nul|com\d|lpt\d)(\.|$))[A-Za-z0-9]([A-Za-z0-9._=,+-]{0,98}[A-Za-z0-9])?")
-"""Names that every system takes for what they are."""
+"""Names that mean the same on every system."""
 _MOST_COMPRESSED = 100
-"""Bytes that a byte of a bundle may stand for; records come to 10, and tables are compressed already."""
+"""Bytes that a byte of a bundle may stand for; in bundles of version 0.2 those of records stand for 10."""
 
 
 @dataclass(frozen=True)
 class Bundle:
-    """An archive whose files are as its manifest says."""
+    """Names an archive whose files are as its manifest says."""
 
     path: Path
     digest: str
-    """Of the manifest, and so of everything in the bundle."""
+    """SHA-256 of the manifest, and so of everything in the bundle."""
     files: Mapping[str, str]
     """SHA-256 by name."""
 
@@ -56,8 +55,8 @@ def is_bundle(path: Path | str) -> bool:
     return Path(path).is_file()
 
 
-def write_bundle(directories: Sequence[Path | str], path: Path, further: Mapping[str, Any] | None = None) -> Bundle:
-    """Puts the results of the directories into one archive, with `further` facts in its manifest."""
+def write_bundle(directories: Sequence[Path | str], path: Path) -> Bundle:
+    """Puts the results of the directories into one archive."""
     contents: dict[str, bytes] = {}
     for directory in map(Path, directories):
         _require_results(directory)
@@ -68,13 +67,10 @@ def write_bundle(directories: Sequence[Path | str], path: Path, further: Mapping
     if not contents:
         raise UserError(f"{', '.join(map(str, directories))}: holds no whole results to bundle; run something first")
     digests = {name: _digest(content) for name, content in sorted(contents.items())}
-    sizes = {name: len(contents[name]) for name in digests}
-    record = {"bundle": "ipe-bench", "schema": SCHEMA, "version": __version__, **(further or {})}
-    record |= {"files": digests, "sizes": sizes}
-    manifest = json.dumps(record, indent=1, ensure_ascii=False).encode()
+    contents[MANIFEST] = "".join(f"{digest}  {name}\n" for name, digest in digests.items()).encode()
     if path.exists():
         found = read_bundle(path)
-        if found.digest != _digest(manifest):
+        if found.files != digests:
             raise UserError(f"{path}: is there and holds other results; choose another name with output=, or remove it")
         return found
 
@@ -83,16 +79,14 @@ def write_bundle(directories: Sequence[Path | str], path: Path, further: Mapping
             for name in (MANIFEST, *digests):
                 entry = zipfile.ZipInfo(name)  # of 1980: times are no part of what is bundled
                 entry.external_attr, entry.create_system = 0o644 << 16, 3
-                # Tables are compressed already.
-                entry.compress_type = zipfile.ZIP_STORED if name.endswith(".parquet") else zipfile.ZIP_DEFLATED
-                archive.writestr(entry, manifest if name == MANIFEST else contents[name])
+                archive.writestr(entry, contents[name])
 
     write_atomically(path, write)
     return read_bundle(path)
 
 
 def _contents(directory: Path) -> dict[str, bytes]:
-    """What is whole below a directory, by name; listed again if a file was merged into another one meanwhile."""
+    """Reads what is whole below a directory, by name; lists it again if a file was merged into another meanwhile."""
     store = Store(directory)
     while True:
         damaged = Results.read([directory]).damaged
@@ -103,36 +97,37 @@ def _contents(directory: Path) -> dict[str, bytes]:
 
 
 def read_bundle(path: Path) -> Bundle:
-    """The bundle, all of whose files were read and are as its manifest says, or a UserError."""
+    """Reads all files of a bundle; raises UserError unless they are as its manifest says."""
     try:
         with zipfile.ZipFile(path) as archive:
             if sum(one.file_size for one in archive.infolist()) > _MOST_COMPRESSED * path.stat().st_size:
                 raise UserError(
                     f"{path}: would unpack to over {_MOST_COMPRESSED} times its size; nothing of it is read"
                 )
-            manifest = archive.read(MANIFEST)
-            record = json.loads(manifest)
-            if record["bundle"] != "ipe-bench" or record["schema"] != SCHEMA:
-                raise UserError(f"{path}: is a bundle of another version of ipe-bench; read it with that one")
-            there = {one.filename: one.file_size for one in archive.infolist() if one.filename != MANIFEST}
-            digests, sizes = dict(record["files"]), dict(record.get("sizes", there))  # version 0.2 states no sizes
-            for name in sorted({*digests, *there}):
+            there = set(archive.namelist())
+            kind = MANIFEST if MANIFEST in there else _OLDER
+            manifest = archive.read(kind)
+            lines = [line.partition("  ") for line in manifest.decode().splitlines()]
+            digests = {name: digest for digest, _, name in lines}
+            if kind == _OLDER:
+                digests = dict(json.loads(manifest)["files"])
+            for name in sorted({*digests, *there} - {kind}):
                 folder, _, file = name.partition("/")
                 if not (_FOLDER.fullmatch(folder) and _FILE.fullmatch(file)):
                     raise UserError(f"{path}: {name!r} is no name of a result; nothing of it is read")
-                if there.get(name, -1) != sizes.get(name) or digests.get(name) != _digest_of(archive, name):
+                if name not in there or digests.get(name) != _digest_of(archive, name):
                     raise UserError(f"{path}: was damaged or changed: {name} is not as its manifest says; get it anew")
     except UserError:
         raise
-    except Exception as error:  # whatever an archive raises that is cut short, changed, encrypted or none at all
+    except Exception as error:  # an archive that is cut short, changed, encrypted or none at all raises many kinds
         raise UserError(f"{path}: is not a whole bundle of ipe-bench ({error or type(error).__name__})") from None
     return Bundle(path, _digest(manifest), digests)
 
 
 @contextlib.contextmanager
 def opened(paths: Sequence[Path | str], into: Path | None = None) -> Iterator[list[Path]]:
-    """Folders of results, with those of every bundle in its place: below `into`, or for as long as this lasts. Refuses
-    a file that is not a whole bundle, and a folder that no run ever wrote to."""
+    """Yields folders of results, with those of every bundle in its place: unpacked below `into`, or for as long as this
+    lasts. Refuses a file that is not a whole bundle, and a folder that no run ever wrote to."""
     with contextlib.ExitStack() as stack:
         found: list[Path] = []
         for path in map(Path, paths):
@@ -158,7 +153,7 @@ def _require_results(folder: Path) -> None:
 
 
 def _digest_of(archive: zipfile.ZipFile, name: str) -> str:
-    """The digest of a file in an archive, which is read in pieces."""
+    """Computes the digest of a file in an archive, in pieces, of no more bytes than the archive's list states."""
     digest = hashlib.sha256()
     with archive.open(name) as file:
         while piece := file.read(1 << 20):

@@ -71,18 +71,11 @@ def test_a_report_on_ones_own_and_a_bundle(bundle, tmp_path, capsys):
     assert "say where the report goes with output=DIR" in capsys.readouterr().err
 
 
-def with_a_size_wrong(manifest: bytes) -> bytes:
-    record = json.loads(manifest)
-    record["sizes"][min(record["sizes"])] += 1
-    return json.dumps(record).encode()
-
-
 CHANGES = {
     "a value": lambda name, content: [(name, content.replace(b"PAR1", b"PAR2") if "trials" in name else content)],
     "a file less": lambda name, content: [] if "runs/" in name else [(name, content)],
     "a file more": lambda name, content: [(name, content), *([("theirs/trials/x.parquet", b"")] * (name == MANIFEST))],
-    "a digest": lambda name, content: [(name, content.replace(b'": "', b'": "0') if name == MANIFEST else content)],
-    "a size": lambda name, content: [(name, with_a_size_wrong(content) if name == MANIFEST else content)],
+    "a digest": lambda name, content: [(name, content.swapcase() if name == MANIFEST else content)],
     "no manifest": lambda name, content: [] if name == MANIFEST else [(name, content)],
 }  # fmt: skip
 
@@ -124,13 +117,9 @@ ODD += [f"theirs/runs/{300 * 'x'}.json", f"{300 * 'x'}/runs/x.json"]
 @pytest.mark.parametrize("name", ODD)
 def test_a_manifest_cannot_write_elsewhere(bundle, tmp_path, name):
     def change(entry, content):
+        yield entry, content + f"{hashlib.sha256(b'{}').hexdigest()}  {name}\n".encode() * (entry == MANIFEST)
         if entry == MANIFEST:
-            record = json.loads(content)
-            record["files"][name] = hashlib.sha256(b"{}").hexdigest()
-            yield entry, json.dumps(record).encode()
             yield name, b"{}"
-        else:
-            yield entry, content
 
     bad = rewritten(bundle.path, tmp_path / "bad.zip", change)
     before = set(tmp_path.rglob("*"))
@@ -143,24 +132,46 @@ def test_a_small_archive_that_unpacks_to_much_is_refused_before_it_is_unpacked(b
     bomb, name = tmp_path / "bomb.zip", "theirs/runs/x.json"
     with zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as archive:
         zeros = bytes(10_000_000)
-        files = {name: hashlib.sha256(zeros).hexdigest()}
-        record = {"bundle": "ipe-bench", "schema": 3, "files": files, "sizes": {name: len(zeros)}}
-        archive.writestr(MANIFEST, json.dumps(record))
+        archive.writestr(MANIFEST, f"{hashlib.sha256(zeros).hexdigest()}  {name}\n")
         archive.writestr(name, zeros)
     with pytest.raises(UserError, match="would unpack to over 100 times its size"):
         read_bundle(bomb)
 
 
-def test_a_folder_of_any_name_and_a_bundle_without_sizes_are_read(tmp_path):
+def test_a_file_that_is_longer_than_the_archive_states_is_refused(bundle, tmp_path):
+    """Of 10 MB that are listed as one byte, one is read."""
+    long, name = tmp_path / "long.zip", "theirs/runs/x.json"
+    with zipfile.ZipFile(long, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(MANIFEST, f"{hashlib.sha256(bytes(1)).hexdigest()}  {name}\n")
+        archive.writestr(name, bytes(10_000_000))
+        archive.getinfo(name).file_size = 1
+    with pytest.raises(UserError, match="is not a whole bundle"):
+        read_bundle(long)
+
+
+def test_a_bundle_is_a_plain_zip_that_other_programs_check(bundle, tmp_path):
+    with zipfile.ZipFile(bundle.path) as archive:
+        archive.extractall(tmp_path / "plain")
+    for line in (tmp_path / "plain" / MANIFEST).read_text().splitlines():
+        digest, name = line.split("  ")
+        assert hashlib.sha256((tmp_path / "plain" / name).read_bytes()).hexdigest() == digest
+    pd.testing.assert_frame_equal(ib.load(tmp_path / "plain" / "theirs"), ib.load(bundle.path))
+
+
+def test_a_folder_of_any_name_and_a_bundle_of_version_0_2_are_read(tmp_path):
     made = write_bundle([fill(tmp_path / "größte (2)")], tmp_path / "named.zip")
     assert made.folders == ("gr_te_2",)
 
-    def without_sizes(entry, content):
-        record = json.loads(content) if entry == MANIFEST else {}
-        yield entry, json.dumps({k: v for k, v in record.items() if k != "sizes"}) if record else content
+    def older(entry, content):
+        record = {"bundle": "ipe-bench", "schema": 3, "files": dict(made.files)}
+        yield ("manifest.json", json.dumps(record)) if entry == MANIFEST else (entry, content)
 
-    older = rewritten(made.path, tmp_path / "older.zip", without_sizes)
-    pd.testing.assert_frame_equal(ib.load(older), ib.load(made.path))
+    old = rewritten(made.path, tmp_path / "older.zip", older)
+    pd.testing.assert_frame_equal(ib.load(old), ib.load(made.path))
+    assert write_bundle([tmp_path / "größte (2)"], old).digest != made.digest
+    old = rewritten(old, tmp_path / "less.zip", lambda name, content: [] if "runs/" in name else [(name, content)])
+    with pytest.raises(UserError, match="was damaged or changed"):
+        read_bundle(old)
 
 
 def test_commands_make_and_check_bundles(tmp_path, capsys):
