@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import itertools
 import keyword
 import re
 import shlex
@@ -72,15 +73,12 @@ def list_command(names: Sequence[str], verbose: bool) -> int:
         if slash:
             _describe(options[option])
             continue
-        columns = {
-            "option": [*ours, *options],
-            "what it is": [
-                *(text.partition(". ")[0] for text in ours.values()),
-                *(o.summary for o in options.values()),
-            ],
-            "from": [*["ipe-bench"] * len(ours), *(o.source.origin for o in options.values())],
-        }
-        _show(group, columns)
+        rows = [(name, text.partition(". ")[0], "built in") for name, text in ours.items()]
+        rows += [(o.name, o.summary, o.source.origin) for o in options.values()]
+        for origin, part in itertools.groupby(rows, lambda row: row[2]):
+            names_here, texts, _ = zip(*part, strict=True)
+            title = group if origin == "built in" else f"{group}, from {origin}"
+            _show(title, {"option": names_here, "what it is": texts})
         print()
         for one in options.values() if verbose else [o for o in options.values() if o.fault is not None]:
             try:

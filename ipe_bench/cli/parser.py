@@ -143,7 +143,7 @@ same model with more errors. output=DIR says where files go.
         "0 the populations of particles agree; 1 in some trial they do not",
         """
   ipe-bench posterior error_scale=300 "solver=[newton]" "baseline=[gauss_newton,ekf]"
-  ipe-bench posterior measurement=triad noise=gaussian noise.deviation=0.01 trials=1
+  ipe-bench posterior measurement=ranging noise=gaussian noise.deviation=0.1 error_scale=100 trials=1
 
 For the first trials of a scenario (trials=3 unless given), the posterior itself is sampled, with nothing linearised,
 by sequential Monte Carlo: particles go from the prior to the posterior as the likelihood is let in. Each estimator's

@@ -74,7 +74,6 @@ ORDINARY, LEAST = 1000, 3
 _PARTS = {
     "beyond": ["error_scale=300,1000,3000"],
     "headline": ["trials=40"],
-    "mgh": ["measurement.start=1"],
     "nist": ["measurement.start=2"],
 }
 """The part that is computed of experiments that take minutes, and the trials of the picture on the first page."""

@@ -25,7 +25,6 @@ NAMES = {
     "calibration": "distribution of NEES beside that of an honest covariance",
     "cost_against_accuracy": "median cost against the error that 95 % of trials stay below",
     "convergence": "how iterates approach their limit, a panel per estimator",
-    "data_profile": "share of problems of known minimum solved within a budget",
     "parameter_errors": "root mean square error of each parameter and its bound; figure_2 and 3 of the paper's setting",
     "tracks": "error of each state at each epoch beside its bounds, and NEES",
 }

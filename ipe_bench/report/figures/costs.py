@@ -1,5 +1,4 @@
-"""What accuracy costs: simulations against error, iterations against the distance from the limit, and the data profile
-of problems of known minimum."""
+"""What accuracy costs: simulations against error, and iterations against the distance from the limit."""
 
 from __future__ import annotations
 
