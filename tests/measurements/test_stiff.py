@@ -220,7 +220,7 @@ def test_two_levels_that_agree_on_what_is_wrong_are_found_out_by_the_implicit_me
     mean = 0.5 * (1.2 + 60 * (60 * np.sin(0.5) - np.cos(0.5)) / 3601)
     assert model.simulate(model.nominal[None])[0, 0] == pytest.approx(np.tanh(mean), abs=1e-8)
     (said,) = model.remarks(model.nominal)
-    assert said.startswith("the steps of the explicit method miss what happens: ")
+    assert said.startswith("the explicit method misses what happens: ")
     assert abs(replace(model, method="explicit").simulate(model.nominal[None])[0, 0] - np.tanh(mean)) > 0.1
 
 
@@ -229,3 +229,12 @@ def test_readings_at_the_start_alone_need_no_step():
     np.testing.assert_array_equal(model.simulate(np.array([[1.0], [3.0]])), [[1.0], [3.0]])
     np.testing.assert_array_equal(model.jacobian(model.nominal[None]), [[[1.0]]])
     assert not model.hindrance(model.nominal)
+
+
+def test_equations_that_the_shortest_explicit_steps_do_not_follow_are_integrated_by_the_implicit_method():
+    model = Ode({"y": "-280*(y-k*sin(3*t))"}, {"k": 1.0}, outputs={"z": "tanh(y)"}, times=(20.0,))
+    lag = 280 * (280 * np.sin(60.0) - 3 * np.cos(60.0)) / (280**2 + 9)
+    assert not model.hindrance(model.nominal)
+    assert model.simulate(model.nominal[None])[0, 0] == pytest.approx(np.tanh(lag), abs=1e-8)
+    (said,) = model.remarks(model.nominal)
+    assert said.startswith("the shortest steps of the explicit method are too long for these equations; they are")

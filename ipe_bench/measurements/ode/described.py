@@ -256,7 +256,9 @@ class Ode(WrittenModel, WrappedModel):
                 f"the solution needs {work.steps}"
             )
             if work.explicit <= _STIFF * work.steps:
-                reason = f"the steps of the explicit method miss what happens: it is {engine.missed:.1e} tolerances off"
+                reason = "the shortest steps of the explicit method are too long for these equations"
+                if engine.missed:
+                    reason = f"the explicit method misses what happens: it is {engine.missed:.1e} tolerances off"
             found.append(
                 f"{reason}; they are integrated by the implicit method "
                 "(measurement.method=explicit or implicit fixes it)"
@@ -394,7 +396,7 @@ class _Engine(OdeMeasurement):
     @cached_property
     def stiff(self) -> bool:
         """Whether every trial is integrated by the implicit method: if stability alone takes more than `_STIFF` times
-        as many explicit steps along the nominal solution."""
+        as many explicit steps along the nominal solution, or the shortest of them do not follow it."""
         if self.described.method != "auto":
             return self.described.method == "implicit"
         if self.step is not None:
@@ -402,7 +404,7 @@ class _Engine(OdeMeasurement):
         if self._rungs[self._nominal_place] <= _EASY:
             return self.missed > 0
         z, work = self.shape
-        return bool(np.isfinite(z).all() and work.explicit > _STIFF * work.steps)
+        return bool(np.isfinite(z).all() and (work.explicit > _STIFF * work.steps or super().hindrance(self.nominal)))
 
     @cached_property
     def missed(self) -> float:
