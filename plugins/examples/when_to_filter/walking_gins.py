@@ -8,9 +8,8 @@ import numpy as np
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, NonNegative, Positive
-from ipe_bench.measurements.base import Parameter
-from ipe_bench.measurements.gins import Gins
-from ipe_bench.states.base import Normal, StateModel
+from ipe_bench.measurements import Gins, Parameter
+from ipe_bench.states import Normal, StateModel
 
 KINEMATIC = 11
 """States of the motion; the parameters follow."""

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Positive
-from ipe_bench.measurements import Gins
-from ipe_bench.measurements.base import Measurement, Parameter
+from ipe_bench.measurements import Gins, Measurement, Parameter
 
 jax.config.update("jax_enable_x64", True)
 

@@ -11,13 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix
 
+from ipe_bench import Estimates, Estimator, Problem, Status
 from ipe_bench.basics.linalg import Array, Covariance, pseudo_inverse
 from ipe_bench.basics.options import Count, Positive
-from ipe_bench.basics.statuses import Status
-from ipe_bench.estimators.base import Estimates, Estimator, one_by_one
+from ipe_bench.estimators.base import one_by_one
 from ipe_bench.estimators.ipe import Start, starting_points
 from ipe_bench.measurements.counted import EvaluationCount
-from ipe_bench.measurements.problem import Problem
 
 jax.config.update("jax_enable_x64", True)
 # A callback that waits for its arguments would wait for ever on few cores.

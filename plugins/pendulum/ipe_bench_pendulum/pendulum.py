@@ -9,8 +9,7 @@ import numpy as np
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Finite, NonNegative, Positive
-from ipe_bench.measurements.base import Parameter, UsualNoise
-from ipe_bench.measurements.ode.model import OdeMeasurement
+from ipe_bench.measurements import OdeMeasurement, Parameter, UsualNoise
 
 
 @dataclass(frozen=True)

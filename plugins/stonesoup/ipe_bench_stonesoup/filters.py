@@ -20,7 +20,7 @@ from stonesoup.types.hypothesis import SingleHypothesis
 from stonesoup.types.prediction import GaussianStatePrediction
 from stonesoup.updater.kalman import ExtendedKalmanUpdater, UnscentedKalmanUpdater
 
-from ipe_bench.baselines.sequential import ConstantFilter, Sequential
+from ipe_bench import ConstantFilter, Sequential
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Finite, NonNegative
 

@@ -1,8 +1,12 @@
-"""Options of the zoo's models that cannot be, each refused by its name."""
+"""Options of the zoo's models that cannot be, each refused by its name; and the version that it goes with."""
+
+import tomllib
+from pathlib import Path
 
 import pytest
 from ipe_bench_zoo import Accelerometer, Gnss, Triad
 
+from ipe_bench import __version__
 from ipe_bench.basics.errors import UserError
 
 FEW = ((1.0, 0.0, 0.0),) * 9
@@ -21,3 +25,8 @@ MISTAKES = [
 def test_mistakes_are_named(make, said):
     with pytest.raises(UserError, match=f"^{said}"):
         make()
+
+
+def test_it_goes_with_this_version_of_the_package():
+    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert (project["version"], project["dependencies"]) == (__version__, [f"ipe-bench=={__version__}"])
