@@ -196,7 +196,7 @@ class Linearized:
 
 
 @dataclass(frozen=True)
-class IPLF(InformationFilter, Method[Linearized]):
+class IPLF(InformationFilter, Method[EpochReadings, Linearized]):
     """Readings linearised by regression over the posterior itself, again and again (García-Fernández, Svensson,
     Morelande, Särkkä, IEEE TSP 63(20), 2015), the mean damped as in Raitoharju, Svensson, García-Fernández and Piché
     (IEEE SPL 25(4), 2018; arXiv 1704.01113).

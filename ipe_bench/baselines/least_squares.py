@@ -71,7 +71,7 @@ class Batch(Estimator):
         return Objective.of(problem, z)
 
     @abstractmethod
-    def method(self, objective: Objective) -> Method[LeastSquaresSystem]:
+    def method(self, objective: Objective) -> Method[Objective, LeastSquaresSystem]:
         """What minimises it."""
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
@@ -91,7 +91,7 @@ class GaussNewton(Batch):
     damping: Positive | None = None
     """The initial lambda of Levenberg-Marquardt with Marquardt's scaling; None: no damping."""
 
-    def method(self, objective: Objective) -> Method[LeastSquaresSystem]:
+    def method(self, objective: Objective) -> Method[Objective, LeastSquaresSystem]:
         return GaussNewtonMethod() if self.damping is None else LevenbergMarquardtMethod(self.damping)
 
 
@@ -106,7 +106,7 @@ class LevenbergMarquardt(Batch):
     """Bends each step along the curvature of the readings, for one more simulation (Transtrum and Sethna, 2012,
     arXiv 1201.5885)."""
 
-    def method(self, objective: Objective) -> Method[LeastSquaresSystem]:
+    def method(self, objective: Objective) -> Method[Objective, LeastSquaresSystem]:
         return LevenbergMarquardtMethod(self.damping, geodesic=self.geodesic)
 
 
@@ -129,7 +129,7 @@ class MapLM(Batch):
     def objective(self, problem: Problem, z: Array) -> Objective:
         return Objective.of(problem, z, self.prior_inflation)
 
-    def method(self, objective: Objective) -> Method[LeastSquaresSystem]:
+    def method(self, objective: Objective) -> Method[Objective, LeastSquaresSystem]:
         return LevenbergMarquardtMethod(self.damping, objective.prior and objective.prior.deviations)
 
 

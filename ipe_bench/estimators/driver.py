@@ -1,10 +1,10 @@
-"""The loop that iterates any method on a batch of trials until each has an answer, or a failure that has a name."""
+"""Iterates any method on a batch of trials until each has an answer, or a failure that has a name."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,21 +12,41 @@ from numpy.typing import NDArray
 from ipe_bench.basics.batches import gather, take
 from ipe_bench.basics.linalg import Array, Mask
 from ipe_bench.basics.statuses import Status
+from ipe_bench.measurements.counted import CountingModel
 
 FAR = 1e8
-"""Where the residual is this many times larger than at the start, the iteration has diverged."""
+"""An iteration has diverged once its residual is this many times that of the start."""
 TINY_STEP = 1e-3
 """Steps below this share of the tolerance, while the equation does not hold within it, mean a stall."""
 
 
+class IteratedSystem(Protocol):
+    """The equations of a batch of trials, as the driver sees them; a method asks for more."""
+
+    @property
+    def model(self) -> CountingModel:
+        """The model, which counts evaluations and failures in its tally."""
+        ...
+
+    @property
+    def rows(self) -> NDArray[np.intp]:
+        """The places (trials,) of the trials in that tally."""
+        ...
+
+    def subset(self, kept: Mask) -> Self:
+        """The same equations for some of the trials."""
+        ...
+
+
+E = TypeVar("E", bound=IteratedSystem, contravariant=True)
 S = TypeVar("S", bound=Any)
 """A state: a frozen dataclass whose fields are arrays with the trials in front, x (trials, n) among them."""
-R = TypeVar("R")
+R = TypeVar("R", bound=Any)
 
 
 @dataclass(frozen=True)
 class ConvergenceCheck:
-    """Where each trial stands after a step; every field is (trials,)."""
+    """How far each trial has come after a step; every field is (trials,)."""
 
     size: Array
     """How far the equation is from holding, in standard deviations: converged where it is within the tolerance."""
@@ -35,24 +55,24 @@ class ConvergenceCheck:
     moved: Array
     """The last step, in standard deviations; infinite before the first."""
     stuck: Mask | bool = False
-    """Where the method itself knows that it gets no further."""
+    """True if the method itself knows that it gets no further."""
     ending: NDArray[Any] | Status = Status.STALLED
-    """What it is called where a trial is stuck, or its steps have become tiny."""
+    """The status of a trial that is stuck, or whose steps have become tiny."""
 
 
-class Method(ABC, Generic[S]):
+class Method(ABC, Generic[E, S]):
     """A method that the driver iterates: where it begins, one step of it, and how far it has come."""
 
     @abstractmethod
-    def begin(self, system: Any, x: Array) -> S:
+    def begin(self, system: E, x: Array) -> S:
         """The state at the start x (trials, n)."""
 
     @abstractmethod
-    def step(self, system: Any, state: S) -> S:
+    def step(self, system: E, state: S) -> S:
         """The state after one more iteration."""
 
     @abstractmethod
-    def check(self, system: Any, before: S | None, state: S) -> ConvergenceCheck:
+    def check(self, system: E, before: S | None, state: S) -> ConvergenceCheck:
         """How far the trials have come; `before` is the state of a step ago, None at the start."""
 
 
@@ -61,7 +81,7 @@ class Limits:
     """How far an iteration goes."""
 
     tolerance: float
-    """Converged is where `ConvergenceCheck.size` is at most this."""
+    """A trial has converged once `ConvergenceCheck.size` is at most this."""
     max_iterations: int
     budget: float | None = None
     """Simulations that a trial may cost, a Jacobian counting n; None: no limit."""
@@ -71,13 +91,13 @@ class Limits:
 
 @dataclass(frozen=True)
 class SolveResult(Generic[S]):
-    """Where the iteration of each trial ended."""
+    """The end of the iteration of each trial."""
 
     state: S
     status: NDArray[np.int8]
     iterations: NDArray[np.int64]
     history: list[Array] | None
-    """For each trial the iterates (iterations + 1, n), where they were asked for."""
+    """The iterates (iterations + 1, n) of each trial, if asked for."""
 
     @property
     def x(self) -> Array:
@@ -88,11 +108,8 @@ class SolveResult(Generic[S]):
         return self.status == Status.CONVERGED
 
 
-def iterate(equations: Any, method: Method[S], start: Array | S, limits: Limits) -> SolveResult[S]:
-    """Iterates from `start`, which is x (trials, n) or a state, until every trial has ended; those leave the batch.
-
-    `equations` have a counting `model`, the `rows` of the trials in its tally, and a `subset` for some of them.
-    """
+def iterate(equations: E, method: Method[E, S], start: Array | S, limits: Limits) -> SolveResult[S]:
+    """Iterates from `start`, which is x (trials, n) or a state, until every trial has ended; those leave the batch."""
     state = method.begin(equations, start) if isinstance(start, np.ndarray) else start
     trials, n = state.x.shape
     tally, active = equations.model.tally, np.arange(trials)
@@ -137,8 +154,8 @@ def iterate(equations: Any, method: Method[S], start: Array | S, limits: Limits)
 
 def continued(first: Any, second: R) -> R:
     """The second of two iterations, results with `iterations` and `history`, with the iterates of both."""
-    history = second.history  # type: ignore[attr-defined]
+    history = second.history
     if history is not None:
         history = [np.concatenate([a, b[1:]]) for a, b in zip(first.history, history, strict=True)]
-    iterations = first.iterations + second.iterations  # type: ignore[attr-defined]
-    return replace(second, iterations=iterations, history=history)  # type: ignore[type-var]
+    iterations = first.iterations + second.iterations
+    return replace(second, iterations=iterations, history=history)

@@ -179,7 +179,7 @@ def starting_points(problem: Problem, z: Array, start: Start, tally: EvaluationC
 
 
 @dataclass(frozen=True, kw_only=True)
-class IPE(Method[S], Estimator, Generic[S]):
+class IPE(Method[FrozenSystem, S], Estimator, Generic[S]):
     """The paper's estimator: a solver iterated on the system of eq. (11), H frozen at the nominal point.
 
     Reports the sandwich covariance (H+ J)^-1 H+ R H+' (H+ J)^-T at the estimate. A new solver is a frozen dataclass
@@ -203,10 +203,10 @@ class IPE(Method[S], Estimator, Generic[S]):
         """The state at the start x (trials, n), where the residual is F."""
         return State(x, F)  # type: ignore[return-value]
 
-    def begin(self, system: Any, x: Array) -> S:
+    def begin(self, system: FrozenSystem, x: Array) -> S:
         return self.init(system, x, system.F(x))
 
-    def check(self, system: Any, before: S | None, state: S) -> ConvergenceCheck:
+    def check(self, system: FrozenSystem, before: S | None, state: S) -> ConvergenceCheck:
         """abs(F_i), and the step, in standard deviations of the linear bound."""
         return root_check(system.deviation, before, state)
 

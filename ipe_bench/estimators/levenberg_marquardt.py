@@ -23,7 +23,7 @@ _MOST_BENT = 0.75
 
 
 @dataclass(frozen=True)
-class GaussNewtonMethod(Method[LeastSquaresSystem]):
+class GaussNewtonMethod(Method[Objective, LeastSquaresSystem]):
     """x <- x - (J' R^-1 J)^-1 J' R^-1 (h(x) - z), undamped; where J lacks rank, the shortest of all such steps."""
 
     def begin(self, objective: Objective, x: Array) -> LeastSquaresSystem:
@@ -49,7 +49,7 @@ class GaussNewtonMethod(Method[LeastSquaresSystem]):
 
 
 @dataclass(frozen=True)
-class LevenbergMarquardtMethod(Method[LeastSquaresSystem]):
+class LevenbergMarquardtMethod(Method[Objective, LeastSquaresSystem]):
     """The step minimises |r + J s|^2 + lambda |D s|^2, and lambda follows the gain ratio.
 
     D = 1 / `deviation` (n,), the metric of a prior covariance; None: Marquardt's, the column norms of J, which only

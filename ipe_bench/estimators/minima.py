@@ -82,7 +82,7 @@ class Minima:
         return Estimates.of(self, tally, covariance=self.covariance, extras={"fit_p": self.fit_probability(readings)})
 
 
-def minimize(objective: Objective, method: Method[LeastSquaresSystem], x: Array, limits: Limits) -> Minima:
+def minimize(objective: Objective, method: Method[Objective, LeastSquaresSystem], x: Array, limits: Limits) -> Minima:
     """Minimises the objective from x (trials, n), by coarse Jacobians on the way if the model has any that are cheaper.
 
     Converged is where the Gauss-Newton step, which is the gradient in whitened units, is at most `limits.tolerance`

@@ -80,7 +80,7 @@ class OnChord:
 
 
 @dataclass(frozen=True)
-class Chord(Method[OnChord]):
+class Chord(Method[Objective, OnChord]):
     """Gauss-Newton steps with the Jacobian of the start, and Anderson's acceleration.
 
     With H, the Jacobian of the nominal point, these are the fixed-point steps of eq. (17).

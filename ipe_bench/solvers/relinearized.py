@@ -42,7 +42,7 @@ class Round(State):
 
 
 @dataclass(frozen=True)
-class Relinearized(Method[Round], Estimator):
+class Relinearized(Method[FrozenSystem, Round], Estimator):
     """Any solver on F(x) = H_k+ (h(x) - z), with H_k = dh/dx at the estimate x_k that the round before has reached.
 
     Where F(x_k) = 0 at its own linearisation, the gradient J' R^-1 (h - z) of least squares vanishes: the estimate is

@@ -61,7 +61,7 @@ def least_squares_root(problem: Problem, z: Array, x_start: Array, *, prior: flo
 
 
 def _first_root(
-    equations: Callable[[Array], Any], z: Array, x_start: Array, *attempts: tuple[Method[Any], int]
+    equations: Callable[[Array], Any], z: Array, x_start: Array, *attempts: tuple[Method[Any, Any], int]
 ) -> Array:
     """Where the first method that converges ends: each has that many iterations from x_start."""
     x, missing = np.full(x_start.shape, np.nan), np.arange(len(z))

@@ -318,7 +318,7 @@ class Shooting:
 
 
 @dataclass(frozen=True)
-class CondensedGaussNewton(Method[Trajectory]):
+class CondensedGaussNewton(Method[Shooting, Trajectory]):
     """Gauss-Newton under the linearised conditions, halved by the natural monotonicity test."""
 
     def begin(self, system: Shooting, x: Array) -> Trajectory:
