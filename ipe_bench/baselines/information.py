@@ -113,7 +113,7 @@ class InformationFilter(Estimator):
         """What is believed after an epoch's readings, and the squared innovations (trials,) of the prediction."""
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
-        self.require_needs(problem)
+        self.require_suited(problem)
         with np.errstate(all="ignore"):
             return _Beliefs(self, problem, z).estimates(history=history)
 

@@ -37,7 +37,10 @@ Rounding = Annotated[float, Ge(float(np.finfo(float).eps)), doc("a number of at 
 
 @dataclass(frozen=True)
 class LinearLSE(Estimator):
-    """x = x0 + H+ (z - h(x0)), eq. (2): takes the measurement for linear. Reports (H' R^-1 H)^-1, eq. (5)."""
+    r"""Takes the measurement for linear, eq. (2), and reports the covariance of eq. (5).
+
+    .. math:: x = x_0 + H^+ \left( z - h(x_0) \right), \quad H^+ = (H^T R^{-1} H)^{-1} H^T R^{-1}
+    """
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         x, system = begin(problem, z, "linear_lse")

@@ -102,7 +102,7 @@ class Sequential(Estimator):
         return 1, 0.0
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
-        self.require_needs(problem)
+        self.require_suited(problem)
         with np.errstate(all="ignore"), warnings.catch_warnings():
             from scipy.linalg import LinAlgWarning
 

@@ -143,7 +143,7 @@ class Spec(Component):
         if isinstance(self.scenario, StateScenario):
             return self
         problem = self.scenario.problem
-        unsuited = {label for label in STANDARD_FILTERS if (e := self.estimators.get(label)) and e.missing(problem)}
+        unsuited = {label for label in STANDARD_FILTERS if (e := self.estimators.get(label)) and e.hindrance(problem)}
         kept = {label: one for label, one in self.estimators.items() if label not in unsuited}
         return replace(self, estimators=kept) if unsuited else self
 

@@ -47,11 +47,11 @@ class Estimates:
     seconds: Array = field(default_factory=lambda: np.zeros(0))
     """Computing time per trial; a batch's time is shared evenly."""
     history: list[Array] | None = None
-    """For each trial the iterates (iterations + 1, n), where they were asked for."""
+    """The iterates (iterations + 1, n) of each trial, if asked for."""
     extras: dict[str, Array] = field(default_factory=dict)
     """Further numbers per trial (trials,) that this estimator reports, by name: NIS of a filter, say."""
     alternatives: list[Array] | None = None
-    """For each trial the other answers (count, n) that fit its readings as well, of estimators that look for them."""
+    """The other answers (count, n) that fit the readings of each trial as well, of estimators that look for them."""
 
     def __post_init__(self) -> None:
         for name in ("iterations", "simulations", "jacobians", "seconds"):
@@ -60,7 +60,7 @@ class Estimates:
 
     @classmethod
     def of(cls, ended: Any, tally: EvaluationCount, **further: Any) -> Estimates:
-        """Where an iteration ended, with what it cost; `further` are fields that only the estimator knows."""
+        """The estimates of an iteration that has ended, with its cost; `further` are fields of the estimator's own."""
         counts = {"simulations": tally.simulations.copy(), "jacobians": tally.jacobians.copy()}
         found = {"x": ended.x, "status": ended.status, "iterations": ended.iterations, "history": ended.history}
         return cls(**{**found, **counts, "messages": dict(tally.messages), **further})
@@ -101,42 +101,56 @@ class Estimates:
 
 
 class Estimator(Component, ABC):
-    """Turns readings into parameters. A new estimator is a frozen dataclass that writes `estimate`.
+    """Turns readings into parameters: a frozen dataclass, whose fields are its options and its identity.
 
-    The trials of a batch are independent: the result of a trial is bit-identical in every batch, and
-    a trial that fails ends as a status without disturbing the others.
+    Required: `estimate`. Optional: `needs`, `equation`, `family`, and `hindrance`, which is asked before any work.
+    Promised: a trial has the same bits alone and in any batch, its random numbers included, so products are stacked
+    `matmul` or `einsum`; a trial that fails ends with a status, or raises if it is alone, and disturbs no other;
+    readings that are not finite end as `Status.NONFINITE`; readings and problem are not written into.
+
+    >>> import ipe_bench as ib
+    >>> @dataclass(frozen=True)
+    ... class Nominal(ib.Estimator):
+    ...     def estimate(self, problem, z, *, history=False):
+    ...         x = np.repeat(problem.x0[None], len(z), axis=0)
+    ...         return ib.Estimates(x=x, status=np.full(len(z), ib.Status.CONVERGED))
+    >>> scenario = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01))
+    >>> print(Nominal().estimate(scenario.problem, scenario.draw(0, 2).z).x)
+    [[0. 0. 0.]
+     [0. 0. 0.]]
     """
 
     needs: ClassVar[frozenset[Need]] = frozenset()
-    """What a scenario must have for this estimator to run: epochs, a prior, a model by differential equations."""
+    """What a problem must have for this estimator to run: epochs, a prior, a model by differential equations."""
     equation: ClassVar[Equation | None] = None
-    """The estimating equation whose root it seeks: that of the frozen H (eq. 11), of least squares, or of the maximum a
-    posteriori; None where an estimate is no root of anything."""
+    """The estimating equation whose root is sought: that of the frozen H (eq. 11), of least squares, or of the maximum
+    a posteriori; None if an estimate is no root of anything. Bounds and first-order covariances follow from it."""
     family: ClassVar[Family | None] = None
-    """The kind of estimator that it is shown with; None where its needs and its equation say: those that take epochs
+    """The kind of estimator that it is shown with; None if its needs and its equation say: those that take epochs
     are filters, those that seek the root of the frozen H are IPE, and all others are least squares."""
 
     @abstractmethod
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
-        """Estimates from readings z (trials, m); `history` asks for the iterates as well."""
+        """Estimates the parameters from readings z (trials, m); `history` asks for the iterates as well."""
 
-    def missing(self, problem: Problem) -> list[str]:
-        """What this estimator needs and the problem does not have."""
+    def hindrance(self, problem: Problem) -> str | None:
+        """Says, in words that follow the estimator's label, why it does not suit the problem; None if it does."""
         has = {
             "differential equations": problem.measurement.by_differential_equations,
             "epochs": problem.measurement.epochs is not None,
             "prior": problem.prior_deviation is not None,
         }
-        return [need for need in sorted(self.needs) if not has[need]]
+        lacking = " and ".join(need for need in sorted(self.needs) if not has[need])
+        return f"needs {lacking}, which measurement={problem.measurement.name} does not have" if lacking else None
 
-    def require_needs(self, problem: Problem) -> None:
-        """Raises UserError unless the problem has what this estimator needs."""
-        for need in self.missing(problem):
-            raise UserError(f"measurement={problem.measurement.name}: has no {need}, which this estimator needs")
+    def require_suited(self, problem: Problem) -> None:
+        """Raises UserError if there is a hindrance."""
+        if why := self.hindrance(problem):
+            raise UserError(f"{self.name}: {why}")
 
 
 def estimate_safely(estimator: Estimator, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
-    """`estimator.estimate`, timed, where an exception becomes the status of the trials that cause it.
+    """Calls `estimator.estimate`, timed; an exception becomes the status of the trials that cause it.
 
     A batch that raises is estimated again trial by trial. Readings and problem are read-only.
     """

@@ -31,9 +31,9 @@ if TYPE_CHECKING:
     from ipe_bench.measurements.problem import Problem
 
 Start = Literal["linear_lse", "nominal", "best"]
-"""Where an iteration begins: at the linear LSE, eq. (16), at the nominal point, or at the better fit of the two."""
+"""The start of an iteration: the linear LSE, eq. (16), the nominal point, or the better fit of the two."""
 _COARSE_BEYOND = 0.03
-"""Where F is larger, in standard deviations of the linear bound, a step is as good with a coarse Jacobian."""
+"""If F is larger, in standard deviations of the linear bound, a step is as good with a coarse Jacobian."""
 
 
 class System(Protocol):
@@ -75,7 +75,9 @@ S = TypeVar("S", bound=State)
 
 @dataclass(frozen=True)
 class FrozenSystem:
-    """F(x) = x - x0 - H+ (z - h(x0) - N(x)) = H+ (h(x) - z), eqs. (11) and (19), for the trials `rows` of a batch.
+    r"""The nonlinear system of eqs. (11) and (19) for the trials `rows` of a batch.
+
+    .. math:: F(x) = x - x_0 - H^+ \left( z - h(x_0) - N(x) \right) = H^+ \left( h(x) - z \right)
 
     H+ is frozen: one (1, n, m) for all trials, or one per trial (trials, n, m) where it was re-linearised.
     """
@@ -130,7 +132,7 @@ class FrozenSystem:
         return dataclasses.replace(self, H_plus=H_plus, deviation=deviations(frozen_covariance(H_plus, self.R)))
 
     def covariance(self) -> Array:
-        """H+ R H+' (1, n, n) or (trials, n, n), eq. (5): of the linear LSE."""
+        """The covariance (1, n, n) or (trials, n, n) of the linear LSE, eq. (5)."""
         return frozen_covariance(self.H_plus, self.R)
 
     def sandwich(self, x: Array) -> Array:
@@ -144,13 +146,16 @@ class FrozenSystem:
 
 
 def frozen_covariance(H_plus: Array, R: Covariance) -> Array:
-    """H+ R H+' (trials, n, n) for H+ (trials, n, m), which is eq. (5) where R = sigma^2 I."""
+    r"""The covariance (trials, n, n) of the linear estimate, eq. (5) for any R, from H+ (trials, n, m).
+
+    .. math:: H^+ R H^{+T} = (H^T R^{-1} H)^{-1}, \quad \sigma^2 (H^T H)^{-1} \text{ if } R = \sigma^2 I
+    """
     scaled = H_plus * R.factor if R.factor.ndim == 1 else np.matmul(H_plus, R.factor)
     return np.matmul(scaled, scaled.swapaxes(1, 2))
 
 
 def begin(problem: Problem, z: Array, start: Start) -> tuple[Array, FrozenSystem]:
-    """Where an iteration begins, x (trials, n), and the paper's system, which has counted the cost of it.
+    """Returns the start x (trials, n) of an iteration, and the paper's system, which has counted the cost of it.
 
     F(x0) = H+ (h(x0) - z), so the linear LSE of eq. (2) is one fixed-point step from the nominal point: eq. (16).
     """
@@ -168,8 +173,8 @@ def begin(problem: Problem, z: Array, start: Start) -> tuple[Array, FrozenSystem
 
 
 def starting_points(problem: Problem, z: Array, start: Start, tally: EvaluationCount) -> Array:
-    """Where least squares begins (trials, n): at the nominal point where H has not full column rank. What that costs
-    goes to the tally."""
+    """Returns the starts (trials, n) of least squares, at the nominal point if H has not full column rank, and adds
+    their cost to the tally."""
     if start == "nominal" or problem.rankless:
         return np.repeat(problem.x0[None], len(z), axis=0)
     x, system = begin(problem, z, start)
@@ -180,11 +185,26 @@ def starting_points(problem: Problem, z: Array, start: Start, tally: EvaluationC
 
 @dataclass(frozen=True, kw_only=True)
 class IPE(Method[FrozenSystem, S], Estimator, Generic[S]):
-    """The paper's estimator: a solver iterated on the system of eq. (11), H frozen at the nominal point.
+    r"""Solves eq. (11), H frozen at the nominal point, by an iteration that a subclass writes: the paper's estimator.
 
-    Reports the sandwich covariance (H+ J)^-1 H+ R H+' (H+ J)^-T at the estimate. A new solver is a frozen dataclass
-    that derives from this class and writes `step`; one with a memory writes `init` too, and names its state:
-    `class Broyden(IPE[BroydenState])`.
+    Required: `step`. Optional: `init`, of a solver with a memory, which names its state: `IPE[BroydenState]`.
+    Promised, beside what an `Estimator` promises: the fields of a state have the trials in front, x and F among them;
+    the driver does the loop, the tests of convergence and divergence, and the counting. The reported covariance is
+
+    .. math:: (H^+ J)^{-1} H^+ R H^{+T} (H^+ J)^{-T}
+
+    >>> import ipe_bench as ib
+    >>> @dataclass(frozen=True)
+    ... class Relaxed(ib.IPE):
+    ...     gain: float = 0.5
+    ...
+    ...     def step(self, system, state):
+    ...         x = state.x - self.gain * state.F
+    ...         return ib.State(x, system.F(x))
+    >>> scenario = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01))
+    >>> found = Relaxed().estimate(scenario.problem, scenario.draw(0, 3).z)
+    >>> print(found.status, found.iterations)
+    [1 1 1] [17 17 17]
     """
 
     start: Start = "linear_lse"

@@ -14,17 +14,39 @@ from ipe_bench.noise.levels import Levels
 
 
 class Noise(Component, ABC):
-    """Errors of readings. A new noise is a frozen dataclass that writes `corrupt` and `covariance`."""
+    """Adds errors to readings, and states the R that estimators assume: a frozen dataclass, whose fields are its options.
+
+    Required: `corrupt` and `covariance`. Optional: `whitened`, if errors are not normal; `true_covariance`, if R is not
+    theirs; `completed`, if options may be left to the model. The others are for noise whose level is estimated.
+    Promised: errors have mean zero, covariance R unless `true_covariance` is False, and come from `rng` alone.
+
+    >>> import ipe_bench as ib
+    >>> from dataclasses import dataclass
+    >>> @dataclass(frozen=True)
+    ... class Laplace(ib.Noise):
+    ...     scale: float = 0.1
+    ...
+    ...     def corrupt(self, h, offset, rng):
+    ...         return h + rng.laplace(0.0, self.scale, len(h))
+    ...
+    ...     def covariance(self, m):
+    ...         return Covariance(np.full(m, np.sqrt(2) * self.scale))
+    ...
+    ...     def whitened(self, shape, rng):
+    ...         return rng.laplace(0.0, np.sqrt(0.5), shape)
+    >>> print(ib.Scenario(ib.measurements.Polynomial(), Laplace()).draw(0, 4).z.shape)
+    (4, 20)
+    """
 
     real: ClassVar[bool] = False
-    """True where readings are not simulated at all, but are those that come with the model."""
+    """True if readings are not simulated at all, but are those that come with the model."""
     estimated: ClassVar[bool] = False
-    """True where the level of the errors is estimated from the residuals, R being known up to a factor."""
+    """True if the level of the errors is estimated from the residuals, R being known up to a factor."""
     true_covariance: bool = True
-    """Whether R is that of the errors; False where estimators are told another one on purpose."""
+    """Whether R is that of the errors; False if estimators are given another one on purpose."""
 
     def completed(self, usual: UsualNoise | None) -> Noise:
-        """This noise, with what its options leave out taken from the usual noise of the model.
+        """Returns this noise, with what its options leave out taken from the usual noise of the model.
 
         Raises:
             UserError: the model names none.
@@ -34,27 +56,25 @@ class Noise(Component, ABC):
 
     @abstractmethod
     def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
-        """The readings z (m,) of one trial, given the error-free h (m,) and what the instruments show besides it."""
+        """Returns the readings z (m,) of one trial, from the error-free h (m,) and what the instruments show besides it."""
 
     @abstractmethod
     def covariance(self, m: int) -> Covariance:
-        """R of m readings, as the estimators assume it."""
+        """Returns R of m readings, as estimators assume it."""
 
     def nominal_covariance(self, model: Measurement) -> Covariance:
-        """R of a model's readings, as estimators are told it."""
+        """Returns R of a model's readings, as estimators are given it."""
         return self.covariance(model.m)
 
     def true_levels(self, m: int) -> tuple[Levels, Array] | None:
-        """Levels of m readings, and their logarithms (k,), if bounds are to count them among what is not known."""
+        """Returns levels of m readings, and their logarithms (k,), if bounds are to count them as unknown."""
         del m
 
     def levels_of(self, model: Measurement) -> Levels | None:
-        """Levels of which standard deviations are formulas, if these are to be estimated with the parameters."""
+        """Returns levels of which standard deviations are formulas, if they are to be estimated with the parameters."""
         del model
 
     def whitened(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array | None:
-        """Draws of the errors of whitened readings, R^-1/2 v, if R is right: independent, of mean 0 and variance 1.
-
-        None, unless a noise says otherwise: they are normal. The test of fit takes its law from here.
-        """
-        return None
+        """Draws errors of whitened readings, R^-1/2 v, if R is right: independent, of mean 0 and variance 1; None if they
+        are normal. The test of fit takes its law from here."""
+        del shape, rng

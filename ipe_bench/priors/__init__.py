@@ -21,28 +21,42 @@ _DEFINITE = 1e-12
 
 
 class Prior(Component, ABC):
-    """A prior. A new one is a frozen dataclass that writes `deviation` and `draw`.
+    """Draws true parameters about the nominal point: a frozen dataclass, whose fields are its options.
 
-    Estimators that use a prior are told N(nominal, P0), P0 being of these deviations and of `correlation`, and the
-    Bayesian bound is the one under that. A prior of another form has draws of the same mean and covariance, and sets
-    `normal` to False: then that bound is one for estimators that know no more than mean and covariance.
+    Required: `deviation` and `draw`. Optional: `correlation`, and `normal`. Promised: draws have the nominal point as
+    mean, and the covariance P0 of these deviations and correlations; they come from `rng` alone. Estimators that use a
+    prior are given N(nominal, P0), and the Bayesian bound is the one under that; if draws are not normal, it is one for
+    estimators that know no more than mean and covariance.
+
+    >>> import ipe_bench as ib
+    >>> @dataclass(frozen=True)
+    ... class Uniform(Prior):
+    ...     normal = False
+    ...
+    ...     def deviation(self, n, error_scale):
+    ...         return np.full(n, error_scale)
+    ...
+    ...     def draw(self, x0, error_scale, rng):
+    ...         return x0 + np.sqrt(3) * error_scale * rng.uniform(-1, 1, len(x0))
+    >>> scenario = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), Uniform(), error_scale=2.0)
+    >>> print(np.abs(scenario.draw(0, 1000).x).max() < 2 * np.sqrt(3))
+    True
     """
 
     normal: ClassVar[bool] = True
-    """Whether its draws are normal: the posterior is sampled for such priors alone."""
+    """Whether draws are normal: the posterior is sampled for such priors alone."""
 
     @abstractmethod
     def deviation(self, n: int, error_scale: float) -> Array:
-        """Standard deviations (n,) of the parameters in multiples of their units."""
+        """Returns the standard deviations (n,) of the parameters in multiples of their units."""
 
     def correlation(self, n: int) -> Array | None:
-        """Correlation (n, n) of the parameters, positive definite; None: they are independent."""
+        """Returns the correlation (n, n) of the parameters, positive definite; None: they are independent."""
         del n
-        return None
 
     @abstractmethod
     def draw(self, x0: Array, error_scale: float, rng: np.random.Generator) -> Array:
-        """One parameter vector (n,) about the nominal point x0 (n,), in multiples of the units."""
+        """Returns one parameter vector (n,) about the nominal point x0 (n,), in multiples of the units."""
 
 
 @dataclass(frozen=True)

@@ -89,14 +89,13 @@ class Question:
         if not self.estimators:
             raise UserError("there is no estimator; choose with solver= and baseline=")
         for label, estimator in self.estimators.items():
-            for need in estimator.missing(self.problem):
-                why = f"measurement={scenario.measurement.name} does not have; leave it out"
-                if need == "prior" and not scenario.noise.real:
-                    why = (
-                        "is not stated; give error_scale=X, the standard deviation of the parameters in multiples of"
-                        " their sizes"
-                    )
-                lacking.append(f"estimators.{label}: needs {need}, which {why}")
+            if why := estimator.hindrance(scenario.problem):
+                lacking.append(f"estimators.{label}: {why}; leave it out")
+            elif estimator.hindrance(self.problem):
+                lacking.append(
+                    f"estimators.{label}: needs prior, which is not stated; give error_scale=X, the standard deviation"
+                    " of the parameters in multiples of their sizes"
+                )
         if lacking:
             raise UserError("; ".join(lacking))
         return self

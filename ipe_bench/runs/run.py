@@ -130,12 +130,8 @@ def validate(
             require_function(scenario.measurement)
             mistakes += _beyond_numbers(scenario)
             require_function(scenario.simulator)
-        model = scenario.measurement.name
-        mistakes += [
-            f"estimators.{label}: needs {need}, which measurement={model} does not have; leave it out"
-            for label, estimator in estimators.items()
-            for need in estimator.missing(scenario.problem)
-        ]
+        found = {label: estimator.hindrance(scenario.problem) for label, estimator in estimators.items()}
+        mistakes += [f"estimators.{label}: {why}; leave it out" for label, why in found.items() if why]
     if mistakes:
         raise UserError("; ".join(dict.fromkeys(mistakes)))
 

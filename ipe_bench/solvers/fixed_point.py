@@ -9,7 +9,9 @@ from ipe_bench.estimators.ipe import IPE, State, System
 
 @dataclass(frozen=True)
 class FixedPoint(IPE):
-    """x <- x - F(x), which is x0 + H+ (z - h(x0) - N(x)), eq. (17).
+    r"""Iterates eq. (17).
+
+    .. math:: x_{k+1} = x_k - F(x_k) = x_0 + H^+ \left( z - h(x_0) - N(x_k) \right)
 
     Converges linearly where g(x) = x - F(x) contracts, eqs. (15) and (18).
     """

@@ -9,7 +9,10 @@ from ipe_bench.estimators.ipe import IPE, State, System
 
 @dataclass(frozen=True)
 class Newton(IPE):
-    """x <- x - J(x)^-1 F(x). Converges quadratically near a root with regular J, eq. (23)."""
+    r"""Iterates eq. (20), and converges quadratically near a root with regular J, eq. (23).
+
+    .. math:: x_{k+1} = x_k - J(x_k)^{-1} F(x_k), \quad J = \partial F / \partial x = H^+ \, \partial h / \partial x
+    """
 
     def step(self, system: System, state: State) -> State:
         x = state.x - system.solve(system.J(state.x, state.F), state.F)

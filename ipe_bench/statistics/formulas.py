@@ -300,7 +300,11 @@ def van_trees_limits(s: Sample) -> Ends:
 
 
 def eq_14(s: Sample) -> Array:
-    """Eq. (14): eq. (5) plus the mean square of H+ dN, which at a root of eq. (11) is the error less H+ v."""
+    r"""Standard deviations (n,) by eq. (14), with dN = N(x) - N(x^): at a root of eq. (11), H+ dN is the error less
+    H+ v.
+
+    .. math:: P = H^+ R H^{+T} + H^+ \, \mathrm{E}(\delta N \, \delta N^T) \, H^{+T}
+    """
     if s.group.footer.get("equation") != "frozen":
         return np.full(s.n, np.nan)
     return np.sqrt(s.linear_bound**2 + mean((s.error - s.of_truth("linear_error")) ** 2, s.solved))

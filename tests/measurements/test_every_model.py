@@ -38,7 +38,7 @@ def every_estimator(experiment: str, scenario: Scenario) -> dict[str, Estimator]
         if option.source == own:
             config = OmegaConf.to_container(OmegaConf.load(option.path), resolve=True)
             estimator = construct(config, f"estimators.{option.name}")
-            if not estimator.missing(scenario.problem) and (experiment, option.name) not in SLOW_TO_CONVERGE:
+            if not estimator.hindrance(scenario.problem) and (experiment, option.name) not in SLOW_TO_CONVERGE:
                 found[option.name] = estimator
     return found
 

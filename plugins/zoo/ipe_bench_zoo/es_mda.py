@@ -56,7 +56,7 @@ class EsMda(Estimator):
         return "map" if self.polish else None
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
-        self.require_needs(problem)
+        self.require_suited(problem)
         objective = Objective.of(problem, z, self.prior_inflation)
         with np.errstate(all="ignore"):
             smoothed = self._smooth(objective)

@@ -59,7 +59,7 @@ class MultipleShooting(Estimator):
     needs: ClassVar[frozenset[Need]] = frozenset({"differential equations"})
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
-        self.require_needs(problem)
+        self.require_suited(problem)
         counted = CountingModel(problem.measurement, EvaluationCount.zeros(len(z)))
         shooting = Shooting(Pieces.of(problem, self.segments, self.step), counted, z, np.arange(len(z)))
         limits = Limits(self.tolerance, self.max_iterations, self.budget, history)

@@ -72,5 +72,5 @@ def test_a_bad_trial_disturbs_no_other():
 
 
 def test_other_models_are_refused():
-    with pytest.raises(UserError, match="has no differential equations"):
+    with pytest.raises(UserError, match="multiple_shooting: needs differential equations, which"):
         MultipleShooting().estimate(Problem(Linear(), Covariance(np.ones(11))), np.zeros((1, 11)))
