@@ -101,7 +101,7 @@ class Estimates:
 
 
 class Estimator(Component, ABC):
-    """Turns readings into parameters: a frozen dataclass, whose fields are its options and its identity.
+    """Turns readings into parameters: a frozen dataclass of its options.
 
     Required: `estimate`. Optional: `needs`, `equation`, `family`, and `hindrance`, which is asked before any work.
     Promised: a trial has the same bits alone and in any batch, its random numbers included, so products are stacked
@@ -116,8 +116,8 @@ class Estimator(Component, ABC):
     ...         return ib.Estimates(x=x, status=np.full(len(z), ib.Status.CONVERGED))
     >>> scenario = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01))
     >>> print(Nominal().estimate(scenario.problem, scenario.draw(0, 2).z).x)
-    [[0. 0. 0.]
-     [0. 0. 0.]]
+    [[0. 0. 0. 0.]
+     [0. 0. 0. 0.]]
     """
 
     needs: ClassVar[frozenset[Need]] = frozenset()

@@ -14,7 +14,7 @@ from ipe_bench.noise.levels import Levels
 
 
 class Noise(Component, ABC):
-    """Adds errors to readings, and states the R that estimators assume: a frozen dataclass, whose fields are its options.
+    """Adds errors to readings, and states the R that estimators assume: a frozen dataclass of its options.
 
     Required: `corrupt` and `covariance`. Optional: `whitened`, if errors are not normal; `true_covariance`, if R is not
     theirs; `completed`, if options may be left to the model. The others are for noise whose level is estimated.
@@ -35,7 +35,7 @@ class Noise(Component, ABC):
     ...     def whitened(self, shape, rng):
     ...         return rng.laplace(0.0, np.sqrt(0.5), shape)
     >>> print(ib.Scenario(ib.measurements.Polynomial(), Laplace()).draw(0, 4).z.shape)
-    (4, 20)
+    (4, 40)
     """
 
     real: ClassVar[bool] = False
@@ -56,7 +56,7 @@ class Noise(Component, ABC):
 
     @abstractmethod
     def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
-        """Returns the readings z (m,) of one trial, from the error-free h (m,) and what the instruments show besides it."""
+        """Returns the readings z (m,) of one trial, from the error-free h (m,) and what instruments show besides it."""
 
     @abstractmethod
     def covariance(self, m: int) -> Covariance:
@@ -75,6 +75,6 @@ class Noise(Component, ABC):
         del model
 
     def whitened(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array | None:
-        """Draws errors of whitened readings, R^-1/2 v, if R is right: independent, of mean 0 and variance 1; None if they
-        are normal. The test of fit takes its law from here."""
+        """Draws errors of whitened readings, R^-1/2 v, if R is right: independent, of mean 0 and variance 1; None if
+        they are normal. The test of fit takes its law from here."""
         del shape, rng

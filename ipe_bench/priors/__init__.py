@@ -21,7 +21,7 @@ _DEFINITE = 1e-12
 
 
 class Prior(Component, ABC):
-    """Draws true parameters about the nominal point: a frozen dataclass, whose fields are its options.
+    """Draws true parameters about the nominal point: a frozen dataclass of its options.
 
     Required: `deviation` and `draw`. Optional: `correlation`, and `normal`. Promised: draws have the nominal point as
     mean, and the covariance P0 of these deviations and correlations; they come from `rng` alone. Estimators that use a

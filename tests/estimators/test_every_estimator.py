@@ -42,6 +42,6 @@ def test_a_trial_that_fails_has_a_status_and_disturbs_no_other(estimator):
 @pytest.mark.parametrize("estimator", FILTERS, ids=str)
 def test_what_an_estimator_needs_is_asked_for(estimator):
     problem = Problem(Bent(), Covariance(np.ones(12)))
-    assert estimator.missing(problem) == ["prior"]
-    with pytest.raises(UserError, match="has no prior"):
+    assert estimator.hindrance(problem) == "needs prior, which measurement=bent does not have"
+    with pytest.raises(UserError, match=f"^{estimator.name}: needs prior, which measurement=bent does not have"):
         estimator.estimate(problem, np.zeros((1, 12)))
