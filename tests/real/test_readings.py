@@ -8,9 +8,10 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from shared.small_models import Bent
 
+import ipe_bench as ib
 from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Bearings, Gins, Ranging
-from ipe_bench.real.readings import header, open_together, write_readings
+from ipe_bench.real.readings import header, open_together, read_tables, write_readings
 
 MODELS = [Ranging(), Bearings(), Gins(), Bent(count=5)]
 
@@ -78,3 +79,16 @@ def test_labels_are_compared_as_what_they_say(tmp_path):
     path.write_text("reading [m],number\n" + "\n".join(f"{i}.5,{i}.0" for i in (5, 3, 1, 2, 4)))
     np.testing.assert_array_equal(open_together([path], Bent(count=5)).z, [1.5, 2.5, 3.5, 4.5, 5.5])
     assert header(Bent(count=5)) == ["number", "reading [m]"]
+
+
+def test_the_samples_of_the_readme_are_found_in_any_folder(tmp_path, monkeypatch):
+    named = Path("ipe_bench/real/samples/oxygen.csv")
+    there = read_tables([Path(ib.__file__).parents[1] / named])
+    monkeypatch.chdir(tmp_path)
+    (found,) = read_tables([named])
+    assert found.rows == there[0].rows
+    named.parent.mkdir(parents=True)
+    named.write_text("t,reading\n1,2\n", encoding="utf-8")  # what is there comes first
+    assert [row for _, row in read_tables([named])[0].rows] == [["1", "2"]]
+    with pytest.raises(UserError, match="there is no such file"):
+        read_tables([named.with_name("other.csv")])
