@@ -38,7 +38,7 @@ class Belief:
 
     @property
     def usable(self) -> Mask:
-        """Where the numbers are finite (trials,)."""
+        """Tells where the numbers are finite (trials,)."""
         return finite(self.mean) & finite(self.U)
 
     def root(self) -> Array:
@@ -46,8 +46,8 @@ class Belief:
         return inverse(self.U)[0]
 
     def given(self, J: Array, r: Array, at: Array) -> tuple[Belief, Array]:
-        """What is believed after readings of unit variance, linear in x, with h(at) - z = r (trials, m) and dh/dx = J,
-        and the squared innovations y' S^-1 y (trials,) of these readings."""
+        """Takes in readings of unit variance, linear in x, with h(at) - z = r (trials, m) and dh/dx = J; returns the
+        belief and the squared innovations y' S^-1 y (trials,) of these readings."""
         # The step s = x - at that minimises |U (s + at - mean)|^2 + |J s + r|^2.
         rows = np.concatenate([self.U, J], axis=1)
         wanted = -np.concatenate([multiply(self.U, at - self.mean), r], axis=1)
@@ -68,7 +68,7 @@ class EpochReadings:
     model: CountingModel
     x0: Array
     deviation: Array
-    """Of the scenario's prior (n,), in multiples of the parameters' units."""
+    """The deviations of the scenario's prior (n,), in multiples of the parameters' units."""
     z: Array
     rows: Rows
     belief: Belief
@@ -88,7 +88,7 @@ class EpochReadings:
         return h - self.epoch.R.whiten(self.z)[:, None]
 
     def physical(self, x: Array) -> Array:
-        """In multiples of the parameters' units."""
+        """Returns x in multiples of the parameters' units."""
         return self.x0 + x * self.deviation
 
     def subset(self, kept: Mask) -> EpochReadings:
@@ -97,7 +97,7 @@ class EpochReadings:
 
 @dataclass(frozen=True)
 class InformationFilter(Estimator):
-    """What the filters of this room have in common: the prior, the epochs, failures and the report.
+    """Holds what the filters of this room share: the prior, the epochs, failures and the report.
 
     Reports its P, and as `extras["nis"]` the trial's squared innovations over their number: 1 on average where the
     filter is consistent.
@@ -110,7 +110,7 @@ class InformationFilter(Estimator):
 
     @abstractmethod
     def update(self, readings: EpochReadings) -> tuple[Belief, Array]:
-        """What is believed after an epoch's readings, and the squared innovations (trials,) of the prediction."""
+        """Takes in an epoch's readings; returns the belief and the squared innovations (trials,) of the prediction."""
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         self.require_suited(problem)
@@ -119,7 +119,7 @@ class InformationFilter(Estimator):
 
 
 class _Beliefs(Walk):
-    """What is believed of the trials of a batch; those that fail keep what they believed before the epoch."""
+    """The beliefs of a batch of trials; those that fail keep what they believed before the epoch."""
 
     def __init__(self, filter: InformationFilter, problem: Problem, z: Array) -> None:
         super().__init__(problem, z)
@@ -164,11 +164,11 @@ def regressed(readings: EpochReadings, x: Array, U: Array) -> tuple[Array, Array
 
 @dataclass(frozen=True)
 class Linearized:
-    """Where an epoch stands; every field has the trials in front."""
+    """The state of an epoch; every field has the trials in front."""
 
     x: Array
     U: Array
-    """Of the covariance over which the readings are linearised."""
+    """A root of the information over which the readings are linearised."""
     r: Array
     A: Array
     W: Array
@@ -179,11 +179,11 @@ class Linearized:
     """The posterior by the present linearisation."""
     innovations: Array
     share: Array
-    """Of the step to the proposal's mean that is tried next."""
+    """The share of the step to the proposal's mean that is tried next."""
     inner: Array
     """Regressions since the covariance was brought up to date."""
     change: Array
-    """What that changed, in deviations and in share of them; infinite before."""
+    """The change that this made, in deviations and in share of them; infinite before."""
 
     @classmethod
     def over(cls, readings: EpochReadings, x: Array, U: Array, change: Array) -> Linearized:

@@ -70,12 +70,12 @@ class Batch(Estimator):
     equation: ClassVar = "least_squares"
 
     def objective(self, problem: Problem, z: Array) -> Objective:
-        """What is minimised for readings z (trials, m)."""
+        """Returns the objective for readings z (trials, m)."""
         return Objective.of(problem, z)
 
     @abstractmethod
     def method(self, objective: Objective) -> Method[Objective, LeastSquaresSystem]:
-        """What minimises it."""
+        """Returns the method that minimises it."""
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         objective = self.objective(problem, z)
@@ -146,7 +146,7 @@ class MultiscaleLM(Estimator):
     """
 
     max_iterations: Count = 1000
-    """Of each of the two minimisations."""
+    """Steps tried in each of the two minimisations."""
     tolerance: Positive = 1e-10
     """Largest Gauss-Newton step in standard deviations of the local bound."""
     damping: Positive = 1e-4
@@ -203,7 +203,7 @@ class Multistart(Estimator):
         limits = Limits(self.tolerance, self.max_iterations, self.budget, history)
 
         def believed(found: Minima, rows: NDArray[np.intp]) -> Mask:
-            """Which minima are believed; those that fit are noted."""
+            """Tells which minima are believed, and notes those that fit."""
             return fitting.note(found, rows) & passes(found, z.shape[1], problem.doubted)
 
         best = minimize(objective, method, np.repeat(x0[None], trials, axis=0), limits)
@@ -322,7 +322,7 @@ class _Residuals:
 
     @cached_property
     def iterates(self) -> list[Array]:
-        """Where slopes were asked for: the start and every accepted step."""
+        """The points at which slopes were asked for: the start and every accepted step."""
         return [self.start]
 
     def r(self, x: Array) -> Array:

@@ -23,7 +23,7 @@ from ipe_bench.states.linearisation import Rule
 from ipe_bench.states.trackers import update
 
 LARGEST = 1e150
-"""What a filter is given must have squares."""
+"""The largest number that a filter takes in, so that its square exists."""
 
 
 class ConstantFilter(ABC):
@@ -61,7 +61,7 @@ class ConstantFilter(ABC):
 
 @dataclass(frozen=True)
 class Sequential(Estimator):
-    """What all filters have in common. A new filter is a frozen dataclass that says how the `ConstantFilter` of a trial
+    """Holds what all filters share. A new filter is a frozen dataclass that says how the `ConstantFilter` of a trial
     begins, or by which `rule` readings are linearised.
 
     Reports the filter's P, and as `extras["nis"]` the trial's squared innovations over their number: 1 on average where
@@ -92,13 +92,13 @@ class Sequential(Estimator):
         raise NotImplementedError
 
     def rule(self) -> Rule:
-        """How readings are linearised where all trials are computed at once."""
+        """Returns how readings are linearised if all trials are computed at once."""
         raise NotImplementedError
 
     @property
     def relinearisations(self) -> tuple[int, float]:
-        """How often the readings of an epoch are linearised at most, and the change of a parameter, in deviations of
-        the updated P, up to which that is not done again."""
+        """Returns the most linearisations of an epoch's readings, and the change of a parameter, in deviations of the
+        updated P, that ends them."""
         return 1, 0.0
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:

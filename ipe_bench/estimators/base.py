@@ -1,4 +1,4 @@
-"""What every estimator is: readings of many trials in, estimates of many trials out."""
+"""Defines an estimator: readings of many trials in, estimates of many trials out."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Estimates:
     jacobians: Array = field(default_factory=lambda: np.zeros(0))
     """Evaluations of dh/dx per trial, likewise."""
     messages: dict[int, str] = field(default_factory=dict)
-    """What went wrong, by trial within the batch."""
+    """The reason of a failure, by trial within the batch."""
     seconds: Array = field(default_factory=lambda: np.zeros(0))
     """Computing time per trial; a batch's time is shared evenly."""
     history: list[Array] | None = None
@@ -67,12 +67,12 @@ class Estimates:
 
     @classmethod
     def join(cls, parts: Sequence[Estimates]) -> Estimates:
-        """The batches one after another."""
+        """Joins batches one after another."""
         n, sizes = parts[0].x.shape[1], [len(part.x) for part in parts]
         starts = np.cumsum([0, *sizes[:-1]]).tolist()
 
         def joined(values: list[Any], *shape: int) -> Any:
-            """NaN where a part has none, and None where no part has any."""
+            """Joins values, NaN if a part has none, and None if no part has any."""
             if all(value is None for value in values):
                 return None
             pairs = zip(values, sizes, strict=True)
@@ -95,7 +95,7 @@ class Estimates:
 
     @classmethod
     def failed(cls, trials: int, n: int, message: str) -> Estimates:
-        """Trials that ended in an exception."""
+        """Makes the estimates of trials that ended in an exception."""
         status = np.full(trials, Status.ERROR, dtype=np.int8)
         return cls(np.full((trials, n), np.nan), status, messages=dict.fromkeys(range(trials), message))
 

@@ -49,9 +49,9 @@ class ConvergenceCheck:
     """How far each trial has come after a step; every field is (trials,)."""
 
     size: Array
-    """How far the equation is from holding, in standard deviations: converged where it is within the tolerance."""
+    """How far the equation is from holding, in standard deviations; within the tolerance, the trial has converged."""
     growth: Array
-    """What grows where the iteration diverges; not finite where the model or the algebra has overflowed."""
+    """A size that grows if the iteration diverges; not finite if the model or the algebra has overflowed."""
     moved: Array
     """The last step, in standard deviations; infinite before the first."""
     stuck: Mask | bool = False
@@ -73,12 +73,12 @@ class Method(ABC, Generic[E, S]):
 
     @abstractmethod
     def check(self, system: E, before: S | None, state: S) -> ConvergenceCheck:
-        """How far the trials have come; `before` is the state of a step ago, None at the start."""
+        """Measures how far the trials have come; `before` is the state of a step ago, None at the start."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """How far an iteration goes."""
+    """The limits of an iteration."""
 
     tolerance: float
     """A trial has converged once `ConvergenceCheck.size` is at most this."""

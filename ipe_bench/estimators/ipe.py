@@ -63,7 +63,7 @@ class System(Protocol):
 
 @dataclass(frozen=True)
 class State:
-    """What a solver carries from step to step. Every field is an array with the trials axis in front, so that the
+    """The state of a solver between steps. Every field is an array with the trials axis in front, so that the
     driver can drop the trials that have finished; a solver with a memory adds fields in a subclass."""
 
     x: Array
@@ -237,7 +237,7 @@ class IPE(Method[FrozenSystem, S], Estimator, Generic[S]):
 
 
 def root_check(deviation: Array, before: State | None, state: State) -> ConvergenceCheck:
-    """How far F is from zero, and how long the last step was, in standard deviations (1, n) or (trials, n)."""
+    """Measures F and the last step in standard deviations (1, n) or (trials, n)."""
     residual = np.abs(state.F / deviation).max(axis=1)
     moved = np.full(len(residual), np.inf)
     if before is not None:

@@ -39,8 +39,8 @@ class Objective:
     prior: Covariance | None = None
     """P0, where it counts."""
     exact_within: float = np.inf
-    """Where the Gauss-Newton step still to go is shorter than so many deviations, Jacobians are exact, elsewhere
-    coarse; infinite: they are exact everywhere; 0: coarse, and good enough to end with."""
+    """Jacobians are exact if the Gauss-Newton step still to go is shorter than so many deviations, else coarse;
+    infinite: always exact; 0: always coarse, and good enough to end with."""
 
     @classmethod
     def of(cls, problem: Problem, z: Array, inflation: float | None = None) -> Objective:
@@ -61,7 +61,7 @@ class Objective:
         return np.concatenate([r, self.prior.whiten(x - self.x0)], axis=1)
 
     def cost(self, x: Array, r: Array) -> Array:
-        """What is minimised (trials,) at x, where the residuals are r: half its gradient is J' r."""
+        """Returns the objective (trials,) at x, where the residuals are r: half its gradient is J' r."""
         return squared(r)
 
     def jacobian(self, x: Array, *, coarse: Mask | bool = False) -> Array:
@@ -110,7 +110,7 @@ class NormalEquations:
 
     @classmethod
     def of(cls, J: Array, r: Array, *, keep_Q: bool = False) -> NormalEquations:
-        """Of J (trials, m, n) and residuals r (trials, m)."""
+        """Factors J (trials, m, n) for residuals r (trials, m)."""
         A = np.ascontiguousarray(J)
         with np.errstate(all="ignore"):
             U, inverse_U, well = definite_factor(np.matmul(A.swapaxes(1, 2), A))
@@ -195,30 +195,30 @@ def slope_at(
 
 @dataclass(frozen=True)
 class LeastSquaresSystem:
-    """What these methods carry from step to step; every field has the trials in front."""
+    """The state of these methods; every field has the trials in front."""
 
     x: Array
     r: Array
     """Whitened residuals, those of the prior included."""
     cost: Array
-    """What is minimised: |r|^2, unless the objective says otherwise."""
+    """The objective: |r|^2, unless it says otherwise."""
     slope: NormalEquations
     moved: Array
     """The last step, tried or taken, in standard deviations of the readings that it moves."""
     lam: Array
     growth: Array
     scale: Array
-    """What damping measures steps by: the diagonal of D (trials, n)."""
+    """The scale of damped steps: the diagonal of D (trials, n)."""
     regular: Mask
-    """Where J had full rank somewhere on the way: an end without it is then a place, and no property of the problem."""
+    """True if J had full rank somewhere on the way: an end without it is then a place, no property of the problem."""
     mark: Array
     """The objective when it last decreased visibly."""
     idle: NDArray[np.int64]
     """Steps since the objective last decreased visibly."""
     exact: Mask
-    """Where the slope is that of an exact Jacobian."""
+    """True if the slope is that of an exact Jacobian."""
     near: Mask
-    """Where Jacobians are exact from now on, since the minimum is near."""
+    """True if Jacobians are exact from now on, since the minimum is near."""
 
     @classmethod
     def at(cls, objective: Objective, x: Array, lam: float = 0.0, *, keep_Q: bool = False) -> LeastSquaresSystem:
@@ -234,7 +234,7 @@ class LeastSquaresSystem:
         return cls(x, r, cost, slope, far, damping, growth, scale, regular, cost, idle, exact, near)
 
     def nearly(self, objective: Objective) -> Mask:
-        """Where the next Jacobian is to be exact, and all after it."""
+        """Tells whether the next Jacobian (trials,) is to be exact, and all after it."""
         return self.near | (self.slope.size < objective.exact_within)
 
     def reach(self, step: Array) -> Array:
@@ -248,7 +248,7 @@ class LeastSquaresSystem:
 
     @property
     def rankless(self) -> Mask:
-        """Where J has not full rank (trials,)."""
+        """Tells whether J lacks full rank (trials,)."""
         return ~np.isfinite(self.slope.size)
 
     def check(self, objective: Objective, stuck: Mask) -> ConvergenceCheck:

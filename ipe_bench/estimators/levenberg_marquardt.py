@@ -44,7 +44,7 @@ class GaussNewtonMethod(Method[Objective, LeastSquaresSystem]):
     def check(
         self, objective: Objective, before: LeastSquaresSystem | None, state: LeastSquaresSystem
     ) -> ConvergenceCheck:
-        """Where J lacks rank and no step leads on, the trial ends as singular."""
+        """Ends a trial as singular if J lacks rank and no step leads on."""
         return state.check(objective, stuck=state.rankless & (state.moved == 0))
 
 
@@ -62,7 +62,7 @@ class LevenbergMarquardtMethod(Method[Objective, LeastSquaresSystem]):
     """lambda at the start."""
     deviation: Array | None = None
     sizes: float | None = None
-    """What is taken for the magnitude of a parameter that begins nearer to zero; None: not this metric."""
+    """The magnitude of a parameter that begins nearer to zero than this; None: not this metric."""
     by_residual: bool = False
     """lambda begins at the mean squared residual where that is larger: far away, `damping` alone would be none."""
     geodesic: bool = False

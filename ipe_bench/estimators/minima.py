@@ -1,4 +1,4 @@
-"""Where a minimisation of least squares ended: its minima, whether they fit, and which of them are the same."""
+"""Minimises least squares, tests whether minima fit, and tells which of them are the same."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _APART = 0.1
 
 @dataclass(frozen=True)
 class Minima:
-    """Where the minimisation of each trial ended, with what is known of the objective there."""
+    """The end of the minimisation of each trial, with what is known of the objective there."""
 
     x: Array
     status: NDArray[np.int8]
@@ -44,13 +44,13 @@ class Minima:
 
     @classmethod
     def of(cls, ended: SolveResult[Any], covariance: Array, r: Array) -> Minima:
-        """Where an iteration ended, with whitened residuals r (trials, m) there."""
+        """Makes the minima of an iteration that has ended, with whitened residuals r (trials, m) there."""
         bulk = np.median(np.abs(r), axis=1)
         return cls(ended.x, ended.status, ended.iterations, ended.history, covariance, squared(r), bulk)
 
     @classmethod
     def nowhere(cls, x: Array, history: bool) -> Minima:
-        """No minimum for any trial, at its start x (trials, n)."""
+        """Marks every trial as without a minimum, at its start x (trials, n)."""
         trials, n = x.shape
         status, none = np.full(trials, Status.MAX_ITERATIONS, np.int8), np.zeros(trials, np.int64)
         unknown, far = np.full((trials, n, n), np.nan), np.full(trials, np.inf)
@@ -61,7 +61,7 @@ class Minima:
         return self.status == Status.CONVERGED
 
     def better_than(self, old: Minima) -> Mask:
-        """Which of these count rather than the old ones: they converged and are lower, or the old one had no end."""
+        """Tells which replace the old ones: they converged and are lower, or the old one had no end."""
         return self.converged & (~(self.chi_square >= old.chi_square) | ~old.converged)
 
     def replaced(self, rows: NDArray[np.intp], again: Minima, better: Mask) -> Minima:
@@ -78,7 +78,7 @@ class Minima:
         return chdtrc(max(readings - self.x.shape[1], 1), self.chi_square)
 
     def estimates(self, tally: EvaluationCount, readings: int) -> Estimates:
-        """What an estimator hands back."""
+        """Makes the estimates of an estimator that ends here."""
         return Estimates.of(self, tally, covariance=self.covariance, extras={"fit_p": self.fit_probability(readings)})
 
 
@@ -95,7 +95,7 @@ def minimize(objective: Objective, method: Method[Objective, LeastSquaresSystem]
 
 
 def minima_of(ended: SolveResult[Any], slope: NormalEquations, readings: int) -> Minima:
-    """What is known of the objective where an iteration of it ended with that slope."""
+    """Makes the minima of an iteration that has ended with that slope."""
     # U^-1 U^-T: inverting U'U would lose twice the digits, and with them the sign of a variance.
     lost = ~finite(slope.inverse_U)
     inverse_U = put(slope.inverse_U, lost, inverse(slope.U[lost])[0]) if lost.any() else slope.inverse_U
@@ -118,7 +118,7 @@ class Fitting:
 
     readings: int
     known: list[list[Array]]
-    """Of each trial, in the order in which they were found."""
+    """The minima of each trial, in the order in which they were found."""
 
     @classmethod
     def none(cls, trials: int, readings: int) -> Fitting:
@@ -149,7 +149,7 @@ class Fitting:
 
 
 def passes(found: Minima, readings: int, significance: float) -> Mask:
-    """Which minima (trials,) pass the test of the fit; none at a significance of 1: their residuals say nothing."""
+    """Tells which minima (trials,) pass the test of the fit; none at a significance of 1: residuals say nothing."""
     return (found.fit_probability(readings) >= significance) & (significance < 1)
 
 
@@ -162,5 +162,5 @@ def spread_of_starts(problem: Problem) -> Array:
 
 
 def _apart(a: Array, b: Array, deviation: Array) -> bool:
-    """Whether two minima (n,) are two."""
+    """Tells whether two minima (n,) are two."""
     return bool((np.abs(a - b) / deviation).max() > _APART)

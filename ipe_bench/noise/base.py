@@ -1,4 +1,4 @@
-"""What a noise is: it adds errors to simulated readings, and states the R that estimators assume."""
+"""Defines a noise: it adds errors to simulated readings, and states the R that estimators assume."""
 
 from __future__ import annotations
 

@@ -83,7 +83,7 @@ class NoNoise(ScaledNoise):
 class StudentT(ScaledNoise):
     """z = h + v with independent v of Student's t distribution, scaled to the given standard deviation.
 
-    Estimators are told the true covariance R = deviation^2 I; what they do not know is the shape.
+    Estimators are given the true covariance R = deviation^2 I, and do not know the shape.
     """
 
     degrees_of_freedom: Annotated[float, Gt(2)] = 3.0
@@ -145,7 +145,7 @@ class Quantization(Noise):
     """
 
     step: Positive | None = None
-    """In the unit of the readings; None: that of the model's usual noise."""
+    """The step in the unit of the readings; None: that of the model's usual noise."""
     deviation: Positive | None = None
     dither: bool = False
 
@@ -186,14 +186,14 @@ class Colored(ScaledNoise):
     """
 
     correlation: Annotated[float, Gt(-1), Lt(1)] = 0.5
-    """Of successive readings of one instrument."""
+    """The correlation of successive readings of one instrument."""
     channels: Count = 1
     length: Count | None = None
     """Readings per instrument in one series; None: all of them."""
     assumed: Literal["white", "full"] = "white"
 
     def _series(self, m: int) -> tuple[int, int, int]:
-        """How m readings divide: (series after one another, length, channels)."""
+        """Divides m readings: (series after one another, length, channels)."""
         length = m // self.channels if self.length is None else self.length
         if length == 0 or m % (length * self.channels):
             raise UserError(f"channels={self.channels}, length={self.length}: {m} readings do not divide into these")
@@ -231,7 +231,7 @@ class Correlated(ScaledNoise):
     """
 
     correlation: Annotated[float, Ge(0), Lt(1)] = 0.5
-    """Of two readings of one block."""
+    """The correlation of two readings of one block."""
     block: Count | None = None
     """Readings per block; None: all are one."""
     matrix: tuple[tuple[float, ...], ...] | None = None

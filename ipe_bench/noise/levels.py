@@ -23,7 +23,7 @@ _PROBES = 1000
 
 @functools.cache
 def read_sigma(text: str) -> Arithmetic:
-    """The formula of a standard deviation.
+    """Reads the formula of a standard deviation.
 
     Raises:
         UserError: it is no formula, has no level, or is negative at some levels and readings, all of them positive.
@@ -52,7 +52,7 @@ def read_sigma(text: str) -> Arithmetic:
 
 
 def level_names(formula: Arithmetic) -> tuple[str, ...]:
-    """The names of the levels of a group of readings."""
+    """Returns the names of the levels of a group of readings."""
     return tuple(name for name in formula.names if name != READING)
 
 
@@ -82,13 +82,13 @@ class Levels:
         return tuple(Parameter(name, self.unit if alone else "") for name in named)
 
     def restricted(self, rows: NDArray[np.intp]) -> Levels:
-        """Those of some of the readings."""
+        """Returns the levels restricted to these rows."""
         kept, group = np.unique(self.group[rows], return_inverse=True)
         groups = tuple(self.groups[k] for k in kept)
         return replace(self, weights=self.weights[rows], groups=groups, group=group)
 
     def covariance(self, h: Array, theta: Array) -> Covariance:
-        """R of readings h (m,) for logarithms theta (k,) of the levels.
+        """Returns R of readings h (m,) for logarithms theta (k,) of the levels.
 
         Raises:
             UserError: the standard deviation of a reading is zero, which makes its likelihood infinite.

@@ -40,7 +40,7 @@ class Question:
 
     @property
     def has_prior(self) -> bool:
-        """Whether anything says how far the parameters may lie from the nominal point."""
+        """Tells whether anything says how far the parameters may lie from the nominal point."""
         deviating = any(one.deviation is not None for one in self.known)
         return deviating or self.prior is not None or self.error_scale is not None
 
@@ -76,7 +76,7 @@ class Question:
 
     @cached_property
     def problem(self) -> Problem:
-        """What estimators are told, a prior only if one is stated."""
+        """The problem that estimators are given, with a prior only if one is stated."""
         return self.scenario.problem if self.has_prior else self.scenario.problem.without_prior()
 
     def checked(self) -> Question:
@@ -106,7 +106,7 @@ class Question:
         return fits, examine(self.problem, self.found.z, fits)
 
     def _noise(self) -> Noise:
-        """What is stated, or a file's column of standard deviations, or the model's own; else its level is unknown."""
+        """Returns the stated noise, or that of a file's column, or the model's own; else its level is unknown."""
         found = self.found
         stated = self.noise.of(found.model) if isinstance(self.noise, ModelNoise) else self.noise
         if self.readings is None and stated is None:

@@ -1,5 +1,5 @@
-"""What can be said of a least-squares minimum beyond its standard errors: intervals that follow the bends of the model,
-which readings carry the answer, and whether another answer fits as well."""
+"""Examines a least-squares minimum beyond its standard errors: intervals that follow the bends of the model, which
+readings carry the answer, and whether another answer fits as well."""
 
 from __future__ import annotations
 
@@ -255,7 +255,7 @@ class Examination:
 
     @property
     def least(self) -> bool:
-        """Whether the estimate is the least minimum that was found."""
+        """Tells whether the estimate is the least minimum that was found."""
         return self.chi_square <= self.minima[0].chi_square + _LOWER * max(1.0, self.chi_square)
 
     @property

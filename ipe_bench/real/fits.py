@@ -36,7 +36,7 @@ _SAME_LEVEL = 1e-3
 _SMALLEST_LEVEL = 1e-8
 """The least level that estimators are told, as a share of the readings: steps of round-off must not count."""
 _FARTHEST = 40.0
-"""A normal deviate beyond every limit."""
+"""Stands for an infinite normal deviate."""
 _OPEN = 1e-4
 """A combination of parameters that changes the readings by less than this share of what others do may be open."""
 _DOUBTED = 0.05
@@ -68,7 +68,7 @@ class Given:
 
 @dataclass(frozen=True, kw_only=True)
 class Fit:
-    """What one estimator makes of the readings."""
+    """The fit of one estimator to the readings."""
 
     label: str
     estimator: Estimator
@@ -224,7 +224,7 @@ class Fit:
 
     @property
     def fits(self) -> bool | None:
-        """Whether the residuals are as small as R says, or as small as they can be; None if neither can be told."""
+        """Tells whether residuals are as small as R says, or as small as they can be; None if neither can be told."""
         if self.beaten_by or (np.isfinite(self.x).all() and not np.isfinite(self.residual).all()):
             return False
         # The size of the residuals says nothing of the model where it made R, nor without any degrees of freedom.
@@ -232,7 +232,7 @@ class Fit:
 
     @property
     def passes(self) -> bool:
-        """Whether the estimator converged, and nothing says that the model does not fit."""
+        """Tells whether the estimator converged, and nothing says that the model does not fit."""
         return self.status is Status.CONVERGED and self.fits is not False
 
     @property

@@ -39,7 +39,7 @@ _LEAST_SHARE = 1e-8
 _HOLD = 1e-2
 """The weight with which the logarithm of a level is held where a search begins: that of a level of zero is infinite."""
 _SHIFT = 3.0
-"""What is added to the logarithm of sigma over R's, since the methods need a positive objective."""
+"""Added to the logarithm of sigma over R's, since the methods need a positive objective."""
 _LEAST_SPARE = 1e-9
 """The least degree of freedom of a reading, by which its residual is divided."""
 
@@ -112,8 +112,14 @@ class _Known(Measurement):
     """Readings without a parameter."""
 
     h: Array
-    parameters = ()  # type: ignore[assignment]
-    index = property(lambda model: {"row": range(len(model.h))})  # type: ignore[assignment]
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return ()
+
+    @property
+    def index(self) -> dict[str, range]:
+        return {"row": range(len(self.h))}
 
     def __post_init__(self) -> None:
         """Made of numbers."""
@@ -155,7 +161,7 @@ class Likelihood(Objective):
 
 
 def objective_of(problem: Problem, z: Array, model: CountingModel | None = None) -> Objective:
-    """What is minimised for readings z (trials, m): -2 times the log likelihood if x has levels, else the sum of
+    """Returns the objective for readings z (trials, m): -2 times the log likelihood if x has levels, else the sum of
     squares. `model` replaces the problem's."""
     model, whole = model or CountingModel(problem.measurement, EvaluationCount.zeros(len(z))), problem.measurement
     given = model, problem.R, z, np.arange(len(z)), problem.x0

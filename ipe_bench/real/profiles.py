@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,7 +100,7 @@ class Released:
     """The sign that leads inwards, of each."""
 
     def inside(self, x: Array) -> Mask:
-        """Which of the points x (points, n) are within each of these bounds, (points, bounds)."""
+        """Tells which of the points x (points, n) are within each of these bounds, (points, bounds)."""
         return (x - self.x)[:, self.places] * self.inwards >= 0
 
 
@@ -176,7 +177,7 @@ class _Side:
 
     def __post_init__(self) -> None:
         self.seen: dict[float, tuple[float, Array]] = {0.0: (0.0, self.x)}
-        """By distance from the estimate: the rise up to twice q, and the parameters."""
+        """The rise up to twice q, and the parameters, by distance from the estimate."""
 
     def end(self) -> float:
         """The distance to the end; infinite if there is none, NaN if minima cannot be followed to it."""
@@ -184,8 +185,7 @@ class _Side:
         near, far = 0.0, half / 8
         for _ in range(_STRETCHES):
             if (risen := self.rise(far)) >= self.q:
-                found = brentq(lambda distance: self.rise(distance) - self.q, near, far, xtol=_PRECISION * half)
-                far = float(found)  # type: ignore[arg-type]
+                far = cast(float, brentq(lambda d: self.rise(d) - self.q, near, far, xtol=_PRECISION * half))
                 if (risen := self.rise(far, around=True)) >= (1 - _JUMP) * self.q:
                     return far if self.rise((1 - _STEP) * far) >= (1 - _JUMP) * self.q else np.nan
                 self.seen = {far: self.seen[far]}
@@ -250,14 +250,13 @@ class _Pinned(CountingModel):
 
 
 def _along(x: Array, P: Array, place: int, at: float) -> Array:
-    """Where a linear model of covariance P (n, n) leads from its minimum x (n,), when the parameter of a place has a
-    value."""
+    """Follows a linear model of covariance P (n, n) from its minimum x (n,) to a value of the parameter of a place."""
     return x + P[:, place] / P[place, place] * (at - x[place])
 
 
 def _ahead(objective: Objective, near: Array, place: int, at: float) -> Array:
-    """Where the profile leads from one of its points `near` (n,) if the model is straight on the way, when the
-    parameter of a place has a value."""
+    """Follows the profile from one of its points `near` (n,) to a value of the parameter of a place, if the model is
+    straight on the way."""
     with np.errstate(all="ignore"):
         J = objective.jacobian(near[None])[0]
     if not np.isfinite(J).all():

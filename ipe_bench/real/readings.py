@@ -213,7 +213,7 @@ def _with_text(table: Table, data: bytes) -> Table:
 
 
 def labels(model: Measurement) -> Mapping[str, Sequence[Any]]:
-    """What stands in every column but that of the readings."""
+    """Returns the entries of every column but that of the readings."""
     return {**model.index, **model.input_columns}
 
 
@@ -332,7 +332,7 @@ def _readings_in(table: Table, model: Measurement) -> Readings:
 
 
 def _rows_of(table: Table, model: Measurement, also: Sequence[str]) -> list[int]:
-    """Where in the table each of the model's readings stands; `also` names further columns that are understood."""
+    """Finds the row of each of the model's readings in the table; `also` names further columns that are understood."""
     wanted = header(model)
     for name in (*model.index, wanted[-1]):
         if name not in table.heading:
@@ -369,7 +369,7 @@ def _label(text: str, number: Callable[[str], float | None] = _number) -> Any:
 
 
 def _shown_as(model: Measurement) -> list[str]:
-    """What the column of the readings may be called."""
+    """Returns the names that the column of the readings may have."""
     unit = f" [{model.reading_unit}]" if model.reading_unit else ""
     return [f"{name}{unit}" for name in dict.fromkeys((model.reading_name, "reading"))]
 

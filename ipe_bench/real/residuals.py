@@ -1,4 +1,4 @@
-"""What the residuals of one fit say of the model: whether they are white, and which readings are outliers."""
+"""Tests the residuals of one fit: whether they are white, and which readings are outliers."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ class Log:
     """Readings of a model's epochs."""
 
     model: StateModel
-    """With as many epochs as the file has rows, and with the inputs of the file, if it is written in formulas."""
+    """The model with an epoch per row of the file, and with the inputs of the file if it is written in formulas."""
     z: Array
     """(K, m); NaN where a reading is missing."""
     file: tuple[str, str] | None = None
@@ -119,7 +119,7 @@ class Constant:
 
 @dataclass(frozen=True)
 class LogTracks:
-    """What one tracker makes of a log, in the units of the states."""
+    """The track of a log by one tracker, in the units of the states."""
 
     label: str
     mean: Array
@@ -131,15 +131,15 @@ class LogTracks:
     mean_nis: float
     """Their sum over the number of readings: 1 on average if the filter is right."""
     limits: tuple[float, float]
-    """Where that mean lies with a probability of 95 % if the filter is right."""
+    """The interval that holds that mean with a probability of 95 % if the filter is right."""
     white_p: float
     """The p-value of Ljung and Box's test that innovations are white."""
     log_likelihood: float
-    """Of the readings; NaN for a smoother."""
+    """The log likelihood of the readings; NaN for a smoother."""
     passes: bool
     """Whether there is a track, and its innovations are no larger than chance explains."""
     message: str
-    """Why there is no track, or no constant; empty if there is one."""
+    """The reason why there is no track, or no constant; empty if there is one."""
     constants: Sequence[Constant] = ()
     """The constants that were asked for."""
 
@@ -165,7 +165,7 @@ class LogTracks:
 
     @property
     def verdict(self) -> str:
-        """Whether the covariance of the innovations is as large as they are."""
+        """Tells whether the covariance of the innovations is as large as they are."""
         if not np.isfinite(self.mean_nis):
             return "-"
         low, high = self.limits
@@ -235,7 +235,7 @@ def _place(model: Formulas, name: str) -> tuple[str, str]:
 
 
 def _minimum(cost: Callable[[Array], float], u: Array) -> tuple[Array, Array]:
-    """Where the cost is least, and standard errors by its second derivatives there; NaN if it has no such minimum."""
+    """Minimises the cost, with standard errors by its second derivatives there; NaN if it has no such minimum."""
     from scipy.optimize import minimize
 
     n = len(u)

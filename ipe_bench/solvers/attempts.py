@@ -40,7 +40,7 @@ class Attempts(ABC):
     z: Array
     tally: EvaluationCount
     limits: Limits
-    """Of a minimisation on all data."""
+    """The limits of a minimisation on all data."""
     growth: float
     window_tolerance: float
     restarts: int | None
@@ -49,10 +49,10 @@ class Attempts(ABC):
     planned: ClassVar[int]
     """The number of attempts."""
     repeats: ClassVar[int] = 1
-    """How many attempts must lead to a minimum again for it to be believed, one of them at least from independent
+    """The number of attempts that must lead to a minimum again for it to be believed, one at least from independent
     draws."""
     most: ClassVar[float] = np.inf
-    """What a search that has tried draws may cost, times the cost of a simulation and a Jacobian."""
+    """The most that a search which has tried draws may cost, in costs of a simulation and a Jacobian."""
 
     @property
     def last(self) -> int:
@@ -65,8 +65,8 @@ class Attempts(ABC):
 
     @abstractmethod
     def draws(self, k: int) -> int:
-        """How many independent draws the k-th attempt begins from; 0 if it begins at the nominal point or where the
-        readings point."""
+        """Returns the number of independent draws that the k-th attempt begins from; 0 if it begins at the nominal
+        point or where the readings point."""
 
     def plain(self, k: int, rows: Rows) -> Minima:
         """Levenberg-Marquardt on all data from the nominal point: in the metric of the parameters' sizes (0), and in
@@ -128,8 +128,8 @@ _HALVINGS = ((5, 5), (15, 2), (_SHORT, 1))
 
 @dataclass(frozen=True)
 class Stages(Attempts):
-    """From the nominal point under two metrics; from the two best points on the ray through the nominal point; then
-    from the best of 20 random points, again and again."""
+    """Starts from the nominal point under two metrics; from the two best points on the ray through the nominal point;
+    then from the best of 20 random points, again and again."""
 
     planned = 16
     repeats = 3
@@ -184,7 +184,7 @@ class Stages(Attempts):
         return 10 ** rng.uniform(-2.5, 0.5, (_LOOKS, 1)) * (x0 + 0.5 * rng.standard_normal((_LOOKS, n)))
 
     def _halved(self, k: int, rows: Rows) -> Minima:
-        """From 20 wide draws, of which few steps thin out those that fit worst: how well a start fits says little."""
+        """Starts from 20 wide draws and drops the worst after few steps: how well a start fits says little."""
         owner, x = np.repeat(rows, _LOOKS), np.tile(self._points(k, wide=True), (len(rows), 1))
         found = Minima.nowhere(x, False)
         for steps, kept in _HALVINGS:
@@ -209,11 +209,11 @@ def _finite(cost: Array) -> Array:
 _DAMPING = 1.0
 """lambda at the start of every window."""
 _FIRST_ITERATIONS = 10
-"""In each window of the first attempt."""
+"""Steps in each window of the first attempt."""
 _SLOW_GROWTH = 1.4
-"""Of the windows of a careful attempt, at most."""
+"""The most that the windows of a careful attempt grow."""
 _CAREFUL_ITERATIONS = (60, 30)
-"""In the first window of a careful attempt, and in later ones."""
+"""Steps in the first window of a careful attempt, and in later ones."""
 _FIRST_DRAWS = 16
 _RANDOMISED = 2
 """Windows, those which leave much open, in which the prior of a candidate is centred at its own start; one more with
@@ -230,8 +230,8 @@ _ONE = (0.03, 0.003)
 
 @dataclass(frozen=True)
 class Windows(Attempts):
-    """By growing windows of data: from the nominal point, then carefully from there, then from 16, 32, ... 256 draws of
-    the prior; among them, where a prior is known after the first draws, Levenberg-Marquardt on all data.
+    """Follows growing windows of data: from the nominal point, then carefully from there, then from 16, 32, ... 256
+    draws of the prior; among them, where a prior is known after the first draws, Levenberg-Marquardt on all data.
 
     In the first two windows, whose fits have several minima of one depth, each candidate's prior is centred at its own
     draw: the randomised maximum likelihood of Oliver, He and Reynolds (5th European Conference on the Mathematics of
@@ -241,8 +241,8 @@ class Windows(Attempts):
     planned = 9
 
     def _place(self, k: int) -> tuple[int | None, int]:
-        """Which of the two attempts on all data the k-th one is, if any, and its place among those by windows: 0 and 1
-        are from the nominal point, later ones from draws."""
+        """Tells which of the two attempts on all data the k-th one is, if any, and its place among those by windows: 0
+        and 1 are from the nominal point, later ones from draws."""
         plain = 2 if self.prior is None else 3
         return (k - plain if plain <= k < plain + 2 else None), (k if k < plain else k - 2)
 
@@ -267,7 +267,7 @@ class Windows(Attempts):
         return result
 
     def _reach(self, rows: Rows) -> Array:
-        """How far the parameters of the trials `rows` may lie if no prior says so: the median of the distances in the
+        """Returns how far the parameters of the trials `rows` may lie if no prior says so: the median distance in the
         linear estimate, rounded up to a power of ten, since a prior ten times too wide does no harm."""
         tally = EvaluationCount.zeros(len(rows))
         x = starting_points(self.problem, self.z[rows], "linear_lse", tally)
@@ -313,7 +313,7 @@ class Windows(Attempts):
         return self._best(rows, owner, found)
 
     def _best(self, rows: Rows, owner: Rows, found: Minima) -> Minima:
-        """Of each trial's candidates the best; a trial that has none left has not arrived."""
+        """Returns each trial's best candidate; a trial that has none left has not arrived."""
         result = Minima.nowhere(np.repeat(self.problem.x0[None], len(rows), axis=0), self.limits.history)
         order = np.lexsort((_finite(found.chi_square), ~found.converged, owner))
         owners, first = np.unique(owner[order], return_index=True)
@@ -350,7 +350,7 @@ def _kept(
 
 
 def _draws(k: int) -> int:
-    """How many candidates the k-th attempt by windows begins with."""
+    """Returns the number of candidates that the k-th attempt by windows begins with."""
     return _FIRST_DRAWS * 2 ** (k - 2) if k > 1 else 1
 
 

@@ -22,7 +22,7 @@ from ipe_bench.solvers.progressive import Progressive, accepted
 
 _CONFIRMATIONS = 4
 _DAMPING, _STEPS = 1e-3, 100
-"""Of a minimisation that looks for another minimum: lambda at its start, and steps tried."""
+"""lambda at the start of a minimisation that looks for another minimum, and steps tried."""
 
 CHORDS, PROGRESSIVE = 1, 2
 """The stages, as extras `stage` names them."""

@@ -20,7 +20,7 @@ _TRIED, _PER_DECADE = 6, 3
 """After `_TRIED` steps from the linear estimate, each decade by which the remaining step has shrunk may have taken at
 most `_PER_DECADE` steps, the first three aside: far from the root the steps wander."""
 _NEAR_ROOT = 1e-2
-"""How near to the root of eq. (11), in deviations, they bring a trial before the Jacobian there takes over."""
+"""The distance from the root of eq. (11), in deviations, at which the Jacobian there takes over."""
 _CHORDS = 8
 """Steps with one Jacobian from then on."""
 _JACOBIANS = 16
@@ -35,19 +35,19 @@ _DEPTH = 5
 
 @dataclass(frozen=True)
 class OnChord:
-    """What chord steps carry; every field has the trials in front."""
+    """The state of chord steps; every field has the trials in front."""
 
     x: Array
     r: Array
     """Whitened residuals."""
     slope: NormalEquations
-    """That of the chord's Jacobian, towards r."""
+    """The normal equations of the chord's Jacobian, towards r."""
     dx: Array
     dF: Array
     """The last differences (trials, n, depth) of x and of the steps, newest first."""
     start: Array
     turn: Array
-    """How much J changed (trials, m, n) on the way to the start, per unit of |J dx|."""
+    """The change of J (trials, m, n) on the way to the start, per unit of |J dx|."""
     moved: Array
     bend: Array
     """The part (trials,) of the first step that the next one had to take back; NaN before it."""
@@ -64,8 +64,8 @@ class OnChord:
 
     @property
     def off(self) -> Array:
-        """How far from the minimum (trials,), in deviations, it may be where the steps end, at J' r = 0 for the J of
-        the start.
+        """Bounds the distance (trials,), in deviations, from the end of the steps, at J' r = 0 for the J of the start,
+        to the minimum.
 
         A change of J by the part e on the way makes that an error of about e deviations. e is seen twice: in the part
         of the first step that was taken back, and in the change of J on the way to the start, taken to go on at that
@@ -87,7 +87,7 @@ class Chord(Method[Objective, OnChord]):
     """
 
     bent: float = np.inf
-    """Where `off` is larger, the Jacobian is of no more use."""
+    """If `off` is larger, the Jacobian is of no more use."""
 
     def begin(self, objective: Objective, x: Array) -> OnChord:
         J = objective.jacobian(x)

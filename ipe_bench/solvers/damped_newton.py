@@ -12,7 +12,7 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.estimators.ipe import IPE, State, System
 
 _HALVINGS = 30
-"""Of a step, before the trial counts as stalled."""
+"""The halvings of a step before the trial counts as stalled."""
 
 
 @dataclass(frozen=True)

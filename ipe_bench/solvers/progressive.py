@@ -29,7 +29,7 @@ _TRUSTED = 1e-3
 """A significance of the test of fit from which on a large bulk of residuals is asked for no longer: R is known, or
 unknown."""
 _WORTH = 20.0
-"""What a search for a better fit may cost, in costs of the first fit."""
+"""The most that a search for a better fit may cost, in costs of the first fit."""
 
 
 @dataclass(frozen=True)
@@ -58,11 +58,11 @@ class Progressive(Estimator):
     prior_inflation: Positive = 1.0
     """Times the prior's standard deviations."""
     window_tolerance: Positive = 0.1
-    """Where a window's fit is good enough: the Gauss-Newton step in standard deviations."""
+    """The Gauss-Newton step, in standard deviations, at which a window's fit is good enough."""
     max_iterations: Count = 60
     """Steps of the last pass."""
     tolerance: Positive = 1e-6
-    """Of the last pass: the Gauss-Newton step in standard deviations of the local bound."""
+    """The Gauss-Newton step, in standard deviations of the local bound, that ends the last pass."""
     restarts: Whole | None = None
     """Further attempts at a trial that fails the test; None: eight with windows, fifteen without."""
     budget: Positive | None = None
@@ -125,14 +125,14 @@ class Progressive(Estimator):
 
 
 def _same(one: Minima, other: Minima) -> Mask:
-    """Where two minima (trials,) are one."""
+    """Tells where two minima (trials,) are one."""
     with np.errstate(invalid="ignore"):  # two infinite fits are not one minimum
         near = _SAME_FIT * np.maximum(one.chi_square, other.chi_square)
         return one.converged & other.converged & (np.abs(one.chi_square - other.chi_square) <= near)
 
 
 def _words(tried: int, drawn: int, repeats: int) -> str:
-    """How far the search went in a trial."""
+    """Says how far the search went in a trial."""
     count = f"{tried} more attempt{'' if tried == 1 else 's'}"
     draws = f", from {drawn} independent draws in all" if drawn else ""
     led = f"{repeats} of them led to this minimum again" if repeats else "none found one"
@@ -140,7 +140,7 @@ def _words(tried: int, drawn: int, repeats: int) -> str:
 
 
 def accepted(minima: Minima, readings: int, significance: float) -> Mask:
-    """Which minima (trials,) are taken for the least: those that fit, and those whose bulk of residuals does."""
+    """Tells which minima (trials,) are taken for the least: those that fit, and those whose bulk of residuals does."""
     gross_errors_only = (minima.bulk <= _BULK) & (readings >= _READINGS * minima.x.shape[1])
     fits = passes(minima, readings, significance)
     return minima.converged & (fits | (gross_errors_only & (significance < _TRUSTED)))

@@ -28,13 +28,13 @@ _ROUND_ENDS = (Status.RUNNING, Status.CONVERGED, Status.STALLED, Status.MAX_ITER
 
 @dataclass(frozen=True)
 class Round(State):
-    """Where a round ended: F is that of the linearisation at x itself."""
+    """The end of a round: F is that of the linearisation at x itself."""
 
     H_plus: Array
     deviation: Array
     """Standard deviations (trials, n) of the local bound."""
     inner: NDArray[np.int8]
-    """How the round's inner iteration ended."""
+    """The status of the round's inner iteration."""
     steps: NDArray[np.int64]
     """Inner steps so far."""
     path: list[Array]
@@ -51,7 +51,7 @@ class Relinearized(Method[FrozenSystem, Round], Estimator):
     """
 
     solver: IPE[Any] = field(default_factory=FixedPoint)
-    """What a round iterates. Its own start, limits and tolerance have no say here."""
+    """The solver that a round iterates. Its own start, limits and tolerance have no say here."""
     start: Start = "linear_lse"
     inner_iterations: Count = 5
     """Steps of the solver before H is evaluated again."""
