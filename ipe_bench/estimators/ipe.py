@@ -197,7 +197,6 @@ class IPE(Method[FrozenSystem, S], Estimator, Generic[S]):
     >>> @dataclass(frozen=True)
     ... class Relaxed(ib.IPE):
     ...     gain: float = 0.5
-    ...
     ...     def step(self, system, state):
     ...         x = state.x - self.gain * state.F
     ...         return ib.State(x, system.F(x))

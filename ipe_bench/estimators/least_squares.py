@@ -119,7 +119,7 @@ class NormalEquations:
         well = well & finite(r)
         Q = np.matmul(A, inverse_U) if keep_Q else None
         if not well.all():
-            QU, U[~well], inverse_U[~well], gradient[~well] = _by_orthogonal_factor(J[~well], r[~well])
+            QU, U[~well], inverse_U[~well], gradient[~well] = _orthogonal_factors(J[~well], r[~well])
             if Q is not None:
                 Q[~well] = QU
         columns = np.sqrt(np.sum(U**2, axis=1))
@@ -159,7 +159,7 @@ def _damped_step(U: Array, weights: Array, gradient: Array) -> Array:
     return solve(V, -multiply(Q[:, :n].swapaxes(1, 2), gradient))[0]
 
 
-def _by_orthogonal_factor(J: Array, r: Array) -> tuple[Array, Array, Array, Array]:
+def _orthogonal_factors(J: Array, r: Array) -> tuple[Array, Array, Array, Array]:
     """Q, U, U^-1 and Q' r for any J; U^-1 is NaN where J has not full rank."""
     m, missing = J.shape[1], max(J.shape[2] - J.shape[1], 0)
     # Fewer readings than parameters: rows of zeros keep U square, and deficient.
@@ -177,7 +177,7 @@ def _by_orthogonal_factor(J: Array, r: Array) -> tuple[Array, Array, Array, Arra
 
 def inverse_factor(J: Array) -> Array:
     """U^-1 (trials, n, n) of J = Q U (trials, m, n), so that (J'J)^-1 = U^-1 U^-T; NaN where J has not full rank."""
-    return _by_orthogonal_factor(J, np.zeros(J.shape[:2]))[2]
+    return _orthogonal_factors(J, np.zeros(J.shape[:2]))[2]
 
 
 def slope_at(

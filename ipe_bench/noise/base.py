@@ -25,13 +25,10 @@ class Noise(Component, ABC):
     >>> @dataclass(frozen=True)
     ... class Laplace(ib.Noise):
     ...     scale: float = 0.1
-    ...
     ...     def corrupt(self, h, offset, rng):
     ...         return h + rng.laplace(0.0, self.scale, len(h))
-    ...
     ...     def covariance(self, m):
     ...         return Covariance(np.full(m, np.sqrt(2) * self.scale))
-    ...
     ...     def whitened(self, shape, rng):
     ...         return rng.laplace(0.0, np.sqrt(0.5), shape)
     >>> print(ib.Scenario(ib.measurements.Polynomial(), Laplace()).draw(0, 4).z.shape)

@@ -32,10 +32,8 @@ class Prior(Component, ABC):
     >>> @dataclass(frozen=True)
     ... class Uniform(Prior):
     ...     normal = False
-    ...
     ...     def deviation(self, n, error_scale):
     ...         return np.full(n, error_scale)
-    ...
     ...     def draw(self, x0, error_scale, rng):
     ...         return x0 + np.sqrt(3) * error_scale * rng.uniform(-1, 1, len(x0))
     >>> scenario = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), Uniform(), error_scale=2.0)

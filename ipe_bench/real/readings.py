@@ -56,7 +56,7 @@ class Readings:
 
 
 @dataclass(frozen=True)
-class Table:
+class TextTable:
     """A file as text: its header, and its rows with their numbers in the file."""
 
     path: Path
@@ -128,7 +128,7 @@ def _unit(heading: str) -> str:
     return heading.partition("[")[2].rstrip("] ")
 
 
-def read_tables(paths: Sequence[Path], without: Sequence[str] = ()) -> list[Table]:
+def read_tables(paths: Sequence[Path], without: Sequence[str] = ()) -> list[TextTable]:
     """The tables of files, without the columns of these headings.
 
     Raises:
@@ -148,14 +148,14 @@ def read_tables(paths: Sequence[Path], without: Sequence[str] = ()) -> list[Tabl
     return reduced
 
 
-def _read_table(path: Path) -> Table:
+def _read_table(path: Path) -> TextTable:
     """The table of a CSV or Parquet file, in which every row has as many cells as the header."""
     if path.parent == _SAMPLES and not path.is_file():
         path = Path(__file__).with_name("samples") / path.name
     if not path.is_file():
-        raise Table(path).error("there is no such file")
+        raise TextTable(path).error("there is no such file")
     data = path.read_bytes()
-    table = Table(path, digest=hashlib.sha256(data).hexdigest())
+    table = TextTable(path, digest=hashlib.sha256(data).hexdigest())
     table = (_with_parquet if path.suffix == ".parquet" else _with_text)(table, data)
     if all(table.number(name) is not None for name in table.heading):
         raise table.error("the first row has only numbers and is no header; write the names of the columns above it")
@@ -176,7 +176,7 @@ def _read_table(path: Path) -> Table:
     return table
 
 
-def _with_parquet(table: Table, data: bytes) -> Table:
+def _with_parquet(table: TextTable, data: bytes) -> TextTable:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -189,7 +189,7 @@ def _with_parquet(table: Table, data: bytes) -> Table:
     return replace(table, heading=found.column_names, rows=list(enumerate(map(list, zip(*columns, strict=True)), 1)))
 
 
-def _with_text(table: Table, data: bytes) -> Table:
+def _with_text(table: TextTable, data: bytes) -> TextTable:
     try:
         text = data.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
     except UnicodeDecodeError as error:
@@ -288,7 +288,7 @@ def _together(paths: Sequence[Path], found: Sequence[Readings]) -> Readings:
     return Readings(joint, np.concatenate([one.z for one in found]), np.concatenate(deviations) if deviations else None)
 
 
-def _readings_in(table: Table, model: Measurement) -> Readings:
+def _readings_in(table: TextTable, model: Measurement) -> Readings:
     """The readings of a file, of which there may be too few."""
     sigma = table.find(SIGMA)
     columns = [table.find(wanted.heading) for wanted in model.inputs]
@@ -331,7 +331,7 @@ def _readings_in(table: Table, model: Measurement) -> Readings:
     return Readings(sampled, z, _sigmas(table, sigma, range(len(z)), z, shown), used)
 
 
-def _rows_of(table: Table, model: Measurement, also: Sequence[str]) -> list[int]:
+def _rows_of(table: TextTable, model: Measurement, also: Sequence[str]) -> list[int]:
     """Finds the row of each of the model's readings in the table; `also` names further columns that are understood."""
     wanted = header(model)
     for name in (*model.index, wanted[-1]):
@@ -374,7 +374,7 @@ def _shown_as(model: Measurement) -> list[str]:
     return [f"{name}{unit}" for name in dict.fromkeys((model.reading_name, "reading"))]
 
 
-def _reading_column(table: Table, model: Measurement) -> str:
+def _reading_column(table: TextTable, model: Measurement) -> str:
     names = _shown_as(model)
     if found := next(filter(None, map(table.find, names)), None):
         return found
@@ -388,7 +388,7 @@ def _reading_column(table: Table, model: Measurement) -> str:
     raise table.error(f"column {names[0]} is missing, which holds the readings; there are {there}; {remedy}")
 
 
-def _input(table: Table, wanted: Input, text: str, where: str) -> Any:
+def _input(table: TextTable, wanted: Input, text: str, where: str) -> Any:
     if not text.strip():
         raise table.error(f"{where}: is empty; what is known of a reading keeps its value, even where it is missing")
     if wanted.kind is str:
@@ -399,7 +399,7 @@ def _input(table: Table, wanted: Input, text: str, where: str) -> Any:
     return wanted.kind(value)
 
 
-def _sigmas(table: Table, column: str | None, rows: Sequence[int], z: Array, shown: str) -> Array | None:
+def _sigmas(table: TextTable, column: str | None, rows: Sequence[int], z: Array, shown: str) -> Array | None:
     """The standard deviations (m,) in `rows` of that column, `shown` being that of the readings; None without one."""
     if column is None:
         return None

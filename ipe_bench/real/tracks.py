@@ -13,7 +13,7 @@ from scipy.special import chdtrc, ndtri
 
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array, deviations, unmasked
-from ipe_bench.real.readings import Table, read_tables
+from ipe_bench.real.readings import TextTable, read_tables
 from ipe_bench.states.base import StateModel
 from ipe_bench.states.formulas import Formulas, RecordedFormulas
 from ipe_bench.states.particles import Bootstrap
@@ -70,7 +70,7 @@ def _wanted(model: StateModel) -> list[str]:
     return [*(model.inputs if isinstance(model, Formulas) else ()), *model.reading_names]
 
 
-def _read(table: Table, model: StateModel) -> Log:
+def _read(table: TextTable, model: StateModel) -> Log:
     wanted = _wanted(model)
     columns = {name: heading for name in ("epoch", "time", *wanted) if (heading := table.find(name))}
     for name in wanted:
