@@ -73,6 +73,11 @@ def test_rooms_know_only_the_libraries_that_are_theirs(path, room):
         assert home is None or PLACE[room] >= PLACE[home], f"{room} knows {name}, which belongs to {home} and above"
 
 
+def test_the_package_imports_no_plugin():
+    names = {name for path in HOUSE.rglob("*.py") for name in imported(path, checked_types=True)}
+    assert [name for name in names if name.startswith("ipe_bench_")] == []
+
+
 def edges(*, late: bool) -> dict[str, set[str]]:
     """Which modules of the package each module imports."""
     paths = {".".join(("ipe_bench", *p.relative_to(HOUSE).with_suffix("").parts)): p for p in HOUSE.rglob("*.py")}

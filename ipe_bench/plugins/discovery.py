@@ -194,11 +194,8 @@ def sources() -> tuple[Source, ...]:
     installed = dict(found)
     for source in (source for folder in dict.fromkeys([*folders, *_added]) for source in _in_folder(folder)):
         twin = installed.pop(source.name, None)
-        if (
-            twin is not None
-            and twin.distribution == source.distribution is not None
-            and not _imported_elsewhere(source)
-        ):
+        one = twin is not None and twin.distribution == source.distribution is not None
+        if one and not _imported_elsewhere(source):
             found[source.name] = source
             _make_importable(source, before=twin)
         elif _take(found, source):
