@@ -27,10 +27,11 @@ class ScaledNoise(Noise):
     """Standard deviation of a reading, in the unit of the readings; None: that of the model's usual noise."""
 
     def completed(self, usual: UsualNoise | None) -> Self:
-        if self.deviation is None and usual is not None:
-            return replace(self, deviation=usual.deviation or usual.step * UNIFORM_DEVIATION)  # type: ignore[operator]
-        _ = self.stated
-        return self
+        known = usual or UsualNoise()
+        deviation = self.deviation or known.deviation or (known.step and known.step * UNIFORM_DEVIATION)
+        found = replace(self, deviation=deviation)
+        _ = found.stated
+        return found
 
     @property
     def stated(self) -> float:

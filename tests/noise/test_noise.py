@@ -5,6 +5,7 @@ import pytest
 
 import ipe_bench as ib
 from ipe_bench.basics.errors import UserError
+from ipe_bench.measurements.base import UsualNoise
 from ipe_bench.noise import Colored, Correlated, Gaussian, NoNoise, Outliers, Quantization, StudentT, Unknown
 
 TRIALS = 4000
@@ -170,3 +171,9 @@ def test_noise_with_true_levels_grows_with_the_reading_as_its_formula_says():
     for offset in (np.zeros(4), np.array([50.0, 0.0, 7.0, -100.0])):
         v = errors(Unknown(sigma="a + b*h", levels=(0.1, 0.02)), h=h, offset=offset)
         assert v.std(axis=0) == pytest.approx(0.1 + 0.02 * np.abs(h), rel=5 / np.sqrt(2 * TRIALS))
+
+
+def test_a_usual_noise_without_a_size_is_none():
+    with pytest.raises(UserError, match="names no noise of its own"):
+        Gaussian().completed(UsualNoise())
+    assert Gaussian().completed(UsualNoise(step=6.0)).deviation == pytest.approx(np.sqrt(3))
