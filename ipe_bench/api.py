@@ -197,11 +197,11 @@ def compare(
     """
     import pandas as pd
 
-    from ipe_bench.statistics.between import JUDGED, compared, described, left_out
+    from ipe_bench.statistics.between import JUDGED, compared, comparison_title, left_out
     from ipe_bench.statistics.collect import collect
-    from ipe_bench.statistics.paired import Plan
+    from ipe_bench.statistics.paired import PowerPlan
 
-    plan = Plan.of(power, difference, anytime=anytime)
+    plan = PowerPlan.of(power, difference, anytime=anytime)
     if not 0 < alpha < 1:
         raise UserError(f"alpha={alpha}: give a number between 0 and 1")
     if wrong := [name for name in fail_on if name not in JUDGED]:
@@ -220,16 +220,16 @@ def compare(
         frame[whole] = frame[whole].astype("Int64")
     worse = frame[(frame["finding"] == "worse") & frame["quantity"].isin(list(fail_on))]
     rows = [{str(name): value for name, value in row.items()} for row in worse.to_dict("records")]
-    frame.attrs["worse"] = [f"{row['second']} in {row['quantity']}, {described(row)}" for row in rows]
+    frame.attrs["worse"] = [f"{row['second']} in {row['quantity']}, {comparison_title(row)}" for row in rows]
     for name in ("problems", "stale"):
         frame.attrs[name] = list(dict.fromkeys(line for c in collections for line in getattr(c, name)))
     frame.attrs["notes"] = left_out(*collections)
     if output is not None:
         from ipe_bench.report.questions import comparison_parts
-        from ipe_bench.report.writer import write
+        from ipe_bench.report.writer import write_files
 
         parts = comparison_parts(frame, alpha)
-        write(Path(output), "comparison", "Comparison", parts, ("comparison.csv", frame))
+        write_files(Path(output), "comparison", "Comparison", parts, ("comparison.csv", frame))
     return frame
 
 
@@ -255,9 +255,9 @@ def audit(table: Path | str | pd.DataFrame, *, output: Path | str | None = None)
     found = examined(read_claims(table))
     if output is not None:
         from ipe_bench.report.questions import audit_parts
-        from ipe_bench.report.writer import write
+        from ipe_bench.report.writer import write_files
 
-        write(Path(output), "audit", "Audit", audit_parts(found), ("audit.csv", found.table()))
+        write_files(Path(output), "audit", "Audit", audit_parts(found), ("audit.csv", found.table()))
     return found
 
 

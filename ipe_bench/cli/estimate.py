@@ -121,7 +121,7 @@ def _described(estimators: Any) -> dict[str, Any]:
 
 def estimate_command(arguments: Sequence[str]) -> int:
     """Estimates with every chosen estimator, prints tables and writes files; exit code 1 where none is an answer."""
-    from ipe_bench.report.answer import FILES, NAME, Answer, contents, write_answer
+    from ipe_bench.report.answer import FILES, NAME, Answer, estimate_parts, write_answer
 
     asked = single("estimate", arguments, STANDARD_ESTIMATORS, run=(*OF_MANY_TRIALS, "trials", "seed", w.TRUTH))
     if asked.spec.state_model is not None:
@@ -140,13 +140,13 @@ def estimate_command(arguments: Sequence[str]) -> int:
     parts = [question.scenario, *question.estimators.values()]
     provenance = _provenance(asked, question.found.files, parts)
     files = write_answer(folder, answer, command, provenance, figures=asked.spec.figures != "none")
-    _show(contents(answer), files)
+    _show(estimate_parts(answer), files)
     return 0 if answer.passes else 1
 
 
 def _track(asked: Single, model: StateModel) -> int:
     """Tracks the states by every chosen tracker, prints tables and writes files; exit code 1 where no track passes."""
-    from ipe_bench.report.tracked import NAME, TABLE, contents, write_tracks
+    from ipe_bench.report.tracked import NAME, TABLE, track_parts, write_tracks
 
     given, trackers = asked.spec.readings, asked.spec.estimators
     find = asked.spec.find or ()
@@ -154,7 +154,7 @@ def _track(asked: Single, model: StateModel) -> int:
     command = {"readings": given, "find": find, "model": describe(model), "trackers": _described(trackers)}
     files, parts = [answer.log.file] if answer.log.file else [], [answer.log.model, *trackers.values()]
     folder = asked.folder(NAME, command, [TABLE])
-    _show(contents(answer), write_tracks(folder, answer, command, _provenance(asked, files, parts)))
+    _show(track_parts(answer), write_tracks(folder, answer, command, _provenance(asked, files, parts)))
     return 0 if answer.passes else 1
 
 

@@ -24,7 +24,7 @@ from ipe_bench.real.fits import Fit
 from ipe_bench.real.residuals import LEAST_P
 from ipe_bench.report.table import Part, Strong, Table, html, plain_text, texts, words
 from ipe_bench.report.words import p_value
-from ipe_bench.report.writer import write
+from ipe_bench.report.writer import write_files
 from ipe_bench.trials.fit_test import DRAWS
 from ipe_bench.trials.thresholds import FIT_LEVEL
 
@@ -97,13 +97,13 @@ class Answer:
         return pd.concat(frames, ignore_index=True)
 
     def __str__(self) -> str:
-        return plain_text(contents(self))
+        return plain_text(estimate_parts(self))
 
     def _repr_html_(self) -> str:
-        return html(contents(self))
+        return html(estimate_parts(self))
 
 
-def contents(answer: Answer) -> Iterator[Part]:
+def estimate_parts(answer: Answer) -> Iterator[Part]:
     """The tables and sentences of an answer, in order."""
     found, one = structure(answer.model), answer.examination
     yield from (Strong(f"No data can tell: {sentence}.") for sentence in (found.sentences if found else ()))
@@ -361,19 +361,20 @@ def write_answer(
     """Writes estimate.json, the page, residuals.csv and the figure; returns the files."""
     from ipe_bench.report.figures.errors import draw_residuals
 
-    content = {"schema": SCHEMA, "command": command, **described(answer), **provenance}
+    content = {"schema": SCHEMA, "command": command, **estimate_content(answer), **provenance}
     write_text(folder / f"{NAME}.json", json.dumps(content, indent=1) + "\n")
     verdict = "an answer that passes" if answer.passes else "NO ANSWER THAT PASSES"
     lead = f"{np.isfinite(answer.z).sum()} readings; {verdict}. {provenance.get('written', '')}"
     drawings = draw_residuals(answer.model, answer.fits) if figures else ()
     table = RESIDUALS, _residuals(answer)
-    files = write(folder, NAME, f"{answer.name}: estimates", contents(answer), table, lead=lead, drawings=drawings)
+    title = f"{answer.name}: estimates"
+    files = write_files(folder, NAME, title, estimate_parts(answer), table, lead=lead, drawings=drawings)
     for old in {folder / each for each in FILES} - set(files):
         old.unlink(missing_ok=True)
     return [folder / f"{NAME}.json", *files]
 
 
-def described(answer: Answer) -> dict[str, Any]:
+def estimate_content(answer: Answer) -> dict[str, Any]:
     """What estimate.json says of the readings, of the estimates, and of the least minimum."""
     model, z, found = answer.model, answer.z, answer.examination
     labels = _reading_labels(model)

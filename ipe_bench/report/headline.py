@@ -10,7 +10,7 @@ import pandas as pd
 
 from ipe_bench.report.figures.views import family_of
 from ipe_bench.report.table import environment
-from ipe_bench.report.words import enumerate_few, plain, short
+from ipe_bench.report.words import enumerate_few, short, value_text
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.certified import certified_averages, certified_table, published_table
 from ipe_bench.statistics.records import ALL, BEST
@@ -179,7 +179,7 @@ def reach(rows: pd.DataFrame) -> Iterator[Fact]:
 def _silent(rows: pd.DataFrame) -> Iterator[Fact]:
     worst = rows.sort_values("failed_silent", kind="stable").iloc[-1]
     if worst["failed_silent"] > 0:
-        where = f"{worst['estimator']} at scale {plain(worst['error_scale'])}"
+        where = f"{worst['estimator']} at scale {value_text(worst['error_scale'])}"
         yield "silent", {"share": worst["failed_silent"], "where": where}
 
 

@@ -13,9 +13,9 @@ import numpy as np
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.identifiability import structure
 from ipe_bench.report.table import Part, Strong, Table, texts, words
-from ipe_bench.report.words import compact, duration, enumerate_few, p_value, percent, plain
-from ipe_bench.report.writer import write
-from ipe_bench.statistics.between import NOT_SETTINGS, described
+from ipe_bench.report.words import compact, duration, enumerate_few, p_value, percent, value_text
+from ipe_bench.report.writer import write_files
+from ipe_bench.statistics.between import NOT_SETTINGS, comparison_title
 from ipe_bench.trials.design import Design, entry_in_words
 from ipe_bench.trials.thresholds import FIT_LEVEL
 
@@ -30,7 +30,7 @@ READINGS = "readings.csv"
 """What the choices of a design take, a row per reading."""
 HONEST = 0.1
 """Nats up to which a Gaussian may stand for another: a deviation is 40 % too large, or a mean half a deviation off."""
-ALIKE = 0.05
+SAME_LAW = 0.05
 """Energy distance up to which draws may come from one law: of Gaussians in few dimensions, some tenths of a nat."""
 _MOST_SUSPECTS = 12
 _TITLES = {"error": "mean length", "cost": "mean cost", "time": "median time"}
@@ -145,7 +145,7 @@ def write_design(folder: Path, name: str, design: Design) -> list[Path]:
     ]
     columns = ["by", "choice", *index]
     table = pd.concat(chosen)[columns] if chosen else pd.DataFrame(columns=columns)
-    return write(folder, "design", f"{name}: design", design_parts(name, design), (READINGS, table))
+    return write_files(folder, "design", f"{name}: design", design_parts(name, design), (READINGS, table))
 
 
 # Posterior -----------------------------------------------------------------------------------------------------------
@@ -160,7 +160,7 @@ def posterior_parts(name: str, found: Sequence[Reference]) -> list[Table]:
         texts("noise", [compact(one.posterior.noise) for one, *_ in rows]),
         words("estimator", [label for _, label, _ in rows]),
         words("status", [Status(int(one.estimates[label].status[0])).label for one, label, _ in rows]),
-        words("honest", [honesty(d, one.posterior) for one, _, d in rows]),
+        words("honest", [honest_word(d, one.posterior) for one, _, d in rows]),
     ]
     numbers = {"kl": "diverg.", "shift": "shift", "width": "width", "energy": "energy"}
     columns += [texts(title, [compact(getattr(d, key)) for *_, d in rows]) for key, title in numbers.items()]
@@ -175,7 +175,7 @@ def _notes(found: Sequence[Reference]) -> Iterator[str]:
         " mean, in standard deviations of the posterior per root of the number of parameters. width is the geometric"
         " mean of the standard deviations over those of the posterior. energy is the distance between draws. An"
         f" estimate is honest if there is a single mode, the divergence is at most {HONEST:g} or twice the noise, and"
-        f" the energy is at most {ALIKE:g}."
+        f" the energy is at most {SAME_LAW:g}."
     )
     for one in found:
         if not one.posterior.settled:
@@ -188,11 +188,11 @@ def _notes(found: Sequence[Reference]) -> Iterator[str]:
             yield f"Trial {one.trial}: {len(one.posterior.modes)} modes, with {shares} of the draws."
 
 
-def honesty(d: Divergence, sampled: Posterior) -> str:
+def honest_word(d: Divergence, sampled: Posterior) -> str:
     """Whether a Gaussian can be taken for the posterior; a wide one over two modes has the moments and is not."""
     if not np.isfinite(d.kl):
         return "-"
-    near = d.kl <= max(HONEST, 2 * sampled.noise) and d.energy <= ALIKE
+    near = d.kl <= max(HONEST, 2 * sampled.noise) and d.energy <= SAME_LAW
     return "yes" if near and len(sampled.modes) == 1 else "NO"
 
 
@@ -209,7 +209,7 @@ def write_posteriors(
         sized = {key: model.sizes * value for key, value in values.items()}
         frames.append(pd.DataFrame({"trial": one.trial, **names, **sized}))
     parts = posterior_parts(scenario, found)
-    return write(folder, "posterior", f"{name}: posteriors", parts, ("posterior.csv", pd.concat(frames)))
+    return write_files(folder, "posterior", f"{name}: posteriors", parts, ("posterior.csv", pd.concat(frames)))
 
 
 # Comparison ----------------------------------------------------------------------------------------------------------
@@ -246,12 +246,12 @@ def _comparisons(frame: pd.DataFrame) -> Iterator[tuple[str, list[dict[str, Any]
     """Each comparison with its title, in order."""
     settings = [c for c in frame.columns if c not in NOT_SETTINGS]
     listed: list[Any] = frame.to_dict("records")
-    for _, part in groupby(listed, key=lambda row: tuple(plain(row[c]) for c in (*settings, "first", "second"))):
+    for _, part in groupby(listed, key=lambda row: tuple(value_text(row[c]) for c in (*settings, "first", "second"))):
         rows = list(part)
         first = rows[0]
         who = first["first"] if first["first"] == first["second"] else f"{first['first']}, then {first['second']}"
         how = "trials" if first["matched_by"] == "trial" else "trials of other seeds, matched in their order"
-        yield f"{described(first)}: {who}; {first['trials']} {how}", rows
+        yield f"{comparison_title(first)}: {who}; {first['trials']} {how}", rows
 
 
 def _cells(row: dict[str, Any]) -> tuple[str, ...]:

@@ -116,12 +116,12 @@ _PRINT: dict[str, Any] = {
     "figure.dpi": 300,
     "savefig.dpi": 300,
 }
-_column: ContextVar[float] = ContextVar("column", default=0.0)
+_print_width: ContextVar[float] = ContextVar("print_width", default=0.0)
 
 
-def column() -> float:
+def print_width() -> float:
     """Inches of the column of print that figures are drawn for; 0 for those of the page."""
-    return _column.get()
+    return _print_width.get()
 
 
 @contextmanager
@@ -139,9 +139,9 @@ def house_style(scale: float = 0.95, more: Mapping[str, Any] | None = None) -> I
 @contextmanager
 def print_style(width: float) -> Iterator[None]:
     """The same look in a column of print, where nothing is scaled any more: letters of 7 points, as IEEE's."""
-    token = _column.set(width)
+    token = _print_width.set(width)
     try:
         with house_style(0.74, _PRINT):
             yield
     finally:
-        _column.reset(token)
+        _print_width.reset(token)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ipe_bench.basics.files import write_text
-from ipe_bench.report.words import brief, duration, enumerate_few, percent, plain
+from ipe_bench.report.words import brief, duration, enumerate_few, percent, value_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -232,7 +232,7 @@ def environment() -> Environment:
     )
     made.tests["strong"] = lambda part: isinstance(part, Strong)
     made.globals["MOST_ROWS"] = MOST_ROWS
-    made.globals |= (written := {one.__name__: one for one in (brief, duration, enumerate_few, percent, plain)})
+    made.globals |= (written := {one.__name__: one for one in (brief, duration, enumerate_few, percent, value_text)})
     made.filters |= written
     return made
 

@@ -9,8 +9,8 @@ from typing import Any
 import pandas as pd
 
 from ipe_bench.report.table import Column, Table, column, words
-from ipe_bench.report.terminal import TRACKED, leading, legend, overview_columns, statistics
-from ipe_bench.report.words import p_value, percent, plain, short
+from ipe_bench.report.terminal import TRACKED, leading, overview_columns, overview_notes, statistics
+from ipe_bench.report.words import p_value, percent, short, value_text
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.certified import (
     certified_averages,
@@ -110,7 +110,7 @@ def head(analysis: Analysis, rows: pd.DataFrame) -> list[Column]:
     """The columns that tell rows apart: those settings that differ, and the error scale."""
     varying = [c for c in analysis.setting_columns if len(set(rows[c].astype(str))) > 1]
     return [
-        *(words(c, [plain(v) for v in rows[c]]) for c in varying),
+        *(words(c, [value_text(v) for v in rows[c]]) for c in varying),
         column("error scale", rows["error_scale"], lambda v: f"{v:g}"),
     ]
 
@@ -136,7 +136,8 @@ def overview(analysis: Analysis) -> Table:
     told: Any = rows.to_dict("records")
     columns = [*first, *overview_columns(told, leading(told, [*analysis.setting_columns, "error_scale"]))]
     columns += statistics("overview", told)
-    return Table("overview", "Overview", "", columns, rows, notes=legend(rows["noise"].tolist()), grouped=len(first))
+    notes = overview_notes(rows["noise"].tolist())
+    return Table("overview", "Overview", "", columns, rows, notes=notes, grouped=len(first))
 
 
 def contraction(analysis: Analysis) -> Table | None:

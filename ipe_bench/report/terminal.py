@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from ipe_bench.report.table import Cell, Column, Part, Table, column, interval, sort_key, words
-from ipe_bench.report.words import brief, duration, p_value, percent, plain, short
+from ipe_bench.report.words import brief, duration, p_value, percent, short, value_text
 from ipe_bench.statistics.formulas import CAP
 from ipe_bench.statistics.records import ALL, BEST, SCORES, Kind, Statistic, Where, all_statistics, summary_columns
 
@@ -31,8 +31,6 @@ _NEES = (
     " is the verdict on the converged trials: optimistic (+) claims too small a variance, pessimistic (-) too large a"
     " one, diverged (!) is lost without reporting it. cost counts simulations."
 )
-LEGEND = (_SUCCESS, _ERROR, _NEES)
-"""What the columns of the overview mean."""
 _TOLD = (
     "With noise=unknown every estimator here is given R, that of the true levels at the nominal readings; bounds and"
     " success are those of parameters that are estimated together with the levels."
@@ -47,7 +45,7 @@ TRACKED = (
 _TRACKED_ERROR = f"error is the median / 95 % quantile over all trials. {_CAPPED}"
 
 
-def legend(noises: Collection[str]) -> tuple[str, ...]:
+def overview_notes(noises: Collection[str]) -> tuple[str, ...]:
     """What the columns of the overview mean, and what estimators are told of these noises."""
     error = _TRACKED_ERROR if set(noises) == {"model"} else _ERROR
     added = (words for noise, words in (("unknown", _TOLD), ("model", TRACKED)) if noise in noises)
@@ -68,12 +66,12 @@ def summary_tables(listed: Sequence[Mapping[str, Any]], totals: Sequence[Table],
     settings: dict[str, list[Any]] = {}
     for row in rows:
         # An option that the class lacks is left out.
-        named = {k: plain(row.get(k)) for k in columns if plain(row.get(k)) != "-"}
+        named = {k: value_text(row.get(k)) for k in columns if value_text(row.get(k)) != "-"}
         title = ", ".join(v if k in ("measurement", "noise") else f"{k}={v}" for k, v in named.items())
         settings.setdefault(title, []).append(row)
     tables = [_setting(title, part, width) for title, part in list(settings.items())[:_MOST_TABLES]]
     if tables:
-        tables[-1] = replace(tables[-1], notes=legend({row["noise"] for row in rows}))
+        tables[-1] = replace(tables[-1], notes=overview_notes({row["noise"] for row in rows}))
     further = [f"{len(settings) - _MOST_TABLES} further settings are in summary.csv and report.html."]
     return [*totals, *tables, *further[: len(settings) > _MOST_TABLES]] or ["nothing is stored yet"]
 

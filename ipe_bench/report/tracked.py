@@ -15,7 +15,7 @@ from ipe_bench.real.tracks import Log, LogTracks
 from ipe_bench.report.answer import as_json, with_error
 from ipe_bench.report.table import Part, Strong, Table, html, interval, plain_text, texts, words
 from ipe_bench.report.words import p_value, short
-from ipe_bench.report.writer import write
+from ipe_bench.report.writer import write_files
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -55,13 +55,13 @@ class LogAnswer:
         return pd.concat(frames, ignore_index=True)
 
     def __str__(self) -> str:
-        return plain_text(contents(self))
+        return plain_text(track_parts(self))
 
     def _repr_html_(self) -> str:
-        return html(contents(self))
+        return html(track_parts(self))
 
 
-def contents(answer: LogAnswer) -> list[Part]:
+def track_parts(answer: LogAnswer) -> list[Part]:
     """What the innovations say of each tracker, and the states at the last epoch."""
     found, states = answer.tracks, answer.log.model.states
     limits = [one.limits[0] for one in found], [one.limits[1] for one in found]
@@ -107,5 +107,5 @@ def write_tracks(folder: Path, answer: LogAnswer, command: Any, provenance: Mapp
     content = {"schema": SCHEMA, "command": command, "trackers": trackers, **provenance}
     write_text(folder / f"{NAME}.json", json.dumps(content, indent=1) + "\n")
     lead = f"{int(np.isfinite(log.z).sum())} readings at {log.model.epochs} epochs"
-    title = f"{log.model.name}: tracks"
-    return [folder / f"{NAME}.json", *write(folder, NAME, title, contents(answer), (TABLE, answer.table()), lead=lead)]
+    table, title = (TABLE, answer.table()), f"{log.model.name}: tracks"
+    return [folder / f"{NAME}.json", *write_files(folder, NAME, title, track_parts(answer), table, lead=lead)]

@@ -16,7 +16,7 @@ CITATION = (
 """How results of the bench are cited."""
 
 
-def plain(value: Any) -> str:
+def value_text(value: Any) -> str:
     """A number without needless zeros; a dash for what is not there."""
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return "-"

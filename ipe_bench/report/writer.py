@@ -50,7 +50,7 @@ def _is_free(folder: Path, result: str, command: Any, files: Sequence[str]) -> b
         return False
 
 
-def write(
+def write_files(
     folder: Path,
     name: str,
     title: str,

@@ -14,17 +14,12 @@ import numpy as np
 from ipe_bench.basics.statuses import Status
 from ipe_bench.statistics.calibration import POINTS, band
 from ipe_bench.statistics.collect import Collection, Group, collect
-from ipe_bench.statistics.comparisons import (
-    Outcomes,
-    compare_pairs,
-    corrected,
-    may_be_best,
-)
+from ipe_bench.statistics.comparisons import Outcomes, compare_pairs, corrected, may_be_best
 from ipe_bench.statistics.formulas import failed, share
 from ipe_bench.statistics.intervals import quantile
 from ipe_bench.statistics.records import BEST, SCORES, rows_of, summary_rows, to_frame
 from ipe_bench.statistics.sample import CONTRACTION, Sample, label_of, median_distances, samples
-from ipe_bench.statistics.tracks import curves
+from ipe_bench.statistics.tracks import epoch_curves
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -134,7 +129,7 @@ class Begun:
                 low, high = band(len(whole.z), whole.level)
                 curve = {"at": POINTS, "difference": whole.size.difference, "low": low, "high": high}
                 found["calibration"].append(numbered | curve)
-            found["tracks"] += [numbered | row for row in curves(sample)]
+            found["tracks"] += [numbered | row for row in epoch_curves(sample)]
         if outcomes:
             best = may_be_best(np.column_stack([outcome.success for outcome in outcomes.values()]))
             marks = dict(zip(outcomes, best.tolist(), strict=True))

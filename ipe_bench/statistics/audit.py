@@ -41,7 +41,7 @@ _FARTHEST = 1e12
 _LARGEST = 10.0
 """Ends of an interval more than so many times its middle are not shown."""
 
-Verdict = Literal["too small", "too large", "right", "undecided"]
+AuditVerdict = Literal["too small", "too large", "right", "undecided"]
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class Factor:
     high: float
 
     @property
-    def verdict(self) -> Verdict:
+    def verdict(self) -> AuditVerdict:
         """What the covariance is; right where the interval leaves nothing that matters."""
         if self.low > 1:
             return "too small"
@@ -143,7 +143,7 @@ class Audit:
     sentences: tuple[str, ...]
 
     @property
-    def verdict(self) -> Verdict:
+    def verdict(self) -> AuditVerdict:
         """What the covariance is as a whole."""
         return self.scale.verdict
 

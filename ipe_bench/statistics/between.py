@@ -15,7 +15,7 @@ from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.runs.provenance import canonical_json
 from ipe_bench.statistics.collect import Collection, Group, config_leaves, differing, scenario_of, shown_leaf
 from ipe_bench.statistics.comparisons import ALPHA, differences, holm
-from ipe_bench.statistics.paired import PLANNED, Effect, Plan, ratio_effect, success_effect
+from ipe_bench.statistics.paired import PLANNED, Effect, PowerPlan, ratio_effect, success_effect
 from ipe_bench.statistics.sample import Sample, samples
 from ipe_bench.trials.thresholds import gate
 
@@ -28,7 +28,7 @@ NOT_SETTINGS = (
 """The columns of a row that do not say what is compared."""
 
 
-def described(row: Mapping[str, Any]) -> str:
+def comparison_title(row: Mapping[str, Any]) -> str:
     """What a row compares, in a line for people."""
     named = {k: _plain(v) for k, v in row.items() if k not in NOT_SETTINGS and v is not None and v == v}
     titles = {"measurement": "", "noise": "", "error_scale": "error scale "}
@@ -46,7 +46,7 @@ def compared(
     *,
     alpha: float = ALPHA,
     anytime: bool = False,
-    plan: Plan | None = None,
+    plan: PowerPlan | None = None,
 ) -> list[dict[str, Any]]:
     """Rows of every comparison that can be made: one per scenario, pair of estimators and quantity.
 

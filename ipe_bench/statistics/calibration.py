@@ -16,9 +16,9 @@ import numpy as np
 from scipy.special import bdtr, bdtrc, chdtri, gammaln, ndtri
 
 from ipe_bench.basics.linalg import Array
+from ipe_bench.statistics.intervals import LEVEL
 from ipe_bench.trials.thresholds import FEW, GATE, gate
 
-LEVEL = 0.95
 POINTS = np.arange(1, 100) / 100
 """Where the distribution functions are compared."""
 INSIDE = "inside its bands"

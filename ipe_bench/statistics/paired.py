@@ -20,7 +20,7 @@ from ipe_bench.trials.thresholds import FEW
 
 FLIPS = 4999
 """Random assignments of signs."""
-LARGEST_SAMPLE = 1000
+MOST_SIGNS = 1000
 """Of more trials, groups of consecutive ones share a sign: as good, since trials are independent."""
 _TILTS = np.concatenate([-(2.0 ** np.arange(-12, 5)), 2.0 ** np.arange(-12, 5)])
 """Multiples of the inverse unit by which differences are tilted, to either side."""
@@ -97,7 +97,7 @@ def ratio_effect(first: Array, second: Array, alpha: float = ALPHA, largest: flo
     Pearson), each by `largest`, the largest difference there can be; None: the largest number seen. It is never widened
     over a ratio of 1 that the test rejects.
     """
-    a, b = grouped(np.array([first, second], dtype=float), LARGEST_SAMPLE).T.copy()
+    a, b = grouped(np.array([first, second], dtype=float), MOST_SIGNS).T.copy()
     means, p_equal = (float(first.mean()), float(second.mean())), _p_of_ratio(a, b)(1.0)
     # The first trial is the unit: whoever looks later divides by the same.
     evidence = no_lean(second - first, float(first[0] + second[0]) or 1.0)
@@ -185,14 +185,14 @@ def _exp(value: float) -> float:
 
 
 @dataclass(frozen=True)
-class Plan:
+class PowerPlan:
     """What is wanted: a difference of success, second less first, is found with this probability."""
 
     power: float
     difference: float
 
     @classmethod
-    def of(cls, power: float | None, difference: float | None, *, anytime: bool = False) -> Plan | None:
+    def of(cls, power: float | None, difference: float | None, *, anytime: bool = False) -> PowerPlan | None:
         """The plan that is asked for; None if none is.
 
         Raises:

@@ -40,7 +40,7 @@ Where = Literal[
 ]
 """A table; its columns are in the order of the records. The overview and the terminal's table show those of plugins
 behind their own."""
-Given = Literal["", "solved", "common"]
+Condition = Literal["", "solved", "common"]
 ALL = "all"
 """The row of the summary over all parameters."""
 BEST = "may_be_best"
@@ -64,7 +64,7 @@ class Statistic:
     meaning: str
     values: Callable[[Sample], Any]
     limits: Callable[[Sample], Ends] | None = None
-    given: Given = ""
+    given: Condition = ""
     """The trials that it is conditional on: their number is the column `count`."""
     kind: Kind = "number"
     where: tuple[Where, ...] = ()
@@ -901,7 +901,7 @@ def fault_of(record: Any) -> str:
         if column in taken:
             return f"there is a column {column} already; choose another name"
     chosen = [("kind", record.kind, Kind), *(("where", where, Where) for where in record.where)]
-    for name, value, choices in [*chosen, ("given", record.given, Given)]:
+    for name, value, choices in [*chosen, ("given", record.given, Condition)]:
         if value not in get_args(choices):
             return f"{name}={value}: choose from {', '.join(get_args(choices))}"
     return ""

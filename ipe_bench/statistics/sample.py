@@ -27,10 +27,10 @@ AMBIGUOUS = "extra_ambiguous"
 SCALARS = ("status", "solved", "success", "iterations", "simulations", "jacobians", "time_s", "nees", "crlb_distance")
 PATH = ("path_nees", "white_p", "log_likelihood", "first_bad_epoch")
 """Scores of a tracker over the whole path."""
-OPTIONAL = ("message", FIT, NIS, AMBIGUOUS, "root_distance", *PATH)
+OPTIONAL_COLUMNS = ("message", FIT, NIS, AMBIGUOUS, "root_distance", *PATH)
 """Columns that not every version or estimator stores."""
 CONTRACTION = ("contraction_K", "contraction_norm", "contraction_radius")
-TRUTH = (*CONTRACTION, "curvature_M", "curvature_intrinsic", "curvature_parameter")
+TRUTH_COLUMNS = (*CONTRACTION, "curvature_M", "curvature_intrinsic", "curvature_parameter")
 """Numbers of the truth."""
 CLOSE = 0.05
 """An iterate within this many standard deviations of the last one is as good as the last one."""
@@ -67,7 +67,7 @@ class Sample:
     number: Array
     """(trials,): one number per (seed, trial)."""
     scalars: Mapping[str, Array]
-    """Per trial, by the names in `SCALARS`, and those of `OPTIONAL` that are stored."""
+    """Per trial, by the names in `SCALARS`, and those of `OPTIONAL_COLUMNS` that are stored."""
     error: Array
     """(trials, n)"""
     deviation: Array
@@ -87,7 +87,7 @@ class Sample:
         solved."""
         names = [p["name"] for p in group.footer["parameters"]]
         errors, deviations = ([f"{kind}_{name}" for name in names] for kind in ("error", "deviation"))
-        parts = [collection.load(cell, [*SCALARS, *errors, *deviations], OPTIONAL) for cell in group.cells]
+        parts = [collection.load(cell, [*SCALARS, *errors, *deviations], OPTIONAL_COLUMNS) for cell in group.cells]
         every = np.concatenate([_numbers(cell, part["trial"]) for cell, part in zip(group.cells, parts, strict=True)])
         status = np.concatenate([part["status"] for part in parts])
         used: Array = np.asarray(status != Status.NO_READINGS.label)
@@ -96,7 +96,7 @@ class Sample:
             """The column, which is forgotten in its parts."""
             return np.concatenate([part.pop(name) for part in parts])[used]
 
-        there = [name for name in (*SCALARS, *OPTIONAL) if all(name in part for part in parts)]
+        there = [name for name in (*SCALARS, *OPTIONAL_COLUMNS) if all(name in part for part in parts)]
         number, scalars = every[used], {name: joined(name) for name in there}
         for name in ("solved", "success"):
             scalars[name] = scalars[name].astype(bool)
@@ -171,8 +171,8 @@ class Sample:
         return self.error / self.linear_bound
 
     def of_truth(self, kind: str) -> Array:
-        """What is stored of the truth for each parameter (trials, n), or (trials,) by a name in `TRUTH`, read anew; NaN
-        where it is not stored."""
+        """Reads what is stored of the truth for each parameter (trials, n), or (trials,) by a name in `TRUTH_COLUMNS`;
+        NaN where it is not stored."""
         return self._stored(kind, self.group.truths)
 
     def of_estimate(self, kind: str) -> Array:
@@ -180,7 +180,7 @@ class Sample:
         return self._stored(kind, self.group.cells)
 
     def _stored(self, kind: str, cells: Sequence[StoredCell | None]) -> Array:
-        names = [kind] if kind in TRUTH else [f"{kind}_{name}" for name in self.names]
+        names = [kind] if kind in TRUTH_COLUMNS else [f"{kind}_{name}" for name in self.names]
         values = np.full((len(names), len(self)), np.nan)
         for cell in filter(None, cells):
             stored = self.collection.load(cell, (), names)
@@ -189,7 +189,7 @@ class Sample:
             for row, name in zip(values, names, strict=True):
                 if name in stored:
                     row[mine] = stored[name][theirs]
-        return values[0] if kind in TRUTH else values.T
+        return values[0] if kind in TRUTH_COLUMNS else values.T
 
     @cached_property
     def calibrations(self) -> list[Calibration]:

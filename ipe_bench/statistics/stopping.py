@@ -26,7 +26,7 @@ from ipe_bench.trials.tracking import AnyScenario
 
 NARROW = "every interval is narrow enough"
 """Why a scenario stops that has come to the precision that was asked for."""
-STATISTICS = ("success", "rmse")
+WITH_PRECISION = ("success", "rmse")
 """What a precision can be asked for: success as a difference of shares, of every estimator; rmse as a ratio less 1, of
 the root mean square over parameters of error over bound, of the trials that an estimator solved."""
 
@@ -40,8 +40,8 @@ def precision_of(given: float | Mapping[str, float]) -> Mapping[str, float]:
     """
     named = {str(k): v for k, v in given.items()} if isinstance(given, Mapping) else {"success": given}
     for name, value in named.items():
-        if name not in STATISTICS:
-            raise UserError(f"precision.{name}: {unknown(name, STATISTICS, 'statistic')}")
+        if name not in WITH_PRECISION:
+            raise UserError(f"precision.{name}: {unknown(name, WITH_PRECISION, 'statistic')}")
         if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 1:
             key = f"precision.{name}" if isinstance(given, Mapping) else "precision"
             raise UserError(f"{key}={value}: give a number between 0 and 1, such as 0.01")

@@ -53,7 +53,7 @@ rmse = of_path(f.rmse)
 bound = of_path(lambda s: s.linear_bound)
 
 
-def rmse_limits(s: Sample) -> f.Limits:
+def rmse_limits(s: Sample) -> f.Ends:
     """Ends (n + 1,) of the intervals of these root mean squares."""
     return f.ends_in_units(f.rmse_ends)(path(s)) if is_track(s) else (np.full(s.n + 1, np.nan),) * 2
 
@@ -83,7 +83,7 @@ def not_white(s: Sample) -> tuple[float, float, float]:
     return rejected / len(p) if len(p) else np.nan, *clopper_pearson(rejected, len(p))
 
 
-def curves(s: Sample) -> Iterator[dict[str, Any]]:
+def epoch_curves(s: Sample) -> Iterator[dict[str, Any]]:
     """Of each state of a track: time, root mean square error, bounds, and NEES with its limits, epoch by epoch."""
     times = np.array(s.group.footer.get("times", ()), dtype=float)
     if not len(times):

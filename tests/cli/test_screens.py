@@ -12,7 +12,7 @@ import ipe_bench as ib
 import ipe_bench.cli
 from ipe_bench.cli.main import main
 from ipe_bench.report import figures
-from ipe_bench.report.answer import contents
+from ipe_bench.report.answer import estimate_parts
 from ipe_bench.report.table import terminal
 
 WIDTHS = (80, 100, 120)
@@ -108,7 +108,7 @@ def answer():
 @pytest.mark.parametrize("width", WIDTHS)
 def test_an_answer_names_every_estimator(answer, width):
     out = io.StringIO()
-    Console(file=out, width=width).print(terminal(contents(answer), width))
+    Console(file=out, width=width).print(terminal(estimate_parts(answer), width))
     lines = out.getvalue().splitlines()
     assert max(map(len, lines)) <= width
     assert not re.search(r"\w…", out.getvalue())  # a range has blanks around it

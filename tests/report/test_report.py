@@ -24,7 +24,7 @@ from ipe_bench.report.headline import about, headline
 from ipe_bench.report.html import DEFINITIONS, render_page
 from ipe_bench.report.table import Strong, Table, column, comma_separated, html, latex, markdown, terminal, texts, words
 from ipe_bench.report.tables import all_tables
-from ipe_bench.report.terminal import LEGEND, reported, summary_tables
+from ipe_bench.report.terminal import overview_notes, reported, summary_tables
 from ipe_bench.report.words import compact, duration, percent, short
 from ipe_bench.statistics import analyse
 from ipe_bench.statistics.records import SCORES, STATISTICS, frame_columns
@@ -196,7 +196,7 @@ def test_what_a_terminal_has_no_room_for_is_named_with_its_file_or_goes_below():
 
 
 def test_the_legend_says_at_what_a_trial_is_capped():
-    assert "where a trial counts as at most 5." in " ".join(LEGEND)
+    assert "where a trial counts as at most 5." in " ".join(overview_notes(["gaussian"]))
 
 
 def _luminance(color: str) -> float:

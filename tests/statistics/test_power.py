@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from ipe_bench.statistics.paired import Plan, mcnemar_power, trials_needed
+from ipe_bench.statistics.paired import PowerPlan, mcnemar_power, trials_needed
 
 CASES = [(0.9, 0.95, 0.0), (0.9, 0.95, 0.6), (0.5, 0.6, 0.0), (0.5, 0.6, 0.7), (0.97, 1.0, 0.0), (0.73, 0.67, 0.3)]
 """Success of the first and of the second, and the correlation of both."""
@@ -53,7 +53,7 @@ def test_plans_of_small_pilots_have_the_power_on_average(case):
     seen = np.random.default_rng(7).binomial(25, share, 200)
     reached, naive = [], []
     for discordant, count in zip(*np.unique(seen, return_counts=True), strict=True):
-        plan = Plan(0.9, difference).row(int(discordant), 25, 0.05)
+        plan = PowerPlan(0.9, difference).row(int(discordant), 25, 0.05)
         shown = trials_needed(max(discordant / 25, difference), difference, 0.9, 0.05)
         reached += [mcnemar_power(plan["trials_needed"], share, difference, 0.05)] * count
         naive += [mcnemar_power(shown, share, difference, 0.05)] * count

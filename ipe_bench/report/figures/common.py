@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from ipe_bench.report.style import BOUND_COLOR, BOUND_DASH, GREY, Look, column
-from ipe_bench.report.words import plain
+from ipe_bench.report.style import BOUND_COLOR, BOUND_DASH, GREY, Look, print_width
+from ipe_bench.report.words import value_text
 from ipe_bench.trials.thresholds import FEW
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ def panels(count: int, look: Mapping[str, Look] | None = None, *, height: float 
 
     down = -(-count // _across())
     across = -(-count // down)
-    width = column() or min(2.0 + 3.2 * across, 11.0)
+    width = print_width() or min(2.0 + 3.2 * across, 11.0)
     size = width, min(height, 0.85 * width / across) * down + 0.4 + 0.05 * len(look or ())
     fig = Figure(figsize=size, layout="constrained")
     axes: list[Axes] = list(fig.subplots(down, across, squeeze=False).flat)
@@ -41,7 +41,7 @@ def panels(count: int, look: Mapping[str, Look] | None = None, *, height: float 
 
 def _across() -> int:
     """The most panels side by side."""
-    return max(2, int(column() / 1.7)) if column() else 4
+    return max(2, int(print_width() / 1.7)) if print_width() else 4
 
 
 def most_panels() -> int:
@@ -55,13 +55,13 @@ def panels_of_scales(rows: pd.DataFrame, look: Mapping[str, Look]) -> tuple[Figu
     scales = [every[round(i)] for i in np.linspace(0, len(every) - 1, min(most_panels(), len(every)))]
     fig, axes = panels(len(scales), look)
     for scale, ax in zip(scales, axes, strict=True):
-        title(ax, f"error scale {plain(scale)}")
+        title(ax, f"error scale {value_text(scale)}")
     return fig, [(ax, rows[rows["error_scale"] == scale]) for scale, ax in zip(scales, axes, strict=True)]
 
 
 def text(value: Any) -> str:
     """A name as it stands in a figure: never read as mathematics, never longer than a line."""
-    words, most = str(value), 16 if column() else 42
+    words, most = str(value), 16 if print_width() else 42
     words = (words if len(words) <= most else words[: most - 1] + "…").replace("$", r"\$")
     # A leading underscore would hide the name from legends.
     return "\u200b" + words if words.startswith("_") else words
@@ -109,7 +109,7 @@ def scale_axis(ax: Axes, scales: Sequence[float], labels: Sequence[str]) -> None
     span = np.log10(scales[-1] / scales[0])
     kept = labelled(scales, span / _letters(_width(ax), "xtick.labelsize"))
     ax.set_xscale("log")
-    ax.set_xticks(kept, [plain(s) for s in kept])
+    ax.set_xticks(kept, [value_text(s) for s in kept])
     ax.set_xticks([], minor=True)
     margin = 10 ** max(0.06 * span, 0.15)
     ax.set_xlim(scales[0] / margin, scales[-1] * margin)
@@ -121,7 +121,7 @@ def labelled(scales: Sequence[float], letter: float) -> list[float]:
     kept = [scales[0]]
     for scale in scales[1:-1]:
         beside = (kept[-1], scale), (scale, scales[-1])
-        if all(np.log10(b / a) > letter * (len(plain(a)) + len(plain(b)) + 1) / 2 for a, b in beside):
+        if all(np.log10(b / a) > letter * (len(value_text(a)) + len(value_text(b)) + 1) / 2 for a, b in beside):
             kept.append(scale)
     return [*kept, *scales[1:][-1:]]
 

@@ -11,16 +11,16 @@ from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing, Figure
 from ipe_bench.report.figures.views import View
 from ipe_bench.report.style import GREY, MARKERS, Look
-from ipe_bench.report.words import enumerate_few, plain, short
+from ipe_bench.report.words import enumerate_few, short, value_text
 from ipe_bench.statistics.sample import CLOSE
 
 LEAST_COST = 0.5
 """What does not simulate at all stands here: a logarithmic axis has no zero."""
 _HIGHEST = 1e6
 """Errors beyond this many bounds stand at the upper edge."""
-FLOOR = 1e-10
+LEAST_DISTANCE = 1e-10
 """Distances from the limit below this are drawn here: round-off."""
-LONG = 60
+MANY_ITERATIONS = 60
 """Iterations from which on the axis is logarithmic."""
 
 
@@ -60,7 +60,7 @@ def draw_costs(view: View) -> Iterator[Drawing]:
         " truth, over all trials; down and left is better. Of points of about the same cost, later ones are shifted to"
         " the right.",
         f"Errors beyond {common.number(_HIGHEST)} stand at the edge." * bool((rows["error"] == _HIGHEST).any()),
-        f"The cheapest within 5 % of the least error at scale {plain(view.scales[-1])}: {good['estimator']}"
+        f"The cheapest within 5 % of the least error at scale {value_text(view.scales[-1])}: {good['estimator']}"
         f" ({short(good['simulations_median'])} simulations).",
     )
 
@@ -78,10 +78,10 @@ def draw_convergence(view: View) -> Iterator[Drawing]:
     rows = rows[rows.groupby("estimator")["iteration"].transform("max") > 0]
     look, scales = view.with_look(rows["estimator"]), sorted(set(rows["error_scale"]))
     shown = sorted(look, key=lambda label: look[label].color == GREY)[: common.most_panels()]
-    names = {scale: f"error scale {plain(scale)}" for scale in scales}
+    names = {scale: f"error scale {value_text(scale)}" for scale in scales}
     colors = sns.color_palette("crest", len(scales)).as_hex()
     by_scale = {name: Look(colors[i], MARKERS[i % len(MARKERS)]) for i, name in enumerate(names.values())}
-    rows = rows.assign(scale=rows["error_scale"].map(names), distance=rows["distance"].clip(lower=FLOOR))
+    rows = rows.assign(scale=rows["error_scale"].map(names), distance=rows["distance"].clip(lower=LEAST_DISTANCE))
     style = {**common.seaborn_style(by_scale, "scale"), "dashes": False, "estimator": None, "linewidth": 1.2}
     fig, axes = common.panels(len(shown), by_scale)
     bottom, top = rows["distance"].min() / 3, rows["distance"].max() * 3
@@ -94,11 +94,11 @@ def draw_convergence(view: View) -> Iterator[Drawing]:
         common.log_ticks(ax.yaxis, bottom, top)
         common.bound_line(ax, CLOSE, f"{CLOSE:g} standard deviations")
         ax.set_xlim(-0.03 * end - 0.2, 1.03 * end + 0.2)
-        if end > LONG:
+        if end > MANY_ITERATIONS:
             ax.set_xscale("symlog", linthresh=10)
         else:
             ax.xaxis.set_major_locator(MaxNLocator(6, integer=True))
-        common.title(ax, f"{label}, logarithmic from 10" if end > LONG else label)
+        common.title(ax, f"{label}, logarithmic from 10" if end > MANY_ITERATIONS else label)
     common.axis_labels(fig, "iteration", "distance to own limit [σ]")
     common.legend(fig, axes, by_scale)
     last = rows[rows["error_scale"] == scales[-1]]
@@ -111,7 +111,7 @@ def draw_convergence(view: View) -> Iterator[Drawing]:
         "Median over the first converged trials of the largest component of the distance between an iterate and the"
         " last one, in standard deviations of the Cramér-Rao bound. The last iterate is not drawn, since its distance"
         " is zero by definition; a curve ends when half of the trials have ended.",
-        f"Iterations until the median is within {CLOSE:g} standard deviations at scale {plain(scales[-1])}:"
+        f"Iterations until the median is within {CLOSE:g} standard deviations at scale {value_text(scales[-1])}:"
         f" {enumerate_few(seen, 20)}.",
         f"{len(look) - len(shown)} further estimators are not shown." * (len(look) > len(shown)),
     )

@@ -16,7 +16,7 @@ from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing, Figure
 from ipe_bench.report.figures.views import View
 from ipe_bench.report.style import BOUND_COLOR, BOUND_DASH, looks
-from ipe_bench.report.words import brief, enumerate_few, p_value, percent, plain
+from ipe_bench.report.words import brief, enumerate_few, p_value, percent, value_text
 
 if TYPE_CHECKING:
     from ipe_bench.measurements.base import Measurement
@@ -61,7 +61,7 @@ def draw(view: View) -> Iterator[Drawing]:
         words = {"heading": "squared error over claimed variance", "label": "NEES, median"}
         common.curves(nees, claims, "nees_median", *shown, **words)
     common.legend(fig, axes, view.look)
-    over = "over error scales" if len(view.scales) > 1 else f"at error scale {plain(view.scales[0])}"
+    over = "over error scales" if len(view.scales) > 1 else f"at error scale {value_text(view.scales[0])}"
     last = totals[totals["error_scale"] == view.scales[-1]].sort_values("success", ascending=False, kind="stable")
     ranked = [f"{e} {percent(v)}" for e, v in zip(last["estimator"], last["success"], strict=True)]
     ceilings = f"{CEILING['error_median']:g}, or {CEILING['nees_median']:g} times the claimed variance"
@@ -74,7 +74,7 @@ def draw(view: View) -> Iterator[Drawing]:
         f" median error over {view.reference} at the truth, with a bar up to the 95 % quantile. Right: squared error"
         " over the variance that the estimator claims; 1 is right.",
         f"An error over {ceilings}, stands at the top." if beyond else "",
-        f"Success at scale {plain(view.scales[-1])}: {enumerate_few(ranked, 20)}.",
+        f"Success at scale {value_text(view.scales[-1])}: {enumerate_few(ranked, 20)}.",
     )
 
 
@@ -113,7 +113,7 @@ def draw_distributions(view: View) -> Iterator[Drawing]:
         ""
         if view.moving
         else "Dotted: the law of an efficient estimator, chi over the root of its degrees of freedom.",
-        f"99 % quantile at scale {plain(top)}: {enumerate_few(seen, 20)}.",
+        f"99 % quantile at scale {value_text(top)}: {enumerate_few(seen, 20)}.",
     )
 
 
@@ -146,7 +146,7 @@ def draw_calibration(view: View) -> Iterator[Drawing]:
         " right; they are light where fewer trials converged. A curve below 0 in the middle means that most errors"
         " are larger than claimed, one above 0 that they are smaller. The vertical axis is logarithmic beyond"
         f" ±{LINEAR / 2:g}.",
-        f"At scale {plain(top)}, parameters included: {enumerate_few(last, 4)}.",
+        f"At scale {value_text(top)}, parameters included: {enumerate_few(last, 4)}.",
     )
 
 

@@ -12,7 +12,7 @@ from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing, Figure
 from ipe_bench.report.figures.views import View
 from ipe_bench.report.style import BLACK, BOUND_COLOR, BOUND_DASH, COLORS, GREY, MARKERS, REFERENCE, Look
-from ipe_bench.report.words import brief, enumerate_few, plain
+from ipe_bench.report.words import brief, enumerate_few, value_text
 from ipe_bench.statistics.records import ALL
 
 MOST_GROUPS = 8
@@ -65,7 +65,7 @@ def _of_one(view: View, estimator: str) -> Drawing:
     for ax, unit in zip(axes, [*(inside[0]["unit"] for inside in groups.values()), "bounds"], strict=True):
         ax.set_ylabel(common.text(f"[{unit}]" if unit else ""))
     common.legend(fig, axes[-1:], {"all together": together})
-    at = [f"{brief(v)} at scale {plain(s)}" for s, v in totals[["error_scale", "rmse"]].dropna().to_numpy()]
+    at = [f"{brief(v)} at scale {value_text(s)}" for s, v in totals[["error_scale", "rmse"]].dropna().to_numpy()]
     number = 2 if estimator == REFERENCE else 3
     of_paper = f"Figure {number} of the paper: " if view.paper else ""
     return view.drawing(
@@ -99,7 +99,7 @@ def _missing(totals: pd.DataFrame) -> str:
     """How many trials an estimator solved at each scale."""
     lacking = totals[totals["solved_trials"] < totals["trials"]]
     rows = lacking[["solved_trials", "trials", "error_scale"]].to_numpy()
-    seen = [f"{solved:.0f} of {trials:.0f} at scale {plain(scale)}" for solved, trials, scale in rows]
+    seen = [f"{solved:.0f} of {trials:.0f} at scale {value_text(scale)}" for solved, trials, scale in rows]
     return enumerate_few(seen, 12) or f"all of {totals['trials'].min():.0f}"
 
 

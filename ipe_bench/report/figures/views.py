@@ -12,7 +12,7 @@ import pandas as pd
 
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.style import MOST_FACES, Look, looks
-from ipe_bench.report.words import plain
+from ipe_bench.report.words import value_text
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.records import ALL
 
@@ -135,7 +135,7 @@ def _word(value: Any) -> str:
     if value is None or (pd.api.types.is_scalar(value) and pd.isna(value)):
         return "-"
     # Six figures where they say it all: values that differ later are different settings.
-    return plain(value) if isinstance(value, float) and float(plain(value)) == value else str(value)
+    return value_text(value) if isinstance(value, float) and float(value_text(value)) == value else str(value)
 
 
 def _looks(analysis: Analysis) -> dict[str, Look]:

@@ -14,7 +14,7 @@ from ipe_bench.report.figures.drawing import Drawing, Figure
 from ipe_bench.report.figures.views import View
 from ipe_bench.report.sections import Section
 from ipe_bench.report.table import Part, Table, column, words
-from ipe_bench.report.words import enumerate_few, plain, short
+from ipe_bench.report.words import enumerate_few, short, value_text
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.certified import certified_cells, certified_estimate
 from ipe_bench.statistics.collect import Collection
@@ -100,7 +100,7 @@ def _problems(minima: pd.DataFrame) -> Table:
     rows = minima.sort_values(["function", "start"], kind="stable", ignore_index=True)
     columns = [
         words("function", rows["function"]),
-        column("start", rows["start"], plain),
+        column("start", rows["start"], value_text),
         words("estimator", rows["estimator"]),
         words("solved", rows["solved"].map({True: "yes", False: "no"})),
         words("minimum", ["-" if pd.isna(v) else f"{int(v) + 1}" for v in rows["minimum"]]),
