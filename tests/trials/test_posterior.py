@@ -12,7 +12,7 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates
 from ipe_bench.measurements import Gins
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.report.questions import honesty
+from ipe_bench.report.questions import honest_word
 from ipe_bench.trials.posterior import Divergence, Posterior, divergence, reference, sample_posterior
 
 PRIOR = np.array([1.0, 0.5, 2.0])
@@ -63,7 +63,7 @@ def test_the_exact_gaussian_does_not_diverge_and_a_wrong_one_does_as_computed(li
     problem, z, found = linear
     mean, P, _ = exact(problem, z)
     right = held(found, mean, P)
-    assert honesty(right, found) == "yes"
+    assert honest_word(right, found) == "yes"
     assert right.kl < 0.05
     assert right.energy < 0.01
     assert right.width == pytest.approx(1.0, abs=0.05)
@@ -77,7 +77,7 @@ def test_the_exact_gaussian_does_not_diverge_and_a_wrong_one_does_as_computed(li
     assert shifted.energy > 50 * max(right.energy, 1e-3)
     assert held(found, mean, None).kl == np.inf
     assert held(found, np.full(3, np.nan), P).kl == np.inf
-    assert honesty(shifted, found) == "NO"
+    assert honest_word(shifted, found) == "NO"
 
 
 def square(tilt: float = 0.0) -> Written:
@@ -114,7 +114,7 @@ def test_one_gaussian_cannot_stand_for_two_modes():
     assert at_one.energy > 0.5
     assert over_both.kl < 1e-6  # the moments are right
     assert over_both.energy > 0.1
-    assert (honesty(at_one, found), honesty(over_both, found)) == ("NO", "NO")
+    assert (honest_word(at_one, found), honest_word(over_both, found)) == ("NO", "NO")
 
 
 def test_the_same_trial_gives_the_same_draws(linear):
