@@ -13,7 +13,8 @@ from ipe_bench.report.headline import about, headline
 from ipe_bench.report.table import Table, environment
 from ipe_bench.report.words import CITATION
 from ipe_bench.statistics.comparisons import TIE
-from ipe_bench.statistics.records import SCORES, STATISTICS, all_statistics
+from ipe_bench.statistics.records import SCORES, STATISTICS
+from ipe_bench.statistics.registry import all_statistics
 
 if TYPE_CHECKING:
     from ipe_bench.report.figures import Drawn

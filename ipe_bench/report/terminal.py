@@ -10,7 +10,8 @@ from typing import Any
 from ipe_bench.report.table import Cell, Column, Part, Table, column, interval, sort_key, words
 from ipe_bench.report.words import brief, duration, p_value, percent, short, value_text
 from ipe_bench.statistics.formulas import CAP
-from ipe_bench.statistics.records import ALL, BEST, SCORES, Kind, Statistic, Where, all_statistics, summary_columns
+from ipe_bench.statistics.records import ALL, BEST, SCORES, Kind, Statistic, Where
+from ipe_bench.statistics.registry import all_statistics, summary_columns
 
 _MOST_TABLES = 12
 """Settings that a terminal shows."""

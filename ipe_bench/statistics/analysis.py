@@ -17,7 +17,8 @@ from ipe_bench.statistics.collect import Collection, Group, collect
 from ipe_bench.statistics.comparisons import Outcomes, compare_pairs, corrected, may_be_best
 from ipe_bench.statistics.formulas import failed, share
 from ipe_bench.statistics.intervals import quantile
-from ipe_bench.statistics.records import BEST, SCORES, rows_of, summary_rows, to_frame
+from ipe_bench.statistics.records import BEST, SCORES, rows_of
+from ipe_bench.statistics.registry import summary_rows, to_frame
 from ipe_bench.statistics.sample import CONTRACTION, Sample, label_of, median_distances, samples
 from ipe_bench.statistics.tracks import epoch_curves
 

@@ -16,9 +16,9 @@ import numpy as np
 from scipy.special import bdtr, bdtrc, chdtri, gammaln, ndtri
 
 from ipe_bench.basics.linalg import Array
-from ipe_bench.statistics.intervals import LEVEL
 from ipe_bench.trials.thresholds import FEW, GATE, gate
 
+BAND_LEVEL = 0.95
 POINTS = np.arange(1, 100) / 100
 """Where the distribution functions are compared."""
 INSIDE = "inside its bands"
@@ -75,7 +75,7 @@ def least_count(trials: Any, p: Array, tail: Array) -> Array:
 
 
 @lru_cache(maxsize=64)
-def band(trials: int, level: float = LEVEL) -> tuple[Array, Array]:
+def band(trials: int, level: float = BAND_LEVEL) -> tuple[Array, Array]:
     """Ends (points,) of the band of the difference, which uniform draws leave anywhere in 1 - level of cases."""
     low, high = (1 - level) / (4 * len(POINTS)), 1 - level
     for _ in range(7):
@@ -196,7 +196,7 @@ def calibrations(error: Array, deviation: Array, nees: Array, claimed: Array) ->
     place = [trials - np.searchsorted(z, least) for z in each]
     size = [np.searchsorted(z, radius, side="right") - np.searchsorted(z, -radius) for z in each]
     found = curves([*place, *size, np.searchsorted(together, whole, side="right")], trials)
-    level = 1 - (1 - LEVEL) / (n + 1)
+    level = 1 - (1 - BAND_LEVEL) / (n + 1)
     parts = [Calibration(z, 1, level, found[n + i], found[i]) for i, z in enumerate(each)]
     return [*parts, Calibration(together, n, level, found[-1])]
 
@@ -218,7 +218,7 @@ def _holds(interval: tuple[float, float], value: float) -> bool:
     return interval[0] <= value <= interval[1]
 
 
-def median_limits(values: Array, level: float = LEVEL) -> tuple[float, float]:
+def median_limits(values: Array, level: float = BAND_LEVEL) -> tuple[float, float]:
     """Interval of the median by order statistics, whatever the distribution; without ends below `FEW` values."""
     count = len(values)
     k = int(least_count(count, np.array([0.5]), np.array([(1 - level) / 2]))[0]) if count >= FEW else 0

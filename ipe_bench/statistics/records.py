@@ -1,27 +1,23 @@
 """Every statistic, each in one record: what it is called and means, over which trials, how it is computed and shown.
 
-`summary.csv`, the appendix of the report, tables and the terminal are read from these lists: who adds a record adds it
-everywhere, and plugins add theirs by `add_statistics`. Formulas longer than a line are in `formulas`.
+`summary.csv`, the appendix of the report, tables and the terminal are read from these lists: a record that is added
+here is added everywhere. `registry` adds those of plugins; formulas longer than a line are in `formulas`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 
 import ipe_bench.statistics.formulas as f
 import ipe_bench.statistics.intervals as intervals
 import ipe_bench.statistics.tracks as t
-from ipe_bench.basics.errors import UserError, place_of
 from ipe_bench.statistics.intervals import clopper_pearson, quantile, share_sequence, verdict
 from ipe_bench.statistics.sample import CLOSE, NIS, Sample, iterations_to_limit, orders_of
 from ipe_bench.trials.thresholds import EVEN, EXPECTED, FEW, GATE, SAME_ROOT
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 Kind = Literal["count", "share", "number", "physical", "seconds", "probability", "word"]
 """How a value is written; `report.words` knows each."""
@@ -50,31 +46,54 @@ Ends = f.Ends
 
 @dataclass(frozen=True)
 class Statistic:
-    """One statistic of a scenario under an estimator.
+    """Defines a statistic of a scenario under an estimator, which becomes a column of `summary.csv` and of tables.
 
-    `values` gives one value, of whole trials, or those of the parameters in their own units, and of all parameters last
-    (n + 1,). `limits` gives the same of both ends of an interval, which are columns of their own.
+    Required: `name`, `title`, `over`, `meaning` and `values`.
+    Optional: `limits` (an interval); `given`, `kind`, `where`, `titles`, `limits_titles` and `rare` (how it is shown).
+    Promised: `values` takes a `Sample`, which it does not write into, and returns one number, or one for each parameter
+    in its own unit and last that of all parameters together (n + 1,), NaN where it is undefined. `limits` returns both
+    ends of the interval in the same form. Names of columns are new, in ASCII letters, digits and underscores.
+
+    A plugin offers a record by `conf/statistic/NAME.yaml`; a record that breaks a promise is left out with a line.
+
+    >>> import tempfile
+    >>> import ipe_bench as ib
+    >>> from ipe_bench.statistics.collect import collect
+    >>> from ipe_bench.statistics.sample import samples
+    >>> meaning = "Share of trials with an error above three times the bound."
+    >>> far = Statistic("far", "far off", "all trials", meaning, lambda s: float((s.distance > 3 * s.n**0.5).mean()))
+    >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = ib.run(bench, {"newton": ib.solvers.Newton()}, trials=20, output=folder)
+    ...     found = collect([folder])
+    ...     (sample,) = samples(found, found.groups)
+    >>> far.columns_of(sample)
+    {'far': [0.0, 0.0, 0.0, 0.0, 0.0]}
+    >>> far.definition
+    'Share of trials with an error above three times the bound. Over all trials.'
     """
 
     name: str
-    """Its column; the ends of its interval are `name_low` and `name_high`."""
+    """Names its column; the ends of its interval are `name_low` and `name_high`."""
     title: str
+    """Heads its column in tables."""
     over: str
-    """The trials that count."""
+    """Says which trials count."""
     meaning: str
+    """Says in a sentence what is computed of them."""
     values: Callable[[Sample], Any]
     limits: Callable[[Sample], Ends] | None = None
     given: Condition = ""
-    """The trials that it is conditional on: their number is the column `count`."""
+    """Names the trials that it is conditional on; their number is the column `count`."""
     kind: Kind = "number"
     where: tuple[Where, ...] = ()
-    """The tables that show it."""
+    """Lists the tables that show it."""
     titles: Mapping[Where, str] = field(default_factory=dict)
-    """Its heading in tables where that is not `title`."""
+    """Replaces `title` in some tables."""
     limits_titles: Mapping[Where, str] = field(default_factory=dict)
-    """The headings of its interval, in tables that show that."""
+    """Heads the interval in the tables that show it."""
     rare: bool = False
-    """Few estimators report it: tables show its column only where one does."""
+    """Leaves it out of tables in which no estimator reports it."""
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -861,113 +880,3 @@ SCORES: tuple[Statistic, ...] = (
     ),
 )
 """Further columns of `Analysis.scores`."""
-
-
-# Those of plugins ----------------------------------------------------------------------------------------------------
-
-_RESERVED = (BEST, "measurement", "noise", "prior", "error_scale", "seed", "estimator", "parameter", "unit", "scenario")
-_added: dict[str, Statistic] = {}
-
-
-def all_statistics() -> tuple[Statistic, ...]:
-    """The records of the summary: ours, and those that were added."""
-    return (*STATISTICS, *_added.values())
-
-
-def add_statistics(records: Sequence[Statistic]) -> list[str]:
-    """Has these computed and shown beside ours, in place of those that were added before.
-
-    Returns a line for each that cannot be.
-    """
-    _added.clear()
-    faults = []
-    for record in records:
-        if fault := fault_of(record):
-            faults.append(f"statistic={getattr(record, 'name', record)}: {fault}; it is left out")
-        else:
-            _added[record.name] = record
-    return faults
-
-
-def fault_of(record: Any) -> str:
-    """What keeps a record from being added to ours and the others; empty where nothing does."""
-    if not isinstance(record, Statistic):
-        return f"is a {type(record).__name__} and not a Statistic"
-    others = [other for other in _added.values() if other is not record]
-    taken = {*_RESERVED, *frame_columns([*STATISTICS, *SCORES, *others])}
-    for column in record.columns:
-        if not (column.isidentifier() and column.isascii()):
-            return f"{column!r} is not a name for a column; use letters, digits and underscores"
-        if column in taken:
-            return f"there is a column {column} already; choose another name"
-    chosen = [("kind", record.kind, Kind), *(("where", where, Where) for where in record.where)]
-    for name, value, choices in [*chosen, ("given", record.given, Condition)]:
-        if value not in get_args(choices):
-            return f"{name}={value}: choose from {', '.join(get_args(choices))}"
-    return ""
-
-
-def columns_of_added(record: Statistic, sample: Sample) -> dict[str, list[Any]]:
-    """The columns of a record that a plugin adds.
-
-    Raises:
-        UserError: it raises, or gives something else than a value per parameter and one over all.
-    """
-    try:
-        columns = record.columns_of(sample)
-    except Exception as error:
-        raise UserError(place_of(error)) from error
-    for name, values in columns.items():
-        if len(values) != sample.n + 1:
-            raise UserError(
-                f"{name}: has {len(values)} values; return one, or one for each of {sample.n} parameters and for all"
-            )
-        for value in values:
-            if not isinstance(value, str if record.kind == "word" else int | float | np.number):
-                raise UserError(f"{name}: a value is a {type(value).__name__}; return a float, or NaN for none")
-    return columns
-
-
-# The summary ---------------------------------------------------------------------------------------------------------
-
-
-def summary_columns() -> tuple[str, ...]:
-    """The columns of `summary.csv` behind those that say what a row is of."""
-    return (*frame_columns(all_statistics()), BEST)
-
-
-def summary_rows(sample: Sample) -> list[dict[str, Any]]:
-    """A row per parameter and one over all, without the comparison of the estimator with its rivals.
-
-    A statistic that was added and raises, or gives what cannot be shown, is missing in these rows, and named in the
-    collection's problems.
-    """
-    rows = rows_of(STATISTICS, sample)
-    for record in _added.values():
-        try:
-            columns = columns_of_added(record, sample)
-        except UserError as error:
-            line = f"statistic={record.name}: {error}; it is missing where that is so"
-            sample.collection.extra_problems.append(line)
-            columns = {name: ["-" if record.kind == "word" else np.nan] * len(rows) for name in record.columns}
-        for i, row in enumerate(rows):
-            row |= {name: values[i] for name, values in columns.items()}
-    group = sample.group
-    head = dict(group.columns) | {"estimator": group.estimator} | dict(group.options)
-    labels = [*((p["name"], p["unit"]) for p in sample.parameters), (ALL, "linear bound")]
-    return [head | {"parameter": p, "unit": unit} | row for (p, unit), row in zip(labels, rows, strict=True)]
-
-
-def to_frame(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    """Rows as a table, columns in the order that readers know."""
-    import pandas as pd
-
-    frame, known = pd.DataFrame(list(rows)), summary_columns()
-    if frame.empty:
-        return pd.DataFrame(columns=["measurement", "noise", "error_scale", "estimator", "parameter", "unit", *known])
-    keys = [c for c in frame.columns if c not in (*known, "parameter", "unit")]
-    first = [c for c in ("measurement", "noise") if c in keys]
-    last = ["error_scale", "estimator"]
-    middle = [c for c in keys if c not in (*first, *last) and not c.startswith("estimator.")]
-    options = [c for c in keys if c.startswith("estimator.")]
-    return frame[[*first, *middle, *last, *options, "parameter", "unit", *known]]

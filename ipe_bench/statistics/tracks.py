@@ -16,7 +16,6 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics import formulas as f
 from ipe_bench.statistics.intervals import clopper_pearson, mean_limits, verdict
 from ipe_bench.statistics.sample import NIS, Sample
-from ipe_bench.trials.tracking import unpacked
 
 if TYPE_CHECKING:
     from ipe_bench.runs.results import StoredCell
@@ -113,6 +112,8 @@ def epoch_curves(s: Sample) -> Iterator[dict[str, Any]]:
 
 
 def _sums(s: Sample, cells: Sequence[StoredCell], epochs: int) -> list[Array]:
-    """The sums (K, columns) of each stored block."""
+    """Reads the sums (K, columns) of each stored block."""
+    from ipe_bench.trials.tracking import unpacked  # late: it knows every tracker
+
     stored = (s.collection.load(cell, (), ("curves",)).get("curves", np.empty(0)) for cell in cells)
     return [block for texts in stored for block in unpacked(texts, epochs)]

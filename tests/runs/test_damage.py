@@ -29,7 +29,7 @@ from ipe_bench.runs.run import compute
 from ipe_bench.runs.store import Store
 from ipe_bench.solvers import Newton
 from ipe_bench.statistics import summarize
-from ipe_bench.statistics.records import add_statistics
+from ipe_bench.statistics.registry import add_statistics
 
 SCENARIOS = [Scenario(Bent(0.02), Gaussian(0.1), seed=seed) for seed in (0, 1)]
 KINDS = ("trials", "runs", "failed")

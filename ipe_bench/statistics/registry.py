@@ -1,0 +1,130 @@
+"""The statistics that are computed, ours and those of plugins, and the rows of the summary."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, get_args
+
+import numpy as np
+
+from ipe_bench.basics.errors import UserError, place_of
+from ipe_bench.statistics.records import (
+    ALL,
+    BEST,
+    SCORES,
+    STATISTICS,
+    Condition,
+    Kind,
+    Statistic,
+    Where,
+    frame_columns,
+    rows_of,
+)
+from ipe_bench.statistics.sample import Sample
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_RESERVED = (BEST, "measurement", "noise", "prior", "error_scale", "seed", "estimator", "parameter", "unit", "scenario")
+_of_plugins: dict[str, Statistic] = {}
+
+
+def all_statistics() -> tuple[Statistic, ...]:
+    """The records of the summary: ours, and those that were added."""
+    return (*STATISTICS, *_of_plugins.values())
+
+
+def add_statistics(records: Sequence[Statistic]) -> list[str]:
+    """Has these computed and shown beside ours, in place of those that were added before.
+
+    Returns a line for each that cannot be.
+    """
+    _of_plugins.clear()
+    faults = []
+    for record in records:
+        if fault := fault_of(record):
+            faults.append(f"statistic={getattr(record, 'name', record)}: {fault}; it is left out")
+        else:
+            _of_plugins[record.name] = record
+    return faults
+
+
+def fault_of(record: Any) -> str:
+    """What keeps a record from being added to ours and the others; empty where nothing does."""
+    if not isinstance(record, Statistic):
+        return f"is a {type(record).__name__} and not a Statistic"
+    others = [other for other in _of_plugins.values() if other is not record]
+    taken = {*_RESERVED, *frame_columns([*STATISTICS, *SCORES, *others])}
+    for column in record.columns:
+        if not (column.isidentifier() and column.isascii()):
+            return f"{column!r} is not a name for a column; use letters, digits and underscores"
+        if column in taken:
+            return f"there is a column {column} already; choose another name"
+    chosen = [("kind", record.kind, Kind), *(("where", where, Where) for where in record.where)]
+    for name, value, choices in [*chosen, ("given", record.given, Condition)]:
+        if value not in get_args(choices):
+            return f"{name}={value}: choose from {', '.join(get_args(choices))}"
+    return ""
+
+
+def columns_of_added(record: Statistic, sample: Sample) -> dict[str, list[Any]]:
+    """The columns of a record that a plugin adds.
+
+    Raises:
+        UserError: it raises, or gives something else than a value per parameter and one over all.
+    """
+    try:
+        columns = record.columns_of(sample)
+    except Exception as error:
+        raise UserError(place_of(error)) from error
+    for name, values in columns.items():
+        if len(values) != sample.n + 1:
+            raise UserError(
+                f"{name}: has {len(values)} values; return one, or one for each of {sample.n} parameters and for all"
+            )
+        for value in values:
+            if not isinstance(value, str if record.kind == "word" else int | float | np.number):
+                raise UserError(f"{name}: a value is a {type(value).__name__}; return a float, or NaN for none")
+    return columns
+
+
+def summary_columns() -> tuple[str, ...]:
+    """The columns of `summary.csv` behind those that say what a row is of."""
+    return (*frame_columns(all_statistics()), BEST)
+
+
+def summary_rows(sample: Sample) -> list[dict[str, Any]]:
+    """A row per parameter and one over all, without the comparison of the estimator with its rivals.
+
+    A statistic that was added and raises, or gives what cannot be shown, is missing in these rows, and named in the
+    collection's problems.
+    """
+    rows = rows_of(STATISTICS, sample)
+    for record in _of_plugins.values():
+        try:
+            columns = columns_of_added(record, sample)
+        except UserError as error:
+            line = f"statistic={record.name}: {error}; it is missing where that is so"
+            sample.collection.extra_problems.append(line)
+            columns = {name: ["-" if record.kind == "word" else np.nan] * len(rows) for name in record.columns}
+        for i, row in enumerate(rows):
+            row |= {name: values[i] for name, values in columns.items()}
+    group = sample.group
+    head = dict(group.columns) | {"estimator": group.estimator} | dict(group.options)
+    labels = [*((p["name"], p["unit"]) for p in sample.parameters), (ALL, "linear bound")]
+    return [head | {"parameter": p, "unit": unit} | row for (p, unit), row in zip(labels, rows, strict=True)]
+
+
+def to_frame(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+    """Rows as a table, columns in the order that readers know."""
+    import pandas as pd
+
+    frame, known = pd.DataFrame(list(rows)), summary_columns()
+    if frame.empty:
+        return pd.DataFrame(columns=["measurement", "noise", "error_scale", "estimator", "parameter", "unit", *known])
+    keys = [c for c in frame.columns if c not in (*known, "parameter", "unit")]
+    first = [c for c in ("measurement", "noise") if c in keys]
+    last = ["error_scale", "estimator"]
+    middle = [c for c in keys if c not in (*first, *last) and not c.startswith("estimator.")]
+    options = [c for c in keys if c.startswith("estimator.")]
+    return frame[[*first, *middle, *last, *options, "parameter", "unit", *known]]
