@@ -45,7 +45,7 @@ def read_members(model: CountingModel, R: Covariance, x: Array, rows: Rows, z: A
         return R.whiten((h - (centre - near(centre, to))).reshape(len(p) * members, -1))
 
     h = [read(p) for p in pieces]
-    # In C order whatever the model returned: BLAS rounds otherwise where the strides are other.
+    # In C order, for any order of the model's: BLAS rounds otherwise where the strides are other.
     return np.ascontiguousarray(np.concatenate(h)).reshape(trials, members, -1)
 
 
@@ -98,7 +98,7 @@ class Walk(ABC):
     """A batch of filters on its way through the epochs: a subclass says how they take one in.
 
     States are distances from the nominal point in prior deviations, and readings are whitened (R = I), so that P starts
-    near the unit matrix whatever the parameters' units.
+    near the unit matrix for any units of the parameters.
     """
 
     def __init__(self, problem: Problem, z: Array) -> None:

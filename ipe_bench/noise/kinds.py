@@ -103,7 +103,7 @@ class StudentT(ScaledNoise):
 class Outliers(ScaledNoise):
     """Tukey's contaminated normal: each reading is, with probability `share`, `factor` times as noisy as it should be.
 
-    `deviation` is that of a good reading. `assumed` is what estimators are told: `nominal`, the variance of the good
+    `deviation` is that of a good reading. `assumed` is what estimators assume: `nominal`, the variance of the good
     readings, as if there were no outliers; or `total`, that of the mixture, deviation^2 (1 - share + share factor^2).
     """
 
@@ -124,7 +124,7 @@ class Outliers(ScaledNoise):
         return np.where(gross, self.factor, 1.0) * rng.standard_normal(shape)
 
     def whitened(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array | None:
-        """The mixture where estimators are told of it; otherwise R is that of good readings, which are normal."""
+        """The mixture where estimators know of it; otherwise R is that of good readings, which are normal."""
         return None if self.assumed == "nominal" else self._mixture(shape, rng) / self._excess
 
     @property
@@ -183,7 +183,7 @@ class Colored(ScaledNoise):
 
     The readings are `channels` instruments in turn, each with a series of its own; after `length` readings of each the
     series start anew. GINS has 2 channels (the axes) and a length of 30 (the times of a case). `assumed` is what
-    estimators are told: `white`, R = deviation^2 I, which is the mistake that the paper warns of; or `full`, the truth.
+    estimators assume: `white`, R = deviation^2 I, which is the mistake that the paper warns of; or `full`, the truth.
     """
 
     correlation: Annotated[float, Gt(-1), Lt(1)] = 0.5
@@ -228,7 +228,7 @@ class Correlated(ScaledNoise):
 
     Either `matrix` is R, in squared units of the readings; or readings of one standard deviation come in blocks of
     `block` that follow one another and share an error, such that two of a block have the given correlation. `assumed`
-    is what estimators are told: `full`, R itself; or `white`, its diagonal.
+    is what estimators assume: `full`, R itself; or `white`, its diagonal.
     """
 
     correlation: Annotated[float, Ge(0), Lt(1)] = 0.5

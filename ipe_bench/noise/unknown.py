@@ -35,7 +35,7 @@ class Unknown(Noise):
     sigma: str = "sigma"
     """Formula of the standard deviation: h is the magnitude of the error-free reading, all other names are levels."""
     levels: tuple[Positive, ...] | None = None
-    """True levels in the order of the formula, for `run`: estimators are told R with these, at the nominal readings."""
+    """True levels in the order of the formula, for `run`: estimators take R with these, at the nominal readings."""
 
     estimated = True
 

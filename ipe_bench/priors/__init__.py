@@ -1,4 +1,4 @@
-"""Priors: where true parameters are drawn from, and what estimators are told of that. Config group `prior`."""
+"""Priors: where true parameters are drawn from, and what estimators assume of that. Config group `prior`."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ _MOST_LEVELS = 6
 _SAME_LEVEL = 1e-3
 """The most by which the level changes, as a share, once it is found."""
 _SMALLEST_LEVEL = 1e-8
-"""The least level that estimators are told, as a share of the readings: steps of round-off must not count."""
+"""The least level that estimators are given, as a share of the readings: steps of round-off must not count."""
 _FARTHEST = 40.0
 """Stands for an infinite normal deviate."""
 _OPEN = 1e-4
