@@ -40,6 +40,15 @@ def test_there_are_as_many_trials_as_the_precision_takes_and_they_are_those_of_a
     assert max(wide.max(), (fewer["success"] - fewer["success_anytime_low"]).max()) > 0.04 or stop["trials"] == 50
 
 
+def test_no_precision_is_called_reached_where_an_interval_is_wider():
+    for wanted in (0.05, 0.06, 0.07, 0.08, 0.09, 0.1):
+        table = ib.run(BENCH, {"linear": LinearLSE()}, precision=wanted, block_size=10)
+        rows = table[table["parameter"] == "all"]
+        assert stop_of(table)["reason"] == "every interval is narrow enough"
+        assert (rows["success_anytime_high"] - rows["success"]).max() <= wanted
+        assert (rows["success"] - rows["success_anytime_low"]).max() <= wanted
+
+
 def test_it_goes_on_from_what_is_stored_and_leaves_one_record_that_is_complete(tmp_path):
     first = stop_of(ib.run(BENCH, ESTIMATORS, precision=0.05, block_size=50, output=tmp_path))
     files = {p.name: p.stat().st_mtime_ns for p in (tmp_path / "trials").iterdir()}

@@ -100,3 +100,15 @@ def test_parameters_that_cannot_be_told_apart_are_refused():
     problem = Problem(model, Covariance(np.ones(model.m)), np.ones(3))
     with pytest.raises(UserError, match="full column rank"):
         FixedPoint().estimate(problem, np.ones((1, model.m)))
+
+
+def test_the_reported_covariance_is_that_of_small_errors_of_the_readings():
+    """x(z + dz) - x(z) = G dz to first order, so R spreads estimates by G R G'; G by differences of estimates."""
+    problem = problem_of(bend=0.02)
+    z = problem.measurement.simulate(np.array([[2.0, -1.5, 1.0]]))[0]
+    step = 1e-5
+    rows = np.concatenate([[z], z + step * np.eye(len(z)), z - step * np.eye(len(z))])
+    found = Newton(tolerance=1e-12).estimate(problem, rows)
+    assert (found.status == Status.CONVERGED).all()
+    G = (found.x[1 : len(z) + 1] - found.x[len(z) + 1 :]).T / (2 * step)
+    np.testing.assert_allclose(found.covariance[0], SIGMA**2 * G @ G.T, rtol=1e-5, atol=1e-9)

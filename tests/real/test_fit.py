@@ -6,10 +6,10 @@ from scipy.stats import binom, chi2, kstest
 from shared.state_models import ConstantVelocity
 
 import ipe_bench as ib
-from ipe_bench.baselines import EKF, UKF, GaussNewton
+from ipe_bench.baselines import EKF, UKF, GaussNewton, LevenbergMarquardt, LinearLSE
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements import Gins, Polynomial
-from ipe_bench.noise import Gaussian, Quantization
+from ipe_bench.noise import Gaussian, Quantization, Unknown
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.real.fits import fit
 from ipe_bench.real.tracks import Log
@@ -88,3 +88,26 @@ def test_rounded_readings_are_held_to_the_law_of_rounding():
 )
 def test_a_value_is_shown_to_two_figures_of_its_error(value, error, expected):
     assert with_error(value, error) == expected
+
+
+def test_of_two_fits_with_noise_of_their_own_size_the_worse_is_beaten():
+    """Residuals that made their own R are as large as it says in both; the sums of squares tell them apart."""
+    t = np.linspace(0, 10, 40)
+    model = ib.measurements.Formula("a*sin(w*t)", {"a": 1.0, "w": 2.0}, {"t": t.tolist()})
+    z = 1.5 * np.sin(2.2 * t) + 0.05 * np.random.default_rng(0).normal(size=40)
+    near, far = ib.estimate(
+        model, z, {"near": LevenbergMarquardt(start="nominal"), "far": LinearLSE()}, noise=Unknown()
+    ).fits
+    assert near.chi_square == pytest.approx(far.chi_square)
+    for one in (near, far):
+        assert one.deviance == pytest.approx(np.sum((z - model.simulate(one.x[None] / model.sizes)[0]) ** 2))
+    assert (near.beaten_by, far.beaten_by) == ("", "near")
+
+
+def test_an_estimate_that_has_not_converged_does_not_pass_however_well_it_fits():
+    t = np.linspace(0, 10, 40)
+    model = ib.measurements.Formula("a*sin(w*t)", {"a": 1.0, "w": 2.0}, {"t": t.tolist()})
+    z = 1.2 * np.sin(2.02 * t) + 0.05 * np.random.default_rng(0).normal(size=40)
+    hasty = LevenbergMarquardt(start="nominal", max_iterations=4, tolerance=1e-14)
+    (found,) = ib.estimate(model, z, {"hasty": hasty}, noise=Gaussian(0.05)).fits
+    assert (found.fits, found.passes) == (True, False)

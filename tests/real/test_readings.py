@@ -92,3 +92,12 @@ def test_the_samples_of_the_readme_are_found_in_any_folder(tmp_path, monkeypatch
     assert [row for _, row in read_tables([named])[0].rows] == [["1", "2"]]
     with pytest.raises(UserError, match="there is no such file"):
         read_tables([named.with_name("other.csv")])
+
+
+def test_a_point_between_decimal_commas_is_no_number(tmp_path):
+    """It might be a decimal point or stand between thousands: 1.234 and 1234 are both numbers, so neither is taken."""
+    path = tmp_path / "mixed.csv"
+    path.write_text("t;reading\n0,5;1,2\n1.234;2,4\n", encoding="utf-8")
+    model = ib.measurements.Formula("a*t", {"a": 1.0})
+    with pytest.raises(UserError, match=r"row 3, column t: '1\.234'"):
+        open_together([path], model)

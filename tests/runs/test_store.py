@@ -20,7 +20,7 @@ from ipe_bench.noise import Gaussian
 from ipe_bench.runs import parts
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.run import compute
-from ipe_bench.runs.schedule import block_size_for
+from ipe_bench.runs.schedule import block_size_for, plan
 from ipe_bench.runs.store import ResultKey, Store, gaps
 from ipe_bench.solvers import Newton
 
@@ -278,3 +278,16 @@ def test_a_run_in_many_blocks_leaves_few_files_and_computes_nothing_again(tmp_pa
     assert blocks_of([scenario()], estimators, 22, tmp_path, block_size=1) == 2
     assert names(tmp_path) == ["0-22.parquet"] * 2
     assert report(tmp_path, figures="none").problems == ()
+
+
+def test_blocks_lie_on_a_grid_of_their_own_wherever_trials_are_missing(tmp_path):
+    class Lacking(Results):
+        def __init__(self):
+            """Without files."""
+
+        def missing(self, key, trials):
+            return [(5, 25), (28, 30)]
+
+    cells = [ResultKey(scenario(), "newton", Newton())]
+    tasks = plan(tmp_path, cells, Lacking(), 30, 10)
+    assert [(task.start, task.stop) for task in tasks] == [(5, 10), (10, 20), (20, 25), (28, 30)]

@@ -146,3 +146,8 @@ def test_squares_without_a_variance_have_no_sequence_to_miss_with():
     miss, none = ever_missing("Student's t, 3 degrees, 4 parameters", 50)
     assert miss <= 0.1
     assert none > 0.8
+
+
+def test_widths_shrink_with_the_root_of_the_number_of_trials():
+    assert next_trials(10_000, 1.2, 50, 10**6) == pytest.approx(10_000 * 1.2**2, rel=0.025)
+    assert next_trials(10_000, 3.0, 50, 10**6) == 20_000
