@@ -41,7 +41,7 @@ TRIES = 2
 
 @dataclass(frozen=True)
 class Task:
-    """The unit of work: the cells of one scenario that are missing in one block."""
+    """Names the unit of work: the cells of one scenario that are missing in one block."""
 
     directory: Path
     cells: tuple[ResultKey, ...]
@@ -50,7 +50,7 @@ class Task:
 
 
 class Progress:
-    """How far a run is: what its watcher is told after each cell."""
+    """Counts how far a run is; its watcher is called with it after each cell."""
 
     def __init__(self, tasks: Sequence[Task]) -> None:
         cells = [(task, cell) for task in tasks for cell in task.cells]
@@ -90,7 +90,7 @@ def block_size_for(trials: int) -> int:
 
 
 def plan(directory: Path, cells: Sequence[ResultKey], results: Results, trials: int, block_size: int) -> list[Task]:
-    """Blocks on a fixed grid, each with the cells of one scenario that lack some of its trials."""
+    """Cuts missing trials into blocks on a fixed grid, each with the cells of one scenario that lack some of them."""
     lacking: dict[tuple[int, int], list[ResultKey]] = {}
     for cell in cells:
         for start, stop in results.missing(cell.key, trials):
@@ -102,8 +102,8 @@ def plan(directory: Path, cells: Sequence[ResultKey], results: Results, trials: 
 
 def run_task(task: Task) -> Iterator[str | tuple[int, Failure | None]]:
     """Computes one task and stores each cell's rows as soon as they are there; then yields the cell's place in the
-    task, and its failure if there was one: an exception fails its cell alone. What an estimator does for the first time
-    in a process, such as to import a library or to compile a model, it does before its time is taken."""
+    task, and its failure if there was one: an exception fails its cell alone. Libraries are imported and models
+    compiled before time is taken."""
     store, cells = Store(task.directory), _recalled(task)
     if any(fingerprint(cell.components) != cell.made_by for cell in cells):
         raise RuntimeError(
@@ -115,7 +115,7 @@ def run_task(task: Task) -> Iterator[str | tuple[int, Failure | None]]:
         block.share()  # which is not to be charged to the first of the cells
     for index, cell in enumerate(cells):
         with contextlib.suppress(Exception, SystemExit), _alone():  # what it raises now, it raises again below
-            _prepare(block, cell)
+            _warm_up(block, cell)
         yield PREPARED
         failure = None
         try:
@@ -133,27 +133,27 @@ _MOST_RECENT = 64
 
 
 def _recalled(task: Task) -> tuple[ResultKey, ...]:
-    """The cells of a task as this process had them before, with all that they have worked out meanwhile: to trace a
-    model and to describe what is constructed takes as long as some ten trials."""
+    """Returns the cells of a task as this process had them before, with all that they have worked out meanwhile: to
+    trace a model and to describe what is constructed takes as long as some ten trials."""
     if len(_recent) > _MOST_RECENT:
         _recent.clear()
     return tuple(_recent.setdefault(cell.key, cell) for cell in task.cells)
 
 
-_prepared: set[str] = set()
+_warm: set[str] = set()
 
 
-def _prepare(block: Any, cell: ResultKey) -> None:
-    """Has an estimator make a first estimate of a first trial, unless it has made one of this model in this process."""
+def _warm_up(block: Any, cell: ResultKey) -> None:
+    """Runs the estimator on a first trial, unless it has run on this model in this process."""
     if cell.estimator is None:
         return
     model = cell.scenario.measurement
     by_equations = getattr(model, "by_differential_equations", False)
     compiled = describe(model) if by_equations else type(model).__qualname__
     what = digest([describe(cell.estimator), compiled])
-    if what not in _prepared:
-        _prepared.add(what)
-        block.warm(cell.estimator)
+    if what not in _warm:
+        _warm.add(what)
+        block.warm_up(cell.estimator)
 
 
 _blas = functools.cache(ThreadpoolController)
@@ -161,12 +161,13 @@ _blas = functools.cache(ThreadpoolController)
 
 @contextlib.contextmanager
 def _alone() -> Iterator[None]:
-    """One thread in BLAS and no warnings of NumPy."""
+    """Limits BLAS to one thread, and silences NumPy's warnings."""
     with _blas().limit(limits=1, user_api="blas"), np.errstate(all="ignore"):
         yield
 
 
 def _compute_cell(store: Store, block: Any, cell: ResultKey) -> None:
+    """Computes a cell of a block and stores it."""
     start, stop, history = block.start, block.start + len(block), None
     if cell.estimator is None:
         columns = block.truth_columns()
@@ -185,54 +186,68 @@ def _compute_cell(store: Store, block: Any, cell: ResultKey) -> None:
     store.write(cell, start, stop, columns, history)
 
 
+class _Run:
+    """Keeps what has become of the cells of a run."""
+
+    def __init__(self, tasks: Sequence[Task], store: Store, watch: Watcher) -> None:
+        self.progress, self.store, self.watch = Progress(tasks), store, watch
+        self.tries = Counter[tuple[str, int]]()
+        watch(self.progress)
+
+    def begin(self) -> None:
+        """Notes when the first estimator begins."""
+        if self.progress.began is None:
+            self.progress.began = time.monotonic()
+            self.watch(self.progress)
+
+    def close(self, task: Task, cell: ResultKey, failure: Failure | None = None) -> None:
+        """Notes that a cell is stored, or has failed for good."""
+        self.progress.close(task, cell, failure)
+        if failure is not None:
+            self.store.write_failure(cell, task.start, task.stop, failure)
+        self.watch(self.progress)
+
+    def tried_again(self, task: Task, cells: Sequence[ResultKey], failure: Failure) -> Iterator[Task]:
+        """Closes the cells that a task failed of, and yields tasks for those of its `cells` that are tried again."""
+        left = []
+        for cell in cells:
+            if self.store.has(cell, task.start, task.stop):  # stored, and the news of it was lost
+                self.close(task, cell)
+            else:
+                left.append(cell)
+        # Cells are computed in order, so the first one that is not there is the one that it happened in; an error
+        # outside of cells is of what all of them need.
+        blamed = len(left) if failure.status == "error" else 1
+        for cell in left[:blamed]:
+            self.tries[cell.key, task.start] += 1
+            if failure.status == "died" and self.tries[cell.key, task.start] < TRIES:
+                log.warning(f"{_described(task, cell)}: {failure.message}; trying it again")
+                yield replace(task, cells=(cell,))
+            else:
+                self.close(task, cell, failure)
+        if left[blamed:]:
+            yield replace(task, cells=tuple(left[blamed:]))
+
+
 def run_tasks(tasks: Sequence[Task], execution: Execution, store: Store, watch: Watcher) -> tuple[str, ...]:
     """Runs tasks until each of their cells is stored or has failed; returns the messages of those that failed."""
-    progress, tries = Progress(tasks), Counter[tuple[str, int]]()
-    watch(progress)
-
-    def close(task: Task, cell: ResultKey, failure: Failure | None) -> None:
-        progress.close(task, cell, failure)
-        if failure is not None:
-            store.write_failure(cell, task.start, task.stop, failure)
-        watch(progress)
-
+    run = _Run(tasks, store, watch)
     while tasks:
-        closed: list[set[int]] = [set() for _ in tasks]
-        again: list[Task] = []
+        waiting, again = [dict(enumerate(task.cells)) for task in tasks], []
         for event in execution.run(run_task, tasks):
             task = tasks[event.index]
             if event.step == PREPARED:
-                if progress.began is None:
-                    progress.began = time.monotonic()
-                    watch(progress)
+                run.begin()
             elif event.step is not None:
                 index, failure = event.step
-                closed[event.index].add(index)
+                waiting[event.index].pop(index, None)
                 if failure is None and not store.has(task.cells[index], task.start, task.stop):
                     failure = Failure("died", "was said to be stored and is not; run the same command again")
-                close(task, task.cells[index], failure)
-            if event.failure is None:
-                continue
-            left = []
-            for cell in (cell for i, cell in enumerate(task.cells) if i not in closed[event.index]):
-                if store.has(cell, task.start, task.stop):  # stored, and the news of it was lost
-                    close(task, cell, None)
-                else:
-                    left.append(cell)
-            # Cells are computed in order, so the first one that is not there is the one that it happened in; an error
-            # outside of cells is of what all of them need.
-            culprits, rest = (left, []) if event.failure.status == "error" else (left[:1], left[1:])
-            for cell in culprits:
-                tries[cell.key, task.start] += 1
-                if event.failure.status == "died" and tries[cell.key, task.start] < TRIES:
-                    log.warning(f"{_described(task, cell)}: {event.failure.message}; trying it again")
-                    again.append(replace(task, cells=(cell,)))
-                else:
-                    close(task, cell, event.failure)
-            if rest:
-                again.append(replace(task, cells=tuple(rest)))
+                run.close(task, task.cells[index], failure)
+            if event.failure is not None:
+                again += run.tried_again(task, list(waiting[event.index].values()), event.failure)
         tasks = again
-    return tuple(progress.failures)
+    return tuple(run.progress.failures)
 
 
 def _described(task: Task, cell: ResultKey) -> str:

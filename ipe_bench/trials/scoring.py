@@ -212,8 +212,8 @@ class Block:
             self._roots[key] = root
         return self._roots[key]
 
-    def warm(self, estimator: Estimator) -> None:
-        """Has an estimator do what it does once in a process."""
+    def warm_up(self, estimator: Estimator) -> None:
+        """Runs the estimator once, so that imports and compilation are not timed."""
         estimate_safely(estimator, self.problem, self.trials.z[:1])
 
     def share(self) -> None:

@@ -123,8 +123,8 @@ class PathBlock:
         C = np.where(usable[:, None, None], P / (d[:, :, None] * d[:, None, :]), 0.0)
         return np.linalg.eigvalsh(C)[:, 0] > _INDEFINITE
 
-    def warm(self, tracker: Tracker) -> None:
-        """Has a tracker do what it does once in a process."""
+    def warm_up(self, tracker: Tracker) -> None:
+        """Runs the tracker once, so that imports are not timed."""
         track_safely(tracker, self.scenario.model, self.paths.z[:1])
 
     def share(self) -> None:
