@@ -15,6 +15,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.machine import library_versions
 from ipe_bench.cli import console, say, show
 from ipe_bench.cli import words as w
+from ipe_bench.cli.keys import OF_CONSTANTS, OF_FILES, OF_STATES, of
 from ipe_bench.cli.session import composed, jobs_of, session
 from ipe_bench.cli.spec import Spec
 from ipe_bench.cli.words import Words
@@ -31,21 +32,11 @@ if TYPE_CHECKING:
 
 STANDARD_ESTIMATORS = ("solver=[auto]", "baseline=[linear_lse,levenberg_marquardt]")
 """Of `estimate`: the one that chooses its way by itself, and two that it can be held against."""
-OF_MANY_TRIALS = ("precision", "time_limit", "block_size", "formats", "execution", "write_readings")
-OF_MANY_TRIALS += ("write_readings_trial", "objective")
-"""Keys of runs."""
-OF_STATES = ("state_model", "tracker", "trackers")
-"""Keys of states that move."""
-OF_CONSTANTS = ("measurement", "truth_measurement", "noise", "prior", "error_scale", "solver", "baseline")
-OF_CONSTANTS += ("estimators", "parameters", "write_readings")
-"""Keys of parameters that stand still."""
 OF_CONSTANTS_ALONE = {
     "design": "the bounds of states are those of `ipe-bench run state_model=NAME`",
     "posterior": "use `ipe-bench run state_model=NAME`, with tracker=[grid] for one state, or tracker=[bootstrap]",
 }
 """Commands on parameters that stand still, with what serves for states that move."""
-OF_FILES = ("readings", "ignore_columns", "find")
-"""Keys of estimates from real readings."""
 _TRIALS, _MOST_TRIALS = 3, 100
 """Of `posterior`."""
 
@@ -123,7 +114,7 @@ def estimate_command(arguments: Sequence[str]) -> int:
     """Estimates with every chosen estimator, prints tables and writes files; exit code 1 where none is an answer."""
     from ipe_bench.report.answer import FILES, NAME, Answer, estimate_parts, write_answer
 
-    asked = single("estimate", arguments, STANDARD_ESTIMATORS, run=(*OF_MANY_TRIALS, "trials", "seed", w.TRUTH))
+    asked = single("estimate", arguments, STANDARD_ESTIMATORS, run=(*of("run", "trials"), w.TRUTH))
     if asked.spec.state_model is not None:
         return _track(asked, asked.spec.state_model)
     question = asked.spec.question(asked.words.keys).checked()
@@ -177,8 +168,7 @@ def design_command(
 
     if any(word.lstrip("+").startswith("readings=") for word in arguments):
         raise UserError("readings: is for `ipe-bench estimate`; the number to choose is --readings NUMBER")
-    of_runs = (*OF_MANY_TRIALS, "figures", "trials", "solver", "baseline", "estimators")
-    asked = single("design", arguments, run=of_runs, estimate=OF_FILES)
+    asked = single("design", arguments, run=(*of("run", "figures", "estimators"), "trials"), estimate=OF_FILES)
     scenario = asked.spec.scenario
     if scenario.noise.real:
         raise UserError("noise=certified: a design is of readings that are still to be taken; choose another noise")
@@ -200,7 +190,7 @@ def posterior_command(arguments: Sequence[str], particles: int) -> int:
     """Samples, prints a table and writes files; exit code 1 where the populations of a trial do not agree."""
     from ipe_bench.report.questions import posterior_parts, write_posteriors
 
-    asked = single("posterior", arguments, run=(*OF_MANY_TRIALS, "figures"), estimate=OF_FILES)
+    asked = single("posterior", arguments, run=of("run", "figures"), estimate=OF_FILES)
     job, name, scenario = asked.spec, asked.measurement, asked.spec.scenario
     trials = job.count if "trials" in asked.words.keys else _TRIALS
     if trials > _MOST_TRIALS:

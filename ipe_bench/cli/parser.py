@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any, NoReturn
 
 from ipe_bench.basics.errors import UserError, unknown
+from ipe_bench.cli.keys import ROWS
 
 _ABOUT = """\
 ipe-bench: which estimator to trust with nonlinear measurements
@@ -48,33 +49,8 @@ COMMANDS: dict[str, tuple[str, str, str, Arguments]] = {
   ipe-bench run -m error_scale=1,10,100 seed=1,2                a job for each combination
   ipe-bench run +solver@estimators.second=newton estimators.second.tolerance=1e-3
 
-measurement=NAME       the measurement model; `ipe-bench list measurement` shows which there are
-noise=NAME             the errors of the readings
-prior=NAME             the distribution of the true parameters about the nominal point
-solver=[A,B]           iterative solvers of the estimating equation
-baseline=[A,B]         other estimators, on the same trials
-state_model=NAME       states that move, in place of a measurement
-tracker=[A,B]          filters and smoothers of such states; trackers.NAME.KEY=X sets an option of one
-execution=NAME         where blocks of trials are computed: in this process, or in several at once
-GROUP.KEY=VALUE        an option of one of these; `ipe-bench list GROUP/NAME` shows its type and default
-estimators.NAME.KEY=X  an option of a solver or a baseline that is chosen
-truth_measurement=NAME the model that simulates the readings, if estimators assume another one
-error_scale=X          standard deviation of the true parameters, in multiples of their sizes (1)
-seed=N                 number that all random draws follow from (0)
-trials=N               number of trials (1000); with precision= the largest number
-precision=X            adds trials until the success shares are known to within X, as in 0.01
-time_limit=SECONDS     ends this earlier
-objective=NAME.COLUMN  the statistic that a sweeper minimises, as in newton.capped_error
-parameters.NAME.KEY=X  knowledge of a parameter: fixed, nominal, deviation, lower, upper, positive
-output=DIR             folder of the results; the same command in the same folder resumes
-name=NAME              name of the folder under outputs/, in place of the one made of the other keys (default_name)
-figures=main           figures to draw: main, all or none
-formats=pdf,svg        file formats of the figures besides PNG
-block_size=N           trials that are computed at once; it changes no number
-write_readings=FILE    writes the simulated readings of trial write_readings_trial=N, and computes nothing
-readings=FILE          is for `ipe-bench estimate`, as are ignore_columns= and find=
-+experiment=NAME       an experiment of `ipe-bench list experiment`, which sets some of these keys
-""",
+"""
+        + "".join(f"{key.written:<22} {key.meaning}\n" for key in ROWS if key.meaning),
         {
             "overrides": _several("KEY=VALUE", "see above"),
             "--dry-run": {"action": "store_true", "help": "say what is stored, what is missing and how long it takes"},

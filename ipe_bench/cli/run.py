@@ -24,20 +24,21 @@ from rich.progress import Progress as Bar
 from ipe_bench.basics.errors import UserError, shortened
 from ipe_bench.cli import say
 from ipe_bench.cli import words as w
-from ipe_bench.cli.estimate import OF_FILES, require_one_kind
+from ipe_bench.cli.estimate import require_one_kind
+from ipe_bench.cli.keys import OF_FILES, SETTING_NOTHING
 from ipe_bench.cli.parser import parsers
 from ipe_bench.cli.results import counted, show_report
 from ipe_bench.cli.session import Jobs, complete, jobs_of, session, show, spec_of
 from ipe_bench.cli.spec import STANDARD_FILTERS, Spec
-from ipe_bench.plugins.discovery import options
+from ipe_bench.plugins.discovery import PACKAGES, options
 from ipe_bench.runs.execution import Serial, end_idle
 from ipe_bench.runs.parts import TRUTH
 from ipe_bench.runs.results import Results
-from ipe_bench.runs.run import accept, record_refusal, result_keys, validate
+from ipe_bench.runs.run import accept, compute, record_refusal, result_keys, validate
 from ipe_bench.runs.schedule import Progress, Watcher
 from ipe_bench.runs.store import describe_names
 
-_NOT_TELLING = {*w.NO_PART_OF_A_NAME, "default_name", "experiment", "solver", "baseline", "tracker"} - {"seed"}
+_NOT_TELLING = {*SETTING_NOTHING, *PACKAGES, "experiment"} - {"seed"}
 """Keys that tell no job of a sweep from another."""
 _LINE_EVERY_S = 10.0
 """Where progress is told in lines."""
@@ -210,20 +211,24 @@ def _computed(job: Spec, begun: Outcome, command: str) -> Outcome:
     if job.write_readings is not None:
         write_trial(job, Path(job.write_readings), job.write_readings_trial)
         return begun
-    from ipe_bench.statistics.stopping import NARROW, compute_until, objective
-
     asked: Any = ([job.scenario], job.estimators, job.count, job.output)
     options: dict[str, Any] = {"execution": job.execution, "block_size": job.block_size, "command": command}
-    options |= {"precision": job.precision, "time_limit": job.time_limit}
+    done = replace(begun, remarks=job.measurement.remarks(job.measurement.nominal))
     with shown_progress(begun.job) as watch:
-        failures, stops = compute_until(*asked, **options, watch=watch)
-    done = replace(begun, failures=failures, remarks=job.measurement.remarks(job.measurement.nominal))
-    for stop in stops:
-        missed = stop["reason"] != NARROW
-        verdict = "the precision is not reached: " if missed else ""
-        said = f"{done.job}: {stop['trials']} trials; {verdict}{stop['reason']} ({stop['widest']})"
-        done = replace(done, stop=said, precision_missed=missed)
+        if job.precision is None:
+            done = replace(done, failures=compute(*asked, **options, watch=watch))
+        else:
+            from ipe_bench.statistics.stopping import NARROW, compute_until
+
+            options |= {"precision": job.precision, "time_limit": job.time_limit}
+            failures, (stop,) = compute_until(*asked, **options, watch=watch)
+            missed = stop["reason"] != NARROW
+            verdict = "the precision is not reached: " if missed else ""
+            said = f"{done.job}: {stop['trials']} trials; {verdict}{stop['reason']} ({stop['widest']})"
+            done = replace(done, failures=failures, stop=said, precision_missed=missed)
     if job.objective is not None:
+        from ipe_bench.statistics.stopping import objective
+
         done = replace(done, objective=objective(job.scenario, job.estimators, *job.aim, job.output))
     cells = {one.key: describe_names(one.names) for one in result_keys(job.scenario, job.estimators)}
     return replace(done, cells=cells)

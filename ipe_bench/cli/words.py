@@ -21,6 +21,7 @@ from hydra.errors import HydraException
 
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.cli import refuse_blanks, renamed
+from ipe_bench.cli.keys import SETTING_NOTHING, WHOLE
 from ipe_bench.cli.spec import KEYS
 from ipe_bench.measurements.nist import FORMULAS
 from ipe_bench.plugins import discovery as plugins
@@ -42,8 +43,6 @@ _GONE = {
     "ignore_rows": "empty the cells of these readings in the file",
     "prior_covariance": "give parameters.NAME.deviation and prior.correlations",
 }
-_WHOLE = ("trials", "block_size", "seed", "write_readings_trial")
-"""Keys that take a whole number."""
 
 Groups = dict[str, list[str]]
 """The names of the options of each group."""
@@ -269,7 +268,7 @@ def _check(override: Override, groups: Groups) -> None:
     if group == "estimators":
         raise UserError(f"{word}: choose with solver= and baseline=, and set options by estimators.LABEL.KEY=VALUE")
     for value in values(override):
-        if group in _WHOLE and isinstance(value, float) and value.is_integer():
+        if group in WHOLE and isinstance(value, float) and value.is_integer():
             raise UserError(f"{word}: is not written as a whole number; write {group}={value:.0f}")
         if group in ("trials", "block_size") and value is None:
             raise UserError(f"{word}: cannot be null; give a whole number, or leave it out")
@@ -374,9 +373,6 @@ def settled(overrides: Sequence[Override]) -> list[Override]:
 # The name of the folder
 
 
-NO_PART_OF_A_NAME = ("name", "output", "trials", "block_size", "seed", "execution", "hydra", "readings", "figures")
-NO_PART_OF_A_NAME += ("precision", "time_limit", "write_readings", "write_readings_trial", "objective", "formats")
-"""Keys that change no setting, or add trials to it."""
 _BARE = ("measurement.dataset", "truth", "state_model", "noise", *plugins.PACKAGES)
 """Keys that come first in a name; the values of most speak for themselves."""
 _LONGEST_NAME = 80
@@ -394,7 +390,7 @@ def default_name(words: Words) -> str:
         key, _, value = line.partition("=")
         key = key.lstrip("+~").replace(HYDRAS_TRUTH, "truth").rpartition("@estimators.")[2].rpartition("@trackers.")[2]
         text = re.sub(r"[\[\]'\" ]", "", value.replace("],[", ";").replace(",", "+") if "[" in value else value)
-        if _first(override) not in NO_PART_OF_A_NAME:
+        if _first(override) not in SETTING_NOTHING:
             parts[key] = text or f"no_{key}"
     experiment = parts.pop("experiment", None)
     names = [parts.pop("measurement", None) or parts.pop("state_model", None) or experiment or "gins"]

@@ -7,14 +7,17 @@ import subprocess
 import sys
 from importlib.metadata import distributions
 from pathlib import Path
+from typing import get_args, get_type_hints
 
 import pandas as pd
 import pytest
 import yaml
 
 import ipe_bench as ib
+from ipe_bench.basics.options import Count, Whole
+from ipe_bench.cli.keys import ROWS, WHOLE
 from ipe_bench.cli.main import COMMANDS, main
-from ipe_bench.cli.spec import KEYS
+from ipe_bench.cli.spec import KEYS, PARTS, Spec
 from ipe_bench.report import figures
 from ipe_bench.statistics.collect import collect
 from ipe_bench.statistics.records import SCORES, STATISTICS
@@ -339,6 +342,18 @@ def test_the_bare_program_and_every_command_have_help(capsys):
             texts.append(capsys.readouterr().out)
         assert texts[0] == texts[1]
         assert f"ipe-bench {command}" in texts[0]
+
+
+def test_the_table_of_keys_names_every_field_of_a_job_and_every_group_that_jobs_choose_from():
+    names = [key.name for key in ROWS]
+    several = {"solver", "baseline", "tracker"}
+    assert sorted(names) == sorted({*KEYS, *several, "experiment", "GROUP"})
+    defaults = yaml.safe_load((ROOT / "conf/config.yaml").read_text(encoding="utf-8"))["defaults"]
+    groups = {key.rpartition("@")[2] for one in defaults if isinstance(one, dict) for key in one} - {"model"}
+    assert {group for group in groups if not group.startswith("override ")} == {*PARTS, *several}
+    kinds = get_type_hints(Spec, include_extras=True)
+    assert {*WHOLE} == {name for name, kind in kinds.items() if {kind, *get_args(kind)} & {Count, Whole}}
+    assert all(key.kind for key in ROWS if key.name in KEYS)
 
 
 def test_the_help_of_run_explains_every_key_of_the_config_in_a_line(capsys):

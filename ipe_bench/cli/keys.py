@@ -1,0 +1,76 @@
+"""The keys of `ipe-bench run` in one table, which help, refusals and names of folders read."""
+
+from typing import NamedTuple
+
+
+class Key(NamedTuple):
+    """A key of the config, or a word that stands for several."""
+
+    kind: str
+    """What it is of: parameters that stand still, moving states, estimators, trials, a run of many, files, ..."""
+    written: str
+    """The word as help writes it: N stands for a whole number, [A,B] for a list of names."""
+    meaning: str
+    """Its line in `ipe-bench run --help`; empty if the line of another key names it."""
+
+    @property
+    def name(self) -> str:
+        """The key's first part."""
+        return self.written.lstrip("+").partition("=")[0].partition(".")[0]
+
+
+_ROWS = (
+    ("still", "measurement=NAME", "the measurement model; `ipe-bench list measurement` shows which there are"),
+    ("still", "noise=NAME", "the errors of the readings"),
+    ("still", "prior=NAME", "the distribution of the true parameters about the nominal point"),
+    ("estimators", "solver=[A,B]", "iterative solvers of the estimating equation"),
+    ("estimators", "baseline=[A,B]", "other estimators, on the same trials"),
+    ("moving", "state_model=NAME", "states that move, in place of a measurement"),
+    ("moving", "tracker=[A,B]", "filters and smoothers of such states; trackers.NAME.KEY=X sets an option of one"),
+    ("moving", "trackers.NAME.KEY=X", ""),
+    ("run", "execution=NAME", "where blocks of trials are computed: in this process, or in several at once"),
+    ("", "GROUP.KEY=VALUE", "an option of one of these; `ipe-bench list GROUP/NAME` shows its type and default"),
+    ("estimators", "estimators.NAME.KEY=X", "an option of a solver or a baseline that is chosen"),
+    ("still", "truth_measurement=NAME", "the model that simulates the readings, if estimators assume another one"),
+    ("still", "error_scale=X", "standard deviation of the true parameters, in multiples of their sizes (1)"),
+    ("trials", "seed=N", "number that all random draws follow from (0)"),
+    ("trials", "trials=N", "number of trials (1000); with precision= the largest number"),
+    ("run", "precision=X", "adds trials until the success shares are known to within X, as in 0.01"),
+    ("run", "time_limit=SECONDS", "ends this earlier"),
+    ("run", "objective=NAME.COLUMN", "the statistic that a sweeper minimises, as in newton.capped_error"),
+    ("still", "parameters.NAME.KEY=X", "knowledge of a parameter: fixed, nominal, deviation, lower, upper, positive"),
+    ("folder", "output=DIR", "folder of the results; the same command in the same folder resumes"),
+    (
+        "folder",
+        "name=NAME",
+        "name of the folder under outputs/, in place of the one made of the other keys (default_name)",
+    ),
+    ("folder", "default_name=NAME", ""),
+    ("figures", "figures=main", "figures to draw: main, all or none"),
+    ("run", "formats=pdf,svg", "file formats of the figures besides PNG"),
+    ("run", "block_size=N", "trials that are computed at once; it changes no number"),
+    (
+        "run",
+        "write_readings=FILE",
+        "writes the simulated readings of trial write_readings_trial=N, and computes nothing",
+    ),
+    ("run", "write_readings_trial=N", ""),
+    ("files", "readings=FILE", "is for `ipe-bench estimate`, as are ignore_columns= and find="),
+    ("files", "ignore_columns=[A]", ""),
+    ("files", "find=[A,B]", ""),
+    ("", "+experiment=NAME", "an experiment of `ipe-bench list experiment`, which sets some of these keys"),
+)
+ROWS = tuple(Key(*row) for row in _ROWS)
+WHOLE = tuple(key.name for key in ROWS if key.written.endswith("=N"))
+"""Keys that take a whole number."""
+
+
+def of(*kinds: str) -> tuple[str, ...]:
+    """The keys of these kinds."""
+    return tuple(key.name for key in ROWS if key.kind in kinds)
+
+
+OF_FILES, OF_STATES = of("files"), of("moving")
+OF_CONSTANTS = (*of("still", "estimators"), "write_readings")
+SETTING_NOTHING = ("hydra", *of("trials", "run", "figures", "files", "folder"))
+"""Keys that change no setting, or add trials to it: no part of a folder's name."""
