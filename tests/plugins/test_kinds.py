@@ -123,7 +123,7 @@ def test_a_report_has_what_plugins_add_beside_all_that_is_ours(ours, capsys):
 RAISING = {
     "statistic": "from ipe_bench.statistics.records import Statistic\n"
     "def f(s):\n    raise ValueError('broken')\nSTATISTIC = Statistic('bad_statistic', 'bad', 'all trials', '', f)\n",
-    "figure": "from ipe_bench.report.figures.drawing import Figure\n"
+    "figure": "from ipe_bench.report.figures.views import Figure\n"
     "def f(view):\n    raise ValueError('broken')\n    yield\nFIGURE = Figure(f, ('summary',), main=True)\n",
     "table": "def table(analysis):\n    raise ValueError('broken')\n",
     "section": "from ipe_bench.report.sections import Section\n"

@@ -12,8 +12,8 @@ from typing import Any
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.files import make_folder, write_text
 from ipe_bench.plugins.extensions import added, require_type
-from ipe_bench.report.figures.drawing import Drawing, Figure
-from ipe_bench.report.figures.views import View, views
+from ipe_bench.report.figures.drawing import Drawing
+from ipe_bench.report.figures.views import Figure, View, views
 from ipe_bench.report.style import FORMATS, PAGE, Which, house_style
 from ipe_bench.statistics.analysis import Analysis
 

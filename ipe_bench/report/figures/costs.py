@@ -8,8 +8,8 @@ import numpy as np
 from scipy.special import chdtri
 
 from ipe_bench.report.figures import common
-from ipe_bench.report.figures.drawing import Drawing, Figure
-from ipe_bench.report.figures.views import View
+from ipe_bench.report.figures.drawing import Drawing
+from ipe_bench.report.figures.views import Figure, View
 from ipe_bench.report.style import GREY, MARKERS, Look
 from ipe_bench.report.words import enumerate_few, short, value_text
 from ipe_bench.statistics.sample import CLOSE

@@ -1,9 +1,9 @@
-"""A kind of figure, and a drawn figure with its words."""
+"""A drawn figure with its words."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from operator import methodcaller
@@ -15,24 +15,8 @@ from ipe_bench.basics.files import write_atomically
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
-    from ipe_bench.report.figures.views import View
-
 _METADATA: dict[str, Any] = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
 """The same figure is the same file whenever it is drawn."""
-
-
-@dataclass(frozen=True)
-class Figure:
-    """A kind of figure: what it reads, and how it is drawn."""
-
-    draw: Callable[[View], Iterator[Drawing]]
-    """Draws what a view allows; nothing if it would be empty."""
-    frames: tuple[str, ...]
-    """Frames of the analysis that the figure reads; its view has no others."""
-    together: bool = False
-    """Drawn once of all settings instead of once of each."""
-    main: bool = False
-    """Belongs to the few figures that are drawn by default."""
 
 
 @dataclass(frozen=True)

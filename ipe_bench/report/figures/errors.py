@@ -13,8 +13,8 @@ from scipy.special import gammainc
 from ipe_bench.basics.linalg import Array
 from ipe_bench.real.residuals import LEAST_P
 from ipe_bench.report.figures import common
-from ipe_bench.report.figures.drawing import Drawing, Figure
-from ipe_bench.report.figures.views import View
+from ipe_bench.report.figures.drawing import Drawing
+from ipe_bench.report.figures.views import Figure, View
 from ipe_bench.report.style import BOUND_COLOR, BOUND_DASH, looks
 from ipe_bench.report.words import brief, enumerate_few, p_value, percent, value_text
 

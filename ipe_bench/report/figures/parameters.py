@@ -9,8 +9,8 @@ import numpy as np
 import pandas as pd
 
 from ipe_bench.report.figures import common
-from ipe_bench.report.figures.drawing import Drawing, Figure
-from ipe_bench.report.figures.views import View
+from ipe_bench.report.figures.drawing import Drawing
+from ipe_bench.report.figures.views import Figure, View
 from ipe_bench.report.style import BLACK, BOUND_COLOR, BOUND_DASH, COLORS, GREY, MARKERS, REFERENCE, Look
 from ipe_bench.report.words import brief, enumerate_few, value_text
 from ipe_bench.statistics.records import ALL

@@ -1,9 +1,9 @@
-"""What figures are drawn from: the analysis seen setting by setting, with what a figure may know of its estimators."""
+"""Kinds of figures, and what they are drawn from: the analysis setting by setting, with the looks of its estimators."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -90,6 +90,20 @@ class View:
     def only(self, names: Sequence[str]) -> View:
         """The same with those frames alone."""
         return replace(self, frames={name: self.frames[name] for name in names})
+
+
+@dataclass(frozen=True)
+class Figure:
+    """Declares a kind of figure: the frames that it reads, and how it is drawn."""
+
+    draw: Callable[[View], Iterator[Drawing]]
+    """Draws what a view allows; nothing if it would be empty."""
+    frames: tuple[str, ...]
+    """Frames of the analysis that the figure reads; its view has no others."""
+    together: bool = False
+    """Drawn once of all settings instead of once of each."""
+    main: bool = False
+    """Belongs to the few figures that are drawn by default."""
 
 
 def views(analysis: Analysis) -> tuple[list[View], View]:

@@ -10,8 +10,8 @@ import pandas as pd
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.counted import cost
 from ipe_bench.report.figures import common
-from ipe_bench.report.figures.drawing import Drawing, Figure
-from ipe_bench.report.figures.views import View
+from ipe_bench.report.figures.drawing import Drawing
+from ipe_bench.report.figures.views import Figure, View
 from ipe_bench.report.sections import Section
 from ipe_bench.report.table import Part, Table, column, words
 from ipe_bench.report.words import enumerate_few, short, value_text

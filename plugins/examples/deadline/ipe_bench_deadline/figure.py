@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from ipe_bench.report.figures import common
-from ipe_bench.report.figures.drawing import Drawing, Figure
-from ipe_bench.report.figures.views import View
+from ipe_bench.report.figures.drawing import Drawing
+from ipe_bench.report.figures.views import Figure, View
 
 
 def draw(view: View) -> Iterator[Drawing]:
