@@ -5,9 +5,9 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partialmethod
+from functools import cached_property
 from operator import attrgetter
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -224,7 +224,10 @@ class Measurement(Component, ABC):
         """What a Jacobian costs, in simulations of the same trial."""
         return float(self.n if self.analytic else 2 * self.n)
 
-    coarse_jacobian_cost: Any = property(attrgetter("jacobian_cost"))
+    @property
+    def coarse_jacobian_cost(self) -> float:
+        """What a coarse Jacobian costs, in simulations of the same trial."""
+        return self.jacobian_cost
 
     def linearization(self) -> Array:
         """The matrix H (m, n) of eq. (1) about the nominal point."""
@@ -258,56 +261,63 @@ def single_epochs(model: Measurement) -> Epochs:
     return tuple(np.arange(model.m)[:, None])
 
 
-def _delegating(cls: type[WrappedModel]) -> type[WrappedModel]:
-    """Gives a class the attributes and the methods of the model inside; what is computed passes the class's hooks."""
+class _Forwarded(property):
+    """The attribute of this name of the model inside."""
 
-    def computing(name: str, own: str) -> Any:
-        return lambda model, x, *stop: getattr(model, own)(x, getattr(model.whole, name)(model.whole_x(x), *stop))
-
-    for name in (
-        *("name", "physical_parameters", "nominal", "nuisance_deviation", "nuisances", "fixed"),
-        *("entry_words", "epochs", "offset", "m", "periods", "recorded", "reading_unit", "reading_name", "usual_noise"),
-        *("inputs", "input_columns", "input_columns_known", "absent_input", "own_parameters"),
-        *("by_differential_equations", "physical", "physical_slope", "near_bounds"),
-        *("jacobian_cost", "coarse_jacobian_cost"),
-    ):
-        setattr(cls, name, property(attrgetter(f"whole.{name}")))
-    for name in ("simulate_until", "coarse_simulate_until"):
-        setattr(cls, name, computing(name, "own_readings"))
-    for name in ("jacobian", "coarse_jacobian", "jacobian_until", "coarse_jacobian_until"):
-        setattr(cls, name, computing(name, "own_jacobian"))
-    return cls
+    def __set_name__(self, owner: type, name: str) -> None:
+        super().__init__(attrgetter(f"whole.{name}"))
 
 
-@_delegating
-class WrappedModel(Measurement):
-    """A model that is another one, `whole`, but for what a subclass overrides.
+def _forwarded() -> Any:
+    return _Forwarded()
 
-    Three hooks stand between the two in all that is computed: `whole_x`, `own_readings` and `own_jacobian`.
+
+class Forwarding(Measurement):
+    """A model that says of itself what another one, `whole`, says, but for what a subclass overrides.
+
+    What it computes is left to the subclass, and so are the columns of a file and recorded readings.
     """
 
     whole: Measurement
 
-    parameters = property(attrgetter("whole.parameters"))
-    index = property(attrgetter("whole.index"))
-
-    def simulate(self, x: Array) -> Array:
-        return self.own_readings(x, self.whole.simulate(self.whole_x(x)))
+    name = _forwarded()
+    parameters = _forwarded()
+    physical_parameters = _forwarded()
+    nominal = _forwarded()
+    nuisance_deviation = _forwarded()
+    nuisances = _forwarded()
+    fixed = _forwarded()
+    index = _forwarded()
+    entry_words = _forwarded()
+    epochs = _forwarded()
+    periods = _forwarded()
+    offset = _forwarded()
+    m = _forwarded()
+    reading_unit = _forwarded()
+    reading_name = _forwarded()
+    usual_noise = _forwarded()
+    own_parameters = _forwarded()
+    by_differential_equations = _forwarded()
+    input_columns_known = _forwarded()
+    jacobian_cost = _forwarded()
+    coarse_jacobian_cost = _forwarded()
 
     def whole_x(self, x: Array) -> Array:
-        """x (trials, k) as the whole model takes it."""
+        """Returns x (trials, k) as the whole model takes it."""
         return x
 
-    def own_readings(self, x: Array, z: Array) -> Array:
-        """The readings at x, from those of the whole model."""
-        return z
+    def around(self, whole: Measurement) -> Measurement:
+        """Returns the same about another model."""
+        return replace(cast(Any, self), whole=whole)
 
-    def own_jacobian(self, x: Array, J: Array) -> Array:
-        """dh/dx at x, from that of the whole model."""
-        return J
+    def physical(self, x: Array) -> Array:
+        return self.whole.physical(x)
 
-    def linearization(self) -> Array:
-        return self.own_jacobian(self.nominal[None], self.whole.linearization()[None])[0]
+    def physical_slope(self, x: Array) -> Array:
+        return self.whole.physical_slope(x)
+
+    def near_bounds(self, x: Array) -> Mapping[int, float]:
+        return self.whole.near_bounds(x)
 
     def hindrance(self, x: Array) -> str:
         return self.whole.hindrance(self.whole_x(x[None])[0])
@@ -316,14 +326,60 @@ class WrappedModel(Measurement):
         return self.whole.remarks(self.whole_x(x[None])[0])
 
     def stating(self, key: str, values: Mapping[int, float]) -> Measurement:
-        return replace(self, whole=self.whole.stating(key, values))  # type: ignore[type-var]
+        return self.around(self.whole.stating(key, values))
+
+
+class WrappedModel(Forwarding):
+    """A model that is another one, `whole`, but for what a subclass overrides.
+
+    Three hooks stand between the two in all that is computed: `whole_x`, `own_readings` and `own_jacobian`.
+    """
+
+    inputs = _forwarded()
+    input_columns = _forwarded()
+    recorded = _forwarded()
+
+    def own_readings(self, x: Array, z: Array) -> Array:
+        """Returns the readings at x, from those of the whole model."""
+        return z
+
+    def own_jacobian(self, x: Array, J: Array) -> Array:
+        """Returns dh/dx at x, from that of the whole model."""
+        return J
+
+    def simulate(self, x: Array) -> Array:
+        return self.own_readings(x, self.whole.simulate(self.whole_x(x)))
+
+    def simulate_until(self, x: Array, stop: int) -> Array:
+        return self.own_readings(x, self.whole.simulate_until(self.whole_x(x), stop))
+
+    def coarse_simulate_until(self, x: Array, stop: int) -> Array:
+        return self.own_readings(x, self.whole.coarse_simulate_until(self.whole_x(x), stop))
+
+    def jacobian(self, x: Array) -> Array:
+        return self.own_jacobian(x, self.whole.jacobian(self.whole_x(x)))
+
+    def coarse_jacobian(self, x: Array) -> Array:
+        return self.own_jacobian(x, self.whole.coarse_jacobian(self.whole_x(x)))
+
+    def jacobian_until(self, x: Array, stop: int) -> Array:
+        return self.own_jacobian(x, self.whole.jacobian_until(self.whole_x(x), stop))
+
+    def coarse_jacobian_until(self, x: Array, stop: int) -> Array:
+        return self.own_jacobian(x, self.whole.coarse_jacobian_until(self.whole_x(x), stop))
+
+    def linearization(self) -> Array:
+        return self.own_jacobian(self.nominal[None], self.whole.linearization()[None])[0]
+
+    def absent_input(self, heading: str, columns: Sequence[str]) -> str:
+        return self.whole.absent_input(heading, columns)
 
     def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Measurement:
-        return replace(self, whole=self.whole.with_inputs(columns, readings))  # type: ignore[type-var]
+        return self.around(self.whole.with_inputs(columns, readings))
 
 
 @dataclass(frozen=True)
-class SubsetModel(WrappedModel):
+class SubsetModel(Forwarding):
     """Some readings of a model: those of the first epochs, or those that are not missing."""
 
     whole: Measurement
@@ -333,14 +389,6 @@ class SubsetModel(WrappedModel):
     """Where the rows all lie within the first `stop` epochs: nothing later is computed."""
     coarse: bool = False
     """Whether readings near enough for fits that only start another will do."""
-
-    inputs = ()
-    input_columns = Measurement.input_columns
-    recorded = None
-    simulate_until = Measurement.simulate_until
-    coarse_simulate_until = Measurement.coarse_simulate_until
-    jacobian_until = Measurement.jacobian_until
-    coarse_jacobian_until = Measurement.coarse_jacobian_until
 
     def __post_init__(self) -> None:
         """Made in every window and epoch, and of no user's options: there is nothing to check."""
@@ -354,9 +402,17 @@ class SubsetModel(WrappedModel):
     def index(self) -> Mapping[str, Sequence[Any]]:
         return {name: [column[i] for i in self.kept] for name, column in self.whole.index.items()}
 
-    offset = property(lambda subset: subset.whole.offset[subset._rows])  # type: ignore[assignment]
-    m = property(lambda subset: len(subset.kept))  # type: ignore[assignment]
-    periods = property(lambda s: np.asarray(s.whole.periods)[s._rows] if len(s.whole.periods) else ())  # type: ignore[assignment]
+    @property
+    def m(self) -> int:
+        return len(self.kept)
+
+    @property
+    def offset(self) -> Array:
+        return self.whole.offset[self._rows]
+
+    @property
+    def periods(self) -> Array | Sequence[float]:
+        return np.asarray(self.whole.periods)[self._rows] if len(self.whole.periods) else ()
 
     @property
     def epochs(self) -> Epochs | None:
@@ -369,7 +425,9 @@ class SubsetModel(WrappedModel):
         order = np.argsort(place[self._rows], kind="stable")
         return tuple(np.split(order, np.flatnonzero(np.diff(place[self._rows][order])) + 1)) if len(order) else ()
 
-    _rows = cached_property(lambda subset: np.array(subset.kept, dtype=np.intp))
+    @cached_property
+    def _rows(self) -> NDArray[np.intp]:
+        return np.array(self.kept, dtype=np.intp)
 
     @cached_property
     def _among_arrived(self) -> NDArray[np.intp] | slice:
@@ -386,8 +444,11 @@ class SubsetModel(WrappedModel):
     def simulate(self, x: Array) -> Array:
         return self._computed("coarse_simulate" if self.coarse and self.stop is not None else "simulate", x)
 
-    jacobian = partialmethod(_computed, "jacobian")  # type: ignore[assignment]
-    coarse_jacobian = partialmethod(_computed, "coarse_jacobian")  # type: ignore[assignment]
+    def jacobian(self, x: Array) -> Array:
+        return self._computed("jacobian", x)
+
+    def coarse_jacobian(self, x: Array) -> Array:
+        return self._computed("coarse_jacobian", x)
 
     def linearization(self) -> Array:
         return self.whole.linearization()[self._rows]

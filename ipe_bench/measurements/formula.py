@@ -13,7 +13,7 @@ import numpy as np
 from ipe_bench.basics.errors import UserError, did_you_mean, unknown
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Finite
-from ipe_bench.measurements.arithmetic import never_switching, parse
+from ipe_bench.measurements.arithmetic import Arithmetic, never_switching, parse
 from ipe_bench.measurements.base import Input, Measurement, Parameter
 from ipe_bench.measurements.ode.trace import Graph, Program, tangent
 
@@ -40,15 +40,28 @@ class WrittenModel(Measurement):
     reading: str
     circular: tuple[str, ...] = ()
 
-    reading_unit = property(lambda model: model.unit)  # type: ignore[assignment]
-    reading_name = property(lambda model: model.reading)  # type: ignore[assignment]
+    own: tuple[str, ...] = ()
+
+    @property
+    def reading_unit(self) -> str:
+        return self.unit
+
+    @property
+    def reading_name(self) -> str:
+        return self.reading
+
+    @property
+    def own_parameters(self) -> tuple[str, ...]:
+        return self.own
 
     @cached_property
     def starts(self) -> dict[str, float]:
         """The parameters with their starts, in the order of x."""
         return {name: float(value) for name, value in self.start.items()}
 
-    parameter_units: Any = property(lambda model: model.units)
+    @property
+    def parameter_units(self) -> Mapping[str, str]:
+        return self.units
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -168,8 +181,9 @@ class Formula(WrittenModel):
             raise UserError(f"reading={self.reading}: stands in the expression too; what is measured cannot explain it")
         self.require_columns_and_parameters("own")
 
-    arithmetic = cached_property(lambda model: parse(model.expression, "expression"))
-    own_parameters = property(lambda model: model.own)  # type: ignore[assignment]
+    @cached_property
+    def arithmetic(self) -> Arithmetic:
+        return parse(self.expression, "expression")
 
     @cached_property
     def headings(self) -> tuple[str, ...]:

@@ -109,8 +109,10 @@ class Function(WrittenModel):
             raise UserError(f"of={self.of}: {unknown(name, functions, 'function')}")
         return getattr(found, name)
 
-    functions = property(lambda model: (model.function,))
-    """What the model computes with beside its class: a change of its source makes results stale."""
+    @property
+    def functions(self) -> tuple[Callable[..., Any], ...]:
+        """What the model computes with beside its class: a change of its source makes results stale."""
+        return (self.function,)
 
     @cached_property
     def _signature(self) -> Mapping[str, inspect.Parameter]:
@@ -173,10 +175,10 @@ class Function(WrittenModel):
         times = self.column(chosen)
         return tuple(np.flatnonzero(times == time) for time in np.unique(times))
 
-    _known = cached_property(
-        lambda model: {n: read_only(model.column(n)) for n in model.headings} | {**model.constants}
-    )
-    """The arguments that are not parameters: columns as arrays (m,), and constants."""
+    @cached_property
+    def _known(self) -> dict[str, Any]:
+        """The arguments that are not parameters: columns as arrays (m,), and constants."""
+        return {name: read_only(self.column(name)) for name in self.headings} | {**self.constants}
 
     def _at(self, values: Any) -> Any:
         """h where the parameters have these values (n,), in their own units; at their real parts if h does not take

@@ -82,8 +82,10 @@ class Gins(OdeMeasurement):
         tried = self.times[-1] <= 5400.0 and self.interval_min >= 3.0 and self._fastest <= 1500.0 * FOOT * (1 + 1e-9)
         return 0.32 if tried else 0.0
 
-    _fastest = cached_property(lambda gins: float(np.hypot(*gins.cases.T).max()))
-    """The largest injected velocity, m/s."""
+    @cached_property
+    def _fastest(self) -> float:
+        """The largest injected velocity, m/s."""
+        return float(np.hypot(*self.cases.T).max())
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -205,7 +207,9 @@ class Gins(OdeMeasurement):
     def read(self, t: Any, y: Sequence[Any], p: Sequence[Any], c: Sequence[Any]) -> Sequence[Any]:
         return y[0], y[1]
 
-    _origin = property(lambda gins: gins.offset)  # type: ignore[assignment]
+    @property
+    def _origin(self) -> Array:
+        return self.offset
 
     @cached_property
     def offset(self) -> Array:
@@ -250,8 +254,10 @@ class RicherGins(Gins):
         ]
         return np.repeat(deviation, [2, 2, 3, len(self.cases) * self.readings_per_case * 3])
 
-    _drift = property(lambda gins: gins.si_sizes[4] / gins.parameters[4].size)
-    """rad/s in a deg/h, as the parameters have them."""
+    @property
+    def _drift(self) -> float:
+        """The rad/s in a deg/h, as the parameters have them."""
+        return self.si_sizes[4] / self.parameters[4].size
 
     @property
     def nuisances(self) -> tuple[Parameter, ...]:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ipe_bench.measurements.arithmetic import Arithmetic
-from ipe_bench.measurements.base import Measurement, WrappedModel
+from ipe_bench.measurements.base import Forwarding, Measurement
 from ipe_bench.measurements.formula import Formula
 from ipe_bench.measurements.ode.described import Ode
 from ipe_bench.measurements.ode.trace import Expression, Graph, in_order, tangent
@@ -49,7 +49,7 @@ def structure(model: Measurement) -> Structure | None:
     cases; None for other models, and for formulas that are not examined (sin, tanh and their kin; conditionals; inputs
     or exponents that change with time; a denominator that is 0 at the start)."""
     fixed: dict[str, float] = {}
-    while isinstance(model, WrappedModel) and not isinstance(model, Ode):
+    while isinstance(model, Forwarding) and not isinstance(model, Ode):
         fixed = {**model.fixed, **fixed}
         model = model.whole
     unknowns = [p.name for p in model.parameters if p.name not in fixed]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partialmethod
+from functools import cached_property
 from itertools import chain
 from typing import Any
 
@@ -26,15 +26,23 @@ class Joint(Measurement):
 
     parts: tuple[Measurement, ...]
 
-    name = property(lambda joint: joint.parts[0].name)  # type: ignore[assignment]
-    reading_unit = property(lambda joint: joint.parts[0].reading_unit)  # type: ignore[assignment]
-    reading_name = property(lambda joint: joint.parts[0].reading_name)  # type: ignore[assignment]
-
     def __post_init__(self) -> None:
         super().__post_init__()
         units = {part.reading_unit for part in self.parts}
         if len(units) > 1:
             raise UserError(f"readings: the files have readings in different units: {', '.join(sorted(units))}")
+
+    @property
+    def name(self) -> str:
+        return self.parts[0].name
+
+    @property
+    def reading_unit(self) -> str:
+        return self.parts[0].reading_unit
+
+    @property
+    def reading_name(self) -> str:
+        return self.parts[0].reading_name
 
     @property
     def copies(self) -> dict[str, list[str]]:
@@ -65,14 +73,15 @@ class Joint(Measurement):
         found = {place: (k, i) for place, k, i in reversed(places)}
         return [found[place] for place in sorted(found)]
 
-    def _each(self, attribute: str) -> tuple[Parameter, ...]:
-        return tuple(
-            self._named(getattr(self.parts[k], attribute)[i], self.parts[k].physical_parameters[i], k)
-            for k, i in self._first
-        )
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        parts = self.parts
+        return tuple(self._named(parts[k].parameters[i], parts[k].physical_parameters[i], k) for k, i in self._first)
 
-    parameters = cached_property(lambda joint: joint._each("parameters"))  # type: ignore[assignment]
-    physical_parameters = cached_property(lambda joint: joint._each("physical_parameters"))  # type: ignore[assignment]
+    @cached_property
+    def physical_parameters(self) -> tuple[Parameter, ...]:
+        known = ((self.parts[k].physical_parameters[i], k) for k, i in self._first)
+        return tuple(self._named(p, p, k) for p, k in known)
 
     @cached_property
     def nominal(self) -> Array:
@@ -91,12 +100,20 @@ class Joint(Measurement):
         values = self._of_parts(method, x)
         return np.stack([values[k][:, i] for k, i in self._first], axis=1)
 
-    physical = partialmethod(_columns, "physical")  # type: ignore[assignment]
-    physical_slope = partialmethod(_columns, "physical_slope")  # type: ignore[assignment]
+    def physical(self, x: Array) -> Array:
+        return self._columns("physical", x)
 
-    _starts = cached_property(lambda joint: np.cumsum([0, *(part.m for part in joint.parts)]).tolist())
-    """Where the readings of each part begin, and where the last one ends."""
-    m = property(lambda joint: joint._starts[-1])  # type: ignore[assignment]
+    def physical_slope(self, x: Array) -> Array:
+        return self._columns("physical_slope", x)
+
+    @cached_property
+    def _starts(self) -> list[int]:
+        """Where the readings of each part begin, and where the last one ends."""
+        return np.cumsum([0, *(part.m for part in self.parts)]).tolist()
+
+    @property
+    def m(self) -> int:
+        return self._starts[-1]
 
     @property
     def index(self) -> Mapping[str, Sequence[Any]]:
@@ -152,6 +169,11 @@ class Joint(Measurement):
             J[:, start : start + slope.shape[1], places] = slope
         return J
 
-    jacobian_cost = property(lambda joint: float(np.mean([part.jacobian_cost for part in joint.parts])))
-    """The mean of the parts, whose simulations are taken to cost alike."""
-    coarse_jacobian_cost = property(lambda joint: float(np.mean([part.coarse_jacobian_cost for part in joint.parts])))
+    @property
+    def jacobian_cost(self) -> float:
+        """The mean of the parts, whose simulations are taken to cost alike."""
+        return float(np.mean([part.jacobian_cost for part in self.parts]))
+
+    @property
+    def coarse_jacobian_cost(self) -> float:
+        return float(np.mean([part.coarse_jacobian_cost for part in self.parts]))

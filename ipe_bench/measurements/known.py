@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array, Mask
@@ -107,7 +108,9 @@ class ConstrainedModel(WrappedModel):
         given = {one.name: one for one in self.known}
         return tuple(given.get(p.name, ParameterInfo(p.name)) for p in self.whole.parameters)
 
-    _free = cached_property(lambda model: np.flatnonzero([one.fixed is None for one in model._known]))
+    @cached_property
+    def _free(self) -> NDArray[np.intp]:
+        return np.flatnonzero([one.fixed is None for one in self._known])
 
     @cached_property
     def _v0(self) -> Array:
@@ -146,12 +149,19 @@ class ConstrainedModel(WrappedModel):
     def fixed(self) -> dict[str, float]:
         return {one.name: one.fixed for one in self._known if one.fixed is not None}
 
-    nominal = cached_property(lambda model: model.inner(model._coordinates.v0))  # type: ignore[assignment]
+    @cached_property
+    def nominal(self) -> Array:
+        return self.inner(self._coordinates.v0)
 
-    physical = property(lambda model: model._coordinates.value)  # type: ignore[assignment]
-    physical_slope = property(lambda model: model._coordinates.slope)  # type: ignore[assignment]
-    inner = property(lambda model: model._coordinates.inner)
-    """From values (..., n) in the parameters' own units to x (..., n)."""
+    def physical(self, x: Array) -> Array:
+        return self._coordinates.value(x)
+
+    def physical_slope(self, x: Array) -> Array:
+        return self._coordinates.slope(x)
+
+    def inner(self, v: Array) -> Array:
+        """Returns x (..., n) of values (..., n) in the parameters' own units."""
+        return self._coordinates.inner(v)
 
     def near_bounds(self, x: Array) -> dict[int, float]:
         c, values = self._coordinates, self.physical(x[None])[0]
@@ -212,7 +222,9 @@ class _Coordinates:
         """What one unit of x is, of the logarithm or logit."""
         return self.size / self._slope_at(self.v0)
 
-    _origin = cached_property(lambda coordinates: coordinates._coordinate(coordinates.v0))
+    @cached_property
+    def _origin(self) -> Array:
+        return self._coordinate(self.v0)
 
     def _slope_at(self, v: Array) -> Array:
         """The derivative of the value by its logarithm or logit."""

@@ -128,16 +128,23 @@ class Nist(Measurement):
     def _numbers(self, key: str) -> Array:
         return np.array(_tables()[self.dataset][key], dtype=float)
 
-    start_values = cached_property(lambda model: model._numbers(f"start_{model.start}"))
-    """The starting point (n,) in physical units."""
+    @cached_property
+    def start_values(self) -> Array:
+        """The starting point (n,) in physical units."""
+        return self._numbers(f"start_{self.start}")
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
         return tuple(Parameter(f"b{i + 1}", size=float(abs(b))) for i, b in enumerate(self.start_values))
 
-    nominal = property(lambda model: np.sign(model.start_values))  # type: ignore[assignment]
-    predictors = cached_property(lambda model: model._numbers("predictors"))
-    """The predictor variables (k, m)."""
+    @property
+    def nominal(self) -> Array:
+        return np.sign(self.start_values)
+
+    @cached_property
+    def predictors(self) -> Array:
+        """The predictor variables (k, m)."""
+        return self._numbers("predictors")
 
     @property
     def index(self) -> Mapping[str, Sequence[Any]]:

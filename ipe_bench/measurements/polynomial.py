@@ -11,7 +11,7 @@ from numpy.polynomial.chebyshev import chebvander
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Finite
-from ipe_bench.measurements.base import Measurement, Parameter, UsualNoise, single_epochs
+from ipe_bench.measurements.base import Epochs, Measurement, Parameter, UsualNoise, single_epochs
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,6 @@ class Polynomial(Measurement):
 
     analytic = True
     usual_noise = UsualNoise(0.01)
-    epochs = cached_property(single_epochs)  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -43,12 +42,23 @@ class Polynomial(Measurement):
     def parameters(self) -> tuple[Parameter, ...]:
         return tuple(Parameter(f"c{i}", group="coefficients") for i in range(self.unknowns))
 
-    times = cached_property(lambda model: np.linspace(-1.0, 1.0, model.count))
-    """Where the polynomials are read (m,)."""
-    matrix = cached_property(lambda model: chebvander(model.times, model.unknowns - 1))
-    """H (m, n)."""
+    @cached_property
+    def times(self) -> Array:
+        """Where the polynomials are read (m,)."""
+        return np.linspace(-1.0, 1.0, self.count)
 
-    index = property(lambda model: {"time": model.times.tolist()})  # type: ignore[assignment]
+    @cached_property
+    def matrix(self) -> Array:
+        """H (m, n)."""
+        return chebvander(self.times, self.unknowns - 1)
+
+    @property
+    def index(self) -> dict[str, list[float]]:
+        return {"time": self.times.tolist()}
+
+    @cached_property
+    def epochs(self) -> Epochs:
+        return single_epochs(self)
 
     def simulate(self, x: Array) -> Array:
         u = np.einsum("kj,tj->tk", self.matrix, x)

@@ -13,7 +13,7 @@ from annotated_types import MinLen
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Positive
-from ipe_bench.measurements.base import Measurement, Parameter, UsualNoise, parameter_table, single_epochs
+from ipe_bench.measurements.base import Epochs, Measurement, Parameter, UsualNoise, parameter_table, single_epochs
 
 _BEACONS = (
     (1000.0, 0.0, 300.0), (500.0, 866.0, 20.0), (-500.0, 866.0, 300.0), (-1000.0, 0.0, 20.0), (-500.0, -866.0, 300.0),
@@ -52,14 +52,18 @@ class Ranging(Measurement):
         place = ("east", "north", "up"), "m", 10.0, "position"
         return parameter_table(place, (("clock",), "m", 10.0, "clock bias"))
 
-    nominal = cached_property(lambda ranging: np.append(ranging.position, 0.0) / ranging.sizes)  # type: ignore[assignment]
+    @cached_property
+    def nominal(self) -> Array:
+        return np.append(self.position, 0.0) / self.sizes
 
     @property
     def index(self) -> Mapping[str, Sequence[Any]]:
         rounds, beacons = np.indices((self.rounds, len(self.beacons))).reshape(2, -1) + 1
         return {"round": rounds.tolist(), "beacon": beacons.tolist()}
 
-    epochs = cached_property(lambda ranging: tuple(np.arange(ranging.m).reshape(ranging.rounds, -1)))  # type: ignore
+    @cached_property
+    def epochs(self) -> Epochs:
+        return tuple(np.arange(self.m).reshape(self.rounds, -1))
 
     def simulate(self, x: Array) -> Array:
         p = x * self.sizes
@@ -92,15 +96,23 @@ class Bearings(Measurement):
     reading_unit = "deg"
     usual_noise = UsualNoise(0.5)
     analytic = True
-    epochs = cached_property(single_epochs)  # type: ignore[assignment]
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
         place = ("east", "north"), "m", 250.0, "position"
         return parameter_table(place, (("v_east", "v_north"), "m/s", 0.25, "velocity"))
 
-    nominal = cached_property(lambda bearings: np.array(bearings.target) / bearings.sizes)  # type: ignore[assignment]
-    index = property(lambda bearings: {"time [s]": bearings.times.tolist()})  # type: ignore[assignment]
+    @cached_property
+    def nominal(self) -> Array:
+        return np.array(self.target) / self.sizes
+
+    @property
+    def index(self) -> Mapping[str, Sequence[Any]]:
+        return {"time [s]": self.times.tolist()}
+
+    @cached_property
+    def epochs(self) -> Epochs:
+        return single_epochs(self)
 
     @cached_property
     def times(self) -> Array:

@@ -6,7 +6,7 @@ import copy
 import time
 from dataclasses import dataclass, is_dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -41,7 +41,10 @@ class Problem:
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, read_only(getattr(self, name)))
 
-    x0 = property(lambda problem: read_only(problem.measurement.nominal))
+    @property
+    def x0(self) -> Array:
+        """The nominal point (n,)."""
+        return read_only(self.measurement.nominal)
 
     @cached_property
     def H(self) -> Array:
@@ -53,8 +56,10 @@ class Problem:
         """H+ (n, m) = (H' R^-1 H)^-1 H' R^-1; NaN where H has not full column rank."""
         return read_only(pseudo_inverse(self.H[None], self.R)[0][0])
 
-    rankless = property(lambda problem: bool(np.isnan(problem.H_plus).all()))
-    """Whether H has not full column rank, so that there is no linear estimate."""
+    @property
+    def rankless(self) -> bool:
+        """Whether H has not full column rank, so that there is no linear estimate."""
+        return bool(np.isnan(self.H_plus).all())
 
     def prior_used(self, inflation: float = 1.0) -> Array | None:
         """The prior's standard deviations (n,) times `inflation`; a parameter that the prior fixes is nearly fixed."""
@@ -124,7 +129,7 @@ def _irregularity(model: Measurement) -> str:
     """What is wrong; empty where nothing is, and where a call raises, which is told of by the trials that it ends."""
     rng = np.random.default_rng(11)
     x, other = (read_only(model.nominal + 0.1 * rng.standard_normal((trials, model.n))) for trials in (4, 7))
-    fresh = replace(model) if is_dataclass(model) else copy.copy(model)  # type: ignore[type-var]
+    fresh: Any = replace(cast(Any, model)) if is_dataclass(model) else copy.copy(model)
     for method, shape in (("simulate", (len(x), model.m)), ("jacobian", (len(x), model.m, model.n))):
         call = getattr(model, method)
         try:

@@ -16,8 +16,8 @@ from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.files import own_conf
 from ipe_bench.basics.linalg import Array, Covariance, own
 from ipe_bench.basics.options import Count, Finite, Positive
-from ipe_bench.measurements.arithmetic import COMPARISONS, Arithmetic, evaluate, never_switching, parse, parts
-from ipe_bench.measurements.base import Input, Measurement, Recorded, SubsetModel, UsualNoise, WrappedModel
+from ipe_bench.measurements.arithmetic import COMPARISONS, Arithmetic, Tree, evaluate, never_switching, parse, parts
+from ipe_bench.measurements.base import Input, Measurement, Parameter, Recorded, SubsetModel, UsualNoise, WrappedModel
 from ipe_bench.measurements.formula import WrittenModel
 from ipe_bench.measurements.ode import driven
 from ipe_bench.measurements.ode.model import OdeMeasurement, time_heading
@@ -112,12 +112,19 @@ class Ode(WrittenModel, WrappedModel):
     circular: tuple[str, ...] = ()
     """Outputs that are angles, in rad, or in deg by their unit: their residuals are within half a turn."""
 
-    name = property(lambda model: model.title)  # type: ignore[assignment]
     index = WrappedModel.index
-    periods = WrappedModel.periods  # type: ignore[assignment]
-    reading_name = WrittenModel.reading_name
-    own_parameters = property(lambda model: model.own)  # type: ignore[assignment]
-    usual_noise = property(lambda model: model.deviation and UsualNoise(model.deviation))  # type: ignore[assignment]
+
+    @property
+    def periods(self) -> Array | Sequence[float]:
+        return self.whole.periods
+
+    @property
+    def name(self) -> str:
+        return self.title
+
+    @property
+    def usual_noise(self) -> UsualNoise | None:
+        return UsualNoise(self.deviation) if self.deviation else None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -185,17 +192,32 @@ class Ode(WrittenModel, WrappedModel):
             raise UserError(f"columns.case: numbers {len(self.courses)} cases, and the constants have {count}")
         return np.array([np.broadcast_to(column, count) for column in columns], dtype=float).reshape(-1, count).T
 
-    rate_formulas = cached_property(lambda model: _read_all("rates", model.rates))
-    initial_formulas = cached_property(
-        lambda model: _read_all("initial", {name: model.initial.get(name, 0.0) for name in model.rates})
-    )
-    output_formulas = cached_property(lambda model: _read_all("outputs", model.outputs or {y: y for y in model.rates}))
-    courses = cached_property(lambda model: driven.courses(model.columns, model.driven_by) if model.driven_by else [])
-    """The inputs of `driven_by` over time in each case; of one where all are alike."""
-    piecewise_rates = cached_property(lambda model: driven.separated(model.rate_formulas, model.constant_names))
-    """The rates with a name in place of every comparison of t with constants, and these comparisons."""
-    engine = cached_property(lambda model: _Engine(model))
-    """The equations as the integrator takes them, with readings wherever an input or a rate changes, too."""
+    @cached_property
+    def rate_formulas(self) -> dict[str, Arithmetic]:
+        return _read_all("rates", self.rates)
+
+    @cached_property
+    def initial_formulas(self) -> dict[str, Arithmetic]:
+        return _read_all("initial", {name: self.initial.get(name, 0.0) for name in self.rates})
+
+    @cached_property
+    def output_formulas(self) -> dict[str, Arithmetic]:
+        return _read_all("outputs", self.outputs or {y: y for y in self.rates})
+
+    @cached_property
+    def courses(self) -> list[dict[str, Any]]:
+        """The inputs of `driven_by` over time in each case; of one where all are alike."""
+        return driven.courses(self.columns, self.driven_by) if self.driven_by else []
+
+    @cached_property
+    def piecewise_rates(self) -> tuple[dict[str, Arithmetic], dict[str, Tree]]:
+        """The rates with a name in place of every comparison of t with constants, and these comparisons."""
+        return driven.separated(self.rate_formulas, self.constant_names)
+
+    @cached_property
+    def engine(self) -> _Engine:
+        """The equations as the integrator takes them, with readings wherever an input or a rate changes, too."""
+        return _Engine(self)
 
     @cached_property
     def reading_times(self) -> Array:
@@ -204,7 +226,7 @@ class Ode(WrittenModel, WrappedModel):
         return np.asarray(self.times) if self.times else self.interval * np.arange(1.0, (self.readings or 0) + 1)
 
     @cached_property
-    def whole(self) -> Measurement:  # type: ignore[override]
+    def whole(self) -> Measurement:
         engine, read = self.engine, np.searchsorted(self.engine.times, self.reading_times)
         if len(read) == len(engine.times):
             return engine
@@ -342,22 +364,35 @@ def _read_all(key: str, texts: Mapping[str, str | float]) -> dict[str, Arithmeti
     return {name: parse(str(text), f"{key}.{name}") for name, text in texts.items()}
 
 
-@dataclass(frozen=True)
 class _Engine(OdeMeasurement):
     """The model that `Ode` describes, for the integrator."""
 
-    described: Ode
-
-    name = property(lambda engine: engine.described.title)  # type: ignore[assignment]
     stiff_remedy = "measurement.method=implicit follows them"
-    states = property(lambda engine: len(engine.described.rates))  # type: ignore[assignment]
-    outputs = property(lambda engine: tuple(engine.described.output_formulas))  # type: ignore[assignment]
-    time_unit = property(lambda engine: engine.described.time_unit)  # type: ignore[assignment]
-    step = property(lambda engine: engine.described.step)  # type: ignore[assignment]
-    cases = property(lambda engine: engine.described.cases)  # type: ignore[assignment]
-    parameters = property(lambda engine: engine.described.parameters)  # type: ignore[assignment]
-    nominal = property(lambda engine: engine.described.nominal)  # type: ignore[assignment]
-    _coarsens = property(lambda engine: engine.step is None and not engine.stiff)  # type: ignore[assignment]
+
+    def __init__(self, described: Ode) -> None:
+        self.described = described
+        self.states, self.outputs = len(described.rates), tuple(described.output_formulas)
+        self.time_unit, self.step = described.time_unit, described.step
+
+    @property
+    def name(self) -> str:
+        return self.described.title
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return self.described.parameters
+
+    @property
+    def nominal(self) -> Array:
+        return self.described.nominal
+
+    @property
+    def cases(self) -> Array:
+        return self.described.cases
+
+    @property
+    def _coarsens(self) -> bool:
+        return self.step is None and not self.stiff
 
     @property
     def periods(self) -> Array | Sequence[float]:
@@ -464,7 +499,7 @@ class _Engine(OdeMeasurement):
         return self._implicit.jacobian(x, stop) if self.stiff else super().jacobian_until(x, stop)
 
     @cached_property
-    def jacobian_cost(self) -> float:  # type: ignore[override]
+    def jacobian_cost(self) -> float:
         return float(1 + self.n) if self.stiff else super().jacobian_cost
 
     def hindrance(self, x: Array) -> str:
@@ -472,7 +507,7 @@ class _Engine(OdeMeasurement):
         return "" if followed else super().hindrance(x)
 
     @cached_property
-    def tolerance(self) -> float:  # type: ignore[override]
+    def tolerance(self) -> float:
         if isinstance(self.described.tolerance, float):
             return self.described.tolerance
         intervals = np.diff(self.times, prepend=0.0)

@@ -71,8 +71,13 @@ class Kernel:
     def plan(self) -> StepPlan:
         return planned(self.equations, self.tableau, sensitive=self.sensitive)
 
-    _narrow = functools.cached_property(lambda self: self._machine_code(_NARROW))
-    _wide = functools.cached_property(lambda self: self._machine_code(compiled.width()))
+    @functools.cached_property
+    def _narrow(self) -> tuple[Callable[..., None], int]:
+        return self._machine_code(_NARROW)
+
+    @functools.cached_property
+    def _wide(self) -> tuple[Callable[..., None], int]:
+        return self._machine_code(compiled.width())
 
     def _machine_code(self, width: int) -> tuple[Callable[..., None], int]:
         """The function for groups of so many lanes, and the numbers that it needs room for."""

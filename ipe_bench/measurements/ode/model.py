@@ -5,8 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property
-from operator import attrgetter
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,11 +37,11 @@ class OdeMeasurement(Measurement):
     arguments, and nothing that asks for a value (no if). z has C order over (case, time, output); a time is an epoch.
     """
 
-    states: ClassVar[int]
+    states: int
     """Number of state variables."""
-    outputs: ClassVar[tuple[str, ...]]
+    outputs: tuple[str, ...]
     """The names of what is read at each time."""
-    time_unit: ClassVar[str] = "s"
+    time_unit: str = "s"
     """The unit of `times`, `step` and t."""
     tolerance: float | Sequence[float] | None = None
     """The error that the integration may leave in a reading, in `reading_unit`; or one such error for each output.
@@ -52,7 +51,7 @@ class OdeMeasurement(Measurement):
     shortest_step: float = 0.0
     """Steps do not become shorter than about this, however wild the parameters, nor than 1/1024 of the usual interval
     between readings: what an iterate that diverges may cost."""
-    stiff_remedy: ClassVar[str] = "put what decays fast in balance with the rest"
+    stiff_remedy: str = "put what decays fast in balance with the rest"
     """What to do about equations that are stiff."""
     trusted_angle: float = 0.0
     """A step that is at most this over `fastest_rate` is known to hold the tolerance; 0: every trial is tested."""
@@ -79,8 +78,10 @@ class OdeMeasurement(Measurement):
             return cases
         return own(np.concatenate([np.repeat(cases, len(self.driven), axis=0), self.driven], axis=2))
 
-    si_sizes: Any = property(attrgetter("sizes"))
-    """The size (n,) of one unit of x in SI units."""
+    @property
+    def si_sizes(self) -> Array:
+        """The size (n,) of one unit of x in SI units."""
+        return self.sizes
 
     @abstractmethod
     def start(self, p: Sequence[Any], c: Sequence[Any]) -> Sequence[Any]:
@@ -100,7 +101,7 @@ class OdeMeasurement(Measurement):
     """A method fastest_rate(p), recorded like `rhs`: how fast the solution may turn, grow or decay, per unit of time.
     It says with which step the search begins; where there is none, it begins with that of the nominal parameters."""
 
-    by_differential_equations = True  # type: ignore[assignment]
+    by_differential_equations = True
 
     @property
     def index(self) -> Mapping[str, Sequence[Any]]:
@@ -129,8 +130,10 @@ class OdeMeasurement(Measurement):
         off by 1e-4 m/s at most in 100 trials, at 30,000 by 4e-7 in the median and 7e-3 in the worst."""
         return self._shown(x, stop, self._origin, guess=True)
 
-    _origin = property(attrgetter("_zeros"))
-    """What readings (m,) are counted from."""
+    @property
+    def _origin(self) -> Array:
+        """What readings (m,) are counted from."""
+        return self._zeros
 
     def _shown(self, x: Array, stop: int, offset: Array, *, guess: bool = False) -> Array:
         """Readings less the offset (m,)."""
@@ -179,17 +182,31 @@ class OdeMeasurement(Measurement):
         times, y = self._times[: z.shape[1] // (len(self._cases) * len(self.outputs))], y if self._kept[1] else None
         self._readings_kernel.run(x, self._si_sizes, self.tables, rows, times, steps, offset, z.reshape(-1), states=y)
 
-    _zeros = cached_property(lambda self: np.zeros(self.m))
-    _si_sizes = cached_property(lambda self: own(self.si_sizes))
-    _cases = cached_property(lambda self: own(self.cases))
-    _times = cached_property(lambda self: own(self.times))
+    @cached_property
+    def _zeros(self) -> Array:
+        return np.zeros(self.m)
+
+    @cached_property
+    def _si_sizes(self) -> Array:
+        return own(self.si_sizes)
+
+    @cached_property
+    def _cases(self) -> Array:
+        return own(self.cases)
+
+    @cached_property
+    def _times(self) -> Array:
+        return own(self.times)
 
     @property
     def _kept(self) -> tuple[int, int, int]:
         """Cases, states and times that are held against each other. A stated rate needs none: no step is unstable."""
         return len(self._cases), self.states if self.fastest_rate is None else 0, len(self._times) + 1
 
-    _remembered = cached_property(lambda self: dict[bytes, tuple[int, bool]]())
+    @cached_property
+    def _remembered(self) -> dict[bytes, tuple[int, bool]]:
+        """The place of each trial that was searched for, and whether it is lost, by the bits of its x."""
+        return {}
 
     def _rungs_of(self, x: Array, offset: Array, *, guess: bool = False) -> ladder.Found:
         """The rung of each trial, and the readings of those whose rung had to be looked for; with `guess` the rates
@@ -355,12 +372,12 @@ class OdeMeasurement(Measurement):
         return rk4, float(np.clip(longer, 1.0, ladder.LONGEST))
 
     @cached_property
-    def jacobian_cost(self) -> float:  # type: ignore[override]
+    def jacobian_cost(self) -> float:
         """Arithmetic operations of a step with all tangents, over those of a simulation's step."""
         return self._jacobian_kernel.plan.operations / self._readings_kernel.plan.operations
 
     @cached_property
-    def coarse_jacobian_cost(self) -> float:  # type: ignore[override]
+    def coarse_jacobian_cost(self) -> float:
         """At the nominal parameters, or where they are at a rung above 2; in simulations at the trial's rung."""
         if not self._coarsens:
             return self.jacobian_cost
@@ -373,9 +390,17 @@ class OdeMeasurement(Measurement):
         """Without what is compiled and remembered, which stays with a process."""
         return {k: v for k, v in self.__dict__.items() if not k.startswith("_") and k != "equations"}
 
-    _readings_kernel = cached_property(lambda self: Kernel(self.equations, DOP853))
-    _jacobian_kernel = cached_property(lambda self: Kernel(self.equations, DOP853, sensitive=True))
-    _rk4_kernel = cached_property(lambda self: Kernel(self.equations, RK4, sensitive=True))
+    @cached_property
+    def _readings_kernel(self) -> Kernel:
+        return Kernel(self.equations, DOP853)
+
+    @cached_property
+    def _jacobian_kernel(self) -> Kernel:
+        return Kernel(self.equations, DOP853, sensitive=True)
+
+    @cached_property
+    def _rk4_kernel(self) -> Kernel:
+        return Kernel(self.equations, RK4, sensitive=True)
 
     @cached_property
     def equations(self) -> Equations:
