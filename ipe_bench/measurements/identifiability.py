@@ -99,10 +99,7 @@ class _Free(dict[Any, int]):
 
 
 def _jacobian(
-    free: _Free,
-    unknowns: Sequence[str],
-    formulas: Iterable[Mapping[str, Arithmetic]],
-    cases: list[dict[str, float]],
+    free: _Free, unknowns: Sequence[str], formulas: Iterable[Mapping[str, Arithmetic]], cases: list[dict[str, float]]
 ) -> list[list[int]]:
     """The derivatives (cases x outputs x orders, unknowns) of the outputs' Taylor coefficients, modulo the prime, where
     the formulas are rates, initial states and outputs; as many coefficients as unknowns suffice."""

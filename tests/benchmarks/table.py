@@ -125,7 +125,7 @@ def stiff() -> Iterator[Row]:
     rates = {"a": "-k1*a + k3*b*c", "b": "k1*a - k3*b*c - k2*b*b", "c": "k2*b*b"}
     times = tuple(np.logspace(0, np.log10(4e5), 20).tolist())
     model = ib.measurements.Ode(rates, {"k1": 0.04, "k2": 3e7, "k3": 1e4}, {"a": 1.0}, times=times)
-    method, x = Rodas5P(model.engine, 1e-8), 1 + 0.01 * np.random.default_rng(0).normal(size=(BATCH, 3))
+    method, x = Rodas5P(model.engine.stepped, 1e-8), 1 + 0.01 * np.random.default_rng(0).normal(size=(BATCH, 3))
 
     def scipy(name: str) -> Any:
         p = (x[0] * model.sizes).tolist()

@@ -66,7 +66,7 @@ def follower(**options):
     ids=["robertson", "van der pol", "hires"],
 )
 def test_the_digits_of_the_test_set(model, expected, left):
-    z = Rodas5P(model.engine, 1e-8).simulate(model.nominal[None], len(model.times))[0]
+    z = Rodas5P(model.engine.stepped, 1e-8).simulate(model.nominal[None], len(model.times))[0]
     np.testing.assert_allclose(z[-len(expected) :], expected, rtol=left)
 
 

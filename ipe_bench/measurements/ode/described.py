@@ -426,7 +426,7 @@ class _Engine(OdeMeasurement):
     @cached_property
     def shape(self) -> tuple[Array, Effort]:
         """The nominal readings (1, m) by the implicit method, near enough to show their size, and what they took."""
-        return Rodas5P(self, SHAPE).measured(own(self.nominal[None]))
+        return Rodas5P(self.stepped, SHAPE).measured(own(self.nominal[None]))
 
     @cached_property
     def stiff(self) -> bool:
@@ -449,7 +449,7 @@ class _Engine(OdeMeasurement):
         x, here, every = own(self.nominal[None]), self._rungs[self._nominal_place], len(self.times)
         explicit, finest = np.empty((2, 1, self.m))
         most = int(_ASKED / (4 + self.states) / max(1.0, len(self.cases) * self.states**2 / 2000))
-        rough = Rodas5P(self, SHAPE).simulate(x, every, most)
+        rough = Rodas5P(self.stepped, SHAPE).simulate(x, every, most)
         self._simulate(x, np.arange(1), here * self._parts, self._zeros, explicit)
         with np.errstate(all="ignore"):
             outputs = np.abs(rough).reshape(-1, len(self.outputs))
@@ -490,7 +490,7 @@ class _Engine(OdeMeasurement):
     @cached_property
     def _implicit(self) -> Rodas5P:
         largest = float(np.nanmax(np.abs(self.shape[0]), initial=0.0)) or 1.0
-        return Rodas5P(self, float(np.clip(_IN_HAND * np.min(self._tolerances) / largest, 1e-10, 1e-4)))
+        return Rodas5P(self.stepped, float(np.clip(_IN_HAND * np.min(self._tolerances) / largest, 1e-10, 1e-4)))
 
     def _shown(self, x: Array, stop: int, offset: Array, *, guess: bool = False) -> Array:
         return self._implicit.simulate(x, stop) if self.stiff else super()._shown(x, stop, offset, guess=guess)

@@ -25,8 +25,11 @@ SAFETY = 16.0
 AIM = 1e-3
 """The contraction of coarse tangents that is aimed at where it is measured or predicted; elsewhere it may be some times
 larger."""
-MOST_RK4 = 3
+MOST_OF_FOURTH = 3
 """Steps of the formula of fourth order, in place of one of eighth order, beyond which it gains nothing."""
+HIGHEST_OF_FOURTH = 2
+"""The highest rung at which it is tried: up to here its stages, 4 (rung + 1) at least, are not more than the 12 of a
+single step of eighth order."""
 LONGEST = 5
 """Times that the steps of tangents may be longer than those of the readings."""
 STATES = 1e-4
@@ -131,3 +134,43 @@ def tangent_contraction(coarse: Array, J: Array) -> float:
     size = np.linalg.norm(J, axis=0)
     size[size == 0] = 1.0
     return float(np.linalg.norm(np.eye(J.shape[1]) - np.linalg.lstsq(coarse / size, J / size, rcond=None)[0], 2))
+
+
+class Coarseness(NamedTuple):
+    """How coarse the tangents inside an iteration may be, as measured at the nominal parameters."""
+
+    fourth: int | None
+    """Steps of the formula of fourth order that contract enough at rung 1; None: none do."""
+    longer: float
+    """How many times longer steps of the formula of eighth order may be than those of the readings."""
+
+    def steps(self, rung: int) -> tuple[bool, int]:
+        """Returns whether the formula is that of fourth order, and the steps between two readings, for trials at this
+        rung; 0 stands for trials whose rung is known without a search."""
+        if rung > HIGHEST_OF_FOURTH or self.fourth is None:
+            return False, max(1, int(np.ceil(max(rung, 1) / self.longer)))
+        # The formula of fourth order loses more by what a trial turns faster than the nominal one: at rung 1 there is
+        # 2^4 in hand, at rung 2 it is 3^4.
+        return True, self.fourth * (rung + 1 if rung else 1)
+
+
+def fewest_of_fourth(tangents: Callable[[int], Array], J: Array) -> int | None:
+    """Returns the fewest steps k of the formula of fourth order for which tangents(k) (m, n) contract enough beside J
+    (m, n), or None."""
+    tried = ((k, tangent_contraction(tangents(k), J)) for k in range(1, MOST_OF_FOURTH + 1))
+    return next((k for k, left in tried if left <= AIM), None)
+
+
+def times_longer(off: Array, coarse: Array, J: Array) -> float:
+    """Returns how many times longer than those of the readings the steps of tangents may be, from longer ones: `off`
+    (m,) is by how much they change the readings, in tolerances, and `coarse` (m, n) is their Jacobian.
+
+    Readings are held to 1/`SAFETY` of the tolerance; the contraction grows with the error, and so with the eighth power
+    of the step.
+    """
+    with np.errstate(all="ignore"):
+        sensitivity = tangent_contraction(coarse, J) / off.max()
+    if not np.isfinite(sensitivity):
+        return 1.0
+    longer = (SAFETY * AIM / sensitivity) ** (1 / ORDER) if sensitivity > 0 else np.inf
+    return float(np.clip(longer, 1.0, LONGEST))

@@ -16,7 +16,7 @@ from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.ode import ladder
 from ipe_bench.measurements.ode.integrator import Kernel, compiled_rates
 from ipe_bench.measurements.ode.plan import DOP853, RK4, Equations, Variation, jumps
-from ipe_bench.measurements.ode.rodas import diagnose
+from ipe_bench.measurements.ode.rodas import MOST_STEPS, SHAPE, STABLE, Rodas5P, Stepped
 from ipe_bench.measurements.ode.trace import Graph, Program
 
 _NOT_FOLLOWED = 1e3
@@ -138,7 +138,7 @@ class OdeMeasurement(Measurement):
     def _shown(self, x: Array, stop: int, offset: Array, *, guess: bool = False) -> Array:
         """Readings less the offset (m,)."""
         x = own(x)
-        cases, outputs = len(self._cases), len(self.outputs)
+        cases, outputs = self.tables.shape[1], len(self.outputs)
         z = np.empty((len(x), cases * stop * outputs))
         if self._trusted(x).all():
             self._simulate(x, np.arange(len(x)), self._parts, offset, z)
@@ -166,20 +166,35 @@ class OdeMeasurement(Measurement):
                 left = ladder.SAFETY * np.abs(z[0] - self.near(z[1], z[0])) / (2.0**ladder.ORDER - 1.0)
             held = bool((left <= _NOT_FOLLOWED * self._tolerances).all() and ladder.apart(*y)[0] <= ladder.LOST)
             shortest = self._usual_interval / self._rungs[top]
-        return "" if held else diagnose(self, x[0], float(shortest))
+        return "" if held else self._diagnosis(x, float(shortest))
+
+    def _diagnosis(self, x: Array, shortest: float) -> str:
+        """Says what hinders the integrator at x (1, n), whose shortest step is `shortest`."""
+        unit = f" {self.time_unit}".rstrip()
+        z, effort = Rodas5P(self.stepped, SHAPE).measured(x)
+        if not np.isfinite(z).all():
+            if effort.steps >= MOST_STEPS:
+                return f"the solution takes more than {MOST_STEPS} steps, by the implicit method, too"
+            return f"the solution itself leaves all numbers near t = {effort.reached:.4g}{unit}"
+        needed, t = STABLE / max(effort.fastest, 1e-300), effort.met
+        if needed >= shortest:
+            return f"steps of {shortest:.2g}{unit}, the shortest, are too long for these equations"
+        looks = f"; they look stiff: {self.stiff_remedy}" if effort.explicit > effort.steps else ""
+        return (
+            f"the equations need steps of {needed:.2g}{unit} at t = {t:.4g}, and the shortest is {shortest:.2g}{looks}"
+        )
+
+    @property
+    def stepped(self) -> Stepped:
+        """The equations with their numbers, as the implicit method takes them."""
+        return Stepped(self.equations, self.tables, np.asarray(self.times, dtype=float), self.si_sizes)
 
     def _simulate(
-        self,
-        x: Array,
-        rows: ladder.Indices,
-        steps: NDArray[np.int64],
-        offset: Array,
-        z: Array,
-        y: Array | None = None,
+        self, x: Array, rows: ladder.Indices, steps: NDArray[np.int64], offset: Array, z: Array, y: Array | None = None
     ) -> None:
         """Fills these rows of z (trials, readings), as many times as it has room for, with so many steps to each, and
         of y (trials, cases, states, times + 1), if it has room for any."""
-        times, y = self._times[: z.shape[1] // (len(self._cases) * len(self.outputs))], y if self._kept[1] else None
+        times, y = self._times[: z.shape[1] // (self.tables.shape[1] * len(self.outputs))], y if self._kept[1] else None
         self._readings_kernel.run(x, self._si_sizes, self.tables, rows, times, steps, offset, z.reshape(-1), states=y)
 
     @cached_property
@@ -191,17 +206,13 @@ class OdeMeasurement(Measurement):
         return own(self.si_sizes)
 
     @cached_property
-    def _cases(self) -> Array:
-        return own(self.cases)
-
-    @cached_property
     def _times(self) -> Array:
         return own(self.times)
 
     @property
     def _kept(self) -> tuple[int, int, int]:
         """Cases, states and times that are held against each other. A stated rate needs none: no step is unstable."""
-        return len(self._cases), self.states if self.fastest_rate is None else 0, len(self._times) + 1
+        return self.tables.shape[1], self.states if self.fastest_rate is None else 0, len(self._times) + 1
 
     @cached_property
     def _remembered(self) -> dict[bytes, tuple[int, bool]]:
@@ -317,8 +328,8 @@ class OdeMeasurement(Measurement):
             return self.jacobian_until(x, stop)
         x = own(x)
         places = self._rungs_of(x, self._zeros, guess=stop < len(self.times)).places
-        groups = ladder.by_rung(np.where(self._trusted(x), -1, places), np.arange(len(x)))
-        return self._tangents(x, stop, ((*self._coarsened(place), rows) for place, rows in groups))
+        groups = ladder.by_rung(np.where(self._trusted(x), 0, self._rungs[places]), np.arange(len(x)))
+        return self._tangents(x, stop, ((*self._coarsened(rung), rows) for rung, rows in groups))
 
     @property
     def _coarsens(self) -> bool:
@@ -327,49 +338,38 @@ class OdeMeasurement(Measurement):
 
     def _tangents(self, x: Array, stop: int, groups: Iterable[tuple[Kernel, int, ladder.Indices]]) -> Array:
         """J (trials, readings, n) at the first times, each group of trials by its kernel at its rung."""
-        J = np.empty((len(x), len(self._cases) * stop * len(self.outputs), self.n))
+        J = np.empty((len(x), self.tables.shape[1] * stop * len(self.outputs), self.n))
         for kernel, rung, rows in groups:
             kernel.run(x, self._si_sizes, self.tables, rows, self._times[:stop], rung * self._parts, J.reshape(-1))
         return J
 
-    def _coarsened(self, place: int) -> tuple[Kernel, int]:
-        """The formula and the rung for the tangents of trials at this place; -1 for those that are trusted."""
-        rung, (rk4, longer) = 1 if place < 0 else int(self._rungs[place]), self._coarseness
-        if rung > 2 or rk4 is None:
-            return self._jacobian_kernel, max(1, int(np.ceil(rung / longer)))
-        # The formula of fourth order loses more by what a trial turns faster than the nominal one: 2^4 and 3^4 in hand.
-        return self._rk4_kernel, rk4 * (1 if place < 0 else rung + 1)
+    def _coarsened(self, rung: int) -> tuple[Kernel, int]:
+        """The formula and its steps for the tangents of trials at this rung; 0 for those that are trusted."""
+        fourth, steps = self._coarseness.steps(rung)
+        return self._rk4_kernel if fourth else self._jacobian_kernel, steps
 
     @cached_property
-    def _coarseness(self) -> tuple[int | None, float]:
-        """How coarse tangents may be, as measured at the nominal parameters: steps of the formula of fourth order that
-        contract enough at the coarsest rung, None if none do; and how many times longer steps of that of eighth order
-        may be where readings are within a sixteenth of the tolerance."""
-        x, everything = own(self.nominal[None]), len(self.times)
+    def _coarseness(self) -> ladder.Coarseness:
+        x, stop = own(self.nominal[None]), len(self.times)
         rung, J = int(self._rungs[self._rungs_of(x, self._zeros).places[0]]), self.jacobian(x)
-        tried = (
-            (k, self._tangents(x, everything, [(self._rk4_kernel, k, np.arange(1))]))
-            for k in range(1, ladder.MOST_RK4 + 1)
-        )
-        enough = (k for k, tangents in tried if ladder.tangent_contraction(tangents[0], J[0]) <= ladder.AIM)
-        rk4 = next(enough, None) if rung <= 2 else None
+
+        def of_fourth(k: int) -> Array:
+            return self._tangents(x, stop, [(self._rk4_kernel, k, np.arange(1))])[0]
+
+        fourth = ladder.fewest_of_fourth(of_fourth, J[0]) if rung <= ladder.HIGHEST_OF_FOURTH else None
         # Half the rung; where that is half a step, every second reading.
-        if rung == 1 and (len(self._times) == 1 or self.driven is not None):
-            return rk4, 1.0
+        if rung == 1 and (stop == 1 or self.driven is not None):
+            return ladder.Coarseness(fourth, 1.0)
         every = slice(None) if rung > 1 else slice(1, None, 2)
-        rows = np.arange(self.m).reshape(len(self._cases), everything, -1)[:, every].ravel()
+        rows = np.arange(self.m).reshape(self.tables.shape[1], stop, -1)[:, every].ravel()
         times, steps = self._times[every], max(1, rung // 2) * self._parts[every]
         z, coarse = np.empty((1, len(rows))), np.empty((1, len(rows), self.n))
         given = (x, self._si_sizes, self.tables, np.arange(1), np.ascontiguousarray(times), steps)
         self._readings_kernel.run(*given, np.zeros(len(rows)), z.reshape(-1))
         self._jacobian_kernel.run(*given, coarse.reshape(-1))
         with np.errstate(all="ignore"):
-            off = np.abs(z - self._shown(x, everything, self._zeros)[:, rows]) / self._tolerances[rows]
-            sensitivity = ladder.tangent_contraction(coarse[0], J[0, rows]) / off.max()
-        if not np.isfinite(sensitivity):
-            return rk4, 1.0
-        longer = (16 * ladder.AIM / sensitivity) ** (1 / ladder.ORDER) if sensitivity > 0 else np.inf
-        return rk4, float(np.clip(longer, 1.0, ladder.LONGEST))
+            off = np.abs(z - self._shown(x, stop, self._zeros)[:, rows]) / self._tolerances[rows]
+        return ladder.Coarseness(fourth, ladder.times_longer(off, coarse[0], J[0, rows]))
 
     @cached_property
     def jacobian_cost(self) -> float:
@@ -382,9 +382,9 @@ class OdeMeasurement(Measurement):
         if not self._coarsens:
             return self.jacobian_cost
         x = own(self.nominal[None])
-        place = int(self._rungs_of(x, self._zeros).places[0])
-        kernel, rung = self._coarsened(-1 if self._trusted(x)[0] else place)
-        return kernel.plan.operations * rung / (self._readings_kernel.plan.operations * int(self._rungs[place]))
+        rung = int(self._rungs[self._rungs_of(x, self._zeros).places[0]])
+        kernel, steps = self._coarsened(0 if self._trusted(x)[0] else rung)
+        return kernel.plan.operations * steps / (self._readings_kernel.plan.operations * rung)
 
     def __getstate__(self) -> dict[str, Any]:
         """Without what is compiled and remembered, which stays with a process."""

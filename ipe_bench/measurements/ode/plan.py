@@ -80,11 +80,7 @@ DOP853 = Tableau(
 """Eighth order in twelve stages (Dormand and Prince; Hairer, Norsett, Wanner, Solving Ordinary Differential Equations
 I, 2nd ed. 1993, II.5, table 5.4 and the code DOP853)."""
 
-RK4 = Tableau(
-    A=((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)),
-    B=(1 / 6, 1 / 3, 1 / 3, 1 / 6),
-    C=(0.0, 0.5, 0.5, 1.0),
-)
+RK4 = Tableau(A=((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)), B=(1 / 6, 1 / 3, 1 / 3, 1 / 6), C=(0.0, 0.5, 0.5, 1.0))
 """The classical formula of fourth order (Kutta, 1901)."""
 
 
@@ -301,8 +297,10 @@ def planned(equations: Equations, tableau: Tableau, *, sensitive: bool) -> StepP
     started = [*tape.start, *fixed, *(e for row in tape.along_each(dp, starts) for e in row)]
     started += [*motion.constant * tableau.stages, *reading.constant]
     return StepPlan(
-        tableau, x, constants, Program.of(started, [*tape.p, *tape.c]), tuple(begun), y,
-        constants[len(constants) - equations.driven :], fixed_at, step, tuple(stage[:k] for stage in stages),
-        len(stages[0]), read, noted_at[:r], shown_at, size, lie, motion.placed(stages[0], fixed),
-        reading.placed(noted_at, fixed),
+        tableau=tableau,
+        x=x, constants=constants, begin=Program.of(started, [*tape.p, *tape.c]), begun=tuple(begun),
+        y=y, driven=constants[len(constants) - equations.driven :], fixed=fixed_at,
+        step=step, kept=tuple(stage[:k] for stage in stages), stage_size=len(stages[0]),
+        read=read, noted=noted_at[:r], shown=shown_at, size=size,
+        tangents=lie, motion=motion.placed(stages[0], fixed), reading=reading.placed(noted_at, fixed),
     )  # fmt: skip

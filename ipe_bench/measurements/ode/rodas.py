@@ -14,16 +14,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ipe_bench.basics.linalg import Array
-from ipe_bench.measurements.ode.plan import Recording
+from ipe_bench.measurements.ode.plan import Equations, Recording
 from ipe_bench.measurements.ode.trace import Program, tangent
-
-if TYPE_CHECKING:
-    from ipe_bench.measurements.ode.model import OdeMeasurement
 
 GAMMA = 0.21193756319429014
 _SIXTH = (-7.502846399306121, 2.561846144803919, -11.627539656261098, -0.18268767659942256, 0.030198172008377946)
@@ -57,7 +54,7 @@ C: tuple[tuple[float, ...], ...] = (
 # fmt: on
 NODES = (0.0, 0.6358126895828704, 0.4095798393397535, 0.9769306725060716, 0.4288403609558664, 1.0, 1.0, 1.0)
 TIME_WEIGHTS = (GAMMA, -0.42387512638858027, -0.3384627126235924, 1.8046452872882734, 2.325825639765069, 0.0, 0.0, 0.0)
-_REACH, _STABLE = 6.0, 5.0
+_REACH, STABLE = 6.0, 5.0
 """About where the stability region of DOP853 ends on the negative real axis, and a step over the fastest rate to which
 it is stable."""
 MOST_STEPS = 4000
@@ -85,18 +82,32 @@ class Effort:
 
 
 @dataclass(frozen=True)
-class Rodas5P:
-    """Integrates a model; an error of `rtol` of each state is allowed in a step."""
+class Stepped:
+    """Equations with the numbers that they are integrated with."""
 
-    model: OdeMeasurement
+    equations: Equations
+    tables: Array
+    """The constants (intervals, cases, constants); of a single interval where none changes."""
+    times: Array
+    """When the solution is read, ascending from 0 on."""
+    sizes: Array
+    """The size (n,) of one unit of x in SI units."""
+
+
+@dataclass(frozen=True)
+class Rodas5P:
+    """Integrates equations; an error of `rtol` of each state is allowed in a step."""
+
+    of: Stepped
     rtol: float = 1e-8
 
     @cached_property
     def _programs(self) -> dict[str, Program]:
         """The equations and the derivatives that the method needs, on arrays over lanes."""
-        tape = Recording(self.model.equations)
-        g, n, t, y, p, c, f = tape.graph, self.model.states, tape.t, tape.y, tape.p, tape.c, tape.slope
-        k, s, d = g.inputs("k", n), g.inputs("s", n), g.inputs("d", self.model.n)
+        equations = self.of.equations
+        tape, n = Recording(equations), equations.states
+        g, t, y, p, c, f = tape.graph, tape.t, tape.y, tape.p, tape.c, tape.slope
+        k, s, d = g.inputs("k", n), g.inputs("s", n), g.inputs("d", equations.parameters)
         one, point, ways = g.constant(1.0), [t, *y, *p, *c], [*s, *d]
         along = dict(zip([*y, *p], ways, strict=True))
         in_time, turned = tangent(f, {t: one}), tangent(f, dict(zip(y, k, strict=True)))
@@ -117,7 +128,7 @@ class Rodas5P:
 
     def measured(self, x: Array) -> tuple[Array, Effort]:
         """The readings (1, m) at x (1, n), and what they take; a tolerance that shows the shape will do."""
-        run = _Run(self, x, len(self.model.times), stretched=True)
+        run = _Run(self, x, len(self.of.times), stretched=True)
         k = int(np.argmax(run.stretch))
         explicit, fastest, met = (float(a[k]) for a in (run.stretch, run.fastest, run.met))
         return run.readings, Effort(int(run.steps.max()), explicit, fastest, met, float(run.t.min()))
@@ -130,8 +141,8 @@ class Rodas5P:
     def jacobian(self, x: Array, stop: int) -> Array:
         """Their derivatives by x (trials, cases x stop x outputs, n)."""
         J = _Run(self, x, stop, sensitive=True).J
-        readings = len(self.model.cases) * stop * len(self.model.outputs)
-        return J.transpose(3, 1, 0, 2).reshape(len(x), readings, self.model.n) * self.model.si_sizes
+        readings = self.of.tables.shape[1] * stop * self.of.equations.outputs
+        return J.transpose(3, 1, 0, 2).reshape(len(x), readings, -1) * self.of.sizes
 
 
 class _Run:
@@ -147,18 +158,19 @@ class _Run:
         sensitive: bool = False,
         stretched: bool = False,
     ) -> None:
-        model = self.model = method.model
+        of, equations = method.of, method.of.equations
         self.do, self.rtol, self.atol = method._programs, method.rtol, _SMALLEST * method.rtol
-        self.times, self.most, self.stretched = np.asarray(model.times, dtype=float)[:stop], most, stretched
-        cases, self.q = len(model.cases), model.n if sensitive else 0
+        self.tables, self.end = of.tables, float(of.times[-1]) or 1.0
+        self.times, self.most, self.stretched = np.asarray(of.times, dtype=float)[:stop], most, stretched
+        cases, self.q = of.tables.shape[1], equations.parameters if sensitive else 0
         lanes = len(x) * cases
-        self.p = np.repeat(x * model.si_sizes, cases, axis=0).T.copy()
-        self.case, self.directions = np.tile(np.arange(cases), len(x)), np.eye(model.n)[:, :, None]
+        self.p = np.repeat(x * of.sizes, cases, axis=0).T.copy()
+        self.case, self.directions = np.tile(np.arange(cases), len(x)), np.eye(equations.parameters)[:, :, None]
         self.t, self.place, self.steps = np.zeros(lanes), np.zeros(lanes, int), np.zeros(lanes, int)
         self.stretch, self.fastest, self.met = np.zeros((3, lanes))
-        self.z = np.full((len(model.outputs), stop, lanes), np.nan)
-        self.J = np.full((len(model.outputs), stop, self.q, lanes), np.nan)
-        self.S = np.zeros((model.states, 0, lanes))
+        self.z = np.full((equations.outputs, stop, lanes), np.nan)
+        self.J = np.full((equations.outputs, stop, self.q, lanes), np.nan)
+        self.S = np.zeros((equations.states, 0, lanes))
         c = self._constants(np.arange(lanes))
         with np.errstate(all="ignore"):
             self.y = self._values("start", [*self.p, *c], lanes)
@@ -215,8 +227,7 @@ class _Run:
 
     def _constants(self, lanes: Array, later: int = 0) -> Array:
         """Of the interval to the next time of each lane, or those that hold from that time on."""
-        tables = self.model.tables
-        return tables[np.minimum(self.place[lanes] + later, len(tables) - 1), self.case[lanes]].T
+        return self.tables[np.minimum(self.place[lanes] + later, len(self.tables) - 1), self.case[lanes]].T
 
     def _step(self, live: Array, h: Array) -> tuple[Array, Array, Array]:
         """States, sensitivities and the error in units of the tolerance after a step h of the lanes `live`."""
@@ -255,11 +266,11 @@ class _Run:
         return y1, V + D[-1] if q else S, (np.abs(K[-1]) / size).max(axis=0)
 
     def _first_step(self) -> Array:
-        end, lanes = float(self.model.times[-1]) or 1.0, len(self.t)
+        lanes = len(self.t)
         scale = self.atol + self.rtol * np.abs(self.y)
         f = self._values("f", [self.t, *self.y, *self.p, *self._constants(np.arange(lanes))], lanes)
         speed, size = (np.abs(f) / scale).max(axis=0), (np.abs(self.y) / scale).max(axis=0)
-        return np.where((speed > 1e-5) & (size > 1e-5), np.minimum(1e-3 * size / speed, end), 1e-6 * end)
+        return np.where((speed > 1e-5) & (size > 1e-5), np.minimum(1e-3 * size / speed, self.end), 1e-6 * self.end)
 
 
 def _factor(W: Array) -> list[Array]:
@@ -289,18 +300,3 @@ def _solve(W: Array, exchanged: Sequence[Array], b: Array) -> Array:
         b[k] /= W[k, k]
         b[:k] -= W[:k, k, None] * b[k]
     return b
-
-
-def diagnose(model: OdeMeasurement, x: Array, shortest: float) -> str:
-    """What hinders the integrator from following the solution at x (n,), whose shortest step that is."""
-    unit = f" {model.time_unit}".rstrip()
-    z, work = Rodas5P(model, SHAPE).measured(x[None])
-    if not np.isfinite(z).all():
-        if work.steps >= MOST_STEPS:
-            return f"the solution takes more than {MOST_STEPS} steps, by the implicit method, too"
-        return f"the solution itself leaves all numbers near t = {work.reached:.4g}{unit}"
-    needed, t = _STABLE / max(work.fastest, 1e-300), work.met
-    if needed >= shortest:
-        return f"steps of {shortest:.2g}{unit}, the shortest, are too long for these equations"
-    looks = f"; they look stiff: {model.stiff_remedy}" if work.explicit > work.steps else ""
-    return f"the equations need steps of {needed:.2g}{unit} at t = {t:.4g}, and the shortest is {shortest:.2g}{looks}"
