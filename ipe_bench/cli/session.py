@@ -155,7 +155,8 @@ def _composed(words: tuple[str, ...], *, whole: bool = False) -> DictConfig:
     try:
         config = compose("config", list(words), return_hydra_config=True)
         if "model" in config:  # the key of state_model in experiments of earlier versions
-            old = w.options_of("state_model", OmegaConf.to_container(config.model), "model")
+            content: Any = OmegaConf.to_container(config.model)
+            old = w.options_of("state_model", content, "model")
             config = compose("config", [*(f"++{word}" for word in old), *words], return_hydra_config=True)
             with open_dict(config):
                 del config["model"]
@@ -183,7 +184,8 @@ _OWN_CALL = re.compile(
 def _require_own_calls(node: Any, where: str) -> None:
     """Refuses a config of Hydra that names something to be called besides Hydra's own classes, those of launchers and
     sweepers, and those of logging."""
-    for key in node if isinstance(node, DictConfig) else range(len(node)) if isinstance(node, ListConfig) else ():
+    keys: Any = node if isinstance(node, DictConfig) else range(len(node)) if isinstance(node, ListConfig) else ()
+    for key in keys:
         value = None
         with contextlib.suppress(OmegaConfBaseException):  # what is not known before a job begins
             value = node[key]
