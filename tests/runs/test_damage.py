@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 from shared.small_models import Bent
 
@@ -159,6 +160,15 @@ def test_trials_are_read_although_their_failures_cannot_be(folder, expected):
     assert any("failed: cannot be listed" in line for line in said(folder))
 
 
+def between_columns(path: Path) -> set[int]:
+    """The bytes that belong to no column: pyarrow 17 repeats there what the footer says, for no reader."""
+    group = pq.read_metadata(path).row_group(0)
+    columns = [group.column(i) for i in range(group.num_columns)]
+    starts = [c.dictionary_page_offset if c.has_dictionary_page else c.data_page_offset for c in columns]
+    ends = [start + c.total_compressed_size for start, c in zip(starts, columns, strict=True)]
+    return {byte for end, start in zip(ends, starts[1:], strict=False) for byte in range(end, start)}
+
+
 def test_one_bit_in_29_of_a_part_and_every_bit_of_a_record_is_told_or_without_effect(tmp_path):
     """Page checksums cover pages and neither their headers nor the footer, which has a digest."""
     compute(SCENARIOS[:1], {"newton": Newton()}, 30, tmp_path)
@@ -175,6 +185,7 @@ def test_one_bit_in_29_of_a_part_and_every_bit_of_a_record_is_told_or_without_ef
     for path, read, step in (*stored, (record, partial(parts.read_record, record, parts.RUN), 1)):
         content, right = path.read_bytes(), read()
         places, told = range(0, 8 * len(content), step), 0
+        unread = between_columns(path) if path.suffix == ".parquet" else set()
         for bit in places:
             changed = bytearray(content)
             changed[bit // 8] ^= 1 << bit % 8
@@ -183,7 +194,7 @@ def test_one_bit_in_29_of_a_part_and_every_bit_of_a_record_is_told_or_without_ef
                 assert read() == right
             except parts.Unusable:
                 told += 1
-        assert told > 0.95 * len(places)
+        assert told > 0.95 * sum(bit // 8 not in unread for bit in places)
 
 
 @pytest.mark.parametrize("name", ["trials", "runs", "failed", "figures", "tables"])
