@@ -115,10 +115,11 @@ def test_the_command_leaves_the_track_and_says_whether_the_filter_is_right(tmp_p
     assert (code, err) == (0, "")
     assert all(words in out for words in ("consistent", "NIS / m", "white p", "position"))
     folder = tmp_path / "outputs" / "estimate-constant_velocity"
-    table = pd.read_csv(folder / "track.csv").query("tracker == 'ekf'")
+    # As text first: pandas 2 rounds the last digit of some numbers that it reads by itself.
+    table = pd.read_csv(folder / "track.csv", dtype=str).query("tracker == 'ekf'")
     track = ekf().track(model, z[None])
-    np.testing.assert_array_equal(table["velocity [m/s]"], track.mean[0, :, 1])
-    np.testing.assert_array_equal(table["nis"].dropna(), np.delete(track.nis[0], 11))
+    np.testing.assert_array_equal(table["velocity [m/s]"].astype(float), track.mean[0, :, 1])
+    np.testing.assert_array_equal(table["nis"].dropna().astype(float), np.delete(track.nis[0], 11))
     assert json.loads((folder / "track.json").read_text())["trackers"]["ekf"]["verdict"] == "consistent"
     code, out, _ = estimate(
         "state_model=constant_velocity", "readings=log.csv", "state_model.deviation.seen=0.3", "output=two"
@@ -139,7 +140,8 @@ def test_a_model_of_formulas_may_stand_in_a_file(tmp_path, estimate):
     assert (code, err) == (0, "")
     model = replace(DRIVEN, count=3, inputs={name: tuple(values) for name, values in columns.items()})
     np.testing.assert_array_equal(
-        pd.read_csv(tmp_path / "one" / "track.csv")["x [m]"], ekf().track(model, z[None]).mean[0, :, 0]
+        pd.read_csv(tmp_path / "one" / "track.csv", dtype=str)["x [m]"].astype(float),
+        ekf().track(model, z[None]).mean[0, :, 0],
     )
     (tmp_path / "copied.yaml").write_text("_target_: ipe_bench.states.Formulas")
     code, _, err = estimate("state_model=formulas", "state_model.file=copied.yaml", "readings=log.csv")
