@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import tempfile
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -20,7 +19,7 @@ from ipe_bench.priors import Prior
 from ipe_bench.runs.bundles import BUNDLES, is_bundle, opened
 from ipe_bench.runs.execution import Execution
 from ipe_bench.runs.results import Results
-from ipe_bench.runs.run import compute, validate
+from ipe_bench.runs.run import validate
 from ipe_bench.runs.schedule import Watcher
 from ipe_bench.states.base import StateModel
 from ipe_bench.states.trackers import Tracker
@@ -31,7 +30,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from ipe_bench.plugins.conformance import Finding
-    from ipe_bench.plugins.discovery import Option
     from ipe_bench.report.answer import Answer
     from ipe_bench.report.run import ReportResult
     from ipe_bench.report.style import Which
@@ -500,47 +498,13 @@ def check(component: Any) -> list[Finding]:
     """
     from ipe_bench.plugins.conformance import check_component, check_option
     from ipe_bench.plugins.discovery import RECORD_GROUPS, options_in
+    from ipe_bench.report.conformance import check_records
 
     if isinstance(component, Path | str):
         chosen = options_in(Path(component))
         findings = [finding for o in chosen if o.group not in RECORD_GROUPS for finding in check_option(o)]
-        return findings + _check_records([o for o in chosen if o.group in RECORD_GROUPS])
+        return findings + check_records([o for o in chosen if o.group in RECORD_GROUPS])
     return list(check_component(getattr(component, "name", type(component).__name__), component))
-
-
-def _check_records(options: Sequence[Option]) -> list[Finding]:
-    """Whether the reports on a small sweep and on a single trial have what each of these options adds to reports."""
-    from ipe_bench.baselines import EKF, LinearLSE
-    from ipe_bench.measurements.polynomial import Polynomial
-    from ipe_bench.noise import Gaussian
-    from ipe_bench.plugins.conformance import Finding
-    from ipe_bench.plugins.extensions import use_statistics
-    from ipe_bench.report.figures import added_drawings
-    from ipe_bench.report.figures.views import views
-    from ipe_bench.report.sections import report_tables, written
-    from ipe_bench.report.style import house_style
-    from ipe_bench.solvers import FixedPoint, Newton
-    from ipe_bench.statistics import analyse
-
-    if not options:
-        return []
-    problems = use_statistics()
-    # The fixed point fails at the largest scale.
-    scenarios = [Scenario(Polynomial(), Gaussian(0.01), error_scale=scale) for scale in (1.0, 10.0, 100.0)]
-    estimators = {"linear_lse": LinearLSE(), "fixed_point": FixedPoint(), "newton": Newton(), "ekf": EKF()}
-    with tempfile.TemporaryDirectory(prefix="ipe-bench-") as folder, house_style():
-        for name, some, trials in (("sweep", scenarios, 25), ("single", scenarios[-1:], 1)):
-            compute(some, estimators, trials, f"{folder}/{name}")
-            analysis = analyse([f"{folder}/{name}"])
-            written("section", analysis, report_tables(analysis))
-            for number, drawing in enumerate(added_drawings(analysis, views(analysis))):
-                drawing.save(Path(folder, str(number)))
-            problems += analysis.collection.extra_problems
-    findings = []
-    for name in (f"{option.group}={option.name}" for option in options):
-        own = [line.removeprefix(f"{name}: ") for line in problems if line.startswith(f"{name}: ")]
-        findings.append(Finding(name, "Is part of reports on a small sweep and on a single trial", "; ".join(own[:1])))
-    return findings
 
 
 def _scenario(given: Any, **stated: Any) -> Scenario:
