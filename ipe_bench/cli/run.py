@@ -317,7 +317,7 @@ def shown_progress(title: str) -> Iterator[Watcher]:
     handler.emit = lambda record: console.print(f"ipe-bench: {record.getMessage()}", markup=False, soft_wrap=True)
     logger.addHandler(handler)
     try:
-        # Before version 14.1, rich ends even a bar that is not shown with an empty line.
+        # Older versions of rich end even a bar that is not shown with an empty line.
         with bar if console.is_terminal else contextlib.nullcontext():
             yield watch
     finally:
