@@ -77,8 +77,8 @@ class Bearings(Measurement):
     """Bearings to a target of constant velocity, from an observer that sails straight legs at known courses and speeds.
 
     Parameters: the target's position (east, north) at time 0 in m relative to the observer's start, and its velocity in
-    m/s. Readings: bearings in degrees clockwise from north, one per `interval`; each is an epoch. They are continuous
-    about the nominal target's bearing, within half a turn of it, so they may leave the range 0 to 360.
+    m/s. Readings: bearings in degrees clockwise from north, one per `interval`; each is an epoch. Simulated ones are
+    within half a turn of the nominal target's; whole turns of a reading say nothing.
 
     On a single leg the range is not observable: every target whose relative motion is scaled by one factor has the same
     bearings. A turn makes it observable unless the observer's acceleration points along the line of sight (Nardone and
@@ -113,6 +113,10 @@ class Bearings(Measurement):
     @cached_property
     def epochs(self) -> Epochs:
         return single_epochs(self)
+
+    @property
+    def periods(self) -> Array:
+        return np.full(self.m, 360.0)
 
     @cached_property
     def times(self) -> Array:

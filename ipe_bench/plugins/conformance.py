@@ -44,6 +44,7 @@ _USUAL_NOISE = UsualNoise(deviation=0.007, step=0.02)
 """What a noise takes where its options leave out how large it is."""
 _IMPROBABLE = 1e-6
 _ROUND_OFF = 1e-9
+_TURN = 360.0
 _READINGS = 6
 """Readings that a noise is tried on, unless it is made for another number."""
 
@@ -170,9 +171,8 @@ def finds_the_parameters(estimator: Estimator) -> None:
     estimates = estimator.estimate(scenario.problem, drawn.z)
     assert isinstance(estimates, Estimates), f"estimate returns {type(estimates).__name__}, and not Estimates"
     _shaped("x", estimates.x, drawn.x.shape)
-    H = scenario.problem.R.whiten_jacobian(scenario.problem.H)
-    error, bound = estimates.x - drawn.x, np.sqrt(np.diag(np.linalg.inv(H.T @ H)))
-    worst = float((np.abs(error) / bound).max())
+    error = estimates.x - drawn.x
+    worst = float((np.abs(error) / _bound(scenario.problem)).max())
     assert worst < 8, f"the largest error is {worst:.1f} standard deviations of the bound"
     P = estimates.covariance
     if P is not None:
@@ -180,6 +180,12 @@ def finds_the_parameters(estimator: Estimator) -> None:
         known = (estimates.status == Status.CONVERGED) & np.isfinite(P).all(axis=(1, 2))
         if known.sum() >= SCATTERED // 2:
             _agrees("the reported variances are", nees(error, P)[known], n)
+
+
+def _bound(problem: Problem) -> Array:
+    """The standard deviations (n,) of the linear bound."""
+    H = problem.R.whiten_jacobian(problem.H)
+    return np.sqrt(np.diag(np.linalg.inv(H.T @ H)))
 
 
 def _agrees(what: str, squared: Array, n: int) -> None:
@@ -206,6 +212,30 @@ def answers_alike(estimator: Estimator) -> None:
                 remedy = "rounding alone: use stacked matmul, einsum or batched solve, one per trial"
             same = a is None or np.array_equal(a[i], b[0], equal_nan=True)
             assert same, f"{name} of trial {i} differs, by {remedy}"
+
+
+@dataclass(frozen=True)
+class _Circular(Polynomial):
+    """A mildly bent model whose readings are angles in degrees."""
+
+    strength: float = 0.0005
+
+    @property
+    def periods(self) -> Array:
+        return np.full(self.m, _TURN)
+
+
+def turns_with_its_angles(estimator: Estimator) -> None:
+    """Gives the same estimate whatever whole turns are added to readings that are angles."""
+    scenario = Scenario(_Circular(), Gaussian(0.01), seed=5)
+    if estimator.hindrance(scenario.problem):
+        return
+    z = scenario.draw(0, TRIALS).z
+    turned = z + _TURN * np.random.default_rng(5).integers(-1, 2, z.shape)
+    x, other = (estimator.estimate(scenario.problem, readings).x for readings in (z, turned))
+    apart = np.abs(other - x) / _bound(scenario.problem)
+    remedy = "take residuals from z - model.near(model.simulate(x), z)"
+    assert (apart < 8).all(), f"whole turns move it by {apart.max():.3g} standard deviations of the bound: {remedy}"
 
 
 def a_bad_trial_disturbs_no_other(estimator: Estimator) -> None:
@@ -279,6 +309,7 @@ def names_its_readings(model: Measurement) -> None:
     assert len(set(zip(*model.index.values(), strict=True))) == model.m, "two readings have one label in index"
     assert len({p.name for p in model.parameters}) == model.n, "two parameters have one name"
     _shaped("nominal", model.nominal, (model.n,), "one number for each parameter")
+    _shaped("periods", model.periods, (model.m if len(model.periods) else 0,), "one number for each reading")
     assert (model.sizes > 0).all(), "a parameter's size is not above 0"
 
 
@@ -546,6 +577,7 @@ _CHECKS: dict[type, tuple[Callable[[Any], None], ...]] = {
         steps_to_a_state,
         finds_the_parameters,
         answers_alike,
+        turns_with_its_angles,
         a_bad_trial_disturbs_no_other,
         accounts_for_itself,
         keeps_a_history_if_asked,

@@ -3,11 +3,14 @@
 import numpy as np
 import pytest
 
+from ipe_bench.baselines import EKF, LevenbergMarquardt
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Covariance
 from ipe_bench.measurements import Bearings
 from ipe_bench.measurements.problem import Problem
+from ipe_bench.noise import Gaussian
 from ipe_bench.solvers import Newton
+from ipe_bench.trials.scenario import Scenario
 
 STRAIGHT = ((1800.0, 90.0, 6.0),)
 
@@ -30,6 +33,21 @@ def test_bearings_do_not_jump_where_the_target_crosses_north_or_south():
     for target in ((-600.0, 9000.0, 3.0, 0.0), (600.0, -9000.0, -3.0, 0.0)):
         model = Bearings(target=target)
         assert np.abs(np.diff(model.simulate(model.nominal[None])[0])).max() < 20.0
+
+
+@pytest.mark.parametrize("estimator", [Newton(), LevenbergMarquardt(), EKF()], ids=["newton", "lm", "ekf"])
+def test_an_estimate_is_the_same_whichever_way_a_file_writes_an_angle(estimator):
+    """North is crossed, so readings from 0 to 360 jump; the prior is one unit of each parameter."""
+    model = Bearings(target=(-600.0, 9000.0, 3.0, 0.0))
+    scenario = Scenario(model, Gaussian(0.05))
+    z = scenario.draw(0, 5).z
+    assert (np.ptp(z % 360.0, axis=1) > 300.0).all()
+    expected = estimator.estimate(scenario.problem, z)
+    for written in (z % 360.0, z - 720.0):
+        found = estimator.estimate(scenario.problem, written)
+        np.testing.assert_allclose(found.x, expected.x, rtol=0.0, atol=1e-6)
+        residuals = written - model.near(model.simulate(found.x), written)
+        assert np.abs(residuals).max() < 0.5
 
 
 @pytest.mark.parametrize("factor", [0.5, 2.0, 10.0])

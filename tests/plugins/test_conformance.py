@@ -1,14 +1,15 @@
 """Our own components pass the checks that plugins are given, and the checks catch what they are for."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 import pytest
 from shared.state_models import CoordinatedTurn
 
-from ipe_bench.basics.linalg import Covariance
+from ipe_bench.baselines import LinearLSE
+from ipe_bench.basics.linalg import Covariance, multiply
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.measurements import Formula, Nist, Ode, Polynomial, Ranging
@@ -102,6 +103,12 @@ def into_H(self, problem, z, *, history=False):
     return Newton.estimate(self, problem, z, history=history)
 
 
+def blind_to_turns(self, problem, z, *, history=False):
+    h = problem.measurement.simulate(problem.x0[None])
+    found = LinearLSE.estimate(self, problem, z, history=history)
+    return replace(found, x=problem.x0 + multiply(problem.H_plus, z - h))
+
+
 def into_x(self, x):
     x += 1.0
     return Polynomial.simulate(self, x)
@@ -142,6 +149,7 @@ FOUND = [
     (Faulty("scribbling"), "it writes into what it is given"),
     (Thawed(), "frozen=True"),
     (altered(Newton(), estimate=into_H), "test_conformance.py, line"),
+    (altered(LinearLSE(), estimate=blind_to_turns), "take residuals from z - model.near(model.simulate(x), z)"),
     (
         altered(Newton(), step=lambda self, system, state: state.x - state.F),
         "step returns ndarray, and not a State: return State(x, system.F(x))",
@@ -162,6 +170,7 @@ FOUND = [
         altered(Polynomial(), nominal=np.array([5.0])),
         "nominal has shape (1,), and not one number for each parameter, which is (4,) here",
     ),
+    (altered(Polynomial(), periods=np.full(4, 360.0)), "periods has shape (4,), and not one number for each reading"),
     (
         altered(Quantization(1.0), whitened=lambda *_: None),
         "is not distributed as normal, since there is no `whitened`",
