@@ -1,4 +1,4 @@
-"""Estimates from real readings: what is said of them in tables and sentences, and in files."""
+"""Writes the answer to real readings: tables and sentences for a reader, and files."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _MOST_READINGS, _MOST_MINIMA = 5, 3
 
 @dataclass(frozen=True)
 class Answer:
-    """The fits of estimators to real readings, and the examination of the least minimum."""
+    """Holds the fits of estimators to real readings, and the examination of the fit with the least minimum."""
 
     name: str
     """Name of the model in titles."""
@@ -58,13 +58,13 @@ class Answer:
     fits: list[Fit]
     """A fit of each estimator, in their order."""
     examination: Examination | None
-    """That of the least minimum; None if no estimator without a prior found any."""
+    """Examination of the least minimum; None if no estimator without a prior found any."""
     left_out: str = ""
     """The columns of the files that were left out on purpose."""
 
     @classmethod
     def to(cls, question: Question, name: str = "") -> Answer:
-        """The answer to a question, by its model's name or another `name`."""
+        """Returns the answer to a question, under its model's name or another `name`."""
         model, z = question.found.model, question.found.z
         return cls(name or model.name, model, z, *question.fitted(), ", ".join(question.ignored))
 
@@ -80,11 +80,11 @@ class Answer:
         return len(self.fits)
 
     def __getitem__(self, which: str | int) -> Fit:
-        """By label or place."""
+        """Returns the fit at this label or place."""
         return self.fits[which] if isinstance(which, int) else next(f for f in self.fits if f.label == which)
 
     def table(self) -> pd.DataFrame:
-        """A row per estimator and parameter: estimate, standard error, 95 % interval, and whether the fit passes."""
+        """Returns estimate, standard error, 95 % interval, and whether the fit passes, per estimator and parameter."""
         import pandas as pd
 
         frames = []
@@ -104,7 +104,7 @@ class Answer:
 
 
 def estimate_parts(answer: Answer) -> Iterator[Part]:
-    """The tables and sentences of an answer, in order."""
+    """Yields the tables and sentences of an answer, in order."""
     found, one = structure(answer.model), answer.examination
     yield from (Strong(f"No data can tell: {sentence}.") for sentence in (found.sentences if found else ()))
     if lacking := next((f"{'; '.join(f.undetermined)} (at {f.label})" for f in answer.fits if f.undetermined), ""):
@@ -125,7 +125,7 @@ def estimate_parts(answer: Answer) -> Iterator[Part]:
 
 
 def _estimates(answer: Answer) -> Table:
-    """Estimates with their errors; what is not an answer stands in brackets, without errors that would be wrong."""
+    """Returns estimates with their errors; an invalid one stands in brackets, without its meaningless errors."""
     parameters = answer.fits[0].model.physical_parameters
     columns = [words("parameter", [p.name for p in parameters]), words("unit", [p.unit for p in parameters])]
     for one in answer.fits:
@@ -139,7 +139,7 @@ def _estimates(answer: Answer) -> Table:
 
 
 def with_error(value: float, error: float) -> str:
-    """A value with its standard error: two figures of the error, and the value to the same place."""
+    """Returns a value with its standard error: two figures of the error, and the value to the same place."""
     if not (math.isfinite(value) and math.isfinite(error) and error > 0):
         return _number(value, 6)
     # 0.0999 rounds to 0.10.
@@ -147,7 +147,7 @@ def with_error(value: float, error: float) -> str:
 
 
 def _rounded(values: Sequence[float], place: int) -> list[str]:
-    """Numbers to one decimal place, with exponents if they are very large or very small."""
+    """Writes numbers to one decimal place, with exponents if they are very large or very small."""
     if 1e-4 <= max(map(abs, values)) < 1e6 and place >= -6:
         return [f"{round(v, -place):.{max(-place, 0)}f}" for v in values]
     figures = [min(max(math.floor(math.log10(abs(v) or 10.0**place)) - place, 0), 15) for v in values]
@@ -159,7 +159,7 @@ def _number(value: float, figures: int = 4) -> str:
 
 
 def _verdicts(answer: Answer) -> Table:
-    """Whether each fit passes; chi-square is left out if the level of the noise is estimated from the residuals."""
+    """Returns whether each fit passes; chi-square is omitted if the noise level is estimated from the residuals."""
     fits = answer.fits
     columns = [
         words("estimator", [one.label for one in fits]),
@@ -244,7 +244,7 @@ def _values(values: Mapping[str, float], figures: int = 6) -> str:
 
 
 def _outliers(answer: Answer) -> Iterator[Table]:
-    """The readings that lie farthest off, each with its largest residual and the estimators that say so."""
+    """Returns the most outlying readings, each with its largest residual and the estimators that find it so."""
     told = [f for f in answer.fits if 0 < f.outliers.sum() <= max(3, _FEW * len(f.outliers))]
     if not told:
         return
@@ -271,7 +271,7 @@ def _reading_labels(model: Measurement) -> list[dict[str, Any]]:
 
 
 def _intervals(found: Examination) -> Table:
-    """Three intervals of each parameter; of one on a bound, that of its profile."""
+    """Returns three intervals of each parameter; for a parameter on a bound, that of its profile."""
     on_bounds, absent = found.on_bounds, ["-"] * len(found.on_bounds)
     parameters = [*found.model.physical_parameters, *(b.parameter for b in on_bounds)]
     middle = [*found.x, *(math.nan for _ in on_bounds)]
@@ -288,7 +288,7 @@ def _intervals(found: Examination) -> Table:
 
 
 def _interval(low: float, high: float, middle: float) -> str:
-    """Each end to a hundredth of twice its distance to the estimate `middle`, or of the width if that is not inside."""
+    """Rounds each end to a hundredth of twice its distance to the estimate `middle`, or of the width if outside."""
     if not math.isfinite(high - low) or high <= low:
         text = f"{low:.6g} … {high:.6g}".replace("-inf", "−∞").replace("inf", "∞").replace("nan", "-")
         return "-" if text == "- … -" else text
@@ -298,7 +298,7 @@ def _interval(low: float, high: float, middle: float) -> str:
 
 
 def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """What a reader should know before signing, a sentence each."""
+    """Returns what a reader should know before relying on the answer, one sentence each."""
     names = [p.name for p in found.model.physical_parameters]
 
     def at(x: Array) -> str:
@@ -339,7 +339,7 @@ def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator
 
 
 def _changed(names: Sequence[str], x: Array, y: Array, errors: Array) -> str:
-    """In words, the signs and exchanges of parameters that lead from x to y; empty if others are needed."""
+    """Names the signs and exchanges of parameters that lead from x to y; empty if others are needed."""
     near = 0.01 * errors
     words, left = [], [i for i in range(len(x)) if abs(y[i] - x[i]) > near[i]]
     while left:
@@ -375,7 +375,7 @@ def write_answer(
 
 
 def estimate_content(answer: Answer) -> dict[str, Any]:
-    """What estimate.json says of the readings, of the estimates, and of the least minimum."""
+    """Returns the content of estimate.json: readings, estimates, and the least minimum."""
     model, z, found = answer.model, answer.z, answer.examination
     labels = _reading_labels(model)
     return {
@@ -423,7 +423,7 @@ def _examined(found: Examination, labels: list[dict[str, Any]]) -> dict[str, Any
 
 
 def as_json(value: Any) -> Any:
-    """A value as JSON knows it, which has neither arrays nor NaN nor infinity: null in their place."""
+    """Converts a value to JSON, which lacks arrays, NaN and infinity: null replaces them."""
     if isinstance(value, np.generic | np.ndarray):
         value = value.tolist()
     if isinstance(value, float):
@@ -436,7 +436,7 @@ def _by_name(names: Sequence[str], values: Any) -> dict[str, Any]:
 
 
 def _residuals(answer: Answer) -> pd.DataFrame:
-    """A row per estimator and reading; of the one that is examined, with influences, and predictions where missing."""
+    """Returns a row per estimator and reading, with influences and predictions where missing for the examined one."""
     import pandas as pd
 
     model, z, found = answer.model, answer.z, answer.examination

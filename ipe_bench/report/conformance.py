@@ -23,7 +23,7 @@ from ipe_bench.trials.scenario import Scenario
 
 
 def check_records(options: Sequence[Option]) -> list[Finding]:
-    """Checks that reports on a small sweep and on a single trial have what each of these options adds to them."""
+    """Checks what each of these options adds to the reports on a small sweep and on a single trial."""
     if not options:
         return []
     problems = use_statistics()

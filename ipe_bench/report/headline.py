@@ -28,11 +28,11 @@ OVERCONFIDENT, UNDECIDED = ("optimistic", "diverged but confident"), ("undecided
 """Verdicts on the reported covariance."""
 SHARED = ("shared_trials", "shared_success", "shared_silent")
 Fact = tuple[str, dict[str, Any]]
-"""What a rule found: the macro that words it, and its arguments."""
+"""Names the macro that words a finding, and its arguments."""
 
 
 def headline(analysis: Analysis) -> list[str]:
-    """Who solves most certified problems; of simulated trials, who agrees, is honest, breaks where, at what cost."""
+    """Says who solves most certified problems and, in trials, who agrees, is honest, breaks where, at what cost."""
     module: Any = environment().overlay(autoescape=False).get_template("headline.j2").module
     found = (" ".join(getattr(module, name)(**values).split()) for name, values in facts(analysis))
     # A number and its sign stay on one line.
@@ -40,7 +40,7 @@ def headline(analysis: Analysis) -> list[str]:
 
 
 def facts(analysis: Analysis) -> list[Fact]:
-    """What the rules find; at least one fact, if only that nothing is stored."""
+    """Returns the findings of the rules: at least one fact, if only that no trial is stored."""
     rows = analysis.summary[analysis.summary["parameter"] == ALL].reset_index(drop=True)
     if rows.empty:
         return [("nothing", {})]
@@ -54,7 +54,7 @@ def facts(analysis: Analysis) -> list[Fact]:
 
 
 def in_common(rows: pd.DataFrame, key: str | list[str]) -> pd.DataFrame:
-    """The rows of the scenarios or problems that every estimator has: only there may estimators be ranked."""
+    """Returns the rows of the scenarios or problems that every estimator has: only these permit a ranking."""
     return rows[rows.groupby(key)["estimator"].transform("nunique") == rows["estimator"].nunique()]
 
 
@@ -92,7 +92,7 @@ def _published(collection: Collection) -> Iterator[Fact]:
 
 
 def _constants(rows: pd.DataFrame, collection: Collection) -> Iterator[Fact]:
-    """What a sweep over error scales says of one setting; of several, or of one scale, who succeeds how often."""
+    """Finds success rates of several settings or of one scale, or the course over error scales of one setting."""
     if rows.empty:
         return
     scales = sorted(rows["error_scale"].unique())
@@ -108,7 +108,7 @@ def _constants(rows: pd.DataFrame, collection: Collection) -> Iterator[Fact]:
 
 
 def _moving(rows: pd.DataFrame) -> Iterator[Fact]:
-    """Who keeps the track how often, and, of one model, how large the errors are."""
+    """Finds who keeps the track how often and, for a single model, how large the errors are."""
     if rows.empty:
         return
     yield from _ranking(rows, "moving")
@@ -119,7 +119,7 @@ def _moving(rows: pd.DataFrame) -> Iterator[Fact]:
 
 
 def _agreement(rows: pd.DataFrame, scales: Sequence[float], kinds: Mapping[str, str]) -> Iterator[Fact]:
-    """Up to which scale IPE and filters attain the same in the same trials."""
+    """Finds up to which scale IPE and filters attain the same in the same trials."""
     compared = rows[rows["estimator"].map(kinds).isin(["IPE", "filters"])]
     named = {kind: [e for e in compared["estimator"].unique() if kinds[e] == kind] for kind in ("IPE", "filters")}
     if not all(named.values()):
@@ -146,7 +146,7 @@ def _agreement(rows: pd.DataFrame, scales: Sequence[float], kinds: Mapping[str, 
 
 
 def _by_scale(rows: pd.DataFrame, column: str) -> list[tuple[float, list[tuple[str, float]]]]:
-    """The estimators of these rows with a column's value, by the smallest error scale at which each is there."""
+    """Returns the estimators of these rows with a column's value, by the smallest error scale of each."""
     first = rows.sort_values("error_scale", kind="stable").drop_duplicates("estimator")
     parts: Any = first.groupby("error_scale")
     return [
@@ -155,7 +155,7 @@ def _by_scale(rows: pd.DataFrame, column: str) -> list[tuple[float, list[tuple[s
 
 
 def honesty(rows: pd.DataFrame) -> Iterator[Fact]:
-    """At which scale who first claims smaller errors than it makes, who never does, and of whom it is undecided."""
+    """Finds from which scale each estimator claims smaller errors than it makes, who never does, and who may."""
     claims = rows[rows["nees_median"].notna()]
     sure = claims[claims["verdict"].isin(OVERCONFIDENT)]
     others = claims[~claims["estimator"].isin(sure["estimator"])]
@@ -166,7 +166,7 @@ def honesty(rows: pd.DataFrame) -> Iterator[Fact]:
 
 
 def reach(rows: pd.DataFrame) -> Iterator[Fact]:
-    """At which scale who first surely fails in more than a tenth of the trials, and who does so at none of its own."""
+    """Finds at which scale each estimator first surely fails in over a tenth of the trials, and who does so at none."""
     broken = rows[rows["success_high"] < BROKEN]
     rest = rows[~rows["estimator"].isin(broken["estimator"])]
     of_each = rest.groupby("estimator", sort=False)
@@ -184,7 +184,7 @@ def _silent(rows: pd.DataFrame) -> Iterator[Fact]:
 
 
 def _costs(rows: pd.DataFrame, scales: Sequence[float]) -> Fact:
-    """What a trial costs at the largest scale at which most hold, and at the largest for those that still do."""
+    """Finds the cost of a trial at the largest scale at which most hold, and at the largest for those that still do."""
     holding = rows[rows["success_high"] >= BROKEN]
     number = holding.groupby("error_scale")["estimator"].nunique()
     most = number.index[number > rows["estimator"].nunique() / 2]
@@ -198,7 +198,7 @@ def _costs(rows: pd.DataFrame, scales: Sequence[float]) -> Fact:
 
 
 def _ranking(rows: pd.DataFrame, kind: str) -> Iterator[Fact]:
-    """Who succeeds in how many of the trials that all have, pooled over all scenarios, and who fails silently."""
+    """Finds who succeeds in how many of the shared trials, pooled over all scenarios, and who fails silently."""
     if rows.empty:
         return
     common = in_common(rows[rows["shared_trials"] > 0], "scenario")
@@ -227,7 +227,7 @@ def _ranking(rows: pd.DataFrame, kind: str) -> Iterator[Fact]:
 
 
 def about(analysis: Analysis) -> list[str]:
-    """What the model of each setting is: its readings and parameters, and what the error scale means."""
+    """Describes the model of each setting: its readings and parameters, and what the error scale means."""
     found: dict[str, str] = {}
     for group in analysis.collection.groups:
         footer, name = group.footer, str(group.columns["measurement"])
@@ -251,7 +251,7 @@ def _about_constants(name: str, footer: Mapping[str, Any]) -> str:
 
 
 def _about_states(name: str, footer: Mapping[str, Any]) -> str:
-    """The docstring of a model that is given by formulas is that of all such models, and is left out."""
+    """Returns whether the docstring is the general one of models by formulas, which is left out."""
     states = [f"{p['name']} in {p['unit']}" if p["unit"] else p["name"] for p in footer["parameters"]]
     words = "" if "next" in footer["identity"]["scenario"].get("model", {}) else str(footer.get("about") or "")
     return (

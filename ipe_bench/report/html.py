@@ -1,4 +1,4 @@
-"""The page report.html: one file that is readable on a phone, on paper and without a network."""
+"""Renders the page report.html: one file that is readable on a phone, on paper and without a network."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 MOST_RUNS = 20
 MOST_COMMANDS = 3
-"""At the head of the page; all stand with the provenance."""
+"""Largest number of commands at the head of the page; all stand with the provenance."""
 _PYTHON, _UNKNOWN = "from Python", "a command that was not recorded"
 
 
@@ -62,7 +62,7 @@ def render_page(
 
 
 def _runs(runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """What was computed, by command, the last first; a run that found everything stored computed nothing."""
+    """Returns what was computed, by command, the last first; a run that found everything stored computed no trial."""
     commands: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
     for run in (run for run in runs if run.get("blocks", 1)):
         command = run.get("command", _UNKNOWN)

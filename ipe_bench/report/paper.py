@@ -1,4 +1,4 @@
-"""Tables and figures for a paper: chosen columns, and figures drawn in the width of one column of print or of two."""
+"""Exports tables and figures for a paper: chosen columns, and figures in the width of one or two columns of print."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def export(
 
 
 def _with_columns(table: Table, names: Sequence[str]) -> Table:
-    """The table with these columns, in this order, or all of them; a column is called by its title in letters, digits
-    and underscores."""
+    """Returns the table with these columns, in this order, or all; a column's name is its title in letters, digits and
+    underscores."""
     known: dict[str, Column] = {}
     for column in table.columns:
         name = re.sub(r"[^a-z0-9]+", "_", column.title.lower()).strip("_") or "column"

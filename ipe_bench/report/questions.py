@@ -1,4 +1,4 @@
-"""The answers of `design`, `posterior`, `compare` and `audit`: tables, sentences, and files."""
+"""Writes the answers of `design`, `posterior`, `compare` and `audit`: tables, sentences, and files."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ if TYPE_CHECKING:
     from ipe_bench.trials.posterior import Divergence, Posterior, Reference
 
 READINGS = "readings.csv"
-"""What the choices of a design take, a row per reading."""
+"""Columns of a design's choices, one row per reading."""
 HONEST = 0.1
 """Nats up to which a Gaussian may stand for another: a deviation is 40 % too large, or a mean half a deviation off."""
 SAME_LAW = 0.05
 """Energy distance up to which draws may come from one law: of Gaussians in few dimensions, some tenths of a nat."""
 _MOST_SUSPECTS = 12
 _TITLES = {"error": "mean length", "cost": "mean cost", "time": "median time"}
-"""What the quantities of a comparison are called, as the table of a run has other statistics of error and cost."""
+"""Names of a comparison's quantities, where the table of a run has other statistics of error and cost."""
 _MOST_EVIDENCE = 1000
 _UNSEEN = 0.05
 """Share of trials below which an error goes unnoticed by any test of residuals."""
@@ -44,7 +44,7 @@ _UNSEEN = 0.05
 
 
 def design_parts(name: str, design: Design) -> Iterator[Part]:
-    """The tables and sentences of a design, under the `name` of its model."""
+    """Yields the tables and sentences of a design, under the `name` of its model."""
     yield _parameters(name, design)
     seen = design.observability
     direction = "Least observable direction" if seen.observable else "The readings do not determine"
@@ -152,7 +152,7 @@ def write_design(folder: Path, name: str, design: Design) -> list[Path]:
 
 
 def posterior_parts(name: str, found: Sequence[Reference]) -> list[Table]:
-    """A row per trial and estimator, under the `name` of the scenario."""
+    """Yields a row per trial and estimator, under the `name` of the scenario."""
     rows = [(one, label, d) for one in found for label, d in one.divergences.items()]
     columns = [
         texts("trial", [str(one.trial) for one, *_ in rows]),
@@ -189,7 +189,7 @@ def _notes(found: Sequence[Reference]) -> Iterator[str]:
 
 
 def honest_word(d: Divergence, sampled: Posterior) -> str:
-    """Whether a Gaussian can be taken for the posterior; a wide one over two modes has the moments and is not."""
+    """Words whether a Gaussian can stand for the posterior; a wide one over two modes, with its moments, cannot."""
     if not np.isfinite(d.kl):
         return "-"
     near = d.kl <= max(HONEST, 2 * sampled.noise) and d.energy <= SAME_LAW
@@ -216,7 +216,7 @@ def write_posteriors(
 
 
 def comparison_parts(frame: pd.DataFrame, alpha: float) -> Iterator[Part]:
-    """A table per comparison, within 80 columns, and what the columns mean."""
+    """Yields a table per comparison, within 80 columns, and what the columns mean."""
     titles = ("", "first", "second", "change", f"{100 * (1 - alpha):g} %", "p", "e", "second is")
     for title, rows in _comparisons(frame):
         cells = zip(titles, zip(*map(_cells, rows), strict=True), strict=True)
@@ -243,7 +243,7 @@ def _needed(row: dict[str, Any]) -> str:
 
 
 def _comparisons(frame: pd.DataFrame) -> Iterator[tuple[str, list[dict[str, Any]]]]:
-    """Each comparison with its title, in order."""
+    """Yields each comparison with its title, in order."""
     settings = [c for c in frame.columns if c not in NOT_SETTINGS]
     listed: list[Any] = frame.to_dict("records")
     for _, part in groupby(listed, key=lambda row: tuple(value_text(row[c]) for c in (*settings, "first", "second"))):
@@ -279,7 +279,7 @@ def _ratio(value: float) -> str:
 
 
 def audit_parts(found: Audit) -> list[Part]:
-    """The sentences, and a row per parameter."""
+    """Yields the sentences of an audit, and a row per parameter."""
     names = found.claims.names
     columns = [
         words("parameter", names),

@@ -36,11 +36,11 @@ class ReportResult:
     figures: tuple[Path, ...]
     report: Path
     problems: tuple[str, ...]
-    """One line per piece that is missing, failed, foreign or damaged; the exit code is 1 if there is any."""
+    """Lines about missing, failed, foreign or damaged pieces; the exit code is 1 if there is any."""
     stale: tuple[str, ...]
     """One line per piece that older code computed, which is left out."""
     headline: tuple[str, ...]
-    """What the page opens with: a few sentences on what the data say."""
+    """Opening of the page: a few sentences on what the data say."""
 
     def __repr__(self) -> str:
         return "\n".join([f"Report  {self.report}", *self.headline, *self.problems, *self.stale])
@@ -132,7 +132,7 @@ def begin_report(
 
 
 def _made_from(directories: Sequence[Path], output: Path, *choices: object) -> str:
-    """A digest of what a report is made from, taken before that is read: results that come meanwhile change it."""
+    """Computes a digest of the report's sources before they are read: results that come meanwhile change it."""
     sources = [p for p in Path(__file__).parents[1].rglob("*") if p.suffix in {".py", ".j2", ".css", ".js"}]
     stores = [Store(directory) for directory in directories]
     stored = [p for s in stores for folder in (s.trials, s.runs, s.failed) for p in folder.glob("*")]
@@ -143,7 +143,7 @@ def _made_from(directories: Sequence[Path], output: Path, *choices: object) -> s
 
 
 def _is_current(output: Path, made: str) -> bool:
-    """Whether the report under `output` was made from this, and its files are as written."""
+    """Returns whether the report under `output` was made from this, and its files are as written."""
     with contextlib.suppress(OSError, ValueError):
         known = json.loads(regular(output / STAMP).read_text(encoding="utf-8"))
         return known == {"from": made, "files": _digests(map(Path, known["files"]))}
@@ -151,7 +151,7 @@ def _is_current(output: Path, made: str) -> bool:
 
 
 def _digests(paths: Iterable[Path]) -> dict[str, str]:
-    """SHA-256 by absolute path, without what cannot be read, or is removed by another command at this moment."""
+    """Computes SHA-256 by absolute path, without unreadable files and those that another command is removing."""
     found = {}
     for path in sorted(paths):
         with contextlib.suppress(OSError):

@@ -18,7 +18,7 @@ CURVES = ("distributions",)
 
 @dataclass(frozen=True)
 class Section:
-    """A section of report.html, behind our tables."""
+    """Defines a section of report.html, which follows our tables."""
 
     title: str
     write: Callable[[Analysis], Iterator[Part]]
@@ -39,13 +39,13 @@ class Written:
 
 
 def report_tables(analysis: Analysis) -> list[Table]:
-    """Every table of the report: those on certified readings, ours on simulated trials, and those of plugins."""
+    """Yields every table of the report: those on certified readings, ours on simulated trials, and those of plugins."""
     shown = certified_tables(analysis.collection) + all_tables(analysis.simulated, analysis)
     return [*shown, *(table for one in written("table", analysis, shown) for table in one.tables)]
 
 
 def written(group: str, analysis: Analysis, tables: Iterable[Table]) -> list[Written]:
-    """What the tables or the sections of plugins give, with tables that have names of their own."""
+    """Yields the tables or sections of plugins, their tables under unique names."""
     names = {*CURVES, *(table.name for table in tables)}
 
     def make(record: Any) -> tuple[str, list[Part]]:

@@ -1,5 +1,5 @@
-"""Which figures a report has, as what files, and how they look: a colour family for each kind of estimator, a marker
-and a dash for each member, one theme."""
+"""Chooses a report's figures, their files and their looks: a colour family per kind of estimator, a marker and a dash
+per member, one theme."""
 
 from __future__ import annotations
 
@@ -24,27 +24,27 @@ FAMILIES: dict[str, tuple[str, ...]] = {
 }
 """Colours by kind of estimator, neighbours differing in lightness; all of them are told apart on white and in print."""
 COLORS = tuple(family[i] for i in range(5) for family in FAMILIES.values() if i < len(family))
-"""The same with the families by turns, for what is no estimator: parameters, settings."""
+"""Colours of the families by turns, for parameters and settings."""
 BLACK, GREY = "#000000", "#b0b0b0"
 MARKERS = ("o", "s", "D", "^", "v", "P", "d", "<", ">", "p", "h")
 DASHES: tuple[Any, ...] = ("", (5, 2), (1, 1.5), (5, 2, 1, 2))
-"""As seaborn and matplotlib take them: lengths on and off, nothing for a solid line."""
+"""Dash patterns as seaborn and matplotlib read them: lengths on and off, empty for a solid line."""
 REFERENCE = "linear_lse"
-"""The estimator that others are held against: black and crossed, whatever else is there."""
+"""Label of the reference estimator: black and crossed in every figure."""
 BOUND_COLOR, BOUND_DASH = "#444444", (0, (2, 2))
 MOST_FACES = 10
 """Estimators up to which each has a colour; of more, `chosen` ones have, and the others are grey."""
 
 
 def which_figures(asked: Any) -> Which:
-    """The choice that this word is; raises UserError if it is none."""
+    """Returns the choice of this name; raises UserError if there is none."""
     if asked not in get_args(Which):
         raise UserError(f"figures={asked}: choose all, main or none")
     return cast(Which, asked)
 
 
 def file_formats(asked: Any) -> tuple[str, ...]:
-    """The formats asked for, in one word or several, with the page's; raises UserError if there is no such format."""
+    """Returns the formats asked for, in one word or several, with the page's; raises UserError if one is unknown."""
     words = asked if isinstance(asked, Sequence) and not isinstance(asked, str) else str(asked).strip("[]").split(",")
     names = [str(word).strip() for word in words]
     if not names or not set(names) <= set(FORMATS):
@@ -70,7 +70,7 @@ class Look:
 def looks(
     labels: Sequence[str], kinds: Mapping[str, str] | None = None, chosen: Sequence[str] | None = None
 ) -> dict[str, Look]:
-    """A look per label: in the family of its kind if `kinds` says which, grey if it is not among those `chosen`.
+    """Returns a look per label: of its kind's family if `kinds` gives one, grey if it is not among those `chosen`.
 
     11 markers and 4 dashes have a common period of 44; with the colours hundreds of labels differ.
     """
@@ -120,13 +120,13 @@ _print_width: ContextVar[float] = ContextVar("print_width", default=0.0)
 
 
 def print_width() -> float:
-    """Inches of the column of print that figures are drawn for; 0 for those of the page."""
+    """Returns the width in inches of the column of print that figures are drawn for; 0 for those of the page."""
     return _print_width.get()
 
 
 @contextmanager
 def house_style(scale: float = 0.95, more: Mapping[str, Any] | None = None) -> Iterator[None]:
-    """seaborn's white grid in its context of a paper, with letters of this scale."""
+    """Sets seaborn's white grid in its context of a paper, with letters of this scale."""
     import matplotlib as mpl
     import seaborn as sns
 
@@ -138,7 +138,7 @@ def house_style(scale: float = 0.95, more: Mapping[str, Any] | None = None) -> I
 
 @contextmanager
 def print_style(width: float) -> Iterator[None]:
-    """The same look in a column of print, where nothing is scaled any more: letters of 7 points, as IEEE's."""
+    """Sets the same look in a column of print, which is not scaled any more: letters of 7 points, as IEEE's."""
     token = _print_width.set(width)
     try:
         with house_style(0.74, _PRINT):

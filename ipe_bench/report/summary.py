@@ -37,7 +37,7 @@ class Stored:
 
 
 class Summary(pd.DataFrame):
-    """A row per scenario, estimator and parameter, shown as the terminal shows it while it has the columns for that."""
+    """Shows a row per scenario, estimator and parameter as the terminal does, while it has the columns for that."""
 
     _metadata: ClassVar = ["_stored"]
     _stored: Stored | None = None
@@ -48,7 +48,7 @@ class Summary(pd.DataFrame):
 
     @classmethod
     def of(cls, frame: pd.DataFrame, stored: Stored) -> Summary:
-        """The summary of what is stored in a folder."""
+        """Reads the summary of the results stored in a folder."""
         made = cls(frame)
         made.attrs, made._stored = frame.attrs, stored
         return made

@@ -48,7 +48,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Column:
-    """A column: numbers stand to the right, words to the left and may be folded."""
+    """Describes a column: numbers are aligned right, words left and possibly folded."""
 
     title: str
     cells: Sequence[Cell]
@@ -57,7 +57,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Table:
-    """A table with its file name, its title, the caption above it and the notes below it."""
+    """Holds a table with its file name, its title, the caption above it and the notes below it."""
 
     name: str
     title: str
@@ -69,9 +69,9 @@ class Table:
     """Whether the page shows it behind the figures."""
     notes: Sequence[str] = ()
     grouped: int = 0
-    """Number of leading columns whose texts make a group of rows: a terminal shows them once a group."""
+    """Number of leading columns whose texts identify a group of rows: a terminal shows them once a group."""
     whole: str = ""
-    """The file that has the columns for which a terminal has no room: they are named and not shown below."""
+    """File with the columns for which a terminal has no room: they are named and not shown below."""
 
     @property
     def rows(self) -> Iterator[tuple[Cell, ...]]:
@@ -91,25 +91,25 @@ class Strong(str):
 
 
 Part = Table | str
-"""What reports are made of: tables and sentences."""
+"""Element of a report: a table or a sentence."""
 
 
 def column(title: str, values: Iterable[Any], show: Callable[[Any], str], best: Iterable[bool] = ()) -> Column:
-    """A column of numbers, written by `show`."""
+    """Makes a column of numbers, written by `show`."""
     values = list(values)
     marks = list(best) or [False] * len(values)
     return Column(title, [Cell(show(v), sort_key(v), m) for v, m in zip(values, marks, strict=True)])
 
 
 def words(title: str, values: Iterable[Any], best: Iterable[bool] = ()) -> Column:
-    """A column of texts."""
+    """Makes a column of texts."""
     values = [str(v) for v in values]
     marks = list(best) or [False] * len(values)
     return Column(title, [Cell(v, None, m) for v, m in zip(values, marks, strict=True)], numeric=False)
 
 
 def interval(title: str, low: Iterable[float], high: Iterable[float], show: Callable[[float], str]) -> Column:
-    """A column of intervals, sorted by their lower ends; one end alone has a sign before it."""
+    """Makes a column of intervals, sorted by their lower ends; one end alone has a sign before it."""
 
     def cell(a: float, b: float) -> str:
         if math.isnan(b):
@@ -120,12 +120,12 @@ def interval(title: str, low: Iterable[float], high: Iterable[float], show: Call
 
 
 def texts(title: str, values: Iterable[str]) -> Column:
-    """A column of numbers that are written already and by which no row is sorted."""
+    """Makes a column of numbers that are written already and by which no row is sorted."""
     return Column(title, [Cell(value) for value in values])
 
 
 def sort_key(value: Any) -> str:
-    """The number by which a cell is sorted; NaN and infinity go last."""
+    """Returns the number by which a cell is sorted; NaN and infinity go last."""
     number = float(value)
     return "1e999" if math.isnan(number) or number == math.inf else repr(number)
 
@@ -163,7 +163,7 @@ def terminal(parts: Iterable[Part], width: int) -> Group:
 
 
 def plain_text(parts: Iterable[Part], width: int = 120) -> str:
-    """What a terminal of that width shows, without colours."""
+    """Returns the text that a terminal of that width shows, without colours."""
     from rich.console import Console
 
     shown = io.StringIO()
@@ -172,7 +172,7 @@ def plain_text(parts: Iterable[Part], width: int = 120) -> str:
 
 
 def _needed(column: Column, table: Table) -> tuple[int, int]:
-    """Letters that a column takes with its title in one line, and with its title folded; numbers are never folded."""
+    """Returns a column's letters with its title in one line, and with its title folded; numbers never fold."""
     from rich.cells import cell_len
 
     longest = max([1, *(cell_len(cell.text) for cell in column.cells)])
@@ -184,14 +184,14 @@ def _needed(column: Column, table: Table) -> tuple[int, int]:
 
 
 def _taken(columns: Iterable[Column], table: Table) -> tuple[int, int]:
-    """The width of a table of such columns with their titles in one line, and with them folded."""
+    """Returns the width of a table of such columns with their titles in one line, and with them folded."""
     whole, folded = zip(*(_needed(column, table) for column in columns), strict=True)
     space = 2 + _PADDING * len(whole)
     return sum(whole) + space, sum(folded) + space
 
 
 def _rich(columns: Sequence[Column], table: Table, width: int) -> Any:
-    """Some columns of a table, with titles that are folded if they have no room."""
+    """Renders some columns of a table, with titles that are folded if they have no room."""
     from rich import box
     from rich.table import Table as RichTable
     from rich.text import Text
@@ -220,7 +220,7 @@ def _rich(columns: Sequence[Column], table: Table, width: int) -> Any:
 
 @cache
 def environment() -> Environment:
-    """The templates of pages; every text in them is escaped."""
+    """Returns the templates of pages; every text in them is escaped."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     made = Environment(
@@ -254,7 +254,7 @@ def write_table(table: Table, folder: Path) -> list[Path]:
 
 
 def comma_separated(table: Table) -> str:
-    """The numbers behind the table in full precision, or else its cells."""
+    """Renders the numbers behind the table in full precision, or else its cells."""
     import pandas as pd
 
     cells = pd.DataFrame([[cell.text for cell in row] for row in table.rows], columns=[c.title for c in table.columns])
@@ -262,7 +262,7 @@ def comma_separated(table: Table) -> str:
 
 
 def markdown(table: Table) -> str:
-    """A GitHub table; names cannot break it."""
+    """Renders a GitHub table; names cannot break it."""
 
     def cell(value: str) -> str:
         return re.sub(r"([\\|*])", r"\\\1", " ".join(value.split())).replace("<", "&lt;")
@@ -294,8 +294,8 @@ _NUMBER = re.compile(r"-?\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?")
 
 
 def latex(table: Table, width: float | None = None) -> str:
-    """A table for `\\input`, by booktabs and siunitx: bare, or floating with its caption in a column of `width` inches;
-    a longtable if it has more than `LONG` rows."""
+    r"""Renders a table for `\input`, by booktabs and siunitx: bare, or floating with its caption in a column of `width`
+    inches; a longtable if it has more than `LONG` rows."""
     shape = "@{}" + "".join("r" if c.numeric else "l" for c in table.columns) + "@{}"
     titles, *rows = [
         f"{' & '.join(cells)} \\\\"
@@ -318,7 +318,7 @@ def latex(table: Table, width: float | None = None) -> str:
 
 
 def _latex_title(column: Column) -> str:
-    """The title of a column, stacked if it is longer than its cells and its longest word."""
+    """Returns the title of a column, stacked if it is longer than its cells and its longest word."""
     letters = max([1, *(len(cell.text) for cell in column.cells), *map(len, column.title.split())])
     lines = [escaped(line) for line in textwrap.wrap(column.title, letters, break_on_hyphens=False)]
     stacked = r"\\".join(lines)
@@ -326,7 +326,7 @@ def _latex_title(column: Column) -> str:
 
 
 def _latex_cell(cell: Cell, column: Column) -> str:
-    """A cell; siunitx sets numbers, whose digits it groups by its own rules."""
+    """Returns a cell; siunitx sets numbers, whose digits it groups by its own rules."""
     text = escaped(cell.text)
     if column.numeric:
         text = _NUMBER.sub(lambda m: f"\\num{{{m.group().replace(',', '')}}}", text).replace(r"} \%", r"}\,\%")
@@ -334,7 +334,7 @@ def _latex_cell(cell: Cell, column: Column) -> str:
 
 
 def escaped(text: str) -> str:
-    """Plain text with its special signs escaped, those that pdflatex may lack by their number."""
+    """Escapes the special signs of plain text, those that pdflatex may lack by their number."""
     return "".join(
         _SIGNS.get(char) or (char if char.isascii() and char.isprintable() else f"\\texttt{{U+{ord(char):04X}}}")
         for char in " ".join(text.split())

@@ -89,13 +89,13 @@ _RECORDED: dict[Where, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
 }
 """Title, caption and rows of the tables that are made of recorded statistics alone."""
 _OF_PARAMETERS = ("tracks", "parameters", "theory")
-"""Those of them that have a row per parameter."""
+"""Names of the recorded tables that have a row per parameter."""
 _MAIN = ("overview", "tracks", "costs", "comparisons", "parameters", "calibration", "endings")
 _APPENDIX = ("all_trials", "solved_trials", "contraction", "covariances", "theory", "iterations")
 
 
 def all_tables(analysis: Analysis, whole: Analysis | None = None) -> list[Table]:
-    """Every table that the data allow, in the order of the report, with the endings of the `whole` analysis."""
+    """Yields every table that the data allow, in the order of the report, with the endings of the `whole` analysis."""
     found = {"endings": endings(whole or analysis)}
     if not analysis.summary.empty:
         rows = analysis.summary[analysis.summary["parameter"] == ALL].reset_index(drop=True)
@@ -108,7 +108,7 @@ def all_tables(analysis: Analysis, whole: Analysis | None = None) -> list[Table]
 
 
 def head(analysis: Analysis, rows: pd.DataFrame) -> list[Column]:
-    """The columns that tell rows apart: those settings that differ, and the error scale."""
+    """Returns the columns that tell rows apart: those settings that differ, and the error scale."""
     varying = [c for c in analysis.setting_columns if len(set(rows[c].astype(str))) > 1]
     return [
         *(words(c, [value_text(v) for v in rows[c]]) for c in varying),
@@ -117,7 +117,7 @@ def head(analysis: Analysis, rows: pd.DataFrame) -> list[Column]:
 
 
 def _recorded(analysis: Analysis, where: Where, totals: pd.DataFrame) -> Table | None:
-    """The table of the statistics whose records name it, behind the estimators and other columns of names."""
+    """Returns the table of the statistics whose records name it, behind the estimators and other columns of names."""
     (title, caption, chosen), names = _RECORDED[where], ("parameter", "unit") if where in _OF_PARAMETERS else ()
     rows = analysis.summary if names else totals
     rows = rows[chosen(rows)]
@@ -131,7 +131,7 @@ def _recorded(analysis: Analysis, where: Where, totals: pd.DataFrame) -> Table |
 
 
 def overview(analysis: Analysis) -> Table:
-    """How each estimator does over all trials: one population for everybody."""
+    """Returns the overview: each estimator over all trials, a population that every one shares."""
     rows = analysis.summary[analysis.summary["parameter"] == ALL].reset_index(drop=True)
     first = head(analysis, rows)
     told: Any = rows.to_dict("records")
@@ -142,7 +142,7 @@ def overview(analysis: Analysis) -> Table:
 
 
 def contraction(analysis: Analysis) -> Table | None:
-    """Whether theory promises that the fixed-point iteration converges, eq. (15)."""
+    """Says whether theory promises that the fixed-point iteration converges, eq. (15)."""
     rows = analysis.contraction
     if rows.empty:
         return None
@@ -162,7 +162,7 @@ def contraction(analysis: Analysis) -> Table | None:
 
 
 def comparisons(analysis: Analysis) -> Table | None:
-    """Every pair of estimators on the same trials."""
+    """Compares every pair of estimators on the same trials."""
     rows = analysis.pairs
     if rows.empty:
         return None
@@ -186,7 +186,7 @@ def comparisons(analysis: Analysis) -> Table | None:
 
 
 def endings(analysis: Analysis) -> Table | None:
-    """How trials ended that did not converge, with their messages."""
+    """Lists the statuses of trials that did not converge, with their messages."""
     rows = analysis.endings
     if rows.empty:
         return None
@@ -202,8 +202,8 @@ def endings(analysis: Analysis) -> Table | None:
 
 
 def certified_tables(collection: Collection) -> list[Table]:
-    """Digits per data set and their averages, and published errors, as far as there are data; a terminal shows those
-    that name the file with the `whole`."""
+    """Yields digits per data set with averages, and published errors, if there are data; a terminal shows those that
+    name the file with the `whole`."""
     digits = certified_table(collection)
     found = [] if digits.empty else _digits(digits)
     if len(rows := published_table(collection)):
@@ -212,7 +212,7 @@ def certified_tables(collection: Collection) -> list[Table]:
 
 
 def _digits(digits: pd.DataFrame) -> list[Table]:
-    """The mean digits of an estimator from each start, the most first, and its digits per data set."""
+    """Returns the mean digits of an estimator from each start, the most first, and its digits per data set."""
     caption = (
         "Log relative error against the certified answer, at most 11. It is the smallest over the parameters of a data"
         " set, the smallest over their standard deviations, and that of the residual sum of squares."

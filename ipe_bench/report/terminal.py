@@ -1,4 +1,4 @@
-"""The summary as tables in a terminal; a narrow one lacks columns from the right, never the names."""
+"""Shows the summary as tables in a terminal; a narrow one omits columns from the right, never the names."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ TRACKED = (
     " a smoother, which uses later readings too. NEES and the statistics of single states refer to the last epoch."
     " Cost counts evaluations of transition and reading."
 )
-"""What a track is held against."""
+"""References of a track's errors."""
 _TRACKED_ERROR = f"error is the median / 95 % quantile over all trials. {_CAPPED}"
 
 
 def overview_notes(noises: Collection[str]) -> tuple[str, ...]:
-    """What the columns of the overview mean, and what estimators are told of these noises."""
+    """Explains the columns of the overview, and what estimators assume about these noises."""
     error = _TRACKED_ERROR if set(noises) == {"model"} else _ERROR
     added = (words for noise, words in (("unknown", _TOLD), ("model", TRACKED)) if noise in noises)
     nees = _NEES.removesuffix(" cost counts simulations.") if error is _TRACKED_ERROR else _NEES
@@ -59,7 +59,7 @@ _VERDICTS |= {"diverged but confident": ("diverged", "!"), "-": ("", "")}
 
 
 def summary_tables(listed: Sequence[Mapping[str, Any]], totals: Sequence[Table], width: int) -> list[Part]:
-    """A table per setting (measurement, noise, and every option that differs), behind the totals of certified runs."""
+    """Yields a table per setting (measurement, noise, differing options), after the totals of certified runs."""
     # Models whose own readings are certified, without being of a collection, have no totals.
     rows = [row for row in listed if row["parameter"] == ALL and not (totals and row["noise"] == "certified")]
     known = {*summary_columns(), "parameter", "unit", "estimator", "error_scale"}
@@ -91,14 +91,14 @@ def _setting(title: str, rows: Sequence[Mapping[str, Any]], width: int) -> Table
 
 
 def leading(rows: Sequence[Mapping[str, Any]], scenario: Sequence[str]) -> list[bool]:
-    """Whether each row's estimator may be the best of its scenario, if another one is surely beaten."""
+    """Returns whether each row's estimator may be the best of its scenario, if another one is surely beaten."""
     keys = [tuple(str(row[name]) for name in scenario) for row in rows]
     beaten = {key for key, row in zip(keys, rows, strict=True) if not row[BEST]}
     return [bool(row[BEST]) and key in beaten for key, row in zip(keys, rows, strict=True)]
 
 
 def overview_columns(rows: Sequence[Mapping[str, Any]], best: Sequence[bool], *, narrow: bool = False) -> list[Column]:
-    """What everybody is judged by, over all trials; a narrow screen lacks the failures and has signs for verdicts."""
+    """Returns the columns over all trials for every estimator; a narrow screen has no failures and short verdicts."""
 
     def cells(title: str, key: str, show: Callable[[Mapping[str, Any]], str], best: Sequence[bool] = ()) -> Column:
         marks = best or [False] * len(rows)
@@ -137,7 +137,7 @@ def overview_columns(rows: Sequence[Mapping[str, Any]], best: Sequence[bool], *,
 
 
 def statistics(where: Where, rows: Sequence[Mapping[str, Any]]) -> list[Column]:
-    """The columns of the statistics that are shown in that table."""
+    """Returns the columns of the statistics that are shown in that table."""
     columns: list[Column] = []
     for record in (*all_statistics(), *SCORES):
         if where not in record.where or not reported(record, rows):
@@ -154,13 +154,13 @@ def statistics(where: Where, rows: Sequence[Mapping[str, Any]]) -> list[Column]:
 
 
 def reported(record: Statistic, rows: Sequence[Mapping[str, Any]]) -> bool:
-    """Whether a table has the column of a statistic; a rare one needs a finite value, a rare count one above 0."""
+    """Returns whether a table has a statistic's column; a rare one needs a finite value, a rare count one above 0."""
     values = [row[record.name] for row in rows]
     return not record.rare or any(math.isfinite(v) and (v > 0 or record.kind != "count") for v in values)
 
 
 def _shown(record: Statistic, where: Where, row: Mapping[str, Any]) -> str:
-    """A value as it stands in a table, with the number of trials that it is conditional on unless that is all."""
+    """Formats a value in a table, with the number of trials behind it unless that is all."""
     if not _applies(record, where, row):
         return "-"
     text = _shower(record.kind, where)(row[record.name])
@@ -170,13 +170,13 @@ def _shown(record: Statistic, where: Where, row: Mapping[str, Any]) -> str:
 
 
 def _applies(record: Statistic, where: Where, row: Mapping[str, Any]) -> bool:
-    """Whether a row can have the statistic: what solves no equation has nothing to say of solved trials. In the
+    """Returns whether a row can have the statistic: an estimator that solves no equation has no solved trials. In the
     tables of parameters and of states its finished trials stand in for them."""
     return record.given != "solved" or where in ("parameters", "tracks") or row["equation"] != "-"
 
 
 def _shower(kind: Kind, where: Where) -> Callable[[Any], str]:
-    """How values of that kind are written in that table."""
+    """Returns the formatter of values of that kind in that table."""
     return {
         "count": lambda v: f"{int(v):d}" if math.isfinite(v) else "-",
         "share": percent,

@@ -25,7 +25,7 @@ NAME, TABLE, SCHEMA = "track", "track.csv", 1
 
 @dataclass(frozen=True)
 class LogAnswer:
-    """The tracks of one log, one for each tracker."""
+    """Holds the tracks of one log, one for each tracker."""
 
     log: Log
     tracks: Sequence[LogTracks]
@@ -42,7 +42,7 @@ class LogAnswer:
         return next(one for one in self.tracks if one.label == label)
 
     def table(self) -> pd.DataFrame:
-        """A row per tracker and epoch: each state with its standard deviation, and NIS."""
+        """Returns a row per tracker and epoch: each state with its standard deviation, and NIS."""
         import pandas as pd
 
         model, frames = self.log.model, []
@@ -62,7 +62,7 @@ class LogAnswer:
 
 
 def track_parts(answer: LogAnswer) -> list[Part]:
-    """What the innovations say of each tracker, and the states at the last epoch."""
+    """Yields the test of the innovations of each tracker, and the states at the last epoch."""
     found, states = answer.tracks, answer.log.model.states
     limits = [one.limits[0] for one in found], [one.limits[1] for one in found]
     columns = [

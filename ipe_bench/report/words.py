@@ -1,4 +1,4 @@
-"""Numbers as readers write them."""
+"""Formats numbers for readers."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ CITATION = (
     " command, the git commit and the source's digest that stand with the provenance, and the digest of the bundle"
     " where results are shared as one (`ipe-bench bundle`)."
 )
-"""How results of the bench are cited."""
+"""Citation of the bench."""
 
 
 def value_text(value: Any) -> str:
-    """A number without needless zeros; a dash for what is not there."""
+    """Formats a number without needless zeros; a dash stands for a missing one."""
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return "-"
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def enumerate_few(items: Sequence[str], most: int = 6) -> str:
-    """'a, b and 3 others'; one that would be left over is named."""
+    """Enumerates 'a, b and 3 others'; a single remaining one is named."""
     more = f" and {len(items) - most} others" if len(items) > most + 1 else ""
     return ", ".join(items[:most] if more else items) + more
 
 
 def percent(share: float) -> str:
-    """A share in per cent; 100 and 0 only if it is all or none."""
+    """Formats a share in per cent; 100 and 0 only if it is all or none."""
     if not math.isfinite(share):
         return "-"
     value = 100 * share
@@ -40,7 +40,7 @@ def percent(share: float) -> str:
 
 
 def short(value: float) -> str:
-    """About four figures."""
+    """Formats about four figures."""
     if not math.isfinite(value):
         return "inf" if value == math.inf else "-"
     if value == int(value) and abs(value) < 1000:
@@ -53,7 +53,7 @@ def short(value: float) -> str:
 
 
 def brief(value: float) -> str:
-    """Two decimals below ten, three figures above, in at most five characters."""
+    """Formats two decimals below ten, three figures above, in at most five characters."""
     if not math.isfinite(value):
         return "inf" if value == math.inf else "-"
     if value == int(value) and value < 1000:
@@ -64,7 +64,7 @@ def brief(value: float) -> str:
 
 
 def compact(value: float) -> str:
-    """Three figures in at most five characters if possible: thousands as k, millions as M."""
+    """Formats three figures in at most five characters if possible: thousands as k, millions as M."""
     if not math.isfinite(value):
         return "inf" if value == math.inf else "-"
     rounded = float(f"{value:.2e}")
@@ -75,7 +75,7 @@ def compact(value: float) -> str:
 
 
 def duration(seconds: float, figures: int = 3) -> str:
-    """Seconds in the unit that suits them."""
+    """Formats seconds in the unit that suits them."""
     if not math.isfinite(seconds):
         return "-"
     if seconds <= 0:
@@ -86,12 +86,12 @@ def duration(seconds: float, figures: int = 3) -> str:
 
 
 def _decimals(value: float, figures: int) -> int:
-    """Those that leave a number so many figures."""
+    """Returns the decimals that leave a number so many figures."""
     return max(0, figures - 1 - math.floor(math.log10(abs(value)) + 1e-9))
 
 
 def p_value(p: float, least: float = 0.0) -> str:
-    """A probability, a very small one by its order; `least` is the limit of one that is counted among simulations."""
+    """Formats a probability, a very small one by its order; `least` is its lower limit in a count of simulations."""
     if not math.isfinite(p):
         return "-"
     if p <= least and least > 0:

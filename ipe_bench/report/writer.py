@@ -1,4 +1,4 @@
-"""The folder of a command that answers one question: whose it is, and its page, CSV and figures."""
+"""Reserves the folder of a command that answers one question, and writes its page, CSV and figures."""
 
 from __future__ import annotations
 

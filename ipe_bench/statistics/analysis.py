@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 PROBABILITIES = np.unique(np.concatenate([np.linspace(0, 1, 101), [0.001, 0.005, 0.025, 0.975, 0.995, 0.999]]))
-"""Where the distribution of errors is tabulated."""
+"""Probabilities at which the distribution of errors is tabulated."""
 MESSAGES = 20
 """Different messages of one estimator on one scenario that are listed one by one."""
 
@@ -39,7 +39,7 @@ class Analysis:
     collection: Collection
     summary: pd.DataFrame
     endings: pd.DataFrame
-    """How trials ended that did not converge: status, message, number, and the first such trial."""
+    """Endings of trials that did not converge: status, message, number, and the first such trial."""
     pairs: pd.DataFrame
     """Every pair of estimators on every scenario; see `comparisons.compare_pairs`."""
     scores: pd.DataFrame
@@ -48,16 +48,16 @@ class Analysis:
     distributions: pd.DataFrame
     """Quantiles of the Mahalanobis error over all trials: `probability` (of `PROBABILITIES`) and `distance`."""
     convergence: pd.DataFrame
-    """Of estimators that iterate: `iteration`, and the median `distance` of the iterate from the last one, the largest
-    over the parameters in deviations of the bound, over the first converged trials; 0 when half of them have ended."""
+    """Median `distance` of each `iteration` of an iterative estimator from its last iterate, the largest over the
+    parameters in deviations of the bound, over the first converged trials; 0 once half of them have ended."""
     calibration: pd.DataFrame
-    """Of NEES: the probability `at`, the `difference` of the empirical distribution function from the uniform one
-    there, and the ends `low` and `high` of the band; NEES and all parameters of an honest estimator keep within theirs
-    in 95 % of cases."""
+    """Calibration of NEES: the probability `at`, the `difference` of the empirical distribution function from the
+    uniform one there, and the ends `low` and `high` of the band; NEES and all parameters of an honest estimator keep
+    within theirs in 95 % of cases."""
     contraction: pd.DataFrame
     """Per scenario, how much the fixed-point iteration contracts at the truth; empty if no file says so."""
     tracks: pd.DataFrame
-    """Of each state of a tracker: time `at` of each epoch, `rmse`, `bound` at the truth, `posterior` and
+    """Errors of each state of a tracker: time `at` of each epoch, `rmse`, `bound` at the truth, `posterior` and
     `posterior_smoothed` Cramér-Rao bounds, and `nees` over n with the ends of its limits."""
 
     @property
@@ -91,26 +91,26 @@ def analyse(directories: Sequence[Path | str]) -> Analysis:
 
 
 def summarize(directories: Sequence[Path | str]) -> pd.DataFrame:
-    """The summary of everything stored under the directories; empty if there is nothing."""
+    """Computes the summary of everything stored under the directories; empty if no trial is."""
     return to_frame(Begun(collect(directories)).summary)
 
 
 class Begun:
-    """An analysis of which the summary stands; comparisons, and libraries that take long to load, are still to come."""
+    """Holds an analysis with its summary; comparisons, and libraries that take long to load, are still to come."""
 
     def __init__(self, collection: Collection) -> None:
         self.collection = collection
         self.summary: list[dict[str, Any]] = []
         """The rows of `Analysis.summary`."""
         self._rows: defaultdict[str, list[dict[str, Any]]] = defaultdict(list)
-        """What the other tables are made of, by their names."""
+        """Rows of the other tables, by their names."""
         self._compared: list[tuple[dict[str, Any], dict[str, Outcomes]]] = []
         """The columns of each scenario, and the outcomes of its estimators."""
         for number, groups in enumerate(collection.scenarios.values()):
             self._add(number, groups)
 
     def _add(self, number: int, groups: Sequence[Group]) -> None:
-        """Adds what each estimator of a scenario came to."""
+        """Adds the results of each estimator of a scenario."""
         found, summary, outcomes = self._rows, [], {}
         found["contraction"] += _contraction_rows(self.collection, groups[0])
         where = dict(groups[0].columns) | {"scenario": number}
@@ -138,7 +138,7 @@ class Begun:
             self._compared.append((where, outcomes))
 
     def finish(self) -> Analysis:
-        """The whole analysis."""
+        """Completes the analysis."""
         import pandas as pd
 
         # Corrected over all scenarios: a sweep asks all its questions at once.
@@ -159,7 +159,7 @@ class Begun:
 
 
 def _joined(parts: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    """Frames one after another, each given by its columns; what is not an array is the same in all its rows."""
+    """Joins frames, each given by its columns; a scalar is repeated in all its rows."""
     import pandas as pd
 
     if not parts:
@@ -169,7 +169,7 @@ def _joined(parts: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
 
 
 def _shared(sample: Sample) -> dict[str, Any]:
-    """Success and silent failure in the trials that every estimator of the scenario has."""
+    """Computes success and silent failure in the trials that every estimator of the scenario has."""
     among = sample.present
     silent = failed(sample, known=False, among=among)
     success = share(sample.scalars["success"][among])
@@ -177,7 +177,7 @@ def _shared(sample: Sample) -> dict[str, Any]:
 
 
 def _contraction_rows(collection: Collection, group: Group) -> list[dict[str, Any]]:
-    """Median and largest contraction constants over the scenario's trials, and how often they promise convergence."""
+    """Computes median and largest contraction constants of a scenario's trials, and how often they are below 1."""
     parts = [collection.load(truth, (), CONTRACTION) for truth in group.truths if truth is not None]
     if not parts or any(name not in part for part in parts for name in CONTRACTION):
         return []
@@ -190,7 +190,7 @@ def _contraction_rows(collection: Collection, group: Group) -> list[dict[str, An
 
 
 def _ending_rows(sample: Sample) -> list[dict[str, Any]]:
-    """How trials ended that did not converge, the commonest ending first; trials without readings are last."""
+    """Counts the endings of trials that did not converge, the commonest first; trials without readings are last."""
     lost, reasons = np.flatnonzero(~sample.converged), {s.label: s.reason for s in Status}
     messages = sample.scalars.get("message", np.full(len(sample), ""))[lost]
     ended = [

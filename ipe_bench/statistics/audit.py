@@ -1,4 +1,4 @@
-"""Whether the covariance that another program reports describes its errors: scale, direction, tails and bias.
+"""Tests whether the covariance that another program reports describes its errors: scale, direction, tails and bias.
 
 Everything is said of the whitened errors w = C^(-1/2) (e / s), with s the reported standard deviations and C the
 reported correlations: w ~ N(0, I) if the report is true, and w'w is the NEES. Scale and tails are separate questions:
@@ -46,7 +46,7 @@ AuditVerdict = Literal["too small", "too large", "right", "undecided"]
 
 @dataclass(frozen=True)
 class Claims:
-    """What a program said of n parameters, and how wrong it was."""
+    """Holds what a program reported of n parameters, and its errors."""
 
     names: tuple[str, ...]
     error: Array
@@ -102,7 +102,7 @@ class Claims:
 
 @dataclass(frozen=True)
 class Factor:
-    """By how much true standard deviations exceed the reported ones, with an interval that needs no normal law."""
+    """Holds the ratio of true to reported standard deviations, with an interval that needs no normal law."""
 
     value: float
     low: float
@@ -110,7 +110,7 @@ class Factor:
 
     @property
     def verdict(self) -> AuditVerdict:
-        """What the covariance is; right where the interval leaves nothing that matters."""
+        """Verdict on the covariance; "right" if the interval excludes every relevant factor."""
         if self.low > 1:
             return "too small"
         if self.high < 1:
@@ -123,7 +123,7 @@ class Factor:
 
     @property
     def words(self) -> str:
-        """How large true errors are beside the reported ones."""
+        """Sentence that compares true errors with reported ones."""
         known = self.high < _LARGEST * self.value
         span = f"{self.low:.2f} to {self.high:.2f}" if known else f"surely more than {self.low:.2g}"
         return f"{self.value:.2f} times as large as reported ({span})"
@@ -131,24 +131,24 @@ class Factor:
 
 @dataclass(frozen=True)
 class Audit:
-    """What was found; `sentences` say it, the strongest first."""
+    """Holds the findings; `sentences` state them, the strongest first."""
 
     claims: Claims
     scale: Factor
-    """Of all parameters, with an interval of 97.5 %: half of the level, the other questions having the rest."""
+    """Factor of all parameters, with an interval of 97.5 %: half of the level, the other questions having the rest."""
     each: tuple[Factor, ...]
-    """Of each parameter, all intervals together at 97.5 %."""
+    """Factor of each parameter, all intervals together at 97.5 %."""
     bias: Array
     """Mean error in reported standard deviations with its interval (n, 3), all together at 95 %."""
     sentences: tuple[str, ...]
 
     @property
     def verdict(self) -> AuditVerdict:
-        """What the covariance is as a whole."""
+        """Verdict on the covariance as a whole."""
         return self.scale.verdict
 
     def table(self) -> pd.DataFrame:
-        """A row per parameter: factor and bias with their intervals."""
+        """Returns a row per parameter: factor and bias with their intervals."""
         import pandas as pd
 
         factors = [(f.value, f.low, f.high, f.verdict) for f in self.each]
@@ -159,7 +159,7 @@ class Audit:
 
 
 def audit(claims: Claims) -> Audit:
-    """Examines what a program said.
+    """Examines the covariance that a program reports.
 
     No covariance allows for an infinite error, so one is enough for "too small"; the rest is of the other runs. A fault
     is said where its question (scale, direction, tails, bias) is refused at 5 % over all of them together (Holm), so an
@@ -207,7 +207,7 @@ def audit(claims: Claims) -> Audit:
 
 
 def _with_infinite_errors(claims: Claims, lost: NDArray[np.bool_]) -> Audit:
-    """What is found where some errors (rows, n) are `lost`, with what is said of the runs that have none."""
+    """Audits errors (rows, n) of which some are `lost`, that is infinite; the other runs are audited alone."""
     kept = ~np.isin(claims.run, claims.run[np.asarray(lost.any(axis=1))])
     correlation, infinite = claims.correlation, np.asarray(lost.any(axis=0))
     others = replace(
@@ -232,7 +232,7 @@ def _with_infinite_errors(claims: Claims, lost: NDArray[np.bool_]) -> Audit:
 
 
 def _of_scale(claims: Claims, scale: Factor, nees: Array) -> str:
-    """What is said of the scale; if it is undecided, with the number of runs in which a standard deviation that is
+    """Words the finding on the scale; if it is undecided, with the number of runs in which a standard deviation that is
     wrong by 10 % is seen in four of five cases."""
     if scale.wrong:
         only = "" if scale.value > 1 else "only "
@@ -249,14 +249,14 @@ def _of_scale(claims: Claims, scale: Factor, nees: Array) -> str:
 
 
 def _factors(claims: Claims, squares: Array, level: float) -> tuple[Factor, ...]:
-    """Roots of the means of squares (rows, k), with bootstrap-t intervals over runs."""
+    """Computes roots of the means of squares (rows, k), with bootstrap-t intervals over runs."""
     mean = claims.per_run(squares)
     low, high = rms_interval(mean, level=level)
     return tuple(map(Factor, np.sqrt(mean.mean(axis=0)).tolist(), low.tolist(), high.tolist()))
 
 
 def _bias(claims: Claims) -> tuple[Array, float]:
-    """The mean errors with their intervals (n, 3), and how often chance does as much to any."""
+    """Computes the mean errors with their intervals (n, 3), and the p that any is due to chance."""
     mean = claims.per_run(claims.z)
     centre, error = mean.mean(axis=0), mean.std(axis=0, ddof=1) / np.sqrt(claims.runs)
     reach = stdtrit(claims.runs - 1, 1 - ALPHA / 2 / claims.n) * error
@@ -266,7 +266,7 @@ def _bias(claims: Claims) -> tuple[Array, float]:
 
 
 def _worst_direction(claims: Claims) -> tuple[float, str]:
-    """How often chance does as much, and in which direction errors are farthest from what is reported.
+    """Computes the p of the least spherical scatter, and the direction in which errors exceed the report most.
 
     Lengths are let go: u = w / |w| is uniform on the sphere under any spherical law, normal or not, so the extreme
     eigenvalues of its scatter have one null distribution (Tyler, Biometrika 74, 1987). Of several rows of a run the
@@ -286,18 +286,18 @@ def _worst_direction(claims: Claims) -> tuple[float, str]:
 
 
 def _scatter(w: Array) -> Array:
-    """n times the mean of u u' over the rows u = w / |w| (n, n)."""
+    """Computes n times the mean of u u' over the rows u = w / |w| (n, n)."""
     u = w / np.maximum(np.linalg.norm(w, axis=1, keepdims=True), 1e-300)
     return w.shape[1] * (u.T @ u) / len(u)
 
 
 def _extremes(w: Array) -> Array:
-    """The least and the largest eigenvalue of the scatter."""
+    """Returns the least and the largest eigenvalue of the scatter."""
     return np.linalg.eigvalsh(_scatter(w))[[0, -1]]
 
 
 def _tails(claims: Claims) -> tuple[float, str]:
-    """How often normal errors of any covariance have as large a fourth moment E[d^2] with d = w' S^-1 w and S the
+    """Computes the p of the fourth moment E[d^2] under normal errors of any covariance, with d = w' S^-1 w and S the
     scatter of w (Mardia, Biometrika 57, 1970, for a known mean); without covariances, any parameter's."""
     parts = claims.parts
     rows, n = parts[0].shape
@@ -318,7 +318,7 @@ def _fourth_moment(w: Array) -> float:
 
 @lru_cache(maxsize=8)
 def _null(statistic: Callable[[Array], Array | float], rows: int, n: int) -> Array:
-    """The statistic of normal errors (draws, ...)."""
+    """Simulates the statistic of normal errors (draws, ...)."""
     rng = np.random.default_rng([rows, n])
     return np.array([statistic(rng.standard_normal((rows, n))) for _ in range(_DRAWS)])
 
@@ -327,7 +327,7 @@ def _null(statistic: Callable[[Array], Array | float], rows: int, n: int) -> Arr
 
 
 def read_claims(table: Path | str | pd.DataFrame) -> Claims:
-    """The claims of a CSV or Parquet file, or of a frame, with a row per run, or per time of a run.
+    """Reads the claims of a CSV or Parquet file, or of a frame, with a row per run, or per time of a run.
 
     wide   NAME_true and NAME, or NAME_error; NAME_std, NAME_var or cov_NAME_NAME; cov_A_B
     long   run, parameter, true and estimate, or error; std or var
@@ -379,7 +379,7 @@ def _read(path: Path) -> pd.DataFrame:
 
 
 def _refuse_twice(frame: pd.DataFrame, name: str) -> None:
-    """Refuses a column that stands there twice; a file's second one has been given the ending .1."""
+    """Refuses a column that appears twice; a file's second one was given the ending .1."""
     columns = list(map(str, frame.columns))
     for i, column in enumerate(columns):
         base = column.removesuffix(".1")
@@ -389,7 +389,7 @@ def _refuse_twice(frame: pd.DataFrame, name: str) -> None:
 
 
 def _numbers(frame: pd.DataFrame, column: str, name: str) -> Array:
-    """The numbers (rows,) of a column; NaN where a cell is empty.
+    """Returns the numbers (rows,) of a column; NaN where a cell is empty.
 
     Raises:
         UserError: a cell says something else.
@@ -404,7 +404,7 @@ def _numbers(frame: pd.DataFrame, column: str, name: str) -> Array:
 
 
 def _widened(frame: pd.DataFrame, name: str) -> pd.DataFrame:
-    """A row per run of a table that has one per run and parameter."""
+    """Converts a table with a row per run and parameter to one with a row per run."""
     values = [c for c in ("true", "estimate", "error", "std", "var") if c in frame]
     index = [c for c in frame.columns if c not in (*values, "parameter")]
     if not index:
@@ -444,7 +444,7 @@ def _error_and_deviation(frame: pd.DataFrame, parameter: str, name: str) -> tupl
 
 
 def _correlation(frame: pd.DataFrame, names: Sequence[str], deviation: Array, name: str) -> Array | None:
-    """(rows, n, n), 0 where a pair has no covariance; None if there is no covariance at all."""
+    """Returns correlations (rows, n, n), 0 where a pair has no covariance; None if there is no covariance at all."""
     found = np.tile(np.eye(len(names)), (len(frame), 1, 1))
     stated = [(i, j) for i, a in enumerate(names) for j, b in enumerate(names) if i != j and f"cov_{a}_{b}" in frame]
     for i, j in stated:

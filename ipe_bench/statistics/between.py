@@ -1,4 +1,4 @@
-"""Is the second better than the first? Two folders of results, or two estimators, trial by trial.
+"""Compares two folders of results, or two estimators, trial by trial.
 
 This module finds the scenarios and trials that belong together; the tests are in `statistics.paired`.
 """
@@ -20,7 +20,7 @@ from ipe_bench.statistics.sample import Sample, samples
 from ipe_bench.trials.thresholds import gate
 
 JUDGED = ("success", "error", "cost")
-"""Those that are tested. Time is not: the trials of a block share theirs evenly, and machines differ."""
+"""Quantities that are tested. Time is not: the trials of a block share theirs evenly, and machines differ."""
 NOT_SETTINGS = (
     *("first", "second", "trials", "matched_by", "quantity", "first_value", "second_value"),
     *("change", "low", "high", "p", "e", "finding", *PLANNED),
@@ -29,7 +29,7 @@ NOT_SETTINGS = (
 
 
 def comparison_title(row: Mapping[str, Any]) -> str:
-    """What a row compares, in a line for people."""
+    """Titles a comparison in one line."""
     named = {k: _plain(v) for k, v in row.items() if k not in NOT_SETTINGS and v is not None and v == v}
     titles = {"measurement": "", "noise": "", "error_scale": "error scale "}
     return ", ".join(titles.get(key, f"{key} ") + value for key, value in named.items())
@@ -48,7 +48,7 @@ def compared(
     anytime: bool = False,
     plan: PowerPlan | None = None,
 ) -> list[dict[str, Any]]:
-    """Rows of every comparison that can be made: one per scenario, pair of estimators and quantity.
+    """Returns rows of every comparison that can be made: one per scenario, pair of estimators and quantity.
 
     Each p is corrected over all of them by Holm; with `anytime`, findings go by e-values, divided by their number. With
     a `plan`, rows on success say how many trials it takes, at the strictest level that Holm asks for.
@@ -70,7 +70,7 @@ def compared(
 
 
 def _rows(a: Sample, b: Sample, alpha: float) -> Iterator[dict[str, Any]]:
-    """A row per quantity of two estimators on one scenario."""
+    """Yields a row per quantity of two estimators on one scenario."""
     if a.n != b.n:
         raise UserError(
             f"{a.group.label}: has {a.n} parameters in the first and {b.n} in the second; compare results on the"
@@ -99,8 +99,7 @@ def _rows(a: Sample, b: Sample, alpha: float) -> Iterator[dict[str, Any]]:
 
 
 def _head(first: Group, second: Group) -> dict[str, Any]:
-    """What tells a comparison from the others: the scenario, and what differs in the options of one label, with both
-    values."""
+    """Returns what identifies a comparison: the scenario, and the differing options of one label, with both values."""
     columns = dict(first.columns)
     if first.label == second.label:
         configs = [{"estimator": group.footer["identity"]["estimator"]} for group in (first, second)]
@@ -117,7 +116,7 @@ def _head(first: Group, second: Group) -> dict[str, Any]:
 def _matches(
     first: Collection, second: Collection, labels: tuple[str | None, str | None]
 ) -> Iterator[tuple[Sample, Sample]]:
-    """The samples that are compared, of the same scenario but for its seed, under the labels or those that both have.
+    """Pairs samples of the same scenario but for its seed, under the labels or those that both have.
 
     Raises:
         UserError: there is none.
@@ -151,7 +150,7 @@ def _matches(
 
 
 def left_out(first: Collection, second: Collection) -> list[str]:
-    """A line where one has scenarios that the other lacks, while both share some."""
+    """Reports scenarios that one side lacks, while both share some."""
     a, b = _by_scenario(first).keys(), _by_scenario(second).keys()
     alone = ((first, len(a - b)), (second, len(b - a))) if a & b else ()
     return [f"{_where(c)}: {count} scenarios that the other lacks are left out" for c, count in alone if count]

@@ -1,4 +1,4 @@
-"""Where the truth falls under the Gaussian that an estimator reports.
+"""Tests the place of the truth under the Gaussian that an estimator reports.
 
 Under the right one the probability integral transform of the truth is uniform; its empirical distribution function less
 the uniform one is held against bands that it leaves anywhere with a stated probability (Säilynoja, Bürkner, Vehtari,
@@ -20,7 +20,7 @@ from ipe_bench.trials.thresholds import FEW, GATE, gate
 
 BAND_LEVEL = 0.95
 POINTS = np.arange(1, 100) / 100
-"""Where the distribution functions are compared."""
+"""Probabilities at which the distribution functions are compared."""
 INSIDE = "inside its bands"
 _RESOLVED = 1e-9
 """Below it, one less a coverage is round-off: then the sum over the points bounds the probability."""
@@ -31,8 +31,8 @@ _LEAST_TAIL = 1e-13
 
 
 def covered(trials: int, tails: Array) -> Array:
-    """The probability (bands,) that the counts of uniform draws below each of `POINTS` all keep both binomial tails
-    above that band's tail (bands,).
+    """Computes the probability (bands,) that the counts of uniform draws below each of `POINTS` all keep both binomial
+    tails above that band's tail (bands,).
 
     Exact: the counts are those of a Poisson process given its total (Moscovich and Nadler, Stat. Probab. Lett. 123,
     2017), whose steps are alike, so that one kernel carries them from each point to the next.
@@ -59,12 +59,12 @@ def _poisson(count: Array, mean: float) -> Array:
 
 
 def _allowed(trials: int, tails: Array) -> tuple[Array, Array]:
-    """The least and the largest count (bands, points) both of whose binomial tails exceed the band's."""
+    """Returns the least and the largest count (bands, points) both of whose binomial tails exceed the band's."""
     return least_count(trials, POINTS, tails[:, None]), trials - least_count(trials, 1 - POINTS, tails[:, None])
 
 
 def least_count(trials: Any, p: Array, tail: Array) -> Array:
-    """The least k with P(binomial <= k) > tail, by bisection: the inverses of libraries are off by one at ties."""
+    """Finds the least k with P(binomial <= k) > tail, by bisection: inverses of libraries are off by one at ties."""
     shape = np.broadcast_shapes(np.shape(trials), p.shape, tail.shape)
     low, high = np.full(shape, -1), np.full(shape, trials)
     while (high - low > 1).any():
@@ -90,11 +90,11 @@ def band(trials: int, level: float = BAND_LEVEL) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class Curve:
-    """An empirical distribution function less the uniform one, at `POINTS`."""
+    """Holds an empirical distribution function less the uniform one, at `POINTS`."""
 
     difference: Array
     p: float
-    """The probability that uniform draws go as far: leave the widest band that this curve does not keep within."""
+    """Probability that uniform draws deviate as far: that they leave the widest band that this curve leaves."""
 
     @property
     def excursion(self) -> float:
@@ -108,7 +108,7 @@ class Curve:
 
 
 def curves(below: Sequence[Array], trials: int) -> list[Curve]:
-    """The curves of which so many of the trials, one or more, lie at each of `POINTS` or below."""
+    """Computes the curves of which so many of the trials, one or more, lie at each of `POINTS` or below."""
     counts = np.array(below)
     reached = np.where(counts > 0, bdtrc(np.maximum(counts - 1, 0), trials, POINTS), 1.0)
     tails = np.minimum(bdtr(counts, trials, POINTS), reached).min(axis=1)
@@ -122,19 +122,19 @@ def curves(below: Sequence[Array], trials: int) -> list[Curve]:
 
 @dataclass(frozen=True)
 class Calibration:
-    """The normalised errors of one parameter, or NEES of all together, as distribution functions with a verdict."""
+    """Holds the normalised errors of one parameter, or NEES of all, as distribution functions with a verdict."""
 
     z: Array
     """(claims,), ascending: error over reported deviation, or the square root of NEES; infinite where the claim is
     void."""
     degrees: int
-    """Of the chi-square law that z² has if the claims are true."""
+    """Degrees of the chi-square law that z² has if the claims are true."""
     level: float
-    """With which the curves keep within their bands if they are, for all those of the estimator in 95 % of cases."""
+    """Probability that true claims keep within these bands; over all bands of the estimator it is 95 %."""
     size: Curve
-    """Of z² under that law."""
+    """Distribution of z² under that law."""
     place: Curve | None = None
-    """Of the truth under the reported Gaussian of one parameter, whose errors have a sign."""
+    """Distribution of the truth under the reported Gaussian of one parameter, whose errors have a sign."""
 
     @property
     def p(self) -> float:
@@ -143,13 +143,13 @@ class Calibration:
 
     @property
     def excursion(self) -> float:
-        """How far off the farther curve is anywhere."""
+        """Largest deviation of the farther curve."""
         return max(curve.excursion for curve in (self.place, self.size) if curve is not None)
 
     @cached_property
     def words(self) -> str:
-        """What is surely wrong: shift, scale and tails, each by order statistics, which no outlier moves. An estimate
-        that is shifted by +1 deviations lies above the truth."""
+        """Proven faults: shift, scale and tails, each by order statistics, which no outlier moves. An estimate that is
+        shifted by +1 deviations lies above the truth."""
         if self.p >= 1 - self.level:
             return INSIDE
         z, faults, middle = self.z, [], float(np.median(self.z))
@@ -177,8 +177,8 @@ class Calibration:
 
 
 def calibrations(error: Array, deviation: Array, nees: Array, claimed: Array) -> list[Calibration]:
-    """Of each parameter, and of all together last, over the trials that claim to know their covariance; empty where
-    none does.
+    """Computes the calibration of each parameter, and of all together last, over the trials that claim to know their
+    covariance; empty if none does.
 
     error and deviation (trials, n), nees (trials,) and claimed (trials,) boolean. A deviation that is none, or 0, puts
     its truth infinitely far out; a trial whose NEES is not a number reports no covariance and claims nothing.
@@ -202,7 +202,7 @@ def calibrations(error: Array, deviation: Array, nees: Array, claimed: Array) ->
 
 
 def overall_words(parts: Sequence[Calibration], names: Sequence[str]) -> str:
-    """The verdict on an estimator: what is wrong with NEES, and with the parameter that is farthest off."""
+    """Words the verdict on an estimator: what is wrong with NEES, and with the parameter that is farthest off."""
     if not parts:
         return "-"
     *said, together = [part.words for part in parts]
@@ -219,7 +219,7 @@ def _holds(interval: tuple[float, float], value: float) -> bool:
 
 
 def median_limits(values: Array, level: float = BAND_LEVEL) -> tuple[float, float]:
-    """Interval of the median by order statistics, whatever the distribution; without ends below `FEW` values."""
+    """Computes the interval of the median by order statistics, for any law; without ends below `FEW` values."""
     count = len(values)
     k = int(least_count(count, np.array([0.5]), np.array([(1 - level) / 2]))[0]) if count >= FEW else 0
     if k == 0:
@@ -229,7 +229,7 @@ def median_limits(values: Array, level: float = BAND_LEVEL) -> tuple[float, floa
 
 
 def _scaled(scale: float) -> str:
-    """Errors whose median is `scale` times what is reported: two figures, three just above 1; of very many times the
+    """Words that the median error is `scale` times what is reported: two figures, three just above 1; of large ones the
     order. Where tails are heavy most are smaller though the variance is right."""
     if scale == 0:
         return "errors of 0"

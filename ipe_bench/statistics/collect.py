@@ -25,14 +25,14 @@ _LONGEST = 34
 
 @dataclass(frozen=True)
 class Group:
-    """The cells of one scenario and one estimator that differ in nothing but the seed."""
+    """Holds the cells of one scenario and one estimator that differ only in the seed."""
 
     columns: Mapping[str, Any]
-    """What tells this group from the others: measurement, noise, every config leaf that differs, error_scale."""
+    """Identifying columns of the group: measurement, noise, every config leaf that differs, error_scale."""
     estimator: str
     """The estimator's label, with the options that differ where one label stands for several configs."""
     options: Mapping[str, Any]
-    """Those options, as columns."""
+    """Differing options of the estimator, as columns."""
     cells: tuple[StoredCell, ...]
     """Each seed's estimates."""
     truths: tuple[StoredCell | None, ...]
@@ -49,7 +49,7 @@ class Group:
 
 @dataclass
 class Collection(Results):
-    """Everything usable under some directories, grouped; a line in `problems` or `stale` for everything that is not."""
+    """Holds everything usable under some directories, grouped; `problems` and `stale` name the rest."""
 
     groups: tuple[Group, ...] = ()
 
@@ -63,7 +63,7 @@ class Collection(Results):
 
 
 def collect(directories: Sequence[Path | str], keys: Keys[str] | None = None) -> Collection:
-    """Finds what is stored under the directories, or of the cells with these keys alone.
+    """Finds what is stored under the directories, or the cells with these keys alone.
 
     Raises:
         UserError: a directory does not exist.
@@ -74,7 +74,7 @@ def collect(directories: Sequence[Path | str], keys: Keys[str] | None = None) ->
 
 
 def trials_frame(collection: Collection) -> pd.DataFrame:
-    """Every usable trial: what it belongs to, what it came to, and the truth; see `ipe_bench.load`."""
+    """Returns every usable trial: its scenario, its result, and the truth; see `ipe_bench.load`."""
     import pandas as pd
 
     parts = []
@@ -96,8 +96,8 @@ def trials_frame(collection: Collection) -> pd.DataFrame:
 
 
 def config_leaves(description: Any, prefix: str = "") -> dict[str, tuple[str, Any]]:
-    """Dotted keys with (class that holds the leaf, plain value); a component's own class stands under its own key, that
-    of the whole under `TARGET`."""
+    """Returns dotted keys with (class that holds the leaf, plain value); a component's own class stands under its own
+    key, that of the whole under `TARGET`."""
     if isinstance(description, list) and any(isinstance(v, Mapping) for v in description):
         description = {str(i): v for i, v in enumerate(description)}
     if not isinstance(description, Mapping):
@@ -113,7 +113,7 @@ def config_leaves(description: Any, prefix: str = "") -> dict[str, tuple[str, An
 
 
 def differing(descriptions: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The leaves that differ between descriptions, in the order of the config.
+    """Finds the leaves that differ between descriptions, in the order of the config.
 
     Options of different classes are not compared: there the class differs, and is the leaf to show.
     """
@@ -125,7 +125,7 @@ def differing(descriptions: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _groups(cells: Sequence[StoredCell], runs: Sequence[Mapping[str, Any]]) -> tuple[Group, ...]:
-    """One group per scenario and estimator: what was constructed decides which those are, and names only show it."""
+    """Forms one group per scenario and estimator: identical constructions are one, and names only show it."""
     truths = {cell.scenario_id: cell for cell in cells if cell.label == TRUTH}
     found: dict[tuple[str, str, str], list[StoredCell]] = {}
     configs: dict[str, dict[str, Any]] = {}
@@ -159,18 +159,18 @@ def _groups(cells: Sequence[StoredCell], runs: Sequence[Mapping[str, Any]]) -> t
 
 
 def scenario_of(cell: StoredCell) -> dict[str, Any]:
-    """What a scenario was constructed from, but for its seed: only seeds are pooled."""
+    """Returns the construction of a scenario without its seed: only seeds are pooled."""
     return {key: value for key, value in cell.footer["identity"]["scenario"].items() if key != "seed"}
 
 
 def _shown(description: Any, keys: Iterable[str]) -> dict[str, Any]:
-    """Some leaves of a description as they stand in a table; None for those that it lacks."""
+    """Formats some leaves of a description for a table; None for missing ones."""
     leaves = config_leaves(description)
     return {k: shown_leaf(leaves[k][1]) if k in leaves else None for k in keys}
 
 
 def _stands_in_a_name(key: str, cells: Sequence[StoredCell]) -> bool:
-    """Whether the name of the component says already what this leaf says."""
+    """Returns whether the name of the component implies this leaf."""
     component = key.split(".")[0]
     if component not in ("measurement", "noise"):
         return False
@@ -180,7 +180,7 @@ def _stands_in_a_name(key: str, cells: Sequence[StoredCell]) -> bool:
 
 
 def shown_leaf(value: Any) -> Any:
-    """A leaf as it stands in a table: a class of ours by its own name, a long text by its beginning and a digest."""
+    """Formats a leaf for a table: a class of ours by its own name, a long text by its beginning and a digest."""
     if isinstance(value, str) and value.startswith("ipe_bench."):
         return value.rpartition(".")[2]
     if isinstance(value, str) and len(value) > _LONGEST:

@@ -23,7 +23,7 @@ ALPHA = 0.05
 
 @dataclass(frozen=True)
 class Outcomes:
-    """What comparisons need of an estimator on one scenario, in the trials that every estimator has."""
+    """Holds what comparisons need of an estimator on one scenario, in the trials that every estimator has."""
 
     distance: Array
     """(trials,) Mahalanobis errors, infinite where the estimate is not finite."""
@@ -32,7 +32,7 @@ class Outcomes:
 
 
 def compare_pairs(outcomes: Mapping[str, Outcomes]) -> list[dict[str, Any]]:
-    """A row for every pair of estimators of one scenario; see `corrected`.
+    """Returns a row for every pair of estimators of one scenario; see `corrected`.
 
     A win is an error of the first smaller by more than `TIE`; `median_difference` is the median of first's error less
     second's, `p_error` Wilcoxon's signed-rank test of the differences that are not ties, `favours` the one on whose
@@ -57,8 +57,8 @@ def compare_pairs(outcomes: Mapping[str, Outcomes]) -> list[dict[str, Any]]:
 
 
 def corrected(pairs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """The rows with each kind of p Holm-corrected over all of them, and `closer`: the estimator that is significantly
-    closer to the truth, or empty."""
+    """Corrects each kind of p by Holm over all rows, and adds `closer`: the estimator that is significantly closer to
+    the truth, or empty."""
     p_error, p_success = (holm([pair[name] for pair in pairs]).tolist() for name in ("p_error", "p_success"))
     return [
         {**pair, "p_error": error, "p_success": success, "closer": pair["favours"] if error < ALPHA else ""}
@@ -67,7 +67,7 @@ def corrected(pairs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def differences(first: Array, second: Array) -> Array:
-    """First less second, ties exactly zero; two infinite errors are a tie."""
+    """Subtracts second from first, ties exactly zero; two infinite errors are a tie."""
     with np.errstate(invalid="ignore"):
         d = first - second
     d[~np.isfinite(first) & ~np.isfinite(second)] = 0.0
@@ -76,12 +76,12 @@ def differences(first: Array, second: Array) -> Array:
 
 
 def mcnemar(only_first: int, only_second: int) -> float:
-    """Two-sided p of McNemar's exact test (Psychometrika 12, 1947): discordant trials are fair coin tosses."""
+    """Computes the two-sided p of McNemar's exact test (Psychometrika 12, 1947), by tosses of a fair coin."""
     return min(1.0, 2 * float(bdtr(min(only_first, only_second), only_first + only_second, 0.5)))
 
 
 def holm(p: Sequence[float], weights: Sequence[float] | None = None) -> Array:
-    """P-values corrected so that any error among them has the stated probability, which is shared by the weights, or
+    """Corrects p-values so that any error among them has the stated probability, which is shared by the weights, or
     evenly (Holm, Scand. J. Statist. 6, 1979, section 4)."""
     shares = np.ones(len(p)) if weights is None else np.asarray(weights, dtype=float)
     values = np.asarray(p, dtype=float) / shares
@@ -93,7 +93,7 @@ def holm(p: Sequence[float], weights: Sequence[float] | None = None) -> Array:
 
 
 def may_be_best(success: Array, level: float = ALPHA) -> Array:
-    """Which of k estimators no rival surely succeeds more often than, by their success (trials, k) in the same trials.
+    """Returns which of k estimators no rival surely beats in success (trials, k) in the same trials.
 
     McNemar's exact one-sided test against every rival at `level` / (k - 1): an estimator that is truly a best one is
     left out with a probability of at most `level` (multiple comparisons with the best: Hsu, Ann. Statist. 9, 1981).

@@ -31,14 +31,14 @@ T = TypeVar("T")
 Ends = tuple[Any, ...]
 """Both ends of an interval."""
 CAP = 5.0
-"""What a trial's error over the bound counts as at most in `efficiency_capped`: an efficient estimate lies beyond it in
-fewer than one trial in a million."""
+"""Upper limit of a trial's error over the bound in `efficiency_capped`: an efficient estimate lies beyond it in fewer
+than one trial in a million."""
 NORMAL_95 = float(-ndtri(0.025))
-"""What 95 % of the values of the normal law do not exceed in size."""
+"""Absolute value that 95 % of normal deviates do not exceed."""
 
 
 def once(formula: Callable[[Sample], T]) -> Callable[[Sample], T]:
-    """The same formula, computed once for each sample."""
+    """Caches a formula for each sample."""
 
     @wraps(formula)
     def kept(s: Sample) -> T:
@@ -51,13 +51,13 @@ def once(formula: Callable[[Sample], T]) -> Callable[[Sample], T]:
 
 
 def mean(values: Array, used: Array | None = None) -> Array:
-    """The mean (k,) of columns (trials, k) over the trials used; NaN where there is none."""
+    """Computes the mean (k,) of columns (trials, k) over the trials used; NaN if there is none."""
     chosen = _chosen(values.T, used)
     return chosen.sum(axis=1) / chosen.shape[1] if chosen.shape[1] else np.full(len(chosen), np.nan)
 
 
 def _chosen(rows: Array, used: Array | None) -> Array:
-    """Rows (k, trials) of the trials used."""
+    """Selects rows (k, trials) of the trials used."""
     return rows if used is None or used.all() else rows[:, used]
 
 
@@ -66,7 +66,7 @@ def share(mask: Array) -> float:
 
 
 def ratio(a: Any, b: Any) -> Array:
-    """a / b; NaN where b is not above 0."""
+    """Computes a / b; NaN where b is not above 0."""
     a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
     return np.where(b > 0, a / b, np.nan)
 
@@ -79,17 +79,17 @@ def rms(values: Array) -> float:
 
 
 def rms_columns(values: Array, used: Array | None = None) -> Array:
-    """The root mean squares (n,) of columns (trials, n) over the trials used."""
+    """Computes the root mean squares (n,) of columns (trials, n) over the trials used."""
     return np.sqrt(mean(values**2, used))
 
 
 def in_units(values: Array, s: Sample) -> Array:
-    """Values (n,) in the parameters' own units, and behind them their root mean square over the linear bound."""
+    """Converts values (n,) to the parameters' own units, followed by their root mean square over the linear bound."""
     return np.append(values * s.sizes, rms(values / s.linear_bound))
 
 
 def of_each(values: Callable[[Sample], Array]) -> Callable[[Sample], Array]:
-    """The formula of values (n,) that gives what is shown of them (n + 1,); see `in_units`."""
+    """Turns a formula of values (n,) into one of the shown values (n + 1,); see `in_units`."""
     return lambda s: in_units(values(s), s)
 
 
@@ -108,8 +108,8 @@ def rmse_all(s: Sample) -> Array:
 
 @once
 def products(s: Sample) -> Array:
-    """Sums (n, n) over solved trials of products of the deviations of errors from their mean, in multiples of the
-    linear bound: parameters may differ by many orders of magnitude."""
+    """Computes sums (n, n) over solved trials of products of centred errors, in multiples of the linear bound:
+    parameters may differ by many orders of magnitude."""
     chosen = _chosen((s.error / _unit(s)).T, s.solved)
     centred = chosen - mean(chosen.T)[:, None]
     return centred @ centred.T
@@ -121,32 +121,32 @@ def _unit(s: Sample) -> Array:
 
 @once
 def std(s: Sample) -> Array:
-    """Standard deviation (n - 1)."""
+    """Computes the standard deviation (n - 1)."""
     count = int(s.solved.sum())
     return _unit(s) * np.sqrt(np.diag(products(s)) / (count - 1)) if count > 1 else np.full(s.n, np.nan)
 
 
 @once
 def together(s: Sample) -> Array:
-    """Root mean square over parameters of error over linear bound (trials,)."""
+    """Computes the root mean square over parameters of error over linear bound (trials,)."""
     return np.sqrt((s.normalised**2).T.mean(axis=0))
 
 
 def _all_squares(s: Sample) -> Array:
-    """Squared errors (n + 1, trials) of each parameter, and of all together over the linear bound."""
+    """Computes squared errors (n + 1, trials) of each parameter, and of all together over the linear bound."""
     return np.vstack([(s.error**2).T, (s.normalised**2).T.mean(axis=0)])
 
 
 @once
 def squares(s: Sample) -> Squares:
-    """Of the errors of solved trials, of each parameter, and of all together over the linear bound."""
+    """Computes squared errors of solved trials, of each parameter, and of all together over the linear bound."""
     return Squares.of(_chosen(_all_squares(s), s.solved))
 
 
 @once
 def degrees(s: Sample) -> Array:
-    """Degrees of freedom (n + 1,) of these squares if errors are normal: 1 of each parameter; of all parameters what
-    matches the variance (Satterthwaite, Biometrics 2, 1946)."""
+    """Computes the degrees of freedom (n + 1,) of these squares if errors are normal: 1 of each parameter; of all
+    parameters what matches the variance (Satterthwaite, Biometrics 2, 1946)."""
     factors = _unit(s) / s.linear_bound
     scaled = products(s) * np.outer(factors, factors)
     matching = np.trace(scaled) ** 2 / np.sum(scaled**2)
@@ -156,14 +156,14 @@ def degrees(s: Sample) -> Array:
 
 @once
 def rmse_unseen(s: Sample) -> Array:
-    """Shares (n + 1,) of trials that may have larger errors than those seen; see `intervals.unseen`."""
+    """Computes shares (n + 1,) of trials that may have larger errors than those seen; see `intervals.unseen`."""
     return unseen(_chosen(_all_squares(s), s.solved), degrees(s))
 
 
 @once
 def rmse_ends(s: Sample) -> tuple[Array, Array]:
-    """Ends (n + 1,) of the intervals of rmse: per parameter, and of all over the linear bound; the upper one is NaN
-    where larger errors may be unseen, and where few trials carry the sum, see `intervals.few_carry`."""
+    """Computes ends (n + 1,) of the intervals of rmse: per parameter, and of all over the linear bound; the upper one
+    is NaN where larger errors may be unseen, and where few trials carry the sum, see `intervals.few_carry`."""
     low, high = rms_interval(_all_squares(s).T, s.solved)
     return low, np.where(few_carry(squares(s), degrees(s)), np.nan, _unless_unseen(s, high))
 
@@ -174,12 +174,12 @@ def _unless_unseen(s: Sample, high: Array) -> Array:
 
 @once
 def rmse_sequence(s: Sample) -> tuple[Array, Array]:
-    """Ends (n + 1,) of such intervals at all numbers of trials at once, as far as the errors that were seen tell."""
+    """Computes ends (n + 1,) of such intervals at all numbers of trials at once, from the errors that were seen."""
     return rms_sequence(squares(s), degrees(s))
 
 
 def rmse_ends_anytime(s: Sample) -> tuple[Array, Array]:
-    """The same, without the upper end where larger errors may be unseen."""
+    """Computes the same ends, without the upper one where larger errors may be unseen."""
     low, high = rmse_sequence(s)
     return low, _unless_unseen(s, high)
 
@@ -189,12 +189,12 @@ def ends_in_units(ends: Callable[[Sample], tuple[Array, Array]]) -> Callable[[Sa
 
 
 def error_quantile(s: Sample, q: float) -> Array:
-    """Of each parameter's absolute error, and of `together` (n + 1,)."""
+    """Computes a quantile of each parameter's absolute error, and of `together` (n + 1,)."""
     return np.append(np.array([quantile(np.abs(e), q) for e in s.error.T]) * s.sizes, quantile(together(s), q))
 
 
 def over_bound(s: Sample) -> Array:
-    """Mahalanobis errors (trials,) over √n: about 1 where the estimate is efficient."""
+    """Computes Mahalanobis errors (trials,) over √n: about 1 where the estimate is efficient."""
     return s.distance / np.sqrt(s.n)
 
 
@@ -212,13 +212,13 @@ def efficiency_capped_limits(s: Sample) -> Ends:
 
 
 def capped_error(s: Sample) -> float:
-    """Mean Mahalanobis error of the trials that all estimators have, each at most the gate's radius."""
+    """Computes the mean Mahalanobis error of the trials that all estimators have, each at most the gate's radius."""
     error = np.minimum(s.distance[s.present], np.sqrt(gate(s.n)))
     return float(error.mean()) if len(error) else np.nan
 
 
 def failed(s: Sample, *, known: bool, among: Array | slice = slice(None)) -> float:
-    """Share that fails, by whether the estimator itself gives notice of it."""
+    """Computes the share that fails, by whether the estimator itself gives notice of it."""
     noticed = ~s.converged
     if FIT in s.scalars and np.isfinite(s.scalars[FIT]).any():
         noticed = noticed | ~(s.scalars[FIT] >= FIT_LEVEL)
@@ -234,7 +234,7 @@ def misfit(s: Sample) -> float:
 
 
 def ambiguous(s: Sample) -> float:
-    """Share among the trials in which the estimator has looked for several minima."""
+    """Computes the share of ambiguous trials among those in which the estimator has looked for several minima."""
     flags = s.scalars.get(AMBIGUOUS, np.empty(0))
     flags = flags[np.isfinite(flags)]
     return share(flags > 0) if len(flags) else np.nan
@@ -265,7 +265,7 @@ def bayes(s: Sample) -> Array:
 
 
 def applying_bound(s: Sample) -> Array:
-    """The bound that the estimator is held against: the Bayesian one if it uses a prior."""
+    """Returns the bound that the estimator is held against: the Bayesian one if it uses a prior."""
     return bayes(s) if s.group.footer["bound"] == "bayes" else crlb(s)
 
 
@@ -285,8 +285,8 @@ def efficiency_all(s: Sample) -> Array:
 
 @once
 def van_trees(s: Sample) -> tuple[Array, Array]:
-    """The bound (n,) over the first trials of the seeds, and its standard error: of the mean of squared bounds, whose
-    errors are twice the bound times its own."""
+    """Computes the bound (n,) over the first trials of the seeds, and its standard error: of the mean of squared
+    bounds, whose errors are twice the bound times its own."""
     bound, error = s.of_truth("van_trees"), s.of_truth("van_trees_error")
     drawn: Array = np.asarray(~np.isnan(bound[:, 0]))
     middle = np.sqrt(mean(bound**2, drawn))
@@ -294,14 +294,14 @@ def van_trees(s: Sample) -> tuple[Array, Array]:
 
 
 def van_trees_limits(s: Sample) -> Ends:
-    """Where the bound lies for truths without end, by the scatter of the information among those it is from."""
+    """Computes limits of the bound for infinitely many truths, by the scatter of the information among those used."""
     bound, error = van_trees(s)
     return in_units(np.maximum(bound - NORMAL_95 * error, 0.0), s), in_units(bound + NORMAL_95 * error, s)
 
 
 def eq_14(s: Sample) -> Array:
-    r"""Standard deviations (n,) by eq. (14), with dN = N(x) - N(x^): at a root of eq. (11), H+ dN is the error less
-    H+ v.
+    r"""Computes standard deviations (n,) by eq. (14), with dN = N(x) - N(x^): at a root of eq. (11), H+ dN is the error
+    less H+ v.
 
     .. math:: P = H^+ R H^{+T} + H^+ \, \mathrm{E}(\delta N \, \delta N^T) \, H^{+T}
     """
@@ -312,7 +312,7 @@ def eq_14(s: Sample) -> Array:
 
 @once
 def predicted(s: Sample) -> tuple[Array, Array]:
-    """Bias (n,) and root mean square error (n,) that theory expects of least squares; NaN of other estimators.
+    """Computes the bias (n,) and root mean square error (n,) expected of least squares; NaN for other estimators.
 
     Where readings come from another model, from each trial's pseudo-true parameters and the scatter about them; where
     they do not, from the Cramér-Rao bound and Box's bias.
@@ -362,7 +362,7 @@ def nees_median(s: Sample) -> float:
 
 
 def nees_median_limits(s: Sample) -> Ends:
-    """The median of N independent values lies at a beta-distributed probability of their law."""
+    """Computes limits of the median of N independent values, whose probability is beta-distributed."""
     if not reports_covariance(s):
         return np.nan, np.nan
     middle = (len(s) + 1) / 2
@@ -379,7 +379,7 @@ def coverage(s: Sample) -> Any:
 
 
 def calibration_p(s: Sample) -> Any:
-    """Of each parameter, and of all by Bonferroni's correction, which needs no independence."""
+    """Computes the p of each parameter, and of all by Bonferroni's correction, which needs no independence."""
     p = [part.p for part in s.calibrations]
     return [*p[:-1], min(1.0, len(p) * min(p))] if p else np.nan
 
@@ -398,14 +398,14 @@ def mean_nis(s: Sample) -> float:
 
 
 def _uses(s: Sample, method: str) -> bool:
-    """Whether the estimator iterates by that method on the frozen equation."""
+    """Returns whether the estimator iterates by that method on the frozen equation."""
     target = str((s.group.footer["identity"]["estimator"] or {}).get("_target_", ""))
     return s.group.footer.get("equation") == "frozen" and target.rpartition(".")[2] == method
 
 
 def fixed_point_bound(iterates: Array, K: float) -> tuple[bool, float]:
-    """Whether the largest error |x_k - x| of each iterate (iterates, n) is at most K^k / (1 - K) |x_1 - x_0|, eq. (18)
-    with the k that the print lost, for K below 1, and the largest such ratio of the iterates between the ends.
+    """Computes whether the largest error |x_k - x| of each iterate (iterates, n) is at most K^k / (1 - K) |x_1 - x_0|,
+    eq. (18) with the k that the print lost, for K below 1, and the largest such ratio of the iterates between the ends.
 
     The last iterate is taken for x (Burden and Faires, Numerical Analysis). The bound is proven for a K that holds all
     along the iterates.
@@ -417,8 +417,8 @@ def fixed_point_bound(iterates: Array, K: float) -> tuple[bool, float]:
 
 
 def observed_constant(iterates: Array) -> float:
-    """The least M with which eq. (23), e_(k+1) <= n^2 M / 2 e_k^2, explains the errors of iterates (iterates, n) that
-    exceed round-off, with the last iterate for the root; NaN where they are over too soon."""
+    """Computes the least M with which eq. (23), e_(k+1) <= n^2 M / 2 e_k^2, explains the errors of iterates (iterates,
+    n) that exceed round-off, with the last iterate for the root; NaN where they are over too soon."""
     e = np.abs(iterates - iterates[-1]).max(axis=1)
     usable = (e[:-1] > FLOOR) & (e[1:] > FLOOR)
     ratios = 2 * e[1:][usable] / (iterates.shape[1] ** 2 * e[:-1][usable] ** 2)
@@ -427,14 +427,14 @@ def observed_constant(iterates: Array) -> float:
 
 @once
 def fixed_point_bounds(s: Sample) -> Array:
-    """(histories, 2): what `fixed_point_bound` says of each history of fixed-point iteration whose K is below 1."""
+    """Computes `fixed_point_bound` (histories, 2) of each history of fixed-point iteration whose K is below 1."""
     histories = s.histories if _uses(s, "FixedPoint") else ()
     return np.array([fixed_point_bound(h.iterates, h.K) for h in histories if h.K < 1]).reshape(-1, 2)
 
 
 @once
 def constants(s: Sample) -> Array:
-    """(histories, 2): M as observed and at the truth, of each history of Newton's method that has both."""
+    """Computes M as observed and at the truth (histories, 2), of each history of Newton's method that has both."""
     histories = s.histories if _uses(s, "Newton") else ()
     pairs = np.array([(observed_constant(h.iterates), h.M) for h in histories]).reshape(-1, 2)
     return pairs[np.isfinite(pairs).all(axis=1)]

@@ -1,4 +1,4 @@
-"""How far a share, a root mean square error or a mean NEES may lie from its true value by chance.
+"""Bounds the distance of a share, a root mean square error or a mean NEES from its true value.
 
 Intervals are of a fixed number of trials; confidence sequences hold the true value at all numbers of trials at once
 with the stated probability, so that one may look as often as one likes.
@@ -30,7 +30,7 @@ _ONE_TRIAL = 0.05
 TIGHTEST = 1000
 """The number of trials at which sequences are about as narrow as they can be; at others they are valid as well."""
 _WEIGHT = TIGHTEST / (2 * math.log(20) + math.log(2 * math.log(20)) + 1)
-"""Of the mixtures, in trials: what makes those of 95 % tightest there (Waudby-Smith et al., 2024, appendix)."""
+"""Weight of the mixtures, in trials: it makes those of 95 % tightest there (Waudby-Smith et al., 2024, appendix)."""
 _HALVINGS = 50
 FIRST = 100
 """Trials from which an asymptotic sequence begins; one that begins earlier misses errors with rare large ones."""
@@ -41,8 +41,8 @@ UNUSUAL = 1e-3
 RARE = 10
 """Number of unusual trials from which a sample shows well enough what they are like."""
 UNSEEN_NEES = 50.0
-"""What NEES over its degrees may be in unseen trials, as errors ten times larger in one trial of a hundred make it, and
-errors of any size in one of fifty, where the covariance is right."""
+"""NEES over its degrees assumed in unseen trials: that of errors ten times larger in one trial of a hundred, or of any
+size in one of fifty, where the covariance is right."""
 _BETS = 0.99 * 2.0 ** -np.arange(9)
 """Shares of the stake."""
 
@@ -53,8 +53,8 @@ Verdict = Literal["consistent", "pessimistic", "optimistic", "undecided", "diver
 
 
 def clopper_pearson(count: int, trials: int, level: float = LEVEL) -> tuple[float, float]:
-    """The exact confidence interval of a share of which `count` in `trials` was seen (Clopper and Pearson, Biometrika
-    26, 1934)."""
+    """Computes the exact confidence interval of a share of which `count` in `trials` was seen (Clopper and Pearson,
+    Biometrika 26, 1934)."""
     if trials < 1:
         return np.nan, np.nan
     tail = (1 - level) / 2
@@ -66,7 +66,7 @@ def clopper_pearson(count: int, trials: int, level: float = LEVEL) -> tuple[floa
 
 
 def rms_interval(squares: Array, used: Array | None = None, level: float = LEVEL) -> tuple[Array, Array]:
-    """Bootstrap-t interval of the root mean square over the trials used, per column; NaN for fewer than `FEW` of them.
+    """Computes the bootstrap-t interval of the root mean square over the trials used, per column; NaN below `FEW`.
 
     squares is (trials, k), used (trials,) boolean, all where it is not given. The logarithm of the mean square is
     studentised (Efron and Tibshirani, An Introduction to the Bootstrap, 1993, ch. 12), which makes its variance nearly
@@ -103,7 +103,7 @@ def grouped(values: Array, groups: int = LARGEST_SAMPLE) -> Array:
 
 
 def _log_ratio(draws: Array, sums: Array, counts: Array) -> tuple[Array, Array]:
-    """Logarithm of sums over counts in each resample (resamples, k), and its standard error."""
+    """Computes the logarithm of sums over counts in each resample (resamples, k), and its standard error."""
     number, k = len(counts), sums.shape[1]
     # One product: a hundred columns take little longer than the way of the draws through memory.
     drawn = draws @ np.hstack([sums, sums**2, sums * counts, counts, counts**2])
@@ -116,7 +116,7 @@ def _log_ratio(draws: Array, sums: Array, counts: Array) -> tuple[Array, Array]:
 
 @lru_cache(maxsize=4)
 def _draws(size: int) -> Array:
-    """How often each of `size` things is drawn in each resample: (RESAMPLES, size)."""
+    """Draws how often each of `size` items occurs in each resample: (RESAMPLES, size)."""
     rng = np.random.Generator(np.random.Philox(size))
     return rng.multinomial(size, np.full(size, 1 / size), size=RESAMPLES).astype(float)
 
@@ -126,7 +126,7 @@ def _draws(size: int) -> Array:
 
 @dataclass(frozen=True)
 class Squares:
-    """Squares beside their own size: they may be anything from 1e-200 to 1e200, whose squares are no numbers."""
+    """Holds squares relative to their largest: they may be anything from 1e-200 to 1e200, whose squares overflow."""
 
     count: int
     size: Array
@@ -138,7 +138,7 @@ class Squares:
 
     @classmethod
     def of(cls, squares: Array) -> Squares:
-        """Of squares (k, trials)."""
+        """Summarises squares (k, trials)."""
         size, count = squares.max(axis=1, initial=0.0), squares.shape[1]
         if not count:
             return cls(0, size, 0 * size, 0 * size)
@@ -155,7 +155,7 @@ class Squares:
 
 
 def few_carry(squares: Squares, degrees: Array) -> Array:
-    """Whether few trials carry the sum of squares (k,), so that no interval made of the trials can be relied on.
+    """Returns whether few trials carry the sum of squares (k,), so that no interval made of them can be relied on.
 
     `degrees` (k,) are those of the chi-square law that a square has for normal errors. The sum of squared shares of
     the trials is beyond what such errors exceed in a share `HEAVY` of cases, and one trial makes up a twentieth of it.
@@ -170,8 +170,8 @@ def few_carry(squares: Squares, degrees: Array) -> Array:
 
 @lru_cache(maxsize=1024)
 def _heaviest(trials: int, degrees: int) -> float:
-    """What the sum of squared shares of so many independent chi-square numbers in their sum exceeds in a share `HEAVY`
-    of cases: that of the shifted lognormal law with its mean, variance and skewness, which are those of Dirichlet's."""
+    """Computes the quantile 1 - `HEAVY` of the sum of squared shares of so many independent chi-square numbers in their
+    sum: that of the shifted lognormal law with its mean, variance and skewness, which are those of Dirichlet's."""
     if trials < 3:
         return np.inf
     a = Fraction(degrees, 2)
@@ -198,8 +198,8 @@ def _heaviest(trials: int, degrees: int) -> float:
 
 
 def unseen(squares: Array, degrees: Array, least: float | Array = 0.0, level: float = LEVEL) -> Array:
-    """The share (k,) of trials that may be unusual beyond those that are: the upper limit of Clopper and Pearson less
-    the share seen, 0 from `RARE` unusual trials on; about 3 / N where N trials show none.
+    """Computes the share (k,) of trials that may be unusual beyond those that are: the upper limit of Clopper and
+    Pearson less the share seen, 0 from `RARE` unusual trials on; about 3 / N where N trials show none.
 
     A square, of squares (k, trials), is unusual beyond the quantile `UNUSUAL` of a chi-square law with `degrees` (k,),
     in a unit that gives the law the median of the squares and is no smaller than `least`. No resampling of trials knows
@@ -216,7 +216,7 @@ def unseen(squares: Array, degrees: Array, least: float | Array = 0.0, level: fl
 
 
 def capped_interval(squares: Array, degrees: Array, cap: float) -> tuple[Array, Array]:
-    """Ends (k,) of the interval of the root mean square of errors that count at most `cap`, from their squares
+    """Computes ends (k,) of the interval of the root mean square of errors that count at most `cap`, from their squares
     (k, trials) over `degrees` (k,), the bound being 1: as `rms_interval`, but the trials that may be `unseen` count
     `cap` at the upper end, in the place of efficient ones."""
     low, high = rms_interval(np.minimum(squares, cap**2).T)
@@ -229,7 +229,7 @@ def capped_interval(squares: Array, degrees: Array, cap: float) -> tuple[Array, 
 
 
 def mean_limits(degrees: float, trials: int, level: float = LEVEL) -> tuple[float, float]:
-    """Where the mean over `trials` of chi-square / degrees lies with probability `level`, if all is consistent.
+    """Computes limits of the mean over `trials` of chi-square / degrees with probability `level`, if all is consistent.
 
     NEES has n degrees per trial, NIS as many as the trial has readings (Bar-Shalom, Li and Kirubarajan, Estimation with
     Applications to Tracking and Navigation, 2001, sec. 5.4.2).
@@ -242,8 +242,8 @@ def mean_limits(degrees: float, trials: int, level: float = LEVEL) -> tuple[floa
 
 
 def verdict(nees: Array, n: int, level: float = LEVEL) -> Verdict:
-    """In one word, what an estimator's own covariance is worth: by the NEES (trials,) of the trials that it calls
-    converged, as `scoring.nees` returns them, for n parameters; none of fewer than `FEW`.
+    """Words the value of an estimator's own covariance: by the NEES (trials,) of the trials that it calls converged, as
+    `scoring.nees` returns them, for n parameters; none for fewer than `FEW`.
 
     Diverged but confident: surely more than `TOLERATED` of the trials lie where the estimator says that a share of
     `GATE` should, and the mean of NEES / n surely lies above 1, as it does not for a right covariance of errors with
@@ -271,8 +271,8 @@ def verdict(nees: Array, n: int, level: float = LEVEL) -> Verdict:
 
 
 def _evidence_above_1(x: Array) -> float:
-    """Evidence that the mean of numbers (trials,) that are not negative is above 1, whatever their law: the mean
-    fortune of those who bet fixed shares on it, which exceeds c with a probability of at most 1 / c otherwise."""
+    """Computes the evidence that the mean of nonnegative numbers (trials,) is above 1, for any law: the mean fortune of
+    those who bet fixed shares on it, which exceeds c with a probability of at most 1 / c otherwise."""
     fortunes = np.log1p(_BETS[:, None] * (x - 1)[None, :]).sum(axis=1)
     return float(np.mean(np.exp(np.minimum(fortunes, 600.0))))
 
@@ -281,8 +281,8 @@ def _evidence_above_1(x: Array) -> float:
 
 
 def share_sequence(count: int, trials: int, level: float = LEVEL) -> tuple[float, float]:
-    """A share of which `count` in `trials` was seen: the hull of those p whose likelihood is not beaten by more than
-    1/(1 - level) by that of a share drawn from a Beta distribution about p.
+    """Computes the confidence sequence of a share of which `count` in `trials` was seen: the hull of those p whose
+    likelihood is not beaten by more than 1/(1 - level) by that of a share drawn from a Beta distribution about p.
 
     That ratio is a martingale under p, so by Ville's inequality it ever exceeds this bound with at most the probability
     1 - level (Robbins, Ann. Math. Statist. 41, 1970; Howard, Ramdas, McAuliffe and Sekhon, Ann. Statist. 49, 2021).
@@ -301,7 +301,7 @@ def share_sequence(count: int, trials: int, level: float = LEVEL) -> tuple[float
 
 
 def first_that(holds: Callable[[float], bool], inside: float, outside: float) -> float:
-    """The first value, on the way from inside to outside, of which something holds, by bisection."""
+    """Finds the first value, from inside to outside, at which a condition holds, by bisection."""
     for _ in range(_HALVINGS):
         middle = (inside + outside) / 2
         if middle in (inside, outside):
@@ -311,8 +311,8 @@ def first_that(holds: Callable[[float], bool], inside: float, outside: float) ->
 
 
 def rms_sequence(squares: Squares, degrees: Array, level: float = LEVEL) -> tuple[Array, Array]:
-    """Root mean square (k,): the sequence of the logarithm of the mean square; NaN below `FIRST`, and where few trials
-    carry the sum; see `few_carry`.
+    """Computes the confidence sequence of the root mean square (k,) from the logarithm of the mean square; NaN below
+    `FIRST`, and where few trials carry the sum; see `few_carry`.
 
     The asymptotic confidence sequence of a Gaussian mixture (Waudby-Smith, Arbour, Sinha, Kennedy and Ramdas, Ann.
     Statist. 52, 2024, theorem 2.2), tightest at `TIGHTEST`: what the central limit theorem is to a fixed number of
@@ -336,7 +336,7 @@ def rms_sequence(squares: Squares, degrees: Array, level: float = LEVEL) -> tupl
 
 
 def quantile(values: Array, q: float) -> float:
-    """Quantile of non-negative numbers where non-finite ones count as infinite (linear between order statistics)."""
+    """Computes a quantile of non-negative numbers, linear between order statistics; non-finite ones are infinite."""
     if len(values) == 0:
         return np.nan
     position = (len(values) - 1) * q

@@ -1,5 +1,5 @@
-"""Two columns of numbers of the same trials: their effects with intervals, evidence that may be looked at daily, and
-how many trials a difference of success takes."""
+"""Compares two columns of numbers of the same trials: effects with intervals, evidence that allows repeated looks, and
+the number of trials that a difference of success takes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ipe_bench.trials.thresholds import FEW
 FLIPS = 4999
 """Random assignments of signs."""
 MOST_SIGNS = 1000
-"""Of more trials, groups of consecutive ones share a sign: as good, since trials are independent."""
+"""Largest number of signs; in more trials, consecutive ones share a sign: as good, since they are independent."""
 _TILTS = np.concatenate([-(2.0 ** np.arange(-12, 5)), 2.0 ** np.arange(-12, 5)])
 """Multiples of the inverse unit by which differences are tilted, to either side."""
 LIMIT = 0.8
@@ -37,7 +37,7 @@ PLANNED = ("power", "difference", "discordant", "discordant_high", "trials_neede
 
 @dataclass(frozen=True)
 class Effect:
-    """What the second has over the first, with its interval, the p of no effect, and the evidence against none."""
+    """Holds the advantage of the second over the first, with interval, the p of no effect, and the evidence."""
 
     first_value: float
     second_value: float
@@ -54,7 +54,7 @@ class Effect:
 
 
 def success_effect(first: Array, second: Array, alpha: float = ALPHA) -> Effect:
-    """Difference of two shares of the same trials (trials,), second less first.
+    """Computes the difference of two shares of the same trials (trials,), second less first.
 
     The p is McNemar's exact one: given their number, the trials in which one alone succeeds are fair coin tosses. The
     interval is Tango's (Stat. Med. 17, 1998), of the score; it is widened to hold 0 where the exact test does not
@@ -70,8 +70,8 @@ def success_effect(first: Array, second: Array, alpha: float = ALPHA) -> Effect:
 
 
 def _tango(losses: int, gains: int, trials: int, alpha: float) -> float:
-    """The least difference of shares at which the score, with the likeliest shares of that difference, is not beyond
-    the normal quantile."""
+    """Finds the least difference of shares at which the score, with the likeliest shares of that difference, is not
+    beyond the normal quantile."""
     quantile = -float(ndtri(alpha / 2))
 
     def inside(difference: float) -> bool:
@@ -85,7 +85,7 @@ def _tango(losses: int, gains: int, trials: int, alpha: float) -> float:
 
 
 def ratio_effect(first: Array, second: Array, alpha: float = ALPHA, largest: float | None = None) -> Effect:
-    """Ratio of the means of two columns (trials,) of finite numbers that are not negative, second over first.
+    """Computes the ratio of the means of two columns (trials,) of finite nonnegative numbers, second over first.
 
     Where neither is larger by nature, each trial's difference is as likely to have the other sign: the p is the share
     of random signs whose sum is as far from 0 (Fisher, The Design of Experiments, 1935, sec. 21), the interval holds
@@ -116,8 +116,8 @@ def ratio_effect(first: Array, second: Array, alpha: float = ALPHA, largest: flo
 
 
 def _p_of_ratio(a: Array, b: Array) -> Callable[[float], float]:
-    """The p of b being r times a: the share of sums with random signs at least as far from 0 as the sum of b - r a,
-    that one among them; where it is alone, Hoeffding's bound of the same share (J. Amer. Statist. Assoc. 58, 1963)."""
+    """Computes the p of b being r times a: the share of sums with random signs at least as far from 0 as the sum of b -
+    r a, itself included; if it is alone, Hoeffding's bound of this share (J. Amer. Statist. Assoc. 58, 1963)."""
     signs = _signs(len(a))
     flipped_a, flipped_b, size_a, size_b = signs @ a, signs @ b, float(a.sum()), float(b.sum())
 
@@ -132,14 +132,14 @@ def _p_of_ratio(a: Array, b: Array) -> Callable[[float], float]:
 
 
 def _least_ratio(a: Array, b: Array, alpha: float) -> float:
-    """The least ratio of b over a that is not rejected."""
+    """Finds the least ratio of b over a that is not rejected."""
     p = _p_of_ratio(a, b)
     return 0.0 if p(0.0) >= alpha else first_that(lambda ratio: p(ratio) >= alpha, 0.0, float(b.sum() / a.sum()))
 
 
 def _unseen(first: Array, second: Array, alpha: float) -> float:
-    """The share of trials that may have another ratio than the commonest one, beyond those that have been seen to; 0
-    where enough have been seen."""
+    """Computes the unseen share of trials that may have another ratio than the commonest one; 0 if enough have been
+    seen."""
     with np.errstate(all="ignore"):
         # Round-off makes no ratio another one.
         _, counts = np.unique((second / first).astype(np.float32), return_counts=True, equal_nan=True)
@@ -151,7 +151,7 @@ def _unseen(first: Array, second: Array, alpha: float) -> float:
 
 @lru_cache(maxsize=2)
 def _signs(size: int) -> Array:
-    """(FLIPS, size) of 1 and -1, the same for all comparisons."""
+    """Draws signs (FLIPS, size) of 1 and -1, the same for all comparisons."""
     rng = np.random.Generator(np.random.Philox(size))
     return rng.integers(0, 2, (FLIPS, size)) * 2.0 - 1
 
@@ -160,7 +160,7 @@ def _signs(size: int) -> Array:
 
 
 def fair_coin(heads: int, tails: int) -> float:
-    """Evidence against a fair coin: the likelihood under a coin drawn from Beta(1/2, 1/2) over that of a fair one.
+    """Measures evidence against a fair coin: the likelihood under a coin drawn from Beta(1/2, 1/2) over a fair one's.
 
     A martingale in the tosses, so it may be looked at after each of them (Robbins, Ann. Math. Statist. 41, 1970).
     """
@@ -168,16 +168,16 @@ def fair_coin(heads: int, tails: int) -> float:
 
 
 def no_lean(differences: Array, unit: float) -> float:
-    """Evidence against differences (trials,) that are as likely to have the other sign, of any size: the mean of
-    exp(t d) / cosh(t d) over both signs of t, which is a martingale under such signs (de la Peña, Ann. Probab. 27,
-    1999). It exceeds 1 only on the side of their sum. `unit` is about what differences are of, and knows no signs."""
+    """Measures evidence against differences (trials,) that are as likely to have the other sign, of any size: the mean
+    of exp(t d) / cosh(t d) over both signs of t, a martingale under such signs (de la Peña, Ann. Probab. 27, 1999). It
+    exceeds 1 only on the side of their sum. `unit` is about what differences are of, and knows no signs."""
     tilts = _TILTS[:, None] * (differences / unit)[None, :]
     log_gains = tilts - np.logaddexp(tilts, -tilts) + np.log(2)
     return _exp(float(np.logaddexp.reduce(log_gains.sum(axis=1))) - np.log(len(_TILTS)))
 
 
 def _exp(value: float) -> float:
-    """Never beyond what a number holds: evidence that large is written as the largest."""
+    """Computes exp without overflow: larger evidence is written as the largest number."""
     return float(np.exp(min(value, 690.0)))
 
 
@@ -186,14 +186,14 @@ def _exp(value: float) -> float:
 
 @dataclass(frozen=True)
 class PowerPlan:
-    """What is wanted: a difference of success, second less first, is found with this probability."""
+    """Plans to find a difference of success, second less first, with this probability."""
 
     power: float
     difference: float
 
     @classmethod
     def of(cls, power: float | None, difference: float | None, *, anytime: bool = False) -> PowerPlan | None:
-        """The plan that is asked for; None if none is.
+        """Returns the plan that is asked for; None if none is.
 
         Raises:
             UserError: one of both is missing or no share, or the findings are those of e-values.
@@ -211,7 +211,7 @@ class PowerPlan:
         return cls(power, difference)
 
     def row(self, discordant: int, trials: int, alpha: float) -> dict[str, Any]:
-        """The columns `PLANNED`, from the number of trials, and of those in which one alone succeeds.
+        """Returns the columns `PLANNED`, from the number of trials, and of those in which one alone succeeds.
 
         Raises:
             UserError: there are too few trials to plan from, or the plan has more than `MOST`.
@@ -225,8 +225,8 @@ class PowerPlan:
 
 
 def mcnemar_power(trials: int, share: float, difference: float, alpha: float) -> float:
-    """The probability that McNemar's exact test at the level `alpha` finds a difference of success, where one estimator
-    alone succeeds in a `share` of the trials.
+    """Computes the probability that McNemar's exact test at the level `alpha` finds a difference of success, where one
+    estimator alone succeeds in a `share` of the trials.
 
     The number of these trials is binomial, and so is the number of those that the second wins (Duffy, Biometrics 40,
     1984).
@@ -242,7 +242,7 @@ def mcnemar_power(trials: int, share: float, difference: float, alpha: float) ->
 
 
 def trials_needed(share: float, difference: float, power: float, alpha: float) -> int:
-    """The least number of trials from which on the power is had.
+    """Finds the least number of trials from which on the power is attained.
 
     Raises:
         UserError: it is above `MOST`.

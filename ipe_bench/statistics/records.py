@@ -1,4 +1,4 @@
-"""Every statistic, each in one record: what it is called and means, over which trials, how it is computed and shown.
+"""Defines every statistic in one record: its name and meaning, its trials, its formula and its format.
 
 `summary.csv`, the appendix of the report, tables and the terminal are read from these lists: a record that is added
 here is added everywhere. `registry` adds those of plugins; formulas longer than a line are in `formulas`.
@@ -20,7 +20,7 @@ from ipe_bench.statistics.sample import CLOSE, NIS, Sample, iterations_to_limit,
 from ipe_bench.trials.thresholds import EVEN, EXPECTED, FEW, GATE, SAME_ROOT
 
 Kind = Literal["count", "share", "number", "physical", "seconds", "probability", "word"]
-"""How a value is written; `report.words` knows each."""
+"""Format of a value; `report.words` knows each."""
 Where = Literal[
     "overview",
     "terminal",
@@ -108,7 +108,7 @@ class Statistic:
         return f"{self.meaning} Over {self.over}."
 
     def columns_of(self, sample: Sample) -> dict[str, list[Any]]:
-        """Its columns, a value for each parameter and one for all together."""
+        """Returns its columns, a value for each parameter and one for all together."""
         with np.errstate(all="ignore"):
             found = [self.values(sample), *(() if self.limits is None else self.limits(sample))]
         columns = [np.asarray(one).tolist() if np.ndim(one) else [one] * (sample.n + 1) for one in found]
@@ -120,7 +120,7 @@ def frame_columns(statistics: Sequence[Statistic]) -> tuple[str, ...]:
 
 
 def rows_of(statistics: Sequence[Statistic], sample: Sample) -> list[dict[str, Any]]:
-    """A row per parameter and one over all: the columns of all the statistics."""
+    """Returns a row per parameter and one over all: the columns of all the statistics."""
     columns = {name: values for s in statistics for name, values in s.columns_of(sample).items()}
     return [{name: values[i] for name, values in columns.items()} for i in range(sample.n + 1)]
 

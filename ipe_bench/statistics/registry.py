@@ -30,12 +30,12 @@ _of_plugins: dict[str, Statistic] = {}
 
 
 def all_statistics() -> tuple[Statistic, ...]:
-    """The records of the summary: ours, and those that were added."""
+    """Returns the records of the summary: ours, and those that were added."""
     return (*STATISTICS, *_of_plugins.values())
 
 
 def add_statistics(records: Sequence[Statistic]) -> list[str]:
-    """Has these computed and shown beside ours, in place of those that were added before.
+    """Registers these statistics beside ours, in place of those that were added before.
 
     Returns a line for each that cannot be.
     """
@@ -50,7 +50,7 @@ def add_statistics(records: Sequence[Statistic]) -> list[str]:
 
 
 def fault_of(record: Any) -> str:
-    """What keeps a record from being added to ours and the others; empty where nothing does."""
+    """Returns the fault that keeps a record from being added to ours and the others; empty if there is none."""
     if not isinstance(record, Statistic):
         return f"is a {type(record).__name__} and not a Statistic"
     others = [other for other in _of_plugins.values() if other is not record]
@@ -68,7 +68,7 @@ def fault_of(record: Any) -> str:
 
 
 def columns_of_added(record: Statistic, sample: Sample) -> dict[str, list[Any]]:
-    """The columns of a record that a plugin adds.
+    """Computes the columns of a record that a plugin adds.
 
     Raises:
         UserError: it raises, or gives something else than a value per parameter and one over all.
@@ -89,12 +89,12 @@ def columns_of_added(record: Statistic, sample: Sample) -> dict[str, list[Any]]:
 
 
 def summary_columns() -> tuple[str, ...]:
-    """The columns of `summary.csv` behind those that say what a row is of."""
+    """Returns the columns of `summary.csv` behind those that say what a row is of."""
     return (*frame_columns(all_statistics()), BEST)
 
 
 def summary_rows(sample: Sample) -> list[dict[str, Any]]:
-    """A row per parameter and one over all, without the comparison of the estimator with its rivals.
+    """Computes a row per parameter and one over all, without the comparison of the estimator with its rivals.
 
     A statistic that was added and raises, or gives what cannot be shown, is missing in these rows, and named in the
     collection's problems.
@@ -116,7 +116,7 @@ def summary_rows(sample: Sample) -> list[dict[str, Any]]:
 
 
 def to_frame(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    """Rows as a table, columns in the order that readers know."""
+    """Converts rows to a table, columns in the order that readers know."""
     import pandas as pd
 
     frame, known = pd.DataFrame(list(rows)), summary_columns()

@@ -41,7 +41,7 @@ _SEED = 1 << 40
 
 @dataclass(frozen=True)
 class History:
-    """How a converged trial came to its limit."""
+    """Records how a converged trial came to its limit."""
 
     iterates: Array
     """(iterates, n)"""
@@ -57,7 +57,7 @@ class History:
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """All trials of one group, seeds one after another; errors and deviations in multiples of the parameters' sizes.
+    """Holds all trials of one group by seeds; errors and deviations in multiples of the parameters' sizes.
 
     Trials without readings are left out of all arrays. Arrays cannot be written into.
     """
@@ -79,12 +79,12 @@ class Sample:
     unread: Array
     """The numbers of the trials that have no readings, since the model gives none at their true parameters."""
     kept: dict[Any, Any] = field(default_factory=dict, repr=False)
-    """What was computed of it once; see `formulas.once`."""
+    """Cache of derived quantities; see `formulas.once`."""
 
     @classmethod
     def load(cls, collection: Collection, group: Group, present: Array, solved: Array) -> Sample:
-        """The stored trials of a group; `present` and `solved` are the numbers of those that all rivals have, and all
-        solved."""
+        """Loads the stored trials of a group; `present` and `solved` are the numbers of those that all rivals have, and
+        all solved."""
         names = [p["name"] for p in group.footer["parameters"]]
         errors, deviations = ([f"{kind}_{name}" for name in names] for kind in ("error", "deviation"))
         parts = [collection.load(cell, [*SCALARS, *errors, *deviations], OPTIONAL_COLUMNS) for cell in group.cells]
@@ -93,7 +93,7 @@ class Sample:
         used: Array = np.asarray(status != Status.NO_READINGS.label)
 
         def joined(name: str) -> Array:
-            """The column, which is forgotten in its parts."""
+            """Concatenates the column, which is removed from its parts."""
             return np.concatenate([part.pop(name) for part in parts])[used]
 
         there = [name for name in (*SCALARS, *OPTIONAL_COLUMNS) if all(name in part for part in parts)]
@@ -176,7 +176,7 @@ class Sample:
         return self._stored(kind, self.group.truths)
 
     def of_estimate(self, kind: str) -> Array:
-        """What is stored of the estimates for each parameter (trials, n) besides errors and deviations, read anew."""
+        """Reads what is stored of the estimates for each parameter (trials, n) besides errors and deviations."""
         return self._stored(kind, self.group.cells)
 
     def _stored(self, kind: str, cells: Sequence[StoredCell | None]) -> Array:
@@ -193,12 +193,12 @@ class Sample:
 
     @cached_property
     def calibrations(self) -> list[Calibration]:
-        """How honest the reported covariance is for each parameter, and for all last; empty where none is reported."""
+        """Honesty of the reported covariance for each parameter, and for all last; empty where none is reported."""
         return calibrations(self.error, self.deviation, self.scalars["nees"], self.converged)
 
     @cached_property
     def histories(self) -> list[History]:
-        """Those of the converged trials whose iterates are stored; none of a filter, which has epochs instead."""
+        """Histories of the converged trials whose iterates are stored; none for a filter, which has epochs instead."""
         if not self.iterates:
             return []
         found = []
@@ -219,13 +219,13 @@ class Sample:
 
 
 def label_of(number: Any) -> str:
-    """A trial as readers name it."""
+    """Names a trial for readers."""
     seed, trial = divmod(int(number), _SEED)
     return f"seed {seed}, trial {trial}"
 
 
 def samples(collection: Collection, groups: Sequence[Group]) -> Iterator[Sample]:
-    """The samples of one scenario that have trials, one after another."""
+    """Yields the samples of one scenario that have trials."""
     present, solved = [], []
     for group in groups:
         parts = [(cell, collection.load(cell, ["solved"])) for cell in group.cells]
@@ -240,7 +240,7 @@ def samples(collection: Collection, groups: Sequence[Group]) -> Iterator[Sample]
 
 
 def _in_all(several: Sequence[Array]) -> Array:
-    """The numbers that all have, ascending."""
+    """Returns the numbers that all have, ascending."""
     return reduce(np.intersect1d, several[1:], np.unique(several[0])) if several else np.empty(0, dtype=np.int64)
 
 
@@ -252,14 +252,14 @@ def _numbers(cell: StoredCell, trial: Array) -> Array:
 
 
 def distances_to_limit(iterates: Array, deviation: Array) -> Array:
-    """Largest component of each iterate's distance from the last one, in standard deviations (n,)."""
+    """Computes the largest component of each iterate's distance from the last one, in standard deviations (n,)."""
     with np.errstate(invalid="ignore"):
         return np.abs((iterates - iterates[-1]) / deviation).max(axis=1)
 
 
 def median_distances(histories: Sequence[History]) -> Array:
-    """Medians (iterates,) over trials of the distances from their limits, where a trial that has ended is nearer than
-    any other: 0 from where half of them have."""
+    """Computes medians (iterates,) over trials of the distances from their limits; an ended trial counts as nearest: 0
+    once half have."""
     table = np.zeros((max(len(h.distances) for h in histories), len(histories)))
     for i, h in enumerate(histories):
         table[: len(h.distances), i] = np.where(np.isfinite(h.distances), h.distances, np.inf)
@@ -267,14 +267,14 @@ def median_distances(histories: Sequence[History]) -> Array:
 
 
 def iterations_to_limit(distances: Array) -> int:
-    """The first iterate from which on all are within `CLOSE` of the last."""
+    """Finds the first iterate from which on all are within `CLOSE` of the last."""
     far = np.flatnonzero(~(distances <= CLOSE))
     return int(far[-1]) + 1 if len(far) else 0
 
 
 def orders_of(errors: Array, floor: float = FLOOR) -> Array:
-    """log(e_(k+1) / e_k) / log(e_k / e_(k-1)) of successive errors (iterates,), where they decrease above the floor:
-    1 where convergence is linear, 2 where it is quadratic."""
+    """Computes log(e_(k+1) / e_k) / log(e_k / e_(k-1)) of successive errors (iterates,), where they decrease above the
+    floor: 1 where convergence is linear, 2 where it is quadratic."""
     e = errors[: np.argmax(np.append(errors <= floor, True))]
     with np.errstate(divide="ignore", invalid="ignore"):
         orders = np.log(e[2:] / e[1:-1]) / np.log(e[1:-1] / e[:-2])

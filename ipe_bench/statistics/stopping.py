@@ -26,15 +26,15 @@ from ipe_bench.trials.scenario import MOST_TRIALS, TRIALS
 from ipe_bench.trials.tracking import AnyScenario
 
 NARROW = "every interval is narrow enough"
-"""Why a scenario stops that has come to the precision that was asked for."""
+"""Reason of a scenario that stops because it has the requested precision."""
 WITH_PRECISION = ("success", "rmse")
-"""What a precision can be asked for: success as a difference of shares, of every estimator; rmse as a ratio less 1, of
-the root mean square over parameters of error over bound, of the trials that an estimator solved."""
+"""Statistics with a precision: success as a difference of shares, of every estimator; rmse as a ratio less 1, of the
+root mean square over parameters of error over bound, of the trials that an estimator solved."""
 
 
 def precision_of(given: float | Mapping[str, float]) -> Mapping[str, float]:
-    """How near to what is found the truth has to be, at whatever number of trials one looks, by statistic; from a
-    number, which is that of success, or from numbers by name.
+    """Returns the requested precision by statistic, valid at any number of trials: from a number, which is that of
+    success, or from numbers by name.
 
     Raises:
         UserError: it is neither.
@@ -52,8 +52,8 @@ def precision_of(given: float | Mapping[str, float]) -> Mapping[str, float]:
 
 
 def _distances(sample: Sample, wanted: Mapping[str, float]) -> Iterator[tuple[float, str]]:
-    """How far each statistic is from the precision that is wanted, as a ratio that is above 1 where it is not near
-    enough yet, and in words."""
+    """Computes the ratio of each statistic's interval to the requested precision, above 1 if too wide, and words for
+    it."""
     for statistic, precision in wanted.items():
         if statistic == "success":
             share = float(sample.scalars["success"].mean())
@@ -133,8 +133,8 @@ def compute_until(
 
 
 def next_trials(trials: int, ratio: float, block: int, most: int) -> int:
-    """How many trials to have before looking again: what the widths ask for, at most twice as many as now, in whole
-    blocks. Widths shrink with the root of the number."""
+    """Computes how many trials to have before looking again: what the widths ask for, at most twice as many as now, in
+    whole blocks. Widths shrink with the root of the number."""
     wanted = 2.0 * trials if not math.isfinite(ratio) else min(2.0 * trials, 1.02 * trials * ratio**2)
     return min(most, max(trials // block + 1, math.ceil(wanted / block)) * block)
 
@@ -142,7 +142,7 @@ def next_trials(trials: int, ratio: float, block: int, most: int) -> int:
 def _first_trials(
     scenario: AnyScenario, estimators: Mapping[str, Any], output: Path, block_size: int, most: int
 ) -> int:
-    """Where to begin: with what is stored of every estimator, or one block."""
+    """Returns the number to begin with: what is stored of every estimator, or one block."""
     cells = result_keys(scenario, estimators)
     results = Results.read([output] if output.is_dir() else [], keys={cell.key for cell in cells})
     stored = min(gaps[0][0] if (gaps := results.missing(cell.key, most)) else most for cell in cells)
@@ -150,7 +150,7 @@ def _first_trials(
 
 
 def _stored(scenario: AnyScenario, estimators: Mapping[str, Any], output: Path | str) -> Iterator[Sample]:
-    """The stored trials of every estimator that has some."""
+    """Returns the stored trials of every estimator that has some."""
     collection = collect([output], {cell.key for cell in result_keys(scenario, estimators)})
     return samples(collection, collection.groups)
 
@@ -158,7 +158,7 @@ def _stored(scenario: AnyScenario, estimators: Mapping[str, Any], output: Path |
 def objective(
     scenario: AnyScenario, estimators: Mapping[str, Any], label: str, column: str, output: Path | str
 ) -> float:
-    """What is known of an estimator by one number: a column of its row over all parameters, of all stored trials.
+    """Returns one number for an estimator: a column of its row over all parameters, of all stored trials.
 
     Columns that compare estimators, such as capped_error, are over the trials that all of these estimators have.
 

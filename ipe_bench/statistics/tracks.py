@@ -26,7 +26,7 @@ NOT_WHITE = 0.05
 
 @dataclass(frozen=True, eq=False)
 class PathSample(Sample):
-    """The same trials with the root mean square over all epochs in the place of errors and of bounds."""
+    """Replaces errors and bounds of the same trials by their root mean square over all epochs."""
 
     @cached_property
     def linear_bound(self) -> Array:
@@ -44,7 +44,7 @@ def path(s: Sample) -> PathSample:
 
 
 def of_path(formula: Callable[[Sample], Array]) -> Callable[[Sample], Array]:
-    """A formula (n,) of errors over all epochs, as it is shown (n + 1,); NaN if nothing is tracked."""
+    """Turns a formula (n,) of errors over all epochs into its shown form (n + 1,); NaN if no state is tracked."""
     return lambda s: f.in_units(formula(path(s)), path(s)) if is_track(s) else np.full(s.n + 1, np.nan)
 
 
@@ -53,12 +53,12 @@ bound = of_path(lambda s: s.linear_bound)
 
 
 def rmse_limits(s: Sample) -> f.Ends:
-    """Ends (n + 1,) of the intervals of these root mean squares."""
+    """Computes ends (n + 1,) of the intervals of these root mean squares."""
     return f.ends_in_units(f.rmse_ends)(path(s)) if is_track(s) else (np.full(s.n + 1, np.nan),) * 2
 
 
 def mean_score(s: Sample, name: str) -> float:
-    """The mean of a score over the trials that have one."""
+    """Computes the mean of a score over the trials that have one."""
     values = s.scalars[name][s.solved] if name in s.scalars else np.empty(0)
     values = values[~np.isnan(values)]
     return float(values.mean()) if len(values) else np.nan
@@ -69,13 +69,13 @@ def path_verdict(s: Sample) -> str:
 
 
 def nis_verdict(s: Sample) -> str:
-    """By as many degrees as a trial has readings."""
+    """Returns the verdict on NIS, whose degrees are the readings of a trial."""
     m = int(s.group.footer["readings"])
     return verdict(m * s.scalars[NIS][s.converged], m) if is_track(s) and NIS in s.scalars else "-"
 
 
 def not_white(s: Sample) -> tuple[float, float, float]:
-    """Share of trials with autocorrelated innovations, and the ends of its interval."""
+    """Computes the share of trials with autocorrelated innovations, and the ends of its interval."""
     p = s.scalars["white_p"][s.converged] if "white_p" in s.scalars else np.empty(0)
     p = p[~np.isnan(p)]
     rejected = int((p < NOT_WHITE).sum())
@@ -83,7 +83,7 @@ def not_white(s: Sample) -> tuple[float, float, float]:
 
 
 def epoch_curves(s: Sample) -> Iterator[dict[str, Any]]:
-    """Of each state of a track: time, root mean square error, bounds, and NEES with its limits, epoch by epoch."""
+    """Computes time, root mean square error, bounds, and NEES with its limits, per epoch and state of a track."""
     times = np.array(s.group.footer.get("times", ()), dtype=float)
     if not len(times):
         return

@@ -1,4 +1,4 @@
-"""The documentation: pages about ipe-bench, a reference read from the code, and a gallery of executed experiments.
+"""Builds the documentation: pages about ipe-bench, a reference read from the code, and a gallery of experiments.
 
 `make docs` builds the site into outputs/docs/html by the extra `docs`. As an extension of Sphinx this package writes
 formulas as MathML, which needs no script and no network.
@@ -13,7 +13,7 @@ import ipe_bench
 from ipe_bench.basics import options
 
 _CONSTRAINED = {n: get_args(t)[0].__name__ for n, t in vars(options).items() if get_origin(t) is Annotated}
-"""The plain types of those that are called by their constraints, such as Positive."""
+"""Plain types of the annotations that name a constraint, such as Positive."""
 _STYLE = "margin: 1rem 0; padding: .5rem 0; overflow-x: auto"
 
 
@@ -28,7 +28,7 @@ def show_type(app: Any, what: str, name: str, thing: Any, options: Any, lines: l
 
 
 def type_of(cls: type, attribute: str) -> str:
-    """The type of an attribute or a property as its class writes it, without constraints; empty if it writes none."""
+    """Returns the type of an attribute or a property as its class writes it, without constraints, or an empty text."""
     for base in cls.__mro__:
         member = vars(base).get(attribute)
         getter = getattr(member, "fget", None) or getattr(member, "func", None)

@@ -56,7 +56,7 @@ SETTINGS = {
     "autodoc_typehints": "none",
     "autodoc_member_order": "bysource",
 }
-"""Sphinx's; nothing that a page needs is fetched when it is opened."""
+"""Settings of Sphinx; an opened page fetches no further resource."""
 GROUPS = {
     "measurement": "Measurement models",
     "noise": "Noises",
@@ -68,7 +68,7 @@ GROUPS = {
     "execution": "Executions",
 }
 FIGURES = 8
-"""Most pictures of an experiment that its page shows."""
+"""Largest number of an experiment's pictures on its page."""
 ORDINARY, LEAST = 1000, 3
 """Trials of an ordinary experiment, and the least number that a costly one is cut to."""
 _PARTS = {
@@ -76,7 +76,7 @@ _PARTS = {
     "headline": ["trials=40"],
     "nist": ["measurement.start=2"],
 }
-"""The part that is computed of experiments that take minutes, and the trials of the picture on the first page."""
+"""Reduced settings of experiments that take minutes, and the trials of the picture on the first page."""
 
 
 def build(output: Path, trials: int) -> int:
@@ -97,7 +97,7 @@ def build(output: Path, trials: int) -> int:
 
 
 def printed_by(command: Sequence[str], columns: int = 80) -> str:
-    """What `ipe-bench COMMAND` prints, without blanks at the ends of lines; a UserError if it fails."""
+    """Returns the output of `ipe-bench COMMAND`, without blanks at the ends of lines; a UserError if it fails."""
     program = [sys.executable, "-m", "ipe_bench", *command]
     environment = os.environ | {"COLUMNS": str(columns), "NO_COLOR": "1"}
     done = subprocess.run(program, capture_output=True, text=True, env=environment, check=False)
@@ -140,8 +140,8 @@ def write_reference(folder: Path) -> None:
 
 
 def write_gallery(folder: Path, results: Path, trials: int) -> None:
-    """A page for each experiment, one that lists them, and a table of the best estimators by model; `trials` is for an
-    experiment that has 1000 by itself."""
+    """Writes a page per experiment, their list, and a table of the best estimators by model; `trials` replaces the
+    default of 1000."""
     chosen, found, began = _ours("experiment"), {}, time.perf_counter()
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         running = {pool.submit(_executed, option, folder, results / option.name, trials): option for option in chosen}
@@ -176,8 +176,8 @@ def _executed(option: Option, folder: Path, results: Path, trials: int) -> list[
 
 
 def _best(experiment: str, summary: pd.DataFrame) -> Iterator[tuple[str, ...]]:
-    """For the least and the largest error scale of an experiment on simulated readings of the assumed model: who
-    succeeds most often, and at what cost."""
+    """Returns who succeeds most often, and at what cost, at the least and the largest error scale of a simulated
+    experiment."""
     if "truth" in summary or not {"measurement", "noise", "success"} <= set(summary):
         return
     totals = summary[(summary["parameter"] == ALL) & (summary["noise"] != "certified")]

@@ -28,13 +28,13 @@ NAMES = {
     "parameter_errors": "root mean square error of each parameter and its bound; figure_2 and 3 of the paper's setting",
     "tracks": "error of each state at each epoch beside its bounds, and NEES",
 }
-"""What our figures are called and show; the names of files go on with the setting."""
+"""Names and subjects of our figures; the names of files go on with the setting."""
 INDEX = "index.json"
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """A figure in its folder."""
+    """Holds a figure in its folder."""
 
     name: str
     title: str
@@ -46,7 +46,7 @@ class Drawn:
 def draw_all(
     analysis: Analysis, folder: Path, *, which: Which = "main", formats: Sequence[str] = (PAGE,)
 ) -> list[Drawn]:
-    """The figures that the data allow, in the order of the report, as files in the folder.
+    """Draws the figures that the data allow, in the order of the report, as files in the folder.
 
     `index.json` in the folder names each with its title and caption; figures of an earlier report are removed.
     """
@@ -66,7 +66,7 @@ def draw_all(
 
 
 def drawings(analysis: Analysis, which: Which = "all") -> Iterator[Drawing]:
-    """Figures of every setting, or of all of them together, ours first."""
+    """Yields the figures of every setting, or of all of them together, ours first."""
     if which == "none" or not analysis.collection.groups:
         return
     parts, whole = views(analysis)
@@ -81,8 +81,8 @@ def drawings(analysis: Analysis, which: Which = "all") -> Iterator[Drawing]:
 def added_drawings(
     analysis: Analysis, shown: tuple[list[View], View], which: Which = "all", taken: set[str] | None = None
 ) -> Iterator[Drawing]:
-    """The figures of plugins; a line is added to the problems of the analysis for every one that cannot be drawn, or
-    has a name that is taken."""
+    """Returns the figures of plugins; a failed drawing or a duplicate name adds a line to the problems of the
+    analysis."""
     names = set() if taken is None else taken
 
     def make(record: Any) -> list[Drawing]:

@@ -1,4 +1,4 @@
-"""What figures share: panels, axes, curves with their intervals, legends and the words of captions."""
+"""Provides what figures share: panels, axes, curves with their intervals, legends and the words of captions."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def panels(count: int, look: Mapping[str, Look] | None = None, *, height: float = 2.7) -> tuple[Figure, list[Axes]]:
-    """A figure with that many panels, and room for the legend of the estimators."""
+    """Makes a figure with that many panels, and room for the legend of the estimators."""
     from matplotlib.figure import Figure
 
     down = -(-count // _across())
@@ -40,17 +40,17 @@ def panels(count: int, look: Mapping[str, Look] | None = None, *, height: float 
 
 
 def _across() -> int:
-    """The most panels side by side."""
+    """Returns the largest number of panels side by side."""
     return max(2, int(print_width() / 1.7)) if print_width() else 4
 
 
 def most_panels() -> int:
-    """The most panels of a kind that a figure has, which are no more than two rows."""
+    """Returns the largest number of panels of a kind in a figure, at most two rows."""
     return min(MOST_PANELS, 2 * _across())
 
 
 def panels_of_scales(rows: pd.DataFrame, look: Mapping[str, Look]) -> tuple[Figure, list[tuple[Axes, pd.DataFrame]]]:
-    """A figure with a panel for each error scale, or for some with both ends, and the panels, each with its rows."""
+    """Makes a figure with a panel per error scale, or for some with both ends; returns it and the panels' rows."""
     every = sorted(set(rows["error_scale"]))
     scales = [every[round(i)] for i in np.linspace(0, len(every) - 1, min(most_panels(), len(every)))]
     fig, axes = panels(len(scales), look)
@@ -60,7 +60,7 @@ def panels_of_scales(rows: pd.DataFrame, look: Mapping[str, Look]) -> tuple[Figu
 
 
 def text(value: Any) -> str:
-    """A name as it stands in a figure: never read as mathematics, never longer than a line."""
+    """Returns a name for use in a figure: never read as mathematics, never longer than a line."""
     words, most = str(value), 16 if print_width() else 42
     words = (words if len(words) <= most else words[: most - 1] + "…").replace("$", r"\$")
     # A leading underscore would hide the name from legends.
@@ -68,14 +68,14 @@ def text(value: Any) -> str:
 
 
 def _letters(inches: float, size: Any) -> float:
-    """About the number of letters of one of matplotlib's sizes in that length."""
+    """Estimates how many letters of one of matplotlib's sizes fit that length."""
     from matplotlib import rcParams
 
     return inches / (0.0085 * float(rcParams[size]))
 
 
 def _width(ax: Axes) -> float:
-    """About the inches across a panel, whose layout is still to come."""
+    """Estimates the width of a panel in inches before the layout."""
     return 0.8 * ax.get_position().width * ax.figure.get_figwidth()  # type: ignore[union-attr]
 
 
@@ -93,14 +93,14 @@ def axis_labels(fig: Figure, x: str, y: str) -> None:
 
 
 def number(value: float) -> str:
-    """A number of an axis: 0.05, 200, 10⁴ or 5·10⁻⁷, with the minus that typography has."""
+    """Formats a number of an axis: 0.05, 200, 10⁴ or 5·10⁻⁷, with a typographic minus."""
     digits, _, exponent = (f"{value:g}" if 1e-3 <= abs(value) < 1e4 or value == 0 else f"{value:e}").partition("e")
     words = f"{float(digits):g}·10{str(int(exponent)).translate(_RAISED)}" if exponent else digits
     return words.removeprefix("1·").replace("-", "\N{MINUS SIGN}")
 
 
 def scale_axis(ax: Axes, scales: Sequence[float], labels: Sequence[str]) -> None:
-    """A logarithmic axis that shows ascending error scales; if there is one alone, the labels side by side."""
+    """Sets a logarithmic axis of ascending error scales; if there is only one, the labels side by side."""
     if len(scales) == 1:
         ax.set_xticks(range(len(labels)), [text(label) for label in labels], rotation=90)
         ax.set_xlim(-0.6, len(labels) - 0.4)
@@ -117,7 +117,7 @@ def scale_axis(ax: Axes, scales: Sequence[float], labels: Sequence[str]) -> None
 
 
 def labelled(scales: Sequence[float], letter: float) -> list[float]:
-    """Those of ascending scales whose labels have room, a letter taking so many decades: both ends, and what fits."""
+    """Selects ascending scales whose labels fit, a letter taking so many decades: both ends, and those between."""
     kept = [scales[0]]
     for scale in scales[1:-1]:
         beside = (kept[-1], scale), (scale, scales[-1])
@@ -127,7 +127,7 @@ def labelled(scales: Sequence[float], letter: float) -> list[float]:
 
 
 def decades(ax: Axes, values: Any, least: float = 10.0, *, ends: Any = ()) -> None:
-    """A logarithmic axis around the values that spans at least a decade, so that scatter of a per cent looks small.
+    """Sets a logarithmic axis around the values that spans at least a decade, so that a scatter of 1 % looks small.
 
     The `ends` of intervals widen it by no more than `REACH` of the values' own span, or a decade: those of heavy tails,
     which may be as wide as numbers go, end at the panel's edge.
@@ -156,7 +156,7 @@ def log_ticks(axis: Axis, low: float, high: float) -> None:
 
 
 def shares(ax: Axes) -> None:
-    """A vertical axis from none to all."""
+    """Sets a vertical axis of shares from 0 to 1."""
     ax.set_ylim(-0.03, 1.03)
     ax.yaxis.set_major_formatter(lambda v, _: f"{100 * v:.0f} %")
 
@@ -175,8 +175,8 @@ def seaborn_style(look: Mapping[str, Look], by: str = "estimator") -> dict[str, 
 
 
 def lines(ax: Axes, rows: pd.DataFrame, x: str, y: str, look: Mapping[str, Look], **style: Any) -> None:
-    """A line per estimator through points that are already dense, with a few markers, whose places differ so that
-    lines that coincide are seen."""
+    """Draws a line per estimator through dense points, with a few markers, staggered so that coinciding lines are
+    seen."""
     import seaborn as sns
 
     dashes, before = {label: one.dash for label, one in look.items()}, len(ax.lines)
@@ -201,7 +201,7 @@ def curves(
     heading: str = "",
     label: str = "",
 ) -> None:
-    """A column over the error scales, a line with markers per label, on an axis whose limits are set already, with the
+    """Draws a column over the error scales, a line with markers per label, on an axis with fixed limits, with the
     panel's heading and the label of its vertical axis.
 
     Labels stand side by side about their scale, so that points and intervals that coincide are seen. A line is broken
@@ -236,7 +236,7 @@ def curves(
 
 
 def legend(fig: Figure, axes: Sequence[Axes], look: Mapping[str, Look] | None = None) -> None:
-    """One legend for all panels, above them: the estimators in colour, then what in the panels has a label."""
+    """Adds one legend above all panels: the estimators in colour, then the other labels in the panels."""
     from matplotlib.lines import Line2D
 
     colored = {label: one for label, one in (look or {}).items() if one.color != GREY}

@@ -1,4 +1,4 @@
-"""What accuracy costs: simulations against error, and iterations against the distance from the limit."""
+"""Draws what accuracy costs: simulations against error, and iterations against the distance from the limit."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ipe_bench.report.words import enumerate_few, short, value_text
 from ipe_bench.statistics.sample import CLOSE
 
 LEAST_COST = 0.5
-"""What does not simulate at all stands here: a logarithmic axis has no zero."""
+"""Position of an estimator without simulations: a logarithmic axis has no zero."""
 _HIGHEST = 1e6
 """Errors beyond this many bounds stand at the upper edge."""
 LEAST_DISTANCE = 1e-10
@@ -66,7 +66,7 @@ def draw_costs(view: View) -> Iterator[Drawing]:
 
 
 def draw_convergence(view: View) -> Iterator[Drawing]:
-    """How iterates approach their limit, a panel per estimator."""
+    """Draws how iterates approach their limit, a panel per estimator."""
     import seaborn as sns
     from matplotlib.ticker import MaxNLocator
 

@@ -1,4 +1,4 @@
-"""A drawn figure with its words."""
+"""Defines a drawn figure with its caption."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Drawing:
     figure: Canvas
 
     def shown(self) -> Canvas:
-        """The figure, which shows itself in a notebook."""
+        """Shows the figure itself in a notebook."""
         self.figure._repr_png_ = lambda: self._content("png")  # type: ignore[attr-defined]
         return self.figure
 

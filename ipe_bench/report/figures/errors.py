@@ -1,5 +1,5 @@
-"""The headline of success, error and honesty of all trials, the distribution of errors, the calibration of NEES, and
-residuals of readings."""
+"""Draws success, error and honesty of all trials, the distribution of errors, the calibration of NEES, and
+residuals."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ipe_bench.real.fits import Fit
 
 CEILING = {"error_median": 100.0, "error_q95": 100.0, "nees_median": 30.0}
-"""What lies beyond is drawn there: how far a diverged estimate is off tells nothing, and the bound needs the room."""
+"""Errors beyond are drawn here: the size of a diverged error carries no information, and the bound needs the room."""
 LINEAR = 0.1
 """Differences below this are drawn about in proportion, larger ones by their logarithm: honest curves differ by
 hundredths, dishonest ones by up to 1."""
@@ -79,7 +79,7 @@ def draw(view: View) -> Iterator[Drawing]:
 
 
 def draw_distributions(view: View) -> Iterator[Drawing]:
-    """Distribution functions of the error, a panel per error scale."""
+    """Draws distribution functions of the error, a panel per error scale."""
     rows = view["distributions"]
     if rows.empty:
         return
@@ -118,7 +118,7 @@ def draw_distributions(view: View) -> Iterator[Drawing]:
 
 
 def draw_calibration(view: View) -> Iterator[Drawing]:
-    """NEES of all estimators, a panel per error scale."""
+    """Draws the calibration of NEES of all estimators, a panel per error scale."""
     rows = view["calibration"]
     if rows.empty:
         return
@@ -151,7 +151,7 @@ def draw_calibration(view: View) -> Iterator[Drawing]:
 
 
 def _bands(ax: Any, rows: pd.DataFrame) -> None:
-    """The widest and the narrowest band of the panel's curves."""
+    """Draws the widest and the narrowest band of the panel's curves."""
     width = (rows["high"] - rows["low"]).groupby(rows["estimator"]).mean()
     for label, alpha in ((width.idxmax(), 0.12), (width.idxmin(), 0.15)):
         edge = rows[rows["estimator"] == label].drop_duplicates("at")
@@ -160,7 +160,7 @@ def _bands(ax: Any, rows: pd.DataFrame) -> None:
 
 
 def draw_residuals(model: Measurement, fits: Sequence[Fit]) -> Iterator[Drawing]:
-    """A panel of normalised residuals for each estimator; nothing if no residual is known."""
+    """Draws normalised residuals, a panel per estimator; returns None if no residual is known."""
     import seaborn as sns
     from matplotlib.ticker import MaxNLocator
 
@@ -202,7 +202,7 @@ def draw_residuals(model: Measurement, fits: Sequence[Fit]) -> Iterator[Drawing]
 
 
 def _abscissa(model: Measurement) -> tuple[Array, str]:
-    """Where each reading (m,) stands along the axis: at its time if there is such a column, else in its row."""
+    """Returns the abscissa of each reading (m,): its time if there is such a column, else its row."""
     for name, column in model.index.items():
         values = np.asarray(column)
         several = 3 * len(set(column)) < model.m  # many readings at one number, such as a case's

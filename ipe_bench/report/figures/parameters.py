@@ -1,4 +1,4 @@
-"""Errors parameter by parameter: figures 2 and 3 of the paper, and those of trackers from epoch to epoch."""
+"""Draws errors parameter by parameter: figures 2 and 3 of the paper, and those of trackers from epoch to epoch."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def draw(view: View) -> Iterator[Drawing]:
 
 
 def _of_one(view: View, estimator: str) -> Drawing:
-    """A panel per group of parameters in physical units, and one of all of them over their bounds."""
+    """Draws a panel per group of parameters in physical units, and one of all of them over their bounds."""
     rows = view["summary"].query("estimator == @estimator and parameter != @ALL")
     rows = rows.assign(solved_trials=(rows["solved"] * rows["trials"]).round())
     totals = view.totals[view.totals["estimator"] == estimator].assign(parameter=ALL)
@@ -80,7 +80,7 @@ def _of_one(view: View, estimator: str) -> Drawing:
 
 
 def _groups(parameters: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
-    """Parameters of one group and one unit, under the name of the group; none if there are too many groups."""
+    """Returns the parameters of one group and one unit, under the group's name; empty if there are too many groups."""
     groups: dict[str, list[Mapping[str, Any]]] = {}
     for p in parameters:
         group = p.get("group") or p["name"]
@@ -96,7 +96,7 @@ def _curves(ax: Any, rows: Any, look: Any, view: View, heading: str = "") -> Non
 
 
 def _missing(totals: pd.DataFrame) -> str:
-    """How many trials an estimator solved at each scale."""
+    """Says in how many trials an estimator solved the equation at each scale."""
     lacking = totals[totals["solved_trials"] < totals["trials"]]
     rows = lacking[["solved_trials", "trials", "error_scale"]].to_numpy()
     seen = [f"{solved:.0f} of {trials:.0f} at scale {value_text(scale)}" for solved, trials, scale in rows]
@@ -104,7 +104,7 @@ def _missing(totals: pd.DataFrame) -> str:
 
 
 def draw_tracks(view: View) -> Iterator[Drawing]:
-    """Root mean square error of each state beside its bounds, and NEES within its limits."""
+    """Draws the root mean square error of each state beside its bounds, and NEES within its limits."""
     rows = view["tracks"]
     if rows.empty:
         return

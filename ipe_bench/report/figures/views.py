@@ -24,35 +24,35 @@ if TYPE_CHECKING:
 MOST_SETTINGS = 6
 """Settings that have figures of their own; the tables have all."""
 MOST_LETTERS = 70
-"""Of a setting in a file name; longer ones are cut and end in a number."""
+"""Largest length of a setting in a file name; longer ones are cut and end in a number."""
 FRAMES = tuple(field.name for field in fields(Analysis) if field.type == "pd.DataFrame")
 """The tables of an analysis that a figure may ask for."""
 
 
 @dataclass(frozen=True)
 class View:
-    """One setting (measurement, noise and whatever else differs) over all its error scales, or all settings."""
+    """Holds one setting (measurement, noise and other differing options) over all its error scales, or all settings."""
 
     suffix: str
-    """What the file names of its figures end in; empty where there is one setting, and for all settings."""
+    """Suffix of the file names of its figures; empty if there is one setting, and for all settings."""
     label: str
     frames: Mapping[str, pd.DataFrame]
     look: Mapping[str, Look]
-    """Of every estimator in these frames, in the order of the legend."""
+    """Look of each estimator in these frames, in the order of the legend."""
     equations: Mapping[str, str | None]
-    """What each estimator solves; None for filters and direct estimates, which have no iterations and no root."""
+    """Equation that each estimator solves; None for filters and direct estimates, which have no iterations."""
     parameters: Sequence[Mapping[str, Any]] = ()
     """Name, unit, size and group of each; empty for all settings."""
     paper: bool = False
     """Whether this is the setting of the paper: the gimballed INS with quantised readings."""
     moving: bool = False
-    """Whether it is of states that move."""
+    """Whether the setting has states that move."""
     collection: Collection | None = None
-    """What is stored; the view of all settings alone has it."""
+    """Stored results; the view of all settings alone has them."""
 
     @property
     def reference(self) -> str:
-        """What errors are multiples of."""
+        """Names the unit of the errors."""
         return "the linearised filter" if self.moving else "the bound"
 
     def __getitem__(self, frame: str) -> pd.DataFrame:
@@ -76,19 +76,19 @@ class View:
         return sorted({float(s) for frame in frames for s in frame["error_scale"]})
 
     def with_look(self, estimators: Any) -> dict[str, Look]:
-        """The looks of those of the estimators that are here."""
+        """Returns the looks of those of the estimators that are present."""
         present = set(estimators)
         return {label: look for label, look in self.look.items() if label in present}
 
     def drawing(self, figure: Canvas, name: str, title: str, *caption: str) -> Drawing:
-        """A figure of this setting: the parts of its caption that say something, and the setting's own label."""
+        """Returns a figure of this setting: the non-empty parts of its caption, and the setting's own label."""
         words = [part for part in caption if part]
         return Drawing(
             f"{name}{self.suffix}", title, " ".join([*words, f"{self.label}."] if self.label else words), figure
         )
 
     def only(self, names: Sequence[str]) -> View:
-        """The same with those frames alone."""
+        """Returns the same view with those frames alone."""
         return replace(self, frames={name: self.frames[name] for name in names})
 
 
@@ -107,7 +107,7 @@ class Figure:
 
 
 def views(analysis: Analysis) -> tuple[list[View], View]:
-    """The settings of the simulated trials, at most `MOST_SETTINGS`, and all of them together with every estimator."""
+    """Yields at most `MOST_SETTINGS` settings of simulated trials, and all of them together with every estimator."""
     every, collection, analysis = _looks(analysis), analysis.collection, analysis.simulated
     look, columns = _looks(analysis), analysis.setting_columns
     equations = {g.estimator: g.footer.get("equation") for g in analysis.collection.groups}
@@ -137,7 +137,7 @@ def views(analysis: Analysis) -> tuple[list[View], View]:
 
 
 def _split(frame: pd.DataFrame, columns: Sequence[str]) -> dict[tuple[str, ...], Any]:
-    """The rows of each setting; none of a frame over all settings."""
+    """Returns the rows of each setting; none of a frame over all settings."""
     if not set(columns) <= set(frame.columns) or frame.empty:
         return {}
     grouped = frame.groupby([*columns], sort=False, dropna=False) if columns else [((), frame)]
@@ -145,7 +145,7 @@ def _split(frame: pd.DataFrame, columns: Sequence[str]) -> dict[tuple[str, ...],
 
 
 def _word(value: Any) -> str:
-    """A setting's value as it is compared and shown; a dash where a setting does not have that option."""
+    """Returns a setting's value as it is compared and shown; a dash where a setting does not have that option."""
     if value is None or (pd.api.types.is_scalar(value) and pd.isna(value)):
         return "-"
     # Six figures where they say it all: values that differ later are different settings.
@@ -153,8 +153,8 @@ def _word(value: Any) -> str:
 
 
 def _looks(analysis: Analysis) -> dict[str, Look]:
-    """A look for each estimator, in the colours of its family; of more than `MOST_FACES` the two best of each family
-    and the reference are in colour."""
+    """Returns a look for each estimator, in the colours of its family; of more than `MOST_FACES` the two best of each
+    family and the reference are in colour."""
     labels = list(dict.fromkeys(g.estimator for g in analysis.collection.groups))
     families = {g.estimator: family_of(g.footer) for g in analysis.collection.groups}
     if len(labels) <= MOST_FACES or analysis.summary.empty:
@@ -167,6 +167,6 @@ def _looks(analysis: Analysis) -> dict[str, Look]:
 
 
 def family_of(footer: Mapping[str, Any]) -> str:
-    """The family of an estimator, one of `FAMILIES`: the one that it declares, else by what it takes and solves."""
+    """Returns the family of an estimator, one of `FAMILIES`: its declared one, else by its inputs and equation."""
     known = "filters" if footer.get("sequential") else "IPE" if footer.get("equation") == "frozen" else "least squares"
     return footer.get("family") or known
