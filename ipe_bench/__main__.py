@@ -1,4 +1,4 @@
-"""`python -m ipe_bench`: the same as the command `ipe-bench`."""
+"""Runs the command `ipe-bench` as `python -m ipe_bench`."""
 
 from ipe_bench.cli.main import main
 

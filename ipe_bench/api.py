@@ -1,4 +1,4 @@
-"""The whole bench as functions: what the command line does, it does by these. They know no Hydra."""
+"""Offers the whole bench as functions, by which the command line does its work. They know no Hydra."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def run(
 
 
 def load(directories: Directories) -> pd.DataFrame:
-    """Every stored trial of one directory or bundle, or of several: a row per trial and estimator.
+    """Reads every stored trial of one directory or bundle, or of several: a row per trial and estimator.
 
     A row has the measurement, noise, prior, error_scale, seed and estimator, and every key of the config that differs;
     `error_NAME` and `deviation_NAME` (as the estimator reports it) per parameter, status, message, iterations,
@@ -171,7 +171,7 @@ def compare(
     difference: float | None = None,
     output: Path | str | None = None,
 ) -> pd.DataFrame:
-    """Whether a second version, setting or estimator is better or worse than a first, trial by trial.
+    """Tests whether a second version, setting or estimator is better or worse than a first, trial by trial.
 
     Compares every estimator and scenario that both directories have, or `first` of the first with `second` of the
     second; without a second directory both are in the first one. Trials are matched by seed and number, else in their
@@ -232,7 +232,7 @@ def compare(
 
 
 def audit(table: Path | str | pd.DataFrame, *, output: Path | str | None = None) -> Audit:
-    """Whether the covariance that another program reports describes its errors.
+    """Tests whether the covariance that another program reports describes its errors.
 
     `table` is a CSV or Parquet file, or a frame, with a row per run: NAME_true and NAME (or NAME_error), NAME_std (or
     NAME_var), and cov_A_B as far as there are any; see `ipe_bench.statistics.audit.read_claims`. The result has
@@ -260,7 +260,7 @@ def audit(table: Path | str | pd.DataFrame, *, output: Path | str | None = None)
 
 
 def status(directories: Directories) -> pd.DataFrame:
-    """How far everything is that runs asked for: a row per scenario and estimator (`truth`: the truth and its bounds).
+    """Counts the trials that runs asked for: a row per scenario and estimator (`truth`: the truth and its bounds).
 
     It has the numbers of trials `expected`, `done`, `missing`, `failed` and `stale`, and `messages`, why trials failed.
     `attrs["problems"]` has a line for everything that is missing, failed or damaged.
@@ -321,7 +321,7 @@ def estimate(
     ignore_columns: Sequence[str] = (),
     find: str | Sequence[str] = (),
 ) -> Answer | LogAnswer:
-    """Parameters from real readings, by every estimator: estimates, standard errors, residuals and a test of the fit.
+    """Estimates parameters from real readings by every estimator, with standard errors, residuals and a test of fit.
 
     A scenario stands for its model with its noise, prior and error scale. `readings` is a CSV or Parquet file, several
     that share parameters, or an array z (m,) in the model's order and unit, NaN where missing; None: those that come
@@ -411,7 +411,7 @@ def design(
     criterion: Criterion = "A",
     errors: Sequence[Measurement] | None = None,
 ) -> Design:
-    """What a scenario's readings say about each parameter, and which readings would say more; nothing is simulated.
+    """Evaluates, without simulation, what a scenario's readings say about each parameter, and which would say more.
 
     The result has `observability` (singular values, bounds, correlations, the least observable direction), `suspects`
     (what each error of the richer models `errors` does to the estimates, and whether a test of residuals will notice)
@@ -454,7 +454,7 @@ def posterior(
     particles: int = 1000,
     watch: Callable[[int], None] | None = None,
 ) -> list[Reference]:
-    """What the readings of a scenario's first trials really say, and how far each estimator's Gaussian is from it.
+    """Samples the posterior of a scenario's first trials, and measures how far each estimator's Gaussian is from it.
 
     The posterior is sampled by sequential Monte Carlo for normal errors of the covariance R that estimators assume. A
     result has the `truth` (n,), the `posterior` (draws `x` (draws, n) in multiples of the parameters' sizes, `mean`,
@@ -485,7 +485,7 @@ def posterior(
 
 
 def check(component: Any) -> list[Finding]:
-    """Whether a component keeps the promises that every component makes: a finding per check, with its complaint.
+    """Checks that a component keeps the promises that every component makes: a finding per check, with its complaint.
 
     `component` is a measurement model, noise, prior, execution or estimator, or the folder of a plugin, all of whose
     options are checked, statistics, figures, tables and sections among them. A finding whose `complaint` is empty
@@ -508,7 +508,7 @@ def check(component: Any) -> list[Finding]:
 
 
 def _scenario(given: Any, **stated: Any) -> Scenario:
-    """The scenario that is given, or that of a model under what is stated of it."""
+    """Returns the given scenario, or that of a model with the stated noise, prior and error scale."""
     stated = {name: value for name, value in stated.items() if value is not None}
     if isinstance(given, Scenario):
         if stated:
@@ -520,14 +520,14 @@ def _scenario(given: Any, **stated: Any) -> Scenario:
 
 
 def _tracking(given: Any) -> StateScenario | None:
-    """The scenario of a state model; None if the given is of constants."""
+    """Returns the scenario of a state model; None for one of constants."""
     if isinstance(given, StateModel):
         return StateScenario(given)
     return given if isinstance(given, StateScenario) else None
 
 
 def _labelled(estimators: Any, kind: Any = Estimator | Tracker) -> Mapping[str, Any]:
-    """The estimators, if each has a label and is one."""
+    """Returns the estimators, if each has a label and is one."""
     if not isinstance(estimators, Mapping):
         raise UserError('estimators: give each a label, as in {"newton": ib.solvers.Newton()}')
     for label, one in estimators.items():
@@ -537,7 +537,7 @@ def _labelled(estimators: Any, kind: Any = Estimator | Tracker) -> Mapping[str, 
 
 
 def _described(given: Any) -> str:
-    """What was given in place of an object of the bench."""
+    """Describes the value that was given in place of an object of the bench."""
     if isinstance(given, type):
         return f"{given.__name__} is a class, whose objects are written {given.__name__}()"
     return f"{given!r:.60} is a {type(given).__name__}"

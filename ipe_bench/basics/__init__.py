@@ -1,1 +1,1 @@
-"""What the whole package uses: arrays and batches, statuses, errors, files, and what this machine offers."""
+"""Holds what the whole package uses: arrays and batches, statuses, errors, files, and facts about this machine."""

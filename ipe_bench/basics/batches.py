@@ -1,4 +1,4 @@
-"""Rows of a batch: taking some trials out of it, and putting some into it.
+"""Takes rows out of a batch, and puts rows into one.
 
 A batch is an array or a list with the trials in front, or a dataclass whose fields are batches. None stays None.
 """
@@ -16,15 +16,15 @@ B = TypeVar("B")
 
 
 def take(batch: B, kept: NDArray[Any]) -> B:
-    """The trials `kept`, a mask (trials,) or indices, of a batch."""
+    """Returns the trials `kept`, a mask (trials,) or indices, of a batch."""
     if isinstance(batch, list):
         return [batch[i] for i in _indices(kept)]  # pyright: ignore[reportReturnType]
     return _each(lambda part: take(part, kept), batch) if is_dataclass(batch) else batch[kept]  # type: ignore[index]
 
 
 def put(batch: B, where: NDArray[Any], part: B) -> B:
-    """A copy of the batch in which the trials `where`, a mask or indices, are those of `part`, in its order; `part`
-    itself where the mask holds everywhere."""
+    """Copies the batch with the trials `where`, a mask or indices, replaced by those of `part`, in its order; returns
+    `part` itself where the mask holds everywhere."""
     if where.dtype == bool and where.all():
         return part
     if isinstance(batch, list):
@@ -38,13 +38,13 @@ def put(batch: B, where: NDArray[Any], part: B) -> B:
 
 
 def gather(parts: Sequence[tuple[NDArray[np.intp], B]]) -> B:
-    """The batch of which each part has the trials at these indices, all of them together."""
+    """Gathers the trials at each part's indices into one batch."""
     rows = np.concatenate([rows for rows, _ in parts])
     return parts[0][1] if len(parts) == 1 else take(_join([part for _, part in parts]), np.argsort(rows))
 
 
 def _join(batches: Sequence[B]) -> B:
-    """Batches one after another."""
+    """Joins batches one after another."""
     first = batches[0]
     if isinstance(first, list):
         return [row for batch in batches for row in batch]  # type: ignore[return-value,union-attr]

@@ -1,4 +1,4 @@
-"""Machine code for this processor, made from LLVM's intermediate representation and kept in files between processes.
+"""Compiles LLVM's intermediate representation to machine code for this processor, kept in files between processes.
 
 A function takes pointers and whole numbers and returns nothing; a call lets other threads run. Where no machine code
 can be made, `available` says so, and callers compute the same with NumPy.
@@ -37,7 +37,7 @@ POINTER, INTEGER = ctypes.c_void_p, ctypes.c_int64
 
 @functools.cache
 def available() -> bool:
-    """Whether machine code can be made here."""
+    """Returns whether machine code can be made here."""
     try:
         _target()
         _addresses()
@@ -49,7 +49,7 @@ def available() -> bool:
 
 @functools.cache
 def _target() -> Any:
-    """LLVM's description of this processor."""
+    """Returns LLVM's description of this processor."""
     import llvmlite.binding as llvm
 
     llvm.initialize_native_target()
@@ -61,7 +61,7 @@ def _target() -> Any:
 
 @functools.cache
 def _addresses() -> dict[str, int]:
-    """Where the functions of the C library are."""
+    """Returns the addresses of the functions of the C library."""
     library = ctypes.CDLL(None if sys.platform != "win32" else "ucrtbase")
     mathematics = ctypes.CDLL(find_library("m")) if sys.platform.startswith("linux") else library
     found = {}
@@ -75,7 +75,7 @@ def _addresses() -> dict[str, int]:
 
 @functools.cache
 def width() -> int:
-    """Numbers in a vector register."""
+    """Returns the numbers that a vector register holds."""
     import llvmlite.binding as llvm
 
     return 8 if llvm.get_host_cpu_features().get("avx512f") else 4
@@ -83,7 +83,7 @@ def width() -> int:
 
 @functools.lru_cache(maxsize=256)
 def load(key: str, write: Callable[[], str], name: str, arguments: tuple[Any, ...]) -> Callable[..., None]:
-    """The function `name` of the module that `write` writes and `key` stands for, compiled once per machine.
+    """Loads the function `name` of the module that `write` writes and `key` identifies, compiled once per machine.
 
     A kept file is used only if it was made of this key for this processor, is whole, and belongs to this user or the
     system.
@@ -111,7 +111,7 @@ def load(key: str, write: Callable[[], str], name: str, arguments: tuple[Any, ..
 
 
 def _own_bytes(path: Path) -> bytes:
-    """The content of a file that belongs to this user or the system and that no other user can write to; else b""."""
+    """Reads a file that belongs to this user or the system and is writable by no other user; returns b"" otherwise."""
     if not path.is_file():
         return b""
     with path.open("rb") as file:
@@ -134,7 +134,7 @@ def _object_code(text: str) -> bytes:
 
 @functools.cache
 def _machine() -> tuple[str, ...]:
-    """What machine code depends on besides its source."""
+    """Describes what machine code depends on besides its source."""
     import llvmlite.binding as llvm
 
     version = importlib.metadata.version("llvmlite")
@@ -153,7 +153,7 @@ DOUBLE, WHOLE = np.dtype(np.float64), np.dtype(np.int64)
 
 
 def at(a: Any, kind: Any = DOUBLE) -> int:
-    """Where the numbers of a C-contiguous array lie, in a third of the time that `a.ctypes.data` takes."""
+    """Returns the address of a C-contiguous array's numbers, in a third of the time that `a.ctypes.data` takes."""
     if a.dtype != kind:
         raise TypeError(f"an array of {a.dtype}, where one of {kind} is taken")
     if not a.size:
@@ -162,6 +162,6 @@ def at(a: Any, kind: Any = DOUBLE) -> int:
 
 
 def aligned(numbers: int) -> tuple[np.ndarray[Any, Any], int]:
-    """Memory for this many numbers, and the address at which it begins, the border of a cache line."""
+    """Allocates memory for this many numbers; returns it and its first address on the border of a cache line."""
     memory = np.empty(numbers + 8)
     return memory, -(-at(memory) // 64) * 64

@@ -1,4 +1,4 @@
-"""The exceptions that are meant for users; everything else that is raised is a bug."""
+"""Defines the exceptions that are meant for users; everything else that is raised is a bug."""
 
 import difflib
 import inspect
@@ -12,7 +12,7 @@ from typing import Any
 
 
 class UserError(Exception):
-    """A mistake in a config, a command or a file: one line that names the key or row, and the remedy.
+    """Reports a mistake in a config, a command or a file: one line that names the key or row, and the remedy.
 
     The command line prints it without a traceback and exits with code 2.
     """
@@ -26,13 +26,13 @@ class StorageError(Exception):
 
 
 def one_line(text: Any) -> str:
-    """The first line of a text, at most 1000 letters of it, with ? for what no file can hold."""
+    """Returns the first line of a text, at most 1000 letters of it, with ? for what no file can hold."""
     lines = str(text)[:1000].encode("utf-8", "replace").decode().splitlines()
     return lines[0] if lines else ""
 
 
 def describe_exception(error: BaseException) -> str:
-    """One line for a table: the type and the first line of the message."""
+    """Describes an exception in one line for a table: the type and the first line of the message."""
     line = one_line(error)
     if "read-only" in line:
         line += " (it writes into what it is given: work on a copy)"
@@ -40,7 +40,7 @@ def describe_exception(error: BaseException) -> str:
 
 
 def place_of(error: BaseException, within: str | None = None) -> str:
-    """What was raised, and the file and line where; the last line of the file `within` that was running, if any was."""
+    """Returns the exception's type, and the file and line where; the last running line of the file `within`, if any."""
     if isinstance(error, SyntaxError):
         return f"{error.filename}, line {error.lineno}: {type(error).__name__}: {error.msg}"
     frames = traceback.extract_tb(error.__traceback__)
@@ -53,7 +53,7 @@ def _shown(filename: str) -> str:
 
 
 def definition(function: Any) -> str:
-    """The file and line in which a function or method is written, if they are known, and its name."""
+    """Returns the file and line in which a function or method is written, if they are known, and its name."""
     function = inspect.unwrap(getattr(function, "__func__", function))
     code, name = getattr(function, "__code__", None), getattr(function, "__qualname__", str(function))
     return (
@@ -62,12 +62,12 @@ def definition(function: Any) -> str:
 
 
 def shortened(text: str, length: int = 120) -> str:
-    """The text, or its beginning and its end where it is longer than a line."""
+    """Returns the text, or its beginning and its end where it is longer than a line."""
     return text if len(text) <= length else f"{text[: length - 24]}...{text[-20:]}"
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """'; did you mean ...?' with the nearest of the known names, capitals or not; empty if none is near."""
+    """Returns '; did you mean ...?' with the nearest of the known names, capitals or not; empty if none is near."""
     cases = {one.lower(): one for one in known}
     close = difflib.get_close_matches(name.lower(), cases, 1)
     return f"; did you mean {cases[close[0]]}?" if close else ""
@@ -88,7 +88,7 @@ ZOO = {
 
 
 def moved(name: str) -> str:
-    """Where an option or a class of an earlier version is now; empty if it has not moved."""
+    """Says where an option or a class of an earlier version is now; empty if it has not moved."""
     if name not in (*ZOO, *ZOO.values()):
         return ""
     what = "" if name in ZOO else f"ipe_bench_zoo.{name} "
@@ -97,7 +97,7 @@ def moved(name: str) -> str:
 
 
 def unknown(name: str, known: Iterable[str], noun: str) -> str:
-    """'there is no such option; did you mean ...', with everything there is, or where it is now."""
+    """Says that there is no such option; names the nearest, and all there are, or where it is now."""
     known = sorted(known)
     if noun in ("option", "estimator", "group") and (place := moved(name)):
         return place

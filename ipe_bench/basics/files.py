@@ -1,4 +1,4 @@
-"""Files that appear under their name complete or not at all."""
+"""Writes files that appear under their name complete or not at all."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
 
 
 def regular(path: Path) -> Path:
-    """The path of a regular file; a pipe or a device may be read without end.
+    """Returns the path of a regular file; a pipe or a device may be endless.
 
     Raises:
         OSError: something else is there, or nothing (FileNotFoundError).
@@ -68,8 +68,8 @@ def write_text(path: Path, text: str) -> None:
 
 
 def cache_folder() -> Path:
-    """Where what is compiled once is kept between processes: `IPE_BENCH_CACHE`, or the user's cache; if that cannot be
-    written to, a folder of the user's own among temporary files."""
+    """Returns the folder of compiled files: `IPE_BENCH_CACHE`, or the user's cache; if that cannot be written to, a
+    folder of the user's own among temporary files."""
     for place in (_chosen_cache, _spare_cache):
         with contextlib.suppress(OSError, KeyError, RuntimeError):  # of homes that are not known, too
             folder = place()
@@ -87,7 +87,7 @@ def _chosen_cache() -> Path:
 
 
 def _spare_cache() -> Path:
-    """A folder that belongs to this user alone, whoever may write to the folder of temporary files."""
+    """Returns a folder that belongs to this user alone, whoever may write to the folder of temporary files."""
     folder = Path(tempfile.gettempdir()) / f"ipe-bench-{os.geteuid() if os.name == 'posix' else 'cache'}"
     folder.mkdir(mode=0o700, exist_ok=True)
     about = folder.lstat()
@@ -97,7 +97,7 @@ def _spare_cache() -> Path:
 
 
 def own_conf() -> Path:
-    """The folder of our configs: inside the installed package, or beside it in a checkout."""
+    """Returns the folder of our configs: inside the installed package, or beside it in a checkout."""
     package = Path(__file__).resolve().parents[1]
     for folder in (package / "conf", package.parent / "conf"):
         if (folder / "config.yaml").is_file():

@@ -1,4 +1,4 @@
-"""Batched linear algebra whose result for one trial does not depend on the other trials in the batch.
+"""Computes batched linear algebra, in which no trial's result depends on the other trials of the batch.
 
 Matrix products are stacked, one per trial: a product over a whole batch would change a trial's bits with the size of
 the batch. A singular matrix spoils its own trial only.
@@ -26,30 +26,30 @@ _WELL_CONDITIONED = 1e3
 
 
 def own(x: Array) -> Array:
-    """The same numbers as compiled code takes them: contiguous, and not marked as read-only."""
+    """Returns the same numbers in the layout of compiled code: contiguous, and not marked as read-only."""
     x = np.ascontiguousarray(x, dtype=float)
     return x if x.flags.writeable else x.copy()
 
 
 def finite(a: Array) -> Mask:
-    """Which trials (trials,) of a (trials, ...) are finite throughout."""
+    """Tells which trials (trials,) of a (trials, ...) are finite throughout."""
     return np.asarray(np.isfinite(a).all(axis=tuple(range(1, a.ndim))))
 
 
 def read_only(a: Array) -> Array:
-    """A read-only view of the same numbers."""
+    """Returns a read-only view of the same numbers."""
     view = np.asarray(a).view()
     view.flags.writeable = False
     return view
 
 
 def unmasked(values: Any) -> Array:
-    """The values as an ordinary array of floats, in which masked entries are NaN."""
+    """Returns an ordinary array of floats, in which masked entries are NaN."""
     return np.asarray(np.ma.asarray(values, dtype=float).filled(np.nan))
 
 
 def plain_numbers(what: str, values: Any, shape: tuple[int, ...]) -> Array:
-    """The values as an ordinary array of floats of this shape, in which masked entries are NaN.
+    """Returns an ordinary array of floats of this shape, in which masked entries are NaN.
 
     Raises:
         ValueError: they have another shape, or are no real numbers.
@@ -63,7 +63,7 @@ def plain_numbers(what: str, values: Any, shape: tuple[int, ...]) -> Array:
 
 
 def nearest(z: Array, to: Array, periods: Array | Sequence[float]) -> Array:
-    """z (..., m) shifted by whole periods next to `to` (..., m); a period of 0, or of none at all, shifts nothing."""
+    """Shifts z (..., m) by whole periods next to `to` (..., m); a period of 0, or none at all, shifts no entry."""
     if not len(periods):
         return z
     period = np.asarray(periods)
@@ -72,7 +72,7 @@ def nearest(z: Array, to: Array, periods: Array | Sequence[float]) -> Array:
 
 
 def multiply(A: Array, x: Array) -> Array:
-    """A x for each trial: A (..., p, q), x (trials, q) -> (trials, p)."""
+    """Computes A x for each trial: A (..., p, q), x (trials, q) -> (trials, p)."""
     return np.matmul(A, x[..., None])[..., 0]
 
 
@@ -89,12 +89,12 @@ def solve(A: Array, b: Array) -> tuple[Array, Mask]:
 
 
 def inverse(A: Array) -> tuple[Array, Mask]:
-    """The inverse of each A (trials, n, n); NaN and flagged where there is none."""
+    """Inverts each A (trials, n, n); NaN and flagged where it is singular."""
     return solve(A, np.broadcast_to(np.eye(A.shape[-1]), A.shape))
 
 
 def _of_each(function: Callable[..., Array], *batches: Array) -> Array:
-    """What a function of NumPy makes of each matrix; NaN where it refuses one."""
+    """Applies a function of NumPy to each matrix; NaN where it refuses one."""
     try:
         return function(*batches)
     except np.linalg.LinAlgError:
@@ -106,23 +106,23 @@ def _of_each(function: Callable[..., Array], *batches: Array) -> Array:
 
 
 def deviations(P: Array) -> Array:
-    """Standard deviations (trials, n) of the covariances P (trials, n, n)."""
+    """Returns the standard deviations (trials, n) of the covariances P (trials, n, n)."""
     return np.sqrt(np.diagonal(P, axis1=-2, axis2=-1))
 
 
 def squared(r: Array) -> Array:
-    """|r|^2 (trials,) of vectors (trials, k)."""
+    """Computes |r|^2 (trials,) of vectors (trials, k)."""
     return np.einsum("ti,ti->t", r, r)
 
 
 def quadratic_form(P_inverse: Array, e: Array) -> Array:
-    """e' P^-1 e for each trial: P_inverse (..., n, n), e (trials, n) -> (trials,)."""
+    """Computes e' P^-1 e for each trial: P_inverse (..., n, n), e (trials, n) -> (trials,)."""
     return np.einsum("...i,...i->...", e, multiply(P_inverse, e))
 
 
 @dataclass(frozen=True)
 class Covariance:
-    """A covariance R of m readings, as what whitens them.
+    """Holds a covariance R of m readings, by the factor that whitens them.
 
     `factor` is the vector (m,) of standard deviations where readings are independent, else the lower Cholesky factor
     (m, m) of R.
@@ -143,36 +143,36 @@ class Covariance:
         return self.factor if self.factor.ndim == 1 else np.sqrt(np.sum(self.factor**2, axis=1))
 
     def whiten(self, r: Array) -> Array:
-        """R^-1/2 r for residuals r (..., m): independent, of unit variance."""
+        """Computes R^-1/2 r for residuals r (..., m): independent, of unit variance."""
         if self.factor.ndim == 1:
             return r / self.factor
         return multiply(self._inverse_factor(), r)
 
     def whiten_jacobian(self, J: Array) -> Array:
-        """R^-1/2 J for J (..., m, n)."""
+        """Computes R^-1/2 J for J (..., m, n)."""
         if self.factor.ndim == 1:
             return J / self.factor[:, None]
         return np.matmul(self._inverse_factor(), J)
 
     def restricted(self, rows: NDArray[np.intp]) -> Covariance:
-        """The covariance of some of the readings."""
+        """Returns the covariance of some of the readings."""
         if self.factor.ndim == 1:
             return Covariance(self.factor[rows])
         return Covariance(np.linalg.cholesky(self.matrix()[np.ix_(rows, rows)]))
 
     def matrix(self) -> Array:
-        """R itself (m, m)."""
+        """Computes R itself (m, m)."""
         return np.diag(self.factor**2) if self.factor.ndim == 1 else self.factor @ self.factor.T
 
     def inverse(self) -> Array:
-        """R^-1 (m, m)."""
+        """Computes R^-1 (m, m)."""
         if self.factor.ndim == 1:
             return np.diag(self.factor**-2.0)
         whitener = self._inverse_factor()
         return whitener.T @ whitener
 
     def coloured(self, w: Array) -> Array:
-        """R^1/2 w: white numbers w (..., m) of unit variance as draws of covariance R."""
+        """Computes R^1/2 w: white numbers w (..., m) of unit variance as draws of covariance R."""
         return w * self.factor if self.factor.ndim == 1 else multiply(self.factor, w)
 
     def _inverse_factor(self) -> Array:
@@ -182,15 +182,15 @@ class Covariance:
 
 
 def information(J: Array, R: Covariance) -> Array:
-    """The Fisher information J' R^-1 J for J (..., m, n)."""
+    """Computes the Fisher information J' R^-1 J for J (..., m, n)."""
     with np.errstate(all="ignore"):
         Jw = np.ascontiguousarray(R.whiten_jacobian(J))
         return np.matmul(Jw.swapaxes(-1, -2), Jw)
 
 
 def definite_factor(G: Array) -> tuple[Array, Array, Mask]:
-    """U (trials, n, n) with U' U = G of each G = J' J (trials, n, n), its inverse, and the mask (trials,) of where J is
-    so well conditioned that this may be had from J' J, a third of the work of QR; elsewhere they are not to be used.
+    """Computes U (trials, n, n) with U' U = G of each G = J' J (trials, n, n), its inverse, and the mask (trials,) of
+    where J is well enough conditioned for this, a third of the work of QR; elsewhere they are not to be used.
 
     The columns of J are scaled first; what is lost of U is n eps times the condition squared (Higham, Accuracy and
     Stability of Numerical Algorithms, 2002, section 20.4).
@@ -207,7 +207,7 @@ def definite_factor(G: Array) -> tuple[Array, Array, Mask]:
 
 
 def _inverse_of_upper(U: Array) -> Array:
-    """The inverses of upper triangular matrices (trials, n, n), by back substitution in all trials at once."""
+    """Inverts upper triangular matrices (trials, n, n), by back substitution in all trials at once."""
     V = np.zeros(U.shape)
     for i in reversed(range(U.shape[1])):
         V[:, i] = -np.matmul(U[:, i, None, i + 1 :], V[:, i + 1 :])[:, 0]
@@ -217,7 +217,7 @@ def _inverse_of_upper(U: Array) -> Array:
 
 
 def pseudo_inverse(H: Array, R: Covariance) -> tuple[Array, Mask]:
-    """H+ = (H' R^-1 H)^-1 H' R^-1 for H (trials, m, n): (trials, n, m).
+    """Computes H+ = (H' R^-1 H)^-1 H' R^-1 for H (trials, m, n): (trials, n, m).
 
     Flags the trials whose H has not full column rank to working precision; their H+ is NaN.
     """
@@ -235,7 +235,7 @@ def pseudo_inverse(H: Array, R: Covariance) -> tuple[Array, Mask]:
 
 
 def _by_orthogonal_factor(H: Array) -> tuple[Array, Mask]:
-    """The pseudo-inverse of any H (trials, m, n), and where it has not full column rank."""
+    """Computes the pseudo-inverse of any H (trials, m, n), and where it has not full column rank."""
     usable = finite(H)
     Q, U = np.linalg.qr(np.where(usable[:, None, None], H, 0.0))
     diagonal = np.abs(np.diagonal(U, axis1=1, axis2=2))

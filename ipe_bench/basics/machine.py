@@ -11,12 +11,12 @@ _LIBRARIES = ("numpy", "scipy", "llvmlite", "filterpy", "hydra-core", "pandas", 
 
 
 def cores() -> int:
-    """Cores that this process may use: fewer than there are where an affinity mask says so."""
+    """Counts the cores that this process may use: fewer than there are where an affinity mask says so."""
     affinity = getattr(os, "sched_getaffinity", None)
     return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
 @functools.cache
 def library_versions() -> dict[str, str]:
-    """Python and the libraries that results depend on, with their versions."""
+    """Returns Python and the libraries that results depend on, with their versions."""
     return {"python": platform.python_version()} | {name: importlib.metadata.version(name) for name in _LIBRARIES}

@@ -41,7 +41,7 @@ _COMPARISONS = {
     MinLen: lambda value, length: len(value) >= length,
     Predicate: lambda value, holds: holds(value),
 }
-"""What each constraint asks of a value, given the constraint's own number or function."""
+"""Test of a value by each constraint, given the constraint's own number or function."""
 _BOUNDED = {
     (): "{}",
     (Gt,): "{} above {}",
@@ -58,7 +58,7 @@ _NOUNS = {int: "a whole number", float: "a number", bool: "true or false", str: 
 
 
 class Component:
-    """What a config describes: a frozen dataclass whose fields are its options and its identity.
+    """Describes a component by a config: a frozen dataclass whose fields are its options and its identity.
 
     A class whose options must suit one another writes `__post_init__` and calls this one first.
     """
@@ -93,7 +93,7 @@ class Component:
 
 
 def component_classes(component: Any) -> list[Any]:
-    """The class of a component with its bases and the functions it computes with, and those of its components."""
+    """Collects the classes of a component and its components, with bases and the functions that they compute with."""
     if isinstance(component, tuple | list):
         return [cls for item in component for cls in component_classes(item)]
     if not dataclasses.is_dataclass(component) or isinstance(component, type):
@@ -105,7 +105,7 @@ def component_classes(component: Any) -> list[Any]:
 
 @functools.cache
 def option_types(cls: type) -> dict[str, Any]:
-    """The types, constraints included, of what the constructor of a dataclass takes.
+    """Returns the types, constraints included, of what the constructor of a dataclass takes.
 
     Raises:
         UserError: one of them cannot be read.
@@ -121,7 +121,7 @@ def option_types(cls: type) -> dict[str, Any]:
 
 
 def checked(value: Any, hint: Any, key: str) -> Any:
-    """The value, converted where the type allows (1 for 1.0, a list for a tuple).
+    """Checks a value and converts it where the type allows (1 for 1.0, a list for a tuple).
 
     Raises:
         UserError: `KEY=VALUE: give ...`, where the value is not of the type or not within its constraints.
@@ -171,7 +171,7 @@ def _constrained(value: Any, kind: Any, metadata: Sequence[Any], key: str) -> An
 
 
 def _bounds(metadata: Sequence[Any]) -> list[Any]:
-    """The constraints among an annotation's metadata."""
+    """Returns the constraints among an annotation's metadata."""
     bounds = [item for item in metadata if isinstance(item, BaseMetadata)]
     for bound in bounds:
         if type(bound) not in _COMPARISONS:
@@ -217,7 +217,7 @@ def _entries(value: Any, arguments: Sequence[Any], key: str) -> tuple[Any, ...]:
 
 
 def describe_type(hint: Any) -> str:
-    """What a user is to give: 'a number above 0 or null'."""
+    """Describes the values that an option takes: 'a number above 0 or null'."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
         bounds = [bound for bound in _bounds(arguments[1:]) if not isinstance(bound, Predicate)]

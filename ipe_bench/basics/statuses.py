@@ -1,10 +1,10 @@
-"""How a trial ended."""
+"""Defines how a trial ends."""
 
 from enum import IntEnum
 
 
 class Status(IntEnum):
-    """The last word on one trial; its `reason` explains it to a reader of the tables."""
+    """States how one trial ended; its `reason` explains it to a reader of the tables."""
 
     reason: str
 

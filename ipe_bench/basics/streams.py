@@ -11,18 +11,18 @@ from ipe_bench.basics.linalg import Array
 
 
 def own_generators(seed: int, z: Array) -> list[np.random.Generator]:
-    """A generator for each trial of readings z (trials, m), which depends on `seed` and on these readings alone."""
+    """Makes a generator for each trial of z (trials, m), which depends on `seed` and on these readings alone."""
     digests = [hashlib.sha256(np.ascontiguousarray(row, dtype=float).tobytes()).digest() for row in z]
     entropy = [[seed, *np.frombuffer(digest, dtype=np.uint32).tolist()] for digest in digests]
     return [np.random.Generator(np.random.Philox(np.random.SeedSequence(words))) for words in entropy]
 
 
 def normals(generators: Sequence[np.random.Generator], *shape: int) -> Array:
-    """Standard normal numbers (trials, *shape), each trial's from its own generator."""
+    """Draws standard normal numbers (trials, *shape), each trial's from its own generator."""
     return np.array([g.standard_normal(shape) for g in generators]).reshape(len(generators), *shape)
 
 
 def numbered(seed: int, start: int, stop: int, child: int) -> Iterator[np.random.Generator]:
-    """A generator for each of the trials start to stop; a trial has as many streams as there are children."""
+    """Makes a generator for each of the trials start to stop; a trial has as many streams as there are children."""
     for trial in range(start, stop):
         yield np.random.Generator(np.random.Philox(np.random.SeedSequence(seed, spawn_key=(trial, child))))

@@ -1,4 +1,4 @@
-"""The command line. Hydra is known here and nowhere else."""
+"""Implements the command line; only this room knows Hydra."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _WIDTH_WITHOUT_TERMINAL = 120
 
 
 def console() -> Console:
-    """Where tables are printed: as wide as the terminal, or wide enough for a table in a file."""
+    """Makes the console for tables: as wide as the terminal, or wide enough for a table in a file."""
     from rich.console import Console
 
     out = Console(highlight=False)
@@ -62,7 +62,7 @@ def show(parts: Iterable[Part]) -> None:
 
 
 def places_and_keys(command: str, words: Sequence[str], kinds: Mapping[str, Any]) -> tuple[list[str], dict[str, Any]]:
-    """The files and folders after a command that Hydra does not read, and the values of its keys by their types."""
+    """Splits off the files and folders after a command that Hydra does not read, and keys' values by their types."""
     from ipe_bench.basics.options import checked
 
     refuse_blanks(words)

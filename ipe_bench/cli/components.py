@@ -1,4 +1,4 @@
-"""The commands on components and plugins: list, check and new."""
+"""Defines the commands on components and plugins: list, check and new."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from ipe_bench.plugins.conformance import Finding
 
 RECORDS = {"statistic": "STATISTIC", "figure": "FIGURE", "table": "table", "section": "SECTION"}
-"""What reports are made of, and what each is called in its module."""
+"""Names of the elements of reports, and of each in its module."""
 ALONE = {
     "function": ("{name}.py", 'measurement=function measurement.of={name}:{name} "measurement.columns.t=[0,1,2,3,4]"'),
     "ode": ("{name}.yaml", "measurement=ode measurement.file={name}.yaml"),
@@ -55,7 +55,7 @@ _GONE = {"keys": "`ipe-bench run --help` explains every key of a run"}
 
 
 def list_command(names: Sequence[str], verbose: bool) -> int:
-    """One line per option of each group, with all that it may be told if `verbose`; of an option, GROUP/NAME, that."""
+    """Prints one line per option of each group, with its own options if `verbose`; for GROUP/NAME only that option."""
     print_problems(plugins.take_problems())
     known = [*plugins.groups(), *({"statistic", "figure"} - set(plugins.groups()))]
     for name in renamed(names) or plugins.groups():
@@ -89,7 +89,7 @@ def list_command(names: Sequence[str], verbose: bool) -> int:
 
 
 def _ours(group: str) -> dict[str, str]:
-    """Statistics and figures that come with the bench, which are no options, with what they are."""
+    """Returns the statistics and figures that come with the bench, which are no options, with descriptions."""
     if group == "statistic":
         from ipe_bench.statistics.records import SCORES, STATISTICS
 
@@ -106,7 +106,7 @@ def _show(title: str, columns: Mapping[str, Sequence[str]]) -> None:
 
 
 def _describe(option: plugins.Option) -> None:
-    """Every option of a component with its value, what may be given, and what it means."""
+    """Describes every option of a component with its value, its type, and its meaning."""
     if option.fault is not None:
         raise UserError(f"{option.group}={option.name}: {option.fault}")
     prefix = "" if option.group == "experiment" else f"{option.group}."
@@ -129,7 +129,7 @@ def _describe(option: plugins.Option) -> None:
 
 
 def _describe_measurement(option: plugins.Option) -> None:
-    """The parameters of a measurement model, and the file of readings that it wants."""
+    """Describes the parameters of a measurement model, and the file of readings that it takes."""
     from ipe_bench.real.readings import header, labels
 
     try:
@@ -189,7 +189,7 @@ def _check_chosen(words: Sequence[str]) -> list[Finding]:
 
 
 def _check_experiments(folder: str) -> Iterator[Finding]:
-    """Whether each experiment of the plugin asks for what there is."""
+    """Checks that each experiment of the plugin asks for existing options."""
     from ipe_bench.cli import words as w
     from ipe_bench.cli.session import jobs_of, session
     from ipe_bench.plugins.conformance import Finding
@@ -295,7 +295,7 @@ def _write_skill(folder: Path) -> list[Path]:
 
 
 def _page(kind: str) -> str:
-    """How to make a component of a kind, with the skeleton, and with the promises that `check` tries."""
+    """Returns instructions for a component of a kind, with the skeleton, and with the promises that `check` tests."""
     name = f"my_{kind}"
     tried = [line.strip() for line in _said(f"new {kind} {name}").splitlines() if "ipe-bench check" in line]
     check = tried[0].removeprefix("ipe-bench ")

@@ -1,4 +1,4 @@
-"""The commands on a single scenario, each with one folder of files: estimate, design and posterior."""
+"""Defines the commands on a single scenario, each with one folder of files: estimate, design and posterior."""
 
 from __future__ import annotations
 
@@ -31,29 +31,29 @@ if TYPE_CHECKING:
     from ipe_bench.trials.design import Criterion
 
 STANDARD_ESTIMATORS = ("solver=[auto]", "baseline=[linear_lse,levenberg_marquardt]")
-"""Of `estimate`: the one that chooses its way by itself, and two that it can be held against."""
+"""Estimators of `estimate`: one that chooses its method itself, and two to compare it with."""
 OF_CONSTANTS_ALONE = {
     "design": "the bounds of states are those of `ipe-bench run state_model=NAME`",
     "posterior": "use `ipe-bench run state_model=NAME`, with tracker=[grid] for one state, or tracker=[bootstrap]",
 }
 """Commands on parameters that stand still, with what serves for states that move."""
 _TRIALS, _MOST_TRIALS = 3, 100
-"""Of `posterior`."""
+"""Number of trials of `posterior`, by default and at most."""
 
 
 @dataclass(frozen=True)
 class Single:
-    """What a command was asked for."""
+    """Holds the request of a command."""
 
     command: str
     words: Words
     spec: Spec
     config: dict[str, Any]
-    """As it was composed."""
+    """Config as Hydra composed it."""
 
     @property
     def measurement(self) -> str:
-        """The model, as it was asked for."""
+        """Measurement model of the request."""
         spec, group = self.spec, "measurement" if self.spec.state_model is None else "state_model"
         model = spec.measurement if spec.state_model is None else spec.state_model
         if isinstance(model, Nist):
@@ -61,16 +61,16 @@ class Single:
         return self.words.chosen(group) or model.name
 
     def folder(self, name: str, identity: Any, files: Sequence[str] = ()) -> Path:
-        """Reserves the folder that was named, or one that is named after the command and the model, for a command that
-        `identity` tells from others, as NAME.json says it, and for its further `files`."""
+        """Reserves the named folder, or one named after the command and the model, for a command that `identity` tells
+        from others in NAME.json, and for its further `files`."""
         output, named = Path(self.spec.output), not {"name", "output"}.isdisjoint(self.words.keys)
         folder = output if named else output.with_name(f"{self.command}-{self.measurement.replace('/', '-')}")
         return reserve_output_folder(folder, name, identity, elsewhere=not named, files=files)
 
 
 def single(command: str, arguments: Sequence[str], standard: Sequence[str] = (), **refused: Sequence[str]) -> Single:
-    """The one job that the arguments of a command ask for; `standard` are words that stand unless others are given, and
-    `refused` are keys that mean nothing to it, by whom they are for."""
+    """Composes the one job that the arguments of a command ask for; `standard` are default words, and `refused` are
+    keys without meaning for it, by whom they are for."""
     with session():
         words = w.read(command, arguments)
         for whose, keys in refused.items():
@@ -111,7 +111,7 @@ def _described(estimators: Any) -> dict[str, Any]:
 
 
 def estimate_command(arguments: Sequence[str]) -> int:
-    """Estimates with every chosen estimator, prints tables and writes files; exit code 1 where none is an answer."""
+    """Estimates with every chosen estimator, prints tables and writes files; returns 1 if no fit passes."""
     from ipe_bench.report.answer import FILES, NAME, Answer, estimate_parts, write_answer
 
     asked = single("estimate", arguments, STANDARD_ESTIMATORS, run=(*of("run", "trials"), w.TRUTH))
@@ -187,7 +187,7 @@ def design_command(
 
 
 def posterior_command(arguments: Sequence[str], particles: int) -> int:
-    """Samples, prints a table and writes files; exit code 1 where the populations of a trial do not agree."""
+    """Samples, prints a table and writes files; returns 1 if the populations of a trial do not agree."""
     from ipe_bench.report.questions import posterior_parts, write_posteriors
 
     asked = single("posterior", arguments, run=of("run", "figures"), estimate=OF_FILES)

@@ -7,7 +7,7 @@ class Key(NamedTuple):
     """A key of the config, or a word that stands for several."""
 
     kind: str
-    """What it is of: parameters that stand still, moving states, estimators, trials, a run of many, files, ..."""
+    """Subject of the key: parameters that stand still, moving states, estimators, trials, a run of many, files, ..."""
     written: str
     """The word as help writes it: N stands for a whole number, [A,B] for a list of names."""
     meaning: str
@@ -15,7 +15,7 @@ class Key(NamedTuple):
 
     @property
     def name(self) -> str:
-        """The key's first part."""
+        """First part of the key."""
         return self.written.lstrip("+").partition("=")[0].partition(".")[0]
 
 
@@ -66,7 +66,7 @@ WHOLE = tuple(key.name for key in ROWS if key.written.endswith("=N"))
 
 
 def of(*kinds: str) -> tuple[str, ...]:
-    """The keys of these kinds."""
+    """Selects the keys of these kinds."""
     return tuple(key.name for key in ROWS if key.kind in kinds)
 
 

@@ -1,4 +1,4 @@
-"""The command `ipe-bench`: finds the command, and turns a user's mistake into one line and exit code 2."""
+"""Defines the command `ipe-bench`: finds the command, and turns a user's mistake into one line and exit code 2."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _explain(error: BaseException) -> tuple[int, str]:
-    """The exit code and the line for what ended the command; raises again what is a bug."""
+    """Returns the exit code and the line for the exception that ended the command; raises again a bug."""
     from ipe_bench.plugins.discovery import blame
 
     if isinstance(error, KeyboardInterrupt):

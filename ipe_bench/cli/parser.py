@@ -32,7 +32,7 @@ INFO_TOPICS = ("all", "config", "defaults", "defaults-tree", "plugins", "searchp
 _MISSING = "0 done; 1 done, but something that was asked for is missing"
 
 Arguments = dict[str, dict[str, Any]]
-"""What argparse is told of each argument, by its names."""
+"""Options of argparse for each argument, by its names."""
 
 
 def _several(metavar: str, what: str) -> dict[str, Any]:
@@ -239,7 +239,7 @@ The same results give the same file, so that the digest may stand in a paper. Ot
 
 
 class Parser(argparse.ArgumentParser):
-    """One that raises a UserError where argparse would print its usage and exit."""
+    """Raises a UserError where argparse would print its usage and exit."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False, **options)
@@ -249,11 +249,11 @@ class Parser(argparse.ArgumentParser):
 
     @property
     def command(self) -> str:
-        """The command's name, to begin a message with."""
+        """Name of the command, to begin a message with."""
         return self.prog.partition(" ")[2]
 
     def parse(self, words: Sequence[str]) -> argparse.Namespace:
-        """The values of these words."""
+        """Parses these words into values."""
         values, surplus = self.parse_known_intermixed_args(words)
         if not surplus:
             return values
@@ -274,7 +274,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def parsers() -> tuple[Parser, dict[str, Parser]]:
-    """The parser of the bare program, and those of its commands by name."""
+    """Builds the parser of the bare program, and those of its commands by name."""
     program = Parser(prog="ipe-bench", description=_ABOUT, epilog=_CODES, usage="ipe-bench COMMAND ...")
     program.add_argument("--version", action="store_true", help="print the version")
     commands = program.add_subparsers(metavar="COMMAND", title="commands", prog="ipe-bench", parser_class=Parser)

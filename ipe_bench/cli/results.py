@@ -1,4 +1,4 @@
-"""The commands on what is stored: report, status, compare and bundle; and audit, on a table of another program."""
+"""Defines the commands on stored results: report, status, compare and bundle; and audit, on another program's table."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def compare_command(arguments: Sequence[str]) -> int:
 
 
 def status_command(arguments: Sequence[str], verbose: bool = False) -> int:
-    """A line per directory that is complete, else a table; exit code 1 where anything is missing or damaged."""
+    """Prints a line per complete directory, else a table; returns 1 if any trial is missing or damaged."""
     if not arguments:
         raise UserError("status: name at least one directory of results, such as outputs/paper")
     with opened(arguments) as folders:
@@ -129,8 +129,8 @@ def report_command(arguments: Sequence[str]) -> int:
 def show_report(
     folders: Sequence[Path], output: Path, figures: Which, formats: Any, cells: Mapping[str, str] | None = None
 ) -> int:
-    """Writes the report on all that folders hold, and prints it, or what belongs to the `cells`, whose keys have a line
-    for people each; returns the exit code."""
+    """Writes the report on all that folders hold, and prints it, or its rows of the `cells`, whose keys have a line for
+    people each; returns the exit code."""
     from ipe_bench.report.run import begin_report
     from ipe_bench.statistics.analysis import Begun
     from ipe_bench.statistics.collect import collect

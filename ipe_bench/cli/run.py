@@ -1,4 +1,4 @@
-"""`ipe-bench run`: reads the words, checks every job, computes what is missing, and shows what is known."""
+"""Defines `ipe-bench run`: reads the words, checks every job, computes what is missing, and shows the results."""
 
 from __future__ import annotations
 
@@ -39,40 +39,40 @@ from ipe_bench.runs.schedule import Progress, Watcher
 from ipe_bench.runs.store import describe_names
 
 _NOT_TELLING = {*SETTING_NOTHING, *PACKAGES, "experiment"} - {"seed"}
-"""Keys that tell no job of a sweep from another."""
+"""Keys that do not distinguish the jobs of a sweep."""
 _LINE_EVERY_S = 10.0
-"""Where progress is told in lines."""
+"""Seconds between lines of progress."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one job came to: plain data, which launchers send back from other processes."""
+    """Holds the result of one job: plain data, which launchers send back from other processes."""
 
     output: str
     words: tuple[str, ...] = ()
     """The overrides of the job."""
     cells: dict[str, str] = field(default_factory=dict)
-    """By key, a line for each result that was asked for."""
+    """Line of each requested result, by key."""
     failures: tuple[str, ...] = ()
     stop: str = ""
-    """How many trials a job with a precision took, and why no more."""
+    """Number of trials of a job with a precision, and the reason for its end."""
     remarks: tuple[str, ...] = ()
-    """What the model says of itself."""
+    """Remarks of the model on itself."""
     precision_missed: bool = False
-    """Whether it did not come to its precision."""
+    """Whether the requested precision was missed."""
     objective: float | None = None
     mistake: str = ""
 
     @property
     def job(self) -> str:
-        """The words that may tell the job from the others of a sweep, or the name of its folder."""
+        """Words that may tell the job from the others of a sweep, or the name of its folder."""
         words = [word.lstrip("+~").replace(w.HYDRAS_TRUTH, w.TRUTH) for word in self.words]
         return (
             ", ".join(word for word in words if re.split("[.=]", word)[0] not in _NOT_TELLING) or Path(self.output).name
         )
 
     def __float__(self) -> float:
-        """What sweepers that optimise make small; they cannot go on from a job that was refused."""
+        """Returns the objective of sweepers that optimise; they cannot go on from a job that was refused."""
         if self.mistake or self.objective is None:
             raise UserError(self.mistake or "objective: is not given; a sweeper that optimises needs it")
         return self.objective
@@ -114,7 +114,7 @@ def run_command(arguments: Sequence[str]) -> int:
 
 
 def _missing(jobs: Jobs) -> list[str]:
-    """What is stored of each job and what is missing, a line each, and the sums."""
+    """Lists what is stored of each job and what is missing, a line each, and the sums."""
     lines, stored, missing = [], 0, 0
     # The words of a job are not known where a sweeper of Hydra's chooses them.
     for told, job in zip(jobs.told or [jobs.words.text] * len(jobs.specs), jobs.specs, strict=True):
@@ -132,7 +132,7 @@ def _missing(jobs: Jobs) -> list[str]:
 
 
 def _there_already(jobs: Jobs) -> list[str]:
-    """A line for each folder that holds what other commands computed; refuses the name of another experiment."""
+    """Warns of each folder that holds results of other commands; refuses the name of another experiment."""
     lines = []
     for output in dict.fromkeys(job.output for job in jobs.specs if job.write_readings is None):
         found = Results.read([output], keys=()).runs if (Path(output) / "runs").is_dir() else ()
@@ -149,7 +149,7 @@ def _there_already(jobs: Jobs) -> list[str]:
 
 
 def _left_out(jobs: Sequence[Spec]) -> list[str]:
-    """A line on the standard filters that do not suit every job."""
+    """Names the standard filters that do not suit every job."""
     lacking = [job for job in jobs if job.state_model is None and not set(STANDARD_FILTERS) <= job.estimators.keys()]
     models = dict.fromkeys(job.measurement.name for job in lacking)
     filters = " and ".join(STANDARD_FILTERS)
@@ -173,13 +173,13 @@ class Task:
     """Computes jobs; a mistake in one stops no other."""
 
     command: str
-    """As it was typed."""
+    """Command as it was typed."""
     files: Mapping[str, str]
-    """By an override that a file holds, the word that names the file."""
+    """Word that names the file, by an override that it holds."""
     standard: bool
     """Whether the baselines are those of a plain run."""
     outcomes: list[Outcome] = field(default_factory=list)
-    """Of the jobs in this process: a sweeper that optimises keeps to itself what they return."""
+    """Outcomes of the jobs in this process: a sweeper that optimises keeps to itself what they return."""
 
     def __call__(self, config: DictConfig) -> Outcome:
         """Computes a job that Hydra has composed and launched."""
@@ -235,7 +235,7 @@ def _computed(job: Spec, begun: Outcome, command: str) -> Outcome:
 
 
 def _conclude(jobs: Jobs, outcomes: list[Outcome]) -> int:
-    """Shows what the jobs came to; the exit code."""
+    """Shows the outcomes of the jobs; returns the exit code."""
     end_idle()  # a report on many trials has use for their memory
     first, refused = jobs.specs[0], [one for one in outcomes if one.mistake]
     if jobs.multirun and first.write_readings is None:
@@ -260,7 +260,7 @@ def _conclude(jobs: Jobs, outcomes: list[Outcome]) -> int:
 
 
 def _refused(outcomes: Sequence[Outcome], *, told: bool) -> str:
-    """Why jobs were refused, and which where that is to be told."""
+    """Says why jobs were refused, and which if there are several."""
     which: dict[str, list[str]] = {}
     for one in outcomes:
         which.setdefault(one.mistake, []).append(one.job)
@@ -269,7 +269,7 @@ def _refused(outcomes: Sequence[Outcome], *, told: bool) -> str:
 
 
 def _best(outcomes: Sequence[Outcome], maximises: bool) -> list[str]:
-    """The best job in a line, with those of its words that not all jobs have; none where no job has an objective."""
+    """Names the best job in a line, with its words that not all jobs have; empty if no job has an objective."""
     known = [one for one in outcomes if one.objective is not None and not one.mistake]
     if not known:
         return []
@@ -295,7 +295,7 @@ def write_trial(job: Spec, path: Path, trial: int) -> None:
 
 @contextlib.contextmanager
 def shown_progress(title: str) -> Iterator[Watcher]:
-    """Yields what `compute` is to call. Warnings of ipe-bench are shown above the bar meanwhile."""
+    """Yields the callback of `compute`. Warnings of ipe-bench are shown above the bar meanwhile."""
     console = Console(stderr=True, highlight=False)
     columns = TextColumn("{task.description}", markup=False), BarColumn(10), TextColumn("{task.fields[state]}")
     bar = Bar(*columns, TimeElapsedColumn(), console=console, disable=not console.is_terminal)
@@ -325,7 +325,7 @@ def shown_progress(title: str) -> Iterator[Watcher]:
 
 
 def _state(progress: Progress) -> str:
-    """How far a job is, with the rate and the forecast once there are any."""
+    """Says how far a job is, with the rate and the forecast once there are any."""
     if not progress.tasks:
         return "nothing left to compute"
     state = f"block {progress.done}/{progress.tasks}"

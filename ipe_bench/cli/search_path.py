@@ -1,4 +1,4 @@
-"""Where Hydra looks for configs: in those of plugins as well, each folder once."""
+"""Extends Hydra's search path by the configs of plugins, each folder once."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ipe_bench.plugins.discovery import Source
 
 
 def extend(search_path: ConfigSearchPath, sources: Iterable[Source]) -> None:
-    """Adds the folders that are not among those that are searched already."""
+    """Adds the folders that are not yet searched."""
     for source in sources:
         searched = {(entry.path or "").removeprefix("file://") for entry in search_path.get_path()}
         if not searched & {str(source.conf), source.conf.as_uri().removeprefix("file://")}:

@@ -1,4 +1,4 @@
-"""Hydra, used from outside: composing, sweeping and launching, with what the jobs came to handed back.
+"""Composes, sweeps and launches with Hydra, and returns each job's result.
 
 `GlobalHydra.instance().hydra` is what `hydra.compose` itself works with. Its `multirun` returns what the jobs returned,
 from other processes as well (joblib, submitit).
@@ -54,7 +54,7 @@ class PluginConfigs(SearchPathPlugin):
 
 @contextlib.contextmanager
 def session(folder: Path | None = None) -> Iterator[None]:
-    """Within it Hydra finds our configs, those of plugins, and those in `folder`."""
+    """Lets Hydra find our configs, those of plugins, and those in `folder` within its block."""
     print_problems(plugins.take_problems())
     store, registry = ConfigStore.instance(), Plugins.instance()
     store.store("schema", node=DEFAULTS, provider="ipe-bench")
@@ -81,11 +81,11 @@ def _hydra() -> Any:
 
 @dataclass(frozen=True)
 class Jobs:
-    """The jobs of a command, each checked."""
+    """Holds the jobs of a command, each checked."""
 
     words: Words
     specs: list[Spec]
-    """Of a sweep whose jobs only its sweeper can choose, the first."""
+    """Checked jobs; for a sweep whose jobs only its sweeper can choose, the first."""
     multirun: bool
     maximises: bool = False
     told: list[list[str]] = field(default_factory=list)
@@ -93,8 +93,8 @@ class Jobs:
     own launcher composes each job twice again, longer than a job of a few trials takes (`hydra/launcher=basic`)."""
 
     def launch(self, task: Callable[[DictConfig], Any]) -> list[Any]:
-        """What each job returned, run by the launcher and the sweeper that the words choose; nothing from a sweeper
-        that optimises, which keeps it to itself."""
+        """Returns each job's result, run by the launcher and the sweeper that the words choose; empty for a sweeper
+        that optimises."""
         try:
             if not self.multirun:
                 return [_hydra().run("config", task, self.words.text).return_value]
@@ -105,7 +105,7 @@ class Jobs:
 
 
 def jobs_of(words: Words, *, multirun: bool) -> Jobs:
-    """The jobs of a command; an experiment that sweeps needs no flag for it."""
+    """Returns the jobs of a command; an experiment that sweeps needs no flag for it."""
     config = _composed(tuple(map(w.forced, w.settled(words.overrides))), whole=True)
     hydra = config.hydra
     if hydra.runtime.choices.get("model"):
@@ -140,7 +140,7 @@ def jobs_of(words: Words, *, multirun: bool) -> Jobs:
 
 
 def _spec(job: Sequence[Override]) -> Spec:
-    """One job: composed for what it chooses, with its other values put in their places."""
+    """Checks one job: composed for its choices, then completed with its other values."""
     config = copy.deepcopy(_composed(tuple(w.forced(one) for one in job if w.chooses(one))))
     try:
         for one in (one for one in job if not w.chooses(one)):
@@ -197,12 +197,12 @@ def _require_own_calls(node: Any, where: str) -> None:
 
 
 def spec_of(config: DictConfig) -> Spec:
-    """The checked job of a composed config."""
+    """Checks the job of a composed config."""
     return spec(_plain(config))
 
 
 def composed(words: Words) -> dict[str, Any]:
-    """The config of a command's only job."""
+    """Composes the config of a command's only job."""
     return _plain(_composed(tuple(map(w.forced, words.overrides)), whole=True))
 
 
@@ -237,7 +237,7 @@ def complete(words: Sequence[str]) -> None:
 
 
 def explain(error: BaseException) -> UserError:
-    """An error of Hydra, OmegaConf or YAML while composing, as one line with the remedy."""
+    """Words an error of Hydra, OmegaConf or YAML while composing, as one line with the remedy."""
     if isinstance(error, UserError):
         return error
     if isinstance(error, yaml.YAMLError):
@@ -290,4 +290,4 @@ _EXPLAINED: tuple[tuple[str, Callable[..., str]], ...] = (
         lambda key: f"{key}: is not given; write {key}{_FORMS.get(key, '=VALUE')}",
     ),
 )
-"""What Hydra says, and the line for it."""
+"""Line for each message of Hydra."""

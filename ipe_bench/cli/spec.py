@@ -1,4 +1,4 @@
-"""All that a command is told, as typed plain data: the keys of the config besides Hydra's own."""
+"""Reads a command's request as typed plain data: the keys of the config besides Hydra's own."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ PARTS: dict[str, type] = {
 }
 """Keys that hold a component, with its kind."""
 OPTIONAL = ("truth_measurement", "state_model")
-"""Those that may be null."""
+"""Keys of components that may be null."""
 STANDARD_FILTERS = ("ekf", "ukf")
 """Baselines of a plain run that suit only models with epochs and a prior."""
 
@@ -59,7 +59,7 @@ class Spec(Component):
     trackers: Mapping[str, Any] = field(default_factory=dict)
     name: str = "${default_name}"
     default_name: str = "gins"
-    """What the command asks for, in short: names the output folder where nothing else does."""
+    """Short description of the request: names the output folder by default."""
     truth_measurement: Measurement | None = None
     error_scale: Positive = 1.0
     seed: Whole = 0
@@ -110,24 +110,24 @@ class Spec(Component):
 
     @property
     def aim(self) -> tuple[str, str]:
-        """The label and the column of the objective."""
+        """Label and column of the objective."""
         label, _, column = str(self.objective).rpartition(".")
         return label, column
 
     @property
     def count(self) -> int:
-        """The trials, or the most there may be where there is a precision."""
+        """Number of trials, or the largest with a precision."""
         unless = TRIALS if self.precision is None else MOST_TRIALS
         return unless if self.trials is None else self.trials
 
     @cached_property
     def known(self) -> tuple[ParameterInfo, ...]:
-        """What is known of each parameter."""
+        """Prior knowledge of each parameter."""
         return known_parameters(self.parameters or {})
 
     @cached_property
     def scenario(self) -> Any:
-        """The trials that are simulated: a `Scenario`, or a `StateScenario` if there is a state model."""
+        """Simulated trials: a `Scenario`, or a `StateScenario` if there is a state model."""
         if self.state_model is not None:
             return StateScenario(self.state_model, self.seed)
         measurement, truth = (m and informed(m, self.known) for m in (self.measurement, self.truth_measurement))
@@ -140,7 +140,7 @@ class Spec(Component):
         return Scenario(measurement, self.noise, prior, self.error_scale, self.seed, truth)
 
     def suited(self) -> Spec:
-        """The job without the standard filters if its model lacks what they need."""
+        """Returns the job without the standard filters if its model lacks what they need."""
         if isinstance(self.scenario, StateScenario):
             return self
         problem = self.scenario.problem
@@ -149,8 +149,8 @@ class Spec(Component):
         return replace(self, estimators=kept) if unsuited else self
 
     def question(self, stated: Collection[str]) -> Question:
-        """What is asked of real readings; `stated` are the keys that a user has given, and a part that stands there by
-        default is stated by nobody."""
+        """Returns the question on real readings; `stated` are the keys that a user has given, so that a default part
+        counts as unstated."""
         from ipe_bench.real.estimation import Question
 
         given = (self.readings,) if isinstance(self.readings, str) else self.readings
@@ -180,7 +180,7 @@ DEFAULTS |= {"estimators": {}, "trackers": {}}
 
 
 def spec(plain: Mapping[Any, Any]) -> Spec:
-    """The job that a composed config describes, its components constructed."""
+    """Constructs the job that a composed config describes."""
     for key in plain:
         if key not in KEYS:
             raise UserError(f"{key}: {unknown(str(key), KEYS, 'key')}")
@@ -218,7 +218,7 @@ def _labelled(key: str, label: str, options: Any, known: Sequence[plugins.Option
 
 
 def _of_kind(part: Any, key: str, kind: type) -> Any:
-    """The part, where it is of the kind that belongs there and can be stored and sent to other processes."""
+    """Returns the part, if it is of the right kind and can be stored and sent to other processes."""
     if not isinstance(part, kind):
         name = type(part).__name__
         raise UserError(f"{key}: {name} is not a {kind.__name__.lower()}; choose one, see `ipe-bench list`")

@@ -1,4 +1,4 @@
-"""The words KEY=VALUE of a command, read once, by Hydra's grammar.
+"""Reads the words KEY=VALUE of a command once, by Hydra's grammar.
 
 What Hydra would answer in words of its own, or take and not do, is refused here by a line that names the word and the
 remedy. What the values of options may be is checked where a job is constructed.
@@ -50,20 +50,20 @@ Groups = dict[str, list[str]]
 
 @dataclass(frozen=True)
 class Words:
-    """What a command was told, word by word."""
+    """Holds the words of a command."""
 
     overrides: tuple[Override, ...]
     files: Mapping[str, str] = field(default_factory=dict)
-    """By an override that a file holds, the word that names the file."""
+    """Word that names the file, by an override that it holds."""
 
     @property
     def text(self) -> list[str]:
-        """The overrides as Hydra takes them."""
+        """Overrides in Hydra's form."""
         return [forced(one) for one in self.overrides]
 
     @property
     def keys(self) -> list[str]:
-        """The first part of each key, in the order of the words."""
+        """First part of each key, in the order of the words."""
         return [_first(one) for one in self.overrides]
 
     @property
@@ -72,7 +72,7 @@ class Words:
         return {"baseline", "experiment"}.isdisjoint(self.keys)
 
     def chosen(self, group: str) -> str | None:
-        """The option that is chosen last."""
+        """Returns the option that is chosen last."""
         found = [one for one in self.overrides if one.key_or_group == group and one.package is None]
         return None if not found else str(plain(found[-1].value()))
 
@@ -89,25 +89,25 @@ def _first(override: Override) -> str:
 
 
 def forced(override: Override) -> str:
-    """A word as Hydra takes it. Options that a file does not name are added: their class judges them."""
+    """Writes a word in Hydra's form. Options that a file does not name are added: their class judges them."""
     line = override.input_line or ""
     option = "." in override.key_or_group and not override.key_or_group.startswith("hydra")
     return f"++{line}" if option and override.type is OverrideType.CHANGE else line
 
 
 def chooses(override: Override) -> bool:
-    """Whether a word says which configs are put together, not what stands in them."""
+    """Returns whether a word chooses configs, rather than values in them."""
     chosen = override.key_or_group in (*plugins.COMPONENT_GROUPS, "experiment") or override.package is not None
     return chosen or override.is_delete() or override.is_hydra_override()
 
 
 def as_typed(words: Sequence[str], files: Mapping[str, str]) -> tuple[str, ...]:
-    """The words of a job, with the file in place of what it holds."""
+    """Returns the words of a job, with the file in place of its content."""
     return tuple(dict.fromkeys(files.get(word, word) for word in words))
 
 
 def read(command: str, words: Sequence[str], folder: Path | None = None) -> Words:
-    """The words of a command; `folder` holds configs besides ours."""
+    """Reads the words of a command; `folder` holds configs besides ours."""
     refuse_blanks(words)
     groups = _groups(folder)
     found: list[Override] = []
@@ -138,12 +138,12 @@ def _groups(folder: Path | None) -> Groups:
 
 
 def said(override: Override) -> str:
-    """A word as its user wrote it."""
+    """Writes a word as its user did."""
     return (override.input_line or "").replace(HYDRAS_TRUTH, TRUTH)
 
 
 def values(override: Override) -> Iterator[Any]:
-    """Each value, those of a list of jobs one by one; nothing of ranges and intervals."""
+    """Returns each value, those of a list of jobs one by one; none of ranges and intervals."""
     given = override.value()
     if isinstance(given, ChoiceSweep):
         yield from map(plain, given.list)
@@ -152,7 +152,7 @@ def values(override: Override) -> Iterator[Any]:
 
 
 def plain(value: Any) -> Any:
-    """A value without Hydra's quotes."""
+    """Strips Hydra's quotes from a value."""
     if isinstance(value, list):
         return [plain(one) for one in value]
     if isinstance(value, dict):
@@ -164,7 +164,7 @@ def plain(value: Any) -> Any:
 
 
 def _expanded(word: str) -> list[str]:
-    """A word in Hydra's grammar, or the words that a file holds in its place."""
+    """Parses a word by Hydra's grammar, or the words of a file in its place."""
     if found := _FILE.fullmatch(word):
         return _from_file(found[1] or found[2], found[3], word)
     found = _FORMULA.fullmatch(word)
@@ -176,7 +176,7 @@ def _expanded(word: str) -> list[str]:
 
 
 def _from_file(group: str, name: str, word: str) -> list[str]:
-    """Options from a YAML file, as if each had been typed."""
+    """Reads options from a YAML file, as if each had been typed."""
     content = plugins.read_yaml_file(Path(name), word)
     if not isinstance(content, dict):
         example = "NAME: {nominal: 1}" if group == "parameters" else "rates, start, outputs"
@@ -187,7 +187,7 @@ def _from_file(group: str, name: str, word: str) -> list[str]:
 
 
 def options_of(group: str, content: Mapping[str, Any], where: str) -> list[str]:
-    """The words by which one would type options that stand in a file."""
+    """Returns the words by which one would type options that stand in a file."""
     return [f"{group}.{key}={_literal(value, where)}" for key, value in content.items()]
 
 
@@ -275,7 +275,7 @@ def _check(override: Override, groups: Groups) -> None:
 
 
 def _check_place(override: Override) -> None:
-    """Whether a part lands where something looks for it."""
+    """Checks that a part has a place where the job looks for it."""
     group, package, word = override.key_or_group, override.package, said(override)
     added = override.is_add() or override.is_force_add()
     if group == "experiment" and package is None:
@@ -293,7 +293,7 @@ def _check_place(override: Override) -> None:
 
 
 def _check_choice(override: Override, groups: Groups) -> None:
-    """Whether each value is an option of the group that can be used."""
+    """Checks that each value is an existing and usable option of the group."""
     group, word = override.key_or_group, said(override)
     several = group in plugins.PACKAGES and override.package is None
     key = word.partition("=")[0].lstrip("+")
@@ -319,7 +319,7 @@ def _check_choice(override: Override, groups: Groups) -> None:
 
 
 def no_option(group: str, name: str, groups: Groups) -> str:
-    """What to write in place of an option that its group lacks: its own group, where another group has it."""
+    """Suggests a replacement of an option that its group lacks: its own group, where another group has it."""
     for other, names in groups.items():
         if name in names and other != group:
             shown = f"[{name}]" if other in plugins.PACKAGES else name
@@ -331,7 +331,7 @@ def no_option(group: str, name: str, groups: Groups) -> str:
 
 
 def _check_labels(overrides: Sequence[Override]) -> None:
-    """Two parts under one label would be mixed, without a word."""
+    """Refuses two parts under one label, which would be mixed silently."""
     taken: dict[str, Override] = {}
     for override in overrides:
         group, package = override.key_or_group, override.package
@@ -350,7 +350,7 @@ def _check_labels(overrides: Sequence[Override]) -> None:
 
 
 def jobs(overrides: Sequence[Override]) -> Iterator[list[Override]]:
-    """The overrides of each job of a sweep, as Hydra's basic sweeper makes them."""
+    """Expands the overrides of each job of a sweep, as Hydra's basic sweeper does."""
     axes = {one.get_key_element(): _swept(one) if one.is_discrete_sweep() else [one] for one in overrides}
     return map(list, itertools.product(*axes.values()))
 
@@ -366,7 +366,7 @@ def _swept(override: Override) -> list[Override]:
 
 
 def settled(overrides: Sequence[Override]) -> list[Override]:
-    """One job of a sweep: the first, without what only a sweeper can choose."""
+    """Returns one job of a sweep: the first, without what only a sweeper can choose."""
     return next(jobs([copy.copy(one) for one in overrides if not one.is_interval_sweep()]), [])
 
 
@@ -379,8 +379,8 @@ _LONGEST_NAME = 80
 
 
 def default_name(words: Words) -> str:
-    """A name for the folder of a command, such as ranging-gaussian-deviation=0.1, the same for the same settings in any
-    order; what changes no setting, or adds trials to it, is no part of it."""
+    """Names the folder of a command, such as ranging-gaussian-deviation=0.1: the same for the same settings in any
+    order, without keys that change no setting or add trials to it."""
     parts: dict[str, str] = {}
     held = ""
     for override in words.overrides:
