@@ -143,7 +143,7 @@ def said(override: Override) -> str:
 
 
 def values(override: Override) -> Iterator[Any]:
-    """Returns each value, those of a list of jobs one by one; none of ranges and intervals."""
+    """Yields each value, those of a list of jobs one by one; none of ranges and intervals."""
     given = override.value()
     if isinstance(given, ChoiceSweep):
         yield from map(plain, given.list)

@@ -1,4 +1,4 @@
-"""The language of formulas: numbers, names, + - * / ** ( ), elementary functions, comparisons and `A if C else B`.
+"""Reads formulas: numbers, names, + - * / ** ( ), elementary functions, comparisons and `A if C else B`.
 
 Python's grammar reads the text, and nothing of it is executed: it becomes a tree, which is evaluated on numbers, arrays
 or recorded expressions.
@@ -23,17 +23,17 @@ from ipe_bench.measurements.ode import trace
 
 
 def choose(condition: Any, a: Any, b: Any) -> Any:
-    """a where the condition is not 0, b elsewhere."""
+    """Returns a where the condition is not 0, b elsewhere."""
     return (a if condition else b) if isinstance(condition, float) else np.where(condition, a, b)
 
 
 def _real(a: Any) -> Any:
-    """The real part of a complex step; expressions are real."""
+    """Returns the real part of a complex step; expressions are real."""
     return getattr(a, "real", a)
 
 
 def _angle(y: Any, x: Any) -> Any:
-    """arctan2, which NumPy has not of complex numbers, with its slope by a complex step."""
+    """Computes arctan2, which NumPy lacks for complex numbers, with its slope by a complex step."""
     b, a = _real(y), _real(x)
     angle = np.arctan2(b, a)
     if isinstance(angle, trace.Expression) or not (np.iscomplexobj(y) or np.iscomplexobj(x)):
@@ -78,16 +78,16 @@ Tree = tuple[Any, ...]
 
 @dataclass(frozen=True)
 class Arithmetic:
-    """A formula that has been read: `names` are what it needs to know, in order of appearance."""
+    """Holds a formula that was read: `names` are its variables, in order of appearance."""
 
     text: str
     tree: Tree
     names: tuple[str, ...]
     where: str = ""
-    """Its config key."""
+    """Config key of the formula."""
 
     def __call__(self, values: Mapping[str, Any]) -> Any:
-        """Its value, where `values` gives that of every name: numbers, arrays, or expressions to be recorded."""
+        """Evaluates the formula at the `values` of its names: numbers, arrays, or expressions to be recorded."""
         return evaluate(self.tree, values)
 
 
@@ -130,7 +130,7 @@ def parse(text: str, where: str) -> Arithmetic:
 
 
 def _tree(node: ast.expr, source: str) -> Tree:
-    """The tree of a part of the text.
+    """Builds the tree of a part of the text.
 
     Raises:
         SyntaxError: the part is Python and no formula.
@@ -174,12 +174,12 @@ def _tree(node: ast.expr, source: str) -> Tree:
 
 
 def _in_a_row(operation: str, trees: Iterable[Tree]) -> Tree:
-    """Operands that an operation joins from the left."""
+    """Joins operands by an operation from the left."""
     return functools.reduce(lambda left, right: (operation, left, right), trees)
 
 
 def parts(tree: Tree) -> list[Tree]:
-    """The tree and all trees in it, in order of appearance."""
+    """Lists the tree and all trees in it, in order of appearance."""
     found, waiting = [], [tree]
     while waiting:
         found.append(waiting.pop())
@@ -188,7 +188,7 @@ def parts(tree: Tree) -> list[Tree]:
 
 
 def never_switching(formulas: Iterable[Arithmetic], values: Mapping[str, Any]) -> list[str]:
-    """A sentence for each comparison in some formulas that holds for all readings, or for none, at these values."""
+    """Words each comparison in some formulas that holds for all readings, or for none, at these values."""
     where = {part: one.where for one in formulas for part in parts(one.tree) if part[0] in COMPARISONS}
     met = {one: np.asarray(evaluate(one, values), dtype=bool) for one in where}
     silent = "so these readings say nothing of the other branch"
@@ -200,7 +200,7 @@ def never_switching(formulas: Iterable[Arithmetic], values: Mapping[str, Any]) -
 
 
 def _extent(tree: Tree, known: dict[int, tuple[int, int]]) -> tuple[int, int]:
-    """The size of a tree, and the most operations that build on one another; an operand that two share is met once."""
+    """Computes the size of a tree, and the most operations that build on one another; a shared operand counts once."""
     if id(tree) not in known:
         size, height = 1, 1
         for part in tree:
@@ -226,7 +226,7 @@ _BINARY: dict[str, Callable[[Any, Any], Any]] = {
 
 
 def evaluate(tree: Tree, values: Mapping[str, Any]) -> Any:
-    """The value of a tree where `values` gives that of every name."""
+    """Evaluates a tree at the `values` of its names."""
     operation, first, *others = tree
     if operation == "number":
         return first

@@ -25,7 +25,7 @@ Epochs = tuple[NDArray[np.intp], ...]
 
 @dataclass(frozen=True)
 class Parameter:
-    """One unknown. Inside, its value is a multiple of `size` `unit`s; at the surface it is shown in `unit`."""
+    """Describes one unknown: x holds multiples of `size` `unit`s; users see the value in `unit`."""
 
     name: str
     unit: str = ""
@@ -35,27 +35,27 @@ class Parameter:
 
 
 def parameter_table(*groups: tuple[Iterable[str], str, float, str]) -> tuple[Parameter, ...]:
-    """The parameters of several groups, each of which is names, unit, size and the group's name."""
+    """Builds the parameters of several groups, each of which is names, unit, size and the group's name."""
     return tuple(Parameter(name, unit, size, group) for names, unit, size, group in groups for name in names)
 
 
 @dataclass(frozen=True)
 class Input:
-    """A column of a readings file that a model takes besides the readings, such as a satellite's place."""
+    """Describes a column of a readings file that a model takes besides the readings, such as a satellite's place."""
 
     heading: str
-    """As in the file, with the unit: `x [m]`."""
+    """Heading of the column in the file, with the unit: `x [m]`."""
     kind: type = float
     """float, int or str."""
     label: bool = False
     """Whether it is part of what tells readings apart, and stands in every file."""
     default: Any = None
-    """What is meant where a file lacks the column; None: it must have it, or none of the inputs."""
+    """Value if the file lacks the column; None: required as soon as the file has any input."""
 
 
 @dataclass(frozen=True)
 class UsualNoise:
-    """The noise that is a model's own: rounding to a step where there is one, else white and Gaussian."""
+    """Describes the noise that is a model's own: rounding to a step if there is one, else white and Gaussian."""
 
     deviation: float | None = None
     """Standard deviation of a reading, in `reading_unit`."""
@@ -64,7 +64,7 @@ class UsualNoise:
 
 @dataclass(frozen=True)
 class Recorded:
-    """Real readings that come with a model, which need no file, and what is known of their answer."""
+    """Holds real readings that come with a model, which need no file, and what is known of their answer."""
 
     z: Array
     """The readings (m,)."""
@@ -86,9 +86,9 @@ class Measurement(Component, ABC):
     """True where `simulate` accepts complex x and is analytic in it: the Jacobian is then a complex step."""
     reading_unit: str = ""
     reading_name: str = "reading"
-    """What the column of the readings is called in a file; `reading` is understood too."""
+    """Name of the readings' column in a file; `reading` is understood too."""
     usual_noise: UsualNoise | None = None
-    """The noise of the readings unless told otherwise; None: the model does not know any."""
+    """Noise of the readings by default; None: the model does not know any."""
     epochs: Epochs | None = None
     """The rows of z by epoch, in order of arrival; None where readings have no order."""
     entry_words: Mapping[str, Mapping[Any, str]] = {}
@@ -118,14 +118,14 @@ class Measurement(Component, ABC):
     @property
     @abstractmethod
     def index(self) -> Mapping[str, Sequence[Any]]:
-        """What each of the m readings is: columns such as case, time, axis, each with m entries."""
+        """Description of each of the m readings: columns such as case, time, axis, each with m entries."""
 
     @abstractmethod
     def simulate(self, x: Array) -> Array:
-        """The error-free readings h(x): (trials, n) -> (trials, m)."""
+        """Computes the error-free readings h(x): (trials, n) -> (trials, m)."""
 
     def near(self, h: Array, z: Array) -> Array:
-        """h (..., m), each angle shifted by whole turns next to the reading z: residuals are within half a turn."""
+        """Shifts each angle of h (..., m) by whole turns next to the reading z: residuals are within half a turn."""
         return nearest(h, z, self.periods)
 
     @property
@@ -136,7 +136,7 @@ class Measurement(Component, ABC):
     @property
     def nuisance_deviation(self) -> Array:
         """Standard deviations (k,) of the further errors of a truth that is richer than what estimators assume: drawn
-        in each trial, whatever the error scale, and handed to `simulate` as columns of x behind the n parameters."""
+        in each trial, at any error scale, and handed to `simulate` as columns of x behind the n parameters."""
         return np.zeros(0)
 
     @property
@@ -150,29 +150,29 @@ class Measurement(Component, ABC):
         return self
 
     def taking(self, rows: Sequence[int]) -> Measurement:
-        """The model with these of its readings (rows of z, ascending) and no others."""
+        """Returns the model with only these of its readings (rows of z, ascending)."""
         return SubsetModel(self, tuple(int(row) for row in rows))
 
     @property
     def offset(self) -> Array:
-        """What the instruments show (m,) where h(x) is zero; read-outs are quantised with it added."""
+        """Readings of the instruments (m,) where h(x) is zero; read-outs are quantised with it added."""
         return np.zeros(self.m)
 
     def hindrance(self, x: Array) -> str:
-        """Why the readings at x (n,) cannot be computed; empty where they can."""
+        """Says why the readings at x (n,) cannot be computed; empty if they can."""
         return "" if np.isfinite(self.simulate(x[None])).all() else "the readings are not finite"
 
     def remarks(self, x: Array) -> tuple[str, ...]:
-        """Sentences that users should read of this model at x (n,), such as by which method it is computed."""
+        """Returns remarks for users on this model at x (n,), such as its integration method."""
         return ()
 
     def absent_input(self, heading: str, columns: Sequence[str]) -> str:
-        """What to do where a file lacks that column, having others of the inputs."""
+        """Says what to do if a file lacks that column, having others of the inputs."""
         return f"give all of {', '.join(i.heading for i in self.inputs)}, or none"
 
     def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Measurement:
-        """This model with the inputs of a file: `columns` by heading, one entry for each of its readings, in the
-        order of the file, which is that of z from then on."""
+        """Returns this model with the inputs of a file: `columns` by heading, one entry for each of its readings, in
+        the order of the file, which is that of z from then on."""
         raise NotImplementedError(f"{self.name} takes nothing from a file but readings")
 
     @property
@@ -194,65 +194,65 @@ class Measurement(Component, ABC):
         return self.parameters
 
     def physical(self, x: Array) -> Array:
-        """Their values (trials, n), each in its own unit."""
+        """Converts x to parameter values (trials, n), each in its own unit."""
         return x * self.sizes
 
     def physical_slope(self, x: Array) -> Array:
-        """The derivative of each value by its own entry of x (trials, n)."""
+        """Computes the derivative of each value by its own entry of x (trials, n)."""
         return np.broadcast_to(self.sizes, x.shape)
 
     def near_bounds(self, x: Array) -> Mapping[int, float]:
-        """Which of the n parameters are next to a bound at x (n,), and that bound in their own unit."""
+        """Finds which of the n parameters are next to a bound at x (n,), and that bound in their own unit."""
         return {}
 
     def stating(self, key: str, values: Mapping[int, float]) -> Measurement:
-        """This model with some of the n parameters `fixed` at values in their own units; or free of bounds, with these
-        `nominal` values."""
+        """Returns this model with some of the n parameters `fixed` at values in their own units; or free of bounds,
+        with these `nominal` values."""
         raise NotImplementedError(f"{self.name} has no bounds")
 
     def jacobian(self, x: Array) -> Array:
-        """dh/dx at each trial: (trials, n) -> (trials, m, n); complex step where analytic, else central differences."""
+        """Computes dh/dx: (trials, n) -> (trials, m, n); complex step where analytic, else central differences."""
         return differentiate(self.simulate, x, analytic=self.analytic, near=self.near)
 
     def coarse_jacobian(self, x: Array) -> Array:
-        """dh/dx near enough for the steps of an iteration, `|I - J~+ J|` below 0.01, where that is cheaper; else exact.
-        Covariances and convergence checks want `jacobian`."""
+        """Computes dh/dx near enough for the steps of an iteration, `|I - J~+ J|` below 0.01, where that is cheaper;
+        else exact. Covariances and convergence checks want `jacobian`."""
         return self.jacobian(x)
 
     @property
     def jacobian_cost(self) -> float:
-        """What a Jacobian costs, in simulations of the same trial."""
+        """Cost of a Jacobian, in simulations of the same trial."""
         return float(self.n if self.analytic else 2 * self.n)
 
     @property
     def coarse_jacobian_cost(self) -> float:
-        """What a coarse Jacobian costs, in simulations of the same trial."""
+        """Cost of a coarse Jacobian, in simulations of the same trial."""
         return self.jacobian_cost
 
     def linearization(self) -> Array:
-        """The matrix H (m, n) of eq. (1) about the nominal point."""
+        """Computes the matrix H (m, n) of eq. (1) about the nominal point."""
         return self.jacobian(self.nominal[None])[0]
 
     def rows(self, stop: int) -> NDArray[np.intp]:
-        """The rows of z that have arrived after `stop` epochs, ascending."""
+        """Returns the rows of z that have arrived after `stop` epochs, ascending."""
         assert self.epochs is not None
         return np.sort(np.concatenate(self.epochs[:stop]))
 
     def simulate_until(self, x: Array, stop: int) -> Array:
-        """h(x) in `rows(stop)` alone; models that arrive in time stop computing there."""
+        """Computes h(x) in `rows(stop)` alone; models that arrive in time stop computing there."""
         return self.simulate(x)[:, self.rows(stop)]
 
     def coarse_simulate_until(self, x: Array, stop: int) -> Array:
-        """`simulate_until` near enough for fits that only start another, to a small part of a reading's usual noise,
-        where that is cheaper; else the same."""
+        """Computes `simulate_until` near enough for fits that only start another, to a small part of a reading's usual
+        noise, where that is cheaper; else the same."""
         return self.simulate_until(x, stop)
 
     def jacobian_until(self, x: Array, stop: int) -> Array:
-        """dh/dx in `rows(stop)` alone."""
+        """Computes dh/dx in `rows(stop)` alone."""
         return self.jacobian(x)[:, self.rows(stop)]
 
     def coarse_jacobian_until(self, x: Array, stop: int) -> Array:
-        """dh/dx in `rows(stop)` alone, near enough for fits that only start another, `|I - J~+ J|` below 0.1."""
+        """Computes dh/dx in `rows(stop)` alone, good enough for fits that start another, `|I - J~+ J|` below 0.1."""
         return self.coarse_jacobian(x)[:, self.rows(stop)]
 
 
@@ -262,7 +262,7 @@ def single_epochs(model: Measurement) -> Epochs:
 
 
 class _Forwarded(property):
-    """The attribute of this name of the model inside."""
+    """Forwards an attribute to the model inside."""
 
     def __set_name__(self, owner: type, name: str) -> None:
         super().__init__(attrgetter(f"whole.{name}"))
@@ -273,7 +273,7 @@ def _forwarded() -> Any:
 
 
 class Forwarding(Measurement):
-    """A model that says of itself what another one, `whole`, says, but for what a subclass overrides.
+    """Forwards the description of another model, `whole`, but for what a subclass overrides.
 
     What it computes is left to the subclass, and so are the columns of a file and recorded readings.
     """
@@ -330,7 +330,7 @@ class Forwarding(Measurement):
 
 
 class WrappedModel(Forwarding):
-    """A model that is another one, `whole`, but for what a subclass overrides.
+    """Wraps another model, `whole`, but for what a subclass overrides.
 
     Three hooks stand between the two in all that is computed: `whole_x`, `own_readings` and `own_jacobian`.
     """
@@ -380,22 +380,22 @@ class WrappedModel(Forwarding):
 
 @dataclass(frozen=True)
 class SubsetModel(Forwarding):
-    """Some readings of a model: those of the first epochs, or those that are not missing."""
+    """Restricts a model to some of its readings: those of the first epochs, or those that are not missing."""
 
     whole: Measurement
     kept: tuple[int, ...]
     """Rows of the whole model's z, ascending."""
     stop: int | None = None
-    """Where the rows all lie within the first `stop` epochs: nothing later is computed."""
+    """Number of epochs that hold all rows: no later one is computed; None: all epochs."""
     coarse: bool = False
     """Whether readings near enough for fits that only start another will do."""
 
     def __post_init__(self) -> None:
-        """Made in every window and epoch, and of no user's options: there is nothing to check."""
+        """Skips the checks of options: every window and epoch makes this object, from checked parts."""
 
     @classmethod
     def until(cls, whole: Measurement, stop: int, *, coarse: bool = False) -> SubsetModel:
-        """The readings of the first `stop` epochs."""
+        """Restricts a model to the readings of the first `stop` epochs."""
         return cls(whole, tuple(whole.rows(stop).tolist()), stop, coarse)
 
     @property
@@ -431,12 +431,12 @@ class SubsetModel(Forwarding):
 
     @cached_property
     def _among_arrived(self) -> NDArray[np.intp] | slice:
-        """Where the kept rows stand in what the whole model returns; a slice where they are all of it."""
+        """Places of the kept rows in what the whole model returns; a slice if they are all of it."""
         arrived = np.arange(self.whole.m) if self.stop is None else self.whole.rows(self.stop)
         return slice(None) if np.array_equal(arrived, self._rows) else np.searchsorted(arrived, self._rows)
 
     def _computed(self, name: str, x: Array) -> Array:
-        """What that method of the whole model computes, in the kept rows."""
+        """Computes that method of the whole model, in the kept rows."""
         if self.stop is None:
             return getattr(self.whole, name)(x)[:, self._among_arrived]
         return getattr(self.whole, f"{name}_until")(x, self.stop)[:, self._among_arrived]
@@ -455,8 +455,8 @@ class SubsetModel(Forwarding):
 
 
 def differentiate(h: Any, x: Array, *, analytic: bool, near: Any = lambda h, z: h) -> Array:
-    """dh/dx (trials, m, n) of a batched function h at x (trials, n), all directions in one call of h; `near` shifts
-    angles by whole turns next to others.
+    """Computes dh/dx (trials, m, n) of a batched function h at x (trials, n), all directions in one call of h; `near`
+    shifts angles by whole turns next to others.
 
     Analytic functions: complex step, exact to round-off (Squire and Trapp, SIAM Review 40, 1998). Others: central
     differences with a step of eps^(1/3) in units of the parameter, or of its value where that is larger.
@@ -481,7 +481,7 @@ def differentiate(h: Any, x: Array, *, analytic: bool, near: Any = lambda h, z: 
 
 
 def contradicted(h: Any, x: Array, J: Array, near: Any) -> NDArray[np.bool_]:
-    """The trials (trials,) in which central differences of h along one direction contradict J = dh/dx (trials, m, n).
+    """Finds the trials (trials,) whose central differences of h along a direction contradict J = dh/dx (trials, m, n).
 
     Two calls per trial, whatever n is. Every parameter changes the readings by about as much, none by a multiple of
     what another does, so that a wrong column shows beside larger ones.

@@ -1,4 +1,4 @@
-"""Counting what a batch costs: a model whose evaluations are counted, and in which no trial spoils another."""
+"""Counts what a batch costs, by a model in which no trial spoils another."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ if TYPE_CHECKING:
 
 
 def cost(simulations: Array, jacobians: Array, jacobian_cost: float) -> Array:
-    """What trials cost (trials,), in simulations: a Jacobian counts as `jacobian_cost` of them."""
+    """Computes the cost of trials (trials,), in simulations: a Jacobian counts as `jacobian_cost` of them."""
     return simulations + jacobian_cost * jacobians
 
 
 @dataclass
 class EvaluationCount:
-    """What a batch has cost and what went wrong in it, by trial; shared by all views of one batch."""
+    """Counts evaluations and failures of a batch, by trial; all views of one batch share it."""
 
     simulations: Array
     jacobians: Array
     reported: Array
-    """Those of the Jacobians (trials,) that only a reported covariance needs."""
+    """Jacobians (trials,) that only a reported covariance needs."""
     singular: Mask
     messages: dict[int, str] = field(default_factory=dict)
 
@@ -39,23 +39,23 @@ class EvaluationCount:
         return cls(simulations, jacobians, reported, np.zeros(trials, dtype=bool))
 
     def of_search(self, n: int) -> Array:
-        """What a search has cost (trials,), which its limits hold against: simulations, a Jacobian counting n, without
-        those that are reported only."""
+        """Computes the cost of a search (trials,), for its limits: simulations, a Jacobian counting n, without reported
+        ones."""
         return cost(self.simulations, self.jacobians - self.reported, n)
 
     def copied(self, rows: NDArray[np.intp]) -> EvaluationCount:
-        """The counts of the trials `rows`, of which nothing has failed yet."""
+        """Copies the counts of the trials `rows`, without failures."""
         counts = (self.simulations[rows], self.jacobians[rows], self.reported[rows])
         return EvaluationCount(*counts, np.zeros(len(rows), dtype=bool))
 
     def failed(self, rows: NDArray[np.intp]) -> Mask:
-        """Which of the trials `rows` an exception has ended."""
+        """Tells which of the trials `rows` an exception has ended."""
         return np.isin(rows, list(self.messages))
 
 
 @dataclass(frozen=True)
 class CountingModel:
-    """A model that counts its evaluations per trial, and in which a trial that raises spoils only itself."""
+    """Counts the evaluations of a model per trial; a trial that raises spoils only itself."""
 
     measurement: Measurement
     tally: EvaluationCount
@@ -66,25 +66,25 @@ class CountingModel:
 
     @classmethod
     def uncounted(cls, measurement: Measurement, trials: int) -> CountingModel:
-        """For what no estimator evaluates: a tally that is not read."""
+        """Makes a model outside of any estimate: its tally is not read."""
         return cls(measurement, EvaluationCount.zeros(trials))
 
     def reporting(self) -> CountingModel:
-        """The same model for what is reported of an answer: counted, but no exception there ends a trial."""
+        """Returns the same model for reports on an answer: counted, but no exception there ends a trial."""
         return replace(self, tally=replace(self.tally, messages={}), for_report=True)
 
     def simulate(self, x: Array, rows: NDArray[np.intp]) -> Array:
-        """h(x) (trials, m) for the trials `rows` of the tally."""
+        """Computes h(x) (trials, m) for the trials `rows` of the tally."""
         self.tally.simulations[rows] += self.share
         return self._each_if_raising(self.measurement.simulate, x, rows, (self.measurement.m,))
 
     def residual(self, x: Array, rows: NDArray[np.intp], z: Array) -> Array:
-        """h(x) - z (trials, m) for readings z of the trials `rows`, angles within half a turn."""
+        """Computes h(x) - z (trials, m) for readings z of the trials `rows`, angles within half a turn."""
         return self.measurement.near(self.simulate(x, rows), z) - z
 
     def jacobian(self, x: Array, rows: NDArray[np.intp], *, coarse: Mask | bool = False) -> Array:
-        """dh/dx (trials, m, n) for the trials `rows` of the tally; of the trials `coarse` by `coarse_jacobian`,
-        counted as what it costs beside an exact one."""
+        """Computes dh/dx (trials, m, n) for the trials `rows` of the tally; of the trials `coarse` by
+        `coarse_jacobian`, counted as what it costs beside an exact one."""
         exact: Mask = ~np.broadcast_to(coarse, len(x)) | (self.coarse_share == 1.0)
         if exact.all():
             return self._jacobian(self.measurement.jacobian, 1.0, x, rows)
@@ -104,7 +104,7 @@ class CountingModel:
 
     @cached_property
     def coarse_share(self) -> float:
-        """What a coarse Jacobian costs beside an exact one; 1 where the model has none that is cheaper."""
+        """Cost of a coarse Jacobian over that of an exact one; 1 where the model has none that is cheaper."""
         coarse, exact = self.measurement.coarse_jacobian_cost, self.measurement.jacobian_cost
         return coarse / exact if coarse < exact else 1.0
 

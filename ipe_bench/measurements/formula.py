@@ -1,4 +1,4 @@
-"""Measurement models that users write out: names with a start are parameters, other names are columns of a file."""
+"""Defines measurement models that users write out: names with a start are parameters, others are columns of a file."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from ipe_bench.measurements.ode.trace import Graph, Program, tangent
 _FARTHER = (0.3, -0.3, 1.0, -1.0)
 """Changes of a parameter without a slope, in multiples of its magnitude, at which readings are looked at again."""
 _FARTHER_BY = 1e-12
-"""Of the largest reading: what rounding errors may change."""
+"""Change of readings that rounding may cause, as a share of the largest reading."""
 
 
 class WrittenModel(Measurement):
-    """A model whose parameters are names with a start; `start`, `columns` and `unit` are options of every such model.
+    """Defines a model whose parameters are names with a start; `start`, `columns` and `unit` are options of each.
 
     The size of a parameter is the magnitude of its start, or 1 where that is 0, unless `size` says otherwise.
     """
@@ -106,7 +106,8 @@ class WrittenModel(Measurement):
         return f"there are {', '.join(columns)}{did_you_mean(heading, columns) or '.'} {remedy}"
 
     def flat(self, x: Array) -> tuple[str, ...]:
-        """That readings are constant in pieces at x (n,): some parameters have no slope there, yet change readings."""
+        """Tells if readings are constant in pieces at x (n,): some parameters have no slope there, yet change
+        readings."""
         x = x[None, : self.n]
         z, still = self.simulate(x), np.flatnonzero((self.jacobian(x)[0] == 0.0).all(axis=0))
         names = []
@@ -141,7 +142,7 @@ class WrittenModel(Measurement):
 
 @dataclass(frozen=True)
 class Formula(WrittenModel):
-    """z = expression, in which every name with a start is a parameter and every other one a column of the readings.
+    """Computes z = expression, in which names with a start are parameters and all others columns of the readings.
 
         ipe-bench estimate measurement=formula "measurement.expression=b1*(1-exp(-b2*t))" \\
             measurement.start.b1=500 measurement.start.b2=1e-4 readings=my.csv
@@ -154,13 +155,13 @@ class Formula(WrittenModel):
     expression: str
     """The formula of a reading, such as b1*(1-exp(-b2*t))."""
     start: Mapping[str, Finite] = field(default_factory=dict)
-    """Where estimation begins, for each parameter: the nominal point."""
+    """Start of each parameter: the nominal point."""
     columns: Mapping[str, Sequence[float]] = field(default_factory=dict)
-    """What is known of each reading: the same columns as in a file, for `run`, which has no file."""
+    """Columns of the readings for `run`, which has no file."""
     readings: Count | None = None
     """Number of readings; None: the length of the columns."""
     reading: str = "y"
-    """What the column of the readings is called in a file; `reading` is understood too."""
+    """Name of the readings' column in a file; `reading` is understood too."""
     unit: str = ""
     """Unit of the readings."""
     own: tuple[str, ...] = ()
@@ -221,7 +222,7 @@ class Formula(WrittenModel):
         return [p[name] if name in p else self.column(name)[None] for name in self.arithmetic.names]
 
     def remarks(self, x: Array) -> tuple[str, ...]:
-        """Which conditionals never switch at x, or else which parameters have no slope there."""
+        """Says which conditionals never switch at x, or else which parameters have no slope there."""
         values = dict(zip(self.arithmetic.names, (value[0] for value in self._values(x[None, : self.n])), strict=True))
         with np.errstate(all="ignore"):
             return tuple(never_switching([self.arithmetic], values)) or self.flat(x)

@@ -1,4 +1,4 @@
-"""A measurement model that is a plain Python function of named parameters, written in NumPy or in JAX."""
+"""Defines a measurement model by a plain Python function of named parameters, written in NumPy or in JAX."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _TIMES = ("t", "time")
 
 @dataclass(frozen=True)
 class Function(WrittenModel):
-    """z = h(parameters, columns), for a function h of a Python file:
+    """Computes z = h(parameters, columns), for a function h of a Python file:
 
         def angle(t, length=1.0, damping=0.1, *, g=9.80665):        # in swing.py
             return 0.1 * np.exp(-damping * t / 2) * np.cos(np.sqrt(g / length) * t)
@@ -47,7 +47,7 @@ class Function(WrittenModel):
     of: str
     """The function: MODULE:NAME, where MODULE is importable or MODULE.py lies in the working folder."""
     start: Mapping[str, Finite] = field(default_factory=dict)
-    """Where estimation begins, by parameter: the nominal point. An argument without a default becomes a parameter."""
+    """Start of each parameter: the nominal point. An argument without a default becomes a parameter."""
     size: Mapping[str, Positive] = field(default_factory=dict)
     """The physical size of one unit of a parameter; otherwise the magnitude of its start, or 1 where that is 0."""
     units: Mapping[str, str] = field(default_factory=dict)
@@ -111,7 +111,7 @@ class Function(WrittenModel):
 
     @property
     def functions(self) -> tuple[Callable[..., Any], ...]:
-        """What the model computes with beside its class: a change of its source makes results stale."""
+        """Functions that the model computes with beside its class: a change of their source makes results stale."""
         return (self.function,)
 
     @cached_property
@@ -181,7 +181,7 @@ class Function(WrittenModel):
         return {name: read_only(self.column(name)) for name in self.headings} | {**self.constants}
 
     def _at(self, values: Any) -> Any:
-        """h where the parameters have these values (n,), in their own units; at their real parts if h does not take
+        """Computes h at these values (n,) of the parameters, in their own units; at their real parts if h refuses
         complex ones."""
         known = self._known
         try:
@@ -200,7 +200,7 @@ class Function(WrittenModel):
         return z
 
     def _rows(self, x: Array) -> Array:
-        """h of every trial, by one call of the function each; x may be complex."""
+        """Computes h of every trial, by one call of the function each; x may be complex."""
         with np.errstate(all="ignore"):
             rows = [self._checked(self._at(row), self.m) for row in x * self.sizes]
         return np.array(rows) if rows else np.empty((0, self.m))
@@ -255,8 +255,8 @@ class Function(WrittenModel):
 
 
 def function(h: Callable[..., Any], start: Mapping[str, float] | None = None, **options: Any) -> Function:
-    """The measurement model of a function that a module holds by name, with the options of `Function`; UserError for a
-    lambda or an inner function."""
+    """Makes the measurement model of a function that a module holds by name, with the options of `Function`; UserError
+    for a lambda or an inner function."""
     module, name = getattr(h, "__module__", ""), getattr(h, "__qualname__", "")
     if not name.isidentifier() or getattr(sys.modules.get(module), name, None) is not h:
         raise UserError(f"{name or h!r}: give a function that stands in a module by its own name, not inside another")
@@ -264,7 +264,7 @@ def function(h: Callable[..., Any], start: Mapping[str, float] | None = None, **
 
 
 def _in_chunks(program: Callable[[Array], Any]) -> Callable[[Array], Array]:
-    """A batched program in calls of `_CHUNK` trials."""
+    """Computes a batched program in calls of `_CHUNK` trials."""
 
     def run(x: Array) -> Array:
         padded = np.zeros((-(-max(len(x), 1) // _CHUNK) * _CHUNK, x.shape[1]))

@@ -1,4 +1,4 @@
-"""The gimballed inertial navigation system (GINS) of the paper, section IV: eleven error parameters, 240 velocities.
+"""Models the gimballed inertial navigation system (GINS) of the paper, section IV: 11 error parameters, 240 velocities.
 
 A stabilised platform on a stationary bench; axes x east, y north, z up at the start, wander azimuth, spherical Earth.
 An injected initial velocity error swings the platform at the Schuler period, which makes scale-factor and
@@ -44,7 +44,7 @@ def _length(*components: Any) -> Any:
 
 @dataclass(frozen=True)
 class Gins(OdeMeasurement):
-    """Velocity errors of a gimballed INS over 90 minutes after an injected velocity, in four cases.
+    """Simulates velocity errors of a gimballed INS over 90 minutes after an injected velocity, in four cases.
 
     Parameters, in multiples of the paper's Table 1: accelerometer biases, accelerometer scale-factor errors, gyro
     drifts, and gyro mass unbalances. Readings in m/s in C order over (case 4, time 30, axis 2), less the velocities of
@@ -136,7 +136,7 @@ class Gins(OdeMeasurement):
         return {"case": {k: f"{x:.0f}, {y:.0f} ft/s" for k, (x, y) in enumerate(self.injected, start=1)}}
 
     def taking(self, rows: Sequence[int]) -> Measurement:
-        """Only the cases that are needed are computed."""
+        """Restricts the model to the cases that the readings need."""
         each = 2 * self.readings_per_case
         cases = sorted({row // each for row in rows})
         fewer = replace(self, injected=tuple(self.injected[case] for case in cases))
@@ -148,8 +148,8 @@ class Gins(OdeMeasurement):
         return [c[0], c[1], 0.0, 0.0, 1.0, 0.0, north, up, 0.0, north, up]
 
     def rhs(self, t: Any, y: Sequence[Any], p: Sequence[Any], c: Sequence[Any]) -> Sequence[Any]:
-        """State: computed velocity (vx, vy); true up u and true Earth rate e in platform axes; c, the Earth rate as
-        the computer believes, in computer axes."""
+        """Computes the derivative of the state: computed velocity (vx, vy); true up u and true Earth rate e in platform
+        axes; c, the Earth rate that the computer assumes, in computer axes."""
         (vx, vy), u, e, c = y[:2], y[2:5], y[5:8], y[8:11]
         (ax, ay), rate, coriolis = self.acceleration(u, p), self.platform_rate(y, p), c[2] + c[2]
         x, y_ = self._transport(vx, vy)
@@ -164,11 +164,11 @@ class Gins(OdeMeasurement):
         ]
 
     def _transport(self, vx: Any, vy: Any) -> tuple[Any, Any]:
-        """Rate over the spherical Earth about x and y, rad/s."""
+        """Computes the rate over the spherical Earth about x and y, rad/s."""
         return vy * (-1.0 / self.earth_radius), vx * (1.0 / self.earth_radius)
 
     def platform_rate(self, y: Sequence[Any], p: Sequence[Any]) -> tuple[Any, Any, Any]:
-        """How the platform turns in its own axes, rad/s: as commanded, and as the gyros drift."""
+        """Computes the turn rate of the platform in its own axes, rad/s: the command plus the drifts of the gyros."""
         dx, dy, dz, Dxx, Dxy, Dyx, Dyy = p[4:11]
         u, c = y[2:4], y[8:11]
         x, y_ = self._transport(y[0], y[1])
@@ -176,7 +176,7 @@ class Gins(OdeMeasurement):
         return about_x, Dyx * u[0] + (Dyy * u[1] + (c[1] + y_ + dy)), c[2] + dz
 
     def acceleration(self, u: Sequence[Any], p: Sequence[Any]) -> tuple[Any, Any]:
-        """What the accelerometers x and y show, m/s^2."""
+        """Computes the output of the accelerometers x and y, m/s^2."""
         bx, by, kx, ky = p[:4]
         return (self.gravity + self.gravity * kx) * u[0] + bx, (self.gravity + self.gravity * ky) * u[1] + by
 
@@ -197,8 +197,8 @@ class Gins(OdeMeasurement):
         return Variation(8, slope, moved)
 
     def fastest_rate(self, p: Sequence[Any]) -> Any:
-        """rad/s: Schuler rate with its scale factors, drifts with their g-terms, Earth, and what injected velocity and
-        biases add over the span."""
+        """Bounds the rate in rad/s: Schuler rate with scale factors, drifts with g-terms, Earth, injected velocity and
+        biases."""
         bx, by, kx, ky = p[:4]
         swing = np.sqrt(self.gravity / self.earth_radius * (1.0 + _length(kx, ky)))
         velocity = self._fastest + _length(bx, by) * self.times[-1]
@@ -217,21 +217,21 @@ class Gins(OdeMeasurement):
         return self._shown(np.zeros((1, self.n)), len(self.times), self._zeros)[0]
 
     def linearization(self) -> Array:
-        """H (m, n) as the paper builds it: the readings at one unit of each parameter, secants rather than slopes."""
+        """Builds H (m, n) as the paper does: the readings at one unit of each parameter, secants rather than slopes."""
         return np.ascontiguousarray(self.simulate(np.eye(self.n)).T)
 
 
 @dataclass(frozen=True)
 class RicherGins(Gins):
-    """`Gins` with errors besides its eleven parameters, each drawn anew in every trial from N(0, deviation^2) whatever
-    the error scale: a truth to measure model mismatch with. For x of eleven columns it is `Gins`.
+    """Adds errors to the eleven parameters of `Gins`, each drawn anew in every trial from N(0, deviation^2) at any
+    error scale: a truth to measure model mismatch with. For x of eleven columns it is `Gins`.
 
     Random walk of the drifts: each reading interval of each case begins with an independent increment of deviation
     `gyro_random_walk` times the root of the interval, and the drift is constant within it.
     """
 
     gyro_random_walk: NonNegative = 0.0
-    """Of each drift, deg/h per root hour."""
+    """Random walk of each drift, deg/h per root hour."""
     accelerometer_quadratic: NonNegative = 0.0
     """Output that grows with the square of the specific force along each level axis, micro-g per g^2."""
     accelerometer_misalignment: NonNegative = 0.0
@@ -261,7 +261,7 @@ class RicherGins(Gins):
 
     @property
     def nuisances(self) -> tuple[Parameter, ...]:
-        """In the units of the options that set their deviations; the walk's increments in deg/h."""
+        """Nuisances in the units of the options that set their deviations; the walk's increments in deg/h."""
         steps = product(range(1, len(self.cases) + 1), range(1, self.readings_per_case + 1), "xyz")
         return parameter_table(
             (("quadratic x", "quadratic y"), "micro-g/g^2", self.gravity / 1e-6, "accelerometer quadratic"),
@@ -286,7 +286,7 @@ class RicherGins(Gins):
             z[rows] = self._walked(x[rows], steps, stop) - offset[self.rows(stop)]
 
     def _rates(self, x: Array) -> Array:
-        """With the farthest that the drifts walk; such a trial is tested however slowly it turns."""
+        """Computes the rates with the farthest walk of the drifts; such a trial is tested at any rate of turn."""
         if x.shape[1] == self.n:
             return super()._rates(x)
         walk = np.abs(self._walk(x)).reshape(len(x), -1).max(axis=1)
@@ -294,7 +294,7 @@ class RicherGins(Gins):
         return np.maximum(rates, np.nextafter(self.trusted_angle / self._longest, np.inf))
 
     def _walk(self, x: Array) -> Array:
-        """How far the drifts have walked: (trials x cases, intervals, axes) in rad/s."""
+        """Computes the walk of the drifts: (trials x cases, intervals, axes) in rad/s."""
         return np.cumsum(x[:, self.n + _CONSTANT :].reshape(len(x) * len(self.cases), -1, 3), axis=1)
 
     def _walked(self, x: Array, steps: NDArray[np.int64], stop: int) -> Array:
@@ -315,7 +315,7 @@ class RicherGins(Gins):
         return z.reshape(len(x), cases * stop * 2)
 
     def acceleration(self, u: Sequence[Any], p: Sequence[Any]) -> tuple[Any, Any]:
-        """With the errors of the accelerometers, where they stand behind the parameters."""
+        """Computes the acceleration with the errors of the accelerometers, if they stand behind the parameters."""
         if len(p) == self.n:
             return super().acceleration(u, p)
         bx, by, kx, ky = p[:4]
@@ -325,7 +325,7 @@ class RicherGins(Gins):
         return (1.0 + kx) * x + bx, (1.0 + ky) * y + by
 
     def _tilted(self, p: Array, c: Array) -> Array:
-        """The platform is turned about x, then y, then z: true up and Earth axis turn the other way in its axes."""
+        """Turns the platform about x, then y, then z: true up and Earth axis turn the other way in its axes."""
         y = self.start(list(p.T), list(c.T))
         turns = list(p[:, self.n + _SENSED :].T)
         y = [*y[:2], *_turned(y[2:5], turns), *_turned(y[5:8], turns), *y[8:11]]
@@ -333,7 +333,7 @@ class RicherGins(Gins):
 
     @cached_property
     def _motion(self) -> Kernel:
-        """From one reading to the next: the parameters, the errors of the accelerometers and the state, as it was."""
+        """Equations between readings: the parameters, the accelerometers' errors and the state are arguments."""
         given = self.n + _SENSED
 
         arithmetic = (lambda p, c: p[given:]), self.rhs, (lambda t, y, p, c: y)
@@ -341,7 +341,7 @@ class RicherGins(Gins):
 
 
 def _turned(v: Sequence[Any], angles: Sequence[NDArray[Any]]) -> list[Any]:
-    """A fixed vector in axes that turn by the angles about x, then y, then z."""
+    """Turns a fixed vector into axes that turn by the angles about x, then y, then z."""
     a, b, c = v
     x, y, z = angles
     b, c = np.cos(x) * b + np.sin(x) * c, np.cos(x) * c - np.sin(x) * b

@@ -1,4 +1,4 @@
-"""Structural identifiability: which parameters of a described model no readings of its outputs can tell, however exact.
+"""Analyses structural identifiability: which parameters of a described model no exact readings of its outputs can tell.
 
 Exact readings at all times determine the Taylor coefficients of the outputs at t = 0 and nothing more. A parameter or
 an initial state is locally identifiable if its column of the Jacobian of these coefficients is no combination of the
@@ -26,11 +26,11 @@ _POWERS = tuple(float(k) for k in range(3, 9))
 
 @dataclass(frozen=True)
 class Structure:
-    """What exact readings of a model could tell."""
+    """Holds the identifiability of a model from exact readings."""
 
     unknowns: tuple[str, ...]
     groups: tuple[tuple[str, ...], ...]
-    """Those that no readings tell, as they move together and leave every reading as it is."""
+    """Groups of parameters that no readings tell, as they move together and leave every reading as it is."""
 
     @property
     def lost(self) -> tuple[str, ...]:
@@ -38,14 +38,14 @@ class Structure:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """In words, a sentence per group; none if everything can be told."""
+        """Sentences on the groups, one each; none if every parameter is identifiable."""
         alone = "{} moves and leaves every reading as it is; fix it, or read another output"
         together = "{} move together and leave every reading as it is; fix one of them, or read another output"
         return tuple((alone if len(g) == 1 else together).format(", ".join(g)) for g in self.groups)
 
 
 def structure(model: Measurement) -> Structure | None:
-    """Which parameters of a model by `Ode` or `Formula` no readings tell, locally, with the real constants of its
+    """Finds which parameters of a model by `Ode` or `Formula` no readings tell, locally, with the real constants of its
     cases; None for other models, and for formulas that are not examined (sin, tanh and their kin; conditionals; inputs
     or exponents that change with time; a denominator that is 0 at the start)."""
     fixed: dict[str, float] = {}
@@ -77,8 +77,8 @@ def structure(model: Measurement) -> Structure | None:
 
 
 class _Free(dict[Any, int]):
-    """Random numbers modulo a prime by what they stand for: a parameter, or a function of one argument. Cases share
-    them: the same argument has the same exponential in all."""
+    """Draws random numbers modulo a prime for parameters and for functions of one argument. Cases share them: the same
+    argument has the same exponential in all."""
 
     def __init__(self, prime: int) -> None:
         self.prime, self._random = prime, random.Random(prime)
@@ -88,7 +88,7 @@ class _Free(dict[Any, int]):
         return self[key]
 
     def power(self, base: int, exponent: int) -> int:
-        """Exponents one apart, such as those of a power and its derivative, have powers that the base divides."""
+        """Computes powers; those with exponents one apart, as of a power and its derivative, have the base as ratio."""
         if exponent == 0:
             return 1
         for apart in (1, -1):
@@ -101,8 +101,8 @@ class _Free(dict[Any, int]):
 def _jacobian(
     free: _Free, unknowns: Sequence[str], formulas: Iterable[Mapping[str, Arithmetic]], cases: list[dict[str, float]]
 ) -> list[list[int]]:
-    """The derivatives (cases x outputs x orders, unknowns) of the outputs' Taylor coefficients, modulo the prime, where
-    the formulas are rates, initial states and outputs; as many coefficients as unknowns suffice."""
+    """Computes the derivatives (cases x outputs x orders, unknowns) of the outputs' Taylor coefficients, modulo the
+    prime, where the formulas are rates, initial states and outputs; as many coefficients as unknowns suffice."""
     graph, (rates, initial, outputs) = Graph(), formulas
     names = {name: graph.input(name) for name in [*unknowns, *rates, *cases[0], "t"]}
 
@@ -135,14 +135,14 @@ def _jacobian(
 
 
 class _Series(dict[int, list[int]]):
-    """Taylor coefficients in t modulo a prime of every recorded expression, by its order, found one after another.
-    exp, log, sqrt and powers enter by their differential equations (u = exp(v): u' = u v')."""
+    """Computes Taylor coefficients in t modulo a prime of every recorded expression, order by order. exp, log, sqrt and
+    powers enter by their differential equations (u = exp(v): u' = u v')."""
 
     def __init__(self, free: _Free, given: dict[int, list[int]]) -> None:
         self.free, self.p, self.given = free, free.prime, given
 
     def extend(self, expressions: Sequence[Expression], k: int) -> None:
-        """Coefficient k of all, operands before their users."""
+        """Computes coefficient k of all expressions, operands before their users."""
         for e in expressions:
             self.setdefault(e.order, []).append(self._coefficient(e, k) % self.p)
 
@@ -187,7 +187,7 @@ class _Series(dict[int, list[int]]):
         raise NotImplementedError(e.operation)
 
     def _power(self, u: list[int], a: list[int], exponent: int, k: int) -> int:
-        """Of u = a^exponent, by a u' = exponent u a'."""
+        """Computes a coefficient of u = a^exponent, by a u' = exponent u a'."""
         inverse = self._inverse(max(k, 1) * a[0])
         rest = exponent * _product(_derivative(a), u, k - 1) - _product(_derivative(u), a[1:], k - 2)
         return rest * inverse if k else self.free.power(a[0], exponent)
@@ -199,7 +199,7 @@ class _Series(dict[int, list[int]]):
 
 
 def _product(a: Sequence[int], b: Sequence[int], k: int) -> int:
-    """Coefficient k of a product of series."""
+    """Computes coefficient k of a product of series."""
     return sum(a[i] * b[k - i] for i in range(k + 1))
 
 
@@ -213,7 +213,7 @@ def _modulo(value: float, prime: int) -> int:
 
 
 def _echelon(J: list[list[int]], p: int) -> tuple[list[list[int]], list[int]]:
-    """The reduced row echelon form of J modulo p, and its pivot columns."""
+    """Computes the reduced row echelon form of J modulo p, and its pivot columns."""
     rows, pivots = J, []
     for column in range(len(J[0])):
         r = len(pivots)

@@ -1,4 +1,4 @@
-"""Several sets of readings that are estimated together: common parameters, and some of which every set has its own."""
+"""Joins several sets of readings with common parameters, and some of which each set has its own."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ipe_bench.measurements.base import Epochs, Measurement, Parameter, UsualNoi
 
 @dataclass(frozen=True)
 class Joint(Measurement):
-    """The readings of several models after one another, file by file.
+    """Joins the readings of several models, file by file.
 
     Parameters of one name are one parameter, but for those that a model calls its own (`own_parameters`): these get the
     number of their file, as in clock_1 and clock_2.
@@ -46,7 +46,7 @@ class Joint(Measurement):
 
     @property
     def copies(self) -> dict[str, list[str]]:
-        """What the parameters are called here of which every file has its own, by what the model calls them."""
+        """Names in this model of the parameters of which every file has its own, by their names in the parts."""
         found: dict[str, list[str]] = {}
         for name, k in ((name, k) for k, part in enumerate(self.parts, 1) for name in part.own_parameters):
             found.setdefault(name, []).append(f"{name}_{k}")
@@ -54,7 +54,7 @@ class Joint(Measurement):
 
     @cached_property
     def _places(self) -> list[NDArray[np.intp]]:
-        """Where the parameters of each part stand among those of all."""
+        """Places of each part's parameters among all."""
         numbers: dict[str, int] = {}
         return [
             np.array([numbers.setdefault(self._named(p, p, k).name, len(numbers)) for p in part.physical_parameters])
@@ -62,7 +62,7 @@ class Joint(Measurement):
         ]
 
     def _named(self, p: Parameter, known: Parameter, k: int) -> Parameter:
-        """A parameter of part k, which users know as `known`, as it is called among those of all."""
+        """Renames a parameter of part k, which users know as `known`, to its name among all."""
         own = known.name in self.parts[k].own_parameters
         return replace(p, name=f"{p.name}_{k + 1}", group=p.group or p.name) if own else p
 
@@ -92,7 +92,7 @@ class Joint(Measurement):
         return {name: value for part in self.parts for name, value in part.fixed.items()}
 
     def _of_parts(self, method: str, x: Array) -> list[Any]:
-        """What that method of each part gives for its own parameters, which are on the last axis of x."""
+        """Computes that method of each part at its own parameters, which are on the last axis of x."""
         pairs = zip(self.parts, self._places, strict=True)
         return [getattr(part, method)(x[..., places]) for part, places in pairs]
 
@@ -108,7 +108,7 @@ class Joint(Measurement):
 
     @cached_property
     def _starts(self) -> list[int]:
-        """Where the readings of each part begin, and where the last one ends."""
+        """First reading of each part, and the end of the last."""
         return np.cumsum([0, *(part.m for part in self.parts)]).tolist()
 
     @property
@@ -131,7 +131,7 @@ class Joint(Measurement):
 
     @cached_property
     def epochs(self) -> Epochs | None:
-        """Those of the files after one another; None where a file has none."""
+        """Epochs of the files one after another; None if a file has none."""
         parts = [part.epochs for part in self.parts]
         if any(epochs is None for epochs in parts):
             return None
@@ -143,7 +143,7 @@ class Joint(Measurement):
 
     @property
     def usual_noise(self) -> UsualNoise | None:
-        """That of the parts, where it is one."""
+        """Usual noise of the parts, if they share one."""
         known = [part.usual_noise for part in self.parts]
         return known[0] if all(one == known[0] for one in known) else None
 
@@ -163,7 +163,7 @@ class Joint(Measurement):
         return self._placed([part.linearization()[None] for part in self.parts])[0]
 
     def _placed(self, slopes: Sequence[Array]) -> Array:
-        """The slopes (trials, m, n) of the parts in one matrix, zero where a part has not the parameter."""
+        """Assembles the slopes (trials, m, n) of the parts in one matrix, zero where a part has not the parameter."""
         J = np.zeros((len(slopes[0]), self.m, self.n))
         for slope, places, start in zip(slopes, self._places, self._starts, strict=False):
             J[:, start : start + slope.shape[1], places] = slope

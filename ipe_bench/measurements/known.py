@@ -1,4 +1,4 @@
-"""What is known of parameters before anything is measured: values, starts, bounds, and how far off they may be."""
+"""States prior knowledge of parameters: values, starts, bounds, and their uncertainty."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ _NEAR = 1e-2
 
 @dataclass(frozen=True)
 class ParameterInfo(Component):
-    """What is known of one parameter; all in its own unit."""
+    """Holds what is known of one parameter; all in its own unit."""
 
     name: str
     fixed: Finite | None = None
     """Its value, where it is not to be estimated."""
     nominal: Finite | None = None
-    """Where estimation starts and the prior is centred, in place of the model's own value."""
+    """Start of the estimation and centre of the prior, in place of the model's own value."""
     deviation: Positive | None = None
     """Standard deviation of the prior at error scale 1, in place of the parameter's size."""
     lower: Finite | None = None
@@ -53,12 +53,12 @@ class ParameterInfo(Component):
 
     @property
     def stated(self) -> dict[str, Any]:
-        """What is said, by option."""
+        """Stated options with their values."""
         return {f.name: value for f in fields(self) if (value := getattr(self, f.name)) != f.default}
 
 
 def informed(model: Measurement, known: Sequence[ParameterInfo]) -> Measurement:
-    """The model in which so much is known of its parameters.
+    """Returns the model with this knowledge of its parameters.
 
     Of a parameter of which every file has its own, what is known of NAME is known of NAME_1, NAME_2 and so on, unless
     that is said of one of them.
@@ -77,7 +77,7 @@ def informed(model: Measurement, known: Sequence[ParameterInfo]) -> Measurement:
 
 @dataclass(frozen=True)
 class ConstrainedModel(WrappedModel):
-    """A model of which some parameters are fixed, bounded or start elsewhere: the model in other coordinates.
+    """Transforms a model of which some parameters are fixed, bounded or start elsewhere to other coordinates.
 
     x counts the parameters that are left. A bounded one is ln((v - lower) / (v0 - lower)), or
     ln((upper - v0) / (upper - v)), or the difference of the logits of v and its start v0, and is named accordingly; its
@@ -121,7 +121,7 @@ class ConstrainedModel(WrappedModel):
 
     @cached_property
     def _coordinates(self) -> _Coordinates:
-        """Of the parameters that are left."""
+        """Coordinates of the parameters that are left."""
         lower, upper = np.array([self._known[i].bounds for i in self._free]).T
         return _Coordinates(self._v0[self._free], lower, upper, self.whole.sizes[self._free])
 
@@ -177,7 +177,7 @@ class ConstrainedModel(WrappedModel):
         return replace(self, known=tuple(({one.name: one for one in self.known} | stated).values()))
 
     def whole_x(self, x: Array) -> Array:
-        """What comes behind the parameters, a truth's nuisances, stays there."""
+        """Converts x to that of the whole model; a truth's nuisances, behind the parameters, stay there."""
         c, own = self._coordinates, x[:, : self.n]
         whole = np.repeat((self._v0 / self.whole.sizes)[None], len(x), axis=0).astype(x.dtype)
         whole[:, self._free] = np.where(c.bounded, c.value(own) / c.size, own)
@@ -201,7 +201,7 @@ class ConstrainedModel(WrappedModel):
 
 @dataclass(frozen=True)
 class _Coordinates:
-    """Values (..., n) inside of bounds by multiples x (..., n) of `inner_size` of their logarithms or logits."""
+    """Converts multiples x (..., n) of `inner_size` of logarithms or logits to values (..., n) inside of bounds."""
 
     v0: Array
     lower: Array
@@ -213,13 +213,13 @@ class _Coordinates:
         return np.isfinite(self.lower) | np.isfinite(self.upper)
 
     def choose(self, free: Any, above: Any, below: Any, between: Any) -> Array:
-        """What holds of each parameter: without bounds, above a lower one, below an upper one, or between two."""
+        """Chooses by parameter what holds: without bounds, above a lower one, below an upper one, or between both."""
         within = np.where(self.upper == np.inf, above, np.where(self.lower == -np.inf, below, between))
         return np.where(self.bounded, within, free)
 
     @cached_property
     def inner_size(self) -> Array:
-        """What one unit of x is, of the logarithm or logit."""
+        """Size of one unit of x, in the logarithm or logit."""
         return self.size / self._slope_at(self.v0)
 
     @cached_property
@@ -227,7 +227,7 @@ class _Coordinates:
         return self._coordinate(self.v0)
 
     def _slope_at(self, v: Array) -> Array:
-        """The derivative of the value by its logarithm or logit."""
+        """Computes the derivative of the value by its logarithm or logit."""
         with np.errstate(all="ignore"):
             above, below = v - self.lower, self.upper - v
             return self.choose(1.0, above, below, above * below / (self.upper - self.lower))
@@ -244,7 +244,7 @@ class _Coordinates:
             return self.choose(x * self.size, self.lower + np.exp(u), self.upper - np.exp(-u), within)
 
     def slope(self, x: Array) -> Array:
-        """dv/dx."""
+        """Computes dv/dx."""
         return self._slope_at(self.value(x)) * self.inner_size
 
     def inner(self, v: Array) -> Array:

@@ -1,4 +1,4 @@
-"""The certified nonlinear regression problems of the NIST Statistical Reference Datasets, and digits of an estimate.
+"""Holds the certified regression problems of the NIST Statistical Reference Datasets, and counts digits of an estimate.
 
 The readings are real or generated data with certified answers (National Institute of Standards and Technology,
 https://www.itl.nist.gov/div898/strd/nls/nls_main.shtml, public domain), kept in `nist.json`.
@@ -92,7 +92,7 @@ def _tables() -> dict[str, dict[str, Any]]:
 
 @dataclass(frozen=True)
 class CertifiedAnswer:
-    """What NIST certifies of one data set, to eleven digits."""
+    """Holds NIST's certified answer to one data set, to eleven digits."""
 
     parameters: Array
     """(n,), in physical units."""
@@ -106,7 +106,7 @@ class CertifiedAnswer:
 
 @dataclass(frozen=True)
 class Nist(Measurement):
-    """One regression problem of NIST, to be started at one of its two certified starting points.
+    """Holds one regression problem of NIST, to be started at one of its two certified starting points.
 
     The nominal point is that start, and each parameter's size is its magnitude there, so x0 consists of ones and minus
     ones. There is no order of arrival and no prior. A reading is one observation y; for Nelson it is log(y), as NIST
@@ -116,7 +116,7 @@ class Nist(Measurement):
     dataset: str = "Misra1a"
     """A name as NIST writes it, a key of `FORMULAS`."""
     start: Literal[1, 2] = 1
-    """Which starting point: 1 is far from the solution, 2 is near."""
+    """Number of the starting point: 1 is far from the solution, 2 is near."""
 
     analytic = True
 
@@ -180,7 +180,7 @@ class Nist(Measurement):
 
 @dataclass(frozen=True)
 class Digits:
-    """Correct digits, the fewest over the parameters: 11 is all that is certified, 0 is a wrong answer."""
+    """Holds correct digits, the fewest over the parameters: 11 is all that is certified, 0 is a wrong answer."""
 
     parameters: float
     deviations: float
@@ -188,7 +188,7 @@ class Digits:
 
 
 def digits(value: Array | float, certified: Array | float) -> float:
-    """The log relative error -log10(|value - certified| / |certified|), the smallest over the entries, at most 11.
+    """Computes the log relative error -log10(|value - certified| / |certified|), the least of all, at most 11.
 
     Less than one digit, or a value that is not finite, counts as none (McCullough, Assessing the
     reliability of statistical software, The American Statistician 52, 1998).
@@ -204,7 +204,7 @@ def digits(value: Array | float, certified: Array | float) -> float:
 def score(model: Nist, x: Array, deviation: Array) -> Digits:
     """Compares an estimate x (n,) and its standard deviations (n,), both in multiples of sizes, with NIST's.
 
-    An estimator is told R = sigma^2 I with NIST's residual deviation as sigma, and states its deviations for that R.
+    An estimator assumes R = sigma^2 I with NIST's residual deviation as sigma, and states its deviations for that R.
     NIST's rest on the residual variance of the fit, rss / (m - n), so that is put in the place of sigma^2.
     """
     certified, residuals = model.certified, model.readings - model.simulate(x[None])[0]

@@ -1,4 +1,4 @@
-"""A polynomial model with knobs for its size and the strength of its nonlinearity: for teaching and for tests."""
+"""Defines a polynomial model with knobs for size and nonlinearity, for teaching and for tests."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ipe_bench.measurements.base import Epochs, Measurement, Parameter, UsualNoi
 
 @dataclass(frozen=True)
 class Polynomial(Measurement):
-    """h_k(x) = u_k + s u_k^2 / 2 + s^2 u_k^3 / 6 with u = H x: a linear model that a cubic bends.
+    """Computes h_k(x) = u_k + s u_k^2 / 2 + s^2 u_k^3 / 6 with u = H x: a linear model that a cubic bends.
 
     H holds Chebyshev polynomials T_0 ... T_(n-1) at m equally spaced times from -1 to 1, so it is well conditioned. At
     s = 0 the model is linear. The cubic is the Taylor polynomial of (exp(s u) - 1) / s; it grows monotonically, so one
@@ -44,7 +44,7 @@ class Polynomial(Measurement):
 
     @cached_property
     def times(self) -> Array:
-        """Where the polynomials are read (m,)."""
+        """Times of the readings (m,), at which the polynomials are evaluated."""
         return np.linspace(-1.0, 1.0, self.count)
 
     @cached_property

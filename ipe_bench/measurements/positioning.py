@@ -23,7 +23,7 @@ _BEACONS = (
 
 @dataclass(frozen=True)
 class Ranging(Measurement):
-    """Pseudoranges |s_i - p| + b from a receiver at p with clock bias b to beacons at known places s_i.
+    """Measures pseudoranges |s_i - p| + b from a receiver at p with clock bias b to beacons at known places s_i.
 
     Parameters: east, north, up in m, and the clock bias as a length in m. Readings: pseudoranges in m, in `rounds` over
     all beacons; each round is an epoch.
@@ -74,7 +74,7 @@ class Ranging(Measurement):
 
 @dataclass(frozen=True)
 class Bearings(Measurement):
-    """Bearings to a target of constant velocity, from an observer that sails straight legs at known courses and speeds.
+    """Measures bearings to a target of constant velocity from an observer on straight legs of known courses and speeds.
 
     Parameters: the target's position (east, north) at time 0 in m relative to the observer's start, and its velocity in
     m/s. Readings: bearings in degrees clockwise from north, one per `interval`; each is an epoch. Simulated ones are
@@ -120,12 +120,12 @@ class Bearings(Measurement):
 
     @cached_property
     def times(self) -> Array:
-        """When bearings are taken (m,), in s."""
+        """Times of the bearings (m,), in s."""
         return self.interval * np.arange(int(sum(leg[0] for leg in self.legs) / self.interval + 1e-9) + 1)
 
     @cached_property
     def observer(self) -> Array:
-        """Where they are taken (m, 2), east and north in m."""
+        """Places of the observer at these times (m, 2), east and north in m."""
         path, began = np.zeros((len(self.times), 2)), 0.0
         for duration, course, speed in self.legs:
             sailed = np.clip(self.times - began, 0.0, duration)
@@ -135,7 +135,7 @@ class Bearings(Measurement):
         return path
 
     def _sight(self, x: Array) -> Array:
-        """The vectors (trials, m, 2) from the observer to the target."""
+        """Returns the vectors (trials, m, 2) from the observer to the target."""
         p = x * self.sizes
         return p[:, None, :2] + self.times[:, None] * p[:, None, 2:] - self.observer
 

@@ -1,4 +1,4 @@
-"""What an estimator is told besides the readings: the model, R and the prior, but not the truth."""
+"""States what an estimator knows besides the readings: the model, R and the prior, but not the truth."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _PATIENCE_S = 1.0
 
 @dataclass(frozen=True)
 class Problem:
-    """All that an estimator may know besides the readings; its arrays are read-only."""
+    """Holds all that an estimator may know besides the readings; its arrays are read-only."""
 
     measurement: Measurement
     R: Covariance
@@ -62,12 +62,12 @@ class Problem:
         return bool(np.isnan(self.H_plus).all())
 
     def prior_used(self, inflation: float = 1.0) -> Array | None:
-        """The prior's standard deviations (n,) times `inflation`; a parameter that the prior fixes is nearly fixed."""
+        """Computes the prior's standard deviations (n,) times `inflation`; one that is fixed gets nearly none."""
         deviation = self.prior_deviation
         return None if deviation is None else inflation * np.maximum(deviation, _FIXED * deviation.max())
 
     def prior_covariance(self, inflation: float = 1.0) -> Covariance | None:
-        """P0 with its deviations times `inflation`, as `prior_used` has them."""
+        """Computes P0 with its deviations times `inflation`, as `prior_used` has them."""
         deviation = self.prior_used(inflation)
         if deviation is None or self.prior_correlation is None:
             return None if deviation is None else Covariance(deviation)
@@ -97,7 +97,7 @@ def require_numbers(owner: str, method: Any, values: Any, shape: tuple[int, ...]
 
 
 def _unfit(method: Any, values: Any, shape: tuple[int, ...]) -> str:
-    """What is wrong with what a method returned, and where it is written; empty if nothing is."""
+    """Says what is wrong with what a method returned, and where it is written; empty if it is right."""
     array = np.asarray(values)
     if isinstance(values, np.ndarray) and type(values) is not np.ndarray:
         found, remedy = f"a {type(values).__name__}", "return an ordinary array, with NaN for what is masked"
@@ -126,7 +126,7 @@ def require_function(model: Measurement) -> None:
 
 @lru_cache(maxsize=256)
 def _irregularity(model: Measurement) -> str:
-    """What is wrong; empty where nothing is, and where a call raises, which is told of by the trials that it ends."""
+    """Says what is irregular; empty if the model is regular, and where a call raises, which its trials report."""
     rng = np.random.default_rng(11)
     x, other = (read_only(model.nominal + 0.1 * rng.standard_normal((trials, model.n))) for trials in (4, 7))
     fresh: Any = replace(cast(Any, model)) if is_dataclass(model) else copy.copy(model)

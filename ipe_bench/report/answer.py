@@ -244,7 +244,7 @@ def _values(values: Mapping[str, float], figures: int = 6) -> str:
 
 
 def _outliers(answer: Answer) -> Iterator[Table]:
-    """Returns the most outlying readings, each with its largest residual and the estimators that find it so."""
+    """Yields the most outlying readings, each with its largest residual and the estimators that find it so."""
     told = [f for f in answer.fits if 0 < f.outliers.sum() <= max(3, _FEW * len(f.outliers))]
     if not told:
         return
@@ -298,7 +298,7 @@ def _interval(low: float, high: float, middle: float) -> str:
 
 
 def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Returns what a reader should know before relying on the answer, one sentence each."""
+    """Yields what a reader should know before relying on the answer, one sentence each."""
     names = [p.name for p in found.model.physical_parameters]
 
     def at(x: Array) -> str:

@@ -251,7 +251,7 @@ def _about_constants(name: str, footer: Mapping[str, Any]) -> str:
 
 
 def _about_states(name: str, footer: Mapping[str, Any]) -> str:
-    """Returns whether the docstring is the general one of models by formulas, which is left out."""
+    """Describes a model of states; the general docstring of models by formulas is left out."""
     states = [f"{p['name']} in {p['unit']}" if p["unit"] else p["name"] for p in footer["parameters"]]
     words = "" if "next" in footer["identity"]["scenario"].get("model", {}) else str(footer.get("about") or "")
     return (

@@ -152,7 +152,7 @@ def write_design(folder: Path, name: str, design: Design) -> list[Path]:
 
 
 def posterior_parts(name: str, found: Sequence[Reference]) -> list[Table]:
-    """Yields a row per trial and estimator, under the `name` of the scenario."""
+    """Returns a row per trial and estimator, under the `name` of the scenario."""
     rows = [(one, label, d) for one in found for label, d in one.divergences.items()]
     columns = [
         texts("trial", [str(one.trial) for one, *_ in rows]),
@@ -279,7 +279,7 @@ def _ratio(value: float) -> str:
 
 
 def audit_parts(found: Audit) -> list[Part]:
-    """Yields the sentences of an audit, and a row per parameter."""
+    """Returns the sentences of an audit, and a row per parameter."""
     names = found.claims.names
     columns = [
         words("parameter", names),

@@ -39,13 +39,13 @@ class Written:
 
 
 def report_tables(analysis: Analysis) -> list[Table]:
-    """Yields every table of the report: those on certified readings, ours on simulated trials, and those of plugins."""
+    """Returns all tables of the report: on certified readings, ours on simulated trials, and those of plugins."""
     shown = certified_tables(analysis.collection) + all_tables(analysis.simulated, analysis)
     return [*shown, *(table for one in written("table", analysis, shown) for table in one.tables)]
 
 
 def written(group: str, analysis: Analysis, tables: Iterable[Table]) -> list[Written]:
-    """Yields the tables or sections of plugins, their tables under unique names."""
+    """Returns the tables or sections of plugins, their tables under unique names."""
     names = {*CURVES, *(table.name for table in tables)}
 
     def make(record: Any) -> tuple[str, list[Part]]:

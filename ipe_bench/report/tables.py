@@ -95,7 +95,7 @@ _APPENDIX = ("all_trials", "solved_trials", "contraction", "covariances", "theor
 
 
 def all_tables(analysis: Analysis, whole: Analysis | None = None) -> list[Table]:
-    """Yields every table that the data allow, in the order of the report, with the endings of the `whole` analysis."""
+    """Returns every table that the data allow, in the order of the report, with the endings of the `whole` analysis."""
     found = {"endings": endings(whole or analysis)}
     if not analysis.summary.empty:
         rows = analysis.summary[analysis.summary["parameter"] == ALL].reset_index(drop=True)
@@ -202,7 +202,7 @@ def endings(analysis: Analysis) -> Table | None:
 
 
 def certified_tables(collection: Collection) -> list[Table]:
-    """Yields digits per data set with averages, and published errors, if there are data; a terminal shows those that
+    """Returns digits per data set with averages, and published errors, if there are data; a terminal shows those that
     name the file with the `whole`."""
     digits = certified_table(collection)
     found = [] if digits.empty else _digits(digits)

@@ -59,7 +59,7 @@ _VERDICTS |= {"diverged but confident": ("diverged", "!"), "-": ("", "")}
 
 
 def summary_tables(listed: Sequence[Mapping[str, Any]], totals: Sequence[Table], width: int) -> list[Part]:
-    """Yields a table per setting (measurement, noise, differing options), after the totals of certified runs."""
+    """Returns a table per setting (measurement, noise, differing options), after the totals of certified runs."""
     # Models whose own readings are certified, without being of a collection, have no totals.
     rows = [row for row in listed if row["parameter"] == ALL and not (totals and row["noise"] == "certified")]
     known = {*summary_columns(), "parameter", "unit", "estimator", "error_scale"}

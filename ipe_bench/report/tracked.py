@@ -62,7 +62,7 @@ class LogAnswer:
 
 
 def track_parts(answer: LogAnswer) -> list[Part]:
-    """Yields the test of the innovations of each tracker, and the states at the last epoch."""
+    """Returns the test of the innovations of each tracker, and the states at the last epoch."""
     found, states = answer.tracks, answer.log.model.states
     limits = [one.limits[0] for one in found], [one.limits[1] for one in found]
     columns = [

@@ -1,4 +1,4 @@
-"""Measurement models defined by ordinary differential equations, on a compiled batched integrator.
+"""Defines measurement models by ordinary differential equations, on a compiled batched integrator.
 
 A model is one class, here a pendulum of unknown length and damping that is released from half a radian:
 

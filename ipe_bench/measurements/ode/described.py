@@ -1,4 +1,4 @@
-"""Differential equations that are described in a config, in the language of formulas: no plugin and no Python."""
+"""Defines differential equations in a config, in the language of formulas: no plugin and no Python."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from ipe_bench.measurements.ode.model import OdeMeasurement, time_heading
 from ipe_bench.measurements.ode.rodas import SHAPE, Effort, Rodas5P
 
 _SHARE = 1e-8
-"""Of the largest reading, what the integration may leave unless told otherwise."""
+"""Default tolerance of the integration, as a share of the largest reading."""
 _TRIAL_STEPS = 16
 """Steps within the shortest interval that tell how large readings are."""
 _KINKED = 5.0
@@ -36,17 +36,17 @@ _STIFF = 10.0
 _ASKED = 3000
 """Implicit steps times states and 4 that hold explicit readings against implicit ones, in a quarter of a second."""
 _APART, _MISSED = 0.05, 1e3
-"""Of the largest reading of an output, what explicit readings may differ by from a rough solution without being held
-against an accurate one; and by how many tolerances they may differ from that."""
+"""Differences of explicit readings from a rough solution that need no accurate one, as a share of the largest reading
+of an output; and from an accurate one, in tolerances."""
 _IN_HAND = 0.3
-"""Of the tolerance, what a step of the implicit method may leave."""
+"""Error of a step of the implicit method, as a share of the tolerance."""
 _COLUMNS = ("case", "time", "output", "reading", "sigma")
 """Columns that mean something else than a constant."""
 
 
 @dataclass(frozen=True)
 class Ode(WrittenModel, WrappedModel):
-    """Readings of the solution of differential equations, each a formula of the states, the parameters and t.
+    """Solves differential equations for readings, each a formula of the states, the parameters and t.
 
         states prey and predators with
         rates    prey: a*prey - b*prey*predators     predators: d*prey*predators - c*predators
@@ -64,13 +64,13 @@ class Ode(WrittenModel, WrappedModel):
     rates: Mapping[str, str | float]
     """The time derivative of every state."""
     start: Mapping[str, Finite] = field(default_factory=dict)
-    """Where estimation begins, for each parameter: the nominal point."""
+    """Start of each parameter: the nominal point."""
     initial: Mapping[str, str | float] = field(default_factory=dict)
     """The states at t = 0."""
     outputs: Mapping[str, str | float] = field(default_factory=dict)
-    """What is read at each time; none: every state."""
+    """Formula of each output; none: every state is read."""
     times: tuple[float, ...] = ()
-    """When it is read; a readings file brings its own."""
+    """Times of the readings; a readings file brings its own."""
     tolerance: Positive | str | None = None
     """The error that the integration may leave in a reading, a number or a formula of t and the constants; None: 1e-8
     of the largest reading at the start."""
@@ -83,9 +83,9 @@ class Ode(WrittenModel, WrappedModel):
     own: tuple[str, ...] = ()
     """Parameters of which every file of readings has its own, where there are several."""
     constants: Mapping[str, Finite | tuple[Finite, ...]] = field(default_factory=dict)
-    """What is known of each case: a number for each, or one for all; a readings file brings its own."""
+    """Constants of each case: a number for each, or one for all; a readings file brings its own."""
     size: Mapping[str, Positive] = field(default_factory=dict)
-    """What one unit of error of a parameter is; where absent, the magnitude of its start."""
+    """Unit of error of a parameter; by default the magnitude of its start."""
     units: Mapping[str, str] = field(default_factory=dict)
     """Units of the parameters."""
     readings: Count | None = None
@@ -108,7 +108,7 @@ class Ode(WrittenModel, WrappedModel):
     columns: Mapping[str, Sequence[float]] = field(default_factory=dict)
     """The inputs of `driven_by`, where no file brings them: time, one column each, and `case` where cases differ."""
     reading: str = "reading"
-    """What the column of the readings is called in a file; `reading` is understood too."""
+    """Name of the readings' column in a file; `reading` is understood too."""
     circular: tuple[str, ...] = ()
     """Outputs that are angles, in rad, or in deg by their unit: their residuals are within half a turn."""
 
@@ -252,7 +252,7 @@ class Ode(WrittenModel, WrappedModel):
         return found | {name: self._at_readings(name) for name in self.driven_by}
 
     def _at_readings(self, name: str) -> list[float]:
-        """The values (m,) of an input; refused where it changes at other times, too."""
+        """Returns the values (m,) of an input; refuses one that changes at other times, too."""
         if lost := {float(t) for one in self.courses for t in one["time"]} - set(map(float, self.reading_times)):
             remedy = "add it to measurement.times to write the readings with their inputs"
             raise UserError(f"measurement.columns.time: {name} changes at {min(lost):g} without a reading; {remedy}")
@@ -267,8 +267,8 @@ class Ode(WrittenModel, WrappedModel):
         return bool(self.times or self.readings) and known.issuperset((*self.constant_names, *self.driven_by))
 
     def remarks(self, x: Array) -> tuple[str, ...]:
-        """That the implicit method is chosen, or is nearer, and which conditionals never switch along the solution at
-        x."""
+        """Says that the implicit method is chosen, or is nearer, and which conditionals never switch along the solution
+        at x."""
         found, engine = [], self.engine
         rates, outputs = self.rate_formulas.values(), self.output_formulas.values()
         if self.method == "auto" and engine.stiff:
@@ -356,7 +356,7 @@ class Ode(WrittenModel, WrappedModel):
         return [dict(zip(self.constant_names, case.tolist(), strict=True)) for case in self.cases]
 
     def known(self, times: Array) -> list[dict[str, float]]:
-        """The constants and t at each of these times of each case."""
+        """Returns the constants and t at each of these times of each case."""
         return [{**case, "t": t} for case in self.known_of_cases for t in times.tolist()]
 
 
@@ -365,7 +365,7 @@ def _read_all(key: str, texts: Mapping[str, str | float]) -> dict[str, Arithmeti
 
 
 class _Engine(OdeMeasurement):
-    """The model that `Ode` describes, for the integrator."""
+    """Implements the model that `Ode` describes, for the integrator."""
 
     stiff_remedy = "measurement.method=implicit follows them"
 
@@ -465,8 +465,8 @@ class _Engine(OdeMeasurement):
         return off if off > max(_MISSED, rough_off) else 0.0
 
     def off(self, x: Array) -> float:
-        """By how many tolerances the explicit method differs from the implicit one in a reading at x (n,); 0 where few
-        explicit steps do."""
+        """Computes by how many tolerances the explicit method differs from the implicit one in a reading at x (n,); 0
+        where few explicit steps do."""
         x = own(x[None, : self.n])
         if self.stiff or self.step is not None or self._rungs[self._rungs_of(x, self._zeros).places[0]] <= _EASY:
             return 0.0
@@ -475,7 +475,7 @@ class _Engine(OdeMeasurement):
         return float(np.nan_to_num(difference / self._tolerances, nan=0.0, posinf=0.0).max())
 
     def along(self, x: Array) -> dict[str, Any]:
-        """What the names in the formulas stand for at x (n,), at the times of each case: (cases, times)."""
+        """Evaluates the names in the formulas at x (n,), at the times of each case: (cases, times)."""
         shown = {y: y for y in self.described.rates}
         shown |= {f"output {k}": formula for k, formula in enumerate(self.described.outputs.values())}
         engine = replace(self.described, outputs=shown, circular=(), exact={}, answer={}).engine
@@ -483,7 +483,7 @@ class _Engine(OdeMeasurement):
         return self.at_times(list(np.moveaxis(y, 2, 0)), list(x[: self.n] * self.si_sizes))
 
     def at_times(self, y: Sequence[Any], p: Sequence[float]) -> dict[str, Any]:
-        """What the names stand for where the states are y, each (cases, times)."""
+        """Evaluates the names at states y, each (cases, times)."""
         c = self.tables[1:] if len(self.tables) > 1 else self.tables
         return self._values(self.times[None], y, p, list(np.moveaxis(c, (2, 1), (0, 1))))
 
@@ -528,7 +528,7 @@ class _Engine(OdeMeasurement):
         return np.repeat([float(formula(known)) for known in self.described.known(self.times)], len(self.outputs))
 
     def _values(self, t: Any, y: Sequence[Any], p: Sequence[Any], c: Sequence[Any]) -> dict[str, Any]:
-        """What the names in the formulas stand for."""
+        """Evaluates the names in the formulas."""
         described = self.described
         values, constants = dict(zip((*described.rates, *described.start), (*y, *p), strict=True)) | {"t": t}, iter(c)
         for name in (*described.constant_names, *described.piecewise_rates[1]):

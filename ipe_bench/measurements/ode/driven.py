@@ -1,4 +1,4 @@
-"""What changes with time and is known: inputs that are held or straight between rows, and comparisons of t in rates.
+"""Handles known changes with time: inputs that are held or straight between rows, and comparisons of t in rates.
 
 A change is the end of a step, so that no step crosses it: within an interval between two such times a comparison of t
 holds throughout or nowhere, a held input is a constant, and one that is straight is a line.
@@ -20,13 +20,13 @@ from ipe_bench.measurements.ode import trace
 PIECEWISE = ("min", "max", "abs", "sign", *COMPARISONS)
 _REMEDY = "compare t itself with a constant, so that the moment of the switch is known"
 _SAME = 1e-12
-"""Of the whole span: times this close are one."""
+"""Largest difference of equal times, as a share of the whole span."""
 
 
 def separated(
     formulas: Mapping[str, Arithmetic], constants: Collection[str]
 ) -> tuple[dict[str, Arithmetic], dict[str, Tree]]:
-    """The formulas with a name in place of every comparison of t with constants, and the comparisons by those names."""
+    """Replaces comparisons of t with constants by names; returns the formulas and the comparisons by these names."""
     switches: dict[Tree, str] = {}
 
     def switching(tree: Tree) -> bool:
@@ -55,7 +55,7 @@ def separated(
 
 
 def switching_times(comparison: Tree, cases: Sequence[Mapping[str, float]]) -> list[float]:
-    """When a comparison of t, by itself or times a constant, begins or ceases to hold in one of the cases."""
+    """Finds when a comparison of t, by itself or times a constant, begins or ceases to hold in one of the cases."""
     _, left, right, text = comparison
     found = []
     for case in cases:
@@ -70,7 +70,7 @@ def switching_times(comparison: Tree, cases: Sequence[Mapping[str, float]]) -> l
 
 
 def grid(readings: Array, changes: Sequence[float]) -> Array:
-    """The times of the readings, and those of the changes between 0 and the last of them."""
+    """Returns the times of the readings, and those of the changes between 0 and the last of them."""
     end = float(readings.max(initial=0.0))
     inside = np.unique([time for time in changes if _SAME * end < time < end])
     nearest = np.abs(inside[:, None] - readings).min(axis=1, initial=np.inf)
@@ -78,13 +78,13 @@ def grid(readings: Array, changes: Sequence[float]) -> Array:
 
 
 def middles(times: Array) -> Array:
-    """A time within each interval that ends at one of these times, and the last of them."""
+    """Returns a time within each interval that ends at one of these times, and the last of them."""
     return (np.append(0.0, times) + np.append(times, times[-1:])) / 2
 
 
 def course(kind: str, times: Array, values: Array, at: Array) -> list[Array]:
-    """The constants, of the intervals around `at`, of an input with these values: a held one, or the line
-    u + slope (t - since) as u, slope and since. It is level before its first row and after its last."""
+    """Returns the constants, of the intervals around `at`, of an input with these values: a held one, or the line u +
+    slope (t - since) as u, slope and since. It is level before its first row and after its last."""
     k = np.searchsorted(times, at, side="right") - 1
     place = np.maximum(k, 0)
     if kind == "hold":
@@ -94,7 +94,7 @@ def course(kind: str, times: Array, values: Array, at: Array) -> list[Array]:
 
 
 def numbered_cases(numbers: Sequence[int]) -> int:
-    """How many cases a column numbers."""
+    """Counts the cases that a column numbers."""
     known = sorted(set(numbers))
     if known != list(range(1, len(known) + 1)):
         raise UserError(f"case={known[-1]}: cases are numbered 1, 2 and so on; there are {', '.join(map(str, known))}")
@@ -104,7 +104,7 @@ def numbered_cases(numbers: Sequence[int]) -> int:
 def agreed(
     name: str, column: Sequence[float], places: Sequence[tuple[float, ...]], remedy: str = ""
 ) -> dict[tuple[float, ...], float]:
-    """What a column of a file says of each place in ascending order: a case, or a time of a case."""
+    """Returns a column's value at each place in ascending order: a case, or a time of a case."""
     found: dict[tuple[float, ...], float] = {}
     for value, place in zip(column, places, strict=True):
         if found.setdefault(place, value) != value:
@@ -114,7 +114,7 @@ def agreed(
 
 
 def courses(columns: Mapping[str, Sequence[Any]], names: Collection[str]) -> list[dict[str, Array]]:
-    """The columns `time` and those of the inputs, of each case."""
+    """Reads the columns `time` and those of the inputs, of each case."""
     for name in ("time", *names):
         if not len(columns.get(name, ())):
             here = " ".join(f"measurement.columns.{one}=[...]" for one in ("time", *names))

@@ -34,13 +34,13 @@ Value = Any
 
 
 def integrate(plan: StepPlan, width: int) -> str:
-    """For groups of `width` lanes."""
+    """Writes the integrator for groups of `width` lanes."""
     return str(_Writer(plan, width).module)
 
 
 def rates(program: Program, width: int) -> str:
-    """void rates(double *x, double *si, double *out, int64 trials): one number from the parameters x[i] times si, for
-    one trial at a time, a width of 1."""
+    """Writes void rates(double *x, double *si, double *out, int64 trials): one number from the parameters x[i] times
+    si, for one trial at a time, a width of 1."""
     made: Any = ir.Function(ir.Module("rates"), ir.FunctionType(VOID, [PTR, PTR, PTR, I64]), "rates")
     x, si, out, trials = made.args
     b: Any = ir.IRBuilder(made.append_basic_block())
@@ -86,8 +86,8 @@ class _Writer:
         return made
 
     def _function(self, name: str, kinds: Sequence[ir.Type], body: Callable[..., None]) -> ir.Function:
-        """A function of its own, never inlined, whose stack is aligned: registers that spill would else lie across
-        cache lines, which takes half as long again."""
+        """Writes a function of its own, never inlined, whose stack is aligned: registers that spill would else lie
+        across cache lines, which takes half as long again."""
         made: Any = ir.Function(self.module, ir.FunctionType(VOID, kinds), name)
         made.linkage = "internal"
         made.attributes.add("noinline")
@@ -102,7 +102,7 @@ class _Writer:
         v.store(v.run(plan.begin, v.load(frame, [*plan.x, *plan.constants])), frame, plan.begun)
 
     def _weigh(self, v: _Vectors, frame: Value, h: Value) -> None:
-        """h times the weights of the formula, behind the vectors of the frame, a vector at a time."""
+        """Writes h times the weights of the formula, behind the vectors of the frame, a vector at a time."""
         share = v.spread(h)
         weighed = [v.builder.fmul(share, weight) for weight in v.load(self.table, range(self.count))]
         v.store(weighed, frame, range(self.plan.size, self.plan.size + self.count))
@@ -129,7 +129,7 @@ class _Writer:
         v.store(v.run(plan.read, given), frame, plan.noted)
 
     def _move(self, together: int, v: _Vectors, frame: Value, first: Value, driving: Value) -> None:
-        """One step of some tangents; `driving` points to the places of their sources."""
+        """Writes one step of some tangents; `driving` points to the places of their sources."""
         plan, move, weights = self.plan, self.plan.motion, self._weights(v, frame)
         one, d, count = range(together), len(plan.tangents[0]), len(move.sources[0])
         own = [range(k * d, (k + 1) * d) for k in one]
@@ -161,17 +161,17 @@ class _Writer:
         t, taken = room(b, F64), room(b, F64)
 
         def at(place: int, lane: Value) -> Value:
-            """Of one number in a vector of the frame."""
+            """Returns the pointer to one number in a vector of the frame."""
             return b.add(integer(place * width), lane)
 
         def tangent(j: Value, table: Value, sources: Sequence[Sequence[int]]) -> tuple[Value, Value]:
-            """Where tangent j lies, and where the places of its sources are listed."""
+            """Returns pointers to tangent j and to the list of its sources."""
             lies = b.add(integer(plan.tangents[0].start), b.mul(j, integer(len(plan.tangents[0]))))
             place = _Vectors(b, width).place(frame, lies)
             return place, b.gep(table, [b.mul(j, integer(len(sources[0])))], source_etype=I64)
 
         def keep(k: Value) -> None:
-            """The state at the time k, the start being 0, if it is asked for."""
+            """Stores the state at the time k, the start being 0, if it is asked for."""
             asked = b.icmp_signed("!=", b.ptrtoint(states, I64), integer(0))
             with b.if_then(asked), loop(b, integer(0), integer(width)) as lane:
                 row = b.add(number_at(b, kept, lane, I64), k)
@@ -239,7 +239,7 @@ class _Writer:
 
 
 class _Vectors:
-    """Instructions on vectors of `width` doubles. A frame is a pointer to an array of such vectors."""
+    """Writes instructions on vectors of `width` doubles. A frame is a pointer to an array of such vectors."""
 
     def __init__(self, builder: ir.IRBuilder, width: int) -> None:
         self.builder, self.width = builder, width
@@ -260,7 +260,7 @@ class _Vectors:
         return ir.Constant(self.type, [value] * self.width)
 
     def spread(self, number: Value) -> Value:
-        """A vector of equal numbers."""
+        """Makes a vector of equal numbers."""
         nothing = ir.Constant(self.type, ir.Undefined)
         single = self.builder.insert_element(nothing, number, ir.Constant(I32, 0))
         return self.builder.shuffle_vector(single, nothing, ir.Constant(ir.VectorType(I32, self.width), None))
@@ -274,13 +274,13 @@ class _Vectors:
         return [values[i] for i in program.outputs]
 
     def combine(self, start: list[Value], weights: list[Value], slopes: list[list[Value]]) -> list[Value]:
-        """start + sum of weight times slope."""
+        """Computes start + sum of weight times slope."""
         for weight, slope in zip(weights, slopes, strict=True):
             start = [self.call("fma", weight, k, y) for k, y in zip(slope, start, strict=True)]
         return start
 
     def apply(self, name: str, *args: Value) -> Value:
-        """One operation of a recorded program."""
+        """Writes one operation of a recorded program."""
         builder = self.builder
         if name in _ARITHMETIC:
             return getattr(builder, _ARITHMETIC[name])(*args)
@@ -301,11 +301,11 @@ class _Vectors:
         return self._each(name.replace("arctan", "atan"), *args)
 
     def call(self, name: str, *args: Value) -> Value:
-        """An instruction of the processor: fma (rounded once), sqrt or floor."""
+        """Writes an instruction of the processor: fma (rounded once), sqrt or floor."""
         return self.builder.call(self._declared(f"llvm.{name}.v{self.width}f64", self.type, len(args)), args)
 
     def _each(self, name: str, *args: Value) -> Value:
-        """A function of the C library, lane by lane."""
+        """Calls a function of the C library, lane by lane."""
         function = self._declared(name, F64, len(args))
         result = ir.Constant(self.type, ir.Undefined)
         for lane in (ir.Constant(I32, i) for i in range(self.width)):
@@ -320,7 +320,7 @@ class _Vectors:
 
 @contextmanager
 def loop(b: ir.IRBuilder, first: Value, last: Value, by: int = 1) -> Iterator[Value]:
-    """for i in range(first, last, by)"""
+    """Writes a loop for i in range(first, last, by)."""
     test, body, after = (b.append_basic_block(name) for name in ("test", "body", "after"))
     before = b.block
     b.branch(test)
@@ -348,7 +348,7 @@ def put(b: ir.IRBuilder, value: Value, array: Value, index: Value) -> None:
 
 
 def room(b: ir.IRBuilder, kind: ir.Type, count: int = 1, align: int = 8) -> Value:
-    """Memory of the function's own."""
+    """Reserves memory of the function's own."""
     made: Any = b.alloca(kind, size=count)
     made.align, made.type = align, PTR  # llvmlite gives it a typed pointer, which stores refuse
     return made

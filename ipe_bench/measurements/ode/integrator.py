@@ -51,7 +51,7 @@ def _pool(workers: int, process: int) -> ThreadPoolExecutor:
 
 
 def _compiled(name: str, source: StepPlan | Program, width: int, arguments: tuple[Any, ...]) -> Callable[..., None]:
-    """The function of `emit` by that name."""
+    """Returns the compiled function of `emit` by that name."""
 
     def write() -> str:
         return getattr(importlib.import_module("ipe_bench.measurements.ode.emit"), name)(source, width)
@@ -61,7 +61,7 @@ def _compiled(name: str, source: StepPlan | Program, width: int, arguments: tupl
 
 @dataclass(frozen=True)
 class Kernel:
-    """The integration of some equations by one formula, for readings or, where `sensitive`, for Jacobians."""
+    """Integrates some equations by one formula, for readings or, if `sensitive`, for Jacobians."""
 
     equations: Equations
     tableau: Tableau
@@ -80,7 +80,7 @@ class Kernel:
         return self._machine_code(compiled.width())
 
     def _machine_code(self, width: int) -> tuple[Callable[..., None], int]:
-        """The function for groups of so many lanes, and the numbers that it needs room for."""
+        """Returns the function for groups of so many lanes, and the numbers that it needs room for."""
         weights = -(-sum(map(len, self.plan.tableau.weights)) // width)
         return _compiled("integrate", self.plan, width, _ARGUMENTS), (self.plan.size + weights) * width
 
@@ -137,7 +137,8 @@ class Kernel:
 
     @functools.cached_property
     def _programs(self) -> tuple[Program, Program, Program]:
-        """From the time, the state with its tangents, and what stays: where these begin, their slopes, and readings."""
+        """Evaluates from the time, the state with its tangents, and constants: their starts, their slopes, and
+        readings."""
         tape = Recording(self.equations)
         d, dp, slopes, shown, starts = tape.tangents if self.sensitive else ([], [], [], tape.shown, [])
         stays = [*tape.p, *tape.c, *dp]
@@ -156,7 +157,7 @@ class Kernel:
         *more: Array,
         states: Array | None = None,
     ) -> None:
-        """`run` in NumPy, all lanes at once; products are rounded before they are added."""
+        """Implements `run` in NumPy, all lanes at once; products are rounded before they are added."""
         begin, slope, read = self._programs
         intervals = cases if cases.ndim == 3 else cases[None]
         count, n = intervals.shape[1], x.shape[1]
@@ -196,8 +197,8 @@ class Kernel:
 
 
 def compiled_rates(program: Program) -> Callable[[Array, Array, Array], None]:
-    """A function that fills its third argument (trials,) with the number that a recorded program computes of the
-    parameters x (trials, n), times their sizes (n,)."""
+    """Compiles a function that fills its third argument (trials,) with the number that a recorded program computes of
+    the parameters x (trials, n), times their sizes (n,)."""
     if compiled.available():
         function = _compiled("rates", program, 1, (POINTER, POINTER, POINTER, INTEGER))
         return lambda x, si, out: function(at(x), at(si), at(out), len(x))

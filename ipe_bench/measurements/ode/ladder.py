@@ -1,4 +1,4 @@
-"""How finely each trial is integrated, a pure function of its parameters, and how coarsely its tangents may be.
+"""Determines how finely each trial is integrated, by its parameters alone, and how coarsely its tangents may be.
 
 A rung is the number of equal steps between two readings. It is accepted if half of it shows, by step doubling, that it
 holds the tolerance on the whole span, and that the states converge: a reading that saturates is the same for any state
@@ -19,7 +19,7 @@ from ipe_bench.basics.linalg import Array, Mask
 Indices = NDArray[np.intp]
 
 ORDER = 8
-"""Of the integration formula: half the step leaves 2^-8 of the error."""
+"""Order of the integration formula: half the step leaves 2^-8 of the error."""
 SAFETY = 16.0
 """The estimate of an error may be this many times too small."""
 AIM = 1e-3
@@ -33,36 +33,36 @@ single step of eighth order."""
 LONGEST = 5
 """Times that the steps of tangents may be longer than those of the readings."""
 STATES = 1e-4
-"""Of a state's largest magnitude in a trial: what the states may be off by."""
+"""Tolerance of the states, as a share of a state's largest magnitude in a trial."""
 LOST = 0.1
-"""Of the same: the move between the two finest rungs from which on the solution is not followed at all."""
+"""Move between the two finest rungs from which on the solution is not followed at all, as the same share."""
 _ROUNDING = 1e-12
-"""Of the largest state: what is held for the rounding errors of another one that should be 0."""
+"""Allowance for rounding errors of a state that should be 0, as a share of the largest state."""
 _LARGEST_CLIMB = 4.0
 """A rung grows by no more at once: far from convergence the estimate says nothing."""
 
 
 def rungs_up_to(finest: float) -> NDArray[np.int64]:
-    """The rungs 1, 2, 3, 4, 6, 8, 12, 16, ... up to `finest`, and at least 1, 2."""
+    """Returns the rungs 1, 2, 3, 4, 6, 8, 12, 16, ... up to `finest`, and at least 1, 2."""
     powers = 2 ** np.arange(int(np.log2(max(finest, 2.0))) + 1)
     rungs = np.union1d(powers, 3 * powers // 2)
     return rungs[rungs <= max(finest, 2.0)].astype(np.int64)
 
 
 def coarser(place: int) -> int:
-    """The place on the ladder of half the rung; of 2 for the rung 3, which has no half there."""
+    """Returns the place on the ladder of half the rung; of 2 for the rung 3, which has no half there."""
     return 1 if place == 2 else max(place - 2, 0)
 
 
 def by_rung(places: Indices, rows: Indices) -> Iterator[tuple[int, Indices]]:
-    """The rows at each place, in order."""
+    """Yields the rows at each place, in order."""
     for place in sorted(set(places.tolist())):
         yield place, rows[places == place]
 
 
 class Found(NamedTuple):
-    """Places on the ladder (trials,), the readings (trials, m) that the search has computed there, those of the trials
-    `computed` in their order, and whether a trial is `lost`: the finest rung does not follow its states."""
+    """Holds places on the ladder (trials,), the readings (trials, m) that the search has computed there, those of the
+    trials `computed` in their order, and whether a trial is `lost`: the finest rung does not follow its states."""
 
     places: Indices
     computed: Indices
@@ -71,7 +71,7 @@ class Found(NamedTuple):
 
 
 def apart(fine: Array, coarse: Array) -> Array:
-    """How far states (trials, cases, states, times) are from others, in units of the largest of each (trials,)."""
+    """Computes the distance of states (trials, cases, states, times) from others over the largest of each (trials,)."""
     with np.errstate(all="ignore"):
         largest, gap = (np.abs(y).max(axis=3).max(axis=1) for y in (fine, fine - coarse))
         scale = np.maximum(largest, _ROUNDING * largest.max(axis=1, keepdims=True, initial=0.0))
@@ -86,7 +86,7 @@ def search(
     start: Indices,
     unturned: Callable[[Array, Array], Array] = lambda h, z: h,
 ) -> Found:
-    """The coarsest rung at which readings hold `tolerance` (m,) and states `STATES`, by comparing rungs n and n/2.
+    """Finds the coarsest rung at which readings hold `tolerance` (m,) and states `STATES`; compares rungs n and n/2.
 
     Where d is how far they move between them, n/2 is accepted if 16 d is within the tolerance, n if the error that an
     eighth-order formula then has left, 16 d / (2^8 - 1), is; else n grows as that formula says. Trials that do not get
@@ -128,7 +128,7 @@ def search(
 
 
 def tangent_contraction(coarse: Array, J: Array) -> float:
-    """|I - J~+ J| in the spectral norm: what is left of an error after a step with J~ (m, n) in place of J."""
+    """Computes |I - J~+ J| in the spectral norm: the share of an error after a step with J~ (m, n) in place of J."""
     if not (np.isfinite(coarse).all() and np.isfinite(J).all()):
         return np.inf
     size = np.linalg.norm(J, axis=0)
@@ -137,12 +137,12 @@ def tangent_contraction(coarse: Array, J: Array) -> float:
 
 
 class Coarseness(NamedTuple):
-    """How coarse the tangents inside an iteration may be, as measured at the nominal parameters."""
+    """Holds how coarse the tangents inside an iteration may be, as measured at the nominal parameters."""
 
     fourth: int | None
     """Steps of the formula of fourth order that contract enough at rung 1; None: none do."""
     longer: float
-    """How many times longer steps of the formula of eighth order may be than those of the readings."""
+    """Ratio of the steps of tangents to those of the readings, both by the formula of eighth order."""
 
     def steps(self, rung: int) -> tuple[bool, int]:
         """Returns whether the formula is that of fourth order, and the steps between two readings, for trials at this

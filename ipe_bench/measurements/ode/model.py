@@ -29,7 +29,7 @@ again, the same."""
 
 
 class OdeMeasurement(Measurement):
-    """Readings of y' = rhs(t, y, p, c) at given times, for one or more cases that share the parameters.
+    """Takes readings of y' = rhs(t, y, p, c) at given times, for one or more cases that share the parameters.
 
     A subclass states `states`, `outputs`, `tolerance`, `parameters` and `times`, and writes `start`, `rhs` and `read`;
     the package's docstring has an example. p are the parameters in SI units (x times `si_sizes`), c the constants of a
@@ -49,10 +49,10 @@ class OdeMeasurement(Measurement):
     step: float | None = None
     """A longest step for all trials, in place of `tolerance`; each interval between readings is divided evenly."""
     shortest_step: float = 0.0
-    """Steps do not become shorter than about this, however wild the parameters, nor than 1/1024 of the usual interval
-    between readings: what an iterate that diverges may cost."""
+    """Shortest step, but for 1/1024 of the usual interval between readings, for any parameters: it limits the cost of
+    an iterate that diverges."""
     stiff_remedy: str = "put what decays fast in balance with the rest"
-    """What to do about equations that are stiff."""
+    """Remedy for equations that are stiff."""
     trusted_angle: float = 0.0
     """A step that is at most this over `fastest_rate` is known to hold the tolerance; 0: every trial is tested."""
 
@@ -85,15 +85,15 @@ class OdeMeasurement(Measurement):
 
     @abstractmethod
     def start(self, p: Sequence[Any], c: Sequence[Any]) -> Sequence[Any]:
-        """The state at time 0."""
+        """Returns the state at time 0."""
 
     @abstractmethod
     def rhs(self, t: Any, y: Sequence[Any], p: Sequence[Any], c: Sequence[Any]) -> Sequence[Any]:
-        """The time derivative of the state."""
+        """Returns the time derivative of the state."""
 
     @abstractmethod
     def read(self, t: Any, y: Sequence[Any], p: Sequence[Any], c: Sequence[Any]) -> Sequence[Any]:
-        """What the instruments show of the state, one entry per output."""
+        """Returns the output of the instruments at the state, one entry per output."""
 
     variation: Variation | None = None
     """Equations of small deviations in fewer numbers than the state has, where the model knows them."""
@@ -126,17 +126,17 @@ class OdeMeasurement(Measurement):
         return self._shown(x, stop, self._origin)
 
     def coarse_simulate_until(self, x: Array, stop: int) -> Array:
-        """`simulate_until` without the search for the rung, if a rate says it well: GINS at an error scale of 2,000 is
-        off by 1e-4 m/s at most in 100 trials, at 30,000 by 4e-7 in the median and 7e-3 in the worst."""
+        """Computes `simulate_until` without the search for the rung, if a rate says it well: GINS at an error scale of
+        2,000 is off by 1e-4 m/s at most in 100 trials, at 30,000 by 4e-7 in the median and 7e-3 in the worst."""
         return self._shown(x, stop, self._origin, guess=True)
 
     @property
     def _origin(self) -> Array:
-        """What readings (m,) are counted from."""
+        """Offset that readings (m,) are counted from."""
         return self._zeros
 
     def _shown(self, x: Array, stop: int, offset: Array, *, guess: bool = False) -> Array:
-        """Readings less the offset (m,)."""
+        """Subtracts the offset (m,) from readings."""
         x = own(x)
         cases, outputs = self.tables.shape[1], len(self.outputs)
         z = np.empty((len(x), cases * stop * outputs))
@@ -220,7 +220,7 @@ class OdeMeasurement(Measurement):
         return {}
 
     def _rungs_of(self, x: Array, offset: Array, *, guess: bool = False) -> ladder.Found:
-        """The rung of each trial, and the readings of those whose rung had to be looked for; with `guess` the rates
+        """Finds the rung of each trial, and the readings of those whose rung was searched for; with `guess` the rates
         say the rung, where the model has them."""
         trusted, remembered = self._trusted(x), self._remembered
         places, unknown = trusted.astype(np.intp) - 1, np.flatnonzero(~trusted)
@@ -249,13 +249,13 @@ class OdeMeasurement(Measurement):
         return ladder.search(self._rungs, self._tolerances, self._kept, simulate, start, self.near)
 
     def _trusted(self, x: Array) -> Mask:
-        """The trials whose steps are fixed, or of which the coarsest rung is known to do."""
+        """Selects the trials whose steps are fixed, or whose coarsest rung is known to suffice."""
         if self.step is not None or self.trusted_angle == 0:
             return np.full(len(x), self.step is not None)
         return self._rates(x) * self._longest <= self.trusted_angle
 
     def _rates(self, x: Array) -> Array:
-        """The rate of each trial; not a number where nothing is known."""
+        """Computes the rate of each trial; NaN where it is unknown."""
         rates = np.full(len(x), np.nan)
         if self._rate_function is not None:
             self._rate_function(x, self._si_sizes, rates)
@@ -272,7 +272,7 @@ class OdeMeasurement(Measurement):
         return float(np.max(np.diff(self.times, prepend=0.0) / np.maximum(self._parts, 1)))
 
     def _first_guess(self, x: Array) -> ladder.Indices:
-        """Where on the ladder the search begins: steps of half a radian, or what the nominal parameters need."""
+        """Returns the place where the search begins: steps of half a radian, or what the nominal parameters need."""
         top = len(self._rungs) - 1
         if self._rate_function is None:
             return np.where(np.isfinite(x).all(axis=1), min(self._nominal_place, top - 1), top)
@@ -302,7 +302,7 @@ class OdeMeasurement(Measurement):
 
     @cached_property
     def _tolerances(self) -> Array:
-        """What each reading (m,) may be off by."""
+        """Tolerance of each reading (m,)."""
         if self.tolerance is None:
             lacking = "states neither a step nor `tolerance`, the error that readings may have"
             raise UserError(f"measurement.step=null: {self.name} {lacking}; give one, as measurement.step=0.1")
@@ -316,14 +316,14 @@ class OdeMeasurement(Measurement):
         return self.coarse_jacobian_until(x, len(self.times))
 
     def jacobian_until(self, x: Array, stop: int) -> Array:
-        """dh/dx by the variational equations, integrated by the same formula and steps as the readings of that x."""
+        """Computes dh/dx by the variational equations, with the formula and the steps of the readings at that x."""
         x = own(x)
         groups = ladder.by_rung(self._rungs_of(x, self._zeros).places, np.arange(len(x)))
         given = ((self._jacobian_kernel, int(self._rungs[place]), rows) for place, rows in groups)
         return self._tangents(x, stop, given)
 
     def coarse_jacobian_until(self, x: Array, stop: int) -> Array:
-        """dh/dx with longer steps, or by a cheaper formula, where that was measured to contract; see `coarse`."""
+        """Computes dh/dx with longer steps, or by a cheaper formula, if that was measured to contract; see `coarse`."""
         if not self._coarsens:
             return self.jacobian_until(x, stop)
         x = own(x)
@@ -337,14 +337,14 @@ class OdeMeasurement(Measurement):
         return self.step is None
 
     def _tangents(self, x: Array, stop: int, groups: Iterable[tuple[Kernel, int, ladder.Indices]]) -> Array:
-        """J (trials, readings, n) at the first times, each group of trials by its kernel at its rung."""
+        """Computes J (trials, readings, n) at the first times, each group of trials by its kernel at its rung."""
         J = np.empty((len(x), self.tables.shape[1] * stop * len(self.outputs), self.n))
         for kernel, rung, rows in groups:
             kernel.run(x, self._si_sizes, self.tables, rows, self._times[:stop], rung * self._parts, J.reshape(-1))
         return J
 
     def _coarsened(self, rung: int) -> tuple[Kernel, int]:
-        """The formula and its steps for the tangents of trials at this rung; 0 for those that are trusted."""
+        """Returns the formula and its steps for the tangents of trials at this rung; 0 for those that are trusted."""
         fourth, steps = self._coarseness.steps(rung)
         return self._rk4_kernel if fourth else self._jacobian_kernel, steps
 
@@ -378,7 +378,7 @@ class OdeMeasurement(Measurement):
 
     @cached_property
     def coarse_jacobian_cost(self) -> float:
-        """At the nominal parameters, or where they are at a rung above 2; in simulations at the trial's rung."""
+        """Cost at the nominal parameters, or where they are at a rung above 2; in simulations at the trial's rung."""
         if not self._coarsens:
             return self.jacobian_cost
         x = own(self.nominal[None])
@@ -387,7 +387,7 @@ class OdeMeasurement(Measurement):
         return kernel.plan.operations * steps / (self._readings_kernel.plan.operations * rung)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without what is compiled and remembered, which stays with a process."""
+        """Returns the state without what is compiled and remembered, which stays with a process."""
         return {k: v for k, v in self.__dict__.items() if not k.startswith("_") and k != "equations"}
 
     @cached_property
@@ -404,7 +404,7 @@ class OdeMeasurement(Measurement):
 
     @cached_property
     def equations(self) -> Equations:
-        """What is integrated; refused where a rate jumps when the solution decides."""
+        """Equations to integrate; refused where a rate jumps when the solution decides."""
         constants, driven = self.tables.shape[2], self.tables.shape[2] - self.cases.shape[1]
         arithmetic = (self.start, self.rhs, self.read, self.variation, driven)
         equations = Equations(self.states, self.n, constants, len(self.outputs), *arithmetic)
@@ -417,5 +417,5 @@ class OdeMeasurement(Measurement):
 
 
 def time_heading(unit: str) -> str:
-    """The column of the times in a file."""
+    """Returns the heading of the times in a file."""
     return f"time [{unit}]" if unit else "time"

@@ -1,4 +1,4 @@
-"""What an integrator of recorded equations computes: formulas, programs, and where their numbers lie."""
+"""Plans what an integrator of recorded equations computes: formulas, programs, and where their numbers lie."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ _POINTS, _NEWTON = 64, 30
 
 @dataclass(frozen=True)
 class Tableau:
-    """An explicit formula: stage s starts from y + h sum_j A[s][j] k_j at t + C[s] h, the step ends at
-    y + h sum_s B[s] k_s."""
+    """Holds an explicit formula: stage s starts from y + h sum_j A[s][j] k_j at t + C[s] h, the step ends at y + h
+    sum_s B[s] k_s."""
 
     A: tuple[tuple[float, ...], ...]
     B: tuple[float, ...]
@@ -32,7 +32,7 @@ class Tableau:
 
     @property
     def weights(self) -> list[list[tuple[int, float]]]:
-        """For every stage, and last for the end of the step: the slopes that count, with their weights."""
+        """Weights of the slopes that count, for every stage, and last for the end of the step."""
         return [[(j, v) for j, v in enumerate(row) if v != 0.0] for row in (*self.A, self.B)]
 
 
@@ -86,7 +86,7 @@ RK4 = Tableau(A=((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)), B=(1 / 6, 1 / 3, 1 / 
 
 @dataclass(frozen=True)
 class Variation:
-    """The equations of small deviations, where fewer numbers than the state has describe them."""
+    """Holds equations of small deviations, where fewer numbers than the state has describe them."""
 
     freedoms: int
     slope: Recordable
@@ -97,7 +97,7 @@ class Variation:
 
 @dataclass(frozen=True)
 class Equations:
-    """What is integrated: functions that can be recorded, and the numbers of their arguments and results."""
+    """Holds functions that can be recorded, and the numbers of their arguments and results."""
 
     states: int
     parameters: int
@@ -108,11 +108,11 @@ class Equations:
     read: Recordable
     variation: Variation | None = None
     driven: int = 0
-    """How many of the constants, the last ones, change from one interval between readings to the next."""
+    """Number of constants, the last ones, that change from one interval between readings to the next."""
 
 
 class Recording:
-    """Equations as expressions of the time t, states y, parameters p and constants c; `moving` change."""
+    """Holds equations as expressions of the time t, states y, parameters p and constants c; `moving` change."""
 
     def __init__(self, equations: Equations) -> None:
         self.equations = equations
@@ -151,18 +151,18 @@ class Recording:
         return d, dp, slopes, trace.tangent(self.shown, along), starts
 
     def along_each(self, directions: Sequence[Expression], tangents: Sequence[Expression]) -> list[list[Expression]]:
-        """The tangents along each direction alone."""
+        """Returns the tangents along each direction alone."""
         one, zero = self.graph.constant(1.0), self.graph.constant(0.0)
         units = [{other: one if other is along else zero for other in directions} for along in directions]
         return [[trace.substitute(e, unit) for e in tangents] for unit in units]
 
     def fixed(self, *outputs: Expression) -> list[Expression]:
-        """What is computed once for each lane: it depends on the parameters and the case alone."""
+        """Returns what is computed once for each lane: it depends on the parameters and the case alone."""
         return trace.border(outputs, trace.dependent(outputs, self.moving))
 
 
 class _Linear:
-    """Tangents of some outputs: their program, what it needs of the state, and the sources of each direction."""
+    """Holds tangents of some outputs: their program, its inputs from the state, and the sources of each direction."""
 
     def __init__(
         self, tape: Recording, d: Sequence[Expression], dp: Sequence[Expression], tangents: Sequence[Expression]
@@ -181,7 +181,7 @@ class _Linear:
         self.inputs, self.outputs = [*d, *names, *self.saved], outputs
 
     def placed(self, at: range, fixed: Sequence[Expression]) -> Tangents:
-        """The program, where what is saved, driving and constant lies one after another from the start of `at`."""
+        """Places the program: saved, driving and constant inputs lie one after another from the start of `at`."""
         order = {e: at.start + i for i, e in enumerate([*self.saved, *self.driving, *self.constant])}
         sources = tuple(tuple(order[e] for e in row) for row in self.sources)
         return Tangents(Program.of(self.outputs, [*self.inputs, *fixed]), sources, at[: len(self.saved)])
@@ -193,10 +193,10 @@ def _distinct(expressions: Iterable[Expression]) -> list[Expression]:
 
 @dataclass(frozen=True)
 class Tangents:
-    """Derivatives of slopes or readings along each direction."""
+    """Holds derivatives of slopes or readings along each direction."""
 
     program: Program
-    """From a tangent of the state, its sources, what is saved of the state, and what is fixed."""
+    """Program of a tangent of the state, its sources, what is saved of the state, and what is fixed."""
     sources: tuple[tuple[int, ...], ...]
     """The places (n, sources) of what drives each direction; of slopes, in the first stage."""
     saved: range
@@ -204,36 +204,36 @@ class Tangents:
 
 @dataclass(frozen=True)
 class StepPlan:
-    """Programs, and the places of their inputs and outputs in a frame."""
+    """Holds programs, and the places of their inputs and outputs in a frame."""
 
     tableau: Tableau
     x: range
     constants: range
     begin: Program
     begun: tuple[int, ...]
-    """Where the results of `begin` lie: state, what is fixed, and for Jacobians tangents and constant sources."""
+    """Places of the results of `begin`: state, what is fixed, and for Jacobians tangents and constant sources."""
     y: range
     driven: range
-    """Where the constants lie that change from interval to interval, the last ones."""
+    """Places of the constants that change from interval to interval, the last ones."""
     fixed: range
     step: Program
-    """From (t, y, driven, fixed): the slope, and what tangents need of a stage."""
+    """Program from (t, y, driven, fixed) to the slope, and to what tangents need of a stage."""
     kept: tuple[range, ...]
-    """Where each stage keeps what tangents need."""
+    """Places where each stage keeps what tangents need."""
     stage_size: int
     read: Program
-    """From the same: the readings, or what their tangents need."""
+    """Program from the same to the readings, or to what their tangents need."""
     noted: range
     shown: range
     size: int
     tangents: tuple[range, ...]
-    """Where each lies; none where readings are shown, and not Jacobians."""
+    """Places of the tangents; none if readings are computed, and not Jacobians."""
     motion: Tangents
     reading: Tangents
 
     @property
     def operations(self) -> int:
-        """Arithmetic operations of a step of one lane: what it costs, whatever the machine."""
+        """Arithmetic operations of a step of one lane: its cost on any machine."""
         weighed, total = sum(map(len, self.tableau.weights)), 0
         for program, place in [(self.step, self.y), *((self.motion.program, place) for place in self.tangents)]:
             counted = sum(name not in ("constant", "neg") for name, *_ in program.operations)
@@ -242,9 +242,9 @@ class StepPlan:
 
 
 def jumps(equations: Equations) -> bool:
-    """Whether the rates jump at a moment that the solution decides: it is no end of a step, and slopes would lack what
-    they owe to it. Both sides of a comparison are evaluated at points that are moved to where its operands are equal;
-    if they agree there, it is a kink and no jump. `floor`, and `mod` by it, jumps whatever it is taken of."""
+    """Tells whether the rates jump at a moment that the solution decides: it is no end of a step, and slopes would lack
+    what they owe to it. Both sides of a comparison are evaluated at points that are moved to where its operands are
+    equal; if they agree there, it is a kink and no jump. `floor`, and `mod` by it, jumps whatever it is taken of."""
     tape = Recording(equations)
     graph, inputs = tape.graph, [tape.t, *tape.y, *tape.p, *tape.c]
     moving = trace.dependent(tape.slope, (tape.t, *tape.y))
@@ -272,8 +272,8 @@ def jumps(equations: Equations) -> bool:
 
 
 def planned(equations: Equations, tableau: Tableau, *, sensitive: bool) -> StepPlan:
-    """How readings are computed, or their Jacobians: the state once, and beside it one tangent for each parameter, by
-    the variational equations in the stages of the state's own steps."""
+    """Plans how readings or their Jacobians are computed: the state once, and beside it one tangent for each parameter,
+    by the variational equations in the stages of the state's own steps."""
     tape, size = Recording(equations), 0
 
     def room(count: int) -> range:

@@ -1,4 +1,4 @@
-"""Rodas5P: stiff equations of a batch of trials, with the exact derivatives of its steps.
+"""Integrates stiff equations of a batch of trials by Rodas5P, with the exact derivatives of its steps.
 
 A Rosenbrock method of order 5 with 8 stages, stiffly accurate and L-stable: one Jacobian and one LU decomposition a
 step, no Newton iteration. Coefficients: Steinebach, BIT Numerical Mathematics 63:27, 2023, in the transformed form of
@@ -61,13 +61,13 @@ MOST_STEPS = 4000
 SHAPE = 1e-4
 """A relative tolerance that shows the shape of a solution."""
 _SMALLEST = 1e-9
-"""Of the relative tolerance: the absolute one, in units of the states."""
+"""Absolute tolerance over the relative one, in units of the states."""
 _SAFETY, _SHRINK, _GROW = 0.9, 0.2, 6.0
 
 
 @dataclass(frozen=True)
 class Effort:
-    """What the integration of a trial took in its hardest case."""
+    """Holds the effort of integrating a trial in its hardest case."""
 
     steps: int
     """Rejected ones included, each with a decomposition."""
@@ -83,13 +83,13 @@ class Effort:
 
 @dataclass(frozen=True)
 class Stepped:
-    """Equations with the numbers that they are integrated with."""
+    """Holds equations with the numbers that they are integrated with."""
 
     equations: Equations
     tables: Array
     """The constants (intervals, cases, constants); of a single interval where none changes."""
     times: Array
-    """When the solution is read, ascending from 0 on."""
+    """Times of the readings, ascending from 0 on."""
     sizes: Array
     """The size (n,) of one unit of x in SI units."""
 
@@ -127,26 +127,26 @@ class Rodas5P:
         return {name: Program.of(outputs, inputs) for name, (outputs, inputs) in recorded.items()}
 
     def measured(self, x: Array) -> tuple[Array, Effort]:
-        """The readings (1, m) at x (1, n), and what they take; a tolerance that shows the shape will do."""
+        """Computes the readings (1, m) at x (1, n), and the effort; a tolerance that shows the shape will do."""
         run = _Run(self, x, len(self.of.times), stretched=True)
         k = int(np.argmax(run.stretch))
         explicit, fastest, met = (float(a[k]) for a in (run.stretch, run.fastest, run.met))
         return run.readings, Effort(int(run.steps.max()), explicit, fastest, met, float(run.t.min()))
 
     def simulate(self, x: Array, stop: int, most: int = MOST_STEPS) -> Array:
-        """Readings (trials, cases x stop x outputs) at the first `stop` times; NaN from where a trial breaks down, or
-        takes more than so many steps."""
+        """Computes readings (trials, cases x stop x outputs) at the first `stop` times; NaN from where a trial breaks
+        down, or exceeds the limit on steps."""
         return _Run(self, x, stop, most).readings
 
     def jacobian(self, x: Array, stop: int) -> Array:
-        """Their derivatives by x (trials, cases x stop x outputs, n)."""
+        """Computes their derivatives by x (trials, cases x stop x outputs, n)."""
         J = _Run(self, x, stop, sensitive=True).J
         readings = self.of.tables.shape[1] * stop * self.of.equations.outputs
         return J.transpose(3, 1, 0, 2).reshape(len(x), readings, -1) * self.of.sizes
 
 
 class _Run:
-    """The lanes of one integration to the last time; arrays are (..., lanes)."""
+    """Integrates lanes to the last time; arrays are (..., lanes)."""
 
     def __init__(
         self,
@@ -180,7 +180,7 @@ class _Run:
         self.readings = self.z.transpose(2, 1, 0).reshape(len(x), -1)
 
     def _values(self, name: str, inputs: Sequence[Any], *shape: int) -> Array:
-        """The outputs of a program, of which some may be numbers, as one array."""
+        """Returns the outputs of a program, of which some may be numbers, as one array."""
         program = self.do[name]
         out = np.empty((len(program.outputs), *shape))
         for row, value in zip(out, program(inputs), strict=True):
@@ -226,11 +226,11 @@ class _Run:
             self.place[here] += 1
 
     def _constants(self, lanes: Array, later: int = 0) -> Array:
-        """Of the interval to the next time of each lane, or those that hold from that time on."""
+        """Returns the constants of the interval to the next time of each lane, or those that hold from that time on."""
         return self.tables[np.minimum(self.place[lanes] + later, len(self.tables) - 1), self.case[lanes]].T
 
     def _step(self, live: Array, h: Array) -> tuple[Array, Array, Array]:
-        """States, sensitivities and the error in units of the tolerance after a step h of the lanes `live`."""
+        """Computes states, sensitivities and the error in units of the tolerance after a step h of the lanes `live`."""
         q, lanes = self.q, len(live)
         t, y, p, c, S = self.t[live], self.y[:, live], self.p[:, live], self._constants(live), self.S[:, :, live]
         n, at = len(y), (t, *y, *p, *c)
@@ -274,7 +274,7 @@ class _Run:
 
 
 def _factor(W: Array) -> list[Array]:
-    """The LU decomposition with row pivots of every lane of W (n, n, lanes), in place; the rows (lanes,) exchanged."""
+    """Factors each lane of W (n, n, lanes) into LU, in place; returns the pivot rows (lanes,) that were exchanged."""
     lanes, exchanged = np.arange(W.shape[2]), []
     for k in range(len(W)):
         row = k + np.argmax(np.abs(W[k:, k]), axis=0)
@@ -288,7 +288,7 @@ def _factor(W: Array) -> list[Array]:
 
 
 def _solve(W: Array, exchanged: Sequence[Array], b: Array) -> Array:
-    """W^-1 b of every lane for b (n, columns, lanes), in place."""
+    """Computes W^-1 b of every lane for b (n, columns, lanes), in place."""
     lanes = np.arange(b.shape[2])
     for k, row in enumerate(exchanged):
         top = b[k].T.copy()

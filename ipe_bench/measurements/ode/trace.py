@@ -33,17 +33,17 @@ FLAT = (*COMPARING, "floor")
 
 
 class Graph:
-    """All expressions of one recording; equal expressions are the same object, so nothing is computed twice."""
+    """Holds all expressions of one recording; equal expressions are the same object, so each is computed once."""
 
     def __init__(self) -> None:
         self._known: dict[tuple[Any, ...], Expression] = {}
 
     def input(self, name: str) -> Expression:
-        """The named quantity, to be given when the emitted source runs."""
+        """Declares the named quantity, to be given when the emitted source runs."""
         return self._node("input", name)
 
     def inputs(self, prefix: str, count: int) -> tuple[Expression, ...]:
-        """`count` inputs named prefix0, prefix1, ..."""
+        """Declares `count` inputs named prefix0, prefix1, ..."""
         return tuple(self.input(f"{prefix}{i}") for i in range(count))
 
     def constant(self, value: float) -> Expression:
@@ -56,7 +56,7 @@ class Graph:
         return self._known[key]
 
     def apply(self, operation: str, *operands: Any) -> Expression:
-        """The expression `operation(operands)`, with constants folded and trivial operations dropped."""
+        """Applies an operation to operands, with constants folded and trivial operations dropped."""
         args = [a if isinstance(a, Expression) else self.constant(a) for a in operands]
         values = [a.value for a in args]
         if all(v is not None for v in values):
@@ -99,7 +99,7 @@ def _operator(name: str, *, reflected: bool = False) -> Any:
 
 @dataclass(eq=False, repr=False, slots=True)
 class Expression:
-    """A quantity that is not known yet: supports + - * / **, NumPy's elementary functions, comparisons and np.where."""
+    """Represents an unknown quantity: supports + - * / **, NumPy's elementary functions, comparisons and np.where."""
 
     graph: Graph
     operation: str
@@ -170,7 +170,7 @@ _COMPOSED: dict[str, Callable[..., Any]] = {
 
 
 def _first_if(apply: Callable[..., Any], condition: Any, a: Any, b: Any) -> Any:
-    """a where the condition holds or a is not a number, else b."""
+    """Returns a where the condition holds or a is not a number, else b."""
     return apply("where", condition, a, apply("where", apply("less_equal", a, a), b, a))
 
 
@@ -228,7 +228,7 @@ _PARTIALS: dict[str, Callable[[Any, Any, Any, Any], list[Any]]] = {
 
 
 def in_order(outputs: Iterable[Expression], stop: Collection[Expression] = ()) -> list[Expression]:
-    """Every expression that the outputs need, operands before their users; what `stop` is computed from is left out."""
+    """Lists what the outputs need, operands before their users; what `stop` is computed from is left out."""
     ends = {e.order for e in stop}
     needed: dict[int, Expression] = {}
     stack = list(outputs)
@@ -246,7 +246,7 @@ def operands(e: Expression) -> list[Expression]:
 
 
 def dependent(outputs: Iterable[Expression], inputs: Iterable[Expression]) -> set[Expression]:
-    """Those among the outputs and what they need that depend on any of the inputs."""
+    """Selects those among the outputs and what they need that depend on any of the inputs."""
     found = set(inputs)
     for e in in_order(outputs):
         if any(a in found for a in operands(e)):
@@ -255,14 +255,14 @@ def dependent(outputs: Iterable[Expression], inputs: Iterable[Expression]) -> se
 
 
 def border(outputs: Sequence[Expression], varying: Collection[Expression]) -> list[Expression]:
-    """What the varying expressions need, or the outputs are, without being varying or a number."""
+    """Selects what the varying expressions need, or the outputs are, without being varying or a number."""
     used = [a for e in in_order(outputs) if e in varying for a in operands(e)]
     distinct = {e.order: e for e in [*used, *outputs] if e not in varying and e.value is None}
     return [distinct[order] for order in sorted(distinct)]
 
 
 def substitute(e: Expression, values: Mapping[Expression, Expression]) -> Expression:
-    """The expression with some inputs replaced, and simplified."""
+    """Replaces some inputs of an expression, and simplifies it."""
     known: dict[Expression, Expression] = {}
     for a in in_order([e]):
         given = [known[o] for o in operands(a)]
@@ -271,7 +271,7 @@ def substitute(e: Expression, values: Mapping[Expression, Expression]) -> Expres
 
 
 def tangent(outputs: Sequence[Expression], direction: Mapping[Expression, Expression]) -> list[Expression]:
-    """The derivative of each output along `direction`, which gives the tangent of every input that varies."""
+    """Differentiates each output along `direction`, which gives the tangent of every input that varies."""
     if not outputs:
         return []
     zero = outputs[0].graph.constant(0.0)
@@ -297,8 +297,8 @@ def tangent(outputs: Sequence[Expression], direction: Mapping[Expression, Expres
 def separate(
     tangents: Sequence[Expression], moving: Sequence[Expression], direction: Sequence[Expression]
 ) -> tuple[list[Expression], list[Expression]]:
-    """Tangents, linear in the tangents of the state (`moving`) and in a `direction` of the parameters, with inputs
-    source0, source1, ... in place of what depends on the direction alone; and what these stand for.
+    """Returns tangents, linear in the tangents of the state (`moving`) and in a `direction` of the parameters, with
+    inputs source0, source1, ... in place of what depends on the direction alone; and what these stand for.
 
     The sources are gathered before they are multiplied, so a direction along one parameter has few that are not zero.
     """
@@ -327,7 +327,7 @@ _NOTHING: _Parts = (None, None)
 
 
 def _linear(e: Expression, own: Sequence[_Parts], joined: Callable[[_Parts], Expression]) -> _Parts:
-    """The parts of an operation that is linear in the parts of its operands."""
+    """Returns the parts of an operation that is linear in the parts of its operands."""
     apply, given = e.graph.apply, operands(e)
     if e.operation in ("neg", "add", "sub", "where"):
         held, terms = (given[:1], own[1:]) if e.operation == "where" else ([], own)
@@ -351,7 +351,7 @@ def _linear(e: Expression, own: Sequence[_Parts], joined: Callable[[_Parts], Exp
 
 @dataclass(frozen=True)
 class Program:
-    """Straight-line arithmetic on numbered values: first the inputs, then the result of each operation.
+    """Holds straight-line arithmetic on numbered values: first the inputs, then the result of each operation.
 
     An operation is its name and the numbers of its operands, or ("constant", value). A product that is added to
     something and used nowhere else is part of a fused multiply-add, which rounds once: ("fma", a, b, c) is a b + c,
@@ -396,7 +396,7 @@ class Program:
         return tuple(reversed(released))
 
     def __call__(self, inputs: Sequence[Any]) -> list[Any]:
-        """The outputs by NumPy, entry by entry; a formula on a million rows keeps few arrays."""
+        """Computes the outputs by NumPy, entry by entry; a formula on a million rows keeps few arrays."""
         values = list(inputs)
         for (name, *numbers), released in zip(self.operations, self._released, strict=True):
             result = np.float64(numbers[0]) if name == "constant" else _ARRAYS[name](*[values[i] for i in numbers])
@@ -409,7 +409,7 @@ class Program:
 def _fusion(
     e: Expression, uses: Mapping[int, int], inputs: Collection[Expression]
 ) -> tuple[str, Expression, Expression] | None:
-    """The name of the fused operation that an expression can be, the product in it, and the other operand."""
+    """Returns the name of the fused operation that an expression can be, the product in it, and the other operand."""
     if e.operation in ("add", "sub"):
         a, b = operands(e)
         for product, other, subtracted in ((a, b, "fms"), (b, a, "fnma")):

@@ -176,7 +176,7 @@ def _executed(option: Option, folder: Path, results: Path, trials: int) -> list[
 
 
 def _best(experiment: str, summary: pd.DataFrame) -> Iterator[tuple[str, ...]]:
-    """Returns who succeeds most often, and at what cost, at the least and the largest error scale of a simulated
+    """Yields who succeeds most often, and at what cost, at the least and the largest error scale of a simulated
     experiment."""
     if "truth" in summary or not {"measurement", "noise", "success"} <= set(summary):
         return

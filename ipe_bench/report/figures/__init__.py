@@ -81,7 +81,7 @@ def drawings(analysis: Analysis, which: Which = "all") -> Iterator[Drawing]:
 def added_drawings(
     analysis: Analysis, shown: tuple[list[View], View], which: Which = "all", taken: set[str] | None = None
 ) -> Iterator[Drawing]:
-    """Returns the figures of plugins; a failed drawing or a duplicate name adds a line to the problems of the
+    """Yields the figures of plugins; a failed drawing or a duplicate name adds a line to the problems of the
     analysis."""
     names = set() if taken is None else taken
 

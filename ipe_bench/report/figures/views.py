@@ -107,7 +107,7 @@ class Figure:
 
 
 def views(analysis: Analysis) -> tuple[list[View], View]:
-    """Yields at most `MOST_SETTINGS` settings of simulated trials, and all of them together with every estimator."""
+    """Returns at most `MOST_SETTINGS` settings of simulated trials, and all of them together with every estimator."""
     every, collection, analysis = _looks(analysis), analysis.collection, analysis.simulated
     look, columns = _looks(analysis), analysis.setting_columns
     equations = {g.estimator: g.footer.get("equation") for g in analysis.collection.groups}
