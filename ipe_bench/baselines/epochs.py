@@ -1,4 +1,4 @@
-"""The readings as a filter meets them, epoch by epoch, and a batch on its way through them."""
+"""Presents the readings to filters epoch by epoch, and keeps the state of a batch on its way through them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ POINTS_AT_ONCE = 8192
 
 
 def read_members(model: CountingModel, R: Covariance, x: Array, rows: Rows, z: Array) -> Array:
-    """Whitened h (trials, members, m) at x (trials, members, n), for the trials `rows` of the model's tally, with
+    """Reads whitened h (trials, members, m) at x (trials, members, n), for the trials `rows` of the model's tally, with
     readings z (trials, m); angles of a trial are next to one another, and their mean is next to that of z."""
     trials, members, n = x.shape
     counted = CountingModel(model.measurement, model.tally, model.share * members)
@@ -51,7 +51,7 @@ def read_members(model: CountingModel, R: Covariance, x: Array, rows: Rows, z: A
 
 @dataclass(frozen=True)
 class Epoch:
-    """The readings that arrive together, as a model of their own that computes nothing later."""
+    """Restricts a model to the readings that arrive together; later ones are not computed."""
 
     number: int
     model: Measurement
@@ -61,16 +61,16 @@ class Epoch:
     """The cost of this model's readings over that of all."""
 
     def counted(self, tally: EvaluationCount) -> CountingModel:
-        """The model, with the cost of a prefix."""
+        """Returns the counting model, with the cost of a prefix."""
         return CountingModel(self.model, tally, self.share)
 
     def whitened(self, z: Array) -> Array:
-        """The epoch's part of all readings z (..., m), whitened."""
+        """Returns the epoch's part of all readings z (..., m), whitened."""
         return self.R.whiten(z[..., self.rows])
 
 
 def arrivals(problem: Problem) -> Iterator[Epoch]:
-    """The epochs in order of arrival."""
+    """Yields the epochs in order of arrival."""
     model = problem.measurement
     assert model.epochs is not None
     # A model some of whose readings are missing is measured through the whole one, which can stop early.
@@ -95,7 +95,7 @@ def arrivals(problem: Problem) -> Iterator[Epoch]:
 
 
 class Walk(ABC):
-    """A batch of filters on its way through the epochs: a subclass says how they take one in.
+    """Leads a batch of filters through the epochs: a subclass says how they take one in.
 
     States are distances from the nominal point in prior deviations, and readings are whitened (R = I), so that P starts
     near the unit matrix for any units of the parameters.
@@ -122,7 +122,7 @@ class Walk(ABC):
         """Takes in the readings of an epoch for the trials `at`: sets their `x`, `P`, `nis`, or ends them."""
 
     def covariance(self, at: Rows) -> Array:
-        """P (trials, n, n) of the trials `at`, in multiples of the parameters' units."""
+        """Returns P (trials, n, n) of the trials `at`, in multiples of the parameters' units."""
         return symmetric(self.P[at] * self.d * self.d[:, None])
 
     @property
@@ -137,8 +137,8 @@ class Walk(ABC):
             self.messages[int(trial)] = message
 
     def read(self, epoch: Epoch, s: Array, at: Rows, *, slopes: bool) -> tuple[Rows, Array, Array | None]:
-        """Whitened h (trials, points, m) at the states s (trials, points, n) of the trials `at`, and dh/dx (trials, m,
-        n), for those that the model does not end."""
+        """Reads whitened h (trials, points, m) at the states s (trials, points, n) of the trials `at`, and dh/dx
+        (trials, m, n), for those that the model does not end."""
         model, x = epoch.counted(self.tally), self.problem.x0 + s * self.d
         h, H = read_members(model, epoch.R, x, at, self.z[at][:, epoch.rows]), None
         kept = finite(h)
@@ -152,7 +152,7 @@ class Walk(ABC):
         return at[kept], h[kept], None if H is None else H[kept]
 
     def estimates(self, *, history: bool) -> Estimates:
-        """The estimates after all epochs, with the squared innovations over their number as extra `nis`."""
+        """Returns the estimates after all epochs, with the squared innovations over their number as extra `nis`."""
         x, taken = np.zeros((len(self.z), len(self.d))), np.zeros(len(self.z), dtype=np.int64)
         path = [x]
         for epoch in self.epochs:

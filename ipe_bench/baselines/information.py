@@ -1,4 +1,4 @@
-"""Filters that linearise an epoch's readings again and again: all trials at once, in square-root information form.
+"""Filters by linearising an epoch's readings repeatedly: all trials at once, in square-root information form.
 
 The covariance is kept as a square root U of P^-1 = U'U, which a QR decomposition updates (Bierman, Factorization
 Methods for Discrete Sequential Estimation, 1977, ch. V): no S to invert and no P - K S K' to cancel, however wide the
@@ -29,7 +29,7 @@ _SHORTEST = 2.0**-10
 
 @dataclass(frozen=True)
 class Belief:
-    """N(mean, (U'U)^-1) for each trial, in prior deviations from the nominal point."""
+    """Holds N(mean, (U'U)^-1) for each trial, in prior deviations from the nominal point."""
 
     mean: Array
     """(trials, n)."""
@@ -42,7 +42,7 @@ class Belief:
         return finite(self.mean) & finite(self.U)
 
     def root(self) -> Array:
-        """U^-1 (trials, n, n), so that P is it times its transpose; NaN where U is singular."""
+        """Computes U^-1 (trials, n, n), so that P is it times its transpose; NaN where U is singular."""
         return inverse(self.U)[0]
 
     def given(self, J: Array, r: Array, at: Array) -> tuple[Belief, Array]:
@@ -59,7 +59,7 @@ class Belief:
 
 @dataclass(frozen=True)
 class EpochReadings:
-    """The readings z (trials, m) of an epoch, for the trials `rows`, and what was believed before them.
+    """Holds the readings z (trials, m) of an epoch, for the trials `rows`, and the belief before them.
 
     x is in prior deviations from the nominal point.
     """
@@ -74,16 +74,16 @@ class EpochReadings:
     belief: Belief
 
     def misfit(self, x: Array) -> Array:
-        """h(x) - z (trials, m), whitened."""
+        """Computes h(x) - z (trials, m), whitened."""
         h = self.model.simulate(self.physical(x), self.rows)
         return self.epoch.R.whiten(self.epoch.model.near(h, self.z)) - self.epoch.R.whiten(self.z)
 
     def slope(self, x: Array) -> Array:
-        """dh/dx (trials, m, n), whitened."""
+        """Computes dh/dx (trials, m, n), whitened."""
         return self.epoch.R.whiten_jacobian(self.model.jacobian(self.physical(x), self.rows)) * self.deviation
 
     def misfits(self, points: Array) -> Array:
-        """h - z (trials, points, m) at points (trials, points, n), whitened."""
+        """Computes h - z (trials, points, m) at points (trials, points, n), whitened."""
         h = read_members(self.model, self.epoch.R, self.physical(points), self.rows, self.z)
         return h - self.epoch.R.whiten(self.z)[:, None]
 
@@ -119,7 +119,7 @@ class InformationFilter(Estimator):
 
 
 class _Beliefs(Walk):
-    """The beliefs of a batch of trials; those that fail keep what they believed before the epoch."""
+    """Holds the beliefs of a batch of trials; those that fail keep their belief from before the epoch."""
 
     def __init__(self, filter: InformationFilter, problem: Problem, z: Array) -> None:
         super().__init__(problem, z)
@@ -149,8 +149,8 @@ class _Beliefs(Walk):
 
 
 def regressed(readings: EpochReadings, x: Array, U: Array) -> tuple[Array, Array, Array]:
-    """r (trials, m), A (trials, m, n) and Omega (trials, m, m) by regression over 2n cubature points: over
-    N(x, (U'U)^-1), h - z is about r + A (. - x) with an error of covariance Omega."""
+    """Regresses h - z over 2n cubature points of N(x, (U'U)^-1): it is about r + A (. - x) with an error of covariance
+    Omega; returns r (trials, m), A (trials, m, n) and Omega (trials, m, m)."""
     n = x.shape[1]
     S = np.sqrt(n) * inverse(U)[0].swapaxes(1, 2)
     d = readings.misfits(np.concatenate([x[:, None] + S, x[:, None] - S], axis=1))
@@ -164,7 +164,7 @@ def regressed(readings: EpochReadings, x: Array, U: Array) -> tuple[Array, Array
 
 @dataclass(frozen=True)
 class Linearized:
-    """The state of an epoch; every field has the trials in front."""
+    """Holds the state of an epoch; every field has the trials in front."""
 
     x: Array
     U: Array
@@ -187,7 +187,7 @@ class Linearized:
 
     @classmethod
     def over(cls, readings: EpochReadings, x: Array, U: Array, change: Array) -> Linearized:
-        """The state at x once the readings are linearised over N(x, (U'U)^-1)."""
+        """Returns the state at x once the readings are linearised over N(x, (U'U)^-1)."""
         r, A, Omega = regressed(readings, x, U)
         W = _whitener(Omega)
         proposal, innovations = readings.belief.given(np.matmul(W, A), multiply(W, r), x)
@@ -197,9 +197,9 @@ class Linearized:
 
 @dataclass(frozen=True)
 class IPLF(InformationFilter, Method[EpochReadings, Linearized]):
-    """Readings linearised by regression over the posterior itself, again and again (García-Fernández, Svensson,
-    Morelande, Särkkä, IEEE TSP 63(20), 2015), the mean damped as in Raitoharju, Svensson, García-Fernández and Piché
-    (IEEE SPL 25(4), 2018; arXiv 1704.01113).
+    """Linearises readings by regression over the posterior itself, repeatedly (García-Fernández, Svensson, Morelande,
+    Särkkä, IEEE TSP 63(20), 2015), the mean damped as in Raitoharju, Svensson, García-Fernández and Piché (IEEE SPL
+    25(4), 2018; arXiv 1704.01113).
 
     At 2n cubature points of the posterior so far, h is about A x + b with an error of covariance Omega; that affine
     model, of noise R + Omega, updates the prior. The inner loop moves the mean at a fixed posterior covariance and
@@ -224,7 +224,7 @@ class IPLF(InformationFilter, Method[EpochReadings, Linearized]):
         return Linearized.over(system, x, system.belief.U, np.full(len(x), np.inf))
 
     def step(self, system: EpochReadings, state: Linearized) -> Linearized:
-        """One regression at the point that the last step proposes, and another where the covariance is renewed."""
+        """Regresses at the point that the last step proposes, and again where the covariance is renewed."""
         x = state.x + state.share[:, None] * (state.proposal.mean - state.x)
         r, A, _ = regressed(system, x, state.U)
         cost = _cost(system, state.W, r, x)
@@ -255,7 +255,7 @@ class IPLF(InformationFilter, Method[EpochReadings, Linearized]):
         return state
 
     def check(self, system: EpochReadings, before: Linearized | None, state: Linearized) -> ConvergenceCheck:
-        """Done where bringing the covariance up to date has changed neither it nor the mean."""
+        """Ends a trial if bringing the covariance up to date has changed neither it nor the mean."""
         growth = np.where(np.isfinite(state.cost) & state.proposal.usable, 1.0, np.nan)
         return ConvergenceCheck(state.change, growth, np.full(len(state.x), np.inf))
 
@@ -265,12 +265,12 @@ def _cost(readings: EpochReadings, W: Array, r: Array, x: Array) -> Array:
 
 
 def _deviations(U: Array) -> Array:
-    """Standard deviations (trials, n) where the information is U'U."""
+    """Returns the standard deviations (trials, n) where the information is U'U."""
     return np.linalg.norm(inverse(U)[0], axis=2)
 
 
 def _whitener(Omega: Array) -> Array:
-    """(I + Omega)^-1/2 (trials, m, m), where rounding has left Omega an eigenvalue below zero as if it were zero."""
+    """Computes (I + Omega)^-1/2 (trials, m, m); an eigenvalue of Omega that rounding left below zero counts as zero."""
     usable: Mask = finite(Omega)
     Omega = np.where(usable[:, None, None], Omega, 0.0)
     values, vectors = np.linalg.eigh((Omega + Omega.swapaxes(1, 2)) / 2)

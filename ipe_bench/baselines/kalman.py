@@ -1,4 +1,4 @@
-"""The Kalman filters: extended, unscented, cubature and ensemble, each trial's a filter of filterpy's."""
+"""Defines the Kalman filters: extended, unscented, cubature and ensemble, each trial's a filter of filterpy's."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ipe_bench.states.linearisation import Cubature, Rule, Taylor, Unscented
 
 
 class _Filterpy(ConstantFilter):
-    """One of filterpy's filters on one trial."""
+    """Runs one of filterpy's filters on one trial."""
 
     filter: Any
 
@@ -36,7 +36,7 @@ class _Filterpy(ConstantFilter):
 
 @dataclass(frozen=True)
 class EKF(Sequential):
-    """Each epoch's readings linearised at the estimate so far (Bar-Shalom et al., 10.3). filterpy updates P in Joseph's
+    """Linearises each epoch's readings at the estimate so far (Bar-Shalom et al., 10.3). filterpy updates P in Joseph's
     form, (I - K H) P (I - K H)' + K R K', which stays positive definite where the prior is much wider than R."""
 
     slopes = True
@@ -50,8 +50,8 @@ class EKF(Sequential):
 
 @dataclass(frozen=True)
 class IteratedEKF(EKF):
-    """An EKF that linearises each epoch's readings again at its updated estimate until that stays: Gauss-Newton on the
-    epoch's readings and the prior that the earlier epochs left (Bell and Cathey, IEEE TAC 38, 1993)."""
+    """Linearises each epoch's readings again at its updated estimate until that stays: Gauss-Newton on the epoch's
+    readings and the prior that the earlier epochs left (Bell and Cathey, IEEE TAC 38, 1993)."""
 
     max_iterations: Count = 20
     """Linearisations per epoch; one that has not settled by then goes on from where it is."""
@@ -64,7 +64,7 @@ class IteratedEKF(EKF):
 
 
 class _EKFTrack(_Filterpy):
-    """An iteration begins its update again from the epoch's prior, with the readings linearised at the last
+    """Begins each iteration's update again from the epoch's prior, with the readings linearised at the last
     estimate."""
 
     def __init__(self, P0: Array, Q: Array, iterations: int, tolerance: float) -> None:
@@ -104,7 +104,7 @@ class _EKFTrack(_Filterpy):
 
 
 class _PointsTrack(_Filterpy):
-    """A filter that reads the model at several points, along the principal axes of what it reads there."""
+    """Reads the model at several points, along the principal axes of the readings there."""
 
     def points(self) -> Array:
         return self.filter.sigmas_f
@@ -125,7 +125,7 @@ class _PointsTrack(_Filterpy):
 
 @dataclass(frozen=True)
 class UKF(Sequential):
-    """Readings at 2n + 1 sigma points stand for the slopes (van der Merwe, dissertation, 2004).
+    """Replaces slopes by readings at 2n + 1 sigma points (van der Merwe, dissertation, 2004).
 
     The points lie at alpha sqrt(n + kappa) deviations. An alpha of 1e-3, as often advised, gives the centre a weight
     of -1e6 and costs as many digits; 0.1 does not.
@@ -168,7 +168,8 @@ class _UKFTrack(_PointsTrack):
 
 @dataclass(frozen=True)
 class CKF(Sequential):
-    """Readings at 2n cubature points, sqrt(n) deviations out (Arasaratnam and Haykin, IEEE TAC 54, 2009)."""
+    """Reads 2n cubature points, sqrt(n) deviations out, in place of slopes (Arasaratnam and Haykin, IEEE TAC 54,
+    2009)."""
 
     def track(self, P0: Array, Q: Array, z: Array) -> ConstantFilter:
         return _CKFTrack(P0, Q)
@@ -178,7 +179,7 @@ class CKF(Sequential):
 
 
 class _CKFTrack(_PointsTrack):
-    """filterpy takes moments as mean(X X') - x x', which loses what x is larger than its deviation, squared. So the
+    """Avoids filterpy's moments mean(X X') - x x', which lose digits if x is much larger than its deviation. So the
     filter's state is the distance from a reference that moves to the estimate after each epoch, and its readings are
     distances from the points' mean: the same filter, with nothing to cancel."""
 
@@ -217,7 +218,7 @@ class _CKFTrack(_PointsTrack):
 
 @dataclass(frozen=True)
 class EnKF(Sequential):
-    """An ensemble of states with perturbed readings (Evensen 1994; Crassidis and Junkins, 2nd ed., 4.5).
+    """Samples the state by an ensemble with perturbed readings (Evensen 1994; Crassidis and Junkins, 2nd ed., 4.5).
 
     Without process noise the ensemble keeps within the span of its first draw, and P carries a sampling error of about
     sqrt(2 / members): more members than parameters are needed, and many more for a P to be believed.
@@ -276,13 +277,13 @@ def _drawing_from(stream: np.random.BitGenerator) -> Iterator[None]:
 
 
 def _squared_innovation(y: Array, S_inverse: Array) -> float:
-    """y' S^-1 y, as a row or as a column as filterpy has it."""
+    """Computes y' S^-1 y, as a row or as a column as filterpy has it."""
     y = y.ravel()
     return float(y @ S_inverse @ y)
 
 
 def _turned(z: Array, h: Array) -> tuple[Array, Array]:
-    """The readings z (m,) and h (points, m) less the points' mean, along the principal axes of the points' spread.
+    """Turns the readings z (m,) and h (points, m), less the points' mean, to the principal axes of the points' spread.
 
     White readings stay white when turned, and the filter is the same; but S is then close to diagonal, so its inverse
     and P - K S K' keep their digits where a wide prior makes S as ill-conditioned as 1e10.
@@ -295,6 +296,6 @@ def _turned(z: Array, h: Array) -> tuple[Array, Array]:
 
 
 def _refuse_overflow(a: Array) -> None:
-    """LAPACK need not come back from an infinite matrix, and a filter needs the squares of what it is given."""
+    """Refuses infinite matrices, on which LAPACK may hang, and numbers whose squares overflow."""
     if not np.abs(a).max() < LARGEST:
         raise OverflowError("what the filter is to take in is beyond the range of numbers")

@@ -1,4 +1,4 @@
-"""Least squares on all readings at once: the linear estimate, Gauss-Newton, Levenberg-Marquardt, and SciPy's own."""
+"""Fits all readings at once: the linear estimate, Gauss-Newton, Levenberg-Marquardt, and SciPy's own methods."""
 
 from __future__ import annotations
 
@@ -55,11 +55,11 @@ class LinearLSE(Estimator):
 
 @dataclass(frozen=True)
 class Batch(Estimator):
-    """Least squares by an iteration; a subclass says what is minimised, and by which method."""
+    """Minimises least squares iteratively; a subclass states the objective and the method."""
 
     start: Start = "nominal"
-    """Where the iteration begins: at the linear LSE, eq. (16), at the nominal point, or at that of the two where the
-    readings fit better (`best`)."""
+    """Start of the iteration: the linear LSE, eq. (16), the nominal point, or that of the two where the readings fit
+    better (`best`)."""
     max_iterations: Count = 100
     """Steps tried."""
     tolerance: Positive = 1e-6
@@ -87,8 +87,8 @@ class Batch(Estimator):
 
 @dataclass(frozen=True)
 class GaussNewton(Batch):
-    """x <- x - (J' R^-1 J)^-1 J' R^-1 (h(x) - z), undamped unless `damping` is given: fast near the minimum, and lost
-    where the model is not nearly linear between start and minimum."""
+    """Iterates x <- x - (J' R^-1 J)^-1 J' R^-1 (h(x) - z), undamped unless `damping` is given: fast near the minimum,
+    and lost where the model is not nearly linear between start and minimum."""
 
     start: Start = "linear_lse"
     damping: Positive | None = None
@@ -100,8 +100,8 @@ class GaussNewton(Batch):
 
 @dataclass(frozen=True)
 class LevenbergMarquardt(Batch):
-    """Gauss-Newton whose step is kept short, with Marquardt's scaling, as long as the fit does not improve as predicted
-    (Marquardt, J. SIAM 11, 1963; More, LNM 630, 1978)."""
+    """Shortens Gauss-Newton steps, in Marquardt's scaling, as long as the fit does not improve as predicted (Marquardt,
+    J. SIAM 11, 1963; More, LNM 630, 1978)."""
 
     damping: Positive = 1e-3
     """lambda at the start."""
@@ -115,7 +115,7 @@ class LevenbergMarquardt(Batch):
 
 @dataclass(frozen=True)
 class MapLM(Batch):
-    """The maximum a posteriori: least squares with the scenario's prior as further readings, by Levenberg-Marquardt
+    """Maximises the posterior: least squares with the scenario's prior as further readings, by Levenberg-Marquardt
     damped in the metric of the prior. It is the batch answer that a filter with the same prior should equal.
 
     Reports (J' R^-1 J + P0^-1)^-1.
@@ -138,7 +138,7 @@ class MapLM(Batch):
 
 @dataclass(frozen=True)
 class MultiscaleLM(Estimator):
-    """Least squares for hard starts: minimised twice from the nominal point, and the lower minimum kept.
+    """Minimises least squares for hard starts: twice from the nominal point, keeping the lower minimum.
 
     Marquardt's scaling (column norms of J, growing) may run along a parameter that the readings hardly see at the
     start; parameters in multiples of their size do not, but fail where one ends far from its size. Costs about twice as
@@ -169,7 +169,7 @@ class MultiscaleLM(Estimator):
 
 @dataclass(frozen=True)
 class Multistart(Estimator):
-    """Levenberg-Marquardt from the nominal point, then from draws of the prior, until the residuals pass the
+    """Runs Levenberg-Marquardt from the nominal point, then from draws of the prior, until the residuals pass the
     chi-square test; of all minima the lowest counts (Boender and Rinnooy Kan, Mathematical Programming 37, 1987).
 
     After the first fit `confirmations` further starts look for another minimum that fits. Extras: `minima`, how many
@@ -223,7 +223,7 @@ class Multistart(Estimator):
 
 @dataclass(frozen=True)
 class LeastSquares(Estimator):
-    """`scipy.optimize.least_squares` on the whitened residuals, with the model's own Jacobian.
+    """Minimises whitened residuals by `scipy.optimize.least_squares`, with the model's own Jacobian.
 
     Parameters are scaled by the columns of that Jacobian (x_scale="jac"). Reports (J' J)^-1 of the whitened J; with a
     robust loss, of the J that SciPy has reweighted for it. SciPy's own rules end the search; the trial has converged
@@ -267,7 +267,7 @@ class LeastSquares(Estimator):
             return one_by_one(trials, lambda trial: self._search(trial, history=history), problem.measurement.n)
 
     def _search(self, residuals: _Residuals, *, history: bool) -> Estimates:
-        """One trial, as a batch of one."""
+        """Runs one trial, as a batch of one."""
         from scipy.optimize import least_squares
 
         jacobian: Any = residuals.J  # SciPy's stubs know its finite differences only
@@ -296,7 +296,7 @@ class LeastSquares(Estimator):
         )
 
     def _judge(self, found: Any) -> tuple[Status, Array]:
-        """The status and (J' J)^-1 (1, n, n) of where SciPy ended."""
+        """Returns the status and (J' J)^-1 (1, n, n) at SciPy's end."""
         J_plus, deficient = pseudo_inverse(found.jac[None], Covariance(np.ones(len(found.jac))))
         P = np.matmul(J_plus, J_plus.swapaxes(1, 2))
         if not (np.isfinite(found.x).all() and np.isfinite(found.jac).all()):
@@ -311,7 +311,7 @@ class LeastSquares(Estimator):
 
 @dataclass
 class _Residuals:
-    """Whitened residuals of one trial and their slopes, as SciPy wants them, counted."""
+    """Computes whitened residuals of one trial and their slopes, as SciPy wants them, counted."""
 
     problem: Problem
     z: Array

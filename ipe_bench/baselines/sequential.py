@@ -1,5 +1,5 @@
-"""Filters epoch by epoch, the parameters as a random constant: a filter of a library's own for each trial, or a
-linearisation rule whose equations are computed for all trials at once."""
+"""Filters epoch by epoch, the parameters as a random constant: by a library's own filter for each trial, or by a
+linearisation rule for all trials at once."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LARGEST = 1e150
 
 
 class ConstantFilter(ABC):
-    """One trial's filter. The state x is the parameters' distance from the nominal point in prior deviations, and the
+    """Filters one trial. The state x is the parameters' distance from the nominal point in prior deviations, and the
     readings are whitened (R = I)."""
 
     nis: float = 0.0
@@ -49,7 +49,7 @@ class ConstantFilter(ABC):
 
     @abstractmethod
     def points(self) -> Array:
-        """The states (points, n) at which this epoch's readings are wanted."""
+        """Returns the states (points, n) at which this epoch's readings are wanted."""
 
     @abstractmethod
     def update(self, z: Array, h: Array, H: Array | None) -> bool:
@@ -74,7 +74,7 @@ class Sequential(Estimator):
     """Standard deviation of the parameters' random walk from one epoch to the next, in prior deviations (before
     inflation). The parameters are constants, so anything above 0 makes the filter forget."""
     engine: Literal["filterpy", "batched"] = "filterpy"
-    """Who computes the filter's equations: filterpy, trial by trial, or this package, for all trials at once."""
+    """Implementation of the filter's equations: filterpy, trial by trial, or this package, for all trials at once."""
 
     needs: ClassVar[frozenset[Need]] = frozenset({"epochs", "prior"})
     slopes: ClassVar[bool] = False
@@ -87,8 +87,8 @@ class Sequential(Estimator):
                 raise UserError(f"engine={engine}: this filter has no {method}; choose the other engine")
 
     def track(self, P0: Array, Q: Array, z: Array) -> ConstantFilter:
-        """The filter of one trial before its first reading, at x = 0 with covariance P0 (n, n) and process noise Q
-        (n, n) per epoch. z (m,) are all readings of the trial, for the seed of a random stream."""
+        """Makes the filter of one trial before its first reading, at x = 0 with covariance P0 (n, n) and process noise
+        Q (n, n) per epoch. z (m,) are all readings of the trial, for the seed of a random stream."""
         raise NotImplementedError
 
     def rule(self) -> Rule:
@@ -113,7 +113,7 @@ class Sequential(Estimator):
 
 
 class _Filters(Walk):
-    """The filters of a batch, at x = 0 with covariance P0 (n, n) and process noise Q (n, n) per epoch."""
+    """Holds the filters of a batch, at x = 0 with covariance P0 (n, n) and process noise Q (n, n) per epoch."""
 
     def __init__(self, filter: Sequential, problem: Problem, z: Array) -> None:
         super().__init__(problem, z)
@@ -123,7 +123,7 @@ class _Filters(Walk):
 
 
 class _OneByOne(_Filters):
-    """A `ConstantFilter` for each trial; an exception ends the trial that raises it and no other."""
+    """Runs a `ConstantFilter` for each trial; an exception ends the trial that raises it and no other."""
 
     def __init__(self, filter: Sequential, problem: Problem, z: Array) -> None:
         super().__init__(filter, problem, z)
@@ -132,7 +132,7 @@ class _OneByOne(_Filters):
             self.tracks[t] = self.attempt(t, lambda t=t: filter.track(self.P[t].copy(), self.Q.copy(), z[t]))
 
     def attempt(self, trial: int, action: Callable[[], Any]) -> Any:
-        """`action()`, or None where it raises."""
+        """Returns `action()`, or None if it raises."""
         try:
             return action()
         except Exception as error:
@@ -160,7 +160,7 @@ class _OneByOne(_Filters):
 
 
 class _Stack(_Filters):
-    """The filters of all trials at once; a trial's bits do not depend on which others there are."""
+    """Filters all trials at once; a trial's bits do not depend on which others there are."""
 
     def take_in(self, epoch: Epoch, at: Rows) -> None:
         rule, (iterations, tolerance) = self.filter.rule(), self.filter.relinearisations
@@ -184,7 +184,7 @@ class _Stack(_Filters):
 
 
 class _TurnedReadings:
-    """An epoch's whitened readings as functions of the states of the trials `at`, along axes that make S nearly
+    """Turns an epoch's whitened readings, functions of the states of the trials `at`, to axes that make S nearly
     diagonal: white readings stay white, and S keeps its digits where a wide prior makes it as ill-conditioned as 1e10.
 
     Trials that the model ends are NaN.
@@ -195,7 +195,7 @@ class _TurnedReadings:
         self.z = epoch.whitened(walk.z[at])
 
     def __call__(self, x: Array) -> Array:
-        """h (trials, points, m) less its mean over the points, and z alike."""
+        """Returns h (trials, points, m) less its mean over the points, and z alike."""
         h, _ = self._read(x, slopes=False)
         centre = h.mean(axis=1, keepdims=True)
         spread = h - centre
@@ -204,14 +204,14 @@ class _TurnedReadings:
         return np.matmul(spread, axes)
 
     def slope(self, x: Array) -> tuple[Array, Array]:
-        """h (trials, m) and dh/dx (trials, m, n)."""
+        """Returns h (trials, m) and dh/dx (trials, m, n)."""
         h, H = self._read(x[:, None], slopes=True)
         axes = _principal_axes(np.matmul(np.matmul(H, self.P), H.swapaxes(1, 2))).swapaxes(1, 2)
         self.z = multiply(axes, self.z)
         return multiply(axes, h[:, 0]), np.matmul(axes, H)
 
     def _read(self, x: Array, *, slopes: bool) -> tuple[Array, Array]:
-        """h (trials, points, m) as it is and, for one point, dh/dx (trials, m, n)."""
+        """Returns h (trials, points, m) as it is and, for one point, dh/dx (trials, m, n)."""
         known, number = finite(x), self.epoch.number
         self.walk.end(self.at[~known], Status.SINGULAR, f"the filter's P is not positive definite at epoch {number}")
         kept, h, H = self.walk.read(self.epoch, x[known], self.at[known], slopes=slopes)
@@ -226,5 +226,6 @@ class _TurnedReadings:
 
 
 def _principal_axes(G: Array) -> Array:
-    """Orthonormal axes (trials, m, m), one per column, along which each G (trials, m, m), symmetric, is diagonal."""
+    """Computes orthonormal axes (trials, m, m), one per column, in which each symmetric G (trials, m, m) is
+    diagonal."""
     return np.linalg.eigh(np.nan_to_num(G))[1]

@@ -60,7 +60,7 @@ class Estimates:
 
     @classmethod
     def of(cls, ended: Any, tally: EvaluationCount, **further: Any) -> Estimates:
-        """The estimates of an iteration that has ended, with its cost; `further` are fields of the estimator's own."""
+        """Makes the estimates of an ended iteration, with its cost; `further` are fields of the estimator's own."""
         counts = {"simulations": tally.simulations.copy(), "jacobians": tally.jacobians.copy()}
         found = {"x": ended.x, "status": ended.status, "iterations": ended.iterations, "history": ended.history}
         return cls(**{**found, **counts, "messages": dict(tally.messages), **further})
@@ -131,7 +131,7 @@ class Estimator(Component, ABC):
 
     @abstractmethod
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
-        """Estimates the parameters from readings z (trials, m); `history` asks for the iterates as well."""
+        """Returns estimates the parameters from readings z (trials, m); `history` asks for the iterates as well."""
 
     def hindrance(self, problem: Problem) -> str | None:
         """Says, in words that follow the estimator's label, why it does not suit the problem; None if it does."""

@@ -21,7 +21,7 @@ TINY_STEP = 1e-3
 
 
 class IteratedSystem(Protocol):
-    """The equations of a batch of trials, as the driver sees them; a method asks for more."""
+    """Presents the equations of a batch of trials to the driver; a method asks for more."""
 
     @property
     def model(self) -> CountingModel:
@@ -34,7 +34,7 @@ class IteratedSystem(Protocol):
         ...
 
     def subset(self, kept: Mask) -> Self:
-        """The same equations for some of the trials."""
+        """Returns the same equations for some of the trials."""
         ...
 
 
@@ -46,10 +46,10 @@ R = TypeVar("R", bound=Any)
 
 @dataclass(frozen=True)
 class ConvergenceCheck:
-    """How far each trial has come after a step; every field is (trials,)."""
+    """Measures how far each trial has come after a step; every field is (trials,)."""
 
     size: Array
-    """How far the equation is from holding, in standard deviations; within the tolerance, the trial has converged."""
+    """Residual of the equation in standard deviations; within the tolerance, the trial has converged."""
     growth: Array
     """A size that grows if the iteration diverges; not finite if the model or the algebra has overflowed."""
     moved: Array
@@ -65,11 +65,11 @@ class Method(ABC, Generic[E, S]):
 
     @abstractmethod
     def begin(self, system: E, x: Array) -> S:
-        """The state at the start x (trials, n)."""
+        """Returns the state at the start x (trials, n)."""
 
     @abstractmethod
     def step(self, system: E, state: S) -> S:
-        """The state after one more iteration."""
+        """Returns the state after one more iteration."""
 
     @abstractmethod
     def check(self, system: E, before: S | None, state: S) -> ConvergenceCheck:
@@ -78,7 +78,7 @@ class Method(ABC, Generic[E, S]):
 
 @dataclass(frozen=True)
 class Limits:
-    """The limits of an iteration."""
+    """Holds the limits of an iteration."""
 
     tolerance: float
     """A trial has converged once `ConvergenceCheck.size` is at most this."""
@@ -91,7 +91,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class SolveResult(Generic[S]):
-    """The end of the iteration of each trial."""
+    """Holds the end of each trial's iteration."""
 
     state: S
     status: NDArray[np.int8]
@@ -153,7 +153,7 @@ def iterate(equations: E, method: Method[E, S], start: Array | S, limits: Limits
 
 
 def continued(first: Any, second: R) -> R:
-    """The second of two iterations, results with `iterations` and `history`, with the iterates of both."""
+    """Joins the iterates of two iterations, results with `iterations` and `history`; all else is the second's."""
     history = second.history
     if history is not None:
         history = [np.concatenate([a, b[1:]]) for a, b in zip(first.history, history, strict=True)]

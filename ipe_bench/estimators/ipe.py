@@ -1,4 +1,4 @@
-"""Iterative parameter estimation: the nonlinear system of eq. (11), and IPE, from which solvers of it derive."""
+"""Defines iterative parameter estimation: the nonlinear system of eq. (11), and IPE, the base of its solvers."""
 
 from __future__ import annotations
 
@@ -33,37 +33,37 @@ if TYPE_CHECKING:
 Start = Literal["linear_lse", "nominal", "best"]
 """The start of an iteration: the linear LSE, eq. (16), the nominal point, or the better fit of the two."""
 _COARSE_BEYOND = 0.03
-"""If F is larger, in standard deviations of the linear bound, a step is as good with a coarse Jacobian."""
+"""Size of F, in standard deviations of the linear bound, above which a coarse Jacobian is as good for a step."""
 
 
 class System(Protocol):
-    """A square system F(x) = 0 for each trial of a batch: all that a solver sees of the problem.
+    """Holds a square system F(x) = 0 for each trial of a batch: all that a solver sees of the problem.
 
     x and F are (trials, n) in multiples of the parameters' units.
     """
 
     def F(self, x: Array) -> Array:
-        """The residual at x; NaN where the model fails."""
+        """Computes the residual at x; NaN where the model fails."""
         ...
 
     def J(self, x: Array, F: Array | None = None) -> Array:
-        """dF/dx (trials, n, n). Where F is given it is for a step from there: near enough for that, and exact near a
+        """Computes dF/dx (trials, n, n); if F is given, for a step from there: near enough for that, and exact near a
         root, so that an order of two is not lost."""
         ...
 
     def solve(self, A: Array, b: Array) -> Array:
-        """A^-1 b for each trial: A (trials, n, n), b (trials, n) or (trials, n, k). Where A is singular the trial ends
-        as such."""
+        """Computes A^-1 b for each trial: A (trials, n, n), b (trials, n) or (trials, n, k). A singular A ends its
+        trial."""
         ...
 
     def subset(self, kept: Mask) -> System:
-        """The same system for some of its trials: a line search goes on with the rows that need it."""
+        """Restricts the system to some of its trials: a line search goes on with the rows that need it."""
         ...
 
 
 @dataclass(frozen=True)
 class State:
-    """The state of a solver between steps. Every field is an array with the trials axis in front, so that the
+    """Holds the state of a solver between steps. Every field is an array with the trials axis in front, so that the
     driver can drop the trials that have finished; a solver with a memory adds fields in a subclass."""
 
     x: Array
@@ -75,7 +75,7 @@ S = TypeVar("S", bound=State)
 
 @dataclass(frozen=True)
 class FrozenSystem:
-    r"""The nonlinear system of eqs. (11) and (19) for the trials `rows` of a batch.
+    r"""Defines the nonlinear system of eqs. (11) and (19) for the trials `rows` of a batch.
 
     .. math:: F(x) = x - x_0 - H^+ \left( z - h(x_0) - N(x) \right) = H^+ \left( h(x) - z \right)
 
@@ -92,7 +92,7 @@ class FrozenSystem:
 
     @classmethod
     def at_nominal(cls, problem: Problem, z: Array) -> FrozenSystem:
-        """The paper's system: H about the nominal point, for readings z (trials, m).
+        """Builds the paper's system: H about the nominal point, for readings z (trials, m).
 
         Raises:
             UserError: H has not full column rank.
@@ -125,18 +125,18 @@ class FrozenSystem:
         return dataclasses.replace(self, z=self.z[kept], rows=self.rows[kept], **slopes)
 
     def relinearized(self, x: Array) -> FrozenSystem:
-        """The same readings with H+ of dh/dx at x (trials, n), for each trial its own; a deficient one is singular."""
+        """Returns the system with H+ of dh/dx at x (trials, n), for each trial its own; a deficient one is singular."""
         J = self.model.jacobian(x, self.rows)
         H_plus, deficient = pseudo_inverse(J, self.R)
         self.model.tally.singular[self.rows[deficient & finite(J)]] = True
         return dataclasses.replace(self, H_plus=H_plus, deviation=deviations(frozen_covariance(H_plus, self.R)))
 
     def covariance(self) -> Array:
-        """The covariance (1, n, n) or (trials, n, n) of the linear LSE, eq. (5)."""
+        """Computes the covariance (1, n, n) or (trials, n, n) of the linear LSE, eq. (5)."""
         return frozen_covariance(self.H_plus, self.R)
 
     def sandwich(self, x: Array) -> Array:
-        """(H+ J)^-1 H+ R H+' (H+ J)^-T at x: the first-order covariance (trials, n, n) of the root of eq. (11)."""
+        """Computes (H+ J)^-1 H+ R H+' (H+ J)^-T at x: the first-order covariance (trials, n, n) of eq. (11)'s root."""
         inverse_slope = np.full((len(x), x.shape[1], x.shape[1]), np.nan)
         if (usable := finite(x)).any():
             part = self.subset(usable)
@@ -146,7 +146,7 @@ class FrozenSystem:
 
 
 def frozen_covariance(H_plus: Array, R: Covariance) -> Array:
-    r"""The covariance (trials, n, n) of the linear estimate, eq. (5) for any R, from H+ (trials, n, m).
+    r"""Computes the covariance (trials, n, n) of the linear estimate, eq. (5) for any R, from H+ (trials, n, m).
 
     .. math:: H^+ R H^{+T} = (H^T R^{-1} H)^{-1}, \quad \sigma^2 (H^T H)^{-1} \text{ if } R = \sigma^2 I
     """
@@ -207,8 +207,8 @@ class IPE(Method[FrozenSystem, S], Estimator, Generic[S]):
     """
 
     start: Start = "linear_lse"
-    """Where the iteration begins: at the linear LSE, eq. (16), at the nominal point, or at that of the two where the
-    readings fit better (`best`)."""
+    """Start of the iteration: the linear LSE, eq. (16), the nominal point, or that of the two where the readings fit
+    better (`best`)."""
     max_iterations: Count = 100
     """Steps at most, then the trial ends as `max_iterations`."""
     tolerance: Positive = 1e-6
@@ -219,14 +219,14 @@ class IPE(Method[FrozenSystem, S], Estimator, Generic[S]):
     equation = "frozen"
 
     def init(self, system: System, x: Array, F: Array) -> S:
-        """The state at the start x (trials, n), where the residual is F."""
+        """Returns the state at the start x (trials, n), where the residual is F."""
         return State(x, F)  # type: ignore[return-value]
 
     def begin(self, system: FrozenSystem, x: Array) -> S:
         return self.init(system, x, system.F(x))
 
     def check(self, system: FrozenSystem, before: S | None, state: S) -> ConvergenceCheck:
-        """abs(F_i), and the step, in standard deviations of the linear bound."""
+        """Measures abs(F_i), and the step, in standard deviations of the linear bound."""
         return root_check(system.deviation, before, state)
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:

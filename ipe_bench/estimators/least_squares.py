@@ -1,4 +1,4 @@
-"""Least squares for a batch of trials: the objective, its normal equations, and the state of an iteration."""
+"""Defines least squares for a batch of trials: the objective, its normal equations, and the state of an iteration."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _STATIONARY = 1e-3
 
 @dataclass(frozen=True)
 class Objective:
-    """|R^-1/2 (h(x) - z)|^2, plus |P0^-1/2 (x - x0)|^2 where a prior counts, for the trials `rows`."""
+    """Computes |R^-1/2 (h(x) - z)|^2, plus |P0^-1/2 (x - x0)|^2 where a prior counts, for the trials `rows`."""
 
     model: CountingModel
     R: Covariance
@@ -44,7 +44,8 @@ class Objective:
 
     @classmethod
     def of(cls, problem: Problem, z: Array, inflation: float | None = None) -> Objective:
-        """The objective of all readings z (trials, m), with the prior, its deviations times `inflation`, if given."""
+        """Makes the objective of all readings z (trials, m), with the prior, if given, its deviations times
+        `inflation`."""
         model = CountingModel(problem.measurement, EvaluationCount.zeros(len(z)))
         prior = None if inflation is None else problem.prior_covariance(inflation)
         return cls(model, problem.R, z, np.arange(len(z)), problem.x0, prior)
@@ -54,7 +55,7 @@ class Objective:
         return self.z.shape[1]
 
     def residual(self, x: Array) -> Array:
-        """Whitened residuals (trials, m), followed by those of the prior (trials, n) where it counts."""
+        """Computes whitened residuals (trials, m), followed by those of the prior (trials, n) where it counts."""
         r = self.R.whiten(self.model.residual(x, self.rows, self.z))
         if self.prior is None:
             return r
@@ -65,8 +66,8 @@ class Objective:
         return squared(r)
 
     def jacobian(self, x: Array, *, coarse: Mask | bool = False) -> Array:
-        """The derivative of the residuals (trials, m, n) or (trials, m + n, n); where `coarse` (trials,) says so, one
-        that is near enough for steps."""
+        """Computes the derivative of the residuals (trials, m, n) or (trials, m + n, n); where `coarse` (trials,) says
+        so, one that is near enough for steps."""
         J = self.R.whiten_jacobian(self.model.jacobian(x, self.rows, coarse=coarse))
         if self.prior is None:
             return J
@@ -75,7 +76,7 @@ class Objective:
         return np.concatenate([J, prior], axis=1)
 
     def coarsened(self, exact_within: float) -> Objective:
-        """The same with coarse Jacobians where steps are longer, if the model has any that are cheaper."""
+        """Returns the objective with coarse Jacobians where steps are longer, if the model has any that are cheaper."""
         cheaper = self.model.coarse_share < 1.0
         return dataclasses.replace(self, exact_within=exact_within if cheaper else np.inf)
 
@@ -88,7 +89,7 @@ class Objective:
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """J = Q U of each trial: all that a step needs to know of the Jacobian."""
+    """Factors J = Q U of each trial, and holds what a step needs of it."""
 
     U: Array
     inverse_U: Array
@@ -127,14 +128,14 @@ class NormalEquations:
         return cls(U, inverse_U, gradient, columns, *_newton_step(inverse_U, gradient), along.max(axis=1), Q)
 
     def towards(self, r: Array) -> NormalEquations:
-        """The same Jacobian with another residual r (trials, m): a chord. It needs Q."""
+        """Returns the same Jacobian with another residual r (trials, m): a chord. It needs Q."""
         assert self.Q is not None
         gradient = multiply(self.Q.swapaxes(1, 2), r)
         newton, size = _newton_step(self.inverse_U, gradient)
         return dataclasses.replace(self, gradient=gradient, newton=newton, size=size)
 
     def damped(self, weights: Array) -> tuple[Array, Array]:
-        """The step that minimises |r + J s|^2 + |weights s|^2, and the decrease of |r + J s|^2 + that it predicts."""
+        """Computes the step that minimises |r + J s|^2 + |weights s|^2, and its predicted decrease of |r + J s|^2."""
         with np.errstate(over="ignore"):  # an overflowing damping is treated by the other way
             squares = weights[:, :, None] ** 2 * np.eye(self.U.shape[1])
         _, root, well = definite_factor(np.matmul(self.U.swapaxes(1, 2), self.U) + squares)
@@ -146,21 +147,21 @@ class NormalEquations:
 
 
 def _newton_step(inverse_U: Array, gradient: Array) -> tuple[Array, Array]:
-    """The Gauss-Newton step (trials, n), and its largest entry (trials,) in deviations."""
+    """Computes the Gauss-Newton step (trials, n), and its largest entry (trials,) in deviations."""
     newton = -multiply(inverse_U, gradient)
     size = np.abs(newton / np.sqrt(np.sum(inverse_U**2, axis=2))).max(axis=1)
     return newton, np.where(np.isfinite(size), size, np.inf)
 
 
 def _damped_step(U: Array, weights: Array, gradient: Array) -> Array:
-    """The step that minimises |gradient + U s|^2 + |weights s|^2 for any U."""
+    """Computes the step that minimises |gradient + U s|^2 + |weights s|^2 for any U."""
     n = U.shape[1]
     Q, V = np.linalg.qr(np.concatenate([U, weights[:, :, None] * np.eye(n)], axis=1))
     return solve(V, -multiply(Q[:, :n].swapaxes(1, 2), gradient))[0]
 
 
 def _orthogonal_factors(J: Array, r: Array) -> tuple[Array, Array, Array, Array]:
-    """Q, U, U^-1 and Q' r for any J; U^-1 is NaN where J has not full rank."""
+    """Computes Q, U, U^-1 and Q' r for any J; U^-1 is NaN where J has not full rank."""
     m, missing = J.shape[1], max(J.shape[2] - J.shape[1], 0)
     # Fewer readings than parameters: rows of zeros keep U square, and deficient.
     J, r = np.pad(J, ((0, 0), (0, missing), (0, 0))), np.pad(r, ((0, 0), (0, missing)))
@@ -176,15 +177,15 @@ def _orthogonal_factors(J: Array, r: Array) -> tuple[Array, Array, Array, Array]
 
 
 def inverse_factor(J: Array) -> Array:
-    """U^-1 (trials, n, n) of J = Q U (trials, m, n), so that (J'J)^-1 = U^-1 U^-T; NaN where J has not full rank."""
+    """Computes U^-1 (trials, n, n) of J = Q U (trials, m, n): (J'J)^-1 = U^-1 U^-T; NaN where J lacks full rank."""
     return _orthogonal_factors(J, np.zeros(J.shape[:2]))[2]
 
 
 def slope_at(
     objective: Objective, x: Array, r: Array, exact: Mask, *, keep_Q: bool = False
 ) -> tuple[NormalEquations, Mask]:
-    """The slope at x, where the residuals are r, and where it is that of an exact Jacobian: where `exact` (trials,)
-    says so, and where a coarse one has not full rank."""
+    """Computes the slope at x, where the residuals are r, and whether it is exact: where `exact` (trials,) says so, and
+    where a coarse Jacobian has not full rank."""
     slope = NormalEquations.of(objective.jacobian(x, coarse=~exact), r, keep_Q=keep_Q)
     lost = ~exact & ~np.isfinite(slope.size)
     if lost.any():
@@ -195,7 +196,7 @@ def slope_at(
 
 @dataclass(frozen=True)
 class LeastSquaresSystem:
-    """The state of these methods; every field has the trials in front."""
+    """Holds the state of these methods; every field has the trials in front."""
 
     x: Array
     r: Array
@@ -222,7 +223,7 @@ class LeastSquaresSystem:
 
     @classmethod
     def at(cls, objective: Objective, x: Array, lam: float = 0.0, *, keep_Q: bool = False) -> LeastSquaresSystem:
-        """The state at the start."""
+        """Returns the state at the start."""
         r = objective.residual(x)
         trials = len(x)
         near = np.full(trials, np.isinf(objective.exact_within))
@@ -238,11 +239,11 @@ class LeastSquaresSystem:
         return self.near | (self.slope.size < objective.exact_within)
 
     def reach(self, step: Array) -> Array:
-        """The length (trials,) of a step in standard deviations of the readings that it moves."""
+        """Computes the length (trials,) of a step in standard deviations of the readings that it moves."""
         return np.abs(step * self.slope.columns).max(axis=1)
 
     def watched(self, cost: Array) -> tuple[Array, NDArray[np.int64]]:
-        """`mark` and `idle` after a step to an objective of that cost."""
+        """Updates `mark` and `idle` after a step to an objective of that cost."""
         visible = cost < self.mark * (1 - _VISIBLE)
         return np.where(visible, cost, self.mark), np.where(visible, 0, self.idle + 1)
 
@@ -252,8 +253,8 @@ class LeastSquaresSystem:
         return ~np.isfinite(self.slope.size)
 
     def check(self, objective: Objective, stuck: Mask) -> ConvergenceCheck:
-        """The Gauss-Newton step still to go says how far the gradient is from zero, where J is good enough to end with;
-        the cost says what diverges."""
+        """Measures the gradient by the Gauss-Newton step still to go, if J is good enough to end with, and divergence
+        by the cost."""
         known = np.isfinite(self.cost) & finite(self.slope.gradient)
         growth = np.where(known, np.sqrt(self.cost), np.nan)
         ending = np.where(self.rankless, Status.SINGULAR, Status.STALLED)

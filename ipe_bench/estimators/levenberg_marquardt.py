@@ -1,4 +1,4 @@
-"""The Gauss-Newton method, and that of Levenberg and Marquardt, plain or with geodesic acceleration."""
+"""Implements the methods of Gauss-Newton and of Levenberg and Marquardt, plain or with geodesic acceleration."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _MOST_BENT = 0.75
 
 @dataclass(frozen=True)
 class GaussNewtonMethod(Method[Objective, LeastSquaresSystem]):
-    """x <- x - (J' R^-1 J)^-1 J' R^-1 (h(x) - z), undamped; where J lacks rank, the shortest of all such steps."""
+    """Iterates x <- x - (J' R^-1 J)^-1 J' R^-1 (h(x) - z), undamped; where J lacks rank, by the shortest such step."""
 
     def begin(self, objective: Objective, x: Array) -> LeastSquaresSystem:
         return LeastSquaresSystem.at(objective, x)
@@ -50,7 +50,7 @@ class GaussNewtonMethod(Method[Objective, LeastSquaresSystem]):
 
 @dataclass(frozen=True)
 class LevenbergMarquardtMethod(Method[Objective, LeastSquaresSystem]):
-    """The step minimises |r + J s|^2 + lambda |D s|^2, and lambda follows the gain ratio.
+    """Minimises |r + J s|^2 + lambda |D s|^2 in each step s, and adapts lambda to the gain ratio.
 
     D = 1 / `deviation` (n,), the metric of a prior covariance; None: Marquardt's, the column norms of J, which only
     grow (More, in Numerical Analysis, LNM 630, 1978); or, with `sizes`, the parameters' own magnitudes at the start,
@@ -123,13 +123,13 @@ class LevenbergMarquardtMethod(Method[Objective, LeastSquaresSystem]):
     def check(
         self, objective: Objective, before: LeastSquaresSystem | None, state: LeastSquaresSystem
     ) -> ConvergenceCheck:
-        """Damping goes on where J lacks rank, until it can gain nothing more."""
+        """Continues damping where J lacks rank, until no gain is left."""
         return state.check(objective, stuck=state.lam > _LARGEST_DAMPING)
 
     def _bend(
         self, objective: Objective, state: LeastSquaresSystem, weights: Array, step: Array
     ) -> tuple[Array, Array]:
-        """The step v + a / 2 with the geodesic acceleration a, and where a is small enough beside v to be believed."""
+        """Returns the step v + a / 2 with the geodesic acceleration a, and whether a is small enough to be believed."""
         if not self.geodesic:
             return step, np.ones(len(step), dtype=bool)
         Q = state.slope.Q

@@ -50,7 +50,7 @@ class Minima:
 
     @classmethod
     def nowhere(cls, x: Array, history: bool) -> Minima:
-        """Marks every trial as without a minimum, at its start x (trials, n)."""
+        """Returns marks every trial as without a minimum, at its start x (trials, n)."""
         trials, n = x.shape
         status, none = np.full(trials, Status.MAX_ITERATIONS, np.int8), np.zeros(trials, np.int64)
         unknown, far = np.full((trials, n, n), np.nan), np.full(trials, np.inf)
@@ -65,14 +65,14 @@ class Minima:
         return self.converged & (~(self.chi_square >= old.chi_square) | ~old.converged)
 
     def replaced(self, rows: NDArray[np.intp], again: Minima, better: Mask) -> Minima:
-        """The minima after further ones `again` of the trials `rows`, where these are `better`; iterations add up."""
+        """Replaces the minima of the trials `rows` by further ones `again` where `better`; iterations add up."""
         spent = self.iterations.copy()
         spent[rows] += again.iterations
         return replace(put(self, rows[better], take(again, better)), iterations=spent)
 
     def fit_probability(self, readings: int) -> Array:
-        """The chi-square test of the fit (trials,): how probable residuals at least this large are if the model holds,
-        R is right and the minimum is the global one."""
+        """Computes the chi-square test of the fit (trials,): how probable residuals at least this large are if the
+        model holds, R is right and the minimum is the global one."""
         from scipy.special import chdtrc
 
         return chdtrc(max(readings - self.x.shape[1], 1), self.chi_square)
@@ -103,7 +103,7 @@ def minima_of(ended: SolveResult[Any], slope: NormalEquations, readings: int) ->
 
 
 def _exact_slope(objective: Objective, state: LeastSquaresSystem) -> NormalEquations:
-    """The slope where an iteration has ended; evaluated for the report where it ended on a coarse one."""
+    """Returns the slope at the end of an iteration; evaluated for the report where that is a coarse one."""
     coarse = ~state.exact & finite(state.x)
     if objective.exact_within == 0 or not coarse.any():
         return state.slope
@@ -114,7 +114,7 @@ def _exact_slope(objective: Objective, state: LeastSquaresSystem) -> NormalEquat
 
 @dataclass(frozen=True)
 class Fitting:
-    """The distinct minima that pass the test of the fit, for the trials of a batch."""
+    """Collects the distinct minima that pass the test of the fit, for the trials of a batch."""
 
     readings: int
     known: list[list[Array]]
@@ -135,8 +135,8 @@ class Fitting:
         return fits
 
     def report(self, estimates: Estimates) -> Estimates:
-        """The estimates with the extras `minima`, the number of distinct ones that fit, and `ambiguous`, 1 where there
-        are several; the others are their `alternatives`."""
+        """Reports the estimates with the extras `minima`, the number of distinct ones that fit, and `ambiguous`, 1
+        where there are several; the others are their `alternatives`."""
         minima = np.array([len(known) for known in self.known], dtype=float)
         estimates.extras |= {"minima": minima, "ambiguous": (minima > 1).astype(float)}
         assert estimates.covariance is not None
@@ -154,8 +154,8 @@ def passes(found: Minima, readings: int, significance: float) -> Mask:
 
 
 def spread_of_starts(problem: Problem) -> Array:
-    """Standard deviations (n,) of random starts about the nominal point: those of the prior where one is known, else
-    the size of the nominal point, or 1 where that is zero."""
+    """Computes standard deviations (n,) of random starts about the nominal point: those of the prior where one is
+    known, else the size of the nominal point, or 1 where that is zero."""
     if problem.prior_deviation is not None:
         return problem.prior_deviation
     return np.where(problem.x0 == 0, 1.0, np.abs(problem.x0))

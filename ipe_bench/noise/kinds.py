@@ -1,4 +1,4 @@
-"""The kinds of noise whose R is known."""
+"""Defines the kinds of noise whose R is known."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ UNIFORM_DEVIATION = 1 / np.sqrt(12)
 
 @dataclass(frozen=True)
 class ScaledNoise(Noise):
-    """A noise whose size is one standard deviation; R is white unless a subclass says otherwise."""
+    """Describes a noise whose size is one standard deviation; R is white unless a subclass says otherwise."""
 
     deviation: Positive | None = None
     """Standard deviation of a reading, in the unit of the readings; None: that of the model's usual noise."""
@@ -53,7 +53,7 @@ class ScaledNoise(Noise):
 
 @dataclass(frozen=True)
 class Gaussian(ScaledNoise):
-    """z = h + v with independent normal v."""
+    """Draws z = h + v with independent normal v."""
 
     deviation: Positive | tuple[Positive, ...] | None = None
     """One standard deviation in the unit of the readings, or one for each; None: that of the model's usual noise."""
@@ -71,7 +71,7 @@ class Gaussian(ScaledNoise):
 
 @dataclass(frozen=True)
 class NoNoise(ScaledNoise):
-    """z = h exactly, while estimators assume readings of the nominal standard deviation."""
+    """Returns z = h exactly, while estimators assume readings of the nominal standard deviation."""
 
     name = "none"
     true_covariance = False
@@ -82,7 +82,7 @@ class NoNoise(ScaledNoise):
 
 @dataclass(frozen=True)
 class StudentT(ScaledNoise):
-    """z = h + v with independent v of Student's t distribution, scaled to the given standard deviation.
+    """Draws z = h + v with independent v of Student's t distribution, scaled to the given standard deviation.
 
     Estimators are given the true covariance R = deviation^2 I, and do not know the shape.
     """
@@ -101,7 +101,7 @@ class StudentT(ScaledNoise):
 
 @dataclass(frozen=True)
 class Outliers(ScaledNoise):
-    """Tukey's contaminated normal: each reading is, with probability `share`, `factor` times as noisy as it should be.
+    """Draws from Tukey's contaminated normal: with probability `share` a reading is `factor` times as noisy.
 
     `deviation` is that of a good reading. `assumed` is what estimators assume: `nominal`, the variance of the good
     readings, as if there were no outliers; or `total`, that of the mixture, deviation^2 (1 - share + share factor^2).
@@ -119,12 +119,12 @@ class Outliers(ScaledNoise):
         return h + self.stated * self._mixture(h.shape, rng)
 
     def _mixture(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
-        """Errors over the deviation of a good reading."""
+        """Draws errors over the deviation of a good reading."""
         gross = rng.random(shape) < self.share
         return np.where(gross, self.factor, 1.0) * rng.standard_normal(shape)
 
     def whitened(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array | None:
-        """The mixture where estimators know of it; otherwise R is that of good readings, which are normal."""
+        """Draws from the mixture if estimators know of it; otherwise R is that of good readings, which are normal."""
         return None if self.assumed == "nominal" else self._mixture(shape, rng) / self._excess
 
     @property
@@ -138,7 +138,7 @@ class Outliers(ScaledNoise):
 
 @dataclass(frozen=True)
 class Quantization(Noise):
-    """z = step * round((offset + h) / step) - offset: the instruments' whole read-out is rounded, not its error.
+    """Rounds z = step * round((offset + h) / step) - offset: the instruments' whole read-out, not its error.
 
     Rounding the difference instead would give equal errors in cases that differ in sign alone. The error is taken to be
     uniform, R = step^2 / 12, unless `deviation` states it. With `dither` a uniform error of one step is added before
@@ -179,7 +179,7 @@ class Quantization(Noise):
 
 @dataclass(frozen=True)
 class Colored(ScaledNoise):
-    """First-order autoregressive noise, stationary: v_k = correlation v_(k-1) + sqrt(1 - correlation^2) deviation e_k.
+    """Draws stationary autoregressive noise: v_k = correlation v_(k-1) + sqrt(1 - correlation^2) deviation e_k.
 
     The readings are `channels` instruments in turn, each with a series of its own; after `length` readings of each the
     series start anew. GINS has 2 channels (the axes) and a length of 30 (the times of a case). `assumed` is what
@@ -224,7 +224,7 @@ class Colored(ScaledNoise):
 
 @dataclass(frozen=True)
 class Correlated(ScaledNoise):
-    """Gaussian errors of any covariance R.
+    """Draws Gaussian errors of any covariance R.
 
     Either `matrix` is R, in squared units of the readings; or readings of one standard deviation come in blocks of
     `block` that follow one another and share an error, such that two of a block have the given correlation. `assumed`
@@ -256,7 +256,7 @@ class Correlated(ScaledNoise):
 
 @functools.lru_cache(maxsize=8)
 def _factor(noise: Correlated, m: int) -> Array:
-    """The lower Cholesky factor (m, m) of R."""
+    """Computes the lower Cholesky factor (m, m) of R."""
     if noise.matrix is None:
         block = m if noise.block is None else noise.block
         if m % block:
@@ -274,7 +274,7 @@ def _factor(noise: Correlated, m: int) -> Array:
 
 
 class _StandIn(Noise):
-    """A noise that draws no errors itself."""
+    """Stands for a noise that draws no errors itself."""
 
     def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
         raise UserError(f"noise={self.name}: simulates no readings of its own; choose another noise")
@@ -285,7 +285,7 @@ class _StandIn(Noise):
 
 @dataclass(frozen=True)
 class Certified(_StandIn):
-    """Readings are those that come with the measurement model, its certified answer stands for the truth, and no prior.
+    """Takes the readings that come with the measurement model, with its certified answer for the truth, and no prior.
 
     A scenario with it has one trial. R is what the model states of its readings.
     """
@@ -308,7 +308,7 @@ class ModelNoise(_StandIn):
     """The step of a read-out that is rounded."""
 
     def of(self, model: Measurement) -> Noise | None:
-        """The noise meant for this model; None where neither the model nor an option says what it is."""
+        """Returns the noise meant for this model; None where neither the model nor an option says what it is."""
         usual = model.usual_noise or UsualNoise()
         step, deviation = self.step or usual.step, self.deviation or usual.deviation
         if step is not None and not isinstance(self.deviation, tuple):
@@ -317,7 +317,7 @@ class ModelNoise(_StandIn):
 
 
 def resolved(noise: Noise, model: Measurement) -> Noise:
-    """The noise itself, or what it stands for with this model.
+    """Returns the noise itself, or what it stands for with this model.
 
     Raises:
         UserError: the model names no noise and none is given.

@@ -1,4 +1,4 @@
-"""Levels of the noise: standard deviations as a formula of levels, one set of levels for each group of readings."""
+"""Defines levels of the noise: standard deviations as a formula of levels, one set per group of readings."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def level_names(formula: Arithmetic) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Levels:
-    """Standard deviations sigma_i = w_i s(|h_i|, levels of the group of i), as functions of the levels' logarithms."""
+    """Computes standard deviations sigma_i = w_i s(|h_i|, levels of the group of i) from the levels' logarithms."""
 
     formula: Arithmetic
     weights: Array
@@ -102,8 +102,8 @@ class Levels:
         return Covariance(sigma)
 
     def at(self, h: Array, theta: Array) -> tuple[Array, Array, Array]:
-        """log sigma (trials, m) for readings h (trials, m) and logarithms theta (trials, k) of the levels, and its
-        derivatives by h (trials, m) and by theta (trials, m, k); not finite where sigma is not positive."""
+        """Computes log sigma (trials, m) for readings h (trials, m) and logarithms theta (trials, k) of the levels, and
+        its derivatives by h (trials, m) and by theta (trials, m, k); not finite where sigma is not positive."""
         trials, m = h.shape
         levels = np.exp(theta).reshape(trials, len(self.groups), -1)[:, self.group]
         values = [np.abs(h), *(levels[:, :, i] for i in range(len(self.names)))]
@@ -117,7 +117,7 @@ class Levels:
 
 @functools.cache
 def _recorded(formula: Arithmetic) -> Program:
-    """The formula and its derivatives by the reading and by each level."""
+    """Records the formula and its derivatives by the reading and by each level."""
     graph = Graph()
     known = {name: graph.input(name) for name in (READING, *level_names(formula))}
     value, one = graph.apply("add", formula(known), 0.0), graph.constant(1.0)

@@ -1,4 +1,4 @@
-"""Noise whose levels are estimated from the residuals."""
+"""Defines noise whose levels are estimated from the residuals."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NO_LEVEL = (
 
 @dataclass(frozen=True)
 class Unknown(Noise):
-    """Independent normal errors whose level is estimated from the residuals.
+    """Draws independent normal errors whose level is estimated from the residuals.
 
     Estimates do not depend on a single level; standard errors are scaled by it, and tests of the level itself are not
     possible. Several levels, or a standard deviation that depends on the reading, are estimated with the parameters by
@@ -48,7 +48,7 @@ class Unknown(Noise):
             raise UserError("noise.by: does not go with noise.levels; state what is known, as in noise=gaussian")
 
     def levels_of(self, model: Measurement) -> Levels | None:
-        """The levels of a model's readings; None if a single one multiplies all standard deviations.
+        """Returns the levels of a model's readings; None if a single one multiplies all standard deviations.
 
         Raises:
             UserError: there is no such column, or a level has the name of a parameter.
@@ -79,7 +79,7 @@ class Unknown(Noise):
         return self._true_covariance(model.simulate(model.nominal[None])[0])
 
     def _true_covariance(self, h: Array) -> Covariance:
-        """R of the errors of readings h (m,)."""
+        """Computes R of the errors of readings h (m,)."""
         known = self.true_levels(len(h))
         if known is None:
             raise UserError(NO_LEVEL)

@@ -1,1 +1,1 @@
-"""Plugins: finding them, constructing their components from config, checking them, and starting new ones."""
+"""Finds plugins, constructs their components from config, checks them, and starts new ones."""

@@ -1,4 +1,4 @@
-"""The promises that every component makes, as checks that plugin authors run on theirs as we do on ours.
+"""Checks the promises that every component makes: plugin authors run on theirs what we run on ours.
 
 A check raises an AssertionError whose message is for the author; the first line of its docstring is the promise.
 """
@@ -41,7 +41,7 @@ SCATTERED = 60
 DRAWS = 10_000
 """Draws from which the covariance of a noise is known to about 1 %, or several where its tails are heavy."""
 _USUAL_NOISE = UsualNoise(deviation=0.007, step=0.02)
-"""What a noise takes where its options leave out how large it is."""
+"""Noise for components whose options leave out how large it is."""
 _IMPROBABLE = 1e-6
 _ROUND_OFF = 1e-9
 _TURN = 360.0
@@ -51,7 +51,7 @@ _READINGS = 6
 
 @dataclass(frozen=True)
 class Finding:
-    """The outcome of one check on one component."""
+    """Holds the outcome of one check on one component."""
 
     component: str
     check: str
@@ -109,7 +109,7 @@ def check_option(option: Option) -> Iterator[Finding]:
 
 
 def _required(config: dict[str, Any], where: str) -> list[str]:
-    """The options without a value for which the class has no default."""
+    """Returns the options without a value for which the class has no default."""
     if "???" not in config.values():
         return []
     return [
@@ -139,7 +139,7 @@ def _shaped(what: str, value: Any, wanted: tuple[int, ...], meaning: str = "") -
 
 
 def _scenario(estimator: Estimator, strength: float = 0.005) -> Scenario:
-    """A mildly bent polynomial model; for estimators that need differential equations a short epidemic."""
+    """Returns a mildly bent polynomial model; for estimators that need differential equations a short epidemic."""
     if "differential equations" in estimator.needs:
         return Scenario(Sir(), Gaussian(5.0), error_scale=0.5, seed=5)
     return Scenario(Polynomial(strength=strength), Gaussian(0.01), seed=5)
@@ -189,7 +189,7 @@ def _bound(problem: Problem) -> Array:
 
 
 def _agrees(what: str, squared: Array, n: int) -> None:
-    """Whether the mean NEES of trials (trials,) is about n."""
+    """Tells whether the mean NEES of trials (trials,) is about n."""
     ratio = float(squared.mean()) / n
     size = f"{max(ratio, 1 / ratio):.3g} times too {'small' if ratio > 1 else 'large'}"
     assert 0.5 < ratio < 2, f"{what} {size}: the mean NEES of {len(squared)} trials is {n * ratio:.3g} for {n} numbers"
@@ -276,8 +276,8 @@ def keeps_a_history_if_asked(estimator: Estimator) -> None:
 
 
 def _with_columns(model: Measurement) -> Measurement | None:
-    """The model with columns of no particular numbers, about 1, or where those must be one number with that; None where
-    it makes no sense with either."""
+    """Returns the model with columns of no particular numbers, about 1, or where those must be one number with that;
+    None where it makes no sense with either."""
     count, rng = 2 * model.n + 4, np.random.default_rng(2)
     numbers = [i.heading for i in model.inputs if i.default is None and not i.label]
     varied = {name: rng.permutation(np.linspace(0.5, 1.5, count)).tolist() for name in numbers}
@@ -295,7 +295,7 @@ def _with_columns(model: Measurement) -> Measurement | None:
 
 
 def _points(model: Measurement) -> Array:
-    """A tenth of a unit around the nominal point, where every model makes sense."""
+    """Returns points a tenth of a unit around the nominal point, where every model makes sense."""
     x = model.nominal + 0.1 * np.random.default_rng(11).standard_normal((4, model.n))
     x.flags.writeable = False
     return x
@@ -366,7 +366,7 @@ def orders_its_epochs(model: Measurement) -> None:
 
 
 def _repeatable(name: str, given: Array, draw: Callable[[Array, np.random.Generator], Array]) -> None:
-    """Whether a function draws alike from one stream."""
+    """Tells whether a function draws alike from one stream."""
     given.flags.writeable = False
     first, second = (draw(given, np.random.default_rng(3)) for _ in range(2))
     _shaped(f"what {name} returns", first, given.shape)
@@ -374,8 +374,8 @@ def _repeatable(name: str, given: Array, draw: Callable[[Array, np.random.Genera
 
 
 def _scatter_as_stated(w: Array, C: Array, slack: float, noun: str) -> None:
-    """Whether draws w (draws, k) in stated deviations have mean zero and the correlations C (k, k), but for the slack
-    and for what chance does."""
+    """Tells whether draws w (draws, k) in stated deviations have mean zero and the correlations C (k, k), but for the
+    slack and for what chance does."""
     products, chance = w[:, :, None] * w[:, None, :], 6 / np.sqrt(len(w))
     mean, moments = np.abs(w.mean(axis=0)), products.mean(axis=0)
     off = np.abs(moments - C) - chance * products.std(axis=0)
@@ -388,7 +388,7 @@ def _scatter_as_stated(w: Array, C: Array, slack: float, noun: str) -> None:
 
 
 def _count(noise: Noise) -> int:
-    """How many readings the noise is tried on: a few, or as many as it is made for, where an option is a list."""
+    """Counts the readings that the noise is tried on: a few, or as many as an option that is a list has."""
     lists = [getattr(noise, f.name) for f in fields(noise)]  # type: ignore[arg-type]
     for m in (_READINGS, *(len(value) for value in lists if isinstance(value, tuple))):
         with suppress(UserError):
@@ -398,12 +398,12 @@ def _count(noise: Noise) -> int:
 
 
 def _draws(noise: Noise) -> bool:
-    """Whether the noise draws errors itself: readings are simulated, and R is neither estimated nor a model's."""
+    """Tells whether the noise draws errors itself: readings are simulated, and R is neither estimated nor a model's."""
     return not (noise.real or noise.estimated or isinstance(noise, ModelNoise))
 
 
 def _errors(noise: Noise, draws: int, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Errors that the noise draws, and the same whitened by R (draws, m); h is spread over many steps of rounding."""
+    """Draws errors of the noise, also whitened by R (draws, m); h is spread over many steps of rounding."""
     m = _count(noise)
     R = noise.covariance(m)
     h = rng.uniform(-1000.0, 1000.0, (draws, m)) * R.deviations
@@ -450,7 +450,7 @@ def states_its_law(noise: Noise) -> None:
 
 
 def _point(prior: Prior) -> Array:
-    """A point of four parameters, or as many as the prior is made for."""
+    """Returns a point of four parameters, or as many as the prior is made for."""
     n = len(getattr(prior, "deviations", None) or getattr(prior, "correlations", None) or range(4))
     return np.linspace(-1.0, 1.0, n)
 
@@ -553,7 +553,7 @@ def does_every_task(execution: Execution) -> None:
 
 
 def _told(execution: Execution) -> dict[int, list[str]]:
-    """What an execution tells of a task that raises and of others, by task."""
+    """Returns what an execution reports of a task that raises and of others, by task."""
     found: dict[int, list[str]] = {0: [], 1: [], 2: []}
     for event in execution.run(_work, (range(3), ValueError("wrong"), range(0))):
         end = "end" if event.failure is None else f"a Failure {event.failure.message}"

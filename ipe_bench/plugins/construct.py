@@ -1,5 +1,5 @@
-"""From config to components, and the options of a component in words: `_target_` names the class, the other keys are
-its fields. Only classes of registered packages are constructed."""
+"""Constructs components from config, and describes their options: `_target_` names the class, the other keys are its
+fields. Only classes of registered packages are constructed."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ipe_bench.runs.provenance import TARGET
 
 
 def construct(config: Any, where: str) -> Any:
-    """The component that a config describes; `where` is the config key, for messages."""
+    """Constructs the component that a config describes; `where` is the config key, for messages."""
     if isinstance(config, list | tuple):
         return tuple(construct(v, f"{where}[{i}]") for i, v in enumerate(config))
     if not isinstance(config, Mapping):
@@ -31,7 +31,7 @@ def construct(config: Any, where: str) -> Any:
 
 
 def find_class(target: Any, where: str) -> type:
-    """The component class of that dotted name."""
+    """Finds the component class of that dotted name."""
     cls = find_object(target, where)
     where = f"{where}.{TARGET}={target}"
     if not (isinstance(cls, type) and dataclasses.is_dataclass(cls)):
@@ -42,7 +42,7 @@ def find_class(target: Any, where: str) -> type:
 
 
 def find_object(target: Any, where: str) -> Any:
-    """What has that dotted name in a registered package."""
+    """Finds the object of that dotted name in a registered package."""
     where = f"{where}.{TARGET}={target}"
     module_name, _, name = str(target).rpartition(".")
     if module_name.startswith("ipe_bench.") and (place := moved(name)):
@@ -68,7 +68,7 @@ def find_object(target: Any, where: str) -> Any:
 
 
 def known_parameters(parameters: Mapping[str, Any]) -> tuple[ParameterInfo, ...]:
-    """What is known of each parameter, by name: {"k": {"fixed": 2.0}} fixes k."""
+    """Reads what is known of each parameter, by name: {"k": {"fixed": 2.0}} fixes k."""
     found = []
     for name, options in parameters.items():
         where = f"parameters.{name}"
@@ -79,7 +79,7 @@ def known_parameters(parameters: Mapping[str, Any]) -> tuple[ParameterInfo, ...]
 
 
 def instantiate(cls: type, options: Mapping[str, Any], where: str) -> Any:
-    """A dataclass with these options; the key `where` stands before their names in messages, unless it is empty."""
+    """Constructs a dataclass with these options; the key `where` stands before their names in messages if not empty."""
     prefix = f"{where}." if where else ""
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}
     for name in options:
@@ -105,19 +105,19 @@ def instantiate(cls: type, options: Mapping[str, Any], where: str) -> Any:
 
 @dataclass(frozen=True)
 class Described:
-    """One option of a component, in words."""
+    """Describes one option of a component."""
 
     name: str
     value: str
-    """What it is set to, as a config writes it; empty where it must be given."""
+    """Value of the option in a config; empty where it must be given."""
     kind: str
-    """What may be given."""
+    """Type of the value."""
     meaning: str
     """The docstring of its field, or the comment behind it in the config."""
 
 
 def described(option: discovery.Option) -> list[Described]:
-    """The options of what a config file names, in the order of its class."""
+    """Describes the options of what a config file names, in the order of its class."""
     config = option.config or {}
     if option.group in discovery.RECORD_GROUPS:
         return []
@@ -150,7 +150,7 @@ def _written(value: Any) -> str:
 
 
 def _meanings(cls: type) -> dict[str, str]:
-    """By field, the text below it, of the class and its bases."""
+    """Collects the text below each field, of the class and its bases."""
     found: dict[str, str] = {}
     for base in (base for base in reversed(cls.__mro__) if dataclasses.is_dataclass(base)):
         (body,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body

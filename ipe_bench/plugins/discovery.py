@@ -31,7 +31,7 @@ PACKAGES = {**dict.fromkeys(ESTIMATOR_GROUPS, "estimators"), "tracker": "tracker
 """Groups of which several options are chosen, each under a label of its own, by the key that holds them."""
 COMPONENT_GROUPS = ("measurement", "noise", "prior", *ESTIMATOR_GROUPS, "state_model", "tracker", "execution")
 RECORD_GROUPS = ("statistic", "figure", "table", "section")
-"""What a report is made of."""
+"""Config groups of the elements of a report."""
 CHECKED_GROUPS = (*COMPONENT_GROUPS, *RECORD_GROUPS, "experiment")
 _TARGET_LINE = re.compile(r"^_target_:\s*['\"]?([\w.]+)", re.MULTILINE)
 _PACKAGE_HEADER = re.compile(r"^#\s*@package\s+(\S+)", re.MULTILINE)
@@ -39,8 +39,8 @@ _COMMENT_BEHIND = re.compile(r"^(\w+):.*? # *(.+)$", re.MULTILINE)
 
 
 class _Loader(yaml.SafeLoader):
-    """Takes 1e-6 for a number, as Hydra does; YAML 1.1 wants 1.0e-6. Of a key that stands twice one value would be
-    lost, and an alias hides what a short file stands for: both are refused."""
+    """Reads 1e-6 as a number, as Hydra does; YAML 1.1 wants 1.0e-6. Of a key that stands twice one value would be lost,
+    and an alias hides what a short file stands for: both are refused."""
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.AliasEvent):
@@ -63,7 +63,7 @@ _Loader.add_implicit_resolver(
 
 
 def read_yaml(text: str) -> Any:
-    """YAML as plain data, with numbers as Hydra reads them."""
+    """Reads YAML as plain data, with numbers as Hydra reads them."""
     try:
         return yaml.load(text, _Loader)
     except RecursionError:
@@ -73,7 +73,7 @@ def read_yaml(text: str) -> Any:
 
 
 def read_yaml_file(path: Path, key: str) -> Any:
-    """What a file of YAML says; `key` is the word of the command that names it."""
+    """Reads a file of YAML; `key` is the word of the command that names it."""
     try:
         return read_yaml(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
@@ -83,7 +83,7 @@ def read_yaml_file(path: Path, key: str) -> Any:
 
 
 def explain_yaml(error: Any, path: Path | None = None) -> str:
-    """A YAML error in one line: the file, the line and what is wrong."""
+    """Explains a YAML error in one line: the file, the line and what is wrong."""
     mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
     where = str(path or getattr(mark, "name", "config"))
     if mark is not None:
@@ -94,7 +94,7 @@ def explain_yaml(error: Any, path: Path | None = None) -> str:
 
 @dataclass(frozen=True)
 class Source:
-    """Where options come from: ipe-bench itself or a plugin."""
+    """Describes a source of options: ipe-bench itself or a plugin."""
 
     name: str
     conf: Path
@@ -106,7 +106,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Option:
-    """One choice in a config group."""
+    """Describes one choice in a config group."""
 
     group: str
     name: str
@@ -117,12 +117,12 @@ class Option:
 
     @property
     def label(self) -> str:
-        """What an estimator is called in tables."""
+        """Label of an estimator in tables."""
         return Path(self.name).name
 
     @functools.cached_property
     def text(self) -> str:
-        """What the file says; what is not UTF-8 is replaced, and told by `fault`."""
+        """Text of the file; characters that are not UTF-8 are replaced, and reported by `fault`."""
         return self.path.read_text(encoding="utf-8", errors="replace")
 
     @property
@@ -133,12 +133,12 @@ class Option:
 
     @functools.cached_property
     def config(self) -> Any:
-        """What the file says, as plain data."""
+        """Content of the file, as plain data."""
         return read_yaml(self.text)
 
     @property
     def package(self) -> str | None:
-        """Where in the config the option lands, where its header says so."""
+        """Package in the config that the option lands in, if its header says so."""
         return found[1] if (found := _PACKAGE_HEADER.search(self.text)) else None
 
     @property
@@ -148,7 +148,7 @@ class Option:
 
     @property
     def comments(self) -> dict[str, str]:
-        """By key, the comment at the end of its line."""
+        """Comment at the end of each key's line, by key."""
         return dict(_COMMENT_BEHIND.findall(self.text))
 
     @functools.cached_property
@@ -174,7 +174,7 @@ _problems: dict[str, None] = {}
 
 
 def take_problems() -> list[str]:
-    """What cannot be used of the plugins that were found, each in a line and once; the rest goes on without it."""
+    """Returns what cannot be used of the plugins that were found, each in a line and once; the rest is used."""
     sources()
     taken = list(_problems)
     _problems.clear()
@@ -183,7 +183,7 @@ def take_problems() -> list[str]:
 
 @functools.cache
 def sources() -> tuple[Source, ...]:
-    """Ours first, then the installed plugins, then the folders `plugins/*/`; their packages become importable.
+    """Returns our source, then the installed plugins, then the folders `plugins/*/`; their packages become importable.
 
     A plugin that is installed and lies in a folder as well is the folder's: its author edits what runs.
     """
@@ -204,7 +204,7 @@ def sources() -> tuple[Source, ...]:
 
 
 def _take(found: dict[str, Source], source: Source) -> bool:
-    """Whether a source is added; another one of its name that is there already is kept, and named as a problem."""
+    """Tells whether a source is added; a present one of its name is kept, and this one named as a problem."""
     known = found.setdefault(source.name, source)
     if known.conf.resolve() != source.conf.resolve():
         home, other = source.conf.parent, known.conf.parent
@@ -213,7 +213,7 @@ def _take(found: dict[str, Source], source: Source) -> bool:
 
 
 def _imported_elsewhere(source: Source) -> bool:
-    """Whether this process has imported the package from another place, which is what runs then."""
+    """Tells whether this process has imported the package from another place, which is what runs then."""
     file = getattr(sys.modules.get(source.name), "__file__", None)
     return file is not None and Path(file).resolve().parent != source.conf.parent.resolve()
 
@@ -233,7 +233,7 @@ def _make_importable(source: Source, before: Source | None = None) -> None:
 
 
 def installed_sources() -> list[Source]:
-    """Ours, then the installed plugins: what is the same in every folder."""
+    """Lists ours, then the installed plugins: the same in every folder."""
     found = [Source("ipe-bench", own_conf(), "built in")]
     for entry in importlib.metadata.entry_points(group=ENTRY_POINTS):
         reason = f"there is no package {entry.value}"
@@ -259,7 +259,7 @@ def _in_folder(folder: Path) -> Iterator[Source]:
 
 
 def _stated_name(folder: Path) -> str | None:
-    """The name of the distribution that a folder's pyproject.toml describes."""
+    """Reads the name of the distribution that a folder's pyproject.toml describes."""
     try:
         project = tomllib.loads((folder / "pyproject.toml").read_text(encoding="utf-8")).get("project")
     except (OSError, ValueError):  # none, or none that can be read
@@ -269,12 +269,12 @@ def _stated_name(folder: Path) -> str | None:
 
 
 def _normal(name: str) -> str:
-    """Names of distributions that differ in case or punctuation alone are one name."""
+    """Normalises names of distributions that differ in case or punctuation alone to one name."""
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
 def options(group: str | None = None) -> list[Option]:
-    """All options of a group, or of all groups; those that cannot be used have a `fault`."""
+    """Lists all options of a group, or of all groups; those that cannot be used have a `fault`."""
     found: dict[tuple[str, str], Option] = {}
     for source in sources():
         for path in sorted(source.conf.glob("*/**/*.yaml")):
@@ -292,8 +292,8 @@ def options(group: str | None = None) -> list[Option]:
 
 
 def composed(option: Option) -> dict[str, Any]:
-    """What an option says together with the options of its group that its `defaults` name, as Hydra composes them:
-    later ones replace what earlier ones say, and the file itself comes last unless `_self_` stands elsewhere."""
+    """Composes an option with the options of its group that its `defaults` name, as Hydra does: later ones replace what
+    earlier ones say, and the file itself comes last unless `_self_` stands elsewhere."""
     config = dict(option.config or {})
     entries = [str(entry) for entry in config.pop("defaults", [])]
     known = {o.name: o for o in options(option.group)} if entries else {}
@@ -307,13 +307,13 @@ def composed(option: Option) -> dict[str, Any]:
 
 
 def _merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
-    """Both, the second in the place of the first but where both are mappings."""
+    """Merges both, the second in the place of the first but where both are mappings."""
     both = {k for k, v in second.items() if isinstance(v, Mapping) and isinstance(first.get(k), Mapping)}
     return {**first, **second, **{key: _merged(first[key], second[key]) for key in both}}
 
 
 def options_in(folder: Path) -> list[Option]:
-    """The options of a plugin's folder that can be checked, with those that they clash with."""
+    """Lists the options of a plugin's folder that can be checked, with those that they clash with."""
     if not folder.is_dir():
         beside = Path("plugins") / folder.name.rpartition("=")[2]
         meant = beside if beside.is_dir() else "a plugin's folder, such as plugins/my_plugin"
@@ -331,12 +331,12 @@ def options_in(folder: Path) -> list[Option]:
 
 
 def groups() -> list[str]:
-    """The config groups that hold options."""
+    """Lists the config groups that hold options."""
     return sorted({option.group for option in options()})
 
 
 def blame(error: BaseException) -> str | None:
-    """The plugin whose code raised this, with file, line and message; None where no plugin's code was running."""
+    """Finds the plugin whose code raised this, with file, line and message; None where no plugin's code was running."""
     homes = {str(source.conf.parent) + os.sep: source.origin for source in sources()[1:]}
     found = None
     for frame in traceback.extract_tb(error.__traceback__):

@@ -1,4 +1,4 @@
-"""What plugins add: richer models of an instrument, and statistics, figures, tables and sections of a report.
+"""Collects what plugins add: richer models of an instrument, and statistics, figures, tables and sections of a report.
 
 Each of those is a record: `conf/figure/NAME.yaml` has one key, `_target_`, its dotted name in the plugin's package.
 """
@@ -19,7 +19,7 @@ from ipe_bench.trials.scenario import Scenario
 
 
 def richer_models(scenario: Scenario) -> list[Measurement]:
-    """What else may act on the readings of a scenario: the truth that simulates them, or every option of `measurement`
+    """Returns the richer models of a scenario: the truth that simulates its readings, or every option of `measurement`
     that is the same model with more errors, with the model's own options."""
     model, truth = scenario.measurement, scenario.truth
     if truth is not None:
@@ -40,7 +40,7 @@ def richer_models(scenario: Scenario) -> list[Measurement]:
 
 
 def find_record(option: Option) -> Any:
-    """The record that an option names."""
+    """Returns the record that an option names."""
     where = f"{option.group}={option.name}"
     if option.fault is not None:
         raise UserError(f"{where}: {option.fault}")
@@ -54,8 +54,8 @@ def find_record(option: Option) -> Any:
 
 
 def added(group: str, problems: list[str], make: Callable[[Any], Any]) -> Iterator[tuple[str, Any]]:
-    """What `make` makes of each record of a group, with its name; a line is added to the problems for every one that
-    cannot be found or raises."""
+    """Yields what `make` makes of each record of a group, with its name; a line is added to the problems for every one
+    that cannot be found or raises."""
     for option in options(group):
         name = f"{group}={option.name}: "
         try:
@@ -69,14 +69,14 @@ def added(group: str, problems: list[str], make: Callable[[Any], Any]) -> Iterat
 
 
 def require_type(thing: Any, kind: type, says: str = "gives") -> Any:
-    """What a plugin gives, or a UserError if it is of another type."""
+    """Returns what a plugin gives, or raises UserError if it is of another type."""
     if not isinstance(thing, kind):
         raise UserError(f"{says} a {type(thing).__name__} and not a {kind.__name__}")
     return thing
 
 
 def use_statistics() -> list[str]:
-    """Has the statistics of all plugins computed beside ours; returns a line for each that cannot be."""
+    """Registers the statistics of all plugins beside ours; returns a line for each that cannot be."""
     from ipe_bench.statistics.records import Statistic
     from ipe_bench.statistics.registry import add_statistics
 
@@ -86,6 +86,6 @@ def use_statistics() -> list[str]:
 
 
 def files_of_records() -> list[Path]:
-    """The files of every plugin that adds to reports."""
+    """Lists the files of every plugin that adds to reports."""
     homes = {option.source.conf.parent for group in RECORD_GROUPS for option in options(group)}
     return [path for home in homes for path in home.rglob("*") if path.is_file() and path.suffix != ".pyc"]

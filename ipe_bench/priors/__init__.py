@@ -59,8 +59,8 @@ class Prior(Component, ABC):
 
 @dataclass(frozen=True)
 class GaussianPrior(Prior):
-    """N(x0, P0), of deviations error_scale x unit and independent parameters; `deviations` widens or narrows some of
-    them, and `correlations` makes them depend on each other."""
+    """Draws from N(x0, P0), of deviations error_scale x unit and independent parameters; `deviations` widens or narrows
+    some of them, and `correlations` makes them depend on each other."""
 
     deviations: tuple[NonNegative, ...] | None = None
     """Per parameter, in multiples of its unit, at error scale 1; None: 1 for each."""

@@ -1,1 +1,1 @@
-"""Real readings: from a file to an answer."""
+"""Leads from a file of real readings to an answer."""

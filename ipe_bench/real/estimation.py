@@ -1,4 +1,4 @@
-"""Parameters from real readings, by one path: question -> readings -> model -> noise and prior -> problem -> fits."""
+"""Estimates parameters from real readings: question -> readings -> model -> noise and prior -> problem -> fits."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from ipe_bench.trials.scenario import Scenario
 
 @dataclass(frozen=True, kw_only=True)
 class Question:
-    """All that is stated about an estimate from real readings."""
+    """Holds all that is stated about an estimate from real readings."""
 
     model: Measurement
     readings: tuple[Path, ...] | Array | None
@@ -80,7 +80,7 @@ class Question:
         return self.scenario.problem if self.has_prior else self.scenario.problem.without_prior()
 
     def checked(self) -> Question:
-        """This question, if it can be answered.
+        """Checks that this question can be answered, and returns it.
 
         Raises:
             UserError: a file does not hold the model's readings, or an estimator needs what is not stated.
@@ -101,7 +101,7 @@ class Question:
         return self
 
     def fitted(self) -> tuple[list[Fit], Examination | None]:
-        """A fit by every estimator, and what is to be said of the least minimum."""
+        """Fits every estimator, and examines the least minimum."""
         fits = fit(self.problem, self.found.z, self.estimators, self.scenario.noise)
         return fits, examine(self.problem, self.found.z, fits)
 
@@ -125,7 +125,7 @@ class Question:
 
 
 def prior_stated(prior: Prior, model: Measurement) -> Prior:
-    """The prior with the standard deviations that are known of single parameters.
+    """Returns the prior with the standard deviations that are known of single parameters.
 
     Raises:
         UserError: it cannot be told of single parameters, or has another number of them.

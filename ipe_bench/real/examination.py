@@ -48,7 +48,7 @@ _BENT = 0.1
 
 @dataclass(frozen=True)
 class Minimum:
-    """A minimum of the sum of squares."""
+    """Holds a minimum of the sum of squares."""
 
     x: Array
     """(n,) in the parameters' own units."""
@@ -61,7 +61,7 @@ class Minimum:
 
 @dataclass(frozen=True)
 class BootstrapIntervals:
-    """Answers to simulated readings of the model as estimated."""
+    """Holds percentile intervals of answers to simulated readings of the model as estimated."""
 
     low: Array
     """Lower ends (n,) of percentile intervals, in the parameters' own units."""
@@ -72,7 +72,7 @@ class BootstrapIntervals:
 
 @dataclass(frozen=True)
 class OnBound:
-    """A parameter whose estimate is on a bound, because the readings want it beyond."""
+    """Describes a parameter whose estimate is on a bound, because the readings want it beyond."""
 
     parameter: Parameter
     bound: float
@@ -82,7 +82,7 @@ class OnBound:
 
 @dataclass(frozen=True, kw_only=True)
 class Examination:
-    """A least-squares minimum; intervals and estimates are in the parameters' own units."""
+    """Examines a least-squares minimum; intervals and estimates are in the parameters' own units."""
 
     label: str
     """The estimator whose answer it is."""
@@ -319,7 +319,7 @@ def _least_squares(one: Fit) -> bool:
 
 
 def _released(problem: Problem, found: Examination, values: Mapping[int, float]) -> Released | None:
-    """The problem in which parameters that are held at `values` may leave them; None if it has no covariance there."""
+    """Returns the problem in which parameters held at `values` may leave them; None if it has no covariance there."""
     places, bounds = np.array(list(values)), np.array(list(values.values()))
     start = problem.measurement.physical(problem.measurement.nominal[None])[0]
     given = replace(problem, measurement=problem.measurement.stating("nominal", values))
@@ -333,7 +333,7 @@ def _released(problem: Problem, found: Examination, values: Mapping[int, float])
 
 
 def _on_bounds(problem: Problem, found: Examination, values: Mapping[int, float]) -> Iterator[OnBound]:
-    """The interval of each parameter on its bound, the others being held on theirs."""
+    """Computes the interval of each parameter on its bound, the others being held on theirs."""
     lower, upper = natural_limits(problem.measurement)
     for place, bound in values.items():
         others = {k: value for k, value in values.items() if k != place}
@@ -349,8 +349,8 @@ def _on_bounds(problem: Problem, found: Examination, values: Mapping[int, float]
 
 
 def answers(problem: Problem, z: Array, x: Array, released: Released | None = None) -> tuple[Array, Mask]:
-    """The least-squares estimates (sets, n) within the bounds, in the parameters' own units, for readings z (sets, m)
-    from x (sets, n), and the sets that have one; `released` are parameters whose bounds are where they stood."""
+    """Computes the least-squares estimates (sets, n) within the bounds, in the parameters' own units, for readings z
+    (sets, m) from x (sets, n), and the sets that have one; `released` parameters keep their bounds."""
     minima, model = maximise_likelihood(problem, z, x), problem.measurement
     values, found = model.physical(minima.x), minima.converged.copy()
     outside, bounds = np.zeros((len(x), 0), dtype=bool), np.zeros(0)

@@ -1,4 +1,4 @@
-"""Estimates from one set of real readings: values, standard errors, and whether the model fits them."""
+"""Fits one set of real readings: values, standard errors, and whether the model fits them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from ipe_bench.trials.observability import in_words
 from ipe_bench.trials.thresholds import FIT_LEVEL
 
 _NORMAL = Gaussian(1.0)
-"""Its whitened errors are those of any normal noise."""
+"""Noise whose whitened errors are those of any normal one."""
 _MOST_LEVELS = 6
 """Fits in search of the level of the noise."""
 _SAME_LEVEL = 1e-3
@@ -40,12 +40,12 @@ _FARTHEST = 40.0
 _OPEN = 1e-4
 """A combination of parameters that changes the readings by less than this share of what others do may be open."""
 _DOUBTED = 0.05
-"""If the test of the fit gives less, estimators that can look for a better fit: there is but one set of readings."""
+"""Least p of the test of the fit without a search for a better one, since there is but one set of readings."""
 
 
 @dataclass(frozen=True)
 class Given:
-    """The readings z (present,) at `rows` of those of a model, and their problem."""
+    """Holds the readings z (present,) at `rows` of those of a model, and their problem."""
 
     problem: Problem
     model: Measurement
@@ -68,7 +68,7 @@ class Given:
 
 @dataclass(frozen=True, kw_only=True)
 class Fit:
-    """The fit of one estimator to the readings."""
+    """Holds the fit of one estimator to the readings."""
 
     label: str
     estimator: Estimator
@@ -98,7 +98,7 @@ class Fit:
     """The estimator with the least sum of squares, if that is so much smaller that chance does not explain it."""
 
     def _all(self, free: Array) -> Array:
-        """Values (n,) or (n, n) of all parameters, NaN for those that are held on bounds."""
+        """Returns values (n,) or (n, n) of all parameters, NaN for those that are held on bounds."""
         n = len(free) + len(self.held_at)
         kept, found = [k for k in range(n) if k not in self.held_at], np.full((n,) * free.ndim, np.nan)
         found[np.ix_(*[kept] * free.ndim)] = free
@@ -249,8 +249,8 @@ class Fit:
         return dict(zip(names, self.x[len(self.x) - len(names) :].tolist(), strict=True))
 
     def interval(self, confidence: float = 0.95) -> tuple[Array, Array]:
-        """Confidence intervals (n,), (n,) from the standard errors, inside of bounds; NaN for levels of the noise: only
-        profiles hold them as often as they say."""
+        """Computes confidence intervals (n,), (n,) from the standard errors, inside of bounds; NaN for levels of the
+        noise: only profiles hold them as often as they say."""
         freedom = None if self.level is None else self.degrees_of_freedom
         if self.estimated is not None:
             freedom = self.estimated.freedom
@@ -274,8 +274,8 @@ class Fit:
 
 
 def fit(problem: Problem, z: Array, estimators: Mapping[str, Estimator], noise: Noise = _NORMAL) -> list[Fit]:
-    """A fit of every estimator to the readings z (m,), NaN if missing; `noise` is the law of their whitened errors, or
-    says that R is known up to levels, which are then estimated."""
+    """Fits every estimator to the readings z (m,), NaN if missing; `noise` is the law of their whitened errors, or says
+    that R is known up to levels, which are then estimated."""
     rows, present = np.flatnonzero(~np.isnan(z)), replace(problem, doubted=1.0 if noise.estimated else _DOUBTED)
     if len(rows) < len(z):
         model = SubsetModel(problem.measurement, tuple(rows.tolist()))
@@ -289,8 +289,8 @@ def fit(problem: Problem, z: Array, estimators: Mapping[str, Estimator], noise: 
 
 
 def _compared(fits: list[Fit]) -> list[Fit]:
-    """The fits, marked if they lie outside of the joint confidence region of the best (Bates and Watts, Nonlinear
-    Regression Analysis and Its Applications, 1988, section 6.1)."""
+    """Marks fits that lie outside of the joint confidence region of the best (Bates and Watts, Nonlinear Regression
+    Analysis and Its Applications, 1988, section 6.1)."""
     sums = [one.deviance if np.isfinite(one.deviance) else np.inf for one in fits]
     best = int(np.argmin(sums))
     least, n, free = sums[best], len(fits[0].x), fits[0].degrees_of_freedom
@@ -305,7 +305,7 @@ def _compared(fits: list[Fit]) -> list[Fit]:
 
 
 def _fit_scaled(given: Given, label: str, estimator: Estimator, problem: Problem) -> Fit:
-    """The fit at which the level that R assumes is that of the residuals."""
+    """Iterates the fit until the level that R assumes is that of the residuals."""
     spread = float(np.sqrt(np.mean(problem.R.whiten(given.z) ** 2)))
     level, found = spread or 1.0, None
     for _ in range(_MOST_LEVELS):
@@ -331,14 +331,14 @@ def _fit_scaled(given: Given, label: str, estimator: Estimator, problem: Problem
 
 
 def scaled(problem: Problem, level: float) -> Problem:
-    """The problem with readings that are noisier by a factor."""
+    """Returns the problem with readings that are noisier by a factor."""
     return replace(problem, R=Covariance(problem.R.factor * level))
 
 
 def _deviates(r: Array, free: Array | int) -> Array:
-    """The normal deviates (m,) that are as probable as internally studentised residuals r (m,) of f = `free` degrees of
-    freedom, by r sqrt((f - 1) / (f - r^2)), which is Student's t with f - 1 (Cook and Weisberg, Residuals and Influence
-    in Regression, 1982, eq. 2.2.8)."""
+    """Computes the normal deviates (m,) that are as probable as internally studentised residuals r (m,) of f = `free`
+    degrees of freedom, by r sqrt((f - 1) / (f - r^2)), which is Student's t with f - 1 (Cook and Weisberg, Residuals
+    and Influence in Regression, 1982, eq. 2.2.8)."""
     with np.errstate(all="ignore"):
         t = r * np.sqrt((free - 1) / np.maximum(free - r**2, 0.0))
         deviates = np.where(np.asarray(free) > 1, -np.sign(r) * ndtri(stdtr(free - 1, -np.abs(t))), np.nan)
@@ -347,8 +347,8 @@ def _deviates(r: Array, free: Array | int) -> Array:
 
 
 def _fit_reml(given: Given, label: str, estimator: Estimator, levels: Levels) -> Fit:
-    """The fit at which the levels that R assumes are those of the residuals; of least squares, the maximum of the
-    restricted likelihood near there."""
+    """Iterates the fit until the levels that R assumes are those of the residuals; of least squares, to the maximum of
+    the restricted likelihood near there."""
     theta, h, z = first_levels(levels, given.z), given.z, given.z
     found: tuple[Fit, Estimated] | None = None
     for _ in range(_MOST_LEVELS):
@@ -382,7 +382,7 @@ def _fit_reml(given: Given, label: str, estimator: Estimator, levels: Levels) ->
 
 
 def _fit_one(given: Given, label: str, estimator: Estimator, problem: Problem) -> Fit:
-    """The fit within the bounds of the parameters, on some of them if its minimum is there."""
+    """Fits within the bounds of the parameters, on some of them if the minimum is there."""
     found = _fit_inside(given, label, estimator, problem)
     near = {} if found.with_prior else problem.measurement.near_bounds(found.inner)
     if not 0 < len(near) < len(found.inner):
@@ -394,7 +394,7 @@ def _fit_one(given: Given, label: str, estimator: Estimator, problem: Problem) -
 
 
 def holding(problem: Problem, values: Mapping[int, float]) -> Problem:
-    """The problem with some parameters fixed at values in their own units."""
+    """Returns the problem with some parameters fixed at values in their own units."""
     kept = [k for k in range(problem.measurement.n) if k not in values]
     deviation, correlation = problem.prior_deviation, problem.prior_correlation
     deviation = None if deviation is None else deviation[kept]
@@ -406,8 +406,8 @@ def holding(problem: Problem, values: Mapping[int, float]) -> Problem:
 def falls_beyond(
     problem: Problem, held: Array, near: Mapping[int, float], z: Array, released: Released | None = None
 ) -> Mask:
-    """The sets of readings z (sets, m) whose sum of squares at `held` (sets, free) falls beyond every bound (Nocedal
-    and Wright, Numerical Optimization, 2nd ed., 2006, theorem 12.1)."""
+    """Finds the sets of readings z (sets, m) whose sum of squares at `held` (sets, free) falls beyond every bound
+    (Nocedal and Wright, Numerical Optimization, 2nd ed., 2006, theorem 12.1)."""
     model, places = problem.measurement.stating("nominal", near), list(near)
     x = np.repeat(np.array(model.nominal, dtype=float)[None], len(z), axis=0)
     x[:, [k for k in range(model.n) if k not in near]] = held
@@ -451,8 +451,8 @@ def _fit_inside(given: Given, label: str, estimator: Estimator, problem: Problem
 
 
 def undetermined(model: Measurement, J: Array, x: Array) -> tuple[str, ...]:
-    """The combinations of parameters that whitened readings of slopes J (m, n) do not determine at x (n,): errors along
-    them are larger than the parameters."""
+    """Finds the combinations of parameters that whitened readings of slopes J (m, n) do not determine at x (n,): errors
+    along them are larger than the parameters."""
     size = np.linalg.norm(J, axis=0)
     size = np.where(size > 0, size, 1.0)
     missing = max(len(x) - len(J), 0)
@@ -468,7 +468,7 @@ def undetermined(model: Measurement, J: Array, x: Array) -> tuple[str, ...]:
 
 
 def at_rows(rows: NDArray[np.intp], values: Array, m: int) -> Array:
-    """Values of some of m readings; NaN of the others."""
+    """Places values of some of m readings among all; NaN for the others."""
     whole = np.full(m, np.nan)
     whole[rows] = values
     return whole

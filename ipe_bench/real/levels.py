@@ -1,4 +1,4 @@
-"""Levels of the noise as further parameters: what a restricted likelihood minimises, in the form of least squares.
+"""Treats levels of the noise as further parameters: minimises the restricted likelihood in the form of least squares.
 
 Each reading comes with a second residual, of the logarithm of its standard deviation sigma. The gradient of
 
@@ -46,7 +46,7 @@ _LEAST_SPARE = 1e-9
 
 @dataclass(frozen=True)
 class Levelled(WrappedModel):
-    """The readings h of a model, then the logarithms of their standard deviations, then those of the levels; x has the
+    """Joins the readings h of a model, the logarithms of their standard deviations, and those of the levels; x has the
     logarithms of the levels behind the parameters."""
 
     whole: Measurement
@@ -59,7 +59,7 @@ class Levelled(WrappedModel):
     epochs = recorded = None
 
     def __post_init__(self) -> None:
-        """Made of a model that has been checked."""
+        """Skips the checks of options: the model was checked before."""
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -109,7 +109,7 @@ class Levelled(WrappedModel):
 
 @dataclass(frozen=True)
 class _Known(Measurement):
-    """Readings without a parameter."""
+    """Holds readings without a parameter."""
 
     h: Array
 
@@ -122,7 +122,7 @@ class _Known(Measurement):
         return {"row": range(len(self.h))}
 
     def __post_init__(self) -> None:
-        """Made of numbers."""
+        """Skips the checks of options: there are none."""
 
     def simulate(self, x: Array) -> Array:
         return np.repeat(self.h[None], len(x), axis=0)
@@ -133,12 +133,12 @@ class _Known(Measurement):
 
 @dataclass(frozen=True, kw_only=True)
 class Likelihood(Objective):
-    """-2 times the log likelihood, as a sum of squares."""
+    """Computes -2 times the log likelihood, as a sum of squares."""
 
     levelled: Levelled
 
     def _split(self, x: Array) -> tuple[Array, Array, Array]:
-        """Whitened residuals (trials, m), log sigma, and how far the levels' logarithms are from their start."""
+        """Splits residuals into whitened ones (trials, m), log sigma, and the levels' logarithms less their start."""
         h, log, theta = np.split(self.model.simulate(x, self.rows), [self.readings, 2 * self.readings], axis=1)
         return (self.levelled.near(h, self.z) - self.z) * np.exp(-log), log, theta - self.levelled.theta
 
@@ -148,7 +148,8 @@ class Likelihood(Objective):
         return np.concatenate([w, (f - w**2) / np.sqrt(f + w**2), _HOLD * moved], axis=1)
 
     def jacobian(self, x: Array, *, coarse: Mask | bool = False) -> Array:
-        """The second residuals' information is f + w^2, whose mean is Fisher's 2 f: steps of log sigma are below 1."""
+        """Computes slopes that give the second residuals f + w^2, of Fisher's mean 2 f: steps of log sigma are below
+        1."""
         w, log, moved = self._split(x)
         weights = [np.exp(-log), np.sqrt(self.levelled.spare + w**2), np.full(moved.shape, _HOLD)]
         J = self.model.jacobian(x, self.rows, coarse=coarse)
@@ -169,7 +170,7 @@ def objective_of(problem: Problem, z: Array, model: CountingModel | None = None)
 
 
 def maximise_likelihood(problem: Problem, z: Array, x: Array) -> Minima:
-    """The minima of `objective_of` for readings z (trials, m) from x (trials, n), with its values as `chi_square`."""
+    """Minimises `objective_of` for readings z (trials, m) from x (trials, n), with its values as `chi_square`."""
     with np.errstate(all="ignore"):
         objective = objective_of(problem, z)
         minima = minimize(objective, LevenbergMarquardtMethod(1e-3), x, Limits(_TOLERANCE, _MOST_STEPS))
@@ -181,7 +182,7 @@ def maximise_likelihood(problem: Problem, z: Array, x: Array) -> Minima:
 
 @dataclass(frozen=True)
 class Estimated:
-    """A model's parameters and levels, with what is known of their errors."""
+    """Holds a model's parameters and levels, with what is known of their errors."""
 
     problem: Problem
     """Its measurement is `Levelled`, its R is that of the levels."""
@@ -217,7 +218,7 @@ class Estimated:
 
 
 def levels_at(problem: Problem, levels: Levels, theta: Array, z: Array, x: Array) -> Estimated:
-    """The levels of maximum restricted likelihood at x (n,), from theta (k,), with R's leverages; NaN if h is unknown.
+    """Finds the levels of maximum restricted likelihood at x (n,) from theta (k,), with R's leverages; NaN without h.
 
     Raises:
         UserError: a group has too few readings for its levels, or residuals of zero.
@@ -239,7 +240,7 @@ def levels_at(problem: Problem, levels: Levels, theta: Array, z: Array, x: Array
 
 
 def maximum(start: Estimated, z: Array) -> Estimated:
-    """The maximum of the restricted likelihood of readings z (m,) near a start."""
+    """Finds the maximum of the restricted likelihood of readings z (m,) near a start."""
     found = start
     for _ in range(_MOST_ROUNDS):
         minima = maximise_likelihood(found.problem, z[None], found.x[None])
@@ -259,12 +260,12 @@ def maximum(start: Estimated, z: Array) -> Estimated:
 
 
 def _covariance(levels: Levels, model: Measurement, x: Array) -> Covariance:
-    """R where the parameters and the logarithms of levels are x (n + k,)."""
+    """Returns R where the parameters and the logarithms of levels are x (n + k,)."""
     return levels.covariance(model.simulate(x[None, : model.n])[0], x[model.n :])
 
 
 def _spare(J: Array, R: Covariance) -> Array:
-    """1 - leverage (m,) of each reading."""
+    """Computes 1 - leverage (m,) of each reading."""
     return np.maximum(1.0 - np.sum(explained(J, R) ** 2, axis=1), _LEAST_SPARE)
 
 
@@ -306,6 +307,6 @@ def _require_residuals(levels: Levels, z: Array, r: Array, J: Array) -> None:
 
 
 def first_levels(levels: Levels, z: Array) -> Array:
-    """Logarithms (k,) of levels as large as each group's readings."""
+    """Returns logarithms (k,) of levels as large as each group's readings."""
     mean = np.sqrt(np.bincount(levels.group, (z / levels.weights) ** 2) / np.bincount(levels.group))
     return np.repeat(np.log(np.where(mean > 0, mean, 1.0)), len(levels.names))

@@ -1,4 +1,4 @@
-"""Intervals of parameters: from standard errors, and from the profile likelihood.
+"""Computes intervals of parameters: from standard errors, and from the profile likelihood.
 
 A profile interval holds what it promises where the model bends and intervals from standard errors do not (Venzon and
 Moolgavkar, Applied Statistics 37, 1988; Bates and Watts, Nonlinear Regression Analysis and Its Applications, 1988,
@@ -47,13 +47,13 @@ _ON_BOUND = 1e-9
 
 
 def half_width(confidence: float, freedom: float | Array | None) -> float | Array:
-    """The normal quantile of a two-sided interval; Student's t if the level of the noise is estimated from `freedom`
-    degrees of freedom, or (n,) of them."""
+    """Returns the normal quantile of a two-sided interval; Student's t if the level of the noise is estimated from
+    `freedom` degrees of freedom, or (n,) of them."""
     return stdtrit(np.inf if freedom is None else freedom, (1 + confidence) / 2)
 
 
 def joint_region(parameters: int, confidence: float, freedom: float | None) -> float:
-    """The squared distance, in standard errors, to the edge of the joint confidence region of some parameters:
+    """Computes the squared distance, in standard errors, to the edge of the joint confidence region of some parameters:
     chi-square, or F if the level of the noise is estimated from `freedom` degrees of freedom."""
     if freedom is None:
         return float(chdtri(parameters, 1 - confidence))
@@ -61,13 +61,13 @@ def joint_region(parameters: int, confidence: float, freedom: float | None) -> f
 
 
 def natural_limits(model: Measurement) -> tuple[Array, Array]:
-    """The lower and the upper bounds (n,) of the parameters in their own units; infinite where there are none."""
+    """Returns the lower and upper bounds (n,) of the parameters in their own units; infinite if there are none."""
     ends = model.physical(np.stack([np.full(model.n, -np.inf), np.full(model.n, np.inf)]))
     return ends.min(axis=0), ends.max(axis=0)
 
 
 def wald_interval(model: Measurement, x: Array, deviation: Array, q: float | Array) -> tuple[Array, Array]:
-    """The interval (n,), (n,) of q standard deviations (n,) about the estimate x (n,), in the parameters' own units.
+    """Computes the interval (n,), (n,) of q standard deviations (n,) about x (n,), in the parameters' own units.
 
     It is symmetric in x, such as the logarithm of a distance to a bound. If three times q standard errors reach a
     bound, the logarithm bends too much over the interval, which is then symmetric in the parameter and ends at the
@@ -86,7 +86,7 @@ def wald_interval(model: Measurement, x: Array, deviation: Array, q: float | Arr
 
 @dataclass(frozen=True)
 class Released:
-    """A problem in which parameters that are on their bounds may leave them."""
+    """Holds a problem in which parameters that are on their bounds may leave them."""
 
     problem: Problem
     """The problem with those parameters free of bounds."""
@@ -115,8 +115,8 @@ def profiles(
     signs: Sequence[int] = (-1, 1),
     released: Released | None = None,
 ) -> tuple[Array, Array]:
-    """The profile intervals (places,), (places,) of the parameters `places`, or of all, in their own units, about the
-    least-squares estimate x (n,) of covariance P (n, n) from readings z (m,), all present.
+    """Computes the profile intervals (places,), (places,) of the parameters `places`, or of all, in their own units,
+    about the least-squares estimate x (n,) of covariance P (n, n) from readings z (m,), all present.
 
     An end is infinite if the readings set no limit, and NaN if no minimum is found on the way to it; both are NaN if
     the search finds a better fit than the estimate.
@@ -154,12 +154,12 @@ def profiles(
 
 
 class _BetterFit(Exception):
-    """The search has found a better fit than the estimate."""
+    """Signals that the search has found a better fit than the estimate."""
 
 
 @dataclass
 class _Side:
-    """One side of the profile of the parameter of a place."""
+    """Follows one side of the profile of the parameter of a place."""
 
     problem: Problem
     z: Array
@@ -180,7 +180,7 @@ class _Side:
         """The rise up to twice q, and the parameters, by distance from the estimate."""
 
     def end(self) -> float:
-        """The distance to the end; infinite if there is none, NaN if minima cannot be followed to it."""
+        """Finds the distance to the end; infinite if there is none, NaN if minima cannot be followed to it."""
         half = self.q * float(np.sqrt(self.P[self.place, self.place]))
         near, far = 0.0, half / 8
         for _ in range(_STRETCHES):
@@ -197,8 +197,8 @@ class _Side:
         return np.inf
 
     def rise(self, distance: float, *, around: bool = False) -> float:
-        """The rise of root chi-square at a distance; that of the least minimum found from the profile's nearest points
-        and, if asked, from all around, where another valley may be lower."""
+        """Computes the rise of root chi-square at a distance; that of the least minimum found from the profile's
+        nearest points and, if asked, from all around, where another valley may be lower."""
         if distance in self.seen and not around:
             return self.seen[distance][0]
         at = float(self.x[self.place] + self.sign * distance)
@@ -224,8 +224,8 @@ class _Side:
         return risen
 
     def _around(self, at: float) -> Array:
-        """Two deviations of the others to both sides of where a linear model would lead from the estimate, along each
-        axis of their covariance, (starts, n)."""
+        """Returns starts (starts, n) two deviations of the others to both sides of a linear model's prediction from the
+        estimate, along each axis of their covariance."""
         gain = self.P[:, self.place] / self.P[self.place, self.place]
         sizes, axes = np.linalg.eigh(self.P - np.outer(gain, self.P[self.place]))
         steps = 2.0 * np.sqrt(np.maximum(sizes, 0.0))[:, None] * axes.T
@@ -234,7 +234,7 @@ class _Side:
 
 @dataclass(frozen=True, kw_only=True)
 class _Pinned(CountingModel):
-    """A model in which one parameter has a fixed value, and x are the others."""
+    """Fixes one parameter of a model; x are the others."""
 
     place: int
     value: float
@@ -269,9 +269,9 @@ def _ahead(objective: Objective, near: Array, place: int, at: float) -> Array:
 def _least_at(
     problem: Problem, z: Array, place: int, at: float, starts: Array, released: Released | None
 ) -> tuple[Array, float]:
-    """The least of the minima (n,) with one parameter at a value that are found from `starts` (starts, n), and the sum
-    of squares there; that is smaller if parameters that are released fit better inside of their bounds, and NaN where
-    the model has no value."""
+    """Finds the least of the minima (n,) with one parameter at a value from `starts` (starts, n), and the sum of
+    squares there; that is smaller if parameters that are released fit better inside of their bounds, and NaN where the
+    model has no value."""
     model = _Pinned(problem.measurement, EvaluationCount.zeros(len(starts)), place=place, value=at)
     objective = objective_of(problem, np.repeat(z[None], len(starts), axis=0), model)
     x = np.delete(starts, place, axis=1)

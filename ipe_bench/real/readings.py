@@ -1,4 +1,4 @@
-"""Files of readings, and the model completed by what stands in them.
+"""Reads files of readings, and completes the model by their columns.
 
 A file has one row per reading, in any order, with columns that say which reading it is, and the reading with its unit:
 `case,time [min],axis,reading [m/s]` for GINS. An empty reading is missing. Cells are separated by commas or tabs; or by
@@ -32,13 +32,13 @@ SIGMA = "sigma"
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _MISSING = "a missing reading is an empty cell"
 _SAMPLES = Path("ipe_bench/real/samples")
-"""Where the package's own samples lie in a clone; from a folder without one, they are found in the package."""
+"""Folder of the package's own samples in a clone; from elsewhere, they are found in the package."""
 _WITH_COMMA = re.compile(r"[+-]?\d*,\d*([eE][+-]?\d+)?", re.ASCII)
 
 
 @dataclass(frozen=True)
 class Readings:
-    """One file of readings, or several."""
+    """Holds one file of readings, or several."""
 
     model: Measurement
     """The model with the inputs of the file."""
@@ -57,7 +57,7 @@ class Readings:
 
 @dataclass(frozen=True)
 class TextTable:
-    """A file as text: its header, and its rows with their numbers in the file."""
+    """Holds a file as text: its header, and its rows with their numbers in the file."""
 
     path: Path
     heading: Sequence[str] = ()
@@ -70,11 +70,12 @@ class TextTable:
         return UserError(f"readings={self.path}: {text}")
 
     def number(self, text: str) -> float | None:
-        """The number in a cell, or None; a point among decimal commas is ambiguous, and none."""
+        """Parses the number in a cell, or None; a point among decimal commas is ambiguous, and none."""
         return _number(text.replace(".", "?").replace(",", ".") if self.decimal == "," else text)
 
     def value(self, text: str, where: str) -> float:
-        """The finite number in a cell, NaN if it is empty; a UserError at `where`, its row and column, otherwise."""
+        """Parses the finite number in a cell, NaN if it is empty; otherwise a UserError at `where`, its row and
+        column."""
         if not text.strip():
             return math.nan
         value = self.number(text)
@@ -86,12 +87,12 @@ class TextTable:
         raise self.error(f"{where}: {said}; correct it, or leave the cell empty if it is missing")
 
     def column(self, name: str) -> list[tuple[str, str]]:
-        """The texts of a column, each with the words that name its place."""
+        """Lists the texts of a column, each with the words that name its place."""
         at = self.heading.index(name)
         return [(row[at], f"row {number}, column {name}") for number, row in self.rows]
 
     def find(self, wanted: str) -> str | None:
-        """The column of that heading; a heading without a unit is found with one, too."""
+        """Finds the column of that heading; a heading without a unit is found with one, too."""
         if wanted in self.heading:
             return wanted
         return next((name for name in self.heading if " [" not in wanted and _quantity(name) == wanted), None)
@@ -129,7 +130,7 @@ def _unit(heading: str) -> str:
 
 
 def read_tables(paths: Sequence[Path], without: Sequence[str] = ()) -> list[TextTable]:
-    """The tables of files, without the columns of these headings.
+    """Reads the tables of files, without the columns of these headings.
 
     Raises:
         UserError: a file is absent or not a table, or no file has such a column.
@@ -149,7 +150,7 @@ def read_tables(paths: Sequence[Path], without: Sequence[str] = ()) -> list[Text
 
 
 def _read_table(path: Path) -> TextTable:
-    """The table of a CSV or Parquet file, in which every row has as many cells as the header."""
+    """Reads the table of a CSV or Parquet file, in which every row has as many cells as the header."""
     if path.parent == _SAMPLES and not path.is_file():
         path = Path(__file__).with_name("samples") / path.name
     if not path.is_file():
@@ -218,7 +219,7 @@ def labels(model: Measurement) -> Mapping[str, Sequence[Any]]:
 
 
 def header(model: Measurement) -> list[str]:
-    """The columns of a readings file of this model."""
+    """Returns the columns of a readings file of this model."""
     return [*labels(model), f"reading [{model.reading_unit}]" if model.reading_unit else "reading"]
 
 
@@ -250,7 +251,7 @@ def _write(path: Path, rows: Sequence[Sequence[Any]]) -> None:
 def open_together(
     paths: Sequence[Path], model: Measurement, known: Sequence[ParameterInfo] = (), without: Sequence[str] = ()
 ) -> Readings:
-    """The readings of one file or of several, which share the parameters that are not a file's own.
+    """Opens one file of readings or several, which share the parameters that are not a file's own.
 
     `known` is what is known of all their parameters. `without` are columns that are left out, by their headings with
     their units or without.
@@ -289,7 +290,7 @@ def _together(paths: Sequence[Path], found: Sequence[Readings]) -> Readings:
 
 
 def _readings_in(table: TextTable, model: Measurement) -> Readings:
-    """The readings of a file, of which there may be too few."""
+    """Reads a file, which may have too few readings."""
     sigma = table.find(SIGMA)
     columns = [table.find(wanted.heading) for wanted in model.inputs]
     there = [c for i, c in zip(model.inputs, columns, strict=True) if c is not None and not i.label]
@@ -363,7 +364,7 @@ def _rows_of(table: TextTable, model: Measurement, also: Sequence[str]) -> list[
 
 
 def _label(text: str, number: Callable[[str], float | None] = _number) -> Any:
-    """A label, as a number if it is one: 3 and 3.0 are one."""
+    """Converts a label to a number if it is one: 3 and 3.0 are one."""
     value = number(text)
     return text.strip() if value is None else round(value, 9)
 
@@ -400,7 +401,8 @@ def _input(table: TextTable, wanted: Input, text: str, where: str) -> Any:
 
 
 def _sigmas(table: TextTable, column: str | None, rows: Sequence[int], z: Array, shown: str) -> Array | None:
-    """The standard deviations (m,) in `rows` of that column, `shown` being that of the readings; None without one."""
+    """Reads the standard deviations (m,) in `rows` of that column, `shown` being the readings' name; None without
+    it."""
     if column is None:
         return None
     if _unit(column) not in ("", _unit(shown)):

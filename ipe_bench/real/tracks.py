@@ -1,5 +1,5 @@
-"""Tracks of real readings: trackers follow the states of a model through a log, and find the constants of the model
-under which the log is most likely (Schweppe, IEEE Trans. Information Theory 11, 1965)."""
+"""Tracks real readings: trackers follow the states of a model through a log, and find the constants of the model under
+which the log is most likely (Schweppe, IEEE Trans. Information Theory 11, 1965)."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _FAR, _VAGUE = 30.0, 5.0
 
 @dataclass(frozen=True)
 class Log:
-    """Readings of a model's epochs."""
+    """Holds the readings of a model's epochs."""
 
     model: StateModel
     """The model with an epoch per row of the file, and with the inputs of the file if it is written in formulas."""
@@ -48,8 +48,8 @@ class Log:
 
     @classmethod
     def of(cls, model: StateModel, readings: Path | Array | None, ignored: Sequence[str] = ()) -> Log:
-        """The readings of a CSV or Parquet file without the columns `ignored`, an array z (K, m), or those that come
-        with the model.
+        """Reads a CSV or Parquet file without the columns `ignored`, an array z (K, m), or the readings that come with
+        the model.
 
         Raises:
             UserError: they are not readings of this model.
@@ -106,7 +106,7 @@ def _read(table: TextTable, model: StateModel) -> Log:
 
 @dataclass(frozen=True)
 class Constant:
-    """A constant of largest likelihood."""
+    """Holds a constant of largest likelihood."""
 
     name: str
     value: float
@@ -119,7 +119,7 @@ class Constant:
 
 @dataclass(frozen=True)
 class LogTracks:
-    """The track of a log by one tracker, in the units of the states."""
+    """Holds the track of a log by one tracker, in the units of the states."""
 
     label: str
     mean: Array
@@ -176,7 +176,7 @@ class LogTracks:
 
 
 def found_and_tracked(log: Log, label: str, tracker: Tracker, find: Sequence[str]) -> LogTracks:
-    """The constants `find` under which a tracker finds the log most likely, and its track with them.
+    """Finds the constants `find` under which a tracker finds the log most likely, and its track with them.
 
     Raises:
         UserError: the model has no such constant, or the tracker has no likelihood that can be maximised.
@@ -224,7 +224,7 @@ def found_and_tracked(log: Log, label: str, tracker: Tracker, find: Sequence[str
 
 
 def _place(model: Formulas, name: str) -> tuple[str, str]:
-    """The key and the name of a constant, which may be written KEY.NAME."""
+    """Returns the key and the name of a constant, which may be written KEY.NAME."""
     known = [(key, label) for key in _KEYS for label in getattr(model, key)]
     found = [one for one in known if name in (one[1], ".".join(one))]
     if len(found) > 1:

@@ -26,7 +26,7 @@ _OLDER = "manifest.json"
 """The manifest of bundles of version 0.2, in JSON."""
 SUFFIX = ".zip"
 BUNDLES = "bundles"
-"""Where bundles are unpacked below a report on them."""
+"""Folder of unpacked bundles, below a report on them."""
 _FILE = re.compile(r"(trials|runs|failed)/[A-Za-z0-9][A-Za-z0-9._-]{0,150}\.(parquet|json)")
 _FOLDER = re.compile(r"(?!(?i:con|prn|aux|nul|com\d|lpt\d)(\.|$))[A-Za-z0-9]([A-Za-z0-9._=,+-]{0,98}[A-Za-z0-9])?")
 """Names that mean the same on every system."""
@@ -51,7 +51,7 @@ class Bundle:
 
 
 def is_bundle(path: Path | str) -> bool:
-    """Whether a path is to be read as a bundle and not as a folder of results."""
+    """Returns whether a path is to be read as a bundle and not as a folder of results."""
     return Path(path).is_file()
 
 

@@ -53,12 +53,12 @@ class Unusable(Exception):
 
 
 class Outdated(Unusable):
-    """A file that an older version wrote."""
+    """Marks a file that an older version wrote."""
 
 
 @dataclass(frozen=True)
 class StoredPart:
-    """A stored file with the rows of trials start to stop of one result."""
+    """Describes a stored file with the rows of trials start to stop of one result."""
 
     path: Path
     key: str
@@ -67,7 +67,7 @@ class StoredPart:
 
     @classmethod
     def parse(cls, path: Path) -> StoredPart | None:
-        """The part that a file name states; None if it states none."""
+        """Parses the part that a file name states; None if it states none."""
         match = _NAME.fullmatch(path.name)
         return None if match is None else cls(path, match[1], int(match[2]), int(match[3]))
 
@@ -77,8 +77,9 @@ class StoredPart:
         return self.start, -self.stop, str(self.path)
 
     def read(self, columns: Keys[str] | None = None) -> tuple[Mapping[str, Any], pa.Table]:
-        """What the rows belong to, and the rows, without metadata: all columns, or those of `columns` that are there.
-        Raises FileNotFoundError if there is no such file any more, and Unusable if it is damaged, or not one of ours.
+        """Reads what the rows belong to, and the rows, without metadata: all columns, or those of `columns` that are
+        there. Raises FileNotFoundError if there is no such file any more, and Unusable if it is damaged, or not one of
+        ours.
         """
         with _opened(self.path) as file:
             footer = _parsed(file.metadata.metadata[FOOTER])
@@ -91,14 +92,14 @@ class StoredPart:
         return footer, table.replace_schema_metadata(None)
 
     def history(self) -> dict[str, Array] | None:
-        """The iterates of its first trials, by column; None if there are none. Raises what `read` does."""
+        """Reads the iterates of its first trials, by column; None if there are none. Raises what `read` does."""
         with _opened(self.path) as file:
             text = file.metadata.metadata.get(HISTORY)
         return None if text is None else {name: np.array(x, dtype=float) for name, x in json.loads(text).items()}
 
 
 def join_histories(several: Iterable[Mapping[str, Array] | None]) -> dict[str, Array] | None:
-    """The iterates that parts have in the order of reading, by column, each trial once; None if none has any."""
+    """Joins the iterates that parts have in the order of reading, by column, each trial once; None if none has any."""
     found: dict[str, Array] = {}
     for one in several:
         new = None if one is None else ~np.isin(one["trial"], found.get("trial", ()))
@@ -108,7 +109,7 @@ def join_histories(several: Iterable[Mapping[str, Array] | None]) -> dict[str, A
 
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[pq.ParquetFile]:
-    """A file whose footer was held against its digest, and whose pages will be held against their checksums."""
+    """Opens a file whose footer matches its digest; its pages will be checked against their checksums."""
     try:
         with pa.OSFile(str(regular(path))) as source:
             _require_footer(source)
@@ -139,7 +140,7 @@ def _require_footer(source: pa.NativeFile) -> None:
 
 @functools.lru_cache(maxsize=4096)
 def _parsed(footer: bytes) -> Mapping[str, Any]:
-    """The footer that all files of one result share."""
+    """Parses the footer that all files of one result share."""
     return _shaped(json.loads(footer), _FOOTER)
 
 
@@ -151,8 +152,8 @@ def write(
     *,
     lasting: bool = False,
 ) -> None:
-    """Writes a file that appears complete or not at all (see `write_atomically`); if `lasting`, not in a buffer of the
-    system only."""
+    """Writes a file that appears complete or not at all (see `write_atomically`); if `lasting`, past the system's
+    buffer."""
     # Texts are few different ones, numbers are all different and alike in their first bytes.
     texts = [field.name for field in table.schema if pa.types.is_string(field.type)]
     floats = [field.name for field in table.schema if pa.types.is_floating(field.type)]
@@ -181,12 +182,12 @@ def write(
 
 
 def table_of(columns: Mapping[str, Array]) -> pa.Table:
-    """Columns as Arrow stores them: numbers, flags or texts."""
+    """Converts columns to Arrow's types: numbers, flags or texts."""
     return pa.Table.from_arrays([_arrow(np.ascontiguousarray(values)) for values in columns.values()], list(columns))
 
 
 def _arrow(values: Array) -> pa.Array:
-    """A column. `pa.array` would import pandas, a second that a worker can do without."""
+    """Converts a column to Arrow. `pa.array` would import pandas, a second that a worker can do without."""
     if values.dtype == object:
         texts = [str(value).encode() for value in values]
         ends = np.cumsum([0, *(len(text) for text in texts)], dtype=np.int32)
@@ -198,7 +199,7 @@ def _arrow(values: Array) -> pa.Array:
 
 
 def as_array(column: pa.ChunkedArray) -> Array:
-    """A column as an array. Arrow's own `to_numpy` would import pandas as well."""
+    """Converts a column to an array. Arrow's own `to_numpy` would import pandas as well."""
     if pa.types.is_string(column.type):
         # A million words are few different ones, each kept once.
         coded = column.combine_chunks().dictionary_encode(null_encoding="encode")
@@ -217,7 +218,7 @@ def write_record(path: Path, record: Mapping[str, Any]) -> None:
 
 
 def read_record(path: Path, shape: Any) -> dict[str, Any]:
-    """A JSON record of this shape that says what was written; raises Unusable if it is damaged, or not one of ours."""
+    """Reads a JSON record of this shape that says what was written; raises Unusable if it is damaged or foreign."""
     try:
         record = json.loads(regular(path).read_bytes())
     except (OSError, ValueError, RecursionError) as error:
@@ -233,14 +234,14 @@ def read_record(path: Path, shape: Any) -> dict[str, Any]:
 
 
 def _shaped(value: Any, shape: Any) -> Any:
-    """The value, if it has what a shape asks for; raises Unusable otherwise."""
+    """Returns the value, if it has what a shape asks for; raises Unusable otherwise."""
     if not _fits(value, shape):
         raise Unusable("damaged: lacks what ipe-bench writes")
     return value
 
 
 def _fits(value: Any, shape: Any) -> bool:
-    """Whether a value is of a type, a list of values that fit, or a mapping with such values under the same keys."""
+    """Tells whether a value is of a type, a list of such values, or a mapping with such values under the same keys."""
     if isinstance(shape, dict):
         there = isinstance(value, dict) and shape.keys() <= value.keys()
         return there and all(_fits(value[key], inner) for key, inner in shape.items())

@@ -1,4 +1,4 @@
-"""What a result was made of: components as plain data, the versions of their packages, and a digest of their source."""
+"""Describes what a result was made of: components as plain data, versions of packages, and a digest of their source."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _SESSION = uuid.uuid4().hex
 
 
 def describe(value: Any) -> Any:
-    """A component as plain JSON data: its class and all its fields. Equal numbers are one number: 10.0 is 10."""
+    """Describes a component as plain JSON data: its class and all its fields. Equal numbers are one: 10.0 is 10."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         cls = type(value)
         fields = {f.name: describe(getattr(value, f.name)) for f in dataclasses.fields(value)}
@@ -53,17 +53,17 @@ def describe(value: Any) -> Any:
 
 
 def canonical_json(value: Any) -> str:
-    """One text for one value: sorted keys, no spaces."""
+    """Writes one text for one value: sorted keys, no spaces."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=True)
 
 
 def digest(value: Any) -> str:
-    """Sixteen hexadecimal digits that stand for plain data."""
+    """Computes sixteen hexadecimal digits that identify plain data."""
     return hashlib.sha256(canonical_json(value).encode()).hexdigest()[:16]
 
 
 def fingerprint(components: Iterable[Any]) -> dict[str, Any]:
-    """The versions of the packages, and a digest of the numerical source, that components are made of.
+    """Returns the versions of the packages, and a digest of the numerical source, that components are made of.
 
     The source of a component is the module of its class with all modules of its package that it imports, and the
     scoring of trials, without comments, docstrings, the texts of exceptions and the modules of `WITHOUT_NUMBERS`.
@@ -79,7 +79,7 @@ def fingerprint(components: Iterable[Any]) -> dict[str, Any]:
 
 @functools.cache
 def _package_version(package: str) -> str:
-    """The version of the distribution that a top-level package comes from, where it is installed as one."""
+    """Returns the version of the distribution that a top-level package comes from, where it is installed as one."""
     if package == "ipe_bench":
         from ipe_bench import __version__
 
@@ -91,7 +91,7 @@ def _package_version(package: str) -> str:
 
 @functools.cache
 def _import_closure(module: str) -> frozenset[str]:
-    """The module and, recursively, what it imports from its own top-level package or from ipe_bench."""
+    """Collects the module and, recursively, what it imports from its own top-level package or from ipe_bench."""
     found: set[str] = set()
     waiting = [module]
     while waiting:
@@ -105,7 +105,7 @@ def _import_closure(module: str) -> frozenset[str]:
 
 @functools.cache
 def _spec_of(module: str) -> ModuleSpec | None:
-    """Where a module comes from; None where there is no such module, or none that can be found again."""
+    """Finds the source of a module; None if there is no such module, or none that can be found again."""
     parent = module.rpartition(".")[0]
     try:
         # To look for something in a module would import the module; and only a package has modules in it.
@@ -118,8 +118,8 @@ def _spec_of(module: str) -> ModuleSpec | None:
 
 @functools.cache
 def _source_of(module: str) -> tuple[str, frozenset[str]]:
-    """A digest of what a module computes with, its code and the JSON files beside it, tables of constants; and the
-    names of modules, and of what may be modules, that it imports."""
+    """Computes a digest of what a module computes with, its code and the JSON files beside it, tables of constants; and
+    the names of modules, and of what may be modules, that it imports."""
     spec, loaded = _spec_of(module), sys.modules.get(module)
     origin = getattr(loaded, "__file__", None) if spec is None else spec.origin  # a script has no spec
     path = None if origin is None else Path(origin)
@@ -146,8 +146,8 @@ def _imported(tree: ast.Module, package: str) -> frozenset[str]:
 
 
 def numerical_code(tree: ast.Module) -> str:
-    """Source as one text in which nothing stands that no number depends on: comments, layout, docstrings (also those
-    of fields), and the words of exceptions that are raised. The tree is used up."""
+    """Writes source as one text without what no number depends on: comments, layout, docstrings (also those of fields),
+    and the words of exceptions that are raised. The tree is used up."""
     return ast.unparse(_Wordless().visit(tree))
 
 

@@ -1,4 +1,4 @@
-"""What is stored under output folders: what is there, done, missing, failed, refused, stale and damaged.
+"""Finds what is stored under output folders: what is there, done, missing, failed, refused, stale and damaged.
 
 `run` asks it what to compute, `status` and `report` what to show, `load` for the rows, so they cannot disagree. A file
 is used, or named with what is wrong with it; nothing is guessed, mixed or deleted.
@@ -45,7 +45,7 @@ _OF_ZOO = re.compile(rf"ipe_bench\.(measurements|baselines)\.[\w.]*\.({'|'.join(
 
 @dataclass(frozen=True)
 class StoredCell:
-    """One scenario (one seed) under one estimator, or its truth, with all its parts from all directories."""
+    """Describes one scenario (one seed) under one estimator, or its truth, with all its parts from all directories."""
 
     footer: Mapping[str, Any]
     parts: tuple[StoredPart, ...]
@@ -79,13 +79,13 @@ class StoredCell:
 
     @property
     def trials(self) -> int:
-        """How many there are, each counted once."""
+        """Number of trials that are there, each counted once."""
         last = max(part.stop for part in self.parts)
         return last - _count(gaps(self.covered, 0, last))
 
     @property
     def written(self) -> float:
-        """When the youngest of its files was written; 0 if they went away meanwhile."""
+        """Time at which the youngest of its files was written; 0 if they went away meanwhile."""
         times = [0.0]
         for part in self.parts:
             with contextlib.suppress(OSError):
@@ -95,7 +95,7 @@ class StoredCell:
 
 @dataclass(frozen=True)
 class CellState:
-    """How far one scenario is under one estimator. `done`, `failed` and `missing` add up to `expected`."""
+    """Counts the trials of one scenario under one estimator. `done`, `failed` and `missing` add up to `expected`."""
 
     names: Mapping[str, Any]
     """measurement, noise, prior, error_scale, seed, estimator (`truth` for the truth and its bounds)."""
@@ -135,7 +135,7 @@ class CellState:
 
 
 class _Asked(NamedTuple):
-    """What the newest run that asked for a cell said of it."""
+    """Records what the newest run that asked for a cell said of it."""
 
     key: str
     trials: int
@@ -145,7 +145,7 @@ class _Asked(NamedTuple):
 
 @dataclass
 class Results:
-    """Everything stored under some directories; `Results.read` finds it."""
+    """Holds everything stored under some directories; `Results.read` finds it."""
 
     directories: tuple[Path, ...]
     runs: tuple[Mapping[str, Any], ...] = ()
@@ -155,7 +155,7 @@ class Results:
     attempts: list[Mapping[str, Any]] = field(default_factory=list)
     """Records of what could not be computed, whether or not it was since."""
     damaged: dict[Path, str] = field(default_factory=dict)
-    """What is wrong with each file that is left out."""
+    """Damage of each file that is left out."""
     outdated: list[Path] = field(default_factory=list)
     """Files in the format of an older version."""
     moved: dict[str, str] = field(default_factory=dict)
@@ -165,7 +165,7 @@ class Results:
 
     @classmethod
     def read(cls, directories: Sequence[Path | str], keys: Keys[str] | None = None) -> Self:
-        """What is stored under the directories, or the trials of the cells with these keys alone."""
+        """Reads what is stored under the directories, or the trials of the cells with these keys alone."""
         results = cls(tuple(map(Path, directories)))
         for path in results.directories:
             if not path.is_dir():
@@ -251,17 +251,17 @@ class Results:
 
     @property
     def complete(self) -> int:
-        """Those of them with every trial."""
+        """Expected cells with every trial."""
         return sum(cell.complete for cell in self.cells[: len(self._asked_for)])
 
     def announces(self, cells: Iterable[ResultKey], trials: int) -> bool:
-        """Whether the records of runs ask for all this already, and a further one would change nothing."""
+        """Tells whether the records of runs ask for all this already, and a further one would change none."""
         asked = [(cell, self._asked_for.get(cell.identity_key)) for cell in cells]
         return all(a and (a.key, a.refused) == (cell.key, "") and a.trials >= trials for cell, a in asked)
 
     @cached_property
     def _asked_for(self) -> dict[str, _Asked]:
-        """What runs asked for, by identity: the newest decides on the key, the largest number of trials counts."""
+        """Requests of runs, by identity: the newest decides on the key, the largest number of trials counts."""
         asked: dict[str, _Asked] = {}
         for run in self.runs:
             for cell in (one for one in run["cells"] if one["identity_key"] not in self.moved):
@@ -273,8 +273,8 @@ class Results:
 
     @cached_property
     def _rivals(self) -> dict[str, tuple[StoredCell | None, list[StoredCell]]]:
-        """By identity: the cell that the newest run expects, or else the one that was written last, if it is stored;
-        and the stale ones."""
+        """Current and stale cells by identity: the one that the newest run expects, or else the one that was written
+        last, if it is stored; and the stale ones."""
         rivals: dict[str, list[StoredCell]] = {}
         for cell in self.stored.values():
             rivals.setdefault(cell.footer["identity_key"], []).append(cell)
@@ -291,7 +291,7 @@ class Results:
 
     @cached_property
     def cells(self) -> tuple[CellState, ...]:
-        """How far every cell is: those that runs asked for in their order, then others that are there."""
+        """States of all cells: those that runs asked for in their order, then others that are there."""
         others, states = [cell for cell in self.current if cell.footer["identity_key"] not in self._asked_for], []
         unasked = {cell.footer["identity_key"]: _Asked(cell.key, 0, cell.names, "") for cell in others}
         for identity, (key, trials, names, refused) in (self._asked_for | unasked).items():
@@ -321,13 +321,13 @@ class Results:
         return self.stored[key].covered if key in self.stored else ()
 
     def missing(self, key: str, trials: int) -> list[tuple[int, int]]:
-        """The ranges of trials 0 to `trials` that no usable file of the cell with this key covers."""
+        """Returns the ranges of trials 0 to `trials` that no usable file of the cell with this key covers."""
         return gaps(self._covered(key), 0, trials)
 
     def load(self, cell: StoredCell, columns: Sequence[str] | None, optional: Sequence[str] = ()) -> dict[str, Array]:
-        """The rows of a cell as arrays, by ascending trial, each trial once; all columns if `columns` is None. A part
-        that cannot be used any more, or lacks one of the `columns`, is named in `problems`, and left out. What some
-        parts lack of the `optional` columns is NaN or None there."""
+        """Loads the rows of a cell as arrays, by ascending trial, each trial once; all columns if `columns` is None. A
+        part that cannot be used any more, or lacks one of the `columns`, is named in `problems`, and left out. What
+        some parts lack of the `optional` columns is NaN or None there."""
         names = None if columns is None else list(dict.fromkeys(["trial", *columns, *optional]))
         tables = self._of_parts(cell, lambda parts: list(self._tables(parts, names, columns or ())))
         if sum(map(len, tables)) < cell.trials and self.damaged.keys().isdisjoint(p.path for p in cell.parts):
@@ -338,7 +338,7 @@ class Results:
         return {name: as_array(table[name]) for name in names or table.column_names if name in table.column_names}
 
     def load_history(self, cell: StoredCell) -> dict[str, Array] | None:
-        """The iterates of a cell's first trials, by column; None if none are stored."""
+        """Loads the iterates of a cell's first trials, by column; None if none are stored."""
         return self._of_parts(cell, lambda parts: join_histories(self._histories(parts)))
 
     def _histories(self, parts: Sequence[StoredPart]) -> Iterator[dict[str, Array] | None]:
@@ -347,7 +347,7 @@ class Results:
                 yield part.history()
 
     def _of_parts(self, cell: StoredCell, read: Callable[[Sequence[StoredPart]], T]) -> T:
-        """What `read` makes of the parts of a cell; of those that are there now, if some were merged meanwhile."""
+        """Applies `read` to the parts of a cell; to those that are there now, if some were merged meanwhile."""
         parts: Sequence[StoredPart] = cell.parts
         while True:
             try:
@@ -359,7 +359,7 @@ class Results:
     def _tables(
         self, parts: Sequence[StoredPart], names: Sequence[str] | None, needed: Sequence[str]
     ) -> Iterator[pa.Table]:
-        """The rows of one part after another, without the trials that an earlier one had."""
+        """Yields the rows of one part after another, without the trials that an earlier one had."""
         reached = 0
         for part in parts:
             if part.stop > reached:

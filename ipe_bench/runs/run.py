@@ -174,12 +174,12 @@ def _beyond_numbers(scenario: Scenario) -> Iterator[str]:
 
 
 def result_keys(scenario: AnyScenario, estimators: Mapping[str, Any]) -> list[ResultKey]:
-    """What a run stores of one scenario: its truth, and each estimator."""
+    """Returns the keys of what a run stores of one scenario: its truth, and each estimator."""
     return [ResultKey(scenario), *(ResultKey(scenario, label, estimator) for label, estimator in estimators.items())]
 
 
 def new_name() -> str:
-    """A name for the record of a run."""
+    """Returns a name for the record of a run."""
     return f"{datetime.datetime.now(datetime.UTC):%Y%m%dT%H%M%S}-{uuid.uuid4().hex[:8]}"
 
 
@@ -226,7 +226,7 @@ def _record(scenarios: Sequence[AnyScenario], estimators: Mapping[str, Any], tri
 
 @functools.cache
 def _git_commit(folder: Path) -> str | None:
-    """The commit of the folder, where it is in a repository; asked once per process, as a sweep records it per job."""
+    """Returns the commit of the folder, if any; asked once per process, as a sweep records it per job."""
     command = ["git", "rev-parse", "HEAD"]
     try:
         return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=5, check=True).stdout.strip()

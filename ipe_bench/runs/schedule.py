@@ -33,10 +33,10 @@ log = logging.getLogger(__name__)
 BLOCK_SIZE = 250
 """Trials of a block, at least, by default."""
 LARGEST_BLOCK = 1000
-"""Of more trials at once, the arrays leave a processor's cache: each trial takes longer again."""
+"""Largest default block: beyond it arrays leave a processor's cache, and each trial takes longer."""
 _WORTH_BLOCKS = 100
 TRIES = 2
-"""How often a cell of a block may take its process with it before it counts as failed."""
+"""Number of times that a cell of a block may take its process with it before it counts as failed."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Progress:
         """Trials times estimators that are done."""
         self.failures: list[str] = []
         self.began: float | None = None
-        """When the first estimator began, by the monotonic clock: code is imported and compiled before."""
+        """Time when the first estimator began, by the monotonic clock: code is imported and compiled before."""
         self._left = Counter((id(cell.scenario), task.start, task.stop) for task, cell in cells)
         """Cells of each task that are not done."""
 
@@ -85,7 +85,7 @@ Watcher = Callable[[Progress], None]
 
 
 def block_size_for(trials: int) -> int:
-    """The default size of a block: 250 trials, and more if there still are a hundred blocks."""
+    """Returns the default size of a block: 250 trials, and more if there still are a hundred blocks."""
     return min(max(trials // _WORTH_BLOCKS // BLOCK_SIZE, 1) * BLOCK_SIZE, LARGEST_BLOCK)
 
 

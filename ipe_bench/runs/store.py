@@ -47,7 +47,7 @@ _ABANDONED_S = 3600.0
 
 @dataclass(frozen=True)
 class ResultKey:
-    """One scenario under one estimator, or its truth: what a stored file belongs to."""
+    """Identifies what a stored file belongs to: one scenario under one estimator, or its truth."""
 
     scenario: AnyScenario
     label: str = TRUTH
@@ -60,7 +60,7 @@ class ResultKey:
 
     @cached_property
     def identity(self) -> dict[str, Any]:
-        """What was computed, without the version of the program."""
+        """Identity of what was computed, without the version of the program."""
         return {"scenario": describe(self.scenario), "label": self.label, "estimator": describe(self.estimator)}
 
     @cached_property
@@ -81,7 +81,7 @@ class ResultKey:
 
     @property
     def names(self) -> dict[str, Any]:
-        """What people call it by."""
+        """Names for people."""
         scenario, truth = self.scenario, self.scenario.truth
         return {
             "measurement": scenario.measurement.name,
@@ -127,7 +127,7 @@ class ResultKey:
 
 
 class Store:
-    """The results under one output directory."""
+    """Holds the results under one output directory."""
 
     def __init__(self, directory: Path | str) -> None:
         self.directory = Path(directory)
@@ -152,7 +152,7 @@ class Store:
                     path.unlink()
 
     def parts(self, keys: Keys[str] | None = None) -> list[StoredPart]:
-        """The parts that lie here, or those of these keys, by key and in the order of reading."""
+        """Returns the parts that lie here, or those of these keys, by key and in the order of reading."""
         found = [part for path in self.trials.glob("*.parquet") if (part := StoredPart.parse(path)) is not None]
         return sorted((p for p in found if keys is None or p.key in keys), key=lambda part: (part.key, part.order))
 
@@ -174,7 +174,7 @@ class Store:
         return self.trials / f"{result.key}-{start}-{stop}.parquet"
 
     def has(self, result: ResultKey, start: int, stop: int) -> bool:
-        """Whether exactly this block is stored."""
+        """Tells whether exactly this block is stored."""
         return self._path(result, start, stop).is_file()
 
     def write_failure(self, result: ResultKey, start: int, stop: int, failure: Failure) -> None:
@@ -216,7 +216,7 @@ class Store:
 
 
 def _typed(name: str, values: Array) -> Array:
-    """A column in one type for all blocks: numbers that are no counts of trials and iterations are floats."""
+    """Converts a column to one type for all blocks: numbers that are no counts of trials and iterations are floats."""
     if values.dtype.kind in "fiu" and name not in ("trial", "iterations"):
         return values.astype(np.float64)
     return values.astype(np.int64) if values.dtype.kind in "iu" else values
@@ -239,7 +239,7 @@ def _join(footer: Mapping[str, Any], group: Sequence[StoredPart], tables: Sequen
 
 
 def gaps(covered: Iterable[tuple[int, int]], start: int, stop: int) -> list[tuple[int, int]]:
-    """The parts of the range start to stop that no covered range holds."""
+    """Returns the parts of the range start to stop that no covered range holds."""
     found, reached = [], start
     for first, last in sorted(covered):
         if reached < min(first, stop):
@@ -249,12 +249,12 @@ def gaps(covered: Iterable[tuple[int, int]], start: int, stop: int) -> list[tupl
 
 
 def title(names: Mapping[str, Any]) -> str:
-    """The scenario of a result in a line for people."""
+    """Words the scenario of a result in a line for people."""
     truth = [f"truth {names['truth_measurement']}"] if "truth_measurement" in names else []
     settings = names["noise"], f"error scale {names['error_scale']:g}", f"seed {names['seed']}"
     return ", ".join([names["measurement"], *truth, *settings])
 
 
 def describe_names(names: Mapping[str, Any]) -> str:
-    """A result in a line for people."""
+    """Words a result in a line for people."""
     return f"{'the truth' if names['estimator'] == TRUTH else names['estimator']} on {title(names)}"

@@ -45,7 +45,7 @@ def _listen(connection: Connection, messages: queue.SimpleQueue[Any]) -> None:
 
 
 def _perform(connection: Connection, memory_gb: float | None, payload: bytes) -> tuple[str, Any]:
-    """Does one task; the last message about it."""
+    """Does one task; returns the last message about it."""
     from ipe_bench.runs.execution import FATAL, Failure
 
     try:

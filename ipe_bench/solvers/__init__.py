@@ -1,4 +1,4 @@
-"""Solvers: IPE by different iterations. Config group `solver`."""
+"""Solves eq. (11) of IPE by different iterations. Config group `solver`."""
 
 from ipe_bench.basics.errors import without_modules
 from ipe_bench.estimators.ipe import IPE, State, System

@@ -1,4 +1,4 @@
-"""Anderson acceleration of the fixed-point iteration (Walker and Ni, SIAM J. Numer. Anal. 49, 2011)."""
+"""Accelerates the fixed-point iteration by Anderson's method (Walker and Ni, SIAM J. Numer. Anal. 49, 2011)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _DEPENDENT = 1e-12
 
 @dataclass(frozen=True)
 class AndersonState(State):
-    """The last `depth` differences of x and of F, each (trials, n, depth), newest first; zero where there are fewer."""
+    """Holds the last `depth` differences of x and F, each (trials, n, depth), newest first; zero if there are fewer."""
 
     dx: Array
     dF: Array
@@ -24,7 +24,7 @@ class AndersonState(State):
 
 @dataclass(frozen=True)
 class Anderson(IPE[AndersonState]):
-    """x <- g(x) - sum of gamma_j times the j-th last difference of g, where gamma minimises |F - dF gamma|.
+    """Iterates x <- g(x) - sum of gamma_j times the j-th last difference of g, where gamma minimises |F - dF gamma|.
 
     The fixed-point step g(x) = x - F(x) corrected by what the last `depth` steps say of the slope: no Jacobian, one
     evaluation a step. Depth 1 is a secant method; depth n is one of Broyden's.
@@ -43,18 +43,18 @@ class Anderson(IPE[AndersonState]):
 
 
 def accelerated(x: Array, F: Array, dx: Array, dF: Array) -> Array:
-    """The next x (trials, n), from the last differences of x and of F, each (trials, n, depth)."""
+    """Computes the next x (trials, n), from the last differences of x and of F, each (trials, n, depth)."""
     gamma = _least_squares(dF, F)
     return x - F - multiply(dx - dF, gamma)
 
 
 def push(memory: Array, newest: Array) -> Array:
-    """The memory (trials, n, depth) with the newest difference (trials, n) in front, the oldest dropped."""
+    """Pushes the newest difference (trials, n) in front of the memory (trials, n, depth), and drops the oldest."""
     return np.concatenate([newest[:, :, None], memory[:, :, :-1]], axis=2)
 
 
 def _least_squares(A: Array, b: Array) -> Array:
-    """The shortest gamma that minimises |b - A gamma|, of columns scaled to length one: A (trials, n, depth)."""
+    """Computes the shortest gamma that minimises |b - A gamma|, with columns of A (trials, n, depth) scaled to 1."""
     length = np.linalg.norm(A, axis=1)
     length = np.where((length > 0) & np.isfinite(length), length, np.inf)
     scaled = np.nan_to_num(A / length[:, None, :], nan=0.0, posinf=0.0, neginf=0.0)

@@ -31,7 +31,7 @@ _PROMISING = 1e-3
 
 @dataclass(frozen=True)
 class Attempts(ABC):
-    """The attempts at one batch z (trials, m), which share its tally."""
+    """Makes the attempts at one batch z (trials, m), which share its tally."""
 
     problem: Problem
     prior: Array | None
@@ -61,7 +61,7 @@ class Attempts(ABC):
 
     @abstractmethod
     def attempt(self, k: int, rows: Rows, before: Minima | None) -> Minima:
-        """The k-th attempt for the trials `rows`; `before` is the best of those so far."""
+        """Makes the k-th attempt for the trials `rows`; `before` is the best of those so far."""
 
     @abstractmethod
     def draws(self, k: int) -> int:
@@ -69,8 +69,8 @@ class Attempts(ABC):
         point or where the readings point."""
 
     def plain(self, k: int, rows: Rows) -> Minima:
-        """Levenberg-Marquardt on all data from the nominal point: in the metric of the parameters' sizes (0), and in
-        Marquardt's (1)."""
+        """Runs Levenberg-Marquardt on all data from the nominal point: in the metric of the parameters' sizes (0), and
+        in Marquardt's (1)."""
         method = (LevenbergMarquardtMethod(1.0, sizes=1.0), LevenbergMarquardtMethod(1e-3))[k]
         x = np.repeat(self.problem.x0[None], len(rows), axis=0)
         return self.minimize(rows, method, x, max(_LONG, self.limits.max_iterations))
@@ -84,7 +84,7 @@ class Attempts(ABC):
         objective: Objective | None = None,
         tolerance: float | None = None,
     ) -> Minima:
-        """One minimisation from x (candidates, n), on all data unless another objective is given, charged to the trials
+        """Minimises from x (candidates, n), on all data unless another objective is given, charged to the trials
         `owner` (candidates,)."""
         objective = self.whole(owner) if objective is None else objective
         limits = replace(self.limits, max_iterations=steps, tolerance=tolerance or self.limits.tolerance)
@@ -93,12 +93,12 @@ class Attempts(ABC):
         return minima
 
     def whole(self, owner: Rows) -> Objective:
-        """The objective on all data for candidates of the trials `owner`."""
+        """Makes the objective on all data for candidates of the trials `owner`."""
         model = self.counted(self.problem.measurement, owner)
         return Objective(model, self.problem.R, self.z[owner], np.arange(len(owner)), self.problem.x0)
 
     def counted(self, measurement: Measurement, owner: Rows, share: float = 1.0) -> CountingModel:
-        """A model for candidates of the trials `owner`, whose tally begins at what each trial has cost so far."""
+        """Makes a model for candidates of the trials `owner`, whose tally begins at what each trial has cost so far."""
         return CountingModel(measurement, self.tally.copied(owner), share)
 
     def charge(self, owner: Rows, tally: EvaluationCount) -> None:
@@ -154,8 +154,8 @@ class Stages(Attempts):
         return found
 
     def _start(self, k: int, rows: Rows) -> Array:
-        """The best of the points on the ray, in attempt 3 the best that is not about the same, and later the best of 20
-        random points."""
+        """Chooses the best of the points on the ray, in attempt 3 the best that is not about the same, and later the
+        best of 20 random points."""
         x0 = self.problem.x0
         if k >= _RANDOM:
             points = self._points(k if k < min(_HALVING) else k - 1)
@@ -170,8 +170,8 @@ class Stages(Attempts):
         return points[chosen]
 
     def _points(self, k: int, *, wide: bool = False) -> Array:
-        """20 random points (20, n): of the prior if one is known, else of any size in the quadrant of the nominal point
-        or one nearby (`wide`), of any sign (k even), or about the nominal point."""
+        """Draws 20 random points (20, n): of the prior if one is known, else of any size in the quadrant of the nominal
+        point or one nearby (`wide`), of any sign (k even), or about the nominal point."""
         x0, n = self.problem.x0, len(self.problem.x0)
         rng = np.random.Generator(np.random.Philox(k))
         if self.prior is not None:
@@ -194,7 +194,7 @@ class Stages(Attempts):
         return found
 
     def _look(self, rows: Rows, points: Array) -> Array:
-        """The objective (trials, points) at points (points, n), counted; infinite where there is none."""
+        """Computes the objective (trials, points) at points (points, n), counted; infinite where there is none."""
         objective = self.whole(rows)
         cost = [squared(objective.residual(np.repeat(point[None], len(rows), axis=0))) for point in points]
         self.charge(rows, objective.model.tally)
@@ -202,7 +202,7 @@ class Stages(Attempts):
 
 
 def _finite(cost: Array) -> Array:
-    """The cost, and infinity where it is not a number."""
+    """Returns the cost, and infinity where it is not a number."""
     return np.where(np.isfinite(cost), cost, np.inf)
 
 
@@ -251,8 +251,8 @@ class Windows(Attempts):
         return 0 if plain is not None or k < 2 else _draws(k)
 
     def attempt(self, k: int, rows: Rows, before: Minima | None) -> Minima:
-        """A careful attempt without a prior takes one in its windows that reaches as far as the linear estimate
-        says."""
+        """Attempts a fit; a careful attempt without a prior takes one in its windows that reaches as far as the linear
+        estimate says."""
         last = k == self.last
         plain, k = self._place(k)
         if plain is not None:
@@ -276,7 +276,7 @@ class Windows(Attempts):
         return 10.0 ** np.ceil(np.log10(np.clip(np.where(np.isfinite(distance), distance, 1.0), 1.0, 1e9)))
 
     def _grown(self, k: int, rows: Rows, before: Minima | None, last: bool) -> Minima:
-        """Window after window, then all data without the prior. If none is known, draws reach as far as `before`."""
+        """Fits window after window, then all data without a prior. If none is known, draws reach as far as `before`."""
         problem, prior, epochs = self.problem, self.prior, self.problem.measurement.epochs
         assert epochs is not None
         metric = spread = np.ones(len(problem.x0)) if prior is None else prior
@@ -320,7 +320,7 @@ class Windows(Attempts):
         return put(result, np.searchsorted(rows, owners), take(found, order[first]))
 
     def _window(self, owner: Rows, stop: int, centre: Array) -> Objective:
-        """The objective of each candidate on the first epochs, with the prior about `centre`."""
+        """Makes the objective of each candidate on the first epochs, with the prior about `centre`."""
         problem, model = self.problem, self.problem.measurement
         assert model.epochs is not None
         arrived, share = model.rows(stop), stop / len(model.epochs)
@@ -333,9 +333,9 @@ class Windows(Attempts):
 def _kept(
     owner: Rows, x: Array, fit: Array, useless: Array, *, most: int, alike: float = -1.0, last: bool = False
 ) -> Rows:
-    """The candidates that go on: of each trial the best few that are not alike and whose `fit` (candidates,) is not
-    above `useless` (candidates,); one in any case in the `last` attempt, and where there is no fit at all: that ends
-    with its own status."""
+    """Selects the candidates that go on: of each trial the best few that are not alike and whose `fit` (candidates,) is
+    not above `useless` (candidates,); one in any case in the `last` attempt, and where there is no fit at all: that
+    ends with its own status."""
     if len(np.unique(owner)) == len(owner):  # nothing to choose among
         return np.flatnonzero((fit <= useless) | last | np.isinf(fit))
     kept: list[int] = []
@@ -355,6 +355,6 @@ def _draws(k: int) -> int:
 
 
 def window_stops(epochs: int, growth: float) -> list[int]:
-    """The number of epochs of each window, the last one short of all: 1, 2, 4, 8, 16 of 30 for growth 2."""
+    """Computes the number of epochs of each window, the last one short of all: 1, 2, 4, 8, 16 of 30 for growth 2."""
     lengths = itertools.takewhile(lambda length: length < epochs, (growth**i for i in itertools.count()))
     return sorted({round(length) for length in lengths} - {epochs})

@@ -1,4 +1,4 @@
-"""A portfolio: chord iterations first; the progressive method where the fit test rejects their answer."""
+"""Combines a portfolio: chord iterations first; the progressive method where the fit test rejects their answer."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ CHORDS, PROGRESSIVE = 1, 2
 
 @dataclass(frozen=True)
 class Auto(Estimator):
-    """The least-squares estimate, as cheaply as this problem allows.
+    """Finds the least-squares estimate, as cheaply as this problem allows.
 
     First the paper's fixed-point iteration, with H frozen at the nominal point and Anderson's acceleration, given up
     where it does not come nearer to a root; then Gauss-Newton steps with one Jacobian, that of the root which it has
@@ -92,7 +92,7 @@ class Auto(Estimator):
     def _confirmed(
         self, problem: Problem, objective: Objective, best: Minima, fitting: Fitting, count: int, history: bool
     ) -> Minima:
-        """The answers, after `count` looks for others in the trials of the objective."""
+        """Returns the answers, after `count` looks for others in the trials of the objective."""
         rows, n = objective.rows, len(problem.x0)
         draws = normals(own_generators(self.seed, objective.z), count, n)
         method = LevenbergMarquardtMethod(_DAMPING, problem.prior_used())
@@ -106,8 +106,8 @@ class Auto(Estimator):
 
 
 def _improbability(problem: Problem, minima: Minima) -> Array:
-    """Minus twice the logarithm (trials,) of the posterior density, or of the likelihood without a prior, but for a
-    constant."""
+    """Computes minus twice the logarithm (trials,) of the posterior density, or of the likelihood without a prior, but
+    for a constant."""
     prior = problem.prior_covariance()
     of_prior = 0.0 if prior is None else np.sum(prior.whiten(minima.x - problem.x0) ** 2, axis=1)
     return minima.chi_square + of_prior

@@ -1,4 +1,4 @@
-"""Broyden's method, the quasi-Newton method of Burden and Faires, Numerical Analysis, chapter 10, algorithm 10.2."""
+"""Implements Broyden's quasi-Newton method (Burden and Faires, Numerical Analysis, chapter 10, algorithm 10.2)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class BroydenState(State):
 
 @dataclass(frozen=True)
 class Broyden(IPE[BroydenState]):
-    """x <- x - B F(x), where B is the inverse Jacobian as the steps so far have shown it ("good" Broyden).
+    """Iterates x <- x - B F(x), where B is the inverse Jacobian as the steps so far have shown it ("good" Broyden).
 
     The least change of the Jacobian that satisfies the secant equation is of rank one, so the Sherman-Morrison formula
     updates its inverse: no Jacobian after the first, no linear system, superlinear convergence.

@@ -1,4 +1,4 @@
-"""Chord iterations: Gauss-Newton steps with one Jacobian and Anderson's acceleration, renewed where it has changed."""
+"""Iterates chords: Gauss-Newton steps with one Jacobian and Anderson's acceleration, renewed where it has changed."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _DEPTH = 5
 
 @dataclass(frozen=True)
 class OnChord:
-    """The state of chord steps; every field has the trials in front."""
+    """Holds the state of chord steps; every field has the trials in front."""
 
     x: Array
     r: Array
@@ -81,13 +81,13 @@ class OnChord:
 
 @dataclass(frozen=True)
 class Chord(Method[Objective, OnChord]):
-    """Gauss-Newton steps with the Jacobian of the start, and Anderson's acceleration.
+    """Takes Gauss-Newton steps with the Jacobian of the start, and Anderson's acceleration.
 
     With H, the Jacobian of the nominal point, these are the fixed-point steps of eq. (17).
     """
 
     bent: float = np.inf
-    """If `off` is larger, the Jacobian is of no more use."""
+    """Largest useful `off`: beyond it, the Jacobian is renewed."""
 
     def begin(self, objective: Objective, x: Array) -> OnChord:
         J = objective.jacobian(x)
@@ -125,8 +125,8 @@ class Chord(Method[Objective, OnChord]):
 def by_chords(
     objective: Objective, H: Array, tolerance: float, budget: float | None, *, history: bool
 ) -> tuple[Minima, Mask]:
-    """The least-squares minimum of each trial, H (m, n) being the Jacobian at the nominal point, and where fixed-point
-    iteration contracts well there, eq. (18). Trials that do not arrive have not converged."""
+    """Finds the least-squares minimum of each trial, H (m, n) being the Jacobian at the nominal point, and where
+    fixed-point iteration contracts well there, eq. (18). Trials that do not arrive have not converged."""
     x0 = np.repeat(objective.x0[None], len(objective.rows), axis=0)
     minima, contracts = Minima.nowhere(x0, history), np.zeros(len(x0), dtype=bool)
     nominal = NormalEquations.of(objective.R.whiten_jacobian(H[None]), np.zeros((1, len(H))), keep_Q=True)
@@ -145,7 +145,7 @@ def by_chords(
 
 
 def _renewed(objective: Objective, found: SolveResult[OnChord], origin: Array, limits: Limits) -> SolveResult[OnChord]:
-    """Chord steps for trials that are near, with a new Jacobian as long as that of the start is not that of the end."""
+    """Takes chord steps for near trials, with a new Jacobian as long as that of the start is not that of the end."""
     bent, rows, off = _BENT * limits.tolerance, np.arange(len(origin)), np.full(len(origin), np.inf)
     for _ in range(_JACOBIANS):
         part, latest = objective.subset(rows), take(found, rows)
@@ -166,7 +166,7 @@ def _renewed(objective: Objective, found: SolveResult[OnChord], origin: Array, l
 
 
 def _radius(nominal: NormalEquations, slope: NormalEquations) -> Array:
-    """The spectral radius (trials,) of I - H+ J, the rate at which fixed-point iteration converges."""
+    """Computes the spectral radius (trials,) of I - H+ J, the rate at which fixed-point iteration converges."""
     assert nominal.Q is not None
     assert slope.Q is not None
     J_F = np.matmul(np.matmul(nominal.inverse_U, np.matmul(nominal.Q.swapaxes(1, 2), slope.Q)), slope.U)

@@ -1,4 +1,4 @@
-"""Newton's method with a line search (Dennis and Schnabel, Numerical Methods for Unconstrained Optimization, 6.3)."""
+"""Adds a line search to Newton's method (Dennis, Schnabel, Numerical Methods for Unconstrained Optimization, 6.3)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _HALVINGS = 30
 
 @dataclass(frozen=True)
 class DampedNewton(IPE):
-    """x <- x - t J(x)^-1 F(x) with t = 1, 1/2, 1/4, ... until |F| has decreased by enough (Armijo's rule).
+    """Iterates x <- x - t J(x)^-1 F(x) with t = 1, 1/2, 1/4, ... until |F| has decreased enough (Armijo's rule).
 
     Newton's method near a root. A trial whose |F| decreases for no t stays where it is, and has stalled.
     """

@@ -1,4 +1,4 @@
-"""Fixed-point iteration, eqs. (16) and (17)."""
+"""Implements fixed-point iteration, eqs. (16) and (17)."""
 
 from __future__ import annotations
 

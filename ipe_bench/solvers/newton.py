@@ -1,4 +1,4 @@
-"""Newton's method, eqs. (20) to (22)."""
+"""Implements Newton's method, eqs. (20) to (22)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Progressive IPE: the least-squares estimate, reached from far away by windows that grow as a filter sees the data."""
+"""Implements progressive IPE: the least-squares estimate, reached from far away by windows that grow."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _WORTH = 20.0
 
 @dataclass(frozen=True)
 class Progressive(Estimator):
-    """The least-squares estimate, reached from far away.
+    """Finds the least-squares estimate from far away.
 
     A short stretch of data is nearly linear in the parameters, so its fit is easy to find; it starts the fit of a
     window `growth` times as long, and so on to all data. In the windows the prior counts, as it does for a filter, and
@@ -78,8 +78,8 @@ class Progressive(Estimator):
     def search(
         self, problem: Problem, z: Array, *, before: Minima | None = None, history: bool = False
     ) -> tuple[Minima, EvaluationCount]:
-        """The best minimum of each trial and the cost of finding it. `before`: minima that are known already and do not
-        fit."""
+        """Finds the best minimum of each trial and the cost of finding it. `before`: minima that are known already and
+        do not fit."""
         everyone, n, m = np.arange(len(z)), len(problem.x0), z.shape[1]
         attempts = (Stages if problem.measurement.epochs is None else Windows)(
             problem,

@@ -1,4 +1,4 @@
-"""Re-linearised IPE: H is evaluated again at the estimate, until the root of eq. (11) is the least-squares minimum."""
+"""Implements re-linearised IPE: H is evaluated again at the estimate, up to the least-squares minimum."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ _ONLY_A_STEP = ("start", "max_iterations", "tolerance", "budget")
 _NO_ROOT = 1e300
 """Stands for F where a round has failed."""
 _ROUND_ENDS = (Status.RUNNING, Status.CONVERGED, Status.STALLED, Status.MAX_ITERATIONS)
-"""After these the next round goes on."""
+"""Endings of a round after which the next one goes on."""
 
 
 @dataclass(frozen=True)
 class Round(State):
-    """The end of a round: F is that of the linearisation at x itself."""
+    """Holds the end of a round: F is that of the linearisation at x itself."""
 
     H_plus: Array
     deviation: Array
@@ -43,7 +43,7 @@ class Round(State):
 
 @dataclass(frozen=True)
 class Relinearized(Method[FrozenSystem, Round], Estimator):
-    """Any solver on F(x) = H_k+ (h(x) - z), with H_k = dh/dx at the estimate x_k that the round before has reached.
+    """Iterates any solver on F(x) = H_k+ (h(x) - z), with H_k = dh/dx at the estimate x_k of the round before.
 
     Where F(x_k) = 0 at its own linearisation, the gradient J' R^-1 (h - z) of least squares vanishes: the estimate is
     no longer a root of the frozen equation but the least-squares minimum, and its covariance is the Cramer-Rao bound.
@@ -76,7 +76,7 @@ class Relinearized(Method[FrozenSystem, Round], Estimator):
         return self._relinearize(system, x, np.full(len(x), Status.RUNNING, np.int8), none, [row[None] for row in x])
 
     def step(self, system: FrozenSystem, state: Round) -> Round:
-        """One round: inner steps from the last linearisation, then a new one where they end."""
+        """Runs one round: inner steps from the last linearisation, then a new one where they end."""
         linearized = replace(system, H_plus=state.H_plus, deviation=state.deviation)
         limits = Limits(self.tolerance, self.inner_iterations, self.budget, history=True)
         ended = iterate(linearized, self.solver, self.solver.init(linearized, state.x, state.F), limits)
@@ -85,7 +85,7 @@ class Relinearized(Method[FrozenSystem, Round], Estimator):
         return self._relinearize(system, ended.x, ended.status, state.steps + ended.iterations, path)
 
     def check(self, system: FrozenSystem, before: Round | None, state: Round) -> ConvergenceCheck:
-        """F at its own linearisation; an inner root, stall or limit is only the end of a round."""
+        """Measures F at its own linearisation; an inner root, stall or limit is only the end of a round."""
         check = root_check(state.deviation, None, state)
         stuck = ~np.isin(state.inner, _ROUND_ENDS)
         return ConvergenceCheck(check.size, check.growth, check.moved, stuck, state.inner)
@@ -100,7 +100,7 @@ class Relinearized(Method[FrozenSystem, Round], Estimator):
     def _relinearize(
         self, system: FrozenSystem, x: Array, inner: NDArray[np.int8], steps: NDArray[np.int64], path: list[Array]
     ) -> Round:
-        """The state at x with a new H; a trial whose round failed keeps its x, and has no F any more."""
+        """Returns the state at x with a new H; a trial whose round failed keeps its x, and has no F any more."""
         going, (n, m) = np.isin(inner, _ROUND_ENDS) & finite(x), (x.shape[1], system.z.shape[1])
         F, H_plus, deviation = np.full(x.shape, _NO_ROOT), np.zeros((len(x), n, m)), np.ones(x.shape)
         if going.any():
@@ -110,8 +110,8 @@ class Relinearized(Method[FrozenSystem, Round], Estimator):
 
 
 def _bound(system: FrozenSystem, state: Round) -> Array:
-    """(J' R^-1 J)^-1 (trials, n, n) at the end: H+ R H+', where the last round has found H+ there; else computed
-    anew. The model may raise at a bad end."""
+    """Computes (J' R^-1 J)^-1 (trials, n, n) at the end: H+ R H+', where the last round has found H+ there; else anew.
+    The model may raise at a bad end."""
     P = frozen_covariance(state.H_plus, system.R)
     failed = (state.H_plus == 0).all(axis=(1, 2))
     P[failed], lost = np.nan, np.flatnonzero(failed & finite(state.x))

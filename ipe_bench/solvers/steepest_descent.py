@@ -1,4 +1,4 @@
-"""Steepest descent on |F|^2, Burden and Faires, Numerical Analysis, chapter 10, algorithm 10.3."""
+"""Implements steepest descent on |F|^2 (Burden and Faires, Numerical Analysis, chapter 10, algorithm 10.3)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _HALVINGS = 40
 
 @dataclass(frozen=True)
 class SteepestDescent(IPE):
-    """x <- x - alpha d along the gradient of g = |F|^2, alpha by quadratic interpolation of g at 0, alpha/2 and alpha.
+    """Iterates x <- x - alpha d along the gradient of g = |F|^2, alpha by quadratic interpolation at 0, alpha/2, alpha.
 
     The book's first trial step has length one; here it is as long as F, the step of fixed-point iteration. Where g no
     longer decreases, at a local minimum that is no root, the step is zero and the trial has stalled.

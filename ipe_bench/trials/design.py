@@ -1,4 +1,4 @@
-"""What to measure next: which of the readings that a model could take to add, to drop, or to take instead.
+"""Chooses what to measure next: which of the readings that a model could take to add, to drop, or to take instead.
 
 Designs are good on average over truths from the prior (Chaloner and Larntz, J. Stat. Plan. Inference 21, 1989): they
 take, one after another, the readings that gain most. What readings say about each parameter is in `observability`.
@@ -24,19 +24,19 @@ Criterion = Literal["A", "D"]
 SUSPECTED = 5
 """Truths at which unmodelled errors are tried: each takes two simulations of each of them."""
 _WEAK = 1e-8
-"""What every choice is taken to know beforehand, as a share of what all candidates together say: the first readings
+"""Information that every choice is assumed to have beforehand, as a share of that of all candidates: the first readings
 chosen do not determine the parameters by themselves."""
 _FEW = 3
-"""With fewer units there is nothing to choose."""
+"""Least number of units with a choice."""
 
 
 @dataclass(frozen=True)
 class Units:
-    """What is taken or left as a whole: the readings with equal entries in the columns `by`."""
+    """Describes what is taken or left as a whole: the readings with equal entries in the columns `by`."""
 
     by: tuple[str, ...]
     entries: tuple[tuple[Any, ...], ...]
-    """What a unit's readings have in those columns."""
+    """Entries of a unit's readings in those columns."""
     rows: tuple[NDArray[np.intp], ...]
     """The rows of the candidates' z."""
     today: Mask
@@ -45,14 +45,14 @@ class Units:
     """(truths, units, r, n): whitened, in units of today's bounds; r rows say what all readings of the unit say."""
 
     def information(self, taken: Mask) -> Array:
-        """(truths, n, n) of the units that are taken (units,)."""
+        """Computes the information (truths, n, n) of the units that are taken (units,)."""
         A = self.slopes[:, taken]
         return np.einsum("turi,turj->tij", A, A, optimize=True)
 
 
 @dataclass(frozen=True)
 class Choice:
-    """Some of the units, and what estimates of their readings would be worth."""
+    """Describes some of the units, and what estimates of their readings would be worth."""
 
     taken: tuple[int, ...]
     """The units, by their place."""
@@ -69,7 +69,7 @@ class Choice:
 
 @dataclass(frozen=True)
 class Way:
-    """One way to choose: by case, by time, or reading by reading; all else as today."""
+    """Describes one way to choose: by case, by time, or reading by reading; all else as today."""
 
     units: Units
     saving: Choice | None
@@ -84,7 +84,7 @@ class Way:
 
 @dataclass(frozen=True)
 class Design:
-    """What a scenario's readings say, and what others would."""
+    """Describes what a scenario's readings say, and what others would."""
 
     scenario: Scenario
     criterion: Criterion
@@ -94,7 +94,7 @@ class Design:
     ways: tuple[Way, ...]
 
     def measurement(self, choice: Choice) -> Measurement:
-        """The model that takes these readings and no others."""
+        """Returns the model that takes these readings and no others."""
         return self.candidates.taking(choice.rows)
 
 
@@ -107,7 +107,7 @@ def design(
     errors: Sequence[Measurement] = (),
     truths: int = TRUTHS,
 ) -> Design:
-    """What the scenario's readings say about its parameters, and which readings would say more.
+    """Evaluates what the scenario's readings say about its parameters, and which readings would say more.
 
     `by` names columns of the model's index, whose entries are chosen while all else stays as today; None tries each
     column and then reading by reading. `readings` is the number to have at most, today's where it is None. `errors` are
@@ -180,12 +180,12 @@ def _columns(model: Measurement, by: Sequence[str] | None) -> list[tuple[str, ..
 
 
 def _entries(model: Measurement, columns: Sequence[str]) -> list[tuple[Any, ...]]:
-    """What each reading (m,) has in these columns."""
+    """Returns the entries of each reading (m,) in these columns."""
     return list(zip(*(model.index[c] for c in columns), strict=True)) if columns else [()] * model.m
 
 
 def _units(model: Measurement, candidates: Measurement, by: tuple[str, ...], slopes: Array) -> Units:
-    """The units of the candidates; in all other columns they have what today's readings have."""
+    """Builds the units of the candidates; in all other columns they have what today's readings have."""
     others = [c for c in model.index if c not in by]
     as_today = set(_entries(model, others))
     groups: dict[tuple[Any, ...], list[int]] = {}
@@ -205,17 +205,17 @@ def _units(model: Measurement, candidates: Measurement, by: tuple[str, ...], slo
 
 @dataclass(frozen=True)
 class _Judge:
-    """A criterion to be small, over information matrices M (truths, n, n) in units of today's bounds: tr M^-1 / n, or
-    -log det M / n, averaged over the truths, with the little that is known beforehand."""
+    """Computes a criterion to be small, over information matrices M (truths, n, n) in units of today's bounds: tr M^-1
+    / n, or -log det M / n, averaged over the truths, with the little that is known beforehand."""
 
     criterion: Criterion
     everything: Array
-    """What all candidates together say (truths, n, n)."""
+    """Information of all candidates together (truths, n, n)."""
     today: float = 1.0
     """The mean bound of today's set-up, which others are shares of; 1 if it is infinite."""
 
     def value(self, M: Array) -> float:
-        """The mean bound in units of today's, without what is known beforehand; infinite if M is singular."""
+        """Computes the mean bound in units of today's, without what is known beforehand; infinite if M is singular."""
         s = np.linalg.eigvalsh(M)
         if (s[:, 0] <= 1e-12 * s[:, -1]).any():
             return float("inf")
@@ -223,7 +223,7 @@ class _Judge:
         return float(mean) / self.today
 
     def gains(self, M: Array, slopes: Array) -> Array:
-        """The fall of the loss with each further unit (units,), where M is the information without it."""
+        """Computes the fall of the loss with each further unit (units,), where M is the information without it."""
         truths, units, r, n = slopes.shape
         P = np.linalg.inv(M + _WEAK * self.everything)
         B = np.matmul(slopes.reshape(truths, units * r, n), P).reshape(slopes.shape)
@@ -234,8 +234,7 @@ class _Judge:
 
 
 def _way(judge: _Judge, units: Units, today: int, most: int) -> Way | None:
-    """The two choices of those to which the unit is added that gains most per reading; None if there is nothing to
-    choose."""
+    """Finds the two choices by adding the unit that gains most per reading; None if there is no choice."""
     if len(units.rows) < _FEW:
         return None
     sizes, taken, found = np.array([*map(len, units.rows)]), np.zeros(len(units.rows), dtype=bool), []
@@ -254,14 +253,14 @@ def _way(judge: _Judge, units: Units, today: int, most: int) -> Way | None:
 
 
 def _choice(judge: _Judge, units: Units, taken: Mask) -> Choice:
-    """The choice of these units (units,)."""
+    """Makes the choice of these units (units,)."""
     places = np.flatnonzero(taken).tolist()
     rows = np.sort(np.concatenate([units.rows[u] for u in places], dtype=np.intp))
     return Choice(tuple(places), tuple(rows.tolist()), judge.value(units.information(taken)))
 
 
 def entry_in_words(model: Measurement, column: str, entry: Any) -> str:
-    """An entry of the index with what it stands for, if the model has words for it."""
+    """Words an entry of the index by what it stands for, if the model has words for it."""
     words = model.entry_words.get(column, {})
     shown = f"{entry:g}" if isinstance(entry, float) else str(entry)
     return f"{shown} ({words[entry]})" if entry in words else shown

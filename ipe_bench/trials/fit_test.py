@@ -31,7 +31,7 @@ _AT_ONCE = 2_000
 
 @dataclass(frozen=True)
 class Spread:
-    """The eigenvalues of the covariance of whitened residuals, trial by trial: those that are 1, and `others`."""
+    """Holds the eigenvalues of the covariance of whitened residuals, trial by trial: those that are 1, and `others`."""
 
     ones: int
     others: Array
@@ -49,7 +49,7 @@ class Spread:
 
 
 def spread_of(estimator: Estimator, problem: Problem, J: Array) -> Spread:
-    """How the residuals scatter that an estimator leaves, with dh/dx = J (trials, m, n) near its estimates."""
+    """Computes how the residuals scatter that an estimator leaves, with dh/dx = J (trials, m, n) near its estimates."""
     trials, m, n = J.shape
     prior = problem.prior_covariance()
     with np.errstate(all="ignore"):
@@ -61,13 +61,13 @@ def spread_of(estimator: Estimator, problem: Problem, J: Array) -> Spread:
 
 
 def inflation_of(estimator: Estimator) -> float:
-    """The factor by which an estimator widens the prior: one that does solves an equation of its own."""
+    """Returns the factor by which an estimator widens the prior: one that does solves an equation of its own."""
     return float(getattr(estimator, "prior_inflation", 1.0)) if "prior" in estimator.needs else 1.0
 
 
 def frozen_spread(J: Array, H: Array, R: Covariance) -> Spread:
-    """For the root of eq. (11), with dh/dx = J (trials, m, n) and H (m, n): I - B is 1 outside the ranges of H and J,
-    and 1 / cos of the principal angles between them on n directions."""
+    """Computes the spread for the root of eq. (11), with dh/dx = J (trials, m, n) and H (m, n): I - B is 1 outside the
+    ranges of H and J, and 1 / cos of the principal angles between them on n directions."""
     m, n = H.shape
     products = np.matmul(_basis(H[None], R).swapaxes(1, 2), _basis(J, R))
     usable = finite(products)
@@ -79,8 +79,8 @@ def frozen_spread(J: Array, H: Array, R: Covariance) -> Spread:
 
 
 def prior_spread(inner: Array, m: int, factor: Array, inflation: float = 1.0) -> Spread:
-    """For an estimate from m readings with J' R^-1 J = inner (trials, n, n) and a prior of deviations `factor` (n,), or
-    with that Cholesky factor (n, n), widened by `inflation` for the estimator."""
+    """Computes the spread for an estimate from m readings with J' R^-1 J = inner (trials, n, n) and a prior of
+    deviations `factor` (n,), or with that Cholesky factor (n, n), widened by `inflation` for the estimator."""
     n = len(factor)
     values = inner * np.outer(factor, factor) if factor.ndim == 1 else np.matmul(np.matmul(factor.T, inner), factor)
     usable = finite(values)
@@ -91,14 +91,14 @@ def prior_spread(inner: Array, m: int, factor: Array, inflation: float = 1.0) ->
 
 
 def _basis(J: Array, R: Covariance) -> Array:
-    """An orthonormal basis (trials, m, n) of the range of R^-1/2 J; NaN where J is not finite."""
+    """Computes an orthonormal basis (trials, m, n) of the range of R^-1/2 J; NaN where J is not finite."""
     white = R.whiten_jacobian(J)
     usable = finite(white)[:, None, None]
     return np.where(usable, np.linalg.qr(np.where(usable, white, 0.0))[0], np.nan)
 
 
 def fit_probability(squares: Array, spread: Spread, noise: Noise, H: Array, R: Covariance) -> Array:
-    """The chance (trials,) of a sum of squares of whitened residuals at least as large as `squares` (trials,).
+    """Computes the chance (trials,) of a sum of squares of whitened residuals at least as large as `squares` (trials,).
 
     NaN where there are no residuals, or none to spare. Where spread is not that of least squares, the sum is scaled to
     the mean and variance of a sum that is (Satterthwaite, Biometrics Bulletin 2, 1946).
@@ -121,7 +121,7 @@ def fit_probability(squares: Array, spread: Spread, noise: Noise, H: Array, R: C
 
 @functools.lru_cache(maxsize=16)
 def _reference(noise: Noise, m: int, basis: bytes) -> Array | None:
-    """Ascending sums of squares of least-squares residuals of simulated whitened noise; None where it is normal."""
+    """Simulates ascending sums of squares of least-squares residuals of whitened noise; None where it is normal."""
     Q = np.frombuffer(basis).reshape(m, -1)
     rng = np.random.Generator(np.random.Philox(0))
     sums = []

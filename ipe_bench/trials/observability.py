@@ -1,5 +1,5 @@
-"""What readings say about each parameter before any are taken: singular values, the least observable direction, bounds
-and correlations, and which errors that the model leaves out look like its parameters.
+"""Analyses what readings say about each parameter before any are taken: singular values, the least observable
+direction, bounds and correlations, and which errors that the model leaves out look like its parameters.
 
 All of it follows from Jacobians at truths drawn from the prior. `design` chooses which readings to take.
 """
@@ -20,9 +20,9 @@ from ipe_bench.trials.thresholds import FIT_LEVEL
 TRUTHS = 30
 """Truths from the prior over which bounds and designs are averaged."""
 _STEP = 0.1
-"""Of a nuisance's deviation, for central differences: far above round-off, far below where it bends."""
+"""Step of central differences, as a share of a nuisance's deviation: far above round-off, far below where it bends."""
 _SINGLE = 4
-"""Nuisances of a group up to which each is told of by itself."""
+"""Largest group of nuisances that are reported one by one."""
 _DRAWS = 200
 _WORTH_SAYING = 0.1
 """Coefficients of a direction below this share of the largest are left out of its words."""
@@ -30,17 +30,17 @@ _WORTH_SAYING = 0.1
 
 @dataclass(frozen=True)
 class Observability:
-    """What a model's readings say about its parameters; lengths in multiples of the parameters' sizes."""
+    """Describes what a model's readings say about its parameters; lengths in multiples of the parameters' sizes."""
 
     parameters: tuple[Parameter, ...]
     singular_values: Array
-    """Of the whitened Jacobian R^-1/2 J (truths, n), descending."""
+    """Singular values of the whitened Jacobian R^-1/2 J (truths, n), descending."""
     right: Array
     """Its right singular vectors (truths, n, n), a row each."""
 
     @classmethod
     def at(cls, model: Measurement, R: Covariance, x: Array) -> Observability:
-        """At the truths x (truths, n)."""
+        """Computes the observability at the truths x (truths, n)."""
         _, s, right = np.linalg.svd(R.whiten_jacobian(model.jacobian(x)), full_matrices=False)
         return cls(model.parameters, s, right)
 
@@ -70,14 +70,14 @@ class Observability:
 
     @cached_property
     def correlation(self) -> Array:
-        """Of the errors of efficient estimates (n, n), over the truths."""
+        """Correlation of the errors of efficient estimates (n, n), over the truths."""
         P = self.covariance.mean(axis=0)
         return P / np.outer(deviations(P), deviations(P))
 
     @cached_property
     def multiple_correlation(self) -> Array:
-        """Of each parameter's error with those of all others (n,): sqrt(1 - 1 / (P_ii (P^-1)_ii)), the median over the
-        truths. The bound is 1 / sqrt(1 - square) of what it were if all others were known."""
+        """Correlation of each parameter's error with those of all others (n,): sqrt(1 - 1 / (P_ii (P^-1)_ii)), the
+        median over the truths. The bound is 1 / sqrt(1 - square) of what it were if all others were known."""
         information = np.sum((self.right * self.singular_values[:, :, None]) ** 2, axis=1)
         inflation = np.diagonal(self.covariance, axis1=1, axis2=2) * information
         return np.sqrt(np.maximum(1 - 1 / np.maximum(np.median(inflation, axis=0), 1.0), 0.0))
@@ -90,12 +90,12 @@ class Observability:
 
     @property
     def words(self) -> str:
-        """`least_observable` in words, such as 'ky - 0.85 kx'."""
+        """Text of `least_observable`, such as 'ky - 0.85 kx'."""
         return in_words([p.name for p in self.parameters], self.least_observable)
 
 
 def in_words(names: Sequence[str], direction: Array) -> str:
-    """A direction (n,) as a sum over its largest coefficient, without what is below a tenth of it."""
+    """Writes a direction (n,) as a sum over its largest coefficient, without what is below a tenth of it."""
     # What is equal but for round-off stays in the order of the names.
     order = np.argsort(-np.round(np.abs(direction) / np.abs(direction).max(), 6), kind="stable")
     coefficients = direction / direction[order[0]]
@@ -110,15 +110,15 @@ def in_words(names: Sequence[str], direction: Array) -> str:
 
 @dataclass(frozen=True)
 class Suspect:
-    """An error that the model leaves out, of its usual size, and what least squares makes of it to first order."""
+    """Describes an error that the model leaves out, of its usual size, and its first-order effect on least squares."""
 
     name: str
     unit: str
     deviation: float
     """Its standard deviation, in `unit`."""
     shift: Array
-    """By how much it moves each parameter's estimate (n,): root mean square, in multiples of the parameters' sizes;
-    with its sign where it is a single number."""
+    """Shift of each parameter's estimate (n,): root mean square, in multiples of the parameters' sizes; with its sign
+    if the error is a single number."""
     bounds: float
     """The largest shift of a parameter, in standard deviations of its bound."""
     parameter: str
@@ -128,7 +128,7 @@ class Suspect:
     noticed: float
     """The chance that the test of fit at its level notices it, by the noncentral chi-square law."""
     words: str
-    """Where it is a single number: the direction, in multiples of its deviation and of the parameters' sizes, in which
+    """Direction, if it is a single number, in multiples of its deviation and of the parameters' sizes, in which
     parameters undo what it does to the readings."""
 
     @property
@@ -138,7 +138,7 @@ class Suspect:
 
 
 def suspects(model: Measurement, R: Covariance, truth: Measurement, x: Array) -> tuple[Suspect, ...]:
-    """The errors that `truth` has and `model` has not, at the truths x (truths, n), the largest shift first.
+    """Finds the errors that `truth` has and `model` has not, at the truths x (truths, n), the largest shift first.
 
     Each is a nuisance of `truth`; those of a group of many are taken together.
     """
@@ -167,7 +167,7 @@ def suspects(model: Measurement, R: Covariance, truth: Measurement, x: Array) ->
 
 
 def nuisance_slopes(truth: Measurement, x: Array) -> Array:
-    """The readings' slopes (truths, m, k) along the k nuisances that have a deviation, per deviation, at 0."""
+    """Computes the readings' slopes (truths, m, k) along the k nuisances that have a deviation, per deviation, at 0."""
     deviation = truth.nuisance_deviation
     active = np.flatnonzero(deviation)
     steps = np.zeros((len(active), len(deviation)))
@@ -181,7 +181,7 @@ def nuisance_slopes(truth: Measurement, x: Array) -> Array:
 
 
 def _told(truth: Measurement) -> Iterator[tuple[str, str, float, list[int]]]:
-    """Name, unit, deviation and columns, among the active nuisances, of each suspect."""
+    """Yields name, unit, deviation and columns, among the active nuisances, of each suspect."""
     deviation = truth.nuisance_deviation
     active = [(p, d) for p, d in zip(truth.nuisances, deviation, strict=True) if d != 0]
     groups: dict[str, list[int]] = {}
@@ -197,7 +197,7 @@ def _told(truth: Measurement) -> Iterator[tuple[str, str, float, list[int]]]:
 
 
 def _noticed(left: Array, degrees: int) -> float:
-    """The mean chance of a misfit, over truths and draws of the nuisances, for what they leave (truths, m, k)."""
+    """Computes the mean chance of a misfit, over truths and nuisances, for residual slopes (truths, m, k)."""
     from scipy.special import chdtri, chndtr
 
     rng = np.random.Generator(np.random.Philox(0))

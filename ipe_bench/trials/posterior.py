@@ -1,5 +1,4 @@
-"""What the readings of one trial really say: draws of the posterior, by sequential Monte Carlo, to hold Gaussians of
-estimators against.
+"""Samples the posterior of one trial by sequential Monte Carlo, to compare Gaussians of estimators with it.
 
 Slow and general, with nothing linearised: particles go from the prior to the posterior by tempering the likelihood (Del
 Moral, Doucet and Jasra, J. R. Stat. Soc. B 68, 2006), moved by Metropolis steps with covariances of Gauss and Newton.
@@ -23,7 +22,7 @@ from ipe_bench.trials.roots import least_squares_root
 from ipe_bench.trials.scenario import Scenario
 
 PARTICLES = 1000
-"""Of two populations together that know nothing of each other: if they disagree, neither is to be believed."""
+"""Number of particles in two independent populations together: if they disagree, neither is to be believed."""
 AGREED = 0.35
 """Means of populations farther apart than this, in deviations of the posterior, have not settled; half of it and the
 deviations differ by more."""
@@ -48,7 +47,7 @@ _COMPARED = 1000
 
 @dataclass(frozen=True)
 class Posterior:
-    """Draws of a trial's posterior, in multiples of the parameters' sizes."""
+    """Holds draws of a trial's posterior, in multiples of the parameters' sizes."""
 
     x: Array
     """(draws, n), equally weighted."""
@@ -57,7 +56,7 @@ class Posterior:
     shares: Array
     """(modes,) of the draws that lead there."""
     apart: float
-    """How far the means of the populations differ, in standard deviations, or half their widths in their logarithms."""
+    """Difference of the populations' means in standard deviations, or half of their widths' in their logarithms."""
     noise: float
     """The divergence (see `Divergence.kl`) of the populations' own moments: what is not above it is chance."""
     evidence: Array
@@ -83,7 +82,7 @@ class Posterior:
 
 @dataclass(frozen=True)
 class Divergence:
-    """How far an estimator's Gaussian is from the posterior."""
+    """Measures how far an estimator's Gaussian is from the posterior."""
 
     kl: float
     """The Kullback-Leibler divergence, in nats, from the Gaussian with the posterior's moments to the estimator's:
@@ -99,7 +98,7 @@ class Divergence:
 
 @dataclass(frozen=True)
 class Reference:
-    """A trial's posterior, and what estimators made of the same readings."""
+    """Holds a trial's posterior, and what estimators made of the same readings."""
 
     trial: int
     truth: Array
@@ -112,7 +111,7 @@ class Reference:
 def reference(
     scenario: Scenario, estimators: Mapping[str, Estimator], trial: int, particles: int = PARTICLES
 ) -> Reference:
-    """The posterior of one trial of a scenario beside its estimators.
+    """Computes the posterior of one trial of a scenario beside its estimators.
 
     Raises:
         UserError: the scenario has no prior or one that is not normal, or there are too few particles.
@@ -135,8 +134,7 @@ def require_particles(problem: Problem, particles: int) -> None:
 
 
 def sample_posterior(problem: Problem, z: Array, *, particles: int = PARTICLES, seed: int = 0) -> Posterior:
-    """Draws of the posterior of one trial's readings z (m,), by two populations that are put together by their
-    evidence.
+    """Samples the posterior of one trial's readings z (m,), by two populations that are put together by their evidence.
 
     Raises:
         UserError: no prior is known, or there are too few particles.
@@ -157,7 +155,7 @@ def sample_posterior(problem: Problem, z: Array, *, particles: int = PARTICLES, 
 
 
 def _kl(d: Array, S: Array, P: Array) -> float:
-    """From N(0, S) to N(d, P), in nats."""
+    """Computes the divergence from N(0, S) to N(d, P), in nats."""
     inner = np.linalg.inv(P)
     log_ratio = np.linalg.slogdet(P)[1] - np.linalg.slogdet(S)[1]
     return float(0.5 * (np.trace(inner @ S) + d @ inner @ d - len(d) + log_ratio))
@@ -179,7 +177,7 @@ def _modes(problem: Problem, z: Array, x: Array) -> tuple[Array, Array]:
 
 
 def _tempered(problem: Problem, x: Array, beta: float) -> Array:
-    """beta J' R^-1 J + P0^-1 (points, n, n)."""
+    """Computes beta J' R^-1 J + P0^-1 (points, n, n)."""
     return beta * information(problem.measurement.jacobian(x), problem.R) + _prior(problem).inverse()
 
 
@@ -191,7 +189,7 @@ def _prior(problem: Problem) -> Covariance:
 
 @dataclass
 class _Population:
-    """Particles on their way from the prior to the posterior."""
+    """Moves particles on their way from the prior to the posterior."""
 
     problem: Problem
     z: Array
@@ -218,7 +216,7 @@ class _Population:
         raise UserError(f"particles={count}: do not reach the posterior in {_MOST_STAGES} stages; give more")
 
     def _log_likelihood(self, x: Array) -> Array:
-        """The logarithm of the likelihood of each, less its constant."""
+        """Computes the logarithm of the likelihood of each, less its constant."""
         with np.errstate(all="ignore"):
             model = self.problem.measurement
             r = self.problem.R.whiten(self.z - model.near(model.simulate(x), self.z))
@@ -226,7 +224,7 @@ class _Population:
         return np.where(np.isfinite(squares), -0.5 * squares, -np.inf)
 
     def _stage(self) -> None:
-        """A step of temperature, resampling, and moves."""
+        """Takes a step of temperature, resampling, and moves."""
         rise = self._rise()
         w = np.exp(rise * (self.log - self.log.max()))
         self.evidence += float(np.log(w.mean()) + rise * self.log.max())
@@ -241,8 +239,8 @@ class _Population:
             tried += 1
 
     def _rise(self) -> float:
-        """The growth of the power at which half of the particles still count, by bisection of its logarithm: it begins
-        at billionths."""
+        """Finds the growth of the power at which half of the particles still count, by bisection of its logarithm: it
+        begins at billionths."""
 
         def effective(rise: float) -> float:
             w = np.exp(rise * (self.log - self.log.max()))
@@ -258,8 +256,8 @@ class _Population:
         return 10**low
 
     def _shapes(self) -> Array:
-        """Factors (shapes, n, n) of covariances: Gauss and Newton's at some particles. A move's shape is that of
-        another particle, drawn anew each time, so that moves there and back are alike."""
+        """Computes factors (shapes, n, n) of covariances: Gauss and Newton's at some particles. A move's shape is that
+        of another particle, drawn anew each time, so that moves there and back are alike."""
         some = self.rng.choice(len(self.x), min(_POOL, len(self.x)), replace=False)
         with np.errstate(all="ignore"):
             P = inverse(_tempered(self.problem, self.x[some], self.beta))[0]
@@ -272,7 +270,7 @@ class _Population:
         return D[:, :, None] * axes * np.sqrt(np.maximum(values, 0.0))[:, None, :]
 
     def _move(self, shapes: Array) -> float:
-        """A Metropolis step of every particle; returns the share that is accepted."""
+        """Takes a Metropolis step of every particle; returns the share that is accepted."""
         (count, n), prior, x0 = self.x.shape, _prior(self.problem), self.problem.x0
         chosen = self.rng.integers(0, len(shapes), count)
         step = multiply(shapes[chosen], self.rng.standard_normal((count, n)))
@@ -288,7 +286,7 @@ class _Population:
         return share
 
     def _final(self) -> Array:
-        """Draws (snapshots x particles, n) of the posterior itself; the length of moves no longer changes."""
+        """Samples draws (snapshots x particles, n) of the posterior itself; the length of moves no longer changes."""
         shapes = self._shapes()
         for _ in range(_SETTLE):
             self._move(shapes)
@@ -303,7 +301,7 @@ class _Population:
 
 
 def divergence(posterior: Posterior, estimates: Estimates) -> Divergence:
-    """How far the Gaussian of the first trial of `estimates` is from the posterior."""
+    """Measures how far the Gaussian of the first trial of `estimates` is from the posterior."""
     scale, n = posterior.deviation, posterior.x.shape[1]
     d, S = (estimates.x[0] - posterior.mean) / scale, posterior.covariance / np.outer(scale, scale)
     shift = float(np.sqrt(d @ np.linalg.solve(S, d) / n)) if np.isfinite(d).all() else np.inf
@@ -323,7 +321,7 @@ def divergence(posterior: Posterior, estimates: Estimates) -> Divergence:
 
 
 def _energy(a: Array, b: Array, S: Array) -> float:
-    """2 E|A - B| - E|A - A'| - E|B - B'| over E|B - B'|, in the metric of S."""
+    """Computes 2 E|A - B| - E|A - A'| - E|B - B'| over E|B - B'|, in the metric of S."""
     from scipy.spatial.distance import cdist, pdist
 
     L = np.linalg.inv(np.linalg.cholesky(S)).T

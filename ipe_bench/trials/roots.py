@@ -1,4 +1,4 @@
-"""Roots of the estimating equations from given points: started at the truth, they tell a false root from the right one.
+"""Finds roots of the estimating equations from given points: started at the truth, they expose a false root.
 
 Nothing here is an estimator: an estimator does not know where to start.
 """
@@ -30,7 +30,7 @@ class _ChordState(State):
 
 @dataclass(frozen=True)
 class _Chord(IPE[_ChordState]):
-    """x <- x - J(x_start)^-1 F(x): Newton's method with the first Jacobian kept."""
+    """Iterates x <- x - J(x_start)^-1 F(x): Newton's method with the first Jacobian kept."""
 
     def init(self, system: System, x: Array, F: Array) -> _ChordState:
         return _ChordState(x, F, system.J(x))
@@ -41,8 +41,8 @@ class _Chord(IPE[_ChordState]):
 
 
 def frozen_root(problem: Problem, z: Array, x_start: Array) -> Array:
-    """The root (trials, n) of the frozen equation (11) next to x_start (trials, n), for readings z (trials, m); NaN
-    where there is none.
+    """Finds the root (trials, n) of the frozen equation (11) next to x_start (trials, n), for readings z (trials, m);
+    NaN where there is none.
 
     Chord steps with the Jacobian at x_start, which is enough where x_start is the truth; Newton's method for the trials
     where it is not.
@@ -51,8 +51,8 @@ def frozen_root(problem: Problem, z: Array, x_start: Array) -> Array:
 
 
 def least_squares_root(problem: Problem, z: Array, x_start: Array, *, prior: float | None) -> Array:
-    """The minimum (trials, n) of |h(x) - z| in the metric of R next to x_start (trials, n); MAP where `prior` says by
-    how much to widen the prior's deviations. NaN where none is found.
+    """Finds the minimum (trials, n) of |h(x) - z| in the metric of R next to x_start (trials, n); MAP where `prior`
+    says by how much to widen the prior's deviations. NaN where none is found.
 
     Gauss-Newton; Levenberg-Marquardt for the trials where that fails.
     """
@@ -63,7 +63,7 @@ def least_squares_root(problem: Problem, z: Array, x_start: Array, *, prior: flo
 def _first_root(
     equations: Callable[[Array], Any], z: Array, x_start: Array, *attempts: tuple[Method[Any, Any], int]
 ) -> Array:
-    """Where the first method that converges ends: each has that many iterations from x_start."""
+    """Returns the end of the first method that converges: each has that many iterations from x_start."""
     x, missing = np.full(x_start.shape, np.nan), np.arange(len(z))
     for method, limit in attempts:
         if len(missing):

@@ -1,4 +1,4 @@
-"""A scenario: what is measured, how noisily, and what the truth is drawn from. It draws trials, and never estimates."""
+"""Defines a scenario: what is measured, how noisily, and what the truth is drawn from. It draws trials."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ _SEEDS = 1 << 23
 
 @dataclass(frozen=True)
 class Trials:
-    """Consecutive trials of a scenario: truth x (trials, n) and readings z (trials, m)."""
+    """Holds consecutive trials of a scenario: truth x (trials, n) and readings z (trials, m)."""
 
     start: int
     x: Array
     z: Array
     h: Array | None = None
-    """The readings (trials, m) before noise, where they are those of the model that estimators are told."""
+    """The readings (trials, m) before noise, where they are those of the model that estimators assume."""
 
     @property
     def stop(self) -> int:
@@ -44,9 +44,9 @@ class Trials:
 
 @dataclass(frozen=True)
 class Scenario:
-    """Everything that determines the trials. `truth` simulates the readings where it differs from what estimators
-    assume (a finer step, a richer model); its parameters and readings are those of `measurement`, and whatever else
-    acts on the readings is drawn by its `nuisance_deviation`.
+    """Determines the trials. `truth` simulates the readings where it differs from what estimators assume (a finer step,
+    a richer model); its parameters and readings are those of `measurement`, and whatever else acts on the readings is
+    drawn by its `nuisance_deviation`.
 
     With a noise that is `real` nothing is drawn: the one trial is the readings that come with the measurement, and its
     truth is their certified answer.
@@ -81,7 +81,7 @@ class Scenario:
 
     @cached_property
     def problem(self) -> Problem:
-        """What the estimators are told."""
+        """Problem of the estimators."""
         model = self.measurement
         if self.noise.real and model.recorded is not None:  # nothing was drawn from a prior
             return Problem(model, model.recorded.R)
@@ -105,11 +105,11 @@ class Scenario:
         return self.measurement if self.truth is None else self.truth
 
     def truths(self, start: int, stop: int) -> Array:
-        """The true parameters (trials, n) of trials start to stop, as `draw` draws them."""
+        """Draws the true parameters (trials, n) of trials start to stop, as `draw` does."""
         return self._drawn(start, stop)[:, : self.simulator.n]
 
     def draw(self, start: int, stop: int) -> Trials:
-        """Trials start to stop. Trial t has random streams of its own, so it is the same in every block.
+        """Draws trials start to stop. Trial t has random streams of its own, so it is the same in every block.
 
         One seed gives the same draws, in units of the error scale, at every error scale.
         """
@@ -128,12 +128,12 @@ class Scenario:
         return Trials(start, x, z, h if self.truth is None else None)
 
     def error_free(self, start: int, stop: int) -> Array:
-        """The readings (trials, m) of trials start to stop before noise is added; those of a richer truth with what
-        else acts on them."""
+        """Computes the readings (trials, m) of trials start to stop before noise is added; those of a richer truth with
+        what else acts on them."""
         return self._simulated(self._drawn(start, stop))
 
     def _simulated(self, drawn: Array) -> Array:
-        """The readings (trials, m) at x and nuisances (trials, n + k)."""
+        """Computes the readings (trials, m) at x and nuisances (trials, n + k)."""
         h = self.simulator.simulate(read_only(drawn))
         require_numbers(
             f"measurement={self.simulator.name}", self.simulator.simulate, h, (len(drawn), self.simulator.m)
@@ -141,7 +141,7 @@ class Scenario:
         return read_only(h)
 
     def _drawn(self, start: int, stop: int) -> Array:
-        """x (trials, n), and behind it the nuisances (trials, k), drawn from each trial's stream of parameters."""
+        """Draws x (trials, n), and behind it the nuisances (trials, k), from each trial's stream of parameters."""
         n, deviation = self.simulator.n, self.simulator.nuisance_deviation
         nominal, drawn = read_only(self.simulator.nominal), np.empty((stop - start, n + len(deviation)))
         for row, rng in zip(drawn, numbered(self.seed, start, stop, _PARAMETERS), strict=True):

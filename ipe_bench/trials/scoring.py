@@ -1,4 +1,4 @@
-"""Trials through estimators: draws a block of a scenario, runs estimators on it, and scores what they return.
+"""Runs trials through estimators: draws a block of a scenario, runs estimators on it, and scores what they return.
 
 A block is a range of trials; its result depends on nothing but the scenario, the estimator and the range.
 """
@@ -52,7 +52,7 @@ Columns = dict[str, Array]
 
 @dataclass(frozen=True)
 class Block:
-    """Trials of a scenario with what the truth says of them: bounds and reference roots, computed when needed."""
+    """Holds trials of a scenario with what the truth says of them: bounds and reference roots, computed when needed."""
 
     scenario: Scenario
     trials: Trials
@@ -76,7 +76,7 @@ class Block:
 
     @cached_property
     def readings(self) -> Array:
-        """h (trials, m) at the truth, of the model that estimators are told; NaN where it fails."""
+        """h (trials, m) at the truth, of the model that estimators assume; NaN where it fails."""
         return self.readings_at(self.trials.x) if self.trials.h is None else self.trials.h
 
     @cached_property
@@ -110,8 +110,8 @@ class Block:
             return bound_deviations(self.bayes_information, _below(self._white, prior) if prior else self._white)
 
     def truth_columns(self) -> Columns:
-        """The truth and its bounds, in multiples of the parameters' units, what the noise alone makes of the linear
-        estimate, and what the paper's theorems ask of the model there."""
+        """Returns the truth and its bounds, in multiples of the parameters' units, what the noise alone makes of the
+        linear estimate, and what the paper's theorems ask of the model there."""
         names = [p.name for p in self.problem.measurement.parameters]
         H_plus = self.problem.H_plus[None]
         K, norm, radius = contraction(np.matmul(H_plus, self.jacobian))
@@ -155,16 +155,16 @@ class Block:
         return bound, error
 
     def readings_at(self, x: Array) -> Array:
-        """h(x) (trials, m) for x (trials, n); NaN where the model fails."""
+        """Computes h(x) (trials, m) for x (trials, n); NaN where the model fails."""
         return CountingModel.uncounted(self.problem.measurement, len(x)).simulate(read_only(x), np.arange(len(x)))
 
     def errors(self, h: Array) -> Array:
-        """The readings (trials, m) less the error-free h, angles within half a turn."""
+        """Computes the readings (trials, m) less the error-free h, angles within half a turn."""
         return self.trials.z - self.problem.measurement.near(h, self.trials.z)
 
     def _curvature_columns(self, names: list[str]) -> Columns:
-        """What second derivatives at the truth say, for the first trials and NaN for the others: M of
-        eq. (23), the relative curvatures, and the bias of least squares."""
+        """Computes what second derivatives at the truth say, for the first trials and NaN for the others: M of eq.
+        (23), the relative curvatures, and the bias of least squares."""
         kept = max(0, min(CURVED, self.trials.stop) - self.trials.start)
         M, intrinsic, parametric = np.full((3, len(self.trials.x)), np.nan)
         bias = np.full(self.trials.x.shape, np.nan)
@@ -185,8 +185,8 @@ class Block:
         }
 
     def _misspecification_columns(self, names: list[str]) -> Columns:
-        """Where least squares goes, and how it scatters there, when readings come from another model; nothing where
-        they do not, and where estimators are told another R than that of the noise."""
+        """Computes where least squares goes, and how it scatters there, when readings come from another model; empty
+        where they do not, and where estimators assume another R than that of the noise."""
         if self.scenario.truth is None or not self.scenario.noise.true_covariance:
             return {}
         h = self.scenario.error_free(self.trials.start, self.trials.stop)
@@ -196,7 +196,7 @@ class Block:
         return by_parameter("pseudo_bias", names, bias) | by_parameter("misspecified", names, deviation)
 
     def reference_root(self, equation: Equation, inflation: float = 1.0) -> Array:
-        """The root (trials, n) that an estimating equation reaches from the truth; NaN where it reaches none.
+        """Finds the root (trials, n) that an estimating equation reaches from the truth; NaN where it reaches none.
 
         `inflation` widens the prior of the equation `map`.
         """
@@ -228,14 +228,14 @@ class Block:
         return self.trials.start
 
     def estimate(self, estimator: Estimator) -> tuple[Estimates, Columns]:
-        """What an estimator makes of the block, and its score."""
+        """Returns what an estimator makes of the block, and its score."""
         history = self.trials.start < HISTORIES
         estimates = estimate_safely(estimator, self.problem, self.trials.z, history=history)
         with np.errstate(all="ignore"):
             return estimates, self.score(estimator, estimates)
 
     def _fit_probability(self, estimator: Estimator, x: Array) -> Array:
-        """The test of fit at x (trials, n); see `fit_test`."""
+        """Computes the test of fit at x (trials, n); see `fit_test`."""
         problem, key = self.problem, (estimator.equation, "prior" in estimator.needs, inflation_of(estimator))
         if key not in self._spreads:
             self._spreads[key] = spread_of(estimator, problem, self.jacobian)
@@ -245,7 +245,7 @@ class Block:
         return fit_probability(squares, self._spreads[key], self.scenario.noise, problem.H, problem.R)
 
     def score(self, estimator: Estimator, estimates: Estimates) -> Columns:
-        """Each trial's error, cost, status and distances, as columns."""
+        """Scores each trial's error, cost, status and distances, as columns."""
         model = self.problem.measurement
         names = [p.name for p in model.parameters]
         error, trials = estimates.x - self.trials.x, len(self)
@@ -282,20 +282,20 @@ class Block:
 
 
 def _squared(rows: Array) -> Array:
-    """A' A (trials, n, n) of rows A (trials, k, n)."""
+    """Computes A' A (trials, n, n) of rows A (trials, k, n)."""
     with np.errstate(all="ignore"):
         return np.matmul(rows.swapaxes(1, 2), rows)
 
 
 def _below(rows: Array, prior: Covariance) -> Array:
-    """The rows (trials, k, n) of each trial, and below them those of the prior."""
+    """Appends the rows of the prior to the rows (trials, k, n) of each trial."""
     more = prior.whiten_jacobian(np.eye(rows.shape[2]))
     return np.concatenate([rows, np.broadcast_to(more, (len(rows), *more.shape))], axis=1)
 
 
 def nees(error: Array, P: Array) -> Array:
-    """The normalised estimation error squared e' P^-1 e of each trial (trials,): chi-square with n degrees where the
-    reported P is right.
+    """Computes the normalised estimation error squared e' P^-1 e of each trial (trials,): chi-square with n degrees
+    where the reported P is right.
 
     error (trials, n) and P (trials, n, n). Infinite where P is not a covariance (not positive definite) or the error is
     not finite; NaN where no P is reported.

@@ -1,5 +1,5 @@
-"""What theory says of a model and its estimates at a point: the bounds that no estimator can beat, the contraction of
-fixed-point iteration, eq. (15), the curvature of the model, and the bias and the error of least squares."""
+"""Computes the theory of a model at a point: the bounds that no estimator can beat, the contraction of fixed-point
+iteration, eq. (15), the curvature of the model, and the bias and the error of least squares."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise.base import Noise
 
 _STEP = 1e-4
-"""Of central differences of the Jacobian, in parameters' sizes or as a share of their values."""
+"""Step of central differences of the Jacobian, in parameters' sizes or as a share of their values."""
 
 
 def linear_bound(problem: Problem) -> Array:
-    """Standard deviations (n,) of eq. (5): what the linear LSE would reach if h were linear."""
+    """Computes standard deviations (n,) of eq. (5): what the linear LSE would reach if h were linear."""
     return deviations(frozen_covariance(problem.H_plus[None], problem.R))[0]
 
 
 def linear_correlation(problem: Problem) -> Array:
-    """Correlation (n, n) of the covariance of eq. (5)."""
+    """Computes the correlation (n, n) of the covariance of eq. (5)."""
     P, d = frozen_covariance(problem.H_plus[None], problem.R)[0], linear_bound(problem)
     return P / np.outer(d, d)
 
 
 def informative_rows(noise: Noise, R: Covariance, J: Array, h: Array) -> Array:
-    """Rows A (trials, k, n) with A' A the information on the parameters in readings h (trials, m) of slopes J (trials,
-    m, n): R^-1/2 J; or, if levels of the noise are to be estimated with them, the rows of the normal law's information
-    (Kay, Fundamentals of Statistical Signal Processing I, 1993, eq. 3.31), less what the levels explain."""
+    """Computes rows A (trials, k, n) with A' A the information on the parameters in readings h (trials, m) of slopes J
+    (trials, m, n): R^-1/2 J; or, if levels of the noise are to be estimated with them, the rows of the normal law's
+    information (Kay, Fundamentals of Statistical Signal Processing I, 1993, eq. 3.31), less what the levels explain."""
     known = noise.true_levels(h.shape[1])
     if known is None:
         return R.whiten_jacobian(J)
@@ -48,8 +48,8 @@ def informative_rows(noise: Noise, R: Covariance, J: Array, h: Array) -> Array:
 
 
 def bound_deviations(information: Array, rows: Array) -> Array:
-    """Standard deviations (trials, n) of the bound whose inverse is `information` A' A (trials, n, n), for rows A
-    (trials, k, n); NaN where it is singular.
+    """Computes standard deviations (trials, n) of the bound whose inverse is `information` A' A (trials, n, n), for
+    rows A (trials, k, n); NaN where it is singular.
 
     An ill-conditioned bound is had from A by QR, since an inverse of A' A loses twice the digits, and with them the
     sign of a variance.
@@ -61,8 +61,8 @@ def bound_deviations(information: Array, rows: Array) -> Array:
 
 
 def contraction(J_F: Array) -> tuple[Array, Array, Array]:
-    """Three measures (trials,) of how much g(x) = x - F(x) contracts, from g' = I - J_F, where J_F = H+ J (trials, n,
-    n) and lengths are in multiples of the parameters' units.
+    """Computes three measures (trials,) of how much g(x) = x - F(x) contracts, from g' = I - J_F, where J_F = H+ J
+    (trials, n, n) and lengths are in multiples of the parameters' units.
 
     K = n max abs(dg_i/dx_j) of eq. (15): below 1 it is sufficient for the fixed-point theorem, and far from necessary.
     The infinity norm: below 1 in a neighbourhood it is sufficient as well, and it is never above K. The spectral
@@ -76,8 +76,8 @@ def contraction(J_F: Array) -> tuple[Array, Array, Array]:
 
 
 def curvature(J: Array, second: Array, H_plus: Array) -> Array:
-    """M (trials,) of eq. (23): the largest abs(d2g_i / dx_j dx_k) of Newton's g, where at a root d2g = J_F^-1 d2F with
-    J_F = H+ J, from the slopes J (trials, m, n) and second derivatives (trials, m, n, n) of the readings, for
+    """Computes M (trials,) of eq. (23): the largest abs(d2g_i / dx_j dx_k) of Newton's g, where at a root d2g = J_F^-1
+    d2F with J_F = H+ J, from the slopes J (trials, m, n) and second derivatives (trials, m, n, n) of the readings, for
     H+ (1, n, m); NaN where J_F is singular.
     """
     trials, m, n = J.shape
@@ -86,13 +86,14 @@ def curvature(J: Array, second: Array, H_plus: Array) -> Array:
 
 
 def second_derivatives(model: Measurement, x: Array) -> Array:
-    """d2h/dx_j dx_k at x (trials, n): (trials, m, n, n), by central differences of the Jacobian, symmetrised."""
+    """Computes d2h/dx_j dx_k (trials, m, n, n) at x (trials, n), by central differences of the Jacobian,
+    symmetrised."""
     second = np.stack(list(_bends(model, x)), axis=3)
     return (second + second.swapaxes(2, 3)) / 2
 
 
 def _bends(model: Measurement, x: Array) -> Iterator[Array]:
-    """The derivative (trials, m, n) of the Jacobian by each parameter."""
+    """Yields the derivative (trials, m, n) of the Jacobian by each parameter."""
     step = _STEP * np.maximum(1.0, np.abs(x))
     for k in range(x.shape[1]):
         shift = np.zeros_like(x)
@@ -101,7 +102,7 @@ def _bends(model: Measurement, x: Array) -> Iterator[Array]:
 
 
 def box_bias(J: Array, second: Array, R: Covariance) -> Array:
-    """The bias (trials, n) of least squares to second order, from the slopes J (trials, m, n) and second derivatives.
+    """Computes the bias (trials, n) of least squares to second order, from J (trials, m, n) and second derivatives.
 
     -P J' R^-1 t / 2 with P = (J' R^-1 J)^-1 and t_i = tr(P d2h_i) (Box, J. R. Stat. Soc. B 33, 1971, eq. 2.5).
     """
@@ -113,8 +114,8 @@ def box_bias(J: Array, second: Array, R: Covariance) -> Array:
 
 
 def relative_curvatures(J: Array, second: Array, R: Covariance) -> tuple[Array, Array]:
-    """How much the surface of readings bends (intrinsic) and how unevenly the parameters run on it (parameter effects):
-    root mean squares over directions, each (trials,), within the 95 % region of the linear bound.
+    """Computes how much the surface of readings bends (intrinsic) and how unevenly the parameters run on it (parameter
+    effects): root mean squares over directions, each (trials,), within the 95 % region of the linear bound.
 
     Bates and Watts, J. R. Stat. Soc. B 42, 1980: c sqrt(F), where sqrt(chi2_95(n)) stands for sqrt(n F), as R is known.
     The readings deviate from the tangent plane by half as much, relative to the region's radius.
@@ -135,7 +136,7 @@ def relative_curvatures(J: Array, second: Array, R: Covariance) -> tuple[Array, 
 
 
 def _mean_square(a: Array) -> Array:
-    """The root mean square (trials,) over unit directions d of |d' a d| for a (trials, p, n, n)."""
+    """Computes the root mean square (trials,) over unit directions d of |d' a d| for a (trials, p, n, n)."""
     n = a.shape[2]
     trace = np.einsum("tpii->tp", a)
     squares = 2 * np.sum(a**2, axis=(1, 2, 3)) + np.sum(trace**2, axis=1)
@@ -143,10 +144,10 @@ def _mean_square(a: Array) -> Array:
 
 
 def misspecified(problem: Problem, h: Array, x: Array, root: Array) -> tuple[Array, Array]:
-    """The asymptotic error of least squares under a wrong model, for normal noise and error-free readings h (trials, m)
-    of truths x (trials, n): the bias (trials, n), which is that of the parameters that come closest to h, and the
-    standard deviation (trials, n) of estimates about these; NaN where there is no minimum (Vuong, Caltech working paper
-    652, 1986; Richmond and Horowitz, IEEE Trans. Signal Processing 63, 2015).
+    """Computes the asymptotic error of least squares under a wrong model, for normal noise and error-free readings h
+    (trials, m) of truths x (trials, n): the bias (trials, n), which is that of the parameters that come closest to h,
+    and the standard deviation (trials, n) of estimates about these; NaN where there is no minimum (Vuong, Caltech
+    working paper 652, 1986; Richmond and Horowitz, IEEE Trans. Signal Processing 63, 2015).
 
     It is known as the misspecified Cramér-Rao bound, but bounds nothing: other estimators may err less (Khatib et al.,
     arXiv 2605.20739). Estimates scatter with A^-1 B A^-1, B = J' R^-1 J and A = B - sum_i (R^-1 r)_i d2h_i with the

@@ -18,7 +18,7 @@ EVEN = 0.3
 
 
 def gate(n: int) -> float:
-    """The squared Mahalanobis error of n parameters up to which a trial is a success."""
+    """Computes the squared Mahalanobis error of n parameters up to which a trial is a success."""
     from scipy.special import chdtri
 
     return float(chdtri(n, GATE))

@@ -1,4 +1,4 @@
-"""Ljung and Box's test that successive numbers have nothing to do with each other (Biometrika 65, 1978)."""
+"""Tests by Ljung and Box that successive numbers are uncorrelated (Biometrika 65, 1978)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _LONGEST_LAG = 10
 
 
 def white_p(e: Array) -> Array:
-    """The p-value (trials,) of the test that series e (trials, series, length) are white."""
+    """Computes the p-value (trials,) of the test that series e (trials, series, length) are white."""
     from scipy.special import chdtrc
 
     Q, lags = ljung_box(e)
@@ -18,9 +18,9 @@ def white_p(e: Array) -> Array:
 
 
 def ljung_box(e: Array) -> tuple[Array, Array]:
-    """Q (trials,) of series e (trials, series, length), pooled over the series of a trial, and the number (trials,) of
-    lags at which there are two numbers: the degrees of freedom of Q, a chi-square if the series are white. A NaN is
-    missing; Q is NaN if there is no such lag or all numbers are 0."""
+    """Computes Q (trials,) of series e (trials, series, length), pooled over the series of a trial, and the number
+    (trials,) of lags at which there are two numbers: the degrees of freedom of Q, a chi-square if the series are white.
+    A NaN is missing; Q is NaN if there is no such lag or all numbers are 0."""
     exists = np.isfinite(e)
     placed = np.where(exists, e, 0.0)
     count, total = exists.sum(axis=(1, 2)), np.sum(placed**2, axis=(1, 2))
