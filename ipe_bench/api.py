@@ -58,18 +58,26 @@ def run(
     block_size: int | None = None,
     watch: Watcher | None = None,
 ) -> Summary:
-    """Runs every estimator on the same trials of every scenario and summarises what is known of them.
+    """Runs every estimator on the same trials of every scenario, and summarises what is known of them.
 
-    A model with its `noise`, `prior` and `error_scale` stands for a scenario, a state model for its `StateScenario`,
-    whose estimators are trackers. What `output` holds already is not computed again; without `output` nothing is kept.
-    The result is a frame with a row per scenario, estimator and parameter, in the parameter's own unit, and one of the
-    parameter `all`, the root mean square over parameters of error over bound. It shows the table of the terminal,
-    `.trials` has a row per trial, `.figures` has Matplotlib's figures by name, and `.report(output)` writes the report.
-    What could not be computed is left out, with a warning that says why.
+    Parameters:
+        scenarios: one or several. A measurement with its `noise`, `prior` and `error_scale` stands for a scenario, a
+            state model for its `StateScenario`, whose estimators are trackers.
+        estimators: by label.
+        trials: of each scenario, 1000 unless given; with `precision` the most, 100,000 unless given.
+        precision: 0.01, or {"success": 0.01, "rmse": 0.05} (relative): trials are added until intervals are so narrow.
+        time_limit: seconds after which no more blocks are added.
+        output: folder of the results; what it has is not computed again. None: nothing is kept.
+        execution, block_size, watch: where trials are computed, how many in a block, what is called at each event.
 
-    There are 1000 `trials` unless another number is given. With `precision` (0.01, or {"success": 0.01, "rmse": 0.05},
-    rmse relative) blocks are added until the intervals are that narrow, there are `trials` (100,000 unless given), or
-    `time_limit` seconds are over; `attrs["stops"]` says how many trials each scenario took, and why no more.
+    Returns:
+        A frame with a row per scenario, estimator and parameter, in the parameter's own unit, and one of the parameter
+        `all`, the root mean square over parameters of error over bound. It shows the table of the terminal; `.trials`
+        has a row per trial, `.figures` Matplotlib's figures by name, and `.report(output)` writes the report. With
+        `precision`, `attrs["stops"]` has trials and reason of each scenario. Warnings name what was not computed.
+
+    Raises:
+        UserError: what was asked for cannot be computed; nothing has been computed then.
 
     >>> import ipe_bench as ib
     >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
@@ -79,9 +87,6 @@ def run(
     >>> table = ib.run(bench, {"newton": ib.solvers.Newton()}, precision=0.05)
     >>> [(stop["trials"], stop["reason"]) for stop in table.attrs["stops"]]
     [(250, 'every interval is narrow enough')]
-
-    Raises:
-        UserError: what was asked for cannot be computed; nothing has been computed then.
     """
     from ipe_bench.plugins.extensions import use_statistics
     from ipe_bench.report.summary import Stored, Summary
@@ -105,13 +110,14 @@ def run(
 
 
 def load(directories: Directories) -> pd.DataFrame:
-    """Reads every stored trial of one directory or bundle, or of several: a row per trial and estimator.
+    """Reads every stored trial of one directory or bundle, or of several.
 
-    A row has the measurement, noise, prior, error_scale, seed and estimator, and every key of the config that differs;
-    `error_NAME` and `deviation_NAME` (as the estimator reports it) per parameter, status, message, iterations,
-    simulations, jacobians, time_s, nees, fit_p, solved, success, `crlb_distance` (the squared Mahalanobis distance by
-    the bound at the truth); and the truth `x_NAME` with its bounds `crlb_NAME` and `bayes_NAME`, all in multiples of
-    the parameters' sizes. What is missing or damaged is a warning, and stale results are left out.
+    Returns:
+        A row per trial and estimator: measurement, noise, prior, error_scale, seed, estimator, and every key of the
+        config that differs; status, message, iterations, simulations, jacobians, time_s, nees, fit_p, solved, success,
+        `crlb_distance` (the squared Mahalanobis distance by the bound at the truth); in multiples of the parameters'
+        sizes `error_NAME`, `deviation_NAME` (as the estimator reports it), the truth `x_NAME` and its bounds
+        `crlb_NAME` and `bayes_NAME`. A warning names what is missing or damaged; stale results are left out.
 
     >>> import tempfile, ipe_bench as ib
     >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
@@ -139,10 +145,15 @@ def report(
     figures: Which = "main",
     formats: str | Sequence[str] = "png",
 ) -> ReportResult:
-    """Writes summary.csv, tables/, figures/ and report.html from what is stored, into `output` or the first directory.
+    """Writes summary.csv, tables/, figures/ and report.html from what is stored.
 
-    `figures` are all that the data allow, main (the few that answer the question) or none, as PNG files and in further
-    `formats` such as "pdf" or ["pdf", "svg"]. The result names the files, and has the summary and the problems.
+    Parameters:
+        output: folder of the report; the first directory unless given.
+        figures: all that the data allow, main (the few that answer the question) or none.
+        formats: of figures beside PNG, such as "pdf" or ["pdf", "svg"].
+
+    Returns:
+        The names of the files, the summary and the problems.
 
     >>> import ipe_bench as ib
     >>> ib.report("outputs/nowhere")
@@ -173,17 +184,21 @@ def compare(
 ) -> pd.DataFrame:
     """Tests whether a second version, setting or estimator is better or worse than a first, trial by trial.
 
-    Compares every estimator and scenario that both directories have, or `first` of the first with `second` of the
-    second; without a second directory both are in the first one. Trials are matched by seed and number, else in their
-    order.
+    Parameters:
+        first_directory, second_directory: whose estimators and scenarios are compared, if both have them, on trials
+            matched by seed and number, else in their order; without a second both versions are in the first.
+        first, second: labels, if one estimator is compared with another.
+        alpha: error probability below which a finding is made, of `p` corrected over all rows (Holm).
+        anytime: findings are made by `e`, evidence that may be looked at after any number of trials.
+        fail_on: quantities whose getting worse is listed in `attrs["worse"]`.
+        power, difference: `trials_needed` find such a difference of success with that probability.
+        output: folder for comparison.csv and a page.
 
-    The result has a row per comparison and quantity: success (a difference of shares), error (a ratio of mean
-    Mahalanobis errors, each at most the radius of the gate), cost in simulations (a ratio), and time, which is not
-    tested. `low` and `high` are the ends of the row's own interval, `p` is corrected over all rows (Holm), and `e` is
-    evidence that may be looked at after any number of trials; `finding` says what the second is, by p below `alpha`, or
-    by e where `anytime`. `attrs` has lines on what of `fail_on` is `worse`, and on `problems`, `stale` results and
-    `notes`. With `power` and `difference`, `trials_needed` of a row on success is how many trials find such a
-    difference with that probability. With `output`, comparison.csv and a page are written there.
+    Returns:
+        A row per comparison and quantity: success (a difference of shares), error (a ratio of mean Mahalanobis errors,
+        each at most the radius of the gate), cost in simulations (a ratio), and time, which is not tested. `low` and
+        `high` are the ends of the row's own interval, `finding` says what the second is. `attrs` has lines on what is
+        `worse`, on `problems`, `stale` results and `notes`.
 
     >>> import tempfile, ipe_bench as ib
     >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
@@ -234,12 +249,15 @@ def compare(
 def audit(table: Path | str | pd.DataFrame, *, output: Path | str | None = None) -> Audit:
     """Tests whether the covariance that another program reports describes its errors.
 
-    `table` is a CSV or Parquet file, or a frame, with a row per run: NAME_true and NAME (or NAME_error), NAME_std (or
-    NAME_var), and cov_A_B as far as there are any; see `ipe_bench.statistics.audit.read_claims`. The result has
-    `sentences`, at most three, the strongest first; `verdict`, what the covariance is: "too small", "too large",
-    "right" or "undecided"; `scale`, by which factor true errors exceed the reported standard deviations, with an
-    interval that needs no normal law; and `table()`, the same for each parameter. With `output`,
-    audit.csv and audit.html are written there.
+    Parameters:
+        table: a CSV or Parquet file, or a frame, with a row per run: NAME_true and NAME (or NAME_error), NAME_std (or
+            NAME_var), and cov_A_B as far as there are any; see `ipe_bench.statistics.audit.read_claims`.
+        output: folder for audit.csv and audit.html.
+
+    Returns:
+        An audit: at most three `sentences`, the strongest first; `verdict` on the covariance, "too small", "too large",
+        "right" or "undecided"; `scale`, true errors over reported standard deviations, with an interval that needs no
+        normal law; and `table()`, the same for each parameter.
 
     >>> import numpy as np, pandas as pd, ipe_bench as ib
     >>> error = np.random.default_rng(0).normal(0, 0.3, 200)
@@ -260,10 +278,12 @@ def audit(table: Path | str | pd.DataFrame, *, output: Path | str | None = None)
 
 
 def status(directories: Directories) -> pd.DataFrame:
-    """Counts the trials that runs asked for: a row per scenario and estimator (`truth`: the truth and its bounds).
+    """Counts the trials that runs asked for.
 
-    It has the numbers of trials `expected`, `done`, `missing`, `failed` and `stale`, and `messages`, why trials failed.
-    `attrs["problems"]` has a line for everything that is missing, failed or damaged.
+    Returns:
+        A row per scenario and estimator (`truth`: the truth and its bounds), with the numbers of trials `expected`,
+        `done`, `missing`, `failed` and `stale`, and `messages`, why trials failed. `attrs["problems"]` has a line for
+        everything that is missing, failed or damaged.
 
     >>> import tempfile, ipe_bench as ib
     >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
@@ -323,20 +343,25 @@ def estimate(
 ) -> Answer | LogAnswer:
     """Estimates parameters from real readings by every estimator, with standard errors, residuals and a test of fit.
 
-    A scenario stands for its model with its noise, prior and error scale. `readings` is a CSV or Parquet file, several
-    that share parameters, or an array z (m,) in the model's order and unit, NaN where missing; None: those that come
-    with the model. `noise` states R; without it R is what the file's column sigma says, or the model's own noise, or
-    else one level that is estimated from the residuals (`Unknown`), whose size then cannot test the fit. Filters and
-    `map_lm` need a prior: `error_scale` is the standard deviation of each parameter in multiples of its size, which
-    `prior` widens or narrows. `parameters` says what is known of each, as in {"k": {"fixed": 2.0}, "c": {"positive":
-    True, "nominal": 3.0}}; also `lower`, `upper` and `deviation`. `ignore_columns` of the files are left out. A
-    fit has its estimates by name in `values`, and `x` and `covariance` in the parameters' own units. The answer is the
-    sequence of the fits; it shows itself in a notebook, and `table()` is a frame.
+    Parameters:
+        model: or a scenario, which states `noise`, `prior`, `error_scale`; or a state model, which takes none.
+        readings: a CSV or Parquet file, several that share parameters, or an array z (m,) in the model's order and
+            unit, NaN if missing; None: those of the model. Of a state model one log, a row per epoch, or (K, m).
+        estimators: by label; of a state model trackers. None: a few that suit most models.
+        noise: states R. None: R is that of the file's column sigma, or of the model's own noise, or else one level is
+            estimated from the residuals (`Unknown`), whose size then cannot test the fit.
+        prior, error_scale: of filters and `map_lm`: deviations of `error_scale` sizes, which `prior` widens or narrows.
+        parameters: as {"k": {"fixed": 2.0}, "c": {"positive": True, "nominal": 3.0}}; also lower, upper, deviation.
+        ignore_columns: columns of the files that are left out.
+        find: constants, noises or readings of a state model by formulas, found as `constants` by largest likelihood.
 
-    Of a state model the `estimators` are trackers, `readings` is one log with a row per epoch or an array (K, m), and
-    the answer has a track of each (see `ipe_bench.real.tracks`); only `ignore_columns` and `find` go with
-    it. `find` names constants, process noises or readings of a model by formulas: each tracker then finds the numbers
-    under which it gives the log the largest likelihood, as `constants`.
+    Returns:
+        The sequence of the fits, each with its estimates by name in `values`, and `x` and `covariance` in the
+        parameters' own units; of a state model a track of each (see `ipe_bench.real.tracks`). It shows itself in a
+        notebook, and `table()` is a frame.
+
+    Raises:
+        UserError: the readings are not this model's, or an estimator needs what is not given.
 
     >>> import ipe_bench as ib
     >>> model = ib.measurements.Polynomial()
@@ -346,9 +371,6 @@ def estimate(
     linear_lse converged False
     levenberg_marquardt converged True
     auto converged True
-
-    Raises:
-        UserError: the readings are not this model's, or an estimator needs what is not given.
     """
     from ipe_bench.baselines import LevenbergMarquardt, LinearLSE
     from ipe_bench.plugins.construct import known_parameters
@@ -413,14 +435,22 @@ def design(
 ) -> Design:
     """Evaluates, without simulation, what a scenario's readings say about each parameter, and which would say more.
 
-    The result has `observability` (singular values, bounds, correlations, the least observable direction), `suspects`
-    (what each error of the richer models `errors` does to the estimates, and whether a test of residuals will notice)
-    and `ways`. The richer models are the scenario's truth, or every option of `measurement` that is the same model with
-    more errors, unless others are given. A way chooses by one column of the model's index or reading by reading; `by`
-    names the columns of one way instead. Its `saving` has the fewest readings whose mean bound is not above today's,
-    its `sharpest` the smallest mean bound with `readings` readings (as many as today unless given), of which
-    `measurement(choice)` is the model. Bounds are averaged over truths from the prior: as squares over parameters in
-    units of today's bound (`criterion` A), or as the volume of the ellipsoid (D).
+    Parameters:
+        scenario: or a measurement, with its `noise`, `prior` and `error_scale`.
+        by: columns of the model's index by which the one way chooses; None: ways by each column, and by reading.
+        readings: number that the sharpest choice has; None: as many as today.
+        criterion: bounds are averaged over truths from the prior, as squares over parameters in units of today's bound
+            (A), or as the volume of the ellipsoid (D).
+        errors: richer models; None: the truth, or every option of `measurement` that is the model with more errors.
+
+    Returns:
+        A design with `observability` (singular values, bounds, correlations, the least observable direction),
+        `suspects` (what each error of the richer models does to the estimates, and whether a test of residuals will
+        notice) and `ways`. Of a way, `saving` has the fewest readings whose mean bound is not above today's, `sharpest`
+        the smallest mean bound; `measurement(choice)` is the model of a choice.
+
+    Raises:
+        UserError: the errors of readings are correlated, a column is unknown, or there are too few readings.
 
     >>> import ipe_bench as ib
     >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
@@ -430,9 +460,6 @@ def design(
     (20, 40, True)
     >>> ib.Scenario(found.measurement(half), bench.noise, error_scale=3.0).draw(0, 5).z.shape
     (5, 20)
-
-    Raises:
-        UserError: the errors of readings are correlated, a column is unknown, or there are too few readings.
     """
     from ipe_bench.plugins.extensions import richer_models
     from ipe_bench.trials.design import design as designed
@@ -456,11 +483,15 @@ def posterior(
 ) -> list[Reference]:
     """Samples the posterior of a scenario's first trials, and measures how far each estimator's Gaussian is from it.
 
-    The posterior is sampled by sequential Monte Carlo for normal errors of the covariance R that estimators assume. A
-    result has the `truth` (n,), the `posterior` (draws `x` (draws, n) in multiples of the parameters' sizes, `mean`,
-    `covariance`, `modes` with their `shares`, and whether it has `settled`: two populations agree), and for
-    each estimator its `estimates` and a `divergences` entry: `kl` in nats, `shift`, `width` and `energy`. `watch` is
-    called with the number of each trial before that is sampled.
+    Parameters:
+        scenario: or a measurement, with its `noise`, `prior` and `error_scale`; errors are taken as N(0, R).
+        particles: number of each of two populations that sequential Monte Carlo takes to the posterior.
+        watch: called with the number of each trial before that is sampled.
+
+    Returns:
+        Of each trial the `truth` (n,), the `posterior` (draws `x` (draws, n) in multiples of the parameters' sizes,
+        `mean`, `covariance`, `modes` with their `shares`, and whether it has `settled`: two populations agree), and by
+        label `estimates` and `divergences`, which have `kl` in nats, `shift`, `width` and `energy`.
 
     >>> import ipe_bench as ib
     >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
@@ -485,11 +516,10 @@ def posterior(
 
 
 def check(component: Any) -> list[Finding]:
-    """Checks that a component keeps the promises that every component makes: a finding per check, with its complaint.
+    """Checks that a component, or each option of the plugin in a folder, keeps the promises of its kind.
 
-    `component` is a measurement model, noise, prior, execution or estimator, or the folder of a plugin, all of whose
-    options are checked, statistics, figures, tables and sections among them. A finding whose `complaint` is empty
-    passed.
+    Returns:
+        A finding per check; one whose `complaint` is empty passed.
 
     >>> import ipe_bench as ib
     >>> findings = ib.check(ib.noise.Gaussian(0.1))

@@ -28,7 +28,11 @@ LARGEST = 1e150
 
 class ConstantFilter(ABC):
     """Filters one trial. The state x is the parameters' distance from the nominal point in prior deviations, and the
-    readings are whitened (R = I)."""
+    readings are whitened (R = I).
+
+    Required: `x`, `P`, `predict`, `points` and `update`. Optional: `nis`, to which `update` adds.
+    Promised: random numbers come from a stream that is seeded by the readings; an exception ends this trial alone.
+    """
 
     nis: float = 0.0
     """The squared innovations y' S^-1 y, summed over the epochs so far."""
@@ -61,11 +65,23 @@ class ConstantFilter(ABC):
 
 @dataclass(frozen=True)
 class Sequential(Estimator):
-    """Holds what all filters share. A new filter is a frozen dataclass that says how the `ConstantFilter` of a trial
-    begins, or by which `rule` readings are linearised.
+    """Filters readings epoch by epoch, the parameters as a random constant: a frozen dataclass of its options.
 
-    Reports the filter's P, and as `extras["nis"]` the trial's squared innovations over their number: 1 on average where
-    the filter is consistent (`ipe_bench.statistics.intervals.mean_limits` has the limits).
+    Required: `rule`, with `engine` "batched", or `track`, which returns a `ConstantFilter`. Optional: `slopes`;
+    `relinearisations`. Promised: what an `Estimator` promises. Reported are the filter's P, and as `extras["nis"]` the
+    squared innovations over their number: 1 on average if the filter is consistent (`intervals.mean_limits`).
+
+    >>> import ipe_bench as ib
+    >>> from ipe_bench.states import Taylor
+    >>> @dataclass(frozen=True)
+    ... class Extended(ib.Sequential):
+    ...     engine: Literal["batched"] = "batched"
+    ...     def rule(self):
+    ...         return Taylor()
+    >>> scenario = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01))
+    >>> z = scenario.draw(0, 3).z
+    >>> print(np.ptp([one.estimate(scenario.problem, z).x for one in (Extended(), ib.baselines.EKF())], 0).max() < 1e-9)
+    True
     """
 
     prior_inflation: Positive = 1.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
 import io
 import itertools
 import keyword
@@ -12,6 +13,7 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
+from pkgutil import resolve_name
 from string import Template
 from typing import TYPE_CHECKING
 
@@ -295,13 +297,15 @@ def _write_skill(folder: Path) -> list[Path]:
 
 
 def _page(kind: str) -> str:
-    """Returns instructions for a component of a kind, with the skeleton, and with the promises that `check` tests."""
+    """Returns instructions for a component of a kind: its contract, the skeleton, and what `check` tests."""
     name = f"my_{kind}"
     tried = [line.strip() for line in _said(f"new {kind} {name}").splitlines() if "ipe-bench check" in line]
     check = tried[0].removeprefix("ipe-bench ")
     promises = [line.partition(": ")[2] for line in _said(check).splitlines() if line.startswith("ok")]
     lines = [f"# A new {kind}", ""]
     lines += [f"    ipe-bench {command}" for command in (f"new {kind} {name}", check, PAGES[kind])]
+    for place in plugins.CONTRACTS.get(kind, ()):
+        lines += ["", f"The contract of `{place}`:", "", "```text", inspect.getdoc(resolve_name(place)) or "", "```"]
     for path in (p for p in sorted(Path().rglob(f"{name}.*")) if p.suffix in (".py", ".yaml")):
         lines += ["", f"`{path}`", "", f"```{path.suffix[1:]}", path.read_text(encoding="utf-8").strip(), "```"]
     return "\n".join([*lines, "", "`check` asks of it:", "", *(f"- {promise}" for promise in promises), ""])

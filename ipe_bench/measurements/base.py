@@ -75,11 +75,29 @@ class Recorded:
 
 
 class Measurement(Component, ABC):
-    """A model z = h(x) + v, without the noise v: a frozen dataclass that writes `parameters`, `index` and `simulate`.
+    """Simulates the error-free readings h(x) of z = h(x) + v: a frozen dataclass of its options.
 
-    x is (trials, n) in multiples of the parameters' sizes, h(x) is (trials, m) in `reading_unit`, m >= n, and a trial's
-    readings depend on that trial's x alone, bit for bit. Where m = n the readings can be met exactly, and no fit can be
-    tested.
+    Required: `parameters`, `index` and `simulate`. Optional: `nominal`, 0 unless stated; `analytic`, or a `jacobian` of
+    its own; `usual_noise`; `epochs`, for filters; `periods`, if readings are angles; `recorded`, if real readings come
+    with the model; `inputs` and `with_inputs`, if files bring more than readings; `own_parameters`, if files are joint.
+    Promised: x is (trials, n) in multiples of the parameters' sizes and is not written into, h(x) is (trials, m) in
+    `reading_unit`, m >= n; a trial has the same bits alone and in any batch. If m = n, no fit can be tested.
+
+    >>> import ipe_bench as ib
+    >>> @dataclass(frozen=True)
+    ... class Decay(ib.Measurement):
+    ...     count: int = 5
+    ...     analytic = True
+    ...     parameters = (Parameter("amplitude", "V"), Parameter("rate", "1/s", 0.1))
+    ...     nominal = np.array([2.0, 5.0])
+    ...     @property
+    ...     def index(self):
+    ...         return {"time [s]": list(range(self.count))}
+    ...     def simulate(self, x):
+    ...         amplitude, rate = (x * self.sizes).T[..., None]
+    ...         return amplitude * np.exp(-rate * np.arange(self.count))
+    >>> print(Decay().simulate(np.array([[2.0, 5.0]])).round(2))
+    [[2.   1.21 0.74 0.45 0.27]]
     """
 
     analytic: ClassVar[bool] = False
@@ -108,7 +126,7 @@ class Measurement(Component, ABC):
     by_differential_equations: bool = False
     """Whether the readings are taken from a trajectory that can be entered anywhere: `OdeMeasurement`."""
     recorded: Recorded | None = None
-    """Real readings that come with this model."""
+    """Real readings that come with this model: `estimate` then needs no file, and noise=certified scores by their x."""
 
     @property
     @abstractmethod

@@ -33,6 +33,22 @@ COMPONENT_GROUPS = ("measurement", "noise", "prior", *ESTIMATOR_GROUPS, "state_m
 RECORD_GROUPS = ("statistic", "figure", "table", "section")
 """Config groups of the elements of a report."""
 CHECKED_GROUPS = (*COMPONENT_GROUPS, *RECORD_GROUPS, "experiment")
+CONTRACTS = {
+    "solver": ("ipe_bench.IPE",),
+    "baseline": ("ipe_bench.Estimator",),
+    "filter": ("ipe_bench.Sequential", "ipe_bench.ConstantFilter"),
+    "measurement": ("ipe_bench.Measurement", "ipe_bench.OdeMeasurement"),
+    "state_model": ("ipe_bench.states.StateModel",),
+    "tracker": ("ipe_bench.states.Tracker",),
+    "noise": ("ipe_bench.Noise",),
+    "prior": ("ipe_bench.priors.Prior",),
+    "execution": ("ipe_bench.runs.execution.Execution",),
+    "statistic": ("ipe_bench.statistics.records.Statistic",),
+    "figure": ("ipe_bench.report.figures.views.Figure",),
+    "table": ("ipe_bench.report.tables.Table",),
+    "section": ("ipe_bench.report.sections.Section",),
+}
+"""The classes by which a plugin of each kind is written: their docstrings say what is required, optional, promised."""
 _TARGET_LINE = re.compile(r"^_target_:\s*['\"]?([\w.]+)", re.MULTILINE)
 _PACKAGE_HEADER = re.compile(r"^#\s*@package\s+(\S+)", re.MULTILINE)
 _COMMENT_BEHIND = re.compile(r"^(\w+):.*? # *(.+)$", re.MULTILINE)

@@ -18,7 +18,15 @@ CURVES = ("distributions",)
 
 @dataclass(frozen=True)
 class Section:
-    """Defines a section of report.html, which follows our tables."""
+    """Defines a section of report.html, which follows our tables.
+
+    Required: `title` and `write`. Optional: nothing else. Promised: `write` does not write into the analysis, whose
+    frames our tables are made of, and its tables have new names; one that raises is left out with a line.
+
+    >>> section = Section("Settings", lambda analysis: iter([f"There are {len(analysis.summary)} rows."]))
+    >>> section.title
+    'Settings'
+    """
 
     title: str
     write: Callable[[Analysis], Iterator[Part]]

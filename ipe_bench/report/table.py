@@ -57,7 +57,17 @@ class Column:
 
 @dataclass(frozen=True)
 class Table:
-    """Holds a table with its file name, its title, the caption above it and the notes below it."""
+    """Holds a table with its file name, its title, the caption above it and the notes below it.
+
+    A plugin offers a function of the analysis that returns one, or None if there is nothing to show.
+    Required: `name`, `title`, `caption` and `columns` (`head`, `words` and `column` of `ipe_bench.report.tables` make
+    them). Optional: the other fields. Promised: the function does not write into the analysis, and `name` is new.
+
+    >>> from ipe_bench.report.tables import words
+    >>> table = Table("methods", "Methods", "Who takes part.", [words("estimator", ["ekf", "ukf"])])
+    >>> [cell.text for (cell,) in table.rows]
+    ['ekf', 'ukf']
+    """
 
     name: str
     title: str

@@ -26,7 +26,8 @@ def test_the_router_names_every_page_and_the_pages_are_short(skill):
     assert router.startswith("---\nname: ipe-bench\n")
     assert set(re.findall(r"`(new-\w+\.md)`", router)) | {"SKILL.md"} == {path.name for path in skill.iterdir()}
     assert "\n    ipe-bench run -m error_scale=1,5 " in router
-    assert sum(path.stat().st_size for path in skill.iterdir()) < 25_000
+    assert max(path.stat().st_size for path in skill.iterdir()) < 6_500
+    assert "Required: `step`." in (skill / "new-solver.md").read_text(encoding="utf-8")
     assert "my_solver" not in router.partition("## Options")[2]
 
 

@@ -1,13 +1,15 @@
 """The compiled integrator: coefficients, levels, and bits that depend on nothing but the trial."""
 
+import doctest
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.integrate import DOP853
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.measurements import Ode, OdeMeasurement, Parameter, ode
+from ipe_bench.measurements import Ode, OdeMeasurement, Parameter
 from ipe_bench.measurements.base import differentiate
 from ipe_bench.measurements.ode import plan
 from ipe_bench.measurements.ode.ladder import tangent_contraction
@@ -154,9 +156,9 @@ def test_a_wrong_number_of_derivatives_is_refused():
 
 
 def test_the_example_in_the_docs_of_ode_works():
-    source = "\n".join(line[4:] for line in ode.__doc__.splitlines() if line.startswith("    "))
-    scope = {"np": np, "dataclass": dataclass, "OdeMeasurement": OdeMeasurement, "Parameter": Parameter}
-    exec(source, scope)
+    scope: dict[str, Any] = {"np": np, "OdeMeasurement": OdeMeasurement}
+    for example in doctest.DocTestParser().get_examples(OdeMeasurement.__doc__ or ""):
+        exec(example.source, scope)
     pendulum = scope["Pendulum"]()
     x = pendulum.nominal[None] + np.array([[0.0, 0.0], [1.0, 2.0]])
     z = pendulum.simulate(x)

@@ -1,6 +1,5 @@
 """On trials made up with known bias, variance and success, the summary says what theory says."""
 
-import doctest
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,7 +8,7 @@ import pytest
 from scipy.stats import beta, chi2
 from shared.synthetic_store import Filter, Pretender, Repeated, Synthetic, forge
 
-from ipe_bench.statistics import analyse, records, summarize
+from ipe_bench.statistics import analyse, summarize
 from ipe_bench.statistics.intervals import clopper_pearson
 from ipe_bench.statistics.registry import summary_columns
 
@@ -28,12 +27,6 @@ def errors(trials: int, seed: int = 0, bias=(0.0, 0.05, 0.0), factor: float = 1.
     # Exactly centred and scaled, so that sample moments are known without sampling error.
     e = (e - e.mean(axis=0)) / e.std(axis=0)
     return 0.1 * factor * e + np.asarray(bias)
-
-
-def test_the_example_of_a_statistic_runs_as_it_says():
-    found = doctest.testmod(records)
-    assert found.attempted > 5
-    assert found.failed == 0
 
 
 def test_moments_are_those_of_the_errors_in_physical_units(synthetic):

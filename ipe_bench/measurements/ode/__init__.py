@@ -1,33 +1,6 @@
 """Defines measurement models by ordinary differential equations, on a compiled batched integrator.
 
-A model is one class, here a pendulum of unknown length and damping that is released from half a radian:
-
-    @dataclass(frozen=True)
-    class Pendulum(OdeMeasurement):
-        tolerance = 1e-9                                       # of a reading, in the reading's unit
-        states, outputs, reading_unit = 2, ("angle",), "rad"
-
-        @property
-        def parameters(self):                                  # x counts in these sizes
-            return Parameter("length", "m", 0.01), Parameter("damping", "1/s", 0.01)
-
-        @property
-        def nominal(self):                                     # about 1 m and no damping
-            return np.array([100.0, 0.0])
-
-        @property
-        def times(self):                                       # readings are taken then; the start is at 0
-            return np.arange(0.5, 10.5, 0.5)
-
-        def start(self, p, c):                                 # p: the parameters, length and damping
-            return 0.5, 0.0
-
-        def rhs(self, t, y, p, c):
-            angle, rate = y
-            return rate, -9.80665 / p[0] * np.sin(angle) - p[1] * rate
-
-        def read(self, t, y, p, c):
-            return (y[0],)
+A model is one class, `OdeMeasurement`, whose docstring has an example.
 
 `start`, `rhs` and `read` are called with unknown quantities in place of numbers, once, and what they do is recorded:
 they may use + - * / **, NumPy's sin cos tan arctan exp log sqrt sinh cosh tanh, arctan2 hypot sign floor mod,

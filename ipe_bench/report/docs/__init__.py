@@ -7,9 +7,9 @@ formulas as MathML, which needs no script and no network.
 from __future__ import annotations
 
 import re
+from pkgutil import resolve_name
 from typing import Annotated, Any, get_args, get_origin
 
-import ipe_bench
 from ipe_bench.basics import options
 
 _CONSTRAINED = {n: get_args(t)[0].__name__ for n, t in vars(options).items() if get_origin(t) is Annotated}
@@ -23,8 +23,8 @@ def show_type(app: Any, what: str, name: str, thing: Any, options: Any, lines: l
         for line in [line for line in lines if line.startswith(":type: ")]:
             lines.remove(line)
             lines[0] = f"{line.removeprefix(':type: ')}: {lines[0]}"
-        owner, _, attribute = name.removeprefix("ipe_bench.").partition(".")
-        lines += ["", f":type: {type_of(getattr(ipe_bench, owner), attribute) or 'object'}"]
+        owner, _, attribute = name.rpartition(".")
+        lines += ["", f":type: {type_of(resolve_name(owner), attribute) or 'object'}"]
 
 
 def type_of(cls: type, attribute: str) -> str:

@@ -26,7 +26,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.files import make_folder, write_text
 from ipe_bench.basics.statuses import Status
 from ipe_bench.plugins.construct import described
-from ipe_bench.plugins.discovery import PACKAGES, Option, options
+from ipe_bench.plugins.discovery import CONTRACTS, PACKAGES, Option, options
 from ipe_bench.report.figures import INDEX
 from ipe_bench.report.table import environment
 from ipe_bench.report.words import brief, duration, enumerate_few, percent
@@ -67,6 +67,7 @@ GROUPS = {
     "tracker": "Filters and smoothers of states",
     "execution": "Executions",
 }
+CLASSES = {place for places in CONTRACTS.values() for place in places}
 FIGURES = 8
 """Largest number of an experiment's pictures on its page."""
 ORDINARY, LEAST = 1000, 3
@@ -133,7 +134,8 @@ def write_reference(folder: Path) -> None:
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         said = pool.map(lambda name: printed_by([name, "--help"], columns=100).rstrip(), names)
         write_page(folder / "commands.md", "commands", commands={"": summary, **dict(zip(names, said, strict=True))})
-    things = [(name, getattr(ipe_bench, name)) for name in ipe_bench.__all__]
+    write_page(folder / "contracts.md", "contracts", kinds=CONTRACTS)
+    things = [(name, getattr(ipe_bench, name)) for name in ipe_bench.__all__ if f"ipe_bench.{name}" not in CLASSES]
     shown = [(name, thing) for name, thing in things if hasattr(thing, "__qualname__")]
     kinds = [("autoclass" if isinstance(t, type) else "autofunction", f"ipe_bench.{name}") for name, t in shown]
     write_page(folder / "python.md", "python", names=kinds)

@@ -94,7 +94,15 @@ class View:
 
 @dataclass(frozen=True)
 class Figure:
-    """Declares a kind of figure: the frames that it reads, and how it is drawn."""
+    """Declares a kind of figure: the frames that it reads, and how it is drawn.
+
+    Required: `draw` and `frames`. Optional: `together` and `main`. Promised: `draw` reads the view's `frames` and does
+    not write into them; it yields drawings, made by `view.drawing(figure, name, title, ...)`, whose names are new.
+    A statistic of a plugin is a column of the frame `summary`; a figure that raises is left out with a line.
+
+    >>> Figure(lambda view: iter(()), ("summary",)).together
+    False
+    """
 
     draw: Callable[[View], Iterator[Drawing]]
     """Draws what a view allows; nothing if it would be empty."""
