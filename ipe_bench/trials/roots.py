@@ -13,7 +13,7 @@ import numpy as np
 
 from ipe_bench.basics.batches import put
 from ipe_bench.basics.linalg import Array
-from ipe_bench.estimators.driver import Limits, Method, iterate
+from ipe_bench.estimators.driver import E, Limits, Method, iterate
 from ipe_bench.estimators.ipe import IPE, FrozenSystem, State, System
 from ipe_bench.estimators.least_squares import Objective
 from ipe_bench.estimators.levenberg_marquardt import GaussNewtonMethod, LevenbergMarquardtMethod
@@ -61,7 +61,7 @@ def least_squares_root(problem: Problem, z: Array, x_start: Array, *, prior: flo
 
 
 def _first_root(
-    equations: Callable[[Array], Any], z: Array, x_start: Array, *attempts: tuple[Method[Any, Any], int]
+    equations: Callable[[Array], E], z: Array, x_start: Array, *attempts: tuple[Method[E, Any], int]
 ) -> Array:
     """Returns the end of the first method that converges: each has that many iterations from x_start."""
     x, missing = np.full(x_start.shape, np.nan), np.arange(len(z))
