@@ -140,7 +140,8 @@ def _there_already(jobs: Jobs) -> list[str]:
         for job in jobs.specs:
             there -= {cell.identity_key for cell in result_keys(job.scenario, job.estimators)}
         if there:
-            lines.append(f"{output}: holds {counted(len(there), 'result')} of other settings; they stay beside the new")
+            held = f"{counted(len(there), 'result')} of other settings or older code"
+            lines.append(f"{output}: holds {held}; they stay beside the new")
     name, own = jobs.words.chosen("name"), jobs.words.chosen("experiment")
     if name != own and name in [option.name for option in options("experiment")]:
         remedy = f"choose another, or write output=outputs/{name} in its place to mix them"

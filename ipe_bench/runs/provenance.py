@@ -29,6 +29,11 @@ WITHOUT_NUMBERS = tuple(
     )
 )
 """Modules and rooms that no number of a trial comes from: they word messages, name, store, summarise and show."""
+_RENAMED = {
+    "ipe_bench.states.Recorded": "ipe_bench.states.RecordedFormulas",
+    "ipe_bench.trials.Tracking": "ipe_bench.trials.StateScenario",
+}
+"""Classes that results of version 0.2 call otherwise."""
 _SESSION = uuid.uuid4().hex
 """Stands for source that no file holds, such as a notebook's: its results are valid in this session alone."""
 
@@ -50,6 +55,20 @@ def describe(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {str(k): describe(v) for k, v in value.items()}
     return value
+
+
+def identified(value: Any) -> Any:
+    """A description whose classes of this package are named by room and class, as every version finds them, in
+    any file of the room."""
+    if isinstance(value, Mapping):
+        return {k: _found_by(v) if k == TARGET else identified(v) for k, v in value.items()}
+    return [identified(v) for v in value] if isinstance(value, list) else value
+
+
+def _found_by(target: str) -> str:
+    package, *modules, name = target.split(".")
+    target = ".".join((package, *modules[:1], name)) if package == "ipe_bench" else target
+    return _RENAMED.get(target, target)
 
 
 def canonical_json(value: Any) -> str:

@@ -34,7 +34,7 @@ from ipe_bench.runs.parts import (
     join_histories,
     read_record,
 )
-from ipe_bench.runs.provenance import canonical_json
+from ipe_bench.runs.provenance import canonical_json, digest, identified
 from ipe_bench.runs.store import ResultKey, Store, describe_names, gaps, title
 from ipe_bench.trials.thresholds import HISTORIES
 
@@ -189,6 +189,8 @@ class Results:
                     if not known and (found := _OF_ZOO.search(canonical_json(footer["identity"]))):
                         self.moved[footer["identity_key"]] = found[0]
                         continue
+                    identity = identified(footer["identity"])
+                    footer = {**footer, "identity": identity, "identity_key": digest(identity)}
                     self.stored[part.key] = StoredCell(footer, tuple(sorted([*known, part], key=lambda p: p.order)))
         self.runs += tuple(self._records(store.runs, RUN))
         self.attempts += self._records(store.failed, FAILED)
@@ -266,9 +268,11 @@ class Results:
         for run in self.runs:
             for cell in (one for one in run["cells"] if one["identity_key"] not in self.moved):
                 new = _Asked(cell["key"], run["trials"], cell["names"], run.get("refused", ""))
-                known = asked.get(cell["identity_key"], new)
+                # Earlier versions made it of the files of classes, too.
+                identity = (self.stored[new.key].footer if new.key in self.stored else cell)["identity_key"]
+                known = asked.get(identity, new)
                 trials = max(new.trials, known.trials) if known.key == new.key else new.trials
-                asked[cell["identity_key"]] = new._replace(trials=trials)
+                asked[identity] = new._replace(trials=trials)
         return asked
 
     @cached_property

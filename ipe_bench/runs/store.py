@@ -32,7 +32,7 @@ from ipe_bench.estimators.base import Estimator
 from ipe_bench.runs import parts
 from ipe_bench.runs.execution import Failure
 from ipe_bench.runs.parts import SCHEMA, TRUTH, StoredPart
-from ipe_bench.runs.provenance import describe, digest, fingerprint
+from ipe_bench.runs.provenance import describe, digest, fingerprint, identified
 from ipe_bench.states.trackers import Tracker
 from ipe_bench.trials.scenario import Scenario
 from ipe_bench.trials.theory import linear_correlation
@@ -71,8 +71,8 @@ class ResultKey:
 
     @cached_property
     def identity_key(self) -> str:
-        """Sixteen hexadecimal digits that stand for the identity alone."""
-        return digest(self.identity)
+        """Sixteen hexadecimal digits that stand for the identity alone, in whichever files its classes stand."""
+        return digest(identified(self.identity))
 
     @cached_property
     def made_by(self) -> dict[str, Any]:

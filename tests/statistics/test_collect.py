@@ -1,5 +1,6 @@
 """Whatever lies in a directory is used or named, and nothing is touched."""
 
+import json
 import shutil
 
 import numpy as np
@@ -78,11 +79,15 @@ def test_a_file_with_fewer_rows_than_its_name_says_is_damaged(filled):
     assert any("does not count from 0 to 20" in line for line in collect([filled.directory]).problems)
 
 
-def test_stale_results_are_named_and_never_mixed_in(filled):
-    # The same identity under the key of another source, as older code would have stored it.
+@pytest.mark.parametrize("file", ["kinds", "base"])
+def test_stale_results_are_named_and_never_mixed_in(filled, file):
+    # The same identity under the key of another source, as older code would have stored it, with noise in this file.
     for path in pieces(filled):
         footer, table = parts.StoredPart.parse(path).read()
-        footer = {**footer, "key": digest("of older code"), "source": "old"}
+        identity = json.loads(json.dumps(footer["identity"]).replace(".noise.kinds.", f".noise.{file}."))
+        assert (identity == footer["identity"]) is (file == "kinds")
+        older = {"key": digest("of older code"), "source": "old"}
+        footer = {**footer, **older, "identity": identity, "identity_key": digest(identity)}
         table = table.set_column(table.column_names.index("error_a"), "error_a", [np.full(20, 1e9)])
         parts.write(path.with_name(path.name.replace(path.name[:16], footer["key"])), table, footer)
     analysis = analyse([filled.directory])
