@@ -15,7 +15,7 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Finite
 from ipe_bench.measurements.arithmetic import Arithmetic, never_switching, parse
 from ipe_bench.measurements.base import Input, Measurement, Parameter
-from ipe_bench.measurements.ode.trace import Graph, Program, tangent
+from ipe_bench.measurements.ode.trace import Graph, Program, slopes
 
 _FARTHER = (0.3, -0.3, 1.0, -1.0)
 """Changes of a parameter without a slope, in multiples of its magnitude, at which readings are looked at again."""
@@ -210,12 +210,12 @@ class Formula(WrittenModel):
         known = {name: graph.input(name) for name in self.arithmetic.names}
         try:
             with np.errstate(all="raise", under="ignore"):
-                value, one = graph.apply("add", self.arithmetic(known), 0.0), graph.constant(1.0)
-                slopes = [tangent([value], {known[name]: one})[0] for name in self.start]
+                value = graph.apply("add", self.arithmetic(known), 0.0)
+                by_parameter = slopes(value, map(known.__getitem__, self.start))
         except (ArithmeticError, ValueError, TypeError) as error:
             numbers = "a part that is made of numbers alone has no real value"
             raise UserError(f"measurement.expression: {numbers} ({error})") from None
-        return Program.of([value], list(known.values())), Program.of(slopes, list(known.values()))
+        return Program.of([value], list(known.values())), Program.of(by_parameter, list(known.values()))
 
     def _values(self, x: Array) -> list[Array]:
         p = dict(zip(self.start, (x * self.sizes).T[:, :, None], strict=True))

@@ -13,7 +13,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.measurements.arithmetic import Arithmetic, parse
 from ipe_bench.measurements.base import Parameter
-from ipe_bench.measurements.ode.trace import Graph, Program, tangent
+from ipe_bench.measurements.ode.trace import Graph, Program, slopes
 
 READING = "h"
 """Name of the error-free reading's magnitude in a formula of the standard deviation."""
@@ -109,10 +109,10 @@ class Levels:
         values = [np.abs(h), *(levels[:, :, i] for i in range(len(self.names)))]
         with np.errstate(all="ignore"):
             s, by_h, *by_level = (np.broadcast_to(a, h.shape) for a in _recorded(self.formula)(values))
-            slopes = np.zeros((trials, m, len(self.groups), len(self.names)))
+            by_theta = np.zeros((trials, m, len(self.groups), len(self.names)))
             for i, slope in enumerate(by_level):
-                slopes[:, np.arange(m), self.group, i] = slope * levels[:, :, i] / s
-            return np.log(self.weights * s), by_h * np.sign(h) / s, slopes.reshape(trials, m, -1)
+                by_theta[:, np.arange(m), self.group, i] = slope * levels[:, :, i] / s
+            return np.log(self.weights * s), by_h * np.sign(h) / s, by_theta.reshape(trials, m, -1)
 
 
 @functools.cache
@@ -120,6 +120,5 @@ def _recorded(formula: Arithmetic) -> Program:
     """Records the formula and its derivatives by the reading and by each level."""
     graph = Graph()
     known = {name: graph.input(name) for name in (READING, *level_names(formula))}
-    value, one = graph.apply("add", formula(known), 0.0), graph.constant(1.0)
-    slopes = [tangent([value], {place: one})[0] for place in known.values()]
-    return Program.of([value, *slopes], list(known.values()))
+    value = graph.apply("add", formula(known), 0.0)
+    return Program.of([value, *slopes(value, known.values())], list(known.values()))

@@ -373,7 +373,11 @@ def _read(path: Path) -> pd.DataFrame:
     if not path.is_file():
         raise UserError(f"{path}: there is no such file")
     try:
-        return pd.read_parquet(path) if path.suffix == ".parquet" else pd.read_csv(path, sep=None, engine="python")
+        if path.suffix == ".parquet":
+            return pd.read_parquet(path)
+        # pandas 2 rounds the last digits of numbers if it finds the separator itself.
+        frame, texts = (pd.read_csv(path, sep=None, engine="python", dtype=dtype) for dtype in (None, str))
+        return frame.assign(**{str(name): texts[name].astype(float) for name in frame.select_dtypes("float")})
     except (ValueError, OSError) as error:
         raise UserError(f"{path}: cannot be read as a table ({str(error).splitlines()[0]})") from None
 

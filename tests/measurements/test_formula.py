@@ -4,6 +4,7 @@ import contextlib
 import csv
 import math
 import pickle
+import time
 
 import numpy as np
 import pytest
@@ -178,6 +179,16 @@ def test_a_formula_is_evaluated_or_refused_however_long():
     for text in ("+".join(["b1*t"] * 900), "b1" + "*t" * 2000, "b1" + "**b1" * 2000):
         with pytest.raises(UserError, match=r"^expression: .* one after another; group"):
             parse(text, "expression")
+
+
+def test_a_formula_of_thousands_of_names_has_its_slopes_in_seconds():
+    texts = names = [f"b{i}" for i in range(3000)]
+    while len(texts) > 1:
+        texts = [f"({'+'.join(texts[i : i + 15])})" for i in range(0, len(texts), 15)]
+    begun = time.process_time()
+    model = Formula(texts[0], dict.fromkeys(names, 1.0), readings=1)
+    assert (model.jacobian(model.nominal[None]) == 1.0).all()
+    assert time.process_time() - begun < 4
 
 
 def test_comparisons_within_comparisons_are_evaluated_or_refused_however_deep():

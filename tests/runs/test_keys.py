@@ -56,6 +56,16 @@ def edit(path: Path, old: str, new: str) -> None:
     path.write_text(text.replace(old, new), encoding="utf-8")
 
 
+def test_keys_do_not_depend_on_the_order_of_sets_or_of_files_in_a_folder(copy, monkeypatch):
+    (copy / "ipe_bench/measurements/another.json").write_text("{}", encoding="utf-8")
+    listed = "from pathlib import Path; glob = Path.glob; Path.glob = lambda *a: iter(sorted(glob(*a), reverse={}))\n"
+    seen = set()
+    for seed, reverse in (("1", False), ("2", True)):
+        monkeypatch.setenv("PYTHONHASHSEED", seed)
+        seen.add(said(listed.format(reverse) + KEYS, copy))
+    assert len(seen) == 1
+
+
 def test_prose_edited_anywhere_leaves_every_key_as_it_was(copy):
     before = keys(copy)
     edited = 0

@@ -13,6 +13,7 @@ import ipe_bench as ib
 from ipe_bench.plugins.construct import construct
 from ipe_bench.plugins.discovery import composed, options
 from ipe_bench.states import Bootstrap, Formulas, Smoother, Tracker, ckf, ekf, ukf
+from ipe_bench.states.algebra import root
 from ipe_bench.statistics import analyse
 from ipe_bench.statistics.certified import published_table
 from ipe_bench.statistics.collect import collect
@@ -314,3 +315,15 @@ def test_masked_states_are_unknown_and_a_wrong_shape_is_refused():
     assert not block.estimate(Masking((slice(None), -1)))[1]["success"].any()
     with pytest.raises(ValueError, match=r"Masking.track returns degrees of shape \(3, 15\), where \(3, 30\) belongs"):
         block.estimate(Masking((0,), degrees=2))
+
+
+@pytest.mark.parametrize("size", [1e-12, 1.0, 1e12])
+def test_the_root_of_a_covariance_has_as_many_columns_as_that_has_rank(size):
+    rng = np.random.default_rng(10)
+    for rank in (*range(8), *[3] * 50):
+        A = rng.normal(size=(8, rank))
+        G = root(size * A @ A.T)
+        assert G.shape == (8, rank)
+        np.testing.assert_allclose(G @ G.T, size * A @ A.T, rtol=1e-12, atol=1e-13 * size)
+    # A variance that is small beside the others is one all the same.
+    assert root(size * np.diag([1.0, 1e-14, 0.0])).shape == (3, 2)

@@ -119,6 +119,16 @@ def test_wide_and_long_tables_are_the_same_claims(tmp_path):
     assert audit(first).table()["parameter"].tolist() == ["x", "y"]
 
 
+def test_a_file_is_read_to_the_last_digit(tmp_path):
+    rng, file = np.random.default_rng(9), tmp_path / "runs.csv"
+    error, deviation = rng.standard_normal((2, 1000)) * 10.0 ** rng.integers(-12, 12, (2, 1000))
+    rows = [f"{a!r},{b!r}\n" for a, b in zip(error.tolist(), np.abs(deviation).tolist(), strict=True)]
+    file.write_text("x_error,x_std\n" + "".join(rows))
+    found = read_claims(file)
+    assert np.array_equal(found.error[:, 0], error)
+    assert np.array_equal(found.deviation[:, 0], np.abs(deviation))
+
+
 def changed(**columns):
     return frame().assign(**columns)
 

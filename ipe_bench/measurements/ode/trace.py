@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib
 import math
 import operator
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -227,7 +227,15 @@ _PARTIALS: dict[str, Callable[[Any, Any, Any, Any], list[Any]]] = {
 """The derivatives of an operation e by its operands, the first a and the last b."""
 
 
-def in_order(outputs: Iterable[Expression], stop: Collection[Expression] = ()) -> list[Expression]:
+def operands(e: Expression) -> list[Expression]:
+    return [a for a in e.operands if isinstance(a, Expression)]
+
+
+def in_order(
+    outputs: Iterable[Expression],
+    stop: Collection[Expression] = (),
+    needs: Callable[[Expression], Iterable[Expression]] = operands,
+) -> list[Expression]:
     """Lists what the outputs need, operands before their users; what `stop` is computed from is left out."""
     ends = {e.order for e in stop}
     needed: dict[int, Expression] = {}
@@ -237,12 +245,8 @@ def in_order(outputs: Iterable[Expression], stop: Collection[Expression] = ()) -
         if e.order not in needed:
             needed[e.order] = e
             if e.order not in ends:
-                stack.extend(operands(e))
+                stack.extend(needs(e))
     return [needed[order] for order in sorted(needed)]
-
-
-def operands(e: Expression) -> list[Expression]:
-    return [a for a in e.operands if isinstance(a, Expression)]
 
 
 def dependent(outputs: Iterable[Expression], inputs: Iterable[Expression]) -> set[Expression]:
@@ -270,13 +274,28 @@ def substitute(e: Expression, values: Mapping[Expression, Expression]) -> Expres
     return known[e]
 
 
-def tangent(outputs: Sequence[Expression], direction: Mapping[Expression, Expression]) -> list[Expression]:
-    """Differentiates each output along `direction`, which gives the tangent of every input that varies."""
+def slopes(output: Expression, inputs: Iterable[Expression]) -> list[Expression]:
+    """Differentiates the output by each input; of thousands of inputs, each is followed to its own users alone."""
+    users: defaultdict[Expression, list[Expression]] = defaultdict(list)
+    for e in in_order([output]):
+        for a in operands(e):
+            users[a].append(e)
+    one = output.graph.constant(1.0)
+    return [tangent([output], {a: one}, in_order([a], needs=users.__getitem__))[0] for a in inputs]
+
+
+def tangent(
+    outputs: Sequence[Expression],
+    direction: Mapping[Expression, Expression],
+    varying: Iterable[Expression] | None = None,
+) -> list[Expression]:
+    """Differentiates each output along `direction`, which gives the tangent of every input that varies; `varying` is
+    what depends on these, operands before their users, where it is known."""
     if not outputs:
         return []
     zero = outputs[0].graph.constant(0.0)
-    along: dict[int, Expression] = {}
-    for e in in_order(outputs):
+    along: defaultdict[int, Expression] = defaultdict(lambda: zero)
+    for e in in_order(outputs) if varying is None else varying:
         if e.operation in ("input", "constant"):
             along[e.order] = direction.get(e, zero)
             continue
