@@ -105,7 +105,8 @@ class Estimator(Component, ABC):
 
     Required: `estimate`. Optional: `needs`, `equation`, `family`, and `hindrance`, which is asked before any work.
     Promised: a trial has the same bits alone and in any batch, its random numbers included, so products are stacked
-    `matmul` or `einsum`; a trial that fails ends with a status, or raises if it is alone, and disturbs no other;
+    `matmul` or `einsum`; a trial that fails ends with a status, or raises if it is alone, and disturbs no other; a
+    UserError is raised if no trial can be estimated, and ends the run;
     readings that are not finite end as `Status.NONFINITE`; readings and problem are not written into.
 
     >>> import ipe_bench as ib
@@ -152,14 +153,15 @@ class Estimator(Component, ABC):
 def estimate_safely(estimator: Estimator, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
     """Calls `estimator.estimate`, timed; an exception becomes the status of the trials that cause it.
 
-    A batch that raises is estimated again trial by trial. Readings and problem are read-only.
+    A batch that raises is estimated again trial by trial. Readings and problem are read-only. A UserError, which
+    concerns the estimator with all its trials, and a MemoryError, which concerns the machine, are raised.
     """
     began, z = time.perf_counter(), read_only(z)
     try:
         with np.errstate(all="ignore"):
             estimates = estimator.estimate(problem, z, history=history)
-    except MemoryError:
-        raise  # says something of the machine, not of the trial: the block fails and is tried again another day
+    except (MemoryError, UserError):
+        raise  # the block fails and is tried again another day; or the run ends in a line
     except Exception as error:
         if len(z) == 1:
             return Estimates.failed(1, problem.measurement.n, describe_exception(error))
@@ -201,13 +203,14 @@ def _make_plain(estimator: Estimator, estimates: Any, trials: int, n: int) -> No
 
 
 def one_by_one(trials: Iterable[Any], estimate: Any, n: int) -> Estimates:
-    """Joins `estimate(trial)` over trials, for libraries that take one at a time; exceptions become statuses."""
+    """Joins `estimate(trial)` over trials, for libraries that take one at a time; exceptions become statuses as in
+    `estimate_safely`."""
     parts = []
     for trial in trials:
         began = time.perf_counter()
         try:
             part = estimate(trial)
-        except MemoryError:
+        except (MemoryError, UserError):
             raise
         except Exception as error:
             part = Estimates.failed(1, n, describe_exception(error))

@@ -226,11 +226,11 @@ def block_of(scenario: AnyScenario, start: int, stop: int) -> Any:
 
 def track_safely(tracker: Tracker, model: StateModel, z: Array) -> tuple[Tracks, dict[int, str]]:
     """The tracks of readings z (trials, K, m), and why trials have none: a batch that raises is tracked trial by trial,
-    and one that raises alone is NaN."""
+    and one that raises alone is NaN; a UserError or MemoryError is raised."""
     try:
         with np.errstate(all="ignore"):
             tracks = tracker.track(model, read_only(z))
-    except MemoryError:
+    except (MemoryError, UserError):
         raise
     except Exception as error:
         if len(z) == 1:

@@ -1,15 +1,17 @@
 """What every estimator promises: trials that do not know of each other, failures that have a name, options that are
 checked. The conformance checks hold the same on mild problems; here problems are far from linear."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 from shared.estimator_checks import ALL, FILTERS, check_bits, check_failures
 from shared.small_models import Bent
 
-from ipe_bench import baselines, solvers
+from ipe_bench import baselines, run, solvers
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Covariance
-from ipe_bench.estimators.base import Estimator
+from ipe_bench.estimators.base import Estimator, one_by_one
 from ipe_bench.measurements import Gins, Polynomial
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian, Quantization
@@ -45,3 +47,23 @@ def test_what_an_estimator_needs_is_asked_for(estimator):
     assert estimator.hindrance(problem) == "needs prior, which measurement=bent does not have"
     with pytest.raises(UserError, match=f"^{estimator.name}: needs prior, which measurement=bent does not have"):
         estimator.estimate(problem, np.zeros((1, 12)))
+
+
+@dataclass(frozen=True)
+class Unlicensed(Estimator):
+    """Refuses what it is given: in a batch, or where it is looped over."""
+
+    loops: bool
+
+    def estimate(self, problem, z, *, history=False):
+        def refuse(_):
+            raise UserError("has no licence")
+
+        return one_by_one(z, refuse, problem.measurement.n) if self.loops else refuse(z)
+
+
+@pytest.mark.parametrize("loops", [False, True])
+def test_an_estimator_that_refuses_ends_the_run(loops, tmp_path):
+    """A thousand rows of errors would be exit code 0."""
+    with pytest.raises(UserError, match="has no licence"):
+        run(SCENARIOS["polynomial"], {"unlicensed": Unlicensed(loops)}, 3, output=tmp_path)
