@@ -13,7 +13,7 @@ from ipe_bench.basics.linalg import Array, multiply, nearest
 from ipe_bench.basics.options import Component
 from ipe_bench.basics.streams import numbered
 from ipe_bench.measurements.base import Parameter
-from ipe_bench.states.algebra import factor, root
+from ipe_bench.states.algebra import factor, half, root
 
 _START, _PROCESS, _READINGS = range(3)
 """The random streams of a trial: its start, its process noise and the noise of its readings."""
@@ -209,11 +209,11 @@ def require_sound(model: StateModel) -> None:
     for k in range(model.epochs):
         matrices |= {f"Q of epoch {k + 1}": (model.Q(k), n), f"R of epoch {k + 1}": (model.R(k), m)}
     for what, (P, size) in matrices.items():
+        if what[0] == "R" and np.shape(P) == (m, m) and half(P).singular:
+            raise UserError(f"{name}: {what} is singular; give every reading a standard deviation above 0")
         if np.shape(P) != (size, size):
             raise UserError(f"{name}: {what} has shape {np.shape(P)}, where {(size, size)} belongs")
         if not np.allclose(P, P.T, rtol=1e-9, atol=0):
             raise UserError(f"{name}: {what} is not symmetric; give a covariance")
         if not np.linalg.eigvalsh(P)[0] >= -1e-12 * np.abs(P).max() * size:
             raise UserError(f"{name}: {what} has a negative eigenvalue; give a covariance")
-    if not np.isfinite(factor(model.R(0))).all():
-        raise UserError(f"{name}: R is singular; give every reading a standard deviation above 0")

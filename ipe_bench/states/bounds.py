@@ -22,8 +22,8 @@ def posterior_bounds(model: StateModel, paths: Paths) -> tuple[Array, Array]:
     Raises:
         UserError: the process noise of a step is singular; a path then has no density.
     """
-    J, before = np.linalg.inv(model.prior.covariance), paths.start
-    filtered, steps = [], []
+    P, before = model.prior.covariance, paths.start
+    eye, filtered, steps = np.eye(model.n), [], []
     for k in range(model.epochs):
         x = paths.x[:, k]
         H = slope(lambda at, k=k: model.observe(at, k), x)[1]
@@ -38,16 +38,15 @@ def posterior_bounds(model: StateModel, paths: Paths) -> tuple[Array, Array]:
             inverse = np.linalg.inv(Q)
             F = slope(lambda at, k=k: model.transition(at, k), before)[1]
             D11, D12 = _mean(np.matmul(np.matmul(transposed(F), inverse), F)), -_mean(F).T @ inverse
-            steps.append((J + D11, D12))
-            J = inverse + gained - D12.T @ np.linalg.solve(J + D11, D12)
+            V = symmetric(P @ np.linalg.inv(eye + D11 @ P))  # (P^-1 + D11)^-1, of singular P too
+            steps.append((V, D12))
+            P = np.linalg.inv(symmetric(inverse + gained - D12.T @ V @ D12))
         else:
-            J = J + gained
-        J = symmetric(J)
-        filtered.append(np.linalg.inv(J))
+            P = symmetric(P @ np.linalg.inv(eye + gained @ P))
+        filtered.append(P)
         before = x
     smoothed = [filtered[-1]]
-    for A, D12 in reversed(steps[1:] if model.moved_first else steps):
-        V = np.linalg.inv(A)
+    for V, D12 in reversed(steps[1:] if model.moved_first else steps):
         smoothed.append(symmetric(V + V @ D12 @ smoothed[-1] @ D12.T @ V))
     return np.array(filtered), np.array(smoothed[::-1])
 

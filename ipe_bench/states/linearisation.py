@@ -19,7 +19,7 @@ import numpy as np
 from ipe_bench.basics.linalg import Array, multiply
 from ipe_bench.basics.options import Component, Count, Finite, Positive
 from ipe_bench.measurements.base import differentiate
-from ipe_bench.states.algebra import factor, symmetric, transposed, upper_solve
+from ipe_bench.states.algebra import half, symmetric, transposed
 
 Function = Callable[[Array], Array]
 Nearest = Callable[[Array, Array], Array]
@@ -76,16 +76,16 @@ class SigmaPoints(Rule):
 
     def linearise(self, g: Function, m: Array, P: Array, nearest: Nearest | None = None) -> Affine:
         s, w = self.points(m.shape[-1])
-        L = factor(P)
-        y = g(m[..., None, :] + np.matmul(s, transposed(L)))
+        parts = half(P)
+        y = g(m[..., None, :] + np.matmul(s, transposed(parts.G)))
         if nearest is not None:
             y = nearest(y, g(m)[..., None, :])
         mean = np.sum(w[:, None] * y, axis=-2)
         d = y - mean[..., None, :]
         w = self.covariance_weights(w)
-        M = np.matmul(s.T, d * w[:, None])  # L' A'
+        M = np.matmul(s.T, d * w[:, None])  # G' A'
         W = np.matmul(transposed(d * w[:, None]), d) - np.matmul(transposed(M), M)
-        A = transposed(upper_solve(L, M))
+        A = parts.over(transposed(M))
         return Affine(A, mean - multiply(A, m), symmetric(W))
 
     def calls(self, n: int, periodic: bool = False) -> int:

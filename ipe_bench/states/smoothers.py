@@ -7,15 +7,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ipe_bench.basics.linalg import Array, multiply
+from ipe_bench.basics.linalg import Array, Mask, multiply
 from ipe_bench.basics.options import Count, NonNegative
-from ipe_bench.states.algebra import divide, mahalanobis, symmetric, transposed
+from ipe_bench.states.algebra import half, lower_solve, mahalanobis, symmetric, transposed
 from ipe_bench.states.base import Normal, StateModel
 from ipe_bench.states.linearisation import Rule, Taylor
 from ipe_bench.states.trackers import Filter, Tracker, Tracks, filtered, misfit
 
 _HALVINGS = 12
 """Halvings of a damped step."""
+_OUTSIDE = 1e-8
+"""Part of a state by which a step may lie outside the range of its process noise."""
 
 
 @dataclass(frozen=True)
@@ -57,8 +59,9 @@ class IteratedSmoother(Tracker):
             if self.damped:
                 new = _shortened(model, z, path, new)
             calls = calls + np.where(going, new.calls, 0.0)
-            moved = np.abs(new.mean - path.mean) / np.sqrt(np.diagonal(new.covariance, axis1=-2, axis2=-1))
-            path, on = new, (moved > self.tolerance).any(axis=(1, 2))
+            deviation = np.sqrt(np.maximum(np.diagonal(new.covariance, axis1=-2, axis2=-1), 0.0))
+            moved = (np.abs(new.mean - path.mean) > self.tolerance * deviation) & (deviation > 0)
+            path, on = new, moved.any(axis=(1, 2))
             going &= on
             if not on.any():
                 break
@@ -75,51 +78,106 @@ def smoothed(model: StateModel, tracks: Tracks) -> Tracks:
 
     with m-[k+1] and P-[k+1] predicted from epoch k by the affine law A of its transition.
     """
-    out = Tracks.empty(model, len(tracks.mean))
+    out, singular = Tracks.empty(model, len(tracks.mean)), np.zeros(len(tracks.mean), dtype=bool)
     out.mean[:, -1], out.covariance[:, -1] = x = tracks.at(model.epochs - 1)
     first = 0 if model.moved_first else 1
     for k in range(model.epochs - 1, first - 1, -1):
         before = tracks.at(k - 1)
         move, predicted = tracks.moves[k - first], tracks.predicted[k - first]
-        G = divide(np.matmul(before.covariance, transposed(move.A)), predicted.covariance)
+        parts = half(predicted.covariance)
+        singular |= parts.singular
+        G = parts.over(parts.whitened(np.matmul(before.covariance, transposed(move.A))))
         P = np.matmul(np.matmul(G, x.covariance - predicted.covariance), transposed(G))
         x = Normal(before.mean + multiply(G, x.mean - predicted.mean), symmetric(before.covariance + P))
         if k:
             out.mean[:, k - 1], out.covariance[:, k - 1] = x
     out.start = x
     out.moves, out.predicted, out.calls = tracks.moves, tracks.predicted, tracks.calls
+    if singular.any() and len(tracks.reads) == model.epochs:
+        _smooth_by_scores(model, tracks, out, singular)
     return out
 
 
+def _smooth_by_scores(model: StateModel, tracks: Tracks, out: Tracks, rows: Mask) -> None:
+    """Smooths the trials `rows` (trials,) without the inverse of a covariance of states, which then may be singular
+    (Bierman, Automatica 9, 1973): with the score r and the information N that later readings hold of x[k],
+
+        m[k] <- m[k] + P[k] r,   P[k] <- P[k] - P[k] N P[k]
+
+    and, on the way from after the reading of an epoch to after that of the epoch before, C = I - P- H' S^-1 H,
+
+        r <- A' (H' S^-1 y + C' r),   N <- A' (H' S^-1 H + C' N C) A.
+    """
+    n, first = model.n, 0 if model.moved_first else 1
+    r, N = np.zeros((rows.sum(), n)), np.zeros((rows.sum(), n, n))
+    for k in range(model.epochs - 1, first - 1, -1):
+        H, L = (a[rows] for a in tracks.reads[k])
+        B = lower_solve(L, H)
+        seen = np.matmul(transposed(B), B)
+        C = np.eye(n) - np.matmul(tracks.predicted[k - first].covariance[rows], seen)
+        e, A = np.nan_to_num(tracks.innovations[rows, k]), tracks.moves[k - first].A[rows]
+        r = multiply(transposed(A), multiply(transposed(B), e) + multiply(transposed(C), r))
+        N = seen + np.matmul(np.matmul(transposed(C), N), C)
+        N = symmetric(np.matmul(np.matmul(transposed(A), N), A))
+        m, P = (a[rows] for a in tracks.at(k - 1))
+        mean, covariance = m + multiply(P, r), symmetric(P - np.matmul(np.matmul(P, N), P))
+        variances = np.einsum("tii->ti", covariance)  # a view
+        np.maximum(variances, 0.0, out=variances)  # round-off of states that are known exactly
+        at = out.at(k - 1)
+        at.mean[rows], at.covariance[rows] = mean, covariance
+
+
 def path_cost(model: StateModel, z: Array, start: Array, mean: Array) -> Array:
-    """-2 log p(path | readings) (trials,) up to a constant; disturbances count by the pseudo-inverse of the gain."""
+    """-2 log p(path | readings) (trials,) up to a constant; disturbances count by the pseudo-inverse of the gain.
+    Infinite if the start or a step lies outside the range of its noise, where a path has no density."""
     total, before = mahalanobis(start - model.prior.mean, model.prior.covariance), start
     for k in range(model.epochs):
         if model.moves(k):
-            w = multiply(np.linalg.pinv(model.gain(k)), mean[:, k] - model.transition(before, k))
-            total = total + np.sum(w**2, axis=-1)
+            G, moved = model.gain(k), model.transition(before, k)
+            w = multiply(np.linalg.pinv(G), step := mean[:, k] - moved)
+            size = np.abs(mean[:, k]) + np.abs(moved) + np.abs(step).max(axis=-1, keepdims=True)
+            outside = (np.abs(step - multiply(G, w)) > _OUTSIDE * size).any(axis=-1)
+            total = total + np.where(outside, np.inf, np.sum(w**2, axis=-1))
         total, before = total + misfit(model, z[:, k], mean[:, k, None], k)[0][:, 0], mean[:, k]
     return total
 
 
-def _halved(old: Array, new: Array, cost: Callable[[Array], Array]) -> tuple[Array, Array]:
-    """The step from `old` to `new` (trials, ...), halved in each trial until the cost (trials,) is not above that of
-    `old`; and how many costs (trials,) that took."""
-    best, share = cost(old), np.ones((len(old),) + (1,) * (old.ndim - 1))
-    worse, taken = np.ones(len(old), dtype=bool), np.ones(len(old))
+def admissible(model: StateModel, x: Array) -> Array:
+    """The path x (trials, 1 + K, n) from before the first transition, each step moved into the range of its noise:
+
+    x[k] <- f(x[k-1]) + G G^+ (x[k] - f(x[k-1]))
+    """
+    gains = {k: model.gain(k) for k in range(model.epochs) if model.moves(k)}
+    if all(np.linalg.matrix_rank(G) == model.n for G in gains.values()):
+        return x
+    x = x.copy()
+    for k, G in gains.items():
+        moved = model.transition(x[:, k], k)
+        x[:, k + 1] = moved + multiply(G @ np.linalg.pinv(G), x[:, k + 1] - moved)
+    return x
+
+
+def _halved(
+    old: Array, new: Array, cost: Callable[[Array], Array], steer: Callable[[Array], Array]
+) -> tuple[Array, Array]:
+    """The step from `old` to `new` (trials, ...), steered, and halved in each trial until the cost (trials,) is not
+    above that of `old`; and how many costs (trials,) that took."""
+    best, share = cost(steer(old)), np.ones((len(old),) + (1,) * (old.ndim - 1))
+    x, worse, taken = new, np.ones(len(old), dtype=bool), np.ones(len(old))
     for _ in range(_HALVINGS):
         taken += worse
-        worse = ~(cost(old + share * (new - old)) <= best * (1 + 1e-12))
+        x = steer(old + share * (new - old))
+        worse = ~(cost(x) <= best * (1 + 1e-12))
         if not worse.any():
             break
         share[worse] /= 2
-    return old + share * (new - old), taken
+    return x, taken
 
 
 def _shortened(model: StateModel, z: Array, old: Tracks, new: Tracks) -> Tracks:
     """The step from one path to the next, halved where it raises the path's cost."""
     first, last = (np.concatenate([path.start.mean[:, None], path.mean], axis=1) for path in (old, new))
-    path, costs = _halved(first, last, lambda x: path_cost(model, z, x[:, 0], x[:, 1:]))
+    path, costs = _halved(first, last, lambda x: path_cost(model, z, x[:, 0], x[:, 1:]), lambda x: admissible(model, x))
     new.calls = new.calls + costs * model.evaluations
     new.mean, new.start = path[:, 1:], Normal(path[:, 0], new.start.covariance)
     return new

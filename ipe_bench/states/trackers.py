@@ -46,6 +46,9 @@ class Tracks:
     """The transitions as they were linearised."""
     predicted: list[Normal] = field(default_factory=list)
     """The states after each transition, before the reading."""
+    reads: list[tuple[Array, Array]] = field(default_factory=list)
+    """H (trials, m, n) of the readings of each epoch as they were linearised, 0 of missing ones, and L (trials, m, m)
+    with L L' = S of their innovations."""
 
     @classmethod
     def empty(cls, model: StateModel, trials: int) -> Tracks:
@@ -66,6 +69,8 @@ class Tracks:
         self.mean[:, k], self.covariance[:, k] = found.x
         self.nis[:, k], self.innovations[:, k], self.degrees[:, k] = found.nis, found.innovation, found.degrees
         self.log_likelihood += found.log_likelihood
+        if found.read is not None:
+            self.reads.append(found.read)
         return found.x
 
     @classmethod
@@ -147,15 +152,19 @@ class Update(NamedTuple):
     nis: Array
     degrees: Array
     log_likelihood: Array
+    read: tuple[Array, Array] | None = None
+    """H and L of `Tracks.reads`."""
 
     @classmethod
-    def of(cls, x: Normal, y: Array, L: Array, seen: Mask) -> Update:
-        """The states x after an innovation y (trials, m) of covariance L L'; only readings that are `seen` count."""
+    def of(cls, x: Normal, y: Array, L: Array, seen: Mask, H: Array | None = None) -> Update:
+        """The states x after an innovation y (trials, m) of covariance L L', by a reading of slope H (trials, m, n);
+        only readings that are `seen` count."""
         e = lower_solve(L, y[..., None])[..., 0]
         nis, degrees = np.sum(e**2, axis=-1), seen.sum(axis=-1)
         log_determinant = 2 * np.log(np.diagonal(L, axis1=-2, axis2=-1)).sum(axis=-1)
         log_likelihood = -0.5 * (nis + log_determinant + degrees * np.log(2 * np.pi))
-        return cls(x, np.where(seen, e, np.nan), nis, degrees, log_likelihood)
+        read = None if H is None else (H, L)
+        return cls(x, np.where(seen, e, np.nan), nis, degrees, log_likelihood, read)
 
 
 def update(x: Normal, read: Affine, R: Array, z: Array) -> Update:
@@ -179,7 +188,7 @@ def update(x: Normal, read: Affine, R: Array, z: Array) -> Update:
     K = transposed(upper_solve(L, lower_solve(L, transposed(PH))))
     rest = np.eye(m.shape[-1]) - np.matmul(K, H)
     covariance = np.matmul(np.matmul(rest, P), transposed(rest)) + np.matmul(np.matmul(K, noise), transposed(K))
-    return Update.of(Normal(m + multiply(K, y), symmetric(covariance)), y, L, seen)
+    return Update.of(Normal(m + multiply(K, y), symmetric(covariance)), y, L, seen, H)
 
 
 @dataclass(frozen=True)

@@ -211,7 +211,7 @@ class Odd(ConstantVelocity):
         ("skew", "Q of epoch 1 is not symmetric"),
         ("negative", "Q of epoch 1 has a negative eigenvalue"),
         ("reading", r"h has shape \(1, 2\), where \(1, 1\) belongs"),
-        ("noise", "R is singular"),
+        ("noise", "R of epoch 1 is singular"),
     ],
 )
 def test_a_model_whose_parts_do_not_suit_one_another_is_refused(part, complaint):

@@ -1,0 +1,228 @@
+"""States that are known exactly and other singular covariances: against exact arithmetic."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from shared.state_models import CoordinatedTurn
+
+import ipe_bench as ib
+from ipe_bench.measurements import Parameter
+from ipe_bench.states import (
+    Bootstrap,
+    Cubature,
+    Filter,
+    GaussHermite,
+    IteratedSmoother,
+    Normal,
+    Smoother,
+    StateModel,
+    Taylor,
+    ckf,
+    ekf,
+    posterior_bounds,
+    ukf,
+)
+from ipe_bench.states.algebra import mahalanobis
+from ipe_bench.states.smoothers import path_cost
+from ipe_bench.trials.tracking import StateScenario
+
+
+@dataclass(frozen=True)
+class Linear(StateModel):
+    """x[k] = F x[k-1] + G w, z = H x + v, of numbers that are exact in binary; the prior is G0 G0'."""
+
+    F: tuple = ((1.0, 1.0), (0.0, 1.0))
+    G0: tuple = ((1.0, 0.0), (0.0, 1.0))
+    G: tuple = ((0.5, 0.0), (0.25, 0.5))
+    H: tuple = ((1.0, 0.0),)
+    V: tuple = ((1.0,),)
+    mean: tuple = (1.0, -2.0)
+    moved_first: bool = True
+
+    @property
+    def times(self):
+        return np.arange(1.0, 8.0)
+
+    @property
+    def states(self):
+        return tuple(Parameter(f"x{i}") for i in range(len(self.F)))
+
+    @property
+    def prior(self):
+        return Normal(np.array(self.mean), np.array(self.G0) @ np.array(self.G0).T)
+
+    def transition(self, x, k):
+        return np.einsum("ij,...j->...i", np.array(self.F), x)
+
+    def observe(self, x, k):
+        return np.einsum("ij,...j->...i", np.array(self.H), x)
+
+    def gain(self, k):
+        return np.array(self.G)
+
+    def R(self, k):
+        return np.array(self.V)
+
+
+NONE = ((0.0, 0.0), (0.0, 0.0))
+CASES = {
+    "one state known and constant": Linear(G0=((1.0, 0.0), (0.0, 0.0)), G=((0.5, 0.0), (0.0, 0.0))),
+    "one state known at first": Linear(G0=((1.0, 0.0), (0.0, 0.0))),
+    "everything known": Linear(G0=NONE, G=NONE),
+    "everything known at first": Linear(G0=NONE),
+    "one error of two states": Linear(G0=((1.0, 0.0), (2.0, 0.0)), G=NONE),
+    "no process noise": Linear(G=NONE),
+    "process noise of rank 1": Linear(G=((0.0,), (0.25,))),
+    "a state that is forgotten": Linear(F=((0.0, 1.0), (0.0, 1.0)), G=((0.0,), (0.25,))),
+    "states that become one": Linear(F=((1.0, 1.0), (1.0, 1.0)), G=NONE, V=((4.0,),)),
+    "readings of what is known": Linear(F=((1.0, 0.0), (0.0, 1.0)), G0=((0.0, 0.0), (0.0, 1.0)), G=NONE),
+    "the same reading twice": Linear(G0=NONE, H=((1.0, 0.0),) * 2, V=((1.0, 0.5), (0.5, 1.0)), G=((1.0,), (1.0,))),
+    "nearly exact readings": Linear(G0=((2.0, 0.0), (0.0, 0.0)), V=((2.0**-30,),)),
+    "a vague and a known state": Linear(G0=((2.0**12, 0.0), (0.0, 0.0)), G=((0.0,), (0.25,))),
+    "no first transition": Linear(G0=((1.0, 0.0), (2.0, 0.0)), G=((0.0,), (0.25,)), moved_first=False),
+    "three states of rank 1": Linear(
+        F=((1.0, 0.5, 0.25), (0.0, 1.0, 0.5), (0.0, 0.0, 1.0)),
+        G0=((1.0,), (0.5,), (0.25,)), G=((0.0,), (0.0,), (0.5,)), H=((1.0, 0.0, 0.0),), mean=(0.0, 1.0, 2.0),
+    ),
+}  # fmt: skip
+FILTERS = {"ekf": ekf(), "ukf": ukf(), "ckf": ckf(), "ghkf": Filter(GaussHermite(2)), "iplf": Filter(Cubature(), 3)}
+SMOOTHERS = {name: Smoother(tracker) for name, tracker in FILTERS.items()} | {
+    "ieks": IteratedSmoother(ekf(), Taylor(), 4),
+    "damped": IteratedSmoother(ukf(), Taylor(), 4, damped=True),
+    "ipls": IteratedSmoother(ukf(), Cubature(), 4),
+}
+
+
+def exact(model, z):
+    """Means (K, n) and covariances (K, n, n) of the states given all readings, and given those up to each epoch, in
+    fractions: conditional expectations of one joint normal distribution."""
+
+    def rational(a):
+        return np.vectorize(Fraction)(np.array(a, dtype=float))
+
+    F, H, V, Q, z = (rational(a) for a in (model.F, model.H, model.V, model.Q(0), z))
+    (m, P), K, n = map(rational, model.prior), len(z), model.n
+    X, means = np.zeros((0, 0), dtype=object) + Fraction(0), []
+    for k in range(K):  # the covariance of the states of all epochs so far
+        if k:
+            cross = F.dot(X[-n:])
+            P = F.dot(X[-n:, -n:]).dot(F.T) + Q
+            X = np.block([[X, cross.T], [cross, P]])
+            m = F.dot(m)
+        else:
+            m, P = (F.dot(m), F.dot(P).dot(F.T) + Q) if model.moved_first else (m, P)
+            X = P
+        means.append(m)
+    mean = np.concatenate(means)
+    A, R = (np.kron(np.eye(K, dtype=int), part) for part in (H, V))
+
+    def given(epochs):
+        rows = slice(0, epochs * len(H))
+        C = X.dot(A[rows].T)
+        gain = C.dot(inverse(A[rows].dot(C) + R[rows, rows]))
+        return mean + gain.dot(z.ravel()[rows] - A[rows].dot(mean)), X - gain.dot(C.T)
+
+    def each(distributions):
+        parts = [
+            (m[i : i + n], P[i : i + n, i : i + n]) for i, (m, P) in zip(range(0, K * n, n), distributions, strict=True)
+        ]
+        return [np.array(part, dtype=float) for part in zip(*parts, strict=True)]
+
+    return each([given(K)] * K), each([given(k + 1) for k in range(K)])
+
+
+def inverse(A):
+    """Of a regular matrix of fractions, by Gauss and Jordan."""
+    n = len(A)
+    M = np.hstack([A, np.eye(n, dtype=int) * Fraction(1)])
+    for i in range(n):
+        M[i] = M[i] / M[i, i]  # positive definite: no pivot is 0
+        for j in set(range(n)) - {i}:
+            M[j] = M[j] - M[i] * M[j, i]
+    return M[:, n:]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_singular_cases_have_their_exact_conditional_means(case):
+    model = CASES[case]
+    z = np.round(model.draw(0, 1).z * 64) / 64
+    (mean, P), (filtered, P_filtered) = exact(model, z[0])
+    for trackers, m, C in ((FILTERS, filtered, P_filtered), (SMOOTHERS, mean, P)):
+        for name, tracker in trackers.items():
+            track = tracker.track(model, z)
+            np.testing.assert_allclose(track.mean[0], m, rtol=1e-9, atol=1e-9, err_msg=name)
+            np.testing.assert_allclose(track.covariance[0], C, rtol=1e-8, atol=1e-9, err_msg=name)
+
+
+@dataclass(frozen=True)
+class Known(CoordinatedTurn):
+    """The turn whose rate at the start is known exactly, and never walks."""
+
+    known: float = 0.0
+
+    @property
+    def prior(self):
+        m, P = super().prior
+        return Normal(m, np.diag([*np.diagonal(P)[:4], self.known]))
+
+
+@pytest.mark.parametrize("walk", [1.75e-4, 0.0], ids=["walks", "constant"])
+@pytest.mark.parametrize("tracker", [ukf(), *SMOOTHERS.values()], ids=["ukf", *SMOOTHERS])
+def test_a_rate_known_exactly_is_the_limit_of_a_rate_known_well(tracker, walk):
+    known, nearly = (Known(count=25, walk=walk, known=variance) for variance in (0.0, 1e-20))
+    paths = known.draw(0, 6)
+    whole, limit = tracker.track(known, paths.z), tracker.track(nearly, paths.z)
+    size = np.sqrt(np.diagonal(limit.covariance, axis1=2, axis2=3))
+    far = 1e-3 if tracker is not SMOOTHERS["damped"] else 0.05  # whose steps are halved at discrete points
+    assert np.abs((whole.mean - limit.mean) / np.where(size > 1e-9, size, 1.0)).max() < far
+    assert np.array_equal(tracker.track(known, paths.z[2:3]).mean, whole.mean[2:3])
+
+
+def test_damped_steps_keep_to_paths_that_the_process_noise_reaches():
+    model = Known(count=25, walk=0.0, known=1e-2)
+    paths = model.draw(0, 8)
+    found = {damped: IteratedSmoother(ekf(), Taylor(), 15, damped).track(model, paths.z) for damped in (False, True)}
+    cost = {damped: path_cost(model, paths.z, t.start.mean, t.mean) for damped, t in found.items()}
+    assert np.isfinite(cost[True]).all()
+    assert (cost[True] <= cost[False] * (1 + 1e-9)).all()
+    assert np.ptp(found[True].mean[..., 4], axis=1).max() == 0.0
+    broken = found[True].mean.copy()
+    broken[3, 7, 4] += 1e-3
+    assert np.isinf(path_cost(model, paths.z, found[True].start.mean, broken)).tolist() == [i == 3 for i in range(8)]
+
+
+def test_a_distance_outside_of_the_range_is_infinite():
+    P = np.array([[1.0, 2.0, 0.0], [2.0, 4.0, 0.0], [0.0, 0.0, 0.0]])
+    e = np.array([[1.0, 2.0, 0.0], [1.0, 2.1, 0.0], [0.0, 0.0, 1e-9], [-3.0, -6.0, 0.0]])
+    np.testing.assert_allclose(mahalanobis(e, P), [1.0, np.inf, np.inf, 9.0], rtol=1e-12)
+
+
+def test_bounds_exist_where_the_start_is_known():
+    model = Linear(G0=((1.0, 0.0), (2.0, 0.0)))
+    paths = model.draw(0, 3)
+    filtered, smoothed = posterior_bounds(model, paths)
+    np.testing.assert_allclose(filtered, ekf().track(model, paths.z).covariance[0], rtol=1e-10)
+    np.testing.assert_allclose(smoothed, Smoother(ekf()).track(model, paths.z).covariance[0], rtol=1e-10)
+
+
+def test_particles_of_known_states_stand_on_them():
+    model = CASES["everything known"]
+    paths = model.draw(0, 2)
+    np.testing.assert_allclose(Bootstrap(20).track(model, paths.z).mean, paths.x, rtol=1e-12)
+
+
+@dataclass(frozen=True)
+class ExactLater(Linear):
+    """A model whose third reading has no error."""
+
+    def R(self, k):
+        return (k != 2) * super().R(k)
+
+
+def test_exact_readings_are_refused():
+    with pytest.raises(ib.UserError, match="R of epoch 3 is singular; give every reading a standard deviation above 0"):
+        StateScenario(ExactLater())
