@@ -7,7 +7,7 @@
     fits = ib.estimate(ib.measurements.Gins(), "my.csv", noise=ib.noise.Quantization(step=0.02286))
     ib.load("outputs/paper").groupby(["estimator", "error_scale"])["nees"].mean()
 
-Importing it costs nothing: each name is loaded when it is first used.
+The import is quick, because each name is loaded when it is first used.
 """
 
 # ruff: noqa: F401

@@ -226,7 +226,7 @@ class EnKF(Sequential):
 
     members: Annotated[int, Gt(1)] = 100
     seed: Whole = 0
-    """A trial's random stream depends on this and on its readings: on nothing else in the batch."""
+    """Seed of a trial's random stream, which depends on this and on the trial's readings alone."""
 
     family = "ensembles"
 

@@ -188,7 +188,7 @@ class Multistart(Estimator):
     tolerance: Positive = 1e-6
     """Largest Gauss-Newton step in standard deviations of the local bound."""
     seed: Whole = 0
-    """A trial's random stream depends on this and on its readings: on nothing else in the batch."""
+    """Seed of a trial's random stream, which depends on this and on the trial's readings alone."""
     budget: Positive | None = None
     """Simulations that a trial may cost, a Jacobian counting n; None: no limit."""
 

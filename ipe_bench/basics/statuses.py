@@ -23,7 +23,7 @@ class Status(IntEnum):
     SINGULAR = 5, "a linear system had no unique solution"
     BUDGET = 6, "the budget of simulations was used up"
     ERROR = 7, "the estimator or the model raised an exception"
-    NO_READINGS = 8, "the true parameters have no finite readings, so there was nothing to estimate from"
+    NO_READINGS = 8, "the true parameters have no finite readings, so there is no estimate"
 
     def __str__(self) -> str:
         return self.label

@@ -74,7 +74,7 @@ def single(command: str, arguments: Sequence[str], standard: Sequence[str] = (),
     with session():
         words = w.read(command, arguments)
         for whose, keys in refused.items():
-            words.refuse(keys, f"is for `ipe-bench {whose}`, and nothing in `ipe-bench {command}`")
+            words.refuse(keys, f"is for `ipe-bench {whose}`, and has no meaning in `ipe-bench {command}`")
         given = w.read(command, [one for one in standard if one.partition("=")[0] not in words.keys])
         jobs = jobs_of(Words(given.overrides + words.overrides), multirun=False)
         require_one_kind(words, jobs.specs[0])

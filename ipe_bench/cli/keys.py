@@ -52,7 +52,7 @@ _ROWS = (
     (
         "run",
         "write_readings=FILE",
-        "writes the simulated readings of trial write_readings_trial=N, and computes nothing",
+        "writes the simulated readings of trial write_readings_trial=N, without any estimate",
     ),
     ("run", "write_readings_trial=N", ""),
     ("files", "readings=FILE", "is for `ipe-bench estimate`, as are ignore_columns= and find="),

@@ -53,9 +53,9 @@ COMMANDS: dict[str, tuple[str, str, str, Arguments]] = {
         + "".join(f"{key.written:<22} {key.meaning}\n" for key in ROWS if key.meaning),
         {
             "overrides": _several("KEY=VALUE", "see above"),
-            "--dry-run": {"action": "store_true", "help": "say what is stored, what is missing and how long it takes"},
+            "--dry-run": {"action": "store_true", "help": "list stored and missing trials, and forecast the time"},
             "-m --multirun": {"action": "store_true", "help": "run all jobs of a sweep"},
-            "-c --cfg": {"choices": ("job", "hydra", "all"), "help": "print the config, and run nothing"},
+            "-c --cfg": {"choices": ("job", "hydra", "all"), "help": "print the config instead of running it"},
             "-p --package": {"help": "with --cfg: the part of the config to print"},
             "--resolve": {"action": "store_true", "help": "with --cfg: replace interpolations"},
             "-i --info": {"nargs": "?", "const": "all", "choices": INFO_TOPICS, "help": "what Hydra finds where"},
@@ -79,15 +79,15 @@ readings=FILE       CSV or Parquet; `ipe-bench list measurement -v` says which r
                     With state_model=, a row per epoch and a column per reading.
 readings=[A,B]      several files, which share all parameters but those in measurement.own=[NAME].
 noise.deviation=X   the standard deviation of a reading; standard errors and tests rest on it.
-noise=unknown       it is estimated, so the size of residuals tests nothing; noise.by=COLUMN: a level for each entry;
+noise=unknown       estimates the noise level, which leaves no test of its size; noise.by=COLUMN: one for each entry;
                     "noise.sigma=a + b*h": a formula of the reading's magnitude h and of levels a and b.
 ignore_columns=[A]  columns to leave out.
 find=[A,B]          constants, noises or readings of state_model=, whose numbers are those of largest likelihood.
 parameters.NAME.fixed=X, .lower=X, .upper=X   what is known of a parameter; parameters=FILE.yaml has that of many.
 error_scale=X       how far the parameters may lie from the nominal point: the prior of filters and map_lm.
-figures=none        draws nothing.
-output=DIR          where the files go, which are named at the end: outputs/estimate-MODEL unless given, or
-                    outputs/estimate-MODEL-2 and so on. Nothing of another command is overwritten.
+figures=none        omits the figures.
+output=DIR          folder of the files, which are listed at the end: by default outputs/estimate-MODEL, or
+                    outputs/estimate-MODEL-2 and so on. Files of other commands are never overwritten.
 """,
         {"arguments": _several("KEY=VALUE", "any key of `ipe-bench run`")},
     ),
@@ -99,14 +99,14 @@ output=DIR          where the files go, which are named at the end: outputs/esti
   ipe-bench design measurement=gins --by time                   the same cases and axes, at other times
   ipe-bench design measurement=gins truth_measurement=gins_tilted
 
-Nothing is simulated with noise and nothing estimated: all follows from the model's slopes at truths drawn from the
-prior. Errors that the model leaves out are those of truth_measurement=, or of every option of measurement= that is the
-same model with more errors. output=DIR says where files go.
+The analysis uses the model's Jacobians at true parameters drawn from the prior, without noise or estimates.
+Unmodelled errors are those of truth_measurement=, or of every option of measurement= that is the same model with
+more errors. output=DIR sets the folder of the files.
 """,
         {
             "arguments": _several("KEY=VALUE", "the scenario, as for `ipe-bench run`"),
             "--by": {"metavar": "COLUMN", "action": "append", "help": "choose by this column of the readings alone"},
-            "--readings": {"metavar": "NUMBER", "type": int, "help": "how many there may be; as many as now"},
+            "--readings": {"metavar": "NUMBER", "type": int, "help": "largest number of readings; by default today's"},
             "--criterion": {
                 "choices": ("A", "D"),
                 "default": "A",
@@ -115,15 +115,15 @@ same model with more errors. output=DIR says where files go.
         },
     ),
     "posterior": (
-        "what the readings of a few trials really say, and how far estimators are from it",
+        "the posterior of a few trials, and how far estimators are from it",
         "0 the populations of particles agree; 1 in some trial they do not",
         """
   ipe-bench posterior error_scale=300 "solver=[newton]" "baseline=[gauss_newton,ekf]"
   ipe-bench posterior measurement=ranging noise=gaussian noise.deviation=0.1 error_scale=100 trials=1
 
-For the first trials of a scenario (trials=3 unless given), the posterior itself is sampled, with nothing linearised,
-by sequential Monte Carlo: particles go from the prior to the posterior as the likelihood is let in. Each estimator's
-estimate and covariance are then held against it. It takes seconds to a minute a trial. output=DIR says where files go.
+Samples the posterior of the first trials of a scenario (trials=3 by default) by sequential Monte Carlo, without
+linearisation: particles move from the prior to the posterior as the likelihood is tempered. Each estimator's
+estimate and covariance are then compared with it. A trial takes seconds to a minute. output=DIR sets the folder.
 """,
         {
             "arguments": _several("KEY=VALUE", "any key of `ipe-bench run`"),
@@ -134,18 +134,18 @@ estimate and covariance are then held against it. It takes seconds to a minute a
         "tables, figures and report of what is stored",
         _MISSING,
         """
-Nothing is computed again.
+The report is made from stored results alone.
 
   ipe-bench report DIR                            into DIR itself
   ipe-bench report DIR1 DIR2 output=DIR           several folders together, into another
   ipe-bench report DIR paper=overview,headline columns=error_scale,estimator,success width=3.5
 
 paper=NAMES          tables and figures for a paper instead, into DIR/paper: LaTeX (booktabs, siunitx), PDF and PNG
-columns=NAMES        those of the tables, in this order; a name that is not there is answered with those that are
-width=INCHES         of a figure or table: 3.5 for one column, 7.16 for two
+columns=NAMES        columns of the tables, in this order; an unknown name is refused with a list of the known ones
+width=INCHES         width of a figure or table: 3.5 for one column, 7.16 for two
 
-figures=all          which to draw: all, main (the few that answer the question; unless told otherwise) or none
-formats=pdf,svg      as these as well; figures are PNG files, and others are written when they are asked for
+figures=all          figures to draw: all, main (the few that answer the question; the default) or none
+formats=pdf,svg      file formats of the figures besides PNG
 """,
         {"arguments": _several("DIR", "folders of results, such as outputs/paper")},
     ),
@@ -153,16 +153,16 @@ formats=pdf,svg      as these as well; figures are PNG files, and others are wri
         "whether a second version, setting or estimator is better or worse than a first",
         "0 not worse; 1 the second is worse, or something that was asked for is missing",
         """
-Nothing is computed: run both first. The same trials are compared one by one; folders of other seeds, in their order.
+Stored results are compared, so run both first. Equal trials are paired; those of other seeds, in their order.
 
   ipe-bench compare outputs/before outputs/after               two versions, or two settings, of the same estimators
   ipe-bench compare outputs/a outputs/b first=newton second=my_solver
   ipe-bench compare outputs/a first=fixed_point second=newton  two estimators of one folder
 
-alpha=0.05           the chance that anything is found where there is no difference
-anytime=true         judge by e-values: then it may be looked at as often as one likes, while trials are added
-fail_on=success,error  what the second may not be worse in: success, error, cost
-power=0.9            how many trials find a difference of success, such as difference=0.05, with this probability
+alpha=0.05           significance level: probability of any finding if there is no difference
+anytime=true         tests by e-values, which remain valid at any number of looks while trials are added
+fail_on=success,error  quantities in which the second must not be worse: success, error, cost
+power=0.9            computes the trials that find a difference of success, such as difference=0.05, with this power
 output=DIR           writes comparison.csv and comparison.html there
 """,
         {"arguments": _several("DIR", "one or two folders of results")},
@@ -177,7 +177,7 @@ output=DIR           writes comparison.csv and comparison.html there
 A row per run, with columns NAME_true and NAME (or NAME_error), NAME_std (or NAME_var), and cov_A_B as far as there are
 any; or long: run, parameter, true, estimate, std. Rows of one run have its number in the column run.
 """,
-        {"arguments": _several("FILE", "a table of truths, estimates and what was claimed of them")},
+        {"arguments": _several("FILE", "a table of truths, estimates and reported covariances")},
     ),
     "bundle": (
         "results in one archive to share, or whether such an archive is whole",
@@ -200,11 +200,11 @@ The same results give the same file, so that the digest may stand in a paper. Ot
         "",
         {
             "arguments": _several("DIR", "folders of results, such as outputs/paper"),
-            "-v --verbose": {"action": "store_true", "help": "with what is complete, too"},
+            "-v --verbose": {"action": "store_true", "help": "list complete scenarios, too"},
         },
     ),
     "list": (
-        "what there is to choose from, and where it comes from",
+        "options to choose from, and where each comes from",
         "",
         "",
         {

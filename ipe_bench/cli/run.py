@@ -128,7 +128,7 @@ def _missing(jobs: Jobs) -> list[str]:
         name = Outcome(job.output, w.as_typed(told, jobs.words.files)).job
         lines.append(f"{name}: {asked - lacking} of {asked} estimates are stored{more}")
         stored, missing = stored + asked - lacking, missing + lacking
-    return [*lines, f"{stored} estimates are stored, {missing} would be computed; nothing was computed now"]
+    return [*lines, f"{stored} estimates are stored, {missing} would be computed; none was computed now"]
 
 
 def _there_already(jobs: Jobs) -> list[str]:
@@ -328,7 +328,7 @@ def shown_progress(title: str) -> Iterator[Watcher]:
 def _state(progress: Progress) -> str:
     """Says how far a job is, with the rate and the forecast once there are any."""
     if not progress.tasks:
-        return "nothing left to compute"
+        return "all trials are stored"
     state = f"block {progress.done}/{progress.tasks}"
     if progress.failures:
         state += f", {len(progress.failures)} failed"

@@ -105,7 +105,7 @@ def parse(text: str, where: str) -> Arithmetic:
     source = _NAME.sub("_", " ".join(text.split()).replace("^", "**"))
     try:
         if not _ALPHABET.fullmatch(text):
-            raise SyntaxError("a character means nothing here")
+            raise SyntaxError("a character has no meaning here")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             tree = _tree(ast.parse(source, mode="eval").body, source)

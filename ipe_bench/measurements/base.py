@@ -191,7 +191,7 @@ class Measurement(Component, ABC):
     def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Measurement:
         """Returns this model with the inputs of a file: `columns` by heading, one entry for each of its readings, in
         the order of the file, which is that of z from then on."""
-        raise NotImplementedError(f"{self.name} takes nothing from a file but readings")
+        raise NotImplementedError(f"{self.name} takes only readings from a file")
 
     @property
     def n(self) -> int:

@@ -177,7 +177,7 @@ class Formula(WrittenModel):
                 raise UserError(f"start.{name}: does not appear in the expression, whose names are {wanted}")
         if not self.start:
             name = f"start.{next(iter(self.arithmetic.names), 'NAME')}"
-            raise UserError(f"start: is empty, so nothing is to be estimated; give each parameter a start: {name}=1")
+            raise UserError(f"start: is empty, so no parameter is estimated; give each parameter a start: {name}=1")
         if self.reading in self.arithmetic.names:
             raise UserError(f"reading={self.reading}: stands in the expression too; what is measured cannot explain it")
         self.require_columns_and_parameters("own")

@@ -342,7 +342,7 @@ def options_in(folder: Path) -> list[Option]:
     own = [o for o in options() if home in (*o.path.parents, *(o.rival.parents if o.rival else ()))]
     found = [option for option in own if option.group in CHECKED_GROUPS]
     if not found:
-        raise UserError(f"{folder}: holds nothing to check; its conf has no option of {', '.join(CHECKED_GROUPS)}")
+        raise UserError(f"{folder}: has no option to check; its conf has none of {', '.join(CHECKED_GROUPS)}")
     return found
 
 

@@ -109,7 +109,7 @@ def _suspects(design: Design) -> Iterator[Part]:
 def _ways(design: Design) -> Iterator[Part]:
     if not design.ways:
         why = "they are too few" if design.observability.observable else "they do not determine all parameters"
-        yield f"There is nothing to choose among the candidates: {why}."
+        yield f"The candidates offer no choice: {why}."
         return
     today = design.scenario.measurement.m
     columns = [
@@ -231,7 +231,7 @@ def comparison_parts(frame: pd.DataFrame, alpha: float) -> Iterator[Part]:
         " repeatedly; e = 20 is as rare as p = 0.05. Each interval is that of its row alone. Times are not tested."
     )
     if (frame["matched_by"] == "order").any():
-        yield "Without common trials nothing is gained from pairing: the intervals are wider."
+        yield "Without common trials pairing gains no precision: the intervals are wider."
 
 
 def _needed(row: dict[str, Any]) -> str:

@@ -74,7 +74,7 @@ def summary_tables(listed: Sequence[Mapping[str, Any]], totals: Sequence[Table],
     if tables:
         tables[-1] = replace(tables[-1], notes=overview_notes({row["noise"] for row in rows}))
     further = [f"{len(settings) - _MOST_TABLES} further settings are in summary.csv and report.html."]
-    return [*totals, *tables, *further[: len(settings) > _MOST_TABLES]] or ["nothing is stored yet"]
+    return [*totals, *tables, *further[: len(settings) > _MOST_TABLES]] or ["no trial is stored yet"]
 
 
 def _setting(title: str, rows: Sequence[Mapping[str, Any]], width: int) -> Table:

@@ -102,7 +102,7 @@ def read_bundle(path: Path) -> Bundle:
         with zipfile.ZipFile(path) as archive:
             if sum(one.file_size for one in archive.infolist()) > _MOST_COMPRESSED * path.stat().st_size:
                 raise UserError(
-                    f"{path}: would unpack to over {_MOST_COMPRESSED} times its size; nothing of it is read"
+                    f"{path}: would unpack to over {_MOST_COMPRESSED} times its size; the bundle is not read"
                 )
             there = set(archive.namelist())
             kind = MANIFEST if MANIFEST in there else _OLDER
@@ -114,7 +114,7 @@ def read_bundle(path: Path) -> Bundle:
             for name in sorted({*digests, *there} - {kind}):
                 folder, _, file = name.partition("/")
                 if not (_FOLDER.fullmatch(folder) and _FILE.fullmatch(file)):
-                    raise UserError(f"{path}: {name!r} is no name of a result; nothing of it is read")
+                    raise UserError(f"{path}: {name!r} is no name of a result; the bundle is not read")
                 if name not in there or digests.get(name) != _digest_of(archive, name):
                     raise UserError(f"{path}: was damaged or changed: {name} is not as its manifest says; get it anew")
     except UserError:

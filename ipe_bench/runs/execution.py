@@ -100,7 +100,7 @@ class Execution(Component, ABC):
 class Serial(Execution):
     """Runs tasks in this process; compiled models still use every core.
 
-    Nothing stands between an estimator and this process: one that never returns, or ends the process, ends the run.
+    An estimator is not isolated from this process: one that never returns, or ends the process, ends the run.
     """
 
     def run(self, work: Work, tasks: Sequence[Any]) -> Iterator[Event]:

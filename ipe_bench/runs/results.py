@@ -1,7 +1,7 @@
 """Finds what is stored under output folders: what is there, done, missing, failed, refused, stale and damaged.
 
 `run` asks it what to compute, `status` and `report` what to show, `load` for the rows, so they cannot disagree. A file
-is used, or named with what is wrong with it; nothing is guessed, mixed or deleted.
+is used, or named with its fault; no file is guessed, mixed or deleted.
 """
 
 from __future__ import annotations

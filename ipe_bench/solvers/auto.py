@@ -52,7 +52,7 @@ class Auto(Estimator):
     """Minimisations that look for other minima that fit, where the problem is far from linear; None: four where a prior
     says where to look and no differential equations make each of them dear, else none."""
     seed: Whole = 0
-    """A trial's random stream depends on this and on its readings: on nothing else in the batch."""
+    """Seed of a trial's random stream, which depends on this and on the trial's readings alone."""
     budget: Positive | None = None
     """Simulations that a trial may cost, a Jacobian counting n; None: no limit."""
 

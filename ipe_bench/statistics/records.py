@@ -568,7 +568,7 @@ STATISTICS: tuple[Statistic, ...] = (
     Statistic(
         "verdict",
         "verdict",
-        "converged trials with a reported covariance: a trial that the estimator itself gives up on claims nothing",
+        "converged trials with a reported covariance: a trial that the estimator itself gives up on makes no claim",
         "Whether the reported covariance is honest. Diverged but confident: surely more than 1 % of the trials lie"
         f" where it says that a share of {GATE:g} should, and the mean NEES is surely above n; optimistic, pessimistic:"
         " the mean NEES lies surely (95 %, for errors of any law) above or below n, and below it also with a NEES of"
@@ -615,7 +615,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "the same trials",
         "How the reported covariance lies, where it surely does, at 5 % for an estimator and all its parameters"
         " together: shifted is the median of error over reported deviation (estimate less truth); most errors larger"
-        " or smaller, the median of its size over that of an honest one, which says nothing of rare large errors; far"
+        " or smaller, the median of its size over that of an honest one, which ignores rare large errors; far"
         f" outside, the share beyond the quantile that {GATE:g} should lie beyond, after that factor if it is above 1."
         " Of all, what is said of NEES and of the parameter that is farthest off.",
         f.calibration,

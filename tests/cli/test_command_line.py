@@ -53,7 +53,7 @@ def test_a_sweep_leaves_tables_figures_and_a_report(tmp_path, ipe_bench, monkeyp
     drawn = {path.name for path in (folder / "figures").iterdir()}
     assert drawn == {"index.json", "cost_against_accuracy.png"}
     assert "fixed_point" in out
-    assert ipe_bench(*words)[2].count("nothing left to compute") == 2
+    assert ipe_bench(*words)[2].count("all trials are stored") == 2
 
 
 SMALL = ("measurement=polynomial", "noise=gaussian", "noise.deviation=0.01")
@@ -108,11 +108,11 @@ MISTAKES = {
     "no richer truth": (["design", *SMALL, "truth_measurement=polynomial"], "has no errors besides the parameters"),
     "posterior of a file": (
         ["posterior", *SMALL, "readings=a.csv"],
-        "readings: is for `ipe-bench estimate`, and nothing in `ipe-bench posterior`",
+        "readings: is for `ipe-bench estimate`, and has no meaning in `ipe-bench posterior`",
     ),
     "posterior to a precision": (
         ["posterior", *SMALL, "precision=0.1"],
-        "precision: is for `ipe-bench run`, and nothing",
+        "precision: is for `ipe-bench run`, and has no meaning",
     ),
     "a thousand posteriors": (["posterior", *SMALL, "trials=1000"], "trials=1000: each takes up to a minute"),
     "few particles": (["posterior", *SMALL, "baseline=[]", "--particles", "20"], "particles=20: give at least 80"),
@@ -418,7 +418,7 @@ def test_a_model_that_brings_its_own_certified_readings_has_a_table(ipe_bench):
     code, out, _ = ipe_bench("run", *words, "baseline=[gauss_newton]")
     assert code == 0
     assert "gauss_newton" in out
-    assert "nothing is stored" not in out
+    assert "no trial is stored" not in out
 
 
 def test_the_list_names_our_statistics_and_figures_too(capsys):

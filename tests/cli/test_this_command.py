@@ -52,7 +52,7 @@ def test_the_name_of_an_experiment_is_for_the_experiment(ipe_bench):
     assert not Path("outputs/headline").exists()
     for words in (["+experiment=polynomial", "name=polynomial"], ["+experiment=polynomial", "name=mine"], ["name=b"]):
         code, out, _ = ipe_bench("run", *words, "--dry-run")
-        assert (code, "nothing was computed" in out) == (0, True)
+        assert (code, "none was computed" in out) == (0, True)
 
 
 NAMES = {

@@ -393,7 +393,7 @@ class Measured(Repeated):
 
 def test_certified_readings_of_no_collection_are_found_too_and_an_empty_folder_is_said_to_be(tmp_path, synthetic):
     make_folder(tmp_path / "empty" / "runs")
-    assert said(tmp_path / "empty") == ["Nothing is stored yet, so there is nothing to find."]
+    assert said(tmp_path / "empty") == ["No trial is stored yet, so there is no finding."]
     scenario = Scenario(Measured(), Certified())
     synthetic.bound = lambda scenario: np.full(3, 0.1)  # type: ignore[method-assign]
     synthetic.add(scenario, "newton", np.zeros((1, 3)))

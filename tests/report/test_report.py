@@ -96,7 +96,7 @@ def test_survivors_are_shown_as_survivors(synthetic):
 def test_nothing_stored_gives_a_page_that_says_so(tmp_path):
     (tmp_path / "runs").mkdir()
     result = write_report([tmp_path], tmp_path / "out")
-    assert "Nothing is stored yet" in result.report.read_text(encoding="utf-8")
+    assert "No trial is stored yet" in result.report.read_text(encoding="utf-8")
     assert result.figures == ()
     assert len(result.problems) == 1
 

@@ -5,8 +5,8 @@
 The inertial system of the paper runs its four cases one after another on one platform, and its three gyro drifts walk
 meanwhile (`walking_gins.py`). Scored are the eight parameters that stand still, over all trials, in
 multiples of the error that a filter linearised at the truth has. Least squares and iterated estimation take drifts for
-constants; told, they know the walk as correlated errors of the readings, linearised at the nominal point. The filters
-are extended Kalman filters, told of the walk or not.
+constants; modelled, the walk is in the correlated errors of the readings, linearised at the nominal point. The filters
+are extended Kalman filters with and without the walk.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ STANDING = [0, 1, 2, 3, 7, 8, 9, 10]
 """The parameters that do not walk."""
 STYLES = {
     "least squares": ("#999999", "--", "s"),
-    "least squares, told": ("#999999", "-", "s"),
+    "least squares, modelled": ("#999999", "-", "s"),
     "iterated (IPE)": ("#0072B2", "--", "o"),
-    "iterated (IPE), told": ("#0072B2", "-", "o"),
+    "iterated (IPE), modelled": ("#0072B2", "-", "o"),
     "EKF": ("#D55E00", "--", "^"),
-    "EKF, told": ("#D55E00", "-", "^"),
+    "EKF, modelled": ("#D55E00", "-", "^"),
 }
 
 
@@ -64,11 +64,11 @@ def ratios(model: WalkingGins, walked: np.ndarray, trials: int) -> dict[str, flo
     linear, iterated = ib.baselines.LinearLSE(), ib.baselines.GaussNewton()
     found = {
         "least squares": linear.estimate(problem, z).x,
-        "least squares, told": linear.estimate(told, z).x,
+        "least squares, modelled": linear.estimate(told, z).x,
         "iterated (IPE)": iterated.estimate(problem, z).x,
-        "iterated (IPE), told": iterated.estimate(told, z).x,
+        "iterated (IPE), modelled": iterated.estimate(told, z).x,
         "EKF": ekf().track(replace(model, walk=0.0), paths.z).mean[:, -1, KINEMATIC:],
-        "EKF, told": ekf().track(model, paths.z).mean[:, -1, KINEMATIC:],
+        "EKF, modelled": ekf().track(model, paths.z).mean[:, -1, KINEMATIC:],
     }
     P = bound_at_truth(model, paths)[:, -1, KINEMATIC:, KINEMATIC:]
     bound = np.sqrt(np.einsum("tii->ti", P)[:, STANDING].mean(axis=0))
