@@ -28,7 +28,7 @@ class Smoother(Tracker):
     """The filter whose tracks are smoothed."""
 
     def track(self, model: StateModel, z: Array) -> Tracks:
-        return smoothed(model, self.filter.track(model, z))
+        return with_cost(model, z, smoothed(model, self.filter.track(model, z)))
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class IteratedSmoother(Tracker):
             if not on.any():
                 break
         path.calls = calls
-        return path
+        return with_cost(model, z, path)
 
 
 def smoothed(model: StateModel, tracks: Tracks) -> Tracks:
@@ -157,6 +157,29 @@ def admissible(model: StateModel, x: Array) -> Array:
     return x
 
 
+def whole(tracks: Tracks) -> tuple[Array, Array]:
+    """Means (trials, 1 + K, n) and covariances (trials, 1 + K, n, n) from before the first transition."""
+    parts = zip(tracks.start, (tracks.mean, tracks.covariance), strict=True)
+    x, P = (np.concatenate([start[:, None], later], axis=1) for start, later in parts)
+    return x, P
+
+
+def with_cost(model: StateModel, z: Array, tracks: Tracks) -> Tracks:
+    """The tracks of a smoother, with the costs of their paths, each moved into the range of its noise."""
+    x = admissible(model, whole(tracks)[0])
+    tracks.cost = path_cost(model, z, x[:, 0], x[:, 1:])
+    tracks.calls = tracks.calls + model.evaluations
+    return tracks
+
+
+def path_p(z: Array, cost: Array) -> Array:
+    """The probability (trials,) of a cost above that of a path of largest density, if the model holds: it is chi-square
+    with as many degrees as the readings z (trials, K, m) that are there."""
+    from scipy.special import chdtrc
+
+    return chdtrc(np.isfinite(z).sum(axis=(1, 2)), cost)
+
+
 def _halved(
     old: Array, new: Array, cost: Callable[[Array], Array], steer: Callable[[Array], Array]
 ) -> tuple[Array, Array]:
@@ -176,7 +199,7 @@ def _halved(
 
 def _shortened(model: StateModel, z: Array, old: Tracks, new: Tracks) -> Tracks:
     """The step from one path to the next, halved where it raises the path's cost."""
-    first, last = (np.concatenate([path.start.mean[:, None], path.mean], axis=1) for path in (old, new))
+    first, last = whole(old)[0], whole(new)[0]
     path, costs = _halved(first, last, lambda x: path_cost(model, z, x[:, 0], x[:, 1:]), lambda x: admissible(model, x))
     new.calls = new.calls + costs * model.evaluations
     new.mean, new.start = path[:, 1:], Normal(path[:, 0], new.start.covariance)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ipe_bench.basics.linalg import Array, Mask, multiply
 from ipe_bench.basics.options import Component, Count
@@ -49,6 +50,12 @@ class Tracks:
     reads: list[tuple[Array, Array]] = field(default_factory=list)
     """H (trials, m, n) of the readings of each epoch as they were linearised, 0 of missing ones, and L (trials, m, m)
     with L L' = S of their innovations."""
+    cost: Array | None = None
+    """-2 log p(path | readings) (trials,) of a smoother's path up to a constant; see `path_p`."""
+    status: NDArray[np.int8] | None = None
+    """How the iterations of a trial ended (trials,), in trackers that iterate until they have converged."""
+    iterations: NDArray[np.int64] | None = None
+    """Steps of each trial (trials,), likewise."""
 
     @classmethod
     def empty(cls, model: StateModel, trials: int) -> Tracks:
@@ -86,6 +93,9 @@ class Tracks:
         names = ("mean", "covariance", "nis", "innovations", "degrees", "log_likelihood", "calls")
         arrays: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
         start = Normal(*[np.concatenate(several) for several in zip(*(part.start for part in parts), strict=True)])
+        for name in ("cost", "status", "iterations"):
+            if all(getattr(part, name) is not None for part in parts):
+                arrays[name] = np.concatenate([getattr(part, name) for part in parts])
         return cls(**arrays, start=start)
 
 
@@ -209,9 +219,18 @@ class Filter(Tracker):
         return filtered(model, z, self.rule, self.iterations)
 
 
-def filtered(model: StateModel, z: Array, rule: Rule, iterations: int = 1, path: Tracks | None = None) -> Tracks:
-    """The filter of the model that a rule linearises about the filter's own states, or about those of a path."""
+def filtered(
+    model: StateModel,
+    z: Array,
+    rule: Rule,
+    iterations: int = 1,
+    path: Tracks | None = None,
+    start: Normal | None = None,
+) -> Tracks:
+    """The filter of the model that a rule linearises about the filter's own states, or about those of a path; `start`
+    replaces the prior."""
     out = Tracks.empty(model, len(z))
+    out.start = start or out.start
     x, found = out.start, None
     for k in range(model.epochs):
         if model.moves(k):
