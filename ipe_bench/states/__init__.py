@@ -5,8 +5,10 @@ from typing import Any
 from ipe_bench.basics.errors import renamed, unknown
 from ipe_bench.states.base import Normal, Paths, StateModel
 from ipe_bench.states.bounds import bound_at_truth, posterior_bounds
+from ipe_bench.states.damped import LevenbergMarquardtSmoother
 from ipe_bench.states.formulas import Formulas, RecordedFormulas
 from ipe_bench.states.grid import Grid
+from ipe_bench.states.ipe import PathIPE
 from ipe_bench.states.linearisation import Cubature, GaussHermite, SigmaPoints, Taylor, Unscented
 from ipe_bench.states.particles import Bootstrap
 from ipe_bench.states.smoothers import IteratedSmoother, Smoother
@@ -20,7 +22,9 @@ __all__ = [
     "GaussHermite",
     "Grid",
     "IteratedSmoother",
+    "LevenbergMarquardtSmoother",
     "Normal",
+    "PathIPE",
     "Paths",
     "RecordedFormulas",
     "SigmaPoints",

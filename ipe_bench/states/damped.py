@@ -18,11 +18,6 @@ from ipe_bench.states.linearisation import Affine, Taylor, Unscented
 from ipe_bench.states.smoothers import path_cost, path_p, smoothed
 from ipe_bench.states.trackers import Tracker, Tracks, filtered, linearised_reading, predict, update
 
-
-def admissible(m, x):
-    return x
-
-
 _TRIES, _FACTOR = 15, 10.0
 """Dampings that are tried about one path, and the factor between them."""
 _ROUND_OFF = 1e-12
@@ -68,9 +63,9 @@ class _Paths:
 class LevenbergMarquardtSmoother(Tracker):
     r"""Damped Gauss-Newton steps to the path of largest posterior density (Särkkä and Svensson, ICASSP 2020: LM-IEKS).
 
-    Each step is a filter and a smoother of the model linearised about the last path x, in which every state is read
-    once more, as where it was: x_k with a covariance of `scale / damping`. The scale of a state is its variance before
-    anything is read. The damping is 0 as long as steps lower the cost of the path, and grows tenfold where one does not,
+    Each step is a filter and a smoother of the model linearised about the last path, in which every state is read once
+    more, where it was, with a variance of `scale / damping`. The scale of a state is its variance before anything is
+    read. The damping is 0 as long as steps lower the cost of the path, and grows tenfold where one does not,
 
     .. math:: J(x) = |x_0 - m_0|^2_{P_0^{-1}} + \sum_k |w_k|^2 + \sum_k |z_k - h(x_k)|^2_{R_k^{-1}}.
 
@@ -87,7 +82,7 @@ class LevenbergMarquardtSmoother(Tracker):
     """The first damping of a step that raises the cost."""
     level: Share = 1e-3
     """A trial is lost if so large a cost is less probable than this."""
-    starts: Whole = 5
+    starts: Whole = 10
     """Draws of the prior among which a trial that is lost looks for another start."""
     seed: int = 0
     """A trial's draws depend on this and on its readings: on nothing else in the batch."""
@@ -144,9 +139,8 @@ class LevenbergMarquardtSmoother(Tracker):
                     blind = whole(_passed(model, np.full_like(z, np.nan), moves, reads))[1]
                     scale = np.diagonal(blind, axis1=2, axis2=3)
                 about = paths.x[rows], scale[rows] / damping[rows, None, None]
-                some = ([Affine(*(a[rows] for a in law)) for law in laws] for laws in (moves, reads))
+                some = ([Affine(law.A[rows], law.b[rows], law.W[rows]) for law in laws] for laws in (moves, reads))
                 new[damped] = whole(smoothed(model, _passed(model, z[rows], *some, about)))[0]
-            new = admissible(model, new)
             found = path_cost(model, z[todo], new[:, 0], new[:, 1:])
             calls[todo] += model.evaluations
             lower = found <= cost[todo] * (1 + _ROUND_OFF)
@@ -207,7 +201,8 @@ def _passed(
             again, _, there = _read_again(about, k + 1)
             W = np.zeros((len(z), m + n, m + n))
             W[:, :m, :m], W[:, m:, m:] = R, again.W
-            read = Affine(*(np.concatenate(parts, axis=1) for parts in zip(read[:2], again[:2], strict=True)), W)
+            H, b = (np.concatenate(parts, axis=1) for parts in ((read.A, again.A), (read.b, again.b)))
+            read = Affine(H, b, W)
             R, y = np.zeros((m + n, m + n)), np.concatenate([y, there], axis=1)
         x = out.note(k, update(x, read, R, y))
     return out

@@ -27,6 +27,7 @@ from ipe_bench.priors import GaussianPrior, Prior
 from ipe_bench.states.base import Paths, StateModel, require_sound
 from ipe_bench.states.bounds import bound_at_truth, posterior_bounds
 from ipe_bench.states.formulas import RecordedFormulas
+from ipe_bench.states.smoothers import path_p
 from ipe_bench.states.trackers import Tracker, Tracks
 from ipe_bench.trials.scenario import Scenario, check_seed
 from ipe_bench.trials.scoring import Block, Columns, by_parameter, nees
@@ -171,17 +172,20 @@ class PathBlock:
         trials, K, n = tracks.mean.shape
         e, P = tracks.mean - self.paths.x, tracks.covariance
         known: Mask = np.asarray(np.isfinite(e).all(axis=2) & np.isfinite(P).all(axis=(2, 3)))
-        status = np.where(known.all(axis=1), Status.CONVERGED, Status.NONFINITE).astype(np.int8)
+        ended = np.full(trials, Status.CONVERGED) if tracks.status is None else tracks.status
+        finished = known.all(axis=1)
+        status = np.where(finished | (ended != Status.CONVERGED), ended, Status.NONFINITE).astype(np.int8)
         status[list(messages)] = Status.ERROR
-        for i in np.flatnonzero(~known.all(axis=1)):
+        for i in np.flatnonzero(~finished):
             messages.setdefault(int(i), f"the track is not finite from epoch {int(np.argmin(known[i])) + 1} on")
         status[~finite(self.paths.x)] = Status.NO_READINGS
         converged = status == Status.CONVERGED
+        finished &= status != Status.NO_READINGS
         estimates = Estimates(
             x=tracks.mean[:, -1],
             status=status,
             covariance=P[:, -1],
-            iterations=np.full(trials, K),
+            iterations=np.full(trials, K) if tracks.iterations is None else tracks.iterations,
             simulations=tracks.calls,
             messages=messages,
             seconds=seconds,
@@ -208,7 +212,8 @@ class PathBlock:
             "crlb_distance": distance,
             "nees": each[:, -1],
             "solved": converged,
-            "success": converged & (distance <= gate(n)),
+            "success": finished & (distance <= gate(n)),
+            "fit_p": self._fit_p(tracks),
             "path_nees": each.mean(axis=1),
             "extra_nis": np.where(read > 0, tracks.nis.sum(axis=1) / np.maximum(read, 1), np.nan),
             "log_likelihood": np.where(read > 0, tracks.log_likelihood, np.nan),
@@ -217,6 +222,16 @@ class PathBlock:
             "curves": packed(trials, [*sums, np.full((K, 1), converged.sum())]),
         }
         return estimates, columns
+
+    def _fit_p(self, tracks: Tracks) -> Array:
+        """How probable a worse fit is (trials,): of the path of a smoother by its cost, of a filter by its innovations;
+        NaN of a tracker that has neither."""
+        from scipy.special import chdtrc
+
+        if tracks.cost is not None:
+            return path_p(self.paths.z, tracks.cost)
+        squares, read = tracks.nis.sum(axis=1), tracks.degrees.sum(axis=1)
+        return np.where(read > 0, chdtrc(read, squares), np.nan)
 
 
 def block_of(scenario: AnyScenario, start: int, stop: int) -> Any:
@@ -250,6 +265,9 @@ def _make_plain(tracker: Tracker, tracks: Any, trials: int, model: StateModel) -
     shapes = {"mean": (K, n), "covariance": (K, n, n), "nis": (K,), "degrees": (K,), "log_likelihood": ()}
     for part, shape in {**shapes, "innovations": (K, len(model.R(0)))}.items():
         setattr(tracks, part, plain_numbers(f"{name} {part}", getattr(tracks, part), (trials, *shape)))
+    for part in ("cost", "status", "iterations"):
+        if (values := getattr(tracks, part)) is not None:
+            setattr(tracks, part, plain_numbers(f"{name} {part}", values, (trials,)))
 
 
 def packed(trials: int, sums: Sequence[Array]) -> Array:

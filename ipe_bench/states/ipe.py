@@ -1,0 +1,195 @@
+"""Iterative parameter estimation of paths: eq. (11) for the start and the process noises of a state model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from ipe_bench.basics.linalg import Array, finite, multiply, solve
+from ipe_bench.basics.options import Count, Positive
+from ipe_bench.basics.statuses import Status
+from ipe_bench.states.algebra import factor, lower_solve, root, transposed
+from ipe_bench.states.base import StateModel
+from ipe_bench.states.linearisation import slope
+from ipe_bench.states.trackers import Tracker, Tracks
+
+_FAR = 1e8
+"""An iteration has diverged once F is this many times that of the start."""
+_NUMBERS = 5e7
+"""Numbers of the largest matrix of a trial, and of the slopes that are held at once."""
+
+
+@dataclass(frozen=True)
+class PathIPE(Tracker):
+    r"""Solves eq. (11) for a whole path, its slopes frozen along the path of the prior's mean: the paper's estimator.
+
+    The unknowns u are the start and all process noises in their own standard deviations, so that their prior is N(0, I)
+    and stands as N readings of 0 beside the M readings z of the log, whose h(u) runs the model from the first epoch to
+    the last. With R = I, by whitening, A = dh/du at u = 0, and B = dh/du at the iterate,
+
+    .. math:: H^+ = (I + A^T A)^{-1} \begin{bmatrix} I & A^T \end{bmatrix}, \quad
+        F(u) = H^+ \begin{bmatrix} u \\ h(u) - z \end{bmatrix}, \quad
+        J_F = (I + A^T A)^{-1} (I + A^T B).
+
+    The fixed-point iteration u <- u - F(u), eq. (17), is the smoother of that frozen model, pass by pass; Newton's,
+    eq. (20), solves with J_F. Both begin at the linear estimate, eq. (16). The covariance is the sandwich at the root.
+    Neither converges where the prior's mean path is far from the true one.
+    """
+
+    method: Literal["fixed_point", "newton"] = "fixed_point"
+    """The iteration: eq. (17), or eq. (20)."""
+    max_iterations: Count = 100
+    """Steps at most, then the trial ends as `max_iterations`."""
+    tolerance: Positive = 1e-6
+    """Largest abs(F_i) in standard deviations of the linear bound."""
+
+    def hindrance(self, model: StateModel) -> str | None:
+        N, M = sum(_widths(model)), model.m
+        if N * max(M, model.n * model.epochs) > _NUMBERS:
+            return f"needs a matrix of {M} readings by {N} unknowns for a path of {model.name}; give fewer epochs"
+        return None
+
+    def track(self, model: StateModel, z: Array) -> Tracks:
+        out = Tracks.empty(model, len(z))
+        out.cost = np.empty(len(z))
+        out.status, out.iterations = np.full(len(z), Status.RUNNING, np.int8), np.zeros(len(z), np.int64)
+        seen, pattern = np.unique(np.isfinite(z), axis=0, return_inverse=True)
+        at_once = max(1, int(_NUMBERS / (sum(_widths(model)) * model.n * model.epochs)))
+        for i, there in enumerate(seen):
+            rows, frozen = np.flatnonzero(pattern.reshape(-1) == i), _Frozen.of(model, there)
+            for part in np.split(rows, range(at_once, len(rows), at_once)):
+                self._solve(frozen, np.where(there, z[part], 0.0), out, part)
+        return out
+
+    def _solve(self, frozen: _Frozen, z: Array, out: Tracks, rows: Array) -> None:
+        """Iterates on F for readings z (trials, K, m) that are the trials `rows` of the tracks."""
+        assert out.cost is not None
+        assert out.status is not None
+        assert out.iterations is not None
+        model, n = frozen.model, frozen.model.n
+        u = np.zeros((len(z), frozen.A.shape[1]))
+        u = u - frozen.F(u, frozen.run(u, z)[1])
+        x, r = frozen.run(u, z)
+        out.calls[rows] += (1 + n + 2) * model.evaluations
+        begun, active, singular = np.ones(len(z)), np.arange(len(z)), np.zeros(len(z), dtype=bool)
+        for iteration in range(self.max_iterations + 1):
+            F = frozen.F(u[active], r[active])
+            size = (np.abs(F) / frozen.deviation).max(axis=1)
+            begun = begun if iteration else np.maximum(size, 1.0)
+            endings = (
+                (singular[active], Status.SINGULAR),
+                (~np.isfinite(size), Status.NONFINITE),
+                (size <= self.tolerance, Status.CONVERGED),
+                (size > _FAR * begun[active], Status.DIVERGED),
+                (np.full(len(size), iteration == self.max_iterations), Status.MAX_ITERATIONS),
+            )
+            now = np.select(*zip(*endings, strict=True), Status.RUNNING)  # type: ignore[arg-type]
+            out.status[rows[active]], out.iterations[rows[active]] = now, iteration
+            F, active = F[now == Status.RUNNING], active[now == Status.RUNNING]
+            if not len(active):
+                break
+            if self.method == "newton":
+                B = frozen.slopes(x[active])[1]
+                F, singular[active] = frozen.divided(u[active], r[active], B)
+                out.calls[rows[active]] += (1 + n) * model.evaluations
+            u[active] -= F
+            x[active], r[active] = frozen.run(u[active], z[active])
+            out.calls[rows[active]] += model.evaluations
+        out.cost[rows] = np.sum(u**2, axis=1) + np.sum(r**2, axis=1)
+        P = np.full((len(z), model.epochs + 1, n, n), np.nan)
+        if (usable := finite(x) & finite(u)).any():
+            P[usable] = frozen.sandwich(*frozen.slopes(x[usable]))
+            out.calls[rows[usable]] += (1 + n) * model.evaluations
+        out.mean[rows], out.covariance[rows] = x[:, 1:], P[:, 1:]
+        out.start.mean[rows], out.start.covariance[rows] = x[:, 0], P[:, 0]
+
+
+def _widths(model: StateModel) -> list[int]:
+    """The numbers of unknowns of the start and of each step."""
+    steps = [model.gain(k).shape[1] for k in range(model.epochs) if model.moves(k)]
+    return [root(model.prior.covariance).shape[1], *steps]
+
+
+@dataclass(frozen=True)
+class _Frozen:
+    """Holds the system of eq. (11) for the path of a model, of whose K m readings those of `seen` are there."""
+
+    model: StateModel
+    gains: list[Array]
+    """Root of the prior's covariance, and the gain of the step into each epoch: (n, 0) if none leads there."""
+    L: list[Array]
+    """Roots (m, m) of the covariances of the readings of each epoch."""
+    seen: Array
+    """(K, m)"""
+    A: Array
+    """dh/du (M, N) at u = 0, whitened; 0 for missing readings."""
+    gain: Array
+    """A' (I + A A')^-1 (N, M)."""
+    deviation: Array
+    """Standard deviations (N,) of the linear estimate, eq. (5)."""
+
+    @classmethod
+    def of(cls, model: StateModel, seen: Array) -> _Frozen:
+        K, n, none = model.epochs, model.n, np.empty(0)
+        gains = [
+            root(model.prior.covariance),
+            *(model.gain(k) if model.moves(k) else np.empty((n, 0)) for k in range(K)),
+        ]
+        both = [s[:, None] & s for s in seen]
+        L = [factor(np.where(both[k], model.R(k), np.eye(len(both[k])))) for k in range(K)]
+        start = cls(model, gains, L, seen, none, none, none)
+        u = np.zeros((1, sum(G.shape[1] for G in gains)))
+        A = start.slopes(start.run(u, np.zeros((1, *seen.shape)))[0])[1][0]
+        gain = np.linalg.solve(np.eye(len(A)) + A @ A.T, A).T
+        deviation = np.sqrt(1.0 - np.sum(gain * A.T, axis=1))
+        return cls(model, gains, L, seen, A, gain, deviation)
+
+    def run(self, u: Array, z: Array) -> tuple[Array, Array]:
+        """The states x (trials, 1 + K, n) of u (trials, N), and h(u) - z (trials, M), whitened."""
+        ends = np.cumsum([G.shape[1] for G in self.gains])
+        noise = [multiply(G, part) for G, part in zip(self.gains, np.split(u, ends[:-1], axis=1), strict=True)]
+        x = [self.model.prior.mean + noise[0]]
+        r = []
+        for k in range(self.model.epochs):
+            x.append((self.model.transition(x[-1], k) if self.model.moves(k) else x[-1]) + noise[k + 1])
+            e = np.where(self.seen[k], self.model.observe_near(x[-1], k, z[:, k]) - z[:, k], 0.0)
+            r.append(lower_solve(self.L[k], e[..., None])[..., 0])
+        return np.stack(x, axis=1), np.concatenate(r, axis=1)
+
+    def slopes(self, x: Array) -> tuple[Array, Array]:
+        """dx/du (trials, 1 + K, n, N) and dh/du (trials, M, N), whitened, along the states x (trials, 1 + K, n)."""
+        model, N, B = self.model, sum(G.shape[1] for G in self.gains), []
+        X, upto = np.zeros((*x.shape, N)), 0
+        for k, G in enumerate(self.gains, -1):
+            if upto:  # the start and noises up to here
+                before = X[:, k, :, :upto]
+                F = slope(lambda at, k=k: model.transition(at, k), x[:, k])[1] if model.moves(k) else None
+                X[:, k + 1, :, :upto] = before if F is None else np.matmul(F, before)
+            X[:, k + 1, :, upto : upto + G.shape[1]] = G
+            upto += G.shape[1]
+            if k >= 0:
+                H = slope(lambda at, k=k: model.observe(at, k), x[:, k + 1])[1]
+                B.append(lower_solve(self.L[k], np.matmul(np.where(self.seen[k][:, None], H, 0.0), X[:, k + 1])))
+        return X, np.concatenate(B, axis=1)
+
+    def F(self, u: Array, r: Array) -> Array:
+        """Eq. (11): H+ (h - z) (trials, N), in which (I + A' A)^-1 A' is the gain and (I + A' A)^-1 = I - gain A."""
+        return u - multiply(self.gain, multiply(self.A, u) - r)
+
+    def divided(self, u: Array, r: Array, B: Array) -> tuple[Array, Array]:
+        """J_F^-1 F (trials, N) = (I + A' B)^-1 (u + A' r), by M equations in place of N (Woodbury), and whether
+        there is none."""
+        v = u + multiply(self.A.T, r)
+        w, singular = solve(np.eye(len(self.A)) + np.matmul(B, self.A.T), multiply(B, v))
+        return v - multiply(self.A.T, w), singular & finite(v)
+
+    def sandwich(self, X: Array, B: Array) -> Array:
+        """The covariances (trials, 1 + K, n, n) of the states at the root: T T' with T = X (I + A' B)^-1 [I, A']."""
+        trials, K, n, N = X.shape
+        X = X.reshape(trials, K * n, N)
+        D, _ = solve(np.eye(len(self.A)) + np.matmul(B, self.A.T), B)
+        Z = X - np.matmul(np.matmul(X, self.A.T), D)
+        T = np.concatenate([Z, np.matmul(Z, self.A.T)], axis=2).reshape(trials, K, n, -1)
+        return np.matmul(T, transposed(T))
