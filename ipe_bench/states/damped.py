@@ -139,8 +139,8 @@ class LevenbergMarquardtSmoother(Tracker):
                     blind = whole(_passed(model, np.full_like(z, np.nan), moves, reads))[1]
                     scale = np.diagonal(blind, axis1=2, axis2=3)
                 about = paths.x[rows], scale[rows] / damping[rows, None, None]
-                some = ([Affine(law.A[rows], law.b[rows], law.W[rows]) for law in laws] for laws in (moves, reads))
-                new[damped] = whole(smoothed(model, _passed(model, z[rows], *some, about)))[0]
+                some = ([Affine(*[part[rows] for part in law]) for law in laws] for laws in (moves, reads))
+                new[damped] = whole(smoothed(model, _passed(model, z[rows], *some, about=about)))[0]
             found = path_cost(model, z[todo], new[:, 0], new[:, 1:])
             calls[todo] += model.evaluations
             lower = found <= cost[todo] * (1 + _ROUND_OFF)

@@ -72,7 +72,7 @@ class PathIPE(Tracker):
         u = np.zeros((len(z), frozen.A.shape[1]))
         u = u - frozen.F(u, frozen.run(u, z)[1])
         x, r = frozen.run(u, z)
-        out.calls[rows] += (1 + n + 2) * model.evaluations
+        out.calls[rows] += (1 + n + 3) * model.evaluations
         begun, active, singular = np.ones(len(z)), np.arange(len(z)), np.zeros(len(z), dtype=bool)
         for iteration in range(self.max_iterations + 1):
             F = frozen.F(u[active], r[active])

@@ -1,0 +1,158 @@
+"""Estimates of whole paths: Levenberg-Marquardt smoothers, eq. (11), and the fit of a path, against dense solutions."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize._numdiff import approx_derivative
+from scipy.stats import chi2, kstest
+from shared.state_models import ConstantVelocity, CoordinatedTurn, Pendulum
+
+from ipe_bench.basics.statuses import Status
+from ipe_bench.plugins.construct import construct
+from ipe_bench.plugins.discovery import options
+from ipe_bench.states import IteratedSmoother, LevenbergMarquardtSmoother, PathIPE, Smoother, Taylor, ekf, ukf
+from ipe_bench.states.damped import _linearised, _passed, whole
+from ipe_bench.states.smoothers import path_cost, path_p, smoothed
+from ipe_bench.trials.tracking import PathBlock, StateScenario
+
+NEAR = Pendulum(count=25, start=(1.0, 0.0), spread=0.2)
+LINEAR = ConstantVelocity(count=12, spread=2.0)
+
+
+def unknowns(model, start, x):
+    """Start and process noises of paths (K, n) in their own deviations, for a diagonal prior and square gains."""
+    before = np.vstack([start, x[:-1]])
+    noise = [np.linalg.solve(model.gain(k), x[k] - model.transition(before[k], k)) for k in range(model.epochs)]
+    return np.concatenate([(start - model.prior.mean) / np.sqrt(np.diag(model.prior.covariance)), *noise])
+
+
+def run(model, u):
+    """All states (K + 1, n) of unknowns u, and whitened readings (K,) of a model that is read once an epoch."""
+    x = [model.prior.mean + np.sqrt(np.diag(model.prior.covariance)) * u[: model.n]]
+    for k, w in enumerate(u[model.n :].reshape(model.epochs, -1)):
+        x.append(model.transition(x[-1], k) + model.gain(k) @ w)
+    read = [model.observe(x[k + 1], k)[..., 0] / np.sqrt(model.R(k)[0, 0]) for k in range(model.epochs)]
+    return np.array(x), np.array(read)
+
+
+def test_levenberg_and_marquardt_find_the_minimum_that_halved_steps_find():
+    z = NEAR.draw(0, 3).z
+    z[1, 4:8] = np.nan
+    found = LevenbergMarquardtSmoother(tolerance=1e-8).track(NEAR, z)
+    other = IteratedSmoother(ukf(), Taylor(), 50, damped=True, tolerance=1e-10).track(NEAR, z)
+    np.testing.assert_allclose(found.mean, other.mean, atol=1e-7)
+    np.testing.assert_allclose(found.covariance, other.covariance, rtol=1e-5)
+    np.testing.assert_allclose(found.cost, path_cost(NEAR, z, other.start.mean, other.mean), rtol=1e-9)
+    assert (found.status == Status.CONVERGED).all()
+
+
+def test_a_damped_step_reads_every_state_once_more():
+    """One dense solution over all states of the linear model, each drawn towards a path."""
+    n, K = LINEAR.n, LINEAR.epochs
+    z, rng = LINEAR.draw(0, 1).z, np.random.default_rng(1)
+    about, variances = rng.normal(size=(1, K + 1, n)), rng.uniform(0.5, 2.0, (1, K + 1, n))
+    F = LINEAR.transition(np.eye(n), 0).T
+    D, H = np.zeros((n * K, n * (K + 1))), np.zeros((K, n * (K + 1)))
+    for k in range(K):
+        D[n * k : n * (k + 1), n * k : n * (k + 2)] = np.hstack([-F, np.eye(n)])
+        H[k, n * (k + 1)] = 1.0
+    prior = np.zeros((n * (K + 1),) * 2)
+    prior[:n, :n] = np.linalg.inv(LINEAR.prior.covariance)
+    free = prior + D.T @ np.kron(np.eye(K), np.linalg.inv(LINEAR.Q(0))) @ D + H.T @ H / LINEAR.R(0)[0, 0]
+    exact = np.linalg.solve(
+        free + np.diag(1 / variances.ravel()),
+        H.T @ z.ravel() / LINEAR.R(0)[0, 0] + (about / variances).ravel(),
+    )
+    affine = _linearised(LINEAR, z, about)
+    mean, _ = whole(smoothed(LINEAR, _passed(LINEAR, z, *affine, about=(about, variances))))
+    np.testing.assert_allclose(mean.ravel(), exact, atol=1e-9)
+
+
+def bearings(scale):
+    """`bearings_only`, its target unknown by so many multiples."""
+    model = construct(next(o for o in options("state_model") if o.name == "bearings_only").config, "state_model")
+    return replace(model, spread={name: scale * float(value) for name, value in model.spread.items()})
+
+
+def test_levenberg_and_marquardt_hold_targets_that_filters_lose():
+    block = PathBlock.draw(StateScenario(bearings(30.0), seed=1), 0, 12)
+    filtered, kept = (block.estimate(tracker)[1] for tracker in (ekf(), LevenbergMarquardtSmoother()))
+    assert not filtered["success"].all()
+    assert kept["success"].all()
+    assert (kept["fit_p"] > 1e-3).all()
+
+
+@pytest.mark.parametrize("tracker", [LevenbergMarquardtSmoother(starts=2), PathIPE(), PathIPE("newton")], ids=str)
+def test_a_trial_has_the_same_bits_in_every_batch(tracker):
+    """Lost trials, which begin again, and missing readings among them."""
+    model = replace(bearings(100.0), count=30)
+    z = model.draw(0, 6).z
+    z[2] += 1.0 * (np.arange(30) % 2)[:, None]
+    z[4, 3:5] = np.nan
+    together = tracker.track(model, z)
+    for trial in (2, 3, 4):
+        alone = tracker.track(model, z[trial : trial + 1])
+        for name in ("mean", "covariance", "cost", "status", "iterations", "calls"):
+            np.testing.assert_array_equal(getattr(together, name)[trial], getattr(alone, name)[0])
+
+
+@pytest.mark.parametrize("method", ["fixed_point", "newton"])
+@pytest.mark.parametrize("singular", [False, True])
+def test_eq_11_of_a_linear_path_is_its_smoother(method, singular):
+    model = LINEAR
+    if singular:  # velocity alone is disturbed, and the position of the start is known
+
+        class Singular(ConstantVelocity):
+            def gain(self, k):
+                return np.array([[0.0], [0.3]])
+
+        model = Singular(count=12)
+    z = model.draw(0, 3).z
+    z[1, 2:5] = np.nan
+    exact, found = Smoother(ekf()).track(model, z), PathIPE(method).track(model, z)
+    np.testing.assert_allclose(found.mean, exact.mean, atol=1e-8)
+    np.testing.assert_allclose(found.covariance, exact.covariance, atol=1e-8)
+    np.testing.assert_allclose(found.start.covariance, exact.start.covariance, atol=1e-8)
+    assert (found.iterations == 0).all()  # the linear estimate is the root
+
+
+def test_the_root_of_eq_11_and_its_covariance_are_those_of_a_dense_solution():
+    z, n = NEAR.draw(0, 2).z, NEAR.n
+    N = n * (NEAR.epochs + 1)
+    A = approx_derivative(lambda u: run(NEAR, u)[1], np.zeros(N), method="3-point", rel_step=1e-5)
+    H_plus = np.linalg.pinv(np.vstack([np.eye(N), A]))
+    tracks = {method: PathIPE(method, tolerance=1e-9).track(NEAR, z) for method in ("fixed_point", "newton")}
+    for found in tracks.values():
+        assert (found.status == Status.CONVERGED).all()
+        np.testing.assert_allclose(found.mean, tracks["newton"].mean, atol=1e-7)
+    u = unknowns(NEAR, found.start.mean[0], found.mean[0])
+    r = run(NEAR, u)[1] - z[0, :, 0] / np.sqrt(NEAR.variance)
+    np.testing.assert_allclose(H_plus @ np.concatenate([u, r]), 0.0, atol=1e-6)
+    assert found.cost[0] == pytest.approx(u @ u + r @ r, rel=1e-9)
+    B = approx_derivative(lambda u: run(NEAR, u)[1], u, method="3-point", rel_step=1e-5)
+    X = approx_derivative(lambda u: run(NEAR, u)[0][-1], u, method="3-point", rel_step=1e-5)
+    T = np.linalg.solve(H_plus @ np.vstack([np.eye(N), B]), H_plus)
+    np.testing.assert_allclose(found.covariance[0, -1], X @ T @ T.T @ X.T, rtol=1e-5)
+
+
+def test_eq_11_of_a_path_says_so_where_it_does_not_converge():
+    model = CoordinatedTurn(count=60)
+    block = PathBlock.draw(StateScenario(model), 0, 4)
+    columns = block.estimate(PathIPE(max_iterations=20))[1]
+    converged = columns["status"] == "converged"
+    assert not converged.all()
+    assert set(columns["status"][~converged]) <= {"diverged", "nonfinite", "max_iterations"}
+    np.testing.assert_array_equal(columns["solved"], converged)
+
+
+def test_the_fit_of_a_linear_path_is_that_of_the_innovations():
+    """The cost of the smoothed path of a linear model is the sum of the filter's NIS: chi-square."""
+    block = PathBlock.draw(StateScenario(LINEAR), 0, 400)
+    filtered, path = (block.estimate(tracker)[1]["fit_p"] for tracker in (ekf(), Smoother(ekf())))
+    np.testing.assert_allclose(path, filtered, rtol=1e-7)
+    assert kstest(path, "uniform").pvalue > 1e-3
+    tracks = Smoother(ekf()).track(LINEAR, block.paths.z)
+    np.testing.assert_allclose(path_p(block.paths.z, tracks.cost), chi2.sf(tracks.cost, 12), rtol=1e-9)
