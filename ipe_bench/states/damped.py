@@ -15,7 +15,7 @@ from ipe_bench.basics.streams import normals, own_generators
 from ipe_bench.states.algebra import root
 from ipe_bench.states.base import Normal, StateModel
 from ipe_bench.states.linearisation import Affine, Taylor, Unscented
-from ipe_bench.states.smoothers import path_cost, path_p, smoothed
+from ipe_bench.states.smoothers import admissible, path_cost, path_p, smoothed, whole
 from ipe_bench.states.trackers import Tracker, Tracks, filtered, linearised_reading, predict, update
 
 _TRIES, _FACTOR = 15, 10.0
@@ -46,6 +46,7 @@ class _Paths:
     def of(cls, model: StateModel, z: Array, tracks: Tracks) -> _Paths:
         """Those of a smoother's tracks; a path that is not finite costs infinitely much."""
         x, P = whole(tracks)
+        x = admissible(model, x)
         cost = np.nan_to_num(path_cost(model, z, x[:, 0], x[:, 1:]), nan=np.inf)
         trials = len(z)
         running, none = np.full(trials, Status.RUNNING, np.int8), np.zeros(trials, np.int64)
@@ -128,8 +129,9 @@ class LevenbergMarquardtSmoother(Tracker):
         moves, reads = _linearised(model, z, paths.x)
         calls = paths.calls + Taylor().calls(model.n) * model.evaluations
         free, P = whole(smoothed(model, _passed(model, z, moves, reads)))
-        moved = np.abs(free - paths.x) / np.sqrt(np.diagonal(P, axis1=2, axis2=3))
-        there = ~(np.nan_to_num(moved, nan=0.0) > self.tolerance).any(axis=(1, 2)) & finite(free)
+        deviation = np.sqrt(np.maximum(np.diagonal(P, axis1=2, axis2=3), 0.0))
+        far = (np.abs(free - paths.x) > self.tolerance * deviation) & (deviation > 0)
+        there = ~far.any(axis=(1, 2)) & finite(free)
         x, cost, damping = paths.x.copy(), paths.cost.copy(), paths.damping.copy()
         todo, scale = np.arange(len(z)), np.empty(0)
         for _ in range(_TRIES):
@@ -141,6 +143,7 @@ class LevenbergMarquardtSmoother(Tracker):
                 about = paths.x[rows], scale[rows] / damping[rows, None, None]
                 some = ([Affine(*[part[rows] for part in law]) for law in laws] for laws in (moves, reads))
                 new[damped] = whole(smoothed(model, _passed(model, z[rows], *some, about=about)))[0]
+            new = admissible(model, new)
             found = path_cost(model, z[todo], new[:, 0], new[:, 1:])
             calls[todo] += model.evaluations
             lower = found <= cost[todo] * (1 + _ROUND_OFF)
@@ -154,15 +157,6 @@ class LevenbergMarquardtSmoother(Tracker):
         status = np.where(there, Status.CONVERGED, Status.RUNNING)
         status[todo] = Status.STALLED
         return _Paths(x, P, cost, damping, status, paths.iterations + 1, calls)
-
-
-def whole(tracks: Tracks) -> tuple[Array, Array]:
-    """Means (trials, 1 + K, n) and covariances (trials, 1 + K, n, n) from before the first transition."""
-    x, P = (
-        np.concatenate([a[:, None], b], axis=1)
-        for a, b in zip(tracks.start, (tracks.mean, tracks.covariance), strict=True)
-    )
-    return x, P
 
 
 def _linearised(model: StateModel, z: Array, x: Array) -> tuple[list[Affine], list[Affine]]:
