@@ -161,6 +161,7 @@ PRESETS = {
     ("measurement", "gins_tilted"): {"platform_misalignment"},
     # The filters and smoothers are rules and numbers of iterations.
     **{("tracker", name): {"rule"} for name in ("ukf", "ckf", "ghkf")},
+    ("tracker", "ipe_newton"): {"method"},
     ("tracker", "iekf"): {"iterations"},
     ("tracker", "iplf"): {"rule", "iterations"},
     ("tracker", "ukf_rts"): {"filter"},
