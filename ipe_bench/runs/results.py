@@ -40,6 +40,8 @@ from ipe_bench.trials.thresholds import HISTORIES
 
 T = TypeVar("T")
 _AGAIN = "run the same command again, which computes it anew"
+_MOST_KEPT = 1 << 25
+"""Bytes of rows that stay in memory from the first reading."""
 _OF_ZOO = re.compile(rf"ipe_bench\.(measurements|baselines)\.[\w.]*\.({'|'.join(ZOO.values())})")
 
 
@@ -162,6 +164,9 @@ class Results:
     """The class that is called otherwise now, by the identity of each result that is of one."""
     extra_problems: list[str] = field(default_factory=list)
     """Problems that are not one file's: a line for each."""
+    _kept: dict[Path, pa.Table] = field(default_factory=dict, repr=False)
+    """Rows of the first files, which hundreds of small runs would otherwise read a dozen times each."""
+    _kept_bytes: int = 0
 
     @classmethod
     def read(cls, directories: Sequence[Path | str], keys: Keys[str] | None = None) -> Self:
@@ -184,7 +189,7 @@ class Results:
             for part in fresh:
                 listed.add(part.path)
                 with self._naming(part.path), contextlib.suppress(FileNotFoundError):
-                    footer, _ = part.read()
+                    footer, table = part.read()
                     known = self.stored[part.key].parts if part.key in self.stored else ()
                     if not known and (found := _OF_ZOO.search(canonical_json(footer["identity"]))):
                         self.moved[footer["identity_key"]] = found[0]
@@ -192,6 +197,9 @@ class Results:
                     identity = identified(footer["identity"])
                     footer = {**footer, "identity": identity, "identity_key": digest(identity)}
                     self.stored[part.key] = StoredCell(footer, tuple(sorted([*known, part], key=lambda p: p.order)))
+                    if self._kept_bytes + table.nbytes <= _MOST_KEPT:
+                        self._kept_bytes += table.nbytes
+                        self._kept[part.path] = table
         self.runs += tuple(self._records(store.runs, RUN))
         self.attempts += self._records(store.failed, FAILED)
         if keys is None and not listed and not self.runs:
@@ -368,7 +376,8 @@ class Results:
         for part in parts:
             if part.stop > reached:
                 with self._naming(part.path):
-                    _, table = part.read(names)
+                    table = self._kept[part.path] if part.path in self._kept else part.read(names)[1]
+                    table = table.select([n for n in table.column_names if names is None or n in names])
                     if lacking := [name for name in needed if name not in table.column_names]:
                         raise Unusable(f"damaged: has no column {lacking[0]}")
                     yield table.slice(max(0, reached - part.start))
