@@ -13,8 +13,8 @@ from ipe_bench.statistics.formulas import CAP
 from ipe_bench.statistics.records import ALL, BEST, SCORES, Kind, Statistic, Where
 from ipe_bench.statistics.registry import all_statistics, summary_columns
 
-_MOST_TABLES = 12
-"""Settings that a terminal shows."""
+_MOST_ROWS = 60
+"""Rows that a terminal shows: about two screens."""
 _WIDE_ENOUGH = 100
 """Letters of a screen that has room for failures, and for verdicts in words."""
 _SUCCESS = (
@@ -70,11 +70,27 @@ def summary_tables(listed: Sequence[Mapping[str, Any]], totals: Sequence[Table],
         named = {k: value_text(row.get(k)) for k in columns if value_text(row.get(k)) != "-"}
         title = ", ".join(v if k in ("measurement", "noise") else f"{k}={v}" for k, v in named.items())
         settings.setdefault(title, []).append(row)
-    tables = [_setting(title, part, width) for title, part in list(settings.items())[:_MOST_TABLES]]
+    kept = {title: part for title, part in _shortened(settings).items() if part}
+    tables = [_setting(title, part, width) for title, part in kept.items()]
     if tables:
         tables[-1] = replace(tables[-1], notes=overview_notes({row["noise"] for row in rows}))
-    further = [f"{len(settings) - _MOST_TABLES} further settings are in summary.csv and report.html."]
-    return [*totals, *tables, *further[: len(settings) > _MOST_TABLES]] or ["no trial is stored yet"]
+    further = len(rows) - sum(map(len, kept.values()))
+    left_out = f"{further} of {len(rows)} rows are left out here; summary.csv and report.html have all."
+    return [*totals, *tables, *([left_out] if further else [])] or ["no trial is stored yet"]
+
+
+def _shortened(settings: Mapping[str, Sequence[Any]]) -> dict[str, list[Any]]:
+    """Returns the rows of each setting, in order, until the screen is full; of one that does not fit, those of error
+    scales evenly between both ends."""
+    room, kept = _MOST_ROWS, {}
+    for title, rows in settings.items():
+        scales = list(dict.fromkeys(row["error_scale"] for row in rows))
+        count = max(1, room * len(scales) // len(rows)) if room > 0 else 0
+        if count < len(scales):
+            scales = [scales[i * (len(scales) - 1) // max(1, count - 1)] for i in range(count)]
+        kept[title] = [row for row in rows if row["error_scale"] in scales]
+        room -= len(kept[title])
+    return kept
 
 
 def _setting(title: str, rows: Sequence[Mapping[str, Any]], width: int) -> Table:
