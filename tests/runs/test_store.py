@@ -260,7 +260,8 @@ def test_killed_at_any_moment_every_trial_is_there_and_the_next_time_it_ends(tmp
     assert_same(everything(tmp_path), expected)
 
 
-def test_rows_that_go_away_for_good_are_missed(tmp_path):
+def test_rows_that_go_away_for_good_are_missed(tmp_path, monkeypatch):
+    monkeypatch.setattr("ipe_bench.runs.results._MOST_KEPT", 0)
     filled(tmp_path)
     results = Results.read([tmp_path])
     path = next((tmp_path / "trials").glob("*-9-12.parquet"))
