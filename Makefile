@@ -32,11 +32,13 @@ plugins: .venv/ready
 		--editable plugins/dask
 	outputs/plugins/.venv/bin/python -m pytest -m plugin plugins
 
-# The quick tests with the lowest versions of all libraries that pyproject.toml allows, and with the newest and their pre-releases.
+# The quick tests with the lowest versions of all libraries that pyproject.toml allows and that have a wheel for this
+# Python, and with the newest and their pre-releases.
 lowest newest: .venv/ready
 	$(BIN)/uv venv --quiet --clear --python $(BIN)/python outputs/$@/.venv
 	$(BIN)/uv pip install --quiet --python outputs/$@/.venv/bin/python --editable ".[test]" \
-		$(if $(filter lowest,$@),--resolution lowest-direct,--upgrade --prerelease allow)
+		$(if $(filter lowest,$@),--resolution lowest-direct --only-binary :all: \
+		--no-binary ipe-bench --no-binary antlr4-python3-runtime,--upgrade --prerelease allow)
 	outputs/$@/.venv/bin/python -m pytest -n auto --dist worksteal -W default
 
 # Whether the tests notice changes on purpose, room by room, as a table in outputs/mutants. SAMPLE=40 draws that many.
