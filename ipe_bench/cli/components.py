@@ -210,15 +210,19 @@ def _check_experiments(folder: str) -> Iterator[Finding]:
             yield Finding(f"experiment={option.name}", "Asks for what there is", complaint)
 
 
-def new_command(kind: str, name: str) -> int:
+def new_command(kind: str, name: str, language: str | None = None) -> int:
     """Writes plugins/NAME in the working folder, or the one file of a function or of differential equations."""
+    if kind in (added := plugins.kinds_to_copy()):
+        return _copy_kind(kind, added[kind], name, language)
+    if language is not None:
+        raise UserError(f"--language={language}: {kind} has no languages; leave it out")
     if kind == "skill":
         written = _write_skill(Path(name))
         print(f"{name} is ready: {', '.join(path.name for path in written)}")
         return 0
     (kind,) = renamed([kind])
     if kind not in (*MODELS, *KINDS):
-        raise UserError(f"{kind}: {unknown(kind, (*MODELS, *KINDS, 'skill'), 'kind')}")
+        raise UserError(f"{kind}: {unknown(kind, (*MODELS, *KINDS, *added, 'skill'), 'kind')}")
     group = "baseline" if kind == "filter" else kind
     _check_name(group, name)
     if kind in ALONE:
@@ -251,6 +255,28 @@ def new_command(kind: str, name: str) -> int:
     choices["figure"] = "figures=all "  # the figures of main are chosen among our own
     choose = choices.get(group, f"{group}={name} ")
     print(f"{folder} is ready. Try:\n  ipe-bench check {folder}\n  ipe-bench run {choose}trials=100")
+    return 0
+
+
+def _copy_kind(kind: str, home: Path, name: str, language: str | None) -> int:
+    """Copies the files of a plugin's kind, and those of one of its languages, into plugins/NAME."""
+    languages = sorted(path.name.removeprefix(f"{kind}-") for path in home.glob(f"{kind}-*"))
+    if languages and language not in languages:
+        why = "is not given" if language is None else unknown(language, languages, "language")
+        raise UserError(f"--language={language or ''}: {why}; choose one of {', '.join(languages)}")
+    sources = (home / kind, *([home / f"{kind}-{language}"] if language else ()))
+    texts = {path: path.relative_to(source) for source in sources for path in source.rglob("*") if path.is_file()}
+    group = next((place.parts[2] for place in texts.values() if place.parts[1:2] == ("conf",)), kind)
+    _check_name(group, name)
+    folder = Path("plugins") / name
+    _require_absent(folder)
+    for path, place in texts.items():
+        target = folder / str(place).replace("NAME", name).removesuffix(".template")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        text = path.read_text(encoding="utf-8")
+        filled = Template(text).substitute(name=name) if path.suffix == ".template" else text
+        target.write_text(filled, encoding="utf-8")
+    print(f"{folder} is ready. Read {folder / 'README.md'}")
     return 0
 
 

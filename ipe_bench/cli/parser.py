@@ -227,11 +227,13 @@ The same results give the same file, so that the digest may stand in a paper. Ot
   ipe-bench new state_model my_model              plugins/my_model, states that move
   ipe-bench new ode my_model                      my_model.yaml, differential equations
   ipe-bench new function my_model                 my_model.py, a function of parameters and columns
+  ipe-bench new KIND NAME --language LANGUAGE     plugins/NAME, of a kind that an installed plugin adds
   ipe-bench new skill DIR                         pages by which a coding agent writes plugins, into a new folder DIR
 """,
         {
             "kind": {"metavar": "KIND", "help": f"{', '.join((*MODELS, *KINDS))} or skill"},
             "name": {"metavar": "NAME", "help": "small letters, digits and underscores"},
+            "--language": {"help": "of a plugin's kind that has several"},
         },
     ),
 }

@@ -307,6 +307,16 @@ def options(group: str | None = None) -> list[Option]:
     return [o for o in found.values() if group is None or o.group == group]
 
 
+def kinds_to_copy() -> dict[str, Path]:
+    """The kinds of plugins that plugins add to `ipe-bench new`, with the folder that holds KIND and KIND-LANGUAGE."""
+    return {
+        path.name: path.parent
+        for source in sources()[1:]
+        for path in source.conf.parent.glob("new/*")
+        if "-" not in path.name
+    }
+
+
 def composed(option: Option) -> dict[str, Any]:
     """Composes an option with the options of its group that its `defaults` name, as Hydra does: later ones replace what
     earlier ones say, and the file itself comes last unless `_self_` stands elsewhere."""

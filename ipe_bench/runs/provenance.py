@@ -39,10 +39,10 @@ _SESSION = uuid.uuid4().hex
 
 
 def describe(value: Any) -> Any:
-    """Describes a component as plain JSON data: its class and all its fields. Equal numbers are one: 10.0 is 10."""
+    """Describes a component as plain JSON data: its class and all fields that count in a comparison; 10.0 is 10."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         cls = type(value)
-        fields = {f.name: describe(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        fields = {f.name: describe(getattr(value, f.name)) for f in dataclasses.fields(value) if f.compare}
         return {TARGET: f"{cls.__module__}.{cls.__qualname__}", **fields}
     if isinstance(value, np.ndarray):
         return describe(value.tolist())
