@@ -32,7 +32,6 @@ def fork(then) -> None:
 
 
 WRONG = {
-    "few": "x 2\n1 2\nstatus 1\n0\nend\n",
     "short": "x 4\n1 2\nstatus 1\n0\nend\n",
     "word": "x 4\n1 2 3 four\nstatus 1\n0\nend\n",
     "huge": "x 99999999999\n1 2\nend\n",

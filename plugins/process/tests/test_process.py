@@ -110,7 +110,6 @@ def test_what_new_makes_keeps_its_promises_and_equals_gauss_newton(language, wor
 TRIALS, BAD = 6, 3
 STATUS = {"nan": ib.Status.NONFINITE, "fork": ib.Status.CONVERGED, "more": ib.Status.CONVERGED}
 LINES = {
-    "few": "wrote x with 2 numbers, and not 4",
     "short": "wrote x with 2 numbers, and not 4",
     "word": "wrote x with what is no number",
     "huge": "wrote x with 2 numbers, and not 99999999999",
