@@ -150,7 +150,7 @@ def report(
     Parameters:
         output: folder of the report; the first directory unless given.
         figures: all that the data allow, main (the few that answer the question) or none.
-        formats: of figures beside PNG, such as "pdf" or ["pdf", "svg"].
+        formats: beside PNG and CSV, such as "pdf" or ["pdf", "svg", "md", "tex"].
 
     Returns:
         The names of the files, the summary and the problems.

@@ -47,7 +47,7 @@ _ROWS = (
     ),
     ("folder", "default_name=NAME", ""),
     ("figures", "figures=main", "figures to draw: main, all or none"),
-    ("run", "formats=pdf,svg", "file formats of the figures besides PNG"),
+    ("run", "formats=pdf,md,tex", "file formats besides PNG of figures (pdf, svg) and CSV of tables (md, tex)"),
     ("run", "block_size=N", "trials that are computed at once; it changes no number"),
     (
         "run",

@@ -145,7 +145,7 @@ columns=NAMES        columns of the tables, in this order; an unknown name is re
 width=INCHES         width of a figure or table: 3.5 for one column, 7.16 for two
 
 figures=all          figures to draw: all, main (the few that answer the question; the default) or none
-formats=pdf,svg      file formats of the figures besides PNG
+formats=pdf,md,tex   file formats besides PNG of figures (pdf, svg) and CSV of tables (md, tex)
 """,
         {"arguments": _several("DIR", "folders of results, such as outputs/paper")},
     ),

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from ipe_bench.basics.files import regular, write_text
 from ipe_bench.plugins.extensions import files_of_records, use_statistics
-from ipe_bench.report.style import PAGE, Which, file_formats, which_figures
+from ipe_bench.report.style import FIGURES, PAGE, Which, file_formats, which_figures
 from ipe_bench.runs.store import Store
 
 if TYPE_CHECKING:
@@ -81,31 +81,37 @@ class Pending:
         from ipe_bench.report.html import render_page
         from ipe_bench.report.sections import CURVES, report_tables, written
         from ipe_bench.report.table import write_table
+        from ipe_bench.statistics.registry import main_columns
 
         analysis, output = self.begun.finish(), self.output
         problems = analysis.collection.extra_problems
         known, tables = len(problems), report_tables(analysis)
         sections = written("section", analysis, tables)
         added = [table for section in sections for table in section.tables]
-        write_text(output / "summary.csv", analysis.summary.to_csv(index=False))
-        files = [path for table in (*tables, *added) for path in write_table(table, output / "tables")]
+        write_text(output / "summary.csv", main_columns(analysis.summary).to_csv(index=False))
+        write_text(whole := output / "summary_all.csv", analysis.summary.to_csv(index=False))
+        files = [path for table in (*tables, *added) for path in write_table(table, output / "tables", self.formats)]
         simulated = analysis.simulated
         for name, frame in {n: getattr(simulated, n) for n in CURVES}.items():
             if len(frame):
                 files.append(output / "tables" / f"{name}.csv")
                 write_text(files[-1], frame.to_csv(index=False))
-        drawn = draw_all(analysis, output / "figures", which=self.figures, formats=self.formats)
+        kinds = [kind for kind in FIGURES if kind in self.formats]
+        drawn = draw_all(analysis, output / "figures", which=self.figures, formats=kinds)
         write_text(output / "report.html", render_page(analysis, tables, drawn, sections))
         result = ReportResult(
             summary=analysis.summary,
             summary_path=output / "summary.csv",
-            tables=tuple(files),
+            tables=(whole, *files),
             figures=tuple(path for figure in drawn for path in figure.files),
             report=output / "report.html",
             problems=tuple(analysis.collection.problems),
             stale=tuple(analysis.collection.stale),
             headline=tuple(headline(analysis)),
         )
+        earlier = {path.name for path in map(Path, _stamped(output).get("files", ())) if path.parent.name == "tables"}
+        for name in earlier - {path.name for path in files}:
+            (output / "tables" / name).unlink(missing_ok=True)
         if len(problems) == known:  # what plugins cannot make is said each time
             stamp = {"from": self.made, "files": _digests(result.files)}
             write_text(output / STAMP, json.dumps(stamp, indent=1) + "\n")
@@ -118,7 +124,7 @@ def begin_report(
     """Collects and summarises what folders hold, with the statistics of plugins.
 
     Raises:
-        UserError: there is no such choice of `figures` (all, main or none) or of `formats` (png, pdf and svg).
+        UserError: there is no such choice of `figures` (all, main or none) or of `formats`.
     """
     from ipe_bench.statistics.analysis import Begun
     from ipe_bench.statistics.collect import collect
@@ -144,10 +150,16 @@ def _made_from(directories: Sequence[Path], output: Path, *choices: object) -> s
 
 def _is_current(output: Path, made: str) -> bool:
     """Returns whether the report under `output` was made from this, and its files are as written."""
+    known = _stamped(output)
+    return known == {"from": made, "files": _digests(map(Path, known.get("files", ())))}
+
+
+def _stamped(output: Path) -> dict[str, Any]:
+    """Returns the stamp of the report under `output`; empty if there is none."""
     with contextlib.suppress(OSError, ValueError):
-        known = json.loads(regular(output / STAMP).read_text(encoding="utf-8"))
-        return known == {"from": made, "files": _digests(map(Path, known["files"]))}
-    return False
+        if isinstance(known := json.loads(regular(output / STAMP).read_text(encoding="utf-8")), dict):
+            return known
+    return {}
 
 
 def _digests(paths: Iterable[Path]) -> dict[str, str]:

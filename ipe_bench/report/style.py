@@ -15,7 +15,11 @@ Which = Literal["all", "main", "none"]
 """All figures that the data allow, the few that answer the question, or none."""
 PAGE = "png"
 """The format that is always written, as the page shows it."""
-FORMATS = (PAGE, "pdf", "svg")
+FIGURES = (PAGE, "pdf", "svg")
+"""Formats of figures."""
+TABLES = ("csv", "md", "tex")
+"""Formats of tables: the first is always written."""
+FORMATS = (*FIGURES, *TABLES)
 FAMILIES: dict[str, tuple[str, ...]] = {
     "IPE": ("#08519c", "#4292c6", "#08a1b8", "#5e4fd0", "#7fb2e5"),
     "filters": ("#d94801", "#fd9a4e", "#8c2d04", "#e31a3c", "#e6ab02"),
@@ -44,12 +48,13 @@ def which_figures(asked: Any) -> Which:
 
 
 def file_formats(asked: Any) -> tuple[str, ...]:
-    """Returns the formats asked for, in one word or several, with the page's; raises UserError if one is unknown."""
+    """Returns the formats asked for, in one word or several, with those that are always written; raises UserError if
+    one is unknown."""
     words = asked if isinstance(asked, Sequence) and not isinstance(asked, str) else str(asked).strip("[]").split(",")
     names = [str(word).strip() for word in words]
     if not names or not set(names) <= set(FORMATS):
         raise UserError(f"formats={','.join(names)}: choose among {', '.join(FORMATS[:-1])} and {FORMATS[-1]}")
-    return tuple(kind for kind in FORMATS if kind == PAGE or kind in names)
+    return tuple(kind for kind in FORMATS if kind in {PAGE, TABLES[0], *names})
 
 
 @dataclass(frozen=True)

@@ -255,12 +255,14 @@ def html(parts: Iterable[Part]) -> str:
 # Files ---------------------------------------------------------------------------------------------------------------
 
 
-def write_table(table: Table, folder: Path) -> list[Path]:
-    """Writes one table as CSV, Markdown and LaTeX."""
-    contents = {"csv": comma_separated(table), "md": markdown(table), "tex": latex(table)}
-    for suffix, text in contents.items():
-        write_text(folder / f"{table.name}.{suffix}", text)
-    return [folder / f"{table.name}.{suffix}" for suffix in contents]
+def write_table(table: Table, folder: Path, formats: Sequence[str]) -> list[Path]:
+    """Writes one table in those of the formats that are of tables; as CSV unless another file has it whole."""
+    writers = {"csv": comma_separated, "md": markdown, "tex": latex}
+    own = table.whole in ("", f"{folder.name}/{table.name}.csv")
+    files = {kind: folder / f"{table.name}.{kind}" for kind in writers if kind in formats and (own or kind != "csv")}
+    for kind, path in files.items():
+        write_text(path, writers[kind](table))
+    return list(files.values())
 
 
 def comma_separated(table: Table) -> str:

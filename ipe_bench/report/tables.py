@@ -138,7 +138,7 @@ def overview(analysis: Analysis) -> Table:
     columns = [*first, *overview_columns(told, leading(told, [*analysis.setting_columns, "error_scale"]))]
     columns += statistics("overview", told)
     notes = overview_notes(rows["noise"].tolist())
-    return Table("overview", "Overview", "", columns, rows, notes=notes, grouped=len(first))
+    return Table("overview", "Overview", "", columns, rows, notes=notes, grouped=len(first), whole="summary.csv")
 
 
 def contraction(analysis: Analysis) -> Table | None:

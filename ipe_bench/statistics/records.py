@@ -774,7 +774,15 @@ STATISTICS: tuple[Statistic, ...] = (
         where=("tracks",),
     ),
 )
-"""The columns of `summary.csv`, in order."""
+"""The columns of `summary_all.csv`, in order."""
+
+MAIN = (
+    *("trials", "success", "failed_known", "failed_silent", "error_median", "error_q95", "efficiency_capped", "rmse"),
+    *("nees_median", "coverage95", "verdict", "iterations_median", "simulations_median", "time_median_s"),
+)
+"""The statistics of estimators of constants that `summary.csv` has, with their intervals."""
+MAIN_OF_STATES = (*MAIN, "path_rmse", "path_bound", "path_nees", "path_verdict", "nis_verdict")
+"""Those of trackers of states that move."""
 
 SCORES: tuple[Statistic, ...] = (
     Statistic(

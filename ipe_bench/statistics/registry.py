@@ -11,6 +11,8 @@ from ipe_bench.basics.errors import UserError, place_of
 from ipe_bench.statistics.records import (
     ALL,
     BEST,
+    MAIN,
+    MAIN_OF_STATES,
     SCORES,
     STATISTICS,
     Condition,
@@ -89,8 +91,16 @@ def columns_of_added(record: Statistic, sample: Sample) -> dict[str, list[Any]]:
 
 
 def summary_columns() -> tuple[str, ...]:
-    """Returns the columns of `summary.csv` behind those that say what a row is of."""
+    """Returns the columns of `summary_all.csv` behind those that say what a row is of."""
     return (*frame_columns(all_statistics()), BEST)
+
+
+def main_columns(summary: pd.DataFrame) -> pd.DataFrame:
+    """Selects the columns of `summary.csv`: what a row is of, the main statistics, and those of plugins."""
+    states = "noise" in summary and (summary["noise"] == "model").any()
+    main = [s for s in STATISTICS if s.name in (MAIN_OF_STATES if states else MAIN)]
+    chosen = {*frame_columns([*main, *_of_plugins.values()]), BEST}
+    return summary[[c for c in summary.columns if c in chosen or c not in summary_columns()]]
 
 
 def summary_rows(sample: Sample) -> list[dict[str, Any]]:

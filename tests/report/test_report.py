@@ -41,15 +41,19 @@ def shown_at(width: int, *parts) -> list[str]:
 def result(tmp_path_factory):
     store = Synthetic(tmp_path_factory.mktemp("report") / "store")
     fill(store, scales=(1.0, 10.0), seeds=5)
-    return write_report([store.directory], store.directory, figures="main", formats="pdf")
+    return write_report([store.directory], store.directory, figures="main", formats="pdf,md,tex")
 
 
 def test_what_is_written_is_whole_and_the_page_stands_alone(result):
     assert result.problems == ()
-    stored = pd.read_csv(result.summary_path)
+    stored = pd.read_csv(result.summary_path.with_name("summary_all.csv"))
     pd.testing.assert_frame_equal(stored, result.summary, check_exact=False, rtol=1e-12)
+    main = pd.read_csv(result.summary_path)
+    pd.testing.assert_frame_equal(main, stored[list(main)])
+    assert {"success_low", "rmse_high", "nees_median", "verdict", "may_be_best"} < set(main)
+    assert len(list(main)) < 35
     assert {p.name for p in result.figures} >= {f"headline.{kind}" for kind in ("png", "pdf")}
-    assert {p.name for p in result.tables} >= {"overview.csv", "overview.md", "overview.tex", "comparisons.tex"}
+    assert {p.name for p in result.tables} >= {"parameters.csv", "overview.md", "overview.tex", "comparisons.tex"}
     for path in (*result.figures, *result.tables, result.report):
         assert path.stat().st_size > 100
     assert not list(result.report.parent.rglob("*.tmp"))

@@ -56,17 +56,29 @@ def test_the_report_has_the_figures_and_formats_that_were_asked_for_last(
         assert page.count("<img") == len({name.partition(".")[0] for name in links})
         return links
 
+    def kinds() -> set[str]:
+        return {path.suffix[1:] for path in tmp_path.glob("tables/*")}
+
     # Two formats are no sweep.
-    assert run(tmp_path, "figures=main", "formats=pdf,svg") == 0
+    assert run(tmp_path, "figures=main", "formats=pdf,svg,tex") == 0
     assert "multirun" not in "".join(path.name for path in tmp_path.iterdir())
     assert drawn() == {f"cost_against_accuracy.{kind}" for kind in ("png", "pdf", "svg")}
+    mine = tmp_path / "tables" / "mine.tex"
+    mine.write_text("not of the report")
+    assert kinds() == {"csv", "tex"}
     report = ["report", str(tmp_path)]
-    assert main([*report, "figures=all", "formats=[pdf]"]) == 0
+    assert main([*report, "figures=all", "formats=[pdf,md]"]) == 0
+    assert kinds() == {"csv", "md", "tex"}
+    mine.unlink()
+    assert kinds() == {"csv", "md"}
     assert {"cost_against_accuracy.pdf", "parameter_errors_linear_lse.png"} <= drawn()
     assert {name.rpartition(".")[2] for name in drawn()} == {"png", "pdf"}
     assert main([*report, "figures=none"]) == 0
     assert drawn() == set()
-    for word, said in (("figures=some", "choose all, main or none"), ("formats=pdf,tiff", "choose among png, pdf and")):
+    for word, said in (
+        ("figures=some", "choose all, main or none"),
+        ("formats=pdf,tiff", "choose among png, pdf, svg, csv, md and tex"),
+    ):
         capsys.readouterr()
         assert main([*report, word]) == 2
         assert f"{word}: {said}" in capsys.readouterr().err

@@ -30,7 +30,7 @@ from ipe_bench.plugins.discovery import CONTRACTS, PACKAGES, Option, options
 from ipe_bench.report.figures import INDEX
 from ipe_bench.report.table import environment
 from ipe_bench.report.words import brief, duration, enumerate_few, percent
-from ipe_bench.statistics.records import ALL, STATISTICS
+from ipe_bench.statistics.records import ALL, MAIN, STATISTICS
 
 SETTINGS = {
     "project": "ipe-bench",
@@ -128,7 +128,7 @@ def write_reference(folder: Path) -> None:
         write_page(folder / f"{group}.md", "options", group=group, title=title, key=key, options=rows)
     statuses = [status for status in Status if status is not Status.RUNNING]
     write_page(folder / "statuses.md", "statuses", statuses=statuses)
-    write_page(folder / "statistics.md", "statistics", records=STATISTICS, definitions=DEFINITIONS.items())
+    write_page(folder / "statistics.md", "statistics", records=STATISTICS, definitions=DEFINITIONS.items(), main=MAIN)
     summary = printed_by(["--help"], columns=100).rstrip()
     names = re.findall(r"^    (\w+)(?:  |$)", summary, re.MULTILINE)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
