@@ -77,7 +77,7 @@ def test_the_report_has_the_figures_and_formats_that_were_asked_for_last(
     assert drawn() == set()
     for word, said in (
         ("figures=some", "choose all, main or none"),
-        ("formats=pdf,tiff", "choose among png, pdf, svg, csv, md and tex"),
+        ("formats=pdf,tiff", "choose among png, pdf, svg, csv"),
     ):
         capsys.readouterr()
         assert main([*report, word]) == 2
