@@ -92,7 +92,7 @@ class PathIPE(Tracker):
                 break
             if self.method == "newton":
                 B = frozen.slopes(x[active])[1]
-                F, singular[active] = frozen.divided(u[active], r[active], B)
+                F, singular[active] = frozen.divided(F, B)
                 out.calls[rows[active]] += (1 + n) * model.evaluations
             u[active] -= F
             x[active], r[active] = frozen.run(u[active], z[active])
@@ -178,18 +178,19 @@ class _Frozen:
         """Eq. (11): H+ (h - z) (trials, N), in which (I + A' A)^-1 A' is the gain and (I + A' A)^-1 = I - gain A."""
         return u - multiply(self.gain, multiply(self.A, u) - r)
 
-    def divided(self, u: Array, r: Array, B: Array) -> tuple[Array, Array]:
-        """J_F^-1 F (trials, N) = (I + A' B)^-1 (u + A' r), by M equations in place of N (Woodbury), and whether
-        there is none."""
-        v = u + multiply(self.A.T, r)
-        w, singular = solve(np.eye(len(self.A)) + np.matmul(B, self.A.T), multiply(B, v))
-        return v - multiply(self.A.T, w), singular & finite(v)
+    def divided(self, F: Array, B: Array) -> tuple[Array, Array]:
+        """J_F^-1 F (trials, N), J_F = I + (I + A' A)^-1 A' (B - A), by M equations in place of N (Woodbury), and
+        whether there is none."""
+        C = B - self.A
+        w, singular = solve(np.eye(len(self.A)) + np.matmul(C, self.gain), multiply(C, F))
+        return F - multiply(self.gain, w), singular & finite(F)
 
     def sandwich(self, X: Array, B: Array) -> Array:
-        """The covariances (trials, 1 + K, n, n) of the states at the root: T T' with T = X (I + A' B)^-1 [I, A']."""
+        """The covariances (trials, 1 + K, n, n) of the states at the root: T T' with T = X J_F^-1 H+."""
         trials, K, n, N = X.shape
-        X = X.reshape(trials, K * n, N)
-        D, _ = solve(np.eye(len(self.A)) + np.matmul(B, self.A.T), B)
-        Z = X - np.matmul(np.matmul(X, self.A.T), D)
-        T = np.concatenate([Z, np.matmul(Z, self.A.T)], axis=2).reshape(trials, K, n, -1)
+        X, C = X.reshape(trials, K * n, N), B - self.A
+        D, _ = solve(np.eye(len(self.A)) + np.matmul(C, self.gain), C)
+        X = X - np.matmul(np.matmul(X, self.gain), D)
+        seen = np.matmul(X, self.gain)
+        T = np.concatenate([X - np.matmul(seen, self.A), seen], axis=2).reshape(trials, K, n, -1)
         return np.matmul(T, transposed(T))
