@@ -201,14 +201,15 @@ class Block:
         `inflation` widens the prior of the equation `map`.
         """
         if (key := (equation, inflation)) not in self._roots:
-            problem, z, x = self.problem, self.trials.z, self.trials.x
+            problem, z, x, known = self.problem, self.trials.z, self.trials.x, (self.readings, self.jacobian)
             with np.errstate(all="ignore"):
                 if equation != "frozen":
-                    root = least_squares_root(problem, z, x, prior=inflation if equation == "map" else None)
+                    prior = inflation if equation == "map" else None
+                    root = least_squares_root(problem, z, x, prior=prior, known=known)
                 elif problem.rankless:  # there is no such equation; the estimators that solve it say so
                     root = np.full(x.shape, np.nan)
                 else:
-                    root = frozen_root(problem, z, x)
+                    root = frozen_root(problem, z, x, known)
             self._roots[key] = root
         return self._roots[key]
 
