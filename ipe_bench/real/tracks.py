@@ -19,7 +19,7 @@ from ipe_bench.states.formulas import Formulas, RecordedFormulas
 from ipe_bench.states.particles import Bootstrap
 from ipe_bench.states.trackers import Tracker
 from ipe_bench.statistics.intervals import mean_limits
-from ipe_bench.trials.thresholds import FIT_LEVEL
+from ipe_bench.trials.thresholds import FIT_LEVEL, GATE
 from ipe_bench.trials.tracking import track_safely
 from ipe_bench.trials.whiteness import white_p
 
@@ -27,6 +27,10 @@ _SAME_TIME = 1e-3
 """Part of the shortest step by which a time of a log may differ from that of its epoch."""
 _KEYS = ("constants", "noise", "deviation")
 """The numbers of a model that can be found; the latter two are positive, and found by their logarithms."""
+_FAR_BELOW = 10.0
+"""By how much more than a tenth of the number of readings a log likelihood lies far below the largest of the log."""
+_COLLAPSED = 2.0
+"""Effective sample sizes below this have no covariance."""
 _STEP = 0.02
 """Step of differences, in standard errors."""
 _ROUNDS, _DONE = 20, 1e-8
@@ -140,6 +144,11 @@ class LogTracks:
     """Whether there is a track, and its innovations are no larger than chance explains."""
     message: str
     """The reason why there is no track, or no constant; empty if there is one."""
+    lost_from: int | None = None
+    """The epoch, from 1 on, from which most innovations are larger than all but one in a million by chance; None if
+    there is none."""
+    effective: float = np.nan
+    """The median effective sample size of an epoch, of a weighted sample; NaN if there is none."""
     constants: Sequence[Constant] = ()
     """The constants that were asked for."""
 
@@ -149,6 +158,7 @@ class LogTracks:
         sizes, innovations = np.array([state.size for state in log.model.states]), tracks.innovations.swapaxes(1, 2)
         mean, deviation = tracks.mean[0] * sizes, deviations(tracks.covariance[0]) * sizes
         nis = np.where(tracks.degrees[0] > 0, tracks.nis[0], np.nan)
+        size = np.nan if tracks.effective is None else float(np.median(tracks.effective))
         m, total = int(np.isfinite(innovations).sum()), float(np.nansum(nis))
         return cls(
             label,
@@ -159,17 +169,44 @@ class LogTracks:
             limits=mean_limits(m, 1),
             white_p=float(white_p(innovations)[0]),
             log_likelihood=float(tracks.log_likelihood[0]) if tracks.degrees.any() else np.nan,
-            passes=bool(np.isfinite([mean, deviation]).all() and not chdtrc(max(m, 1), total) < FIT_LEVEL),
+            passes=bool(np.isfinite([mean, deviation]).all() and not chdtrc(max(m, 1), total) < FIT_LEVEL)
+            and not size < _COLLAPSED,
             message=messages.get(0, ""),
+            lost_from=_lost_from(nis, tracks.degrees[0]),
+            effective=size,
         )
 
     @property
     def verdict(self) -> str:
-        """Tells whether the covariance of the innovations is as large as they are."""
+        """Tells whether the covariance of the innovations is as large as they are, or from where the track is lost."""
+        if self.lost_from is not None:
+            return f"lost from epoch {self.lost_from}"
+        if self.effective < _COLLAPSED:
+            return "collapsed"
         if not np.isfinite(self.mean_nis):
             return "-"
         low, high = self.limits
         return "optimistic" if self.mean_nis > high else "pessimistic" if self.mean_nis < low else "consistent"
+
+
+def _lost_from(nis: Array, degrees: Array) -> int | None:
+    """The first epoch, from 1 on, whose NIS (K,) lies beyond the gate, and from which on most do, if there is one."""
+    at = np.flatnonzero(np.isfinite(nis))
+    beyond = chdtrc(degrees[at], nis[at]) < GATE
+    share = np.cumsum(beyond[::-1])[::-1] / np.arange(len(at), 0, -1)
+    lost = at[beyond & (share > 0.5)]
+    return int(lost[0]) + 1 if len(lost) else None
+
+
+def far_below(tracks: Sequence[LogTracks]) -> list[str]:
+    """A line for each track under which the log is far less likely than under the best of the others."""
+    best = max(tracks, key=lambda one: np.nan_to_num(one.log_likelihood, nan=-np.inf))
+    readings = np.isfinite(best.nis).sum()
+    return [
+        f"{one.label}: its log likelihood is {below:.4g} below that of {best.label}, which describes the log better"
+        for one in tracks
+        if (below := best.log_likelihood - one.log_likelihood) > _FAR_BELOW + readings / 10
+    ]
 
 
 # Constants -----------------------------------------------------------------------------------------------------------

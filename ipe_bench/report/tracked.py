@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ipe_bench.basics.files import write_text
-from ipe_bench.real.tracks import Log, LogTracks
+from ipe_bench.real.tracks import Log, LogTracks, far_below
 from ipe_bench.report.answer import as_json, with_error
 from ipe_bench.report.table import Part, Strong, Table, html, interval, plain_text, texts, words
 from ipe_bench.report.words import p_value, short
@@ -74,9 +74,14 @@ def track_parts(answer: LogAnswer) -> list[Part]:
         texts("white p", [p_value(one.white_p) for one in found]),
         texts("log likelihood", [f"{one.log_likelihood:.2f}".replace("nan", "-") for one in found]),
     ]
+    if np.isfinite([one.effective for one in found]).any():
+        columns.append(texts("effective particles", [short(one.effective) for one in found]))
     note = (
         "Innovations are readings less their predictions, in predicted standard deviations; NIS / m is their mean"
-        " square. They are white if the filter is right (Ljung and Box). Smoothers have none."
+        " square. They are white if the filter is right (Ljung and Box). Smoothers have none. A track is lost from the"
+        " epoch from which most of them are larger than all but one in a million by chance. Those of particles are by"
+        " the mean and covariance of the readings that they predict; effective particles: 1 / sum of squared weights,"
+        " the median of all epochs; collapsed: below 2."
     )
     if any(one.constants for one in found):
         note += " Since the constants were found by them, their mean square hardly tests the model; whiteness does."
@@ -92,6 +97,7 @@ def track_parts(answer: LogAnswer) -> list[Part]:
     ]
     return [
         *(Strong(f"{one.label}: {one.message}") for one in found if one.message),
+        *map(Strong, far_below(found)),
         *([Table("constants", "Constants of largest likelihood", "", maximum)] if constants else ()),
         Table("innovations", f"{answer.log.model.name}: is the filter right?", "", columns, notes=[note]),
         Table("last", "States at the last epoch ± standard deviation", "", ends),
@@ -100,7 +106,10 @@ def track_parts(answer: LogAnswer) -> list[Part]:
 
 def write_tracks(folder: Path, answer: LogAnswer, command: Any, provenance: Mapping[str, Any]) -> list[Path]:
     """Writes track.json, track.csv and track.html, and returns them."""
-    log, rows = answer.log, ("message", "mean_nis", "limits", "verdict", "white_p", "log_likelihood", "passes")
+    log, rows = (
+        answer.log,
+        ("lost_from", "effective", "message", "mean_nis", "limits", "verdict", "white_p", "log_likelihood", "passes"),
+    )
     trackers = {one.label: {name: as_json(getattr(one, name)) for name in rows} for one in answer}
     for one in answer:
         trackers[one.label]["constants"] = {each.name: as_json([each.value, each.error]) for each in one.constants}

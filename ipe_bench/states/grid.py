@@ -51,7 +51,6 @@ class Grid(Tracker):
         if self.smooths and len(z) > _AT_ONCE:  # whose densities are kept for all epochs
             return Tracks.join([self.track(model, z[i : i + _AT_ONCE]) for i in range(0, len(z), _AT_ONCE)])
         out, grids = Tracks.empty(model, len(z)), self._grids(model)
-        out.nis[:] = np.nan  # a density has no innovation
         again = (model.epochs - 1) * self.smooths  # transitions on the way back
         out.calls += (self.points + _PATHS) * model.evaluations + self.points * again
         m, P = model.prior.mean[0], model.prior.covariance[0, 0]

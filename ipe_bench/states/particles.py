@@ -9,9 +9,9 @@ import numpy as np
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count
 from ipe_bench.basics.streams import own_generators
-from ipe_bench.states.algebra import root, transposed
-from ipe_bench.states.base import StateModel
-from ipe_bench.states.trackers import Tracker, Tracks, misfit
+from ipe_bench.states.algebra import factor, root, transposed
+from ipe_bench.states.base import Normal, StateModel
+from ipe_bench.states.trackers import Tracker, Tracks, Update, residuals, squares
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Bootstrap(Tracker):
             return np.stack([g.standard_normal((N, columns)) for g in generators])
 
         out = Tracks.empty(model, trials)
-        out.nis[:] = np.nan  # a weighted sample has no innovation
+        out.effective = np.empty((trials, model.epochs))
         spread = root(model.prior.covariance)
         x = model.prior.mean + np.matmul(normals(spread.shape[1]), spread.T)
         for k in range(model.epochs):
@@ -40,6 +40,7 @@ class Bootstrap(Tracker):
                 G = model.gain(k)
                 x = model.transition(x, k) + np.matmul(normals(G.shape[1]), G.T)
             w = weighed(model, x, k, z[:, k], 1.0, out)
+            out.effective[:, k] = 1 / np.sum(w**2, axis=1)
             mean = np.sum(w[..., None] * x, axis=1)
             d = x - mean[:, None]
             out.mean[:, k], out.covariance[:, k] = mean, np.matmul(transposed(d * w[..., None]), d)
@@ -51,13 +52,20 @@ class Bootstrap(Tracker):
 
 def weighed(model: StateModel, x: Array, k: int, z: Array, before: Array | float, out: Tracks) -> Array:
     """The weights `before` (trials, N) of states x (trials, N, n) times the likelihood of readings z (trials, m), with
-    sum 1; the logarithm of their sum is added to the log likelihood of the track."""
-    square, size = misfit(model, z, x, k)
+    sum 1. The track notes the logarithm of their sum, and the innovation by the mean and covariance of h(x) before."""
+    r, R, seen = residuals(model, z, x, k), model.R(k), np.isfinite(z)
+    square, size = squares(r, z, R)
+    p = np.broadcast_to(before, square.shape)
+    p = (p / p.sum(axis=1, keepdims=True))[..., None]
+    y = np.sum(p * r, axis=1)
+    d = r - y[:, None]
+    S = np.matmul(transposed(d * p), d) + np.where(seen[:, :, None] & seen[:, None, :], R, np.eye(len(R)))
+    found = Update.of(Normal(y, S), y, factor(S), seen)
+    out.nis[:, k], out.innovations[:, k], out.degrees[:, k] = found.nis, found.innovation, found.degrees
     least = square.min(axis=1, keepdims=True)
     w = before * np.exp(-0.5 * (square - least))
     total = w.sum(axis=1, keepdims=True)
     out.log_likelihood += np.log(total[:, 0]) - 0.5 * (least[:, 0] + size)
-    out.degrees[:, k] = np.isfinite(z).sum(axis=1)
     return w / total
 
 

@@ -47,6 +47,8 @@ class Tracks:
     """The transitions as they were linearised."""
     predicted: list[Normal] = field(default_factory=list)
     """The states after each transition, before the reading."""
+    effective: Array | None = None
+    """Effective sample sizes 1 / sum w^2 (trials, K) of weighted samples."""
     reads: list[tuple[Array, Array]] = field(default_factory=list)
     """H (trials, m, n) of the readings of each epoch as they were linearised, 0 of missing ones, and L (trials, m, m)
     with L L' = S of their innovations."""
@@ -252,9 +254,20 @@ def filtered(
 def misfit(model: StateModel, z: Array, x: Array, k: int) -> tuple[Array, Array]:
     """(z - h)' R^-1 (z - h) (trials, N) of states x (trials, N, n) over the readings z (trials, m) of epoch k that are
     there, and log det 2 pi R (trials,) of these."""
+    return squares(residuals(model, z, x, k), z, model.R(k))
+
+
+def residuals(model: StateModel, z: Array, x: Array, k: int) -> Array:
+    """z - h (trials, N, m) of states x (trials, N, n) at epoch k; 0 of missing readings."""
     seen = np.isfinite(z)
-    r = np.where(seen[:, None], z[:, None] - model.observe_near(x, k, np.where(seen, z, 0.0)), 0.0)
-    L = factor(np.where(seen[:, :, None] & seen[:, None, :], model.R(k), np.eye(z.shape[1])))
+    return np.where(seen[:, None], z[:, None] - model.observe_near(x, k, np.where(seen, z, 0.0)), 0.0)
+
+
+def squares(r: Array, z: Array, R: Array) -> tuple[Array, Array]:
+    """r' R^-1 r (trials, N) of residuals r (trials, N, m), and log det 2 pi R (trials,), over readings z (trials, m)
+    that are there."""
+    seen = np.isfinite(z)
+    L = factor(np.where(seen[:, :, None] & seen[:, None, :], R, np.eye(z.shape[1])))
     size = 2 * np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1) + np.log(2 * np.pi) * seen.sum(axis=1)
     return np.sum(lower_solve(L, transposed(r)) ** 2, axis=1), size
 

@@ -61,12 +61,24 @@ def test_a_log_is_tracked_with_the_bits_of_a_run(tmp_path):
         np.testing.assert_array_equal(one.mean, whole.mean[4])
         np.testing.assert_array_equal(one.deviation, np.sqrt(np.einsum("kii->ki", whole.covariance[4])))
         assert one.log_likelihood == stored.loc[(label, 4), "log_likelihood"] or label == "rts"
-        assert one.white_p == stored.loc[(label, 4), "white_p"] or label in ("rts", "particles")
+        assert one.white_p == stored.loc[(label, 4), "white_p"] or label == "rts"
         assert one.mean_nis == pytest.approx(stored.loc[(label, 4), "extra_nis"], rel=1e-12, nan_ok=True)
     one = answer["ekf"]
     assert one.limits == pytest.approx(chi2.ppf([0.025, 0.975], 50) / 50, rel=1e-9)
     assert np.isnan(answer["rts"].mean_nis)
-    assert answer["rts"].verdict == answer["particles"].verdict == "-"
+    assert answer["rts"].verdict == "-"
+
+
+def test_particles_that_lose_a_log_are_named():
+    sharp = ConstantVelocity(count=40, deviation=1e-3)
+    answer = ib.estimate(sharp, sharp.draw(0, 1).z[0], {"kf": ekf(), "few": Bootstrap(200)})
+    assert [one.passes for one in answer] == [True, False]
+    assert answer["few"].verdict == "collapsed"
+    assert "few: its log likelihood is 8.291e+04 below that of kf" in str(answer)
+    steered = replace(DRIVEN, noise={"w": 1e-3}, count=50)  # whose particles do not spread far enough to follow
+    z = np.r_[np.zeros(30), np.linspace(1.0, 30.0, 20)][:, None]
+    one = ib.estimate(steered, z, {"few": Bootstrap(200)})["few"]
+    assert (one.verdict, one.passes, one.lost_from) == ("lost from epoch 31", False, 31)
 
 
 def test_known_inputs_and_unequal_steps_of_a_log_give_the_closed_form(tmp_path):

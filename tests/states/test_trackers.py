@@ -323,6 +323,7 @@ def test_a_grid_gives_the_kalman_filter_and_its_smoother_of_a_linear_model(moved
         np.testing.assert_allclose(found.mean, exact.mean, atol=1e-6)
         np.testing.assert_allclose(found.covariance, exact.covariance, atol=1e-6)
         np.testing.assert_allclose(found.log_likelihood, filtered.log_likelihood, atol=1e-6)
+        np.testing.assert_allclose(found.innovations, filtered.innovations, atol=1e-5)
         np.testing.assert_array_equal(found.mean[26:], grid.track(model, z[26:]).mean)
 
 
@@ -331,7 +332,10 @@ def test_particles_have_the_likelihood_of_the_kalman_filter_of_a_linear_model():
     model = Scalar(True)
     z = model.draw(0, 5).z
     exact = ekf().track(model, z).log_likelihood
-    np.testing.assert_allclose(Bootstrap(2000).track(model, z).log_likelihood, exact, atol=1.5)
+    particles, filtered = Bootstrap(2000).track(model, z), ekf().track(model, z)
+    np.testing.assert_allclose(particles.log_likelihood, exact, atol=1.5)
+    assert np.corrcoef(particles.nis.ravel(), filtered.nis.ravel())[0, 1] > 0.99
+    assert 1 < particles.effective.min() < particles.effective.max() < 2000
 
 
 def test_a_grid_refuses_what_it_cannot_be_exact_for():
