@@ -97,7 +97,7 @@ def run(
     if isinstance(scenarios, Sequence):
         scenarios = [_tracking(one) or _scenario(one) for one in scenarios]
     else:
-        scenarios = [_tracking(scenarios) or _scenario(scenarios, **stated)]
+        scenarios = [_tracking(scenarios, **stated) or _scenario(scenarios, **stated)]
     estimators, stored = _labelled(estimators), Stored(output)
     options: dict[str, Any] = {"execution": execution, "block_size": block_size, "watch": watch}
     options |= {"precision": precision, "time_limit": time_limit}
@@ -549,11 +549,14 @@ def _scenario(given: Any, **stated: Any) -> Scenario:
     return Scenario(given, **stated)
 
 
-def _tracking(given: Any) -> StateScenario | None:
-    """Returns the scenario of a state model; None for one of constants."""
-    if isinstance(given, StateModel):
-        return StateScenario(given)
-    return given if isinstance(given, StateScenario) else None
+def _tracking(given: Any, **stated: Any) -> StateScenario | None:
+    """Returns the scenario of a state model under what is stated of it; None for one of constants."""
+    stated = {name: value for name, value in stated.items() if value is not None}
+    if not isinstance(given, StateModel | StateScenario):
+        return None
+    if other := [name for name in stated if name != "error_scale" or isinstance(given, StateScenario)]:
+        raise UserError(f"{other[0]}=: is part of the state model or its scenario; leave it out")
+    return given if isinstance(given, StateScenario) else StateScenario(given, **stated)
 
 
 def _labelled(estimators: Any, kind: Any = Estimator | Tracker) -> Mapping[str, Any]:

@@ -139,6 +139,7 @@ def _track(asked: Single, model: StateModel) -> int:
     """Tracks the states by every chosen tracker, prints tables and writes files; exit code 1 where no track passes."""
     from ipe_bench.report.tracked import NAME, TABLE, track_parts, write_tracks
 
+    asked.words.refuse(("error_scale",), "is of simulated trials; give the state model another prior")
     given, trackers = asked.spec.readings, asked.spec.estimators
     find = asked.spec.find or ()
     answer = ib.estimate(model, given, trackers, ignore_columns=asked.spec.ignored, find=find)

@@ -32,7 +32,12 @@ _ROWS = (
     ("", "GROUP.KEY=VALUE", "an option of one of these; `ipe-bench list GROUP/NAME` shows its type and default"),
     ("estimators", "estimators.NAME.KEY=X", "an option of a solver or a baseline that is chosen"),
     ("still", "truth_measurement=NAME", "the model that simulates the readings, if estimators assume another one"),
-    ("still", "error_scale=X", "standard deviation of the true parameters, in multiples of their sizes (1)"),
+    (
+        "scale",
+        "error_scale=X",
+        "standard deviation of the true parameters, in multiples of their sizes, or of states in multiples of that of"
+        " the prior of a state model (1)",
+    ),
     ("trials", "seed=N", "number that all random draws follow from (0)"),
     ("trials", "trials=N", "number of trials (1000); with precision= the largest number"),
     ("run", "precision=X", "adds trials until the success shares are known to within X, as in 0.01"),

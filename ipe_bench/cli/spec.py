@@ -129,7 +129,7 @@ class Spec(Component):
     def scenario(self) -> Any:
         """Simulated trials: a `Scenario`, or a `StateScenario` if there is a state model."""
         if self.state_model is not None:
-            return StateScenario(self.state_model, self.seed)
+            return StateScenario(self.state_model, self.seed, self.error_scale)
         measurement, truth = (m and informed(m, self.known) for m in (self.measurement, self.truth_measurement))
         assert measurement is not None
         prior = self.prior

@@ -50,7 +50,7 @@ def facts(analysis: Analysis) -> list[Fact]:
     collected = [*_certified(analysis), *_published(analysis.collection)]
     own = [] if collected else _ranking(rows[certified], "certified")
     constants = _constants(rows[~certified & ~moving], analysis.collection)
-    return [*collected, *own, *constants, *_moving(rows[moving])]
+    return [*collected, *own, *constants, *_moving(rows[moving], analysis.summary)]
 
 
 def in_common(rows: pd.DataFrame, key: str | list[str]) -> pd.DataFrame:
@@ -107,15 +107,35 @@ def _constants(rows: pd.DataFrame, collection: Collection) -> Iterator[Fact]:
     yield _costs(rows, scales)
 
 
-def _moving(rows: pd.DataFrame) -> Iterator[Fact]:
-    """Finds who keeps the track how often and, for a single model, how large the errors are."""
+def _moving(rows: pd.DataFrame, summary: pd.DataFrame) -> Iterator[Fact]:
+    """Finds who keeps the track how often and, for a single model at one scale, how large the errors are; for a sweep
+    over scales, who holds up to where and is honest, and the costs."""
     if rows.empty:
+        return
+    scales = sorted(rows["error_scale"].unique())
+    if len(scales) > 1 and rows.groupby(["error_scale", "estimator"]).size().max() == 1:
+        yield from reach(rows)
+        yield from honesty(rows)
+        yield from _silent(rows)
+        yield _costs(rows, scales)
         return
     yield from _ranking(rows, "moving")
     one = rows["scenario"].min() == rows["scenario"].max()
     if one and (rows["trials"] == rows["shared_trials"]).all():
         listed = rows.sort_values("error_median", kind="stable")[["estimator", "error_median"]]
         yield "errors", {"errors": list(listed.itertuples(index=False, name=None))}
+        yield from _over_paths(summary)
+
+
+def _over_paths(summary: pd.DataFrame) -> Iterator[Fact]:
+    """Finds the errors over all epochs, root mean square over the states, in multiples of the largest."""
+    states = summary[(summary["parameter"] != ALL) & (summary["noise"] == "model")]
+    errors = states.pivot_table(index="estimator", columns="parameter", values="path_rmse")
+    errors = errors.loc[:, (errors > 0).all()].dropna()
+    if len(errors) < 2 or errors.empty:
+        return
+    size = np.sqrt((errors / errors.max()).pow(2).mean(axis=1)).sort_values(kind="stable")
+    yield "paths", {"errors": list((size / size.max()).items())}
 
 
 def _agreement(rows: pd.DataFrame, scales: Sequence[float], kinds: Mapping[str, str]) -> Iterator[Fact]:
@@ -253,8 +273,10 @@ def _about_constants(name: str, footer: Mapping[str, Any]) -> str:
 def _about_states(name: str, footer: Mapping[str, Any]) -> str:
     """Describes a model of states; the general docstring of models by formulas is left out."""
     states = [f"{p['name']} in {p['unit']}" if p["unit"] else p["name"] for p in footer["parameters"]]
+    all_states = footer.get("states", len(states))
     words = "" if "next" in footer["identity"]["scenario"].get("model", {}) else str(footer.get("about") or "")
     return (
         f"{name}{': ' * bool(words)}{words.rstrip('.')}. {footer['readings']} readings at {len(footer['times'])} epochs"
-        f" tell {len(states)} states that move: {enumerate_few(states, 8)}."
+        f" tell {all_states} states that move{', of which are scored' * (all_states > len(states))}:"
+        f" {enumerate_few(states, 12)}. Error scale s multiplies the standard deviations of their prior by s."
     )

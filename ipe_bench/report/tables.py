@@ -9,7 +9,7 @@ from typing import Any
 import pandas as pd
 
 from ipe_bench.report.table import Column, Table, column, words
-from ipe_bench.report.terminal import TRACKED, leading, overview_columns, overview_notes, statistics
+from ipe_bench.report.terminal import leading, overview_columns, overview_notes, statistics
 from ipe_bench.report.words import p_value, percent, short, value_text
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.certified import (
@@ -28,7 +28,9 @@ _OPEN = (
 _RECORDED: dict[Where, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
     "tracks": (
         "States over all epochs",
-        f"{TRACKED} all: root mean square over the states, each over that of this filter.{_OPEN}",
+        "Over all epochs; all: root mean square over the states, each over that of the filter linearised at the true"
+        " path for filters, and of the smoother behind it for smoothers, which use later readings too; about 1 is good"
+        f" for either.{_OPEN}",
         lambda rows: rows["path_rmse"].notna(),
     ),
     "costs": (

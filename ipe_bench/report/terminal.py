@@ -37,13 +37,16 @@ _TOLD = (
     " success are those of parameters that are estimated together with the levels."
 )
 TRACKED = (
-    "For states that move, success is the share of trials that keep the track, and the error is the root mean square"
-    " over all epochs divided by that of the filter linearised at the true path: about 1 for a good filter, below 1 for"
-    " a smoother, which uses later readings too. NEES and the statistics of single states refer to the last epoch."
-    " Cost counts evaluations of transition and reading."
+    "For states that move, all of this is of the last epoch, where filters and smoothers have the same readings:"
+    " success is the share of trials whose error there lies within all but one in a million of the covariance of the"
+    " filter linearised at the true path. The whole path is in the table of all epochs, where filters and smoothers"
+    " have bounds of their own. Cost counts evaluations of transition and reading."
 )
 """References of a track's errors."""
-_TRACKED_ERROR = f"error is the median / 95 % quantile over all trials. {_CAPPED}"
+_TRACKED_ERROR = (
+    "error is the median / 95 % quantile over all trials, in multiples of that of the filter linearised at the true"
+    f" path; about 1 is good. {_CAPPED}"
+)
 
 
 def overview_notes(noises: Collection[str]) -> tuple[str, ...]:

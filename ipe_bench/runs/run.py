@@ -120,7 +120,7 @@ def validate(
         other = [f"estimators.{label}: {what}" for label, one in estimators.items() if not isinstance(one, kind)]
         mistakes += other
         if isinstance(scenario, StateScenario) and not other:
-            found = {label: tracker.hindrance(scenario.model) for label, tracker in estimators.items()}
+            found = {label: tracker.hindrance(scenario.assumed) for label, tracker in estimators.items()}
             mistakes += [f"trackers.{label}: {why}" for label, why in found.items() if why]
         if isinstance(scenario, StateScenario) or other:
             continue

@@ -113,6 +113,7 @@ class ResultKey:
             "equation": getattr(self.estimator, "equation", None),
             "family": getattr(self.estimator, "family", None),
             "sequential": "epochs" in needs,
+            "smooths": bool(getattr(self.estimator, "smooths", False)),
             "jacobian_cost": float(getattr(model, "jacobian_cost", model.n)),
             "parameters": [describe(p) for p in model.parameters],
             "readings": model.m,
@@ -121,7 +122,7 @@ class ResultKey:
             **(
                 {"linear_correlation": linear_correlation(scenario.problem).round(4).tolist()}
                 if isinstance(scenario, Scenario)
-                else {"times": scenario.model.times.tolist()}
+                else {"times": scenario.model.times.tolist(), "states": scenario.model.n}
             ),
         }
 

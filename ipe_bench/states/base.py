@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array, multiply, nearest
 from ipe_bench.basics.options import Component
 from ipe_bench.basics.streams import numbered
@@ -47,7 +48,7 @@ class StateModel(Component, ABC):
         z[k] = h(x[k], k) + v[k],          v[k] ~ N(0, R[k])
 
     Required: `states`, `times`, `prior`, `transition` (f), `observe` (h), `gain` (G) and `R`.
-    Optional: `moved_first`, `periods` and `reading_names`; `draw`, if paths are stored.
+    Optional: `moved_first`, `periods`, `reading_names` and `scored`; `draw`, if paths are stored.
     Promised: f and h take stacks of states (..., n), real or complex, and are analytic in them, since slopes are
     complex steps; a trial has the same bits alone and in any batch; `require_sound` finds nothing to refuse.
 
@@ -129,9 +130,14 @@ class StateModel(Component, ABC):
         return len(self.states)
 
     @property
+    def scored(self) -> tuple[str, ...]:
+        """Names of the states by which trackers are scored, such as constants among states that move; empty: all."""
+        return ()
+
+    @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """The states, which are what is estimated."""
-        return self.states
+        """The states by which trackers are scored."""
+        return tuple(state for state in self.states if not self.scored or state.name in self.scored)
 
     @property
     def m(self) -> int:
@@ -188,9 +194,29 @@ class StateModel(Component, ABC):
         return paths
 
 
+def widened(model: StateModel, scale: float) -> StateModel:
+    """The model with the deviations of its prior multiplied by a scale: for the truth, and for every tracker.
+
+    Raises:
+        UserError: the model's paths are stored, and no prior is drawn from.
+    """
+    if scale == 1:
+        return model
+    if type(model).draw is not StateModel.draw:
+        raise UserError(f"error_scale={scale:g}: state_model={model.name} has stored paths; leave error_scale out")
+    m, P = model.prior
+    wider = Normal(m, scale**2 * P)
+    parts = {"__doc__": type(model).__doc__, "name": model.name, "prior": property(lambda self: wider)}
+    other = copy.copy(model)
+    object.__setattr__(other, "__class__", type(type(model).__name__, (type(model),), parts))
+    return other
+
+
 def require_sound(model: StateModel) -> None:
     """Raises UserError unless the parts of a model suit one another: times, prior, Q, R, f and h."""
     n, name = model.n, f"state_model={model.name}"
+    if absent := [one for one in model.scored if one not in [state.name for state in model.states]]:
+        raise UserError(f"{name}: scored: {unknown(absent[0], [state.name for state in model.states], 'state')}")
     if not model.epochs or not (np.diff(model.times) > 0).all():
         raise UserError(f"{name}: its times do not increase from epoch to epoch; give epochs in order")
     m, x = len(model.R(0)), model.prior.mean

@@ -9,6 +9,7 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.states.algebra import symmetric, transposed
 from ipe_bench.states.base import Normal, Paths, StateModel
 from ipe_bench.states.linearisation import Taylor, slope
+from ipe_bench.states.smoothers import smoothed
 from ipe_bench.states.trackers import Tracks, filtered
 
 
@@ -23,7 +24,7 @@ def posterior_bounds(model: StateModel, paths: Paths) -> tuple[Array, Array]:
         UserError: the process noise of a step is singular; a path then has no density.
     """
     P, before = model.prior.covariance, paths.start
-    eye, filtered, steps = np.eye(model.n), [], []
+    eye, forward, steps = np.eye(model.n), [], []
     for k in range(model.epochs):
         x = paths.x[:, k]
         H = slope(lambda at, k=k: model.observe(at, k), x)[1]
@@ -43,23 +44,24 @@ def posterior_bounds(model: StateModel, paths: Paths) -> tuple[Array, Array]:
             P = np.linalg.inv(symmetric(inverse + gained - D12.T @ V @ D12))
         else:
             P = symmetric(P @ np.linalg.inv(eye + gained @ P))
-        filtered.append(P)
+        forward.append(P)
         before = x
-    smoothed = [filtered[-1]]
+    backward = [forward[-1]]
     for V, D12 in reversed(steps[1:] if model.moved_first else steps):
-        smoothed.append(symmetric(V + V @ D12 @ smoothed[-1] @ D12.T @ V))
-    return np.array(filtered), np.array(smoothed[::-1])
+        backward.append(symmetric(V + V @ D12 @ backward[-1] @ D12.T @ V))
+    return np.array(forward), np.array(backward[::-1])
 
 
 def _mean(a: Array) -> Array:
     return np.asarray(a.mean(axis=0))
 
 
-def bound_at_truth(model: StateModel, paths: Paths) -> Array:
+def bound_at_truth(model: StateModel, paths: Paths, smooths: bool = False) -> Array:
     """The error covariances (trials, K, n, n) of an extended Kalman filter that is linearised at the true path (Taylor,
-    IEEE TAC 24, 1979). They exist for every Q, zero included; their mean is what a good filter attains, but no bound of
-    errors averaged over paths."""
+    IEEE TAC 24, 1979), or of the smoother behind it, which at the last epoch are the same. They exist for every Q, zero
+    included; their mean is what a good filter attains, but no bound of errors averaged over paths."""
     path = Tracks.empty(model, len(paths.x))
     path.mean, path.covariance[:] = paths.x, model.prior.covariance
     path.start = Normal(paths.start, path.start.covariance)
-    return filtered(model, np.zeros((*paths.x.shape[:2], len(model.R(0)))), Taylor(), path=path).covariance
+    tracks = filtered(model, np.zeros((*paths.x.shape[:2], len(model.R(0)))), Taylor(), path=path)
+    return (smoothed(model, tracks) if smooths else tracks).covariance

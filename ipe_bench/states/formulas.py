@@ -47,6 +47,8 @@ class Formulas(StateModel):
     """Known inputs that the formulas name, such as a control: one number, or one for each epoch."""
     units: Mapping[str, str] = field(default_factory=dict)
     """Units of states."""
+    scored: tuple[str, ...] = ()
+    """Names of the states by which trackers are scored, such as constants among states that move; empty: all."""
     period: Mapping[str, NonNegative] = field(default_factory=dict)
     """Periods of readings that come round, such as 6.283185307 of a bearing in rad."""
     count: Count = 100

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 
@@ -24,6 +25,7 @@ _OUTSIDE = 1e-8
 class Smoother(Tracker):
     """The smoother of Rauch, Tung and Striebel (AIAA J. 3, 1965) behind a filter."""
 
+    smooths: ClassVar[bool] = True
     filter: Filter = field(default_factory=Filter)
     """The filter whose tracks are smoothed."""
 
@@ -40,6 +42,7 @@ class IteratedSmoother(Tracker):
     smoother (García-Fernández, Svensson, Särkkä, IEEE TSP 65, 2017). The first path is that of `first`, smoothed.
     """
 
+    smooths: ClassVar[bool] = True
     first: Filter = field(default_factory=Filter)
     """The filter whose smoothed tracks are the first path."""
     rule: Rule = field(default_factory=Taylor)

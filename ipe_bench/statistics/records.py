@@ -706,9 +706,20 @@ STATISTICS: tuple[Statistic, ...] = (
         "bound at the truth",
         "all trials of trackers",
         "Standard deviation of the extended Kalman filter that is linearised at the true path (Taylor, IEEE TAC 24,"
-        " 1979), root mean square over all epochs: what a good filter attains, and a smoother can fall below.",
+        " 1979), or of the smoother behind it if the tracker smooths, root mean square over all epochs.",
         t.bound,
         kind="physical",
+        where=("tracks",),
+    ),
+    Statistic(
+        "path_success",
+        "path held",
+        "all trials of trackers",
+        "Share of trials whose mean squared error over all epochs, each state in multiples of this bound, lies in the"
+        " gate of a success. Interval: Clopper and Pearson.",
+        lambda s: t.path_success(s)[0],
+        limits=lambda s: t.path_success(s)[1:],
+        kind="share",
         where=("tracks",),
     ),
     Statistic(

@@ -25,7 +25,7 @@ NIS = "extra_nis"
 AMBIGUOUS = "extra_ambiguous"
 """The column in which estimators that look for several minima report 1 if they found some, else 0."""
 SCALARS = ("status", "solved", "success", "iterations", "simulations", "jacobians", "time_s", "nees", "crlb_distance")
-PATH = ("path_nees", "white_p", "log_likelihood", "first_bad_epoch")
+PATH = ("path_nees", "path_success", "white_p", "log_likelihood", "first_bad_epoch")
 """Scores of a tracker over the whole path."""
 OPTIONAL_COLUMNS = ("message", FIT, NIS, AMBIGUOUS, "root_distance", *PATH)
 """Columns that not every version or estimator stores."""

@@ -30,7 +30,7 @@ class PathSample(Sample):
 
     @cached_property
     def linear_bound(self) -> Array:
-        return f.rms_columns(self.of_truth("path_bound"))
+        return f.rms_columns(self.of_estimate("path_bound"))
 
 
 def is_track(s: Sample) -> bool:
@@ -64,6 +64,14 @@ def mean_score(s: Sample, name: str) -> float:
     return float(values.mean()) if len(values) else np.nan
 
 
+def path_success(s: Sample) -> tuple[float, float, float]:
+    """The share of trials that keep to the whole path, and the ends of its interval."""
+    if "path_success" not in s.scalars:
+        return np.nan, np.nan, np.nan
+    held = int(s.scalars["path_success"].sum())
+    return held / len(s), *clopper_pearson(held, len(s))
+
+
 def path_verdict(s: Sample) -> str:
     return verdict(s.scalars["path_nees"][s.converged], s.n) if is_track(s) else "-"
 
@@ -88,11 +96,10 @@ def epoch_curves(s: Sample) -> Iterator[dict[str, Any]]:
     if not len(times):
         return
     K, n = len(times), s.n
-    own = sum(_sums(s, s.group.cells, K), np.zeros((K, n + 4)))
+    own = sum(_sums(s, s.group.cells, K), np.zeros((K, 2 * n + 4)))
     truths = _sums(s, [truth for truth in s.group.truths if truth is not None], K)
-    errors, nees, count = own[:, :n], own[:, n], own[:, -1]
-    total = sum((block[:, : n + 1] for block in truths), np.zeros((K, n + 1)))
-    posterior = next((block[:, n + 1 :] for block in truths if np.isfinite(block).all()), np.full((K, 2 * n), np.nan))
+    errors, nees, total, count = own[:, :n], own[:, n], own[:, n + 3 : -1], own[:, -1]
+    posterior = next((block for block in truths if np.isfinite(block).all()), np.full((K, 2 * n), np.nan))
     with np.errstate(all="ignore"):
         low, high = mean_limits(n, int(count[0]))
         for i, name in enumerate(s.names):
@@ -102,7 +109,8 @@ def epoch_curves(s: Sample) -> Iterator[dict[str, Any]]:
                 "unit": s.parameters[i]["unit"],
                 "at": times,
                 "rmse": size * np.sqrt(errors[:, i] / count),
-                "bound": size * np.sqrt(total[:, i] / total[:, n]),
+                "bound": size * np.sqrt(total[:, i] / count),
+                "smooths": bool(s.group.footer.get("smooths")),
                 "posterior": size * np.sqrt(posterior[:, i]),
                 "posterior_smoothed": size * np.sqrt(posterior[:, n + i]),
                 "nees": nees / count / n,

@@ -24,7 +24,8 @@ from ipe_bench.estimators.base import Estimates
 from ipe_bench.noise.base import Noise
 from ipe_bench.noise.kinds import Certified, ModelNoise
 from ipe_bench.priors import GaussianPrior, Prior
-from ipe_bench.states.base import Paths, StateModel, require_sound
+from ipe_bench.states.algebra import half
+from ipe_bench.states.base import Paths, StateModel, require_sound, widened
 from ipe_bench.states.bounds import bound_at_truth, posterior_bounds
 from ipe_bench.states.formulas import RecordedFormulas
 from ipe_bench.states.smoothers import path_p
@@ -47,14 +48,22 @@ class StateScenario:
 
     model: StateModel
     seed: int = 0
+    error_scale: float = 1.0
+    """Multiplies the deviations of the prior, of the truth and of every tracker."""
 
-    error_scale: ClassVar[float] = 1.0
     truth: ClassVar[None] = None
     prior: ClassVar[Prior] = GaussianPrior()
 
     def __post_init__(self) -> None:
         check_seed(self.seed)
-        require_sound(self.model)
+        if not 0 < self.error_scale < np.inf:
+            raise UserError(f"error_scale={self.error_scale}: give a finite number above 0")
+        require_sound(self.assumed)
+
+    @cached_property
+    def assumed(self) -> StateModel:
+        """The model with the prior that the truth is drawn from."""
+        return widened(self.model, self.error_scale)
 
     @property
     def noise(self) -> Noise:
@@ -67,19 +76,25 @@ class StateScenario:
 
     @cached_property
     def linear_bound(self) -> Array:
-        """Standard deviations (n,) of the states at the last epoch in a filter that is linearised along the path
+        """Standard deviations (n,) of the scored states at the last epoch in a filter that is linearised along the path
         without process noise from the mean of the prior."""
-        model = self.model
+        model = self.assumed
         start = x = model.prior.mean[None]
         path = np.empty((1, model.epochs, model.n))
         for k in range(model.epochs):
             x = path[:, k] = model.transition(x, k) if model.moves(k) else x
         with np.errstate(all="ignore"):
-            return deviations(bound_at_truth(model, Paths(start, path, np.empty(0)))[0, -1])
+            return deviations(bound_at_truth(model, Paths(start, path, np.empty(0)))[0, -1])[self.scored]
+
+    @cached_property
+    def scored(self) -> Array:
+        """The places (n,) among the states of those that are scored."""
+        names = [p.name for p in self.model.parameters]
+        return np.array([i for i, state in enumerate(self.model.states) if state.name in names])
 
     def draw(self, start: int, stop: int) -> Paths:
         """Paths of trials start to stop."""
-        return self.model.draw(start, stop, self.seed)
+        return self.assumed.draw(start, stop, self.seed)
 
 
 AnyScenario = Scenario | StateScenario
@@ -103,18 +118,27 @@ class PathBlock:
 
     @property
     def names(self) -> list[str]:
-        return [p.name for p in self.scenario.model.states]
+        return [p.name for p in self.scenario.model.parameters]
 
     @cached_property
     def bound(self) -> Array:
-        """Covariances (trials, K, n, n) of the filter that is linearised at the truth."""
+        """Covariances (trials, K, n, n) of the scored states in the filter that is linearised at the truth."""
+        return self._bound(smooths=False)
+
+    def _bound(self, smooths: bool) -> Array:
+        at = self.scenario.scored
         with np.errstate(all="ignore"):
-            return bound_at_truth(self.scenario.model, self.paths)
+            return bound_at_truth(self.scenario.assumed, self.paths, smooths)[..., at[:, None], at]
 
     @cached_property
     def variances(self) -> Array:
         """Their diagonals (trials, K, n)."""
         return np.ascontiguousarray(np.diagonal(self.bound, axis1=2, axis2=3))
+
+    @cached_property
+    def smoothed_variances(self) -> Array:
+        """Those (trials, K, n) of the smoother that is linearised at the truth."""
+        return np.ascontiguousarray(np.diagonal(self._bound(smooths=True), axis1=2, axis2=3))
 
     @cached_property
     def definite(self) -> Mask:
@@ -126,17 +150,17 @@ class PathBlock:
 
     def warm_up(self, tracker: Tracker) -> None:
         """Runs the tracker once, so that imports are not timed."""
-        track_safely(tracker, self.scenario.model, self.paths.z[:1])
+        track_safely(tracker, self.scenario.assumed, self.paths.z[:1])
 
     def share(self) -> None:
         """Computes what all trackers share."""
         _ = self.variances
 
     def truth_columns(self) -> Columns:
-        """The states at the last epoch with their bounds, and the bounds along the whole path."""
-        model, names = self.scenario.model, self.names
-        posterior, error = np.full((2, len(self), model.n), np.nan)
-        curves = np.full((2, model.epochs, model.n), np.nan)
+        """The scored states at the last epoch with their bounds, and the posterior bounds along the whole path."""
+        model, names, at = self.scenario.assumed, self.names, self.scenario.scored
+        posterior, error = np.full((2, len(self), len(at)), np.nan)
+        curves = np.full((2, model.epochs, len(at)), np.nan)
         if self.start == 0 and len(self) and not self.scenario.noise.real:
             drawn = self.scenario.draw(0, EXPECTED)
             # Without a density of paths there is no such bound.
@@ -144,34 +168,38 @@ class PathBlock:
                 filtered, smoothed = posterior_bounds(model, drawn)
                 groups = [take(drawn, np.arange(i, EXPECTED, _PARTS)) for i in range(_PARTS)]
                 parts = [posterior_bounds(model, group)[0][-1] for group in groups]
-                posterior[0] = deviations(filtered[-1])
-                error[0] = deviations(np.array(parts)).std(axis=0, ddof=1) / np.sqrt(_PARTS)
-                curves = np.stack([np.diagonal(P, axis1=1, axis2=2) for P in (filtered, smoothed)])
-        sums = [self.variances.sum(axis=0), np.full((model.epochs, 1), len(self)), *curves]
+                posterior[0] = deviations(filtered[-1])[at]
+                error[0] = deviations(np.array(parts)).std(axis=0, ddof=1)[at] / np.sqrt(_PARTS)
+                curves = np.stack([np.diagonal(P, axis1=1, axis2=2)[:, at] for P in (filtered, smoothed)])
         return {
             "trial": np.arange(self.start, self.start + len(self)),
-            **by_parameter("x", names, self.paths.x[:, -1]),
+            **by_parameter("x", names, self.paths.x[:, -1, at]),
             **by_parameter("bayes", names, np.sqrt(self.variances[:, -1])),
-            **by_parameter("path_bound", names, np.sqrt(self.variances.mean(axis=1))),
             **by_parameter("van_trees", names, posterior),
             **by_parameter("van_trees_error", names, error),
-            "curves": packed(len(self), sums),
+            "curves": packed(len(self), list(curves)),
         }
 
     def estimate(self, tracker: Tracker) -> tuple[Estimates, Columns]:
         """What a tracker makes of the states at the last epoch, and its scores over the whole path."""
-        model, z = self.scenario.model, self.paths.z
+        model, z = self.scenario.assumed, self.paths.z
+        variances = self.smoothed_variances if tracker.smooths else self.variances
         began = time.perf_counter()
         tracks, messages = track_safely(tracker, model, z)
         seconds = np.full(len(self), (time.perf_counter() - began) / max(1, len(self)))
         with np.errstate(all="ignore"):
-            return self._scored(tracks, messages, seconds)
+            return self._scored(tracks, messages, seconds, variances)
 
-    def _scored(self, tracks: Tracks, messages: dict[int, str], seconds: Array) -> tuple[Estimates, Columns]:
-        """The tracks as estimates of the last epoch, with what is stored of each trial."""
-        trials, K, n = tracks.mean.shape
+    def _scored(
+        self, tracks: Tracks, messages: dict[int, str], seconds: Array, variances: Array
+    ) -> tuple[Estimates, Columns]:
+        """The tracks as estimates of the last epoch, with what is stored of each trial; `variances` (trials, K, n) are
+        those of the bound over the path."""
+        at = self.scenario.scored
         e, P = tracks.mean - self.paths.x, tracks.covariance
         known: Mask = np.asarray(np.isfinite(e).all(axis=2) & np.isfinite(P).all(axis=(2, 3)))
+        e, P = e[..., at], P[..., at[:, None], at]
+        trials, K, n = e.shape
         ended = np.full(trials, Status.CONVERGED) if tracks.status is None else tracks.status
         finished = known.all(axis=1)
         status = np.where(finished | (ended != Status.CONVERGED), ended, Status.NONFINITE).astype(np.int8)
@@ -182,7 +210,7 @@ class PathBlock:
         converged = status == Status.CONVERGED
         finished &= status != Status.NO_READINGS
         estimates = Estimates(
-            x=tracks.mean[:, -1],
+            x=tracks.mean[:, -1, at],
             status=status,
             covariance=P[:, -1],
             iterations=np.full(trials, K) if tracks.iterations is None else tracks.iterations,
@@ -192,17 +220,18 @@ class PathBlock:
         )
         each = nees(e.reshape(-1, n), P.reshape(-1, n, n)).reshape(trials, K)
         each[~self.definite] = np.nan
-        normalised = np.sum(np.where(self.variances > 0, e**2 / self.variances, 0.0), axis=2)
-        distance = normalised.mean(axis=1)
+        distance = np.sum(half(self.bound[:, -1]).whitened(e[:, -1, None])[:, 0] ** 2, axis=1)
+        normalised = np.sum(np.where(variances > 0, e**2 / variances, 0.0), axis=2)
         lost = ~(normalised <= gate(n))
         read = tracks.degrees.sum(axis=1)
-        by_epoch = [e**2, *(a[:, :, None] for a in (each, tracks.nis, tracks.degrees))]
+        by_epoch = [e**2, *(a[:, :, None] for a in (each, tracks.nis, tracks.degrees)), variances]
         sums = [a[converged].sum(axis=0) for a in by_epoch]
         columns = {
             "trial": np.arange(self.start, self.start + len(self)),
             **by_parameter("error", self.names, e[:, -1]),
             **by_parameter("deviation", self.names, deviations(P[:, -1])),
             **by_parameter("path", self.names, np.sqrt(np.mean(e**2, axis=1))),
+            **by_parameter("path_bound", self.names, np.sqrt(variances.mean(axis=1))),
             "status": np.array([Status(s).label for s in status.tolist()], dtype=object),
             "message": np.array([messages.get(i, "") for i in range(trials)], dtype=object),
             "iterations": estimates.iterations,
@@ -215,6 +244,7 @@ class PathBlock:
             "success": finished & (distance <= gate(n)),
             "fit_p": self._fit_p(tracks),
             "path_nees": each.mean(axis=1),
+            "path_success": finished & (normalised.mean(axis=1) <= gate(n)),
             "extra_nis": np.where(read > 0, tracks.nis.sum(axis=1) / np.maximum(read, 1), np.nan),
             "log_likelihood": np.where(read > 0, tracks.log_likelihood, np.nan),
             "white_p": white_p(tracks.innovations.swapaxes(1, 2)),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.stats import chi2, kstest
 from shared.state_models import ConstantVelocity, CoordinatedTurn, Growth, Pendulum
@@ -63,20 +64,62 @@ def test_the_mean_nis_of_several_readings_an_epoch_is_that_of_one():
 
 
 def test_the_kalman_filter_attains_both_bounds_on_its_own_model():
-    table = ib.run(StateScenario(LINEAR), {"kf": ekf()}, 400)
+    table = ib.run(StateScenario(LINEAR), {"kf": ekf(), "rts": Smoother(ekf())}, 400)
     found = row(table, "kf")
+    assert row(table, "rts")["path_rmse"] == pytest.approx(1.0, abs=0.06)
+    assert row(table, "rts")["path_success"] == found["path_success"] == 1.0
     assert found["success"] == 1.0
     assert found["path_rmse"] == pytest.approx(1.0, abs=0.06)
     assert {found[name] for name in ("verdict", "path_verdict", "nis_verdict")} == {"consistent"}
     assert found["path_nees"] == pytest.approx(1.0, abs=0.06)
     assert found["path_nis"] == pytest.approx(1.0, abs=4 * np.sqrt(2 / (400 * 30)))
-    assert found["error_median"] == pytest.approx(1.0, abs=0.1)
+    assert found["error_median"] == pytest.approx(np.sqrt(np.log(2)), abs=0.1)
+    smoothed = Smoother(ekf()).track(LINEAR, LINEAR.draw(0, 1).z).covariance[0]
     P = ekf().track(LINEAR, LINEAR.draw(0, 1).z).covariance[0]
     for i, name in enumerate(("position", "velocity")):
         one = row(table, "kf", name)
         for column in ("van_trees", "bayes_bound", "linear_bound", "reported"):
             assert one[column] == pytest.approx(np.sqrt(P[-1, i, i]), rel=1e-8)
         assert one["path_bound"] == pytest.approx(np.sqrt(P[:, i, i].mean()), rel=1e-8)
+        assert row(table, "rts", name)["path_bound"] == pytest.approx(np.sqrt(smoothed[:, i, i].mean()), rel=1e-8)
+
+
+def test_an_error_scale_widens_the_prior_of_truth_and_trackers(tmp_path):
+    trackers = {"ckf": ckf(), "rts": Smoother(ekf())}
+    for scale, name in ((1.0, "one"), (3.0, "three")):
+        ib.run(LINEAR, trackers, 20, error_scale=scale, output=tmp_path / name)
+        ib.run(replace(LINEAR, spread=3.0 * scale), trackers, 20, output=tmp_path / f"{name} written")
+        one, other = (ib.load(tmp_path / each) for each in (name, f"{name} written"))
+        drop = ["time_s", "error_scale", "spread"]
+        frames = [each.drop(columns=drop, errors="ignore") for each in (one, other)]
+        pd.testing.assert_frame_equal(*frames, check_exact=scale == 1.0, rtol=1e-12)
+    both = [StateScenario(LINEAR, error_scale=scale) for scale in (1.0, 3.0)]
+    table = ib.run(both, trackers, 20)
+    assert sorted(table["error_scale"].unique()) == [1.0, 3.0]
+    stored = construct(composed(next(o for o in options("state_model") if o.name == "pendulum_book")), "state_model")
+    with pytest.raises(ib.UserError, match=r"error_scale=10: state_model=.* has stored paths"):
+        StateScenario(stored, error_scale=10.0)
+    with pytest.raises(ib.UserError, match="error_scale=: is part of the state model or its scenario"):
+        ib.run(both[0], trackers, 3, error_scale=2.0)
+
+
+def test_only_the_states_that_are_named_are_scored():
+    model = Formulas(
+        next={"x": "x + c + w", "c": "c"},
+        readings={"z": "x"},
+        noise={"w": 0.1},
+        deviation={"z": 1.0},
+        spread={"x": 1.0, "c": 1.0},
+        scored=("c",),
+        count=20,
+    )
+    table = ib.run(model, {"kf": ekf()}, 30)
+    tracks, paths = ekf().track(model, model.draw(0, 30).z), model.draw(0, 30)
+    e = tracks.mean[:, -1, 1] - paths.x[:, -1, 1]
+    assert set(table["parameter"]) == {"c", "all"}
+    assert row(table, "kf", "c")["rmse"] == pytest.approx(np.sqrt(np.mean(e**2)), rel=1e-12)
+    with pytest.raises(ib.UserError, match="scored: there is no such state"):
+        StateScenario(replace(model, scored=("d",)))
 
 
 @dataclass(frozen=True)

@@ -115,8 +115,13 @@ def draw_tracks(view: View) -> Iterator[Drawing]:
         part = rows[rows["parameter"] == state]
         common.lines(ax, part, "at", "rmse", look, legend=False)
         one = part[part["estimator"] == part["estimator"].iloc[0]]
+        for smooths, dash, kind in ((False, "--", "filter"), (True, (0, (5, 1)), "smoother")):
+            those = part[part["smooths"] == smooths]
+            if len(those) and np.isfinite(those["bound"]).any():
+                same = those[those["estimator"] == those["estimator"].iloc[0]]
+                style: Any = {"color": BOUND_COLOR, "linewidth": 1.0, "zorder": 1}
+                ax.plot(same["at"], same["bound"], linestyle=dash, label=f"{kind} linearised at the truth", **style)
         for name, dash, label in (
-            ("bound", "--", "filter linearised at the truth"),
             ("posterior", ":", "posterior bound of filters"),
             ("posterior_smoothed", "-.", "posterior bound of smoothers"),
         ):
@@ -136,9 +141,10 @@ def draw_tracks(view: View) -> Iterator[Drawing]:
         fig,
         "tracks",
         "Tracks, converged trials",
-        "Root mean square error over trials at each epoch, with that of the filter linearised at the truth, which a"
-        " good filter attains, and the posterior Cramér-Rao bounds, which lie far below. NEES over n stays within the"
-        " band at 95 % of single epochs if the covariance is right; neighbouring epochs are dependent.",
+        "Root mean square error over trials at each epoch, with that of the filter, and of the smoother, linearised at"
+        " the truth, which good ones attain, and the posterior Cramér-Rao bounds, which lie far below. NEES over n"
+        " stays within the band at 95 % of single epochs if the covariance is right; neighbouring epochs are"
+        " dependent.",
         f"{states[0]} over all epochs: {enumerate_few([f'{k} {v:.3g}' for k, v in total.items()], 20)}.",
     )
 

@@ -21,14 +21,13 @@ class WalkingGins(StateModel):
     """The paper's four runs of 90 minutes one after another on one platform, whose three gyro drifts walk meanwhile.
 
     The states are the eleven of the motion, which begin anew with each run, and the eleven parameters of `Gins` in
-    multiples of their sizes; eight of them stand still. An epoch is a pair of velocities, every three minutes.
+    multiples of their sizes; eight of them stand still. The parameters alone are scored. An
+    epoch is a pair of velocities, every three minutes.
     """
 
     walk: NonNegative = 1.0
     """By how much a drift walks in an hour: standard deviation, in multiples of the drift's size (0.01 deg/h about x
     and y, 0.1 deg/h about z)."""
-    error_scale: Positive = 10.0
-    """Standard deviation of each parameter at the beginning, in multiples of its size."""
     deviation: Positive = 0.0066
     """Standard deviation of a reading, m/s: that of rounding to 0.02286 m/s."""
     steps: Count = 4
@@ -41,13 +40,17 @@ class WalkingGins(StateModel):
         return (*(Parameter(name) for name in names), *self.gins.parameters)
 
     @property
+    def scored(self) -> tuple[str, ...]:
+        return tuple(p.name for p in self.gins.parameters)
+
+    @property
     def times(self) -> Array:
         runs, interval = len(self.gins.cases), 60.0 * self.gins.interval_min
         return interval * np.arange(1, runs * self.gins.readings_per_case + 1)
 
     @property
     def prior(self) -> Normal:
-        variances = np.r_[np.zeros(KINEMATIC), np.full(self.gins.n, self.error_scale**2)]
+        variances = np.r_[np.zeros(KINEMATIC), np.ones(self.gins.n)]
         return Normal(np.zeros(len(variances)), np.diag(variances))
 
     def transition(self, x: Array, k: int) -> Array:

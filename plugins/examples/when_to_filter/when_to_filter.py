@@ -23,6 +23,7 @@ import ipe_bench as ib
 from ipe_bench.basics.linalg import Covariance
 from ipe_bench.states import bound_at_truth, ekf
 from ipe_bench.states.linearisation import slope
+from ipe_bench.trials.tracking import StateScenario
 
 WALKS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
 """Multiples of a drift's size (0.01 deg/h about x and y, 0.1 deg/h about z) in an hour."""
@@ -53,12 +54,13 @@ def errors_by_walk(model: WalkingGins) -> np.ndarray:
     return A @ A.T
 
 
-def ratios(model: WalkingGins, walked: np.ndarray, trials: int) -> dict[str, float]:
+def ratios(model: WalkingGins, scale: float, walked: np.ndarray, trials: int) -> dict[str, float]:
     """Root mean square over trials and standing parameters of error over bound, for each estimator."""
-    paths = model.draw(0, trials)
+    wide, unaware = (StateScenario(m, error_scale=scale).assumed for m in (model, replace(model, walk=0.0)))
+    paths = wide.draw(0, trials)
     z, truth = paths.z.reshape(trials, -1), paths.start[:, KINEMATIC:]
     noise = ib.noise.Gaussian(model.deviation)
-    problem = ib.Scenario(model.gins, noise, error_scale=model.error_scale).problem
+    problem = ib.Scenario(model.gins, noise, error_scale=scale).problem
     R = model.deviation**2 * np.eye(len(walked)) + model.walk**2 * walked
     told = replace(problem, R=Covariance(np.linalg.cholesky(R)))
     linear, iterated = ib.baselines.LinearLSE(), ib.baselines.GaussNewton()
@@ -67,10 +69,10 @@ def ratios(model: WalkingGins, walked: np.ndarray, trials: int) -> dict[str, flo
         "least squares, modelled": linear.estimate(told, z).x,
         "iterated (IPE)": iterated.estimate(problem, z).x,
         "iterated (IPE), modelled": iterated.estimate(told, z).x,
-        "EKF": ekf().track(replace(model, walk=0.0), paths.z).mean[:, -1, KINEMATIC:],
-        "EKF, modelled": ekf().track(model, paths.z).mean[:, -1, KINEMATIC:],
+        "EKF": ekf().track(unaware, paths.z).mean[:, -1, KINEMATIC:],
+        "EKF, modelled": ekf().track(wide, paths.z).mean[:, -1, KINEMATIC:],
     }
-    P = bound_at_truth(model, paths)[:, -1, KINEMATIC:, KINEMATIC:]
+    P = bound_at_truth(wide, paths)[:, -1, KINEMATIC:, KINEMATIC:]
     bound = np.sqrt(np.einsum("tii->ti", P)[:, STANDING].mean(axis=0))
     return {name: float(np.sqrt(np.mean(((x - truth)[:, STANDING] / bound) ** 2))) for name, x in found.items()}
 
@@ -78,9 +80,9 @@ def ratios(model: WalkingGins, walked: np.ndarray, trials: int) -> dict[str, flo
 def main(trials: int, figure: Path) -> None:
     fig, axes = plt.subplots(1, len(SCALES), figsize=(9.5, 3.4), sharex=True, sharey=True, layout="constrained")
     for ax, scale in zip(axes, SCALES, strict=True):
-        model = WalkingGins(error_scale=scale)
+        model = WalkingGins()
         walked = errors_by_walk(model)
-        rows = [ratios(replace(model, walk=walk), walked, trials) for walk in WALKS]
+        rows = [ratios(replace(model, walk=walk), scale, walked, trials) for walk in WALKS]
         print(f"error scale {scale:g}\n{'walk':>8}  " + "  ".join(f"{name:>20}" for name in STYLES))
         for walk, row in zip(WALKS, rows, strict=True):
             print(f"{walk:8g}  " + "  ".join(f"{row[name]:20.2f}" for name in STYLES), flush=True)
