@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,6 +76,7 @@ class LevenbergMarquardtSmoother(Tracker):
     prior, each smoothed by a UKF of half the prior's deviations, from the one that costs least.
     """
 
+    smooths: ClassVar[bool] = True
     iterations: Count = 30
     """Steps at most from one start."""
     tolerance: Positive = 1e-2

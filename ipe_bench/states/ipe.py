@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -38,6 +38,7 @@ class PathIPE(Tracker):
     Neither converges where the prior's mean path is far from the true one.
     """
 
+    smooths: ClassVar[bool] = True
     method: Literal["fixed_point", "newton"] = "fixed_point"
     """The iteration: eq. (17), or eq. (20)."""
     max_iterations: Count = 100

@@ -137,7 +137,10 @@ IN_A_SWEEP = [
 OF_STATES = [
     (["state_model=pendulum", "baseline=[ekf]"], "baseline: is of a measurement, and state_model= chooses"),
     (["state_model=pendulum", "write_readings=a.csv"], "write_readings: is of a measurement, and state_model="),
-    (["state_model=pendulum", "error_scale=3"], "error_scale: is of a measurement, and state_model= chooses"),
+    (
+        ["state_model=pendulum_book", "error_scale=3", "trials=1"],
+        "error_scale=3: state_model=pendulum_book has stored paths",
+    ),
     (["measurement=polynomial", "tracker=[ekf]"], "tracker: goes with state_model=NAME"),
     (["state_model=pendulum", "tracker=[newton]"], "tracker=newton: newton is no tracker but a solver"),
     (["state_model=pendulum", "trackers.ukf.iterations=0"], "trackers.ukf.iterations=0: give a whole number above 0"),
