@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import hydra
 import yaml
 from hydra import compose, initialize_config_dir
 from hydra.core.config_search_path import ConfigSearchPath
@@ -71,7 +72,9 @@ def session(folder: Path | None = None) -> Iterator[None]:
     PluginConfigs.folder = folder
     _composed.cache_clear()
     GlobalHydra.instance().clear()
-    with initialize_config_dir(str(plugins.own_conf()), job_name="ipe-bench", version_base="1.3"):
+    # Hydra 1.3 asks for the version whose rules hold, and 1.4 warns of whoever says one.
+    base = {"version_base": "1.3"} if hydra.__version__.startswith("1.3.") else {}
+    with initialize_config_dir(str(plugins.own_conf()), job_name="ipe-bench", **base):
         yield
 
 
