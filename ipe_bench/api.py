@@ -208,8 +208,8 @@ def compare(
     >>> rows.set_index("quantity")["finding"].to_dict()
     {'success': 'better', 'error': 'better', 'cost': 'worse', 'time': ''}
     """
-    import pandas as pd
-
+    from ipe_bench.report.questions import Comparison, write_comparison
+    from ipe_bench.report.writer import digests
     from ipe_bench.statistics.between import JUDGED, compared, comparison_title, left_out
     from ipe_bench.statistics.collect import collect
     from ipe_bench.statistics.paired import PowerPlan
@@ -226,8 +226,8 @@ def compare(
         if first == second and {path.resolve() for path in paths[0]} == {path.resolve() for path in paths[1]}:
             label = "one folder" if first is None else f"{first} of one folder"
             raise UserError(f"compare: {label} is compared with itself; name another, or first=LABEL and second=LABEL")
-        collections = collect(one), collect(other)
-        frame = pd.DataFrame(compared(*collections, (first, second), alpha=alpha, anytime=anytime, plan=plan))
+        collections, read = (collect(one), collect(other)), digests(dict.fromkeys([*one, *other]))
+        frame = Comparison(compared(*collections, (first, second), alpha=alpha, anytime=anytime, plan=plan))
     if plan is not None:
         whole = ["discordant", "trials_needed"]
         frame[whole] = frame[whole].astype("Int64")
@@ -237,12 +237,9 @@ def compare(
     for name in ("problems", "stale"):
         frame.attrs[name] = list(dict.fromkeys(line for c in collections for line in getattr(c, name)))
     frame.attrs["notes"] = left_out(*collections)
+    frame.attrs["alpha"] = alpha
     if output is not None:
-        from ipe_bench.report.questions import comparison_parts
-        from ipe_bench.report.writer import write_files
-
-        parts = comparison_parts(frame, alpha)
-        write_files(Path(output), "comparison", "Comparison", parts, ("comparison.csv", frame))
+        write_comparison(Path(output), frame, read)
     return frame
 
 
@@ -265,15 +262,16 @@ def audit(table: Path | str | pd.DataFrame, *, output: Path | str | None = None)
     >>> found.verdict, round(found.scale.value, 1)
     ('too small', 2.9)
     """
+    import pandas as pd
+
+    from ipe_bench.report.questions import AuditAnswer, write_audit
+    from ipe_bench.report.writer import digests
     from ipe_bench.statistics.audit import audit as examined
     from ipe_bench.statistics.audit import read_claims
 
-    found = examined(read_claims(table))
+    found = AuditAnswer(**vars(examined(read_claims(table))))
     if output is not None:
-        from ipe_bench.report.questions import audit_parts
-        from ipe_bench.report.writer import write_files
-
-        write_files(Path(output), "audit", "Audit", audit_parts(found), ("audit.csv", found.table()))
+        write_audit(Path(output), found, [] if isinstance(table, pd.DataFrame) else digests([Path(table)]))
     return found
 
 
@@ -462,12 +460,13 @@ def design(
     (5, 20)
     """
     from ipe_bench.plugins.extensions import richer_models
+    from ipe_bench.report.questions import DesignAnswer
     from ipe_bench.trials.design import design as designed
 
     scenario = _scenario(scenario, noise=noise, prior=prior, error_scale=error_scale)
     errors = richer_models(scenario) if errors is None else errors
     scenario = dataclasses.replace(scenario, truth=None)
-    return designed(scenario, by=by, readings=readings, criterion=criterion, errors=errors)
+    return DesignAnswer(**vars(designed(scenario, by=by, readings=readings, criterion=criterion, errors=errors)))
 
 
 def posterior(
@@ -501,6 +500,7 @@ def posterior(
     >>> found.divergences["newton"].kl < 1 < found.divergences["linear"].kl
     True
     """
+    from ipe_bench.report.questions import PosteriorAnswer
     from ipe_bench.trials.posterior import reference, require_particles
 
     scenario = _scenario(scenario, noise=noise, prior=prior, error_scale=error_scale)
@@ -512,7 +512,7 @@ def posterior(
         if watch is not None:
             watch(trial)
         found.append(reference(scenario, estimators, trial, particles))
-    return found
+    return PosteriorAnswer(scenario, found)
 
 
 def check(component: Any) -> list[Finding]:

@@ -6,6 +6,7 @@ import errno
 import importlib
 import io
 import os
+import shlex
 import sys
 import warnings
 from collections.abc import Sequence
@@ -15,6 +16,7 @@ from ipe_bench import __version__
 from ipe_bench.basics.errors import StorageError, UserError, shortened, unknown
 from ipe_bench.cli import discard_output
 from ipe_bench.cli.parser import COMMANDS, parsers
+from ipe_bench.report.writer import COMMAND
 
 HOMES = {
     "run": "run",
@@ -42,6 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.environ.setdefault(variable, "1")
     # Arrow's own allocator keeps what it was given back: of a million rows, as much again as is in use.
     os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
+    COMMAND.set(shlex.join(["ipe-bench", *words]))
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning

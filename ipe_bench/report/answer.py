@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from decimal import Decimal
 from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,17 +23,19 @@ from ipe_bench.real.estimation import Question
 from ipe_bench.real.examination import CONFIDENCE, Examination
 from ipe_bench.real.fits import Fit
 from ipe_bench.real.residuals import LEAST_P
-from ipe_bench.report.table import Part, Strong, Table, html, plain_text, texts, words
-from ipe_bench.report.words import p_value
-from ipe_bench.report.writer import write_files
+from ipe_bench.report.table import Part, Shown, Strong, Table, texts, words
+from ipe_bench.report.words import enumerate_few, p_value
+from ipe_bench.report.writer import Page, write_files
 from ipe_bench.trials.fit_test import DRAWS
 from ipe_bench.trials.thresholds import FIT_LEVEL
 
 if TYPE_CHECKING:
     import pandas as pd
 
+    from ipe_bench.report.figures.drawing import Drawing
+
 NAME, RESIDUALS, SCHEMA = "estimate", "residuals.csv", 3
-FILES = (RESIDUALS, "residuals.png", "residuals.pdf")
+FILES = (RESIDUALS, "fit.png", "residuals.png", "residuals.pdf")
 LEAST_FIT_P = 1 / (DRAWS + 1)
 """Least p of the test of fit if the law of the noise is simulated."""
 _MOST_OUTLIERS = 8
@@ -47,7 +50,7 @@ _MOST_READINGS, _MOST_MINIMA = 5, 3
 
 
 @dataclass(frozen=True)
-class Answer:
+class Answer(Shown):
     """Holds the fits of estimators to real readings, and the examination of the fit with the least minimum."""
 
     name: str
@@ -96,11 +99,22 @@ class Answer:
             frames.append(pd.DataFrame(own))
         return pd.concat(frames, ignore_index=True)
 
-    def __str__(self) -> str:
-        return plain_text(estimate_parts(self))
+    def parts(self) -> Iterator[Part]:
+        return estimate_parts(self)
 
-    def _repr_html_(self) -> str:
-        return html(estimate_parts(self))
+    def sentences(self) -> list[str]:
+        """Says who has an answer, what it is, and what a reader should know first."""
+        passing = [one for one in self.fits if one.passes]
+        others = enumerate_few([one.label for one in self.fits if not one.passes])
+        if not self.passes:
+            return [f"No answer that passes: {others or 'a better minimum was found'}."]
+        labels = enumerate_few([one.label for one in passing])
+        found = [f"Nothing speaks against the fit of {labels}{f'; no answer: {others}' if others else ''}."]
+        one, told = passing[0], self.examination
+        parameters = zip(one.model.physical_parameters, one.x, one.standard_errors, strict=True)
+        values = [f"{p.name} = {with_error(x, s)} {p.unit}".rstrip() for p, x, s in parameters]
+        found.append(f"{one.label}: {enumerate_few(values, 4)}.")
+        return [*found, *(remarks(told, _reading_labels(self.model)) if told else ())][:3]
 
 
 def estimate_parts(answer: Answer) -> Iterator[Part]:
@@ -139,19 +153,21 @@ def _estimates(answer: Answer) -> Table:
 
 
 def with_error(value: float, error: float) -> str:
-    """Returns a value with its standard error: two figures of the error, and the value to the same place."""
+    """Returns a value with its standard error: two figures of the error, the value to the same place, one exponent."""
     if not (math.isfinite(value) and math.isfinite(error) and error > 0):
         return _number(value, 6)
     # 0.0999 rounds to 0.10.
-    return " ± ".join(_rounded((value, error), math.floor(math.log10(float(f"{error:.1e}"))) - 1))
+    return _together((value, error), " ± ", math.floor(math.log10(float(f"{error:.1e}"))) - 1)
 
 
-def _rounded(values: Sequence[float], place: int) -> list[str]:
-    """Writes numbers to one decimal place, with exponents if they are very large or very small."""
-    if 1e-4 <= max(map(abs, values)) < 1e6 and place >= -6:
-        return [f"{round(v, -place):.{max(-place, 0)}f}" for v in values]
-    figures = [min(max(math.floor(math.log10(abs(v) or 10.0**place)) - place, 0), 15) for v in values]
-    return [f"{v:.{most}e}" for v, most in zip(values, figures, strict=True)]
+def _together(values: Sequence[float], between: str, place: int) -> str:
+    """Writes numbers to one decimal place, with one exponent for all if they are very large or very small."""
+    largest = max(map(abs, values))
+    if 1e-4 <= largest < 1e6 and place >= -6:
+        return between.join(f"{round(v, -place):.{max(-place, 0)}f}" for v in values)
+    power = math.floor(math.log10(largest or 10.0**place))
+    figures = min(max(power - place, 0), 15)
+    return f"({between.join(f'{Decimal(v).scaleb(-power):.{figures}f}' for v in values)})e{power}"
 
 
 def _number(value: float, figures: int = 4) -> str:
@@ -288,13 +304,13 @@ def _intervals(found: Examination) -> Table:
 
 
 def _interval(low: float, high: float, middle: float) -> str:
-    """Rounds each end to a hundredth of twice its distance to the estimate `middle`, or of the width if outside."""
+    """Rounds the ends to a hundredth of twice the lesser distance to the estimate `middle`, or of the width if
+    outside."""
     if not math.isfinite(high - low) or high <= low:
         text = f"{low:.6g} … {high:.6g}".replace("-inf", "−∞").replace("inf", "∞").replace("nan", "-")
         return "-" if text == "- … -" else text
-    reaches = (2 * (middle - low), 2 * (high - middle)) if low < middle < high else (high - low, high - low)
-    ends = zip((low, high), reaches, strict=True)
-    return " … ".join(_rounded((end,), math.floor(math.log10(reach)) - 2)[0] for end, reach in ends)
+    reach = 2 * min(middle - low, high - middle) if low < middle < high else high - low
+    return _together((low, high), " … ", math.floor(math.log10(reach)) - 2)
 
 
 def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator[str]:
@@ -359,19 +375,33 @@ def write_answer(
     folder: Path, answer: Answer, command: Any, provenance: Mapping[str, Any], *, figures: bool = True
 ) -> list[Path]:
     """Writes estimate.json, the page, residuals.csv and the figure; returns the files."""
-    from ipe_bench.report.figures.errors import draw_residuals
-
     content = {"schema": SCHEMA, "command": command, **estimate_content(answer), **provenance}
     write_text(folder / f"{NAME}.json", json.dumps(content, indent=1) + "\n")
-    verdict = "an answer that passes" if answer.passes else "NO ANSWER THAT PASSES"
-    lead = f"{np.isfinite(answer.z).sum()} readings; {verdict}. {provenance.get('written', '')}"
-    drawings = draw_residuals(answer.model, answer.fits) if figures else ()
-    table = RESIDUALS, _residuals(answer)
-    title = f"{answer.name}: estimates"
-    files = write_files(folder, NAME, title, estimate_parts(answer), table, lead=lead, drawings=drawings)
+    page = Page(
+        f"{answer.name}: estimates",
+        answer.sentences(),
+        list(answer.parts()),
+        _drawings(answer) if figures else (),
+        [f"{np.isfinite(answer.z).sum()} readings"],
+        read_from(provenance),
+    )
+    files = write_files(folder, NAME, page, (RESIDUALS, _residuals(answer)))
     for old in {folder / each for each in FILES} - set(files):
         old.unlink(missing_ok=True)
     return [folder / f"{NAME}.json", *files]
+
+
+def _drawings(answer: Answer) -> Iterator[Drawing]:
+    from ipe_bench.report.figures.answers import draw_fit, draw_residuals
+
+    if answer.examination is not None and answer[answer.examination.label].passes:
+        yield from draw_fit(answer.examination, answer.z)
+    yield from draw_residuals(answer.model, answer.fits)
+
+
+def read_from(provenance: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Returns the files that were read with their digests."""
+    return [(one["file"], one["sha256"]) for one in provenance.get("readings") or ()]
 
 
 def estimate_content(answer: Answer) -> dict[str, Any]:

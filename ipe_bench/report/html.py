@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import base64
 import json
 from collections.abc import Mapping, Sequence
-from importlib import resources
 from typing import TYPE_CHECKING, Any
 
 from ipe_bench import __version__
 from ipe_bench.report.headline import about, headline
-from ipe_bench.report.table import Table, environment
-from ipe_bench.report.words import CITATION
+from ipe_bench.report.table import Table
+from ipe_bench.report.words import public
+from ipe_bench.report.writer import digests, rendered
 from ipe_bench.statistics.comparisons import TIE
 from ipe_bench.statistics.records import SCORES, STATISTICS
 from ipe_bench.statistics.registry import all_statistics
@@ -31,29 +30,44 @@ def render_page(
     analysis: Analysis, tables: Sequence[Table], figures: Sequence[Drawn], written: Sequence[Written] = ()
 ) -> str:
     """Renders the page as text; what plugins have written stands behind our tables."""
-    from markupsafe import Markup
-
     collection, runs = analysis.collection, _runs(analysis.collection.runs)
     commands = dict.fromkeys(run["command"] for run in runs if run["command"] not in (_PYTHON, _UNKNOWN))
-    templates, page = resources.files("ipe_bench.report") / "templates", environment().get_template("report.html.j2")
-    return page.render(
-        version=__version__,
-        script=Markup((templates / "report.js").read_text(encoding="utf-8")),
-        style=Markup((templates / "report.css").read_text(encoding="utf-8")),
+    appendix = [table for table in tables if table.appendix]
+    tables = [table for table in tables if not table.appendix]
+    nothing_failed = analysis.endings.empty and not analysis.summary.empty
+    complete = f"{collection.complete} of {collection.expected} expected cells (a scenario under an estimator) complete"
+    sections = [
+        *([("figures", "Figures")] if len(figures) > 1 else ()),
+        *([("tables", "Tables")] if len(tables) > 1 or nothing_failed else ()),
+        *((f"section-{section.name}", section.title) for section in written),
+        *([("appendix", "Further tables")] if appendix else ()),
+        ("provenance", "Configuration and provenance"),
+        ("definitions", "Definitions"),
+        ("cite", "How to cite"),
+    ]
+    return rendered(
+        "report.html.j2",
+        figures,
+        kind="report",
+        folder="figures/",
+        facts=[
+            *([_minute(collection.runs[-1]["started"])] if collection.runs else ()),
+            complete,
+            f"ipe-bench {__version__}",
+        ],
+        sources=[(public(folder), digest) for folder, digest in digests(collection.directories)],
         about=about(analysis),
         headline=headline(analysis),
-        collection=collection,
+        problems=[*collection.problems, *collection.stale],
         title=", ".join(d.resolve().name or str(d) for d in collection.directories),
-        computed=_minute(collection.runs[-1]["started"]) if collection.runs else "",
         commands=list(commands)[:MOST_COMMANDS],
-        tables=[table for table in tables if not table.appendix],
+        sections=sections,
+        tables=tables,
         written=written,
-        appendix=[table for table in tables if table.appendix],
-        figures=[vars(one) | {"data": base64.b64encode(one.files[0].read_bytes()).decode()} for one in figures],
-        nothing_failed=analysis.endings.empty and not analysis.summary.empty,
+        appendix=appendix,
+        nothing_failed=nothing_failed,
         runs=runs[:MOST_RUNS],
         older_runs=max(0, len(runs) - MOST_RUNS),
-        citation=CITATION,
         definitions=[
             *DEFINITIONS.items(),
             *((one.title, one.definition) for one in all_statistics()[len(STATISTICS) :]),
@@ -66,7 +80,7 @@ def _runs(runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     commands: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
     for run in (run for run in runs if run.get("blocks", 1)):
         command = run.get("command", _UNKNOWN)
-        commands.setdefault((_PYTHON, run["file"]) if command is None else (str(command), ""), []).append(run)
+        commands.setdefault((_PYTHON, run["file"]) if command is None else (public(str(command)), ""), []).append(run)
     found = []
     for (command, _), records in reversed(commands.items()):
         last = records[-1]

@@ -1,30 +1,32 @@
-"""Writes the answers of `design`, `posterior`, `compare` and `audit`: tables, sentences, and files."""
+"""Writes the answers of `design`, `posterior`, `compare` and `audit`: sentences, tables, pictures, and files."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from itertools import groupby
+from itertools import chain, groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.identifiability import structure
-from ipe_bench.report.table import Part, Strong, Table, texts, words
+from ipe_bench.report.table import Cell, Column, Part, Shown, Strong, Table, texts, words
 from ipe_bench.report.words import compact, duration, enumerate_few, p_value, percent, value_text
-from ipe_bench.report.writer import write_files
+from ipe_bench.report.writer import Page, write_files
+from ipe_bench.statistics.audit import Audit
 from ipe_bench.statistics.between import NOT_SETTINGS, comparison_title
-from ipe_bench.trials.design import Design, entry_in_words
+from ipe_bench.trials.design import Design, Way, entry_in_words
+from ipe_bench.trials.observability import TRUTHS, Observability
+from ipe_bench.trials.posterior import Divergence, Posterior, Reference
 from ipe_bench.trials.thresholds import FIT_LEVEL
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from ipe_bench.measurements.base import Measurement
-    from ipe_bench.statistics.audit import Audit
-    from ipe_bench.trials.posterior import Divergence, Posterior, Reference
+    from ipe_bench.report.figures.drawing import Drawing
+    from ipe_bench.trials.scenario import Scenario
 
 READINGS = "readings.csv"
 """Columns of a design's choices, one row per reading."""
@@ -36,6 +38,8 @@ _MOST_SUSPECTS = 12
 _TITLES = {"error": "mean length", "cost": "mean cost", "time": "median time"}
 """Names of a comparison's quantities, where the table of a run has other statistics of error and cost."""
 _MOST_EVIDENCE = 1000
+_WORTH = 0.005
+"""Part of the mean bound below which a better choice is none."""
 _UNSEEN = 0.05
 """Share of trials below which an error goes unnoticed by any test of residuals."""
 
@@ -43,12 +47,45 @@ _UNSEEN = 0.05
 # Design --------------------------------------------------------------------------------------------------------------
 
 
+class DesignAnswer(Shown, Design):
+    """Shows a design."""
+
+    def parts(self) -> Iterator[Part]:
+        return design_parts(self.scenario.measurement.name, self)
+
+
+def _best(design: Design) -> Way | None:
+    """Returns the way whose sharpest choice has the smallest mean bound; None if there is nothing to choose."""
+    return min(design.ways, key=lambda way: way.sharpest.mean_bound, default=None)
+
+
+def _direction(seen: Observability) -> str:
+    return f"{'Least observable direction' if seen.observable else 'The readings do not determine'}: {seen.words}"
+
+
+def _design_sentences(design: Design) -> Iterator[str]:
+    yield f"{_direction(design.observability)}."
+    if best := _best(design):
+        chosen, share = f"{best.sharpest.readings} readings chosen {best.title}", percent(best.sharpest.mean_bound)
+        gain = best.sharpest.mean_bound < 1 - _WORTH
+        yield f"{chosen} have {share} of today's mean bound." if gain else "No choice of as many readings says more."
+    yield from _unseen(design)
+
+
+def _draw_design(design: Design) -> Iterator[Drawing]:
+    from ipe_bench.report.figures.answers import draw_bounds
+
+    best, scenario, after = _best(design), design.scenario, None
+    if best is not None:
+        model = design.measurement(best.sharpest)
+        after = Observability.at(model, scenario.noise.covariance(model.m), scenario.truths(0, TRUTHS))
+    yield from draw_bounds(design.observability, after, f"best choice {best.title}" if best else "")
+
+
 def design_parts(name: str, design: Design) -> Iterator[Part]:
     """Yields the tables and sentences of a design, under the `name` of its model."""
     yield _parameters(name, design)
-    seen = design.observability
-    direction = "Least observable direction" if seen.observable else "The readings do not determine"
-    yield Strong(f"{direction}: {seen.words}")
+    yield Strong(_direction(design.observability))
     if told := structure(design.scenario.measurement):
         if not told.lost:
             yield f"Exact readings would tell all {len(told.unknowns)} parameters from their neighbours."
@@ -98,8 +135,12 @@ def _suspects(design: Design) -> Iterator[Part]:
         words("looks like", [s.words for s in shown]),
     ]
     yield Table("suspects", "Errors that the model leaves out", "", columns, notes=[note])
+    yield from map(Strong, _unseen(design))
+
+
+def _unseen(design: Design) -> Iterator[str]:
     if unseen := [s for s in design.suspects if s.hidden and s.noticed < _UNSEEN]:
-        yield Strong(
+        yield (
             f"No test of residuals will detect {enumerate_few([s.name for s in unseen])}: the parameters imitate it."
             f" {unseen[0].parameter} will be wrong by {unseen[0].bounds:.3g} bounds where {unseen[0].name} is"
             f" {unseen[0].deviation:.3g} {unseen[0].unit}."
@@ -134,8 +175,6 @@ def _ways(design: Design) -> Iterator[Part]:
 
 def write_design(folder: Path, name: str, design: Design) -> list[Path]:
     """Writes the page of a design, and readings.csv with what each choice takes; returns the files."""
-    import pandas as pd
-
     index = pd.DataFrame(dict(design.candidates.index))
     chosen = [
         index.iloc[list(choice.rows)].assign(by=" and ".join(way.units.by), choice=name)
@@ -145,10 +184,22 @@ def write_design(folder: Path, name: str, design: Design) -> list[Path]:
     ]
     columns = ["by", "choice", *index]
     table = pd.concat(chosen)[columns] if chosen else pd.DataFrame(columns=columns)
-    return write_files(folder, "design", f"{name}: design", design_parts(name, design), (READINGS, table))
+    said, parts = list(_design_sentences(design))[:3], list(design_parts(name, design))
+    return write_files(folder, "design", Page(f"{name}: design", said, parts, _draw_design(design)), (READINGS, table))
 
 
 # Posterior -----------------------------------------------------------------------------------------------------------
+
+
+class PosteriorAnswer(Shown, list[Reference]):
+    """Shows the posteriors of a scenario's trials."""
+
+    def __init__(self, scenario: Scenario, found: Sequence[Reference]) -> None:
+        super().__init__(found)
+        self.name = f"{scenario.measurement.name}, {scenario.noise.name}, error scale {scenario.error_scale:g}"
+
+    def parts(self) -> list[Table]:
+        return posterior_parts(self.name, self)
 
 
 def posterior_parts(name: str, found: Sequence[Reference]) -> list[Table]:
@@ -196,11 +247,9 @@ def honest_word(d: Divergence, sampled: Posterior) -> str:
     return "yes" if near and len(sampled.modes) == 1 else "NO"
 
 
-def write_posteriors(
-    folder: Path, name: str, scenario: str, model: Measurement, found: Sequence[Reference]
-) -> list[Path]:
+def write_posteriors(folder: Path, name: str, title: str, model: Measurement, found: Sequence[Reference]) -> list[Path]:
     """Writes a page, and posterior.csv with a row per trial and parameter; returns the files."""
-    import pandas as pd
+    from ipe_bench.report.figures.answers import draw_marginals
 
     frames = []
     for one in found:
@@ -208,11 +257,67 @@ def write_posteriors(
         values = {"truth": one.truth, "mean": one.posterior.mean, "deviation": one.posterior.deviation}
         sized = {key: model.sizes * value for key, value in values.items()}
         frames.append(pd.DataFrame({"trial": one.trial, **names, **sized}))
-    parts = posterior_parts(scenario, found)
-    return write_files(folder, "posterior", f"{name}: posteriors", parts, ("posterior.csv", pd.concat(frames)))
+    page = Page(
+        f"{name}: posteriors", _honest_sentences(found), posterior_parts(title, found), draw_marginals(model, found)
+    )
+    return write_files(folder, "posterior", page, ("posterior.csv", pd.concat(frames)))
+
+
+def _honest_sentences(found: Sequence[Reference]) -> list[str]:
+    """Says in how many trials each estimator's Gaussian can stand for the posterior, and if that is settled."""
+    counts = dict.fromkeys(found[0].divergences, 0)
+    for one in found:
+        for label, d in one.divergences.items():
+            counts[label] += honest_word(d, one.posterior) == "yes"
+    listed = enumerate_few([f"{label} in {count}" for label, count in counts.items()], 12)
+    unsettled = sum(not one.posterior.settled for one in found)
+    more = [f"In {unsettled} the posterior itself cannot be relied on; give more --particles."] if unsettled else []
+    return [f"Of {len(found)} trials, an estimator's Gaussian can stand for the posterior: {listed}.", *more]
 
 
 # Comparison ----------------------------------------------------------------------------------------------------------
+
+
+class Comparison(Shown, pd.DataFrame):
+    """Shows a comparison; what is selected of it is a plain frame."""
+
+    def parts(self) -> Iterator[Part]:
+        return comparison_parts(self, self.attrs["alpha"])
+
+
+def write_comparison(folder: Path, frame: pd.DataFrame, sources: Sequence[tuple[str, str]]) -> None:
+    """Writes comparison.csv and its page."""
+    from ipe_bench.report.figures.answers import draw_pairs
+
+    said, parts = list(_finding_sentences(frame)), list(comparison_parts(frame, frame.attrs["alpha"]))
+    tables = [part for part in parts if isinstance(part, Table)]
+    rest = [part for part in parts if not isinstance(part, Table)]
+    page = Page("Comparison", said, [_joined(tables), *rest], draw_pairs(frame), sources=sources)
+    write_files(folder, "comparison", page, ("comparison.csv", frame))
+
+
+def _joined(tables: Sequence[Table]) -> Table:
+    """Puts tables of the same columns below each other, their titles in a column."""
+    titles = list(dict.fromkeys(column.title for table in tables for column in table.columns))
+    columns = [words("comparison", [table.title for table in tables for _ in table.rows])]
+    for title in titles:
+        found = [next((c for c in table.columns if c.title == title), None) for table in tables]
+        cells = [c.cells if c else [Cell("")] * len(t) for c, t in zip(found, tables, strict=True)]
+        columns.append(Column(title, list(chain.from_iterable(cells)), title not in ("", "second is")))
+    notes = [note for table in tables for note in table.notes]
+    return Table("comparison", "Trial by trial", "", columns, notes=notes, grouped=1)
+
+
+def _finding_sentences(frame: pd.DataFrame) -> Iterator[str]:
+    """Says in how many comparisons the second is better, and worse, by quantity."""
+    judged, names = frame[frame["p"].notna()], [frame[which].unique() for which in ("first", "second")]
+    who = [str(each[0]) if len(each) == 1 and len({*names[0], *names[1]}) == 2 else "" for each in names]
+    number = judged.groupby("quantity").size().max()
+    for word in ("better", "worse"):
+        counts = judged[judged["finding"] == word].groupby("quantity", sort=False).size()
+        listed = ", ".join(f"{quantity} ({count} of {number})" for quantity, count in counts.items())
+        than = f"{who[1]} is {word} than {who[0]}" if all(who) else f"The second is {word}"
+        yield f"{than} in {listed or 'nothing that was tested'}."
 
 
 def comparison_parts(frame: pd.DataFrame, alpha: float) -> Iterator[Part]:
@@ -276,6 +381,22 @@ def _ratio(value: float) -> str:
 
 
 # Audit ---------------------------------------------------------------------------------------------------------------
+
+
+class AuditAnswer(Shown, Audit):
+    """Shows an audit."""
+
+    def parts(self) -> list[Part]:
+        return audit_parts(self)
+
+
+def write_audit(folder: Path, found: Audit, sources: Sequence[tuple[str, str]]) -> None:
+    """Writes audit.csv and its page."""
+    from ipe_bench.report.figures.answers import draw_audit
+
+    parts = [part for part in audit_parts(found) if isinstance(part, Table)]
+    page = Page("Audit", found.sentences[:3], parts, draw_audit(found), sources=sources)
+    write_files(folder, "audit", page, ("audit.csv", found.table()))
 
 
 def audit_parts(found: Audit) -> list[Part]:

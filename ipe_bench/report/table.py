@@ -83,6 +83,11 @@ class Table:
     whole: str = ""
     """File with the columns for which a terminal has no room: they are named and not shown below."""
 
+    def __post_init__(self) -> None:
+        """Leaves out columns without content."""
+        kept = [c for c in self.columns if any(cell.text for cell in c.cells)]
+        object.__setattr__(self, "columns", kept or self.columns)
+
     @property
     def rows(self) -> Iterator[tuple[Cell, ...]]:
         return zip(*(c.cells for c in self.columns), strict=True)
@@ -102,6 +107,20 @@ class Strong(str):
 
 Part = Table | str
 """Element of a report: a table or a sentence."""
+
+
+class Shown:
+    """Shows an answer in a terminal and in a notebook."""
+
+    def parts(self) -> Iterable[Part]:
+        """Returns its tables and sentences, in order."""
+        raise NotImplementedError
+
+    def __str__(self) -> str:
+        return plain_text(self.parts())
+
+    def _repr_html_(self) -> str:
+        return html(self.parts())
 
 
 def column(title: str, values: Iterable[Any], show: Callable[[Any], str], best: Iterable[bool] = ()) -> Column:

@@ -12,10 +12,10 @@ import numpy as np
 
 from ipe_bench.basics.files import write_text
 from ipe_bench.real.tracks import Log, LogTracks, far_below
-from ipe_bench.report.answer import as_json, with_error
-from ipe_bench.report.table import Part, Strong, Table, html, interval, plain_text, texts, words
+from ipe_bench.report.answer import as_json, read_from, with_error
+from ipe_bench.report.table import Part, Shown, Strong, Table, interval, texts, words
 from ipe_bench.report.words import p_value, short
-from ipe_bench.report.writer import write_files
+from ipe_bench.report.writer import Page, write_files
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -24,7 +24,7 @@ NAME, TABLE, SCHEMA = "track", "track.csv", 1
 
 
 @dataclass(frozen=True)
-class LogAnswer:
+class LogAnswer(Shown):
     """Holds the tracks of one log, one for each tracker."""
 
     log: Log
@@ -54,11 +54,8 @@ class LogAnswer:
             frames.append(pd.DataFrame(columns | {"nis": one.nis}))
         return pd.concat(frames, ignore_index=True)
 
-    def __str__(self) -> str:
-        return plain_text(track_parts(self))
-
-    def _repr_html_(self) -> str:
-        return html(track_parts(self))
+    def parts(self) -> list[Part]:
+        return track_parts(self)
 
 
 def track_parts(answer: LogAnswer) -> list[Part]:
@@ -115,6 +112,8 @@ def write_tracks(folder: Path, answer: LogAnswer, command: Any, provenance: Mapp
         trackers[one.label]["constants"] = {each.name: as_json([each.value, each.error]) for each in one.constants}
     content = {"schema": SCHEMA, "command": command, "trackers": trackers, **provenance}
     write_text(folder / f"{NAME}.json", json.dumps(content, indent=1) + "\n")
-    lead = f"{int(np.isfinite(log.z).sum())} readings at {log.model.epochs} epochs"
-    table, title = (TABLE, answer.table()), f"{log.model.name}: tracks"
-    return [folder / f"{NAME}.json", *write_files(folder, NAME, title, track_parts(answer), table, lead=lead)]
+    facts = [f"{int(np.isfinite(log.z).sum())} readings at {log.model.epochs} epochs"]
+    verdicts = [f"{one.label} {one.verdict}" for one in answer if one.verdict != "-"]
+    said = [f"By their innovations: {', '.join(verdicts)}."] if verdicts else []
+    page = Page(f"{log.model.name}: tracks", said, answer.parts(), facts=facts, sources=read_from(provenance))
+    return [folder / f"{NAME}.json", *write_files(folder, NAME, page, (TABLE, answer.table()))]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -27,6 +28,11 @@ def enumerate_few(items: Sequence[str], most: int = 6) -> str:
     """Enumerates 'a, b and 3 others'; a single remaining one is named."""
     more = f" and {len(items) - most} others" if len(items) > most + 1 else ""
     return ", ".join(items[:most] if more else items) + more
+
+
+def public(text: str) -> str:
+    """Shortens absolute paths to their last part: what lies before it is of this machine alone."""
+    return re.sub(r"(?<![^\s='\"\[,(])/(?:[^/\s,'\"\]]+/)+(?=[^/\s])", "…/", text)
 
 
 def percent(share: float) -> str:

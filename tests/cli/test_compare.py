@@ -193,7 +193,7 @@ def test_the_table_fits_80_columns_and_files_are_written(tmp_path, capsys, monke
     lines = capsys.readouterr().out.splitlines()
     table = lines[next(i for i, line in enumerate(lines) if "second is" in line) :][:6]
     assert max(len(line.rstrip()) for line in table) <= 80
-    assert {p.name for p in (tmp_path / "out").iterdir()} == {"comparison.csv", "comparison.html"}
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {f"comparison.{kind}" for kind in ("csv", "html", "png")}
     written = pd.read_csv(tmp_path / "out" / "comparison.csv")
     assert written["quantity"].tolist() == ["success", "error", "cost", "time"]
 

@@ -24,7 +24,7 @@ def test_tables_and_files_say_the_same(ipe_bench, tmp_path):
     times = found.candidates.index["time"]
     assert [float(row["time"]) for row in rows] == pytest.approx([times[k] for k in best.rows])
     assert len(rows) == best.readings == 20
-    assert {path.name for path in folder.iterdir()} == {"design.json", "readings.csv", "design.html"}
+    assert {path.name for path in folder.iterdir()} == {"design.json", "design.png", "readings.csv", "design.html"}
     # The same command writes there again, another one elsewhere.
     assert ipe_bench("design", *SMALL, "--readings", "20")[0] == 0
     assert not (tmp_path / "outputs" / "design-polynomial-2").exists()
@@ -49,7 +49,7 @@ def test_a_table_and_files_for_each_trial(ipe_bench, tmp_path):
     assert code == 0
     assert error.splitlines() == ["polynomial: trial 1 of 2", "polynomial: trial 2 of 2"]
     folder = tmp_path / "outputs" / "posterior-polynomial"
-    assert {path.name for path in folder.iterdir()} == {"posterior.json", "posterior.csv", "posterior.html"}
+    assert {path.name for path in folder.iterdir()} == {f"posterior.{kind}" for kind in ("json", "csv", "html", "png")}
     found = pd.read_csv(folder / "posterior.csv")
     assert list(found["trial"]) == [0] * 4 + [1] * 4
     assert (abs(found["mean"] - found["truth"]) < 5 * found["deviation"]).all()

@@ -1,38 +1,25 @@
-"""Draws success, error and honesty of all trials, the distribution of errors, the calibration of NEES, and
-residuals."""
+"""Draws success, error and honesty of all trials, the distribution of errors and the calibration of NEES."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from scipy.special import gammainc
 
-from ipe_bench.basics.linalg import Array
-from ipe_bench.real.residuals import LEAST_P
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.views import Figure, View
-from ipe_bench.report.style import BOUND_COLOR, BOUND_DASH, looks
-from ipe_bench.report.words import brief, enumerate_few, p_value, percent, value_text
-
-if TYPE_CHECKING:
-    from ipe_bench.measurements.base import Measurement
-    from ipe_bench.real.fits import Fit
+from ipe_bench.report.style import BOUND_COLOR, BOUND_DASH
+from ipe_bench.report.words import brief, enumerate_few, percent, value_text
 
 CEILING = {"error_median": 100.0, "error_q95": 100.0, "nees_median": 30.0}
 """Errors beyond are drawn here: the size of a diverged error carries no information, and the bound needs the room."""
 LINEAR = 0.1
 """Differences below this are drawn about in proportion, larger ones by their logarithm: honest curves differ by
 hundredths, dishonest ones by up to 1."""
-MOST_ESTIMATORS = 12
-"""Estimators with a panel of residuals; `residuals.csv` has all."""
-_MANY = 5000
-"""Points from which on they are pixels in the PDF, too."""
-_BENT = 30.0
-"""Normalised residuals beyond this are drawn on a logarithmic axis: a model that does not fit at all."""
 
 
 def draw(view: View) -> Iterator[Drawing]:
@@ -157,58 +144,6 @@ def _bands(ax: Any, rows: pd.DataFrame) -> None:
         edge = rows[rows["estimator"] == label].drop_duplicates("at")
         ax.fill_between(edge["at"], edge["low"], edge["high"], color=BOUND_COLOR, alpha=alpha, linewidth=0, zorder=0)
     ax.axhline(0, color=BOUND_COLOR, linewidth=0.6, zorder=1)
-
-
-def draw_residuals(model: Measurement, fits: Sequence[Fit]) -> Iterator[Drawing]:
-    """Draws normalised residuals, a panel per estimator; returns None if no residual is known."""
-    import seaborn as sns
-    from matplotlib.ticker import MaxNLocator
-
-    shown = [one for one in fits if np.isfinite(one.normalised).any()][:MOST_ESTIMATORS]
-    if not shown:
-        return
-    x, heading = _abscissa(model)
-    look, limit = looks([one.label for one in fits]), shown[0].outlier_limit
-    fig, axes = common.panels(len(shown), height=2.6)
-    for one, ax in zip(shown, axes, strict=True):
-        r, out = one.normalised, one.outliers
-        ax.axhline(0.0, color=BOUND_COLOR, linewidth=0.6, zorder=1)
-        common.bound_line(ax, limit, "limit for outliers")
-        common.bound_line(ax, -limit, "")
-        good, style = np.isfinite(r) & ~out, {"color": look[one.label].color, "legend": False, "ax": ax}
-        sns.scatterplot(x=x[good], y=r[good], s=9, alpha=0.75, linewidth=0, rasterized=len(x) > _MANY, **style)
-        if out.any():
-            sns.scatterplot(x=x[out], y=r[out], s=25, marker="x", linewidth=1.2, label="outlier", **style)
-        edge = 1.15 * max(float(np.nanmax(np.abs(r))), limit)
-        ax.set_ylim(-edge, edge)
-        if edge > _BENT:
-            ax.set_yscale("symlog", linthresh=10.0, linscale=1.0)
-        else:
-            ax.yaxis.set_major_locator(MaxNLocator(7, integer=True))
-        ax.xaxis.set_major_locator(MaxNLocator(6, integer=heading == "reading"))
-        tests = f"fit p {p_value(one.p_value)}, white p {p_value(one.white_p, LEAST_P)}"
-        ax.set_title(f"{common.text(one.label)}\n{tests}")
-    common.axis_labels(fig, common.text(heading), "residual / its deviation")
-    common.legend(fig, axes)
-    parts = [f"{one.label} {int(one.outliers.sum())}" for one in shown]
-    caption = (
-        "Normalised residuals of the readings; each is standard normal if the model and the noise are right."
-        f" Beyond ±{limit:.2f} a reading is an outlier: {enumerate_few(parts, 12)}."
-        " p is that of chi-square, white that of the Ljung-Box test."
-    )
-    if len(fits) > len(shown):
-        caption += f" {len(fits) - len(shown)} further estimators: see residuals.csv."
-    yield Drawing("residuals", "Residuals", caption, fig)
-
-
-def _abscissa(model: Measurement) -> tuple[Array, str]:
-    """Returns the abscissa of each reading (m,): its time if there is such a column, else its row."""
-    for name, column in model.index.items():
-        values = np.asarray(column)
-        several = 3 * len(set(column)) < model.m  # many readings at one number, such as a case's
-        if np.issubdtype(values.dtype, np.number) and not several and (np.diff(values) >= 0).all():
-            return values.astype(float), name
-    return np.arange(1.0, model.m + 1), "reading"
 
 
 FIGURES = (
