@@ -13,6 +13,7 @@ from ipe_bench.states.linearisation import Cubature, GaussHermite, SigmaPoints, 
 from ipe_bench.states.particles import Bootstrap
 from ipe_bench.states.smoothers import IteratedSmoother, Smoother
 from ipe_bench.states.trackers import Filter, Tracker, Tracks, ckf, ekf, ukf
+from ipe_bench.states.walking_gins import WalkingGins
 
 __all__ = [
     "Bootstrap",
@@ -34,6 +35,7 @@ __all__ = [
     "Tracker",
     "Tracks",
     "Unscented",
+    "WalkingGins",
     "bound_at_truth",
     "ckf",
     "ekf",

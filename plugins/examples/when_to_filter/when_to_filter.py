@@ -3,7 +3,7 @@
     python plugins/examples/when_to_filter/when_to_filter.py 100 outputs/when_to_filter.png
 
 The inertial system of the paper runs its four cases one after another on one platform, and its three gyro drifts walk
-meanwhile (`walking_gins.py`). Scored are the eight parameters that stand still, over all trials, in
+meanwhile (`state_model=walking_gins`). Scored are the eight parameters that stand still, over all trials, in
 multiples of the error that a filter linearised at the truth has. Least squares and iterated estimation take drifts for
 constants; modelled, the walk is in the correlated errors of the readings, linearised at the nominal point. The filters
 are extended Kalman filters with and without the walk.
@@ -17,12 +17,12 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
-from walking_gins import KINEMATIC, WalkingGins
 
 import ipe_bench as ib
 from ipe_bench.basics.linalg import Covariance
-from ipe_bench.states import bound_at_truth, ekf
+from ipe_bench.states import WalkingGins, bound_at_truth, ekf
 from ipe_bench.states.linearisation import slope
+from ipe_bench.states.walking_gins import KINEMATIC
 from ipe_bench.trials.tracking import StateScenario
 
 WALKS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)

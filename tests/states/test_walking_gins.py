@@ -1,19 +1,14 @@
 """The inertial system whose drifts walk: against GINS where they stand still, and by how far they walk."""
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
 import ipe_bench as ib
 from ipe_bench.measurements import Gins
-from ipe_bench.states import Cubature, IteratedSmoother, Smoother, Taylor, ekf, ukf
+from ipe_bench.states import Cubature, IteratedSmoother, Smoother, Taylor, WalkingGins, ekf, ukf
 from ipe_bench.statistics.intervals import mean_limits
 from ipe_bench.trials.tracking import StateScenario
-
-sys.path.append(str(Path(__file__).parents[1]))
-from walking_gins import WalkingGins
 
 
 def test_the_inertial_system_with_drifts_that_stand_still_reads_what_gins_does():

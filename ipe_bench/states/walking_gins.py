@@ -9,10 +9,12 @@ import numpy as np
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, NonNegative, Positive
 from ipe_bench.measurements import Gins, Parameter
-from ipe_bench.states import Normal, StateModel
+from ipe_bench.states.base import Normal, StateModel
 
 KINEMATIC = 11
 """States of the motion; the parameters follow."""
+_SPEED = 457.2
+"""The injected velocity of the paper, m/s."""
 _DRIFTS = slice(KINEMATIC + 4, KINEMATIC + 7)
 
 
@@ -21,13 +23,16 @@ class WalkingGins(StateModel):
     """The paper's four runs of 90 minutes one after another on one platform, whose three gyro drifts walk meanwhile.
 
     The states are the eleven of the motion, which begin anew with each run, and the eleven parameters of `Gins` in
-    multiples of their sizes; eight of them stand still. The parameters alone are scored. An
-    epoch is a pair of velocities, every three minutes.
+    multiples of their sizes; eight of them stand still. The parameters alone are scored. An epoch is a pair of
+    velocities, every three minutes.
     """
 
-    walk: NonNegative = 1.0
+    walk: NonNegative = 0.1
     """By how much a drift walks in an hour: standard deviation, in multiples of the drift's size (0.01 deg/h about x
     and y, 0.1 deg/h about z)."""
+    motion: NonNegative = 0.0
+    """Standard deviation of further noise on each state of the motion at each reading and at the start, in multiples of
+    457.2 m/s for velocities and of 1 for unit vectors; with 0 covariances are singular."""
     deviation: Positive = 0.0066
     """Standard deviation of a reading, m/s: that of rounding to 0.02286 m/s."""
     steps: Count = 4
@@ -49,8 +54,13 @@ class WalkingGins(StateModel):
         return interval * np.arange(1, runs * self.gins.readings_per_case + 1)
 
     @property
+    def _motion(self) -> Array:
+        """Standard deviations (11,) of the noise on the motion."""
+        return self.motion * np.repeat([_SPEED, 1.0], [2, KINEMATIC - 2])
+
+    @property
     def prior(self) -> Normal:
-        variances = np.r_[np.zeros(KINEMATIC), np.ones(self.gins.n)]
+        variances = np.r_[self._motion**2, np.ones(self.gins.n)]
         return Normal(np.zeros(len(variances)), np.diag(variances))
 
     def transition(self, x: Array, k: int) -> Array:
@@ -76,8 +86,10 @@ class WalkingGins(StateModel):
         return x[..., :2] - self.gins.offset.reshape(-1, 2)[k]
 
     def gain(self, k: int) -> Array:
-        G = np.zeros((self.n, 3))
-        G[_DRIFTS] = self.walk * np.sqrt(self.gins.interval_min / 60.0) * np.eye(3)
+        G = np.zeros((self.n, 3 + KINEMATIC * (self.motion > 0)))
+        G[_DRIFTS, :3] = self.walk * np.sqrt(self.gins.interval_min / 60.0) * np.eye(3)
+        if self.motion:
+            G[:KINEMATIC, 3:] = np.diag(self._motion)
         return G
 
     def R(self, k: int) -> Array:
