@@ -30,7 +30,10 @@ class Smoother(Tracker):
     """The filter whose tracks are smoothed."""
 
     def track(self, model: StateModel, z: Array) -> Tracks:
-        return with_cost(model, z, smoothed(model, self.filter.track(model, z)))
+        tracks = self.filter.track(model, z)
+        out = smoothed(model, tracks)
+        out.cost = tracks.nis.sum(axis=1)  # that of its path is chi-square at the minimum alone
+        return out
 
 
 @dataclass(frozen=True)
@@ -68,8 +71,10 @@ class IteratedSmoother(Tracker):
             going &= on
             if not on.any():
                 break
-        path.calls = calls
-        return with_cost(model, z, path)
+        x = admissible(model, whole(path)[0])
+        path.cost = path_cost(model, z, x[:, 0], x[:, 1:])
+        path.calls = calls + model.evaluations
+        return path
 
 
 def smoothed(model: StateModel, tracks: Tracks) -> Tracks:
@@ -165,14 +170,6 @@ def whole(tracks: Tracks) -> tuple[Array, Array]:
     parts = zip(tracks.start, (tracks.mean, tracks.covariance), strict=True)
     x, P = (np.concatenate([start[:, None], later], axis=1) for start, later in parts)
     return x, P
-
-
-def with_cost(model: StateModel, z: Array, tracks: Tracks) -> Tracks:
-    """The tracks of a smoother, with the costs of their paths, each moved into the range of its noise."""
-    x = admissible(model, whole(tracks)[0])
-    tracks.cost = path_cost(model, z, x[:, 0], x[:, 1:])
-    tracks.calls = tracks.calls + model.evaluations
-    return tracks
 
 
 def path_p(z: Array, cost: Array) -> Array:

@@ -53,7 +53,8 @@ class Tracks:
     """H (trials, m, n) of the readings of each epoch as they were linearised, 0 of missing ones, and L (trials, m, m)
     with L L' = S of their innovations."""
     cost: Array | None = None
-    """-2 log p(path | readings) (trials,) of a smoother's path up to a constant; see `path_p`."""
+    """-2 log p(path | readings) (trials,) of an iterated smoother up to a constant, or the NIS of the filter behind a
+    smoother: chi-square with a degree per reading; see `path_p`."""
     status: NDArray[np.int8] | None = None
     """How the iterations of a trial ended (trials,), in trackers that iterate until they have converged."""
     iterations: NDArray[np.int64] | None = None

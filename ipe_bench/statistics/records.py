@@ -187,8 +187,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "failed and known",
         "all trials",
         "Share of trials without success that the estimator itself reports: it did not converge, its residuals fail"
-        " the test of fit, or several minima fit. The test of a filter of states is that of its innovations, that of a"
-        " smoother the cost of its path, chi-square with as many degrees as there are readings.",
+        " the test of fit, or several minima fit. The test of a filter of states is that of its innovations, that of an"
+        " iterated smoother the cost of its path, chi-square with as many degrees as there are readings.",
         lambda s: f.failed(s, known=True),
         kind="share",
         where=("all_trials",),

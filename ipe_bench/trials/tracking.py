@@ -254,8 +254,8 @@ class PathBlock:
         return estimates, columns
 
     def _fit_p(self, tracks: Tracks) -> Array:
-        """How probable a worse fit is (trials,): of the path of a smoother by its cost, of a filter by its innovations;
-        NaN of a tracker that has neither."""
+        """How probable a worse fit is (trials,): of the path of an iterated smoother by its cost, else by the filter's
+        innovations; NaN of a tracker that has neither."""
         from scipy.special import chdtrc
 
         if tracks.cost is not None:

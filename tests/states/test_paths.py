@@ -151,8 +151,10 @@ def test_eq_11_of_a_path_says_so_where_it_does_not_converge():
 def test_the_fit_of_a_linear_path_is_that_of_the_innovations():
     """The cost of the smoothed path of a linear model is the sum of the filter's NIS: chi-square."""
     block = PathBlock.draw(StateScenario(LINEAR), 0, 400)
-    filtered, path = (block.estimate(tracker)[1]["fit_p"] for tracker in (ekf(), Smoother(ekf())))
+    trackers = ekf(), Smoother(ekf()), IteratedSmoother(ekf(), iterations=1)
+    filtered, smooth, path = (block.estimate(tracker)[1]["fit_p"] for tracker in trackers)
     np.testing.assert_allclose(path, filtered, rtol=1e-7)
+    np.testing.assert_array_equal(smooth, filtered)
     assert kstest(path, "uniform").pvalue > 1e-3
-    tracks = Smoother(ekf()).track(LINEAR, block.paths.z)
-    np.testing.assert_allclose(path_p(block.paths.z, tracks.cost), chi2.sf(tracks.cost, 12), rtol=1e-9)
+    cost = trackers[2].track(LINEAR, block.paths.z).cost
+    np.testing.assert_allclose(path_p(block.paths.z, cost), chi2.sf(cost, 12), rtol=1e-9)
