@@ -351,6 +351,10 @@ PAGES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     **dict.fromkeys(("headline", "filters", "beyond"), (("error_scale=1,300",), RIVALS)),
     **dict.fromkeys(("paper", "bearings", "ranging", "polynomial"), (("error_scale=0.1,1",), SWEEP)),
     "lotka_volterra": (("error_scale=0.1,1",), SWEEP),
+    "states": (
+        ("state_model=bearings_only", "error_scale=1,10"),
+        (r"Everywhere to scale 10 ", r"Overconfident .* ekf", r"Failures that look right", r"A trial costs"),
+    ),
 }
 """For each experiment the part of it that is stored here, with errors as large as their bound, and what its page says
 first."""
@@ -361,8 +365,11 @@ def test_the_page_of_every_experiment_opens_with_what_fits_it(option, synthetic)
     words, patterns = PAGES[option.name]
     with session():
         specs = jobs_of(read("run", [f"+experiment={option.name}", *words]), multirun=True).specs
-    if option.name == "pendulum_book":
-        run(specs[0].scenario, {"ekf": specs[0].estimators["ekf"]}, 1, output=synthetic.directory)
+    if option.name in ("pendulum_book", "states"):
+        trials = 1 if option.name == "pendulum_book" else 20
+        for spec in specs:
+            chosen = {label: spec.estimators[label] for label in ("ekf", "ukf")}
+            run(spec.scenario, chosen, trials, output=synthetic.directory)
     else:
         fill(synthetic, specs)
     sentences = said(synthetic.directory)
