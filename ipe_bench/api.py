@@ -519,21 +519,22 @@ def check(component: Any) -> list[Finding]:
     """Checks that a component, or each option of the plugin in a folder, keeps the promises of its kind.
 
     Returns:
-        A finding per check; one whose `complaint` is empty passed.
+        A finding per check; one whose `complaint` is empty passed, or did not apply, which its `note` says.
 
     >>> import ipe_bench as ib
     >>> findings = ib.check(ib.noise.Gaussian(0.1))
     >>> [f.check for f in findings if f.complaint]
     []
     """
-    from ipe_bench.plugins.conformance import check_component, check_option
+    from ipe_bench.plugins.conformance import check_component, check_option, left_of_skeleton
     from ipe_bench.plugins.discovery import RECORD_GROUPS, options_in
     from ipe_bench.report.conformance import check_records
 
     if isinstance(component, Path | str):
         chosen = options_in(Path(component))
         findings = [finding for o in chosen if o.group not in RECORD_GROUPS for finding in check_option(o)]
-        return findings + check_records([o for o in chosen if o.group in RECORD_GROUPS])
+        findings += check_records([o for o in chosen if o.group in RECORD_GROUPS])
+        return [*findings, *left_of_skeleton(chosen)]
     return list(check_component(getattr(component, "name", type(component).__name__), component))
 
 

@@ -8,7 +8,7 @@ the information, which a QR decomposition updates, for priors so wide that P - K
 """
 
 from ipe_bench.baselines.information import IPLF
-from ipe_bench.baselines.kalman import CKF, EKF, UKF, EnKF, IteratedEKF
+from ipe_bench.baselines.kalman import CKF, EKF, UKF, EnKF, FilterpyFilter, IteratedEKF
 from ipe_bench.baselines.least_squares import (
     GaussNewton,
     LeastSquares,
@@ -26,6 +26,7 @@ __all__ = [
     "IPLF",
     "UKF",
     "EnKF",
+    "FilterpyFilter",
     "GaussNewton",
     "IteratedEKF",
     "LeastSquares",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,10 +19,29 @@ from ipe_bench.states.algebra import symmetric
 from ipe_bench.states.linearisation import Cubature, Rule, Taylor, Unscented
 
 
-class _Filterpy(ConstantFilter):
-    """Runs one of filterpy's filters on one trial."""
+class FilterpyFilter(ConstantFilter):
+    """Runs one of filterpy's sigma-point filters on one trial: `UnscentedKalmanFilter` as it is.
 
-    filter: Any
+    Required: `filter`, filterpy's object, with `x` at 0 (n,), `P` at P0 and `Q` at Q. Optional: `predict`, `points` and
+    `take_in`, for other objects of filterpy's. Promised: `take_in` hands out the readings at all `points`, in order.
+
+    >>> import numpy as np, ipe_bench as ib
+    >>> from filterpy.kalman import JulierSigmaPoints, UnscentedKalmanFilter
+    >>> class Julier(ib.Sequential):
+    ...     def track(self, P0, Q, z):
+    ...         n = len(P0)
+    ...         points = JulierSigmaPoints(n, kappa=0.0)
+    ...         f = UnscentedKalmanFilter(dim_x=n, dim_z=1, dt=1.0, hx=None, fx=lambda x, dt: x, points=points)
+    ...         f.x, f.P, f.Q = np.zeros(n), P0, Q
+    ...         return FilterpyFilter(f)
+    >>> scenario = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01))
+    >>> z = scenario.draw(0, 3).z
+    >>> print(np.ptp([one.estimate(scenario.problem, z).x for one in (Julier(), ib.baselines.CKF())], 0).max() < 1e-6)
+    True
+    """
+
+    def __init__(self, filter: Any) -> None:
+        self.filter = filter
 
     @property
     def x(self) -> Array:
@@ -32,6 +50,30 @@ class _Filterpy(ConstantFilter):
     @property
     def P(self) -> Array:
         return self.filter.P
+
+    def predict(self) -> None:
+        if self.filter.Q.any():
+            self.filter.predict()
+        else:
+            # Constants without process noise: the moments of their sigma points are x and P themselves.
+            self.filter.compute_process_sigmas(dt=1.0)
+
+    def points(self) -> Array:
+        return self.filter.sigmas_f
+
+    def take_in(self, z: Array, hx: Callable[[Any], Array]) -> Array:
+        """Takes in the readings z (m,), whose covariance is I, and returns the innovation. Call `hx` once
+        for each point, in order: each call returns the readings (m,) at the next one."""
+        self.filter.update(z, R=np.eye(len(z)), hx=hx)
+        return self.filter.y
+
+    def update(self, z: Array, h: Array, H: Array | None) -> bool:
+        z, h = _turned(z, h)
+        rows = iter(h)
+        y = self.take_in(z, lambda _: next(rows))
+        self.filter.P = symmetric(self.filter.P)
+        self.nis += _squared_innovation(y, self.filter.SI)
+        return True
 
 
 @dataclass(frozen=True)
@@ -63,7 +105,7 @@ class IteratedEKF(EKF):
         return self.max_iterations, self.tolerance
 
 
-class _EKFTrack(_Filterpy):
+class _EKFTrack(FilterpyFilter):
     """Begins each iteration's update again from the epoch's prior, with the readings linearised at the last
     estimate."""
 
@@ -103,26 +145,6 @@ class _EKFTrack(_Filterpy):
         return self.iteration >= self.iterations or bool(change.max() <= self.tolerance)
 
 
-class _PointsTrack(_Filterpy):
-    """Reads the model at several points, along the principal axes of the readings there."""
-
-    def points(self) -> Array:
-        return self.filter.sigmas_f
-
-    @abstractmethod
-    def take_in(self, z: Array, hx: Callable[[Any], Array], count: int) -> Array:
-        """Takes in the readings z (m,) by `hx`, which hands out those at the `count` points in turn, and returns the
-        innovation."""
-
-    def update(self, z: Array, h: Array, H: Array | None) -> bool:
-        z, h = _turned(z, h)
-        rows = iter(h)
-        y = self.take_in(z, lambda _: next(rows), len(h))
-        self.filter.P = symmetric(self.filter.P)
-        self.nis += _squared_innovation(y, self.filter.SI)
-        return True
-
-
 @dataclass(frozen=True)
 class UKF(Sequential):
     """Replaces slopes by readings at 2n + 1 sigma points (van der Merwe, dissertation, 2004).
@@ -137,33 +159,17 @@ class UKF(Sequential):
     kappa: NonNegative = 0.0
 
     def track(self, P0: Array, Q: Array, z: Array) -> ConstantFilter:
-        from filterpy.kalman import MerweScaledSigmaPoints
+        from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
-        return _UKFTrack(P0, Q, MerweScaledSigmaPoints(len(P0), self.alpha, self.beta, self.kappa))
+        n = len(P0)
+        points = MerweScaledSigmaPoints(n, self.alpha, self.beta, self.kappa)
+        # hx differs from epoch to epoch, so update is given it.
+        filter = UnscentedKalmanFilter(dim_x=n, dim_z=1, dt=1.0, hx=None, fx=lambda x, dt: x, points=points)
+        filter.x, filter.P, filter.Q = np.zeros(n), P0, Q
+        return FilterpyFilter(filter)
 
     def rule(self) -> Rule:
         return Unscented(self.kappa, self.alpha, self.beta)
-
-
-class _UKFTrack(_PointsTrack):
-    def __init__(self, P0: Array, Q: Array, points: Any) -> None:
-        from filterpy.kalman import UnscentedKalmanFilter
-
-        n = len(P0)
-        # hx differs from epoch to epoch, so update is given it.
-        self.filter = UnscentedKalmanFilter(dim_x=n, dim_z=1, dt=1.0, hx=None, fx=lambda x, dt: x, points=points)
-        self.filter.x, self.filter.P, self.filter.Q = np.zeros(n), P0, Q
-
-    def predict(self) -> None:
-        if self.filter.Q.any():
-            self.filter.predict()
-        else:
-            # Constants without process noise: the moments of their sigma points are x and P themselves.
-            self.filter.compute_process_sigmas(dt=1.0)
-
-    def take_in(self, z: Array, hx: Callable[[Any], Array], count: int) -> Array:
-        self.filter.update(z, R=np.eye(len(z)), hx=hx)
-        return self.filter.y
 
 
 @dataclass(frozen=True)
@@ -178,7 +184,7 @@ class CKF(Sequential):
         return Cubature()
 
 
-class _CKFTrack(_PointsTrack):
+class _CKFTrack(FilterpyFilter):
     """Avoids filterpy's moments mean(X X') - x x', which lose digits if x is much larger than its deviation. So the
     filter's state is the distance from a reference that moves to the estimate after each epoch, and its readings are
     distances from the points' mean: the same filter, with nothing to cancel."""
@@ -206,9 +212,9 @@ class _CKFTrack(_PointsTrack):
     def points(self) -> Array:
         return self.reference + self.filter.sigmas_f
 
-    def take_in(self, z: Array, hx: Callable[[Any], Array], count: int) -> Array:
+    def take_in(self, z: Array, hx: Callable[[Any], Array]) -> Array:
         f = self.filter
-        f.hx, f.sigmas_h = hx, np.empty((count, len(z)))
+        f.hx, f.sigmas_h = hx, np.empty((len(f.sigmas_f), len(z)))
         # A flat z would make x a matrix: filterpy's x is a column here.
         f.update(z[:, None], R=np.eye(len(z)))
         self.reference = self.reference + f.x[:, 0]
@@ -234,7 +240,7 @@ class EnKF(Sequential):
         return _EnKFTrack(P0, Q, self.members, own_generators(self.seed, z[None])[0].bit_generator)
 
 
-class _EnKFTrack(_PointsTrack):
+class _EnKFTrack(FilterpyFilter):
     def __init__(self, P0: Array, Q: Array, members: int, stream: np.random.BitGenerator) -> None:
         from filterpy.kalman import EnsembleKalmanFilter
 
@@ -251,7 +257,7 @@ class _EnKFTrack(_PointsTrack):
     def points(self) -> Array:
         return self.filter.sigmas
 
-    def take_in(self, z: Array, hx: Callable[[Any], Array], count: int) -> Array:
+    def take_in(self, z: Array, hx: Callable[[Any], Array]) -> Array:
         # filterpy draws the perturbations about the second; epochs differ in length.
         self.filter.hx, self.filter._mean_z = hx, np.zeros(len(z))
         with _drawing_from(self.stream):

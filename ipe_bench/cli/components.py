@@ -48,9 +48,13 @@ PAGES = {
     f"measurement.columns.t=[0,1,2,3,4,5,6,7] error_scale=0.1 {SMALL}",
     "ode": "run measurement=ode measurement.file=my_ode.yaml error_scale=0.1 trials=50 figures=none",
     "state_model": "run state_model=my_state_model trials=50 figures=none",
+    "tracker": 'run state_model=pendulum "tracker=[ekf,ukf,my_tracker]" trials=50 figures=none',
     "noise": "run measurement=polynomial noise=my_noise trials=50 figures=none",
-    "statistic": f"run {BENT}",
+    "prior": f"run measurement=polynomial prior=my_prior {SMALL}",
+    "execution": f"run {BENT} execution=my_execution",
+    **{kind: f"run {BENT} name=my_{kind}" for kind in RECORDS},
 }
+PAGES["figure"] = PAGES["figure"].replace("figures=none", "figures=all")
 """The kinds that have a page for coding agents, and a run of each beside its rivals."""
 _GONE = {"keys": "`ipe-bench run --help` explains every key of a run"}
 """Lists of earlier versions, and what to use instead."""
@@ -170,8 +174,9 @@ def check_command(words: Sequence[str]) -> int:
     for folder in [*folders, *([" ".join(keys)] if keys else [])]:
         findings = [*ib.check(folder), *_check_experiments(folder)] if folder in folders else _check_chosen(keys)
         for one in findings:
-            complaint = f" -- {one.complaint}" if one.complaint else ""
-            say(f"{'FAILED' if complaint else 'ok':7}{one.component}: {one.check}{complaint}")
+            outcome = "FAILED" if one.complaint else "-" if one.note else "ok"
+            said = f" -- {one.complaint or one.note}" if one.complaint or one.note else ""
+            say(f"{outcome:7}{one.component}: {one.check}{said}")
         wrong = sum(bool(finding.complaint) for finding in findings)
         say(f"{folder}: {f'{wrong} of {len(findings)} checks failed' if wrong else 'all checks passed'}")
         failed += wrong
@@ -252,6 +257,7 @@ def new_command(kind: str, name: str, language: str | None = None) -> int:
         _fill(folder / target, source, words)
     choices = {"solver": f'"solver=[{name}]" ', "baseline": f'"baseline=[{name}]" '}
     choices |= {"experiment": f"+experiment={name} ", **dict.fromkeys(RECORDS, "")}
+    choices["tracker"] = f'state_model=pendulum "tracker=[{name}]" '
     choices["figure"] = "figures=all "  # the figures of main are chosen among our own
     choose = choices.get(group, f"{group}={name} ")
     print(f"{folder} is ready. Try:\n  ipe-bench check {folder}\n  ipe-bench run {choose}trials=100")

@@ -25,8 +25,8 @@ Exit codes: 0 done; 1 done, but some pieces failed or are missing; 2 a mistake i
 """
 MODELS = ("function", "ode")
 """Models of one file."""
-KINDS = ("solver", "baseline", "filter", "measurement", "state_model", "noise", "prior", "execution")
-KINDS += ("statistic", "figure", "table", "section", "experiment")
+KINDS = ("solver", "baseline", "filter", "measurement", "state_model", "tracker", "noise", "prior")
+KINDS += ("execution", "statistic", "figure", "table", "section", "experiment")
 """Of plugins that `new` makes."""
 INFO_TOPICS = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
 _MISSING = "0 done; 1 done, but something that was asked for is missing"
@@ -225,6 +225,7 @@ The same results give the same file, so that the digest may stand in a paper. Ot
   ipe-bench new solver my_solver                  plugins/my_solver
   ipe-bench new filter my_filter                  plugins/my_filter, a baseline that takes readings epoch by epoch
   ipe-bench new state_model my_model              plugins/my_model, states that move
+  ipe-bench new tracker my_tracker                plugins/my_tracker, a filter or smoother of such states
   ipe-bench new ode my_model                      my_model.yaml, differential equations
   ipe-bench new function my_model                 my_model.py, a function of parameters and columns
   ipe-bench new KIND NAME --language LANGUAGE     plugins/NAME, of a kind that an installed plugin adds

@@ -1,18 +1,21 @@
 """Checks the promises that every component makes: plugin authors run on theirs what we run on ours.
 
-A check raises an AssertionError whose message is for the author; the first line of its docstring is the promise.
+A check raises an AssertionError whose message is for the author, or returns why it does not apply; the first line of
+its docstring is the promise.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Generator, Iterator
+import re
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 
+from ipe_bench.baselines.sequential import Sequential
 from ipe_bench.basics.errors import UserError, describe_exception, place_of
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
@@ -44,7 +47,10 @@ _USUAL_NOISE = UsualNoise(deviation=0.007, step=0.02)
 """Noise for components whose options leave out how large it is."""
 _IMPROBABLE = 1e-6
 _ROUND_OFF = 1e-9
+_NO_LAW = "it draws no errors of a covariance that it states as the true one"
 _TURN = 360.0
+_PLACEHOLDER = re.compile(r"One line that (says|`ipe-bench list)[^.]*|Replace (it|them) by your own[^.]*")
+"""Texts of the skeletons of `ipe-bench new`."""
 _READINGS = 6
 """Readings that a noise is tried on, unless it is made for another number."""
 
@@ -57,6 +63,8 @@ class Finding:
     check: str
     complaint: str = ""
     """Empty where the check passed."""
+    note: str = ""
+    """Why the check tested nothing, or what the author has left to do; empty where neither is so."""
 
 
 def check_component(name: str, component: Any) -> Iterator[Finding]:
@@ -74,17 +82,18 @@ def check_component(name: str, component: Any) -> Iterator[Finding]:
     if isinstance(component, Noise):
         component = component.completed(_USUAL_NOISE)
     for check in (describes_itself, *checks):
-        complaint = ""
+        complaint, inapplicable = "", None
         try:
             with np.errstate(all="ignore"):
-                check(component)
+                inapplicable = check(component)
         except (AssertionError, UserError) as error:
             complaint = str(error) or "it does not"
         except Exception as error:
             complaint = f"it raises {describe_exception(error)}"
             if "read-only" in complaint:
                 complaint = f"it raises {place_of(error)}"
-        yield Finding(name, (check.__doc__ or "").splitlines()[0].rstrip("."), complaint)
+        note = f"does not apply, {inapplicable}" if inapplicable else ""
+        yield Finding(name, (check.__doc__ or "").splitlines()[0].rstrip("."), complaint, note)
 
 
 def check_option(option: Option) -> Iterator[Finding]:
@@ -106,6 +115,16 @@ def check_option(option: Option) -> Iterator[Finding]:
         if complaint is None:
             raise
         yield Finding(name, "Can be used", complaint)
+
+
+def left_of_skeleton(options: Sequence[Option]) -> Iterator[Finding]:
+    """Finds the texts of `ipe-bench new` that authors replace, in the packages of these options."""
+    homes = dict.fromkeys(option.source.conf.parent for option in options)
+    for path in (p for home in homes for p in sorted(home.rglob("*")) if p.suffix in (".py", ".yaml")):
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+            if found := _PLACEHOLDER.search(line):
+                note = f'line {number} still says "{found[0].strip()}": say what yours is'
+                yield Finding(path.name, "Describes itself", note=note)
 
 
 def _required(config: dict[str, Any], where: str) -> list[str]:
@@ -152,10 +171,10 @@ def _readings(estimator: Estimator) -> tuple[Problem, Array]:
     return scenario.problem, z
 
 
-def steps_to_a_state(estimator: Estimator) -> None:
+def steps_to_a_state(estimator: Estimator) -> str | None:
     """Returns from step() a state with x and F of the trials."""
     if not isinstance(estimator, IPE):
-        return
+        return "it is no IPE and has no step()"
     x, system = begin(*_readings(estimator), "linear_lse")
     after = estimator.step(system, estimator.begin(system, x))
     remedy = "return State(x, system.F(x))"
@@ -225,17 +244,31 @@ class _Circular(Polynomial):
         return np.full(self.m, _TURN)
 
 
-def turns_with_its_angles(estimator: Estimator) -> None:
+def turns_with_its_angles(estimator: Estimator) -> str | None:
     """Gives the same estimate whatever whole turns are added to readings that are angles."""
     scenario = Scenario(_Circular(), Gaussian(0.01), seed=5)
-    if estimator.hindrance(scenario.problem):
-        return
+    if why := estimator.hindrance(scenario.problem):
+        return f"it {why}"
     z = scenario.draw(0, TRIALS).z
     turned = z + _TURN * np.random.default_rng(5).integers(-1, 2, z.shape)
     x, other = (estimator.estimate(scenario.problem, readings).x for readings in (z, turned))
     apart = np.abs(other - x) / _bound(scenario.problem)
     remedy = "take residuals from z - model.near(model.simulate(x), z)"
     assert (apart < 8).all(), f"whole turns move it by {apart.max():.3g} standard deviations of the bound: {remedy}"
+
+
+def takes_process_noise(estimator: Estimator) -> str | None:
+    """Reports larger variances on average if its parameters may walk, by `process_noise`."""
+    if not isinstance(estimator, Sequential):
+        return "it is no Sequential and has no process_noise"
+    problem, z = _readings(estimator)
+    still, walking = (replace(estimator, process_noise=q).estimate(problem, z) for q in (0.0, 0.3))
+    message = "; ".join(dict.fromkeys(walking.messages.values()))
+    assert (walking.status == Status.CONVERGED).all(), f"with process_noise=0.3 trials end: {message}"
+    P = [one.covariance for one in (still, walking) if one.covariance is not None]
+    assert len(P) == 2, "it reports no covariance"
+    small, large = (np.einsum("tii->ti", one).mean(axis=0) for one in P)
+    assert (large > small).all(), "with process_noise=0.3 a variance is not larger: add Q to P in predict"
 
 
 def a_bad_trial_disturbs_no_other(estimator: Estimator) -> None:
@@ -262,10 +295,11 @@ def accounts_for_itself(estimator: Estimator) -> None:
         assert (np.diagonal(P, axis1=1, axis2=2) > 0).all(), "a variance is not positive"
 
 
-def keeps_a_history_if_asked(estimator: Estimator) -> None:
+def keeps_a_history_if_asked(estimator: Estimator) -> str | None:
     """Returns the iterates that lead to the estimate, where it keeps any."""
     estimates = estimator.estimate(*_readings(estimator), history=True)
-    history = estimates.x[:, None] if estimates.history is None else estimates.history
+    if (history := estimates.history) is None:
+        return "it keeps none"
     assert len(history) == len(estimates.x), "history has not one entry per trial"
     for x, iterates in zip(estimates.x, history, strict=True):
         assert iterates.ndim == 2, "an entry of history is not (iterations + 1, n)"
@@ -349,10 +383,10 @@ def _largest(values: Array) -> tuple[int, ...]:
     return tuple(int(k) for k in np.unravel_index(int(values.argmax()), values.shape))
 
 
-def orders_its_epochs(model: Measurement) -> None:
+def orders_its_epochs(model: Measurement) -> str | None:
     """Splits its readings into epochs, each reading in one, and computes a prefix as the whole does."""
     if model.epochs is None:
-        return
+        return "it has no epochs"
     rows = np.sort(np.concatenate(model.epochs))
     assert np.array_equal(rows, np.arange(model.m)), "the epochs do not hold every reading once"
     x, stop = _points(model), max(1, len(model.epochs or ()) // 2)
@@ -411,10 +445,10 @@ def _errors(noise: Noise, draws: int, rng: np.random.Generator) -> tuple[Array, 
     return v, R.whiten(v)
 
 
-def corrupts_reproducibly(noise: Noise) -> None:
+def corrupts_reproducibly(noise: Noise) -> str | None:
     """States a covariance R of the readings, and gives the same readings from the same random stream."""
     if noise.real or isinstance(noise, ModelNoise):
-        return  # R comes with the readings, or with the model.
+        return "R comes with the readings or with the model"
     m = _count(noise)
     R = noise.covariance(m)
     assert R.m == m, f"covariance({m}) is for {R.m} readings"
@@ -423,20 +457,21 @@ def corrupts_reproducibly(noise: Noise) -> None:
         _repeatable("corrupt", np.linspace(-1.0, 1.0, m), lambda h, rng: noise.corrupt(h, np.zeros(m), rng))
 
 
-def draws_what_it_states(noise: Noise) -> None:
+def draws_what_it_states(noise: Noise) -> str | None:
     """Draws errors of mean zero whose standard deviations and correlations are those of R."""
-    if _draws(noise) and noise.true_covariance:
-        v, _ = _errors(noise, DRAWS, np.random.default_rng(7))
-        R = noise.covariance(v.shape[1])
-        _scatter_as_stated(v / R.deviations, R.matrix() / np.outer(R.deviations, R.deviations), 0.02, "reading")
+    if not (_draws(noise) and noise.true_covariance):
+        return _NO_LAW
+    v, _ = _errors(noise, DRAWS, np.random.default_rng(7))
+    R = noise.covariance(v.shape[1])
+    _scatter_as_stated(v / R.deviations, R.matrix() / np.outer(R.deviations, R.deviations), 0.02, "reading")
 
 
-def states_its_law(noise: Noise) -> None:
+def states_its_law(noise: Noise) -> str | None:
     """Says by `whitened` how its errors are distributed, where they are not normal: the test of fit takes that law."""
     from scipy.stats import ks_2samp
 
     if not (_draws(noise) and noise.true_covariance):
-        return
+        return _NO_LAW
     rng = np.random.default_rng(9)
     _, w = _errors(noise, DRAWS // 5, rng)
     stated = noise.whitened(w.shape, rng)
@@ -572,12 +607,13 @@ def ends_with_the_run(execution: Execution) -> None:
     events.close()
 
 
-_CHECKS: dict[type, tuple[Callable[[Any], None], ...]] = {
+_CHECKS: dict[type, tuple[Callable[[Any], str | None], ...]] = {
     Estimator: (
         steps_to_a_state,
         finds_the_parameters,
         answers_alike,
         turns_with_its_angles,
+        takes_process_noise,
         a_bad_trial_disturbs_no_other,
         accounts_for_itself,
         keeps_a_history_if_asked,

@@ -36,7 +36,7 @@ CHECKED_GROUPS = (*COMPONENT_GROUPS, *RECORD_GROUPS, "experiment")
 CONTRACTS = {
     "solver": ("ipe_bench.IPE",),
     "baseline": ("ipe_bench.Estimator",),
-    "filter": ("ipe_bench.Sequential", "ipe_bench.ConstantFilter"),
+    "filter": ("ipe_bench.Sequential", "ipe_bench.ConstantFilter", "ipe_bench.baselines.FilterpyFilter"),
     "measurement": ("ipe_bench.Measurement", "ipe_bench.OdeMeasurement"),
     "state_model": ("ipe_bench.states.StateModel",),
     "tracker": ("ipe_bench.states.Tracker",),

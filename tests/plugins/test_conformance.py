@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from shared.state_models import CoordinatedTurn
 
-from ipe_bench.baselines import LinearLSE
+from ipe_bench.baselines import EKF, LinearLSE
 from ipe_bench.basics.linalg import Covariance, multiply
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator
@@ -120,6 +120,28 @@ def one_entry(self, x):
     return J
 
 
+def with_predict(predict):
+    """An EKF whose filter of a trial predicts otherwise."""
+
+    def track(self, P0, Q, z):
+        made = EKF.track(self, P0, Q, z)
+        made.__class__ = type("Mine", (type(made),), {"predict": predict})
+        return made
+
+    return altered(EKF(), track=track)
+
+
+def raises_if_it_walks(track):
+    if track.filter.Q.any():
+        raise RuntimeError("no such thing")
+    type(track).__mro__[1].predict(track)
+
+
+def forgets_Q(track):
+    track.filter.Q = 0 * track.filter.Q
+    type(track).__mro__[1].predict(track)
+
+
 def changed_tracks(share: float, leaning: float):
     def track(self, model, z):
         tracks = Filter.track(self, model, z)
@@ -149,6 +171,8 @@ FOUND = [
     (Faulty("scribbling"), "it writes into what it is given"),
     (Thawed(), "frozen=True"),
     (altered(Newton(), estimate=into_H), "test_conformance.py, line"),
+    (with_predict(raises_if_it_walks), "with process_noise=0.3 trials end: RuntimeError: no such thing"),
+    (with_predict(forgets_Q), "a variance is not larger: add Q to P in predict"),
     (altered(LinearLSE(), estimate=blind_to_turns), "take residuals from z - model.near(model.simulate(x), z)"),
     (
         altered(Newton(), step=lambda self, system, state: state.x - state.F),
@@ -205,6 +229,16 @@ FOUND = [
 @pytest.mark.parametrize(("faulty", "complaint"), FOUND, ids=[complaint for _, complaint in FOUND])
 def test_a_fault_is_found(faulty, complaint):
     assert complaint in complaints(faulty)
+
+
+@pytest.mark.parametrize(
+    ("made", "idle"), [(EKF(), {"Returns from step()"}), (Newton(), {"Reports larger variances"}), (Filter(), set())]
+)
+def test_a_check_that_tests_nothing_says_so(made, idle):
+    found = {f.check: f.note for f in check_component("mine", made) if f.note}
+    assert all(note.startswith("does not apply, it ") for note in found.values())
+    assert {name for name in idle if any(check.startswith(name) for check in found)} == idle
+    assert bool(found) == bool(idle)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """Every kind of plugin that `new` makes works, and one that does not is named and leaves the rest as it was."""
 
 import hashlib
+import re
 import shutil
 import sys
 from dataclasses import dataclass
@@ -88,6 +89,7 @@ def test_what_new_makes_passes_its_checks(kind, capsys):
     out = capsys.readouterr().out
     assert f"ok     {GROUPS.get(kind, kind)}=mine: " in out
     assert "all checks passed" in out
+    assert re.search(r'^-      mine.yaml: Describes itself -- line \d still says "One line that', out, re.MULTILINE)
 
 
 def test_a_report_has_what_plugins_add_beside_all_that_is_ours(ours, capsys):

@@ -42,6 +42,13 @@ def generated(tmp_path_factory) -> Path:
     return folder
 
 
+def blocks(page: Path, language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+
+
+FILTERS = blocks(PAGES / "howto" / "write_filter.md", "python")
+
+
 @pytest.mark.parametrize("page", WRITTEN, ids=ids)
 def test_links_lead_to_pages(page, generated):
     for link in re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8")):
@@ -67,10 +74,6 @@ def test_every_command_has_a_section(generated):
     assert found == set(COMMANDS)
 
 
-def blocks(page: Path, language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
-
-
 def test_the_cells_of_the_notebook_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names: dict = {}
@@ -80,13 +83,15 @@ def test_the_cells_of_the_notebook_run(tmp_path, monkeypatch):
     assert (tmp_path / "outputs" / "notebook" / "report.html").exists()
 
 
-def test_the_filter_of_the_page_is_the_kalman_filter_on_a_linear_model():
+@pytest.mark.parametrize("code", FILTERS, ids=range(len(FILTERS)))
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_the_filters_of_the_page_are_the_kalman_filter_on_a_linear_model(code, noise):
     names: dict = {"__name__": __name__}
-    (code,) = blocks(PAGES / "howto" / "write_filter.md", "python")
     exec(compile(code, "write_filter.md", "exec", dont_inherit=True), names)
     scenario = ipe_bench.Scenario(Polynomial(strength=0.0), Gaussian(0.01))
     z = scenario.draw(0, 5).z
-    ours, kalman = (one.estimate(scenario.problem, z) for one in (names["MyFilter"](), EKF()))
+    mine = names.get("MyFilter") or names["Julier"]
+    ours, kalman = (one(process_noise=noise).estimate(scenario.problem, z) for one in (mine, EKF))
     assert ours.covariance is not None
     assert kalman.covariance is not None
     np.testing.assert_allclose(ours.x, kalman.x, rtol=1e-6, atol=1e-9)
