@@ -57,6 +57,7 @@ def run(
     execution: Execution | None = None,
     block_size: int | None = None,
     watch: Watcher | None = None,
+    progress: bool = True,
 ) -> Summary:
     """Runs every estimator on the same trials of every scenario, and summarises what is known of them.
 
@@ -68,7 +69,10 @@ def run(
         precision: 0.01, or {"success": 0.01, "rmse": 0.05} (relative): trials are added until intervals are so narrow.
         time_limit: seconds after which no more blocks are added.
         output: folder of the results; what it has is not computed again. None: nothing is kept.
-        execution, block_size, watch: where trials are computed, how many in a block, what is called at each event.
+        execution, block_size: where trials are computed, and how many in a block.
+        progress: whether a terminal or a notebook shows how far the run is.
+        watch: called at each event in place of that; its argument has the `trials` of the `total` that are done, where
+            each estimator's count as its own.
 
     Returns:
         A frame with a row per scenario, estimator and parameter, in the parameter's own unit, and one of the parameter
@@ -89,6 +93,7 @@ def run(
     [(250, 'every interval is narrow enough')]
     """
     from ipe_bench.plugins.extensions import use_statistics
+    from ipe_bench.report.progress import watching
     from ipe_bench.report.summary import Stored, Summary
     from ipe_bench.statistics import summarize
     from ipe_bench.statistics.stopping import compute_until
@@ -99,9 +104,11 @@ def run(
     else:
         scenarios = [_tracking(scenarios, **stated) or _scenario(scenarios, **stated)]
     estimators, stored = _labelled(estimators), Stored(output)
-    options: dict[str, Any] = {"execution": execution, "block_size": block_size, "watch": watch}
+    options: dict[str, Any] = {"execution": execution, "block_size": block_size}
     options |= {"precision": precision, "time_limit": time_limit}
-    failures, stops = compute_until(scenarios, estimators, trials, stored.folder, **options)
+    with watching("run", off=watch is not None or not progress) as shown:
+        asked: Any = scenarios, estimators, trials, stored.folder
+        failures, stops = compute_until(*asked, **options, watch=watch or shown)
     _warn([*(f"failed: {failure}" for failure in failures), *use_statistics()])
     table = Summary.of(summarize([stored.folder]), stored)
     if precision is not None:
@@ -310,6 +317,7 @@ def estimate(
     *,
     ignore_columns: Sequence[str] = (),
     find: str | Sequence[str] = (),
+    progress: bool = True,
 ) -> LogAnswer: ...
 
 
@@ -324,6 +332,7 @@ def estimate(
     error_scale: float | None = None,
     parameters: Mapping[str, Mapping[str, Any]] | None = None,
     ignore_columns: Sequence[str] = (),
+    progress: bool = True,
 ) -> Answer: ...
 
 
@@ -338,6 +347,7 @@ def estimate(
     parameters: Mapping[str, Mapping[str, Any]] | None = None,
     ignore_columns: Sequence[str] = (),
     find: str | Sequence[str] = (),
+    progress: bool = True,
 ) -> Answer | LogAnswer:
     """Estimates parameters from real readings by every estimator, with standard errors, residuals and a test of fit.
 
@@ -352,6 +362,7 @@ def estimate(
         parameters: as {"k": {"fixed": 2.0}, "c": {"positive": True, "nominal": 3.0}}; also lower, upper, deviation.
         ignore_columns: columns of the files that are left out.
         find: constants, noises or readings of a state model by formulas, found as `constants` by largest likelihood.
+        progress: whether a terminal or a notebook shows which estimator is at work.
 
     Returns:
         The sequence of the fits, each with its estimates by name in `values`, and `x` and `covariance` in the
@@ -374,13 +385,14 @@ def estimate(
     from ipe_bench.plugins.construct import known_parameters
     from ipe_bench.real.estimation import Question
     from ipe_bench.report.answer import Answer
+    from ipe_bench.report.progress import counting
     from ipe_bench.solvers import Auto
 
     if isinstance(model, StateModel):
         stated = {"noise": noise, "prior": prior, "error_scale": error_scale, "parameters": parameters}
         if other := [name for name, value in stated.items() if value is not None]:
             raise UserError(f"{other[0]}=: is of a measurement, and this is a model of states that move; leave it out")
-        return _tracked(model, readings, estimators, ignore_columns, find)
+        return _tracked(model, readings, estimators, ignore_columns, find, progress)
     if find:
         raise UserError("find=: is for models of states that move; all parameters of a measurement are found")
     if not isinstance(model, Measurement):
@@ -393,7 +405,9 @@ def estimate(
     given = readings if readings is None or isinstance(readings, np.ndarray) else tuple(_paths(readings))
     stated: dict[str, Any] = {"noise": noise, "prior": prior, "error_scale": error_scale}
     stated |= {"known": known_parameters(parameters or {}), "ignored": tuple(ignore_columns)}
-    return Answer.to(Question(model=model, readings=given, estimators=estimators, **stated).checked())
+    question = Question(model=model, readings=given, estimators=estimators, **stated).checked()
+    with counting("estimate", len(estimators), off=not progress) as begin:
+        return Answer.to(question, watch=begin)
 
 
 def _tracked(
@@ -402,8 +416,10 @@ def _tracked(
     trackers: Mapping[str, Any] | None,
     ignored: Sequence[str],
     find: str | Sequence[str],
+    progress: bool,
 ) -> LogAnswer:
     from ipe_bench.real.tracks import Log, LogTracks, found_and_tracked
+    from ipe_bench.report.progress import counting
     from ipe_bench.report.tracked import LogAnswer
     from ipe_bench.states.trackers import ckf, ekf, ukf
 
@@ -415,9 +431,13 @@ def _tracked(
     log = Log.of(model, Path(readings) if isinstance(readings, str) else readings, ignored)
     validate([StateScenario(log.model)], trackers, 1)
     names = [find] if isinstance(find, str) else list(find)
-    return LogAnswer(
-        log, [found_and_tracked(log, *one, names) if names else LogTracks.of(log, *one) for one in trackers.items()]
-    )
+    tracks = []
+    with counting("estimate", len(trackers), off=not progress) as begin:
+        for label, tracker in trackers.items():
+            begin(label)
+            one = log, label, tracker
+            tracks.append(found_and_tracked(*one, names) if names else LogTracks.of(*one))
+    return LogAnswer(log, tracks)
 
 
 def design(

@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
-import logging
 import re
 import shlex
-import time
 from argparse import Namespace
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
-from rich.console import Console
-from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
-from rich.progress import Progress as Bar
 
-from ipe_bench.basics.errors import UserError, shortened
+from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import say
 from ipe_bench.cli import words as w
 from ipe_bench.cli.estimate import require_one_kind
@@ -31,17 +24,15 @@ from ipe_bench.cli.results import counted, show_report
 from ipe_bench.cli.session import Jobs, complete, jobs_of, session, show, spec_of
 from ipe_bench.cli.spec import STANDARD_FILTERS, Spec
 from ipe_bench.plugins.discovery import PACKAGES, options
+from ipe_bench.report.progress import watching
 from ipe_bench.runs.execution import Serial, end_idle
 from ipe_bench.runs.parts import TRUTH
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.run import accept, compute, record_refusal, result_keys, validate
-from ipe_bench.runs.schedule import Progress, Watcher
 from ipe_bench.runs.store import describe_names
 
 _NOT_TELLING = {*SETTING_NOTHING, *PACKAGES, "experiment"} - {"seed"}
 """Keys that do not distinguish the jobs of a sweep."""
-_LINE_EVERY_S = 10.0
-"""Seconds between lines of progress."""
 
 
 @dataclass(frozen=True)
@@ -215,7 +206,7 @@ def _computed(job: Spec, begun: Outcome, command: str) -> Outcome:
     asked: Any = ([job.scenario], job.estimators, job.count, job.output)
     options: dict[str, Any] = {"execution": job.execution, "block_size": job.block_size, "command": command}
     done = replace(begun, remarks=job.measurement.remarks(job.measurement.nominal))
-    with shown_progress(begun.job) as watch:
+    with watching(begun.job, lines=True) as watch:
         if job.precision is None:
             done = replace(done, failures=compute(*asked, **options, watch=watch))
         else:
@@ -292,51 +283,3 @@ def write_trial(job: Spec, path: Path, trial: int) -> None:
     write_readings(path, model, drawn.z[0])
     write_truth(truth, model, drawn.x[0])
     print(f"Readings of trial {trial}: {path}\nTrue parameters:     {truth}")
-
-
-@contextlib.contextmanager
-def shown_progress(title: str) -> Iterator[Watcher]:
-    """Yields the callback of `compute`. Warnings of ipe-bench are shown above the bar meanwhile."""
-    console = Console(stderr=True, highlight=False)
-    columns = TextColumn("{task.description}", markup=False), BarColumn(10), TextColumn("{task.fields[state]}")
-    bar = Bar(*columns, TimeElapsedColumn(), console=console, disable=not console.is_terminal)
-    line = bar.add_task(shortened(title, max(30, console.width - 80)), total=None, state="")
-    spoken = time.monotonic()
-
-    def watch(progress: Progress) -> None:
-        nonlocal spoken
-        state = _state(progress)
-        # A job without estimators to run still has its truth to store: then blocks stand in for trials.
-        total, done = (progress.total, progress.trials) if progress.total else (progress.tasks, progress.done)
-        bar.update(line, total=total or 1, completed=done if total else 1, state=state)
-        if not console.is_terminal and (progress.done == progress.tasks or time.monotonic() - spoken >= _LINE_EVERY_S):
-            spoken = time.monotonic()
-            console.print(f"{title}: {state}", markup=False, soft_wrap=True)
-
-    logger, handler = logging.getLogger("ipe_bench"), logging.Handler(logging.WARNING)
-    # Through the console that draws the bar, so that neither spoils the other.
-    handler.emit = lambda record: console.print(f"ipe-bench: {record.getMessage()}", markup=False, soft_wrap=True)
-    logger.addHandler(handler)
-    try:
-        # Older versions of rich end even a bar that is not shown with an empty line.
-        with bar if console.is_terminal else contextlib.nullcontext():
-            yield watch
-    finally:
-        logger.removeHandler(handler)
-
-
-def _state(progress: Progress) -> str:
-    """Says how far a job is, with the rate and the forecast once there are any."""
-    if not progress.tasks:
-        return "all trials are stored"
-    state = f"block {progress.done}/{progress.tasks}"
-    if progress.failures:
-        state += f", {len(progress.failures)} failed"
-    if progress.began is None:
-        return f"{state}, compiling, once"
-    seconds = time.monotonic() - progress.began
-    if rate := progress.trials / max(seconds, 1e-9):
-        state += f", {rate:.0f} estimates/s" if rate >= 10 else f", {rate:.2g} estimates/s"
-    if 0 < progress.done < progress.tasks:
-        state += f", {timedelta(seconds=round(seconds * (progress.tasks / progress.done - 1)))} left"
-    return state

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -100,9 +100,9 @@ class Question:
             raise UserError("; ".join(lacking))
         return self
 
-    def fitted(self) -> tuple[list[Fit], Examination | None]:
-        """Fits every estimator, and examines the least minimum."""
-        fits = fit(self.problem, self.found.z, self.estimators, self.scenario.noise)
+    def fitted(self, watch: Callable[[str], object] = str) -> tuple[list[Fit], Examination | None]:
+        """Fits every estimator, whose label `watch` is called with before, and examines the least minimum."""
+        fits = fit(self.problem, self.found.z, self.estimators, self.scenario.noise, watch)
         return fits, examine(self.problem, self.found.z, fits)
 
     def _noise(self) -> Noise:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from itertools import compress
@@ -66,10 +66,11 @@ class Answer(Shown):
     """The columns of the files that were left out on purpose."""
 
     @classmethod
-    def to(cls, question: Question, name: str = "") -> Answer:
-        """Returns the answer to a question, under its model's name or another `name`."""
+    def to(cls, question: Question, name: str = "", watch: Callable[[str], object] = str) -> Answer:
+        """Returns the answer to a question, under its model's name or another `name`; `watch` is called with the label
+        of each estimator before its fit."""
         model, z = question.found.model, question.found.z
-        return cls(name or model.name, model, z, *question.fitted(), ", ".join(question.ignored))
+        return cls(name or model.name, model, z, *question.fitted(watch), ", ".join(question.ignored))
 
     @property
     def passes(self) -> bool:

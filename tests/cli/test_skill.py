@@ -48,7 +48,7 @@ def test_what_a_page_says_to_type_works(skill, page, ipe_bench):
     # The component that was made is scored, and a statistic is a column of the summary.
     for summary in Path().rglob("summary.csv"):
         text = summary.read_text(encoding="utf-8")
-        nameless = ("newton", "function", "ode", "execution", "figure", "table", "section")
+        nameless = ("newton", "function", "ode", "prior", "execution", "figure", "table", "section")
         assert f"my_{kind}" in text or kind in nameless
 
 
