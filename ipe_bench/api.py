@@ -121,10 +121,11 @@ def load(directories: Directories) -> pd.DataFrame:
 
     Returns:
         A row per trial and estimator: measurement, noise, prior, error_scale, seed, estimator, and every key of the
-        config that differs; status, message, iterations, simulations, jacobians, time_s, nees, fit_p, solved, success,
-        `crlb_distance` (the squared Mahalanobis distance by the bound at the truth); in multiples of the parameters'
-        sizes `error_NAME`, `deviation_NAME` (as the estimator reports it), the truth `x_NAME` and its bounds
-        `crlb_NAME` and `bayes_NAME`. A warning names what is missing or damaged; stale results are left out.
+        config that differs; trial, status, success, solved, `error_NAME`, `crlb_distance` (the squared Mahalanobis
+        distance by the bound at the truth), nees, fit_p, iterations, simulations, jacobians, time_s, message, the truth
+        `x_NAME`, `deviation_NAME` as the estimator reports it, the bounds `crlb_NAME` and `bayes_NAME`, in multiples of
+        the parameters' sizes; columns that only some rows have come last. A warning names what is missing or damaged;
+        stale results are left out.
 
     >>> import tempfile, ipe_bench as ib
     >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)

@@ -57,6 +57,25 @@ _BOUNDED = {
 _NOUNS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text", type(None): "null"}
 
 
+def as_python(value: Any) -> str:
+    """Writes a component as Python with the options that are not the defaults, shortened to a line, or any value."""
+    if not isinstance(value, Component) or not dataclasses.is_dataclass(value):
+        return shortened(repr(value))
+    own = []
+    for field in (field for field in dataclasses.fields(value) if field.init):
+        option, make = getattr(value, field.name), field.default_factory
+        if repr(option) != repr(field.default if make is dataclasses.MISSING else make()):
+            own.append(f"{field.name}={as_python(option)}")
+    return shortened(f"{type(value).__name__}({', '.join(own)})")
+
+
+def in_lines(self: Any) -> str:
+    """Writes a dataclass with a line for each field that is not None."""
+    values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+    lines = [f"    {name}={as_python(value)},\n" for name, value in values.items() if value is not None]
+    return f"{type(self).__name__}(\n{''.join(lines)})"
+
+
 class Component:
     """Describes a component by a config: a frozen dataclass whose fields are its options and its identity.
 

@@ -19,6 +19,20 @@ if TYPE_CHECKING:
     import pandas as pd
 
 NAMES = ("measurement", "noise", "prior", "error_scale", "seed", "estimator")
+_MAIN = [
+    "trial",
+    "status",
+    "success",
+    "solved",
+    "error_",
+    "crlb_distance",
+    "nees",
+    "fit_p",
+    "iterations",
+    "simulations",
+]
+_MAIN += ["jacobians", "time_s", "message", "x_", "deviation_", "crlb_", "bayes_"]
+"""Columns of a trial that come first, in this order, or what they begin with."""
 _LONGEST = 34
 """Letters of a value in a table or a heading."""
 
@@ -77,7 +91,7 @@ def trials_frame(collection: Collection) -> pd.DataFrame:
     """Returns every usable trial: its scenario, its result, and the truth; see `ipe_bench.load`."""
     import pandas as pd
 
-    parts = []
+    parts, first = [], {}
     for group in collection.groups:
         for cell, truth in zip(group.cells, group.truths, strict=True):
             rows = pd.DataFrame(collection.load(cell, None))
@@ -87,9 +101,20 @@ def trials_frame(collection: Collection) -> pd.DataFrame:
             rows.insert(0, "trial", rows.pop("trial"))
             rows = rows.loc[:, ~rows.columns.str.startswith("curves")]  # sums over trials, and no trial's
             parts.append(pd.concat([pd.DataFrame(belongs, index=rows.index), rows], axis=1))
+            first |= belongs
     if not parts:
         return pd.DataFrame(columns=[*NAMES, "trial"])
-    return pd.concat(parts, ignore_index=True)
+    frame = pd.concat(parts, ignore_index=True)
+    scarce = frame.columns[frame.isna().mean() > 0.5]  # most rows have none
+
+    def place(name: str) -> tuple[int, bool]:
+        if name in first:
+            return -1, False
+        main = (i for i, begin in enumerate(_MAIN) if name == begin or (begin[-1] == "_" and name.startswith(begin)))
+        at = next(main, len(_MAIN))
+        return at, at == len(_MAIN) and name in scarce
+
+    return frame[sorted(frame.columns, key=place)]
 
 
 # Which config leaves tell scenarios, or the estimators of one label, apart -------------------------------------------

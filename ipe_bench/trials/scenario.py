@@ -9,6 +9,7 @@ import numpy as np
 
 from ipe_bench.basics.errors import UserError, definition
 from ipe_bench.basics.linalg import Array, Covariance, read_only
+from ipe_bench.basics.options import in_lines
 from ipe_bench.basics.streams import numbered
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.problem import Problem, require_nominal, require_numbers
@@ -60,6 +61,8 @@ class Scenario:
     """Times the prior's deviations."""
     seed: int = 0
     truth: Measurement | None = None
+
+    __repr__ = in_lines
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "noise", resolved(self.noise, self.measurement))

@@ -19,6 +19,7 @@ import numpy as np
 from ipe_bench.basics.batches import take
 from ipe_bench.basics.errors import UserError, describe_exception
 from ipe_bench.basics.linalg import Array, Mask, deviations, finite, plain_numbers, read_only
+from ipe_bench.basics.options import in_lines
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates
 from ipe_bench.noise.base import Noise
@@ -53,6 +54,8 @@ class StateScenario:
 
     truth: ClassVar[None] = None
     prior: ClassVar[Prior] = GaussianPrior()
+
+    __repr__ = in_lines
 
     def __post_init__(self) -> None:
         check_seed(self.seed)

@@ -100,6 +100,10 @@ def test_rows_of_trials_say_what_they_belong_to(tmp_path, polynomial):
     assert len(rows) == 2 * 2 * 12
     belongs = ["measurement", "noise", "error_scale", "seed", "estimator", "measurement.strength", "trial"]
     assert not rows[belongs].isna().any().any()
+    order, few = [*rows.columns], [*rows.columns[rows.isna().mean() > 0.5]]
+    assert {*order[: len(belongs) + 1]} == {*belongs, "prior"}
+    assert order[len(belongs) :][:5] == ["trial", "status", "success", "solved", "error_c0"]
+    assert order[-len(few) :] == few
     assert not rows.duplicated(belongs).any()
     assert rows.groupby("seed")["measurement.strength"].unique().map(list).to_dict() == {0: [0.005], 1: [0.001]}
     drawn = polynomial.draw(0, 12).x
