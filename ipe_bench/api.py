@@ -185,7 +185,9 @@ def compare(
     second: str | None = None,
     alpha: float = 0.05,
     anytime: bool = False,
-    fail_on: Sequence[str] = ("success", "error"),
+    fail_on: Sequence[str] | None = None,
+    margins: Mapping[str, float] | None = None,
+    complete: bool = False,
     power: float | None = None,
     difference: float | None = None,
     output: Path | str | None = None,
@@ -196,9 +198,13 @@ def compare(
         first_directory, second_directory: whose estimators and scenarios are compared, if both have them, on trials
             matched by seed and number, else in their order; without a second both versions are in the first.
         first, second: labels, if one estimator is compared with another.
-        alpha: error probability below which a finding is made, of `p` corrected over all rows (Holm).
+        alpha: error probability below which a finding is made, of `p` corrected over all tests (Holm).
         anytime: findings are made by `e`, evidence that may be looked at after any number of trials.
-        fail_on: quantities whose getting worse is listed in `attrs["worse"]`.
+        fail_on: quantities that are tested, and listed in `attrs["worse"]` if they get worse: success, error, cost,
+            honesty (ratio of mean squared errors over claimed variances, worse farther from 1), bias of each parameter
+            (difference of mean errors in deviations of the bound, worse farther from 0). Unless given: success, error.
+        margins: changes that matter, by quantity; the interval of a finding lies beyond.
+        complete: what the second lacks of the first is among the problems.
         power, difference: `trials_needed` find such a difference of success with that probability.
         output: folder for comparison.csv and a page.
 
@@ -218,15 +224,20 @@ def compare(
     """
     from ipe_bench.report.questions import Comparison, write_comparison
     from ipe_bench.report.writer import digests
-    from ipe_bench.statistics.between import JUDGED, compared, comparison_title, left_out
+    from ipe_bench.statistics import between
     from ipe_bench.statistics.collect import collect
     from ipe_bench.statistics.paired import PowerPlan
 
     plan = PowerPlan.of(power, difference, anytime=anytime)
     if not 0 < alpha < 1:
         raise UserError(f"alpha={alpha}: give a number between 0 and 1")
-    if wrong := [name for name in fail_on if name not in JUDGED]:
-        raise UserError(f"fail_on={wrong[0]}: {unknown(wrong[0], JUDGED, 'quantity')}")
+    tested, margins = tuple(fail_on or between.JUDGED), between.MARGINS | dict(margins or {})
+    if wrong := [name for name in (*tested, *margins) if name not in between.MARGINS]:
+        raise UserError(f"fail_on={wrong[0]}: {unknown(wrong[0], between.MARGINS, 'quantity')}")
+    if wrong := [f"{name}={margin}" for name, margin in margins.items() if not 0 <= margin < np.inf]:
+        raise UserError(f"margin.{wrong[0]}: give a number from 0 on")
+    if plan is not None and "success" not in tested:
+        raise UserError("power: is that of success, which fail_on does not name; add it, or leave out power")
     paths = [_paths(first_directory), _paths(first_directory if second_directory is None else second_directory)]
     with opened(paths[0]) as one, opened(paths[1]) as other:
         if second_directory is None and (first is None or second is None):
@@ -234,18 +245,22 @@ def compare(
         if first == second and {path.resolve() for path in paths[0]} == {path.resolve() for path in paths[1]}:
             label = "one folder" if first is None else f"{first} of one folder"
             raise UserError(f"compare: {label} is compared with itself; name another, or first=LABEL and second=LABEL")
-        collections, read = (collect(one), collect(other)), digests(dict.fromkeys([*one, *other]))
-        frame = Comparison(compared(*collections, (first, second), alpha=alpha, anytime=anytime, plan=plan))
+        asked, read = (collect(one), collect(other)), digests(dict.fromkeys([*one, *other]))
+        options: dict[str, Any] = {"anytime": anytime, "plan": plan, "tested": tested, "margins": margins}
+        frame = Comparison(between.compared(*asked, (first, second), alpha=alpha, **options))
+        lacking = list(between.gone(*asked, (first, second))) if complete else []
     if plan is not None:
         whole = ["discordant", "trials_needed"]
         frame[whole] = frame[whole].astype("Int64")
-    worse = frame[(frame["finding"] == "worse") & frame["quantity"].isin(list(fail_on))]
+    failing = ("success", "error") if fail_on is None else fail_on
+    worse = frame[(frame["finding"] == "worse") & frame["quantity"].str.split(" ").str[0].isin(list(failing))]
     rows = [{str(name): value for name, value in row.items()} for row in worse.to_dict("records")]
-    frame.attrs["worse"] = [f"{row['second']} in {row['quantity']}, {comparison_title(row)}" for row in rows]
+    frame.attrs["worse"] = [f"{row['second']} in {row['quantity']}, {between.comparison_title(row)}" for row in rows]
     for name in ("problems", "stale"):
-        frame.attrs[name] = list(dict.fromkeys(line for c in collections for line in getattr(c, name)))
-    frame.attrs["notes"] = left_out(*collections)
-    frame.attrs["alpha"] = alpha
+        frame.attrs[name] = list(dict.fromkeys(line for c in asked for line in getattr(c, name)))
+    frame.attrs["problems"] += lacking
+    frame.attrs["notes"] = [*between.left_out(*asked), *between.other_sources(*asked)]
+    frame.attrs["margins"], frame.attrs["alpha"] = margins, alpha
     if output is not None:
         write_comparison(Path(output), frame, read)
     return frame

@@ -215,8 +215,12 @@ def _check_experiments(folder: str) -> Iterator[Finding]:
             yield Finding(f"experiment={option.name}", "Asks for what there is", complaint)
 
 
-def new_command(kind: str, name: str, language: str | None = None) -> int:
-    """Writes plugins/NAME in the working folder, or the one file of a function or of differential equations."""
+def new_command(kind: str, name: str | None, language: str | None = None) -> int:
+    """Writes plugins/NAME in the working folder, or the files of a model, of a skill or of a guard in CI."""
+    if kind == "ci" and name is None:
+        return _write_ci()
+    if name is None:
+        raise UserError("new: the following arguments are required: NAME")
     if kind in (added := plugins.kinds_to_copy()):
         return _copy_kind(kind, added[kind], name, language)
     if language is not None:
@@ -227,7 +231,7 @@ def new_command(kind: str, name: str, language: str | None = None) -> int:
         return 0
     (kind,) = renamed([kind])
     if kind not in (*MODELS, *KINDS):
-        raise UserError(f"{kind}: {unknown(kind, (*MODELS, *KINDS, *added, 'skill'), 'kind')}")
+        raise UserError(f"{kind}: {unknown(kind, (*MODELS, *KINDS, *added, 'skill', 'ci'), 'kind')}")
     group = "baseline" if kind == "filter" else kind
     _check_name(group, name)
     if kind in ALONE:
@@ -283,6 +287,24 @@ def _copy_kind(kind: str, home: Path, name: str, language: str | None) -> int:
         filled = Template(text).substitute(name=name) if path.suffix == ".template" else text
         target.write_text(filled, encoding="utf-8")
     print(f"{folder} is ready. Read {folder / 'README.md'}")
+    return 0
+
+
+def _write_ci() -> int:
+    """Writes a workflow that compares the estimators in plugins/ with those of a base, and the trials for it."""
+    ours, place = {"solver": "", "baseline": ""}, Path("plugins").resolve()
+    for option in (o for o in plugins.options() if o.group in ours and place in o.path.resolve().parents):
+        ours[option.group] += ", " * bool(ours[option.group]) + option.name
+    if not any(ours.values()):
+        raise UserError(
+            "new ci: plugins/ has no estimator to guard; write one, such as `ipe-bench new baseline my_fit`"
+        )
+    texts = {".github/workflows/estimator.yml": "ci.yml", "ci/experiment/guard.yaml": "ci.yaml"}
+    for target in texts:
+        _require_absent(Path(target))
+    for target, source in texts.items():
+        _fill(Path(target), source, {"version": ib.__version__, **ours})
+    print(f"{' and '.join(texts)} are ready. Try:\n  ipe-bench run --config-dir ci +experiment=guard figures=none")
     return 0
 
 

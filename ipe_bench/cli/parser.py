@@ -161,7 +161,9 @@ Stored results are compared, so run both first. Equal trials are paired; those o
 
 alpha=0.05           significance level: probability of any finding if there is no difference
 anytime=true         tests by e-values, which remain valid at any number of looks while trials are added
-fail_on=success,error  quantities in which the second must not be worse: success, error, cost
+fail_on=success,error  what is tested and must not be worse: success, error, cost, honesty (NEES farther from 1), bias
+margin.cost=0.1      the change that matters: success 0.01, error 0.02, cost 0.05, honesty 0.05, bias 0.1 deviations
+complete=true        fails on what the second lacks, too: estimators, scenarios, trials, a covariance
 power=0.9            computes the trials that find a difference of success, such as difference=0.05, with this power
 output=DIR           writes comparison.csv and comparison.html there
 """,
@@ -230,10 +232,11 @@ The same results give the same file, so that the digest may stand in a paper. Ot
   ipe-bench new function my_model                 my_model.py, a function of parameters and columns
   ipe-bench new KIND NAME --language LANGUAGE     plugins/NAME, of a kind that an installed plugin adds
   ipe-bench new skill DIR                         pages by which a coding agent writes plugins, into a new folder DIR
+  ipe-bench new ci                                a GitHub workflow that compares what plugins/ estimates with its base
 """,
         {
-            "kind": {"metavar": "KIND", "help": f"{', '.join((*MODELS, *KINDS))} or skill"},
-            "name": {"metavar": "NAME", "help": "small letters, digits and underscores"},
+            "kind": {"metavar": "KIND", "help": f"{', '.join((*MODELS, *KINDS))}, skill or ci"},
+            "name": {"metavar": "NAME", "nargs": "?", "help": "small letters, digits and underscores; none for ci"},
             "--language": {"help": "of a plugin's kind that has several"},
         },
     ),

@@ -20,7 +20,7 @@ _REPORT = {"output": str, "figures": str, "formats": str}
 _PAPER = {"output": str, "paper": NAMES, "columns": NAMES, "width": float}
 """Keys of tables and figures for a paper."""
 _COMPARE = {"first": str, "second": str, "alpha": float, "anytime": bool, "fail_on": NAMES}
-_COMPARE |= {"power": float, "difference": float, "output": str}
+_COMPARE |= {"power": float, "difference": float, "output": str, "complete": bool}
 
 
 def audit_command(arguments: Sequence[str]) -> int:
@@ -63,8 +63,11 @@ def bundle_command(arguments: Sequence[str]) -> int:
 def compare_command(arguments: Sequence[str]) -> int:
     """Prints the table; exit code 1 where the second is worse, or lacks what was asked for."""
     from ipe_bench.report.questions import comparison_parts
+    from ipe_bench.statistics.between import MARGINS
 
-    folders, keys = places_and_keys("compare", arguments, _COMPARE)
+    margins = {f"margin.{name}": float for name in MARGINS}
+    folders, keys = places_and_keys("compare", arguments, _COMPARE | margins)
+    keys["margins"] = {key.partition(".")[2]: keys.pop(key) for key in margins if key in keys}
     if not 1 <= len(folders) <= 2:
         raise UserError("compare: name one or two folders of results, such as outputs/before outputs/after")
     frame = ib.compare(*folders, **keys)

@@ -35,9 +35,9 @@ HONEST = 0.1
 SAME_LAW = 0.05
 """Energy distance up to which draws may come from one law: of Gaussians in few dimensions, some tenths of a nat."""
 _MOST_SUSPECTS = 12
-_TITLES = {"error": "mean length", "cost": "mean cost", "time": "median time"}
+_TITLES = {"error": "mean length", "honesty": "mean NEES", "cost": "mean cost", "time": "median time"}
 """Names of a comparison's quantities, where the table of a run has other statistics of error and cost."""
-_MOST_EVIDENCE = 1000
+_LEAST_P, _MOST_EVIDENCE = 1e-6, 1000
 _WORTH = 0.005
 """Part of the mean bound below which a better choice is none."""
 _UNSEEN = 0.05
@@ -332,9 +332,16 @@ def comparison_parts(frame: pd.DataFrame, alpha: float) -> Iterator[Part]:
         "length is that of the error in standard deviations of the bound (Mahalanobis), where a trial counts as at most"
         " the radius of the gate of success; cost counts simulations. Both are means over the common trials, where the"
         " table of a run has medians, and errors over the bound. p comes from McNemar's exact test for success and from"
-        " random signs for ratios, with Holm's correction over all rows. e is evidence that may be looked at"
+        " random signs for the others, with Holm's correction over all tests. e is evidence that may be looked at"
         " repeatedly; e = 20 is as rare as p = 0.05. Each interval is that of its row alone. Times are not tested."
     )
+    margins = ", ".join(f"{name} {margin:g}" for name, margin in frame.attrs["margins"].items())
+    yield f"better and worse are changes that p tells from none, by more than a margin: {margins}."
+    if frame["quantity"].str.match("honesty|bias").any():
+        yield (
+            "NEES (honesty) is the squared error over the claimed variance, by the number of parameters, where both"
+            " converge: right is 1. bias is the mean error in deviations of the bound, where both succeed: right is 0."
+        )
     if (frame["matched_by"] == "order").any():
         yield "Without common trials pairing gains no precision: the intervals are wider."
 
@@ -364,13 +371,15 @@ def _cells(row: dict[str, Any]) -> tuple[str, ...]:
     show = {"success": percent, "time": lambda v: duration(v, 2)}.get(quantity, compact)
     if quantity == "success":
         change, ends = f"{100 * row['change']:+.1f} %", f"{100 * row['low']:+.1f} to {100 * row['high']:+.1f}"
+    elif quantity.startswith("bias "):
+        change, ends = f"{row['change']:+.3f}", f"{row['low']:+.3f} to {row['high']:+.3f}"
     else:
         change, ends = _ratio(row["change"]), f"{_ratio(row['low'])} to {_ratio(row['high'])}"
     p, e = row["p"], row["e"]
     return (
         *(_TITLES.get(quantity, quantity), show(row["first_value"]), show(row["second_value"]), change),
         ends if math.isfinite(row["low"]) else "-",
-        p_value(p) if math.isfinite(p) else "",
+        (p_value(p) if p >= _LEAST_P else f"<{_LEAST_P:g}") if math.isfinite(p) else "",
         (compact(e) if e <= _MOST_EVIDENCE else f">{_MOST_EVIDENCE}") if math.isfinite(e) else "",
         row["finding"] or ("-" if quantity != "time" else ""),
     )

@@ -5,22 +5,26 @@ This module finds the scenarios and trials that belong together; the tests are i
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict
+from collections.abc import Container, Iterator, Mapping
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 
 from ipe_bench.basics.errors import UserError, unknown
+from ipe_bench.basics.linalg import Array
 from ipe_bench.runs.provenance import canonical_json
 from ipe_bench.statistics.collect import Collection, Group, config_leaves, differing, scenario_of, shown_leaf
 from ipe_bench.statistics.comparisons import ALPHA, differences, holm
-from ipe_bench.statistics.paired import PLANNED, Effect, PowerPlan, ratio_effect, success_effect
+from ipe_bench.statistics.paired import PLANNED, Effect, PowerPlan, mean_effect, ratio_effect, success_effect
 from ipe_bench.statistics.sample import Sample, samples
 from ipe_bench.trials.thresholds import gate
 
 JUDGED = ("success", "error", "cost")
-"""Quantities that are tested. Time is not: the trials of a block share theirs evenly, and machines differ."""
+"""Quantities that are tested unless others are asked for."""
+MARGINS = {"success": 0.01, "error": 0.02, "honesty": 0.05, "bias": 0.1, "cost": 0.05}
+"""Quantities that can be tested, with the change that matters: a difference of success, and of bias in deviations of
+the bound; of the others a ratio less 1. Time is not: trials of a block share theirs evenly, and machines differ."""
 NOT_SETTINGS = (
     *("first", "second", "trials", "matched_by", "quantity", "first_value", "second_value"),
     *("change", "low", "high", "p", "e", "finding", *PLANNED),
@@ -47,29 +51,32 @@ def compared(
     alpha: float = ALPHA,
     anytime: bool = False,
     plan: PowerPlan | None = None,
+    tested: Container[str] = JUDGED,
+    margins: Mapping[str, float] = MARGINS,
 ) -> list[dict[str, Any]]:
     """Returns rows of every comparison that can be made: one per scenario, pair of estimators and quantity.
 
-    Each p is corrected over all of them by Holm; with `anytime`, findings go by e-values, divided by their number. With
-    a `plan`, rows on success say how many trials it takes, at the strictest level that Holm asks for.
+    Each p is corrected by Holm over all that are `tested`; with `anytime`, findings go by e-values, divided by their
+    number. A finding's own interval lies beyond the margin, too. With a `plan`, rows on success say how many trials it
+    takes, at the strictest level that Holm asks for.
 
     Raises:
         UserError: there is nothing to compare.
     """
-    rows = [row for match in _matches(first, second, labels) for row in _rows(*match, alpha)]
-    judged = [row for row in rows if row["quantity"] in JUDGED]
-    for row, p in zip(judged, holm([row["p"] for row in judged]), strict=True):
-        discordant = row.pop("discordant", None)
-        if plan is not None and discordant is not None:
+    rows = [row for match in _matches(first, second, labels) for row in _rows(*match, alpha, tested)]
+    hidden = [(row.pop("loss"), row.pop("discordant")) for row in rows]
+    judged = [one for one in zip(rows, hidden, strict=True) if np.isfinite(one[0]["p"])]
+    for (row, ((low, high), discordant)), p in zip(judged, holm([row["p"] for row, _ in judged]), strict=True):
+        if plan is not None and row["quantity"] == "success":
             row |= plan.row(discordant, row["trials"], alpha / len(judged))
-        row["p"] = float(p)
+        row["p"], kind = float(p), row["quantity"].partition(" ")[0]
         if row["e"] >= len(judged) / alpha if anytime else p < alpha:
-            more = row["second_value"] > row["first_value"]
-            row["finding"] = "better" if more == (row["quantity"] == "success") else "worse"
+            margin = margins[kind] if kind in ("success", "bias") else np.log1p(margins[kind])
+            row["finding"] = "worse" if low > margin else "better" if high < -margin else ""
     return rows
 
 
-def _rows(a: Sample, b: Sample, alpha: float) -> Iterator[dict[str, Any]]:
+def _rows(a: Sample, b: Sample, alpha: float, tested: Container[str]) -> Iterator[dict[str, Any]]:
     """Yields a row per quantity of two estimators on one scenario."""
     if a.n != b.n:
         raise UserError(
@@ -83,19 +90,63 @@ def _rows(a: Sample, b: Sample, alpha: float) -> Iterator[dict[str, Any]]:
         one = other = np.arange(min(len(a), len(b)))
     head = _head(a.group, b.group) | {"first": a.group.estimator, "second": b.group.estimator}
     head |= {"trials": len(one), "matched_by": matched_by}
-    success = a.inside_gate[one], b.inside_gate[other]
-    radius = float(np.sqrt(gate(a.n)))
-    error = np.minimum(a.distance[one], radius), np.minimum(b.distance[other], radius)
+    for quantity, first, second, largest in _columns(a, b, one, other, tested):
+        kind, effect, loss = quantity.partition(" ")[0], Effect(np.nan, np.nan, np.nan), (np.nan, np.nan)
+        if len(first):
+            effect = {"success": success_effect, "bias": mean_effect}.get(kind, ratio_effect)(
+                first, second, alpha, *largest
+            )
+            loss = _loss(kind, effect, first)
+        effect = effect if kind in tested else replace(effect, p=np.nan, e=np.nan)
+        more = {"finding": "", "loss": loss, "discordant": int(np.sum(first != second))}
+        yield head | {"quantity": quantity} | asdict(effect) | more
     seconds = float(np.median(a.scalars["time_s"][one])), float(np.median(b.scalars["time_s"][other]))
-    effects = {
-        "success": success_effect(*success, alpha),
-        "error": ratio_effect(error[0], error[0] + differences(error[1], error[0]), alpha, radius),
-        "cost": ratio_effect(a.cost[one], b.cost[other], alpha),
-        "time": Effect(*seconds, seconds[1] / seconds[0] if seconds[0] > 0 else np.nan),
-    }
-    for quantity, effect in effects.items():
-        discordant = {"discordant": int(np.sum(success[0] != success[1]))} if quantity == "success" else {}
-        yield head | {"quantity": quantity} | asdict(effect) | {"finding": ""} | discordant
+    effect = Effect(*seconds, seconds[1] / seconds[0] if seconds[0] > 0 else np.nan)
+    yield head | {"quantity": "time"} | asdict(effect) | {"finding": "", "loss": None, "discordant": 0}
+
+
+def _columns(
+    a: Sample, b: Sample, one: Array, other: Array, tested: Container[str]
+) -> Iterator[tuple[str, Array, Array, tuple[float, ...]]]:
+    """Yields the numbers of both in the matched trials, with the largest difference there can be if it is known."""
+    success, n, radius = (a.inside_gate[one], b.inside_gate[other]), a.n, float(np.sqrt(gate(a.n)))
+    yield "success", *success, ()
+    error = np.minimum(a.distance[one], radius), np.minimum(b.distance[other], radius)
+    yield "error", error[0], error[0] + differences(error[1], error[0]), (radius,)
+    if "honesty" in tested:
+        # Trials that do not converge claim nothing. What the second claims no more, in some or in all, is on the gate.
+        nees = [np.where(s.converged[at], s.scalars["nees"][at] / n, np.nan) for s, at in ((a, one), (b, other))]
+        claimed, common = ~np.isnan(nees[0]), ~np.isnan(nees[0]) & b.converged[other]
+        first, second = (np.fmin(v[common if common.any() else claimed], radius**2 / n) for v in nees)
+        yield "honesty", first, second, (radius**2 / n,)
+    if "bias" in tested:
+        bound, both = a.group.footer["bound"], success[0] & success[1]
+        errors = [(s.error[at] / s.of_truth(bound)[at])[both].T for s, at in ((a, one), (b, other))]
+        for name, first, second in zip(a.names, *errors, strict=True):
+            known = np.isfinite(first) & np.isfinite(second)
+            yield f"bias of {name}", first[known], second[known], (2 * radius,)
+    yield "cost", a.cost[one], b.cost[other], ()
+
+
+def _loss(kind: str, effect: Effect, first: Array) -> tuple[float, float]:
+    """Returns the ends of how much worse the second is, as a difference of success and bias, else of logarithms.
+
+    Honesty and bias are worse farther from 1 and from 0, which the first counts as unless it surely is not.
+    """
+    low, high, start, right = effect.low, effect.high, effect.first_value, float(kind == "honesty")
+    if kind == "success":
+        return -high, -low
+    if abs(start - right) <= 2 * first.std() / np.sqrt(len(first)):
+        start = right
+    if kind != "bias":
+        if np.isnan(low):  # a ratio to or from 0 has no ends
+            low = high = 0.0 if effect.second_value < effect.first_value else np.inf
+        with np.errstate(divide="ignore"):
+            low, high, start = np.log([low, high, start]).tolist()
+    if kind not in ("honesty", "bias"):
+        return low, high
+    ends = abs(start + low), abs(start + high)
+    return (0.0 if (start + low) * (start + high) < 0 else min(ends)) - abs(start), max(ends) - abs(start)
 
 
 def _head(first: Group, second: Group) -> dict[str, Any]:
@@ -147,6 +198,34 @@ def _matches(
         if mine is None or theirs is None:
             raise UserError(f"{one.estimator}: has no trials to compare; run more of them")
         yield mine, theirs
+
+
+def gone(first: Collection, second: Collection, labels: tuple[str | None, str | None]) -> Iterator[str]:
+    """Yields a line where the second lacks an estimator of the first on a scenario, some trials, or its covariance."""
+    matched, wanted = list(_matches(first, second, labels)), labels[0] or labels[1]
+    for group in (g for g in first.groups if wanted in (None, g.estimator, g.label)):
+        title = f"gone: {group.estimator}, {comparison_title(group.columns)}: the second"
+        pairs = [(a, b) for a, b in matched if a.group is group]
+        if not pairs:
+            yield f"{title} has no trials of it"
+        for a, b in pairs:
+            common = len(np.intersect1d(a.number, b.number)) or min(len(a), len(b))
+            if common < len(a):
+                yield f"{title} has {common} of its {len(a)} trials"
+            if [bool(np.isnan(s.scalars["nees"]).all()) for s in (a, b)] == [False, True]:
+                yield f"{title} reports no covariance"
+
+
+def other_sources(first: Collection, second: Collection) -> Iterator[str]:
+    """Yields a line if other versions of the bench, a plugin or a library drew the trials of a scenario of both."""
+    a, b = _by_scenario(first), _by_scenario(second)
+    truths = [(x, y) for key in a if key in b for x in a[key][0].truths for y in b[key][0].truths if x and y]
+    made = [
+        [{**t.footer["versions"], **t.footer["libraries"], "source": t.footer["source"]} for t in p] for p in truths
+    ]
+    differ = dict.fromkeys(f"{k} {x[k]} | {y.get(k)}" for x, y in made for k in x if x[k] != y.get(k))
+    if differ:
+        yield f"other sources: {', '.join(differ)}; differences may be theirs: run both sides with the same ones"
 
 
 def left_out(first: Collection, second: Collection) -> list[str]:

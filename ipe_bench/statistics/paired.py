@@ -14,7 +14,7 @@ from scipy.special import bdtr, betaln, ndtri
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics.calibration import least_count
-from ipe_bench.statistics.comparisons import ALPHA, mcnemar
+from ipe_bench.statistics.comparisons import ALPHA, differences, mcnemar
 from ipe_bench.statistics.intervals import RARE, clopper_pearson, first_that, grouped
 from ipe_bench.trials.thresholds import FEW
 
@@ -115,11 +115,25 @@ def ratio_effect(first: Array, second: Array, alpha: float = ALPHA, largest: flo
     return Effect(*means, value, low, high, p_equal, evidence)
 
 
+def mean_effect(first: Array, second: Array, alpha: float, largest: float) -> Effect:
+    """Compares the means of two columns (trials,) of bounded numbers of either sign: second less first.
+
+    The p is that of random signs, the interval the normal one, widened as that of a ratio by differences of at most
+    `largest` in trials that may be unseen.
+    """
+    d = differences(second, first)
+    ones, mean = np.ones(len(d)), float(d.mean())
+    reach = -float(ndtri(alpha / 2)) * float(d.std()) / np.sqrt(len(d)) + _unseen(ones, d, alpha) * largest
+    p = _p_of_ratio(*grouped(np.array([ones, d]), MOST_SIGNS).T.copy())(0.0)
+    evidence = no_lean(d, float(abs(first[0]) + abs(second[0])) or 1.0)
+    return Effect(float(first.mean()), float(second.mean()), mean, mean - reach, mean + reach, p, evidence)
+
+
 def _p_of_ratio(a: Array, b: Array) -> Callable[[float], float]:
     """Computes the p of b being r times a: the share of sums with random signs at least as far from 0 as the sum of b -
     r a, itself included; if it is alone, Hoeffding's bound of this share (J. Amer. Statist. Assoc. 58, 1963)."""
     signs = _signs(len(a))
-    flipped_a, flipped_b, size_a, size_b = signs @ a, signs @ b, float(a.sum()), float(b.sum())
+    flipped_a, flipped_b, size_a, size_b = signs @ a, signs @ b, float(a.sum()), float(np.abs(b).sum())
 
     def p(ratio: float) -> float:
         d, flipped, roundoff = b - ratio * a, flipped_b - ratio * flipped_a, 1e-12 * (size_b + ratio * size_a)

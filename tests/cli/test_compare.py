@@ -1,13 +1,18 @@
 """`compare` finds what is there, nothing where there is nothing, and says which trials it compared."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
 from scipy.stats import binom, binomtest, chi2
-from shared.synthetic_store import Pretender, Synthetic
+from shared.synthetic_store import Pretender, Synthetic, forge
 
 import ipe_bench as ib
 from ipe_bench.cli.main import main
+from ipe_bench.plugins import discovery
 from ipe_bench.trials.thresholds import GATE
 
 ERROR = 0.1
@@ -23,6 +28,17 @@ def store(folder, *, seed=0, factor=1.0, trials=200, label="it", draws=0, estima
     filled.add(filled.scenario(seed=seed, **scenario), label, error, estimator=estimator, **given)
     filled.record(trials)
     return folder
+
+
+def changed(tmp_path, first: dict, second: dict, trials=1000, n=3, **options):
+    """The rows of a comparison of two stores of the same trials, by quantity, where `error` and other columns of each
+    are functions of the same normal deviates (trials, n) in deviations of the bound."""
+    for name, columns in (("a", first), ("b", second)):
+        filled, columns = Synthetic(tmp_path / name), dict(columns)
+        deviates = np.random.default_rng(0).standard_normal((trials, n))
+        error = ERROR * columns.pop("error", np.array)(deviates)
+        filled.add(filled.scenario(), "it", error, **columns)
+    return ib.compare(tmp_path / "a", tmp_path / "b", **options).set_index("quantity")
 
 
 def findings(frame: pd.DataFrame) -> dict[str, str]:
@@ -148,6 +164,117 @@ def test_costs_are_judged_by_their_means_alone(tmp_path):
     assert row["finding"] == ""
 
 
+ALL = ("success", "error", "honesty", "bias", "cost")
+
+
+def shifted(by: float, every: int = 1):
+    """Adds a bias to the second parameter, in every so many of the trials."""
+    return lambda e: e + by * np.outer(np.arange(len(e)) % every == 0, [0.0, 1.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "expected"),
+    [
+        ({}, {}, {}),
+        ({}, {"deviation": ERROR * np.sqrt(0.9)}, {"honesty": "worse"}),
+        ({}, {"deviation": ERROR * np.sqrt(0.97)}, {}),
+        ({"deviation": ERROR * np.sqrt(2)}, {"deviation": ERROR / np.sqrt(1.02)}, {"honesty": "better"}),
+        ({"deviation": ERROR / np.sqrt(1.02)}, {"deviation": ERROR * np.sqrt(2)}, {"honesty": "worse"}),
+        ({"deviation": ERROR * np.sqrt(2)}, {"deviation": ERROR / np.sqrt(2)}, {}),
+        ({}, {"deviation": np.nan}, {"honesty": "worse"}),
+        ({"deviation": np.nan}, {}, {}),
+        ({}, {"status": "max_iterations"}, {"honesty": "worse"}),
+        ({}, {"error": shifted(0.3)}, {"bias of b": "worse"}),
+        ({}, {"error": shifted(-0.3)}, {"bias of b": "worse"}),
+        ({"error": shifted(0.3)}, {"error": shifted(-0.3)}, {}),
+        ({"error": shifted(0.3)}, {}, {"bias of b": "better"}),
+        ({}, {"error": shifted(0.15, 2)}, {}),
+        ({}, {"error": lambda e: 1.015 * e}, {}),
+        ({}, {"error": lambda e: 1.05 * e, "deviation": 1.05 * ERROR}, {"error": "worse"}),
+        ({}, {"simulations": 6.0}, {"cost": "worse"}),
+        ({}, {"simulations": 5.2}, {}),
+        ({}, {"error": shifted(1e3, 20)}, {"success": "worse", "error": "worse", "honesty": "worse"}),
+        ({}, {"error": shifted(1e3, 125)}, {}),
+    ],
+)
+def test_what_matters_is_found_and_nothing_else(tmp_path, first, second, expected):
+    """1,000 trials of the same errors: every change is one of all trials, or of the stated share of them. Eight lost
+    trials in 1,000 are within the margin of success."""
+    rows = changed(tmp_path, first, second, fail_on=ALL)
+    found = {quantity: finding for quantity, finding in rows["finding"].items() if finding}
+    assert found == expected
+    assert [line.partition(" in ")[2].partition(",")[0] for line in rows.attrs["worse"]] == [
+        quantity for quantity, finding in found.items() if finding == "worse"
+    ]
+
+
+def test_honesty_and_bias_are_those_of_the_definition(tmp_path):
+    """Mean of the squared errors over the claimed variances, by n, of trials that converge in both; mean error."""
+    e = np.random.default_rng(0).standard_normal((1000, 3))
+    status = np.where(np.arange(1000) < 100, "diverged", "converged").astype(object)
+    rows = changed(tmp_path, {}, {"error": shifted(0.2), "status": status}, fail_on=("honesty", "bias"))
+    assert rows.loc["honesty", "first_value"] == pytest.approx((e[100:] ** 2).mean())
+    assert rows.loc["bias of b", "first_value"] == pytest.approx(e[:, 1].mean())
+    assert rows.loc["bias of b", "change"] == pytest.approx(0.2)
+    assert rows.loc["bias of a", ["change", "p"]].tolist() == [0.0, 1.0]
+
+
+def test_only_what_is_asked_for_is_tested_and_changes_a_p(tmp_path):
+    """Four failures of one alone: McNemar's p of 1/8, multiplied by the number of questions; three without fail_on."""
+    a, b = store(tmp_path / "a"), store(tmp_path / "b", fails=4)
+    asked = (None, ["success"], ["success", "honesty"], ["success", "bias"], ["cost", "success", "error"])
+    frames = [ib.compare(a, b, fail_on=fail_on).set_index("quantity") for fail_on in asked]
+    assert [frame.loc["success", "p"] for frame in frames] == pytest.approx([3 / 8, 1 / 8, 2 / 8, 4 / 8, 3 / 8])
+    assert [frame["p"].notna().sum() for frame in frames] == [3, 1, 2, 4, 3]
+    assert frames[0].index.tolist() == ["success", "error", "cost", "time"]
+
+
+def test_margins_are_for_the_user_to_say(tmp_path, capsys):
+    a, b = store(tmp_path / "a", trials=1000), store(tmp_path / "b", trials=1000, factor=1.05)
+    words = ["compare", str(a), str(b)]
+    assert [main([*words, *more]) for more in ([], ["margin.error=0.05"], ["margin.error=0"])] == [1, 0, 1]
+    assert "by more than a margin: success 0.01, error 0.05" in " ".join(capsys.readouterr().out.split())
+
+
+def test_what_is_gone_is_named_where_completeness_is_asked_for(tmp_path, capsys):
+    """An estimator, half of the trials, a scenario and a covariance: a line each, and none without the word."""
+    first, second = Synthetic(tmp_path / "a"), Synthetic(tmp_path / "b")
+    error = ERROR * np.random.default_rng(0).standard_normal((200, 3))
+    for label, scale in (("it", 1.0), ("it", 7.0), ("lost", 1.0), ("half", 1.0), ("mute", 1.0)):
+        first.add(first.scenario(error_scale=scale), label, error)
+    second.add(second.scenario(), "it", error)
+    second.add(second.scenario(), "new", error)
+    second.add(second.scenario(), "half", error[:100])
+    second.add(second.scenario(), "mute", error, deviation=np.nan)
+    words = ["compare", str(tmp_path / "a"), str(tmp_path / "b")]
+    assert main(words) == 0
+    assert "gone:" not in capsys.readouterr().err
+    assert main([*words, "complete=true"]) == 1
+    lines = [line.removeprefix("ipe-bench: gone: ") for line in capsys.readouterr().err.splitlines() if "gone:" in line]
+    at = [(line.split(",")[0], line.split(": ")[1]) for line in lines]
+    assert sorted(at) == [
+        ("half", "the second has 100 of its 200 trials"),
+        ("it", "the second has no trials of it"),
+        ("lost", "the second has no trials of it"),
+        ("mute", "the second reports no covariance"),
+    ]
+    assert "error scale 7:" in next(line for line in lines if line.startswith("it"))
+    assert main([*words, "complete=true", "first=it", "second=new"]) == 1  # at scale 7
+    assert capsys.readouterr().err.count("gone:") == 1
+    assert main(["compare", words[2], words[1], "first=it", "complete=true"]) == 0
+
+
+def test_other_sources_of_the_bench_are_said(tmp_path, capsys):
+    """A stored side grows old: an estimator's own version is what is compared, that of the truths is not."""
+    a, b = store(tmp_path / "a"), store(tmp_path / "b")
+    assert main(["compare", str(a), str(b)]) == 0
+    assert "other sources" not in capsys.readouterr().err
+    for path in (a / "trials").glob("*.parquet"):
+        forge(path, lambda _, footer: footer["versions"].update(ipe_bench="0.2.0"))
+    assert main(["compare", str(a), str(b)]) == 0
+    assert f"other sources: ipe_bench 0.2.0 | {ib.__version__};" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("words", "remedy"),
     [
@@ -165,6 +292,9 @@ def test_costs_are_judged_by_their_means_alone(tmp_path):
         (["{a}", "{b}", "first=it", "first=it"], "stands there twice"),
         (["{a}", "{b}", "anytime=1"], "true or false"),
         (["{a}", "{b}", "fail_on=time"], "there is no such quantity"),
+        (["{a}", "{b}", "margin.time=1"], "there is no such key"),
+        (["{a}", "{b}", "margin.cost=-1"], "margin.cost=-1.0: give a number from 0 on"),
+        (["{a}", "{b}", "fail_on=cost", "power=0.9", "difference=0.05"], "power: is that of success"),
         (["{a}", "{b}", "first=nobody"], "there is no such estimator"),
         (["{a}", "{other}"], "no estimator is in both"),
         (["{a}", "{model}"], "no scenario in common"),
@@ -268,3 +398,24 @@ def test_what_cannot_be_planned_is_refused_in_a_line(tmp_path, capsys, wrong, sa
     error = capsys.readouterr().err
     assert said in error
     assert error.count("\n") == 1
+
+
+def test_a_guard_runs_the_estimators_in_plugins_and_fails_where_the_workflow_says(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    discovery.sources.cache_clear()
+    assert main(["new", "ci"]) == 2
+    assert "plugins/ has no estimator to guard" in capsys.readouterr().err
+    assert main(["new", "baseline", "guarded_fit"]) == 0
+    discovery.sources.cache_clear()
+    assert main(["new", "ci"]) == 0
+    steps = yaml.safe_load(Path(".github/workflows/estimator.yml").read_text())["jobs"]["compare"]["steps"]
+    assert f"pip install ipe-bench=={ib.__version__}" in steps[3]["run"]
+    assert "estimator-change" in steps[4]["continue-on-error"]
+    run = ["run", "--config-dir", "ci", "+experiment=guard", "figures=none", "trials=20"]
+    assert [main([*run, f"output={side}"]) for side in ("base", "head")] == [0, 0]
+    (compared,) = re.findall("ipe-bench (compare .*?) 2>&1", steps[4]["run"])
+    assert main(compared.replace("results/", "").split()) == 0
+    assert capsys.readouterr().out.count("guarded_fit; 20 trials") == 3
+    assert main(["new", "ci"]) == 2
+    assert "is there already" in capsys.readouterr().err
+    discovery.sources.cache_clear()
