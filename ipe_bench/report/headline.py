@@ -9,8 +9,8 @@ import numpy as np
 import pandas as pd
 
 from ipe_bench.report.figures.views import family_of
-from ipe_bench.report.table import environment
-from ipe_bench.report.words import enumerate_few, short, value_text
+from ipe_bench.report.table import Table, environment, texts, words
+from ipe_bench.report.words import brief, duration, enumerate_few, short, value_text
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.certified import certified_averages, certified_table, published_table
 from ipe_bench.statistics.records import ALL, BEST
@@ -33,15 +33,61 @@ Fact = tuple[str, dict[str, Any]]
 
 def headline(analysis: Analysis) -> list[str]:
     """Says who solves most certified problems and, in trials, who agrees, is honest, breaks where, at what cost."""
+    return [sentence for _, sentence in _worded(analysis)]
+
+
+def _worded(analysis: Analysis) -> list[tuple[str, str]]:
+    """Returns the kind of each fact with its sentence."""
     module: Any = environment().overlay(autoescape=False).get_template("headline.j2").module
-    found = (" ".join(getattr(module, name)(**values).split()) for name, values in facts(analysis))
+    found = ((name, " ".join(getattr(module, name)(**values).split())) for name, values in facts(analysis))
     # A number and its sign stay on one line.
-    return [sentence.replace(" %", "\u00a0%") for sentence in found]
+    return [(name, sentence.replace(" %", "\u00a0%")) for name, sentence in found]
+
+
+def box(analysis: Analysis) -> tuple[list[str], Table | None]:
+    """Returns what opens a page: the sentences, or for a sweep some of them, and a row per estimator."""
+    said, rows = _worded(analysis), _totals(analysis)
+    if not {"honesty", "reach", "costs"} <= {name for name, _ in said}:
+        return [sentence for _, sentence in said], None
+    kept = [sentence for name, sentence in said if name not in ("honesty", "reach", "costs")]
+    return kept, _limits(rows[(rows["noise"] != "certified") & (rows["noise"] != "model")])
+
+
+def _limits(rows: pd.DataFrame) -> Table:
+    """Returns up to which error scale the claims and the success of each estimator hold, and what a trial costs."""
+    (_, claims), (_, success) = *honesty(rows), *reach(rows)
+    ends = rows.groupby("estimator", sort=False)["error_scale"]
+    undecided = [label for _, pairs in success["open"] for label, _ in pairs]
+
+    def until(first: Mapping[str, float], label: str, open_at: Sequence[str]) -> str:
+        if label in first:
+            before = [scale for scale in ends.get_group(label) if scale < first[label]]
+            return value_text(max(before)) if before else "none"
+        return "undecided" if label in open_at else value_text(ends.max()[label])
+
+    scale, listed = _costs(rows, sorted(rows["error_scale"].unique()))[1]["scales"][0]
+    cost = {label: f"{brief(each)} ({duration(time, 2)})" for label, each, time in listed}
+    broken, wrong = ({one: at for at, each in fact["first"] for one, _ in each} for fact in (success, claims))
+    labels = sorted(map(str, ends.groups), key=lambda one: (-broken.get(one, np.inf), -wrong.get(one, np.inf)))
+    claimed = {*claims["never"], *claims["undecided"], *(one for _, pairs in claims["first"] for one, _ in pairs)}
+    columns = [
+        words("estimator", labels),
+        texts(
+            "honest up to scale", [until(wrong, one, claims["undecided"]) if one in claimed else "-" for one in labels]
+        ),
+        texts(f"holds {100 * BROKEN:.0f} % up to scale", [until(broken, one, undecided) for one in labels]),
+        texts(f"median cost (time) at {value_text(scale)}", [cost.get(one, "-") for one in labels]),
+    ]
+    return Table("limits", "", "", columns)
+
+
+def _totals(analysis: Analysis) -> pd.DataFrame:
+    return analysis.summary[analysis.summary["parameter"] == ALL].reset_index(drop=True)
 
 
 def facts(analysis: Analysis) -> list[Fact]:
     """Returns the findings of the rules: at least one fact, if only that no trial is stored."""
-    rows = analysis.summary[analysis.summary["parameter"] == ALL].reset_index(drop=True)
+    rows = _totals(analysis)
     if rows.empty:
         return [("nothing", {})]
     # Both have a row per scenario and estimator, in the same order.

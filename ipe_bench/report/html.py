@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from ipe_bench import __version__
-from ipe_bench.report.headline import about, headline
+from ipe_bench.report.headline import about, box
 from ipe_bench.report.table import Table
 from ipe_bench.report.words import public
 from ipe_bench.report.writer import digests, rendered
@@ -36,6 +36,7 @@ def render_page(
     tables = [table for table in tables if not table.appendix]
     nothing_failed = analysis.endings.empty and not analysis.summary.empty
     complete = f"{collection.complete} of {collection.expected} expected cells (a scenario under an estimator) complete"
+    sentences, table = box(analysis)
     sections = [
         *([("figures", "Figures")] if len(figures) > 1 else ()),
         *([("tables", "Tables")] if len(tables) > 1 or nothing_failed else ()),
@@ -57,7 +58,8 @@ def render_page(
         ],
         sources=[(public(folder), digest) for folder, digest in digests(collection.directories)],
         about=about(analysis),
-        headline=headline(analysis),
+        headline=sentences,
+        box=table,
         problems=[*collection.problems, *collection.stale],
         title=", ".join(d.resolve().name or str(d) for d in collection.directories),
         commands=list(commands)[:MOST_COMMANDS],

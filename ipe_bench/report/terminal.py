@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from ipe_bench.report.table import Cell, Column, Part, Table, column, interval, sort_key, words
-from ipe_bench.report.words import brief, duration, p_value, percent, short, value_text
+from ipe_bench.report.words import brief, duration, ends_in_percent, p_value, percent, short, value_text
 from ipe_bench.statistics.formulas import CAP
 from ipe_bench.statistics.records import ALL, BEST, SCORES, Kind, Statistic, Where
 from ipe_bench.statistics.registry import all_statistics, summary_columns
@@ -17,21 +17,12 @@ _MOST_ROWS = 60
 """Rows that a terminal shows: about two screens."""
 _WIDE_ENOUGH = 100
 """Letters of a screen that has room for failures, and for verdicts in words."""
-_SUCCESS = (
-    "success is the percentage of all trials, with its 95 % interval; bold marks estimators that may be the best where"
-    " others are beaten: no rival succeeds significantly more often. failed (on wide screens) gives known / silent"
-    " failures: the status or the test of fit reports a known one."
+_LEGEND = (
+    "success: % of all trials (95 % interval; bold may be the best){failed}; error: median / 95 % quantile over"
+    " {reference}; efficiency and NEES: 1 is right{sign}; cost: simulations. More: `ipe-bench list statistic`."
 )
-_CAPPED = f"efficiency is the reciprocal of its root mean square, where a trial counts as at most {CAP:g}."
-_ERROR = (
-    "error is the median / 95 % quantile over all trials, in multiples of the bound at the truth; 1 is the best"
-    f" possible. {_CAPPED}"
-)
-_NEES = (
-    "NEES is the median of the squared error over the variance that the estimator claims; 1 is right. The word or sign"
-    " is the verdict on the converged trials: optimistic (+) claims too small a variance, pessimistic (-) too large a"
-    " one, diverged (!) is lost without reporting it. cost counts simulations."
-)
+_FAILED = "; failed: known / silent"
+_SIGN = ", + optimistic, - pessimistic, ! diverged"
 _TOLD = (
     "With noise=unknown every estimator here is given R, that of the true levels at the nominal readings; bounds and"
     " success are those of parameters that are estimated together with the levels."
@@ -43,18 +34,13 @@ TRACKED = (
     " have bounds of their own. Cost counts evaluations of transition and reading."
 )
 """References of a track's errors."""
-_TRACKED_ERROR = (
-    "error is the median / 95 % quantile over all trials, in multiples of that of the filter linearised at the true"
-    f" path; about 1 is good. {_CAPPED}"
-)
 
 
-def overview_notes(noises: Collection[str]) -> tuple[str, ...]:
+def overview_notes(noises: Collection[str], *, narrow: bool = False) -> tuple[str, ...]:
     """Explains the columns of the overview, and what estimators assume about these noises."""
-    error = _TRACKED_ERROR if set(noises) == {"model"} else _ERROR
-    added = (words for noise, words in (("unknown", _TOLD), ("model", TRACKED)) if noise in noises)
-    nees = _NEES.removesuffix(" cost counts simulations.") if error is _TRACKED_ERROR else _NEES
-    return (_SUCCESS, error, nees, *added)
+    reference = "the linearised filter" if set(noises) == {"model"} else "the bound"
+    legend = _LEGEND.format(failed="" if narrow else _FAILED, reference=reference, sign=_SIGN if narrow else "")
+    return (legend, *(words for noise, words in (("unknown", _TOLD), ("model", TRACKED)) if noise in noises))
 
 
 _VERDICTS = {"consistent": ("", ""), "optimistic": ("optimistic", "+"), "pessimistic": ("pessimistic", "-")}
@@ -76,7 +62,9 @@ def summary_tables(listed: Sequence[Mapping[str, Any]], totals: Sequence[Table],
     kept = {title: part for title, part in _shortened(settings).items() if part}
     tables = [_setting(title, part, width) for title, part in kept.items()]
     if tables:
-        tables[-1] = replace(tables[-1], notes=overview_notes({row["noise"] for row in rows}))
+        tables[-1] = replace(
+            tables[-1], notes=overview_notes({row["noise"] for row in rows}, narrow=width < _WIDE_ENOUGH)
+        )
     further = len(rows) - sum(map(len, kept.values()))
     left_out = f"{further} of {len(rows)} rows are left out here; summary.csv and report.html have all."
     return [*totals, *tables, *([left_out] if further else [])] or ["no trial is stored yet"]
@@ -127,7 +115,7 @@ def overview_columns(rows: Sequence[Mapping[str, Any]], best: Sequence[bool], *,
         return percent(share).removesuffix(" %")
 
     def success(row: Mapping[str, Any]) -> str:
-        return f"{points(row['success'])} ({100 * row['success_low']:.0f}-{100 * row['success_high']:.0f})"
+        return f"{points(row['success'])} ({'-'.join(ends_in_percent(row['success_low'], row['success_high']))})"
 
     def efficiency(row: Mapping[str, Any]) -> str:
         # Where half of the trials are capped, it is a limit and no value.
@@ -147,8 +135,8 @@ def overview_columns(rows: Sequence[Mapping[str, Any]], best: Sequence[bool], *,
         cells("error", "error_median", lambda r: f"{brief(r['error_median'])}{slash}{brief(r['error_q95'])}"),
         cells("eff." if narrow else "efficiency", "efficiency_capped", efficiency),
         cells("NEES", "nees_median", nees),
-        cells("cost", "simulations_median", lambda r: brief(r["simulations_median"])),
-        cells("time", "time_median_s", lambda r: duration(r["time_median_s"], 2)),
+        cells("median cost", "simulations_median", lambda r: brief(r["simulations_median"])),
+        cells("median time", "time_median_s", lambda r: duration(r["time_median_s"], 2)),
     ]
 
 

@@ -45,6 +45,13 @@ def percent(share: float) -> str:
     return f"{value:.0f} %" if value in (0, 100) else f"{value:.1f} %"
 
 
+def ends_in_percent(low: float, high: float) -> tuple[str, str]:
+    """Formats the ends of an interval of a share, with a decimal more for each tenth of its width below 2 per cent."""
+    figures = max(0, math.ceil(math.log10(0.02 / (high - low)))) if low < high else 0
+    low_text, high_text = (f"{100 * end:.{0 if end in (0, 1) else figures}f}" for end in (low, high))
+    return low_text, high_text
+
+
 def short(value: float) -> str:
     """Formats about four figures."""
     if not math.isfinite(value):

@@ -118,6 +118,7 @@ def write_files(folder: Path, name: str, page: Page, table: tuple[str, pd.DataFr
         "commands": [public(asked)] if (asked := COMMAND.get()) else [],
         "sources": [(public(file), digest) for file, digest in page.sources],
         "headline": page.answer,
+        "box": None,
         "tables": tables,
         "rest": rest,
         "sections": [("details", "Details")] * bool(rest or figures[1:]) + [("cite", "How to cite")],

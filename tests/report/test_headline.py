@@ -25,7 +25,7 @@ from ipe_bench.cli.words import read
 from ipe_bench.measurements import Recorded
 from ipe_bench.noise import Certified
 from ipe_bench.plugins import discovery
-from ipe_bench.report.headline import about, headline, honesty, in_common
+from ipe_bench.report.headline import about, box, headline, honesty, in_common
 from ipe_bench.report.tables import all_tables
 from ipe_bench.report.words import percent
 from ipe_bench.states import Smoother, ekf
@@ -61,6 +61,10 @@ def test_the_headline_says_who_agrees_who_is_honest_who_breaks_and_what_it_costs
     assert reach == "Success is surely below 90 % first at scale 100: filter (0 %). solver (100 %) holds to 100."
     assert silent == "Failures that look right: at most 25.0 % of the trials (filter at scale 100)."
     assert "at scale 10 solver 4 (1.0 ms), filter 187 (1.0 ms); at scale 100 solver 4" in costs
+    sentences, limits = box(analysis)
+    assert [s.replace("\u00a0", " ") for s in sentences] == [agree, silent]
+    cells = [[cell.text for cell in row] for row in limits.rows] if limits else []
+    assert cells == [["solver", "100", "100", "4 (1.0 ms)"], ["filter", "1", "10", "187 (1.0 ms)"]]
     (model,) = about(analysis)
     assert model.startswith("repeated: Each parameter read `repeats` times directly")
     assert "12 readings determine 3 parameters" in model

@@ -20,7 +20,7 @@ from shared.synthetic_store import Seeker, Synthetic
 from ipe_bench.api import report as write_report
 from ipe_bench.noise import Quantization
 from ipe_bench.report import figures
-from ipe_bench.report.headline import about, headline
+from ipe_bench.report.headline import about, box
 from ipe_bench.report.html import DEFINITIONS, render_page
 from ipe_bench.report.table import Strong, Table, column, comma_separated, html, latex, markdown, terminal, texts, words
 from ipe_bench.report.tables import all_tables
@@ -64,7 +64,9 @@ def test_what_is_written_is_whole_and_the_page_stands_alone(result):
     assert led_to == {f"figures/{path.name}" for path in result.figures}
     assert "http" not in re.sub(r"base64,[^\"]*|http-equiv", "", page)
     analysis, shown = analyse([result.report.parent]), page.replace("&#39;", "'")
-    assert all(sentence in shown for sentence in (*headline(analysis), *about(analysis)))
+    sentences, limits = box(analysis)
+    assert all(sentence in shown for sentence in (*sentences, *about(analysis)))
+    assert (limits is None) != ('id="table-limits"' in shown)
 
 
 def test_survivors_are_shown_as_survivors(synthetic):
@@ -199,8 +201,11 @@ def test_what_a_terminal_has_no_room_for_is_named_with_its_file_or_goes_below():
     assert max(map(len, left + below)) <= 60
 
 
-def test_the_legend_says_at_what_a_trial_is_capped():
-    assert "where a trial counts as at most 5." in " ".join(overview_notes(["gaussian"]))
+def test_the_legend_is_two_lines_and_names_the_columns_that_are_there():
+    wide, narrow = overview_notes(["gaussian"])[0], overview_notes(["gaussian"], narrow=True)[0]
+    assert max(len(wide), len(narrow)) <= 240
+    assert ("failed:" in wide, "failed:" in narrow) == (True, False)
+    assert any("each trial counting at most 5" in one.definition for one in STATISTICS)
 
 
 def _luminance(color: str) -> float:
