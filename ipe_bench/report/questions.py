@@ -14,7 +14,7 @@ import pandas as pd
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.identifiability import structure
 from ipe_bench.report.table import Cell, Column, Part, Shown, Strong, Table, texts, words
-from ipe_bench.report.words import compact, duration, enumerate_few, p_value, percent, value_text
+from ipe_bench.report.words import compact, duration, enumerate_few, p_value, percent, scientific, value_text
 from ipe_bench.report.writer import Page, write_files
 from ipe_bench.statistics.audit import Audit
 from ipe_bench.statistics.between import NOT_SETTINGS, comparison_title
@@ -101,7 +101,7 @@ def _parameters(name: str, design: Design) -> Table:
     columns = [
         words("parameter", [p.name for p in parameters]),
         words("unit", [p.unit for p in parameters]),
-        texts("bound", [f"{bound * p.size:.3g}" for p, bound in zip(parameters, seen.bound, strict=True)]),
+        texts("bound", [scientific(bound * p.size) for p, bound in zip(parameters, seen.bound, strict=True)]),
         texts("with the others", [f"{r:.2f}" for r in seen.multiple_correlation]),
     ]
     if len(parameters) > 1:
@@ -303,7 +303,7 @@ def _joined(tables: Sequence[Table]) -> Table:
     for title in titles:
         found = [next((c for c in table.columns if c.title == title), None) for table in tables]
         cells = [c.cells if c else [Cell("")] * len(t) for c, t in zip(found, tables, strict=True)]
-        columns.append(Column(title, list(chain.from_iterable(cells)), title not in ("", "second is")))
+        columns.append(Column(title or "quantity", list(chain.from_iterable(cells)), title not in ("", "second is")))
     notes = [note for table in tables for note in table.notes]
     return Table("comparison", "Trial by trial", "", columns, notes=notes, grouped=1)
 

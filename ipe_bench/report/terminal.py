@@ -19,7 +19,7 @@ _WIDE_ENOUGH = 100
 """Letters of a screen that has room for failures, and for verdicts in words."""
 _LEGEND = (
     "success: % of all trials (95 % interval; bold may be the best){failed}; error: median / 95 % quantile over"
-    " {reference}; efficiency and NEES: 1 is right{sign}; cost: simulations. More: `ipe-bench list statistic`."
+    " {reference}; efficiency and NEES: 1 is right{sign}; cost: simulations. More: ipe-bench list statistic."
 )
 _FAILED = "; failed: known / silent"
 _SIGN = ", + optimistic, - pessimistic, ! diverged"

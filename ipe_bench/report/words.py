@@ -65,6 +65,12 @@ def short(value: float) -> str:
     return f"{value:.3f}" if abs(value) < 10 else f"{value:.1f}"
 
 
+def scientific(value: float) -> str:
+    """Formats three figures, with an exponent below a thousandth."""
+    digits, _, power = (f"{value:.2e}" if 0 < abs(value) < 1e-3 else f"{value:.3g}").partition("e")
+    return f"{digits}e{int(power)}" if power else digits
+
+
 def brief(value: float) -> str:
     """Formats two decimals below ten, three figures above, in at most five characters."""
     if not math.isfinite(value):
