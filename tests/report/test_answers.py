@@ -48,6 +48,13 @@ def test_the_band_of_a_straight_line_is_the_textbooks_and_equal_residuals_are_dr
         assert np.ptp(ends) == pytest.approx(2 * half, rel=1e-4)
 
 
+def test_certified_readings_have_a_curve_over_their_input():
+    found = ib.estimate(ib.measurements.Nist("Misra1a"))
+    with house_style():
+        (fit,) = draw_fit(found.examination, found.z)
+    assert fit.figure.axes[0].get_xlabel() == "x"
+
+
 @pytest.mark.parametrize(
     ("low", "high", "ends"),
     [(0.9963, 1, ("99.6", "100")), (0, 0.0037, ("0", "0.4")), (0.93, 1, ("93", "100")), (1, 1, ("100", "100"))],

@@ -50,7 +50,9 @@ def draw_fit(found: Examination, z: Array) -> Iterator[Drawing]:
     """Draws readings z (m,) with the fitted curve and its band, if one numeric column alone tells readings apart."""
     model = found.whole.measurement
     columns = {**model.index, **model.input_columns}
-    varying = {name: column for name, column in columns.items() if name != "row" and len(set(column)) > 1}
+    varying = {name: column for name, column in columns.items() if len(set(column)) > 1}
+    running = list(range(1, model.m + 1))  # a number of the row says nothing beside an input
+    varying = {name: column for name, column in varying.items() if list(column) != running} or varying
     name, column = next(iter(varying.items()), ("", ()))
     x = np.asarray(column)
     if len(varying) != 1 or not np.issubdtype(x.dtype, np.number):
