@@ -96,8 +96,8 @@ def epoch_curves(s: Sample) -> Iterator[dict[str, Any]]:
     if not len(times):
         return
     K, n = len(times), s.n
-    own = sum(_sums(s, s.group.cells, K), np.zeros((K, 2 * n + 4)))
-    truths = _sums(s, [truth for truth in s.group.truths if truth is not None], K)
+    own = sum(_sums(s, s.group.cells, K, 2 * n + 4), np.zeros((K, 2 * n + 4)))
+    truths = _sums(s, [truth for truth in s.group.truths if truth is not None], K, 2 * n)
     errors, nees, total, count = own[:, :n], own[:, n], own[:, n + 3 : -1], own[:, -1]
     posterior = next((block for block in truths if np.isfinite(block).all()), np.full((K, 2 * n), np.nan))
     with np.errstate(all="ignore"):
@@ -119,9 +119,9 @@ def epoch_curves(s: Sample) -> Iterator[dict[str, Any]]:
             }
 
 
-def _sums(s: Sample, cells: Sequence[StoredCell], epochs: int) -> list[Array]:
+def _sums(s: Sample, cells: Sequence[StoredCell], epochs: int, columns: int) -> list[Array]:
     """Reads the sums (K, columns) of each stored block."""
     from ipe_bench.trials.tracking import unpacked  # late: it knows every tracker
 
     stored = (s.collection.load(cell, (), ("curves",)).get("curves", np.empty(0)) for cell in cells)
-    return [block for texts in stored for block in unpacked(texts, epochs)]
+    return [block for texts in stored for block in unpacked(texts, epochs, columns)]

@@ -309,7 +309,8 @@ def packed(trials: int, sums: Sequence[Array]) -> Array:
     return np.array([text, *[""] * (trials - 1)], dtype=object)[:trials]
 
 
-def unpacked(texts: Array, epochs: int) -> Array:
-    """The sums (blocks, K, columns) that `packed` wrote."""
-    found = [np.frombuffer(base64.b64decode(text), "<f8").reshape(epochs, -1) for text in texts if text]
-    return np.array(found).reshape(len(found), epochs, -1)
+def unpacked(texts: Array, epochs: int, columns: int) -> Array:
+    """The sums (blocks, K, columns) that `packed` wrote, without those of versions that kept other columns."""
+    found = [np.frombuffer(base64.b64decode(text), "<f8") for text in texts if text]
+    kept = [numbers for numbers in found if len(numbers) == epochs * columns]
+    return np.array(kept).reshape(len(kept), epochs, columns)

@@ -18,7 +18,7 @@ from ipe_bench.states.algebra import root
 from ipe_bench.statistics import analyse
 from ipe_bench.statistics.certified import published_table
 from ipe_bench.statistics.collect import collect
-from ipe_bench.trials.tracking import PathBlock, StateScenario
+from ipe_bench.trials.tracking import PathBlock, StateScenario, packed, unpacked
 from ipe_bench.trials.whiteness import white_p
 
 LINEAR = ConstantVelocity(count=30, spread=3.0)
@@ -51,6 +51,13 @@ def test_a_run_says_what_direct_computation_says(tmp_path):
     assert row(table, "ekf")["path_nis"] == pytest.approx(tracks.nis.mean(), rel=1e-12)
     assert row(table, "ekf")["log_likelihood"] == pytest.approx(tracks.log_likelihood.mean(), rel=1e-12)
     assert np.isnan(row(table, "rts")["path_nis"])
+
+
+def test_sums_that_another_version_stored_are_left_out():
+    own, older = np.arange(20.0).reshape(4, 5), np.arange(12.0).reshape(4, 3)
+    texts = np.concatenate([packed(3, [own[:, :2], own[:, 2:]]), packed(2, [older])])
+    np.testing.assert_array_equal(unpacked(texts, 4, 5), [own])
+    assert unpacked(texts, 4, 2).shape == (0, 4, 2)
 
 
 def test_the_mean_nis_of_several_readings_an_epoch_is_that_of_one():
