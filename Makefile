@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: run test slow cluster campaigns plugins lowest newest mutants lint dist bench docs clean
+.PHONY: run test slow cluster campaigns plugins lowest newest mutants lint dist bench docs gallery clean
 
 # Draws README's figure too: cp outputs/headline/figures/headline.png .assets
 run: .venv/ready
@@ -64,11 +64,15 @@ bench: .venv/ready
 	$(if $(PEERS),$(BIN)/uv pip install --quiet --python $(BIN)/python --editable ".[peers]")
 	IPE_BENCH_THREADS=1 OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/table.py outputs/bench $(PARTS)
 
-# The documentation, with every experiment executed, in outputs/docs/html, in minutes. TRIALS=1000 gives the gallery all
-# the trials that experiments have by themselves.
+# The documentation, in outputs/docs/html. Its gallery shows what is stored of the experiments.
 docs: .venv/ready
 	$(BIN)/uv pip install --quiet --python $(BIN)/python --editable ".[docs]"
-	$(BIN)/python -m ipe_bench.report.docs outputs/docs $(if $(TRIALS),--trials $(TRIALS))
+	$(BIN)/python -m ipe_bench.report.docs outputs/docs
+
+# Computes the gallery again and stores it with the pages, in the better part of an hour: all experiments with their own
+# trials, or NAMES="headline paper" of them. TRIALS=100 takes a tenth of them.
+gallery: .venv/ready
+	$(BIN)/python -m ipe_bench.report.docs outputs/docs --store $(NAMES) $(if $(TRIALS),--trials $(TRIALS))
 
 .venv/ready: pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' || \

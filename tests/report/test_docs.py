@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shlex
@@ -31,12 +32,18 @@ def ids(path: Path) -> str:
     return str(path.relative_to(PAGES))
 
 
+def nothing_new(option, folder, *_):
+    """Stands for an experiment of which nothing is stored."""
+    empty = {"command": "", "version": "", "trials": "", "html": "", "figures": [], "best": []}
+    (folder / f"{option.name}.json").write_text(json.dumps(empty))
+
+
 @pytest.fixture(scope="module")
 def generated(tmp_path_factory) -> Path:
     """The pages that nobody writes; of the gallery its list alone, as no experiment is run."""
     folder = tmp_path_factory.mktemp("generated")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pages, "_executed", lambda *_: [])
+        patch.setattr(pages, "store", nothing_new)
         pages.write_reference(folder / "reference")
         pages.write_gallery(folder / "gallery", folder, 1)
     return folder
@@ -47,6 +54,25 @@ def blocks(page: Path, language: str) -> list[str]:
 
 
 FILTERS = blocks(PAGES / "howto" / "write_filter.md", "python")
+
+
+STORED = sorted((PAGES.parent / "gallery").glob("*.json"))
+
+
+@pytest.mark.parametrize("path", STORED, ids=lambda path: path.stem)
+def test_what_is_stored_of_an_experiment_says_what_computed_it_and_shows_it_first(path):
+    found = json.loads(path.read_text(encoding="utf-8"))
+    assert path.stem in [option.name for option in discovery.options("experiment")]
+    assert found["command"].startswith(f"run +experiment={path.stem}")
+    assert re.fullmatch(r"\d+\.\d+\.\d+\S*", found["version"])
+    assert found["html"].index("<p>") < found["html"].index("<table")  # the answer, then the numbers
+    counts = {int(count.replace(",", "")) for count in found["trials"].split(" to ")}
+    assert min(counts) >= 100 or counts == {1}
+    pictures = [f"{path.stem}.png", *(f"{path.stem}_{one['name']}.png" for one in found["figures"])]
+    sizes = [(path.parent / name).stat().st_size for name in pictures]
+    assert max(sizes) < 100_000
+    assert path.stat().st_size < 100_000
+    assert not re.search(r"(/home|/root|/tmp|outputs)/", path.read_text(encoding="utf-8"))
 
 
 @pytest.mark.parametrize("page", WRITTEN, ids=ids)
@@ -129,7 +155,7 @@ def test_what_a_page_says_to_type_works(page, tmp_path):
 
 @pytest.mark.slow
 def test_the_whole_site_builds_without_a_warning_and_fetches_nothing(tmp_path):
-    """Every experiment, those among them that have no figures, and a line about each while it runs."""
+    """Every experiment, and a line about each that runs since nothing is stored of it."""
     pytest.importorskip("pydata_sphinx_theme")
     # In a process of its own, as a user builds it: what its libraries will do away with is no error of ours.
     command = [sys.executable, "-m", "ipe_bench.report.docs", str(tmp_path), "--trials=1"]
@@ -141,9 +167,11 @@ def test_the_whole_site_builds_without_a_warning_and_fetches_nothing(tmp_path):
     assert 'href="gallery/ranging.html"' in (html / "choosing.html").read_text(encoding="utf-8")
     assert "100 trials per row" in (html / "howto" / "notebook.html").read_text(encoding="utf-8")
     for name in ours:
-        assert f" of {len(ours)}: {name}, at " in done.stdout
+        ran = f"{name}: nothing is stored of it; it runs now" in done.stdout
+        assert ran == (not (PAGES.parent / "gallery" / f"{name}.json").exists())
         page = (html / "gallery" / f"{name}.html").read_text(encoding="utf-8")
         assert f"experiment={name}" in re.sub("<[^>]*>", "", page)  # without the marks of colours
-        assert ("<img" in page) == any((tmp_path / "results" / name).glob("figures/*.png"))
+        assert "<table" in page
+        assert str(tmp_path) not in page
     fetched = r"""<(?:script|img|iframe|link(?=[^>]*stylesheet))[^>]*(?:src|href)=["']?(?:https?:)?//"""
     assert [page for page in html.rglob("*.html") if re.search(fetched, page.read_text(encoding="utf-8"))] == []

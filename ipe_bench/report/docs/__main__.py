@@ -1,5 +1,5 @@
 """`python -m ipe_bench.report.docs [OUTPUT] [--trials N]`: builds the site by Sphinx, of written pages, of what the
-program says of itself, and of what its experiments print and draw."""
+program says of itself, and of what is stored of its experiments, which `--store` computes."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ import shlex
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import version
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -27,9 +26,15 @@ from ipe_bench.basics.files import make_folder, write_text
 from ipe_bench.basics.statuses import Status
 from ipe_bench.plugins.construct import described
 from ipe_bench.plugins.discovery import CONTRACTS, PACKAGES, Option, options
-from ipe_bench.report.figures import INDEX
-from ipe_bench.report.table import environment
-from ipe_bench.report.words import brief, duration, enumerate_few, percent
+from ipe_bench.report.figures import common, drawings
+from ipe_bench.report.figures.views import views
+from ipe_bench.report.headline import headline
+from ipe_bench.report.sections import report_tables
+from ipe_bench.report.style import house_style
+from ipe_bench.report.table import environment, html
+from ipe_bench.report.tables import certified_tables
+from ipe_bench.report.words import brief, enumerate_few, percent
+from ipe_bench.statistics.analysis import Analysis, analyse
 from ipe_bench.statistics.records import ALL, MAIN, STATISTICS
 
 SETTINGS = {
@@ -68,16 +73,14 @@ GROUPS = {
     "execution": "Executions",
 }
 CLASSES = {place for places in CONTRACTS.values() for place in places}
-FIGURES = 8
-"""Largest number of an experiment's pictures on its page."""
+TABLES = 2
+"""Tables on the page of an experiment: who does best, and what it costs."""
 ORDINARY, LEAST = 1000, 3
 """Trials of an ordinary experiment, and the least number that a costly one is cut to."""
-_PARTS = {
-    "beyond": ["error_scale=300,1000,3000"],
-    "headline": ["trials=40"],
-    "nist": ["measurement.start=2"],
-}
-"""Reduced settings of experiments that take minutes, and the trials of the picture on the first page."""
+_PARTS = {"beyond": ["error_scale=300,1000,3000"], "nist": ["measurement.start=2"]}
+"""Reduced settings of experiments that take minutes, where nothing is stored of them."""
+_FIGURES = {"paper": ("figure_2", "figure_3")}
+"""The figures of an experiment's page, where they are not the first."""
 
 
 def build(output: Path, trials: int) -> int:
@@ -142,39 +145,85 @@ def write_reference(folder: Path) -> None:
 
 
 def write_gallery(folder: Path, results: Path, trials: int) -> None:
-    """Writes a page per experiment, their list, and a table of the best estimators by model; `trials` replaces the
-    default of 1000."""
-    chosen, found, began = _ours("experiment"), {}, time.perf_counter()
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        running = {pool.submit(_executed, option, folder, results / option.name, trials): option for option in chosen}
-        for number, done in enumerate(as_completed(running), 1):
-            name, at = running[done].name, duration(time.perf_counter() - began, 2)
-            found[name] = done.result()
-            print(f"experiment {number} of {len(chosen)}: {name}, at {at}", flush=True)
+    """Writes a page per experiment, their list, and a table of the best estimators by model, of what is stored; of an
+    experiment of which nothing is stored, `trials` replaces the default of 1000."""
+    chosen, found = _ours("experiment"), {}
+    make_folder(pictures := folder / "pictures")
+    for option in chosen:
+        with as_file(files("ipe_bench.report.docs") / "gallery") as stored:
+            for path in stored.glob(f"{option.name}*"):
+                shutil.copyfile(path, pictures / path.name)
+        if not (pictures / f"{option.name}.json").exists():
+            print(f"{option.name}: nothing is stored of it; it runs now, with few trials ...", flush=True)
+            store(option, pictures, results / option.name, trials, _PARTS.get(option.name, ()))
+        found[option.name] = json.loads((pictures / f"{option.name}.json").read_text(encoding="utf-8"))
+        write_page(folder / f"{option.name}.md", "experiment", option=option, **found[option.name])
     write_page(folder / "index.md", "gallery", experiments=[(option, found[option.name]) for option in chosen])
-    summaries = {option.name: results / option.name / "summary.csv" for option in chosen}
-    rows = [row for name, path in summaries.items() if path.exists() for row in _best(name, pd.read_csv(path))]
-    write_page(folder / "best.inc", "best", rows=rows)
+    write_page(folder / "best.inc", "best", rows=[row for one in found.values() for row in one["best"]])
 
 
-def _executed(option: Option, folder: Path, results: Path, trials: int) -> list[dict[str, str]]:
-    """Runs one experiment, writes its page, and returns the figures that the page shows."""
-    command = ["run", f"+experiment={option.name}", *_PARTS.get(option.name, ())]
+def store(option: Option, folder: Path, results: Path, trials: int, part: Sequence[str] = ()) -> None:
+    """Runs an experiment, or a part of it, and writes what the gallery shows: NAME.json, its pictures, a small one."""
+    name, command = option.name, ["run", f"+experiment={option.name}", *part]
     own = (option.config or {}).get("trials", ORDINARY)
     number = min(own, max(round(own * trials / ORDINARY), min(trials, LEAST)))
-    if number != own and not any(word.startswith("trials=") for word in command):
+    if number != own and not any(word.startswith("trials=") for word in part):
         command.append(f"trials={number}")
-    whole = printed_by([*command, "execution=serial", f"output={results.resolve()}"])
-    printed = whole.partition("\nSummary ")[0].strip()  # the paths at its end are of no use to a reader
-    index = results / "figures" / INDEX  # there is none without figures
-    figures = json.loads(index.read_text(encoding="utf-8"))[:FIGURES] if index.exists() else []
-    make_folder(folder / "pictures")
-    for figure in figures:
-        picture = results / "figures" / f"{figure['name']}.png"
-        shutil.copyfile(picture, folder / "pictures" / f"{option.name}_{figure['name']}.png")
-    text = {"command": shlex.join(command), "printed": printed, "figures": figures}
-    write_page(folder / f"{option.name}.md", "experiment", option=option, **text)
-    return figures
+    try:
+        printed_by([*command, "execution=serial", "figures=none", f"output={results}"])
+    except UserError as error:  # such as a data set of many that one of the estimators cannot begin with
+        if not (results / "summary.csv").exists():
+            raise
+        print(f"{name}: {str(error).strip().splitlines()[-1]}", flush=True)
+    analysis = analyse([results])
+    tables = [table for table in report_tables(analysis) if not table.appendix][:TABLES]
+    with house_style():
+        drawn = {drawing.name: drawing for drawing in drawings(analysis, "all")}
+        figures = [drawn[one] for one in _FIGURES.get(name, list(drawn)[:1])]
+        for file, figure in (*((f"{name}_{one.name}", one.figure) for one in figures), (name, _small(analysis))):
+            save_small(figure, folder / f"{file}.png")
+    counts = sorted(set(analysis.summary["trials"]))
+    text = {
+        "command": shlex.join(command),
+        "version": version("ipe-bench"),
+        "trials": " to ".join(dict.fromkeys(f"{count:,}" for count in (counts[0], counts[-1]))),
+        "html": html([*headline(analysis), *tables]).strip(),
+        "figures": [{"name": one.name, "title": one.title, "caption": one.caption} for one in figures],
+        "best": list(_best(name, analysis.summary)),
+    }
+    write_text(folder / f"{name}.json", json.dumps(text, indent=1, ensure_ascii=False) + "\n")
+
+
+def save_small(figure: Any, path: Path) -> None:
+    """Saves a figure as a PNG of at most 64 colours, a quarter of the size."""
+    from PIL import Image
+
+    figure.savefig(path, dpi=150)
+    with Image.open(path) as picture:
+        few = picture.convert("RGB").quantize(64)
+    few.save(path, optimize=True)
+
+
+def _small(analysis: Analysis) -> Any:
+    """Draws one legible panel: success over the error scale, or a bar for each estimator."""
+    parts, _ = views(analysis)
+    if parts and len(parts[0].scales) > 1:
+        view = parts[0]
+        fig, (ax,) = common.panels(1, view.look, height=2.4)
+        common.curves(ax, view.totals, "success", view.look, view.scales, trials="trials")
+        common.shares(ax)
+        ax.set_ylabel("success")
+        common.legend(fig, [ax], view.look)
+        return fig
+    rows: Any = analysis.summary[analysis.summary["parameter"] == ALL]
+    column = "success"
+    for table in certified_tables(analysis.collection)[:1]:
+        rows, column = table.data, "mean_lre_parameters" if table.name == "certified_averages" else "found"
+    means = rows.groupby("estimator")[column].mean().sort_values()
+    fig, (ax,) = common.panels(1, height=0.6 + 0.2 * len(means))
+    ax.barh(list(means.index), means)
+    ax.set_xlabel({"success": "success", "found": "root mean square error"}.get(column, "correct digits, mean"))
+    return fig
 
 
 def _best(experiment: str, summary: pd.DataFrame) -> Iterator[tuple[str, ...]]:
@@ -193,9 +242,24 @@ def _best(experiment: str, summary: pd.DataFrame) -> Iterator[tuple[str, ...]]:
         yield link, f"{scale:g}", enumerate_few(list(best["estimator"]), 5), share, cost
 
 
+def store_all(results: Path, trials: int, names: Sequence[str]) -> int:
+    """Computes what the gallery shows of these experiments, or of all, and stores it with the documentation's pages."""
+    make_folder(folder := Path(str(files("ipe_bench.report.docs"))) / "gallery")
+    for option in _ours("experiment"):
+        if not names or option.name in names:
+            print(f"{option.name} ...", flush=True)
+            store(option, folder, results / option.name, trials)
+    return 0
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("output", nargs="?", default="outputs/docs", type=Path)
-    parser.add_argument("--trials", type=int, default=10, help="of an experiment that has 1000 by itself")
-    arguments = parser.parse_args()
-    sys.exit(build(arguments.output, arguments.trials))
+    parser.add_argument("--trials", type=int, help="of an experiment that has 1000 by itself")
+    parser.add_argument(
+        "--store", nargs="*", metavar="NAME", help="compute the gallery of these experiments, or of all"
+    )
+    given = parser.parse_args()
+    if given.store is not None:
+        sys.exit(store_all(given.output / "results", given.trials or ORDINARY, given.store))
+    sys.exit(build(given.output, given.trials or 10))
