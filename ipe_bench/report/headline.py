@@ -260,7 +260,8 @@ def _costs(rows: pd.DataFrame, scales: Sequence[float]) -> Fact:
         part = part.sort_values("simulations_median", kind="stable")
         listed = part[["estimator", "simulations_median", "time_median_s"]].itertuples(index=False, name=None)
         found.append((scale, list(listed)))
-    return "costs", {"scales": found}
+    unit = "evaluations" if (rows["noise"] == "model").all() else "simulations"
+    return "costs", {"scales": found, "unit": unit}
 
 
 def _ranking(rows: pd.DataFrame, kind: str) -> Iterator[Fact]:

@@ -69,13 +69,15 @@ class Half(NamedTuple):
     def over(self, B: Array) -> Array:
         """B G^- (..., r, n) for B (..., r, n)."""
         X = transposed(upper_solve(self.L, transposed(B)))
-        X[self.singular] = np.matmul(B[self.singular], self.inverse[self.singular])
+        if self.singular.any():
+            X[self.singular] = np.matmul(B[self.singular], self.inverse[self.singular])
         return X
 
     def whitened(self, B: Array) -> Array:
         """B G^-' (..., r, n) for B (..., r, n)."""
         X = transposed(lower_solve(self.L, transposed(B)))
-        X[self.singular] = np.matmul(B[self.singular], transposed(self.inverse[self.singular]))
+        if self.singular.any():
+            X[self.singular] = np.matmul(B[self.singular], transposed(self.inverse[self.singular]))
         return X
 
 
@@ -85,10 +87,11 @@ def half(P: Array) -> Half:
     L = factor(P)
     pivots, variances = np.diagonal(L, axis1=-2, axis2=-1) ** 2, np.diagonal(P, axis1=-2, axis2=-1)
     singular = np.asarray(~(pivots > _SMALL * variances).all(axis=-1))
+    if not singular.any():
+        return Half(L, L, L, singular)  # G^- is not asked for
     G, inverse = L.copy(), np.zeros(P.shape)
-    if singular.any():
-        L[singular] = np.nan
-        G[singular], inverse[singular] = _by_eigenvalues(P[singular])
+    L[singular] = np.nan
+    G[singular], inverse[singular] = _by_eigenvalues(P[singular])
     return Half(G, L, inverse, singular)
 
 

@@ -16,11 +16,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, multiply
 from ipe_bench.basics.options import Component, Count, Finite, Positive
 from ipe_bench.measurements.base import differentiate
 from ipe_bench.states.algebra import half, symmetric, transposed
 
+_MOST_POINTS = 100_000
+"""Points of a product rule at most."""
 Function = Callable[[Array], Array]
 Nearest = Callable[[Array, Array], Array]
 
@@ -132,6 +135,8 @@ class GaussHermite(SigmaPoints):
 
     def points(self, n: int) -> tuple[Array, Array]:
         s, w = self._line
+        if self.order**n > _MOST_POINTS:
+            raise UserError(f"order={self.order}: {self.order}^{n} points for {n} states; choose the rule Cubature")
         return np.array(list(product(s, repeat=n))), np.array([np.prod(c) for c in product(w, repeat=n)])
 
     @cached_property

@@ -223,6 +223,11 @@ class ExactLater(Linear):
         return (k != 2) * super().R(k)
 
 
+def test_a_product_rule_of_too_many_points_is_refused():
+    with pytest.raises(ib.UserError, match=r"order=3: 3\^22 points for 22 states; choose the rule Cubature"):
+        GaussHermite(3).points(22)
+
+
 def test_exact_readings_are_refused():
     with pytest.raises(ib.UserError, match="R of epoch 3 is singular; give every reading a standard deviation above 0"):
         StateScenario(ExactLater())
