@@ -47,10 +47,11 @@ def _worded(analysis: Analysis) -> list[tuple[str, str]]:
 def box(analysis: Analysis) -> tuple[list[str], Table | None]:
     """Returns what opens a page: the sentences, or for a sweep some of them, and a row per estimator."""
     said, rows = _worded(analysis), _totals(analysis)
-    if not {"honesty", "reach", "costs"} <= {name for name, _ in said}:
+    rows = rows[rows["noise"] != "certified"]
+    one_kind = len(set(rows["noise"] == "model")) == 1  # constants, or states that move
+    if not one_kind or not {"honesty", "reach", "costs"} <= {name for name, _ in said}:
         return [sentence for _, sentence in said], None
-    kept = [sentence for name, sentence in said if name not in ("honesty", "reach", "costs")]
-    return kept, _limits(rows[(rows["noise"] != "certified") & (rows["noise"] != "model")])
+    return [sentence for name, sentence in said if name not in ("honesty", "reach", "costs")], _limits(rows)
 
 
 def _limits(rows: pd.DataFrame) -> Table:

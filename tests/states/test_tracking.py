@@ -13,6 +13,7 @@ from shared.state_models import ConstantVelocity, CoordinatedTurn, Growth, Pendu
 import ipe_bench as ib
 from ipe_bench.plugins.construct import construct
 from ipe_bench.plugins.discovery import composed, options
+from ipe_bench.report.headline import box
 from ipe_bench.states import Bootstrap, Formulas, Smoother, Tracker, ckf, ekf, ukf
 from ipe_bench.states.algebra import root
 from ipe_bench.statistics import analyse
@@ -51,6 +52,18 @@ def test_a_run_says_what_direct_computation_says(tmp_path):
     assert row(table, "ekf")["path_nis"] == pytest.approx(tracks.nis.mean(), rel=1e-12)
     assert row(table, "ekf")["log_likelihood"] == pytest.approx(tracks.log_likelihood.mean(), rel=1e-12)
     assert np.isnan(row(table, "rts")["path_nis"])
+
+
+def test_a_sweep_of_states_opens_with_a_row_per_tracker(tmp_path):
+    for scale in (1.0, 10.0):
+        ib.run(StateScenario(LINEAR, error_scale=scale), {"ekf": ekf(), "ukf": ukf()}, 40, output=tmp_path)
+    _, limits = box(analyse([tmp_path]))
+    assert limits is not None
+    assert [[cell.text for cell in row][:3] for row in limits.rows] == [["ekf", "10", "10"], ["ukf", "10", "10"]]
+    ib.run(ib.Scenario(ib.measurements.Polynomial()), {"newton": ib.solvers.Newton()}, 5, output=tmp_path)
+    sentences, none = box(analyse([tmp_path]))
+    assert none is None
+    assert len(sentences) > 3
 
 
 def test_sums_that_another_version_stored_are_left_out():
