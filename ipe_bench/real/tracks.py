@@ -7,12 +7,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.special import chdtrc, ndtri
 
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array, deviations, unmasked
+from ipe_bench.basics.options import Finite, NonNegative, Positive, option_types
 from ipe_bench.real.readings import TextTable, read_tables
 from ipe_bench.states.base import StateModel
 from ipe_bench.states.formulas import Formulas, RecordedFormulas
@@ -26,7 +28,9 @@ from ipe_bench.trials.whiteness import white_p
 _SAME_TIME = 1e-3
 """Part of the shortest step by which a time of a log may differ from that of its epoch."""
 _KEYS = ("constants", "noise", "deviation")
-"""The numbers of a model that can be found; the latter two are positive, and found by their logarithms."""
+"""The numbers of a model by formulas that can be found; the latter two are positive, and found by their logarithms."""
+_POSITIVE = (Positive, NonNegative)
+"""Types of options of a model in Python that are found by their logarithms."""
 _FAR_BELOW = 10.0
 """By how much more than a tenth of the number of readings a log likelihood lies far below the largest of the log."""
 _COLLAPSED = 2.0
@@ -71,7 +75,7 @@ class Log:
 
 
 def _wanted(model: StateModel) -> list[str]:
-    return [*(model.inputs if isinstance(model, Formulas) else ()), *model.reading_names]
+    return [*model.log_inputs, *model.reading_names]
 
 
 def _read(table: TextTable, model: StateModel) -> Log:
@@ -92,10 +96,14 @@ def _read(table: TextTable, model: StateModel) -> Log:
 
     cells = {name: np.array([table.value(*cell) for cell in table.column(at)]) for name, at in columns.items()}
     z = np.stack([cells[name] for name in model.reading_names], axis=1)
-    if isinstance(model, Formulas):
-        for name in model.inputs:
-            refuse(np.isnan(cells[name]), name, "is empty; a known input has a value at each epoch")
-        model = replace(model, count=len(z), inputs={name: tuple(cells[name].tolist()) for name in model.inputs})
+    for name in model.log_inputs:
+        refuse(np.isnan(cells[name]), name, "is empty; a known input has a value at each epoch")
+    for fault in model.faults({name: cells[name] for name in wanted}):
+        refuse(fault.where, fault.column, fault.reason)
+    if "time" in model.log_inputs:
+        back = np.diff(cells["time"], prepend=-np.inf) <= 0
+        refuse(back, "time", "is not after that of the row before; give rows in the order of their times")
+    model = model.with_log(len(z), {name: cells[name] for name in model.log_inputs})
     if len(z) != model.epochs:
         raise table.error(f"has {len(z)} rows, and {model.name} {model.epochs} epochs; give a row for each of them")
     near = _SAME_TIME * (model.times[-1] - model.times[0]) / len(z)
@@ -219,13 +227,12 @@ def found_and_tracked(log: Log, label: str, tracker: Tracker, find: Sequence[str
         UserError: the model has no such constant, or the tracker has no likelihood that can be maximised.
     """
     model = log.model
-    if not isinstance(model, Formulas):
-        raise UserError(f"find: is for models by formulas; {model.name} is written in Python")
-    places = [_place(model, name) for name in find]
+    numbers = _numbers(model)
+    places = [_place(list(numbers), name) for name in find]
     if twice := next((name for name, place in zip(find, places, strict=True) if places.count(place) > 1), None):
         raise UserError(f"find={twice}: is named twice; name it once")
-    start = np.array([getattr(model, key)[name] for key, name in places])
-    positive = np.array([key != "constants" for key, _ in places])
+    start = np.array([numbers[place][0] for place in places])
+    positive = np.array([numbers[place][1] for place in places])
     if (positive & ~(start > 0)).any():
         raise UserError(f"find={find[int(np.argmax(positive & ~(start > 0)))]}: is 0; give a value above to start from")
     size = np.where(start == 0, 1.0, np.abs(start))
@@ -233,11 +240,11 @@ def found_and_tracked(log: Log, label: str, tracker: Tracker, find: Sequence[str
     def values(u: Array) -> Array:
         return np.where(positive, start * np.exp(np.where(positive, u, 0.0)), start + size * u)
 
-    def model_at(u: Array) -> Formulas:
-        parts = {key: dict(getattr(model, key)) for key in _KEYS}
+    def model_at(u: Array) -> StateModel:
+        parts: dict[str, Any] = {}
         for (key, name), value in zip(places, values(u).tolist(), strict=True):
-            parts[key][name] = value
-        return replace(model, **parts)
+            parts[key] = {**parts.get(key, getattr(model, key)), name: value} if name else value
+        return replace(model, **parts)  # type: ignore[type-var]
 
     def cost(u: Array) -> float:
         if not (np.abs(u[positive]) < _FAR).all() or tracker.hindrance(model_at(u)):
@@ -260,14 +267,24 @@ def found_and_tracked(log: Log, label: str, tracker: Tracker, find: Sequence[str
     return replace(LogTracks.of(replace(log, model=model_at(u)), label, tracker), constants=constants)
 
 
-def _place(model: Formulas, name: str) -> tuple[str, str]:
-    """Returns the key and the name of a constant, which may be written KEY.NAME."""
-    known = [(key, label) for key in _KEYS for label in getattr(model, key)]
-    found = [one for one in known if name in (one[1], ".".join(one))]
+def _numbers(model: StateModel) -> dict[tuple[str, str], tuple[float, bool]]:
+    """Returns the numbers of a model that can be found, and whether each is positive: by key and name of a model by
+    formulas, by option of one in Python."""
+    if isinstance(model, Formulas):
+        return {
+            (key, name): (value, key != "constants") for key in _KEYS for name, value in getattr(model, key).items()
+        }
+    options = [(name, hint) for name, hint in option_types(type(model)).items() if hint in (*_POSITIVE, float, Finite)]
+    return {(name, ""): (getattr(model, name), hint in _POSITIVE) for name, hint in options}
+
+
+def _place(known: Sequence[tuple[str, str]], name: str) -> tuple[str, str]:
+    """Returns the key and the name of a number, which may be written KEY.NAME."""
+    found = [one for one in known if name in (one[1] or one[0], ".".join(one))]
     if len(found) > 1:
         raise UserError(f"find={name}: is a name of two numbers; write {' or '.join(map('.'.join, found))}")
     if not found:
-        raise UserError(f"find={name}: {unknown(name, [label for _, label in known], 'constant')}")
+        raise UserError(f"find={name}: {unknown(name, [label or key for key, label in known], 'constant')}")
     return found[0]
 
 

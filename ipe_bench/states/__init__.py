@@ -3,7 +3,7 @@
 from typing import Any
 
 from ipe_bench.basics.errors import renamed, unknown
-from ipe_bench.states.base import Normal, Paths, StateModel
+from ipe_bench.states.base import Fault, Normal, Paths, StateModel
 from ipe_bench.states.bounds import bound_at_truth, posterior_bounds
 from ipe_bench.states.damped import LevenbergMarquardtSmoother
 from ipe_bench.states.formulas import Formulas, RecordedFormulas
@@ -18,6 +18,7 @@ from ipe_bench.states.walking_gins import WalkingGins
 __all__ = [
     "Bootstrap",
     "Cubature",
+    "Fault",
     "Filter",
     "Formulas",
     "GaussHermite",

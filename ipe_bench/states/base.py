@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -41,6 +42,16 @@ class Paths:
     """The readings (trials, K, m)."""
 
 
+class Fault(NamedTuple):
+    """Holds what a state model refuses of a column of a log."""
+
+    column: str
+    where: Array
+    """The refused rows (K,)."""
+    reason: str
+    """What is wrong, with the remedy."""
+
+
 class StateModel(Component, ABC):
     """Describes states that move, and what is read of them at K epochs k = 0 ... K-1:
 
@@ -48,7 +59,8 @@ class StateModel(Component, ABC):
         z[k] = h(x[k], k) + v[k],          v[k] ~ N(0, R[k])
 
     Required: `states`, `times`, `prior`, `transition` (f), `observe` (h), `gain` (G) and `R`.
-    Optional: `moved_first`, `periods`, `reading_names` and `scored`; `draw`, if paths are stored.
+    Optional: `moved_first`, `periods`, `reading_names` and `scored`; `draw`, if paths are stored; `log_inputs`,
+    `with_log` and `faults`, if a log has known inputs.
     Promised: f and h take stacks of states (..., n), real or complex, and are analytic in them, since slopes are
     complex steps; a trial has the same bits alone and in any batch; `require_sound` finds nothing to refuse.
 
@@ -124,6 +136,19 @@ class StateModel(Component, ABC):
         """Names of the readings of an epoch: the columns of a log."""
         m = len(self.R(0))
         return ("reading",) if m == 1 else tuple(f"reading{i + 1}" for i in range(m))
+
+    @property
+    def log_inputs(self) -> tuple[str, ...]:
+        """Names of the known inputs that a log has for each epoch, beside the readings; `time` in s is its times."""
+        return ()
+
+    def with_log(self, count: int, inputs: Mapping[str, Array]) -> StateModel:
+        """Returns the model of a log of `count` epochs K, with its known inputs (K,)."""
+        return self
+
+    def faults(self, columns: Mapping[str, Array]) -> Iterable[Fault]:
+        """Yields what the model refuses of the known inputs and readings (K,) of a log, by the names of its columns."""
+        return ()
 
     @property
     def n(self) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -44,7 +44,8 @@ class Formulas(StateModel):
     constants: Mapping[str, Finite] = field(default_factory=dict)
     """Numbers that the formulas name."""
     inputs: Mapping[str, Finite | tuple[Finite, ...]] = field(default_factory=dict)
-    """Known inputs that the formulas name, such as a control: one number, or one for each epoch."""
+    """Known inputs that the formulas name, such as a control: one number, or one for each epoch. `time` is the time of
+    each epoch in s."""
     units: Mapping[str, str] = field(default_factory=dict)
     """Units of states."""
     scored: tuple[str, ...] = ()
@@ -116,7 +117,18 @@ class Formulas(StateModel):
 
     @property
     def times(self) -> Array:
-        return self.step * (np.arange(self.count) + self.moved_first)
+        return self._times
+
+    @cached_property
+    def _times(self) -> Array:
+        return self._inputs.get("time", self.step * (np.arange(self.count) + self.moved_first))
+
+    @property
+    def log_inputs(self) -> tuple[str, ...]:
+        return tuple(self.inputs)
+
+    def with_log(self, count: int, inputs: Mapping[str, Array]) -> Formulas:
+        return replace(self, count=count, inputs={name: tuple(values.tolist()) for name, values in inputs.items()})
 
     @property
     def states(self) -> tuple[Parameter, ...]:
@@ -161,7 +173,7 @@ class Formulas(StateModel):
         """Those formulas (..., number) at states x (..., n) at epoch k."""
         known = dict(zip(self.next, np.moveaxis(x, -1, 0), strict=True)) | dict(noise)
         known |= {name: float(values[k]) for name, values in self._inputs.items()}
-        known |= {**self.constants, "k": k + 1.0, "t": self.step * (k + self.moved_first)}
+        known |= {**self.constants, "k": k + 1.0, "t": float(self._times[k])}
         with np.errstate(all="ignore"):
             values = np.broadcast_arrays(x[..., 0], *(formula(known) for formula in formulas.values()))[1:]
         return np.stack(np.broadcast_arrays(*values), axis=-1)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal, norm
+from shared.state_models import ConstantVelocity
 
 import ipe_bench as ib
 from ipe_bench.states import Bootstrap, Formulas, Grid, Smoother, ckf, ekf
@@ -90,6 +91,24 @@ def test_a_log_without_noise_determines_no_noise():
     assert not one.passes
     assert one.constants == ()
     assert one.message.startswith("the likelihood has no maximum in w")
+
+
+def test_an_option_of_a_model_in_python_is_found_as_that_of_its_formulas():
+    written = ConstantVelocity(count=30, deviation=2.0)
+    formulas = Formulas(
+        next={"p": "p + v + sqrt(1/3)*a", "v": "v + sqrt(3)/2*a + b/2"},
+        readings={"z": "p"},
+        noise={"a": 1.0, "b": 1.0},
+        deviation={"z": 2.0},
+        spread={"p": 10.0, "v": 10.0},
+        count=30,
+    )
+    z = replace(written, deviation=0.7).draw(0, 1).z[0]
+    (one,), (other,) = (
+        ib.estimate(model, z, {"kf": ekf()}, find=name).tracks[0].constants
+        for model, name in ((written, "deviation"), (formulas, "z"))
+    )
+    assert (one.value, one.error) == pytest.approx((other.value, other.error), rel=1e-6)
 
 
 @pytest.mark.parametrize(

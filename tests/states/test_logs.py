@@ -103,6 +103,20 @@ def test_known_inputs_and_unequal_steps_of_a_log_give_the_closed_form(tmp_path):
     assert one.mean_nis == pytest.approx(np.nansum(one.nis) / 38, rel=1e-12)
 
 
+def test_the_times_of_a_log_are_those_of_its_epochs(tmp_path):
+    """x grows by t at each step, and no reading but the last."""
+    model = replace(DRIVEN, next={"x": "x + t + w"}, noise={"w": 0.0}, inputs={"time": 0.0})
+    z, t = np.array([np.nan, np.nan, 4.0]), np.array([0.5, 2.0, 2.25])
+    pd.DataFrame({"time [s]": t, "z": z}).to_csv(tmp_path / "log.csv", index=False)
+    answer = ib.estimate(model, tmp_path / "log.csv", {"ekf": ekf()})
+    np.testing.assert_array_equal(answer.log.model.times, t)
+    assert answer["ekf"].mean[:2, 0] == pytest.approx([0.5, 2.5], rel=1e-12)
+    assert answer["ekf"].mean[2, 0] == pytest.approx(4.75 + (4.0 - 4.75) / 1.04, rel=1e-12)
+    pd.DataFrame({"time [s]": t[[0, 2, 1]], "z": z}).to_csv(tmp_path / "back.csv", index=False)
+    with pytest.raises(ib.UserError, match=r"row 4, column time \[s\]: is not after that of the row before"):
+        ib.estimate(model, tmp_path / "back.csv", {"ekf": ekf()})
+
+
 def test_a_first_reading_at_the_time_of_the_prior_gives_the_closed_form(tmp_path):
     """x grows by t and w at each step: the mean and covariance of all readings at once."""
     model = replace(DRIVEN, next={"x": "x + t + k*w"}, inputs={}, count=6, step=0.5, moved_first=False)
