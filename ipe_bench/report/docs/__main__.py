@@ -73,8 +73,6 @@ GROUPS = {
     "execution": "Executions",
 }
 CLASSES = {place for places in CONTRACTS.values() for place in places}
-TABLES = 2
-"""Tables on the page of an experiment: who does best, and what it costs."""
 ORDINARY, LEAST = 1000, 3
 """Trials of an ordinary experiment, and the least number that a costly one is cut to."""
 _PARTS = {"beyond": ["error_scale=300,1000,3000"], "nist": ["measurement.start=2"]}
@@ -176,9 +174,8 @@ def store(option: Option, folder: Path, results: Path, trials: int, part: Sequen
             raise
         print(f"{name}: {str(error).strip().splitlines()[-1]}", flush=True)
     analysis = analyse([results])
-    tables = [table for table in report_tables(analysis) if not table.appendix][:TABLES]
     with house_style():
-        drawn = {drawing.name: drawing for drawing in drawings(analysis, "all")}
+        drawn = {one.name: one for one in drawings(analysis, "all" if name in _FIGURES else "main")}
         figures = [drawn[one] for one in _FIGURES.get(name, list(drawn)[:1])]
         for file, figure in (*((f"{name}_{one.name}", one.figure) for one in figures), (name, _small(analysis))):
             save_small(figure, folder / f"{file}.png")
@@ -187,7 +184,7 @@ def store(option: Option, folder: Path, results: Path, trials: int, part: Sequen
         "command": shlex.join(command),
         "version": version("ipe-bench"),
         "trials": " to ".join(dict.fromkeys(f"{count:,}" for count in (counts[0], counts[-1]))),
-        "html": html([*headline(analysis), *tables]).strip(),
+        "html": html([*headline(analysis), *report_tables(analysis)[:1]]).strip(),
         "figures": [{"name": one.name, "title": one.title, "caption": one.caption} for one in figures],
         "best": list(_best(name, analysis.summary)),
     }
