@@ -103,7 +103,7 @@ class Estimates:
 class Estimator(Component, ABC):
     """Turns readings into parameters: a frozen dataclass of its options.
 
-    Required: `estimate`. Optional: `needs`, `equation`, `family`, and `hindrance`, which is asked before any work.
+    Required: `estimate`. Optional: `needs`, `equation`, `family`, `look`, and `hindrance`, asked before any work.
     Promised: a trial has the same bits alone and in any batch, its random numbers included, so products are stacked
     `matmul` or `einsum`; a trial that fails ends with a status, or raises if it is alone, and disturbs no other; a
     UserError is raised if no trial can be estimated, and ends the run;
@@ -129,6 +129,8 @@ class Estimator(Component, ABC):
     family: ClassVar[Family | None] = None
     """The kind of estimator that it is shown with; None if its needs and its equation say: those that take epochs
     are filters, those that seek the root of the frozen H are IPE, and all others are least squares."""
+    look: ClassVar[tuple[str, str] | None] = None
+    """Colour and marker in every figure, in matplotlib's words such as `("#c51b7d", "s")`; None: one of the pool."""
 
     @abstractmethod
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:

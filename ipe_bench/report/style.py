@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any, Literal, cast, get_args
+from zlib import crc32
 
 from ipe_bench.basics.errors import UserError
 
@@ -21,23 +22,25 @@ TABLES = ("csv", "md", "tex")
 """Formats of tables: the first is always written."""
 FORMATS = (*FIGURES, *TABLES)
 FAMILIES: dict[str, tuple[str, ...]] = {
-    "IPE": ("#08519c", "#4292c6", "#08a1b8", "#5e4fd0", "#7fb2e5"),
-    "filters": ("#d94801", "#fd9a4e", "#8c2d04", "#e31a3c", "#e6ab02"),
-    "least squares": ("#1b7837", "#5aae61", "#00441b", "#8a9a1b", "#9bd19b"),
-    "ensembles": ("#6a1b9a", "#b07cc6", "#c2188f", "#f07fc0"),
+    "IPE": ("#0f7f8f", "#86a9e0", "#5b76b8", "#3648c9"),
+    "filters": ("#8c2d04", "#c08a00", "#c2273d", "#f08a6c"),
+    "least squares": ("#1b7837", "#5aae61", "#00441b", "#8a9a1b"),
+    "ensembles": ("#c2188f", "#b07cc6", "#6a1b9a", "#f07fc0"),
 }
 """Colours by kind of estimator, neighbours differing in lightness; all of them are told apart on white and in print."""
-COLORS = tuple(family[i] for i in range(5) for family in FAMILIES.values() if i < len(family))
+COLORS = tuple(family[i] for i in range(4) for family in FAMILIES.values())
 """Colours of the families by turns, for parameters and settings."""
-BLACK, GREY = "#000000", "#b0b0b0"
-MARKERS = ("o", "s", "D", "^", "v", "P", "d", "<", ">", "p", "h")
-DASHES: tuple[Any, ...] = ("", (5, 2), (1, 1.5), (5, 2, 1, 2))
-"""Dash patterns as seaborn and matplotlib read them: lengths on and off, empty for a solid line."""
+BLACK, GREY, WHITE = "#000000", "#b0b0b0", "#ffffff"
+MARKERS = ("v", "P", "p", "<", "d", ">", "h", "^", "s", "o", "D")
+DASHES: tuple[Any, ...] = ((1, 1.5), (5, 2, 1, 2), (8, 2, 1, 2, 1, 2), (3, 1, 1, 1))
+"""Dash patterns of the pool as seaborn and matplotlib read them: lengths on and off."""
 REFERENCE = "linear_lse"
 """Label of the reference estimator: black and crossed in every figure."""
 BOUND_COLOR, BOUND_DASH = "#444444", (0, (2, 2))
 MOST_FACES = 10
-"""Estimators up to which each has a colour; of more, `chosen` ones have, and the others are grey."""
+"""Estimators up to which each has a colour; of more, those with a face have, and the others are grey."""
+DARK, LIGHT = "#15181c", "#e4e7ea"
+"""What white and black become on a page that is dark."""
 
 
 def which_figures(asked: Any) -> Which:
@@ -72,23 +75,79 @@ class Look:
         return {"color": self.color, "marker": self.marker, "linestyle": dashes, "markeredgecolor": "white"}
 
 
-def looks(
-    labels: Sequence[str], kinds: Mapping[str, str] | None = None, chosen: Sequence[str] | None = None
-) -> dict[str, Look]:
-    """Returns a look per label: of its kind's family if `kinds` gives one, grey if it is not among those `chosen`.
+FACES = {
+    REFERENCE: Look(BLACK, "X", (5, 2)),
+    "fixed_point": Look("#123ba0", "o"),
+    "newton": Look("#2299dc", "s"),
+    "broyden": Look("#0f7f8f", "p", (5, 2)),
+    "steepest_descent": Look("#5b76b8", "<", (5, 2)),
+    "auto": Look("#7b2fd0", "D"),
+    "ekf": Look("#d8420c", "^", (5, 2)),
+    "ukf": Look("#f29a17", "v", (5, 2)),
+}
+"""The looks of those that the bench is about, which no other has and which are never grey. They differ from each other
+in hue, marker and lightness, also for the colour-blind and in grey."""
+POOL = (
+    *(
+        "gauss_newton",
+        "relinearized",
+        "ukf_rts",
+        "ekf_rts",
+        "levenberg_marquardt",
+        "progressive",
+        "iterated_ekf",
+        "ckf",
+    ),
+    *("map_lm", "enkf", "iplf", "ukf_wide", "anderson", "damped_newton", "minpack", "dogbox", "least_squares"),
+    *("geodesic_lm", "multiscale_lm", "multistart", "ghkf", "ieks", "ipls", "grid", "bootstrap"),
+)
+"""Our others, of which each has its own place among the markers and dashes; a name from elsewhere has one by chance."""
+_ALIKE = {"iekf": "iterated_ekf"}
+"""Trackers under another name than the baseline of the same filter."""
 
-    11 markers and 4 dashes have a common period of 44; with the colours hundreds of labels differ.
+
+def looks(
+    labels: Sequence[str],
+    kinds: Mapping[str, str] | None = None,
+    chosen: Sequence[str] | None = None,
+    own: Mapping[str, Sequence[str]] | None = None,
+) -> dict[str, Look]:
+    """Returns a look per label, the same whichever others are there: its `own` colour and marker, its face, or a place
+    of the pool in the colours of its kind. It is grey if it is neither among those `chosen` nor a face.
+
+    Of two labels from elsewhere that chance gives one place, the later takes the next. What follows a name in brackets
+    changes marker and dash alone.
     """
-    counts: dict[str, int] = {}
-    found = {REFERENCE: Look(BLACK, "X", (5, 2))}
-    for i, label in enumerate(label for label in labels if label != REFERENCE):
-        kind = (kinds or {}).get(label, "")
-        family = FAMILIES.get(kind, COLORS)
-        k = counts[kind] = counts.get(kind, -1) + 1
-        color = family[k % len(family)] if chosen is None or label in chosen else GREY
-        dash = list(FAMILIES).index(kind) if kind in FAMILIES else i // 11
-        found[label] = Look(color, MARKERS[i % len(MARKERS)], DASHES[(dash + k // len(family)) % len(DASHES)])
-    return {label: found[label] for label in labels}
+    found: dict[str, Look] = {}
+    for label in labels:
+        name, (color, marker) = _ALIKE.get(label, label), (own or {}).get(label, (None, None))
+        if variant := FACES.get(name.partition(" (")[0]):
+            color = color or variant.color
+        family = (color,) if color else FAMILIES.get((kinds or {}).get(label, ""), COLORS)
+        at = POOL.index(name) if name in POOL else len(POOL) + crc32(name.encode()) % 1009
+        look = FACES.get(name) or _from_pool(at, family)
+        while look in found.values():
+            look = _from_pool(at := at + 1, family)
+        grey = chosen is not None and label not in chosen and name not in FACES
+        found[label] = Look(GREY if grey else look.color, marker or look.marker, look.dash)
+    return found
+
+
+def _from_pool(at: int, family: Sequence[str]) -> Look:
+    places = len(MARKERS) * len(DASHES)
+    color, dash = family[(at + at // places) % len(family)], DASHES[at // len(MARKERS) % len(DASHES)]
+    return Look(color, MARKERS[at % len(MARKERS)], dash)
+
+
+def dark(color: str) -> str:
+    """Returns what a colour on white becomes on a dark page: greys change places, and the others are lighter."""
+    rgb = [int(color[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+    if max(rgb) - min(rgb) > 0.05:
+        mixed = [c + 0.25 * (1 - c) for c in rgb]
+    else:
+        ends = ([int(end[i : i + 2], 16) / 255 for i in (1, 3, 5)] for end in (DARK, LIGHT))
+        mixed = [low + (1 - rgb[0]) * (high - low) for low, high in zip(*ends, strict=True)]
+    return "#" + "".join(f"{round(255 * c):02x}" for c in mixed)
 
 
 _HOUSE: dict[str, Any] = {
@@ -106,6 +165,7 @@ _HOUSE: dict[str, Any] = {
     "figure.dpi": 150,
     "savefig.dpi": 150,
     "pdf.fonttype": 42,
+    "figure.constrained_layout.wspace": 0.14,
     "svg.hashsalt": "ipe-bench",
 }
 _PRINT: dict[str, Any] = {

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import hashlib
 import json
 from collections.abc import Iterable, Sequence
@@ -82,11 +81,10 @@ def rendered(template: str, figures: Iterable[Any], **content: Any) -> str:
 
     templates = resources.files("ipe_bench.report") / "templates"
     files = {name: Markup((templates / f"report.{name}").read_text(encoding="utf-8")) for name in ("css", "js")}
-    shown = [vars(one) | {"data": base64.b64encode(one.files[0].read_bytes()).decode()} for one in figures]
     return (
         environment()
         .get_template(template)
-        .render(style=files["css"], script=files["js"], figures=shown, citation=CITATION, **content)
+        .render(style=files["css"], script=files["js"], figures=list(figures), citation=CITATION, **content)
     )
 
 
@@ -107,7 +105,7 @@ def write_files(folder: Path, name: str, page: Page, table: tuple[str, pd.DataFr
     write_text(files[0], table[1].to_csv(index=False))
     with house_style() if page.drawings else nullcontext():
         for drawing in page.drawings:
-            figures.append(SimpleNamespace(**vars(drawing), files=drawing.save(folder, (PAGE,))))
+            figures.append(SimpleNamespace(**vars(drawing), files=drawing.save(folder, (PAGE,)), html=drawing.html()))
             files += figures[-1].files
     tables = [part for part in page.parts if isinstance(part, Table)][:1]
     rest = [part for part in page.parts if all(part is not one for one in tables)]

@@ -112,6 +112,7 @@ class ResultKey:
             "bound": "bayes" if "prior" in needs else "crlb",
             "equation": getattr(self.estimator, "equation", None),
             "family": getattr(self.estimator, "family", None),
+            "look": getattr(self.estimator, "look", None),
             "sequential": "epochs" in needs,
             "smooths": bool(getattr(self.estimator, "smooths", False)),
             "jacobian_cost": float(getattr(model, "jacobian_cost", model.n)),

@@ -40,7 +40,8 @@ class Drawn:
     title: str
     caption: str
     files: tuple[Path, ...]
-    """One file per format; the first is the page's."""
+    html: str
+    """The figure as the page shows it."""
 
 
 def draw_all(
@@ -55,7 +56,9 @@ def draw_all(
     with house_style():
         for drawing in drawings(analysis, which):
             make_folder(folder)
-            drawn.append(Drawn(drawing.name, drawing.title, drawing.caption, drawing.save(folder, formats)))
+            drawn.append(
+                Drawn(drawing.name, drawing.title, drawing.caption, drawing.save(folder, formats), drawing.html())
+            )
     written = {path.name for one in drawn for path in one.files}
     for name in {f"{entry['name']}.{kind}" for entry in old for kind in FORMATS} - written:
         (folder / name).unlink(missing_ok=True)

@@ -120,13 +120,13 @@ def draw_residuals(model: Measurement, fits: Sequence[Fit]) -> Iterator[Drawing]
         ax.xaxis.set_major_locator(MaxNLocator(6, integer=heading == "reading"))
         tests = {"fit": p_value(one.p_value), "white": p_value(one.white_p, LEAST_P)}
         p = ", ".join(f"{name} p {value}" for name, value in tests.items() if value != "-")
-        ax.set_title(f"{common.text(enumerate_few([each.label for each in group], 3))}\n{p}")
+        common.title(ax, f"{enumerate_few([each.label for each in group], 1)}: {p}")
     common.axis_labels(fig, common.text(heading), "residual / its deviation")
     common.legend(fig, axes)
     parts = [f"{each.label} {int(each.outliers.sum())}" for group in shown for each in group]
     caption = (
         "Each is standard normal if the model and the noise are right. Beyond"
-        f" ±{limit:.2f} a reading is an outlier: {enumerate_few(parts, 12)}."
+        f" ±{limit:.2f} a reading is an outlier: {enumerate_few(parts, 3)}."
     )
     if len(groups) > len(shown):
         caption += f" {len(groups) - len(shown)} further panels: see residuals.csv."

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,14 +17,19 @@ if TYPE_CHECKING:
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
-MOST_PANELS = 6
+MOST_PANELS = 8
 REACH = 0.3
 """Part of the span of the points that intervals may add to an axis at either end."""
+BEYOND = "beyond the axis"
+"""Label of the arrow at points that lie there."""
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
-def panels(count: int, look: Mapping[str, Look] | None = None, *, height: float = 2.7) -> tuple[Figure, list[Axes]]:
-    """Makes a figure with that many panels, and room for the legend of the estimators."""
+def panels(
+    count: int, look: Mapping[str, Look] | None = None, *, height: float = 2.7, scales: Sequence[float] = ()
+) -> tuple[Figure, list[Axes]]:
+    """Makes a figure with that many panels, and room for the legend of the estimators; if there is one of `scales`
+    their names stand on the vertical axes, and values on the horizontal ones."""
     from matplotlib.figure import Figure
 
     down = -(-count // _across())
@@ -36,7 +40,22 @@ def panels(count: int, look: Mapping[str, Look] | None = None, *, height: float 
     axes: list[Axes] = list(fig.subplots(down, across, squeeze=False).flat)
     for ax in axes[count:]:
         ax.set_axis_off()
+    if len(scales) == 1:
+        fig.set_figheight((0.22 * len(look or ()) + 0.9) * down + 0.3)
+        for ax in axes[:count]:
+            name_axis(ax, list(look or ()))
     return fig, axes[:count]
+
+
+def name_axis(ax: Axes, names: Sequence[str]) -> None:
+    """Sets names down the vertical axis; values stand on the horizontal one."""
+    ax.set_yticks(range(len(names)), [text(name) for name in names])
+    ax.set_ylim(len(names) - 0.4, -0.6)
+
+
+def _value(ax: Axes) -> str:
+    """Says on which axis values stand: the horizontal one where names stand downwards."""
+    return "x" if ax.yaxis_inverted() else "y"
 
 
 def _across() -> int:
@@ -59,6 +78,11 @@ def panels_of_scales(rows: pd.DataFrame, look: Mapping[str, Look]) -> tuple[Figu
     return fig, [(ax, rows[rows["error_scale"] == scale]) for scale, ax in zip(scales, axes, strict=True)]
 
 
+def left_out(scales: Sequence[float], panels: Sequence[Any]) -> str:
+    """Says how many of the scales have no panel."""
+    return f"{len(scales) - len(panels)} scales between have no panel." if len(panels) < len(scales) else ""
+
+
 def text(value: Any) -> str:
     """Returns a name for use in a figure: never read as mathematics, never longer than a line."""
     words, most = str(value), 16 if print_width() else 42
@@ -74,45 +98,41 @@ def _letters(inches: float, size: Any) -> float:
     return inches / (0.0085 * float(rcParams[size]))
 
 
-def _width(ax: Axes) -> float:
-    """Estimates the width of a panel in inches before the layout."""
-    return 0.8 * ax.get_position().width * ax.figure.get_figwidth()  # type: ignore[union-attr]
+def _room(ax: Axes, size: str) -> float:
+    """Estimates how many letters fit the width of a panel, before the layout."""
+    across = ax.get_subplotspec().get_gridspec().ncols  # type: ignore[union-attr]
+    names = max((len(label.get_text()) for label in ax.get_yticklabels()), default=0) if _value(ax) == "x" else 7
+    return _letters(ax.figure.get_figwidth() / across, size) - names  # type: ignore[union-attr]
 
 
 def title(ax: Axes, words: str) -> None:
-    """Sets the title of a panel, in as many lines as its width needs."""
-    ax.set_title(fill(words.replace("$", r"\$"), max(12, int(_letters(_width(ax), "axes.titlesize")))))
+    """Sets the title of a panel, in one line."""
+    most = max(12, int(_room(ax, "axes.titlesize")) + 3)
+    ax.set_title((words if len(words) <= most else words[: most - 1] + "…").replace("$", r"\$"))
 
 
 def axis_labels(fig: Figure, x: str, y: str) -> None:
-    """Labels of the axes that all panels share, once for the figure."""
-    fig.supxlabel(x, fontsize="medium")
-    fig.supylabel(y, fontsize="medium")
+    """Labels the axes of all panels alike, so that each can stand alone."""
     for ax in fig.axes:
-        ax.set(xlabel="", ylabel="")
+        ax.set(xlabel=x, ylabel=y)
 
 
 def number(value: float) -> str:
-    """Formats a number of an axis: 0.05, 200, 10⁴ or 5·10⁻⁷, with a typographic minus."""
-    digits, _, exponent = (f"{value:g}" if 1e-3 <= abs(value) < 1e4 or value == 0 else f"{value:e}").partition("e")
+    """Formats a number of an axis: 0.05, 200, 10³ or 5·10⁻⁷, with a typographic minus."""
+    digits, _, exponent = (f"{value:g}" if 0.01 <= abs(value) < 1e3 or value == 0 else f"{value:e}").partition("e")
     words = f"{float(digits):g}·10{str(int(exponent)).translate(_RAISED)}" if exponent else digits
     return words.removeprefix("1·").replace("-", "\N{MINUS SIGN}")
 
 
-def scale_axis(ax: Axes, scales: Sequence[float], labels: Sequence[str]) -> None:
-    """Sets a logarithmic axis of ascending error scales; if there is only one, the labels side by side."""
-    if len(scales) == 1:
-        ax.set_xticks(range(len(labels)), [text(label) for label in labels], rotation=90)
-        ax.set_xlim(-0.6, len(labels) - 0.4)
-        ax.set_xlabel("")
-        return
+def scale_axis(ax: Axes, scales: Sequence[float]) -> None:
+    """Sets a logarithmic axis with a tick at each of the ascending error scales."""
     span = np.log10(scales[-1] / scales[0])
-    kept = labelled(scales, span / _letters(_width(ax), "xtick.labelsize"))
+    margin = max(0.06 * span, 0.15)
+    kept = labelled(scales, (span + 2 * margin) / _room(ax, "xtick.labelsize"))
     ax.set_xscale("log")
-    ax.set_xticks(kept, [value_text(s) for s in kept])
+    ax.set_xticks(scales, [value_text(s) if s in kept else "" for s in scales])
     ax.set_xticks([], minor=True)
-    margin = 10 ** max(0.06 * span, 0.15)
-    ax.set_xlim(scales[0] / margin, scales[-1] * margin)
+    ax.set_xlim(scales[0] / 10**margin, scales[-1] * 10**margin)
     ax.set_xlabel("error scale")
 
 
@@ -141,9 +161,9 @@ def decades(ax: Axes, values: Any, least: float = 10.0, *, ends: Any = ()) -> No
     room = max(least, (high / low) ** REACH)
     low, high = max(low / room, ends.min(initial=low)) / 1.6, min(high * room, ends.max(initial=high)) * 1.6
     wider = max(np.sqrt(least * low / high), 1.0)
-    ax.set_yscale("log")
-    ax.set_ylim(low / wider, high * wider)
-    log_ticks(ax.yaxis, low / wider, high * wider)
+    axis, ends = _value(ax), (low / wider, high * wider)
+    ax.set(**{f"{axis}scale": "log", f"{axis}lim": ends})
+    log_ticks(ax.xaxis if axis == "x" else ax.yaxis, *ends)
 
 
 def log_ticks(axis: Axis, low: float, high: float) -> None:
@@ -156,13 +176,37 @@ def log_ticks(axis: Axis, low: float, high: float) -> None:
 
 
 def shares(ax: Axes) -> None:
-    """Sets a vertical axis of shares from 0 to 1."""
-    ax.set_ylim(-0.03, 1.03)
-    ax.yaxis.set_major_formatter(lambda v, _: f"{100 * v:.0f} %")
+    """Sets an axis of shares from 0 to 1."""
+    axis = _value(ax)
+    ax.set(**{f"{axis}lim": (-0.03, 1.03)})
+    (ax.xaxis if axis == "x" else ax.yaxis).set_major_formatter(lambda v, _: f"{100 * v:.0f} %")
 
 
 def bound_line(ax: Axes, at: float, label: str) -> None:
-    ax.axhline(at, color=BOUND_COLOR, linestyle=BOUND_DASH, linewidth=1.0, label=label, zorder=1)
+    draw = ax.axvline if _value(ax) == "x" else ax.axhline
+    draw(at, color=BOUND_COLOR, linestyle=BOUND_DASH, linewidth=1.0, label=label, zorder=1)
+
+
+def band(ax: Axes, low: float, high: float, label: str = "") -> None:
+    draw = ax.axvspan if _value(ax) == "x" else ax.axhspan
+    draw(low, high, color=BOUND_COLOR, alpha=0.25, linewidth=0, label=label, zorder=0)
+
+
+def beyond(ax: Axes, x: Any, y: Any, one: Look) -> None:
+    """Draws points that lie beyond the axis at its end: hollow, with an arrow."""
+    from matplotlib.transforms import ScaledTranslation
+
+    across = _value(ax) == "x"
+    inches = (6 / 72, 0) if across else (0, 6 / 72)
+    outwards = ax.transData + ScaledTranslation(*inches, ax.figure.dpi_scale_trans)
+    style: dict[str, Any] = {"linestyle": "none", "clip_on": False, "zorder": 3}
+    hollow = {"marker": one.marker, "markeredgecolor": one.color, "markerfacecolor": "white", "markeredgewidth": 1.1}
+    ax.plot(x, y, **hollow, **style)
+    arrow = {"marker": r"$\rightarrow$" if across else r"$\uparrow$", "color": one.color, "markeredgewidth": 0.0}
+    (arrows,) = ax.plot(x, y, transform=outwards, **arrow, **style)
+    arrows.set_in_layout(False)
+    if BEYOND not in ax.get_legend_handles_labels()[1]:
+        ax.plot([], [], label=BEYOND, **arrow | {"color": BOUND_COLOR}, linestyle="none")
 
 
 def seaborn_style(look: Mapping[str, Look], by: str = "estimator") -> dict[str, Any]:
@@ -198,51 +242,67 @@ def curves(
     interval: tuple[str, str] | None = None,
     by: str = "estimator",
     trials: str = "trials",
+    most: float = np.inf,
     heading: str = "",
     label: str = "",
 ) -> None:
     """Draws a column over the error scales, a line with markers per label, on an axis with fixed limits, with the
-    panel's heading and the label of its vertical axis.
+    panel's heading and the label of its axis of values; at one scale a row per label of panels that were made for it.
 
     Labels stand side by side about their scale, so that points and intervals that coincide are seen. A line is broken
     where a value is missing; a point that some of the trials or fewer than `FEW` carry is hollow, and without an
-    interval if they are fewer than `FEW`. Of an interval that lacks an end the other is drawn.
+    interval if they are fewer than `FEW`. Of an interval that lacks an end the other is drawn. What exceeds `most`
+    stands there.
     """
-    scale_axis(ax, scales, list(look))
+    across, one_scale = _value(ax) == "x", len(scales) == 1
+    if not one_scale:
+        scale_axis(ax, scales)
+    elif not across:
+        ax.set_xticks([])
     gap = float(np.diff(np.log10(scales)).min(initial=1.0))
-    most, emptied = rows["trials"].max(), {"linestyle": "none", "markerfacecolor": "white", "markeredgewidth": 1.1}
+    all_trials, emptied = rows["trials"].max(), {"linestyle": "none", "markerfacecolor": "white"}
+    emptied["markeredgewidth"] = 1.1
     hollow = False
     for i, (name, one) in enumerate(look.items()):
         part: Any = rows[rows[by] == name].sort_values("error_scale", kind="stable")
         beside = 10 ** (0.3 * gap * ((i + 0.5) / len(look) - 0.5))
-        x, values = (part["error_scale"] * beside if len(scales) > 1 else np.full(len(part), i)), part[y]
-        few = part[trials] < FEW
+        x, values = np.full(len(part), i) if one_scale else part["error_scale"] * beside, part[y].clip(upper=most)
+        few, over = part[trials] < FEW, part[y] > most
         ends = None
         if interval and one.color != GREY:
-            sizes = np.array([values - part[interval[0]], part[interval[1]] - values]).clip(min=0)
+            low, high = (part[end].clip(upper=most) for end in interval)
+            sizes = np.array([values - low, high - values]).clip(min=0)
             known = np.isfinite(sizes) & ~few.to_numpy()
             ends = np.where(known, sizes, np.where(known.any(axis=0), 0.0, np.nan))
-        line: dict[str, Any] = {**one.line, "zorder": 2 - (one.color == GREY)}
-        line |= {"linestyle": "none"} if len(scales) == 1 else {}
-        ax.errorbar(x, values.where(np.isfinite(values)), ends, elinewidth=0.8, **line)
-        empty = few | (part[trials] < most)
+        line: dict[str, Any] = {**one.line, "zorder": 2} | ({"linestyle": "none"} if one_scale else {})
+        empty = few | (part[trials] < all_trials)
+        if one.color == GREY and not one_scale:  # in the background, where nothing is told apart
+            line, empty = line | {"marker": ",", "zorder": 1}, empty & False
         hollow |= bool(empty.any())
-        ax.plot(x[empty], values[empty], marker=one.marker, markeredgecolor=one.color, zorder=3, **emptied)
+        values = values.where(np.isfinite(values))
+        at = (values, x) if across else (x, values)
+        ax.errorbar(*at, elinewidth=0.8, **{"xerr" if across else "yerr": ends}, **line)
+        ax.plot(*(v[empty & ~over] for v in at), marker=one.marker, markeredgecolor=one.color, zorder=3, **emptied)
+        if one.color != GREY and over.any():
+            beyond(ax, *(v[over] for v in at), one)
     if hollow:
         ax.plot([], [], marker="o", markeredgecolor=BOUND_COLOR, label="hollow: trials missing, or few", **emptied)
-    ax.set_ylabel(label)
+    ax.set(**{f"{_value(ax)}label": label})
     if heading:
         title(ax, heading)
 
 
-def legend(fig: Figure, axes: Sequence[Axes], look: Mapping[str, Look] | None = None) -> None:
-    """Adds one legend above all panels: the estimators in colour, then the other labels in the panels."""
+def legend(fig: Figure, axes: Sequence[Axes], look: Mapping[str, Look] | None = None, *, points: bool = False) -> None:
+    """Adds one legend above all panels: the estimators in colour unless their names stand on the axes, then the other
+    labels in the panels."""
     from matplotlib.lines import Line2D
 
-    colored = {label: one for label, one in (look or {}).items() if one.color != GREY}
-    handles: dict[str, Any] = {text(label): Line2D([], [], **one.line) for label, one in colored.items()}
-    if len(colored) < len(look or ()):
-        handles[f"{len(look or ()) - len(colored)} others"] = Line2D([], [], color=GREY)
+    named = {} if any(_value(ax) == "x" for ax in axes) else look or {}
+    colored = {label: one for label, one in named.items() if one.color != GREY}
+    plain = {"linestyle": "none"} if points else {}
+    handles: dict[str, Any] = {text(label): Line2D([], [], **one.line | plain) for label, one in colored.items()}
+    if len(colored) < len(named):
+        handles[f"{len(named) - len(colored)} others"] = Line2D([], [], color=GREY)
     for ax in axes:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)

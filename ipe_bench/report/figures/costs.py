@@ -31,37 +31,40 @@ def draw_costs(view: View) -> Iterator[Drawing]:
     rows = view.totals[np.isfinite(view.totals["simulations_median"])]
     if rows.empty:
         return
-    shown = {"cost": rows["simulations_median"].clip(lower=LEAST_COST), "error": rows["error_q95"].clip(upper=_HIGHEST)}
-    rows, look = rows.assign(**shown), view.with_look(rows["estimator"])
+    # The 95 % quantile of chi, over its root mean square; the errors of an epoch and of the next are dependent.
+    efficient = 1.0 if view.moving else float(np.sqrt(chdtri(view.n, 0.05) / view.n))
+    error = rows["error_q95"] / efficient
+    shown = {"cost": rows["simulations_median"].clip(lower=LEAST_COST), "error": error.clip(upper=_HIGHEST)}
+    rows, look = rows.assign(**shown, over=error > _HIGHEST), view.with_look(rows["estimator"])
     # Points of about the same cost stand side by side, so that all are seen.
     step = 0.04 * np.log(max(10.0, rows["cost"].max() / rows["cost"].min()))
     place = (np.log(rows["cost"]) / step).round()
     rows["cost"] *= np.exp(step * rows.groupby(["error_scale", place]).cumcount())
     fig, panels = common.panels_of_scales(rows, look)
     style = {**common.seaborn_style(look), "edgecolor": "white", "linewidth": 0.6, "zorder": 3, "clip_on": False}
-    efficient = float(np.sqrt(chdtri(view.n, 0.05) / view.n))  # the 95 % quantile of chi, over its root mean square
     for ax, here in panels:
-        common.decades(ax, [*rows["error"], efficient])
-        sns.scatterplot(here, x="cost", y="error", ax=ax, s=(1.4 * rcParams["lines.markersize"]) ** 2, **style)
-        if not view.moving:  # the errors of an epoch and of the next are dependent
-            common.bound_line(ax, efficient, "efficient estimator")
+        common.decades(ax, [*rows["error"], 1.0])
+        inside = here[~here["over"]]
+        sns.scatterplot(inside, x="cost", y="error", ax=ax, s=(1.4 * rcParams["lines.markersize"]) ** 2, **style)
+        for name, lost in here[here["over"]].groupby("estimator", sort=False):
+            common.beyond(ax, lost["cost"], lost["error"], look[name])
+        common.bound_line(ax, 1.0, view.reference if view.moving else "efficient estimator")
         ax.set_xscale("log")
         ax.set_xlim(rows["cost"].min() / 1.5, rows["cost"].max() * 1.5)
         common.log_ticks(ax.xaxis, *ax.get_xlim())
-    common.axis_labels(fig, "simulations per trial (median)", f"95 % error over {view.reference}")
-    common.legend(fig, fig.axes, look)
+    over = view.reference.removeprefix("the ") if view.moving else "efficient one"
+    common.axis_labels(fig, "simulations (median)", f"95 % error / {over}")
+    common.legend(fig, fig.axes, look, points=True)
     last = rows[rows["error_scale"] == view.scales[-1]]
     good = last[last["error"] <= last["error"].min() * 1.05].sort_values("simulations_median", kind="stable").iloc[0]
     yield view.drawing(
         fig,
         "cost_against_accuracy",
         "Cost against accuracy, all trials",
-        f"Median cost of a trial in simulations against the 95 % quantile of the error over {view.reference} at the"
-        " truth, over all trials; down and left is better. Of points of about the same cost, later ones are shifted to"
-        " the right.",
-        f"Errors beyond {common.number(_HIGHEST)} stand at the edge." * bool((rows["error"] == _HIGHEST).any()),
-        f"The cheapest within 5 % of the least error at scale {value_text(view.scales[-1])}: {good['estimator']}"
-        f" ({short(good['simulations_median'])} simulations).",
+        "Down and left is better; points of one cost stand side by side.",
+        common.left_out(view.scales, panels),
+        f"Cheapest within 5 % of the least error at scale {value_text(view.scales[-1])}: {good['estimator']},"
+        f" {short(good['simulations_median'])}.",
     )
 
 
@@ -108,12 +111,9 @@ def draw_convergence(view: View) -> Iterator[Drawing]:
         fig,
         "convergence",
         "Convergence, converged trials",
-        "Median over the first converged trials of the largest component of the distance between an iterate and the"
-        " last one, in standard deviations of the Cramér-Rao bound. The last iterate is not drawn, since its distance"
-        " is zero by definition; a curve ends when half of the trials have ended.",
-        f"Iterations until the median is within {CLOSE:g} standard deviations at scale {value_text(scales[-1])}:"
-        f" {enumerate_few(seen, 20)}.",
-        f"{len(look) - len(shown)} further estimators are not shown." * (len(look) > len(shown)),
+        "Median of the largest component of the distance to the last iterate.",
+        f"Iterations to {CLOSE:g} σ at scale {value_text(scales[-1])}: {enumerate_few(seen, 2)}.",
+        f"{len(look) - len(shown)} more are not shown." * (len(look) > len(shown)),
     )
 
 

@@ -11,10 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ipe_bench.basics.files import write_atomically
+from ipe_bench.report.figures.page import page_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
+MOST_LETTERS = 300_000
+"""Length of a figure on a page from which on its curves and points are a bitmap."""
 _METADATA: dict[str, Any] = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
 """The same figure is the same file whenever it is drawn."""
 
@@ -40,6 +43,19 @@ class Drawing:
             paths.append(folder / f"{self.name}.{kind}")
             write_atomically(paths[-1], methodcaller("write_bytes", self._content(kind)))
         return tuple(paths)
+
+    def html(self) -> str:
+        """Returns the figure as a page shows it."""
+        from matplotlib import rc_context
+
+        # Names within the figure are its own on a page of several.
+        with rc_context({"svg.fonttype": "none", "svg.hashsalt": self.name}):
+            page = page_figure(self.figure, self._content("svg").decode())
+            if len(page) > MOST_LETTERS:
+                for artist in (one for ax in self.figure.axes for one in (*ax.lines, *ax.collections)):
+                    artist.set_rasterized(True)
+                page = page_figure(self.figure, self._content("svg").decode())
+        return page
 
     def _content(self, kind: str) -> bytes:
         content = BytesIO()

@@ -13,7 +13,7 @@ from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.views import Figure, View
 from ipe_bench.report.style import BOUND_COLOR, BOUND_DASH
-from ipe_bench.report.words import brief, enumerate_few, percent, value_text
+from ipe_bench.report.words import brief, enumerate_few, value_text
 
 CEILING = {"error_median": 100.0, "error_q95": 100.0, "nees_median": 30.0}
 """Errors beyond are drawn here: the size of a diverged error carries no information, and the bound needs the room."""
@@ -26,42 +26,35 @@ def draw(view: View) -> Iterator[Drawing]:
     totals = view.totals
     if totals.empty:
         return
-    beyond = bool((totals[list(CEILING)] > pd.Series(CEILING)).any(axis=None))
-    totals = totals.assign(**{name: totals[name].clip(upper=most) for name, most in CEILING.items()})
+    capped = totals[list(CEILING)].clip(upper=pd.Series(CEILING), axis=1)
     claims = totals[totals["nees_median"].notna()]
-    fig, axes = common.panels(3 if len(claims) else 2, view.look, height=3.3)
+    fig, axes = common.panels(3 if len(claims) else 2, view.look, height=3.3, scales=view.scales)
     shown = view.look, view.scales
     words: dict[str, Any] = {"heading": "success", "label": "share of all trials"}
     common.shares(axes[0])
     common.curves(axes[0], totals, "success", *shown, interval=("success_low", "success_high"), **words)
-    words = {"heading": f"error over {view.reference}", "label": "median, bar to 95 %"}
-    common.decades(axes[1], totals[["error_median", "error_q95"]].clip(lower=0.5), least=4.0)
+    words = {"heading": f"error over {view.reference}", "label": "median, bar to 95 %", "most": CEILING["error_q95"]}
+    common.decades(axes[1], capped[["error_median", "error_q95"]].clip(lower=0.5), least=4.0)
     best = f"1: {view.reference}, an honest covariance"
     common.bound_line(axes[1], 1.0, best)
     common.curves(axes[1], totals, "error_median", *shown, interval=("error_median", "error_q95"), **words)
     if len(claims):
         nees = axes[2]
-        common.decades(nees, np.append(claims["nees_median"].clip(lower=0.5), 1.0), least=4.0)
+        common.decades(nees, np.append(capped["nees_median"].clip(lower=0.5), 1.0), least=4.0)
         common.bound_line(nees, 1.0, best)
         limits = claims["nees_median_low"].min(), claims["nees_median_high"].max()
-        nees.axhspan(*limits, color=BOUND_COLOR, alpha=0.15, linewidth=0, label="limits of an honest one, 95 %")
-        words = {"heading": "squared error over claimed variance", "label": "NEES, median"}
+        common.band(nees, *limits, "limits of an honest one, 95 %")
+        words = {"heading": "NEES", "label": "median", "most": CEILING["nees_median"]}
         common.curves(nees, claims, "nees_median", *shown, **words)
     common.legend(fig, axes, view.look)
     over = "over error scales" if len(view.scales) > 1 else f"at error scale {value_text(view.scales[0])}"
-    last = totals[totals["error_scale"] == view.scales[-1]].sort_values("success", ascending=False, kind="stable")
-    ranked = [f"{e} {percent(v)}" for e, v in zip(last["estimator"], last["success"], strict=True)]
-    ceilings = f"{CEILING['error_median']:g}, or {CEILING['nees_median']:g} times the claimed variance"
-    gate = "that keep the track" if view.moving else "whose error lies inside the gate of the bound"
+    gate = "keep the track" if view.moving else "lie inside the gate"
     yield view.drawing(
         fig,
         "headline",
         f"Success, error and reported covariance {over}",
-        f"All panels are over all trials. Left: share of trials {gate}, with Clopper-Pearson 95 % intervals. Middle:"
-        f" median error over {view.reference} at the truth, with a bar up to the 95 % quantile. Right: squared error"
-        " over the variance that the estimator claims; 1 is right.",
-        f"An error over {ceilings}, stands at the top." if beyond else "",
-        f"Success at scale {value_text(view.scales[-1])}: {enumerate_few(ranked, 20)}.",
+        f"Trials that {gate}, with 95 % intervals; median error, with a bar to the 95 % quantile; NEES, the squared"
+        " error over the claimed variance.",
     )
 
 
@@ -95,12 +88,9 @@ def draw_distributions(view: View) -> Iterator[Drawing]:
         fig,
         "distributions",
         "Distribution of errors, all trials",
-        f"Share of all trials whose error is at most that many times {view.reference} at the truth. A curve that ends"
-        " below 100 % has trials beyond the panel.",
-        ""
-        if view.moving
-        else "Dotted: the law of an efficient estimator, chi over the root of its degrees of freedom.",
-        f"99 % quantile at scale {value_text(top)}: {enumerate_few(seen, 20)}.",
+        "Share of all trials whose error is at most that; where a curve ends, the others lie beyond.",
+        common.left_out(view.scales, panels),
+        f"99 % quantile at scale {value_text(top)}: {enumerate_few(seen, 2)}.",
     )
 
 
@@ -109,7 +99,7 @@ def draw_calibration(view: View) -> Iterator[Drawing]:
     rows = view["calibration"]
     if rows.empty:
         return
-    look, top = view.with_look(rows["estimator"]), rows["error_scale"].max()
+    look = view.with_look(rows["estimator"])
     fig, panels = common.panels_of_scales(rows, look)
     reach = 1.15 * max(LINEAR, float(rows[["difference", "low", "high"]].abs().max().max()))
     ticks: Sequence[float] = [t for t in (-1.0, -0.3, -0.1, -0.05, 0.0, 0.05, 0.1, 0.3, 1.0) if abs(t) <= reach]
@@ -122,18 +112,13 @@ def draw_calibration(view: View) -> Iterator[Drawing]:
         common.lines(ax, part, "at", "difference", look)
     common.axis_labels(fig, "nominal probability", "observed − nominal")
     common.legend(fig, fig.axes, look)
-    each = view.totals.set_index(["error_scale", "estimator"])["calibration"]
-    last = [f"{label} ({each[top, label]})" for label in look if each.get((top, label), "-") != "-"]
     yield view.drawing(
         fig,
         "calibration",
         "Calibration of NEES, converged trials",
-        "Share of converged trials whose NEES is below each quantile of chi-square, less its nominal probability. The"
-        " grey bands are simultaneous: all parameters and NEES stay inside them in 95 % of cases if the covariance is"
-        " right; they are light where fewer trials converged. A curve below 0 in the middle means that most errors"
-        " are larger than claimed, one above 0 that they are smaller. The vertical axis is logarithmic beyond"
-        f" ±{LINEAR / 2:g}.",
-        f"At scale {value_text(top)}, parameters included: {enumerate_few(last, 4)}.",
+        "Share of converged trials whose NEES is below each quantile of chi-square, less its nominal probability. Grey:"
+        f" 95 % bands. Logarithmic beyond ±{LINEAR / 2:g}.",
+        common.left_out(view.scales, panels),
     )
 
 

@@ -35,8 +35,12 @@ def _of_one(view: View, estimator: str) -> Drawing:
     totals = view.totals[view.totals["estimator"] == estimator].assign(parameter=ALL)
     groups, several = _groups(view.parameters), len(view.scales) > 1
     fig, axes = common.panels(len(groups) + 1, height=2.4)
+    if not several:
+        fig.set_figheight(fig.get_figheight() + 0.08 * len(view.parameters))
     for (group, inside), ax in zip(groups.items(), axes, strict=False):
         look = {p["name"]: Look(COLORS[i % len(COLORS)], MARKERS[i % len(MARKERS)]) for i, p in enumerate(inside)}
+        if not several:
+            common.name_axis(ax, list(look))
         part = rows[rows["parameter"].isin(list(look))]
         common.decades(ax, part[["rmse", "linear_bound"]], ends=part[["rmse_low", "rmse_high"]])
         for i, (name, one) in enumerate(look.items()):
@@ -45,8 +49,8 @@ def _of_one(view: View, estimator: str) -> Drawing:
             if several:
                 ax.plot(bound["error_scale"], bound["linear_bound"], **style)
             else:
-                ax.hlines(bound["linear_bound"], i - 0.3, i + 0.3, **style)
-        _curves(ax, part, look, view, group)
+                ax.vlines(bound["linear_bound"], i - 0.3, i + 0.3, **style)
+        _curves(ax, part, look, view, group, inside[0]["unit"])
         if len(inside) > 1 and several:
             low, high = ax.get_ylim()
             ax.set_ylim(low, high * (high / low) ** (0.05 * (len(inside) + 1)))
@@ -55,27 +59,25 @@ def _of_one(view: View, estimator: str) -> Drawing:
             tight: Any = {"handlelength": 0.4, "handletextpad": 0.4, "columnspacing": 0.8, "borderaxespad": 0.2}
             ax.legend(handles, list(map(common.text, look)), ncols=2, fontsize="small", loc="upper left", **tight)
     ratio, last = "rmse_over_linear_bound", axes[-1]
+    each, together = {p["name"]: Look(GREY, ",") for p in view.parameters}, {ALL: Look(BLACK, "o")}
+    if not several:
+        common.name_axis(last, [ALL])
     common.decades(last, np.append(rows[ratio], [1.0, *totals["rmse"]]), ends=totals[["rmse_low", "rmse_high"]])
-    _curves(last, rows.assign(rmse=rows[ratio]), {p["name"]: Look(GREY, ",") for p in view.parameters}, view)
-    together = Look(BLACK, "o")
-    _curves(last, totals, {ALL: together}, view, "all parameters")
+    if several:
+        _curves(last, rows.assign(rmse=rows[ratio]), each, view)
+        last.plot([], [], color=GREY, label="each parameter")
+    _curves(last, totals, together, view, "all parameters", "bounds")
     common.bound_line(last, 1.0, "linear bound, eq. (5)")
-    last.plot([], [], color=GREY, label="each parameter")
-    common.axis_labels(fig, "error scale" if several else "", "rms error")
-    for ax, unit in zip(axes, [*(inside[0]["unit"] for inside in groups.values()), "bounds"], strict=True):
-        ax.set_ylabel(common.text(f"[{unit}]" if unit else ""))
-    common.legend(fig, axes[-1:], {"all together": together})
-    at = [f"{brief(v)} at scale {value_text(s)}" for s, v in totals[["error_scale", "rmse"]].dropna().to_numpy()]
+    common.legend(fig, axes[-1:])
+    at = [f"{brief(v)} at scale {value_text(s)}" for s, v in totals[["error_scale", "rmse"]].dropna().to_numpy()[-1:]]
     number = 2 if estimator == REFERENCE else 3
     of_paper = f"Figure {number} of the paper: " if view.paper else ""
     return view.drawing(
         fig,
         f"figure_{number}" if view.paper else f"parameter_errors_{estimator}",
         f"{of_paper}error of {estimator}, solved trials",
-        f"Root mean square error of {estimator} over the trials that it solved ({_missing(totals)}), with 95 %"
-        " bootstrap intervals, whose upper ends are drawn where no larger errors may be unseen; dotted: the linear"
-        " bound. Last panel: the same over the bounds.",
-        f"All parameters together: {'; '.join(at)}." if at else "",
+        f"Root mean square error and 95 % interval of the trials solved ({_missing(totals)}). Dotted: linear bounds.",
+        f"All together: {at[0]}." if at else "",
     )
 
 
@@ -90,17 +92,18 @@ def _groups(parameters: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[s
     return groups if len(groups) <= MOST_GROUPS else {}
 
 
-def _curves(ax: Any, rows: Any, look: Any, view: View, heading: str = "") -> None:
+def _curves(ax: Any, rows: Any, look: Any, view: View, heading: str = "", unit: str = "") -> None:
     given: Any = {"by": "parameter", "trials": "solved_trials", "heading": heading}
+    given["label"] = common.text(f"rms error [{unit}]" if unit else "rms error")
     common.curves(ax, rows, "rmse", look, view.scales, interval=("rmse_low", "rmse_high"), **given)
 
 
 def _missing(totals: pd.DataFrame) -> str:
-    """Says in how many trials an estimator solved the equation at each scale."""
-    lacking = totals[totals["solved_trials"] < totals["trials"]]
+    """Says in how many trials an estimator solved the equation at the largest scale where it did not in all."""
+    lacking = totals[totals["solved_trials"] < totals["trials"]].tail(1)
     rows = lacking[["solved_trials", "trials", "error_scale"]].to_numpy()
     seen = [f"{solved:.0f} of {trials:.0f} at scale {value_text(scale)}" for solved, trials, scale in rows]
-    return enumerate_few(seen, 12) or f"all of {totals['trials'].min():.0f}"
+    return "".join(seen) or f"all of {totals['trials'].min():.0f}"
 
 
 def draw_tracks(view: View) -> Iterator[Drawing]:
@@ -128,24 +131,23 @@ def draw_tracks(view: View) -> Iterator[Drawing]:
             if np.isfinite(one[name]).any():
                 ax.plot(one["at"], one[name], dash, color=BOUND_COLOR, linewidth=1.0, label=label, zorder=1)
         common.decades(ax, part[["rmse", "bound", "posterior", "posterior_smoothed"]])
-        common.title(ax, f"{state} [{one['unit'].iloc[0]}]" if one["unit"].iloc[0] else state)
+        unit = f" [{one['unit'].iloc[0]}]" if one["unit"].iloc[0] else ""
+        common.title(ax, state)
+        ax.set(xlabel="time [s]", ylabel=common.text(f"rms error{unit}"))
     first, ax = rows[rows["parameter"] == states[0]], axes[-1]
     common.lines(ax, first, "at", "nees", look, legend=False)
-    ax.axhspan(first["nees_low"].iloc[0], first["nees_high"].iloc[0], color=BOUND_COLOR, alpha=0.25, zorder=0)
+    common.band(ax, first["nees_low"].iloc[0], first["nees_high"].iloc[0], "limits of an honest covariance, 95 %")
     common.decades(ax, first["nees"])
-    common.title(ax, "NEES / n")
-    common.axis_labels(fig, "time [s]", "")
+    common.title(ax, "NEES")
+    ax.set(xlabel="time [s]", ylabel="NEES / n")
     common.legend(fig, axes, look)
     total = {name: np.sqrt(np.mean(part["rmse"] ** 2)) for name, part in first.groupby("estimator", sort=False)}
     yield view.drawing(
         fig,
         "tracks",
         "Tracks, converged trials",
-        "Root mean square error over trials at each epoch, with that of the filter, and of the smoother, linearised at"
-        " the truth, which good ones attain, and the posterior Cramér-Rao bounds, which lie far below. NEES over n"
-        " stays within the band at 95 % of single epochs if the covariance is right; neighbouring epochs are"
-        " dependent.",
-        f"{states[0]} over all epochs: {enumerate_few([f'{k} {v:.3g}' for k, v in total.items()], 20)}.",
+        "Root mean square error at each epoch, beside posterior Cramér-Rao bounds; NEES over states.",
+        f"{states[0]} over all epochs: {enumerate_few([f'{k} {v:.3g}' for k, v in total.items()], 3)}.",
     )
 
 

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
+from ipe_bench.basics.errors import UserError
 from ipe_bench.report.figures.drawing import Drawing
-from ipe_bench.report.style import MOST_FACES, Look, looks
+from ipe_bench.report.style import FACES, MOST_FACES, Look, looks
 from ipe_bench.report.words import value_text
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.records import ALL
@@ -19,7 +20,7 @@ from ipe_bench.statistics.records import ALL
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
-    from ipe_bench.statistics.collect import Collection
+    from ipe_bench.statistics.collect import Collection, Group
 
 MOST_SETTINGS = 6
 """Settings that have figures of their own; the tables have all."""
@@ -81,11 +82,9 @@ class View:
         return {label: look for label, look in self.look.items() if label in present}
 
     def drawing(self, figure: Canvas, name: str, title: str, *caption: str) -> Drawing:
-        """Returns a figure of this setting: the non-empty parts of its caption, and the setting's own label."""
-        words = [part for part in caption if part]
-        return Drawing(
-            f"{name}{self.suffix}", title, " ".join([*words, f"{self.label}."] if self.label else words), figure
-        )
+        """Returns a figure of this setting, whose label stands with the title; empty parts of the caption go."""
+        titled = f"{title} ({self.label})" if self.label else title
+        return Drawing(f"{name}{self.suffix}", titled, " ".join(filter(None, caption)), figure)
 
     def only(self, names: Sequence[str]) -> View:
         """Returns the same view with those frames alone."""
@@ -161,17 +160,33 @@ def _word(value: Any) -> str:
 
 
 def _looks(analysis: Analysis) -> dict[str, Look]:
-    """Returns a look for each estimator, in the colours of its family; of more than `MOST_FACES` the two best of each
-    family and the reference are in colour."""
+    """Returns a look for each estimator, in the colours of its family; of more than `MOST_FACES` those with a face are
+    in colour, or if there is none the two best of each family."""
     labels = list(dict.fromkeys(g.estimator for g in analysis.collection.groups))
     families = {g.estimator: family_of(g.footer) for g in analysis.collection.groups}
+    own = {g.estimator: _named(g) for g in analysis.collection.groups if g.footer.get("look")}
     if len(labels) <= MOST_FACES or analysis.summary.empty:
-        return looks(labels, families)
+        return looks(labels, families, own=own)
     totals = analysis.summary[analysis.summary["parameter"] == ALL]
     success = totals.groupby("estimator")["success"].mean()
     ranked = sorted(labels, key=lambda label: -success.get(label, 0.0))
     best = [label for label in labels if label in [e for e in ranked if families.get(e) == families.get(label)][:2]]
-    return looks(labels, families, chosen=best)
+    return looks(labels, families, () if FACES.keys() & set(labels) else best, own)
+
+
+def _named(group: Group) -> tuple[str, str]:
+    """Returns the colour and marker that an estimator's class names; raises UserError if there are none such."""
+    from matplotlib.colors import to_hex
+    from matplotlib.markers import MarkerStyle
+
+    try:
+        color, marker = group.footer["look"]
+        MarkerStyle(marker)
+        return to_hex(color), marker
+    except (TypeError, ValueError):
+        raise UserError(
+            f'{group.estimator}: look={group.footer["look"]} is no colour and marker; write look = ("#c51b7d", "s")'
+        ) from None
 
 
 def family_of(footer: Mapping[str, Any]) -> str:

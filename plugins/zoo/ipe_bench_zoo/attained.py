@@ -139,10 +139,8 @@ def draw_known_minima(view: View) -> Iterator[Drawing]:
         fig,
         "data_profile",
         "Data profile on known minima",
-        f"{problems} problems: functions of Moré, Garbow and Hillstrom from their starts. Solved: the sum of squares is"
-        " the least known one. Data profile of Moré and Wild: the share solved within that cost, a Jacobian counting n"
-        " simulations.",
-        f"Most, {round(final['share'].max() * problems)}, are solved by {enumerate_few(best)}.",
+        f"Share of {problems} problems of Moré, Garbow and Hillstrom solved within that cost (Moré and Wild).",
+        f"Most, {round(final['share'].max() * problems)}, are solved by {enumerate_few(best, 3)}.",
     )
 
 

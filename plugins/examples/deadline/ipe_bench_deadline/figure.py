@@ -24,23 +24,21 @@ def draw(view: View) -> Iterator[Drawing]:
     low, high = rows["deadline_low"].where(known), rows["deadline_high"].where(known)
     rows = rows.assign(low=low, high=high, tail=rows["deadline"] / rows["cost_median"].clip(lower=1))
     look = view.with_look(rows["estimator"])
-    fig, (by, tail) = common.panels(2, look, height=3.0)
+    fig, (by, tail) = common.panels(2, look, height=3.0, scales=view.scales)
     common.decades(by, np.concatenate([rows["deadline"], high, low]))
-    common.curves(by, rows, "deadline", look, view.scales, interval=("low", "high"), trials="trials")
-    by.set(title="99 % of trials are done by", ylabel="simulations")
+    words = {"heading": "99 % of trials are done by", "label": "simulations"}
+    common.curves(by, rows, "deadline", look, view.scales, interval=("low", "high"), **words)
     common.decades(tail, np.append(rows["tail"], 1.0))
-    common.curves(tail, rows, "tail", look, view.scales, trials="trials")
-    tail.set(title="over the median", ylabel="ratio")
+    common.curves(tail, rows, "tail", look, view.scales, heading="over the median", label="ratio")
     common.bound_line(tail, 1.0, "every trial alike")
     common.legend(fig, [by, tail], look)
     last = rows[rows["error_scale"] == view.scales[-1]].sort_values("deadline", kind="stable")
-    told = ", ".join(f"{e} {v:.3g}" for e, v in zip(last["estimator"], last["deadline"], strict=True))
+    told = ", ".join(f"{e} {v:.3g}" for e, v in last[["estimator", "deadline"]].to_numpy()[:3])
     yield view.drawing(
         fig,
         "deadline",
         "How long the slowest trials take",
-        "The cost by which 99 % of trials are done, well or not, with its 95 % interval where there are trials enough"
-        " for one; and how many times the median that is: far above 1, a few trials take most of the time.",
+        "The cost by which 99 % of trials are done, well or not, with its 95 % interval, and over the median.",
         f"At the largest scale: {told}.",
     )
 
