@@ -88,17 +88,8 @@ FACES = {
 """The looks of those that the bench is about, which no other has and which are never grey. They differ from each other
 in hue, marker and lightness, also for the colour-blind and in grey."""
 POOL = (
-    *(
-        "gauss_newton",
-        "relinearized",
-        "ukf_rts",
-        "ekf_rts",
-        "levenberg_marquardt",
-        "progressive",
-        "iterated_ekf",
-        "ckf",
-    ),
-    *("map_lm", "enkf", "iplf", "ukf_wide", "anderson", "damped_newton", "minpack", "dogbox", "least_squares"),
+    *("gauss_newton", "relinearized", "ukf_rts", "ekf_rts", "progressive", "levenberg_marquardt", "iterated_ekf"),
+    *("ckf", "map_lm", "enkf", "iplf", "ukf_wide", "anderson", "damped_newton", "minpack", "dogbox", "least_squares"),
     *("geodesic_lm", "multiscale_lm", "multistart", "ghkf", "ieks", "ipls", "grid", "bootstrap"),
 )
 """Our others, of which each has its own place among the markers and dashes; a name from elsewhere has one by chance."""

@@ -61,7 +61,7 @@ def test_there_are_no_errors_no_dialogs_no_requests_and_all_figures(desktop, pag
     outside = [url for url in desktop.requests if not url.startswith(("file:", "data:"))]
     assert outside == []
     assert HOSTILE in desktop.run("document.body.innerText")
-    widths = desktop.run("Array.from(document.images, i => i.naturalWidth)")
+    widths = desktop.run("Array.from(document.querySelectorAll('figure'), f => f.getBoundingClientRect().width)")
     drawn = {path.stem for path in (page_file.parent / "figures").glob("*.png")}
     assert "headline" in drawn
     assert len(widths) == len(drawn)
@@ -74,8 +74,10 @@ def test_the_page_is_dark_where_the_reader_has_it_so(desktop, page_file):
     desktop.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "dark"}])
     try:
         assert max(map(int, re.findall(r"\d+", desktop.run(color)))) < 50
-        # Pictures are drawn on white: black and white change places.
-        assert "invert" in desktop.run("getComputedStyle(document.images[0]).filter")
+        # Figures are dark by their own colours: the axes' ground is the page's, and their letters are light.
+        fill = "(e => getComputedStyle(document.querySelector(e)).fill)"
+        assert desktop.run(f"{fill}('.panels svg path')") == desktop.run(color)
+        assert min(map(int, re.findall(r"\d+", desktop.run(f"{fill}('.panels text')")))) > 150
     finally:
         desktop.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "light"}])
 
@@ -123,6 +125,11 @@ def test_a_phone_never_scrolls_the_page_sideways(browser, page_file):
     browser.go(page_file, 390, 844, phone=True)
     assert browser.run("document.documentElement.scrollWidth") <= 390
     assert browser.run("document.body.scrollWidth") <= 390
+    # The panels of a figure stand below each other.
+    tops = browser.run(
+        "Array.from(document.querySelectorAll('#figure-headline .panels svg'), s => s.getBoundingClientRect().y)"
+    )
+    assert len(tops) == len(set(tops)) >= 2
     # Tables scroll in a box of their own.
     box = "document.querySelector('#table-overview').parentElement"
     assert browser.run(f"{box}.scrollWidth > {box}.clientWidth")

@@ -199,14 +199,13 @@ def beyond(ax: Axes, x: Any, y: Any, one: Look) -> None:
     across = _value(ax) == "x"
     inches = (6 / 72, 0) if across else (0, 6 / 72)
     outwards = ax.transData + ScaledTranslation(*inches, ax.figure.dpi_scale_trans)
-    style: dict[str, Any] = {"linestyle": "none", "clip_on": False, "zorder": 3}
-    hollow = {"marker": one.marker, "markeredgecolor": one.color, "markerfacecolor": "white", "markeredgewidth": 1.1}
-    ax.plot(x, y, **hollow, **style)
-    arrow = {"marker": r"$\rightarrow$" if across else r"$\uparrow$", "color": one.color, "markeredgewidth": 0.0}
-    (arrows,) = ax.plot(x, y, transform=outwards, **arrow, **style)
-    arrows.set_in_layout(False)
+    edge: dict[str, Any] = {"markeredgecolor": one.color, "markerfacecolor": "white", "markeredgewidth": 1.1}
+    ax.plot(x, y, marker=one.marker, linestyle="none", clip_on=False, zorder=3, **edge)
+    arrow: dict[str, Any] = {"marker": r"$\rightarrow$" if across else r"$\uparrow$", "linestyle": "none"}
+    (arrows,) = ax.plot(x, y, transform=outwards, color=one.color, clip_on=False, zorder=3, **arrow)
+    arrows.set(in_layout=False, markeredgewidth=0.0)
     if BEYOND not in ax.get_legend_handles_labels()[1]:
-        ax.plot([], [], label=BEYOND, **arrow | {"color": BOUND_COLOR}, linestyle="none")
+        ax.plot([], [], label=BEYOND, color=BOUND_COLOR, markeredgewidth=0.0, **arrow)
 
 
 def seaborn_style(look: Mapping[str, Look], by: str = "estimator") -> dict[str, Any]:
@@ -260,13 +259,13 @@ def curves(
     elif not across:
         ax.set_xticks([])
     gap = float(np.diff(np.log10(scales)).min(initial=1.0))
-    all_trials, emptied = rows["trials"].max(), {"linestyle": "none", "markerfacecolor": "white"}
-    emptied["markeredgewidth"] = 1.1
+    all_trials = rows["trials"].max()
+    emptied: dict[str, Any] = {"linestyle": "none", "markerfacecolor": "white", "markeredgewidth": 1.1}
     hollow = False
     for i, (name, one) in enumerate(look.items()):
         part: Any = rows[rows[by] == name].sort_values("error_scale", kind="stable")
         beside = 10 ** (0.3 * gap * ((i + 0.5) / len(look) - 0.5))
-        x, values = np.full(len(part), i) if one_scale else part["error_scale"] * beside, part[y].clip(upper=most)
+        place, values = np.full(len(part), i) if one_scale else part["error_scale"] * beside, part[y].clip(upper=most)
         few, over = part[trials] < FEW, part[y] > most
         ends = None
         if interval and one.color != GREY:
@@ -280,11 +279,12 @@ def curves(
             line, empty = line | {"marker": ",", "zorder": 1}, empty & False
         hollow |= bool(empty.any())
         values = values.where(np.isfinite(values))
-        at = (values, x) if across else (x, values)
-        ax.errorbar(*at, elinewidth=0.8, **{"xerr" if across else "yerr": ends}, **line)
-        ax.plot(*(v[empty & ~over] for v in at), marker=one.marker, markeredgecolor=one.color, zorder=3, **emptied)
+        right, up = (values, place) if across else (place, values)
+        ax.errorbar(right, up, elinewidth=0.8, **{"xerr" if across else "yerr": ends}, **line)
+        inside = empty & ~over
+        ax.plot(right[inside], up[inside], marker=one.marker, markeredgecolor=one.color, zorder=3, **emptied)
         if one.color != GREY and over.any():
-            beyond(ax, *(v[over] for v in at), one)
+            beyond(ax, right[over], up[over], one)
     if hollow:
         ax.plot([], [], marker="o", markeredgecolor=BOUND_COLOR, label="hollow: trials missing, or few", **emptied)
     ax.set(**{f"{_value(ax)}label": label})
@@ -299,7 +299,7 @@ def legend(fig: Figure, axes: Sequence[Axes], look: Mapping[str, Look] | None = 
 
     named = {} if any(_value(ax) == "x" for ax in axes) else look or {}
     colored = {label: one for label, one in named.items() if one.color != GREY}
-    plain = {"linestyle": "none"} if points else {}
+    plain: dict[str, Any] = {"linestyle": "none"} if points else {}
     handles: dict[str, Any] = {text(label): Line2D([], [], **one.line | plain) for label, one in colored.items()}
     if len(colored) < len(named):
         handles[f"{len(named) - len(colored)} others"] = Line2D([], [], color=GREY)

@@ -47,7 +47,7 @@ def draw_costs(view: View) -> Iterator[Drawing]:
         inside = here[~here["over"]]
         sns.scatterplot(inside, x="cost", y="error", ax=ax, s=(1.4 * rcParams["lines.markersize"]) ** 2, **style)
         for name, lost in here[here["over"]].groupby("estimator", sort=False):
-            common.beyond(ax, lost["cost"], lost["error"], look[name])
+            common.beyond(ax, lost["cost"], lost["error"], look[str(name)])
         common.bound_line(ax, 1.0, view.reference if view.moving else "efficient estimator")
         ax.set_xscale("log")
         ax.set_xlim(rows["cost"].min() / 1.5, rows["cost"].max() * 1.5)

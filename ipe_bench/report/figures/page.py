@@ -45,10 +45,11 @@ def page_figure(figure: Figure, svg: str) -> str:
 
 def _cells(figure: Figure) -> dict[tuple[int, int], list[int]]:
     """Returns which axes stand at each row and column; empty if they are in no plain grid, or are not all there is."""
-    specs, cells = [ax.get_subplotspec() for ax in figure.axes], dict[tuple[int, int], list[int]]()
+    cells: dict[tuple[int, int], list[int]] = {}
+    specs = [spec for ax in figure.axes if (spec := ax.get_subplotspec()) and spec.num1 == spec.num2]
+    if figure.texts or len(specs) < len(figure.axes) or len({id(spec.get_gridspec()) for spec in specs}) != 1:
+        return {}
     for i, (ax, spec) in enumerate(zip(figure.axes, specs, strict=True)):
-        if figure.texts or spec is None or spec.num1 != spec.num2 or spec.get_gridspec() != specs[0].get_gridspec():
-            return {}
         if ax.axison:
             cells.setdefault((spec.rowspan.start, spec.colspan.start), []).append(i)
     return cells
@@ -59,7 +60,7 @@ def _edges(figure: Figure, cells: dict[tuple[int, int], list[int]]) -> list[dict
     width, height = 72 * figure.get_size_inches()
     columns, rows = dict[int, tuple[float, float]](), dict[int, tuple[float, float]]()
     for (row, column), inside in cells.items():
-        for box in (figure.axes[i].get_tightbbox() for i in inside):
+        for box in filter(None, (figure.axes[i].get_tightbbox() for i in inside)):
             x0, y0, x1, y1 = (72 / figure.dpi * v for v in box.extents)
             for ends, at, low, high in ((columns, column, x0, x1), (rows, row, height - y1, height - y0)):
                 least, most = ends.get(at, (low, high))
@@ -83,7 +84,7 @@ def _classed(html: str) -> str:
         styles[name] = re.sub(r"font-family: [^;]*; ", "", found[1])
         return f' class="{name}"'
 
-    html = re.sub(r'<g id="[^"]*">', "<g>", html)
+    html = re.sub(r'<g id="[^"]*"', "<g", html)
     html = re.sub(r' style="((?:fill|stroke|font|opacity|clip)[^"]*)"', named, html)
     html = re.sub(r' transform="rotate\(-0 [^"]*"', "", html)
     html = re.sub(r' (?:d|x|y)="[^"]*"', lambda found: re.sub(r"(\.\d\d)\d+|\s*\n", r"\1", found[0]), html)
