@@ -107,7 +107,7 @@ class Tracker(Component, ABC):
     options, and the identity of its results.
 
     Required: `track(model, z)`, which returns `Tracks`. `Tracks.empty(model, trials)` has the arrays to be filled.
-    Optional: `look`; `hindrance(model)`, which is asked before any work; `smooths`, if later readings count, whose error over
+    Optional: `look`; `hindrance(model)`, asked before any work; `smooths`, if later readings count, whose error over
     the path is then held against a smoother's bound. A filter of a new `Rule` needs no tracker of its own.
     Promised: readings that are NaN are missing; a trial has the same bits alone and in any batch, its random numbers
     included; a trial that breaks down is NaN, or raises if it is alone, and disturbs no other.

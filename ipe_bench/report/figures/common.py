@@ -79,8 +79,8 @@ def panels_of_scales(rows: pd.DataFrame, look: Mapping[str, Look]) -> tuple[Figu
 
 
 def left_out(scales: Sequence[float], panels: Sequence[Any]) -> str:
-    """Says how many of the scales have no panel."""
-    return f"{len(scales) - len(panels)} scales between have no panel." if len(panels) < len(scales) else ""
+    """Says how many of the scales have panels, unless all have."""
+    return f"Panels: {len(panels)} of {len(scales)} scales." if len(panels) < len(scales) else ""
 
 
 def text(value: Any) -> str:

@@ -88,7 +88,7 @@ def draw_distributions(view: View) -> Iterator[Drawing]:
         fig,
         "distributions",
         "Distribution of errors, all trials",
-        "Share of all trials whose error is at most that; where a curve ends, the others lie beyond.",
+        "Share of all trials with at most that error.",
         common.left_out(view.scales, panels),
         f"99 % quantile at scale {value_text(top)}: {enumerate_few(seen, 2)}.",
     )
