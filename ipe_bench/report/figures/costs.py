@@ -61,7 +61,7 @@ def draw_costs(view: View) -> Iterator[Drawing]:
         fig,
         "cost_against_accuracy",
         "Cost against accuracy, all trials",
-        "Down and left is better; points of one cost stand side by side.",
+        "Down and left is better; equal costs stand side by side.",
         common.left_out(view.scales, panels),
         f"Cheapest within 5 % of the least error at scale {value_text(view.scales[-1])}: {good['estimator']},"
         f" {short(good['simulations_median'])}.",
