@@ -22,7 +22,7 @@ def test_a_page_states_command_version_and_file_and_no_path_of_this_machine(tmp_
     pd.DataFrame({"x_error": error, "x_std": 0.1}).to_csv(file, index=False)
     assert main(["audit", str(file), f"output={tmp_path / 'out'}"]) == 1
     page = (tmp_path / "out" / "audit.html").read_text(encoding="utf-8")
-    for words in ("ipe-bench audit …/runs.csv output=…/out", f"ipe-bench {ib.__version__}", "How to cite", "<img"):
+    for words in ("ipe-bench audit …/runs.csv output=…/out", f"ipe-bench {ib.__version__}", "How to cite", "<figure"):
         assert words in page
     assert hashlib.sha256(file.read_bytes()).hexdigest()[:16] in page
     assert str(tmp_path) not in page

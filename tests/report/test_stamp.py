@@ -53,7 +53,7 @@ def test_the_report_has_the_figures_and_formats_that_were_asked_for_last(
         page = (tmp_path / "report.html").read_text(encoding="utf-8")
         links = set(re.findall(r'href="figures/([^"]+)"', page))
         assert links == {path.name for path in tmp_path.glob("figures/*.*")} - {"index.json"}
-        assert page.count("<img") == len({name.partition(".")[0] for name in links})
+        assert page.count("<figure") == len({name.partition(".")[0] for name in links})
         return links
 
     def kinds() -> set[str]:

@@ -64,7 +64,7 @@ def draw_costs(view: View) -> Iterator[Drawing]:
         "Down and left is better; equal costs stand side by side.",
         common.left_out(view.scales, panels),
         f"Cheapest within 5 % of the least error at scale {value_text(view.scales[-1])}: {good['estimator']},"
-        f" {short(good['simulations_median'])}.",
+        f" {short(good['simulations_median'])} simulations.",
     )
 
 

@@ -53,7 +53,7 @@ def draw(view: View) -> Iterator[Drawing]:
         fig,
         "headline",
         f"Success, error and reported covariance {over}",
-        f"Trials that {gate}, with 95 % intervals; median error, with a bar to the 95 % quantile; NEES, the squared"
+        f"Trials that {gate}, with 95 % intervals; median error over {view.reference}, bar to 95 %; NEES, the squared"
         " error over the claimed variance.",
     )
 
