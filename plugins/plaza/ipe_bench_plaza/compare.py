@@ -23,6 +23,15 @@ def errors(x: Array, gps: Array) -> tuple[float, float, float]:
     return float(np.sqrt(np.mean(distance**2))), float(distance.max()), float(distance[-1])
 
 
+def turned(x: Array, gps: Array) -> Array:
+    """Returns a path (K, 2) moved and turned as a whole next to that of GPS, by least squares (Kabsch, 1976)."""
+    path, true = (one @ np.array([1.0, 1j]) for one in (x, gps))
+    path, middle = path - path.mean(), true.mean()
+    across = np.sum(path.conj() * (true - middle))
+    path = middle + path * across / np.abs(across)
+    return np.stack([path.real, path.imag], axis=1)
+
+
 def compared(folder: Path, samples: Path = SAMPLES) -> pd.DataFrame:
     """Returns a row per tracker: errors of path and beacons in m, and the verdict on its innovations."""
     gps = pd.read_csv(samples / "plaza2_gps.csv")
@@ -31,8 +40,11 @@ def compared(folder: Path, samples: Path = SAMPLES) -> pd.DataFrame:
     tracks, rows = pd.read_csv(folder / "track.csv"), []
     for label, track in tracks.groupby("tracker", sort=False):
         x = track[["x [m]", "y [m]"]].to_numpy()
-        rms, largest, end = errors(x, gps.iloc[:, 1:].to_numpy())
-        last, row = track.iloc[-1], {"path rms": rms, "largest": largest, "last": end}
+        true = gps.iloc[:, 1:].to_numpy()
+        rms, largest, end = errors(x, true)
+        claimed = float(np.sqrt((track[["x_deviation [m]", "y_deviation [m]"]] ** 2).sum(axis=1).mean()))
+        row = {"path rms": rms, "claimed": claimed, "turned": errors(turned(x, true), true)[0]}
+        last, row = track.iloc[-1], {**row, "largest": largest, "last": end}
         for number, *place in surveyed.itertuples(index=False):
             at = [last[f"{axis}{number:.0f} [m]"] for axis in "xy"]
             row[f"beacon {number:.0f}"] = float(np.hypot(*np.subtract(at, place)))
@@ -41,4 +53,5 @@ def compared(folder: Path, samples: Path = SAMPLES) -> pd.DataFrame:
 
 
 if __name__ == "__main__":
-    print(compared(Path(sys.argv[1])).round(2).to_string(index=False))
+    found = pd.concat([compared(Path(folder)) for folder in sys.argv[1:]])
+    print(found.round(2).to_string(index=False))

@@ -10,7 +10,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from ipe_bench_plaza import Plaza
-from ipe_bench_plaza.compare import errors
+from ipe_bench_plaza.compare import errors, turned
 from ipe_bench_plaza.make_log import motion
 
 import ipe_bench as ib
@@ -82,3 +82,8 @@ def test_beacons_that_are_none_are_refused(options, complaint):
 def test_errors_are_those_beside_gps():
     gps, x = np.zeros((3, 2)), np.array([[3.0, 4.0], [0.0, 0.0], [0.0, 1.0]])
     assert errors(x, gps) == pytest.approx((np.sqrt(26 / 3), 5.0, 1.0))
+
+
+def test_a_path_that_is_moved_and_turned_comes_to_lie_on_gps():
+    gps, c, s = np.random.default_rng(2).normal(size=(30, 2)), np.cos(1.3), np.sin(1.3)
+    np.testing.assert_allclose(turned(gps @ [[c, s], [-s, c]] + [5.0, -3.0], gps), gps, atol=1e-12)
