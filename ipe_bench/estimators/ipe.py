@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Generic, Literal, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import (
     Array,
     Covariance,
@@ -95,10 +94,10 @@ class FrozenSystem:
         """Builds the paper's system: H about the nominal point, for readings z (trials, m).
 
         Raises:
-            UserError: H has not full column rank.
+            LinAlgError: H has not full column rank.
         """
         if problem.rankless:
-            raise UserError(
+            raise np.linalg.LinAlgError(
                 f"measurement={problem.measurement.name}: H has not full column rank at the nominal point: some "
                 "parameters cannot be told apart there, so there is no linear estimate to start from; give another "
                 "nominal point, start=nominal or best for least squares, or an estimator with a prior"
