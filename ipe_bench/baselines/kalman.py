@@ -194,7 +194,7 @@ class _CKFTrack(FilterpyFilter):
 
         n = len(P0)
         self.reference = np.zeros(n)
-        self.filter = CubatureKalmanFilter(dim_x=n, dim_z=1, dt=1.0, hx=None, fx=lambda x, dt: x)
+        self.filter: Any = CubatureKalmanFilter(dim_x=n, dim_z=1, dt=1.0, hx=None, fx=lambda x, dt: x)
         self.filter.x, self.filter.P, self.filter.Q = np.zeros((n, 1)), P0, Q
 
     @property
@@ -247,7 +247,7 @@ class _EnKFTrack(FilterpyFilter):
         self.stream = stream
         with _drawing_from(stream):
             x = np.zeros(len(P0))
-            self.filter = EnsembleKalmanFilter(x=x, P=P0, dim_z=1, dt=1.0, N=members, hx=None, fx=lambda x, dt: x)
+            self.filter: Any = EnsembleKalmanFilter(x=x, P=P0, dim_z=1, dt=1.0, N=members, hx=None, fx=lambda x, dt: x)
         self.filter.Q = Q
 
     def predict(self) -> None:

@@ -181,7 +181,7 @@ def _over_paths(summary: pd.DataFrame) -> Iterator[Fact]:
     errors = errors.loc[:, (errors > 0).all()].dropna()
     if len(errors) < 2 or errors.empty:
         return
-    size = np.sqrt((errors / errors.max()).pow(2).mean(axis=1)).sort_values(kind="stable")
+    size = (errors / errors.max()).pow(2).mean(axis=1).pow(0.5).sort_values(kind="stable")
     yield "paths", {"errors": list((size / size.max()).items())}
 
 

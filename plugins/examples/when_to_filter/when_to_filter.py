@@ -22,8 +22,6 @@ import ipe_bench as ib
 from ipe_bench.basics.linalg import Covariance
 from ipe_bench.states import WalkingGins, bound_at_truth, ekf
 from ipe_bench.states.linearisation import slope
-from ipe_bench.states.walking_gins import KINEMATIC
-from ipe_bench.trials.tracking import StateScenario
 
 WALKS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
 """Multiples of a drift's size (0.01 deg/h about x and y, 0.1 deg/h about z) in an hour."""
@@ -56,9 +54,9 @@ def errors_by_walk(model: WalkingGins) -> np.ndarray:
 
 def ratios(model: WalkingGins, scale: float, walked: np.ndarray, trials: int) -> dict[str, float]:
     """Root mean square over trials and standing parameters of error over bound, for each estimator."""
-    wide, unaware = (StateScenario(m, error_scale=scale).assumed for m in (model, replace(model, walk=0.0)))
+    wide, unaware = (ib.StateScenario(m, error_scale=scale).assumed for m in (model, replace(model, walk=0.0)))
     paths = wide.draw(0, trials)
-    z, truth = paths.z.reshape(trials, -1), paths.start[:, KINEMATIC:]
+    z, truth = paths.z.reshape(trials, -1), paths.start[:, -ib.measurements.Gins().n :]
     noise = ib.noise.Gaussian(model.deviation)
     problem = ib.Scenario(model.gins, noise, error_scale=scale).problem
     R = model.deviation**2 * np.eye(len(walked)) + model.walk**2 * walked

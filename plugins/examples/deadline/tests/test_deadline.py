@@ -51,7 +51,7 @@ def test_a_report_has_the_column_and_the_figure(tmp_path, monkeypatch):
         ib.run(bench, {"newton": ib.solvers.Newton()}, 40, output="out")
         trials = ib.load("out")
         cost = trials["simulations"] + trials["jacobians"] * bench.measurement.n
-        result = ib.report("out", figures="all")
+        result = ib.report("out", figures="all", formats="md")
     finally:
         monkeypatch.undo()
         discovery.sources.cache_clear()
