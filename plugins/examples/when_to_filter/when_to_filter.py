@@ -26,6 +26,8 @@ from ipe_bench.states.linearisation import slope
 WALKS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
 """Multiples of a drift's size (0.01 deg/h about x and y, 0.1 deg/h about z) in an hour."""
 SCALES = (1.0, 10.0, 33.0)
+KINEMATIC = 11
+"""States of the platform and the computer, which stand before the eleven errors."""
 STANDING = [0, 1, 2, 3, 7, 8, 9, 10]
 """The parameters that do not walk."""
 STYLES = {
@@ -56,7 +58,7 @@ def ratios(model: WalkingGins, scale: float, walked: np.ndarray, trials: int) ->
     """Root mean square over trials and standing parameters of error over bound, for each estimator."""
     wide, unaware = (ib.StateScenario(m, error_scale=scale).assumed for m in (model, replace(model, walk=0.0)))
     paths = wide.draw(0, trials)
-    z, truth = paths.z.reshape(trials, -1), paths.start[:, -ib.measurements.Gins().n :]
+    z, truth = paths.z.reshape(trials, -1), paths.start[:, KINEMATIC:]
     noise = ib.noise.Gaussian(model.deviation)
     problem = ib.Scenario(model.gins, noise, error_scale=scale).problem
     R = model.deviation**2 * np.eye(len(walked)) + model.walk**2 * walked
