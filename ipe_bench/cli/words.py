@@ -31,7 +31,7 @@ MOST_JOBS = 10_000
 """The largest sweep."""
 TRUTH = "truth_measurement"
 HYDRAS_TRUTH = f"measurement@{TRUTH}"
-_FORMULA = re.compile(
+_TEXT = re.compile(
     rf"(\+*(?:(?:measurement|{TRUTH})\.(?:expression|(?:time_)?unit|(?:initial|rates|outputs)\.\w+)"
     r"|state_model\.(?:next|readings)\.\w+))=([^'\"].*)",
     re.DOTALL,
@@ -167,7 +167,7 @@ def _expanded(word: str) -> list[str]:
     """Parses a word by Hydra's grammar, or the words of a file in its place."""
     if found := _FILE.fullmatch(word):
         return _from_file(found[1] or found[2], found[3], word)
-    found = _FORMULA.fullmatch(word)
+    found = _TEXT.fullmatch(word)
     if found and not (found[1].endswith("unit") and re.search(r"[,\[\]{}]", found[2])):
         return [f"{found[1]}={_quoted(found[2])}"]
     if word.startswith("formats=") and "," in word and "[" not in word:

@@ -1,7 +1,7 @@
 """Defines every statistic in one record: its name and meaning, its trials, its formula and its format.
 
-`summary.csv`, the appendix of the report, tables and the terminal are read from these lists: a record that is added
-here is added everywhere. `registry` adds those of plugins; formulas longer than a line are in `formulas`.
+`summary_all.csv`, the appendix of the report, tables and the terminal are read from these lists; `summary.csv` has what
+`MAIN` names. `registry` adds those of plugins; formulas longer than a line are in `formulas`.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ Ends = f.Ends
 
 @dataclass(frozen=True)
 class Statistic:
-    """Defines a statistic of a scenario under an estimator, which becomes a column of `summary.csv` and of tables.
+    """Defines a statistic of a scenario under an estimator, which becomes a column of `summary_all.csv` and of tables.
 
     Required: `name`, `title`, `over`, `meaning` and `values`.
     Optional: `limits` (an interval); `given`, `kind`, `where`, `titles`, `limits_titles` and `rare` (how it is shown).
