@@ -121,7 +121,7 @@ def left_of_skeleton(options: Sequence[Option]) -> Iterator[Finding]:
     """Finds the texts of `ipe-bench new` that authors replace, in the packages of these options."""
     homes = dict.fromkeys(option.source.conf.parent for option in options)
     for path in (p for home in homes for p in sorted(home.rglob("*")) if p.suffix in (".py", ".yaml")):
-        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+        for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
             if found := _PLACEHOLDER.search(line):
                 note = f'line {number} still says "{found[0].strip()}": say what yours is'
                 yield Finding(path.name, "Describes itself", note=note)

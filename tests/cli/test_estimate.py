@@ -244,9 +244,9 @@ def test_the_digest_is_of_the_bytes_that_were_estimated(estimate, misra, tmp_pat
     before = hashlib.sha256((tmp_path / "my.csv").read_bytes()).hexdigest()
     fitted = Question.fitted
 
-    def changed(self):
+    def changed(self, *watching):
         (tmp_path / "my.csv").write_text("t,y\n1,2\n")
-        return fitted(self)
+        return fitted(self, *watching)
 
     monkeypatch.setattr(Question, "fitted", changed)
     code, printed, answer = estimate(*SATURATION, *LM, "readings=my.csv")
@@ -270,4 +270,4 @@ def test_noise_that_is_overstated_is_said_and_rounded_intervals_hold_the_estimat
     # Towards growth at any rate, of an a of 1e-155 and less, numbers end before the readings set a limit.
     assert "b -3.12 … 4.55 - … ∞" in printed
     assert "An end of the profile is missing: b;" in printed
-    assert "c -2.30 … 2.90 −∞ … ∞ -10.0 … 1.57" in printed  # to tens, as the width is, the upper end would be 0
+    assert "c -2.30 … 2.90 −∞ … ∞ -9.97 … 1.57" in printed  # to tens, as the width is, the upper end would be 0

@@ -222,7 +222,9 @@ def test_summary_table_and_figures_say_so(synthetic):
     with house_style():
         drawings = {d.name: d for kind in figure.FIGURES for d in kind.draw(view)}
     assert set(drawings) == {"headline", "calibration", "distributions"}
-    assert "boaster (most errors 2.0 times larger than claimed" in drawings["calibration"].caption
+    said = [cell.text for column in shown.columns for cell in column.cells if "most errors" in cell.text]
+    assert len(said) == 2
+    assert all("most errors 2.0 times larger than claimed" in text for text in said)
 
 
 def _verdicts(scenario, estimators, trials):
