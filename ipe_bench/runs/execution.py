@@ -182,10 +182,14 @@ def supervise(
                 worker = busy[connection]  # pyright: ignore[reportArgumentType]
                 kind, value = worker.receive()
                 if kind == "started":
+                    worker.fresh = True
                     worker.extend(prepares_s)
                 elif kind == "step":
                     worker.extend(timeout_s if value == PREPARED else prepares_s)
                     yield Event(worker.index, value)
+                elif kind == "died" and not worker.fresh:  # it was ending while it was handed this task
+                    del busy[connection]  # pyright: ignore[reportArgumentType]
+                    waiting.appendleft(worker.index)
                 else:
                     del busy[worker.connection]
                     if kind != "died":
@@ -226,6 +230,8 @@ class _Worker:
         )
         there.close()
         self.index, self.deadline = -1, math.inf
+        self.fresh = True
+        """Whether a death is the work of the task at hand: false from when it has waited until its next task starts."""
 
     def extend(self, seconds: float | None) -> None:
         """Resets the deadline of the next step; None: there is none."""
@@ -269,7 +275,11 @@ def _begun(index: int, message: Any) -> _Worker:
     """Hands a task to an idle worker, else to a new one."""
     kept = _idle.setdefault(os.getpid(), [])
     while True:
-        worker = kept.pop() if kept else _Worker()
+        if kept:
+            worker = kept.pop()
+            worker.fresh = False
+        else:
+            worker = _Worker()
         worker.index, worker.deadline = index, math.inf
         with contextlib.suppress(OSError):
             if worker.process.poll() is None:

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -65,11 +66,6 @@ def reference(tmp_path_factory) -> dict[str, np.ndarray]:
     folder = tmp_path_factory.mktemp("serial")
     assert compute([scenario()], GOOD, 40, folder, execution=Serial(), block_size=10) == ()
     return stored(folder)
-
-
-def test_processes_compute_the_same_bits_as_one_process(tmp_path, reference):
-    assert compute([scenario()], GOOD, 40, tmp_path, execution=Processes(2), block_size=10) == ()
-    assert_same(stored(tmp_path), reference)
 
 
 def test_a_run_completes_when_a_worker_is_killed(tmp_path, reference):
@@ -243,8 +239,20 @@ def test_a_worker_that_dies_between_two_runs_is_replaced():
         assert events[-1].failure is None
         pids.append(events[0].step[0])
         os.kill(pids[-1], signal.SIGTERM)
-        gone_within(5, pids[-1])
+        assert gone_within(60, pids[-1])
     assert pids[0] != pids[1]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="stops processes with POSIX means")
+def test_a_task_handed_to_a_worker_that_is_ending_is_handed_to_another():
+    (seen,) = [event.step for event in Processes(1).run(rogues.surroundings, [0]) if not event.ended]
+    os.kill(seen[0], signal.SIGSTOP)  # it takes a message, and never reads it
+    killer = threading.Timer(1.0, os.kill, (seen[0], signal.SIGKILL))
+    killer.start()
+    events = list(Processes(1).run(rogues.surroundings, [0]))
+    killer.join()
+    assert [event.failure for event in events] == [None, None]
+    assert events[0].step[0] != seen[0]
 
 
 def test_a_script_needs_no_guard_against_being_imported_by_its_workers(tmp_path):
