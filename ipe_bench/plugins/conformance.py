@@ -537,23 +537,29 @@ def suits_itself(model: StateModel) -> None:
 def moves_batches(model: StateModel) -> None:
     """Moves and reads a stack of states as one by one, bit for bit, and analytically: slopes are complex steps."""
     x, k = StateModel.draw(model, 0, 4).x[:, -1], model.epochs - 1
-    for name, function in (("transition", model.transition), ("observe", model.observe)):
+    by_state = {"gain_at": model.gain_by_state, "R_at": model.R_by_state}
+    for name in ("transition", "observe", *(name for name, varies in by_state.items() if varies)):
+        function = getattr(model, name)
         values = function(x, k)
         alone = np.concatenate([function(one[None], k) for one in x])
         assert np.array_equal(values, alone), f"{name} gives a state alone other bits: compute each by itself"
+        if name in by_state:
+            continue
         exact, rough = (differentiate(lambda u, f=function: f(u, k), x, analytic=how) for how in (True, False))
         close = np.allclose(exact, rough, rtol=1e-4, atol=1e-6 * np.abs(rough).max())
         assert close, f"{name} is not analytic: write np.where(u.real < 0, -u, u) for np.abs(u), and the like"
 
 
 def wraps_its_angles(model: StateModel) -> None:
-    """States the periods of readings that jump by a whole turn."""
+    """States the periods of readings and states that jump by a whole turn."""
     x = StateModel.draw(model, 0, TRIALS).x[:, -1]
     ways = np.linspace(x, -np.roll(x, 1, axis=0), 2001)  # from each state to the far side of another
-    steps = np.abs(np.diff(model.observe(ways, model.epochs - 1), axis=0)).max(axis=(0, 1))
-    for i, (step, period) in enumerate(zip(steps, model.periods or np.zeros(len(steps)), strict=True)):
-        turns = any(0.98 * turn < step < 1.02 * turn for turn in (2 * np.pi, 360.0))
-        assert period or not turns, f"reading {i + 1} jumps by {step:.3g}: it is an angle; state its period"
+    sides = ("reading", model.observe, model.periods), ("state", model.transition, model.state_periods)
+    for what, function, periods in sides:
+        steps = np.abs(np.diff(function(ways, model.epochs - 1), axis=0)).max(axis=(0, 1))
+        for i, (step, period) in enumerate(zip(steps, periods or np.zeros(len(steps)), strict=True)):
+            turns = any(0.98 * turn < step < 1.02 * turn for turn in (2 * np.pi, 360.0))
+            assert period or not turns, f"{what} {i + 1} jumps by {step:.3g}: it is an angle; state its period"
 
 
 def tracks_its_trials(tracker: Tracker) -> None:

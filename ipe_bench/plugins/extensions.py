@@ -77,8 +77,8 @@ def require_type(thing: Any, kind: type, says: str = "gives") -> Any:
 
 def use_statistics() -> list[str]:
     """Registers the statistics of all plugins beside ours; returns a line for each that cannot be."""
-    from ipe_bench.statistics.records import Statistic
     from ipe_bench.statistics.registry import add_statistics
+    from ipe_bench.statistics.statistic import Statistic
 
     problems: list[str] = []
     found = [one for _, one in added("statistic", problems, lambda record: require_type(record, Statistic, "is"))]

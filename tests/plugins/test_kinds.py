@@ -81,7 +81,11 @@ def files(folder: str) -> dict[str, str]:
     return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in paths if path.name != "index.json"}
 
 
-@pytest.mark.parametrize("kind", KINDS)
+DEAR = ("figure", "table", "section")
+"""Each draws a report, as `test_a_report_has_what_plugins_add_beside_all_that_is_ours` does of all of them at once."""
+
+
+@pytest.mark.parametrize("kind", [pytest.param(k, marks=pytest.mark.slow if k in DEAR else ()) for k in KINDS])
 def test_what_new_makes_passes_its_checks(kind, capsys):
     assert main(["new", kind, "mine"]) == 0
     assert ("figures=all" in capsys.readouterr().out) == (kind == "figure")  # the main ones do not hold a new figure

@@ -79,18 +79,14 @@ def test_values_are_kept_as_their_type_has_them():
     assert hash(model) == hash(Ranging(position=(1.0, 2.0, 3.0), beacons=((1.0, 1.0, 1.0),) * 5, rounds=2))
 
 
+# fmt: off
 WRONG = [
-    (Newton, "tolerance", -1.0),
-    (Newton, "start", "home"),
-    (Relinearized, "budget", 0.0),
-    (LevenbergMarquardt, "damping", inf),
-    (EKF, "prior_inflation", nan),
-    (Gaussian, "deviation", True),
-    (Gins, "readings_per_case", 0),
-    (Nist, "dataset", "Iris"),
-    (Processes, "workers", 0),
+    (Newton, "tolerance", -1.0), (Newton, "start", "home"), (Relinearized, "budget", 0.0),
+    (Gaussian, "deviation", True), (LevenbergMarquardt, "damping", inf), (EKF, "prior_inflation", nan),
+    (Gins, "readings_per_case", 0), (Nist, "dataset", "Iris"), (Processes, "workers", 0),
     (SteepestDescent, "max_iterations", "many"),
 ]
+# fmt: on
 
 
 @pytest.mark.parametrize(("cls", "key", "value"), WRONG, ids=lambda v: getattr(v, "__name__", str(v)))

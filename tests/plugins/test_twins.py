@@ -41,7 +41,16 @@ def test_of_one_distribution_the_folders_copy_runs_in_workers_too_and_nothing_is
     listed = run("list", "solver", site=site)
     assert (listed.returncode, listed.stderr) == (0, "")
     assert "\nsolver, from plugins/twin\n" in listed.stdout
-    done = run("run", *CHOSEN, "trials=4", "execution=processes", "output=out", "figures=none", site=site)
+    done = run(
+        "run",
+        *CHOSEN,
+        "trials=4",
+        "execution=processes",
+        "execution.workers=1",
+        "output=out",
+        "figures=none",
+        site=site,
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     assert "left out" not in done.stderr
 

@@ -158,6 +158,7 @@ def _opening(problem: Problem, needs: tuple[Need, ...]) -> str:
     model, R, prior = problem.measurement, problem.R, problem.prior_covariance()
     told = [{"name": p.name, "unit": p.unit, "size": p.size} for p in model.parameters]
     blocks = {"n": np.array([model.n]), "m": np.array([model.m]), "nominal": problem.x0}
+    blocks["size"] = np.array([p.size for p in model.parameters])
     blocks |= {"sigma": R.factor} if R.factor.ndim == 1 else {"R": R.matrix()}
     if "prior" in needs and prior is not None:
         blocks |= {"prior": prior.factor} if prior.factor.ndim == 1 else {"P0": prior.matrix()}

@@ -21,6 +21,8 @@ _BEGIN_S = 20.0
 """The first answer may take this long: some languages compile when they start."""
 _LONGEST = 1 << 26
 """Bytes of the longest line: a covariance of a thousand parameters has a third of that."""
+_QUOTED = 4
+"""Last lines of a program that ended: R and Octave say why before the very last one."""
 _SPELT = {"nan": "NaN", "inf": "Inf", "-inf": "-Inf"}
 """R reads no others."""
 
@@ -149,10 +151,10 @@ class Program:
             self.process.wait(1.0)
         with contextlib.suppress(BlockingIOError):
             self.complaint += os.read(self.errors, 1 << 16)
-        code, last = self.process.returncode, self.complaint.strip().splitlines()[-1:]
+        code, last = self.process.returncode, self.complaint.strip().splitlines()[-_QUOTED:]
         how = "closed its output" if code is None else f"ended with exit code {code}"
         how = f"was ended by signal {-code}" if code is not None and code < 0 else how
-        return how + "".join(f": {_shown(line)[1:-1]}" for line in last)
+        return how + (": " + " | ".join(_shown(line)[1:-1] for line in last) if last else "")
 
     def end(self) -> None:
         """Ends the program with all that it has started in its process group."""

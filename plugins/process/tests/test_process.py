@@ -37,10 +37,6 @@ def require(language: str) -> None:
             pytest.skip(f"{tool} is not installed")
 
 
-def bits(estimates) -> list[bytes]:
-    return [getattr(estimates, name).tobytes() for name in ("x", "status", "simulations", "covariance")]
-
-
 @pytest.fixture(scope="module")
 def programs(tmp_path_factory) -> Path:
     require("cpp")
@@ -109,28 +105,21 @@ def test_what_new_makes_keeps_its_promises_and_equals_gauss_newton(language, wor
 
 TRIALS, BAD = 6, 3
 STATUS = {"nan": ib.Status.NONFINITE, "fork": ib.Status.CONVERGED, "more": ib.Status.CONVERGED}
+# fmt: off
 LINES = {
-    "short": "wrote x with 2 numbers, and not 4",
-    "word": "wrote x with what is no number",
-    "huge": "wrote x with 2 numbers, and not 99999999999",
+    "short": "wrote x with 2 numbers, and not 4", "word": "wrote x with what is no number",
+    "huge": "wrote x with 2 numbers, and not 99999999999", "nothing": "answered without x and status",
     "print": "wrote 'Warning: step rejected', where a line NAME COUNT or `end` belongs",
-    "nothing": "answered without x and status",
-    "no_status": "answered without status",
-    "status": "wrote status 42, and not one of 0 to 8",
-    "half_status": "wrote status 0.5",
-    "twice": "wrote x twice in one answer",
-    "count": "wrote iterations -1, which is no count",
-    "skew": "wrote a P that is not symmetric",
-    "question": "asked with 3 numbers, and not a multiple of 4",
-    "signal": "was ended by signal 11",
-    "exit": "ended with exit code 2: matrix is singular",
+    "no_status": "answered without status", "status": "wrote status 42, and not one of 0 to 8",
+    "half_status": "wrote status 0.5", "twice": "wrote x twice in one answer",
+    "count": "wrote iterations -1, which is no count", "skew": "wrote a P that is not symmetric",
+    "question": "asked with 3 numbers, and not a multiple of 4", "signal": "was ended by signal 11",
+    "exit": "ended with exit code 2: reading settings | matrix is singular", "blocks": "wrote a twice in one answer",
     "sleep": "gave no whole answer within the time limit; does it flush its output after `end`?",
-    "blocks": "wrote a twice in one answer",
-    "line": "",
-    "stderr": "gave no whole answer within the time limit",
-    "close": "closed its output",
+    "stderr": "gave no whole answer within the time limit", "close": "closed its output", "line": "",
     "fork_and_exit": "ended with exit code 0",
 }
+# fmt: on
 
 
 @functools.cache
@@ -163,8 +152,8 @@ def test_a_fault_costs_its_own_trial_and_a_line(fault):
 
 
 REFUSED = {
-    "LICENCE": "ended with exit code 3: the licence has expired",
-    "VERSION": "ended with exit code 3: speaks version 2 alone",
+    "LICENCE": "ended with exit code 3: reading settings | the licence has expired",
+    "VERSION": "ended with exit code 3: reading settings | speaks version 2 alone",
     "BANNER": "wrote 'Solver 3.1, 2026', where a line NAME COUNT",
     "DOUBLE": "after `end`",
     "ONCE": "ended with exit code 0",
@@ -216,6 +205,7 @@ def rows(folder: str) -> pd.DataFrame:
     return ib.load(folder).sort_values(["estimator", "trial"]).drop(columns="time_s").reset_index(drop=True)
 
 
+@pytest.mark.slow
 def test_two_processes_and_a_second_command_have_the_same_rows(workplace, programs, capsys):
     chosen = (*RUN, "solver=[]", "baseline=[process]", f"estimators.process.command=[{programs / 'ekf'}]")
     chosen += ("estimators.process.needs=[epochs,prior]", "trials=40")

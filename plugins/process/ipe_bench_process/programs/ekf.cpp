@@ -16,6 +16,6 @@ int main() {
       for (int a = 0; a < n; a++) { x[a] += PH[a] / S * y; for (int c = 0; c < n; c++) P[a * n + c] -= PH[a] * PH[c] / S; }
     }
     write("x", x); write("P", P); write("status", {0}); write("iterations", {double(m)}); write("nis", {nis});
-    write("simulations", {1.}); write("jacobians", {1.}); end();
+    write_cost(1); end();
   }
 }

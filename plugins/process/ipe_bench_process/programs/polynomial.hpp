@@ -15,3 +15,16 @@ struct Polynomial {
     return u * (1 + s * u / 2 * (1 + s * u / 3));
   }
 };
+inline Vec simulate(const Blocks& p, const Vec& x) {
+  static const Polynomial model(p);
+  Vec h, H(model.n);
+  for (int k = 0; k < model.m; k++) h.push_back(model.reading(x, k, H.data()));
+  return h;
+}
+inline Vec jacobian(const Blocks& p, const Vec& x) {
+  static const Polynomial model(p);
+  Vec J(model.m * model.n);
+  for (int k = 0; k < model.m; k++) model.reading(x, k, &J[k * model.n]);
+  return J;
+}
+inline void write_cost(double evaluations) { write("simulations", {evaluations}); write("jacobians", {evaluations}); }
