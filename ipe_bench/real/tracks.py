@@ -15,6 +15,7 @@ from scipy.special import chdtrc, ndtri
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array, deviations, unmasked
 from ipe_bench.basics.options import Finite, NonNegative, Positive, option_types
+from ipe_bench.basics.statuses import Status
 from ipe_bench.real.readings import TextTable, read_tables
 from ipe_bench.states.base import StateModel
 from ipe_bench.states.formulas import Formulas, RecordedFormulas
@@ -35,6 +36,10 @@ _FAR_BELOW = 10.0
 """By how much more than a tenth of the number of readings a log likelihood lies far below the largest of the log."""
 _COLLAPSED = 2.0
 """Effective sample sizes below this have no covariance."""
+SEARCHES = 4
+"""Searches for a maximum of the likelihood: from the values of the model, and from draws about them."""
+_ALIKE = 2.0
+"""Log likelihood by which one maximum has to exceed another: two constants of a 95 % interval differ by 1.92."""
 _STEP = 0.02
 """Step of differences, in standard errors."""
 _ROUNDS, _DONE = 20, 1e-8
@@ -141,15 +146,19 @@ class LogTracks:
     nis: Array
     """Squared normalised innovations (K,); NaN at epochs without readings, and if the tracker has none."""
     mean_nis: float
-    """Their sum over the number of readings: 1 on average if the filter is right."""
+    """Their sum over the number of readings, or the cost of the path of a smoother: 1 on average if the model is right;
+    NaN if the tracker has neither."""
     limits: tuple[float, float]
     """The interval that holds that mean with a probability of 95 % if the filter is right."""
+    fit_p: float
+    """The probability of a larger sum, or cost, if the model is right: chi-square with a degree per reading."""
     white_p: float
     """The p-value of Ljung and Box's test that innovations are white."""
     log_likelihood: float
     """The log likelihood of the readings; NaN for a smoother."""
     passes: bool
-    """Whether there is a track, and its innovations are no larger than chance explains."""
+    """Whether there is a track that is not lost, whose iteration, if it has one, has converged, and whose innovations,
+    or path, are no further from the model than chance explains; and one maximum, if constants were asked for."""
     message: str
     """The reason why there is no track, or no constant; empty if there is one."""
     lost_from: int | None = None
@@ -159,6 +168,10 @@ class LogTracks:
     """The median effective sample size of an epoch, of a weighted sample; NaN if there is none."""
     constants: Sequence[Constant] = ()
     """The constants that were asked for."""
+    found: str = ""
+    """The verdict on the search for them; empty if one maximum was found and its innovations fit."""
+    notes: Sequence[str] = ()
+    """Other maxima that the searches have found."""
 
     @classmethod
     def of(cls, log: Log, label: str, tracker: Tracker) -> LogTracks:
@@ -168,6 +181,11 @@ class LogTracks:
         nis = np.where(tracks.degrees[0] > 0, tracks.nis[0], np.nan)
         size = np.nan if tracks.effective is None else float(np.median(tracks.effective))
         m, total = int(np.isfinite(innovations).sum()), float(np.nansum(nis))
+        if tracks.cost is not None:
+            m, total = int(np.isfinite(log.z).sum()), float(tracks.cost[0])
+        fit_p = float(chdtrc(m, total)) if m else np.nan
+        ended = Status.CONVERGED if tracks.status is None else Status(int(tracks.status[0]))
+        lost_from = _lost_from(nis, tracks.degrees[0])
         return cls(
             label,
             mean,
@@ -175,24 +193,28 @@ class LogTracks:
             nis,
             mean_nis=total / m if m else np.nan,
             limits=mean_limits(m, 1),
+            fit_p=fit_p,
             white_p=float(white_p(innovations)[0]),
             log_likelihood=float(tracks.log_likelihood[0]) if tracks.degrees.any() else np.nan,
-            passes=bool(np.isfinite([mean, deviation]).all() and not chdtrc(max(m, 1), total) < FIT_LEVEL)
-            and not size < _COLLAPSED,
-            message=messages.get(0, ""),
-            lost_from=_lost_from(nis, tracks.degrees[0]),
+            passes=bool(np.isfinite([mean, deviation]).all() and not fit_p < FIT_LEVEL)
+            and not size < _COLLAPSED
+            and lost_from is None
+            and ended == Status.CONVERGED,
+            message=messages.get(0, "" if ended == Status.CONVERGED else f"{ended.label}: {ended.reason}"),
+            lost_from=lost_from,
             effective=size,
         )
 
     @property
     def verdict(self) -> str:
-        """Tells whether the covariance of the innovations is as large as they are, or from where the track is lost."""
+        """Tells whether innovations, or a smoother's path, are as far from the model as it says, from where the
+        track is lost, or what is wrong with the constants that were found."""
         if self.lost_from is not None:
             return f"lost from epoch {self.lost_from}"
         if self.effective < _COLLAPSED:
             return "collapsed"
-        if not np.isfinite(self.mean_nis):
-            return "-"
+        if self.found or np.isnan(self.mean_nis):
+            return self.found or "-"
         low, high = self.limits
         return "optimistic" if self.mean_nis > high else "pessimistic" if self.mean_nis < low else "consistent"
 
@@ -253,18 +275,45 @@ def found_and_tracked(log: Log, label: str, tracker: Tracker, find: Sequence[str
         value = -float(tracks.log_likelihood[0])
         return value if tracks.degrees.any() and np.isfinite(value) else np.inf
 
-    u = np.zeros(len(find))
-    if isinstance(tracker, Bootstrap) or not np.isfinite(cost(u)):
+    if isinstance(tracker, Bootstrap) or not np.isfinite(cost(np.zeros(len(find)))):
         raise UserError(f"find: trackers.{label} has no likelihood that can be maximised; choose a filter")
     with np.errstate(invalid="ignore"):
-        u, error = _minimum(cost, u)
-    if not (np.isfinite(error).all() and (error[positive] < _VAGUE).all()):
-        message = f"the likelihood has no maximum in {', '.join(find)}: the log does not determine them"
-        return replace(LogTracks.of(log, label, tracker), message=message, passes=False)
-    ends = [values(u + sign * float(ndtri(0.975)) * error) for sign in (-1, 1)]
-    rows = zip(find, values(u), np.where(positive, values(u), size) * error, *ends, strict=True)
-    constants = [Constant(name, *map(float, numbers)) for name, *numbers in rows]
-    return replace(LogTracks.of(replace(log, model=model_at(u)), label, tracker), constants=constants)
+        best, *others = _minima(cost, len(find))
+    if not (np.isfinite(best.error).all() and (best.error[positive] < _VAGUE).all()):
+        message = (
+            f"no maximum of the likelihood was found in {', '.join(find)}: the log may not determine all of them; the"
+            f" search ended at {_written(find, values(best.u))}, and the track is that of the model's own values"
+        )
+        return replace(LogTracks.of(log, label, tracker), message=message, found="no maximum", passes=False)
+    ends = [values(best.u + sign * float(ndtri(0.975)) * best.error) for sign in (-1, 1)]
+    rows = zip(find, values(best.u), np.where(positive, values(best.u), size) * best.error, *ends, strict=True)
+    track = LogTracks.of(replace(log, model=model_at(best.u)), label, tracker)
+    notes = [
+        f"another maximum, of a log likelihood {one.cost - best.cost:.3g} lower, is at {_written(find, values(one.u))}"
+        for one in others
+        if np.isfinite(one.error).all()
+    ]
+    found, message = "", track.message
+    if track.fit_p < FIT_LEVEL or track.white_p < FIT_LEVEL:
+        found = "does not fit"
+        message = (
+            f"find= ended at a maximum whose innovations do not fit (NIS: p = {track.fit_p:.2g}; white: p ="
+            f" {track.white_p:.2g}): the model does not describe the log, and neither values nor errors can be trusted"
+        )
+    elif any(one.cost - best.cost < _ALIKE for one in others):
+        found, message = "several maxima", "the log hardly tells the maxima of the likelihood apart"
+    return replace(
+        track,
+        constants=[Constant(name, *map(float, numbers)) for name, *numbers in rows],
+        notes=notes,
+        found=found,
+        message=message,
+        passes=track.passes and not found,
+    )
+
+
+def _written(names: Sequence[str], values: Array) -> str:
+    return ", ".join(f"{name}={value:.4g}" for name, value in zip(names, values, strict=True))
 
 
 def _numbers(model: StateModel) -> dict[tuple[str, str], tuple[float, bool]]:
@@ -272,7 +321,10 @@ def _numbers(model: StateModel) -> dict[tuple[str, str], tuple[float, bool]]:
     formulas, by option of one in Python."""
     if isinstance(model, Formulas):
         return {
-            (key, name): (value, key != "constants") for key in _KEYS for name, value in getattr(model, key).items()
+            (key, name): (value, key != "constants")
+            for key in _KEYS
+            for name, value in getattr(model, key).items()
+            if not isinstance(value, str)
         }
     options = [(name, hint) for name, hint in option_types(type(model)).items() if hint in (*_POSITIVE, float, Finite)]
     return {(name, ""): (getattr(model, name), hint in _POSITIVE) for name, hint in options}
@@ -288,13 +340,49 @@ def _place(known: Sequence[tuple[str, str]], name: str) -> tuple[str, str]:
     return found[0]
 
 
-def _minimum(cost: Callable[[Array], float], u: Array) -> tuple[Array, Array]:
-    """Minimises the cost, with standard errors by its second derivatives there; NaN if it has no such minimum."""
+@dataclass(frozen=True)
+class _Minimum:
+    """Holds where a search for a minimum of a cost ended."""
+
+    u: Array
+    cost: float
+    error: Array
+    """Standard errors by the second derivatives; NaN if the cost has no minimum there."""
+    H: Array
+    """The second derivatives."""
+
+    def holds(self, u: Array) -> bool:
+        """Whether u is within a standard error of this minimum."""
+        return bool((u - self.u) @ self.H @ (u - self.u) < 1)
+
+
+def _minima(cost: Callable[[Array], float], n: int) -> list[_Minimum]:
+    """The different ends of `SEARCHES` searches, the lowest first. They begin at 0 and at draws of N(0, I), or nearer
+    to 0 if the cost is infinite there."""
+    found: list[_Minimum] = []
+    for start in [np.zeros(n), *np.random.default_rng(0).standard_normal((SEARCHES - 1, n))]:
+        u = next(u for u in (start, start / 2, start / 8, 0 * start) if np.isfinite(cost(u)))
+        u = _descended(cost, u)
+        if not any(one.holds(u) for one in found):
+            end = _polished(cost, u)
+            if not any(one.holds(end.u) for one in found):
+                found.append(end)
+    return sorted(found, key=lambda one: one.cost)
+
+
+def _descended(cost: Callable[[Array], float], u: Array) -> Array:
+    """Where a search by Nelder and Mead's simplex ends."""
     from scipy.optimize import minimize
 
+    simplex = np.vstack([u, u + 0.5 * np.eye(len(u))])
+    options = {"initial_simplex": simplex, "xatol": 0.1, "fatol": 0.1}
+    return np.asarray(minimize(cost, u, method="Nelder-Mead", options=options).x)
+
+
+def _polished(cost: Callable[[Array], float], u: Array) -> _Minimum:
+    """The end of Newton's iteration from u."""
     n = len(u)
-    options = {"initial_simplex": np.vstack([u, u + 0.5 * np.eye(n)]), "xatol": 1e-2, "fatol": 1e-2}
-    u, h = np.asarray(minimize(cost, u, method="Nelder-Mead", options=options).x), np.full(n, 1e-2)
+    h, H = np.full(n, 1e-2), np.full((n, n), np.nan)
     for _ in range(_ROUNDS):
         E, here = np.diag(h), cost(u)
         up, down = (np.array([cost(u + sign * e) for e in E]) for sign in (1, -1))
@@ -307,5 +395,5 @@ def _minimum(cost: Callable[[Array], float], u: Array) -> tuple[Array, Array]:
         P = np.linalg.inv(H)
         u, h = u - P @ g, _STEP * np.sqrt(np.diagonal(P))
         if g @ P @ g < _DONE:
-            return u, h / _STEP
-    return u, np.full(n, np.nan)
+            return _Minimum(u, here, h / _STEP, H)
+    return _Minimum(u, cost(u), np.full(n, np.nan), np.full((n, n), np.nan))

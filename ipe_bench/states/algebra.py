@@ -33,11 +33,13 @@ def factor(P: Array) -> Array:
     """The lower Cholesky factors L, L L' = P, of P (..., n, n); NaN from the first pivot that is not positive."""
     L = np.zeros(P.shape)
     for j in range(P.shape[-1]):
-        row = L[..., j, :j]
-        pivot = P[..., j, j] - np.sum(row * row, axis=-1)
+        column = P[..., j:, j]  # the pivot, and what is below
+        if j:
+            column = column - np.add.reduce(L[..., j:, :j] * L[..., j, None, :j], axis=-1)
+        pivot = column[..., 0]
         L[..., j, j] = np.sqrt(np.where(pivot > 0, pivot, np.nan))
-        below = P[..., j + 1 :, j] - np.sum(L[..., j + 1 :, :j] * row[..., None, :], axis=-1)
-        L[..., j + 1 :, j] = below / L[..., j, j, None]
+        if j + 1 < P.shape[-1]:
+            L[..., j + 1 :, j] = column[..., 1:] / L[..., j, j, None]
     return L
 
 
@@ -45,7 +47,9 @@ def lower_solve(L: Array, B: Array) -> Array:
     """L^-1 B for lower triangular L (..., n, n) and B (..., n, r)."""
     X = np.empty((*np.broadcast_shapes(L.shape[:-2], B.shape[:-2]), *B.shape[-2:]))
     for i in range(L.shape[-1]):
-        rest = B[..., i, :] - np.sum(L[..., i, :i, None] * X[..., :i, :], axis=-2)
+        rest = B[..., i, :]
+        if i:
+            rest = rest - np.add.reduce(L[..., i, :i, None] * X[..., :i, :], axis=-2)
         X[..., i, :] = rest / L[..., i, i, None]
     return X
 

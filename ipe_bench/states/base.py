@@ -15,7 +15,7 @@ from ipe_bench.basics.linalg import Array, multiply, nearest
 from ipe_bench.basics.options import Component
 from ipe_bench.basics.streams import numbered
 from ipe_bench.measurements.base import Parameter
-from ipe_bench.states.algebra import factor, half, root
+from ipe_bench.states.algebra import factor, half, root, transposed
 
 _START, _PROCESS, _READINGS = range(3)
 """The random streams of a trial: its start, its process noise and the noise of its readings."""
@@ -58,9 +58,10 @@ class StateModel(Component, ABC):
         x[k] = f(x[k-1], k) + G[k] w[k],   w[k] ~ N(0, I)
         z[k] = h(x[k], k) + v[k],          v[k] ~ N(0, R[k])
 
-    Required: `states`, `times`, `prior`, `transition` (f), `observe` (h), `gain` (G) and `R`.
-    Optional: `moved_first`, `periods`, `reading_names` and `scored`; `draw`, if paths are stored; `log_inputs`,
-    `with_log` and `faults`, if a log has known inputs.
+    Required: `states`, `times`, `prior`, `transition` (f), `observe` (h), `gain` (G) and `R`; if noise depends on the
+    states, `gain_at(x, k)` in place of `gain(k)`, for the states x[k-1], or `R_at(x, k)` in place of `R(k)`.
+    Optional: `moved_first`, `periods`, `state_periods`, `reading_names` and `scored`; `draw`, if paths are stored;
+    `log_inputs`, `with_log` and `faults`, if a log has known inputs.
     Promised: f and h take stacks of states (..., n), real or complex, and are analytic in them, since slopes are
     complex steps; a trial has the same bits alone and in any batch; `require_sound` finds nothing to refuse.
 
@@ -118,13 +119,36 @@ class StateModel(Component, ABC):
     def observe(self, x: Array, k: int) -> Array:
         """h: (..., n) -> (..., m)."""
 
-    @abstractmethod
     def gain(self, k: int) -> Array:
-        """G (n, q) of the step into epoch k."""
+        """G (n, q) of the step into epoch k; UserError if it depends on the states."""
+        raise self._by_state("gain")
 
-    @abstractmethod
     def R(self, k: int) -> Array:
-        """Covariance (m, m) of the readings of epoch k."""
+        """Covariance (m, m) of the readings of epoch k; UserError if it depends on the states."""
+        raise self._by_state("R")
+
+    def _by_state(self, name: str) -> UserError:
+        return UserError(
+            f"state_model={self.name}: {name} depends on the states; what takes {name}(k) does not suit it"
+        )
+
+    def gain_at(self, x: Array, k: int) -> Array:
+        """G (..., n, q) of the step into epoch k from each of the states x (..., n); (n, q) if it is that of all."""
+        return self.gain(k)
+
+    def R_at(self, x: Array, k: int) -> Array:
+        """R (..., m, m) of the readings of epoch k at each of the states x (..., n); (m, m) if it is that of all."""
+        return self.R(k)
+
+    @property
+    def gain_by_state(self) -> bool:
+        """Whether G depends on the states."""
+        return type(self).gain_at is not StateModel.gain_at
+
+    @property
+    def R_by_state(self) -> bool:
+        """Whether R depends on the states."""
+        return type(self).R_at is not StateModel.R_at
 
     @property
     def periods(self) -> tuple[float, ...]:
@@ -132,9 +156,18 @@ class StateModel(Component, ABC):
         return ()
 
     @property
+    def state_periods(self) -> tuple[float, ...]:
+        """The period of each state, such as 2 pi of a heading in rad; 0 for a state without. Empty: none has."""
+        return ()
+
+    @property
+    def readings_per_epoch(self) -> int:
+        return np.shape(self.R_at(self.prior.mean[None], 0))[-1]
+
+    @property
     def reading_names(self) -> tuple[str, ...]:
         """Names of the readings of an epoch: the columns of a log."""
-        m = len(self.R(0))
+        m = self.readings_per_epoch
         return ("reading",) if m == 1 else tuple(f"reading{i + 1}" for i in range(m))
 
     @property
@@ -167,7 +200,7 @@ class StateModel(Component, ABC):
     @property
     def m(self) -> int:
         """The number of readings of all epochs."""
-        return self.epochs * len(self.R(0))
+        return self.epochs * self.readings_per_epoch
 
     @property
     def epochs(self) -> int:
@@ -188,9 +221,18 @@ class StateModel(Component, ABC):
         G = self.gain(k)
         return G @ G.T
 
+    def Q_at(self, x: Array, k: int) -> Array:
+        """Q (..., n, n) of the step into epoch k from each of the states x (..., n); (n, n) if it is that of all."""
+        G = self.gain_at(x, k)
+        return np.matmul(G, transposed(G)) if self.gain_by_state else self.Q(k)
+
     def nearest(self, z: Array, to: Array) -> Array:
         """z (..., m), each periodic reading shifted by whole periods next to that of `to` (..., m)."""
         return nearest(z, to, self.periods)
+
+    def nearest_state(self, x: Array, to: Array) -> Array:
+        """x (..., n), each periodic state shifted by whole periods next to that of `to` (..., n)."""
+        return nearest(x, to, self.state_periods)
 
     def observe_near(self, x: Array, k: int, to: Array) -> Array:
         """h without jumps around readings `to` (trials, m), for x (trials, ..., n)."""
@@ -201,7 +243,7 @@ class StateModel(Component, ABC):
         """Trials `start` to `stop`. Start, process noise and readings' noise have a stream each per trial: with another
         Q or R, or in another batch, a trial keeps its standard normal numbers."""
         K, n, trials = self.epochs, self.n, stop - start
-        q, m = self.gain(K - 1).shape[1], len(self.R(0))
+        q, m = self.gain_at(self.prior.mean[None], K - 1).shape[-1], self.readings_per_epoch
 
         def normals(stream: int, *shape: int) -> Array:
             drawn = [g.standard_normal(shape) for g in numbered(seed, start, stop, stream)]
@@ -213,9 +255,9 @@ class StateModel(Component, ABC):
         paths = Paths(x, np.empty((trials, K, n)), np.empty((trials, K, m)))
         for k in range(K):
             if self.moves(k):
-                x = self.transition(x, k) + multiply(self.gain(k), w[:, k])
+                x = self.transition(x, k) + multiply(self.gain_at(x, k), w[:, k])
             paths.x[:, k] = x
-            paths.z[:, k] = self.observe(x, k) + multiply(factor(self.R(k)), v[:, k])
+            paths.z[:, k] = self.observe(x, k) + multiply(factor(self.R_at(x, k)), v[:, k])
         return paths
 
 
@@ -244,21 +286,28 @@ def require_sound(model: StateModel) -> None:
         raise UserError(f"{name}: scored: {unknown(absent[0], [state.name for state in model.states], 'state')}")
     if not model.epochs or not (np.diff(model.times) > 0).all():
         raise UserError(f"{name}: its times do not increase from epoch to epoch; give epochs in order")
-    m, x = len(model.R(0)), model.prior.mean
+    for one in ("gain", "R"):
+        if all(getattr(type(model), own) is getattr(StateModel, own) for own in (one, f"{one}_at")):
+            raise UserError(f"{name}: it has no {one}; write {one}(k), or {one}_at(x, k) if it depends on the states")
+    m, x = model.readings_per_epoch, model.prior.mean
     shapes = {
         "the mean of the prior": (x, (n,)),
         "f": (model.transition(x[None], model.epochs - 1), (1, n)),
         "h": (model.observe(x[None], 0), (1, m)),
         "periods": (model.periods, (m,) if model.periods else (0,)),
+        "state_periods": (model.state_periods, (n,) if model.state_periods else (0,)),
     }
     for k in {0, model.epochs - 1}:
-        shapes |= {f"the gain of epoch {k + 1}": (model.gain(k), (n, np.shape(model.gain(k))[-1]))}
+        G = model.gain_at(x[None], k)
+        shapes |= {f"the gain of epoch {k + 1}": (G, (1,) * model.gain_by_state + (n, np.shape(G)[-1]))}
     for what, (value, shape) in shapes.items():
         if np.shape(value) != shape:
             raise UserError(f"{name}: {what} has shape {np.shape(value)}, where {shape} belongs")
     matrices = {"the covariance of the prior": (model.prior.covariance, n)}
     for k in range(model.epochs):
-        matrices |= {f"Q of epoch {k + 1}": (model.Q(k), n), f"R of epoch {k + 1}": (model.R(k), m)}
+        Q, R = model.Q_at(x[None], k), model.R_at(x[None], k)
+        Q, R = Q[0] if model.gain_by_state else Q, R[0] if model.R_by_state else R
+        matrices |= {f"Q of epoch {k + 1}": (Q, n), f"R of epoch {k + 1}": (R, m)}
     for what, (P, size) in matrices.items():
         if what[0] == "R" and np.shape(P) == (m, m) and half(P).singular:
             raise UserError(f"{name}: {what} is singular; give every reading a standard deviation above 0")

@@ -21,7 +21,7 @@ def posterior_bounds(model: StateModel, paths: Paths) -> tuple[Array, Array]:
     attains, where informations of single paths differ.
 
     Raises:
-        UserError: the process noise of a step is singular; a path then has no density.
+        UserError: the process noise of a step is singular, and a path has no density; or noise depends on the states.
     """
     P, before = model.prior.covariance, paths.start
     eye, forward, steps = np.eye(model.n), [], []
@@ -59,9 +59,10 @@ def _mean(a: Array) -> Array:
 def bound_at_truth(model: StateModel, paths: Paths, smooths: bool = False) -> Array:
     """The error covariances (trials, K, n, n) of an extended Kalman filter that is linearised at the true path (Taylor,
     IEEE TAC 24, 1979), or of the smoother behind it, which at the last epoch are the same. They exist for every Q, zero
-    included; their mean is what a good filter attains, but no bound of errors averaged over paths."""
+    included; their mean is what a good filter attains, but no bound of errors averaged over paths. Noise that depends
+    on the states has its Q and R there, and tells no more of them by its size."""
     path = Tracks.empty(model, len(paths.x))
     path.mean, path.covariance[:] = paths.x, model.prior.covariance
     path.start = Normal(paths.start, path.start.covariance)
-    tracks = filtered(model, np.zeros((*paths.x.shape[:2], len(model.R(0)))), Taylor(), path=path)
+    tracks = filtered(model, np.zeros((*paths.x.shape[:2], model.readings_per_epoch)), Taylor(), path=path)
     return (smoothed(model, tracks) if smooths else tracks).covariance

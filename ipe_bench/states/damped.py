@@ -17,7 +17,7 @@ from ipe_bench.states.algebra import root
 from ipe_bench.states.base import Normal, StateModel
 from ipe_bench.states.linearisation import Affine, Taylor, Unscented
 from ipe_bench.states.smoothers import admissible, path_cost, path_p, smoothed, whole
-from ipe_bench.states.trackers import Tracker, Tracks, filtered, linearised_reading, predict, update
+from ipe_bench.states.trackers import Tracker, Tracks, filtered, linearised_move, linearised_reading, predict, update
 
 _TRIES, _FACTOR = 15, 10.0
 """Dampings that are tried about one path, and the factor between them."""
@@ -76,6 +76,7 @@ class LevenbergMarquardtSmoother(Tracker):
     prior, each smoothed by a UKF of half the prior's deviations, from the one that costs least.
     """
 
+    family: ClassVar[str] = "least squares"
     smooths: ClassVar[bool] = True
     iterations: Count = 30
     """Steps at most from one start."""
@@ -165,9 +166,7 @@ def _linearised(model: StateModel, z: Array, x: Array) -> tuple[list[Affine], li
     """The tangents of transitions and readings along paths x (trials, 1 + K, n)."""
     rule, P = Taylor(), np.empty(0)
     moves = [
-        rule.linearise(lambda at, k=k: model.transition(at, k), x[:, k], P)
-        for k in range(model.epochs)
-        if model.moves(k)
+        linearised_move(model, rule, k, Normal(x[:, k], P), x[:, k + 1]) for k in range(model.epochs) if model.moves(k)
     ]
     reads = [linearised_reading(model, rule, k, z[:, k], Normal(x[:, k + 1], P)) for k in range(model.epochs)]
     return moves, reads

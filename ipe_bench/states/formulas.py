@@ -15,16 +15,14 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Finite, NonNegative, Positive
 from ipe_bench.measurements.arithmetic import Arithmetic, parse
 from ipe_bench.measurements.base import Parameter, differentiate
+from ipe_bench.measurements.ode.trace import Expression, Graph, Program, dependent, slopes
 from ipe_bench.states.base import Normal, Paths, StateModel
-
-_OTHER_PLACES = 0.0, 0.7, -1.3
-"""Multiples of the prior's deviations at which the gain of the process noise has to be the same."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Formulas(StateModel):
     """States whose next values, and readings, are formulas of the states, constants, the number k of the epoch from 1
-    on, and its time t in s; the transition may contain the names of the process noise, with constant factors.
+    on, and its time t in s; the transition may contain the names of the process noise, each with a factor.
 
     The language is that of `ipe_bench.measurements.arithmetic`: + - * / ** and elementary functions, angles in rad.
     """
@@ -35,8 +33,8 @@ class Formulas(StateModel):
     """Each reading."""
     noise: Mapping[str, NonNegative] = field(default_factory=dict)
     """Standard deviation of each independent process noise, by the name that it has in the transition."""
-    deviation: Mapping[str, NonNegative]
-    """Standard deviation of each reading."""
+    deviation: Mapping[str, NonNegative | str]
+    """Standard deviation of each reading: a number, or a formula as those of the readings are."""
     start: Mapping[str, Finite] = field(default_factory=dict)
     """Mean of each state in the prior; 0 where absent."""
     spread: Mapping[str, NonNegative]
@@ -52,6 +50,8 @@ class Formulas(StateModel):
     """Names of the states by which trackers are scored, such as constants among states that move; empty: all."""
     period: Mapping[str, NonNegative] = field(default_factory=dict)
     """Periods of readings that come round, such as 6.283185307 of a bearing in rad."""
+    state_period: Mapping[str, NonNegative] = field(default_factory=dict)
+    """Periods of states that come round, such as 6.283185307 of a heading in rad."""
     count: Count = 100
     """K, the number of epochs."""
     step: Positive = 1.0
@@ -73,15 +73,16 @@ class Formulas(StateModel):
         for key, formulas, names in (
             ("next", self._transitions, {*known, *self.noise}),
             ("readings", self._readings, known),
+            ("deviation", self._deviations, known),
         ):
-            if not formulas:
+            if not formulas and key != "deviation":
                 raise UserError(f"{key}: is empty; write {key}.NAME=FORMULA")
             for label, formula in formulas.items():
                 for name in formula.names:
                     if name not in names:
                         raise UserError(f"{key}.{label}: {unknown(name, names, 'name')}")
         owners = {"deviation": self.readings, "period": self.readings, "spread": self.next, "start": self.next}
-        owners |= {"noise": self.noise, "constants": self.constants}
+        owners["state_period"] = self.next
         for key, labels in owners.items():
             given = getattr(self, key)
             for label in given:
@@ -94,9 +95,11 @@ class Formulas(StateModel):
                 raise UserError(
                     f"inputs.{label}: has {number} numbers; give one, or one for each of {self.count} epochs"
                 )
-        gains = [self._gain_at(multiple) for multiple in _OTHER_PLACES]
-        if not all(np.allclose(gain, gains[0], rtol=1e-9, atol=0) for gain in gains):
-            raise UserError("next: the factor of a process noise depends on a state; give it a constant one")
+        known, factors = self._factors
+        if found := next((name for name in self.noise if dependent(factors, [known[name]]) & {*factors}), None):
+            raise UserError(
+                f"next: depends on {found} by more than a factor; write FACTOR*{found} + ... of process noise"
+            )
 
     @cached_property
     def _transitions(self) -> dict[str, Arithmetic]:
@@ -105,6 +108,13 @@ class Formulas(StateModel):
     @cached_property
     def _readings(self) -> dict[str, Arithmetic]:
         return {name: parse(text, f"readings.{name}") for name, text in self.readings.items()}
+
+    @cached_property
+    def _deviations(self) -> dict[str, Arithmetic]:
+        """The formulas of standard deviations, if any is one and no number."""
+        if not any(isinstance(value, str) for value in self.deviation.values()):
+            return {}
+        return {name: parse(str(self.deviation[name]), f"deviation.{name}") for name in self.readings}
 
     @cached_property
     def _inputs(self) -> dict[str, Array]:
@@ -139,6 +149,10 @@ class Formulas(StateModel):
         return tuple(self.period.get(name, 0.0) for name in self.readings) if self.period else ()
 
     @property
+    def state_periods(self) -> tuple[float, ...]:
+        return tuple(self.state_period.get(name, 0.0) for name in self.next) if self.state_period else ()
+
+    @property
     def prior(self) -> Normal:
         mean = np.array([self.start.get(name, 0.0) for name in self.next], dtype=float)
         return Normal(mean, np.diag([float(self.spread[name]) ** 2 for name in self.next]))
@@ -149,22 +163,72 @@ class Formulas(StateModel):
     def observe(self, x: Array, k: int) -> Array:
         return self._values(self._readings, x, k, {})
 
+    @cached_property
+    def _factors(self) -> tuple[dict[str, Expression], list[Expression]]:
+        """What the transitions name besides constants, and the factor of each noise in each state, as recordings."""
+        graph = Graph()
+        known = {name: graph.input(name) for name in (*self.next, *self.inputs, "k", "t", *self.noise)}
+        moved = (
+            graph.apply("add", formula({**self.constants, **known}), 0.0) for formula in self._transitions.values()
+        )
+        return known, [factor for one in moved for factor in slopes(one, [known[name] for name in self.noise])]
+
+    @property
+    def gain_by_state(self) -> bool:
+        return self._gain_by_state
+
+    @cached_property
+    def _gain_by_state(self) -> bool:
+        known, factors = self._factors
+        return bool(dependent(factors, [known[name] for name in self.next]) & {*factors})
+
+    @cached_property
+    def _program(self) -> Program:
+        known, factors = self._factors
+        return Program.of(factors, list(known.values())[: -len(self.noise)])
+
+    def gain_at(self, x: Array, k: int) -> Array:
+        if not self.gain_by_state:
+            return self.gain(k)
+        inputs = (float(values[k]) for values in self._inputs.values())
+        with np.errstate(all="ignore"):
+            G = self._program([*np.moveaxis(x, -1, 0), *inputs, k + 1.0, float(self._times[k])])
+        G = np.stack(np.broadcast_arrays(x[..., 0], *G)[1:], axis=-1).reshape(*x.shape, len(self.noise))
+        return G * np.array([float(value) for value in self.noise.values()])
+
     def gain(self, k: int) -> Array:
+        if self.gain_by_state:
+            return super().gain(k)
         named = {name for formula in self._transitions.values() for name in formula.names}
-        return self._gain_at(0.0, k) if named & {"k", "t", *self.inputs} else self._steady_gain
+        return self._gain(k) if named & {"k", "t", *self.inputs} else self._steady_gain
 
     @cached_property
     def _steady_gain(self) -> Array:
-        return self._gain_at(0.0)
+        return self._gain(0)
+
+    def _gain(self, k: int) -> Array:
+        """G (n, q) of the step into epoch k, which is that of all states."""
+        if not self.noise:
+            return np.zeros((self.n, 0))
+        x = self.prior.mean
+        factors = differentiate(lambda w: self._moved(x, w, k), np.zeros((1, len(self.noise))), analytic=True)[0]
+        return factors * np.array([float(value) for value in self.noise.values()])
+
+    @property
+    def R_by_state(self) -> bool:
+        return any(name in self.next for formula in self._deviations.values() for name in formula.names)
+
+    def R_at(self, x: Array, k: int) -> Array:
+        if not self.R_by_state:
+            return self.R(k)
+        return self._values(self._deviations, x, k, {})[..., None] ** 2 * np.eye(len(self.readings))
 
     def R(self, k: int) -> Array:
+        if self.R_by_state:
+            return super().R(k)
+        if self._deviations:
+            return np.diag(self._values(self._deviations, self.prior.mean, k, {}) ** 2)
         return np.diag([float(self.deviation[name]) ** 2 for name in self.readings])
-
-    def _gain_at(self, multiple: float, k: int = 0) -> Array:
-        """G (n, q) of the step into epoch k, from states that many deviations of the prior away from its mean."""
-        x = self.prior.mean + multiple * np.sqrt(np.diagonal(self.prior.covariance))
-        slopes = differentiate(lambda w: self._moved(x, w, k), np.zeros((1, len(self.noise))), analytic=True)[0]
-        return slopes * np.array([float(value) for value in self.noise.values()])
 
     def _moved(self, x: Array, w: Array, k: int) -> Array:
         return self._values(self._transitions, x, k, dict(zip(self.noise, np.moveaxis(w, -1, 0), strict=True)))

@@ -37,8 +37,10 @@ class Grid(Tracker):
     def hindrance(self, model: StateModel) -> str | None:
         if model.n > 1:
             return f"is exact for one state, and {model.name} has {model.n}; leave it out"
+        if model.state_periods:
+            return f"has no place for a state that comes round, as that of {model.name}; leave it out"
         grids, epochs = self._grids(model), [k for k in range(model.epochs) if model.moves(k)]
-        noise = np.sqrt([_COARSE * model.Q(k)[0, 0] for k in epochs])
+        noise = np.sqrt([_COARSE * _variances(model, grids, k).min() for k in epochs])
         if not (noise > 0).all():
             return f"needs process noise at every step of {model.name}; leave it out"
         steps = [max(np.diff(grids[k + 1]).max(), np.abs(np.diff(_moved(model, grids, k))).max()) for k in epochs]
@@ -85,7 +87,14 @@ class Grid(Tracker):
 
 def _kernel(model: StateModel, grids: Array, k: int) -> Array:
     """The probability (points, points) of each point of epoch k, up to a factor, from each of the epoch before."""
-    return np.exp(-0.5 * (grids[k + 1][:, None] - _moved(model, grids, k)) ** 2 / model.Q(k)[0, 0])
+    Q = _variances(model, grids, k)
+    p = np.exp(-0.5 * (grids[k + 1][:, None] - _moved(model, grids, k)) ** 2 / Q)
+    return p / np.sqrt(Q) if model.gain_by_state else p
+
+
+def _variances(model: StateModel, grids: Array, k: int) -> Array:
+    """The variance of the process noise into epoch k: of all points (), or from each of those before it (points,)."""
+    return model.Q_at(grids[k][:, None], k)[..., 0, 0]
 
 
 def _moved(model: StateModel, grids: Array, k: int) -> Array:

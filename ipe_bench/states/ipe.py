@@ -38,6 +38,7 @@ class PathIPE(Tracker):
     Neither converges where the prior's mean path is far from the true one.
     """
 
+    family: ClassVar[str] = "IPE"
     smooths: ClassVar[bool] = True
     method: Literal["fixed_point", "newton"] = "fixed_point"
     """The iteration: eq. (17), or eq. (20)."""
@@ -47,6 +48,8 @@ class PathIPE(Tracker):
     """Largest abs(F_i) in standard deviations of the linear bound."""
 
     def hindrance(self, model: StateModel) -> str | None:
+        if why := super().hindrance(model):
+            return why
         N, M = sum(_widths(model)), model.m
         if N * max(M, model.n * model.epochs) > _NUMBERS:
             return f"needs a matrix of {M} readings by {N} unknowns for a path of {model.name}; give fewer epochs"

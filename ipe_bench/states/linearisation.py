@@ -47,6 +47,10 @@ class Rule(Component, ABC):
         """The affine law of g about N(m, P), for m (trials, n) and P (trials, n, n). `nearest` shifts values of g that
         are periodic next to others: the mean of points on both sides of a bearing's jump would lie opposite."""
 
+    def mean(self, g: Function, m: Array, P: Array) -> Array:
+        """The mean (trials, ...) of g over N(m, P), g (trials, p, ...) at points (trials, p, n)."""
+        return g(m)
+
     @abstractmethod
     def calls(self, n: int, periodic: bool = False) -> int:
         """Evaluations of g per trial, a slope in one direction counted as one; `periodic` where values are shifted."""
@@ -90,6 +94,11 @@ class SigmaPoints(Rule):
         W = np.matmul(transposed(d * w[:, None]), d) - np.matmul(transposed(M), M)
         A = parts.over(transposed(M))
         return Affine(A, mean - multiply(A, m), symmetric(W))
+
+    def mean(self, g: Function, m: Array, P: Array) -> Array:
+        s, w = self.points(m.shape[-1])
+        values = g(m[..., None, :] + np.matmul(s, transposed(half(P).G)))
+        return np.sum(w[:, None, None] * values, axis=-3)
 
     def calls(self, n: int, periodic: bool = False) -> int:
         return len(self.points(n)[1]) + periodic

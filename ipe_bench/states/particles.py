@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.linalg import Array, multiply
 from ipe_bench.basics.options import Count
 from ipe_bench.basics.streams import own_generators
 from ipe_bench.states.algebra import factor, root, transposed
@@ -24,6 +24,9 @@ class Bootstrap(Tracker):
     seed: int = 0
     """A trial's random numbers depend on this and on its readings: on nothing else in the batch."""
 
+    def hindrance(self, model: StateModel) -> str | None:
+        return None
+
     def track(self, model: StateModel, z: Array) -> Tracks:
         trials, N = len(z), self.particles
         generators = own_generators(self.seed, z.reshape(trials, -1))
@@ -37,10 +40,12 @@ class Bootstrap(Tracker):
         x = model.prior.mean + np.matmul(normals(spread.shape[1]), spread.T)
         for k in range(model.epochs):
             if model.moves(k):
-                G = model.gain(k)
-                x = model.transition(x, k) + np.matmul(normals(G.shape[1]), G.T)
+                G = model.gain_at(x, k)
+                w = normals(G.shape[-1])
+                x = model.transition(x, k) + (multiply(G, w) if model.gain_by_state else np.matmul(w, G.T))
             w = weighed(model, x, k, z[:, k], 1.0, out)
             out.effective[:, k] = 1 / np.sum(w**2, axis=1)
+            x = model.nearest_state(x, x[np.arange(trials), w.argmax(axis=1)][:, None])
             mean = np.sum(w[..., None] * x, axis=1)
             d = x - mean[:, None]
             out.mean[:, k], out.covariance[:, k] = mean, np.matmul(transposed(d * w[..., None]), d)
@@ -53,13 +58,15 @@ class Bootstrap(Tracker):
 def weighed(model: StateModel, x: Array, k: int, z: Array, before: Array | float, out: Tracks) -> Array:
     """The weights `before` (trials, N) of states x (trials, N, n) times the likelihood of readings z (trials, m), with
     sum 1. The track notes the logarithm of their sum, and the innovation by the mean and covariance of h(x) before."""
-    r, R, seen = residuals(model, z, x, k), model.R(k), np.isfinite(z)
+    r, R, seen = residuals(model, z, x, k), model.R_at(x, k), np.isfinite(z)
     square, size = squares(r, z, R)
     p = np.broadcast_to(before, square.shape)
     p = (p / p.sum(axis=1, keepdims=True))[..., None]
+    if model.R_by_state:
+        R = np.sum(p[..., None] * R, axis=1)
     y = np.sum(p * r, axis=1)
     d = r - y[:, None]
-    S = np.matmul(transposed(d * p), d) + np.where(seen[:, :, None] & seen[:, None, :], R, np.eye(len(R)))
+    S = np.matmul(transposed(d * p), d) + np.where(seen[:, :, None] & seen[:, None, :], R, np.eye(R.shape[-1]))
     found = Update.of(Normal(y, S), y, factor(S), seen)
     out.nis[:, k], out.innovations[:, k], out.degrees[:, k] = found.nis, found.innovation, found.degrees
     least = square.min(axis=1, keepdims=True)

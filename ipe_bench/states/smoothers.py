@@ -29,6 +29,9 @@ class Smoother(Tracker):
     filter: Filter = field(default_factory=Filter)
     """The filter whose tracks are smoothed."""
 
+    def hindrance(self, model: StateModel) -> str | None:
+        return self.filter.hindrance(model)
+
     def track(self, model: StateModel, z: Array) -> Tracks:
         tracks = self.filter.track(model, z)
         out = smoothed(model, tracks)
@@ -45,6 +48,7 @@ class IteratedSmoother(Tracker):
     smoother (García-Fernández, Svensson, Särkkä, IEEE TSP 65, 2017). The first path is that of `first`, smoothed.
     """
 
+    family: ClassVar[str] = "least squares"
     smooths: ClassVar[bool] = True
     first: Filter = field(default_factory=Filter)
     """The filter whose smoothed tracks are the first path."""
@@ -56,6 +60,10 @@ class IteratedSmoother(Tracker):
     """Whether steps that raise the cost of the path are halved; for Taylor's rule."""
     tolerance: NonNegative = 0.0
     """Ends where no trial's path moves by more than so many of its own standard deviations."""
+
+    def hindrance(self, model: StateModel) -> str | None:
+        tangents = self.damped or isinstance(self.rule, Taylor)  # steps on a cost, which knows Q and R alone
+        return (super() if tangents else self.first).hindrance(model)
 
     def track(self, model: StateModel, z: Array) -> Tracks:
         path = self.first.track(model, z)
@@ -71,9 +79,11 @@ class IteratedSmoother(Tracker):
             going &= on
             if not on.any():
                 break
-        x = admissible(model, whole(path)[0])
-        path.cost = path_cost(model, z, x[:, 0], x[:, 1:])
-        path.calls = calls + model.evaluations
+        path.calls = calls
+        if not (model.gain_by_state or model.R_by_state):
+            x = admissible(model, whole(path)[0])
+            path.cost = path_cost(model, z, x[:, 0], x[:, 1:])
+            path.calls = calls + model.evaluations
         return path
 
 
@@ -142,7 +152,7 @@ def path_cost(model: StateModel, z: Array, start: Array, mean: Array) -> Array:
     for k in range(model.epochs):
         if model.moves(k):
             G, moved = model.gain(k), model.transition(before, k)
-            w = multiply(np.linalg.pinv(G), step := mean[:, k] - moved)
+            w = multiply(np.linalg.pinv(G), step := model.nearest_state(mean[:, k], moved) - moved)
             size = np.abs(mean[:, k]) + np.abs(moved) + np.abs(step).max(axis=-1, keepdims=True)
             outside = (np.abs(step - multiply(G, w)) > _OUTSIDE * size).any(axis=-1)
             total = total + np.where(outside, np.inf, np.sum(w**2, axis=-1))
@@ -161,6 +171,7 @@ def admissible(model: StateModel, x: Array) -> Array:
     x = x.copy()
     for k, G in gains.items():
         moved = model.transition(x[:, k], k)
+        moved = model.nearest_state(moved, x[:, k + 1])
         x[:, k + 1] = moved + multiply(G @ np.linalg.pinv(G), x[:, k + 1] - moved)
     return x
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -64,7 +65,7 @@ class Tracks:
     def empty(cls, model: StateModel, trials: int) -> Tracks:
         K, n = model.epochs, model.n
         nis, degrees = np.zeros((trials, K)), np.zeros((trials, K))
-        innovations = np.full((trials, K, len(model.R(0))), np.nan)
+        innovations = np.full((trials, K, model.readings_per_epoch), np.nan)
         means, covariances = np.empty((trials, K, n)), np.empty((trials, K, n, n))
         likelihood, calls = np.zeros((2, trials))
         start = spread_prior(model, trials)
@@ -132,7 +133,10 @@ class Tracker(Component, ABC):
     """Whether each epoch is estimated from all readings, those of later epochs included."""
 
     def hindrance(self, model: StateModel) -> str | None:
-        """Says, in words that follow the tracker's label, why it does not suit the model; None if it does."""
+        """Says, in words that follow the tracker's label, why it does not suit the model; None if it does. A tracker
+        that takes noise by `Q_at` and `R_at` says so by a method of its own."""
+        if model.gain_by_state or model.R_by_state:
+            return f"takes noise that is the same at all states, unlike that of {model.name}; leave it out"
         return None
 
     @abstractmethod
@@ -153,6 +157,16 @@ def predict(x: Normal, move: Affine, Q: Array) -> Normal:
     """
     P = np.matmul(np.matmul(move.A, x.covariance), transposed(move.A)) + move.W + Q
     return Normal(multiply(move.A, x.mean) + move.b, symmetric(P))
+
+
+def linearised_move(model: StateModel, rule: Rule, k: int, x: Normal, to: Array | None = None) -> Affine:
+    """Linearises f about the states x; periodic states next to those of `to` (trials, n), if these are given."""
+    periodic = bool(model.state_periods)
+    move = rule.linearise(lambda at: model.transition(at, k), *x, model.nearest_state if periodic else None)
+    if to is None or not periodic:
+        return move
+    value = multiply(move.A, x.mean) + move.b
+    return move._replace(b=move.b + model.nearest_state(value, to) - value)
 
 
 def linearised_reading(model: StateModel, rule: Rule, k: int, z: Array, x: Normal) -> Affine:
@@ -216,12 +230,23 @@ class Filter(Tracker):
     With `iterations` above 1 the reading is linearised again about its posterior: by Taylor's rule the iterated
     extended Kalman filter (Bell and Cathey, IEEE TAC 38, 1993), by sigma points the iterated posterior linearisation
     filter (García-Fernández, Svensson, Morelande, Särkkä, IEEE TSP 63, 2015).
+
+    Noise that depends on the states counts by its mean covariance over the states about which f or h is linearised:
+    Taylor's rule takes Q and R at their mean, sigma points the weighted mean of Q and R at the points, which is exact
+    to the degree of the rule (Tronarp, García-Fernández, Särkkä, IEEE SPL 25, 2018).
     """
 
     rule: Rule = field(default_factory=Taylor)
     """How transition and reading are linearised."""
     iterations: Count = 1
     """Linearisations of each reading."""
+
+    def hindrance(self, model: StateModel) -> str | None:
+        spread = np.sqrt(np.diagonal(model.prior.covariance))
+        h = model.observe(model.prior.mean + spread * np.array([[0.0], [1.0], [-0.7]]), 0)
+        if model.R_by_state and (h == h[0]).all():
+            return f"takes in readings by their mean, which in {model.name} no state changes; choose bootstrap or grid"
+        return None
 
     def track(self, model: StateModel, z: Array) -> Tracks:
         return filtered(model, z, self.rule, self.iterations)
@@ -242,18 +267,20 @@ def filtered(
     x, found = out.start, None
     for k in range(model.epochs):
         if model.moves(k):
-            move = rule.linearise(lambda at, k=k: model.transition(at, k), *(x if path is None else path.at(k - 1)))
-            x = predict(x, move, model.Q(k))
+            at, to = (x, None) if path is None else (path.at(k - 1), path.mean[:, k])
+            move = linearised_move(model, rule, k, at, to)
+            x = predict(x, move, rule.mean(partial(model.Q_at, k=k), *at) if model.gain_by_state else model.Q(k))
             out.moves.append(move)
             out.predicted.append(x)
-        at, R = x if path is None else path.at(k), model.R(k)
+        at = x if path is None else path.at(k)
         for _ in range(iterations):
+            R = rule.mean(partial(model.R_at, k=k), *at) if model.R_by_state else model.R(k)
             found = update(x, linearised_reading(model, rule, k, z[:, k], at), R, z[:, k])
             at = found.x
         assert found is not None
         x = out.note(k, found)
     read = rule.calls(model.n, bool(model.periods))
-    out.calls += rule.calls(model.n) * len(out.moves) + read * iterations * model.epochs
+    out.calls += rule.calls(model.n, bool(model.state_periods)) * len(out.moves) + read * iterations * model.epochs
     return out
 
 
@@ -271,8 +298,13 @@ def residuals(model: StateModel, z: Array, x: Array, k: int) -> Array:
 
 def squares(r: Array, z: Array, R: Array) -> tuple[Array, Array]:
     """r' R^-1 r (trials, N) of residuals r (trials, N, m), and log det 2 pi R (trials,), over readings z (trials, m)
-    that are there."""
+    that are there; of an R (trials, N, m, m) for each residual the sum of both, and 0."""
     seen = np.isfinite(z)
+    if R.ndim > 3:
+        each, size = squares(
+            r.reshape(-1, 1, z.shape[1]), np.repeat(z, r.shape[1], axis=0), R.reshape(-1, *R.shape[2:])
+        )
+        return (each[:, 0] + size).reshape(r.shape[:2]), np.zeros(len(z))
     L = factor(np.where(seen[:, :, None] & seen[:, None, :], R, np.eye(z.shape[1])))
     size = 2 * np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1) + np.log(2 * np.pi) * seen.sum(axis=1)
     return np.sum(lower_solve(L, transposed(r)) ** 2, axis=1), size

@@ -18,6 +18,7 @@ from ipe_bench.noise import Gaussian, Unknown
 T = np.linspace(0, 10, 41)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [Gaussian(0.85), Unknown()], ids=["known level", "unknown level"])
 def test_of_two_minima_far_apart_the_worse_does_not_fit(noise):
     """A wave in so much noise that a wrong frequency passes the test of the fit by itself."""

@@ -100,14 +100,6 @@ def test_a_file_may_have_fewer_readings_than_the_model_has_parameters(tmp_path):
 # What is left out on purpose
 
 
-def test_columns_that_are_left_out_are_said(tmp_path):
-    path, _ = simulated(tmp_path / "a.csv", 240.0, 6)
-    left = ib.estimate(Formula(SATURATION, START), path, LM, ignore_columns=["sigma"])
-    assert left.left_out == "sigma"
-    for shown in (str(left), left._repr_html_()):
-        assert "Left out on purpose: columns sigma." in shown
-
-
 def test_columns_are_left_out_with_their_units_or_without(tmp_path):
     line = Formula("a+b*t", {"a": 1.0, "b": 1.0})
     (tmp_path / "a.csv").write_text("t,remark,T [C],y,sigma\n0,x,20,1,1\n1,,21,2,9\n2,y,22,4,1\n")

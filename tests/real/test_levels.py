@@ -115,7 +115,10 @@ def test_a_single_level_is_certified(dataset):
     assert single.normalised == pytest.approx(old.normalised, rel=1e-4, abs=1e-6)
 
 
-@pytest.mark.parametrize(("case", "data"), [*zip(NOISES, NOISES, strict=True), ("a + b h", "by output")])
+ZERO = pytest.param("a + b h", "by output", marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize(("case", "data"), [*zip(NOISES, NOISES, strict=True), ZERO])
 def test_profile_ends_are_where_the_likelihood_has_risen_by_the_quantile(case, data):
     """In the last case errors do not grow with the readings, and the share of these is zero."""
     z = readings(data, 8)
@@ -226,6 +229,7 @@ def test_missing_readings_leave_their_groups_smaller():
     assert fitted("by output", z).x == pytest.approx(alone.x, rel=1e-7)
 
 
+@pytest.mark.slow
 def test_a_parameter_on_its_bound_is_held_there_beside_the_levels():
     model = informed(DECAY, (ParameterInfo("k", lower=1.0, nominal=1.2),))
     z = readings("by output", 1)

@@ -132,6 +132,8 @@ REFUSED = {
         "row 2: has 6 cells and the header 3; with decimal commas, separate the cells by semicolons",
     ),
     "thousands": (text(GOOD[0], '1,"1,017.5",1', *GOOD[1:]), r"row 2, column y: '1,017.5' is not a number"),
+    # Of which nobody knows whether it is 1.234 or 1234.
+    "a point between decimal commas": (text("t;y;sigma", "0,5;1,2;1", "1.234;2,4;1"), r"row 3, column t: '1\.234'"),
     "thousands of Germany": (text("t;y;sigma", "1,5;1.017,5;1", "2;3;1", "3;4;1"), r"row 2, column y: '1.017,5'"),
     "a cell too few": (text(*GOOD[:2], "1.25,2.5", *GOOD[3:]), "row 3: has 2 cells and the header 3"),
     "a cell too many": (text(*GOOD[:2], GOOD[2] + ",7", *GOOD[3:]), "row 3: has 4 cells and the header 3"),

@@ -47,7 +47,7 @@ def test_what_is_written_is_read_bit_for_bit_with_points_and_with_commas(tmp_pat
     np.testing.assert_array_equal(open_together([european(path)], model).z, z)
 
 
-@settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(value=st.floats(allow_nan=False, allow_infinity=False))
 def test_every_number_survives_both_ways_of_writing_it(tmp_path, value):
     path = with_reading(tmp_path, repr(value))
@@ -55,7 +55,7 @@ def test_every_number_survives_both_ways_of_writing_it(tmp_path, value):
     assert open_together([european(path)], Bent(count=5)).z[2] == value
 
 
-@settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @example(text="0\x1f")
 @given(text=st.text(st.characters(codec="utf-8", exclude_characters='"\n\r'), min_size=1, max_size=8))
 def test_no_text_is_read_as_a_number_that_it_does_not_say(tmp_path, text):
@@ -92,12 +92,3 @@ def test_the_samples_of_the_readme_are_found_in_any_folder(tmp_path, monkeypatch
     assert [row for _, row in read_tables([named])[0].rows] == [["1", "2"]]
     with pytest.raises(UserError, match="there is no such file"):
         read_tables([named.with_name("other.csv")])
-
-
-def test_a_point_between_decimal_commas_is_no_number(tmp_path):
-    """It might be a decimal point or stand between thousands: 1.234 and 1234 are both numbers, so neither is taken."""
-    path = tmp_path / "mixed.csv"
-    path.write_text("t;reading\n0,5;1,2\n1.234;2,4\n", encoding="utf-8")
-    model = ib.measurements.Formula("a*t", {"a": 1.0})
-    with pytest.raises(UserError, match=r"row 3, column t: '1\.234'"):
-        open_together([path], model)

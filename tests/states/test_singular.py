@@ -170,7 +170,7 @@ class Known(CoordinatedTurn):
         return Normal(m, np.diag([*np.diagonal(P)[:4], self.known]))
 
 
-@pytest.mark.parametrize("walk", [1.75e-4, 0.0], ids=["walks", "constant"])
+@pytest.mark.parametrize("walk", [pytest.param(1.75e-4, marks=pytest.mark.slow), 0.0], ids=["walks", "constant"])
 @pytest.mark.parametrize("tracker", [ukf(), *SMOOTHERS.values()], ids=["ukf", *SMOOTHERS])
 def test_a_rate_known_exactly_is_the_limit_of_a_rate_known_well(tracker, walk):
     known, nearly = (Known(count=25, walk=walk, known=variance) for variance in (0.0, 1e-20))

@@ -37,6 +37,7 @@ def test_swings_little_as_a_damped_oscillator():
     assert np.allclose(model.simulate(model.nominal[None])[0], exact, rtol=0, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_many_swings_are_too_many_for_gauss_newton_but_not_for_progressive():
     bench = ib.Scenario(Pendulum(), Gaussian(0.01), error_scale=10.0)
     drawn = bench.draw(0, 8)
