@@ -31,11 +31,11 @@ if TYPE_CHECKING:
 
     from ipe_bench.plugins.conformance import Finding
     from ipe_bench.report.answer import Answer
+    from ipe_bench.report.questions import AuditAnswer, Comparison
     from ipe_bench.report.run import ReportResult
     from ipe_bench.report.style import Which
     from ipe_bench.report.summary import Summary
     from ipe_bench.report.tracked import LogAnswer
-    from ipe_bench.statistics.audit import Audit
     from ipe_bench.trials.design import Criterion, Design
     from ipe_bench.trials.posterior import Reference
 
@@ -191,7 +191,7 @@ def compare(
     power: float | None = None,
     difference: float | None = None,
     output: Path | str | None = None,
-) -> pd.DataFrame:
+) -> Comparison:
     """Tests whether a second version, setting or estimator is better or worse than a first, trial by trial.
 
     Parameters:
@@ -266,7 +266,7 @@ def compare(
     return frame
 
 
-def audit(table: Path | str | pd.DataFrame, *, output: Path | str | None = None) -> Audit:
+def audit(table: Path | str | pd.DataFrame, *, output: Path | str | None = None) -> AuditAnswer:
     """Tests whether the covariance that another program reports describes its errors.
 
     Parameters:

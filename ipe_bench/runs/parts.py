@@ -34,6 +34,8 @@ TRUTH = "truth"
 _TAIL = 8
 """Bytes at the end of a Parquet file: the length of the footer, and a mark."""
 _DIGEST = 32
+GROUP = 1 << 16
+"""Rows, at most, that are written and read at once."""
 _NAME = re.compile(r"([0-9a-f]+)-(\d+)-(\d+)\.parquet")
 _OLDER = tuple(f'"schema":{number},'.encode() for number in range(1, SCHEMA))
 
@@ -81,15 +83,37 @@ class StoredPart:
         there. Raises FileNotFoundError if there is no such file any more, and Unusable if it is damaged, or not one of
         ours.
         """
+        footers, tables = zip(*self.groups(columns), strict=True)
+        return footers[0], pa.concat_tables(tables)
+
+    def groups(self, columns: Keys[str] | None = None) -> Iterator[tuple[Mapping[str, Any], pa.Table]]:
+        """Reads the same, at most `GROUP` rows at a time: those of a million trials take gigabytes."""
         with _opened(self.path) as file:
-            footer = _parsed(file.metadata.metadata[FOOTER])
-            names = file.schema_arrow.names
-            table = file.read([n for n in names if columns is None or n in {"trial", *columns}], use_threads=False)
-            if footer["key"] != self.key:
-                raise Unusable(f"damaged: its content belongs to {footer['key']}")
-            if not np.array_equal(as_array(table["trial"]), np.arange(self.start, self.stop)):
-                raise Unusable(f"damaged: its column trial does not count from {self.start} to {self.stop}")
-        return footer, table.replace_schema_metadata(None)
+            footer, names, reached = self._footer(file), file.schema_arrow.names, self.start
+            names = [name for name in names if columns is None or name in {"trial", *columns}]
+            for group in range(file.num_row_groups):
+                table = file.read_row_group(group, names, use_threads=False)
+                first, reached = reached, reached + len(table)
+                if not np.array_equal(as_array(table["trial"]), np.arange(first, reached)):
+                    raise self._miscounted
+                yield footer, table.replace_schema_metadata(None)
+            if reached != self.stop or not file.num_row_groups:
+                raise self._miscounted
+
+    def head(self) -> tuple[Mapping[str, Any], pa.Schema]:
+        """Reads what the rows belong to, and the types of their columns; raises what `read` does."""
+        with _opened(self.path) as file:
+            return self._footer(file), file.schema_arrow.remove_metadata()
+
+    @property
+    def _miscounted(self) -> Unusable:
+        return Unusable(f"damaged: its column trial does not count from {self.start} to {self.stop}")
+
+    def _footer(self, file: pq.ParquetFile) -> Mapping[str, Any]:
+        footer = _parsed(file.metadata.metadata[FOOTER])
+        if footer["key"] != self.key:
+            raise Unusable(f"damaged: its content belongs to {footer['key']}")
+        return footer
 
     def history(self) -> dict[str, Array] | None:
         """Reads the iterates of its first trials, by column; None if there are none. Raises what `read` does."""
@@ -152,33 +176,58 @@ def write(
     *,
     lasting: bool = False,
 ) -> None:
-    """Writes a file that appears complete or not at all (see `write_atomically`); if `lasting`, past the system's
-    buffer."""
+    """Writes the rows of one table as `write_groups` does."""
+    write_groups(path, table.schema, [table], footer, history, lasting=lasting)
+
+
+def write_groups(
+    path: Path,
+    schema: pa.Schema,
+    tables: Iterable[pa.Table],
+    footer: Mapping[str, Any],
+    history: Mapping[str, Array] | None = None,
+    *,
+    lasting: bool = False,
+) -> None:
+    """Writes the rows of tables in succession to a file that appears complete or not at all (see `write_atomically`);
+    if `lasting`, past the system's buffer."""
     # Texts are few different ones, numbers are all different and alike in their first bytes.
-    texts = [field.name for field in table.schema if pa.types.is_string(field.type)]
-    floats = [field.name for field in table.schema if pa.types.is_floating(field.type)]
+    texts = [field.name for field in schema if pa.types.is_string(field.type)]
+    floats = [field.name for field in schema if pa.types.is_floating(field.type)]
     how: dict[str, Any] = {"compression": "lz4", "use_dictionary": texts, "use_byte_stream_split": floats}
     how |= {"write_page_checksum": True, "write_statistics": False, "store_schema": False}
     metadata = {FOOTER: canonical_json(footer)}
     if history is not None:
         metadata[HISTORY] = canonical_json({name: values.tolist() for name, values in history.items()})
-    buffer = pa.BufferOutputStream()
-    with pq.ParquetWriter(buffer, table.schema, **how) as writer:
-        writer.write_table(table)
-        writer.add_key_value_metadata(metadata)
-    content = memoryview(buffer.getvalue())
-    end = len(content) - int.from_bytes(content[-_TAIL:-4], "little") - _TAIL
 
     def written(temporary: Path) -> None:
-        with temporary.open("wb") as file:
-            file.write(content[:end])
-            file.write(hashlib.sha256(content[end:]).digest())
-            file.write(content[end:])
+        with temporary.open("w+b") as file:
+            with pq.ParquetWriter(file, schema, **how) as writer:
+                for table in _grouped(tables):
+                    writer.write_table(table, GROUP)
+                writer.add_key_value_metadata(metadata)
+            file.seek(-_TAIL, os.SEEK_END)
+            start = file.seek(-int.from_bytes(file.read(4), "little") - _TAIL, os.SEEK_END)
+            end = file.read()
+            file.seek(start)
+            file.write(hashlib.sha256(end).digest() + end)
             file.flush()
             if lasting:
                 os.fsync(file.fileno())
 
     write_atomically(path, written)
+
+
+def _grouped(tables: Iterable[pa.Table]) -> Iterator[pa.Table]:
+    """Joins tables in succession, that have the columns of one schema, to larger ones of at most `GROUP` rows."""
+    waiting: list[pa.Table] = []
+    for table in tables:
+        if waiting and sum(map(len, waiting)) + len(table) > GROUP:
+            yield pa.concat_tables(waiting)
+            waiting = []
+        waiting.append(table)
+    if waiting:
+        yield pa.concat_tables(waiting)
 
 
 def table_of(columns: Mapping[str, Array]) -> pa.Table:

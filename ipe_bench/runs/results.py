@@ -10,7 +10,7 @@ import contextlib
 import os
 import re
 import uuid
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from collections.abc import Collection as Keys
 from dataclasses import dataclass, field, replace
@@ -189,7 +189,7 @@ class Results:
             for part in fresh:
                 listed.add(part.path)
                 with self._naming(part.path), contextlib.suppress(FileNotFoundError):
-                    footer, table = part.read()
+                    ((footer, table),) = deque(part.groups(), maxlen=1)
                     known = self.stored[part.key].parts if part.key in self.stored else ()
                     if not known and (found := _OF_ZOO.search(canonical_json(footer["identity"]))):
                         self.moved[footer["identity_key"]] = found[0]
@@ -197,7 +197,7 @@ class Results:
                     identity = identified(footer["identity"])
                     footer = {**footer, "identity": identity, "identity_key": digest(identity)}
                     self.stored[part.key] = StoredCell(footer, tuple(sorted([*known, part], key=lambda p: p.order)))
-                    if self._kept_bytes + table.nbytes <= _MOST_KEPT:
+                    if len(table) == part.stop - part.start and self._kept_bytes + table.nbytes <= _MOST_KEPT:
                         self._kept_bytes += table.nbytes
                         self._kept[part.path] = table
         self.runs += tuple(self._records(store.runs, RUN))
@@ -346,8 +346,13 @@ class Results:
             self.extra_problems.append(f"missing: {describe_names(cell.names)}: trials went away while they were read")
         if not tables:
             return {name: np.empty(0) for name in names or ("trial",)}
-        table = pa.concat_tables(tables, promote_options="default")
-        return {name: as_array(table[name]) for name in names or table.column_names if name in table.column_names}
+        table, loaded = pa.concat_tables(tables, promote_options="default"), {}
+        tables.clear()
+        for name in [one for one in names or table.column_names if one in table.column_names]:
+            loaded[name] = as_array(table[name])
+            table = table.drop_columns(name)  # so that no two copies of all columns are there at once
+            pa.default_memory_pool().release_unused()
+        return loaded
 
     def load_history(self, cell: StoredCell) -> dict[str, Array] | None:
         """Loads the iterates of a cell's first trials, by column; None if none are stored."""

@@ -16,7 +16,7 @@ import socket
 import tempfile
 import time
 from collections.abc import Collection as Keys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -203,15 +203,15 @@ class Store:
         once. If a part is damaged (Unusable) or nothing can be written any more (StorageError), all stay as they are.
         """
         found, gone, reached = self.parts({key}), 0, 0
-        groups: list[tuple[Mapping[str, Any], list[StoredPart], list[pa.Table]]] = []
+        groups: list[tuple[Mapping[str, Any], list[StoredPart], list[pa.Schema]]] = []
         with contextlib.suppress(FileNotFoundError):  # another run merges the same
             for part in found if len(found) > 1 else ():
-                footer, table = part.read()
+                footer, schema = part.head()
                 if not groups or part.start > reached or footer != groups[-1][0]:
                     groups.append((footer, [], []))
                     reached = part.start
                 groups[-1][1].append(part)
-                groups[-1][2].append(table.slice(max(0, reached - part.start)))
+                groups[-1][2].append(schema)
                 reached = max(reached, part.stop)
             gone = sum(_join(*group) for group in groups if len(group[1]) > 1)
         return gone
@@ -224,20 +224,33 @@ def _typed(name: str, values: Array) -> Array:
     return values.astype(np.int64) if values.dtype.kind in "iu" else values
 
 
-def _join(footer: Mapping[str, Any], group: Sequence[StoredPart], tables: Sequence[pa.Table]) -> int:
+def _join(footer: Mapping[str, Any], group: Sequence[StoredPart], schemas: Sequence[pa.Schema]) -> int:
     """Writes one part with the rows of a group, unless there is one, and removes the others; returns their number."""
     first, stop = group[0], max(part.stop for part in group)
     whole = replace(first, path=first.path.with_name(f"{first.key}-{first.start}-{stop}.parquet"), stop=stop)
     if whole not in group:
-        table = pa.concat_tables(tables, promote_options="default")
+        schema = pa.unify_schemas(schemas)
         history = parts.join_histories(part.history() for part in group if part.start < HISTORIES)
-        parts.write(whole.path, table, footer, history, lasting=True)
-    whole.read()
+        parts.write_groups(whole.path, schema, _rows(group, schema), footer, history, lasting=True)
+    for _ in whole.groups():
+        pass
     others = [part.path for part in group if part != whole]
     for path in others:
         with contextlib.suppress(OSError):  # another run may have done so; what stays is read once all the same
             path.unlink()
     return len(others)
+
+
+def _rows(group: Sequence[StoredPart], schema: pa.Schema) -> Iterator[pa.Table]:
+    """Reads the rows of parts, each trial once, with all columns of the schema."""
+    reached, nothing = group[0].start, pa.Table.from_batches([], schema)
+    for part in group:
+        at = part.start
+        for _, table in part.groups() if part.stop > reached else ():
+            fresh = table.slice(max(0, reached - at))
+            at += len(table)
+            yield pa.concat_tables([nothing, fresh], promote_options="default")
+        reached = max(reached, part.stop)
 
 
 def gaps(covered: Iterable[tuple[int, int]], start: int, stop: int) -> list[tuple[int, int]]:

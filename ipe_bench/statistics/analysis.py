@@ -17,9 +17,10 @@ from ipe_bench.statistics.collect import Collection, Group, collect
 from ipe_bench.statistics.comparisons import Outcomes, compare_pairs, corrected, may_be_best
 from ipe_bench.statistics.formulas import failed, share
 from ipe_bench.statistics.intervals import quantile
-from ipe_bench.statistics.records import BEST, SCORES, rows_of
+from ipe_bench.statistics.records import SCORES
 from ipe_bench.statistics.registry import summary_rows, to_frame
 from ipe_bench.statistics.sample import CONTRACTION, Sample, label_of, median_distances, samples
+from ipe_bench.statistics.statistic import BEST, rows_of
 from ipe_bench.statistics.tracks import epoch_curves
 
 if TYPE_CHECKING:
@@ -131,6 +132,7 @@ class Begun:
                 curve = {"at": POINTS, "difference": whole.size.difference, "low": low, "high": high}
                 found["calibration"].append(numbered | curve)
             found["tracks"] += [numbered | row for row in epoch_curves(sample)]
+            del sample  # before the next one takes as much memory
         if outcomes:
             best = may_be_best(np.column_stack([outcome.success for outcome in outcomes.values()]))
             marks = dict(zip(outcomes, best.tolist(), strict=True))

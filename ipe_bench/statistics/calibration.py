@@ -187,9 +187,7 @@ def calibrations(error: Array, deviation: Array, nees: Array, claimed: Array) ->
     if not claimed.any():
         return []
     n, trials = error.shape[1], int(claimed.sum())
-    error, deviation = error[claimed].T, deviation[claimed].T
-    with np.errstate(all="ignore"):
-        each = np.sort(np.where(deviation > 0, error / deviation, np.copysign(np.inf, error)))
+    each = [_normalised(e[claimed], s[claimed]) for e, s in zip(error.T, deviation.T, strict=True)]
     together = np.sort(np.sqrt(nees[claimed]))
     # Each u is below a point where z is beyond that point's quantile: 99 quantiles are had sooner than every u.
     least, radius, whole = -ndtri(POINTS), np.sqrt(chdtri(1, 1 - POINTS)), np.sqrt(chdtri(n, 1 - POINTS))
@@ -199,6 +197,12 @@ def calibrations(error: Array, deviation: Array, nees: Array, claimed: Array) ->
     level = 1 - (1 - BAND_LEVEL) / (n + 1)
     parts = [Calibration(z, 1, level, found[n + i], found[i]) for i, z in enumerate(each)]
     return [*parts, Calibration(together, n, level, found[-1])]
+
+
+def _normalised(error: Array, deviation: Array) -> Array:
+    """Computes errors over reported deviations, ascending (claims,)."""
+    with np.errstate(all="ignore"):
+        return np.sort(np.where(deviation > 0, error / deviation, np.copysign(np.inf, error)))
 
 
 def overall_words(parts: Sequence[Calibration], names: Sequence[str]) -> str:

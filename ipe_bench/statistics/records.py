@@ -1,4 +1,4 @@
-"""Defines every statistic in one record: its name and meaning, its trials, its formula and its format.
+"""Lists every statistic of ours, a record each; those of states that move are in `tracks`.
 
 `summary_all.csv`, the appendix of the report, tables and the terminal are read from these lists; `summary.csv` has what
 `MAIN` names. `registry` adds those of plugins; formulas longer than a line are in `formulas`.
@@ -6,9 +6,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -17,112 +16,18 @@ import ipe_bench.statistics.intervals as intervals
 import ipe_bench.statistics.tracks as t
 from ipe_bench.statistics.intervals import clopper_pearson, quantile, share_sequence, verdict
 from ipe_bench.statistics.sample import CLOSE, NIS, Sample, iterations_to_limit, orders_of
+from ipe_bench.statistics.statistic import Statistic
 from ipe_bench.trials.thresholds import EVEN, EXPECTED, FEW, GATE, SAME_ROOT
 
-Kind = Literal["count", "share", "number", "physical", "seconds", "probability", "word"]
-"""Format of a value; `report.words` knows each."""
-Where = Literal[
-    "overview",
-    "terminal",
-    "all_trials",
-    "solved_trials",
-    "costs",
-    "parameters",
-    "covariances",
-    "iterations",
-    "theory",
-    "calibration",
-    "tracks",
-]
-"""A table; its columns are in the order of the records. The overview and the terminal's table show those of plugins
-behind their own."""
-Condition = Literal["", "solved", "common"]
-ALL = "all"
-"""The row of the summary over all parameters."""
-BEST = "may_be_best"
-"""Whether no rival surely succeeds more often in the same trials; see `comparisons.may_be_best`."""
-Ends = f.Ends
+
+def _all(name: str, title: str, meaning: str, values: Callable[[Sample], Any], **shown: Any) -> Statistic:
+    """Defines a statistic over all trials."""
+    return Statistic(name, title, "all trials", meaning, values, **shown)
 
 
-@dataclass(frozen=True)
-class Statistic:
-    """Defines a statistic of a scenario under an estimator, which becomes a column of `summary_all.csv` and of tables.
-
-    Required: `name`, `title`, `over`, `meaning` and `values`.
-    Optional: `limits` (an interval); `given`, `kind`, `where`, `titles`, `limits_titles` and `rare` (how it is shown).
-    Promised: `values` takes a `Sample`, which it does not write into, and returns one number, or one for each parameter
-    in its own unit and last that of all parameters together (n + 1,), NaN where it is undefined. `limits` returns both
-    ends of the interval in the same form. Names of columns are new, in ASCII letters, digits and underscores.
-
-    A plugin offers a record by `conf/statistic/NAME.yaml`; a record that breaks a promise is left out with a line.
-
-    >>> import tempfile
-    >>> import ipe_bench as ib
-    >>> from ipe_bench.statistics.collect import collect
-    >>> from ipe_bench.statistics.sample import samples
-    >>> meaning = "Share of trials with an error above three times the bound."
-    >>> far = Statistic("far", "far off", "all trials", meaning, lambda s: float((s.distance > 3 * s.n**0.5).mean()))
-    >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     _ = ib.run(bench, {"newton": ib.solvers.Newton()}, trials=20, output=folder)
-    ...     found = collect([folder])
-    ...     (sample,) = samples(found, found.groups)
-    >>> far.columns_of(sample)
-    {'far': [0.0, 0.0, 0.0, 0.0, 0.0]}
-    >>> far.definition
-    'Share of trials with an error above three times the bound. Over all trials.'
-    """
-
-    name: str
-    """Names its column; the ends of its interval are `name_low` and `name_high`."""
-    title: str
-    """Heads its column in tables."""
-    over: str
-    """Says which trials count."""
-    meaning: str
-    """Says in a sentence what is computed of them."""
-    values: Callable[[Sample], Any]
-    limits: Callable[[Sample], Ends] | None = None
-    given: Condition = ""
-    """Names the trials that it is conditional on; their number is the column `count`."""
-    kind: Kind = "number"
-    where: tuple[Where, ...] = ()
-    """Lists the tables that show it."""
-    titles: Mapping[Where, str] = field(default_factory=dict)
-    """Replaces `title` in some tables."""
-    limits_titles: Mapping[Where, str] = field(default_factory=dict)
-    """Heads the interval in the tables that show it."""
-    rare: bool = False
-    """Leaves it out of tables in which no estimator reports it."""
-
-    @property
-    def columns(self) -> tuple[str, ...]:
-        return (self.name,) if self.limits is None else (self.name, f"{self.name}_low", f"{self.name}_high")
-
-    @property
-    def count(self) -> str:
-        return f"{self.given}_trials"
-
-    @property
-    def definition(self) -> str:
-        return f"{self.meaning} Over {self.over}."
-
-    def columns_of(self, sample: Sample) -> dict[str, list[Any]]:
-        """Returns its columns, a value for each parameter and one for all together."""
-        with np.errstate(all="ignore"):
-            found = [self.values(sample), *(() if self.limits is None else self.limits(sample))]
-        columns = [np.asarray(one).tolist() if np.ndim(one) else [one] * (sample.n + 1) for one in found]
-        return dict(zip(self.columns, columns, strict=True))
-
-
-def frame_columns(statistics: Sequence[Statistic]) -> tuple[str, ...]:
-    return tuple(column for s in statistics for column in s.columns)
-
-
-def rows_of(statistics: Sequence[Statistic], sample: Sample) -> list[dict[str, Any]]:
-    """Returns a row per parameter and one over all: the columns of all the statistics."""
-    columns = {name: values for s in statistics for name, values in s.columns_of(sample).items()}
-    return [{name: values[i] for name, values in columns.items()} for i in range(sample.n + 1)]
+def _solved(name: str, title: str, meaning: str, values: Callable[[Sample], Any], **shown: Any) -> Statistic:
+    """Defines a statistic over the solved trials."""
+    return Statistic(name, title, "solved trials", meaning, values, given="solved", **shown)
 
 
 STATISTICS: tuple[Statistic, ...] = (
@@ -138,20 +43,18 @@ STATISTICS: tuple[Statistic, ...] = (
         where=("overview", "terminal", "all_trials"),
         rare=True,
     ),
-    Statistic(
+    _all(
         "converged",
         "converged",
-        "all trials",
         "Share of trials in which the estimating equation holds within the tolerance. The other endings have their own"
         " names and messages.",
         lambda s: f.share(s.converged),
         kind="share",
         where=("all_trials",),
     ),
-    Statistic(
+    _all(
         "solved",
         "solved",
-        "all trials",
         f"Share that converged to the root, within {SAME_ROOT:g} standard deviations, that the same estimating equation"
         " reaches if it starts at the truth. Filters and the linear LSE solve no equation; they count as solved if"
         " they finished.",
@@ -159,10 +62,9 @@ STATISTICS: tuple[Statistic, ...] = (
         kind="share",
         where=("solved_trials",),
     ),
-    Statistic(
+    _all(
         "success",
         "success",
-        "all trials",
         "Share whose error lies inside the ellipsoid of the bound at the truth that all but a share of"
         f" {GATE:g} of efficient estimates lie in (chi-square quantile); the Bayesian bound's for estimators that use a"
         " prior. Interval: Clopper and Pearson, Biometrika 26, 1934.",
@@ -170,10 +72,9 @@ STATISTICS: tuple[Statistic, ...] = (
         limits=lambda s: clopper_pearson(int(s.scalars["success"].sum()), len(s)),
         kind="share",
     ),
-    Statistic(
+    _all(
         "success_anytime",
         "success, any time",
-        "all trials",
         "The same share with a 95 % interval that stays valid if it is looked at repeatedly and at any time of"
         " stopping, as runs with `precision` do (beta-binomial confidence sequence: Robbins, Ann. Math. Statist. 41,"
         " 1970;"
@@ -182,10 +83,9 @@ STATISTICS: tuple[Statistic, ...] = (
         limits=lambda s: share_sequence(int(s.scalars["success"].sum()), len(s)),
         kind="share",
     ),
-    Statistic(
+    _all(
         "failed_known",
         "failed and known",
-        "all trials",
         "Share of trials without success that the estimator itself reports: it did not converge, its residuals fail"
         " the test of fit, or several minima fit. The test of a filter of states is that of its innovations, that of an"
         " iterated smoother the cost of its path, chi-square with as many degrees as there are readings.",
@@ -193,35 +93,31 @@ STATISTICS: tuple[Statistic, ...] = (
         kind="share",
         where=("all_trials",),
     ),
-    Statistic(
+    _all(
         "failed_silent",
         "failed silently",
-        "all trials",
         "Share of trials without success that converged to residuals that fit. These answers are wrong and look right.",
         lambda s: f.failed(s, known=False),
         kind="share",
         where=("all_trials",),
     ),
-    Statistic(
+    _all(
         "error_median",
         "median error",
-        "all trials",
         "Median of the error over the bound, sqrt(e' J' R⁻¹ J e / n) at the truth: about 1 if an estimate attains the"
         " Cramér-Rao bound, which is used for estimators with a prior too. A value that is not finite counts as"
         " infinite.",
         lambda s: quantile(f.over_bound(s), 0.5),
     ),
-    Statistic(
+    _all(
         "error_q95",
         "95 % error",
-        "all trials",
         "95 % quantile of the error over the bound.",
         lambda s: quantile(f.over_bound(s), 0.95),
     ),
-    Statistic(
+    _all(
         "efficiency_capped",
         "efficiency",
-        "all trials",
         f"One over the root mean square of the same, each trial counting at most {f.CAP:g}, so that no single trial"
         f" decides; {1 / f.CAP:g} where all count that. Interval: as that of rmse, but its lower end is where it would"
         f" be if a share of trials (95 %) that may be unusual beyond those seen counted {f.CAP:g} each; 0 from"
@@ -231,10 +127,9 @@ STATISTICS: tuple[Statistic, ...] = (
         where=("all_trials",),
         limits_titles={"all_trials": "95 % of efficiency"},
     ),
-    Statistic(
+    _all(
         "nees_median",
         "NEES",
-        "all trials",
         "Median of e' P⁻¹ e with the covariance P that the estimator reports, over the median of chi-square with n"
         " degrees: 1 if the covariance is right. A value that is not finite counts as infinite. Limits: 95 % of"
         " medians over as many trials lie between them if the covariance is right.",
@@ -243,19 +138,17 @@ STATISTICS: tuple[Statistic, ...] = (
         where=("calibration",),
         limits_titles={"calibration": "NEES limits"},
     ),
-    Statistic(
+    _all(
         "solved_trials",
         "solved trials",
-        "all trials",
         "Number of solved trials, over which bias, std, rmse, bounds, efficiency and NEES are computed.",
         lambda s: int(s.solved.sum()),
         kind="count",
         where=("solved_trials",),
     ),
-    Statistic(
+    _all(
         "common_trials",
         "common trials",
-        "all trials",
         "Number of trials that every estimator of the scenario solved.",
         lambda s: int((s.solved & s.solved_by_all).sum()),
         kind="count",
@@ -269,10 +162,9 @@ STATISTICS: tuple[Statistic, ...] = (
         lambda s: s.group.footer.get("equation") or "-",
         kind="word",
     ),
-    Statistic(
+    _all(
         "false_root",
         "false root",
-        "all trials",
         "Share of trials that converged to another root of the same equation, so that they are not solved.",
         lambda s: f.share(s.converged & ~s.solved),
         kind="share",
@@ -287,30 +179,25 @@ STATISTICS: tuple[Statistic, ...] = (
         f.false_root_distance,
         where=("covariances",),
     ),
-    Statistic(
+    _solved(
         "bias",
         "bias",
-        "solved trials",
         "Mean error.",
         f.of_each(lambda s: f.mean(s.error, s.solved)),
-        given="solved",
         kind="physical",
         where=("parameters", "theory"),
     ),
-    Statistic(
+    _solved(
         "std",
         "std",
-        "solved trials",
         "Standard deviation of the error (n - 1).",
         f.of_each(f.std),
-        given="solved",
         kind="physical",
         where=("parameters",),
     ),
-    Statistic(
+    _solved(
         "rmse",
         "rmse",
-        "solved trials",
         "Root mean square error. Interval: 95 %, by the studentised bootstrap of its logarithm over trials (Efron and"
         f" Tibshirani, An Introduction to the Bootstrap, 1993, ch. 12), {intervals.RESAMPLES} resamples, the same for"
         f" every estimator; above {intervals.LARGEST_SAMPLE} trials, groups of consecutive trials are resampled. None"
@@ -319,45 +206,38 @@ STATISTICS: tuple[Statistic, ...] = (
         f" Sampling, 1965), is less than that of normal errors in all but {100 * intervals.HEAVY:g} % of cases.",
         f.of_each(f.rmse),
         limits=f.ends_in_units(f.rmse_ends),
-        given="solved",
         kind="physical",
         where=("parameters", "covariances", "theory"),
         limits_titles={"parameters": "95 % of rmse", "theory": "95 % of rmse"},
     ),
-    Statistic(
+    _solved(
         "rmse_anytime",
         "rmse, any time",
-        "solved trials",
         "The same root mean square error, with an asymptotic interval of 95 % that stays valid however often one looks"
         " and whenever one stops (Waudby-Smith et al., Ann. Statist. 52, 2024); none for fewer than"
         f" {intervals.FIRST} trials, nor where a few trials carry the sum of squares, and no upper end where larger"
         " errors may be unseen.",
         f.of_each(f.rmse),
         limits=f.ends_in_units(f.rmse_ends_anytime),
-        given="solved",
         kind="physical",
     ),
-    Statistic(
+    _solved(
         "rmse_unseen",
         "unseen",
-        "solved trials",
         "Share of trials that may have larger errors than those seen: the upper limit (95 %, Clopper and Pearson) of"
         f" the share of errors that {intervals.UNUSUAL:g} of normal ones with the same median exceed, less the share"
         f" seen; about 3 / N where none of N trials has one, and 0 from {intervals.RARE} on. No interval of the root"
         " mean square knows of errors that are so rare.",
         f.rmse_unseen,
-        given="solved",
         kind="share",
     ),
-    Statistic(
+    _solved(
         "effective_trials",
         "effective trials",
-        "solved trials",
         "Number of equal trials that would share the sum of squared errors as evenly, (Σ e²)² / Σ e⁴ (Kish,"
         " Survey Sampling, 1965): a third of the trials for normal errors of one parameter, one if a single trial"
         " carries the whole sum.",
         lambda s: f.squares(s).effective,
-        given="solved",
         where=("parameters",),
     ),
     Statistic(
@@ -378,25 +258,21 @@ STATISTICS: tuple[Statistic, ...] = (
         kind="physical",
         where=("parameters",),
     ),
-    Statistic(
+    _solved(
         "crlb",
         "CRLB",
-        "solved trials",
         "Cramér-Rao bound (J' R⁻¹ J)⁻¹ at the truth: root mean square of its standard deviation.",
         f.of_each(f.crlb),
-        given="solved",
         kind="physical",
         where=("parameters", "covariances", "theory"),
     ),
-    Statistic(
+    _solved(
         "bayes_bound",
         "Bayesian bound",
-        "solved trials",
         "(J' R⁻¹ J + P₀⁻¹)⁻¹ at the truth, which estimators that use a prior are compared with: root mean square of its"
         " standard deviation. It is a local bound, for each truth its own, and not Van Trees's. Of states that move: of"
         " the filter that is linearised at the truth.",
         f.of_each(f.bayes),
-        given="solved",
         kind="physical",
         where=("parameters",),
     ),
@@ -426,16 +302,14 @@ STATISTICS: tuple[Statistic, ...] = (
         kind="physical",
         where=("theory",),
     ),
-    Statistic(
+    _solved(
         "predicted_rmse",
         "rmse by theory",
-        "solved trials",
         "Root mean square error of least squares by theory, without any draw of noise. Under a wrong model it combines"
         " that distance with the asymptotic covariance A⁻¹ B A⁻¹ of least squares about it (Vuong, 1986; Richmond and"
         " Horowitz, IEEE Trans. Signal Processing 63, 2015), which is not a bound, since another estimator may have a"
         " smaller error; under the right one it combines the Cramér-Rao bound with the bias of second order.",
         f.of_each(lambda s: f.predicted(s)[1]),
-        given="solved",
         kind="physical",
         where=("theory",),
     ),
@@ -456,94 +330,81 @@ STATISTICS: tuple[Statistic, ...] = (
         lambda s: f.median_of_truth(s, "curvature_parameter"),
         where=("theory",),
     ),
-    Statistic(
+    _solved(
         "reported",
         "reported",
-        "solved trials",
         "Root mean square of the standard deviation that the estimator itself reports: eq. (5) for the linear LSE, the"
         " sandwich (H⁺J)⁻¹ H⁺RH⁺' (H⁺J)⁻ᵀ at the estimate for the frozen root.",
         f.of_each(lambda s: f.rms_columns(s.deviation, s.solved & np.isfinite(s.deviation).all(axis=1))),
-        given="solved",
         kind="physical",
         where=("covariances",),
     ),
-    Statistic(
+    _solved(
         "eq_14",
         "eq. (14)",
-        "solved trials",
         "Standard deviation by eq. (14), eq. (5) with the compensation error N(x) - N(x̂) of a root of eq. (11) added"
         " as if it were independent of the noise. It is not: x̂ is made from the noise, and the cross terms that"
         " eq. (14) leaves out are of the same order. The sandwich has them, to first order.",
         f.of_each(f.eq_14),
-        given="solved",
         kind="physical",
         where=("covariances",),
     ),
-    Statistic(
+    _solved(
         "rmse_over_linear_bound",
         "rmse / bound",
-        "solved trials",
         "Root mean square error over the linear bound.",
         lambda s: f.ratio(f.in_units(f.rmse(s), s), np.append(s.linear_bound * s.sizes, 1.0)),
-        given="solved",
         where=("parameters",),
     ),
-    Statistic(
+    _solved(
         "efficiency",
         "efficiency, solved",
-        "solved trials",
         "Bound over rmse, as standard deviations: 1 for an efficient estimator. The bound is the one at the truth,"
         " Cramér and Rao's or, for estimators that use a prior, the Bayesian one. Interval: from that of rmse.",
         f.efficiency,
         limits=f.efficiency_limits,
-        given="solved",
         where=("solved_trials", "parameters"),
         titles={"solved_trials": "efficiency"},
         limits_titles={"solved_trials": "95 % of efficiency"},
     ),
-    Statistic(
+    _all(
         "rmse_all",
         "rmse, all",
-        "all trials",
         "Root mean square error over all trials; infinite if one of them has no finite estimate.",
         f.of_each(f.rmse_all),
         kind="physical",
         where=("all_trials", "parameters"),
         titles={"all_trials": "rmse / linear bound"},
     ),
-    Statistic(
+    _all(
         "efficiency_all",
         "efficiency, all",
-        "all trials",
         "The same bound over the root mean square error of all trials. Because no trial is left out, it compares"
         " estimators that solve an equation with those that do not.",
         f.efficiency_all,
         where=("all_trials", "parameters"),
         titles={"all_trials": "efficiency, uncapped"},
     ),
-    Statistic(
+    _all(
         "median_abs_error",
         "median abs error",
-        "all trials",
         "Median of the absolute error, where a value that is not finite counts as infinite. Over all parameters it is"
         " the median of the root mean square over parameters of the error over the linear bound.",
         lambda s: f.error_quantile(s, 0.5),
         kind="physical",
         where=("parameters",),
     ),
-    Statistic(
+    _all(
         "q95_abs_error",
         "95 % abs error",
-        "all trials",
         "95 % quantile of the same.",
         lambda s: f.error_quantile(s, 0.95),
         kind="physical",
         where=("parameters",),
     ),
-    Statistic(
+    _solved(
         "nees",
         "NEES / n, solved",
-        "solved trials",
         "Mean of e' P⁻¹ e / n with the covariance P that the estimator reports: 1 if it is right. For a parameter it"
         " is the mean of the squared error over the reported variance. Limits: 95 % of chi-square, which hold for a"
         " right covariance and normal errors (Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking"
@@ -551,15 +412,13 @@ STATISTICS: tuple[Statistic, ...] = (
         " 5.4).",
         f.nees,
         limits=f.nees_limits,
-        given="solved",
         where=("solved_trials", "parameters"),
         titles={"parameters": "NEES", "solved_trials": "NEES / n"},
         limits_titles={"solved_trials": "NEES limits"},
     ),
-    Statistic(
+    _all(
         "coverage95",
         "coverage",
-        "all trials",
         "Share of trials whose truth lies inside the 95 % ellipsoid that the estimator reports, or for a parameter"
         " inside its interval. A value that is not finite counts as not covered.",
         f.coverage,
@@ -580,10 +439,9 @@ STATISTICS: tuple[Statistic, ...] = (
         kind="word",
         where=("calibration",),
     ),
-    Statistic(
+    _all(
         "claims",
         "claims",
-        "all trials",
         "Number of trials that converged and report a covariance, over which calibration is computed.",
         lambda s: int((s.converged & ~np.isnan(s.scalars["nees"])).sum()),
         kind="count",
@@ -623,10 +481,9 @@ STATISTICS: tuple[Statistic, ...] = (
         kind="word",
         where=("calibration", "parameters"),
     ),
-    Statistic(
+    _all(
         "misfit",
         "misfit",
-        "all trials",
         "Share whose residuals fail the test of fit: |R^-1/2 (z - h(x))|² is larger than it would be in 0.1 % of trials"
         " if model and noise were right. Its law is chi-square with m - n degrees for least squares and normal noise."
         " For other noise it is simulated; for other estimators it is scaled to the effective degrees of what they"
@@ -655,136 +512,36 @@ STATISTICS: tuple[Statistic, ...] = (
         where=("all_trials",),
         rare=True,
     ),
-    Statistic(
+    _all(
         "iterations_median",
         "iterations",
-        "all trials",
         "Median; none for filters, whose epochs are not iterations.",
         lambda s: quantile(s.scalars["iterations"], 0.5) if s.iterates else np.nan,
         where=("costs",),
     ),
-    Statistic(
+    _all(
         "iterations_p95",
         "iterations, 95 %",
-        "all trials",
         "95 % quantile.",
         lambda s: quantile(s.scalars["iterations"], 0.95) if s.iterates else np.nan,
         where=("costs",),
     ),
-    Statistic(
+    _all(
         "simulations_median",
         "simulations",
-        "all trials",
         "Median cost of a trial. A Jacobian counts as many simulations as the model says that it costs.",
         lambda s: quantile(s.cost, 0.5),
         where=("costs",),
     ),
-    Statistic(
+    _all(
         "time_median_s",
         "time",
-        "all trials",
         "Median over trials of the mean wall clock per trial of the block that a trial was computed in.",
         lambda s: quantile(s.scalars["time_s"], 0.5),
         kind="seconds",
         where=("costs",),
     ),
-    Statistic(
-        "path_rmse",
-        "rmse, all epochs",
-        "solved trials of trackers",
-        "Root mean square error over all epochs; over all states, root mean square of its ratio to the bound at the"
-        " truth. Interval: as that of rmse, over trials.",
-        t.rmse,
-        limits=t.rmse_limits,
-        given="solved",
-        kind="physical",
-        where=("tracks",),
-        limits_titles={"tracks": "95 % of rmse"},
-    ),
-    Statistic(
-        "path_bound",
-        "bound at the truth",
-        "all trials of trackers",
-        "Standard deviation of the extended Kalman filter that is linearised at the true path (Taylor, IEEE TAC 24,"
-        " 1979), or of the smoother behind it if the tracker smooths, root mean square over all epochs.",
-        t.bound,
-        kind="physical",
-        where=("tracks",),
-    ),
-    Statistic(
-        "path_success",
-        "path held",
-        "all trials of trackers",
-        "Share of trials whose mean squared error over all epochs, each state in multiples of this bound, lies in the"
-        " gate of a success. Interval: Clopper and Pearson.",
-        lambda s: t.path_success(s)[0],
-        limits=lambda s: t.path_success(s)[1:],
-        kind="share",
-        where=("tracks",),
-    ),
-    Statistic(
-        "path_nees",
-        "NEES / n, all epochs",
-        "solved trials of trackers",
-        "Mean over all epochs of e' P⁻¹ e / n with the covariance P that the tracker reports: 1 where it is right; none"
-        " where P is singular by the model.",
-        lambda s: t.mean_score(s, "path_nees") / s.n,
-        where=("tracks",),
-    ),
-    Statistic(
-        "path_verdict",
-        "verdict, all epochs",
-        "converged trials of trackers",
-        "The verdict on each trial's mean NEES over all epochs: epochs are dependent, trials are not.",
-        t.path_verdict,
-        kind="word",
-        where=("tracks",),
-    ),
-    Statistic(
-        "path_nis",
-        "NIS / m",
-        "all trials of filters of states",
-        "Mean normalised innovation squared over the number of readings, 1 where the filter is right.",
-        lambda s: f.mean_nis(s) if t.is_track(s) else np.nan,
-        where=("tracks",),
-    ),
-    Statistic(
-        "nis_verdict",
-        "verdict of NIS",
-        "converged trials of filters of states",
-        "The verdict on each trial's mean NIS, which needs no truth.",
-        t.nis_verdict,
-        kind="word",
-        where=("tracks",),
-    ),
-    Statistic(
-        "not_white",
-        "not white",
-        "converged trials of filters of states",
-        f"Share of trials whose normalised innovations are autocorrelated at the level {t.NOT_WHITE:g}, by Ljung and"
-        " Box's test (Biometrika 65, 1978) pooled over readings, lags 1 to 10 at most and to a fifth of the epochs:"
-        f" {t.NOT_WHITE:g} where the filter is right. Interval: Clopper and Pearson.",
-        lambda s: t.not_white(s)[0],
-        limits=lambda s: t.not_white(s)[1:],
-        kind="share",
-        where=("tracks",),
-    ),
-    Statistic(
-        "log_likelihood",
-        "log likelihood",
-        "solved trials of filters of states",
-        "Mean logarithm of the density of a trial's readings, by the innovations.",
-        lambda s: t.mean_score(s, "log_likelihood"),
-        where=("tracks",),
-    ),
-    Statistic(
-        "first_bad_epoch",
-        "first bad epoch",
-        "solved trials of trackers that have one",
-        f"Mean number of the first epoch whose error lies where a share of {GATE:g} should by the bound at the truth.",
-        lambda s: t.mean_score(s, "first_bad_epoch"),
-        where=("tracks",),
-    ),
+    *t.STATISTICS,
 )
 """The columns of `summary_all.csv`, in order."""
 

@@ -8,21 +8,9 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 
 from ipe_bench.basics.errors import UserError, place_of
-from ipe_bench.statistics.records import (
-    ALL,
-    BEST,
-    MAIN,
-    MAIN_OF_STATES,
-    SCORES,
-    STATISTICS,
-    Condition,
-    Kind,
-    Statistic,
-    Where,
-    frame_columns,
-    rows_of,
-)
+from ipe_bench.statistics.records import MAIN, MAIN_OF_STATES, SCORES, STATISTICS
 from ipe_bench.statistics.sample import Sample
+from ipe_bench.statistics.statistic import ALL, BEST, Condition, Kind, Statistic, Where, frame_columns, rows_of
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -87,7 +87,7 @@ class Sample:
         all solved."""
         names = [p["name"] for p in group.footer["parameters"]]
         errors, deviations = ([f"{kind}_{name}" for name in names] for kind in ("error", "deviation"))
-        parts = [collection.load(cell, [*SCALARS, *errors, *deviations], OPTIONAL_COLUMNS) for cell in group.cells]
+        parts = [collection.load(cell, [*errors, *deviations, *SCALARS], OPTIONAL_COLUMNS) for cell in group.cells]
         every = np.concatenate([_numbers(cell, part["trial"]) for cell, part in zip(group.cells, parts, strict=True)])
         status = np.concatenate([part["status"] for part in parts])
         used: Array = np.asarray(status != Status.NO_READINGS.label)
@@ -100,7 +100,11 @@ class Sample:
         number, scalars = every[used], {name: joined(name) for name in there}
         for name in ("solved", "success"):
             scalars[name] = scalars[name].astype(bool)
-        error, deviation = (np.array([joined(name) for name in columns]).T for columns in (errors, deviations))
+        error, deviation = np.empty((2, len(names), len(number)))
+        for values, columns in ((error, errors), (deviation, deviations)):
+            for row, name in zip(values, columns, strict=True):
+                row[:] = joined(name)
+        error, deviation = error.T, deviation.T
         for array in (number, error, deviation, *scalars.values()):
             array.flags.writeable = False
         common = np.isin(number, present), np.isin(number, solved)
@@ -237,6 +241,7 @@ def samples(collection: Collection, groups: Sequence[Group]) -> Iterator[Sample]
     for group in groups:
         if len(sample := Sample.load(collection, group, *common)):
             yield sample
+        del sample  # before the next one takes as much memory
 
 
 def _in_all(several: Sequence[Array]) -> Array:

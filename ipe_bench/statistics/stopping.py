@@ -19,9 +19,10 @@ from ipe_bench.runs.store import ResultKey, describe_names
 from ipe_bench.statistics.collect import collect
 from ipe_bench.statistics.formulas import rmse_sequence, rmse_unseen
 from ipe_bench.statistics.intervals import share_sequence
-from ipe_bench.statistics.records import SCORES, rows_of
+from ipe_bench.statistics.records import SCORES
 from ipe_bench.statistics.registry import summary_rows
 from ipe_bench.statistics.sample import Sample, samples
+from ipe_bench.statistics.statistic import rows_of
 from ipe_bench.trials.scenario import MOST_TRIALS, TRIALS
 from ipe_bench.trials.tracking import AnyScenario
 

@@ -16,6 +16,8 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics import formulas as f
 from ipe_bench.statistics.intervals import clopper_pearson, mean_limits, verdict
 from ipe_bench.statistics.sample import NIS, Sample
+from ipe_bench.statistics.statistic import Statistic
+from ipe_bench.trials.thresholds import GATE
 
 if TYPE_CHECKING:
     from ipe_bench.runs.results import StoredCell
@@ -125,3 +127,105 @@ def _sums(s: Sample, cells: Sequence[StoredCell], epochs: int, columns: int) -> 
 
     stored = (s.collection.load(cell, (), ("curves",)).get("curves", np.empty(0)) for cell in cells)
     return [block for texts in stored for block in unpacked(texts, epochs, columns)]
+
+
+STATISTICS: tuple[Statistic, ...] = (
+    Statistic(
+        "path_rmse",
+        "rmse, all epochs",
+        "solved trials of trackers",
+        "Root mean square error over all epochs; over all states, root mean square of its ratio to the bound at the"
+        " truth. Interval: as that of rmse, over trials.",
+        rmse,
+        limits=rmse_limits,
+        given="solved",
+        kind="physical",
+        where=("tracks",),
+        limits_titles={"tracks": "95 % of rmse"},
+    ),
+    Statistic(
+        "path_bound",
+        "bound at the truth",
+        "all trials of trackers",
+        "Standard deviation of the extended Kalman filter that is linearised at the true path (Taylor, IEEE TAC 24,"
+        " 1979), or of the smoother behind it if the tracker smooths, root mean square over all epochs.",
+        bound,
+        kind="physical",
+        where=("tracks",),
+    ),
+    Statistic(
+        "path_success",
+        "path held",
+        "all trials of trackers",
+        "Share of trials whose mean squared error over all epochs, each state in multiples of this bound, lies in the"
+        " gate of a success. Interval: Clopper and Pearson.",
+        lambda s: path_success(s)[0],
+        limits=lambda s: path_success(s)[1:],
+        kind="share",
+        where=("tracks",),
+    ),
+    Statistic(
+        "path_nees",
+        "NEES / n, all epochs",
+        "solved trials of trackers",
+        "Mean over all epochs of e' P⁻¹ e / n with the covariance P that the tracker reports: 1 where it is right; none"
+        " where P is singular by the model.",
+        lambda s: mean_score(s, "path_nees") / s.n,
+        where=("tracks",),
+    ),
+    Statistic(
+        "path_verdict",
+        "verdict, all epochs",
+        "converged trials of trackers",
+        "The verdict on each trial's mean NEES over all epochs: epochs are dependent, trials are not.",
+        path_verdict,
+        kind="word",
+        where=("tracks",),
+    ),
+    Statistic(
+        "path_nis",
+        "NIS / m",
+        "all trials of filters of states",
+        "Mean normalised innovation squared over the number of readings, 1 where the filter is right.",
+        lambda s: f.mean_nis(s) if is_track(s) else np.nan,
+        where=("tracks",),
+    ),
+    Statistic(
+        "nis_verdict",
+        "verdict of NIS",
+        "converged trials of filters of states",
+        "The verdict on each trial's mean NIS, which needs no truth.",
+        nis_verdict,
+        kind="word",
+        where=("tracks",),
+    ),
+    Statistic(
+        "not_white",
+        "not white",
+        "converged trials of filters of states",
+        f"Share of trials whose normalised innovations are autocorrelated at the level {NOT_WHITE:g}, by Ljung and"
+        " Box's test (Biometrika 65, 1978) pooled over readings, lags 1 to 10 at most and to a fifth of the epochs:"
+        f" {NOT_WHITE:g} where the filter is right. Interval: Clopper and Pearson.",
+        lambda s: not_white(s)[0],
+        limits=lambda s: not_white(s)[1:],
+        kind="share",
+        where=("tracks",),
+    ),
+    Statistic(
+        "log_likelihood",
+        "log likelihood",
+        "solved trials of filters of states",
+        "Mean logarithm of the density of a trial's readings, by the innovations.",
+        lambda s: mean_score(s, "log_likelihood"),
+        where=("tracks",),
+    ),
+    Statistic(
+        "first_bad_epoch",
+        "first bad epoch",
+        "solved trials of trackers that have one",
+        f"Mean number of the first epoch whose error lies where a share of {GATE:g} should by the bound at the truth.",
+        lambda s: mean_score(s, "first_bad_epoch"),
+        where=("tracks",),
+    ),
+)
+"""The columns of `summary_all.csv` that are of tracks, in order."""

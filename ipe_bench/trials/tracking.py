@@ -199,7 +199,8 @@ class PathBlock:
         """The tracks as estimates of the last epoch, with what is stored of each trial; `variances` (trials, K, n) are
         those of the bound over the path."""
         at = self.scenario.scored
-        e, P = tracks.mean - self.paths.x, tracks.covariance
+        x = self.paths.x
+        e, P = self.scenario.assumed.nearest_state(tracks.mean, x) - x, tracks.covariance
         known: Mask = np.asarray(np.isfinite(e).all(axis=2) & np.isfinite(P).all(axis=(2, 3)))
         e, P = e[..., at], P[..., at[:, None], at]
         trials, K, n = e.shape
@@ -296,7 +297,7 @@ def _make_plain(tracker: Tracker, tracks: Any, trials: int, model: StateModel) -
     if not isinstance(tracks, Tracks):
         raise ValueError(f"{name} {type(tracks).__name__}, where Tracks are asked for")
     shapes = {"mean": (K, n), "covariance": (K, n, n), "nis": (K,), "degrees": (K,), "log_likelihood": ()}
-    for part, shape in {**shapes, "innovations": (K, len(model.R(0)))}.items():
+    for part, shape in {**shapes, "innovations": (K, model.readings_per_epoch)}.items():
         setattr(tracks, part, plain_numbers(f"{name} {part}", getattr(tracks, part), (trials, *shape)))
     for part in ("cost", "status", "iterations"):
         if (values := getattr(tracks, part)) is not None:

@@ -39,6 +39,12 @@ def copy(tmp_path) -> Path:
     return tmp_path
 
 
+@pytest.fixture(scope="module")
+def before() -> dict[str, str]:
+    """The keys of the package as it is."""
+    return keys(Path(ipe_bench.__file__).parents[1])
+
+
 def said(code: str, copy: Path) -> str:
     """What that code prints in a process that has the copy."""
     environment = {**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
@@ -66,8 +72,7 @@ def test_keys_do_not_depend_on_the_order_of_sets_or_of_files_in_a_folder(copy, m
     assert len(seen) == 1
 
 
-def test_prose_edited_anywhere_leaves_every_key_as_it_was(copy):
-    before = keys(copy)
+def test_prose_edited_anywhere_leaves_every_key_as_it_was(copy, before):
     edited = 0
     for path in (copy / "ipe_bench").rglob("*.py"):
         text = path.read_text(encoding="utf-8")
@@ -82,8 +87,7 @@ def test_prose_edited_anywhere_leaves_every_key_as_it_was(copy):
     assert keys(copy) == before
 
 
-def test_a_changed_constant_makes_stale_what_was_computed_with_it_and_nothing_else(copy):
-    before = keys(copy)
+def test_a_changed_constant_makes_stale_what_was_computed_with_it_and_nothing_else(copy, before):
     edit(copy / "ipe_bench/report/style.py", "\n", "\nUNSEEN = 3\n")
     edit(copy / "ipe_bench/basics/errors.py", "there is no such", "nobody knows such a")
     assert keys(copy) == before
@@ -95,8 +99,7 @@ def test_a_changed_constant_makes_stale_what_was_computed_with_it_and_nothing_el
     assert all(before[name] != after[name] for name in before)
 
 
-def test_a_change_to_states_that_move_makes_stale_what_is_computed_with_them_and_no_constants(copy):
-    before = keys(copy)
+def test_a_change_to_states_that_move_makes_stale_what_is_computed_with_them_and_no_constants(copy, before):
     # Filters of constants update as trackers do; bounds of states are those of a filter and of a smoother.
     changed = {"states/trackers.py": {"track", "path", "ukf"}, "trials/tracking.py": {"track", "path"}}
     changed |= {"states/smoothers.py": {"track", "path"}, "states/particles.py": set()}
@@ -119,23 +122,17 @@ def code(source: str) -> str:
     return numerical_code(ast.parse(source))
 
 
-@pytest.mark.parametrize(
-    ("one", "other"),
-    [
-        ("x = 1", "x = 2"),
-        ("x = 1", "x = 1.0"),
-        ("x = None", "x = ..."),
-        ("x = 'a'", "x = 'b'"),
-        ("x = []", "x = [None]"),
-        ("raise ValueError('a')", "raise KeyError('a')"),
-        ("raise E(1)", "raise E(2)"),
-        ("f(a, b)", "f(b, a)"),
-        ("f(a, k=b)", "f(a, b)"),
-        ("def f(a=1): pass", "def f(*, a=1): pass"),
-        ("x + y - z", "x + (y - z)"),
-        ("if a: b\nc", "if a:\n  b\n  c"),
-    ],
-)
+# fmt: off
+OTHERS = [
+    ("x = 1", "x = 2"), ("x = 1", "x = 1.0"), ("x = None", "x = ..."), ("x = 'a'", "x = 'b'"), ("x = []", "x = [None]"),
+    ("raise ValueError('a')", "raise KeyError('a')"), ("raise E(1)", "raise E(2)"), ("f(a, b)", "f(b, a)"),
+    ("f(a, k=b)", "f(a, b)"), ("def f(a=1): pass", "def f(*, a=1): pass"), ("x + y - z", "x + (y - z)"),
+    ("if a: b\nc", "if a:\n  b\n  c"),
+]
+# fmt: on
+
+
+@pytest.mark.parametrize(("one", "other"), OTHERS)
 def test_whatever_can_change_a_number_is(one, other):
     assert code(one) != code(other)
 
@@ -159,7 +156,7 @@ print(ib.status("out")["stale"].sum())
 """
 
 
-@pytest.mark.parametrize("given", ["file", "input"])
+@pytest.mark.parametrize("given", ["file", pytest.param("input", marks=pytest.mark.slow)])
 def test_an_estimator_can_stand_in_a_script_and_what_it_computed_before_an_edit_is_stale(tmp_path, given):
     def stale(text: str) -> int:
         (tmp_path / "script.py").write_text(text, encoding="utf-8")

@@ -166,7 +166,9 @@ def names(folder: Path, key: str = "") -> list[str]:
     return sorted(path.name.partition("-")[2] for path in (folder / "trials").glob(f"{key}*.parquet"))
 
 
-def test_the_rows_are_the_same_in_one_file(tmp_path):
+@pytest.mark.parametrize("group", [parts.GROUP, 7])
+def test_the_rows_are_the_same_in_one_file(tmp_path, monkeypatch, group):
+    monkeypatch.setattr(parts, "GROUP", group)
     filled(tmp_path)
     expected = everything(tmp_path)
     assert merge(tmp_path) == 68
@@ -191,6 +193,21 @@ def test_a_file_that_the_disk_does_not_give_back_stands_for_none(tmp_path, monke
     assert set(before) < set(names(tmp_path))
 
 
+def test_a_file_of_several_groups_counts_its_trials_across_them(tmp_path, monkeypatch):
+    monkeypatch.setattr(parts, "GROUP", 7)
+    filled(tmp_path)
+    merge(tmp_path)
+    path = next((tmp_path / "trials").glob("*-0-100.parquet"))
+    part = parts.StoredPart.parse(path)
+    assert part is not None
+    (footer, _), *_, (_, last) = groups = list(part.groups())
+    assert max(len(table) for _, table in groups) <= 7
+    for wrong in ([table for _, table in groups[:-1]], [*(table for _, table in groups[1:]), last]):
+        parts.write_groups(path, last.schema, wrong, footer)
+        with pytest.raises(parts.Unusable, match="does not count from 0 to 100"):
+            part.read()
+
+
 def test_what_a_larger_file_holds_is_read_once_and_goes(tmp_path):
     filled(tmp_path)
     expected = everything(tmp_path)
@@ -203,8 +220,10 @@ def test_what_a_larger_file_holds_is_read_once_and_goes(tmp_path):
     assert_same(everything(tmp_path), expected)
 
 
-def test_ranges_that_overlap_are_read_and_merged_once(tmp_path):
+@pytest.mark.parametrize("group", [parts.GROUP, 7])
+def test_ranges_that_overlap_are_read_and_merged_once(tmp_path, monkeypatch, group):
     """Two runs with other sizes of blocks: trials 20 to 29 and 45 to 59 were computed twice."""
+    monkeypatch.setattr(parts, "GROUP", group)
     error = np.random.default_rng(1).standard_normal((TRIALS, 3))
     synthetic = Synthetic(tmp_path)
     for start, stop in ((0, 30), (20, 50), (45, 60), (47, 52), (60, TRIALS)):

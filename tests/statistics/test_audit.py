@@ -43,7 +43,7 @@ def test_a_wrong_scale_is_said_first(factor, said):
     assert len(found.sentences) == 1
 
 
-@pytest.mark.parametrize("law", ["normal", "t5"])
+@pytest.mark.parametrize("law", ["normal", pytest.param("t5", marks=pytest.mark.slow)])
 def test_honest_reports_are_believed_or_left_open(law):
     rng = np.random.default_rng(2)
     false = 0
@@ -150,10 +150,7 @@ def changed(**columns):
         (changed(cov_y_y=[0.09] * 49 + [0.1]), "row 51: y_var and cov_y_y differ"),
         (pd.concat([frame(), frame()[["x_std"]]], axis=1), "column x_std stands there twice"),
         (changed(x_std=np.inf, y_var=np.inf), "no row has an estimate with finite deviations of x, y"),
-        (
-            pd.DataFrame({"x_error": np.linspace(-1, 1, 50) * 1e-300, "x_std": 0.2}),
-            "errors of x are 0",
-        ),
+        (pd.DataFrame({"x_error": np.linspace(-1, 1, 50) * 1e-300, "x_std": 0.2}), "errors of x are 0"),
         (frame(200).drop(columns="cov_x_y").assign(x_std=0.2 * np.pi / 180), "the factor between degrees and radians"),
     ],
 )
@@ -281,6 +278,7 @@ def bundle_adjustments(runs: int, assumed: float, seed: int) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+@pytest.mark.slow
 def test_a_bundle_adjustment_in_pixels_reports_the_covariance_of_errors_of_one_pixel():
     """The question of users of such solvers: 'the covariance is larger than that of a Monte Carlo simulation'. The
     residuals were in pixels, and the image points half a pixel wrong; divided by that, it is right."""

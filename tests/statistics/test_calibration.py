@@ -48,7 +48,7 @@ def test_one_trial_in_closed_form():
     assert covered(1, tails) == pytest.approx(1 - 2 * np.floor(100 * tails) / 100, abs=1e-12)
 
 
-@pytest.mark.parametrize("trials", [7, 150, 2500])
+@pytest.mark.parametrize("trials", [7, 150, pytest.param(2500, marks=pytest.mark.slow)])
 def test_the_coverage_is_that_of_simulated_draws(trials):
     """20,000 simulated sets of counts keep both tails as often as computed, within 4 deviations."""
     rng = np.random.default_rng(trials)
@@ -89,6 +89,7 @@ def test_p_values_are_uniform():
 # Verdicts ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_false_alarms_keep_to_their_level():
     """Of 400 honest estimators of five parameters at most 5 % are called anything, up to 3 deviations; NEES alone
     exactly 5 %."""

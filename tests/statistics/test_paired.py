@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import minimize_scalar
 from scipy.stats import chi, norm
 
-from ipe_bench.statistics.paired import fair_coin, no_lean, ratio_effect, success_effect
+from ipe_bench.statistics.paired import fair_coin, mean_effect, no_lean, ratio_effect, success_effect
 
 
 def successes(both: int, only_first: int, only_second: int, neither: int):
@@ -126,6 +126,27 @@ def test_a_widened_interval_says_what_the_test_says():
     assert 1.0 <= effect.low < effect.change < 1 + 8 / 400 * 5 < effect.high
 
 
+def test_a_mean_difference_has_the_normal_interval_and_the_p_of_all_signs():
+    rng = np.random.default_rng(4)
+    first, second = rng.standard_normal(12), 0.4 + rng.standard_normal(12)
+    effect, d = mean_effect(first, second, 0.05, 8.0), second - first
+    signs = np.array(list(itertools.product([-1.0, 1.0], repeat=12)))
+    exact = (np.abs(signs @ d) >= abs(d.sum()) - 1e-12).mean()
+    assert 0.01 < exact < 0.5
+    assert abs(effect.p - exact) < 4 * np.sqrt(exact / 4999)
+    assert effect.change == pytest.approx(d.mean())
+    reach = norm.isf(0.025) * d.std() / np.sqrt(12)
+    assert (effect.low, effect.high) == pytest.approx((d.mean() - reach, d.mean() + reach))
+
+
+def test_a_mean_difference_counts_trials_that_may_be_unseen():
+    """None of 200 differs by other than 0.3: at most 1 - .025^(1/200) of all do, each by the largest there can be."""
+    first = np.random.default_rng(5).standard_normal(200)
+    effect = mean_effect(first, first + 0.3, 0.05, 8.0)
+    reach = 8 * (1 - 0.025 ** (1 / 200))
+    assert (effect.low, effect.high) == pytest.approx((0.3 - reach, 0.3 + reach), rel=1e-6)
+
+
 def test_success_is_mcnemar_s_test():
     """12 against 3 discordant trials: 2 (C(15,0) + ... + C(15,3)) / 2^15."""
     effect = success_effect(*successes(50, 3, 12, 5))
@@ -201,6 +222,7 @@ def test_evidence_is_for_the_side_of_the_sum():
     assert no_lean(np.full(400, -50.0), 150.0) > 1e60
 
 
+@pytest.mark.slow
 def test_who_looks_after_every_trial_is_misled_no_more_often_than_promised():
     """1 / alpha is exceeded anywhere among 400 tosses in at most alpha of 300 sequences, up to 3 deviations."""
     tosses = np.random.default_rng(0).integers(0, 2, (300, 400))

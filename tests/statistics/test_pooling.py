@@ -3,12 +3,9 @@
 import io
 import re
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from rich.console import Console
 from shared.synthetic_store import Pretender, Repeated
 
@@ -107,41 +104,11 @@ def test_equal_numbers_of_another_type_are_one_experiment():
     assert ResultKey(scenario).key != ResultKey(replace(scenario, error_scale=2.5)).key
 
 
-OPTIONS = st.fixed_dictionaries(
-    {
-        "repeats": st.sampled_from([2, 3]),
-        "names": st.sampled_from([("a", "b", "c"), ("a", "b"), ("c", "b", "a")]),
-        "sizes_given": st.sampled_from([(1.0,), (1.0, 2.0), (1.0, 2.0, 3.0)]),
-    }
-)
-
-
-@given(st.lists(OPTIONS, min_size=2, max_size=4, unique_by=lambda m: str(sorted(m.items()))))
-@settings(max_examples=15, deadline=None)
-def test_different_models_are_never_pooled_and_always_told_apart(tmp_path_factory, models):
-    from shared.synthetic_store import Synthetic
-
-    store = Synthetic(tmp_path_factory.mktemp("store"))
-    for model in models:
-        store.add(store.scenario(**model), "one", errors(n=len(model["names"])))
-    groups = collect([store.directory]).groups
-    assert len(groups) == len(models)
-    assert all(a.columns != b.columns for a, b in combinations(groups, 2))
-
-
 def test_a_sweep_over_lists_names_what_differs_in_tables_status_and_files(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     one, other = ("[" + ",".join(str(list(b)).replace(" ", "") for b in part) + "]" for part in (BEACONS, BEACONS[:4]))
-    arguments = [
-        "noise=gaussian",
-        "noise.deviation=0.1",
-        "trials=20",
-        "solver=[]",
-        "baseline=[linear_lse]",
-        "execution=serial",
-        "output=out",
-    ]
-    arguments += ["figures=none"]
+    arguments = ["noise=gaussian", "noise.deviation=0.1", "trials=20", "solver=[]", "baseline=[linear_lse]"]
+    arguments += ["execution=serial", "output=out", "figures=none"]
     assert main(["run", "-m", "measurement=ranging", f"measurement.beacons={one},{other}", *arguments]) == 0
     titles = titles_in(capsys.readouterr().out)
     assert len(titles) == len(set(titles)) == 2

@@ -45,7 +45,7 @@ def test_the_plan_is_the_least_from_which_on_the_power_stays(share, difference):
     assert power[0] < 0.9 <= min(power[1:])
 
 
-@pytest.mark.parametrize("case", [(0.9, 0.95, 0.3), (0.5, 0.6, 0.7)], ids=str)
+@pytest.mark.parametrize("case", [(0.9, 0.95, 0.3), pytest.param((0.5, 0.6, 0.7), marks=pytest.mark.slow)], ids=str)
 def test_plans_of_small_pilots_have_the_power_on_average(case):
     """Of 25 trials each: by the upper limit of the discordant share, and not by the share that the pilot shows."""
     p = outcomes(*case)

@@ -30,7 +30,14 @@ def p_values(model, noise, error_scale, estimator, trials=2000):
     return columns["fit_p"]
 
 
-@pytest.mark.parametrize("noise", NOISES, ids=lambda noise: f"{type(noise).__name__}")
+QUICK = (Gaussian, Outliers, Quantization)
+
+
+@pytest.mark.parametrize(
+    "noise",
+    [pytest.param(n, marks=() if isinstance(n, QUICK) else pytest.mark.slow) for n in NOISES],
+    ids=lambda noise: type(noise).__name__,
+)
 def test_p_is_uniform_for_every_noise_that_states_its_law(noise):
     """With chi-square in its place the test fails for Student's t, outliers and quantisation."""
     assert kstest(p_values(Polynomial(strength=0.01), noise, 1.0, GaussNewton()), "uniform").pvalue > 0.01
