@@ -223,7 +223,7 @@ def new_command(kind: str, name: str | None, language: str | None = None) -> int
         raise UserError("new: the following arguments are required: NAME")
     if kind in (added := plugins.kinds_to_copy()):
         return _copy_kind(kind, added[kind], name, language)
-    if language is not None:
+    if language is not None and kind in (*MODELS, *KINDS, "skill", "ci"):
         raise UserError(f"--language={language}: {kind} has no languages; leave it out")
     if kind == "skill":
         written = _write_skill(Path(name))
@@ -231,7 +231,8 @@ def new_command(kind: str, name: str | None, language: str | None = None) -> int
         return 0
     (kind,) = renamed([kind])
     if kind not in (*MODELS, *KINDS):
-        raise UserError(f"{kind}: {unknown(kind, (*MODELS, *KINDS, *added, 'skill', 'ci'), 'kind')}")
+        hint = "; `pip install plugins/process` in a checkout adds it" if kind == "process" else ""
+        raise UserError(f"{kind}: {unknown(kind, (*MODELS, *KINDS, *added, 'skill', 'ci'), 'kind')}{hint}")
     group = "baseline" if kind == "filter" else kind
     _check_name(group, name)
     if kind in ALONE:

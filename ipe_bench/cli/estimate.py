@@ -112,7 +112,7 @@ def _described(estimators: Any) -> dict[str, Any]:
 
 def estimate_command(arguments: Sequence[str]) -> int:
     """Estimates with every chosen estimator, prints tables and writes files; returns 1 if no fit passes."""
-    from ipe_bench.report.answer import FILES, NAME, Answer, estimate_parts, write_answer
+    from ipe_bench.report.answer import FILES, NAME, Answer, write_answer
 
     asked = single("estimate", arguments, STANDARD_ESTIMATORS, run=(*of("run", "trials"), w.TRUTH))
     if asked.spec.state_model is not None:
@@ -131,13 +131,13 @@ def estimate_command(arguments: Sequence[str]) -> int:
     parts = [question.scenario, *question.estimators.values()]
     provenance = _provenance(asked, question.found.files, parts)
     files = write_answer(folder, answer, command, provenance, figures=asked.spec.figures != "none")
-    _show(estimate_parts(answer), files)
+    _show(answer.parts(), files)
     return 0 if answer.passes else 1
 
 
 def _track(asked: Single, model: StateModel) -> int:
     """Tracks the states by every chosen tracker, prints tables and writes files; exit code 1 where no track passes."""
-    from ipe_bench.report.tracked import NAME, TABLE, track_parts, write_tracks
+    from ipe_bench.report.tracked import NAME, TABLE, write_tracks
 
     asked.words.refuse(("error_scale",), "is of simulated trials; give the state model another prior")
     given, trackers = asked.spec.readings, asked.spec.estimators
@@ -146,7 +146,7 @@ def _track(asked: Single, model: StateModel) -> int:
     command = {"readings": given, "find": find, "model": describe(model), "trackers": _described(trackers)}
     files, parts = [answer.log.file] if answer.log.file else [], [answer.log.model, *trackers.values()]
     folder = asked.folder(NAME, command, [TABLE])
-    _show(track_parts(answer), write_tracks(folder, answer, command, _provenance(asked, files, parts)))
+    _show(answer.parts(), write_tracks(folder, answer, command, _provenance(asked, files, parts)))
     return 0 if answer.passes else 1
 
 

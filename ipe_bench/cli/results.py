@@ -25,13 +25,11 @@ _COMPARE |= {"power": float, "difference": float, "output": str, "complete": boo
 
 def audit_command(arguments: Sequence[str]) -> int:
     """Prints whether reported covariances describe the errors; exit code 1 if they surely do not."""
-    from ipe_bench.report.questions import audit_parts
-
     files, keys = places_and_keys("audit", arguments, {"output": str})
     if len(files) != 1:
         raise UserError("audit: name one table of truths, estimates and deviations, such as runs.csv")
     found = ib.audit(files[0], **keys)
-    show(audit_parts(found))
+    show(found.parts())
     if "output" in keys:
         say(f"\nTable   {keys['output']}/audit.csv", f"Page    {keys['output']}/audit.html")
     return 1 if found.scale.wrong else 0
@@ -62,7 +60,6 @@ def bundle_command(arguments: Sequence[str]) -> int:
 
 def compare_command(arguments: Sequence[str]) -> int:
     """Prints the table; exit code 1 where the second is worse, or lacks what was asked for."""
-    from ipe_bench.report.questions import comparison_parts
     from ipe_bench.statistics.between import MARGINS
 
     margins = {f"margin.{name}": float for name in MARGINS}
@@ -71,7 +68,7 @@ def compare_command(arguments: Sequence[str]) -> int:
     if not 1 <= len(folders) <= 2:
         raise UserError("compare: name one or two folders of results, such as outputs/before outputs/after")
     frame = ib.compare(*folders, **keys)
-    show(comparison_parts(frame, keys.get("alpha", 0.05)))
+    show(frame.parts())
     print_problems([*frame.attrs["problems"], *frame.attrs["stale"], *frame.attrs["notes"]])
     if "output" in keys:
         say(f"\nTable   {keys['output']}/comparison.csv", f"Page    {keys['output']}/comparison.html")

@@ -97,8 +97,9 @@ class Spec(Component):
 
     def _check_objective(self, label: str, column: str) -> None:
         from ipe_bench.plugins.extensions import use_statistics
-        from ipe_bench.statistics.records import SCORES, frame_columns
+        from ipe_bench.statistics.records import SCORES
         from ipe_bench.statistics.registry import all_statistics
+        from ipe_bench.statistics.statistic import frame_columns
 
         use_statistics()
         columns = frame_columns([s for s in (*all_statistics(), *SCORES) if s.kind != "word"])

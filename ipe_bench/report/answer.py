@@ -25,7 +25,7 @@ from ipe_bench.real.fits import Fit
 from ipe_bench.real.residuals import LEAST_P
 from ipe_bench.report.table import Part, Shown, Strong, Table, texts, words
 from ipe_bench.report.words import enumerate_few, p_value
-from ipe_bench.report.writer import Page, write_files
+from ipe_bench.report.writer import write_files
 from ipe_bench.trials.fit_test import DRAWS
 from ipe_bench.trials.thresholds import FIT_LEVEL
 
@@ -40,7 +40,7 @@ LEAST_FIT_P = 1 / (DRAWS + 1)
 """Least p of the test of fit if the law of the noise is simulated."""
 _MOST_OUTLIERS = 8
 _FEW = 0.05
-"""Share of outliers above which the model is wrong, and a list of readings says nothing."""
+"""Share of outliers above which the model is wrong, and no list of readings helps."""
 _FITS = {True: "yes", False: "NO", None: "not tested"}
 _TOO_WELL = 0.999
 """The p of chi-square above which residuals are smaller than the stated noise explains."""
@@ -74,7 +74,7 @@ class Answer(Shown):
 
     @property
     def passes(self) -> bool:
-        """Whether any estimator has an answer that nothing speaks against."""
+        """Whether the answer of any estimator passes every test."""
         return (self.examination is None or self.examination.least) and any(one.passes for one in self.fits)
 
     def __iter__(self) -> Iterator[Fit]:
@@ -101,7 +101,23 @@ class Answer(Shown):
         return pd.concat(frames, ignore_index=True)
 
     def parts(self) -> Iterator[Part]:
-        return estimate_parts(self)
+        found, one = structure(self.model), self.examination
+        yield from (Strong(f"No data can tell: {sentence}.") for sentence in (found.sentences if found else ()))
+        if lacking := next((f"{'; '.join(f.undetermined)} (at {f.label})" for f in self.fits if f.undetermined), ""):
+            yield Strong(f"The readings do not determine {lacking}; fix parameters, or give prior, until they do.")
+        # Without the parameters that are held on bounds, and the levels.
+        model = one.whole.measurement if one else self.model
+        yield from (f"Note: {sentence}." for sentence in model.remarks(one.inner[: model.n] if one else model.nominal))
+        yield _estimates(self)
+        yield _verdicts(self)
+        yield from _outliers(self)
+        if one is not None:
+            passes = self[one.label].passes
+            if passes:
+                yield _intervals(one)
+            if passes or not one.least:
+                for remark in remarks(one, _reading_labels(self.model)):
+                    yield Strong(remark) if remark.split(":")[0].isupper() else remark
 
     def sentences(self) -> list[str]:
         """Says who has an answer, what it is, and what a reader should know first."""
@@ -110,33 +126,12 @@ class Answer(Shown):
         if not self.passes:
             return [f"No answer that passes: {others or 'a better minimum was found'}."]
         labels = enumerate_few([one.label for one in passing])
-        found = [f"Nothing speaks against the fit of {labels}{f'; no answer: {others}' if others else ''}."]
+        found = [f"Passing every test: {labels}{f'; no answer: {others}' if others else ''}."]
         one, told = passing[0], self.examination
         parameters = zip(one.model.physical_parameters, one.x, one.standard_errors, strict=True)
         values = [f"{p.name} = {with_error(x, s)} {p.unit}".rstrip() for p, x, s in parameters]
         found.append(f"{one.label}: {enumerate_few(values, 4)}.")
         return [*found, *(remarks(told, _reading_labels(self.model)) if told else ())][:3]
-
-
-def estimate_parts(answer: Answer) -> Iterator[Part]:
-    """Yields the tables and sentences of an answer, in order."""
-    found, one = structure(answer.model), answer.examination
-    yield from (Strong(f"No data can tell: {sentence}.") for sentence in (found.sentences if found else ()))
-    if lacking := next((f"{'; '.join(f.undetermined)} (at {f.label})" for f in answer.fits if f.undetermined), ""):
-        yield Strong(f"The readings do not determine {lacking}; fix parameters, or give prior, until they do.")
-    # Without the parameters that are held on bounds, and the levels.
-    model = one.whole.measurement if one else answer.model
-    yield from (f"Note: {sentence}." for sentence in model.remarks(one.inner[: model.n] if one else model.nominal))
-    yield _estimates(answer)
-    yield _verdicts(answer)
-    yield from _outliers(answer)
-    if one is not None:
-        passes = answer[one.label].passes
-        if passes:
-            yield _intervals(one)
-        if passes or not one.least:
-            for remark in remarks(one, _reading_labels(answer.model)):
-                yield Strong(remark) if remark.split(":")[0].isupper() else remark
 
 
 def _estimates(answer: Answer) -> Table:
@@ -334,8 +329,10 @@ def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator
         yield f"The readings are exactly the same with {listed}: choose one of these answers."
     for one in [one for one in found.ambiguous if not one.same_readings][:_MOST_MINIMA]:
         yield f"AMBIGUOUS: the readings fit as well at {at(one.x)} (chi-square {one.chi_square:.5g})."
-    if bent := list(compress(names, found.bent)):
-        yield f"Profiles that are no parabola: {', '.join(bent)}; trust their profile intervals."
+    if found.bent.any():
+        rows = zip(names, *found.profiles, found.x, strict=True)
+        ends = [f"{name} {_interval(low, high, x)}" for name, low, high, x in compress(rows, found.bent)]
+        yield f"Profiles that are not parabolic: trust their intervals of {CONFIDENCE:.0%}, {enumerate_few(ends, 3)}."
     if unlimited := list(compress(names, np.any(np.isinf(found.profiles), axis=0))):
         yield f"The readings set no limit to one side of {', '.join(unlimited)}."
     if lost := list(compress(names, np.any(np.isnan(found.profiles), axis=0))):
@@ -378,15 +375,9 @@ def write_answer(
     """Writes estimate.json, the page, residuals.csv and the figure; returns the files."""
     content = {"schema": SCHEMA, "command": command, **estimate_content(answer), **provenance}
     write_text(folder / f"{NAME}.json", json.dumps(content, indent=1) + "\n")
-    page = Page(
-        f"{answer.name}: estimates",
-        answer.sentences(),
-        list(answer.parts()),
-        _drawings(answer) if figures else (),
-        [f"{np.isfinite(answer.z).sum()} readings"],
-        read_from(provenance),
-    )
-    files = write_files(folder, NAME, page, (RESIDUALS, _residuals(answer)))
+    shown = answer.sentences(), answer.parts(), _drawings(answer) if figures else ()
+    told = {"facts": [f"{np.isfinite(answer.z).sum()} readings"], "sources": read_from(provenance)}
+    files = write_files(folder, NAME, (RESIDUALS, _residuals(answer)), f"{answer.name}: estimates", *shown, **told)
     for old in {folder / each for each in FILES} - set(files):
         old.unlink(missing_ok=True)
     return [folder / f"{NAME}.json", *files]

@@ -6,11 +6,10 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from ipe_bench import __version__
-from ipe_bench.report.headline import about, box
-from ipe_bench.report.table import Table
+from ipe_bench.report.headline import about, headline
+from ipe_bench.report.table import Part, Table, environment, words
 from ipe_bench.report.words import public
-from ipe_bench.report.writer import digests, rendered
+from ipe_bench.report.writer import Page, digests
 from ipe_bench.statistics.comparisons import TIE
 from ipe_bench.statistics.records import SCORES, STATISTICS
 from ipe_bench.statistics.registry import all_statistics
@@ -30,61 +29,60 @@ def render_page(
     analysis: Analysis, tables: Sequence[Table], figures: Sequence[Drawn], written: Sequence[Written] = ()
 ) -> str:
     """Renders the page as text; what plugins have written stands behind our tables."""
-    collection, runs = analysis.collection, _runs(analysis.collection.runs)
+    collection = analysis.collection
+    runs, older = _runs(collection.runs)
     commands = dict.fromkeys(run["command"] for run in runs if run["command"] not in (_PYTHON, _UNKNOWN))
-    appendix = [table for table in tables if table.appendix]
-    tables = [table for table in tables if not table.appendix]
-    nothing_failed = analysis.endings.empty and not analysis.summary.empty
-    complete = f"{collection.complete} of {collection.expected} expected cells (a scenario under an estimator) complete"
-    sentences, table = box(analysis)
+    main: list[Part] = [table for table in tables if not table.appendix]
+    converged = analysis.endings.empty and not analysis.summary.empty
     sections = [
-        *([("figures", "Figures")] if len(figures) > 1 else ()),
-        *([("tables", "Tables")] if len(tables) > 1 or nothing_failed else ()),
-        *((f"section-{section.name}", section.title) for section in written),
-        *([("appendix", "Further tables")] if appendix else ()),
-        ("provenance", "Configuration and provenance"),
-        ("definitions", "Definitions"),
-        ("cite", "How to cite"),
+        ("figures", "Figures", figures[1:]),
+        ("tables", "Tables", [*main[1:], *(["Every trial of every estimator converged."] if converged else [])]),
+        *((f"section-{section.name}", section.title, section.parts) for section in written),
+        ("appendix", "Further tables", [table for table in tables if table.appendix]),
+        ("provenance", "Configuration and provenance", _provenance(runs, older)),
+        ("definitions", "Definitions", [_definitions()]),
     ]
-    return rendered(
-        "report.html.j2",
-        figures,
-        kind="report",
+    page = Page(
+        "report",
+        ", ".join(d.resolve().name or str(d) for d in collection.directories),
+        headline(analysis),
+        [*figures[:1], *main[:1]],
+        sections,
         folder="figures/",
         facts=[
             *([_minute(collection.runs[-1]["started"])] if collection.runs else ()),
-            complete,
-            f"ipe-bench {__version__}",
+            f"{collection.complete} of {collection.expected} expected cells (a scenario under an estimator) complete",
         ],
-        sources=[(public(folder), digest) for folder, digest in digests(collection.directories)],
-        about=about(analysis),
-        headline=sentences,
-        box=table,
-        problems=[*collection.problems, *collection.stale],
-        title=", ".join(d.resolve().name or str(d) for d in collection.directories),
         commands=list(commands)[:MOST_COMMANDS],
-        sections=sections,
-        tables=tables,
-        written=written,
-        appendix=appendix,
-        nothing_failed=nothing_failed,
-        runs=runs[:MOST_RUNS],
-        older_runs=max(0, len(runs) - MOST_RUNS),
-        definitions=[
-            *DEFINITIONS.items(),
-            *((one.title, one.definition) for one in all_statistics()[len(STATISTICS) :]),
-        ],
+        sources=digests(collection.directories),
+        about=about(analysis),
+        problems=[*collection.problems, *collection.stale],
     )
+    return page.html()
 
 
-def _runs(runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Returns what was computed, by command, the last first; a run that found everything stored computed no trial."""
+def _definitions() -> Table:
+    added = all_statistics()[len(STATISTICS) :]
+    defined = DEFINITIONS | {one.title: one.definition for one in added}
+    return Table("words", "", "", [words("word", defined), words("meaning", defined.values())])
+
+
+def _provenance(runs: Sequence[Mapping[str, Any]], older: int) -> list[str]:
+    """Returns an entry for each command, as HTML, and how many older ones are left out."""
+    entry: Any = environment().get_template("parts.html.j2").module
+    shown = [entry.run(run) for run in runs] or ["No record of a run is stored here."]
+    return [*shown, *([f"{older} older commands have their records in runs/."] if older else [])]
+
+
+def _runs(runs: Sequence[Mapping[str, Any]]) -> tuple[list[dict[str, Any]], int]:
+    """Returns what was computed, by command, the last first, and the number of older commands; a run that found
+    everything stored computed no trial."""
     commands: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
     for run in (run for run in runs if run.get("blocks", 1)):
         command = run.get("command", _UNKNOWN)
         commands.setdefault((_PYTHON, run["file"]) if command is None else (public(str(command)), ""), []).append(run)
     found = []
-    for (command, _), records in reversed(commands.items()):
+    for (command, _), records in list(reversed(commands.items()))[:MOST_RUNS]:
         last = records[-1]
         facts = {
             "runs": ", ".join(record["file"] for record in records),
@@ -99,7 +97,7 @@ def _runs(runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         config = {"scenarios": scenarios, "estimators": last.get("estimators", {})}
         text = json.dumps(config, indent=1, ensure_ascii=False)
         found.append({"command": command, "started": _minute(records[0]["started"]), "facts": facts, "config": text})
-    return found
+    return found, len(commands) - len(found)
 
 
 def _minute(started: str) -> str:
@@ -124,6 +122,6 @@ DEFINITIONS: dict[str, str] = {
     " 1947), with Holm's correction.",
     "may be the best (bold)": "No rival succeeds significantly more often in the same trials, by the gate of the"
     " Cramér-Rao bound for all: McNemar's exact one-sided test against every rival at 5 % over their number, which"
-    " leaves a true best out in at most 5 % of scenarios (Hsu, Annals of Statistics 9, 1981). Nothing is bold if no"
+    " leaves a true best out in at most 5 % of scenarios (Hsu, Annals of Statistics 9, 1981). No name is bold if no"
     " estimator is beaten.",
 }

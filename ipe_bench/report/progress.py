@@ -40,7 +40,7 @@ def counting(title: str, total: int, *, off: bool = False) -> Iterator[Callable[
 
 
 def _telling(title: str, *, lines: bool = False, off: bool = False) -> AbstractContextManager[Tell]:
-    """Yields a callback that shows what it is told, in a notebook, in a terminal or, by `lines`, anywhere."""
+    """Yields a callback that shows progress in a notebook, in a terminal or, by `lines`, anywhere."""
     if _in_notebook() and not off:
         return _line_of_notebook(title)
     if lines or (not off and sys.stderr is not None and sys.stderr.isatty()):

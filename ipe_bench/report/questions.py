@@ -15,7 +15,7 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.identifiability import structure
 from ipe_bench.report.table import Cell, Column, Part, Shown, Strong, Table, texts, words
 from ipe_bench.report.words import compact, duration, enumerate_few, p_value, percent, scientific, value_text
-from ipe_bench.report.writer import Page, write_files
+from ipe_bench.report.writer import write_files
 from ipe_bench.statistics.audit import Audit
 from ipe_bench.statistics.between import NOT_SETTINGS, comparison_title
 from ipe_bench.trials.design import Design, Way, entry_in_words
@@ -55,7 +55,7 @@ class DesignAnswer(Shown, Design):
 
 
 def _best(design: Design) -> Way | None:
-    """Returns the way whose sharpest choice has the smallest mean bound; None if there is nothing to choose."""
+    """Returns the way whose sharpest choice has the smallest mean bound; None without a choice."""
     return min(design.ways, key=lambda way: way.sharpest.mean_bound, default=None)
 
 
@@ -184,8 +184,8 @@ def write_design(folder: Path, name: str, design: Design) -> list[Path]:
     ]
     columns = ["by", "choice", *index]
     table = pd.concat(chosen)[columns] if chosen else pd.DataFrame(columns=columns)
-    said, parts = list(_design_sentences(design))[:3], list(design_parts(name, design))
-    return write_files(folder, "design", Page(f"{name}: design", said, parts, _draw_design(design)), (READINGS, table))
+    answer, parts = list(_design_sentences(design)), design_parts(name, design)
+    return write_files(folder, "design", (READINGS, table), f"{name}: design", answer, parts, _draw_design(design))
 
 
 # Posterior -----------------------------------------------------------------------------------------------------------
@@ -257,10 +257,8 @@ def write_posteriors(folder: Path, name: str, title: str, model: Measurement, fo
         values = {"truth": one.truth, "mean": one.posterior.mean, "deviation": one.posterior.deviation}
         sized = {key: model.sizes * value for key, value in values.items()}
         frames.append(pd.DataFrame({"trial": one.trial, **names, **sized}))
-    page = Page(
-        f"{name}: posteriors", _honest_sentences(found), posterior_parts(title, found), draw_marginals(model, found)
-    )
-    return write_files(folder, "posterior", page, ("posterior.csv", pd.concat(frames)))
+    shown = _honest_sentences(found), posterior_parts(title, found), draw_marginals(model, found)
+    return write_files(folder, "posterior", ("posterior.csv", pd.concat(frames)), f"{name}: posteriors", *shown)
 
 
 def _honest_sentences(found: Sequence[Reference]) -> list[str]:
@@ -282,18 +280,41 @@ class Comparison(Shown, pd.DataFrame):
     """Shows a comparison; what is selected of it is a plain frame."""
 
     def parts(self) -> Iterator[Part]:
-        return comparison_parts(self, self.attrs["alpha"])
+        """Yields a table per comparison, within 80 columns, and what the columns mean."""
+        titles = ("", "first", "second", "change", f"{100 * (1 - self.attrs['alpha']):g} %", "p", "e", "second is")
+        for title, rows in _comparisons(self):
+            cells = zip(titles, zip(*map(_cells, rows), strict=True), strict=True)
+            columns = [(words if title in ("", "second is") else texts)(title, column) for title, column in cells]
+            needed = [_needed(row) for row in rows if row.get("power", math.nan) > 0]
+            yield Table("comparison", title, "", columns, notes=needed)
+        yield (
+            "length is that of the error in standard deviations of the bound (Mahalanobis), where a trial counts as at"
+            " most the radius of the gate of success; cost counts simulations. Both are means over the common trials,"
+            " where the table of a run has medians, and errors over the bound. p comes from McNemar's exact test for"
+            " success and from random signs for the others, with Holm's correction over all tests. e is evidence that"
+            " may be looked at repeatedly; e = 20 is as rare as p = 0.05. Each interval is that of its row alone."
+            " Times are not tested."
+        )
+        margins = ", ".join(f"{name} {margin:g}" for name, margin in self.attrs["margins"].items())
+        yield f"better and worse are changes that p tells from none, by more than a margin: {margins}."
+        if self["quantity"].str.match("honesty|bias").any():
+            yield (
+                "NEES (honesty) is the squared error over the claimed variance, by the number of parameters, where"
+                " both converge: right is 1. bias is the mean error in deviations of the bound, where both succeed:"
+                " right is 0."
+            )
+        if (self["matched_by"] == "order").any():
+            yield "Without common trials pairing gains no precision: the intervals are wider."
 
 
-def write_comparison(folder: Path, frame: pd.DataFrame, sources: Sequence[tuple[str, str]]) -> None:
+def write_comparison(folder: Path, frame: Comparison, sources: Sequence[tuple[str, str]]) -> None:
     """Writes comparison.csv and its page."""
     from ipe_bench.report.figures.answers import draw_pairs
 
-    said, parts = list(_finding_sentences(frame)), list(comparison_parts(frame, frame.attrs["alpha"]))
+    parts = list(frame.parts())
     tables = [part for part in parts if isinstance(part, Table)]
-    rest = [part for part in parts if not isinstance(part, Table)]
-    page = Page("Comparison", said, [_joined(tables), *rest], draw_pairs(frame), sources=sources)
-    write_files(folder, "comparison", page, ("comparison.csv", frame))
+    shown = list(_finding_sentences(frame)), [_joined(tables), *parts[len(tables) :]], draw_pairs(frame)
+    write_files(folder, "comparison", ("comparison.csv", frame), "Comparison", *shown, sources=sources)
 
 
 def _joined(tables: Sequence[Table]) -> Table:
@@ -317,33 +338,7 @@ def _finding_sentences(frame: pd.DataFrame) -> Iterator[str]:
         counts = judged[judged["finding"] == word].groupby("quantity", sort=False).size()
         listed = ", ".join(f"{quantity} ({count} of {number})" for quantity, count in counts.items())
         than = f"{who[1]} is {word} than {who[0]}" if all(who) else f"The second is {word}"
-        yield f"{than} in {listed or 'nothing that was tested'}."
-
-
-def comparison_parts(frame: pd.DataFrame, alpha: float) -> Iterator[Part]:
-    """Yields a table per comparison, within 80 columns, and what the columns mean."""
-    titles = ("", "first", "second", "change", f"{100 * (1 - alpha):g} %", "p", "e", "second is")
-    for title, rows in _comparisons(frame):
-        cells = zip(titles, zip(*map(_cells, rows), strict=True), strict=True)
-        columns = [(words if title in ("", "second is") else texts)(title, column) for title, column in cells]
-        needed = [_needed(row) for row in rows if row.get("power", math.nan) > 0]
-        yield Table("comparison", title, "", columns, notes=needed)
-    yield (
-        "length is that of the error in standard deviations of the bound (Mahalanobis), where a trial counts as at most"
-        " the radius of the gate of success; cost counts simulations. Both are means over the common trials, where the"
-        " table of a run has medians, and errors over the bound. p comes from McNemar's exact test for success and from"
-        " random signs for the others, with Holm's correction over all tests. e is evidence that may be looked at"
-        " repeatedly; e = 20 is as rare as p = 0.05. Each interval is that of its row alone. Times are not tested."
-    )
-    margins = ", ".join(f"{name} {margin:g}" for name, margin in frame.attrs["margins"].items())
-    yield f"better and worse are changes that p tells from none, by more than a margin: {margins}."
-    if frame["quantity"].str.match("honesty|bias").any():
-        yield (
-            "NEES (honesty) is the squared error over the claimed variance, by the number of parameters, where both"
-            " converge: right is 1. bias is the mean error in deviations of the bound, where both succeed: right is 0."
-        )
-    if (frame["matched_by"] == "order").any():
-        yield "Without common trials pairing gains no precision: the intervals are wider."
+        yield f"{than} in {listed or 'no tested quantity'}."
 
 
 def _needed(row: dict[str, Any]) -> str:
@@ -396,35 +391,31 @@ class AuditAnswer(Shown, Audit):
     """Shows an audit."""
 
     def parts(self) -> list[Part]:
-        return audit_parts(self)
+        """Returns the sentences of an audit, and a row per parameter."""
+        names = self.claims.names
+        columns = [
+            words("parameter", names),
+            texts("true over reported", [f"{f.value:.2f}" for f in self.each]),
+            texts("97.5 %", [f"{f.low:.2f} to {f.high:.2f}" for f in self.each]),
+            words("deviation", [f.verdict for f in self.each]),
+            texts("bias", [f"{value:+.2f}" for value in self.bias[:, 0]]),
+            texts("95 % of bias", [f"{low:+.2f} to {high:+.2f}" for low, high in self.bias[:, 1:]]),
+        ]
+        runs, left_out = self.claims.runs, self.claims.left_out
+        notes = [
+            "true over reported is the root mean square of errors in reported standard deviations, 1 if the report is"
+            " right; bias is their mean. Intervals hold for all parameters together, and for heavy tails."
+        ]
+        if not self.claims.joint:
+            notes.append("No covariances are reported, so directions are not judged.")
+        title = f"Audit of {runs} runs" + (f", {left_out} rows without an estimate left out" if left_out else "")
+        return [*self.sentences, Table("audit", title, "", columns, notes=notes)]
 
 
-def write_audit(folder: Path, found: Audit, sources: Sequence[tuple[str, str]]) -> None:
+def write_audit(folder: Path, found: AuditAnswer, sources: Sequence[tuple[str, str]]) -> None:
     """Writes audit.csv and its page."""
     from ipe_bench.report.figures.answers import draw_audit
 
-    parts = [part for part in audit_parts(found) if isinstance(part, Table)]
-    page = Page("Audit", found.sentences[:3], parts, draw_audit(found), sources=sources)
-    write_files(folder, "audit", page, ("audit.csv", found.table()))
-
-
-def audit_parts(found: Audit) -> list[Part]:
-    """Returns the sentences of an audit, and a row per parameter."""
-    names = found.claims.names
-    columns = [
-        words("parameter", names),
-        texts("true over reported", [f"{f.value:.2f}" for f in found.each]),
-        texts("97.5 %", [f"{f.low:.2f} to {f.high:.2f}" for f in found.each]),
-        words("deviation", [f.verdict for f in found.each]),
-        texts("bias", [f"{value:+.2f}" for value in found.bias[:, 0]]),
-        texts("95 % of bias", [f"{low:+.2f} to {high:+.2f}" for low, high in found.bias[:, 1:]]),
-    ]
-    runs, left_out = found.claims.runs, found.claims.left_out
-    notes = [
-        "true over reported is the root mean square of errors in reported standard deviations, 1 if the report is"
-        " right; bias is their mean. Intervals hold for all parameters together, and for heavy tails."
-    ]
-    if not found.claims.joint:
-        notes.append("No covariances are reported, so directions are not judged.")
-    title = f"Audit of {runs} runs" + (f", {left_out} rows without an estimate left out" if left_out else "")
-    return [*found.sentences, Table("audit", title, "", columns, notes=notes)]
+    parts = [part for part in found.parts() if isinstance(part, Table)]
+    shown = found.sentences, parts, draw_audit(found)
+    write_files(folder, "audit", ("audit.csv", found.table()), "Audit", *shown, sources=sources)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from ipe_bench.basics.files import regular, write_text
 from ipe_bench.plugins.extensions import files_of_records, use_statistics
 from ipe_bench.report.style import FIGURES, PAGE, Which, file_formats, which_figures
+from ipe_bench.report.table import Part, Shown
 from ipe_bench.runs.store import Store
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ STAMP = ".report.json"
 
 
 @dataclass(frozen=True, repr=False)
-class ReportResult:
+class ReportResult(Shown):
     """The files of a report, its summary, and what is missing from it."""
 
     summary: pd.DataFrame
@@ -39,18 +40,20 @@ class ReportResult:
     """Lines about missing, failed, foreign or damaged pieces; the exit code is 1 if there is any."""
     stale: tuple[str, ...]
     """One line per piece that older code computed, which is left out."""
-    headline: tuple[str, ...]
-    """Opening of the page: a few sentences on what the data say."""
+    headline: tuple[Part, ...]
+    """Opening of the page: a few sentences on what the data say, and for a sweep a table."""
+
+    def parts(self) -> tuple[Part, ...]:
+        return (*self.headline, *self.problems, *self.stale)
 
     def __repr__(self) -> str:
-        return "\n".join([f"Report  {self.report}", *self.headline, *self.problems, *self.stale])
+        return f"Report  {self.report}\n{self}"
 
     def _repr_html_(self) -> str:
         from markupsafe import Markup
 
         link = Markup('<a href="{}" target="_blank">{}</a>').format(os.path.relpath(self.report), self.report)
-        lines = [Markup("<li>{}</li>").format(line) for line in (*self.headline, *self.problems, *self.stale)]
-        return f"<p>{link}</p><ul>{''.join(lines)}</ul>"
+        return f"<p>{link}</p>{super()._repr_html_()}"
 
     @property
     def files(self) -> tuple[Path, ...]:

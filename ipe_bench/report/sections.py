@@ -20,7 +20,7 @@ CURVES = ("distributions",)
 class Section:
     """Defines a section of report.html, which follows our tables.
 
-    Required: `title` and `write`. Optional: nothing else. Promised: `write` does not write into the analysis, whose
+    Required: `title` and `write`. Optional: none. Promised: `write` does not write into the analysis, whose
     frames our tables are made of, and its tables have new names; one that raises is left out with a line.
 
     >>> section = Section("Settings", lambda analysis: iter([f"There are {len(analysis.summary)} rows."]))
@@ -30,7 +30,7 @@ class Section:
 
     title: str
     write: Callable[[Analysis], Iterator[Part]]
-    """Yields paragraphs of plain text and tables; nothing if the section would be empty."""
+    """Yields paragraphs of plain text and tables; none where the section would be empty."""
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ from ipe_bench.report.tables import certified_tables
 from ipe_bench.report.terminal import summary_tables
 from ipe_bench.statistics.analysis import analyse
 from ipe_bench.statistics.collect import collect, trials_frame
-from ipe_bench.statistics.records import ALL
 from ipe_bench.statistics.registry import summary_columns
+from ipe_bench.statistics.statistic import ALL
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ipe_bench.basics.files import write_text
-from ipe_bench.report.words import brief, duration, enumerate_few, percent, value_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -55,11 +54,29 @@ class Column:
     numeric: bool = True
 
 
+class Strong(str):
+    """A sentence that stands out."""
+
+
+class Shown:
+    """Shows an answer in a terminal and in a notebook."""
+
+    def parts(self) -> Iterable[Part]:
+        """Returns its tables and sentences, in order."""
+        raise NotImplementedError
+
+    def __str__(self) -> str:
+        return plain_text(self.parts())
+
+    def _repr_html_(self) -> str:
+        return html(self.parts())
+
+
 @dataclass(frozen=True)
-class Table:
+class Table(Shown):
     """Holds a table with its file name, its title, the caption above it and the notes below it.
 
-    A plugin offers a function of the analysis that returns one, or None if there is nothing to show.
+    A plugin offers a function of the analysis that returns one, or None where it would be empty.
     Required: `name`, `title`, `caption` and `columns` (`head`, `words` and `column` of `ipe_bench.report.tables` make
     them). Optional: the other fields. Promised: the function does not write into the analysis, and `name` is new.
 
@@ -100,27 +117,12 @@ class Table:
     def __len__(self) -> int:
         return len(self.columns[0].cells)
 
-
-class Strong(str):
-    """A sentence that stands out."""
+    def parts(self) -> list[Part]:
+        return [self]
 
 
 Part = Table | str
 """Element of a report: a table or a sentence."""
-
-
-class Shown:
-    """Shows an answer in a terminal and in a notebook."""
-
-    def parts(self) -> Iterable[Part]:
-        """Returns its tables and sentences, in order."""
-        raise NotImplementedError
-
-    def __str__(self) -> str:
-        return plain_text(self.parts())
-
-    def _repr_html_(self) -> str:
-        return html(self.parts())
 
 
 def column(title: str, values: Iterable[Any], show: Callable[[Any], str], best: Iterable[bool] = ()) -> Column:
@@ -261,8 +263,6 @@ def environment() -> Environment:
     )
     made.tests["strong"] = lambda part: isinstance(part, Strong)
     made.globals["MOST_ROWS"] = MOST_ROWS
-    made.globals |= (written := {one.__name__: one for one in (brief, duration, enumerate_few, percent, value_text)})
-    made.filters |= written
     return made
 
 

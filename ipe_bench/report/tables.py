@@ -18,8 +18,9 @@ from ipe_bench.statistics.certified import (
     published_table,
 )
 from ipe_bench.statistics.collect import Collection
-from ipe_bench.statistics.records import ALL, SCORES, Where, frame_columns
+from ipe_bench.statistics.records import SCORES
 from ipe_bench.statistics.registry import all_statistics
+from ipe_bench.statistics.statistic import ALL, Where, frame_columns
 
 _OPEN = (
     " An interval of one end (> or <) stands where larger errors may be unseen, in 3 of N trials or fewer; rmse_unseen"

@@ -10,13 +10,14 @@ from typing import Any
 from ipe_bench.report.table import Cell, Column, Part, Table, column, interval, sort_key, words
 from ipe_bench.report.words import brief, duration, ends_in_percent, p_value, percent, short, value_text
 from ipe_bench.statistics.formulas import CAP
-from ipe_bench.statistics.records import ALL, BEST, SCORES, Kind, Statistic, Where
+from ipe_bench.statistics.records import SCORES
 from ipe_bench.statistics.registry import all_statistics, summary_columns
+from ipe_bench.statistics.statistic import ALL, BEST, Kind, Statistic, Where
 
 _MOST_ROWS = 60
 """Rows that a terminal shows: about two screens."""
 _WIDE_ENOUGH = 100
-"""Letters of a screen that has room for failures, and for verdicts in words."""
+"""Letters of a screen with room for failures, and for verdicts spelt out."""
 _LEGEND = (
     "success: % of all trials (95 % interval; bold may be the best){failed}; error: median / 95 % quantile over"
     " {reference}; efficiency and NEES: 1 is right{sign}; cost: simulations. More: ipe-bench list statistic."

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ipe_bench.basics.files import write_text
-from ipe_bench.real.tracks import Log, LogTracks, far_below
+from ipe_bench.real.tracks import SEARCHES, Log, LogTracks, far_below
 from ipe_bench.report.answer import as_json, read_from, with_error
 from ipe_bench.report.table import Part, Shown, Strong, Table, interval, texts, words
 from ipe_bench.report.words import p_value, short
-from ipe_bench.report.writer import Page, write_files
+from ipe_bench.report.writer import write_files
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -32,7 +32,7 @@ class LogAnswer(Shown):
 
     @property
     def passes(self) -> bool:
-        """Whether any tracker has a track that nothing speaks against."""
+        """Whether the track of any tracker passes every test."""
         return any(one.passes for one in self.tracks)
 
     def __iter__(self) -> Iterator[LogTracks]:
@@ -55,58 +55,58 @@ class LogAnswer(Shown):
         return pd.concat(frames, ignore_index=True)
 
     def parts(self) -> list[Part]:
-        return track_parts(self)
-
-
-def track_parts(answer: LogAnswer) -> list[Part]:
-    """Returns the test of the innovations of each tracker, and the states at the last epoch."""
-    found, states = answer.tracks, answer.log.model.states
-    limits = [one.limits[0] for one in found], [one.limits[1] for one in found]
-    columns = [
-        words("tracker", [one.label for one in found]),
-        texts("rms of innovations", [short(np.sqrt(one.mean_nis)) for one in found]),
-        texts("NIS / m", [short(one.mean_nis) for one in found]),
-        interval("95 % if right", *limits, short),
-        words("verdict", [one.verdict for one in found]),
-        texts("white p", [p_value(one.white_p) for one in found]),
-        texts("log likelihood", [f"{one.log_likelihood:.2f}".replace("nan", "-") for one in found]),
-    ]
-    if np.isfinite([one.effective for one in found]).any():
-        columns.append(texts("effective particles", [short(one.effective) for one in found]))
-    note = (
-        "Innovations are readings less their predictions, in predicted standard deviations; NIS / m is their mean"
-        " square. They are white if the filter is right (Ljung and Box). Smoothers have none. A track is lost from the"
-        " epoch from which most of them are larger than all but one in a million by chance. Those of particles are by"
-        " the mean and covariance of the readings that they predict; effective particles: 1 / sum of squared weights,"
-        " the median of all epochs; collapsed: below 2."
-    )
-    if any(one.constants for one in found):
-        note += " Since the constants were found by them, their mean square hardly tests the model; whiteness does."
-    ends = [words("state", [state.name for state in states]), words("unit", [state.unit for state in states])]
-    ends += [texts(one.label, map(with_error, one.mean[-1], one.deviation[-1])) for one in found]
-    constants = [(one.label, each) for one in found for each in one.constants]
-    rows = [each for _, each in constants]
-    maximum = [
-        words("tracker", [label for label, _ in constants]),
-        words("constant", [each.name for each in rows]),
-        texts("value ± standard error", [with_error(each.value, each.error) for each in rows]),
-        interval("95 %", [each.low for each in rows], [each.high for each in rows], short),
-    ]
-    return [
-        *(Strong(f"{one.label}: {one.message}") for one in found if one.message),
-        *map(Strong, far_below(found)),
-        *([Table("constants", "Constants of largest likelihood", "", maximum)] if constants else ()),
-        Table("innovations", f"{answer.log.model.name}: is the filter right?", "", columns, notes=[note]),
-        Table("last", "States at the last epoch ± standard deviation", "", ends),
-    ]
+        """Returns the test of the innovations of each tracker, and the states at the last epoch."""
+        found, states = self.tracks, self.log.model.states
+        limits = [one.limits[0] for one in found], [one.limits[1] for one in found]
+        columns = [
+            words("tracker", [one.label for one in found]),
+            texts("NIS or cost / m", [short(one.mean_nis) for one in found]),
+            interval("95 % if right", *limits, short),
+            words("verdict", [one.verdict for one in found]),
+            texts("fit p", [p_value(one.fit_p) for one in found]),
+            texts("white p", [p_value(one.white_p) for one in found]),
+            texts("log likelihood", [f"{one.log_likelihood:.2f}".replace("nan", "-") for one in found]),
+        ]
+        if np.isfinite([one.effective for one in found]).any():
+            columns.append(texts("effective particles", [short(one.effective) for one in found]))
+        note = (
+            "Innovations are readings less their predictions, in predicted standard deviations, and NIS / m is"
+            " their mean square. A smoother has none: it is judged by the cost of its path, and one behind a filter"
+            " by the NIS of that filter. If the model is right both are chi-square with a degree per reading, and"
+            " fit p is the probability of larger ones. Innovations are white if the filter is right (Ljung and Box)."
+            " A track is lost from the epoch from which most of them are larger than all but one in a million by"
+            " chance. Those of particles are by the mean and covariance of the readings that they predict; effective"
+            " particles: 1 / sum of squared weights, the median of all epochs; collapsed: below 2. A dash: the"
+            " tracker has neither innovations nor a cost."
+        )
+        if any(one.constants for one in found):
+            note += (
+                f" Constants are those of the largest likelihood that {SEARCHES} searches found. Since they were"
+                " found by the innovations, the mean square of these hardly tests the model; whiteness does."
+            )
+        ends = [words("state", [state.name for state in states]), words("unit", [state.unit for state in states])]
+        ends += [texts(one.label, map(with_error, one.mean[-1], one.deviation[-1])) for one in found]
+        constants = [(one.label, each) for one in found for each in one.constants]
+        rows = [each for _, each in constants]
+        maximum = [
+            words("tracker", [label for label, _ in constants]),
+            words("constant", [each.name for each in rows]),
+            texts("value ± standard error", [with_error(each.value, each.error) for each in rows]),
+            interval("95 %", [each.low for each in rows], [each.high for each in rows], short),
+        ]
+        return [
+            *(Strong(f"{one.label}: {text}") for one in found for text in (one.message, *one.notes) if text),
+            *map(Strong, far_below(found)),
+            *([Table("constants", "Constants of largest likelihood", "", maximum)] if constants else ()),
+            Table("innovations", f"{self.log.model.name}: is the filter right?", "", columns, notes=[note]),
+            Table("last", "States at the last epoch ± standard deviation", "", ends),
+        ]
 
 
 def write_tracks(folder: Path, answer: LogAnswer, command: Any, provenance: Mapping[str, Any]) -> list[Path]:
     """Writes track.json, track.csv and track.html, and returns them."""
-    log, rows = (
-        answer.log,
-        ("lost_from", "effective", "message", "mean_nis", "limits", "verdict", "white_p", "log_likelihood", "passes"),
-    )
+    log, rows = answer.log, ("lost_from", "effective", "message", "notes", "mean_nis", "limits", "verdict")
+    rows = (*rows, "fit_p", "white_p", "log_likelihood", "passes")
     trackers = {one.label: {name: as_json(getattr(one, name)) for name in rows} for one in answer}
     for one in answer:
         trackers[one.label]["constants"] = {each.name: as_json([each.value, each.error]) for each in one.constants}
@@ -115,5 +115,8 @@ def write_tracks(folder: Path, answer: LogAnswer, command: Any, provenance: Mapp
     facts = [f"{int(np.isfinite(log.z).sum())} readings at {log.model.epochs} epochs"]
     verdicts = [f"{one.label} {one.verdict}" for one in answer if one.verdict != "-"]
     said = [f"By their innovations: {', '.join(verdicts)}."] if verdicts else []
-    page = Page(f"{log.model.name}: tracks", said, answer.parts(), facts=facts, sources=read_from(provenance))
-    return [folder / f"{NAME}.json", *write_files(folder, NAME, page, (TABLE, answer.table()))]
+    told = {"facts": facts, "sources": read_from(provenance)}
+    files = write_files(
+        folder, NAME, (TABLE, answer.table()), f"{log.model.name}: tracks", said, answer.parts(), **told
+    )
+    return [folder / f"{NAME}.json", *files]

@@ -12,7 +12,6 @@ from datetime import UTC, datetime
 from importlib import resources
 from itertools import chain, count
 from pathlib import Path
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from ipe_bench import __version__
@@ -62,30 +61,31 @@ def _is_free(folder: Path, result: str, command: Any, files: Sequence[str]) -> b
 
 @dataclass(frozen=True)
 class Page:
-    """Describes the answer to one question, as its page shows it: the first table is open, the rest is folded."""
+    """Holds what a page shows: the answer, a figure and a table are seen at once, and the sections are folded."""
 
+    kind: str
     title: str
-    answer: Sequence[str]
-    """At most three sentences."""
-    parts: Sequence[Part]
-    drawings: Iterable[Drawing] = ()
-    """Drawn in the style of the house when they are written."""
-    facts: Sequence[str] = ()
-    sources: Sequence[tuple[str, str]] = ()
-    """Files that were read, each with its SHA-256."""
+    answer: Sequence[Part]
+    shown: Sequence[Any]
+    sections: Sequence[tuple[str, str, Sequence[Any]]]
+    """Place, title and parts: sentences, tables, figures or pieces of HTML; one without parts is left out."""
+    commands: Sequence[str]
+    sources: Sequence[tuple[str, str]]
+    """What was read, each with its SHA-256."""
+    facts: Sequence[str]
+    about: Sequence[str] = ()
+    problems: Sequence[str] = ()
+    folder: str = ""
+    """Where the figures' files are, seen from the page."""
 
+    def html(self) -> str:
+        """Renders it, with the style, the script and the citation of every page."""
+        from markupsafe import Markup
 
-def rendered(template: str, figures: Iterable[Any], **content: Any) -> str:
-    """Renders a page with what every page has: style, script, pictures (name, title, caption, files), citation."""
-    from markupsafe import Markup
-
-    templates = resources.files("ipe_bench.report") / "templates"
-    files = {name: Markup((templates / f"report.{name}").read_text(encoding="utf-8")) for name in ("css", "js")}
-    return (
-        environment()
-        .get_template(template)
-        .render(style=files["css"], script=files["js"], figures=list(figures), citation=CITATION, **content)
-    )
+        templates = resources.files("ipe_bench.report") / "templates"
+        style, script = (Markup((templates / f"report.{kind}").read_text(encoding="utf-8")) for kind in ("css", "js"))
+        constant = {"style": style, "script": script, "citation": CITATION, "version": __version__, "public": public}
+        return environment().get_template("page.html.j2").render(**vars(self), **constant)
 
 
 def digests(places: Iterable[Path]) -> list[tuple[str, str]]:
@@ -98,31 +98,29 @@ def digests(places: Iterable[Path]) -> list[tuple[str, str]]:
     return found
 
 
-def write_files(folder: Path, name: str, page: Page, table: tuple[str, pd.DataFrame]) -> list[Path]:
-    """Writes the files of a command and returns them: the `table` under its name, the page `name`.html and its
-    figures."""
-    files, figures = [folder / table[0], folder / f"{name}.html"], []
+def write_files(
+    folder: Path,
+    name: str,
+    table: tuple[str, pd.DataFrame],
+    title: str,
+    answer: Sequence[str],
+    parts: Iterable[Part],
+    drawings: Iterable[Drawing] = (),
+    *,
+    facts: Sequence[str] = (),
+    sources: Sequence[tuple[str, str]] = (),
+) -> list[Path]:
+    """Writes the files of a command and returns them: the `table` under its name, the page `name`.html with at most
+    three sentences and the first of its tables seen at once, and its figures."""
+    files = [folder / table[0], folder / f"{name}.html"]
     write_text(files[0], table[1].to_csv(index=False))
-    with house_style() if page.drawings else nullcontext():
-        for drawing in page.drawings:
-            figures.append(SimpleNamespace(**vars(drawing), files=drawing.save(folder, (PAGE,)), html=drawing.html()))
-            files += figures[-1].files
-    tables = [part for part in page.parts if isinstance(part, Table)][:1]
-    rest = [part for part in page.parts if all(part is not one for one in tables)]
-    content = {
-        "kind": name,
-        "title": page.title,
-        "facts": [*page.facts, f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC", f"ipe-bench {__version__}"],
-        "commands": [public(asked)] if (asked := COMMAND.get()) else [],
-        "sources": [(public(file), digest) for file, digest in page.sources],
-        "headline": page.answer,
-        "box": None,
-        "tables": tables,
-        "rest": rest,
-        "sections": [("details", "Details")] * bool(rest or figures[1:]) + [("cite", "How to cite")],
-        "about": (),
-        "problems": (),
-        "folder": "",
-    }
-    write_text(files[1], rendered("page.html.j2", figures, **content))
-    return files
+    with house_style() if drawings else nullcontext():
+        figures = [drawing.drawn(folder, (PAGE,)) for drawing in drawings]
+    rest = list(parts)
+    first = [rest.pop(i) for i in [i for i, part in enumerate(rest) if isinstance(part, Table)][:1]]
+    commands = [public(asked)] if (asked := COMMAND.get()) else []
+    facts = [*facts, f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"]
+    sections = [("details", "Details", [*figures[1:], *rest])]
+    page = Page(name, title, list(answer)[:3], [*figures[:1], *first], sections, commands, sources, facts)
+    write_text(files[1], page.html())
+    return [*files, *(file for figure in figures for file in figure.files)]

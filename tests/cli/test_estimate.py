@@ -144,20 +144,6 @@ def test_columns_are_left_out_on_purpose(estimate, misra, tmp_path):
     assert (tmp_path / "outputs/estimate-formula-2/estimate.json").is_file()
 
 
-def test_equations_in_a_file_are_a_model(estimate, tmp_path):
-    (tmp_path / "decay.yaml").write_text("rates: {y: -k*y}\ninitial: {y: y0}\nstart: {k: 0.5, y0: 5}\n")
-    t = np.array([0.3, 1.1, 2.0, 3.5, 6.0])
-    y = 8 * np.exp(-0.4 * t) + 0.01 * np.array([1, -2, 1, 2, -1])
-    rows = [f"{a!r},{b!r}" for a, b in zip(t.tolist(), y.tolist(), strict=True)]
-    (tmp_path / "d.csv").write_text("\n".join(["time,reading", *rows]))
-    code, printed, answer = estimate(
-        "measurement=ode", "measurement.file=decay.yaml", *LM, "readings=d.csv", "figures=all"
-    )
-    assert code == 0, printed
-    x, _ = curve_fit(lambda t, k, y0: y0 * np.exp(-k * t), t, y, (0.5, 5), ftol=1e-14, xtol=1e-14, gtol=1e-14)
-    assert list(of(answer, "estimates").values()) == pytest.approx(x, rel=1e-6)
-
-
 def test_a_unit_as_it_stands_and_a_row_without_a_reading_that_is_predicted(estimate, tmp_path):
     (tmp_path / "a.csv").write_text("t [s],y [m/s^2]\n0,0.8\n1,2.3\n2,2.9\n3,4.2\n20,\n")
     line = ("measurement=formula", "measurement.expression=a+b*t", "measurement.start.a=1", "measurement.start.b=1")
@@ -173,32 +159,25 @@ def test_a_unit_as_it_stands_and_a_row_without_a_reading_that_is_predicted(estim
     assert float(last["prediction_error [m/s^2]"]) == pytest.approx(4.174326, rel=1e-5)
 
 
+# fmt: off
 MISTAKES = {
-    "noise twice": (
-        ("readings=weighted.csv", "noise.deviation=0.3"),
-        "noise: is given, and the readings have a column",
-    ),
+    "noise twice": (("readings=weighted.csv", "noise.deviation=0.3"),
+                    "noise: is given, and the readings have a column"),
     "unknown parameter": (("readings=my.csv", "parameters.b3.fixed=1"), "parameters.b3: "),
     "all fixed": (("readings=my.csv", "parameters.b1.fixed=1", "parameters.b2.fixed=1"), "parameters: all are fixed"),
     "no start": (("readings=my.csv", "~measurement.start.b2"), "start"),
     "one file twice": (("readings=[my.csv,my.csv]",), "names a file twice"),
-    "rows left out": (
-        ("readings=my.csv", "ignore_rows=[3,9]"),
-        "is no key any more; empty the cells of these readings",
-    ),
-    "a covariance": (
-        ("readings=my.csv", "prior_covariance=p.csv"),
-        "is no key any more; give parameters.NAME.deviation",
-    ),
+    "rows left out": (("readings=my.csv", "ignore_rows=[3,9]"), "is no key any more; empty the cells of these"),
+    "a covariance": (("readings=my.csv", "prior_covariance=p.csv"),
+                     "is no key any more; give parameters.NAME.deviation"),
     "a number for a column": (("readings=my.csv", "ignore_columns=[3]"), "ignore_columns"),
     "no such file": (("readings=my.csv", "parameters=no.yaml"), "parameters=no.yaml: cannot be read"),
-    "a key twice": (
-        ("readings=my.csv", "parameters=twice.yaml"),
-        "is not YAML that can be read (the key b1 is there twice)",
-    ),
+    "a key twice": (("readings=my.csv", "parameters=twice.yaml"),
+                    "is not YAML that can be read (the key b1 is there twice)"),
     "an alias": (("readings=my.csv", "parameters=alias.yaml"), "an alias (*NAME); write out what is meant"),
     "deviations too few": (("readings=my.csv", "noise.deviation=[1,2]"), "has 2 numbers; give one for each of 14"),
 }
+# fmt: on
 
 
 @pytest.mark.parametrize("case", MISTAKES)
@@ -254,6 +233,7 @@ def test_the_digest_is_of_the_bytes_that_were_estimated(estimate, misra, tmp_pat
     assert answer["readings"] == [{"file": "my.csv", "sha256": before}]
 
 
+@pytest.mark.slow
 def test_noise_that_is_overstated_is_said_and_rounded_intervals_hold_the_estimate(estimate):
     """A standard deviation of 3 where errors are .03: 100 times too large."""
     t = np.linspace(0, 6, 25)

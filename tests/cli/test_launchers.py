@@ -10,7 +10,7 @@ from ipe_bench.cli.main import main
 
 LAUNCHERS = {"joblib": "hydra-joblib-launcher", "submitit_local": "hydra-submitit-launcher"}
 EACH = ["basic", *(pytest.param(launcher, marks=pytest.mark.slow) for launcher in LAUNCHERS)]
-SWEEP = ["measurement=polynomial", "noise=gaussian", "trials=12", "error_scale=1,10", "seed=1,2"]
+SWEEP = ["measurement=polynomial", "noise=gaussian", "trials=12", "error_scale=1,10"]
 SWEEP += ["solver=[newton]", "baseline=[linear_lse]", "figures=none"]
 
 
@@ -32,7 +32,7 @@ def test_rows_are_those_of_a_serial_sweep(launcher, tmp_path, monkeypatch, capsy
     assert main(["run", "-m", *SWEEP, "execution=serial", "output=serial"]) == 0
     assert main(["run", "-m", *SWEEP, f"hydra/launcher={launcher}", f"output={tmp_path}/launched"]) == 0
     serial = rows("serial")
-    assert len(serial) == 4 * 12 * 2
+    assert len(serial) == 2 * 12 * 2
     pd.testing.assert_frame_equal(rows("launched"), serial, check_exact=True)
 
 
@@ -45,6 +45,6 @@ def test_a_job_that_is_refused_is_told_and_stands_in_the_books(launcher, tmp_pat
     sweep = [*SWEEP, "execution=serial", "noise.deviation=0.01,1e-150", f"output={tmp_path}/out"]
     sweep.append(f"hydra/launcher={launcher}")
     assert main(["run", "-m", *sweep]) == 2
-    assert "noise.deviation=1e-150 and 3 more)" in capsys.readouterr().err.splitlines()[-1]
+    assert "noise.deviation=1e-150 and 1 more)" in capsys.readouterr().err.splitlines()[-1]
     assert main(["status", "out"]) == 1
-    assert capsys.readouterr().out.count("refused: ") == 4
+    assert capsys.readouterr().out.count("refused: ") == 2

@@ -49,23 +49,10 @@ OPTIONS = {
     "trails": ("3",),
     "a.b": ("3",),
 }
-CHOICES = (
-    "null",
-    "5",
-    "1.5",
-    "true",
-    "[]",
-    "[null]",
-    "[1]",
-    "{a: 1}",
-    "../noise/none",
-    "nothing",
-    "''",
-    LONG,
-    "a/b",
-    "*",
-)
 # fmt: off
+CHOICES = (
+    "null", "5", "1.5", "true", "[]", "[null]", "[1]", "{a: 1}", "../noise/none", "nothing", "''", LONG, "a/b", "*",
+)
 FLAGS = {
     "run": (
         "--trials=5", "-x", "--verbose", "-make", "--cfg", "--cfg nope", "-i nope", "--resolve", "-m --cfg job",
@@ -95,93 +82,33 @@ FLAGS = {
         "", "nowhere", ".", "-x", "loop", LONG,
     ),
 }
-# fmt: on
 SYNTAX = (
-    "trials",
-    "+",
-    "~",
-    "=5",
-    "+=5",
-    "~=",
-    "solver=[newton",
-    "solver=newton]",
-    "a=b=c",
-    "output=out/ünï",
-    "trials=5,",
-)
-SYNTAX += (
-    "trials=,5",
-    "error_scale=1,,2",
-    "error_scale=(1,2)",
-    "x@y@z=3",
-    "output=a{b",
-    "name='a",
-    'name="a',
-    "++",
-    "~~trials",
-)
-SYNTAX += (
-    "error_scale=range(1",
-    "solver=[newton,,ekf]",
-    "name=a(b)",
-    "trials:5",
-    "@x=3",
-    "solver=[[newton]]",
+    "trials", "+", "~", "=5", "+=5", "~=", "solver=[newton", "solver=newton]", "a=b=c", "output=out/ünï", "trials=5,",
+    "trials=,5", "error_scale=1,,2", "error_scale=(1,2)", "x@y@z=3", "output=a{b", "name='a", 'name="a', "++",
+    "~~trials", "error_scale=range(1", "solver=[newton,,ekf]", "name=a(b)", "trials:5", "@x=3", "solver=[[newton]]",
 )
 SWEEPS = ("error_scale=1,2", "seed=range(0,3)", "measurement=gins,ranging", "solver=[newton],[fixed_point]")
-BAD_SWEEPS = ("error_scale=range(1,nan)", "error_scale=range(1,inf)", "seed=range(0,1000000000)", "seed=range(3,0)")
-BAD_SWEEPS += (
-    "error_scale=range(1,2,0)",
-    "error_scale=interval(1,2)",
-    "measurement=glob(nothing*)",
-    "noise=nothing,none",
-)
-BAD_SWEEPS += (
-    "measurement=gins,gims",
-    "solver=[newton],[newtn]",
-    "solver=[newton,newton],[newton]",
-    "+experiment=paper,nist",
-)
-BAD_SWEEPS += (
-    "error_scale=1,-1 trials=1 output=/proc/x",
-    "error_scale=choice()",
-    "hydra/launcher=joblib",
-    "hydra/sweeper=optuna",
+BAD_SWEEPS = (
+    "error_scale=range(1,nan)", "error_scale=range(1,inf)", "seed=range(0,1000000000)", "seed=range(3,0)",
+    "error_scale=range(1,2,0)", "error_scale=interval(1,2)", "measurement=glob(nothing*)", "noise=nothing,none",
+    "measurement=gins,gims", "solver=[newton],[newtn]", "solver=[newton,newton],[newton]", "+experiment=paper,nist",
+    "error_scale=1,-1 trials=1 output=/proc/x", "error_scale=choice()", "hydra/launcher=joblib", "hydra/sweeper=optuna",
 )
 PLACES = (
-    "+noise@estimators.x=gaussian",
-    "+measurement@estimators.x=polynomial",
-    "+solver@x=newton",
-    "solver@estimators.x=newton",
-)
-PLACES += ("+solver@estimators=newton", "+solver@estimators.a.b=newton", "+solver@estimators.fixed_point=newton")
-PLACES += (
-    "+baseline@estimators.fixed_point=ekf",
-    "+solver@estimators.truth=newton",
-    "noise@prior=gaussian",
-    "+nothing@x=y",
-)
-PLACES += ("+measurement=gins", "+noise=gaussian", "+execution=serial", "+truth_measurement=gins", "experiment=paper")
-PLACES += ("+experiment=nothing", "+experiment=null", "+experiment=[paper]", "+experiment=paper +experiment=nist")
-PLACES += ("solver=[newton,newton]", "solver=['newton',newton]", "solver=[newton] +baseline@estimators.newton=ekf")
-PLACES += (
-    "solver=[] baseline=[]",
-    "execution=serial execution.workers=2",
+    "+noise@estimators.x=gaussian", "+measurement@estimators.x=polynomial", "+solver@x=newton",
+    "solver@estimators.x=newton", "+solver@estimators=newton", "+solver@estimators.a.b=newton",
+    "+solver@estimators.fixed_point=newton", "+baseline@estimators.fixed_point=ekf", "+solver@estimators.truth=newton",
+    "noise@prior=gaussian", "+nothing@x=y", "+measurement=gins", "+noise=gaussian", "+execution=serial",
+    "+truth_measurement=gins", "experiment=paper", "+experiment=nothing", "+experiment=null", "+experiment=[paper]",
+    "+experiment=paper +experiment=nist", "solver=[newton,newton]", "solver=['newton',newton]",
+    "solver=[newton] +baseline@estimators.newton=ekf", "solver=[] baseline=[]", "execution=serial execution.workers=2",
     "noise=certified",
 )
 DELETED = (
-    "trials",
-    "seed",
-    "name",
-    "output",
-    "noise",
-    "measurement",
-    "prior",
-    "execution",
-    "estimators",
-    "truth_measurement",
+    "trials", "seed", "name", "output", "noise", "measurement", "prior", "execution", "estimators", "truth_measurement",
+    "noise.step", "solver.x", "experiment", "nothing", "noise=quantization",
 )
-DELETED += ("noise.step", "solver.x", "experiment", "nothing", "noise=quantization")
+# fmt: on
 
 
 def command_lines() -> dict[str, list[str]]:
@@ -261,7 +188,7 @@ def one_in(count: int, cases: Iterable[str], rest: pytest.MarkDecorator) -> list
     return [pytest.param(case, marks=() if i % count == 0 else rest) for i, case in enumerate(cases)]
 
 
-@pytest.mark.parametrize("line", one_in(7, LINES, pytest.mark.campaign))
+@pytest.mark.parametrize("line", one_in(16, LINES, pytest.mark.campaign))
 def test_a_wrong_command_line_is_answered_in_one_line(answer, tmp_path, line):
     code, error = answer(*LINES[line])
     assert code == 2
@@ -348,33 +275,14 @@ BROKEN_WHEN_READ: dict[str, dict[str, str | bytes]] = {
     "missing value": config(YAML + "start: ???\n"),
     "a group of defaults": config(YAML.replace("_target_", "defaults: [nothing]\n_target_")),
 }
+RAISED = (
+    *("RuntimeError('a\\nb')", "ValueError(3)", "KeyError('k')", "OSError(2, 'no', 'file')", "TypeError()"),
+    *("ImportError('a\\nb')", "ModuleNotFoundError('x')", "AttributeError('x')", "NameError('x')", "Warning('x')"),
+    *("RecursionError()", "MemoryError()", "AssertionError()", "StopIteration()", "GeneratorExit()", "SystemExit(5)"),
+    *("BaseException('x')", "UnicodeDecodeError('utf-8', b'', 0, 1, 'x')", "ExceptionGroup('g', [ValueError()])"),
+)
 BROKEN_WHEN_IMPORTED: dict[str, dict[str, str | bytes]] = {
-    **{
-        f"raises {what.partition('(')[0]}": imports(f"raise {what}\n")
-        for what in (
-            *("RuntimeError('a\\nb')", "ValueError(3)", "KeyError('k')", "OSError(2, 'no', 'file')", "TypeError()"),
-            *(
-                "ImportError('a\\nb')",
-                "ModuleNotFoundError('x')",
-                "AttributeError('x')",
-                "NameError('x')",
-                "Warning('x')",
-            ),
-            *(
-                "RecursionError()",
-                "MemoryError()",
-                "AssertionError()",
-                "StopIteration()",
-                "GeneratorExit()",
-                "SystemExit(5)",
-            ),
-            *(
-                "BaseException('x')",
-                "UnicodeDecodeError('utf-8', b'', 0, 1, 'x')",
-                "ExceptionGroup('g', [ValueError()])",
-            ),
-        )
-    },
+    **{f"raises {what.partition('(')[0]}": imports(f"raise {what}\n") for what in RAISED},
     "sys.exit": imports("import sys; sys.exit(0)\n"),
     "syntax": imports("def (:\n"),
     "indentation of code": imports("  x = 1\n y = 2\n"),
@@ -426,7 +334,7 @@ def test_there_are_sixty_broken_plugins():
     assert len(BROKEN) >= 60
 
 
-@pytest.mark.parametrize("kind", one_in(4, BROKEN, pytest.mark.slow))
+@pytest.mark.parametrize("kind", one_in(12, BROKEN, pytest.mark.slow))
 def test_a_broken_plugin_is_named_where_it_is_chosen(answer, plugin, tmp_path, kind):
     plugin(**BROKEN[kind])
     code, error = answer("run", "solver=[bad]", *SMALL)
@@ -436,14 +344,14 @@ def test_a_broken_plugin_is_named_where_it_is_chosen(answer, plugin, tmp_path, k
     assert stored(tmp_path) == []
 
 
-@pytest.mark.parametrize("kind", one_in(4, BROKEN, pytest.mark.slow))
+@pytest.mark.parametrize("kind", one_in(12, BROKEN, pytest.mark.slow))
 def test_a_broken_plugin_stops_nobody_who_does_not_use_it(answer, plugin, capsys, kind):
     plugin(**BROKEN[kind])
     assert answer("run", "solver=[newton]", *SMALL, "--cfg", "job")[0] == 0
     assert answer("list", "solver")[0] == 0
 
 
-@pytest.mark.parametrize("kind", one_in(4, BROKEN, pytest.mark.slow))
+@pytest.mark.parametrize("kind", one_in(12, BROKEN, pytest.mark.slow))
 def test_check_fails_a_broken_plugin(answer, plugin, kind):
     folder = plugin(**BROKEN[kind])
     code, error = answer("check", str(folder))

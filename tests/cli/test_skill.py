@@ -9,6 +9,8 @@ import pytest
 from ipe_bench.cli.components import PAGES
 from ipe_bench.cli.main import main
 
+pytestmark = pytest.mark.slow  # to write the pages is to make and to check a component of each kind
+
 
 @pytest.fixture(scope="module")
 def skill(tmp_path_factory) -> Path:
@@ -31,13 +33,7 @@ def test_the_router_names_every_page_and_the_pages_are_short(skill):
     assert "my_solver" not in router.partition("## Options")[2]
 
 
-QUICK = ("filter", "function", "ode", "measurement", "baseline")
-EACH = ["SKILL", *(f"new-{kind}" for kind in PAGES if kind not in QUICK)]
-
-
-@pytest.mark.parametrize(
-    "page", [*(f"new-{kind}" for kind in QUICK), *(pytest.param(page, marks=pytest.mark.slow) for page in EACH)]
-)
+@pytest.mark.parametrize("page", ["SKILL", *(f"new-{kind}" for kind in PAGES)])
 def test_what_a_page_says_to_type_works(skill, page, ipe_bench):
     found = commands(skill / f"{page}.md")
     assert len(found) >= 3

@@ -155,7 +155,7 @@ def test_what_a_page_says_to_type_works(page, tmp_path):
 
 @pytest.mark.slow
 def test_the_whole_site_builds_without_a_warning_and_fetches_nothing(tmp_path):
-    """Every experiment, and a line about each that runs since nothing is stored of it."""
+    """Every experiment, and a line about each that runs without a stored result."""
     pytest.importorskip("pydata_sphinx_theme")
     # In a process of its own, as a user builds it: what its libraries will do away with is no error of ours.
     command = [sys.executable, "-m", "ipe_bench.report.docs", str(tmp_path), "--trials=1"]
@@ -167,7 +167,7 @@ def test_the_whole_site_builds_without_a_warning_and_fetches_nothing(tmp_path):
     assert 'href="gallery/ranging.html"' in (html / "choosing.html").read_text(encoding="utf-8")
     assert "100 trials per row" in (html / "howto" / "notebook.html").read_text(encoding="utf-8")
     for name in ours:
-        ran = f"{name}: nothing is stored of it; it runs now" in done.stdout
+        ran = f"{name}: no result of it is stored; it runs now" in done.stdout
         assert ran == (not (PAGES.parent / "gallery" / f"{name}.json").exists())
         page = (html / "gallery" / f"{name}.html").read_text(encoding="utf-8")
         assert f"experiment={name}" in re.sub("<[^>]*>", "", page)  # without the marks of colours

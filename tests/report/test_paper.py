@@ -105,6 +105,7 @@ def test_tables_say_what_the_report_says_whatever_the_names(synthetic, tmp_path)
     assert [row[3] for row in rows[1:]] == [f"{short(low)} to {short(high)}" for low, high in ends]
 
 
+@pytest.mark.slow
 def test_a_figure_is_as_wide_as_the_column_and_the_report_stays_as_it_is(synthetic, tmp_path, monkeypatch):
     fill(synthetic)
     analysis = analyse([synthetic.directory])

@@ -68,16 +68,6 @@ def check(folder: Path) -> pd.DataFrame:
     return found
 
 
-def test_the_summary_is_what_pandas_makes_of_the_trials(tmp_path):
-    estimators = {"newton": ib.solvers.Newton(), "linear_lse": ib.baselines.LinearLSE(), "ekf": ib.baselines.EKF()}
-    for scale in (1.0, 40.0):
-        bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=scale)
-        ib.run(bench, estimators, trials=60, output=tmp_path)
-    ib.report(tmp_path, figures="none")
-    found = check(tmp_path)
-    assert found["known"].between(0, 1, inclusive="neither").any()
-
-
 @pytest.mark.slow
 def test_every_line_runs_in_order_and_the_table_comes_out(tmp_path):
     (tmp_path / "ipe_bench").symlink_to(ROOT / "ipe_bench")

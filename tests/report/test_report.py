@@ -20,14 +20,15 @@ from shared.synthetic_store import Seeker, Synthetic
 from ipe_bench.api import report as write_report
 from ipe_bench.noise import Quantization
 from ipe_bench.report import figures
-from ipe_bench.report.headline import about, box
+from ipe_bench.report.headline import about, headline
 from ipe_bench.report.html import DEFINITIONS, render_page
 from ipe_bench.report.table import Strong, Table, column, comma_separated, html, latex, markdown, terminal, texts, words
 from ipe_bench.report.tables import all_tables
-from ipe_bench.report.terminal import overview_notes, reported, summary_tables
+from ipe_bench.report.terminal import reported, summary_tables
 from ipe_bench.report.words import compact, duration, percent, short
 from ipe_bench.statistics import analyse
-from ipe_bench.statistics.records import SCORES, STATISTICS, frame_columns
+from ipe_bench.statistics.records import SCORES, STATISTICS
+from ipe_bench.statistics.statistic import frame_columns
 
 
 def shown_at(width: int, *parts) -> list[str]:
@@ -64,9 +65,9 @@ def test_what_is_written_is_whole_and_the_page_stands_alone(result):
     assert led_to == {f"figures/{path.name}" for path in result.figures}
     assert "http" not in re.sub(r"base64,[^\"]*|http-equiv", "", page)
     analysis, shown = analyse([result.report.parent]), page.replace("&#39;", "'")
-    sentences, limits = box(analysis)
+    *sentences, limits = headline(analysis)
     assert all(sentence in shown for sentence in (*sentences, *about(analysis)))
-    assert (limits is None) != ('id="table-limits"' in shown)
+    assert f'id="table-{limits.name}"' in shown
 
 
 def test_survivors_are_shown_as_survivors(synthetic):
@@ -157,12 +158,11 @@ def test_settings_that_differ_have_figures_of_their_own(synthetic, tmp_path, mon
     synthetic.bound = lambda scenario: np.full(3, 0.1)
     for scenario in (*gaussian, *(replace(s, noise=Quantization(0.7)) for s in gaussian[:2])):
         synthetic.add(scenario, "one", 0.1 * rng.normal(size=(40, 3)))
-    monkeypatch.setattr(figures, "FIGURES", ("errors", "costs"))
+    monkeypatch.setattr(figures, "FIGURES", ("costs",))
     result = write_report([synthetic.directory], tmp_path / "out", figures="all")
-    names = {path.stem for path in result.figures}
-    for kind in ("headline", "cost_against_accuracy"):
-        settings = {name.removeprefix(f"{kind}_") for name in names if name.startswith(f"{kind}_")}
-        assert settings == {"gaussian-0.2", "gaussian-0.4", "quantization"}
+    kind = "cost_against_accuracy_"
+    settings = {path.stem.removeprefix(kind) for path in result.figures if path.stem.startswith(kind)}
+    assert settings == {"gaussian-0.2", "gaussian-0.4", "quantization"}
     page = re.sub(r'base64,[^"]*', "", result.report.read_text(encoding="utf-8"))
     assert not re.search(r"\bnan\b", page)
 
@@ -199,13 +199,6 @@ def test_what_a_terminal_has_no_room_for_is_named_with_its_file_or_goes_below():
     assert sum("estimator" in line for line in below) > 1
     assert re.findall(r"value \d", " ".join(below)) == [f"value {i}" for i in range(9)]
     assert max(map(len, left + below)) <= 60
-
-
-def test_the_legend_is_two_lines_and_names_the_columns_that_are_there():
-    wide, narrow = overview_notes(["gaussian"])[0], overview_notes(["gaussian"], narrow=True)[0]
-    assert max(len(wide), len(narrow)) <= 240
-    assert ("failed:" in wide, "failed:" in narrow) == (True, False)
-    assert any("each trial counting at most 5" in one.definition for one in STATISTICS)
 
 
 def _luminance(color: str) -> float:

@@ -44,6 +44,7 @@ def test_a_report_is_made_again_where_anything_has_changed(tmp_path: Path, capsy
         assert "0123456789abcdef-0-4.parquet" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_report_has_the_figures_and_formats_that_were_asked_for_last(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -35,7 +35,8 @@ from ipe_bench.report.table import environment, html
 from ipe_bench.report.tables import certified_tables
 from ipe_bench.report.words import brief, enumerate_few, percent
 from ipe_bench.statistics.analysis import Analysis, analyse
-from ipe_bench.statistics.records import ALL, MAIN, STATISTICS
+from ipe_bench.statistics.records import MAIN, STATISTICS
+from ipe_bench.statistics.statistic import ALL
 
 SETTINGS = {
     "project": "ipe-bench",
@@ -75,8 +76,12 @@ GROUPS = {
 CLASSES = {place for places in CONTRACTS.values() for place in places}
 ORDINARY, LEAST = 1000, 3
 """Trials of an ordinary experiment, and the least number that a costly one is cut to."""
-_PARTS = {"beyond": ["error_scale=300,1000,3000"], "nist": ["measurement.start=2"]}
-"""Reduced settings of experiments that take minutes, where nothing is stored of them."""
+_PARTS = {
+    "beyond": ["error_scale=300,1000,3000"],
+    "nist": ["measurement.start=2"],
+    "states": ["state_model=bearings_only", "error_scale=1,10"],
+}
+"""Reduced settings of experiments that take minutes, of which no result is stored."""
 _FIGURES = {"paper": ("figure_2", "figure_3")}
 """The figures of an experiment's page, where they are not the first."""
 
@@ -144,7 +149,7 @@ def write_reference(folder: Path) -> None:
 
 def write_gallery(folder: Path, results: Path, trials: int) -> None:
     """Writes a page per experiment, their list, and a table of the best estimators by model, of what is stored; of an
-    experiment of which nothing is stored, `trials` replaces the default of 1000."""
+    experiment without a stored result, `trials` replaces the default of 1000."""
     chosen, found = _ours("experiment"), {}
     make_folder(pictures := folder / "pictures")
     for option in chosen:
@@ -152,7 +157,7 @@ def write_gallery(folder: Path, results: Path, trials: int) -> None:
             for path in stored.glob(f"{option.name}*"):
                 shutil.copyfile(path, pictures / path.name)
         if not (pictures / f"{option.name}.json").exists():
-            print(f"{option.name}: nothing is stored of it; it runs now, with few trials ...", flush=True)
+            print(f"{option.name}: no result of it is stored; it runs now, with few trials ...", flush=True)
             store(option, pictures, results / option.name, trials, _PARTS.get(option.name, ()))
         found[option.name] = json.loads((pictures / f"{option.name}.json").read_text(encoding="utf-8"))
         write_page(folder / f"{option.name}.md", "experiment", option=option, **found[option.name])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from typing import Any
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.files import make_folder, write_text
 from ipe_bench.plugins.extensions import added, require_type
-from ipe_bench.report.figures.drawing import Drawing
+from ipe_bench.report.figures.drawing import Drawing, Drawn
 from ipe_bench.report.figures.views import Figure, View, views
 from ipe_bench.report.style import FORMATS, PAGE, Which, house_style
 from ipe_bench.statistics.analysis import Analysis
@@ -32,18 +31,6 @@ NAMES = {
 INDEX = "index.json"
 
 
-@dataclass(frozen=True)
-class Drawn:
-    """Holds a figure in its folder."""
-
-    name: str
-    title: str
-    caption: str
-    files: tuple[Path, ...]
-    html: str
-    """The figure as the page shows it."""
-
-
 def draw_all(
     analysis: Analysis, folder: Path, *, which: Which = "main", formats: Sequence[str] = (PAGE,)
 ) -> list[Drawn]:
@@ -56,9 +43,7 @@ def draw_all(
     with house_style():
         for drawing in drawings(analysis, which):
             make_folder(folder)
-            drawn.append(
-                Drawn(drawing.name, drawing.title, drawing.caption, drawing.save(folder, formats), drawing.html())
-            )
+            drawn.append(drawing.drawn(folder, formats))
     written = {path.name for one in drawn for path in one.files}
     for name in {f"{entry['name']}.{kind}" for entry in old for kind in FORMATS} - written:
         (folder / name).unlink(missing_ok=True)

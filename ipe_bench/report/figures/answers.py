@@ -51,7 +51,7 @@ def draw_fit(found: Examination, z: Array) -> Iterator[Drawing]:
     model = found.whole.measurement
     columns = {**model.index, **model.input_columns}
     varying = {name: column for name, column in columns.items() if len(set(column)) > 1}
-    running = list(range(1, model.m + 1))  # a number of the row says nothing beside an input
+    running = list(range(1, model.m + 1))  # beside an input the number of the row is no abscissa
     varying = {name: column for name, column in varying.items() if list(column) != running} or varying
     name, column = next(iter(varying.items()), ("", ()))
     x = np.asarray(column)

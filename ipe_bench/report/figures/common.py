@@ -275,7 +275,7 @@ def curves(
             ends = np.where(known, sizes, np.where(known.any(axis=0), 0.0, np.nan))
         line: dict[str, Any] = {**one.line, "zorder": 2} | ({"linestyle": "none"} if one_scale else {})
         empty = few | (part[trials] < all_trials)
-        if one.color == GREY and not one_scale:  # in the background, where nothing is told apart
+        if one.color == GREY and not one_scale:  # the background, where estimators are alike
             line, empty = line | {"marker": ",", "zorder": 1}, empty & False
         hollow |= bool(empty.any())
         values = values.where(np.isfinite(values))

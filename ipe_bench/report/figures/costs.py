@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from scipy.special import chdtri
@@ -25,7 +26,6 @@ MANY_ITERATIONS = 60
 
 
 def draw_costs(view: View) -> Iterator[Drawing]:
-    import seaborn as sns
     from matplotlib import rcParams
 
     rows = view.totals[np.isfinite(view.totals["simulations_median"])]
@@ -41,11 +41,14 @@ def draw_costs(view: View) -> Iterator[Drawing]:
     place = (np.log(rows["cost"]) / step).round()
     rows["cost"] *= np.exp(step * rows.groupby(["error_scale", place]).cumcount())
     fig, panels = common.panels_of_scales(rows, look)
-    style = {**common.seaborn_style(look), "edgecolor": "white", "linewidth": 0.6, "zorder": 3, "clip_on": False}
+    size = (1.4 * rcParams["lines.markersize"]) ** 2
+    style: Any = {"s": size, "edgecolor": "white", "linewidth": 0.6, "clip_on": False}
     for ax, here in panels:
         common.decades(ax, [*rows["error"], 1.0])
-        inside = here[~here["over"]]
-        sns.scatterplot(inside, x="cost", y="error", ax=ax, s=(1.4 * rcParams["lines.markersize"]) ** 2, **style)
+        for name, inside in here[~here["over"]].groupby("estimator", sort=False):
+            one = look[str(name)]
+            layer = 2.5 if one.color == GREY else 3
+            ax.scatter(inside["cost"], inside["error"], marker=one.marker, color=one.color, zorder=layer, **style)
         for name, lost in here[here["over"]].groupby("estimator", sort=False):
             common.beyond(ax, lost["cost"], lost["error"], look[str(name)])
         common.bound_line(ax, 1.0, view.reference if view.moving else "efficient estimator")
@@ -77,7 +80,7 @@ def draw_convergence(view: View) -> Iterator[Drawing]:
     rows = rows[(rows["distance"] > 0) & np.isfinite(rows["distance"])] if len(rows) else rows
     if rows.empty or not rows["iteration"].any():
         return
-    # An estimate that is had at once has a start and an end, and nothing between.
+    # An estimate in one step has a start and an end alone.
     rows = rows[rows.groupby("estimator")["iteration"].transform("max") > 0]
     look, scales = view.with_look(rows["estimator"]), sorted(set(rows["error_scale"]))
     shown = sorted(look, key=lambda label: look[label].color == GREY)[: common.most_panels()]

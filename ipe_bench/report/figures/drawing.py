@@ -23,6 +23,18 @@ _METADATA: dict[str, Any] = {"pdf": {"CreationDate": None}, "svg": {"Date": None
 
 
 @dataclass(frozen=True)
+class Drawn:
+    """Holds a figure in its folder."""
+
+    name: str
+    title: str
+    caption: str
+    files: tuple[Path, ...]
+    html: str
+    """The figure as a page shows it."""
+
+
+@dataclass(frozen=True)
 class Drawing:
     """A figure with its file name, its title and a caption that says what is seen."""
 
@@ -30,6 +42,12 @@ class Drawing:
     title: str
     caption: str
     figure: Canvas
+
+    def drawn(self, folder: Path, formats: Sequence[str]) -> Drawn:
+        """Writes the figure, and returns what a page shows of it."""
+        files = self.save(folder, formats)
+        self.figure.set_layout_engine("none")  # laid out once: again for the page takes a third of the time
+        return Drawn(self.name, self.title, self.caption, files, self.html())
 
     def shown(self) -> Canvas:
         """Shows the figure itself in a notebook."""

@@ -13,7 +13,7 @@ from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.views import Figure, View
 from ipe_bench.report.style import BLACK, BOUND_COLOR, BOUND_DASH, COLORS, GREY, MARKERS, REFERENCE, Look
 from ipe_bench.report.words import brief, enumerate_few, value_text
-from ipe_bench.statistics.records import ALL
+from ipe_bench.statistics.statistic import ALL
 
 MOST_GROUPS = 8
 """Groups of parameters that have panels."""

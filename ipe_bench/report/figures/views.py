@@ -15,7 +15,7 @@ from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.style import FACES, MOST_FACES, Look, looks
 from ipe_bench.report.words import value_text
 from ipe_bench.statistics.analysis import Analysis
-from ipe_bench.statistics.records import ALL
+from ipe_bench.statistics.statistic import ALL
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -104,7 +104,7 @@ class Figure:
     """
 
     draw: Callable[[View], Iterator[Drawing]]
-    """Draws what a view allows; nothing if it would be empty."""
+    """Draws what a view allows; no figure where it would be empty."""
     frames: tuple[str, ...]
     """Frames of the analysis that the figure reads; its view has no others."""
     together: bool = False
