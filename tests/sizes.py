@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-CEILINGS = {"ipe_bench": 30_900, "ipe_bench and plugins": 33_300, "tests": 19_500}
+CEILINGS = {"ipe_bench": 31_900, "ipe_bench and plugins": 34_700, "tests": 20_500}
 
 
 def lines(files: Iterable[Path]) -> int:

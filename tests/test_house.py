@@ -6,71 +6,71 @@ import ast
 import functools
 from pathlib import Path
 
-import pytest
-
 import ipe_bench
 
 HOUSE = Path(ipe_bench.__file__).parent
-LINE = (
-    ("basics",),
-    ("measurements",),
-    ("noise", "priors", "states"),
-    ("estimators",),
-    ("solvers", "baselines"),
-    ("trials",),
-    ("runs",),
-    ("statistics",),
-    ("real", "plugins"),
-    ("report",),
-    ("api",),
-    ("cli",),
-)
+LINE = [
+    *(
+        ["basics"],
+        ["measurements"],
+        ["noise", "priors", "states"],
+        ["estimators"],
+        ["solvers", "baselines"],
+        ["trials"],
+    ),
+    *(["runs"], ["statistics"], ["real", "plugins"], ["report"], ["api"], ["cli"]),
+]
 PLACE = {room: place for place, rooms in enumerate(LINE) for room in rooms}
 HEAVY_BELOW = {"matplotlib": "report", "seaborn": "report", "hydra": "cli", "omegaconf": "cli", "rich": "report"}
+MODULES = [
+    (path, path.relative_to(HOUSE).with_suffix("").parts[0])
+    for path in sorted(HOUSE.rglob("*.py"))
+    if path.relative_to(HOUSE).with_suffix("").parts[0] in PLACE
+]
 
 
-def modules():
-    for path in sorted(HOUSE.rglob("*.py")):
-        parts = path.relative_to(HOUSE).with_suffix("").parts
-        if parts[0] in PLACE:
-            yield pytest.param(path, parts[0], id="/".join(parts))
+@functools.cache
+def statements(path: Path) -> list[tuple[frozenset[str], bool, bool]]:
+    """What each import of a file names, whether it is for type checkers alone, and whether it stands in a function."""
+    found = []
+
+    def visit(node: ast.AST, for_types: bool, late: bool) -> None:
+        for_types |= isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+        late |= isinstance(node, ast.FunctionDef)
+        if isinstance(node, ast.Import):
+            found.append((frozenset(alias.name for alias in node.names), for_types, late))
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names = {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+            found.append((frozenset(names), for_types, late))
+        elif not isinstance(node, ast.expr):  # which holds no statement
+            for child in ast.iter_child_nodes(node):
+                visit(child, for_types, late)
+
+    visit(ast.parse(path.read_text(encoding="utf-8")), False, False)
+    return found
 
 
 def imported(path: Path, *, checked_types: bool, late: bool = True) -> set[str]:
     """The modules that a file imports: late ones too unless told otherwise, those for type checkers where asked for."""
-    names: set[str] = set()
-
-    def visit(node: ast.AST) -> None:
-        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test) and not checked_types:
-            return
-        if isinstance(node, ast.FunctionDef) and not late:
-            return
-        if isinstance(node, ast.Import):
-            names.update(alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            names.update({node.module, *(f"{node.module}.{alias.name}" for alias in node.names)})
-        for child in ast.iter_child_nodes(node):
-            visit(child)
-
-    visit(ast.parse(path.read_text(encoding="utf-8")))
-    return names
+    kept = (names for names, types, inside in statements(path) if types <= checked_types and inside <= late)
+    return {name for names in kept for name in names}
 
 
-@pytest.mark.parametrize(("path", "room"), list(modules()))
-def test_nothing_is_imported_against_the_line(path, room):
-    for name in imported(path, checked_types=True):
-        parts = name.split(".")
-        if parts[0] == "ipe_bench" and len(parts) > 1 and parts[1] in PLACE:
-            assert PLACE[parts[1]] <= PLACE[room], f"{room} imports {name}, which stands later in the line"
-            rooms = LINE[PLACE[room]]
-            assert parts[1] == room or parts[1] not in rooms, f"{room} imports {name}, its neighbour in the line"
+def test_nothing_is_imported_against_the_line():
+    for path, room in MODULES:
+        for name in imported(path, checked_types=True):
+            parts = name.split(".")
+            if parts[0] == "ipe_bench" and len(parts) > 1 and parts[1] in PLACE:
+                assert PLACE[parts[1]] <= PLACE[room], f"{path} imports {name}, which stands later in the line"
+                rooms = LINE[PLACE[room]]
+                assert parts[1] == room or parts[1] not in rooms, f"{path} imports {name}, its neighbour in the line"
 
 
-@pytest.mark.parametrize(("path", "room"), list(modules()))
-def test_rooms_know_only_the_libraries_that_are_theirs(path, room):
-    for name in imported(path, checked_types=False):
-        home = HEAVY_BELOW.get(name.split(".")[0])
-        assert home is None or PLACE[room] >= PLACE[home], f"{room} knows {name}, which belongs to {home} and above"
+def test_rooms_know_only_the_libraries_that_are_theirs():
+    for path, room in MODULES:
+        for name in imported(path, checked_types=False):
+            home = HEAVY_BELOW.get(name.split(".")[0])
+            assert home is None or PLACE[room] >= PLACE[home], f"{path} knows {name}, which belongs to {home} and above"
 
 
 def test_the_package_imports_no_plugin():

@@ -207,19 +207,6 @@ def test_what_overflows_ends_its_own_trial(estimator):
     assert estimator.estimate(problem, z).status[1] != Status.CONVERGED
 
 
-@pytest.mark.parametrize(
-    ("estimator", "simulations", "jacobians"),
-    [(EKF(), 1, 1), (IteratedEKF(), 2, 2), (UKF(), 9, 0), (CKF(), 8, 0), (EnKF(members=30), 30, 0)],
-    ids=label,
-)
-def test_a_prefix_costs_its_share(estimator, simulations, jacobians):
-    """(1 + 2 + 3 + 4) / 4 evaluations per point. On a linear model the iterated EKF looks twice, to see it is done."""
-    scenario = Scenario(Linear(), Gaussian(1.0), GaussianPrior(), 1.0)
-    found = estimator.estimate(scenario.problem, scenario.draw(0, 3).z)
-    assert found.simulations == pytest.approx(2.5 * simulations)
-    assert found.jacobians == pytest.approx(2.5 * jacobians)
-
-
 def test_the_ensemble_leaves_the_global_random_state_alone():
     scenario = Scenario(Linear(), Gaussian(1.0), GaussianPrior(), 1.0)
     problem, z = scenario.problem, scenario.draw(0, 2).z

@@ -265,6 +265,7 @@ def test_without_readings_that_fit_every_start_is_tried():
     assert (found.jacobians >= 5).all()
 
 
+@pytest.mark.slow
 def test_no_fit_is_believed_where_the_level_of_the_noise_is_unknown():
     """Under an assumed deviation far too wide any minimum fits; the lowest of all starts counts."""
     problem, trials = draw(WAVE, 0.1, 1.0, 12)

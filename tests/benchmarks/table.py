@@ -230,14 +230,8 @@ def trackers() -> Iterator[Row]:
             other.predict()
             other.update(reading)
 
-    def cubature(z: Any) -> None:
-        other = prepared(kalman.CubatureKalmanFilter(2, 1, step, seen, moved), np.zeros((2, 1)))
-        for reading in z:
-            other.predict()
-            other.update(reading[:, None])
-
     z = model.draw(0, BATCH).z
-    for name, ours, theirs in (("EKF", S.ekf(), extended), ("UKF", S.ukf(), unscented), ("CKF", S.ckf(), cubature)):
+    for name, ours, theirs in (("EKF", S.ekf(), extended), ("UKF", S.ukf(), unscented)):
         (batch,) = least(lambda ours=ours: ours.track(model, z), rounds=2)
         (plain,) = least(lambda theirs=theirs: theirs(z[0]), rounds=2)
         what = f"{name} of states, {BATCH} trials of 500 epochs"

@@ -1,7 +1,6 @@
 """Eqs. (2), (5), (11) = (19), (15), (17), (18) and (24) as identities, on random systems."""
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -80,25 +79,6 @@ def test_sandwich_is_the_spread_of_the_roots():
     P = system.sandwich(truth)[0]
     np.testing.assert_allclose(np.cov(estimates.x.T), P, atol=4 * np.sqrt(2 / 40_000) * np.abs(P).max())
     assert np.trace(P) > np.trace(system.covariance()[0]) * 0.1
-
-
-def test_counts_are_per_trial():
-    problem = problem_of(bend=0.0)
-    estimates = FixedPoint().estimate(problem, np.ones((2, problem.measurement.m)))
-    # h(x0) for the start, and one evaluation that finds F to be zero there.
-    assert estimates.iterations.tolist() == [0, 0]
-    assert estimates.simulations.tolist() == [2.0, 2.0]
-
-
-def test_parameters_that_cannot_be_told_apart_are_refused():
-    class Twins(Bent):
-        def simulate(self, x):
-            return super().simulate(np.stack([x[:, 0] + x[:, 1], 0 * x[:, 1], x[:, 2]], axis=1))
-
-    model = Twins()
-    problem = Problem(model, Covariance(np.ones(model.m)), np.ones(3))
-    with pytest.raises(np.linalg.LinAlgError, match="full column rank"):
-        FixedPoint().estimate(problem, np.ones((1, model.m)))
 
 
 def test_the_reported_covariance_is_that_of_small_errors_of_the_readings():

@@ -30,7 +30,7 @@ def test_these_are_all_estimators():
     assert ours == {*map(type, ALL), baselines.LinearLSE}
 
 
-@pytest.mark.parametrize("name", SCENARIOS)
+@pytest.mark.parametrize("name", [pytest.param("gins", marks=pytest.mark.slow), "polynomial"])
 @pytest.mark.parametrize("estimator", [*ALL, baselines.LinearLSE()], ids=str)
 def test_a_batch_is_its_trials_one_by_one_bit_for_bit(estimator, name):
     check_bits(estimator, SCENARIOS[name], 5)

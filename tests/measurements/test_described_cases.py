@@ -106,25 +106,19 @@ def test_a_constant_of_the_config_stands_for_a_column(tmp_path):
     assert h == pytest.approx([4 - 3 * np.exp(-0.5 * t) for t in (1, 2, 3)], abs=1e-6)
 
 
+# fmt: off
 REFUSED = {
-    "two numbers of a case": (
-        "case,time,feed,begin,reading\n1,1,2,1,3\n1,2,3,1,3\n",
-        "case=1: feed is 2 in one row and 3",
-    ),
+    "two numbers of a case": ("case,time,feed,begin,reading\n1,1,2,1,3\n1,2,3,1,3\n",
+                              "case=1: feed is 2 in one row and 3"),
     "no column of cases": ("time,feed,begin,reading\n1,2,1,3\n2,3,1,3\n", "number the cases in a column case"),
-    "a case left out": (
-        "case,time,feed,begin,reading\n1,1,2,1,3\n3,2,3,1,3\n",
-        "case=3: cases are numbered 1, 2 and so",
-    ),
-    "a column left out": (
-        "time,begin,reading\n1,2,3\n2,2,3\n",
-        "column feed is missing; there are time, begin, reading",
-    ),
-    "times of another name": (
-        "t,feed,begin,reading\n1,2,2,3\n2,2,2,3\n",
-        "column time is missing; there are t, feed, begin, reading; call the times `time`",
-    ),
+    "a case left out": ("case,time,feed,begin,reading\n1,1,2,1,3\n3,2,3,1,3\n",
+                        "case=3: cases are numbered 1, 2 and so"),
+    "a column left out": ("time,begin,reading\n1,2,3\n2,2,3\n",
+                          "column feed is missing; there are time, begin, reading"),
+    "times of another name": ("t,feed,begin,reading\n1,2,2,3\n2,2,2,3\n",
+                              "column time is missing; there are t, feed, begin, reading; call the times `time`"),
 }
+# fmt: on
 
 
 @pytest.mark.parametrize("case", REFUSED)

@@ -27,16 +27,20 @@ def answers():
         return np.split(stored["z"], np.cumsum(stored["count"])[:-1])
 
 
-@pytest.mark.parametrize("number", range(0, COUNT, 10))
+@pytest.mark.parametrize("number", range(0, COUNT, 50))
 def test_readings_of_drawn_equations_are_those_of_scipy(number):
     check(number, answers()[number])
 
 
-@pytest.mark.slow
-def test_readings_of_all_drawn_equations_are_those_of_scipy():
+def test_scipy_has_an_answer_for_nearly_all_drawn_equations():
     stored = answers()
     assert len(stored) == COUNT
     assert sum(map(len, stored)) > 0
     assert sum(len(z) == 0 for z in stored) < 0.05 * COUNT
-    for number, expected in enumerate(stored):
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("start", range(10))
+def test_readings_of_all_drawn_equations_are_those_of_scipy(start):
+    for number, expected in list(enumerate(answers()))[start::10]:
         check(number, expected)

@@ -101,8 +101,7 @@ def test_readings_are_written_with_their_inputs_and_read_again(tmp_path):
 
 @pytest.mark.parametrize("method", ["explicit", "implicit"])
 @pytest.mark.parametrize(
-    "dose",
-    ["(dose if 1 <= t and not begin + 1.3 <= t else 0)", "dose*(sign(t - 1) - sign(t - begin - 1.3))/2"],
+    "dose", ["(dose if 1 <= t and not begin + 1.3 <= t else 0)", "dose*(sign(t - 1) - sign(t - begin - 1.3))/2"]
 )
 def test_rates_in_pieces_of_time_have_their_exact_solution(method, dose):
     """y' = dose - k y within [1, 2.3) and -k y outside, then with a ramp q (t - 3)."""

@@ -23,26 +23,19 @@ from ipe_bench.noise import Gaussian, Unknown
 from ipe_bench.real.fits import fit
 from ipe_bench.real.readings import open_together
 
-_ENSO = (
-    "b1 + b2*cos(2*pi*x/12) + b3*sin(2*pi*x/12) + b5*cos(2*pi*x/b4) + b6*sin(2*pi*x/b4) + b8*cos(2*pi*x/b7)"
-    " + b9*sin(2*pi*x/b7)"
-)
+# fmt: off
 NIST = {
-    "Misra1a": "b1*(1-exp(-b2*x))",
-    "Chwirut2": "exp(-b1*x)/(b2+b3*x)",
+    "Misra1a": "b1*(1-exp(-b2*x))", "Chwirut2": "exp(-b1*x)/(b2+b3*x)", "DanWood": "b1*x**b2",
     "Gauss1": "b1*exp(-b2*x) + b3*exp(-(x-b4)**2/b5**2) + b6*exp(-(x-b7)**2/b8**2)",
-    "DanWood": "b1*x**b2",
-    "Misra1b": "b1*(1-(1+b2*x/2)**(-2))",
-    "Kirby2": "(b1 + b2*x + b3*x**2)/(1 + b4*x + b5*x**2)",
-    "Hahn1": "(b1+b2*x+b3*x**2+b4*x**3)/(1+b5*x+b6*x**2+b7*x**3)",
-    "Nelson": "b1 - b2*time*exp(-b3*temperature)",
-    "Lanczos1": "b1*exp(-b2*x) + b3*exp(-b4*x) + b5*exp(-b6*x)",
-    "Roszman1": "b1 - b2*x - arctan(b3/(x-b4))/pi",
-    "ENSO": _ENSO,
-    "MGH09": "b1*(x**2+x*b2)/(x**2+x*b3+b4)",
-    "Rat43": "b1/((1+exp(b2-b3*x))**(1/b4))",
+    "Misra1b": "b1*(1-(1+b2*x/2)**(-2))", "Kirby2": "(b1 + b2*x + b3*x**2)/(1 + b4*x + b5*x**2)",
+    "Hahn1": "(b1+b2*x+b3*x**2+b4*x**3)/(1+b5*x+b6*x**2+b7*x**3)", "Nelson": "b1 - b2*time*exp(-b3*temperature)",
+    "Lanczos1": "b1*exp(-b2*x) + b3*exp(-b4*x) + b5*exp(-b6*x)", "Roszman1": "b1 - b2*x - arctan(b3/(x-b4))/pi",
+    "ENSO": "b1 + b2*cos(2*pi*x/12) + b3*sin(2*pi*x/12) + b5*cos(2*pi*x/b4) + b6*sin(2*pi*x/b4) + b8*cos(2*pi*x/b7)"
+            " + b9*sin(2*pi*x/b7)",
+    "MGH09": "b1*(x**2+x*b2)/(x**2+x*b3+b4)", "Rat43": "b1/((1+exp(b2-b3*x))**(1/b4))",
     "Bennett5": "b1*(b2+x)**(-1/b3)",
 }
+# fmt: on
 """Some of NIST's functions, as its files print them but for the names of functions."""
 
 
@@ -70,38 +63,23 @@ def test_nist_answers_come_from_the_formula_with_an_unknown_noise(dataset, tmp_p
     assert result.level == pytest.approx(nist.certified.residual_deviation, rel=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("text", "value"),
-    [
-        ("-2**2", -4.0),
-        ("2**-1", 0.5),
-        ("2**3**2", 512.0),
-        ("2^3", 8.0),
-        ("-a/b*c", -3.0),
-        ("a-b-c", -1.0),
-        ("--a", 2.0),
-        ("1.5e-3*2", 0.003),
-        (".5+5.", 5.5),
-        ("log10(1000)+ln(1)", 3.0),
-        ("4*atan(1)-pi", 0.0),
-        ("sqrt(a*b*4)-tanh(0)", 4.0),
-        ("min(a, 5, c) + max(1, b)", 4.0),
-        ("abs(a-c) + abs(1)", 2.0),
-        ("erf(0.5) + erfc(0.5)", 1.0),
-        ("arctan2(-1, -c)", -math.pi + math.atan(1 / 3)),
-        ("atan2(a, 0) - pi/2 + hypot(3, 4) + hypot(1, a, 2)", 8.0),
-        ("mod(-1, c) + 10*mod(7.5, 2) + 100*floor(-0.5)", 2.0 + 15.0 - 100.0),
-        ("sign(a - 5) + 10*sign(a - b) + 100*sign(c)", 99.0),
-        ("(1 < a <= 2) + (c != 3) + (a == b)", 2.0),
-        ("1 if a > 2 else 2 if c > 2 else 3", 2.0),
-        ("not a > 1 or c > 2 and b < 3", 1.0),
-        ("1/(a-2) if a != b else c", 3.0),
-        ("min(lambda, c)\n  + 1.e0*(is - 1)", 2.0),
-    ],
-)
-def test_the_language_is_that_of_algebra(text, value):
-    values = {"a": 2.0, "b": 2.0, "c": 3.0 if "a-b-c" not in text else 1.0, "lambda": 2.0, "is": 1.0}
-    assert float(parse(text, "expression")(values)) == pytest.approx(value, abs=1e-12)
+# fmt: off
+ALGEBRA = {
+    "-2**2": -4, "2**-1": 0.5, "2**3**2": 512, "2^3": 8, "-a/b*c": -3, "a-b-c": -3, "--a": 2, "1.5e-3*2": 0.003,
+    ".5+5.": 5.5, "log10(1000)+ln(1)": 3, "4*atan(1)-pi": 0, "sqrt(a*b*4)-tanh(0)": 4, "min(a, 5, c) + max(1, b)": 4,
+    "abs(a-c) + abs(1)": 2, "erf(0.5) + erfc(0.5)": 1, "arctan2(-1, -c)": -math.pi + math.atan(1 / 3),
+    "atan2(a, 0) - pi/2 + hypot(3, 4) + hypot(1, a, 2)": 8, "mod(-1, c) + 10*mod(7.5, 2) + 100*floor(-0.5)": -83,
+    "sign(a - 5) + 10*sign(a - b) + 100*sign(c)": 99, "(1 < a <= 2) + (c != 3) + (a == b)": 2,
+    "1 if a > 2 else 2 if c > 2 else 3": 2, "not a > 1 or c > 2 and b < 3": 1, "1/(a-2) if a != b else c": 3,
+    "min(lambda, c)\n  + 1.e0*(is - 1)": 2,
+}
+# fmt: on
+
+
+@pytest.mark.parametrize("text", ALGEBRA)
+def test_the_language_is_that_of_algebra(text):
+    values = {"a": 2.0, "b": 2.0, "c": 3.0, "lambda": 2.0, "is": 1.0}
+    assert float(parse(text, "expression")(values)) == pytest.approx(ALGEBRA[text], abs=1e-12)
 
 
 REFUSED = [
@@ -126,7 +104,7 @@ def test_what_is_not_arithmetic_is_refused(text):
 def test_nothing_that_looks_like_a_formula_reaches_the_interpreter():
     """Text of any kind is a formula or a user's mistake, and never any other exception."""
 
-    @settings(max_examples=1500, deadline=None)
+    @settings(max_examples=400, deadline=None)
     @given(st.text(alphabet="abt12.e+-*/^() ,_'\"[]{}:=<>!%\\\nsincoexplgifmn", max_size=40))
     def check(text):
         with contextlib.suppress(UserError):
@@ -218,7 +196,7 @@ drawn = st.recursive(
 PYTHON = {"abs": abs, "min": min, "max": max, "sin": math.sin, "erf": math.erf, "erfc": math.erfc}
 
 
-@settings(max_examples=150, deadline=None, derandomize=True)
+@settings(max_examples=50, deadline=None, derandomize=True)
 @given(drawn)
 def test_a_drawn_formula_is_what_python_makes_of_it_and_its_slopes_are_differences(text):
     """A branch that is not taken has no effect, even where it is not a number."""

@@ -34,14 +34,6 @@ def high_by_abs(t, height=2.0, centre=1.5, width=0.5, base=0.3):
     y = bell(t, height, centre, width, base)
     return np.where(y > 2.5, np.abs(y), y)
 
-def high_by_norm(t, height=2.0, centre=1.5, width=0.5, base=0.3):
-    y = bell(t, height, centre, width, base)
-    return y if height.real < 2.5 else np.linalg.norm(np.stack([y, 0 * y]), axis=0)
-
-def high_by_math(t, height=2.0, centre=1.5, width=0.5, base=0.3):
-    y = bell(t, height, centre, width, base)
-    return y if height.real < 2.5 else np.array([math.sqrt(s) ** 2 for s in y])
-
 def high_by_array(t, height=2.0, centre=1.5, width=0.5, base=0.3):
     y = bell(t, height, centre, width, base)
     z = np.empty(len(t), dtype=y.dtype if height.real < 2.5 else float)
@@ -132,7 +124,7 @@ def test_slopes_are_differences_where_the_complex_step_is_wrong(laws, name, cost
     assert ours.jacobian_cost == cost
 
 
-@pytest.mark.parametrize("name", ["high_by_abs", "high_by_norm"])
+@pytest.mark.parametrize("name", ["high_by_abs", "high_by_array"])
 def test_an_estimate_is_right_in_a_branch_that_the_start_is_not_in(laws, name):
     z = 3.0 * np.exp(-0.5 * ((T - 1.5) / 0.5) ** 2) + 0.3 + np.random.default_rng(2).normal(0, 0.03, len(T))
     (laws / "bell.csv").write_text("t,reading\n" + "".join(f"{t},{value}\n" for t, value in zip(T, z, strict=True)))
@@ -145,7 +137,7 @@ def test_an_estimate_is_right_in_a_branch_that_the_start_is_not_in(laws, name):
     np.testing.assert_allclose(np.sqrt(np.diag(fit.covariance)), np.sqrt(np.diag(covariance)), rtol=1e-4)
 
 
-@pytest.mark.parametrize("name", ["high_by_abs", "high_by_norm", "high_by_math", "high_by_array"])
+@pytest.mark.parametrize("name", ["high_by_abs", "high_by_array"])
 def test_slopes_of_a_trial_in_a_branch_that_is_not_analytic_do_not_depend_on_others(laws, name):
     ours = model(name)
     x = ours.nominal + np.array([[0.0], [0.5]]) * np.array([1.0, 0.0, 0.0, 0.0])

@@ -78,17 +78,6 @@ def test_few_lanes_and_many_have_the_same_bits(cases):
         np.testing.assert_array_equal(whole[:1], getattr(Several(0.7), method)(x[:1]))
 
 
-def test_bits_do_not_depend_on_the_batch_or_on_the_number_of_threads(monkeypatch):
-    model, x = Cases(0.5), np.random.default_rng(3).normal(size=(70, 2))
-    z, J = model.simulate(x), model.jacobian(x)
-    for threads in ("1", "2", "5"):
-        monkeypatch.setenv("IPE_BENCH_THREADS", threads)
-        for size in (1, 7, 33, 70):
-            parts = [slice(i, i + size) for i in range(0, 70, size)]
-            assert (np.concatenate([model.simulate(x[part]) for part in parts]) == z).all()
-            assert (np.concatenate([model.jacobian(x[part]) for part in parts]) == J).all()
-
-
 def test_a_trial_that_overflows_leaves_its_neighbours_alone():
     x = np.array([[1.0, 1.0], [1e4, 1.0], [1.0, 2.0]])
     z = Pulse(0.5).simulate(x)

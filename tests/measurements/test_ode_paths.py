@@ -51,66 +51,39 @@ def scalar(rate: Any, formula: str, solution: Any, **more: Any) -> Law:
                lambda t, p, c: (solution(t, *p, c[0]),), **more)  # fmt: skip
 
 
+# fmt: off
 LAWS = {
     "decay": scalar(lambda t, y, p, c: -p[0] * y, "-p0*a", lambda t, k, b, c: b * np.exp(-k * t)),
-    "relaxation": scalar(
-        lambda t, y, p, c: p[0] * (c - y), "p0*(c-a)", lambda t, k, b, c: c + (b - c) * np.exp(-k * t)
-    ),
-    "pulse": scalar(
-        lambda t, y, p, c: p[0] * y * np.cos(t), "p0*a*cos(t)", lambda t, k, b, c: b * np.exp(k * np.sin(t))
-    ),
-    "logistic": scalar(
-        lambda t, y, p, c: p[0] * y * (1.0 - y / 3.0),
-        "p0*a*(1-a/3)",
-        lambda t, r, b, c: 3.0 / (1.0 + (3.0 / b - 1.0) * np.exp(-r * t)),
-    ),
+    "relaxation": scalar(lambda t, y, p, c: p[0] * (c - y), "p0*(c-a)",
+                         lambda t, k, b, c: c + (b - c) * np.exp(-k * t)),
+    "pulse": scalar(lambda t, y, p, c: p[0] * y * np.cos(t), "p0*a*cos(t)",
+                    lambda t, k, b, c: b * np.exp(k * np.sin(t))),
+    "logistic": scalar(lambda t, y, p, c: p[0] * y * (1.0 - y / 3.0), "p0*a*(1-a/3)",
+                       lambda t, r, b, c: 3.0 / (1.0 + (3.0 / b - 1.0) * np.exp(-r * t))),
     "riccati": scalar(lambda t, y, p, c: -p[0] * y * y, "-p0*a**2", lambda t, k, b, c: b / (1.0 + k * b * t)),
-    "power": scalar(
-        lambda t, y, p, c: -p[0] * y**1.5, "-p0*a**1.5", lambda t, k, b, c: (b**-0.5 + 0.5 * k * t) ** -2.0
-    ),
-    "quadrature": scalar(
-        lambda t, y, p, c: p[0] / (1.0 + t) + c, "p0/(1+t)+c", lambda t, k, b, c: b + k * np.log(1.0 + t) + c * t
-    ),
-    "oscillator": Law(
-        lambda p, c: (p[1], 0.0),
-        lambda t, y, p, c: (y[1], -p[0] * p[0] * y[0]),
-        ("b", "-p0^2*a"),
-        ("p1", "0"),
-        lambda t, p, c: (p[1] * np.cos(p[0] * t), -p[1] * p[0] * np.sin(p[0] * t)),
-    ),
-    "chain": Law(
-        lambda p, c: (p[2], c[0]),
-        lambda t, y, p, c: (-p[0] * y[0], p[0] * y[0] - (2.0 + p[1]) * y[1]),
-        ("-p0*a", "p0*a-(2+p1)*b"),
-        ("p2", "c"),
-        lambda t, p, c: (
-            p[2] * np.exp(-p[0] * t),
-            p[0] * p[2] / (2.0 + p[1] - p[0]) * (np.exp(-p[0] * t) - np.exp(-(2.0 + p[1]) * t))
-            + c[0] * np.exp(-(2.0 + p[1]) * t),
-        ),
-        parameters=3,
-        spread=0.2,
-    ),
-    "predators": Law(
-        lambda p, c: (2.0, p[2]),
-        lambda t, y, p, c: (p[0] * y[0] - y[0] * y[1], p[1] * y[0] * y[1] - c[0] * y[1]),
-        ("p0*a-a*b", "p1*a*b-c*b"),
-        ("2", "p2"),
-        parameters=3,
-    ),
-    "pendulum": Law(
-        lambda p, c: (p[1], 0.0),
-        lambda t, y, p, c: (y[1], -4.0 * p[0] * np.sin(y[0]) - c[0] * y[1]),
-        ("b", "-4*p0*sin(a)-c*b"),
-        ("p1", "0"),
-    ),
-    "driven": Law(
-        lambda p, c: (1.0, p[1]),
-        lambda t, y, p, c: (y[1], p[0] * (1.0 - y[0] * y[0]) * y[1] - y[0] + c[0] * np.tanh(t)),
-        ("b", "p0*(1-a^2)*b-a+c*tanh(t)"),
-        ("1", "p1"),
-    ),
+    "power": scalar(lambda t, y, p, c: -p[0] * y**1.5, "-p0*a**1.5",
+                    lambda t, k, b, c: (b**-0.5 + 0.5 * k * t) ** -2.0),
+    "quadrature": scalar(lambda t, y, p, c: p[0] / (1.0 + t) + c, "p0/(1+t)+c",
+                         lambda t, k, b, c: b + k * np.log(1.0 + t) + c * t),
+    "oscillator": Law(lambda p, c: (p[1], 0.0), lambda t, y, p, c: (y[1], -p[0] * p[0] * y[0]),
+                      ("b", "-p0^2*a"), ("p1", "0"),
+                      lambda t, p, c: (p[1] * np.cos(p[0] * t), -p[1] * p[0] * np.sin(p[0] * t))),
+    "chain": Law(lambda p, c: (p[2], c[0]), lambda t, y, p, c: (-p[0] * y[0], p[0] * y[0] - (2.0 + p[1]) * y[1]),
+                 ("-p0*a", "p0*a-(2+p1)*b"), ("p2", "c"),
+                 lambda t, p, c: (p[2] * np.exp(-p[0] * t),
+                                  p[0] * p[2] / (2.0 + p[1] - p[0]) * (np.exp(-p[0] * t) - np.exp(-(2.0 + p[1]) * t))
+                                  + c[0] * np.exp(-(2.0 + p[1]) * t)),
+                 parameters=3, spread=0.2),
+    "predators": Law(lambda p, c: (2.0, p[2]),
+                     lambda t, y, p, c: (p[0] * y[0] - y[0] * y[1], p[1] * y[0] * y[1] - c[0] * y[1]),
+                     ("p0*a-a*b", "p1*a*b-c*b"), ("2", "p2"), parameters=3),
+    "pendulum": Law(lambda p, c: (p[1], 0.0), lambda t, y, p, c: (y[1], -4.0 * p[0] * np.sin(y[0]) - c[0] * y[1]),
+                    ("b", "-4*p0*sin(a)-c*b"), ("p1", "0")),
+    "driven": Law(lambda p, c: (1.0, p[1]),
+                  lambda t, y, p, c: (y[1], p[0] * (1.0 - y[0] * y[0]) * y[1] - y[0] + c[0] * np.tanh(t)),
+                  ("b", "p0*(1-a^2)*b-a+c*tanh(t)"), ("1", "p1")),
 }
+# fmt: on
 
 
 @dataclass(frozen=True)
@@ -264,7 +237,7 @@ def check(law, gaps, given, batch, seed):
         assert np.abs(found - whole).max() < TOLERANCE * max(1.0, np.abs(exact).max())
 
 
-@settings(max_examples=100, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@settings(max_examples=30, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(draws)
 def test_every_path_solves_the_equations_with_the_same_bits(draw):
     check(**draw)
@@ -277,23 +250,17 @@ def test_every_path_solves_the_equations_with_the_same_bits_in_many_draws(draw):
     check(**draw)
 
 
+# fmt: off
 OPERATIONS = {
-    "+": lambda a, b: a + b,
-    "-": lambda a, b: a - b,
-    "*": lambda a, b: a * b,
-    "over": lambda a, b: a / (2.0 + b * b),
-    "power": lambda a, b: (1.0 + a * a) ** 1.5 - b,
-    "root": lambda a, b: np.sqrt(1.0 + a * a) - b**2,
-    "sin": lambda a, b: np.sin(a) - b,
-    "cos": lambda a, b: np.cos(a + b),
-    "exp": lambda a, b: np.exp(np.tanh(a)) * b,
-    "log": lambda a, b: np.log(3.0 + np.sin(a)) + b,
-    "arctan": lambda a, b: np.arctan(a) * b,
+    "+": lambda a, b: a + b, "-": lambda a, b: a - b, "*": lambda a, b: a * b, "over": lambda a, b: a / (2.0 + b * b),
+    "power": lambda a, b: (1.0 + a * a) ** 1.5 - b, "root": lambda a, b: np.sqrt(1.0 + a * a) - b**2,
+    "sin": lambda a, b: np.sin(a) - b, "cos": lambda a, b: np.cos(a + b), "exp": lambda a, b: np.exp(np.tanh(a)) * b,
+    "log": lambda a, b: np.log(3.0 + np.sin(a)) + b, "arctan": lambda a, b: np.arctan(a) * b,
     "hyperbolic": lambda a, b: np.sinh(np.sin(a)) - np.cosh(np.cos(b)),
-    "tan": lambda a, b: np.tan(np.sin(a) / 2.0) - b,
+    "tan": lambda a, b: np.tan(np.sin(a) / 2.0) - b, "hypot": lambda a, b: SEVERAL["hypot"](a, 2.0 + np.sin(b)),
     "arctan2": lambda a, b: PAIRS["arctan2"](a, np.sin(b) + 1.5),
-    "hypot": lambda a, b: SEVERAL["hypot"](a, 2.0 + np.sin(b)),
 }
+# fmt: on
 PIECES = {
     "least": lambda a, b: np.minimum(a, b),
     "most": lambda a, b: np.maximum(a, b),
@@ -397,7 +364,7 @@ def check_drawn(rates, shown, gaps, batch, seed):
     same(free.jacobian(x[:1])[0], free.jacobian(x)[0]), same(Drawn(rates, shown, model.at).simulate(x[::-1]), z[::-1])
 
 
-@settings(max_examples=10, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@settings(max_examples=4, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(written)
 def test_equations_that_are_drawn_are_solved_as_a_plain_loop_solves_them(draw):
     check_drawn(**draw)

@@ -7,24 +7,17 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-import ipe_bench as ib
-from ipe_bench.baselines import LinearLSE
 from ipe_bench.measurements import Ode, OdeMeasurement, Parameter
 from ipe_bench.measurements.base import differentiate
 from ipe_bench.measurements.ode.rodas import Rodas5P
-from ipe_bench.noise import Gaussian
-from ipe_bench.runs.execution import Processes, Serial
 
+# fmt: off
 HIRES = {
-    "y1": "-1.71*y1+0.43*y2+8.32*y3+0.0007",
-    "y2": "1.71*y1-8.75*y2",
-    "y3": "-10.03*y3+0.43*y4+0.035*y5",
-    "y4": "8.32*y2+1.71*y3-1.12*y4",
-    "y5": "-1.745*y5+0.43*y6+0.43*y7",
-    "y6": "-k*y6*y8+0.69*y4+1.71*y5-0.43*y6+0.69*y7",
-    "y7": "k*y6*y8-1.81*y7",
-    "y8": "-k*y6*y8+1.81*y7",
+    "y1": "-1.71*y1+0.43*y2+8.32*y3+0.0007", "y2": "1.71*y1-8.75*y2", "y3": "-10.03*y3+0.43*y4+0.035*y5",
+    "y4": "8.32*y2+1.71*y3-1.12*y4", "y5": "-1.745*y5+0.43*y6+0.43*y7",
+    "y6": "-k*y6*y8+0.69*y4+1.71*y5-0.43*y6+0.69*y7", "y7": "k*y6*y8-1.81*y7", "y8": "-k*y6*y8+1.81*y7",
 }
+# fmt: on
 
 
 def robertson(*times):
@@ -52,7 +45,10 @@ def follower(**options):
 @pytest.mark.parametrize(
     ("model", "expected", "left"),
     [
-        (robertson(1e11), (0.2083340149701255e-7, 0.8333360770334713e-13, 0.9999999791665050), 5e-9),
+        pytest.param(
+            *(robertson(1e11), (0.2083340149701255e-7, 0.8333360770334713e-13, 0.9999999791665050), 5e-9),
+            marks=pytest.mark.slow,
+        ),
         (van_der_pol(1000.0, 2000.0), (1.706167732170469, -0.8928097010248125e-3), 2e-8),
         (
             hires(),
@@ -85,7 +81,7 @@ def test_a_stiff_model_is_found_and_is_within_its_tolerance():
 
 
 def test_readings_beside_radau_and_slopes_beside_differences():
-    model = robertson(*np.logspace(0, 5, 6))
+    model = robertson(*np.logspace(0, 3, 4))
     x = model.nominal * np.array([[1.0, 1.0, 1.0], [1.1, 0.9, 1.05]])
     z, J = model.simulate(x), model.jacobian(x)
     for row, p in zip(z, x * model.sizes, strict=True):
@@ -93,14 +89,14 @@ def test_readings_beside_radau_and_slopes_beside_differences():
         def rhs(t, y, p=p):
             return model.engine.rhs(t, y, p, ())
 
-        solved = solve_ivp(rhs, (0, 1e5), [1.0, 0.0, 0.0], "Radau", model.times, rtol=1e-10, atol=1e-16)
+        solved = solve_ivp(rhs, (0, 1e3), [1.0, 0.0, 0.0], "Radau", model.times, rtol=1e-10, atol=1e-16)
         np.testing.assert_allclose(row.reshape(-1, 3), solved.y.T, rtol=1e-7)
     by_differences = differentiate(model.simulate, x, analytic=False)
     np.testing.assert_allclose(J, by_differences, atol=1e-7 * np.abs(by_differences).max())
 
 
 def test_a_trial_and_a_prefix_have_the_same_bits_alone_and_in_a_batch():
-    model = robertson(*np.logspace(0, 5, 6))
+    model = robertson(0.1, 0.3, 1.0, 3.0)
     x = model.nominal + 0.1 * np.random.default_rng(0).standard_normal((7, 3))
     assert np.array_equal(model.simulate(x)[4:5], model.simulate(x[4:5]))
     assert np.array_equal(model.jacobian(x)[4:5], model.jacobian(x[4:5]))
@@ -112,20 +108,13 @@ def test_the_rule_tells_stiff_oscillators_from_others(mu, stiff):
     assert van_der_pol(mu, 2 * mu).engine.stiff == stiff
 
 
-def test_a_stiff_model_that_was_used_goes_to_worker_processes(tmp_path):
+def test_a_stiff_model_that_was_used_goes_to_worker_processes():
     model = follower(times=(10.0, 20.0))
     x = model.nominal[None] * 1.1
     z, J = model.simulate(x), model.jacobian(x)
     again = pickle.loads(pickle.dumps(model))
     assert np.array_equal(again.simulate(x), z)
     assert np.array_equal(again.jacobian(x), J)
-    bench, tables = ib.Scenario(model, Gaussian(1e-5), error_scale=0.01), []
-    for execution in (Serial(), Processes(2)):
-        folder = tmp_path / type(execution).__name__
-        ib.run(bench, {"linear": LinearLSE()}, 4, output=folder, execution=execution, block_size=2)
-        tables.append(ib.load(folder)["error_k"].to_numpy())
-    assert len(tables[0]) == 4
-    np.testing.assert_array_equal(*tables)
 
 
 SHOWN = {
@@ -159,7 +148,7 @@ def check_fast(shown, rate, times):
     np.testing.assert_allclose(model.jacobian(x)[:, :, 0], turned * slope, atol=1e-6)
 
 
-@pytest.mark.parametrize(("shown", "rate", "times"), FAST[::9])
+@pytest.mark.parametrize(("shown", "rate", "times"), FAST[::40])
 def test_a_reading_that_saturates_is_that_of_the_solution(shown, rate, times):
     check_fast(shown, rate, times)
 

@@ -127,13 +127,14 @@ def fits(model: Formula, z: NDArray[np.float64], noise, estimator) -> Fit:
     return fit(problem, z, {"it": estimator}, noise)[0]
 
 
+@pytest.mark.parametrize("starts", [2, pytest.param(16, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("noise", [Gaussian(0.3), Unknown()], ids=["known level", "unknown level"])
-def test_a_noisy_peak_is_found_from_anywhere(noise):
-    """From 16 random starts, among flat lines and dips that are minima, too; an unknown level has no test of the fit to
+def test_a_noisy_peak_is_found_from_anywhere(noise, starts):
+    """From random starts, among flat lines and dips that are minima, too; an unknown level has no test of the fit to
     tell them."""
     rng = np.random.default_rng(7)
     truth = {"c": 1.0, "A": 3.0, "mu": 6.2, "w": 0.5}
-    for i in range(16):
+    for i in range(starts):
         uniform = ((-2, 3), (0.5, 6), (0, 10), (0.1, 3))
         start = {name: float(rng.uniform(*ends)) for name, ends in zip(truth, uniform, strict=True)}
         there = Formula(PEAK, truth, {"t": T.tolist()})

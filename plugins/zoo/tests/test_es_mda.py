@@ -61,6 +61,7 @@ def test_inflation_widens_the_prior():
     assert np.abs(deviations(wide.covariance) / deviations(P) - 1).max() < 0.1
 
 
+@pytest.mark.slow
 def test_gins_at_scale_300_is_solved_from_the_seed_given():
     block = block_of_gins(300.0, 6, 91)
     found, score = block.estimate(EsMda())
@@ -74,6 +75,7 @@ def test_gins_at_scale_300_is_solved_from_the_seed_given():
     assert np.abs((found.x - by_descent.x) / deviations(found.covariance))[near].max() < 1e-3
 
 
+@pytest.mark.slow
 def test_equal_steps_fail_where_the_noise_is_far_below_the_prior():
     """Why the information grows geometrically."""
     block = block_of_gins(1000.0, 12, 91)

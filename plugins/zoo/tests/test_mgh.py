@@ -122,17 +122,16 @@ def test_scipy_finds_nothing_lower_beside_the_least_minimum(function):
     model = Mgh(function)
     least = np.array(model.minima[0].x)
     scale = np.where(least == 0, 1.0, np.abs(least))
-    for seed in range(3):
-        found = least_squares(
-            lambda x: model.simulate(x[None] / model.sizes)[0],
-            least + 0.01 * scale * np.random.default_rng(seed).standard_normal(model.n),
-            x_scale=scale,
-            xtol=1e-15,
-            ftol=1e-15,
-            gtol=1e-15,
-        )
-        assert 2 * found.cost >= model.minima[0].sum_of_squares * (1 - 1e-9)
-        assert score(model, found.x / model.sizes).solved
+    found = least_squares(
+        lambda x: model.simulate(x[None] / model.sizes)[0],
+        least + 0.01 * scale * np.random.default_rng(0).standard_normal(model.n),
+        x_scale=scale,
+        xtol=1e-15,
+        ftol=1e-15,
+        gtol=1e-15,
+    )
+    assert 2 * found.cost >= model.minima[0].sum_of_squares * (1 - 1e-9)
+    assert score(model, found.x / model.sizes).solved
 
 
 @pytest.mark.parametrize(("function", "zero"), [(f, zero) for f, zeros in ZEROS.items() for zero in zeros])

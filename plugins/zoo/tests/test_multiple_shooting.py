@@ -25,7 +25,7 @@ def scenario(name: str) -> Scenario:
     return Scenario(model, Gaussian(deviation), GaussianPrior(), scale, seed=2)
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", [pytest.param("gins", marks=pytest.mark.slow), "lotka_volterra", "sir"])
 def test_its_minimum_is_that_of_single_shooting(name):
     drawn, problem = scenario(name).draw(0, 4), scenario(name).problem
     found = MultipleShooting(step=0.05).estimate(problem, drawn.z)
@@ -37,6 +37,7 @@ def test_its_minimum_is_that_of_single_shooting(name):
     np.testing.assert_allclose(found.extras["fit_p"], single.extras["fit_p"], rtol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("initial", [False, True])
 def test_bocks_problem_is_solved_where_single_shooting_is_lost(initial):
     """Solutions grow by exp(60) = 1e26; p = pi in closed form."""

@@ -23,6 +23,7 @@ def test_a_root_of_a_passed_jacobian_is_no_minimum():
     assert score(scenario.measurement, estimates.x[0]).solved
 
 
+@pytest.mark.slow
 def test_minima_that_fit_alike_are_found_flagged_and_listed():
     """|M (r - b)|^2 is r'Ar - 2 r'Ab + b'Ab with A = M^2, which has eight symmetric square roots M; and since every r
     has the length 1, a multiple of I in A can stand for another b'Ab."""
