@@ -82,6 +82,8 @@ _PARTS = {
     "states": ["state_model=bearings_only", "error_scale=1,10"],
 }
 """Reduced settings of experiments that take minutes, of which no result is stored."""
+_STORED = {"states": ["state_model=bearings_only,coordinated_turn,pendulum"]}
+"""Reduced settings of an experiment whose whole takes hours, as its page's command says."""
 _FIGURES = {"paper": ("figure_2", "figure_3")}
 """The figures of an experiment's page, where they are not the first."""
 
@@ -250,7 +252,7 @@ def store_all(results: Path, trials: int, names: Sequence[str]) -> int:
     for option in _ours("experiment"):
         if not names or option.name in names:
             print(f"{option.name} ...", flush=True)
-            store(option, folder, results / option.name, trials)
+            store(option, folder, results / option.name, trials, _STORED.get(option.name, ()))
     return 0
 
 
