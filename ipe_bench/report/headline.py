@@ -10,7 +10,8 @@ import pandas as pd
 
 from ipe_bench.report.figures.views import family_of
 from ipe_bench.report.table import Part, Table, texts, words
-from ipe_bench.report.words import brief, duration, enumerate_few, percent, short, value_text
+from ipe_bench.report.tables import differing
+from ipe_bench.report.words import brief, duration, enumerate_few, percent, value_text
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.certified import certified_averages, certified_table, published_table
 from ipe_bench.statistics.statistic import ALL, BEST
@@ -26,7 +27,12 @@ MET = 1e-9
 """Difference up to which a published number is met."""
 OVERCONFIDENT, UNDECIDED = ("optimistic", "diverged but confident"), ("undecided", "-")
 """Verdicts on the reported covariance."""
+_LIMITS = (
+    "Honest: at no scale up to there is the reported covariance surely too small (none: at the least it is; undecided:"
+    f" too few trials). Holds: {100 * BROKEN:.0f} % of the trials or more may succeed; who does not hold has no cost."
+)
 SHARED = ("shared_trials", "shared_success", "shared_silent")
+_SILENT = "Failures that no test of fit notices:"
 
 
 def headline(analysis: Analysis) -> list[Part]:
@@ -36,6 +42,7 @@ def headline(analysis: Analysis) -> list[Part]:
         return ["No trial is stored yet, so there is no finding."]
     # Both have a row per scenario and estimator, in the same order.
     rows = rows.join(analysis.scores.reset_index(drop=True)[["scenario", *SHARED]])
+    rows = rows.assign(setting=differing(rows, analysis.setting_columns))
     certified, moving = rows["noise"] == "certified", rows["noise"] == "model"
     found = [*_certified(analysis), *_published(analysis.collection)]
     found += [] if found else _ranking(rows[certified], "certified")
@@ -172,7 +179,7 @@ def _silent(rows: pd.DataFrame) -> Iterator[str]:
     worst = rows.sort_values("failed_silent", kind="stable").iloc[-1]
     if worst["failed_silent"] > 0:
         where = f"{worst['estimator']} at scale {value_text(worst['error_scale'])}"
-        yield f"Failures that look right: at most {percent(worst['failed_silent'])} of the trials ({where})."
+        yield f"{_SILENT} up to {percent(worst['failed_silent'])} of the trials ({where})."
 
 
 def limits(rows: pd.DataFrame, name: str) -> Table:
@@ -190,9 +197,9 @@ def limits(rows: pd.DataFrame, name: str) -> Table:
         words("estimator", [label for label, *_ in found]),
         texts("honest up to scale", [honest for _, honest, *_ in found]),
         texts(f"holds {100 * BROKEN:.0f} % up to scale", [holds for *_, holds, _ in found]),
-        texts(f"median cost (time) at {value_text(scale)}", [spent.get(label, "-") for label, *_ in found]),
+        texts(f"median cost (time) at scale {value_text(scale)}", [spent.get(label, "-") for label, *_ in found]),
     ]
-    return Table(name, "", "", columns)
+    return Table(name, "", "", columns, notes=[_LIMITS])
 
 
 def _until(scales: pd.Series[float], broken: pd.Series[bool], unsure: bool) -> tuple[str, float]:
@@ -236,8 +243,9 @@ def _ranking(rows: pd.DataFrame, kind: str) -> Iterator[str]:
     }
     verb, track = ("keep", " the track to the last epoch") if kind == "moving" else ("succeed", "")
     number = f"{trials:,} trial{'s' * (trials != 1)}{f' in {scenarios} scenarios' if scenarios > 1 else ''}"
-    if len(ranked) > 1 and ranked.min() == 1:
-        told = f"{enumerate_few(list(ranked.index))} {verb}{track} in {'all of ' * (trials > 1)}{number}"
+    if len(ranked) > 1 and ranked.min() == ranked.max():
+        share = f"{percent(ranked.max())} of " if ranked.max() < 1 else "all of " * (trials > 1)
+        told = f"{enumerate_few(list(ranked.index))} {verb}{track} in {share}{number}"
     else:
         (first, most), *others = ranked.items()
         head = f"{first} {verb}s{track} in {percent(most)} of {number}"
@@ -246,9 +254,14 @@ def _ranking(rows: pd.DataFrame, kind: str) -> Iterator[str]:
     if left_out := rows["scenario"].nunique() - scenarios:
         are = "scenario is" if left_out == 1 else "scenarios are"
         sentences.append(f"{left_out} other {are} left out, which not all of them have.")
-    worst = shares.sort_values("silent", kind="stable").iloc[-1]
-    if worst["silent"] > 0:
-        sentences.append(f"Failures that look right: {percent(worst['silent'])} at most ({worst.name}).")
+    if (most := common["shared_silent"].max()) > 0:
+        worst = common[common["shared_silent"] == most]
+        first = worst.iloc[0]
+        labels = worst.loc[worst["scenario"] == first["scenario"], "estimator"]
+        place = f", {first['setting']}" * (first["setting"] != "-") + f", scale {value_text(first['error_scale'])}"
+        where = f"{enumerate_few(list(labels))}{place * (scenarios > 1)}"
+        where = f"the trials{' of a scenario' * (scenarios > 1)} ({where})"
+        sentences.append(f"{_SILENT} up to {percent(most)} of {where}.")
     yield " ".join(sentences)
 
 
@@ -267,7 +280,7 @@ def _about_constants(name: str, footer: Mapping[str, Any]) -> str:
     groups: dict[str, Mapping[str, Any]] = {}
     for parameter in footer["parameters"]:
         groups.setdefault(parameter.get("group") or parameter["name"], parameter)
-    sizes = [f"{label} {short(p['size'])} {p['unit']}".strip() for label, p in groups.items()]
+    sizes = [f"{label} {p['size']:g} {p['unit']}".strip() for label, p in groups.items()]
     words = str(footer.get("about") or "").rstrip(".")
     readings = f"{footer['readings']} readings" if "readings" in footer else "Its readings"
     return (

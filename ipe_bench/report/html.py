@@ -10,6 +10,7 @@ from ipe_bench.report.headline import about, headline
 from ipe_bench.report.table import Part, Table, environment, words
 from ipe_bench.report.words import public
 from ipe_bench.report.writer import Page, digests
+from ipe_bench.runs.parts import TRUTH
 from ipe_bench.statistics.comparisons import TIE
 from ipe_bench.statistics.records import SCORES, STATISTICS
 from ipe_bench.statistics.registry import all_statistics
@@ -33,6 +34,7 @@ def render_page(
     runs, older = _runs(collection.runs)
     commands = dict.fromkeys(run["command"] for run in runs if run["command"] not in (_PYTHON, _UNKNOWN))
     main: list[Part] = [table for table in tables if not table.appendix]
+    asked = [cell for cell in collection.cells if cell.expected and cell.names["estimator"] != TRUTH]
     converged = analysis.endings.empty and not analysis.summary.empty
     sections = [
         ("figures", "Figures", figures[1:]),
@@ -51,7 +53,7 @@ def render_page(
         folder="figures/",
         facts=[
             *([_minute(collection.runs[-1]["started"])] if collection.runs else ()),
-            f"{collection.complete} of {collection.expected} expected cells (a scenario under an estimator) complete",
+            f"{sum(cell.complete for cell in asked)} of {len(asked)} results (an estimator in a scenario) complete",
         ],
         commands=list(commands)[:MOST_COMMANDS],
         sources=digests(collection.directories),

@@ -253,6 +253,7 @@ def _rich(columns: Sequence[Column], table: Table, width: int) -> Any:
 def environment() -> Environment:
     """Returns the templates of pages; every text in them is escaped."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
+    from markupsafe import Markup, escape
 
     made = Environment(
         loader=PackageLoader("ipe_bench.report", "templates"),
@@ -261,6 +262,8 @@ def environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    # Names may be broken behind their underscores.
+    made.filters["soft"] = lambda text: escape(text).replace("_", Markup("_<wbr>"))
     made.tests["strong"] = lambda part: isinstance(part, Strong)
     made.globals["MOST_ROWS"] = MOST_ROWS
     return made

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -91,6 +91,8 @@ _RECORDED: dict[Where, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
     ),
 }
 """Title, caption and rows of the tables that are made of recorded statistics alone."""
+MOST_SETTINGS = 2
+"""Differing settings that have a column each."""
 _OF_PARAMETERS = ("tracks", "parameters", "theory")
 """Names of the recorded tables that have a row per parameter."""
 _MAIN = ("overview", "tracks", "costs", "comparisons", "parameters", "calibration", "endings")
@@ -111,12 +113,25 @@ def all_tables(analysis: Analysis, whole: Analysis | None = None) -> list[Table]
 
 
 def head(analysis: Analysis, rows: pd.DataFrame) -> list[Column]:
-    """Returns the columns that tell rows apart: those settings that differ, and the error scale."""
-    varying = [c for c in analysis.setting_columns if len(set(rows[c].astype(str))) > 1]
-    return [
-        *(words(c, [value_text(v) for v in rows[c]]) for c in varying),
-        column("error scale", rows["error_scale"], lambda v: f"{v:g}"),
-    ]
+    """Returns the columns that tell rows apart: those settings that differ, of many in one column, and the scale."""
+    varying = _varying(analysis.setting_columns, rows)
+    told = [words(c, [value_text(v) for v in rows[c]]) for c in varying]
+    if len(varying) > MOST_SETTINGS:
+        told = [words("setting", differing(rows, varying))]
+    return [*told, column("error scale", rows["error_scale"], lambda v: f"{v:g}")]
+
+
+def _varying(columns: Sequence[str], rows: pd.DataFrame) -> list[str]:
+    return [c for c in columns if len(set(rows[c].astype(str))) > 1]
+
+
+def differing(rows: pd.DataFrame, columns: Sequence[str]) -> list[str]:
+    """Returns for each row those of its settings that differ among the rows, of many those other than the most frequent
+    ones; a dash if there are none."""
+    values = rows[_varying(columns, rows)].map(value_text)
+    usual = {c: values[c].mode().iloc[0] for c in values if len(values.columns) > MOST_SETTINGS}
+    told = ([(c, v) for c, v in row.items() if v not in ("-", usual.get(c))] for row in values.to_dict("records"))
+    return [", ".join(v if c in ("measurement", "noise") else f"{c}={v}" for c, v in each) or "-" for each in told]
 
 
 def _recorded(analysis: Analysis, where: Where, totals: pd.DataFrame) -> Table | None:
@@ -140,7 +155,9 @@ def overview(analysis: Analysis) -> Table:
     told: Any = rows.to_dict("records")
     columns = [*first, *overview_columns(told, leading(told, [*analysis.setting_columns, "error_scale"]))]
     columns += statistics("overview", told)
-    notes = overview_notes(rows["noise"].tolist())
+    notes = [*overview_notes(rows["noise"].tolist())]
+    if first[0].title == "setting":
+        notes.insert(0, "setting: what differs from the values that most rows have.")
     return Table("overview", "Overview", "", columns, rows, notes=notes, grouped=len(first), whole="summary.csv")
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from ipe_bench.report.table import Cell, Column, Part, Table, column, interval, sort_key, words
-from ipe_bench.report.words import brief, duration, ends_in_percent, p_value, percent, short, value_text
+from ipe_bench.report.words import brief, duration, ends_in_percent, p_value, percent, scientific, short, value_text
 from ipe_bench.statistics.formulas import CAP
 from ipe_bench.statistics.records import SCORES
 from ipe_bench.statistics.registry import all_statistics, summary_columns
@@ -20,10 +20,13 @@ _WIDE_ENOUGH = 100
 """Letters of a screen with room for failures, and for verdicts spelt out."""
 _LEGEND = (
     "success: % of all trials (95 % interval; bold may be the best){failed}; error: median / 95 % quantile over"
-    " {reference}; efficiency and NEES: 1 is right{sign}; cost: simulations. More: ipe-bench list statistic."
+    " {reference}; efficiency and NEES (median): 1 is right{sign}; cost: simulations. More: ipe-bench list statistic."
 )
 _FAILED = "; failed: known / silent"
-_SIGN = ", + optimistic, - pessimistic, ! diverged"
+_SIGNS = (
+    "; verdict: by the mean and the largest NEES of the converged trials",
+    ", + optimistic, - pessimistic, ! diverged",
+)
 _TOLD = (
     "With noise=unknown every estimator here is given R, that of the true levels at the nominal readings; bounds and"
     " success are those of parameters that are estimated together with the levels."
@@ -40,12 +43,12 @@ TRACKED = (
 def overview_notes(noises: Collection[str], *, narrow: bool = False) -> tuple[str, ...]:
     """Explains the columns of the overview, and what estimators assume about these noises."""
     reference = "the linearised filter" if set(noises) == {"model"} else "the bound"
-    legend = _LEGEND.format(failed="" if narrow else _FAILED, reference=reference, sign=_SIGN if narrow else "")
+    legend = _LEGEND.format(failed="" if narrow else _FAILED, reference=reference, sign=_SIGNS[narrow])
     return (legend, *(words for noise, words in (("unknown", _TOLD), ("model", TRACKED)) if noise in noises))
 
 
 _VERDICTS = {"consistent": ("", ""), "optimistic": ("optimistic", "+"), "pessimistic": ("pessimistic", "-")}
-_VERDICTS |= {"diverged but confident": ("diverged", "!"), "-": ("", "")}
+_VERDICTS |= {"diverged but confident": ("diverged", "!"), "-": ("-", "")}
 
 
 def summary_tables(listed: Sequence[Mapping[str, Any]], totals: Sequence[Table], width: int) -> list[Part]:
@@ -123,7 +126,10 @@ def overview_columns(rows: Sequence[Mapping[str, Any]], best: Sequence[bool], *,
         return f"{'<' * (row['error_median'] > CAP)}{row['efficiency_capped']:.2f}"
 
     def nees(row: Mapping[str, Any]) -> str:
-        return f"{brief(row['nees_median'])} {_VERDICTS.get(row['verdict'], (row['verdict'], '?'))[narrow]}".strip()
+        return f"{brief(row['nees_median'])} {verdict(row) * narrow}".strip()
+
+    def verdict(row: Mapping[str, Any]) -> str:
+        return _VERDICTS.get(row["verdict"], (row["verdict"], "?"))[narrow]
 
     def failed(row: Mapping[str, Any]) -> str:
         return f"{points(row['failed_known'])} / {points(row['failed_silent'])}"
@@ -136,6 +142,7 @@ def overview_columns(rows: Sequence[Mapping[str, Any]], best: Sequence[bool], *,
         cells("error", "error_median", lambda r: f"{brief(r['error_median'])}{slash}{brief(r['error_q95'])}"),
         cells("eff." if narrow else "efficiency", "efficiency_capped", efficiency),
         cells("NEES", "nees_median", nees),
+        *([] if narrow else [words("verdict", map(verdict, rows))]),
         cells("median cost", "simulations_median", lambda r: brief(r["simulations_median"])),
         cells("median time", "time_median_s", lambda r: duration(r["time_median_s"], 2)),
     ]
@@ -190,7 +197,7 @@ def _shower(kind: Kind, where: Where) -> Callable[[Any], str]:
         "share": percent,
         "number": short,
         # Physical units are of any size.
-        "physical": (lambda v: f"{v:.4g}" if math.isfinite(v) else short(v)) if where == "parameters" else short,
+        "physical": (lambda v: scientific(v) if math.isfinite(v) else short(v)) if where == "parameters" else short,
         "seconds": (lambda v: duration(v, 2)) if where == "terminal" else duration,
         "probability": p_value,
         "word": str,

@@ -59,7 +59,7 @@ def short(value: float) -> str:
     if value == int(value) and abs(value) < 1000:
         return str(int(value))
     if abs(value) >= 1e6 or 0 < abs(value) < 1e-3:
-        return f"{value:.1e}"
+        return _powered(f"{value:.1e}")
     if abs(value) >= 100:
         return f"{value:,.0f}"
     return f"{value:.3f}" if abs(value) < 10 else f"{value:.1f}"
@@ -67,7 +67,12 @@ def short(value: float) -> str:
 
 def scientific(value: float) -> str:
     """Formats three figures, with an exponent below a thousandth."""
-    digits, _, power = (f"{value:.2e}" if 0 < abs(value) < 1e-3 else f"{value:.3g}").partition("e")
+    return _powered(f"{value:.2e}" if 0 < abs(value) < 1e-3 else f"{value:.3g}")
+
+
+def _powered(text: str) -> str:
+    """Writes an exponent without its plus and leading zero."""
+    digits, _, power = text.partition("e")
     return f"{digits}e{int(power)}" if power else digits
 
 
@@ -78,7 +83,7 @@ def brief(value: float) -> str:
     if value == int(value) and value < 1000:
         return str(int(value))
     if value >= 999.5e6:
-        return f"{value:.0e}".replace("e+0", "e").replace("e+", "e")
+        return _powered(f"{value:.0e}")
     return compact(value) if value >= 9.995 else f"{value:.2f}"
 
 
@@ -88,7 +93,7 @@ def compact(value: float) -> str:
         return "inf" if value == math.inf else "-"
     rounded = float(f"{value:.2e}")
     if rounded == 0 or not 1e-2 <= abs(rounded) < 1e9:
-        return f"{value:.1e}" if rounded else "0"
+        return _powered(f"{value:.1e}") if rounded else "0"
     size, letter = next(((s, u) for s, u in ((1e6, "M"), (1e3, "k")) if abs(rounded) >= s), (1.0, ""))
     return f"{rounded / size:.{_decimals(rounded / size, 3)}f}{letter}"
 

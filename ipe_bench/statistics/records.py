@@ -354,7 +354,6 @@ STATISTICS: tuple[Statistic, ...] = (
         "rmse / bound",
         "Root mean square error over the linear bound.",
         lambda s: f.ratio(f.in_units(f.rmse(s), s), np.append(s.linear_bound * s.sizes, 1.0)),
-        where=("parameters",),
     ),
     _solved(
         "efficiency",
@@ -363,7 +362,7 @@ STATISTICS: tuple[Statistic, ...] = (
         " Cramér and Rao's or, for estimators that use a prior, the Bayesian one. Interval: from that of rmse.",
         f.efficiency,
         limits=f.efficiency_limits,
-        where=("solved_trials", "parameters"),
+        where=("solved_trials",),
         titles={"solved_trials": "efficiency"},
         limits_titles={"solved_trials": "95 % of efficiency"},
     ),
@@ -373,7 +372,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "Root mean square error over all trials; infinite if one of them has no finite estimate.",
         f.of_each(f.rmse_all),
         kind="physical",
-        where=("all_trials", "parameters"),
+        where=("all_trials",),
         titles={"all_trials": "rmse / linear bound"},
     ),
     _all(
@@ -382,7 +381,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "The same bound over the root mean square error of all trials. Because no trial is left out, it compares"
         " estimators that solve an equation with those that do not.",
         f.efficiency_all,
-        where=("all_trials", "parameters"),
+        where=("all_trials",),
         titles={"all_trials": "efficiency, uncapped"},
     ),
     _all(

@@ -149,7 +149,7 @@ def test_numbers_are_written_for_readers():
     assert [short(v) for v in (1.00234, 14520.3, 3.0, float("inf"))] == ["1.002", "14,520", "3", "inf"]
     assert [duration(v) for v in (2.0, 0.0123, 9.4e-6)] == ["2.00 s", "12.3 ms", "9.40 µs"]
     assert [duration(v, 2) for v in (0.00096, 0.123, 0.9996, 0.0)] == ["960 µs", "120 ms", "1.0 s", "0 s"]
-    assert [compact(v) for v in (0.945, 12195, 999.7, 1.6e6, 3e-5)] == ["0.945", "12.2k", "1.00k", "1.60M", "3.0e-05"]
+    assert [compact(v) for v in (0.945, 12195, 999.7, 1.6e6, 3e-5)] == ["0.945", "12.2k", "1.00k", "1.60M", "3.0e-5"]
 
 
 def test_settings_that_differ_have_figures_of_their_own(synthetic, tmp_path, monkeypatch):
@@ -178,7 +178,7 @@ def test_every_renderer_has_every_cell():
     assert places == sorted(places)
     page = html([table, Strong("Stands out"), "does not"])
     cells = re.findall(r"<td[^>]*>(?:<b>)?(.*?)(?:</b>)?</td>", page)
-    assert [unescape(text) for text in cells] == [cell for row in rows for cell in row]
+    assert [unescape(text.replace("<wbr>", "")) for text in cells] == [cell for row in rows for cell in row]
     assert HOSTILE not in page
     assert "<b>2</b>" in page
     assert "<b>Stands out</b>" in page

@@ -43,7 +43,7 @@ def draw(view: View) -> Iterator[Drawing]:
         common.decades(nees, np.append(capped["nees_median"].clip(lower=0.5), 1.0), least=4.0)
         common.bound_line(nees, 1.0, best)
         limits = claims["nees_median_low"].min(), claims["nees_median_high"].max()
-        common.band(nees, *limits, "limits of an honest one, 95 %")
+        common.band(nees, *limits, "95 % limits of the median if honest")
         words = {"heading": "NEES", "label": "median", "most": CEILING["nees_median"]}
         common.curves(nees, claims, "nees_median", *shown, **words)
     common.legend(fig, axes, view.look)

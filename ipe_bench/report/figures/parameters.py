@@ -107,10 +107,12 @@ def _missing(totals: pd.DataFrame) -> str:
 
 
 def draw_tracks(view: View) -> Iterator[Drawing]:
-    """Draws the root mean square error of each state beside its bounds, and NEES within its limits."""
+    """Draws the root mean square error of each state beside its bounds, and NEES within its limits, at the largest
+    error scale."""
     rows = view["tracks"]
     if rows.empty:
         return
+    rows = rows[rows["error_scale"] == (scale := rows["error_scale"].max())]
     look = view.with_look(rows["estimator"])
     states = list(dict.fromkeys(rows["parameter"]))[: common.MOST_PANELS - 1]
     fig, axes = common.panels(len(states) + 1, look)
@@ -145,8 +147,8 @@ def draw_tracks(view: View) -> Iterator[Drawing]:
     yield view.drawing(
         fig,
         "tracks",
-        "Tracks, converged trials",
-        "Root mean square error at each epoch, beside posterior Cramér-Rao bounds; NEES over states.",
+        f"Tracks at error scale {value_text(scale)}, converged trials",
+        "Root mean square error at each epoch, beside what linearisation at the true path promises; NEES over states.",
         f"{states[0]} over all epochs: {enumerate_few([f'{k} {v:.3g}' for k, v in total.items()], 3)}.",
     )
 
