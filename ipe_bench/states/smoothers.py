@@ -45,13 +45,13 @@ class IteratedSmoother(Tracker):
 
     By Taylor's rule these are Gauss-Newton steps to the path of largest posterior density (Bell, SIAM J. Optim. 4,
     1994), with `damped` halved while they raise its cost; by sigma points it is the iterated posterior linearisation
-    smoother (García-Fernández, Svensson, Särkkä, IEEE TSP 65, 2017). The first path is that of `first`, smoothed.
+    smoother (García-Fernández, Svensson, Särkkä, IEEE TSP 65, 2017). The first path is the track of `first`.
     """
 
     family: ClassVar[str] = "least squares"
     smooths: ClassVar[bool] = True
     first: Filter = field(default_factory=Filter)
-    """The filter whose smoothed tracks are the first path."""
+    """The filter whose tracks are the first path."""
     rule: Rule = field(default_factory=Taylor)
     """How transition and reading are linearised about a path."""
     iterations: Count = 10
@@ -164,11 +164,15 @@ def admissible(model: StateModel, x: Array) -> Array:
     """The path x (trials, 1 + K, n) from before the first transition, each step moved into the range of its noise:
 
     x[k] <- f(x[k-1]) + G G^+ (x[k] - f(x[k-1]))
+
+    Without a transition before the first epoch, the states before it are those of that epoch.
     """
     gains = {k: model.gain(k) for k in range(model.epochs) if model.moves(k)}
-    if all(np.linalg.matrix_rank(G) == model.n for G in gains.values()):
+    if model.moved_first and all(np.linalg.matrix_rank(G) == model.n for G in gains.values()):
         return x
     x = x.copy()
+    if not model.moved_first:
+        x[:, 0] = x[:, 1]
     for k, G in gains.items():
         moved = model.transition(x[:, k], k)
         moved = model.nearest_state(moved, x[:, k + 1])

@@ -84,6 +84,7 @@ CASES = {
     "nearly exact readings": Linear(G0=((2.0, 0.0), (0.0, 0.0)), V=((2.0**-30,),)),
     "a vague and a known state": Linear(G0=((2.0**12, 0.0), (0.0, 0.0)), G=((0.0,), (0.25,))),
     "no first transition": Linear(G0=((1.0, 0.0), (2.0, 0.0)), G=((0.0,), (0.25,)), moved_first=False),
+    "constants, read before any transition": Linear(F=((1.0, 0.0), (0.0, 1.0)), G=NONE, moved_first=False),
     "three states of rank 1": Linear(
         F=((1.0, 0.5, 0.25), (0.0, 1.0, 0.5), (0.0, 0.0, 1.0)),
         G0=((1.0,), (0.5,), (0.25,)), G=((0.0,), (0.0,), (0.5,)), H=((1.0, 0.0, 0.0),), mean=(0.0, 1.0, 2.0),
