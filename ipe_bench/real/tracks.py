@@ -89,6 +89,8 @@ def _read(table: TextTable, model: StateModel) -> Log:
     for name in wanted:
         if name not in columns:
             raise table.error(f"column {name} is missing (the header must be {','.join(wanted)})")
+    if columns.get("time", "time") not in ("time", "time [s]"):
+        raise table.error(f"column {columns['time']}: the unit must be that of time [s]; convert the values")
     table.require_known(list(columns.values()), wanted)
     if not table.rows:
         raise table.error("has a header and no rows")

@@ -143,6 +143,9 @@ def test_the_times_of_a_log_are_those_of_its_epochs(tmp_path):
     pd.DataFrame({"time [s]": t[[0, 2, 1]], "z": z}).to_csv(tmp_path / "back.csv", index=False)
     with pytest.raises(ib.UserError, match=r"row 4, column time \[s\]: is not after that of the row before"):
         ib.estimate(model, tmp_path / "back.csv", {"ekf": ekf()})
+    pd.DataFrame({"time [ms]": t, "z": z}).to_csv(tmp_path / "ms.csv", index=False)
+    with pytest.raises(ib.UserError, match=r"column time \[ms\]: the unit must be that of time \[s\]"):
+        ib.estimate(model, tmp_path / "ms.csv", {"ekf": ekf()})
 
 
 def test_a_first_reading_at_the_time_of_the_prior_gives_the_closed_form(tmp_path):
