@@ -134,8 +134,8 @@ class Program:
         """Reads the next block; None at the end of an answer."""
         if (text := self.line()) == b"end":
             return None
-        name, _, count = text.decode("ascii", "replace").partition(" ")
-        if not (name.isidentifier() and name.isascii() and count.isdigit()):
+        name, count, *more = [*text.decode("ascii", "replace").split(), "", ""]
+        if not (name.isidentifier() and name.isascii() and count.isdigit()) or any(more):
             raise ProgramError(f"wrote {_shown(text)}, where a line NAME COUNT or `end` belongs")
         try:
             values = np.array(self.line().split(), dtype=float)

@@ -1,12 +1,12 @@
 """A program that answers with the first readings, except where the first one is 99: there it has the fault that its
-argument names. Faults in capitals show in every trial."""
+argument names. Faults in capitals show in every trial. Spaces are as R's `cat` leaves them."""
 
 import os
 import signal
 import sys
 import time
 
-RIGHT = "x 4\n{}\nstatus 1\n0\niterations 1\n1\nsimulations 1\n1\njacobians 1\n1\nend\n"
+RIGHT = "x  4 \n{} \nstatus 1\n0\niterations 1\n1\nsimulations 1\n1\njacobians 1\n1\nend\n"
 
 
 def say(text: str) -> None:
