@@ -247,7 +247,8 @@ def compare(
             raise UserError(f"compare: {label} is compared with itself; name another, or first=LABEL and second=LABEL")
         asked, read = (collect(one), collect(other)), digests(dict.fromkeys([*one, *other]))
         options: dict[str, Any] = {"anytime": anytime, "plan": plan, "tested": tested, "margins": margins}
-        frame = Comparison(between.compared(*asked, (first, second), alpha=alpha, **options))
+        found = between.compared(*asked, (first, second), alpha=alpha, **options)
+        frame, few = Comparison(found), [] if anytime else list(between.too_few(found, alpha))
         lacking = list(between.gone(*asked, (first, second))) if complete else []
     if plan is not None:
         whole = ["discordant", "trials_needed"]
@@ -259,7 +260,7 @@ def compare(
     for name in ("problems", "stale"):
         frame.attrs[name] = list(dict.fromkeys(line for c in asked for line in getattr(c, name)))
     frame.attrs["problems"] += lacking
-    frame.attrs["notes"] = [*between.left_out(*asked), *between.other_sources(*asked)]
+    frame.attrs["notes"] = [*few, *between.left_out(*asked), *between.other_sources(*asked)]
     frame.attrs["margins"], frame.attrs["alpha"] = margins, alpha
     if output is not None:
         write_comparison(Path(output), frame, read)

@@ -5,7 +5,7 @@ This module finds the scenarios and trials that belong together; the tests are i
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -226,6 +226,14 @@ def other_sources(first: Collection, second: Collection) -> Iterator[str]:
     differ = dict.fromkeys(f"{k} {x[k]} | {y.get(k)}" for x, y in made for k in x if x[k] != y.get(k))
     if differ:
         yield f"other sources: {', '.join(differ)}; differences may be theirs: run both sides with the same ones"
+
+
+def too_few(rows: Iterable[Mapping[str, Any]], alpha: float) -> Iterator[str]:
+    """Yields a line for each number of trials so small that, with all signs alike, Holm's test rejects no change."""
+    tested = [row["trials"] for row in rows if np.isfinite(row["p"])]
+    least = int(np.ceil(1 + np.log2(max(1, len(tested)) / alpha)))
+    for trials in sorted({trials for trials in tested if trials < least}):
+        yield f"common trials: {trials} are too few for any finding in {len(tested)} tests; run at least {least}"
 
 
 def left_out(first: Collection, second: Collection) -> list[str]:

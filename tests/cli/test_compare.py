@@ -135,6 +135,17 @@ def test_scenarios_of_one_folder_alone_are_left_out_and_it_is_said(tmp_path):
     assert "1 scenarios that the other lacks are left out" in frame.attrs["notes"][0]
 
 
+def test_so_few_trials_that_none_can_be_worse_are_named(tmp_path):
+    """Success, error and cost at 5 %: with seven trials the least p is 2/128 and, three times as large, .047."""
+    for trials, finding in ((6, ""), (7, "worse")):
+        folders = [store(tmp_path / f"{trials} {name}", trials=trials) for name in "ab"]
+        folders[1] = store(tmp_path / f"{trials} c", trials=trials, fails=trials)
+        frame = ib.compare(*folders)
+        assert findings(frame)["success"] == finding
+        line = "common trials: 6 are too few for any finding in 3 tests; run at least 7"
+        assert frame.attrs["notes"] == ([] if finding else [line])
+
+
 def test_judging_by_evidence(tmp_path):
     """Three questions at 5 %: evidence of 60 is needed, which nine failures of one alone give. Eight give 50, which is
     enough for one question only."""
