@@ -81,6 +81,9 @@ class Formulas(StateModel):
                 for name in formula.names:
                     if name not in names:
                         raise UserError(f"{key}.{label}: {unknown(name, names, 'name')}")
+        moved = {name for formula in self._transitions.values() for name in formula.names}
+        if idle := next((name for name in self.noise if name not in moved), None):
+            raise UserError(f"noise.{idle}: stands in no formula of next; add it to one, or leave it out")
         owners = {"deviation": self.readings, "period": self.readings, "spread": self.next, "start": self.next}
         owners["state_period"] = self.next
         for key, labels in owners.items():

@@ -312,6 +312,7 @@ WALK = {
         ({"next": {"x": "x + y", "v": "v + w"}}, r"next\.x: there is no such name"),
         ({"next": {"x": "x +", "v": "v"}}, r"next\.x: 'x \+' is not a formula"),
         ({"next": {"x": "x", "v": "v + w*w"}}, "next: depends on w by more than a factor"),
+        ({"next": {"x": "x", "v": "v"}}, r"noise\.w: stands in no formula of next; add it to one, or leave it out"),
         ({"readings": {}}, "readings: is empty"),
         ({"constants": {"h": 1.0, "x": 2.0}}, r"next\.x: two of states, noise, constants, inputs, k and t have"),
         ({"readings": {"z": "x + w"}}, r"readings\.z: there is no such name"),
