@@ -309,6 +309,8 @@ def require_sound(model: StateModel) -> None:
         Q, R = Q[0] if model.gain_by_state else Q, R[0] if model.R_by_state else R
         matrices |= {f"Q of epoch {k + 1}": (Q, n), f"R of epoch {k + 1}": (R, m)}
     for what, (P, size) in matrices.items():
+        if not np.isfinite(P).all():
+            raise UserError(f"{name}: {what} is not finite at the mean of the prior; give another mean or noise")
         if what[0] == "R" and np.shape(P) == (m, m) and half(P).singular:
             raise UserError(f"{name}: {what} is singular; give every reading a standard deviation above 0")
         if np.shape(P) != (size, size):

@@ -72,6 +72,11 @@ def weighed(model: StateModel, x: Array, k: int, z: Array, before: Array | float
     least = square.min(axis=1, keepdims=True)
     w = before * np.exp(-0.5 * (square - least))
     total = w.sum(axis=1, keepdims=True)
+    if not (total > 0).all():
+        raise ArithmeticError(
+            f"the readings of epoch {k + 1} have no density at some states: f, h or a standard deviation has no value"
+            " there, or is 0 or infinite"
+        )
     out.log_likelihood += np.log(total[:, 0]) - 0.5 * (least[:, 0] + size)
     return w / total
 

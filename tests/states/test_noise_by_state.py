@@ -212,6 +212,10 @@ def test_trackers_are_calibrated_and_give_a_trial_the_same_bits_alone(label):
     np.testing.assert_array_equal(alone.mean[0], tracker.track(ROVER, block.paths.z[6:8]).mean[1])
 
 
+SCALAR = {
+    "next": {"x": "x + w"}, "readings": {"z": "x"}, "noise": {"w": 1.0}, "deviation": {"z": 1.0}, "spread": {"x": 1.0},
+    "count": 3,
+}  # fmt: skip
 VOLATILITY = Formulas(
     next={"logvar": "0.95*logvar + 0.3*w"},
     readings={"gain": "0*logvar"},
@@ -305,6 +309,19 @@ def test_formulas_of_noise_that_make_no_model_are_refused(changes, complaint):
 
 def test_a_state_known_exactly_may_change_the_noise_all_the_same():
     assert Formulas(**WRITTEN | {"spread": {"x": 0.3, "y": 0.2, "heading": 0.0}}).gain_by_state
+
+
+def test_noise_without_a_value_at_the_mean_of_the_prior_is_refused():
+    for changes, what in (({"next": {"x": "x + w/x"}}, "Q"), ({"deviation": {"z": "sqrt(x - 1)"}}, "R")):
+        with pytest.raises(ib.UserError, match=f"{what} of epoch 1 is not finite at the mean of the prior"):
+            StateScenario(Formulas(**SCALAR | changes))
+
+
+def test_particles_at_which_readings_have_no_density_are_a_reason():
+    model = Formulas(**SCALAR | {"deviation": {"z": "0.5 + 0.5*sign(x - 1)"}, "start": {"x": 3.0}})
+    columns = PathBlock.draw(StateScenario(model), 0, 2).estimate(TRACKERS["bootstrap"])[1]
+    said = [message.partition(": ")[2][:65] for message in columns["message"]]
+    assert said == ["the readings of epoch 1 have no density at some states: f, h or a"] * 2
 
 
 def test_a_model_without_noise_is_refused():
