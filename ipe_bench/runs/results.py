@@ -10,7 +10,7 @@ import contextlib
 import os
 import re
 import uuid
-from collections import Counter, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from collections.abc import Collection as Keys
 from dataclasses import dataclass, field, replace
@@ -166,6 +166,8 @@ class Results:
     """Problems that are not one file's: a line for each."""
     _kept: dict[Path, pa.Table] = field(default_factory=dict, repr=False)
     """Rows of the first files, which hundreds of small runs would otherwise read a dozen times each."""
+    _arrays: dict[Path, dict[str, Array]] = field(default_factory=lambda: defaultdict(dict), repr=False)
+    """Those of their columns that were loaded, which cannot be written into."""
     _kept_bytes: int = 0
 
     @classmethod
@@ -341,6 +343,13 @@ class Results:
         part that cannot be used any more, or lacks one of the `columns`, is named in `problems`, and left out. What
         some parts lack of the `optional` columns is NaN or None there."""
         names = None if columns is None else list(dict.fromkeys(["trial", *columns, *optional]))
+        if len(cell.parts) == 1 and (kept := self._kept.get(path := cell.parts[0].path)) is not None:
+            there, known = set(kept.column_names), self._arrays[path]
+            if there.issuperset(columns or ()):
+                for name in there.difference(known) if names is None else there.intersection(names).difference(known):
+                    known[name] = as_array(kept[name])
+                    known[name].flags.writeable = False
+                return {name: known[name] for name in names or kept.column_names if name in there}
         tables = self._of_parts(cell, lambda parts: list(self._tables(parts, names, columns or ())))
         if sum(map(len, tables)) < cell.trials and self.damaged.keys().isdisjoint(p.path for p in cell.parts):
             self.extra_problems.append(f"missing: {describe_names(cell.names)}: trials went away while they were read")
@@ -383,7 +392,8 @@ class Results:
                 with self._naming(part.path):
                     table = self._kept[part.path] if part.path in self._kept else part.read(names)[1]
                     table = table.select([n for n in table.column_names if names is None or n in names])
-                    if lacking := [name for name in needed if name not in table.column_names]:
+                    there = table.column_names
+                    if lacking := [name for name in needed if name not in there]:
                         raise Unusable(f"damaged: has no column {lacking[0]}")
                     yield table.slice(max(0, reached - part.start))
                     reached = part.stop

@@ -16,7 +16,7 @@ from ipe_bench.statistics.calibration import POINTS, band
 from ipe_bench.statistics.collect import Collection, Group, collect
 from ipe_bench.statistics.comparisons import Outcomes, compare_pairs, corrected, may_be_best
 from ipe_bench.statistics.formulas import failed, share
-from ipe_bench.statistics.intervals import quantile
+from ipe_bench.statistics.intervals import quantile, quantiles
 from ipe_bench.statistics.records import SCORES
 from ipe_bench.statistics.registry import summary_rows, to_frame
 from ipe_bench.statistics.sample import CONTRACTION, Sample, label_of, median_distances, samples
@@ -122,7 +122,7 @@ class Begun:
             outcomes[sample.group.estimator] = Outcomes(sample.distance[present], sample.inside_gate[present])
             found["endings"] += [dict(sample.group.columns) | label | row for row in _ending_rows(sample)]
             found["scores"].append(numbered | rows_of(SCORES, sample)[-1] | _shared(sample))
-            distances = np.array([quantile(sample.distance, p) for p in PROBABILITIES])
+            distances = quantiles(sample.distance, PROBABILITIES)
             found["distributions"].append(numbered | {"probability": PROBABILITIES, "distance": distances})
             if sample.histories and sample.group.footer.get("equation") is not None:
                 medians = median_distances(sample.histories)

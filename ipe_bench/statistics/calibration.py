@@ -42,15 +42,21 @@ def covered(trials: int, tails: Array) -> Array:
     width, reach = int((last - first).max()) + 1, int((last - np.append(0, first[:-1])).max()) + 1
     mean, size = trials / (len(POINTS) + 1), 1 << (width + reach).bit_length()
     kernel = np.fft.rfft(_poisson(np.arange(reach), mean), size)
+    count = first[:, None] + np.arange(width)
+    kept = ((count >= low[..., None]) & (count <= high[..., None])).transpose(1, 0, 2)
     state, start = np.zeros((len(tails), width)), 0
     state[:, 0] = 1.0
-    for i, lowest in enumerate(first.tolist()):
-        moved = np.fft.irfft(np.fft.rfft(state, size) * kernel, size)[:, lowest - start : lowest - start + width]
-        count = np.arange(lowest, lowest + width)
-        state = np.where((count >= low[:, i, None]) & (count <= high[:, i, None]), moved, 0.0)
-        start = lowest
+    for lowest, inside in zip(first.tolist(), kept, strict=True):
+        moved = np.fft.irfft(np.fft.rfft(state, size) * kernel, size)
+        state, start = moved[:, lowest - start : lowest - start + width] * inside, lowest
     rest = _poisson(trials - start - np.arange(width), mean)
     return np.clip(state @ rest / _poisson(np.array([trials]), float(trials)), 0.0, 1.0)
+
+
+@lru_cache(maxsize=256)
+def _covered_once(trials: int, tails: tuple[float, ...]) -> Array:
+    """Computes the same once: estimators that agree have the same tails."""
+    return covered(trials, np.array(tails))
 
 
 def _poisson(count: Array, mean: float) -> Array:
@@ -60,7 +66,8 @@ def _poisson(count: Array, mean: float) -> Array:
 
 def _allowed(trials: int, tails: Array) -> tuple[Array, Array]:
     """Returns the least and the largest count (bands, points) both of whose binomial tails exceed the band's."""
-    return least_count(trials, POINTS, tails[:, None]), trials - least_count(trials, 1 - POINTS, tails[:, None])
+    least = least_count(trials, POINTS, tails[:, None])
+    return least, trials - least[:, ::-1]  # the points lie symmetrically about 1/2
 
 
 def least_count(trials: Any, p: Array, tail: Array) -> Array:
@@ -112,7 +119,7 @@ def curves(below: Sequence[Array], trials: int) -> list[Curve]:
     counts = np.array(below)
     reached = np.where(counts > 0, bdtrc(np.maximum(counts - 1, 0), trials, POINTS), 1.0)
     tails = np.minimum(bdtr(counts, trials, POINTS), reached).min(axis=1)
-    outside = 1 - covered(trials, np.maximum(tails, _LEAST_TAIL))
+    outside = 1 - _covered_once(trials, tuple(np.maximum(tails, _LEAST_TAIL).tolist()))
     p = np.where(outside > _RESOLVED, outside, np.minimum(2 * len(POINTS) * tails, _RESOLVED))
     return [Curve(c / trials - POINTS, float(q)) for c, q in zip(counts, p, strict=True)]
 
@@ -225,11 +232,17 @@ def _holds(interval: tuple[float, float], value: float) -> bool:
 def median_limits(values: Array, level: float = BAND_LEVEL) -> tuple[float, float]:
     """Computes the interval of the median by order statistics, for any law; without ends below `FEW` values."""
     count = len(values)
-    k = int(least_count(count, np.array([0.5]), np.array([(1 - level) / 2]))[0]) if count >= FEW else 0
+    k = _rank(count, level) if count >= FEW else 0
     if k == 0:
         return -np.inf, np.inf
     ordered = np.partition(values, (k - 1, count - k))
     return float(ordered[k - 1]), float(ordered[count - k])
+
+
+@lru_cache(maxsize=256)
+def _rank(count: int, level: float) -> int:
+    """Finds the place from either end of the values that bound the median of `count`."""
+    return int(least_count(count, np.array([0.5]), np.array([(1 - level) / 2]))[0])
 
 
 def _scaled(scale: float) -> str:

@@ -344,3 +344,11 @@ def quantile(values: Array, q: float) -> float:
     a, b = np.partition(np.where(np.isfinite(values), values, np.inf), places)[[*places]]
     # Between two infinite values nothing is interpolated: inf - inf is not a number.
     return float(a + (b - a) * (position - places[0]) if a < b else a)
+
+
+def quantiles(values: Array, q: Array) -> Array:
+    """Computes many such quantiles (k,) of one or more numbers from one sort."""
+    ordered, position = np.sort(np.where(np.isfinite(values), values, np.inf)), (len(values) - 1) * q
+    a, b = (ordered[place(position).astype(int)] for place in (np.floor, np.ceil))
+    with np.errstate(invalid="ignore"):
+        return np.where(a < b, a + (b - a) * (position - np.floor(position)), a)

@@ -207,9 +207,12 @@ class Sample:
             return []
         found = []
         for cell in self.group.cells:
-            history = self.collection.load_history(cell) or {"trial": np.empty(0)}
+            history = self.collection.load_history(cell)
+            if history is None:
+                continue
+            every = np.stack([history[f"x_{name}"] for name in self.names], axis=1)
             for trial in np.unique(history["trial"]):
-                iterates = np.stack([history[f"x_{name}"][history["trial"] == trial] for name in self.names], axis=1)
+                iterates = every[history["trial"] == trial]
                 rows = np.flatnonzero(self.converged & (self.number == cell.seed * _SEED + trial))
                 found += [(row, iterates) for row in rows.tolist() if len(iterates) > 1]
         if not found:
