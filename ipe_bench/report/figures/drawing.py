@@ -56,11 +56,10 @@ class Drawing:
 
     def save(self, folder: Path, formats: Sequence[str] = ("png", "pdf")) -> tuple[Path, ...]:
         """Writes the figure in these formats, named for it; no file is ever seen half written."""
-        paths = []
-        for kind in formats:
-            paths.append(folder / f"{self.name}.{kind}")
-            write_atomically(paths[-1], methodcaller("write_bytes", self._content(kind)))
-        return tuple(paths)
+        paths = {kind: folder / f"{self.name}.{kind}" for kind in formats}
+        for kind, path in paths.items():
+            write_atomically(path, methodcaller("write_bytes", self._content(kind)))
+        return tuple(paths.values())
 
     def html(self) -> str:
         """Returns the figure as a page shows it."""
@@ -76,9 +75,14 @@ class Drawing:
         return page
 
     def _content(self, kind: str) -> bytes:
-        content = BytesIO()
+        from matplotlib.backend_bases import get_registered_canvas_class
+
+        canvas, content, dpi = get_registered_canvas_class(kind)(self.figure), BytesIO(), self.figure.dpi
         with warnings.catch_warnings():
             # Labels of great length leave a panel no room: it is drawn as it is.
             warnings.filterwarnings("ignore", "constrained_layout not applied")
-            self.figure.savefig(content, format=kind, metadata=_METADATA.get(kind))
+            # `savefig` draws twice, for the layout and for the file, which takes a third longer.
+            getattr(canvas, f"print_{kind}")(content, metadata=_METADATA.get(kind))
+        self.figure.dpi = dpi  # which vectors set to 72
+        get_registered_canvas_class("png")(self.figure)  # by which a page's panels are measured
         return content.getvalue()
