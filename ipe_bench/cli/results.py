@@ -10,7 +10,7 @@ from typing import Any
 import ipe_bench as ib
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import NAMES, console, places_and_keys, print_problems, say, show
-from ipe_bench.report.style import PAGE, Which
+from ipe_bench.report.style import PAGE, Which, drawn_settings
 from ipe_bench.report.table import Table, texts, words
 from ipe_bench.runs.bundles import BUNDLES, SUFFIX, is_bundle, opened, read_bundle, write_bundle
 from ipe_bench.runs.parts import TRUTH
@@ -155,6 +155,8 @@ def show_report(
             told.append(f"{output}: {number} of other commands; `ipe-bench status {output}` lists them")
     print_problems(told)
     drawn = f"\nFigures  {output / 'figures'}" if any(output.glob("figures/*.png")) else ""
+    if drawn and (left_out := drawn_settings(collection.settings, figures)[1]):
+        drawn += f" ({left_out})"
     say(f"\nSummary  {output / 'summary.csv'}\nTables   {output / 'tables'}{drawn}\nReport   {output / 'report.html'}")
     if others:
         print(f"Here too  {counted(others, 'result')} of other commands; `ipe-bench report {output}` shows all")

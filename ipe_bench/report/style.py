@@ -14,6 +14,8 @@ from ipe_bench.basics.errors import UserError
 
 Which = Literal["all", "main", "none"]
 """All figures that the data allow, the few that answer the question, or none."""
+MOST_SETTINGS, FIRST_SETTINGS = 6, 2
+"""Settings with figures of their own: that many, or of more the first few unless all figures are asked for."""
 PAGE = "png"
 """The format that is always written, as the page shows it."""
 FIGURES = (PAGE, "pdf", "svg")
@@ -48,6 +50,13 @@ def which_figures(asked: Any) -> Which:
     if asked not in get_args(Which):
         raise UserError(f"figures={asked}: choose all, main or none")
     return cast(Which, asked)
+
+
+def drawn_settings(number: int, which: Which) -> tuple[int, str]:
+    """Returns how many of the settings have figures of their own, and a sentence on the others if there are any."""
+    drawn = min(number, MOST_SETTINGS if which == "all" or number <= MOST_SETTINGS else FIRST_SETTINGS)
+    more = f"; figures=all draws {MOST_SETTINGS} of the {number}" if which == "main" else ""
+    return drawn, f"{number - drawn} further settings are in the tables{more}" if drawn < number else ""
 
 
 def file_formats(asked: Any) -> tuple[str, ...]:

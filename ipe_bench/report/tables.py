@@ -12,11 +12,7 @@ from ipe_bench.report.table import Column, Table, column, words
 from ipe_bench.report.terminal import leading, overview_columns, overview_notes, statistics
 from ipe_bench.report.words import p_value, percent, short, value_text
 from ipe_bench.statistics.analysis import Analysis
-from ipe_bench.statistics.certified import (
-    certified_averages,
-    certified_table,
-    published_table,
-)
+from ipe_bench.statistics.certified import certified_averages, certified_table, published_table
 from ipe_bench.statistics.collect import Collection
 from ipe_bench.statistics.records import SCORES
 from ipe_bench.statistics.registry import all_statistics
@@ -248,9 +244,7 @@ def _digits(digits: pd.DataFrame) -> list[Table]:
     rows = certified_averages(digits).sort_values(["mean_lre_parameters", "start"], ascending=False)
     columns = [
         words("estimator", rows["estimator"]),
-        column("start", rows["start"], str),
-        column("data sets", rows["datasets"], str),
-        column("solved", rows["solved"], str),
+        *(column(name, rows[name.replace(" ", "")], str) for name in ("start", "data sets", "solved")),
         *_lre(rows, "mean_"),
         column("deviations to 6 digits", rows["deviations_to_6_digits"], str),
     ]
@@ -268,8 +262,7 @@ def _published(rows: pd.DataFrame, collection: Collection) -> Table:
     ]
     sources = " ".join(dict.fromkeys(model["source"] for model in models if "source" in model))
     caption = f"Root mean square errors over all epochs of one stored path, beside those that are published. {sources}"
-    title = "Published errors of trackers"
-    return Table("published", title, caption, columns, rows, whole="tables/published.csv")
+    return Table("published", "Published errors of trackers", caption, columns, rows, whole="tables/published.csv")
 
 
 def _lre(rows: pd.DataFrame, prefix: str) -> list[Column]:

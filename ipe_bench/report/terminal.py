@@ -14,8 +14,10 @@ from ipe_bench.statistics.records import SCORES
 from ipe_bench.statistics.registry import all_statistics, summary_columns
 from ipe_bench.statistics.statistic import ALL, BEST, Kind, Statistic, Where
 
-_MOST_ROWS = 60
-"""Rows that a terminal shows: about two screens."""
+_MOST_LINES = 75, 50
+"""Lines that a terminal shows of one setting, and of several: about two screens with what stands below."""
+_HEAD = 4
+"""Lines of a table besides its rows and the blank one after each error scale."""
 _WIDE_ENOUGH = 100
 """Letters of a screen with room for failures, and for verdicts spelt out."""
 _LEGEND = (
@@ -69,22 +71,23 @@ def summary_tables(listed: Sequence[Mapping[str, Any]], totals: Sequence[Table],
         tables[-1] = replace(
             tables[-1], notes=overview_notes({row["noise"] for row in rows}, narrow=width < _WIDE_ENOUGH)
         )
-    further = len(rows) - sum(map(len, kept.values()))
-    left_out = f"{further} of {len(rows)} rows are left out here; summary.csv and report.html have all."
+    further, hidden = len(rows) - sum(map(len, kept.values())), len(settings) - len(kept)
+    whole = f", {hidden} of {len(settings)} settings whole" if hidden else ""
+    left_out = f"{further} of {len(rows)} rows are left out here{whole}; summary.csv and report.html have all."
     return [*totals, *tables, *([left_out] if further else [])] or ["no trial is stored yet"]
 
 
 def _shortened(settings: Mapping[str, Sequence[Any]]) -> dict[str, list[Any]]:
     """Returns the rows of each setting, in order, until the screen is full; of one that does not fit, those of error
     scales evenly between both ends."""
-    room, kept = _MOST_ROWS, {}
+    room, kept = _MOST_LINES[len(settings) > 1], {}
     for title, rows in settings.items():
         scales = list(dict.fromkeys(row["error_scale"] for row in rows))
-        count = max(1, room * len(scales) // len(rows)) if room > 0 else 0
+        count = max(not kept, int((room - _HEAD) / (len(rows) / len(scales) + 1)))
         if count < len(scales):
             scales = [scales[i * (len(scales) - 1) // max(1, count - 1)] for i in range(count)]
         kept[title] = [row for row in rows if row["error_scale"] in scales]
-        room -= len(kept[title])
+        room -= _HEAD + len(kept[title]) + len(scales)
     return kept
 
 

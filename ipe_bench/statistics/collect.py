@@ -75,6 +75,12 @@ class Collection(Results):
             result.setdefault(tuple(group.columns.values()), []).append(group)
         return result
 
+    @property
+    def settings(self) -> int:
+        """Number of settings of simulated trials: scenarios that differ in more than the error scale."""
+        simulated = [key for key, groups in self.scenarios.items() if groups[0].columns["noise"] != "certified"]
+        return len({key[:-1] for key in simulated})
+
 
 def collect(directories: Sequence[Path | str], keys: Keys[str] | None = None) -> Collection:
     """Finds what is stored under the directories, or the cells with these keys alone.

@@ -68,6 +68,25 @@ def unfolded(lines: list[str]) -> list[str]:
     return found
 
 
+def test_a_report_of_many_settings_takes_two_screens_and_names_what_is_left_out(capsys, tmp_path):
+    store, rng = Synthetic(tmp_path / "many"), np.random.default_rng(0)
+    for sigma in range(1, 9):
+        for scale in (1.0, 3.0, 10.0, 30.0, 100.0):
+            for label in SHORT[:2]:
+                store.add(store.scenario(error_scale=scale, sigma=0.1 * sigma), label, rng.normal(size=(30, 3)))
+    store.record(30)
+    assert main(["report", str(store.directory)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) <= 60
+    shown, titles = sum(rows(lines, name) for name in SHORT[:2]), sum("30 trials per row" in line for line in lines)
+    left_out = f"{80 - shown} of 80 rows are left out here, {8 - titles} of 8 settings whole; summary.csv and"
+    assert any(line.startswith(left_out) for line in lines)
+    drawn = set((store.directory / "figures").glob("headline_*.png"))
+    without = f"{8 - len(drawn)} further settings are in the tables; figures=all draws 6 of the 8"
+    assert any(line.startswith("Figures") and without in line for line in lines)
+    assert without in (store.directory / "report.html").read_text(encoding="utf-8")
+
+
 def test_a_report_names_every_estimator_of_every_scenario(screen, folders, tmp_path):
     lines = screen("report", folders[0], f"output={tmp_path / 'out'}")
     for name in SHORT:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -40,7 +41,7 @@ def draw_all(
     """
     drawn: list[Drawn] = []
     old = json.loads((folder / INDEX).read_text(encoding="utf-8")) if (folder / INDEX).exists() else []
-    with house_style():
+    with nullcontext() if which == "none" else house_style():  # which takes a second to load
         for drawing in drawings(analysis, which):
             make_folder(folder)
             drawn.append(drawing.drawn(folder, formats))
@@ -57,7 +58,7 @@ def drawings(analysis: Analysis, which: Which = "all") -> Iterator[Drawing]:
     """Yields the figures of every setting, or of all of them together, ours first."""
     if which == "none" or not analysis.collection.groups:
         return
-    parts, whole = views(analysis)
+    parts, whole = views(analysis, which)
     taken: set[str] = set()
     for figure in (figure for name in FIGURES for figure in import_module(f"{__name__}.{name}").FIGURES):
         for drawing in _drawn_by(figure, parts, whole, which):

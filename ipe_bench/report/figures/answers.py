@@ -152,16 +152,8 @@ def draw_bounds(now: Observability, after: Observability | None, choice: str) ->
     known = np.isfinite(now.bound)
     if after is not None:
         ax.hlines(y[known], now.bound[known], after.bound[known], color=BOUND_COLOR, linewidth=1.0, zorder=1)
-    ax.plot(
-        now.bound[known],
-        y[known],
-        "o",
-        color=BOUND_COLOR,
-        markerfacecolor="white",
-        markersize=8,
-        markeredgewidth=1.0,
-        label="today",
-    )
+    hollow: Any = {"markerfacecolor": "white", "markersize": 8, "markeredgewidth": 1.0}
+    ax.plot(now.bound[known], y[known], "o", color=BOUND_COLOR, label="today", **hollow)
     if after is not None:
         ax.plot(after.bound, y, "o", color=FAMILIES["IPE"][0], label=choice)
     ax.set_xscale("log")

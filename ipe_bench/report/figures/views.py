@@ -12,7 +12,7 @@ import pandas as pd
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.report.figures.drawing import Drawing
-from ipe_bench.report.style import FACES, MOST_FACES, Look, looks
+from ipe_bench.report.style import FACES, MOST_FACES, Look, Which, drawn_settings, looks
 from ipe_bench.report.words import value_text
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.statistic import ALL
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
     from ipe_bench.statistics.collect import Collection, Group
 
-MOST_SETTINGS = 6
-"""Settings that have figures of their own; the tables have all."""
 MOST_LETTERS = 70
 """Largest length of a setting in a file name; longer ones are cut and end in a number."""
 FRAMES = tuple(field.name for field in fields(Analysis) if field.type == "pd.DataFrame")
@@ -113,8 +111,8 @@ class Figure:
     """Belongs to the few figures that are drawn by default."""
 
 
-def views(analysis: Analysis) -> tuple[list[View], View]:
-    """Returns at most `MOST_SETTINGS` settings of simulated trials, and all of them together with every estimator."""
+def views(analysis: Analysis, which: Which = "all") -> tuple[list[View], View]:
+    """Returns the settings of simulated trials that are drawn, and all settings together with every estimator."""
     every, collection, analysis = _looks(analysis), analysis.collection, analysis.simulated
     look, columns = _looks(analysis), analysis.setting_columns
     equations = {g.estimator: g.footer.get("equation") for g in analysis.collection.groups}
@@ -123,8 +121,8 @@ def views(analysis: Analysis) -> tuple[list[View], View]:
     footers = {tuple(_word(g.columns.get(c)) for c in columns): g.footer for g in analysis.collection.groups}
     settings = [dict(zip(columns, key, strict=True)) for key in split["scores"]]
     varying = [c for c in columns if len({setting[c] for setting in settings}) > 1]
-    parts: list[View] = []
-    for setting in settings[:MOST_SETTINGS]:
+    parts, (most, left_out) = list[View](), drawn_settings(len(settings), which)
+    for setting in settings[:most]:
         key = tuple(setting.values())
         frames = {name: split[name].get(key, frame.iloc[:0]) for name, frame in whole.items()}
         seen = {label: one for label, one in look.items() if label in set(frames["scores"]["estimator"])}
@@ -132,8 +130,8 @@ def views(analysis: Analysis) -> tuple[list[View], View]:
         own = {c: setting[c] for c in varying if setting[c] != "-"}
         head = [setting[c] for c in ("measurement", "noise") if setting.get(c, "-") != "-"]
         label = ", ".join([*head, *(f"{c}={v}" for c, v in own.items() if c not in ("measurement", "noise"))])
-        if len(parts) + 1 == MOST_SETTINGS < len(settings):
-            label += f" ({len(settings) - MOST_SETTINGS} further settings are in the tables)"
+        if left_out and len(parts) + 1 == most:
+            label += f" ({left_out})"
         suffix = re.sub(r"[^A-Za-z0-9.]+", "-", "_".join(own.values())).strip("-.")
         if varying and (len(suffix) > MOST_LETTERS or f"_{suffix}" in ("_", *(part.suffix for part in parts))):
             suffix = f"{suffix[:MOST_LETTERS]}-{len(parts) + 1}"
