@@ -126,7 +126,8 @@ class Answer(Shown):
         if not self.passes:
             return [f"No answer that passes: {others or 'a better minimum was found'}."]
         labels = enumerate_few([one.label for one in passing])
-        found = [f"Passing every test: {labels}{f'; no answer: {others}' if others else ''}."]
+        tests = "every test" if passing[0].fits else "what tests there are, none of the size of the residuals"
+        found = [f"Passing {tests}: {labels}{f'; no answer: {others}' if others else ''}."]
         one, told = passing[0], self.examination
         parameters = zip(one.model.physical_parameters, one.x, one.standard_errors, strict=True)
         values = [f"{p.name} = {with_error(x, s)} {p.unit}".rstrip() for p, x, s in parameters]
@@ -332,7 +333,7 @@ def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator
     if found.bent.any():
         rows = zip(names, *found.profiles, found.x, strict=True)
         ends = [f"{name} {_interval(low, high, x)}" for name, low, high, x in compress(rows, found.bent)]
-        yield f"Profiles that are not parabolic: trust their intervals of {CONFIDENCE:.0%}, {enumerate_few(ends, 3)}."
+        yield f"The fit is curved: trust the {100 * CONFIDENCE:.0f} % intervals of profiles, {enumerate_few(ends, 3)}."
     if unlimited := list(compress(names, np.any(np.isinf(found.profiles), axis=0))):
         yield f"The readings set no limit to one side of {', '.join(unlimited)}."
     if lost := list(compress(names, np.any(np.isnan(found.profiles), axis=0))):

@@ -14,7 +14,7 @@ import pandas as pd
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.identifiability import structure
 from ipe_bench.report.table import Cell, Column, Part, Shown, Strong, Table, texts, words
-from ipe_bench.report.words import compact, duration, enumerate_few, p_value, percent, scientific, value_text
+from ipe_bench.report.words import compact, duration, enumerate_few, p_value, percent, scientific, short, value_text
 from ipe_bench.report.writer import write_files
 from ipe_bench.statistics.audit import Audit
 from ipe_bench.statistics.between import NOT_SETTINGS, comparison_title
@@ -35,7 +35,7 @@ HONEST = 0.1
 SAME_LAW = 0.05
 """Energy distance up to which draws may come from one law: of Gaussians in few dimensions, some tenths of a nat."""
 _MOST_SUSPECTS = 12
-_TITLES = {"error": "mean length", "honesty": "mean NEES", "cost": "mean cost", "time": "median time"}
+_TITLES = {"error": "mean error", "honesty": "mean NEES", "cost": "mean cost", "time": "median time"}
 """Names of a comparison's quantities, where the table of a run has other statistics of error and cost."""
 _LEAST_P, _MOST_EVIDENCE = 1e-6, 1000
 _WORTH = 0.005
@@ -102,15 +102,15 @@ def _parameters(name: str, design: Design) -> Table:
         words("parameter", [p.name for p in parameters]),
         words("unit", [p.unit for p in parameters]),
         texts("bound", [scientific(bound * p.size) for p, bound in zip(parameters, seen.bound, strict=True)]),
-        texts("with the others", [f"{r:.2f}" for r in seen.multiple_correlation]),
+        texts("correlation with all others", [f"{r:.2f}" for r in seen.multiple_correlation]),
     ]
     if len(parameters) > 1:
         most = np.argmax(np.abs(others), axis=1)
-        columns.append(words("most", [f"{parameters[j].name} {others[i, j]:+.2f}" for i, j in enumerate(most)]))
+        columns.append(words("strongest", [f"{parameters[j].name} {others[i, j]:+.2f}" for i, j in enumerate(most)]))
     notes = [
-        "bound is that of the standard deviation, as a root mean square over the prior. with the others is the"
-        " multiple correlation of its error; most is the parameter with the largest correlation.",
-        f"Singular values of the whitened Jacobian, per parameter's size: {s[0]:.3g} to {s[-1]:.3g}.",
+        "bound is that of the standard deviation, as a root mean square over the prior. The correlation with all others"
+        " is the multiple correlation of its error; strongest is that with a single one.",
+        f"Singular values of the whitened Jacobian, per parameter's size: {short(s[0])} to {short(s[-1])}.",
     ]
     title = f"{name}, {scenario.noise.name}, error scale {scenario.error_scale:g}: what {scenario.measurement.m}"
     return Table("parameters", f"{title} readings say", "", columns, notes=notes)
@@ -122,8 +122,8 @@ def _suspects(design: Design) -> Iterator[Part]:
     shown = design.suspects[:_MOST_SUSPECTS]
     note = (
         f"noticed is the share of trials in which the test of fit at {FIT_LEVEL:g} will report the error. It is hidden"
-        " if it makes a parameter wrong by more than its bound and is noticed in less than half. looks like names the"
-        " parameters that imitate it."
+        " if it makes a parameter wrong by more than its bound and is noticed in less than half. The readings"
+        " hardly change along the unseen direction."
     )
     columns = [
         words("error", [s.name for s in shown]),
@@ -132,7 +132,7 @@ def _suspects(design: Design) -> Iterator[Part]:
         texts("bounds", [f"{s.bounds:.3g}" for s in shown]),
         texts("noticed", [percent(s.noticed) for s in shown]),
         words("hidden", ["yes" if s.hidden else "" for s in shown]),
-        words("looks like", [s.words for s in shown]),
+        words("unseen direction", [s.words if s.words != s.name else "" for s in shown]),
     ]
     yield Table("suspects", "Errors that the model leaves out", "", columns, notes=[note])
     yield from map(Strong, _unseen(design))
@@ -141,7 +141,7 @@ def _suspects(design: Design) -> Iterator[Part]:
 def _unseen(design: Design) -> Iterator[str]:
     if unseen := [s for s in design.suspects if s.hidden and s.noticed < _UNSEEN]:
         yield (
-            f"No test of residuals will detect {enumerate_few([s.name for s in unseen])}: the parameters imitate it."
+            f"No test of residuals will detect {enumerate_few([s.name for s in unseen])}, which parameters imitate."
             f" {unseen[0].parameter} will be wrong by {unseen[0].bounds:.3g} bounds where {unseen[0].name} is"
             f" {unseen[0].deviation:.3g} {unseen[0].unit}."
         )
@@ -156,7 +156,7 @@ def _ways(design: Design) -> Iterator[Part]:
     columns = [
         words("chosen", [way.title for way in design.ways]),
         texts("fewest readings", [f"{way.saving.readings if way.saving else today}" for way in design.ways]),
-        texts("bound", [f"{way.saving.mean_bound:.3f}" if way.saving else "1" for way in design.ways]),
+        texts("bound", [f"{way.saving.mean_bound:.3f}" if way.saving else "1.000" for way in design.ways]),
         texts("at most", [f"{way.sharpest.readings}" for way in design.ways]),
         texts("smallest bound", [f"{way.sharpest.mean_bound:.3f}" for way in design.ways]),
     ]
@@ -213,7 +213,7 @@ def posterior_parts(name: str, found: Sequence[Reference]) -> list[Table]:
         words("status", [Status(int(one.estimates[label].status[0])).label for one, label, _ in rows]),
         words("honest", [honest_word(d, one.posterior) for one, _, d in rows]),
     ]
-    numbers = {"kl": "diverg.", "shift": "shift", "width": "width", "energy": "energy"}
+    numbers = {"kl": "divergence", "shift": "shift", "width": "width", "energy": "energy"}
     columns += [texts(title, [compact(getattr(d, key)) for *_, d in rows]) for key, title in numbers.items()]
     title = f"{name}: estimators beside the posterior"
     return [Table("posterior", title, "", columns, notes=list(_notes(found)), grouped=3)]
@@ -221,7 +221,7 @@ def posterior_parts(name: str, found: Sequence[Reference]) -> list[Table]:
 
 def _notes(found: Sequence[Reference]) -> Iterator[str]:
     yield (
-        "diverg. is the divergence of the estimator's Gaussian from the moments of the posterior, in nats; noise is"
+        "divergence is that of the estimator's Gaussian from the moments of the posterior, in nats; noise is"
         " the same between two populations of particles, so a divergence below it is chance. shift is that of the"
         " mean, in standard deviations of the posterior per root of the number of parameters. width is the geometric"
         " mean of the standard deviations over those of the posterior. energy is the distance between draws. An"
@@ -267,10 +267,10 @@ def _honest_sentences(found: Sequence[Reference]) -> list[str]:
     for one in found:
         for label, d in one.divergences.items():
             counts[label] += honest_word(d, one.posterior) == "yes"
-    listed = enumerate_few([f"{label} in {count}" for label, count in counts.items()], 12)
+    listed = enumerate_few([f"{label} in {count} of {len(found)}" for label, count in counts.items()], 12)
     unsettled = sum(not one.posterior.settled for one in found)
     more = [f"In {unsettled} the posterior itself cannot be relied on; give more --particles."] if unsettled else []
-    return [f"Of {len(found)} trials, an estimator's Gaussian can stand for the posterior: {listed}.", *more]
+    return [f"Trials in which an estimator's Gaussian can stand for the posterior: {listed}.", *more]
 
 
 # Comparison ----------------------------------------------------------------------------------------------------------
@@ -288,8 +288,8 @@ class Comparison(Shown, pd.DataFrame):
             needed = [_needed(row) for row in rows if row.get("power", math.nan) > 0]
             yield Table("comparison", title, "", columns, notes=needed)
         yield (
-            "length is that of the error in standard deviations of the bound (Mahalanobis), where a trial counts as at"
-            " most the radius of the gate of success; cost counts simulations. Both are means over the common trials,"
+            "error is its length in standard deviations of the bound (Mahalanobis), where a trial counts as at most"
+            " the radius of the gate of success; cost counts simulations. Both are means over the common trials,"
             " where the table of a run has medians, and errors over the bound. p comes from McNemar's exact test for"
             " success and from random signs for the others, with Holm's correction over all tests. e is evidence that"
             " may be looked at repeatedly; e = 20 is as rare as p = 0.05. Each interval is that of its row alone."
@@ -336,7 +336,7 @@ def _finding_sentences(frame: pd.DataFrame) -> Iterator[str]:
     number = judged.groupby("quantity").size().max()
     for word in ("better", "worse"):
         counts = judged[judged["finding"] == word].groupby("quantity", sort=False).size()
-        listed = ", ".join(f"{quantity} ({count} of {number})" for quantity, count in counts.items())
+        listed = ", ".join(f"{quantity} ({count} of {number} comparisons)" for quantity, count in counts.items())
         than = f"{who[1]} is {word} than {who[0]}" if all(who) else f"The second is {word}"
         yield f"{than} in {listed or 'no tested quantity'}."
 
@@ -396,8 +396,8 @@ class AuditAnswer(Shown, Audit):
         columns = [
             words("parameter", names),
             texts("true over reported", [f"{f.value:.2f}" for f in self.each]),
-            texts("97.5 %", [f"{f.low:.2f} to {f.high:.2f}" for f in self.each]),
-            words("deviation", [f.verdict for f in self.each]),
+            texts("97.5 % interval", [f"{f.low:.2f} to {f.high:.2f}" for f in self.each]),
+            words("reported", [f.verdict for f in self.each]),
             texts("bias", [f"{value:+.2f}" for value in self.bias[:, 0]]),
             texts("95 % of bias", [f"{low:+.2f} to {high:+.2f}" for low, high in self.bias[:, 1:]]),
         ]
@@ -406,8 +406,8 @@ class AuditAnswer(Shown, Audit):
             "true over reported is the root mean square of errors in reported standard deviations, 1 if the report is"
             " right; bias is their mean. Intervals hold for all parameters together, and for heavy tails."
         ]
-        if not self.claims.joint:
-            notes.append("No covariances are reported, so directions are not judged.")
+        joint = "The first sentence is of all parameters together, by the whole covariance."
+        notes.append(joint if self.claims.joint else "No covariances are reported, so directions are not judged.")
         title = f"Audit of {runs} runs" + (f", {left_out} rows without an estimate left out" if left_out else "")
         return [*self.sentences, Table("audit", title, "", columns, notes=notes)]
 

@@ -266,5 +266,5 @@ def _published(rows: pd.DataFrame, collection: Collection) -> Table:
 
 
 def _lre(rows: pd.DataFrame, prefix: str) -> list[Column]:
-    titles = {"parameters": "digits", "deviations": "of deviations", "rss": "of residuals"}
+    titles = {"parameters": "digits of parameters", "deviations": "of deviations", "rss": "of residuals"}
     return [column(title, rows[f"{prefix}lre_{name}"], lambda v: f"{v:.2f}") for name, title in titles.items()]

@@ -14,7 +14,7 @@ from ipe_bench.basics.files import write_text
 from ipe_bench.real.tracks import SEARCHES, Log, LogTracks, far_below
 from ipe_bench.report.answer import as_json, read_from, with_error
 from ipe_bench.report.table import Part, Shown, Strong, Table, interval, texts, words
-from ipe_bench.report.words import p_value, short
+from ipe_bench.report.words import enumerate_few, p_value, short
 from ipe_bench.report.writer import write_files
 
 if TYPE_CHECKING:
@@ -67,18 +67,20 @@ class LogAnswer(Shown):
             texts("white p", [p_value(one.white_p) for one in found]),
             texts("log likelihood", [f"{one.log_likelihood:.2f}".replace("nan", "-") for one in found]),
         ]
-        if np.isfinite([one.effective for one in found]).any():
-            columns.append(texts("effective particles", [short(one.effective) for one in found]))
         note = (
             "Innovations are readings less their predictions, in predicted standard deviations, and NIS / m is"
             " their mean square. A smoother has none: it is judged by the cost of its path, and one behind a filter"
             " by the NIS of that filter. If the model is right both are chi-square with a degree per reading, and"
             " fit p is the probability of larger ones. Innovations are white if the filter is right (Ljung and Box)."
             " A track is lost from the epoch from which most of them are larger than all but one in a million by"
-            " chance. Those of particles are by the mean and covariance of the readings that they predict; effective"
-            " particles: 1 / sum of squared weights, the median of all epochs; collapsed: below 2. A dash: the"
-            " tracker has neither innovations nor a cost."
+            " chance. A dash: the tracker has none of it."
         )
+        if np.isfinite([one.effective for one in found]).any():
+            columns.append(texts("effective particles", [short(one.effective) for one in found]))
+            note += (
+                " Innovations of particles are by the mean and covariance of the readings that they predict; effective"
+                " particles: 1 / sum of squared weights, the median of all epochs; collapsed: below 2."
+            )
         if any(one.constants for one in found):
             note += (
                 f" Constants are those of the largest likelihood that {SEARCHES} searches found. Since they were"
@@ -113,8 +115,10 @@ def write_tracks(folder: Path, answer: LogAnswer, command: Any, provenance: Mapp
     content = {"schema": SCHEMA, "command": command, "trackers": trackers, **provenance}
     write_text(folder / f"{NAME}.json", json.dumps(content, indent=1) + "\n")
     facts = [f"{int(np.isfinite(log.z).sum())} readings at {log.model.epochs} epochs"]
-    verdicts = [f"{one.label} {one.verdict}" for one in answer if one.verdict != "-"]
-    said = [f"By their innovations: {', '.join(verdicts)}."] if verdicts else []
+    verdicts = dict.fromkeys(one.verdict for one in answer if one.verdict != "-")
+    found = {word: enumerate_few([one.label for one in answer if one.verdict == word]) for word in verdicts}
+    listed = "; ".join(f"{who} {word}" for word, who in found.items())
+    said = [f"Judged by innovations or the cost of a path: {listed}."] if found else []
     told = {"facts": facts, "sources": read_from(provenance)}
     files = write_files(
         folder, NAME, (TABLE, answer.table()), f"{log.model.name}: tracks", said, answer.parts(), **told

@@ -176,7 +176,7 @@ def test_scales_are_labelled_as_far_as_there_is_room_with_both_ends():
         assert all(np.log10(b / a) > letter * (len(f"{a:g}") + len(f"{b:g}")) / 2 for a, b in pairwise(kept))
     assert kept == scales
     assert common.labelled([33.0], 1.0) == [33.0]
-    shown = {0.0: "0", 1e-3: "10⁻³", -0.05: "−0.05", 200.0: "200", 1e3: "10³", 1e4: "10⁴", 5e-7: "5·10⁻⁷"}
+    shown = {0.0: "0", 1e-3: "0.001", -0.05: "−0.05", 200.0: "200", 1e3: "1000", 1e4: "10⁴", 5e-7: "5·10⁻⁷"}
     shown[1e-12] = "10⁻¹²"
     assert [common.number(v) for v in shown] == list(shown.values())
 

@@ -68,7 +68,7 @@ def draw_fit(found: Examination, z: Array) -> Iterator[Drawing]:
     q = half_width(CONFIDENCE, None if found.freedom is None else float(np.min(found.freedom)))
     look = looks([found.label])
     fig, (ax,) = common.panels(1, height=3.2)
-    fig.set_figwidth(7.0)
+    fig.set_figwidth(5.2)
     band = f"{100 * CONFIDENCE:.0f} % band of the curve"
     ax.fill_between(at, h - q * error, h + q * error, color=look[found.label].color, alpha=0.2, linewidth=0, label=band)
     ax.plot(at, h, color=look[found.label].color, label=common.text(found.label))
@@ -76,7 +76,7 @@ def draw_fit(found: Examination, z: Array) -> Iterator[Drawing]:
     unit = f" [{model.reading_unit}]" if model.reading_unit else ""
     ax.set(xlabel=common.text(name), ylabel=common.text(f"{model.reading_name}{unit}"))
     common.legend(fig, [ax])
-    caption = "The band holds the curve at any one point, to first order: its variance there is J P J'."
+    caption = "At any one point the band holds the curve, to first order in the parameters' errors."
     yield Drawing("fit", "Readings and fitted curve", caption, fig)
 
 
@@ -99,7 +99,6 @@ def draw_residuals(model: Measurement, fits: Sequence[Fit]) -> Iterator[Drawing]
     shown = groups[:MOST_ESTIMATORS]
     look, limit = looks([one.label for one in fits]), shown[0][0].outlier_limit
     fig, axes = common.panels(len(shown), height=2.6)
-    fig.set_figwidth(max(fig.get_figwidth(), 7.0))
     for group, ax in zip(shown, axes, strict=True):
         one = group[0]
         r, out = one.normalised, one.outliers

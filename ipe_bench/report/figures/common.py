@@ -118,8 +118,8 @@ def axis_labels(fig: Figure, x: str, y: str) -> None:
 
 
 def number(value: float) -> str:
-    """Formats a number of an axis: 0.05, 200, 10³ or 5·10⁻⁷, with a typographic minus."""
-    digits, _, exponent = (f"{value:g}" if 0.01 <= abs(value) < 1e3 or value == 0 else f"{value:e}").partition("e")
+    """Formats a number of an axis: 0.005, 2000, 10⁴ or 5·10⁻⁷, with a typographic minus."""
+    digits, _, exponent = (f"{value:g}" if 0.001 <= abs(value) < 1e4 or value == 0 else f"{value:e}").partition("e")
     words = f"{float(digits):g}·10{str(int(exponent)).translate(_RAISED)}" if exponent else digits
     return words.removeprefix("1·").replace("-", "\N{MINUS SIGN}")
 
