@@ -76,6 +76,10 @@ class Log:
             raise UserError(
                 f"readings: has shape {z.shape}, where {shape} belongs: epochs and readings of {model.name}"
             )
+        if np.isinf(z).any():
+            raise UserError("readings: inf is not a reading; give NaN if it is missing")
+        if np.isnan(z).all():
+            raise UserError("readings: there is no reading; all are missing")
         return cls(model, z)
 
 

@@ -148,6 +148,12 @@ def test_the_times_of_a_log_are_those_of_its_epochs(tmp_path):
         ib.estimate(model, tmp_path / "ms.csv", {"ekf": ekf()})
 
 
+@pytest.mark.parametrize(("z", "said"), [(np.inf, "inf is not a reading"), (np.nan, "there is no reading")])
+def test_an_array_without_readings_is_refused(z, said):
+    with pytest.raises(ib.UserError, match=f"readings: {said}"):
+        ib.estimate(replace(DRIVEN, inputs={}, next={"x": "x + w"}, count=3), np.full((3, 1), z), {"ekf": ekf()})
+
+
 def test_a_first_reading_at_the_time_of_the_prior_gives_the_closed_form(tmp_path):
     """x grows by t and w at each step: the mean and covariance of all readings at once."""
     model = replace(DRIVEN, next={"x": "x + t + k*w"}, inputs={}, count=6, step=0.5, moved_first=False)
