@@ -111,9 +111,8 @@ def all_tables(analysis: Analysis, whole: Analysis | None = None) -> list[Table]
 def head(analysis: Analysis, rows: pd.DataFrame) -> list[Column]:
     """Returns the columns that tell rows apart: those settings that differ, of many in one column, and the scale."""
     varying = _varying(analysis.setting_columns, rows)
-    told = [words(c, [value_text(v) for v in rows[c]]) for c in varying]
-    if len(varying) > MOST_SETTINGS:
-        told = [words("setting", differing(rows, varying))]
+    each = [words(c, [value_text(v) for v in rows[c]]) for c in varying]
+    told = each if len(each) <= MOST_SETTINGS else [words("setting", differing(rows, varying))]
     return [*told, column("error scale", rows["error_scale"], lambda v: f"{v:g}")]
 
 
@@ -151,9 +150,8 @@ def overview(analysis: Analysis) -> Table:
     told: Any = rows.to_dict("records")
     columns = [*first, *overview_columns(told, leading(told, [*analysis.setting_columns, "error_scale"]))]
     columns += statistics("overview", told)
-    notes = [*overview_notes(rows["noise"].tolist())]
-    if first[0].title == "setting":
-        notes.insert(0, "setting: what differs from the values that most rows have.")
+    setting = ("setting: what differs from the values that most rows have.",) * (first[0].title == "setting")
+    notes = (*setting, *overview_notes(rows["noise"].tolist()))
     return Table("overview", "Overview", "", columns, rows, notes=notes, grouped=len(first), whole="summary.csv")
 
 

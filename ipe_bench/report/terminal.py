@@ -128,9 +128,6 @@ def overview_columns(rows: Sequence[Mapping[str, Any]], best: Sequence[bool], *,
         # Where half of the trials are capped, it is a limit and no value.
         return f"{'<' * (row['error_median'] > CAP)}{row['efficiency_capped']:.2f}"
 
-    def nees(row: Mapping[str, Any]) -> str:
-        return f"{brief(row['nees_median'])} {verdict(row) * narrow}".strip()
-
     def verdict(row: Mapping[str, Any]) -> str:
         return _VERDICTS.get(row["verdict"], (row["verdict"], "?"))[narrow]
 
@@ -144,7 +141,7 @@ def overview_columns(rows: Sequence[Mapping[str, Any]], best: Sequence[bool], *,
         *([] if narrow else [cells("failed", "failed_silent", failed)]),
         cells("error", "error_median", lambda r: f"{brief(r['error_median'])}{slash}{brief(r['error_q95'])}"),
         cells("eff." if narrow else "efficiency", "efficiency_capped", efficiency),
-        cells("NEES", "nees_median", nees),
+        cells("NEES", "nees_median", lambda r: f"{brief(r['nees_median'])} {verdict(r) * narrow}".strip()),
         *([] if narrow else [words("verdict", map(verdict, rows))]),
         cells("median cost", "simulations_median", lambda r: brief(r["simulations_median"])),
         cells("median time", "time_median_s", lambda r: duration(r["time_median_s"], 2)),

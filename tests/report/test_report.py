@@ -64,7 +64,7 @@ def test_what_is_written_is_whole_and_the_page_stands_alone(result):
     led_to = set(re.findall(r"""href\s*=\s*["'](?!data:|#)([^"']*)""", page))
     assert led_to == {f"figures/{path.name}" for path in result.figures}
     assert "http" not in re.sub(r"base64,[^\"]*|http-equiv", "", page)
-    analysis, shown = analyse([result.report.parent]), page.replace("&#39;", "'")
+    analysis, shown = analyse([result.report.parent]), page.replace("&#39;", "'").replace("\u00a0", " ")
     *sentences, limits = headline(analysis)
     assert all(sentence in shown for sentence in (*sentences, *about(analysis)))
     assert f'id="table-{limits.name}"' in shown
