@@ -153,6 +153,8 @@ def with_error(value: float, error: float) -> str:
     """Returns a value with its standard error: two figures of the error, the value to the same place, one exponent."""
     if not (math.isfinite(value) and math.isfinite(error) and error > 0):
         return _number(value, 6)
+    if error < 1e-14 * abs(value):
+        return f"{_number(value, 15)} ± {error:.2g}"
     # 0.0999 rounds to 0.10.
     return _together((value, error), " ± ", math.floor(math.log10(float(f"{error:.1e}"))) - 1)
 

@@ -357,8 +357,8 @@ def _comparisons(frame: pd.DataFrame) -> Iterator[tuple[str, list[dict[str, Any]
         rows = list(part)
         first = rows[0]
         who = first["first"] if first["first"] == first["second"] else f"{first['first']}, then {first['second']}"
-        how = "trials" if first["matched_by"] == "trial" else "trials of other seeds, matched in their order"
-        yield f"{comparison_title(first)}: {who}; {first['trials']} {how}", rows
+        how = "" if first["matched_by"] == "trial" else " of other seeds, matched in their order"
+        yield f"{comparison_title(first)}: {who}; {first['trials']} trial{'s' * (first['trials'] != 1)}{how}", rows
 
 
 def _cells(row: dict[str, Any]) -> tuple[str, ...]:
@@ -372,7 +372,8 @@ def _cells(row: dict[str, Any]) -> tuple[str, ...]:
         change, ends = _ratio(row["change"]), f"{_ratio(row['low'])} to {_ratio(row['high'])}"
     p, e = row["p"], row["e"]
     return (
-        *(_TITLES.get(quantity, quantity), show(row["first_value"]), show(row["second_value"]), change),
+        *(_TITLES.get(quantity, quantity), show(row["first_value"]), show(row["second_value"])),
+        change if math.isfinite(row["change"]) else "-",
         ends if math.isfinite(row["low"]) else "-",
         (p_value(p) if p >= _LEAST_P else f"<{_LEAST_P:g}") if math.isfinite(p) else "",
         (compact(e) if e <= _MOST_EVIDENCE else f">{_MOST_EVIDENCE}") if math.isfinite(e) else "",

@@ -246,6 +246,14 @@ def test_honesty_and_bias_are_those_of_the_definition(tmp_path):
     assert rows.loc["bias of a", ["change", "p"]].tolist() == [0.0, 1.0]
 
 
+def test_what_no_common_trial_shows_is_a_dash(tmp_path, capsys):
+    a, b = store(tmp_path / "a", trials=1), store(tmp_path / "b", trials=1, fails=1)
+    main(["compare", str(a), str(b), "fail_on=bias"])
+    said = capsys.readouterr().out
+    assert "1 trial\n" in said
+    assert "nan" not in said
+
+
 def test_only_what_is_asked_for_is_tested_and_changes_a_p(tmp_path):
     """Four failures of one alone: McNemar's p of 1/8, multiplied by the number of questions; three without fail_on."""
     a, b = store(tmp_path / "a"), store(tmp_path / "b", fails=4)

@@ -84,6 +84,7 @@ def test_rounded_readings_are_held_to_the_law_of_rounding():
         (1.0, 0.0999, "1.00 ± 0.10"),
         (3.5, float("nan"), "3.5"),
         (float("nan"), 1.0, "-"),
+        (2.5e198, 3.1e180, "2.5e+198 ± 3.1e+180"),
     ],
 )
 def test_a_value_is_shown_to_two_figures_of_its_error(value, error, expected):
