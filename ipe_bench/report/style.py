@@ -39,6 +39,8 @@ DASHES: tuple[Any, ...] = ((1, 1.5), (5, 2, 1, 2), (8, 2, 1, 2, 1, 2), (3, 1, 1,
 REFERENCE = "linear_lse"
 """Label of the reference estimator: black and crossed in every figure."""
 BOUND_COLOR, BOUND_DASH = "#444444", (0, (2, 2))
+MOST_TOGETHER = 7
+"""Coloured curves, the reference estimator's aside, that are told apart in one panel."""
 MOST_FACES = 10
 """Estimators up to which each has a colour; of more, those with a face have, and the others are grey."""
 DARK, LIGHT = "#15181c", "#e4e7ea"

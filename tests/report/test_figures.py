@@ -278,6 +278,26 @@ def test_an_estimator_is_in_the_colours_of_its_family_and_of_many_the_best_are_i
     assert [t.get_text() for t in legend.get_texts()][:5] == [*(e for e in view.look if e in colored), "8 others"]
 
 
+def test_more_than_seven_in_colour_have_a_row_of_panels_for_each_family_with_the_others_in_grey(synthetic):
+    fill(synthetic, labels=(REFERENCE, *(f"iterated{i}" for i in range(4))))
+    error = 0.1 * np.random.default_rng(0).normal(size=(60, 3))
+    for i in range(4):
+        (drawing,) = [d for name, d in drawn(errors, only_view(synthetic)).items() if name == "headline"]
+        assert len(drawing.figure.axes) == 3
+        for scale in SCALES:
+            synthetic.add(synthetic.scenario(error_scale=scale), f"filter{i}", error, estimator=Filter())
+    view = only_view(synthetic)
+    drawing = drawn(errors, view)["headline"]
+    axes = drawing.figure.axes
+    assert [ax.get_title() for ax in axes[::3]] == [f"success: {f}" for f in ("filters", "IPE")]
+    for ax in axes:
+        family = ax.get_title().partition(": ")[2]
+        seen = {line.get_color() for line in ax.lines if len(line.get_xdata()) == len(SCALES)} - {GREY}
+        own = {label for label in view.look if view.families[label] == family}
+        assert seen == {view.look[label].color for label in {REFERENCE, *own}}
+    assert "Grey" in drawing.caption
+
+
 # Distributions and convergence ---------------------------------------------------------------------------------------
 
 

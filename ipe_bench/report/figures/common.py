@@ -26,13 +26,18 @@ _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def panels(
-    count: int, look: Mapping[str, Look] | None = None, *, height: float = 2.7, scales: Sequence[float] = ()
+    count: int,
+    look: Mapping[str, Look] | None = None,
+    *,
+    height: float = 2.7,
+    scales: Sequence[float] = (),
+    row: int = MOST_PANELS,
 ) -> tuple[Figure, list[Axes]]:
-    """Makes a figure with that many panels, and room for the legend of the estimators; if there is one of `scales`
-    their names stand on the vertical axes, and values on the horizontal ones."""
+    """Makes a figure with that many panels, at most `row` side by side, and room for the legend of the estimators; if
+    there is one of `scales` their names stand on the vertical axes, and values on the horizontal ones."""
     from matplotlib.figure import Figure
 
-    down = -(-count // _across())
+    down = -(-count // min(row, _across()))
     across = -(-count // down)
     width = print_width() or min(2.0 + 3.2 * across, 11.0)
     size = width, min(height, 0.85 * width / across) * down + 0.4 + 0.05 * len(look or ())

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from scipy.special import gammainc
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.views import Figure, View
-from ipe_bench.report.style import BOUND_COLOR, BOUND_DASH
+from ipe_bench.report.style import BOUND_COLOR, BOUND_DASH, GREY, MOST_TOGETHER, REFERENCE, Look
 from ipe_bench.report.words import brief, enumerate_few, value_text
 
 CEILING = {"error_median": 100.0, "error_q95": 100.0, "nees_median": 30.0}
@@ -26,26 +27,12 @@ def draw(view: View) -> Iterator[Drawing]:
     totals = view.totals
     if totals.empty:
         return
-    capped = totals[list(CEILING)].clip(upper=pd.Series(CEILING), axis=1)
-    claims = totals[totals["nees_median"].notna()]
-    fig, axes = common.panels(3 if len(claims) else 2, view.look, height=3.3, scales=view.scales)
-    shown = view.look, view.scales
-    words: dict[str, Any] = {"heading": "success", "label": "share of all trials"}
-    common.shares(axes[0])
-    common.curves(axes[0], totals, "success", *shown, interval=("success_low", "success_high"), **words)
-    words = {"heading": f"error over {view.reference}", "label": "median, bar to 95 %", "most": CEILING["error_q95"]}
-    common.decades(axes[1], capped[["error_median", "error_q95"]].clip(lower=0.5), least=4.0)
-    best = f"1: {view.reference}, an honest covariance"
-    common.bound_line(axes[1], 1.0, best)
-    common.curves(axes[1], totals, "error_median", *shown, interval=("error_median", "error_q95"), **words)
-    if len(claims):
-        nees = axes[2]
-        common.decades(nees, np.append(capped["nees_median"].clip(lower=0.5), 1.0), least=4.0)
-        common.bound_line(nees, 1.0, best)
-        limits = claims["nees_median_low"].min(), claims["nees_median_high"].max()
-        common.band(nees, *limits, "95 % limits of the median if honest")
-        words = {"heading": "NEES", "label": "median", "most": CEILING["nees_median"]}
-        common.curves(nees, claims, "nees_median", *shown, **words)
+    claims, rows = totals[totals["nees_median"].notna()], _rows(view)
+    row = 3 if len(claims) else 2
+    height = 3.3 if len(rows) == 1 else 2.6
+    fig, axes = common.panels(row * len(rows), view.look, height=height, scales=view.scales, row=row)
+    for i, (family, look) in enumerate(rows.items()):
+        _row(view, axes[row * i : row * (i + 1)], look, f": {family}" if family else "", claims)
     common.legend(fig, axes, view.look)
     over = "over error scales" if len(view.scales) > 1 else f"at error scale {value_text(view.scales[0])}"
     gate = "keep the track" if view.moving else "lie inside the gate"
@@ -55,7 +42,44 @@ def draw(view: View) -> Iterator[Drawing]:
         f"Success, error and reported covariance {over}",
         f"Trials that {gate}, with 95 % intervals; median error over {view.reference}, bar to 95 %; NEES, the squared"
         " error over the claimed variance.",
+        "Grey: the estimators of the other rows." if len(rows) > 1 else "",
     )
+
+
+def _rows(view: View) -> dict[str, Mapping[str, Look]]:
+    """Returns the looks in each row of panels: a row for all estimators, or for each family of many, with the others
+    but the reference in grey."""
+    shown = [label for label, one in view.look.items() if one.color != GREY and label != REFERENCE]
+    families = dict.fromkeys(view.families[label] for label in shown)
+    if len(view.scales) == 1 or len(shown) <= MOST_TOGETHER or len(families) == 1:
+        return {"": view.look}
+    kept = {family: {REFERENCE, *(e for e in shown if view.families[e] == family)} for family in families}
+    return {
+        family: {e: one if e in own else replace(one, color=GREY) for e, one in view.look.items()}
+        for family, own in kept.items()
+    }
+
+
+def _row(view: View, axes: Sequence[Any], look: Mapping[str, Look], family: str, claims: pd.DataFrame) -> None:
+    """Draws success, error and, if there is a third panel, NEES."""
+    totals, shown = view.totals, (look, view.scales)
+    capped = totals[list(CEILING)].clip(upper=pd.Series(CEILING), axis=1)
+    words: dict[str, Any] = {"heading": f"success{family}", "label": "share of all trials"}
+    common.shares(axes[0])
+    common.curves(axes[0], totals, "success", *shown, interval=("success_low", "success_high"), **words)
+    heading = f"error over {view.reference}{family}"
+    words = {"heading": heading, "label": "median, bar to 95 %", "most": CEILING["error_q95"]}
+    common.decades(axes[1], capped[["error_median", "error_q95"]].clip(lower=0.5), least=4.0)
+    best = f"1: {view.reference}, an honest covariance"
+    common.bound_line(axes[1], 1.0, best)
+    common.curves(axes[1], totals, "error_median", *shown, interval=("error_median", "error_q95"), **words)
+    for nees in axes[2:]:
+        common.decades(nees, np.append(capped["nees_median"].clip(lower=0.5), 1.0), least=4.0)
+        common.bound_line(nees, 1.0, best)
+        limits = claims["nees_median_low"].min(), claims["nees_median_high"].max()
+        common.band(nees, *limits, "95 % limits of the median if honest")
+        words = {"heading": f"NEES{family}", "label": "median", "most": CEILING["nees_median"]}
+        common.curves(nees, claims, "nees_median", *shown, **words)
 
 
 def draw_distributions(view: View) -> Iterator[Drawing]:

@@ -40,6 +40,8 @@ class View:
     """Look of each estimator in these frames, in the order of the legend."""
     equations: Mapping[str, str | None]
     """Equation that each estimator solves; None for filters and direct estimates, which have no iterations."""
+    families: Mapping[str, str]
+    """Family of each estimator, of which smoothers are one."""
     parameters: Sequence[Mapping[str, Any]] = ()
     """Name, unit, size and group of each; empty for all settings."""
     paper: bool = False
@@ -116,6 +118,7 @@ def views(analysis: Analysis, which: Which = "all") -> tuple[list[View], View]:
     every, collection, analysis = _looks(analysis), analysis.collection, analysis.simulated
     look, columns = _looks(analysis), analysis.setting_columns
     equations = {g.estimator: g.footer.get("equation") for g in analysis.collection.groups}
+    families = {g.estimator: _smoothers_apart(g.footer) for g in analysis.collection.groups}
     whole: dict[str, Any] = {name: getattr(analysis, name) for name in FRAMES}
     split = {name: _split(frame, columns) for name, frame in whole.items()}
     footers = {tuple(_word(g.columns.get(c)) for c in columns): g.footer for g in analysis.collection.groups}
@@ -137,8 +140,8 @@ def views(analysis: Analysis, which: Which = "all") -> tuple[list[View], View]:
             suffix = f"{suffix[:MOST_LETTERS]}-{len(parts) + 1}"
         paper = (setting.get("measurement"), setting.get("noise")) == ("gins", "quantization")
         known = footers[key]["parameters"], paper, setting.get("noise") == "model"
-        parts.append(View(f"_{suffix}" * bool(varying), label, frames, seen, {e: equations[e] for e in seen}, *known))
-    return parts, View("", "", whole, every, equations, collection=collection)
+        parts.append(View(f"_{suffix}" * bool(varying), label, frames, seen, equations, families, *known))
+    return parts, View("", "", whole, every, equations, families, collection=collection)
 
 
 def _split(frame: pd.DataFrame, columns: Sequence[str]) -> dict[tuple[str, ...], Any]:
@@ -191,3 +194,8 @@ def family_of(footer: Mapping[str, Any]) -> str:
     """Returns the family of an estimator, one of `FAMILIES`: its declared one, else by its inputs and equation."""
     known = "filters" if footer.get("sequential") else "IPE" if footer.get("equation") == "frozen" else "least squares"
     return footer.get("family") or known
+
+
+def _smoothers_apart(footer: Mapping[str, Any]) -> str:
+    family = family_of(footer)
+    return "smoothers" if footer.get("smooths") and family != "IPE" else family
