@@ -406,6 +406,14 @@ def overlaps(fig) -> list[str]:
     return found
 
 
+def test_the_setting_with_most_failures_is_drawn_first_and_those_alike_keep_their_order(synthetic):
+    error = 0.1 * np.random.default_rng(0).normal(size=(60, 3))
+    for sigma, factor in ((0.1, 1.0), (0.2, 1e3), (0.4, 1.0)):
+        synthetic.add(synthetic.scenario(sigma=sigma), "one", factor * error, estimator=Seeker())
+    parts, _ = views(analyse([synthetic.directory]))
+    assert [float(part.suffix[-3:]) for part in parts] == [0.2, 0.1, 0.4]
+
+
 @pytest.mark.parametrize("width", [3.5, *(pytest.param(wide, marks=pytest.mark.slow) for wide in (None, 7.16))])
 def test_nothing_is_clipped_on_the_page_or_in_print(synthetic, width):
     """Long names of groups and many estimators included, in a column of print too."""

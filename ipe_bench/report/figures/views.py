@@ -114,7 +114,8 @@ class Figure:
 
 
 def views(analysis: Analysis, which: Which = "all") -> tuple[list[View], View]:
-    """Returns the settings of simulated trials that are drawn, and all settings together with every estimator."""
+    """Returns the settings of simulated trials that are drawn, those with most failures first, and all settings
+    together with every estimator."""
     every, collection, analysis = _looks(analysis), analysis.collection, analysis.simulated
     look, columns = _looks(analysis), analysis.setting_columns
     equations = {g.estimator: g.footer.get("equation") for g in analysis.collection.groups}
@@ -125,7 +126,7 @@ def views(analysis: Analysis, which: Which = "all") -> tuple[list[View], View]:
     settings = [dict(zip(columns, key, strict=True)) for key in split["scores"]]
     varying = [c for c in columns if len({setting[c] for setting in settings}) > 1]
     parts, (most, left_out) = list[View](), drawn_settings(len(settings), which)
-    for setting in settings[:most]:
+    for setting in sorted(settings[:most], key=lambda setting: _success(split["summary"][tuple(setting.values())])):
         key = tuple(setting.values())
         frames = {name: split[name].get(key, frame.iloc[:0]) for name, frame in whole.items()}
         seen = {label: one for label, one in look.items() if label in set(frames["scores"]["estimator"])}
@@ -142,6 +143,11 @@ def views(analysis: Analysis, which: Which = "all") -> tuple[list[View], View]:
         known = footers[key]["parameters"], paper, setting.get("noise") == "model"
         parts.append(View(f"_{suffix}" * bool(varying), label, frames, seen, equations, families, *known))
     return parts, View("", "", whole, every, equations, families, collection=collection)
+
+
+def _success(summary: pd.DataFrame) -> float:
+    """Returns the mean rate of success to a tenth, so that settings which are alike keep their order."""
+    return round(summary.loc[summary["parameter"] == ALL, "success"].mean(), 1)
 
 
 def _split(frame: pd.DataFrame, columns: Sequence[str]) -> dict[tuple[str, ...], Any]:
