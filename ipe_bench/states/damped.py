@@ -16,7 +16,7 @@ from ipe_bench.basics.streams import normals, own_generators
 from ipe_bench.states.algebra import root
 from ipe_bench.states.base import Normal, StateModel
 from ipe_bench.states.linearisation import Affine, Taylor, Unscented
-from ipe_bench.states.smoothers import admissible, path_cost, path_p, smoothed, whole
+from ipe_bench.states.smoothers import path_p, settled, smoothed, whole
 from ipe_bench.states.trackers import Tracker, Tracks, filtered, linearised_move, linearised_reading, predict, update
 
 _TRIES, _FACTOR = 15, 10.0
@@ -47,8 +47,8 @@ class _Paths:
     def of(cls, model: StateModel, z: Array, tracks: Tracks) -> _Paths:
         """Those of a smoother's tracks; a path that is not finite costs infinitely much."""
         x, P = whole(tracks)
-        x = admissible(model, x)
-        cost = np.nan_to_num(path_cost(model, z, x[:, 0], x[:, 1:]), nan=np.inf)
+        x, cost = settled(model, z, x)
+        cost = np.nan_to_num(cost, nan=np.inf)
         trials = len(z)
         running, none = np.full(trials, Status.RUNNING, np.int8), np.zeros(trials, np.int64)
         return cls(x, P, cost, np.zeros(trials), running, none, tracks.calls + model.evaluations)
@@ -146,8 +146,7 @@ class LevenbergMarquardtSmoother(Tracker):
                 about = paths.x[rows], scale[rows] / damping[rows, None, None]
                 some = ([Affine(*[part[rows] for part in law]) for law in laws] for laws in (moves, reads))
                 new[damped] = whole(smoothed(model, _passed(model, z[rows], *some, about=about)))[0]
-            new = admissible(model, new)
-            found = path_cost(model, z[todo], new[:, 0], new[:, 1:])
+            new, found = settled(model, z[todo], new)
             calls[todo] += model.evaluations
             lower = found <= cost[todo] * (1 + _ROUND_OFF)
             x[todo[lower]], cost[todo[lower]] = new[lower], found[lower]

@@ -17,8 +17,6 @@ from ipe_bench.states.trackers import Filter, Tracker, Tracks, filtered, misfit
 
 _HALVINGS = 12
 """Halvings of a damped step."""
-_OUTSIDE = 1e-8
-"""Part of a state by which a step may lie outside the range of its process noise."""
 
 
 @dataclass(frozen=True)
@@ -81,8 +79,7 @@ class IteratedSmoother(Tracker):
                 break
         path.calls = calls
         if not (model.gain_by_state or model.R_by_state):
-            x = admissible(model, whole(path)[0])
-            path.cost = path_cost(model, z, x[:, 0], x[:, 1:])
+            path.cost = settled(model, z, whole(path)[0])[1]
             path.calls = calls + model.evaluations
         return path
 
@@ -145,39 +142,28 @@ def _smooth_by_scores(model: StateModel, tracks: Tracks, out: Tracks, rows: Mask
         at.mean[rows], at.covariance[rows] = mean, covariance
 
 
-def path_cost(model: StateModel, z: Array, start: Array, mean: Array) -> Array:
-    """-2 log p(path | readings) (trials,) up to a constant; disturbances count by the pseudo-inverse of the gain.
-    Infinite if the start or a step lies outside the range of its noise, where a path has no density."""
-    total, before = mahalanobis(start - model.prior.mean, model.prior.covariance), start
-    for k in range(model.epochs):
-        if model.moves(k):
-            G, moved = model.gain(k), model.transition(before, k)
-            w = multiply(np.linalg.pinv(G), step := model.nearest_state(mean[:, k], moved) - moved)
-            size = np.abs(mean[:, k]) + np.abs(moved) + np.abs(step).max(axis=-1, keepdims=True)
-            outside = (np.abs(step - multiply(G, w)) > _OUTSIDE * size).any(axis=-1)
-            total = total + np.where(outside, np.inf, np.sum(w**2, axis=-1))
-        total, before = total + misfit(model, z[:, k], mean[:, k, None], k)[0][:, 0], mean[:, k]
-    return total
+def settled(model: StateModel, z: Array, x: Array) -> tuple[Array, Array]:
+    """The path x (trials, 1 + K, n) from before the first transition, each step moved into the range of its noise, with
+    its cost -2 log p(path | readings) (trials,) up to a constant:
 
+    x[k] <- f(x[k-1]) + G w,  w = G^+ (x[k] - f(x[k-1]))
 
-def admissible(model: StateModel, x: Array) -> Array:
-    """The path x (trials, 1 + K, n) from before the first transition, each step moved into the range of its noise:
-
-    x[k] <- f(x[k-1]) + G G^+ (x[k] - f(x[k-1]))
-
-    Without a transition before the first epoch, the states before it are those of that epoch.
+    Without a transition before the first epoch, the states before it are those of that epoch. Infinite if the start
+    lies outside the range of the prior, where a path has no density.
     """
-    gains = {k: model.gain(k) for k in range(model.epochs) if model.moves(k)}
-    if model.moved_first and all(np.linalg.matrix_rank(G) == model.n for G in gains.values()):
-        return x
     x = x.copy()
     if not model.moved_first:
         x[:, 0] = x[:, 1]
-    for k, G in gains.items():
-        moved = model.transition(x[:, k], k)
-        moved = model.nearest_state(moved, x[:, k + 1])
-        x[:, k + 1] = moved + multiply(G @ np.linalg.pinv(G), x[:, k + 1] - moved)
-    return x
+    total = mahalanobis(x[:, 0] - model.prior.mean, model.prior.covariance)
+    for k in range(model.epochs):
+        if model.moves(k):
+            G, moved = model.gain(k), model.nearest_state(model.transition(x[:, k], k), x[:, k + 1])
+            w = multiply(np.linalg.pinv(G), x[:, k + 1] - moved)
+            if np.linalg.matrix_rank(G) < model.n:
+                x[:, k + 1] = moved + multiply(G, w)
+            total = total + np.sum(w**2, axis=-1)
+        total = total + misfit(model, z[:, k], x[:, k + 1, None], k)[0][:, 0]
+    return x, total
 
 
 def whole(tracks: Tracks) -> tuple[Array, Array]:
@@ -195,17 +181,15 @@ def path_p(z: Array, cost: Array) -> Array:
     return chdtrc(np.isfinite(z).sum(axis=(1, 2)), cost)
 
 
-def _halved(
-    old: Array, new: Array, cost: Callable[[Array], Array], steer: Callable[[Array], Array]
-) -> tuple[Array, Array]:
-    """The step from `old` to `new` (trials, ...), steered, and halved in each trial until the cost (trials,) is not
+def _halved(old: Array, new: Array, settle: Callable[[Array], tuple[Array, Array]]) -> tuple[Array, Array]:
+    """The step from `old` to `new` (trials, ...), settled, and halved in each trial until its cost (trials,) is not
     above that of `old`; and how many costs (trials,) that took."""
-    best, share = cost(steer(old)), np.ones((len(old),) + (1,) * (old.ndim - 1))
+    best, share = settle(old)[1], np.ones((len(old),) + (1,) * (old.ndim - 1))
     x, worse, taken = new, np.ones(len(old), dtype=bool), np.ones(len(old))
     for _ in range(_HALVINGS):
         taken += worse
-        x = steer(old + share * (new - old))
-        worse = ~(cost(x) <= best * (1 + 1e-12))
+        x, cost = settle(old + share * (new - old))
+        worse = ~(cost <= best * (1 + 1e-12))
         if not worse.any():
             break
         share[worse] /= 2
@@ -215,7 +199,7 @@ def _halved(
 def _shortened(model: StateModel, z: Array, old: Tracks, new: Tracks) -> Tracks:
     """The step from one path to the next, halved where it raises the path's cost."""
     first, last = whole(old)[0], whole(new)[0]
-    path, costs = _halved(first, last, lambda x: path_cost(model, z, x[:, 0], x[:, 1:]), lambda x: admissible(model, x))
+    path, costs = _halved(first, last, lambda x: settled(model, z, x))
     new.calls = new.calls + costs * model.evaluations
     new.mean, new.start = path[:, 1:], Normal(path[:, 0], new.start.covariance)
     return new

@@ -1,7 +1,7 @@
 """What is booked is what is evaluated: calls of the model, counted from outside, of every estimator and tracker."""
 
 from collections import Counter
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -60,7 +60,17 @@ TRACKERS = registered("tracker") | {
     "ieks, till it stays": IteratedSmoother(Filter(Unscented()), tolerance=1e-3),
     "grid, smoothing": Grid(smooths=True),
 }
-MODELS = {model.name: model for model in (Growth(), CoordinatedTurn(), ConstantVelocity())}
+
+
+@dataclass(frozen=True)
+class Exact(ConstantVelocity):
+    """Its noise reaches one direction of two."""
+
+    def gain(self, k):
+        return super().gain(k)[:, :1]
+
+
+MODELS = {"exact": Exact()} | {model.name: model for model in (Growth(), CoordinatedTurn(), ConstantVelocity())}
 
 
 def watched(model: StateModel, seen: Counter[str], first: bool) -> StateModel:

@@ -82,9 +82,9 @@ def test_intervals_and_signs_read_as_they_are_meant():
     rows = read(text)
     assert [row[:2] for row in rows] == [
         ["95 % of it", "twice"],
-        ["99.6 % to 100 %", "1.5e-07 to 14520"],
+        ["99.6 % to 100 %", "1.5e-7 to 14520"],
         ["\\textgreater{} 100 %", "-1.250 to 2"],
-        ["-", "0 to 4.0e-05"],
+        ["-", "0 to 4.0e-5"],
     ]
     assert [row[3] for row in rows[:2]] == ["a & b_c", "a_b & 50 %"]
     assert r"\texttt{U+4E2D}" in text

@@ -10,12 +10,28 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Finite, NonNegative, Positive
 from ipe_bench.measurements import Parameter
 from ipe_bench.states import Normal, StateModel
-from ipe_bench.states.algebra import root
+from ipe_bench.states.algebra import mahalanobis, root
 
 
 def white_acceleration(step: float, density: float) -> Array:
     """Covariance (2, 2) that a white acceleration of this density adds to position and velocity in `step` seconds."""
     return density * np.array([[step**3 / 3, step**2 / 2], [step**2 / 2, step]])
+
+
+def path_cost(model: StateModel, z: Array, start: Array, mean: Array) -> Array:
+    """-2 log p(path | readings) (trials,) up to a constant, of a path that begins at `start` (trials, n) before the
+    first transition; infinite where a step lies outside the range of its noise."""
+    total, before = mahalanobis(start - model.prior.mean, model.prior.covariance), start
+    for k in range(model.epochs):
+        if model.moves(k):
+            total = total + mahalanobis(mean[:, k] - model.transition(before, k), model.Q(k))
+        seen = np.isfinite(z[:, k])
+        e = np.where(seen, z[:, k] - model.observe(mean[:, k], k), 0.0)
+        for i, there in enumerate(seen):
+            R = model.R(k)[np.ix_(there, there)]
+            total[i] = total[i] + e[i, there] @ np.linalg.solve(R, e[i, there])
+        before = mean[:, k]
+    return total
 
 
 @dataclass(frozen=True)

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from scipy.optimize._numdiff import approx_derivative
 from scipy.stats import chi2, kstest
-from shared.state_models import ConstantVelocity, CoordinatedTurn, Pendulum
+from shared.state_models import ConstantVelocity, CoordinatedTurn, Pendulum, path_cost
 
 from ipe_bench.basics.statuses import Status
 from ipe_bench.plugins.construct import construct
 from ipe_bench.plugins.discovery import options
 from ipe_bench.states import IteratedSmoother, LevenbergMarquardtSmoother, PathIPE, Smoother, Taylor, ekf, ukf
 from ipe_bench.states.damped import _linearised, _passed
-from ipe_bench.states.smoothers import path_cost, path_p, smoothed, whole
+from ipe_bench.states.smoothers import path_p, smoothed, whole
 from ipe_bench.trials.tracking import PathBlock, StateScenario
 
 NEAR = Pendulum(count=25, start=(1.0, 0.0), spread=0.2)

@@ -11,7 +11,7 @@ from filterpy.kalman import CubatureKalmanFilter, spherical_radial_sigmas
 from scipy.optimize import least_squares
 from scipy.optimize._numdiff import approx_derivative
 from shared.filterpy_tracks import Filterpy
-from shared.state_models import ConstantVelocity, CoordinatedTurn, Growth, Pendulum
+from shared.state_models import ConstantVelocity, CoordinatedTurn, Growth, Pendulum, path_cost
 
 import ipe_bench as ib
 import ipe_bench.states
@@ -34,7 +34,6 @@ from ipe_bench.states import (
     posterior_bounds,
     ukf,
 )
-from ipe_bench.states.smoothers import path_cost
 
 BOOK = {
     "EKF": (Taylor(), 1, 0.16830859061153763, 0.057446202494837),
