@@ -59,7 +59,7 @@ def test_the_report_writes_the_table_and_draws_nothing_over_error_scales(folder)
     page = result.report.read_text(encoding="utf-8")
     assert page.index('id="certified_averages"') < page.index('<details class="part"') < page.index('id="certified"')
     # The linear estimate has no digits, the fixed point not all of them.
-    most = "multiscale_lm solves most, 6, with four digits or more of every parameter"
+    most = "multiscale_lm solves all with four digits or more of every parameter"
     assert f"Of 6 certified problems, each a data set from one start, {most}" in page
 
 
