@@ -123,7 +123,10 @@ def _varying(columns: Sequence[str], rows: pd.DataFrame) -> list[str]:
 def differing(rows: pd.DataFrame, columns: Sequence[str]) -> list[str]:
     """Returns for each row those of its settings that differ among the rows, of many those other than the most frequent
     ones; a dash if there are none."""
-    values = rows[_varying(columns, rows)].map(value_text)
+    varying = _varying(columns, rows)
+    if not varying:  # a frame without columns loses its rows in pandas 2.2
+        return ["-"] * len(rows)
+    values = rows[varying].map(value_text)
     usual = {c: values[c].mode().iloc[0] for c in values if len(values.columns) > MOST_SETTINGS}
     told = ([(c, v) for c, v in row.items() if v not in ("-", usual.get(c))] for row in values.to_dict("records"))
     return [", ".join(v if c in ("measurement", "noise") else f"{c}={v}" for c, v in each) or "-" for each in told]

@@ -23,7 +23,7 @@ from ipe_bench.report import figures
 from ipe_bench.report.headline import about, headline
 from ipe_bench.report.html import DEFINITIONS, render_page
 from ipe_bench.report.table import Strong, Table, column, comma_separated, html, latex, markdown, terminal, texts, words
-from ipe_bench.report.tables import all_tables
+from ipe_bench.report.tables import all_tables, differing
 from ipe_bench.report.terminal import reported, summary_tables
 from ipe_bench.report.words import compact, duration, percent, short
 from ipe_bench.statistics import analyse
@@ -165,6 +165,13 @@ def test_settings_that_differ_have_figures_of_their_own(synthetic, tmp_path, mon
     assert settings == {"gaussian-0.2", "gaussian-0.4", "quantization"}
     page = re.sub(r'base64,[^"]*', "", result.report.read_text(encoding="utf-8"))
     assert not re.search(r"\bnan\b", page)
+
+
+def test_rows_of_equal_settings_each_have_a_dash():
+    """Also with the lowest pandas that is allowed, which forgets the rows of a frame without columns."""
+    rows = pd.DataFrame({"size": [1.0, 1.0], "shape": ["round", "round"]})
+    assert differing(rows, ["size", "shape"]) == differing(rows, []) == ["-", "-"]
+    assert differing(rows.assign(size=[1.0, 2.0]), ["size", "shape"]) == ["size=1", "size=2"]
 
 
 def test_every_renderer_has_every_cell():
