@@ -40,17 +40,19 @@ if TYPE_CHECKING:
     from ipe_bench.trials.posterior import Reference
 
 Directories = Path | str | Sequence[Path | str]
+Simulated = AnyScenario | Measurement | StateModel
 RealReadings = Path | str | Sequence[Path | str] | Array | None
 
 
 def run(
-    scenarios: AnyScenario | Measurement | StateModel | Sequence[AnyScenario],
+    scenarios: Simulated | Sequence[Simulated],
     estimators: Mapping[str, Any],
     trials: int | None = None,
     *,
     noise: Noise | None = None,
     prior: Prior | None = None,
     error_scale: float | None = None,
+    seed: int | None = None,
     precision: float | Mapping[str, float] | None = None,
     time_limit: float | None = None,
     output: Path | str | None = None,
@@ -65,6 +67,7 @@ def run(
         scenarios: one or several. A measurement with its `noise`, `prior` and `error_scale` stands for a scenario, a
             state model for its `StateScenario`, whose estimators are trackers.
         estimators: by label.
+        seed: number that all draws follow from; that of each scenario unless given.
         trials: of each scenario, 1000 unless given; with `precision` the most, 100,000 unless given.
         precision: 0.01, or {"success": 0.01, "rmse": 0.05} (relative): trials are added until intervals are so narrow.
         time_limit: seconds after which no more blocks are added.
@@ -99,10 +102,10 @@ def run(
     from ipe_bench.statistics.stopping import compute_until
 
     stated = {"noise": noise, "prior": prior, "error_scale": error_scale}
-    if isinstance(scenarios, Sequence):
-        scenarios = [_tracking(one) or _scenario(one) for one in scenarios]
-    else:
-        scenarios = [_tracking(scenarios, **stated) or _scenario(scenarios, **stated)]
+    several = scenarios if isinstance(scenarios, Sequence) else [scenarios]
+    scenarios = [_tracking(one, **stated) or _scenario(one, **stated) for one in several]
+    if seed is not None:
+        scenarios = [dataclasses.replace(one, seed=seed) for one in scenarios]
     estimators, stored = _labelled(estimators), Stored(output)
     options: dict[str, Any] = {"execution": execution, "block_size": block_size}
     options |= {"precision": precision, "time_limit": time_limit}
@@ -394,9 +397,9 @@ def estimate(
     >>> trial = ib.Scenario(model, ib.noise.Gaussian(0.01), error_scale=3.0).draw(0, 1)
     >>> for fit in ib.estimate(model, trial.z[0], noise=ib.noise.Gaussian(0.01)):
     ...     print(fit.label, fit.status.label, fit.fits)
+    auto converged True
     linear_lse converged False
     levenberg_marquardt converged True
-    auto converged True
     """
     from ipe_bench.baselines import LevenbergMarquardt, LinearLSE
     from ipe_bench.plugins.construct import known_parameters
@@ -417,7 +420,8 @@ def estimate(
         model, noise = scenario.measurement, None if scenario.noise.real else scenario.noise
         prior, error_scale = scenario.prior, scenario.error_scale
     if estimators is None:
-        estimators = {"linear_lse": LinearLSE(), "levenberg_marquardt": LevenbergMarquardt(), "auto": Auto()}
+        # In the order of the command line, whose solvers come before baselines.
+        estimators = {"auto": Auto(), "linear_lse": LinearLSE(), "levenberg_marquardt": LevenbergMarquardt()}
     estimators = _labelled(estimators, Estimator)
     given = readings if readings is None or isinstance(readings, np.ndarray) else tuple(_paths(readings))
     stated: dict[str, Any] = {"noise": noise, "prior": prior, "error_scale": error_scale}

@@ -11,17 +11,26 @@ from types import ModuleType
 from typing import Any
 
 
-class UserError(Exception):
+class _Plain(Exception):
+    """Is shown as one line, without a traceback."""
+
+    def _render_traceback_(self) -> list[str]:
+        """Returns the line that IPython prints in place of a traceback."""
+        return [f"{type(self).__name__}: {' '.join(str(self).split())}"]
+
+
+class UserError(_Plain):
     """Reports a mistake in a config, a command or a file: one line that names the key or row, and the remedy.
 
-    The command line prints it without a traceback and exits with code 2.
+    The command line and a notebook print it without a traceback; the command line exits with code 2.
     """
 
 
-class StorageError(Exception):
+class StorageError(_Plain):
     """Results cannot be stored any more: a full disk, a folder that went away. One line.
 
-    What was stored before is whole. The command line prints it without a traceback and exits with code 1.
+    What was stored before is whole. The command line and a notebook print it without a traceback; the command line
+    exits with code 1.
     """
 
 

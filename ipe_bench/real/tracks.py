@@ -149,6 +149,8 @@ class LogTracks:
     """States (K, n)."""
     deviation: Array
     """Their standard deviations (K, n)."""
+    covariance: Array
+    """Their covariance (K, n, n)."""
     nis: Array
     """Squared normalised innovations (K,); NaN at epochs without readings, and if the tracker has none."""
     mean_nis: float
@@ -184,6 +186,7 @@ class LogTracks:
         tracks, messages = track_safely(tracker, log.model, log.z[None])
         sizes, innovations = np.array([state.size for state in log.model.states]), tracks.innovations.swapaxes(1, 2)
         mean, deviation = tracks.mean[0] * sizes, deviations(tracks.covariance[0]) * sizes
+        covariance = tracks.covariance[0] * np.outer(sizes, sizes)
         nis = np.where(tracks.degrees[0] > 0, tracks.nis[0], np.nan)
         size = np.nan if tracks.effective is None else float(np.median(tracks.effective))
         m, total = int(np.isfinite(innovations).sum()), float(np.nansum(nis))
@@ -196,6 +199,7 @@ class LogTracks:
             label,
             mean,
             deviation,
+            covariance,
             nis,
             mean_nis=total / m if m else np.nan,
             limits=mean_limits(m, 1),

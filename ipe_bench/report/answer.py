@@ -9,10 +9,11 @@ from dataclasses import dataclass
 from decimal import Decimal
 from itertools import compress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
+from ipe_bench.basics.errors import unknown
 from ipe_bench.basics.files import write_text
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
@@ -47,6 +48,22 @@ _TOO_WELL = 0.999
 _INFLUENTIAL = 1.0
 """Standard errors by which a parameter moves without a reading from which on that reading is named."""
 _MOST_READINGS, _MOST_MINIMA = 5, 3
+
+
+T = TypeVar("T")
+
+
+def labelled(parts: Sequence[T], labels: Sequence[str], which: str | int) -> T:
+    """Returns the part at a place, or at its label.
+
+    Raises:
+        KeyError: there is no such label; those that there are follow, the nearest first.
+    """
+    if isinstance(which, int):
+        return parts[which]
+    if which not in labels:
+        raise KeyError(f"{which}: {unknown(which, labels, 'label')}")
+    return parts[labels.index(which)]
 
 
 @dataclass(frozen=True)
@@ -85,7 +102,7 @@ class Answer(Shown):
 
     def __getitem__(self, which: str | int) -> Fit:
         """Returns the fit at this label or place."""
-        return self.fits[which] if isinstance(which, int) else next(f for f in self.fits if f.label == which)
+        return labelled(self.fits, [one.label for one in self.fits], which)
 
     def table(self) -> pd.DataFrame:
         """Returns estimate, standard error, 95 % interval, and whether the fit passes, per estimator and parameter."""

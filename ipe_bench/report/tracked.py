@@ -12,7 +12,7 @@ import numpy as np
 
 from ipe_bench.basics.files import write_text
 from ipe_bench.real.tracks import SEARCHES, Log, LogTracks, far_below
-from ipe_bench.report.answer import as_json, read_from, with_error
+from ipe_bench.report.answer import as_json, labelled, read_from, with_error
 from ipe_bench.report.table import Part, Shown, Strong, Table, interval, texts, words
 from ipe_bench.report.words import enumerate_few, p_value, short
 from ipe_bench.report.writer import write_files
@@ -38,8 +38,12 @@ class LogAnswer(Shown):
     def __iter__(self) -> Iterator[LogTracks]:
         return iter(self.tracks)
 
-    def __getitem__(self, label: str) -> LogTracks:
-        return next(one for one in self.tracks if one.label == label)
+    def __len__(self) -> int:
+        return len(self.tracks)
+
+    def __getitem__(self, which: str | int) -> LogTracks:
+        """Returns the track at this label or place."""
+        return labelled(self.tracks, [one.label for one in self.tracks], which)
 
     def table(self) -> pd.DataFrame:
         """Returns a row per tracker and epoch: each state with its standard deviation, and NIS."""

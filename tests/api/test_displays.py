@@ -3,17 +3,21 @@
 # pyright: reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false
 # (what is wrong here is wrong on purpose)
 import copy
+import dataclasses
 import gc
 import pickle
 import re
 
+import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 
 import ipe_bench as ib
+from ipe_bench.basics.errors import StorageError
 from ipe_bench.report import figures
 from ipe_bench.report.summary import Summary
+from ipe_bench.states import ekf, ukf
 
 ESTIMATORS = {"newton": ib.solvers.Newton(), "linear": ib.baselines.LinearLSE()}
 MODEL, NOISE = ib.measurements.Polynomial(), ib.noise.Gaussian(0.01)
@@ -99,6 +103,48 @@ def test_a_wrong_argument_is_answered_in_one_sentence(call, said):
         call()
     assert said in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_seed_draws_the_trials_of_a_scenario_with_that_seed(table):
+    other = ib.run(BENCH, ESTIMATORS, 20, seed=3)
+    own = ib.run(dataclasses.replace(BENCH, seed=3), ESTIMATORS, 20)
+    numbers = [c for c in table if "time" not in str(c)]
+    pd.testing.assert_frame_equal(pd.DataFrame(other[numbers]), pd.DataFrame(own[numbers]))
+    assert not other["rmse"].equals(table["rmse"])
+    with pytest.raises(ib.UserError, match="seed"):
+        ib.run(BENCH, ESTIMATORS, 20, seed=-1)
+
+
+def test_what_is_stated_holds_for_each_of_several_models():
+    stated = ib.run([MODEL, ib.measurements.Polynomial(count=30)], ESTIMATORS, 5, noise=NOISE, error_scale=3.0)
+    assert set(stated.trials["noise"]) == {"gaussian"}
+    assert set(stated.trials["error_scale"]) == {3.0}
+    with pytest.raises(ib.UserError, match="noise=: is part of the scenario"):
+        ib.run([BENCH], ESTIMATORS, 5, noise=NOISE)
+
+
+def test_a_mistake_is_one_line_where_a_notebook_asks_how_to_show_it():
+    for kind in (ib.UserError, StorageError):
+        assert kind("trials=0:\n give 1")._render_traceback_() == [f"{kind.__name__}: trials=0: give 1"]
+    assert not hasattr(ValueError(), "_render_traceback_")
+
+
+def test_an_answer_is_asked_by_label_or_place_and_names_its_labels():
+    fits = ib.estimate(BENCH, BENCH.draw(0, 1).z[0], ESTIMATORS)
+    level = ib.states.Formulas(
+        next={"x": "x + w"}, readings={"z": "x"}, noise={"w": 1.0}, deviation={"z": 1.0}, spread={"x": 1.0}, count=9
+    )
+    tracks = ib.estimate(level, np.ones((9, 1)), {"newton": ekf(), "linear": ukf()})
+    assert len(fits) == len(tracks) == 2
+    for answer in (fits, tracks):
+        assert answer[0] is answer["newton"] is answer[-2]
+        assert answer[1].label == "linear"
+        with pytest.raises(KeyError, match=r"newtn: .* did you mean newton\?"):
+            answer["newtn"]
+        with pytest.raises(KeyError, match=r"\(there are: linear, newton\)"):
+            answer["something else"]
+        with pytest.raises(IndexError):
+            answer[2]
 
 
 class Scaled(ib.noise.Gaussian):

@@ -13,6 +13,7 @@ from scipy.stats import chi2, multivariate_normal
 from shared.state_models import ConstantVelocity, CoordinatedTurn
 
 import ipe_bench as ib
+from ipe_bench.measurements import Parameter
 from ipe_bench.plugins.construct import construct
 from ipe_bench.plugins.discovery import options
 from ipe_bench.states import Bootstrap, Formulas, IteratedSmoother, Smoother, ckf, ekf, ukf
@@ -37,6 +38,28 @@ def estimate(ipe_bench):
 
 def written(path, model, z, **columns):
     pd.DataFrame({**columns, **dict(zip(model.reading_names, z.T, strict=True))}).to_csv(path, index=False)
+
+
+class Feet(ConstantVelocity):
+    """A velocity in feet per second, of which the model computes in metres."""
+
+    @property
+    def states(self):
+        return Parameter("position", "m"), Parameter("velocity", "ft/s", 1 / 0.3048)
+
+
+def test_a_track_is_continued_from_its_covariance():
+    long, short = Feet(count=6, step=2.0), Feet(count=5, step=2.0)
+    z = np.arange(6.0)[:, None]
+    (before,), (after,) = (ib.estimate(model, z[: model.epochs], {"kf": ekf()}) for model in (short, long))
+    D = np.diag([1.0, 1 / 0.3048])
+    F = D @ [[1.0, 2.0], [0.0, 1.0]] @ np.linalg.inv(D)
+    P = F @ before.covariance[-1] @ F.T + D @ [[8 / 3, 2.0], [2.0, 2.0]] @ D
+    gain = P[:, 0] / (P[0, 0] + 1.0)
+    predicted = F @ before.mean[-1]
+    np.testing.assert_allclose(after.mean[-1], predicted + gain * (z[5, 0] - predicted[0]), rtol=1e-12)
+    np.testing.assert_allclose(after.covariance[-1], P - np.outer(gain, P[0]), rtol=1e-9)
+    np.testing.assert_allclose(after.deviation**2, np.einsum("kii->ki", after.covariance), rtol=1e-12)
 
 
 def test_a_log_is_tracked_with_the_bits_of_a_run(tmp_path):
