@@ -45,6 +45,7 @@ def test_a_summary_shows_the_table_of_the_terminal_and_is_a_frame(table):
     pd.testing.assert_frame_equal(pd.DataFrame(table), pd.DataFrame(pickle.loads(pickle.dumps(table))))
 
 
+@pytest.mark.slow
 def test_trials_and_figures_are_those_of_the_folder_which_goes_with_the_last_frame(table, tmp_path, monkeypatch):
     monkeypatch.setattr(figures, "FIGURES", ("errors", "costs"))
     kept = ib.run(BENCH, ESTIMATORS, trials=20, output=tmp_path / "kept")

@@ -40,6 +40,7 @@ def test_there_are_as_many_trials_as_the_precision_takes_and_they_are_those_of_a
     assert max(wide.max(), (fewer["success"] - fewer["success_anytime_low"]).max()) > 0.04 or stop["trials"] == 50
 
 
+@pytest.mark.slow
 def test_no_precision_is_called_reached_where_an_interval_is_wider():
     for wanted in (0.05, 0.06, 0.07, 0.08, 0.09, 0.1):
         table = ib.run(BENCH, {"linear": LinearLSE()}, precision=wanted, block_size=10)
@@ -115,6 +116,7 @@ def test_mistakes_are_told_before_anything_is_computed(tmp_path, given, remedy):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_the_command_says_how_many_trials_it_took_and_why(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     words = ["measurement=polynomial", "noise=gaussian", "noise.deviation=0.01", "error_scale=3", "solver=[newton]"]

@@ -21,6 +21,7 @@ ib.estimate(bench, bench.draw(0, 1).z[0], progress=PROGRESS)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="has no pseudo-terminals")
+@pytest.mark.slow
 @pytest.mark.parametrize(("terminal", "shown"), [(True, True), (False, True)])
 def test_a_bar_is_shown_on_a_stderr_that_is_a_terminal(terminal, shown):
     import pty

@@ -116,6 +116,7 @@ def test_nis_is_chi_square_on_a_linear_model(estimator):
 # On GINS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", KALMAN, ids=label)
 def test_gins_at_scale_10_is_near_the_map_and_consistent(estimator):
     block = block_of_gins(10.0, 50)
@@ -260,6 +261,7 @@ def test_posterior_linearization_has_the_fixed_point_of_the_textbook():
         np.testing.assert_allclose(np.sqrt(np.diag(P_found)), np.sqrt(np.diag(P)), rtol=0.02)
 
 
+@pytest.mark.slow
 def test_filters_reach_far_on_gins():
     """All of them find every trial at scale 300, and posterior linearisation at 1000 as well."""
     block = block_of_gins(300.0, 6, 91)

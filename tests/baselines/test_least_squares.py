@@ -228,6 +228,7 @@ def lowest_of_a_grid(z: Array) -> float:
     return float(w[np.argmin(np.sum((WAVE.simulate(w[:, None]) - z) ** 2, axis=1))])
 
 
+@pytest.mark.slow
 def test_the_lowest_of_many_minima_is_found_where_one_start_is_lost():
     problem, trials = draw(WAVE, 0.1, 1.0, 20)
     wanted = np.array([lowest_of_a_grid(z) for z in trials.z])
@@ -249,6 +250,7 @@ def test_it_stops_at_the_first_fit_if_nothing_is_to_be_confirmed():
     assert (more.simulations > found.simulations).all()
 
 
+@pytest.mark.slow
 def test_a_budget_ends_the_search():
     problem, trials = draw(WAVE, 0.1, 3.0, 20)
     free, bounded = (Multistart(starts=20, budget=b).estimate(problem, trials.z) for b in (None, 40.0))

@@ -121,6 +121,7 @@ def test_an_empty_home_is_none_and_a_tilde_is_the_home(tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["home"]
 
 
+@pytest.mark.slow
 def test_what_is_compiled_already_needs_no_compiler(tmp_path):
     script = """
 import sys

@@ -252,6 +252,7 @@ def test_help_is_quick_to_load_and_names_the_commands():
     assert result.stdout.strip().endswith("[]")
 
 
+@pytest.mark.slow
 def test_the_word_model_of_earlier_versions_chooses_and_sets_a_state_model_still(tmp_path, ipe_bench):
     _, now, _ = ipe_bench("run", "state_model=pendulum", "state_model.count=9", "tracker=[ekf]", "--cfg=job")
     code, old, err = ipe_bench("run", "model=pendulum", "model.count=9", "tracker=[ekf]", "--cfg=job")
@@ -283,6 +284,7 @@ def test_a_plugin_without_its_header_or_with_a_taken_name_is_refused(tmp_path):
     assert "rename one of the two" in alone("list", folder=tmp_path).stderr
 
 
+@pytest.mark.slow
 def test_estimate_leaves_numbers_residuals_and_figures_from_csv_and_parquet_alike(readings, tmp_path, ipe_bench):
     # By themselves, both engines of pandas 2 round the last digit of some numbers.
     exact = dict.fromkeys(("time [min]", "reading [m/s]"), float)
@@ -361,6 +363,7 @@ def test_the_help_of_run_explains_every_key_of_the_config_in_a_line(capsys):
     assert {key for key in keys if not re.search(rf"\b{key}\b", text)} == set()
 
 
+@pytest.mark.slow
 def test_a_reader_that_closes_the_pipe_is_no_mistake(tmp_path):
     for words in (["list", "measurement", "-v"], ["run", *QUICK, "figures=none", f"output={tmp_path / 'out'}"]):
         command = [sys.executable, "-m", "ipe_bench", *words]
@@ -373,6 +376,7 @@ def test_a_reader_that_closes_the_pipe_is_no_mistake(tmp_path):
     assert (tmp_path / "out/summary.csv").is_file()
 
 
+@pytest.mark.slow
 def test_a_stream_that_knows_no_greek_letters_shows_question_marks(tmp_path):
     result = alone("run", *QUICK, "figures=none", "output=out", folder=tmp_path, PYTHONIOENCODING="ascii")
     assert result.returncode == 0, result.stderr

@@ -68,6 +68,7 @@ def unfolded(lines: list[str]) -> list[str]:
     return found
 
 
+@pytest.mark.slow
 def test_a_report_of_many_settings_takes_two_screens_and_names_what_is_left_out(capsys, tmp_path):
     store, rng = Synthetic(tmp_path / "many"), np.random.default_rng(0)
     for sigma in range(1, 9):

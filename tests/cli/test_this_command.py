@@ -107,6 +107,7 @@ def test_unnamed_commands_have_folders_of_their_own_and_the_same_one_goes_on(ipe
     assert all(len(list((Path("outputs") / f / "trials").iterdir())) == 2 for f in folders)
 
 
+@pytest.mark.slow
 def test_a_dry_run_says_what_is_missing_and_computes_nothing(ipe_bench):
     words = ("run", *SMALL, "solver=[newton]", "-m", "error_scale=1,3", "output=dry")
     code, out, _ = ipe_bench(*words, "trials=8", "--dry-run")

@@ -85,6 +85,7 @@ def test_a_run_scores_the_trials_as_without_the_jump():
     assert turning["success"].min() == 1.0
 
 
+@pytest.mark.slow
 def test_what_is_not_near_a_jump_has_the_bits_of_a_model_that_knows_of_none():
     model = replace(PASSING, start={"a": 40.0, "b": 6.0, "u": 2.0, "v": 1.2})
     plain = replace(model, circular=())
@@ -149,6 +150,7 @@ def test_estimates_of_files_their_residuals_and_predictions_are_those_without_tu
         assert other == pytest.approx(residuals[0], abs=1e-5, nan_ok=True)
 
 
+@pytest.mark.slow
 def test_levels_of_noise_and_the_posterior_are_those_without_turns(passing):
     problem, uncut, z = passing
     within, besides = turned(z)

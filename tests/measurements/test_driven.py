@@ -45,7 +45,7 @@ def circuit(r0, r1, c1):
     return np.array(z)
 
 
-@pytest.mark.parametrize("method", ["explicit", "implicit"])
+@pytest.mark.parametrize("method", ["explicit", pytest.param("implicit", marks=pytest.mark.slow)])
 def test_a_battery_follows_its_current(method):
     model = replace(BATTERY, method=method)
     x = model.nominal * np.array([[1.0, 1.0, 1.0], [1.2, 0.8, 1.5]])
@@ -59,7 +59,7 @@ def test_a_battery_follows_its_current(method):
         np.testing.assert_allclose(replace(model).simulate(x), z, atol=1e-12)
 
 
-@pytest.mark.parametrize("method", ["explicit", "implicit"])
+@pytest.mark.parametrize("method", ["explicit", pytest.param("implicit", marks=pytest.mark.slow)])
 def test_a_stiff_follower_of_a_straight_input_has_its_exact_solution(method):
     """y' = k (u - y), where u is straight between its rows."""
     t = np.linspace(0.0, 10.0, 21)

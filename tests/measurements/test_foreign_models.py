@@ -25,6 +25,7 @@ def stiff(rate):
     return Ode({"y": "-k*(y-cos(t))"}, start, {"y": "y0"}, times=TIMES, time_unit="s", method="explicit")
 
 
+@pytest.mark.slow
 def test_stiff_equations_are_told_of_with_the_step_that_they_need():
     assert stiff(1.0).hindrance(stiff(1.0).nominal) == ""
     expected = (

@@ -82,6 +82,7 @@ def test_every_step_keeps_its_promise_where_few_parameters_dominate(scale):
     assert np.abs(Gins().simulate(x) - Gins(step=3.75).simulate(x)).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_bits_of_a_trial_depend_on_itself_alone_where_steps_differ(monkeypatch):
     """In one batch of several levels, alone, in another order, up to a stop, and after other calls or none."""
     x = np.concatenate([draw(scale, 8, seed=9) for scale in (33.0, 1000.0, 3000.0, 10000.0)])

@@ -237,6 +237,7 @@ def check(law, gaps, given, batch, seed):
         assert np.abs(found - whole).max() < TOLERANCE * max(1.0, np.abs(exact).max())
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(draws)
 def test_every_path_solves_the_equations_with_the_same_bits(draw):
@@ -364,6 +365,7 @@ def check_drawn(rates, shown, gaps, batch, seed):
     same(free.jacobian(x[:1])[0], free.jacobian(x)[0]), same(Drawn(rates, shown, model.at).simulate(x[::-1]), z[::-1])
 
 
+@pytest.mark.slow
 @settings(max_examples=4, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(written)
 def test_equations_that_are_drawn_are_solved_as_a_plain_loop_solves_them(draw):

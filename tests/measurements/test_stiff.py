@@ -80,6 +80,7 @@ def test_a_stiff_model_is_found_and_is_within_its_tolerance():
     np.testing.assert_allclose(model.jacobian(np.array([[1.0]]))[0, :, 0], k * slope, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_readings_beside_radau_and_slopes_beside_differences():
     model = robertson(*np.logspace(0, 3, 4))
     x = model.nominal * np.array([[1.0, 1.0, 1.0], [1.1, 0.9, 1.05]])
@@ -95,6 +96,7 @@ def test_readings_beside_radau_and_slopes_beside_differences():
     np.testing.assert_allclose(J, by_differences, atol=1e-7 * np.abs(by_differences).max())
 
 
+@pytest.mark.slow
 def test_a_trial_and_a_prefix_have_the_same_bits_alone_and_in_a_batch():
     model = robertson(0.1, 0.3, 1.0, 3.0)
     x = model.nominal + 0.1 * np.random.default_rng(0).standard_normal((7, 3))
@@ -220,6 +222,7 @@ def test_readings_at_the_start_alone_need_no_step():
     assert not model.hindrance(model.nominal)
 
 
+@pytest.mark.slow
 def test_equations_that_the_shortest_explicit_steps_do_not_follow_are_integrated_by_the_implicit_method():
     model = Ode({"y": "-280*(y-k*sin(3*t))"}, {"k": 1.0}, outputs={"z": "tanh(y)"}, times=(20.0,))
     lag = 280 * (280 * np.sin(60.0) - 3 * np.cos(60.0)) / (280**2 + 9)

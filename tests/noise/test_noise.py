@@ -44,6 +44,7 @@ def test_coloured_noise_runs_along_the_times_of_each_channel():
     assert R[4, 6] == pytest.approx(0.0)  # the next series starts anew
 
 
+@pytest.mark.slow
 def test_whitening_with_the_full_r_makes_coloured_noise_white():
     noise = Colored(0.3, 0.9, assumed="full")
     white = noise.covariance(40).whiten(errors(noise))
@@ -149,6 +150,7 @@ def test_estimate_asks_for_a_deviation_that_nobody_has_stated(tmp_path):
         ib.estimate(model, tmp_path / "z.csv", noise=ib.noise.Gaussian())
 
 
+@pytest.mark.slow
 def test_noise_with_true_levels_grows_with_the_reading_as_its_formula_says():
     """With the reading itself, in whatever place the read-out begins."""
     h = np.array([0.0, 1.0, -10.0, 100.0])

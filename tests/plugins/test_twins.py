@@ -37,6 +37,7 @@ def site(tmp_path, monkeypatch):
     return site
 
 
+@pytest.mark.slow
 def test_of_one_distribution_the_folders_copy_runs_in_workers_too_and_nothing_is_said(site):
     listed = run("list", "solver", site=site)
     assert (listed.returncode, listed.stderr) == (0, "")
@@ -55,6 +56,7 @@ def test_of_one_distribution_the_folders_copy_runs_in_workers_too_and_nothing_is
     assert "left out" not in done.stderr
 
 
+@pytest.mark.slow
 def test_what_is_installed_runs_where_the_folder_holds_none(site, tmp_path):
     shutil.rmtree(tmp_path / "plugins")
     done = run("run", *CHOSEN, "trials=4", "output=out", site=site)
@@ -62,6 +64,7 @@ def test_what_is_installed_runs_where_the_folder_holds_none(site, tmp_path):
     assert "this is the installed copy" in done.stderr
 
 
+@pytest.mark.slow
 def test_another_distribution_of_that_package_is_named_and_left_out(site, tmp_path):
     project = tmp_path / "plugins/twin/pyproject.toml"
     project.write_text(project.read_text().replace('name = "ipe-bench-twin"', 'name = "somebody-elses"'))

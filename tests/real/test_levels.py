@@ -118,6 +118,7 @@ def test_a_single_level_is_certified(dataset):
 ZERO = pytest.param("a + b h", "by output", marks=pytest.mark.slow)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("case", "data"), [*zip(NOISES, NOISES, strict=True), ZERO])
 def test_profile_ends_are_where_the_likelihood_has_risen_by_the_quantile(case, data):
     """In the last case errors do not grow with the readings, and the share of these is zero."""
@@ -178,6 +179,7 @@ def test_intervals_hold_the_truth_and_levels_have_no_bias(case):
         assert np.abs(np.mean(excess, axis=0)).max() < 0.02
 
 
+@pytest.mark.slow
 def test_levels_stand_beside_the_parameters_of_every_estimator():
     answer = ib.estimate(DECAY, readings("by output", 1), {**LM, "linear": LinearLSE()}, noise=NOISES["by output"][0])
     assert answer.table()["parameter"].tolist() == ["a", "k", "l", "sigma_0", "sigma_1"] * 2
@@ -200,6 +202,7 @@ def test_only_the_profile_stands_beside_a_level():
     assert not found.bent[3:].any()
 
 
+@pytest.mark.slow
 def test_estimates_with_a_prior_have_the_levels_of_their_residuals():
     """A wide prior says next to nothing, so that its estimate is that without one."""
     estimators = {**LM, "map": MapLM(tolerance=1e-10, prior_inflation=1e6)}

@@ -55,6 +55,7 @@ def test_every_number_survives_both_ways_of_writing_it(tmp_path, value):
     assert open_together([european(path)], Bent(count=5)).z[2] == value
 
 
+@pytest.mark.slow
 @settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @example(text="0\x1f")
 @given(text=st.text(st.characters(codec="utf-8", exclude_characters='"\n\r'), min_size=1, max_size=8))

@@ -100,6 +100,7 @@ def test_every_command_has_a_section(generated):
     assert found == set(COMMANDS)
 
 
+@pytest.mark.slow
 def test_the_cells_of_the_notebook_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names: dict = {}

@@ -278,6 +278,7 @@ def test_an_estimator_is_in_the_colours_of_its_family_and_of_many_the_best_are_i
     assert [t.get_text() for t in legend.get_texts()][:5] == [*(e for e in view.look if e in colored), "8 others"]
 
 
+@pytest.mark.slow
 def test_more_than_seven_in_colour_have_a_row_of_panels_for_each_family_with_the_others_in_grey(synthetic):
     fill(synthetic, labels=(REFERENCE, *(f"iterated{i}" for i in range(4))))
     error = 0.1 * np.random.default_rng(0).normal(size=(60, 3))
@@ -372,6 +373,7 @@ def test_long_settings_have_file_names_of_their_own(synthetic):
     assert all(len(suffix) < 100 for suffix in suffixes)
 
 
+@pytest.mark.slow
 def test_stale_figures_go_foreign_files_stay_and_the_same_figure_is_the_same_file(synthetic, monkeypatch, tmp_path):
     monkeypatch.setattr(figures, "FIGURES", ("costs",))
     folder, small = tmp_path / "figures", {"labels": (REFERENCE, "two"), "scales": (1.0, 10.0), "names": ("a",)}
@@ -414,7 +416,8 @@ def test_the_setting_with_most_failures_is_drawn_first_and_those_alike_keep_thei
     assert [float(part.suffix[-3:]) for part in parts] == [0.2, 0.1, 0.4]
 
 
-@pytest.mark.parametrize("width", [3.5, *(pytest.param(wide, marks=pytest.mark.slow) for wide in (None, 7.16))])
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [3.5, None, 7.16])
 def test_nothing_is_clipped_on_the_page_or_in_print(synthetic, width):
     """Long names of groups and many estimators included, in a column of print too."""
     labels, names = (REFERENCE, *(f"an_estimator_{i}" for i in range(11))), ("a" * 30, "b", "c", "d", "e")
@@ -462,6 +465,7 @@ def test_captions_are_short_and_titles_and_labels_stand_at_their_own_panels(synt
                     assert label.x0 - left.x1 > 4 * fig.dpi / 72, drawing.name
 
 
+@pytest.mark.slow
 def test_a_point_at_a_cap_is_hollow_with_an_arrow_and_what_is_dense_is_a_bitmap(synthetic):
     error = np.full((60, 3), 0.1)
     for scale, factor in zip(SCALES, (1.0, 2.0, 1e9), strict=True):

@@ -93,10 +93,13 @@ def test_a_run_completes_when_a_worker_is_killed(tmp_path, reference):
         *((f"status {value}", {}, "a status that is not one of") for value in (-1, 0.5, 99)),
         ("status None", {}, "status of type object"),
         ("history", {}, "history of 1 trials, where 10 belong"),
-        ("sleep", {"block_timeout_s": 3.0}, "block_timeout_s=3"),
+        pytest.param("sleep", {"block_timeout_s": 3.0}, "block_timeout_s=3", marks=pytest.mark.slow),
         pytest.param(
             *("memory", {"memory_limit_gb": 1.0}, "MemoryError"),
-            marks=pytest.mark.skipif(sys.platform != "linux", reason="limits memory on Linux only"),
+            marks=[
+                pytest.mark.slow,
+                pytest.mark.skipif(sys.platform != "linux", reason="limits memory on Linux only"),
+            ],
         ),
     ],
 )
@@ -110,6 +113,7 @@ def test_one_estimator_that_fails_loses_nothing_but_itself(tmp_path, reference, 
     assert (rogue.done, rogue.failed, rogue.missing) == (0, 10, 0)
 
 
+@pytest.mark.slow
 def test_the_time_limit_does_not_count_what_any_estimator_compiles(tmp_path):
     estimators = {**GOOD, "rogue": Rogue("compile")}
     assert compute([scenario()], estimators, 10, tmp_path, execution=Processes(1, block_timeout_s=2.5)) == ()
@@ -177,6 +181,7 @@ def test_what_a_process_does_first_is_not_booked_as_time_of_estimation(tmp_path,
     assert rows_of(tmp_path, "once")["time_s"].max() < 0.03
 
 
+@pytest.mark.slow
 def test_what_failed_is_tried_again_by_the_next_run(tmp_path):
     estimators = {"rogue": Rogue("exit", until=str(tmp_path / "repaired"))}
     assert len(compute([scenario()], estimators, 10, tmp_path, execution=Processes(1))) == 1

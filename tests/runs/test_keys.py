@@ -99,6 +99,7 @@ def test_a_changed_constant_makes_stale_what_was_computed_with_it_and_nothing_el
     assert all(before[name] != after[name] for name in before)
 
 
+@pytest.mark.slow
 def test_a_change_to_states_that_move_makes_stale_what_is_computed_with_them_and_no_constants(copy, before):
     # Filters of constants update as trackers do; bounds of states are those of a filter and of a smoother.
     changed = {"states/trackers.py": {"track", "path", "ukf"}, "trials/tracking.py": {"track", "path"}}
@@ -156,7 +157,8 @@ print(ib.status("out")["stale"].sum())
 """
 
 
-@pytest.mark.parametrize("given", ["file", pytest.param("input", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("given", ["file", "input"])
 def test_an_estimator_can_stand_in_a_script_and_what_it_computed_before_an_edit_is_stale(tmp_path, given):
     def stale(text: str) -> int:
         (tmp_path / "script.py").write_text(text, encoding="utf-8")
@@ -171,6 +173,7 @@ def test_an_estimator_can_stand_in_a_script_and_what_it_computed_before_an_edit_
         assert stale(SCRIPT.replace("FACTOR = 2.0", "FACTOR = 3.0")) == 5
 
 
+@pytest.mark.slow
 def test_a_base_class_in_another_module_is_part_of_the_source(copy):
     edit(copy / "ipe_bench/baselines/least_squares.py", "import annotations\n", "import annotations\nFACTOR = 2\n")
     (copy / "mine.py").write_text(

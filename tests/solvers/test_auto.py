@@ -128,7 +128,9 @@ def fits(model: Formula, z: NDArray[np.float64], noise, estimator) -> Fit:
 
 
 @pytest.mark.parametrize("starts", [2, pytest.param(16, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("noise", [Gaussian(0.3), Unknown()], ids=["known level", "unknown level"])
+@pytest.mark.parametrize(
+    "noise", [Gaussian(0.3), pytest.param(Unknown(), marks=pytest.mark.slow)], ids=["known level", "unknown level"]
+)
 def test_a_noisy_peak_is_found_from_anywhere(noise, starts):
     """From random starts, among flat lines and dips that are minima, too; an unknown level has no test of the fit to
     tell them."""

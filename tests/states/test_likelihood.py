@@ -40,6 +40,7 @@ DAMPED = Formulas(
 )
 
 
+@pytest.mark.slow
 def test_the_variances_of_the_nile_are_those_of_durbin_and_koopman():
     """Time Series Analysis by State Space Methods, 2012, section 2.10.3: 15099 and 1469.1, from a diffuse prior."""
     z = np.array(NILE.split(), dtype=float)[:, None]
@@ -57,6 +58,7 @@ def dense_log_likelihood(a, w, s, z):
     return multivariate_normal(np.zeros(len(z)), C).logpdf(z)
 
 
+@pytest.mark.slow
 def test_constants_and_errors_are_those_of_the_dense_likelihood():
     z = DAMPED.draw(0, 1, 4).z[0]
     for one in ib.estimate(DAMPED, z, {"ekf": ekf()}, find=["a", "w", "deviation.z"]):
@@ -89,6 +91,7 @@ def test_intervals_hold_the_constants_as_often_as_they_say(monkeypatch):
     assert (np.abs(held.mean(axis=0) - 0.95) < 3 * np.sqrt(0.95 * 0.05 / 100)).all(), held.mean(axis=0)
 
 
+@pytest.mark.slow
 def test_a_log_without_noise_determines_no_noise():
     x = 0.8 ** np.arange(1, 61)
     (one,) = ib.estimate(DAMPED, x[:, None], {"kf": ekf()}, find="w")

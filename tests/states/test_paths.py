@@ -85,7 +85,15 @@ def test_levenberg_and_marquardt_hold_targets_that_filters_lose():
     assert (kept["fit_p"] > 1e-3).all()
 
 
-@pytest.mark.parametrize("tracker", [LevenbergMarquardtSmoother(starts=2), PathIPE(), PathIPE("newton")], ids=str)
+@pytest.mark.parametrize(
+    "tracker",
+    [
+        pytest.param(LevenbergMarquardtSmoother(starts=2), marks=pytest.mark.slow),
+        PathIPE(),
+        pytest.param(PathIPE("newton"), marks=pytest.mark.slow),
+    ],
+    ids=str,
+)
 def test_a_trial_has_the_same_bits_in_every_batch(tracker):
     """Lost trials, which begin again, and missing readings among them."""
     model = replace(bearings(100.0), count=12)

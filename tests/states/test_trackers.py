@@ -287,6 +287,7 @@ def test_a_grid_refuses_what_it_cannot_be_exact_for():
         Grid(400).track(Sharp(), Sharp().draw(0, 3).z)
 
 
+@pytest.mark.slow
 def test_the_growth_model_separates_the_filters_from_the_exact_answer():
     model = Growth()
     paths = model.draw(0, 60)

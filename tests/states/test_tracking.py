@@ -143,6 +143,7 @@ def test_only_the_states_that_are_named_are_scored():
         StateScenario(replace(model, scored=("d",)))
 
 
+@pytest.mark.slow
 def test_trackers_that_are_named_are_all_that_an_experiment_runs():
     def chosen(*more):
         with session():
@@ -153,6 +154,7 @@ def test_trackers_that_are_named_are_all_that_an_experiment_runs():
     assert chosen()["ipls"] == IteratedSmoother(ukf(), Cubature())
 
 
+@pytest.mark.slow
 @dataclass(frozen=True)
 class Deceived(Tracker):
     """The Kalman filter with another process noise than the states have."""

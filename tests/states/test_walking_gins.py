@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 import ipe_bench as ib
 from ipe_bench.measurements import Gins
@@ -40,6 +41,7 @@ TRACKERS = {
 }
 
 
+@pytest.mark.slow
 def test_trackers_of_singular_covariances_are_calibrated():
     """The motion follows from the parameters after each first reading of a run: ranks of 11 to 22 of 22."""
     table = ib.run(StateScenario(WalkingGins(gins=Gins(readings_per_case=4)), error_scale=10.0), TRACKERS, 12)

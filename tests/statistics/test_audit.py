@@ -43,7 +43,8 @@ def test_a_wrong_scale_is_said_first(factor, said):
     assert len(found.sentences) == 1
 
 
-@pytest.mark.parametrize("law", ["normal", pytest.param("t5", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("law", ["normal", "t5"])
 def test_honest_reports_are_believed_or_left_open(law):
     rng = np.random.default_rng(2)
     false = 0
@@ -64,6 +65,7 @@ def test_a_planted_direction_is_named():
     assert not any("tails" in s for sentences in told for s in sentences)
 
 
+@pytest.mark.slow
 def test_a_direction_is_named_as_a_combination_of_reported_deviations():
     """Errors of correlation C = [[1, .6], [.6, 1]] with the first whitened one three times too large: C^(-1/2) maps
     parameters to it by 1.19 and -.40."""

@@ -48,7 +48,7 @@ def test_one_trial_in_closed_form():
     assert covered(1, tails) == pytest.approx(1 - 2 * np.floor(100 * tails) / 100, abs=1e-12)
 
 
-@pytest.mark.parametrize("trials", [7, 150, pytest.param(2500, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("trials", [7, *(pytest.param(trials, marks=pytest.mark.slow) for trials in (150, 2500))])
 def test_the_coverage_is_that_of_simulated_draws(trials):
     """20,000 simulated sets of counts keep both tails as often as computed, within 4 deviations."""
     rng = np.random.default_rng(trials)
@@ -78,6 +78,7 @@ def test_a_band_has_its_level_and_a_curve_its_p(trials):
         assert high[4] * np.sqrt(trials) < 1.0
 
 
+@pytest.mark.slow
 def test_p_values_are_uniform():
     """4 deviations of the binomial, over 3,000 honest curves."""
     u = np.random.default_rng(3).random((3000, 400))
@@ -102,6 +103,7 @@ def test_false_alarms_keep_to_their_level():
     assert 0.03 < each < 0.05 + 3 * np.sqrt(0.05 * 0.95 / 2000)
 
 
+@pytest.mark.slow
 def test_a_deviation_ten_per_cent_too_small_is_found_with_2000_trials():
     """Of one parameter among eleven, judged together with all others."""
     found = []

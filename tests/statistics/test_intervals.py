@@ -79,6 +79,7 @@ def test_intervals_of_few_trials_hold_the_truth(law):
         assert floor <= coverage(law, trials, repeats) <= 0.985
 
 
+@pytest.mark.slow
 def test_an_interval_of_many_trials_is_at_the_level_of_95_per_cent():
     """90 % would hold the truth in 90 of 100: nine standard deviations below."""
     assert coverage("normal", 400, 4000) == pytest.approx(0.957, abs=4 * np.sqrt(0.95 * 0.05 / 4000))

@@ -122,6 +122,10 @@ LINES = {
 # fmt: on
 
 
+WAITS = dict.fromkeys(("sleep", "stderr", "close"), pytest.mark.slow)
+"""Faults that take their time limits."""
+
+
 @functools.cache
 def answers(fault: str):
     z = SCENARIO.draw(0, TRIALS).z.copy()
@@ -136,7 +140,7 @@ def left(fault: str) -> list[str]:
     return [str(each) for each in words if str(FAULTY).encode() in each and fault.encode() in each]
 
 
-@pytest.mark.parametrize("fault", [*LINES, *STATUS])
+@pytest.mark.parametrize("fault", [pytest.param(each, marks=WAITS.get(each, ())) for each in (*LINES, *STATUS)])
 def test_a_fault_costs_its_own_trial_and_a_line(fault):
     found, right = answers(fault), answers("none")
     spoilt = [BAD + 1] if fault == "more" else [BAD]  # it is seen when the next answer is asked for

@@ -27,6 +27,7 @@ def folders(tmp_path_factory):
     return looking, blind
 
 
+@pytest.mark.slow
 def test_the_summary_counts_the_flags_that_are_stored(folders):
     trials = ib.load(folders[0]).set_index("estimator")
     summary = analyse([folders[0]]).summary

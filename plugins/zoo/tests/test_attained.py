@@ -37,6 +37,7 @@ def table(folder):
     return attained_table(collect([folder])).set_index(["function", "start", "estimator"])
 
 
+@pytest.mark.slow
 def test_the_other_minimum_of_freudenstein_and_roth_is_named(table):
     """Powell, Levenberg and Marquardt end there from the standard start; it is in every textbook."""
     for local in ("levenberg_marquardt", "minpack"):

@@ -18,6 +18,7 @@ from ipe_bench.report import figures
 PLUGIN = Path(__file__).resolve().parents[1]
 
 
+@pytest.mark.slow
 def test_keeps_the_promises_of_statistics_and_figures():
     findings = ib.check(PLUGIN)
     assert {finding.component for finding in findings} == {"statistic=deadline", "figure=deadline"}
