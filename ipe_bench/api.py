@@ -6,7 +6,7 @@ import dataclasses
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
 
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from ipe_bench.trials.posterior import Reference
 
 Directories = Path | str | Sequence[Path | str]
+Shows = bool | Literal["lines"]
 Simulated = AnyScenario | Measurement | StateModel
 RealReadings = Path | str | Sequence[Path | str] | Array | None
 
@@ -337,7 +338,7 @@ def estimate(
     *,
     ignore_columns: Sequence[str] = (),
     find: str | Sequence[str] = (),
-    progress: bool = True,
+    progress: Shows = True,
 ) -> LogAnswer: ...
 
 
@@ -352,7 +353,7 @@ def estimate(
     error_scale: float | None = None,
     parameters: Mapping[str, Mapping[str, Any]] | None = None,
     ignore_columns: Sequence[str] = (),
-    progress: bool = True,
+    progress: Shows = True,
 ) -> Answer: ...
 
 
@@ -367,7 +368,7 @@ def estimate(
     parameters: Mapping[str, Mapping[str, Any]] | None = None,
     ignore_columns: Sequence[str] = (),
     find: str | Sequence[str] = (),
-    progress: bool = True,
+    progress: Shows = True,
 ) -> Answer | LogAnswer:
     """Estimates parameters from real readings by every estimator, with standard errors, residuals and a test of fit.
 
@@ -382,7 +383,7 @@ def estimate(
         parameters: as {"k": {"fixed": 2.0}, "c": {"positive": True, "nominal": 3.0}}; also lower, upper, deviation.
         ignore_columns: columns of the files that are left out.
         find: constants, noises or readings of a state model by formulas, found as `constants` by largest likelihood.
-        progress: whether a terminal or a notebook shows which estimator is at work.
+        progress: whether a terminal or a notebook shows what is at work; "lines" prints a line now and then elsewhere.
 
     Returns:
         The sequence of the fits, each with its estimates by name in `values`, and `x` and `covariance` in the
@@ -427,7 +428,7 @@ def estimate(
     stated: dict[str, Any] = {"noise": noise, "prior": prior, "error_scale": error_scale}
     stated |= {"known": known_parameters(parameters or {}), "ignored": tuple(ignore_columns)}
     question = Question(model=model, readings=given, estimators=estimators, **stated).checked()
-    with counting("estimate", len(estimators), off=not progress) as begin:
+    with counting("estimate", len(estimators), lines=progress == "lines", off=not progress) as begin:
         return Answer.to(question, watch=begin)
 
 
@@ -437,7 +438,7 @@ def _tracked(
     trackers: Mapping[str, Any] | None,
     ignored: Sequence[str],
     find: str | Sequence[str],
-    progress: bool,
+    progress: Shows,
 ) -> LogAnswer:
     from ipe_bench.real.tracks import Log, LogTracks, found_and_tracked
     from ipe_bench.report.progress import counting
@@ -453,11 +454,11 @@ def _tracked(
     validate([StateScenario(log.model)], trackers, 1)
     names = [find] if isinstance(find, str) else list(find)
     tracks = []
-    with counting("estimate", len(trackers), off=not progress) as begin:
+    with counting("estimate", len(trackers), lines=progress == "lines", off=not progress) as begin:
         for label, tracker in trackers.items():
-            begin(label)
+            tell = begin(label)
             one = log, label, tracker
-            tracks.append(found_and_tracked(*one, names) if names else LogTracks.of(*one))
+            tracks.append(found_and_tracked(*one, names, tell) if names else LogTracks.of(*one))
     return LogAnswer(log, tracks)
 
 

@@ -113,6 +113,7 @@ def _described(estimators: Any) -> dict[str, Any]:
 def estimate_command(arguments: Sequence[str]) -> int:
     """Estimates with every chosen estimator, prints tables and writes files; returns 1 if no fit passes."""
     from ipe_bench.report.answer import FILES, NAME, Answer, write_answer
+    from ipe_bench.report.progress import counting
 
     asked = single("estimate", arguments, STANDARD_ESTIMATORS, run=(*of("run", "trials"), w.TRUTH))
     if asked.spec.state_model is not None:
@@ -127,7 +128,8 @@ def estimate_command(arguments: Sequence[str]) -> int:
         **({"left_out": list(question.ignored)} if question.ignored else {}),
     }
     folder = asked.folder(NAME, command, FILES)
-    answer = Answer.to(question, asked.measurement)
+    with counting("estimate", len(question.estimators), lines=True) as begin:
+        answer = Answer.to(question, asked.measurement, begin)
     parts = [question.scenario, *question.estimators.values()]
     provenance = _provenance(asked, question.found.files, parts)
     files = write_answer(folder, answer, command, provenance, figures=asked.spec.figures != "none")
@@ -142,7 +144,7 @@ def _track(asked: Single, model: StateModel) -> int:
     asked.words.refuse(("error_scale",), "is of simulated trials; give the state model another prior")
     given, trackers = asked.spec.readings, asked.spec.estimators
     find = asked.spec.find or ()
-    answer = ib.estimate(model, given, trackers, ignore_columns=asked.spec.ignored, find=find)
+    answer = ib.estimate(model, given, trackers, ignore_columns=asked.spec.ignored, find=find, progress="lines")
     command = {"readings": given, "find": find, "model": describe(model), "trackers": _described(trackers)}
     files, parts = [answer.log.file] if answer.log.file else [], [answer.log.model, *trackers.values()]
     folder = asked.folder(NAME, command, [TABLE])

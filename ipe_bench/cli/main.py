@@ -57,17 +57,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         discard_output()
         return 0
     except (Exception, KeyboardInterrupt, SystemExit) as error:  # a model may call sys.exit
-        code, line = _explain(error)
+        code, line = _explain(error, words[:1])
         print(f"ipe-bench: {line}", file=sys.stderr)
         return code
 
 
-def _explain(error: BaseException) -> tuple[int, str]:
-    """Returns the exit code and the line for the exception that ended the command; raises again a bug."""
+def _explain(error: BaseException, command: Sequence[str]) -> tuple[int, str]:
+    """Returns the exit code and the line for the exception that ended a command; raises again a bug."""
     from ipe_bench.plugins.discovery import blame
 
     if isinstance(error, KeyboardInterrupt):
-        return 130, "stopped; what was computed is kept, and the same command goes on from there"
+        kept = "what was computed is kept, and the same command goes on from there"
+        return 130, f"stopped; {kept if command == ['run'] else 'the same command begins anew'}"
     if isinstance(error, UserError | StorageError):
         return 2 if isinstance(error, UserError) else 1, " ".join(str(error).split())
     if isinstance(error, OSError):

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import chdtrc, ndtri
 
 from ipe_bench.basics.errors import UserError, unknown
-from ipe_bench.basics.linalg import Array, deviations, unmasked
+from ipe_bench.basics.linalg import Array, Mask, deviations, unmasked
 from ipe_bench.basics.options import Finite, NonNegative, Positive, option_types
 from ipe_bench.basics.statuses import Status
 from ipe_bench.real.readings import TextTable, read_tables
@@ -42,6 +42,8 @@ _ALIKE = 2.0
 """Log likelihood by which one maximum has to exceed another: two constants of a 95 % interval differ by 1.92."""
 _STEP = 0.02
 """Step of differences, in standard errors."""
+EVALUATIONS, _OF_SIMPLEX = 500, 300
+"""Evaluations of the likelihood in one search at most, and in its first part."""
 _ROUNDS, _DONE = 20, 1e-8
 """Newton steps at most behind the search, and the squared step, in standard errors, that ends them."""
 _FAR, _VAGUE = 30.0, 5.0
@@ -252,8 +254,11 @@ def far_below(tracks: Sequence[LogTracks]) -> list[str]:
 # Constants -----------------------------------------------------------------------------------------------------------
 
 
-def found_and_tracked(log: Log, label: str, tracker: Tracker, find: Sequence[str]) -> LogTracks:
-    """Finds the constants `find` under which a tracker finds the log most likely, and its track with them.
+def found_and_tracked(
+    log: Log, label: str, tracker: Tracker, find: Sequence[str], watch: Callable[[str], object] = str
+) -> LogTracks:
+    """Finds the constants `find` under which a tracker finds the log most likely, and its track with them; `watch` is
+    told at each evaluation of the likelihood how far the search is.
 
     Raises:
         UserError: the model has no such constant, or the tracker has no likelihood that can be maximised.
@@ -288,11 +293,12 @@ def found_and_tracked(log: Log, label: str, tracker: Tracker, find: Sequence[str
     if isinstance(tracker, Bootstrap) or not np.isfinite(cost(np.zeros(len(find)))):
         raise UserError(f"find: trackers.{label} has no likelihood that can be maximised; choose a filter")
     with np.errstate(invalid="ignore"):
-        best, *others = _minima(cost, len(find))
-    if not (np.isfinite(best.error).all() and (best.error[positive] < _VAGUE).all()):
+        best, *others = _minima(cost, positive, watch)
+    if not np.isfinite(best.error).all():
         message = (
             f"no maximum of the likelihood was found in {', '.join(find)}: the log may not determine all of them; the"
-            f" search ended at {_written(find, values(best.u))}, and the track is that of the model's own values"
+            f" search ended after {best.evaluations} evaluations at {_written(find, values(best.u))}, and the track is"
+            " that of the model's own values"
         )
         return replace(LogTracks.of(log, label, tracker), message=message, found="no maximum", passes=False)
     ends = [values(best.u + sign * float(ndtri(0.975)) * best.error) for sign in (-1, 1)]
@@ -360,40 +366,66 @@ class _Minimum:
     """Standard errors by the second derivatives; NaN if the cost has no minimum there."""
     H: Array
     """The second derivatives."""
+    evaluations: int
+    """Evaluations of the cost in the search."""
 
     def holds(self, u: Array) -> bool:
         """Whether u is within a standard error of this minimum."""
         return bool((u - self.u) @ self.H @ (u - self.u) < 1)
 
 
-def _minima(cost: Callable[[Array], float], n: int) -> list[_Minimum]:
+@dataclass
+class _Search:
+    """Counts the evaluations of a cost in one search for its minimum."""
+
+    cost: Callable[[Array], float]
+    name: str
+    watch: Callable[[str], object]
+    evaluations: int = 0
+
+    def __call__(self, u: Array) -> float:
+        self.evaluations += 1
+        self.watch(f"{self.name}, evaluation {self.evaluations} of at most {EVALUATIONS}")
+        return self.cost(u)
+
+    @property
+    def left(self) -> int:
+        """Evaluations that are left, but for the last."""
+        return EVALUATIONS - 1 - self.evaluations
+
+
+def _minima(cost: Callable[[Array], float], positive: Mask, watch: Callable[[str], object] = str) -> list[_Minimum]:
     """The different ends of `SEARCHES` searches, the lowest first. They begin at 0 and at draws of N(0, I), or nearer
-    to 0 if the cost is infinite there."""
+    to 0 if the cost is infinite there. Those that are `positive` are logarithms."""
+    n = len(positive)
     found: list[_Minimum] = []
-    for start in [np.zeros(n), *np.random.default_rng(0).standard_normal((SEARCHES - 1, n))]:
-        u = next(u for u in (start, start / 2, start / 8, 0 * start) if np.isfinite(cost(u)))
-        u = _descended(cost, u)
+    starts = [np.zeros(n), *np.random.default_rng(0).standard_normal((SEARCHES - 1, n))]
+    for number, start in enumerate(starts, 1):
+        search = _Search(cost, f"search {number} of {SEARCHES}", watch)
+        u = next(u for u in (start, start / 2, start / 8, 0 * start) if np.isfinite(search(u)))
+        u = _descended(search, u)
         if not any(one.holds(u) for one in found):
-            end = _polished(cost, u)
+            end = _polished(search, u, positive)
             if not any(one.holds(end.u) for one in found):
                 found.append(end)
     return sorted(found, key=lambda one: one.cost)
 
 
-def _descended(cost: Callable[[Array], float], u: Array) -> Array:
+def _descended(search: _Search, u: Array) -> Array:
     """Where a search by Nelder and Mead's simplex ends."""
     from scipy.optimize import minimize
 
     simplex = np.vstack([u, u + 0.5 * np.eye(len(u))])
-    options = {"initial_simplex": simplex, "xatol": 0.1, "fatol": 0.1}
-    return np.asarray(minimize(cost, u, method="Nelder-Mead", options=options).x)
+    options = {"initial_simplex": simplex, "xatol": 0.1, "fatol": 0.1, "maxfev": _OF_SIMPLEX}
+    return np.asarray(minimize(search, u, method="Nelder-Mead", options=options).x)
 
 
-def _polished(cost: Callable[[Array], float], u: Array) -> _Minimum:
-    """The end of Newton's iteration from u."""
+def _polished(cost: _Search, u: Array, positive: Mask) -> _Minimum:
+    """The end of Newton's iteration from u, which stops where a logarithm has hardly any effect on the cost."""
     n = len(u)
     h, H = np.full(n, 1e-2), np.full((n, n), np.nan)
-    for _ in range(_ROUNDS):
+    rounds = cost.left // (n**2 + n + 1)
+    for _ in range(min(_ROUNDS, rounds)):
         E, here = np.diag(h), cost(u)
         up, down = (np.array([cost(u + sign * e) for e in E]) for sign in (1, -1))
         g, H = (up - down) / (2 * h), np.diag((up - 2 * here + down) / h**2)
@@ -403,7 +435,10 @@ def _polished(cost: Callable[[Array], float], u: Array) -> _Minimum:
         if not (np.isfinite(H).all() and np.linalg.eigvalsh(H)[0] > 0):
             break
         P = np.linalg.inv(H)
-        u, h = u - P @ g, _STEP * np.sqrt(np.diagonal(P))
+        error = np.sqrt(np.diagonal(P))
+        if (error[positive] >= _VAGUE).any():
+            break
+        u, h = u - P @ g, _STEP * error
         if g @ P @ g < _DONE:
-            return _Minimum(u, here, h / _STEP, H)
-    return _Minimum(u, cost(u), np.full(n, np.nan), np.full((n, n), np.nan))
+            return _Minimum(u, here, h / _STEP, H, cost.evaluations)
+    return _Minimum(u, cost(u), np.full(n, np.nan), np.full((n, n), np.nan), cost.evaluations)

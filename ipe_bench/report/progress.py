@@ -26,25 +26,34 @@ _NOTEBOOK_EVERY_S = 0.5
 @contextlib.contextmanager
 def watching(title: str, *, lines: bool = False, off: bool = False) -> Iterator[Watcher]:
     """Yields a callback of `compute`; `lines` prints a line now and then on a stderr that is no terminal."""
-    with _telling(title, lines=lines, off=off) as tell:
+    with _telling(title, lines=lines, kept=lines, off=off) as tell:
         # A job without estimators to run still has its truth to store: then blocks stand in for trials.
         yield lambda p: tell(*((p.trials, p.total) if p.total else (p.done, p.tasks)), _state(p))
 
 
 @contextlib.contextmanager
-def counting(title: str, total: int, *, off: bool = False) -> Iterator[Callable[[str], None]]:
-    """Yields a callback that is given the name of each of `total` pieces of work before it begins."""
+def counting(
+    title: str, total: int, *, lines: bool = False, off: bool = False
+) -> Iterator[Callable[[str], Callable[[str], None]]]:
+    """Yields a callback that is given the name of each of `total` pieces of work before it begins, and returns one that
+    is told how far that is."""
     begun = itertools.count(0)
-    with _telling(title, off=off) as tell:
-        yield lambda name: tell(next(begun), total, name)
+    with _telling(title, lines=lines, off=off) as tell:
+
+        def begin(name: str) -> Callable[[str], None]:
+            done = next(begun)
+            tell(done, total, name)
+            return lambda state: tell(done, total, f"{name}: {state}")
+
+        yield begin
 
 
-def _telling(title: str, *, lines: bool = False, off: bool = False) -> AbstractContextManager[Tell]:
+def _telling(title: str, *, lines: bool = False, kept: bool = False, off: bool = False) -> AbstractContextManager[Tell]:
     """Yields a callback that shows progress in a notebook, in a terminal or, by `lines`, anywhere."""
     if _in_notebook() and not off:
         return _line_of_notebook(title)
     if lines or (not off and sys.stderr is not None and sys.stderr.isatty()):
-        return _bar(title, kept=lines)
+        return _bar(title, lines=lines, kept=kept)
     return contextlib.nullcontext(lambda done, total, state: None)
 
 
@@ -78,9 +87,9 @@ def _line_of_notebook(title: str) -> Iterator[Tell]:
 
 
 @contextlib.contextmanager
-def _bar(title: str, *, kept: bool) -> Iterator[Tell]:
-    """Shows a bar on stderr, with warnings of ipe-bench above it; one that is `kept` stays there, and is a line now and
-    then where stderr is no terminal."""
+def _bar(title: str, *, lines: bool, kept: bool) -> Iterator[Tell]:
+    """Shows a bar on stderr, with warnings of ipe-bench above it; one that is `kept` stays there. Where stderr is no
+    terminal, `lines` prints a line now and then."""
     from rich.console import Console
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
@@ -95,7 +104,7 @@ def _bar(title: str, *, kept: bool) -> Iterator[Tell]:
     def tell(done: float, total: float, state: str) -> None:
         nonlocal spoken
         bar.update(line, total=total or 1, completed=done if total else 1, state=state)
-        if kept and not console.is_terminal and (done >= total or time.monotonic() - spoken >= _LINE_EVERY_S):
+        if lines and not console.is_terminal and (done >= total or time.monotonic() - spoken >= _LINE_EVERY_S):
             spoken = time.monotonic()
             console.print(f"{title}: {state}", markup=False, soft_wrap=True)
 

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.optimize import minimize_scalar
+from scipy.optimize import minimize_scalar, rosen
 from scipy.stats import multivariate_normal, norm
 from shared.state_models import ConstantVelocity
 
 import ipe_bench as ib
 from ipe_bench.real import tracks
+from ipe_bench.report import progress
 from ipe_bench.states import Bootstrap, Formulas, Grid, Smoother, ekf
 
 NILE = """
@@ -91,6 +93,53 @@ def test_intervals_hold_the_constants_as_often_as_they_say(monkeypatch):
     assert (np.abs(held.mean(axis=0) - 0.95) < 3 * np.sqrt(0.95 * 0.05 / 100)).all(), held.mean(axis=0)
 
 
+@pytest.mark.parametrize(
+    "cost",
+    [lambda u: np.exp(-u).sum(), lambda u: np.log1p(rosen(4 * u)), lambda u: u[0] ** 2],
+    ids=["down", "bent", "flat"],
+)
+def test_a_search_ends_after_five_hundred_evaluations(cost):
+    told = []
+    for one in tracks._minima(cost, np.zeros(5, dtype=bool), told.append):
+        assert one.evaluations <= 500
+    counted = Counter(line.partition(", ")[0] for line in told)
+    assert set(told) == {f"{name}, evaluation {k + 1} of at most 500" for name in counted for k in range(counted[name])}
+    assert list(counted) == [f"search {k} of 4" for k in (1, 2, 3, 4)]
+    assert max(counted.values()) <= 500
+
+
+@pytest.fixture
+def log(tmp_path):
+    """The words of a command on a log, in which two noises have but one variance."""
+    (tmp_path / "log.csv").write_text("z\n1\n-2\n0.5\n3\n")
+    words = "readings.z=x next.x=0.5*x+v+w noise.v=1 noise.w=1 deviation.z=1 spread.x=1"
+    return [*(f"state_model.{word}" for word in words.split()), "tracker=[ekf]", "readings=log.csv", "output=out"]
+
+
+def test_a_search_tells_how_far_it_is_and_where_it_ended(ipe_bench, log, monkeypatch):
+    monkeypatch.setattr(tracks, "SEARCHES", 1)
+    monkeypatch.setattr(tracks, "EVALUATIONS", 40)
+    monkeypatch.setattr(tracks, "_OF_SIMPLEX", 20)
+    monkeypatch.setattr(progress, "_LINE_EVERY_S", 0.0)
+    code, out, err = ipe_bench("estimate", "state_model=formulas", *log, "find=[v,w,z]")
+    assert code == 1
+    lines = err.splitlines()
+    assert lines[0] == "estimate: ekf"
+    assert re.fullmatch(r"estimate: ekf: search 1 of 1, evaluation \d+ of at most 40", lines[-1])
+    last = lines[-1].split()[-5]
+    assert f"the search ended after {last} evaluations at v=" in " ".join(out.split())
+
+
+def test_a_search_that_is_interrupted_is_one_line_and_no_file(ipe_bench, log, monkeypatch, tmp_path):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(tracks, "_descended", interrupted)
+    code, _, err = ipe_bench("estimate", "state_model=formulas", *log, "find=[v,w,z]")
+    assert (code, err) == (130, "ipe-bench: stopped; the same command begins anew\n")
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.slow
 def test_a_log_without_noise_determines_no_noise():
     x = 0.8 ** np.arange(1, 61)
@@ -98,7 +147,9 @@ def test_a_log_without_noise_determines_no_noise():
     assert not one.passes
     assert one.constants == ()
     assert one.verdict == "no maximum"
-    assert re.match(r"no maximum of the likelihood was found in w: .* ended at w=[\d.]+e-", one.message)
+    assert re.match(
+        r"no maximum of the likelihood was found in w: .* ended after \d+ evaluations at w=[\d.]+e-", one.message
+    )
 
 
 def test_a_maximum_whose_innovations_do_not_fit_is_no_answer():
