@@ -20,8 +20,20 @@ from ipe_bench.real.readings import TextTable, read_tables
 from ipe_bench.states.base import StateModel
 from ipe_bench.states.formulas import Formulas, RecordedFormulas
 from ipe_bench.states.particles import Bootstrap
+from ipe_bench.states.smoothers import Smoother
 from ipe_bench.states.trackers import Tracker
 from ipe_bench.statistics.intervals import mean_limits
+from ipe_bench.statistics.verdicts import (
+    COLLAPSED,
+    CONSISTENT,
+    LOST,
+    NO_MAXIMUM,
+    NO_VERDICT,
+    OVERCONFIDENT,
+    SEVERAL_MAXIMA,
+    TOO_CAUTIOUS,
+    WRONG,
+)
 from ipe_bench.trials.thresholds import FIT_LEVEL, GATE
 from ipe_bench.trials.tracking import track_safely
 from ipe_bench.trials.whiteness import white_p
@@ -163,12 +175,13 @@ class LogTracks:
     fit_p: float
     """The probability of a larger sum, or cost, if the model is right: chi-square with a degree per reading."""
     white_p: float
-    """The p-value of Ljung and Box's test that innovations are white."""
+    """The p-value of Ljung and Box's test that innovations are white: those of the filter that is smoothed, if any."""
     log_likelihood: float
     """The log likelihood of the readings; NaN for a smoother."""
     passes: bool
-    """Whether there is a track that is not lost, whose iteration, if it has one, has converged, and whose innovations,
-    or path, are no further from the model than chance explains; and one maximum, if constants were asked for."""
+    """Whether there is a track that is not lost, whose iteration, if it has one, has converged, whose innovations, or
+    path, are no further from the model than chance explains, and whose innovations are white; and one maximum, if
+    constants were asked for."""
     message: str
     """The reason why there is no track, or no constant; empty if there is one."""
     lost_from: int | None = None
@@ -179,7 +192,7 @@ class LogTracks:
     constants: Sequence[Constant] = ()
     """The constants that were asked for."""
     found: str = ""
-    """The verdict on the search for them; empty if one maximum was found and its innovations fit."""
+    """The verdict on the search for them; empty if one maximum was found."""
     notes: Sequence[str] = ()
     """Other maxima that the searches have found."""
 
@@ -197,6 +210,7 @@ class LogTracks:
         fit_p = float(chdtrc(m, total)) if m else np.nan
         ended = Status.CONVERGED if tracks.status is None else Status(int(tracks.status[0]))
         lost_from = _lost_from(nis, tracks.degrees[0])
+        white = float(white_p(_judged_innovations(log, tracker, innovations))[0])
         return cls(
             label,
             mean,
@@ -206,9 +220,11 @@ class LogTracks:
             mean_nis=total / m if m else np.nan,
             limits=mean_limits(m, 1),
             fit_p=fit_p,
-            white_p=float(white_p(innovations)[0]),
+            white_p=white,
             log_likelihood=float(tracks.log_likelihood[0]) if tracks.degrees.any() else np.nan,
-            passes=bool(np.isfinite([mean, deviation]).all() and not fit_p < FIT_LEVEL)
+            passes=bool(np.isfinite([mean, deviation]).all())
+            and not fit_p < FIT_LEVEL
+            and not white < FIT_LEVEL
             and not size < _COLLAPSED
             and lost_from is None
             and ended == Status.CONVERGED,
@@ -219,16 +235,30 @@ class LogTracks:
 
     @property
     def verdict(self) -> str:
-        """Tells whether innovations, or a smoother's path, are as far from the model as it says, from where the
-        track is lost, or what is wrong with the constants that were found."""
+        """Tells whether innovations are white and, as a smoother's path, as far from the model as it says, from where
+        the track is lost, or what is wrong with the constants that were found."""
         if self.lost_from is not None:
-            return f"lost from epoch {self.lost_from}"
+            return f"{LOST} from epoch {self.lost_from}"
         if self.effective < _COLLAPSED:
-            return "collapsed"
-        if self.found or np.isnan(self.mean_nis):
-            return self.found or "-"
+            return COLLAPSED
+        if self.found:
+            return self.found
+        if np.isnan(self.mean_nis):
+            return NO_VERDICT
+        if self.white_p < FIT_LEVEL:
+            return WRONG
         low, high = self.limits
-        return "optimistic" if self.mean_nis > high else "pessimistic" if self.mean_nis < low else "consistent"
+        if self.mean_nis > high:
+            return OVERCONFIDENT
+        return TOO_CAUTIOUS if self.mean_nis < low else CONSISTENT
+
+
+def _judged_innovations(log: Log, tracker: Tracker, innovations: Array) -> Array:
+    """Returns innovations (1, m, K) of a tracker, or of the filter that it smooths, as a smoother has none."""
+    if not isinstance(tracker, Smoother):
+        return innovations
+    tracks, _ = track_safely(tracker.filter, log.model, log.z[None])
+    return tracks.innovations.swapaxes(1, 2)
 
 
 def _lost_from(nis: Array, degrees: Array) -> int | None:
@@ -241,13 +271,21 @@ def _lost_from(nis: Array, degrees: Array) -> int | None:
 
 
 def far_below(tracks: Sequence[LogTracks]) -> list[str]:
-    """A line for each track under which the log is far less likely than under the best of the others."""
-    best = max(tracks, key=lambda one: np.nan_to_num(one.log_likelihood, nan=-np.inf))
-    readings = np.isfinite(best.nis).sum()
+    """A line for each track whose predictions are far less likely than the best of those whose innovations fit.
+
+    A filter that linearises has the likelihood of its own approximation, so that the largest one may be of a track that
+    is lost: an overconfident track, or one whose innovations are not white, is no standard for others.
+    """
+    sound = [one for one in tracks if one.verdict in (CONSISTENT, TOO_CAUTIOUS) and np.isfinite(one.log_likelihood)]
+    if not sound:
+        return []
+    best = max(sound, key=lambda one: one.log_likelihood)
+    limit = _FAR_BELOW + np.isfinite(best.nis).sum() / 10
+    below = {one.label: best.log_likelihood - one.log_likelihood for one in tracks}
     return [
-        f"{one.label}: its log likelihood is {below:.4g} below that of {best.label}, which describes the log better"
-        for one in tracks
-        if (below := best.log_likelihood - one.log_likelihood) > _FAR_BELOW + readings / 10
+        f"{label}: {best.label} predicts each next reading far better, by {less:.4g} in log likelihood"
+        for label, less in below.items()
+        if less > limit
     ]
 
 
@@ -300,7 +338,7 @@ def found_and_tracked(
             f" search ended after {best.evaluations} evaluations at {_written(find, values(best.u))}, and the track is"
             " that of the model's own values"
         )
-        return replace(LogTracks.of(log, label, tracker), message=message, found="no maximum", passes=False)
+        return replace(LogTracks.of(log, label, tracker), message=message, found=NO_MAXIMUM, passes=False)
     ends = [values(best.u + sign * float(ndtri(0.975)) * best.error) for sign in (-1, 1)]
     rows = zip(find, values(best.u), np.where(positive, values(best.u), size) * best.error, *ends, strict=True)
     track = LogTracks.of(replace(log, model=model_at(best.u)), label, tracker)
@@ -311,13 +349,12 @@ def found_and_tracked(
     ]
     found, message = "", track.message
     if track.fit_p < FIT_LEVEL or track.white_p < FIT_LEVEL:
-        found = "does not fit"
         message = (
             f"find= ended at a maximum whose innovations do not fit (NIS: p = {track.fit_p:.2g}; white: p ="
             f" {track.white_p:.2g}): the model does not describe the log, and neither values nor errors can be trusted"
         )
     elif any(one.cost - best.cost < _ALIKE for one in others):
-        found, message = "several maxima", "the log hardly tells the maxima of the likelihood apart"
+        found, message = SEVERAL_MAXIMA, "the log hardly tells the maxima of the likelihood apart"
     return replace(
         track,
         constants=[Constant(name, *map(float, numbers)) for name, *numbers in rows],

@@ -13,6 +13,7 @@ from ipe_bench.statistics.formulas import CAP
 from ipe_bench.statistics.records import SCORES
 from ipe_bench.statistics.registry import all_statistics, summary_columns
 from ipe_bench.statistics.statistic import ALL, BEST, Kind, Statistic, Where
+from ipe_bench.statistics.verdicts import VERDICTS, shown, sign_of
 
 _MOST_LINES = 75, 50
 """Lines that a terminal shows of one setting, and of several: about two screens with what stands below."""
@@ -26,8 +27,8 @@ _LEGEND = (
 )
 _FAILED = "; failed: known / silent"
 _SIGNS = (
-    "; verdict: by the mean and the largest NEES of the converged trials",
-    ", + optimistic, - pessimistic, ! diverged",
+    "; verdict: is the reported covariance right, by the mean NEES of the converged trials",
+    f", {', '.join(f'{word.sign} {word.shown}' for word in VERDICTS[:4])}",
 )
 _TOLD = (
     "With noise=unknown every estimator here is given R, that of the true levels at the nominal readings; bounds and"
@@ -47,10 +48,6 @@ def overview_notes(noises: Collection[str], *, narrow: bool = False) -> tuple[st
     reference = "the linearised filter" if set(noises) == {"model"} else "the bound"
     legend = _LEGEND.format(failed="" if narrow else _FAILED, reference=reference, sign=_SIGNS[narrow])
     return (legend, *(words for noise, words in (("unknown", _TOLD), ("model", TRACKED)) if noise in noises))
-
-
-_VERDICTS = {"consistent": ("", ""), "optimistic": ("optimistic", "+"), "pessimistic": ("pessimistic", "-")}
-_VERDICTS |= {"diverged but confident": ("diverged", "!"), "-": ("-", "")}
 
 
 def summary_tables(listed: Sequence[Mapping[str, Any]], totals: Sequence[Table], width: int) -> list[Part]:
@@ -129,7 +126,7 @@ def overview_columns(rows: Sequence[Mapping[str, Any]], best: Sequence[bool], *,
         return f"{'<' * (row['error_median'] > CAP)}{row['efficiency_capped']:.2f}"
 
     def verdict(row: Mapping[str, Any]) -> str:
-        return _VERDICTS.get(row["verdict"], (row["verdict"], "?"))[narrow]
+        return sign_of(row["verdict"]) if narrow else shown(row["verdict"])
 
     def failed(row: Mapping[str, Any]) -> str:
         return f"{points(row['failed_known'])} / {points(row['failed_silent'])}"
@@ -200,5 +197,5 @@ def _shower(kind: Kind, where: Where) -> Callable[[Any], str]:
         "physical": (lambda v: scientific(v) if math.isfinite(v) else short(v)) if where == "parameters" else short,
         "seconds": (lambda v: duration(v, 2)) if where == "terminal" else duration,
         "probability": p_value,
-        "word": str,
+        "word": shown,
     }[kind]

@@ -16,6 +16,7 @@ from ipe_bench.report.answer import as_json, labelled, read_from, with_error
 from ipe_bench.report.table import Part, Shown, Strong, Table, interval, texts, words
 from ipe_bench.report.words import enumerate_few, p_value, short
 from ipe_bench.report.writer import write_files
+from ipe_bench.statistics.verdicts import NO_VERDICT, shown
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -66,18 +67,19 @@ class LogAnswer(Shown):
             words("tracker", [one.label for one in found]),
             texts("NIS or cost / m", [short(one.mean_nis) for one in found]),
             interval("95 % if right", *limits, short),
-            words("verdict", [one.verdict for one in found]),
+            words("verdict", [shown(one.verdict) for one in found]),
             texts("fit p", [p_value(one.fit_p) for one in found]),
             texts("white p", [p_value(one.white_p) for one in found]),
             texts("log likelihood", [f"{one.log_likelihood:.2f}".replace("nan", "-") for one in found]),
         ]
         note = (
-            "Innovations are readings less their predictions, in predicted standard deviations, and NIS / m is"
-            " their mean square. A smoother has none: it is judged by the cost of its path, and one behind a filter"
-            " by the NIS of that filter. If the model is right both are chi-square with a degree per reading, and"
+            "Innovations are readings less their predictions, in predicted standard deviations, and NIS / m is their"
+            " mean square. A smoother has none: it is judged by the cost of its path, and one behind a filter by NIS"
+            " and whiteness of that filter. If the model is right both are chi-square with a degree per reading, and"
             " fit p is the probability of larger ones. Innovations are white if the filter is right (Ljung and Box)."
-            " A track is lost from the epoch from which most of them are larger than all but one in a million by"
-            " chance. A dash: the tracker has none of it."
+            " The verdict is on innovations alone: an error that no reading shows, such as the turn of a whole map,"
+            " leaves them as they are. A track is lost from the epoch from which most of them are larger than all but"
+            " one in a million by chance. A dash: the tracker has none of it."
         )
         if np.isfinite([one.effective for one in found]).any():
             columns.append(texts("effective particles", [short(one.effective) for one in found]))
@@ -119,9 +121,9 @@ def write_tracks(folder: Path, answer: LogAnswer, command: Any, provenance: Mapp
     content = {"schema": SCHEMA, "command": command, "trackers": trackers, **provenance}
     write_text(folder / f"{NAME}.json", json.dumps(content, indent=1) + "\n")
     facts = [f"{int(np.isfinite(log.z).sum())} readings at {log.model.epochs} epochs"]
-    verdicts = dict.fromkeys(one.verdict for one in answer if one.verdict != "-")
+    verdicts = dict.fromkeys(one.verdict for one in answer if one.verdict != NO_VERDICT)
     found = {word: enumerate_few([one.label for one in answer if one.verdict == word]) for word in verdicts}
-    listed = "; ".join(f"{who} {word}" for word, who in found.items())
+    listed = "; ".join(f"{who} {shown(word)}" for word, who in found.items())
     said = [f"Judged by innovations or the cost of a path: {listed}."] if found else []
     told = {"facts": facts, "sources": read_from(provenance)}
     files = write_files(

@@ -16,8 +16,10 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.runs.provenance import canonical_json
 from ipe_bench.statistics.collect import Collection, Group, config_leaves, differing, scenario_of, shown_leaf
 from ipe_bench.statistics.comparisons import ALPHA, differences, holm
+from ipe_bench.statistics.intervals import verdict
 from ipe_bench.statistics.paired import PLANNED, Effect, PowerPlan, mean_effect, ratio_effect, success_effect
 from ipe_bench.statistics.sample import Sample, samples
+from ipe_bench.statistics.verdicts import CONSISTENT
 from ipe_bench.trials.thresholds import gate
 
 JUDGED = ("success", "error", "cost")
@@ -96,7 +98,7 @@ def _rows(a: Sample, b: Sample, alpha: float, tested: Container[str]) -> Iterato
             effect = {"success": success_effect, "bias": mean_effect}.get(kind, ratio_effect)(
                 first, second, alpha, *largest
             )
-            loss = _loss(kind, effect, first)
+            loss = _loss(kind, effect, first, a.n)
         effect = effect if kind in tested else replace(effect, p=np.nan, e=np.nan)
         more = {"finding": "", "loss": loss, "discordant": int(np.sum(first != second))}
         yield head | {"quantity": quantity} | asdict(effect) | more
@@ -128,16 +130,16 @@ def _columns(
     yield "cost", a.cost[one], b.cost[other], ()
 
 
-def _loss(kind: str, effect: Effect, first: Array) -> tuple[float, float]:
+def _loss(kind: str, effect: Effect, first: Array, n: int) -> tuple[float, float]:
     """Returns the ends of how much worse the second is, as a difference of success and bias, else of logarithms.
 
-    Honesty and bias are worse farther from 1 and from 0, which the first counts as unless it surely is not.
+    Honesty and bias are worse farther from 1 and from 0, which the first counts as if it may be right.
     """
-    low, high, start, right = effect.low, effect.high, effect.first_value, float(kind == "honesty")
+    low, high, start = effect.low, effect.high, effect.first_value
     if kind == "success":
         return -high, -low
-    if abs(start - right) <= 2 * first.std() / np.sqrt(len(first)):
-        start = right
+    if _may_be_right(kind, first, n):
+        start = float(kind == "honesty")
     if kind != "bias":
         if np.isnan(low):  # a ratio to or from 0 has no ends
             low = high = 0.0 if effect.second_value < effect.first_value else np.inf
@@ -147,6 +149,13 @@ def _loss(kind: str, effect: Effect, first: Array) -> tuple[float, float]:
         return low, high
     ends = abs(start + low), abs(start + high)
     return (0.0 if (start + low) * (start + high) < 0 else min(ends)) - abs(start), max(ends) - abs(start)
+
+
+def _may_be_right(kind: str, first: Array, n: int) -> bool:
+    """Returns whether the mean of the first may be that of a right covariance of n parameters, or of no bias."""
+    if kind == "honesty":
+        return verdict(n * first, n) == CONSISTENT
+    return abs(first.mean()) <= 2 * first.std() / np.sqrt(len(first))
 
 
 def _head(first: Group, second: Group) -> dict[str, Any]:

@@ -11,13 +11,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
-from typing import Literal
 
 import numpy as np
 from scipy.special import betaincinv, betaln, chdtri, ndtri
 
 from ipe_bench.basics.linalg import Array
-from ipe_bench.trials.thresholds import FEW, gate
+from ipe_bench.statistics.verdicts import CONSISTENT, NO_VERDICT, OVERCONFIDENT, TOO_CAUTIOUS, UNDECIDED, Verdict
+from ipe_bench.trials.thresholds import FEW
 
 LEVEL = 0.95
 RESAMPLES = 2000
@@ -34,8 +34,6 @@ _WEIGHT = TIGHTEST / (2 * math.log(20) + math.log(2 * math.log(20)) + 1)
 _HALVINGS = 50
 FIRST = 100
 """Trials from which an asymptotic sequence begins; one that begins earlier misses errors with rare large ones."""
-TOLERATED = 0.01
-"""Share of trials outside their own gate above which an estimator is named diverged but confident."""
 UNUSUAL = 1e-3
 """Share of normal errors that are at least as large as one that counts as unusual."""
 RARE = 10
@@ -45,8 +43,6 @@ UNSEEN_NEES = 50.0
 size in one of fifty, where the covariance is right."""
 _BETS = 0.99 * 2.0 ** -np.arange(9)
 """Shares of the stake."""
-
-Verdict = Literal["consistent", "pessimistic", "optimistic", "undecided", "diverged but confident", "-"]
 
 
 # Shares --------------------------------------------------------------------------------------------------------------
@@ -245,29 +241,25 @@ def verdict(nees: Array, n: int, level: float = LEVEL) -> Verdict:
     """Words the value of an estimator's own covariance: by the NEES (trials,) of the trials that it calls converged, as
     `scoring.nees` returns them, for n parameters; none for fewer than `FEW`.
 
-    Diverged but confident: surely more than `TOLERATED` of the trials lie where the estimator says that a share of
-    `GATE` should, and the mean of NEES / n surely lies above 1, as it does not for a right covariance of errors with
-    heavy tails. Optimistic, pessimistic: the mean of NEES / n surely lies above or below 1, by the interval that
-    root mean squares have, whatever the law of the errors; below 1 it does if it would with a NEES / n of `UNSEEN_NEES`
-    in the share of trials that may be `unseen`. Where few trials carry that mean there is no such interval: it may
-    still surely lie above 1, and is undecided otherwise; so is one that only seems to lie below 1. A trial whose NEES
-    is NaN made no claim and is left out.
+    Overconfident, too cautious: the mean of NEES / n surely lies above or below 1. Above 1 it does by bets on it, for
+    any law of the errors, or by the interval that root mean squares have; below 1 it does if it would by that interval
+    with a NEES / n of `UNSEEN_NEES` in the share of trials that may be `unseen`, and is undecided if it only seems to.
+    Where few trials carry the mean there is no such interval: bets alone decide. A trial whose NEES is NaN made no
+    claim and is left out.
     """
     claims = nees[~np.isnan(nees)]
     if len(claims) < FEW:
-        return "-"
+        return NO_VERDICT
     x = np.minimum(claims / n, 1e150)
-    above = _evidence_above_1(x) >= 2 / (1 - level)
-    outside = int(np.sum(claims > gate(n)))
-    if above and clopper_pearson(outside, len(claims), level)[0] > TOLERATED:
-        return "diverged but confident"
+    if _evidence_above_1(x) >= 2 / (1 - level):
+        return OVERCONFIDENT
     if few_carry(Squares.of(x[None]), np.array([n]))[0]:
-        return "optimistic" if above else "undecided"
+        return UNDECIDED
     low, high = rms_interval(x[:, None], level=level)
     if high[0] < 1:
         rare = unseen(x[None], np.array([n]), level=level)[0]
-        return "pessimistic" if high[0] ** 2 + rare * (UNSEEN_NEES - 1) < 1 else "undecided"
-    return "optimistic" if low[0] > 1 else "consistent"
+        return TOO_CAUTIOUS if high[0] ** 2 + rare * (UNSEEN_NEES - 1) < 1 else UNDECIDED
+    return OVERCONFIDENT if low[0] > 1 else CONSISTENT
 
 
 def _evidence_above_1(x: Array) -> float:

@@ -428,12 +428,11 @@ STATISTICS: tuple[Statistic, ...] = (
         "verdict",
         "verdict",
         "converged trials with a reported covariance: a trial that the estimator itself gives up on makes no claim",
-        "Whether the reported covariance is honest. Diverged but confident: surely more than 1 % of the trials lie"
-        f" where it says that a share of {GATE:g} should, and the mean NEES is surely above n; optimistic, pessimistic:"
-        " the mean NEES lies surely (95 %, for errors of any law) above or below n, and below it also with a NEES of"
-        f" {intervals.UNSEEN_NEES:g} n in as many trials as may be unusual and unseen; undecided: a few trials carry"
-        f" that mean, or it seems to lie below n and rare large errors may be missing. None for fewer than {FEW}"
-        " trials.",
+        "Whether the reported covariance is right. Overconfident, too cautious: the mean NEES lies significantly (95 %,"
+        " for errors of any law) above or below n, and below it also with a NEES of"
+        f" {intervals.UNSEEN_NEES:g} n in as many trials as may be unusual and unseen; consistent: neither; undecided:"
+        " a few trials carry that mean, or it seems to lie below n and rare large errors may be missing. None for fewer"
+        f" than {FEW} trials.",
         lambda s: verdict(s.scalars["nees"][s.converged], s.n),
         kind="word",
         where=("calibration",),

@@ -17,13 +17,16 @@ from ipe_bench.statistics import formulas as f
 from ipe_bench.statistics.intervals import clopper_pearson, mean_limits, verdict
 from ipe_bench.statistics.sample import NIS, Sample
 from ipe_bench.statistics.statistic import Statistic
-from ipe_bench.trials.thresholds import GATE
+from ipe_bench.statistics.verdicts import NO_VERDICT, WRONG
+from ipe_bench.trials.thresholds import FIT_LEVEL, GATE
 
 if TYPE_CHECKING:
     from ipe_bench.runs.results import StoredCell
 
 NOT_WHITE = 0.05
 """Level of the test that innovations are white."""
+_TOLERATED = 0.01
+"""Share of trials whose innovations may surely not be white before the tracker is called wrong."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,19 +78,30 @@ def path_success(s: Sample) -> tuple[float, float, float]:
 
 
 def path_verdict(s: Sample) -> str:
-    return verdict(s.scalars["path_nees"][s.converged], s.n) if is_track(s) else "-"
+    return verdict(s.scalars["path_nees"][s.converged], s.n) if is_track(s) else NO_VERDICT
 
 
 def nis_verdict(s: Sample) -> str:
-    """Returns the verdict on NIS, whose degrees are the readings of a trial."""
+    """Returns the verdict on innovations: on whiteness, then on NIS, whose degrees are the readings of a trial."""
+    if not (is_track(s) and NIS in s.scalars):
+        return NO_VERDICT
+    p = _white_p(s)
+    surely_wrong, _ = clopper_pearson(int((p < FIT_LEVEL).sum()), len(p))
+    if surely_wrong > _TOLERATED:
+        return WRONG
     m = int(s.group.footer["readings"])
-    return verdict(m * s.scalars[NIS][s.converged], m) if is_track(s) and NIS in s.scalars else "-"
+    return verdict(m * s.scalars[NIS][s.converged], m)
+
+
+def _white_p(s: Sample) -> Array:
+    """Returns the p-values of whiteness of the converged trials that have one."""
+    p = s.scalars["white_p"][s.converged] if "white_p" in s.scalars else np.empty(0)
+    return p[~np.isnan(p)]
 
 
 def not_white(s: Sample) -> tuple[float, float, float]:
     """Computes the share of trials with autocorrelated innovations, and the ends of its interval."""
-    p = s.scalars["white_p"][s.converged] if "white_p" in s.scalars else np.empty(0)
-    p = p[~np.isnan(p)]
+    p = _white_p(s)
     rejected = int((p < NOT_WHITE).sum())
     return rejected / len(p) if len(p) else np.nan, *clopper_pearson(rejected, len(p))
 
@@ -194,7 +208,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "nis_verdict",
         "verdict of NIS",
         "converged trials of filters of states",
-        "The verdict on each trial's mean NIS, which needs no truth.",
+        "The verdict on each trial's mean NIS, which needs no truth; wrong where significantly (95 %) more than"
+        f" {100 * _TOLERATED:g} % of the trials have innovations that are not white at the level {FIT_LEVEL:g}.",
         nis_verdict,
         kind="word",
         where=("tracks",),

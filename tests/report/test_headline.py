@@ -203,7 +203,7 @@ def limits_are_so(table: Table, results: Results, summary: pd.DataFrame) -> None
         below = {
             scale: sum(v) < len(v) and beta.ppf(0.975, sum(v) + 1, len(v) - sum(v)) < 0.9 for scale, v in own.items()
         }
-        wrong = {scale: verdicts[scale] in ("optimistic", "diverged but confident") for scale in own}
+        wrong = {scale: verdicts[scale] == "overconfident" for scale in own}
         poor = min(np.mean(v) for v in own.values()) < 0.9
         unsure = bool({"undecided", "-"} & set(verdicts))
         for text, broken, is_open in ((holds, below, poor), (honest, wrong, unsure)):
@@ -290,13 +290,13 @@ def test_trials_in_common_alone_are_ranked(synthetic):
 
 
 @pytest.mark.parametrize(
-    "verdict", ["undecided", "-", "consistent", "pessimistic", "optimistic", "diverged but confident"]
+    "verdict", ["undecided", "-", "consistent", "too cautious", "overconfident", "optimistic", "diverged but confident"]
 )
 def test_only_a_sure_verdict_calls_an_estimator_overconfident(verdict):
     rows = pd.DataFrame({"estimator": "one", "error_scale": [1.0, 10.0], "nees_median": [1.0, 2.5], "success": 1.0})
     rows = rows.assign(success_high=1.0, simulations_median=1.0, time_median_s=1.0, verdict=["consistent", verdict])
     ((_, honest, *_),) = cells(limits(rows, "limits"))
-    expected = {"undecided": "undecided", "-": "undecided", "consistent": "10", "pessimistic": "10"}
+    expected = {"undecided": "undecided", "-": "undecided", "consistent": "10", "too cautious": "10"}
     assert honest == expected.get(verdict, "1")
 
 

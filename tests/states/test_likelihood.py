@@ -157,7 +157,7 @@ def test_a_maximum_whose_innovations_do_not_fit_is_no_answer():
     white = replace(DAMPED, next={"x": "w"}, constants={})
     (one,) = ib.estimate(white, 3 * np.sin(np.arange(60.0) / 5)[:, None], {"kf": ekf()}, find="w")
     assert one.constants[0].value == pytest.approx(np.sqrt(9 / 2 - 1), rel=0.05)
-    assert (one.verdict, one.passes) == ("does not fit", False)
+    assert (one.verdict, one.passes) == ("wrong", False)
     assert one.fit_p > 0.1
     assert "find= ended at a maximum whose innovations do not fit" in one.message
 

@@ -37,6 +37,7 @@ from ipe_bench.report.words import brief, enumerate_few, percent
 from ipe_bench.statistics.analysis import Analysis, analyse
 from ipe_bench.statistics.records import MAIN, STATISTICS
 from ipe_bench.statistics.statistic import ALL
+from ipe_bench.statistics.verdicts import VERDICTS
 
 SETTINGS = {
     "project": "ipe-bench",
@@ -136,7 +137,8 @@ def write_reference(folder: Path) -> None:
         write_page(folder / f"{group}.md", "options", group=group, title=title, key=key, options=rows)
     statuses = [status for status in Status if status is not Status.RUNNING]
     write_page(folder / "statuses.md", "statuses", statuses=statuses)
-    write_page(folder / "statistics.md", "statistics", records=STATISTICS, definitions=DEFINITIONS.items(), main=MAIN)
+    words = {"records": STATISTICS, "verdicts": VERDICTS, "definitions": DEFINITIONS.items()}
+    write_page(folder / "statistics.md", "statistics", main=MAIN, **words)
     summary = printed_by(["--help"], columns=100).rstrip()
     names = re.findall(r"^    (\w+)(?:  |$)", summary, re.MULTILINE)
     with ThreadPoolExecutor(os.cpu_count()) as pool:

@@ -1,0 +1,114 @@
+"""Holds every word of verdict in one table: its value in files, the word shown, its rule and the words it replaces.
+
+The rules themselves are computed where their numbers are: `intervals.verdict` judges covariances, and
+`real.tracks.LogTracks.verdict` the track of a log.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from ipe_bench.trials.thresholds import FEW, FIT_LEVEL
+
+Verdict = Literal["overconfident", "too cautious", "consistent", "undecided", "wrong", "-"]
+"""Values of a verdict on a covariance."""
+
+OVERCONFIDENT: Final = "overconfident"
+TOO_CAUTIOUS: Final = "too cautious"
+CONSISTENT: Final = "consistent"
+UNDECIDED: Final = "undecided"
+WRONG: Final = "wrong"
+NO_VERDICT: Final = "-"
+LOST: Final = "lost"
+COLLAPSED: Final = "collapsed"
+NO_MAXIMUM: Final = "no maximum"
+SEVERAL_MAXIMA: Final = "several maxima"
+
+
+@dataclass(frozen=True)
+class Word:
+    """Defines a word of verdict."""
+
+    value: str
+    """Stands in files and in Python."""
+    shown: str
+    """Stands in tables and sentences."""
+    sign: str
+    """Stands for it on a narrow screen, behind NEES."""
+    rule: str
+    """States when it is given."""
+    replaces: tuple[str, ...] = ()
+    """Lists the words of older versions that it replaces; they are read as this one."""
+
+
+VERDICTS = (
+    Word(
+        OVERCONFIDENT,
+        "overconfident",
+        "+",
+        "The reported covariance is too small: the mean NEES lies significantly (95 %) above the number of parameters.",
+        replaces=("optimistic", "diverged but confident"),
+    ),
+    Word(
+        TOO_CAUTIOUS,
+        "too cautious",
+        "-",
+        "The reported covariance is too large: the mean NEES lies significantly (95 %) below the number of parameters,"
+        " even if errors that no trial shows are large.",
+        replaces=("pessimistic",),
+    ),
+    Word(
+        CONSISTENT,
+        "consistent",
+        "=",
+        "There is no evidence against the reported covariance.",
+    ),
+    Word(
+        UNDECIDED,
+        "undecided",
+        "?",
+        "A few trials carry the mean NEES, or it seems too small and rare large errors may be missing.",
+    ),
+    Word(
+        WRONG,
+        "wrong (not white)",
+        "!",
+        f"Successive innovations of a filter are correlated: a log has p below {FIT_LEVEL:g}, or significantly"
+        " more than 1 % of the simulated trials have. The size of the innovations then proves nothing.",
+        replaces=("does not fit",),
+    ),
+    Word(
+        NO_VERDICT,
+        "-",
+        "-",
+        f"Fewer than {FEW} trials converged with a reported covariance, or a tracker has neither innovations nor a"
+        " path's cost.",
+    ),
+    Word(
+        LOST,
+        "lost",
+        "!",
+        "From the named epoch of a log on, most innovations are larger than all but one in a million by chance.",
+    ),
+    Word(COLLAPSED, "collapsed", "!", "The particles of a log have a median effective sample size below 2."),
+    Word(NO_MAXIMUM, "no maximum", "!", "The likelihood of a log has no maximum in the constants that `find=` names."),
+    Word(SEVERAL_MAXIMA, "several maxima", "!", "The log hardly tells several maxima of the likelihood apart."),
+)
+"""The words of verdict, those on covariances first."""
+_WORDS = {name: word for word in VERDICTS for name in (word.value, *word.replaces)}
+
+
+def current(value: str) -> str:
+    """Returns the value of a verdict from files of any version; a value that is no verdict stays."""
+    return _WORDS[value].value if value in _WORDS else value
+
+
+def shown(value: str) -> str:
+    """Returns the word shown for a verdict from files of any version."""
+    return _WORDS[value].shown if value in _WORDS else value
+
+
+def sign_of(value: str) -> str:
+    """Returns the sign of a verdict on a narrow screen."""
+    return _WORDS[value].sign

@@ -1,0 +1,92 @@
+"""Words of verdict: one table has all that is said, reads the words of older files, and decides who passes."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+from shared.state_models import ConstantVelocity
+
+import ipe_bench as ib
+from ipe_bench.real.tracks import far_below
+from ipe_bench.report.table import plain_text
+from ipe_bench.report.terminal import overview_notes, summary_tables
+from ipe_bench.states import Formulas, Smoother, ekf, ukf
+from ipe_bench.statistics import analyse
+from ipe_bench.statistics.sample import NIS
+from ipe_bench.statistics.tracks import nis_verdict
+from ipe_bench.statistics.verdicts import VERDICTS, Verdict, current, shown
+
+WHITE = Formulas(
+    next={"x": "w"}, readings={"z": "x"}, noise={"w": 6.0}, deviation={"z": 1.0}, spread={"x": 6.0}, count=60
+)
+"""Successive states of this model are independent, with deviation 6."""
+SINE = 3 * np.sin(np.arange(60.0) / 5)[:, None]
+
+
+def test_the_table_has_every_word_once_and_reads_those_of_older_files():
+    assert [word.value for word in VERDICTS[:6]] == list(get_args(Verdict))
+    names = [name for word in VERDICTS for name in (word.value, *word.replaces)]
+    assert len(names) == len(set(names))
+    old = ("optimistic", "diverged but confident", "pessimistic", "does not fit", "consistent", "undecided")
+    now = ["overconfident", "overconfident", "too cautious", "wrong", "consistent", "undecided"]
+    assert [current(word) for word in old] == now
+    assert current("lost from epoch 31") == shown("lost from epoch 31") == "lost from epoch 31"
+
+
+def test_every_row_says_its_verdict_on_any_screen(synthetic):
+    """A row whose covariance is right has its word too."""
+    synthetic.add(synthetic.scenario(), "newton", np.ones((20, 3)))
+    rows: Any = analyse([synthetic.directory]).summary.to_dict("records")
+    for verdict, word, sign in (
+        ("consistent", "consistent", "="),
+        ("diverged but confident", "overconfident", "+"),
+        ("overconfident", "overconfident", "+"),
+        ("too cautious", "too cautious", "-"),
+        ("undecided", "undecided", "?"),
+    ):
+        told = [row | {"verdict": verdict} for row in rows]
+        wide, narrow = (plain_text(summary_tables(told, (), width), width) for width in (120, 80))
+        (row,) = (line for line in wide.splitlines() if line.lstrip().startswith("1  newton"))
+        assert f" {word} " in row
+        (row,) = (line for line in narrow.splitlines() if line.lstrip().startswith("1  newton"))
+        assert f" {sign} " in row
+        assert f"{sign} {word}" in " ".join(overview_notes((), narrow=True))
+
+
+def test_a_log_whose_innovations_are_not_white_is_wrong_however_small_they_are():
+    """A sine of amplitude 3 is small for states of deviation 6, but neighbouring readings are alike."""
+    trackers = {"ekf": ekf(), "ekf_rts": Smoother(ekf())}
+    answer = ib.estimate(WHITE, SINE, trackers)
+    for one in answer:
+        assert one.mean_nis < one.limits[0]
+        assert one.fit_p > 0.99
+        assert one.white_p < 1e-7
+        assert (one.verdict, one.passes) == ("wrong", False)
+    assert not answer.passes
+    assert "wrong (not white)" in str(answer)
+    for right in ib.estimate(WHITE, WHITE.draw(0, 1, 3).z[0], trackers):
+        assert (right.verdict, right.passes) == ("consistent", True)
+
+
+@pytest.mark.parametrize(("worse", "said"), [({}, True), ({"mean_nis": 3.0}, False), ({"white_p": 1e-9}, False)])
+def test_only_a_track_whose_innovations_fit_is_a_standard_for_others(worse, said):
+    """The likelihood of a filter that linearises is that of its own approximation."""
+    model = ConstantVelocity(count=50)
+    first, second = ib.estimate(model, model.draw(0, 1, 1).z[0], {"ekf": ekf(), "ukf": ukf()})
+    assert far_below([first, second]) == []
+    far = replace(second, log_likelihood=first.log_likelihood - 400)
+    lines = ["ukf: ekf predicts each next reading far better, by 400 in log likelihood"]
+    assert far_below([replace(first, **worse), far]) == (lines if said else [])
+
+
+@pytest.mark.parametrize(("wrong", "verdict"), [(0, "consistent"), (5, "consistent"), (6, "wrong")])
+def test_simulated_trackers_are_wrong_where_surely_more_than_one_trial_in_a_hundred_is_not_white(wrong, verdict):
+    """If the share is 1 %, 5 or more of 200 trials have a probability of .052, and 6 or more one of .016 < .025."""
+    p = np.where(np.arange(200) < wrong, 1e-4, 0.5)
+    nis = np.random.default_rng(0).chisquare(10, 200) / 10
+    scalars = {"path_nees": nis, NIS: nis, "white_p": p}
+    group = SimpleNamespace(footer={"readings": 10})
+    sample: Any = SimpleNamespace(scalars=scalars, group=group, converged=np.ones(200, dtype=bool))
+    assert nis_verdict(sample) == verdict
