@@ -29,12 +29,13 @@ from hydra.core.plugins import Plugins
 from hydra.errors import HydraException
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.types import RunMode
-from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from ipe_bench.basics.errors import UserError, describe_exception, unknown
 from ipe_bench.cli import print_problems
 from ipe_bench.cli import words as w
+from ipe_bench.cli.hydra_keys import Guarded
 from ipe_bench.cli.search_path import extend
 from ipe_bench.cli.spec import DEFAULTS, KEYS, Spec, spec
 from ipe_bench.cli.words import Words
@@ -57,6 +58,9 @@ class PluginConfigs(SearchPathPlugin):
 def session(folder: Path | None = None) -> Iterator[None]:
     """Lets Hydra find our configs, those of plugins, and those in `folder` within its block."""
     print_problems(plugins.take_problems())
+    for name in ("config.yaml", "schema.yaml", "hydra/config.yaml") if folder else ():
+        if (folder / name).exists():
+            raise UserError(f"{folder / name}: would replace ipe-bench's own config; move it to experiment/NAME.yaml")
     store, registry = ConfigStore.instance(), Plugins.instance()
     store.store("schema", node=DEFAULTS, provider="ipe-bench")
     for name in FORMULAS:
@@ -75,6 +79,7 @@ def session(folder: Path | None = None) -> Iterator[None]:
     # Hydra 1.3 asks for the version whose rules hold, and 1.4 warns of whoever says one.
     base = {"version_base": "1.3"} if hydra.__version__.startswith("1.3.") else {}
     with initialize_config_dir(str(plugins.own_conf()), job_name="ipe-bench", **base):
+        _hydra().config_loader = Guarded(_hydra().config_loader.get_search_path())
         yield
 
 
@@ -137,8 +142,7 @@ def jobs_of(words: Words, *, multirun: bool) -> Jobs:
             raise UserError(f"the sweep has {number} jobs: give 1 to {w.MOST_JOBS}, and check its patterns")
         specs = [_spec(job) for job in jobs]
     told = any(one.is_hydra_override() for one in words.overrides)
-    elsewhere = told or hydra.callbacks or hydra.job.chdir or hydra.job.env_set
-    ours = hydra.launcher["_target_"].endswith(".BasicLauncher") and not elsewhere
+    ours = hydra.launcher["_target_"].endswith(".BasicLauncher") and not told
     return Jobs(words, specs, multirun, told=[list(map(w.forced, job)) for job in jobs] if ours else [])
 
 
@@ -165,7 +169,6 @@ def _composed(words: tuple[str, ...], *, whole: bool = False) -> DictConfig:
                 del config["model"]
     except Exception as error:  # what Hydra makes of overrides raises nearly anything
         raise explain(error) from error
-    _require_own_calls(config.hydra, "hydra")
     chosen = config.hydra.runtime.choices
     if chosen.get("model") and chosen.state_model:
         raise UserError(f"state_model={chosen.state_model}: the experiment overrides /model; write /state_model there")
@@ -173,30 +176,6 @@ def _composed(words: tuple[str, ...], *, whole: bool = False) -> DictConfig:
         with open_dict(config):
             del config["hydra"]
     return config
-
-
-_CALLS = ("_target_", "class", "()")
-"""Keys whose value Hydra or the module logging calls, with the keys beside it as arguments."""
-_OWN_CALL = re.compile(
-    r"hydra\._internal\.core_plugins\.\w+\.[A-Z]\w*|hydra\.experimental\.callbacks\.[A-Z]\w*"
-    r"|hydra_plugins\.(\w+\.){1,2}[A-Z]\w*|optuna\.(samplers|pruners)\.[A-Z]\w*"
-    r"|(logging|logging\.handlers|colorlog)\.[A-Z]\w*"
-)
-
-
-def _require_own_calls(node: Any, where: str) -> None:
-    """Refuses a config of Hydra that names something to be called besides Hydra's own classes, those of launchers and
-    sweepers, and those of logging."""
-    keys: Any = node if isinstance(node, DictConfig) else range(len(node)) if isinstance(node, ListConfig) else ()
-    for key in keys:
-        value = None
-        with contextlib.suppress(OmegaConfBaseException):  # what is not known before a job begins
-            value = node[key]
-        if key not in _CALLS:
-            _require_own_calls(value, f"{where}.{key}")
-        elif not _OWN_CALL.fullmatch(str(value)):
-            known = "only classes of Hydra, of launchers and sweepers, and of logging"
-            raise UserError(f"{where}.{key}={value}: {known} may be named here; remove it, or write a plugin")
 
 
 def spec_of(config: DictConfig) -> Spec:

@@ -176,25 +176,22 @@ def test_an_experiment_of_ones_own_sweeps_as_ours_do(ipe_bench):
     assert [path.name for path in Path("outputs").iterdir()] == ["mine"]
 
 
-COPY = "{_target_: shutil.copyfile, src: conf/experiment/mine.yaml, dst: copy}"
 CALLED = {
-    "a callback": ("", f"callbacks: {{mine: {COPY}}}", "hydra.callbacks.mine._target_"),
-    "one from elsewhere": (f"parameters: {{a: {COPY}}}", "callbacks: ${parameters}", "hydra.callbacks.a._target_"),
-    "a handler of logs": (
-        "",
-        f"job_logging: {{handlers: {{mine: {COPY.replace('_target_', 'class')}}}}}",
-        "hydra.job_logging.handlers.mine.class",
-    ),
+    "a callback": """callbacks: '${oc.decode:"{x:{_target_:shutil.copyfile,src:mine,dst:copy}}"}'""",
+    "a handler of logs": "job_logging: {version: 1, root: {handlers: [x]},"
+    " handlers: {x: {class: logging.FileHandler, filename: mine, mode: w}}}",
 }
 
 
-@pytest.mark.parametrize(("before", "below_hydra", "where"), CALLED.values(), ids=CALLED)
-@pytest.mark.parametrize("flag", [(), ("-m",)])
-def test_an_experiment_has_no_function_called(ipe_bench, before, below_hydra, where, flag):
+@pytest.mark.parametrize("below_hydra", CALLED.values(), ids=CALLED)
+def test_an_experiment_has_no_function_called(ipe_bench, below_hydra):
+    Path("mine").write_text("kept")
     folder = Path("conf/experiment")
     folder.mkdir(parents=True)
-    (folder / "mine.yaml").write_text(f"# @package _global_\n{before}\nhydra:\n  {below_hydra}\n")
-    code, _, err = ipe_bench("run", *flag, "--config-dir", "conf", "+experiment=mine", *SMALL, "seed=1", "trials=2")
-    assert code == 2
-    assert where in err
+    (folder / "mine.yaml").write_text(f"# @package _global_\nhydra:\n  job: {{env_set: {{A: b}}}}\n  {below_hydra}\n")
+    words = ("--config-dir", "conf", "+experiment=mine", *SMALL, "solver=[newton]", "trials=2")
+    code, _, err = ipe_bench("run", *words)
+    assert (code, err.count("\n")) == (2, 1)
+    assert "hydra." in err
+    assert Path("mine").read_text() == "kept"
     assert not Path("copy").exists()
