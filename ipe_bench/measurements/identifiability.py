@@ -3,15 +3,22 @@
 Exact readings at all times determine the Taylor coefficients of the outputs at t = 0 and nothing more. A parameter or
 an initial state is locally identifiable if its column of the Jacobian of these coefficients is no combination of the
 others. The rank is taken at a random point modulo a prime, so that no rounding blurs it (Sedoglavic, J. Symb. Comput.
-33, 2002); it is too small with a probability of about degree / prime, and a second prime repeats it.
+33, 2002); it is too small with a probability of about degree / prime.
+
+From a general start the rank of n unknowns is complete after n orders. Where states start at 0 it may stand still in
+between, so more orders follow, and the Jacobian of the readings has the last word.
 """
 
 from __future__ import annotations
 
+import itertools
+import operator
 import random
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
 
 from ipe_bench.measurements.arithmetic import Arithmetic
 from ipe_bench.measurements.base import Forwarding, Measurement
@@ -19,9 +26,13 @@ from ipe_bench.measurements.formula import Formula
 from ipe_bench.measurements.ode.described import Ode
 from ipe_bench.measurements.ode.trace import Expression, Graph, in_order, tangent
 
-_PRIMES = (2147483647, 2147483629)
+_PRIME = (1 << 61) - 1
 _POWERS = tuple(float(k) for k in range(3, 9))
 """Exponents that are multiplied out, so that the base may be zero at the start."""
+_LONGEST = 200_000
+"""Coefficients of expressions, some two seconds, after which an examination ends without an answer."""
+_SEEN = 1e-6
+"""Least relative size of what counts as different from 0 in a Jacobian that was integrated."""
 
 
 @dataclass(frozen=True)
@@ -46,34 +57,56 @@ class Structure:
 
 def structure(model: Measurement) -> Structure | None:
     """Finds which parameters of a model by `Ode` or `Formula` no readings tell, locally, with the real constants of its
-    cases; None for other models, and for formulas that are not examined (sin, tanh and their kin; conditionals; inputs
-    or exponents that change with time; a denominator that is 0 at the start)."""
+    cases.
+
+    Returns None for other models, for formulas that are not examined (sin, tanh and their kin; conditionals; inputs or
+    exponents that change with time; a denominator that is 0 at the start), for models so large that it would take long,
+    and where the readings at the nominal point determine more than the coefficients that were examined.
+    """
     fixed: dict[str, float] = {}
-    while isinstance(model, Forwarding) and not isinstance(model, Ode):
-        fixed = {**model.fixed, **fixed}
-        model = model.whole
-    unknowns = [p.name for p in model.parameters if p.name not in fixed]
-    if isinstance(model, Ode) and not model.driven_by:
-        formulas = (model.rate_formulas, model.initial_formulas, model.output_formulas)
-        cases = [{**case, **fixed} for case in model.known_of_cases]
-    elif isinstance(model, Formula):  # without time: rows stand for cases, at any values of the columns
-        formulas, draw = ({}, {}, {"reading": model.arithmetic}), random.Random(1)
-        rows = [{i.heading: float(draw.randrange(2, 1 << 20)) for i in model.inputs} for _ in range(len(unknowns) + 1)]
+    described = model
+    while isinstance(described, Forwarding) and not isinstance(described, Ode):
+        fixed = {**described.fixed, **fixed}
+        described = described.whole
+    unknowns = [p.name for p in described.parameters if p.name not in fixed]
+    if isinstance(described, Ode) and not described.driven_by:
+        formulas = (described.rate_formulas, described.initial_formulas, described.output_formulas)
+        cases = [{**case, **fixed} for case in described.known_of_cases]
+    elif isinstance(described, Formula):  # without time: rows stand for cases, at any values of the columns
+        formulas, draw = ({}, {}, {"reading": described.arithmetic}), random.Random(1)
+        headings = [i.heading for i in described.inputs]
+        rows = [{name: float(draw.randrange(2, 1 << 20)) for name in headings} for _ in range(len(unknowns) + 1)]
         cases = [{**row, **fixed} for row in rows]
     else:
         return None
     try:
-        bases = [_echelon(_jacobian(_Free(prime), unknowns, formulas, cases), prime) for prime in _PRIMES]
+        basis = _independent(_Free(_PRIME), unknowns, formulas, cases)
     except (NotImplementedError, ZeroDivisionError):
         return None
-    rows, pivots = max(bases, key=lambda basis: len(basis[1]))
+    lacking = len(basis) < len(unknowns)
+    if lacking and model.n == len(unknowns) and _rank(model) > len(basis):
+        return None
     groups: list[set[int]] = []
-    for free in (f for f in range(len(unknowns)) if f not in pivots):
-        moved = {free} | {c for row, c in zip(rows, pivots, strict=True) if row[free]}
+    for free in (f for f in range(len(unknowns)) if f not in basis):
+        moved = {free} | {pivot for pivot, row in basis.items() if row[free]}
         touched = [g for g in groups if g & moved]
         groups = [g for g in groups if not g & moved] + [moved.union(*touched)]
     named = tuple(tuple(unknowns[i] for i in sorted(g)) for g in groups)
     return Structure(tuple(unknowns), named)
+
+
+def _rank(model: Measurement) -> int:
+    """Computes how many parameters or combinations of them the readings determine at the nominal point, at least."""
+    if not model.input_columns_known:
+        return 0
+    x = model.nominal[None]
+    with np.errstate(all="ignore"):
+        J, z = model.jacobian(x)[0], model.simulate(x)[0]
+    if not (np.isfinite(J).all() and np.isfinite(z).all()):
+        return 0
+    lengths = np.linalg.norm(J, axis=0)
+    moving = lengths > _SEEN * np.linalg.norm(z)
+    return int(np.linalg.matrix_rank(J[:, moving] / lengths[moving], rtol=_SEEN)) if moving.any() else 0
 
 
 class _Free(dict[Any, int]):
@@ -81,6 +114,7 @@ class _Free(dict[Any, int]):
     argument has the same exponential in all."""
 
     def __init__(self, prime: int) -> None:
+        super().__init__({("exp", 0): 1, ("log", 1): 0})
         self.prime, self._random = prime, random.Random(prime)
 
     def __missing__(self, key: Any) -> int:
@@ -89,7 +123,7 @@ class _Free(dict[Any, int]):
 
     def power(self, base: int, exponent: int) -> int:
         """Computes powers; those with exponents one apart, as of a power and its derivative, have the base as ratio."""
-        if exponent == 0:
+        if exponent == 0 or base == 1:
             return 1
         for apart in (1, -1):
             other = ("pow", base, (exponent + apart) % self.prime)
@@ -98,11 +132,11 @@ class _Free(dict[Any, int]):
         return self["pow", base, exponent]
 
 
-def _jacobian(
+def _independent(
     free: _Free, unknowns: Sequence[str], formulas: Iterable[Mapping[str, Arithmetic]], cases: list[dict[str, float]]
-) -> list[list[int]]:
-    """Computes the derivatives (cases x outputs x orders, unknowns) of the outputs' Taylor coefficients, modulo the
-    prime, where the formulas are rates, initial states and outputs; as many coefficients as unknowns suffice."""
+) -> _Basis:
+    """Finds the independent ones among the derivatives by the unknowns of the outputs' Taylor coefficients, modulo the
+    prime, where the formulas are rates, initial states and outputs."""
     graph, (rates, initial, outputs) = Graph(), formulas
     names = {name: graph.input(name) for name in [*unknowns, *rates, *cases[0], "t"]}
 
@@ -118,20 +152,58 @@ def _jacobian(
         slopes += tangent(equations[0], along)
         starts += tangent(equations[1], along)
         states += moved
-    everything, orders = in_order([*slopes, *(e for column in columns for e in column)]), len(unknowns) + 1
-    rows = []
-    for case in cases:
+    everything = in_order([*slopes, *(e for column in columns for e in column)])
+
+    def orders(case: dict[str, float]) -> Iterator[tuple[list[list[int]], bool]]:
+        """Yields the derivatives (outputs, unknowns) of one coefficient after the other, and whether every state that
+        ever moves has moved."""
         given = {names[name].order: [free[name]] for name in unknowns} | {names["t"].order: [0, 1]}
         given |= {names[name].order: [_modulo(value, free.prime)] for name, value in case.items()}
         begun = _Series(free, {**given})
         begun.extend(in_order(starts), 0)
-        series = _Series(free, given | {y.order: [begun[e.order][0]] for y, e in zip(states, starts, strict=True)})
-        for k in range(orders if rates else 1):
+        given |= {y.order: [begun[e.order][0]] for y, e in zip(states, starts, strict=True)}
+        later = given | {names["t"].order: [free["t"]]}
+        moving = _moving(free, dict(zip(states, equations[0], strict=False)), later)
+        series = _Series(free, given)
+        for k in itertools.count():
             series.extend(everything, k)
+            rows = [[series[column[i].order][k] for column in columns] for i in range(len(shown))]
+            yield rows, all(any(series.given[y.order]) for y in moving)
             for state, slope in zip(states, slopes, strict=True):
                 series.given[state.order].append(series[slope.order][k] * pow(k + 1, -1, free.prime) % free.prime)
-            rows += [[series[column[i].order][k] for column in columns] for i in range(len(shown))]
-    return rows
+
+    basis = _Basis(free.prime)
+    grown = moved = 0
+    for k, cases_at_k in enumerate(zip(*map(orders, cases), strict=True)):
+        known = len(basis)
+        for rows, all_move in cases_at_k:
+            for row in rows:
+                basis.add(row)
+            moved = moved if all_move else k + 1
+        grown = k if len(basis) > known else grown
+        # The slopes of a linear model of n states, driven by constants, satisfy a linear equation of order 2 n + 2: as
+        # many zeros are followed by zeros alone. What begins at order k begins to depart from its beginning, as
+        # y^4 / (K + y^4) does from y^4 / K, at order 2 k.
+        if len(basis) == len(unknowns) or not rates or k - max(grown, moved) > 2 * len(rates) + 2 + moved:
+            break
+        if k * len(everything) * len(cases) > _LONGEST:
+            raise NotImplementedError("a model of this size")
+    return basis
+
+
+def _moving(
+    free: _Free, slopes: Mapping[Expression, Expression], given: Mapping[int, list[int]]
+) -> tuple[Expression, ...]:
+    """Finds the states that do not stay at 0 for ever."""
+    at_rest = [y for y in slopes if not any(given[y.order])]
+    while True:
+        anywhere = {y.order: [free[y]] for y in slopes} | {y.order: [0] for y in at_rest}
+        series = _Series(free, {**given, **anywhere})
+        series.extend(in_order(slopes.values()), 0)
+        resting = [y for y in at_rest if series[slopes[y].order] == [0]]
+        if resting == at_rest:
+            return tuple(y for y in slopes if y not in at_rest)
+        at_rest = resting
 
 
 class _Series(dict[int, list[int]]):
@@ -140,6 +212,7 @@ class _Series(dict[int, list[int]]):
 
     def __init__(self, free: _Free, given: dict[int, list[int]]) -> None:
         self.free, self.p, self.given = free, free.prime, given
+        self.powers: dict[int, list[list[int]]] = {}
 
     def extend(self, expressions: Sequence[Expression], k: int) -> None:
         """Computes coefficient k of all expressions, operands before their users."""
@@ -176,10 +249,10 @@ class _Series(dict[int, list[int]]):
             case "where" if a[0]:  # of a power's derivative: what is not 0 here is not 0 nearby
                 return self[e.operands[1].order][k]
             case "pow" if e.operands[1].value in _POWERS:
-                power = a
-                for _ in range(1, int(e.operands[1].value or 0)):
-                    power = [_product(power, a, i) % self.p for i in range(k + 1)]
-                return power[k]
+                powers = self.powers.setdefault(e.order, [[] for _ in range(1, int(e.operands[1].value or 0))])
+                for lower, higher in itertools.pairwise([a, *powers]):
+                    higher.append(_product(lower, a, k) % self.p)
+                return powers[-1][k]
             case "sqrt":
                 return self._power(u, a, pow(2, -1, self.p), k)
             case "pow" if not any(b[1:]):
@@ -200,7 +273,7 @@ class _Series(dict[int, list[int]]):
 
 def _product(a: Sequence[int], b: Sequence[int], k: int) -> int:
     """Computes coefficient k of a product of series."""
-    return sum(a[i] * b[k - i] for i in range(k + 1))
+    return sum(map(operator.mul, a[: k + 1], b[k::-1])) if k >= 0 else 0
 
 
 def _derivative(a: Sequence[int]) -> list[int]:
@@ -212,19 +285,27 @@ def _modulo(value: float, prime: int) -> int:
     return numerator * pow(denominator, -1, prime) % prime
 
 
-def _echelon(J: list[list[int]], p: int) -> tuple[list[list[int]], list[int]]:
-    """Computes the reduced row echelon form of J modulo p, and its pivot columns."""
-    rows, pivots = J, []
-    for column in range(len(J[0])):
-        r = len(pivots)
-        found = next((i for i in range(r, len(rows)) if rows[i][column]), None)
-        if found is None:
-            continue
-        rows[r], rows[found] = rows[found], rows[r]
-        scale = pow(rows[r][column], -1, p)
-        rows[r] = [v * scale % p for v in rows[r]]
-        for i, row in enumerate(rows):
-            if i != r and row[column]:
-                rows[i] = [(v - row[column] * w) % p for v, w in zip(row, rows[r], strict=True)]
-        pivots.append(column)
-    return rows[: len(pivots)], pivots
+class _Basis(dict[int, list[int]]):
+    """Holds independent rows modulo a prime by their pivot columns; in each of these all other rows are 0."""
+
+    def __init__(self, prime: int) -> None:
+        super().__init__()
+        self.p = prime
+
+    def add(self, row: list[int]) -> None:
+        """Adds a row, unless it is a combination of those that are there."""
+        for pivot, known in self.items():
+            row = self._without(pivot, row, known)
+        pivot = next((column for column, value in enumerate(row) if value), None)
+        if pivot is None:
+            return
+        scale = pow(row[pivot], -1, self.p)
+        row = [value * scale % self.p for value in row]
+        for other, known in self.items():
+            self[other] = self._without(pivot, known, row)
+        self[pivot] = row
+
+    def _without(self, pivot: int, row: list[int], known: list[int]) -> list[int]:
+        """Subtracts what makes a row 0 in the pivot column of a known one."""
+        factor = row[pivot]
+        return [(v - factor * w) % self.p for v, w in zip(row, known, strict=True)] if factor else row
