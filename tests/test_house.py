@@ -73,6 +73,12 @@ def test_rooms_know_only_the_libraries_that_are_theirs():
             assert home is None or PLACE[room] >= PLACE[home], f"{path} knows {name}, which belongs to {home} and above"
 
 
+def test_all_texts_of_consoles_leave_by_one_door():
+    """Rich's own console obeys what a name says to a terminal."""
+    homes = {path.name for path, _ in MODULES if "rich.console.Console" in imported(path, checked_types=False)}
+    assert homes == {"screen.py"}
+
+
 def test_the_package_imports_no_plugin():
     names = {name for path in HOUSE.rglob("*.py") for name in imported(path, checked_types=True)}
     assert [name for name in names if name.startswith("ipe_bench_")] == []

@@ -25,9 +25,9 @@ _WIDTH_WITHOUT_TERMINAL = 120
 
 def console() -> Console:
     """Makes the console for tables: as wide as the terminal, or wide enough for a table in a file."""
-    from rich.console import Console
+    from ipe_bench.report.screen import Screen
 
-    out = Console(highlight=False)
+    out = Screen()
     out.on_broken_pipe = discard_output
     if not out.is_terminal:
         out.width = _WIDTH_WITHOUT_TERMINAL
@@ -43,7 +43,7 @@ def discard_output() -> None:
 def say(*lines: str) -> None:
     """Prints lines as they are, which a terminal may fold."""
     for line in lines:
-        console().print(line, markup=False, soft_wrap=True)
+        console().print(line, soft_wrap=True)
 
 
 def print_problems(lines: Iterable[str]) -> None:

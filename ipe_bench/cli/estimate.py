@@ -103,7 +103,7 @@ def _show(parts: Iterable[Part], files: Sequence[Path]) -> None:
     """Prints tables, and which files a command has written into its folder."""
     show(parts)
     say(f"\nIn {files[0].parent}:")
-    console().print(", ".join(path.name for path in files), markup=False)
+    console().print(", ".join(path.name for path in files))
 
 
 def _described(estimators: Any) -> dict[str, Any]:

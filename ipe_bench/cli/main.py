@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import importlib
 import io
@@ -14,6 +15,7 @@ from typing import Any
 
 from ipe_bench import __version__
 from ipe_bench.basics.errors import StorageError, UserError, shortened, unknown
+from ipe_bench.basics.visible import VisibleStream
 from ipe_bench.cli import discard_output
 from ipe_bench.cli.parser import COMMANDS, parsers
 from ipe_bench.report.writer import COMMAND
@@ -45,6 +47,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     # Arrow's own allocator keeps what it was given back: of a million rows, as much again as is in use.
     os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
     COMMAND.set(shlex.join(["ipe-bench", *words]))
+    with contextlib.redirect_stdout(_door(sys.stdout)), contextlib.redirect_stderr(_door(sys.stderr)):
+        return _answer(words)
+
+
+def _door(stream: Any) -> Any:
+    return stream and VisibleStream(stream)
+
+
+def _answer(words: list[str]) -> int:
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning

@@ -58,8 +58,8 @@ class PluginConfigs(SearchPathPlugin):
 def session(folder: Path | None = None) -> Iterator[None]:
     """Lets Hydra find our configs, those of plugins, and those in `folder` within its block."""
     print_problems(plugins.take_problems())
-    for name in ("config.yaml", "schema.yaml", "hydra/config.yaml") if folder else ():
-        if (folder / name).exists():
+    for name in ("config.yaml", "schema.yaml", "hydra/config.yaml"):
+        if folder is not None and (folder / name).exists():
             raise UserError(f"{folder / name}: would replace ipe-bench's own config; move it to experiment/NAME.yaml")
     store, registry = ConfigStore.instance(), Plugins.instance()
     store.store("schema", node=DEFAULTS, provider="ipe-bench")

@@ -90,12 +90,14 @@ def _line_of_notebook(title: str) -> Iterator[Tell]:
 def _bar(title: str, *, lines: bool, kept: bool) -> Iterator[Tell]:
     """Shows a bar on stderr, with warnings of ipe-bench above it; one that is `kept` stays there. Where stderr is no
     terminal, `lines` prints a line now and then."""
-    from rich.console import Console
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
 
-    console = Console(stderr=True, highlight=False)
-    columns = TextColumn("{task.description}", markup=False), BarColumn(10), TextColumn("{task.fields[state]}")
+    from ipe_bench.report.screen import Screen
+
+    console = Screen(stderr=True)
+    name, state_of = (TextColumn(field, markup=False) for field in ("{task.description}", "{task.fields[state]}"))
+    columns = name, BarColumn(10), state_of
     options: dict[str, Any] = {"console": console, "disable": not console.is_terminal, "transient": not kept}
     bar = Bar(*columns, TimeElapsedColumn(), **options)
     line = bar.add_task(shortened(title, max(30, console.width - 80)), total=None, state="")
@@ -106,11 +108,11 @@ def _bar(title: str, *, lines: bool, kept: bool) -> Iterator[Tell]:
         bar.update(line, total=total or 1, completed=done if total else 1, state=state)
         if lines and not console.is_terminal and (done >= total or time.monotonic() - spoken >= _LINE_EVERY_S):
             spoken = time.monotonic()
-            console.print(f"{title}: {state}", markup=False, soft_wrap=True)
+            console.print(f"{title}: {state}", soft_wrap=True)
 
     logger, handler = logging.getLogger("ipe_bench"), logging.Handler(logging.WARNING)
     # Through the console that draws the bar, so that neither spoils the other.
-    handler.emit = lambda record: console.print(f"ipe-bench: {record.getMessage()}", markup=False, soft_wrap=True)
+    handler.emit = lambda record: console.print(f"ipe-bench: {record.getMessage()}", soft_wrap=True)
     logger.addHandler(handler)
     try:
         # Older versions of rich end even a bar that is not shown with an empty line.

@@ -195,10 +195,10 @@ def terminal(parts: Iterable[Part], width: int) -> Group:
 
 def plain_text(parts: Iterable[Part], width: int = 120) -> str:
     """Returns the text that a terminal of that width shows, without colours."""
-    from rich.console import Console
+    from ipe_bench.report.screen import Screen
 
     shown = io.StringIO()
-    Console(width=width, file=shown, force_jupyter=False).print(terminal(parts, width))
+    Screen(width=width, file=shown, force_jupyter=False).print(terminal(parts, width))
     return shown.getvalue()
 
 

@@ -84,10 +84,14 @@ def _classed(html: str) -> str:
         styles[name] = re.sub(r"font-family: [^;]*; ", "", found[1])
         return f' class="{name}"'
 
-    html = re.sub(r'<g id="[^"]*"', "<g", html)
-    html = re.sub(r' style="((?:fill|stroke|font|opacity|clip)[^"]*)"', named, html)
-    html = re.sub(r' transform="rotate\(-0 [^"]*"', "", html)
-    html = re.sub(r' (?:d|x|y)="[^"]*"', lambda found: re.sub(r"(\.\d\d)\d+|\s*\n", r"\1", found[0]), html)
+    def rewritten(tag: re.Match[str]) -> str:
+        short = re.sub(r'^<g id="[^"]*"', "<g", tag[0])
+        short = re.sub(r' style="((?:fill|stroke|font|opacity|clip)[^"]*)"', named, short)
+        short = re.sub(r' transform="rotate\(-0 [^"]*"', "", short)
+        return re.sub(r' (?:d|x|y)="[^"]*"', lambda found: re.sub(r"(\.\d\d)\d+|\s*\n", r"\1", found[0]), short)
+
+    # In tags alone: a name between them may read as an attribute, and matplotlib escapes no quotes there.
+    html = re.sub(r"<\w[^<>]*>", rewritten, html)
     light = "".join(f".{name}{{{style}}}" for name, style in styles.items())
     night = re.sub("#[0-9a-f]{6}", lambda color: dark(color[0]), light)
     html = re.sub(r">\s*\n\s*<", "><", html)
