@@ -14,7 +14,7 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.least_squares import inverse_factor
 from ipe_bench.measurements.base import Measurement, Parameter
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.real.fits import Fit, at_rows, falls_beyond, holding, scaled
+from ipe_bench.real.fits import FAR_BELOW, Fit, at_rows, falls_beyond, holding, scaled
 from ipe_bench.real.levels import Levelled, maximise_likelihood, maximum, objective_of
 from ipe_bench.real.profiles import (
     CONFIDENCE,
@@ -101,6 +101,8 @@ class Examination:
     freedom: int | Array | None
     """Degrees of freedom behind the level of the noise, or (n,) behind each variance; None if R is known."""
     bootstraps: int
+    overstated: bool = False
+    """Whether the residuals are so far below the stated noise that no interval by chi-square means anything."""
     released: Released | None = None
     """The problem in which parameters that are held on bounds may leave them."""
     on_bounds: tuple[OnBound, ...] = ()
@@ -307,6 +309,7 @@ def examine(problem: Problem, z: Array, fits: list[Fit], *, bootstraps: int = BO
         chi_square=chi_square,
         freedom=freedom,
         bootstraps=bootstraps,
+        overstated=best.overstated >= FAR_BELOW,
     )
     if not values:
         return found

@@ -22,7 +22,7 @@ from ipe_bench.measurements.identifiability import structure
 from ipe_bench.measurements.known import ConstrainedModel
 from ipe_bench.real.estimation import Question
 from ipe_bench.real.examination import CONFIDENCE, Examination
-from ipe_bench.real.fits import Fit
+from ipe_bench.real.fits import TOO_WELL, Fit
 from ipe_bench.real.residuals import LEAST_P
 from ipe_bench.report.table import Part, Shown, Strong, Table, texts, words
 from ipe_bench.report.words import enumerate_few, p_value
@@ -43,8 +43,6 @@ _MOST_OUTLIERS = 8
 _FEW = 0.05
 """Share of outliers above which the model is wrong, and no list of readings helps."""
 _FITS = {True: "yes", False: "NO", None: "not tested"}
-_TOO_WELL = 0.999
-"""The p of chi-square above which residuals are smaller than the stated noise explains."""
 _INFLUENTIAL = 1.0
 """Standard errors by which a parameter moves without a reading from which on that reading is named."""
 _MOST_READINGS, _MOST_MINIMA = 5, 3
@@ -130,7 +128,7 @@ class Answer(Shown):
         yield from _outliers(self)
         if one is not None:
             passes = self[one.label].passes
-            if passes:
+            if passes and not one.overstated:
                 yield _intervals(one)
             if passes or not one.least:
                 for remark in remarks(one, _reading_labels(self.model)):
@@ -145,7 +143,8 @@ class Answer(Shown):
         labels = enumerate_few([one.label for one in passing])
         tests = "every test" if passing[0].fits else "what tests there are, none of the size of the residuals"
         found = [f"Passing {tests}: {labels}{f'; no answer: {others}' if others else ''}."]
-        one, told = passing[0], self.examination
+        told = self.examination
+        one = next((one for one in passing if told and one.label == told.label), passing[0])
         parameters = zip(one.model.physical_parameters, one.x, one.standard_errors, strict=True)
         values = [f"{p.name} = {with_error(x, s)} {p.unit}".rstrip() for p, x, s in parameters]
         found.append(f"{one.label}: {enumerate_few(values, 4)}.")
@@ -224,6 +223,8 @@ def _notes(answer: Answer) -> Iterator[str]:
     for one in fits:
         if one.beaten_by:
             yield f"{one.label}: {one.beaten_by} found a better fit, by more than chance explains; this is no answer."
+        if one.lower_at:
+            yield f"{one.label}: {one.lower_at} ended at a lower minimum, which is the better answer."
         if one.held_at:
             at = {one.model.physical_parameters[k].name: value for k, value in one.held_at.items()}
             yield (
@@ -249,13 +250,17 @@ def _notes(answer: Answer) -> Iterator[str]:
             f"{', '.join(suspect)}: successive residuals resemble each other (white p below {FIT_LEVEL:g}); the model"
             " is in doubt, and standard errors are too small."
         )
-    if small := [one for one in fits if one.level is None and not one.levels and one.p_value > _TOO_WELL]:
-        least = min(small, key=lambda one: one.chi_square)
-        times = math.sqrt(least.degrees_of_freedom / least.chi_square) if least.chi_square else math.inf
+    if small := [one for one in fits if one.overstated > 1]:
+        times = max(one.overstated for one in small)
         yield (
             f"{', '.join(one.label for one in small)}: the residuals are up to {times:.2g} times smaller than the"
-            f" stated noise, by chance in less than {1 - _TOO_WELL:.1g} of cases; if it is overstated, so are standard"
+            f" stated noise, by chance in less than {1 - TOO_WELL:.1g} of cases; if it is overstated, so are standard"
             " errors."
+        )
+    if answer.examination is not None and answer.examination.overstated:
+        yield (
+            "By noise that is so far overstated no interval means anything, and none is computed: state the noise of"
+            " these readings, or choose noise=unknown, whose level is estimated."
         )
     if told := [one.label for one in fits if one.with_prior]:
         yield f"{', '.join(told)}: with a prior, which counts in the standard errors as further readings would."
@@ -347,6 +352,8 @@ def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator
         ways = dict.fromkeys(_changed(names, found.x, one.x, found.standard_errors) or at(one.x) for one in equal)
         listed = "; with ".join(list(ways)[:_MOST_MINIMA])
         yield f"The readings are exactly the same with {listed}: choose one of these answers."
+    if found.overstated:
+        return
     for one in [one for one in found.ambiguous if not one.same_readings][:_MOST_MINIMA]:
         yield f"AMBIGUOUS: the readings fit as well at {at(one.x)} (chi-square {one.chi_square:.5g})."
     if found.bent.any():
@@ -435,8 +442,8 @@ def estimate_content(answer: Answer) -> dict[str, Any]:
 
 def _fitted(one: Fit, labels: list[dict[str, Any]]) -> dict[str, Any]:
     names = [p.name for p in one.model.physical_parameters]
-    rows = ("message", "chi_square", "degrees_of_freedom", "fits", "passes", "with_prior", "beaten_by", "iterations")
-    rows += ("simulations", "correlation", "residual_deviation")
+    rows = ("message", "chi_square", "degrees_of_freedom", "fits", "passes", "with_prior", "beaten_by", "lower_at")
+    rows += ("iterations", "simulations", "correlation", "residual_deviation")
     return {
         "status": one.status.label,
         "estimates": _by_name(names, one.x),
@@ -454,14 +461,13 @@ def _fitted(one: Fit, labels: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _examined(found: Examination, labels: list[dict[str, Any]]) -> dict[str, Any]:
-    names, bootstrap = [p.name for p in found.model.physical_parameters], found.bootstrap
-    return {
-        "estimator": found.label,
-        "estimates": _by_name(names, found.x),
-        "profile95": _by_name(names, np.transpose(found.profiles)),
-        "bootstrap95": _by_name(names, np.column_stack([bootstrap.low, bootstrap.high])),
-        "remarks": list(remarks(found, labels)),
-    }
+    names = [p.name for p in found.model.physical_parameters]
+    told: dict[str, Any] = {"estimator": found.label, "estimates": _by_name(names, found.x)}
+    if not found.overstated:
+        bootstrap = found.bootstrap
+        told["profile95"] = _by_name(names, np.transpose(found.profiles))
+        told["bootstrap95"] = _by_name(names, np.column_stack([bootstrap.low, bootstrap.high]))
+    return told | {"remarks": list(remarks(found, labels))}
 
 
 def as_json(value: Any) -> Any:

@@ -1,5 +1,6 @@
 """What is said of answers that cannot all be right, and of parameters that the readings do not determine."""
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,8 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators import Estimates, Estimator
 from ipe_bench.measurements import Formula
 from ipe_bench.noise import Gaussian, Unknown
+from ipe_bench.real.examination import Examination
+from ipe_bench.report.answer import estimate_content
 
 T = np.linspace(0, 10, 41)
 
@@ -77,6 +80,55 @@ def test_with_an_unknown_level_the_joint_region_of_the_best_is_that_of_snedecors
     away = Stating(tuple((best + np.sqrt(share) * reach * along).tolist()))
     answer = ib.estimate(LINE, z, {"lm": LevenbergMarquardt(tolerance=1e-10), "away": away}, noise=Unknown())
     assert answer["away"].beaten_by == beaten
+
+
+@dataclass(frozen=True)
+class Seeking(Stating):
+    """One that says of its answer that it is a minimum."""
+
+    equation = "least_squares"
+
+
+@pytest.mark.parametrize("noise", [Gaussian(0.3), Unknown()], ids=["known level", "unknown level"])
+@pytest.mark.parametrize(("excess", "lower"), [(0.5, "lm"), (1e-5, "")])
+def test_a_later_column_that_fits_better_is_named_and_quoted(noise, excess, lower):
+    z = A @ [1.0, 1.2, 0.8] + 0.3 * np.random.default_rng(2).standard_normal(12)
+    best = np.linalg.lstsq(A, z, rcond=None)[0]
+    along = np.array([1.0, -2.0, 0.5])
+    away = tuple((best + 0.3 * np.sqrt(excess) / np.linalg.norm(A @ along) * along).tolist())
+    estimators = {"first": Seeking(away), "stated": Stating(away), "lm": LevenbergMarquardt(tolerance=1e-10)}
+    answer = ib.estimate(LINE, z, estimators, noise=noise)
+    assert all(one.passes for one in answer)
+    assert [one.lower_at for one in answer] == [lower, "", ""]
+    said = "first: lm ended at a lower minimum" in " ".join(str(answer).split())
+    assert said == bool(lower)
+    assert any(line.startswith("lm: a = ") for line in answer.sentences()) or not lower
+
+
+def far_overstated(deviation):
+    z = A @ [1.0, 1.2, 0.8] + 0.01 * np.random.default_rng(2).standard_normal(12)
+    return ib.estimate(LINE, z, {"lm": LevenbergMarquardt()}, noise=deviation and Gaussian(deviation))
+
+
+def test_noise_that_is_far_overstated_ends_an_estimate_before_its_intervals(monkeypatch):
+    for name in ("profiles", "bootstrap"):
+        monkeypatch.setattr(Examination, name, property(lambda _, name=name: pytest.fail(name)))
+    answer = far_overstated(1.0)
+    text = " ".join(str(answer).split())
+    assert re.search(r"the residuals are up to \d\d+ times smaller than the stated noise", text)
+    assert "no interval means anything" in text
+    assert "choose noise=unknown" in text
+    assert answer["lm"].passes
+    told = estimate_content(answer)["examination"]
+    assert told["remarks"] == []
+    assert told.keys() == {"estimator", "estimates", "remarks"}
+
+
+@pytest.mark.parametrize("deviation", [0.05, None], ids=["five times", "unknown, as advised"])
+def test_noise_that_is_less_overstated_or_estimated_has_intervals(deviation):
+    answer = far_overstated(deviation)
+    assert "95 % intervals of lm" in str(answer)
+    assert estimate_content(answer)["examination"].keys() >= {"profile95", "bootstrap95"}
 
 
 def test_with_an_unknown_level_a_normalised_residual_is_as_probable_as_its_error_of_prediction():
