@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import cloudpickle
 
+from ipe_bench.basics.definitions import pinned
 from ipe_bench.basics.errors import UserError, describe_exception, unknown
 from ipe_bench.basics.options import Component, Count, Positive, Whole
 from ipe_bench.estimators.base import Estimator
@@ -130,7 +131,7 @@ class Spec(Component):
     def scenario(self) -> Any:
         """Simulated trials: a `Scenario`, or a `StateScenario` if there is a state model."""
         if self.state_model is not None:
-            return StateScenario(self.state_model, self.seed, self.error_scale)
+            return pinned(StateScenario(self.state_model, self.seed, self.error_scale))
         measurement, truth = (m and informed(m, self.known) for m in (self.measurement, self.truth_measurement))
         assert measurement is not None
         prior = self.prior
@@ -138,7 +139,7 @@ class Spec(Component):
             from ipe_bench.real.estimation import prior_stated
 
             prior = prior_stated(prior, measurement)
-        return Scenario(measurement, self.noise, prior, self.error_scale, self.seed, truth)
+        return pinned(Scenario(measurement, self.noise, prior, self.error_scale, self.seed, truth))
 
     def suited(self) -> Spec:
         """Returns the job without the standard filters if its model lacks what they need."""
@@ -197,7 +198,8 @@ def spec(plain: Mapping[Any, Any]) -> Spec:
     made["trackers"] = {}
     chosen = "estimators" if made["state_model"] is None else "trackers"
     known = [option for option in plugins.options() if plugins.PACKAGES.get(option.group) == chosen]
-    made["estimators"] = {str(k): _labelled(chosen, str(k), one, known) for k, one in (plain[chosen] or {}).items()}
+    labelled = {str(k): _labelled(chosen, str(k), one, known) for k, one in (plain[chosen] or {}).items()}
+    made["estimators"] = {label: pinned(one) for label, one in labelled.items()}
     return instantiate(Spec, made, "")
 
 

@@ -67,6 +67,8 @@ class Function(WrittenModel):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        # Held from now on: by its name another could be found later.
+        object.__setattr__(self, "function", self._found())
         arguments = [name for name in self._signature if name not in self._keywords]
         for name in self.start:
             if name not in arguments:
@@ -88,9 +90,11 @@ class Function(WrittenModel):
                 raise UserError(f"columns: {name} is missing; give columns.{name}=[...], or start.{name}=VALUE")
         self.require_columns_and_parameters("size", "units")
 
-    @cached_property
-    def function(self) -> Callable[..., Any]:
-        """The function that `of` names; its module is imported from the working folder or the path."""
+    if typing.TYPE_CHECKING:
+        function: typing.ClassVar[Callable[..., Any]]
+
+    def _found(self) -> Callable[..., Any]:
+        """Finds the function that `of` names; its module is imported from the working folder or the path."""
         module, colon, name = self.of.partition(":")
         module = module.removesuffix(".py")
         if not (module and colon and name.isidentifier()):

@@ -10,6 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from ipe_bench.basics.definitions import definition_digest
 from ipe_bench.basics.errors import UserError, definition, place_of
 from ipe_bench.basics.linalg import Array, Covariance, pseudo_inverse, read_only
 from ipe_bench.basics.options import component_classes
@@ -117,16 +118,17 @@ def require_function(model: Measurement) -> None:
     if all(cls.__module__.startswith("ipe_bench.") for cls in component_classes(model)):
         return
     try:
-        complaint = _irregularity(model)
+        complaint = _irregularity(model, definition_digest(model))
     except TypeError:  # options that cannot be hashed
-        complaint = _irregularity.__wrapped__(model)
+        complaint = _irregularity.__wrapped__(model, "")
     if complaint:
         raise UserError(f"measurement={model.name}: {complaint}")
 
 
 @lru_cache(maxsize=256)
-def _irregularity(model: Measurement) -> str:
-    """Says what is irregular; empty if the model is regular, and where a call raises, which its trials report."""
+def _irregularity(model: Measurement, definition: str) -> str:
+    """Says what is irregular of a model by this definition; empty if the model is regular, and where a call raises,
+    which its trials report."""
     rng = np.random.default_rng(11)
     x, other = (read_only(model.nominal + 0.1 * rng.standard_normal((trials, model.n))) for trials in (4, 7))
     fresh: Any = replace(cast(Any, model)) if is_dataclass(model) else copy.copy(model)

@@ -10,21 +10,21 @@ import importlib.metadata
 import importlib.util
 import json
 import sys
-import uuid
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ipe_bench.basics.definitions import definition_digest, importable_digest, is_installed
 from ipe_bench.basics.options import component_classes
 
 TARGET = "_target_"
 WITHOUT_NUMBERS = tuple(
     f"ipe_bench.{name}"
     for name in (
-        *("basics.errors", "basics.files", "basics.machine", "basics.statuses"),
+        *("basics.definitions", "basics.errors", "basics.files", "basics.machine", "basics.statuses"),
         *("runs", "statistics", "real", "plugins", "report", "api", "cli"),
     )
 )
@@ -34,8 +34,6 @@ _RENAMED = {
     "ipe_bench.trials.Tracking": "ipe_bench.trials.StateScenario",
 }
 """Classes that results of version 0.2 call otherwise."""
-_SESSION = uuid.uuid4().hex
-"""Stands for source that no file holds, such as a notebook's: its results are valid in this session alone."""
 
 
 def describe(value: Any) -> Any:
@@ -81,19 +79,40 @@ def digest(value: Any) -> str:
     return hashlib.sha256(canonical_json(value).encode()).hexdigest()[:16]
 
 
-def fingerprint(components: Iterable[Any]) -> dict[str, Any]:
+def fingerprint(components: Sequence[Any]) -> dict[str, Any]:
     """Returns the versions of the packages, and a digest of the numerical source, that components are made of.
 
     The source of a component is the module of its class with all modules of its package that it imports, and the
-    scoring of trials, without comments, docstrings, the texts of exceptions and the modules of `WITHOUT_NUMBERS`.
+    scoring of trials, without comments, docstrings, the texts of exceptions and the modules of `WITHOUT_NUMBERS`; and
+    what is not of an installed package as it is in this process, which may differ from its file.
     """
-    classes = [cls for component in components for cls in component_classes(component)]
-    modules = set[str]().union(
-        *map(_import_closure, ["ipe_bench.trials.scoring", *(cls.__module__ for cls in classes)])
-    )
-    packages = sorted({m.split(".")[0] for m in modules})
-    digest = hashlib.sha256("".join(f"{m} {_source_of(m)[0]}\n" for m in sorted(modules)).encode())
-    return {"versions": {p: _package_version(p) for p in packages}, "source": digest.hexdigest()[:16]}
+    modules = _modules_of(_homes(components))
+    defined = [found for component in components if (found := definition_digest(component))]
+    return {"versions": _versions_of(modules), "source": _source_digest(modules, defined)}
+
+
+def importable(components: Sequence[Any]) -> dict[str, Any]:
+    """Returns the part of the fingerprint that another process has to agree with, since it imports it by name."""
+    modules = _modules_of(_homes(components) - {"__main__"})
+    defined = [importable_digest(component) for component in components]
+    return {"versions": _versions_of(modules), "source": _source_digest(modules, defined)}
+
+
+def _homes(components: Sequence[Any]) -> set[str]:
+    return {cls.__module__ for component in components for cls in component_classes(component)}
+
+
+def _modules_of(homes: Iterable[str]) -> set[str]:
+    return set[str]().union(*map(_import_closure, ["ipe_bench.trials.scoring", *homes]))
+
+
+def _versions_of(modules: Iterable[str]) -> dict[str, str]:
+    return {package: _package_version(package) for package in sorted({m.split(".")[0] for m in modules})}
+
+
+def _source_digest(modules: Iterable[str], defined: Iterable[str]) -> str:
+    lines = [*(f"{m} {_source_of(m)[0]}\n" for m in sorted(modules)), *defined]
+    return hashlib.sha256("".join(lines).encode()).hexdigest()[:16]
 
 
 @functools.cache
@@ -108,18 +127,28 @@ def _package_version(package: str) -> str:
     return "none"
 
 
-@functools.cache
 def _import_closure(module: str) -> frozenset[str]:
     """Collects the module and, recursively, what it imports from its own top-level package or from ipe_bench."""
+    return _installed_closure(module) if is_installed(module) else _closure(module)
+
+
+def _closure(module: str) -> frozenset[str]:
     found: set[str] = set()
     waiting = [module]
     while waiting:
         name = waiting.pop()
-        if name not in found and not f"{name}.".startswith(tuple(f"{n}." for n in WITHOUT_NUMBERS)):
-            found.add(name)
-            own = {name.split(".")[0], "ipe_bench"}
-            waiting += [n for n in _source_of(name)[1] if n.split(".")[0] in own and _spec_of(n) is not None]
+        if name in found or f"{name}.".startswith(tuple(f"{n}." for n in WITHOUT_NUMBERS)):
+            continue
+        if is_installed(name) and not is_installed(module):
+            found |= _installed_closure(name)
+            continue
+        found.add(name)
+        own = {name.split(".")[0], "ipe_bench"}
+        waiting += [n for n in _source_of(name)[1] if n.split(".")[0] in own and _spec_of(n) is not None]
     return frozenset(found)
+
+
+_installed_closure = functools.cache(_closure)
 
 
 @functools.cache
@@ -135,22 +164,40 @@ def _spec_of(module: str) -> ModuleSpec | None:
         return None
 
 
-@functools.cache
 def _source_of(module: str) -> tuple[str, frozenset[str]]:
     """Computes a digest of what a module computes with, its code and the JSON files beside it, tables of constants; and
     the names of modules, and of what may be modules, that it imports."""
-    spec, loaded = _spec_of(module), sys.modules.get(module)
-    origin = getattr(loaded, "__file__", None) if spec is None else spec.origin  # a script has no spec
-    path = None if origin is None else Path(origin)
-    if path is None or not path.is_file():
-        return "" if hasattr(loaded, "__path__") else _SESSION, frozenset()
-    content, imported = path.read_bytes(), frozenset()
+    path = None if is_installed(module) else _file_of(module)
+    files = () if path is None else (path, *_tables_beside(path))
+    return _source_when(module, tuple((about.st_mtime_ns, about.st_size) for about in map(Path.stat, files)))
+
+
+@functools.lru_cache(maxsize=4096)
+def _source_when(module: str, written: tuple[tuple[int, int], ...]) -> tuple[str, frozenset[str]]:
+    """Computes the same for files that were `written` then, with these sizes."""
+    path, imported = _file_of(module), frozenset[str]()
+    if path is None:
+        return "", imported
+    content = path.read_bytes()
     if path.suffix == ".py":
         tree = ast.parse(content)
         imported = _imported(tree, module if path.name == "__init__.py" else module.rpartition(".")[0])
         content = numerical_code(tree).encode()
-    tables = b"".join(table.read_bytes() for table in sorted(path.parent.glob("*.json")))
+    tables = b"".join(table.read_bytes() for table in _tables_beside(path))
     return hashlib.sha256(content + tables).hexdigest(), imported
+
+
+def _file_of(module: str) -> Path | None:
+    """Returns the file of a module or script; None if no file holds it, such as the cells of a notebook."""
+    spec = _spec_of(module)
+    found = None if spec is None else spec.origin
+    origin = getattr(sys.modules.get(module), "__file__", found)  # a script has no spec
+    path = None if origin is None else Path(origin)
+    return path if path is not None and path.is_file() else None
+
+
+def _tables_beside(path: Path) -> list[Path]:
+    return sorted(path.parent.glob("*.json"))
 
 
 def _imported(tree: ast.Module, package: str) -> frozenset[str]:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from ipe_bench.basics.definitions import pinned
 from ipe_bench.basics.errors import StorageError, UserError
 from ipe_bench.basics.machine import cores, library_versions
 from ipe_bench.estimators.base import Estimator
@@ -59,6 +60,7 @@ def compute(
     """
     # Absolute: workers may have another working folder.
     store = Store(Path(output).absolute())
+    scenarios, estimators = pinned(list(scenarios)), {label: pinned(one) for label, one in estimators.items()}
     # What is stored of a scenario shows that its numbers can be computed with, without drawing any.
     stored = {part.key for part in store.parts()}
     untried = [scenario for scenario in scenarios if ResultKey(scenario).key not in stored]

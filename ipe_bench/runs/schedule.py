@@ -21,8 +21,9 @@ import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from ipe_bench.basics.errors import StorageError
+from ipe_bench.basics.options import component_classes
 from ipe_bench.runs.execution import FATAL, PREPARED, Execution, Failure
-from ipe_bench.runs.provenance import describe, digest, fingerprint
+from ipe_bench.runs.provenance import describe, digest, importable
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.store import ResultKey, Store, describe_names
 from ipe_bench.trials.thresholds import HISTORIES
@@ -93,6 +94,7 @@ def plan(directory: Path, cells: Sequence[ResultKey], results: Results, trials: 
     """Cuts missing trials into blocks on a fixed grid, each with the cells of one scenario that lack some of them."""
     lacking: dict[tuple[int, int], list[ResultKey]] = {}
     for cell in cells:
+        _ = cell.importable  # as it is here, and not where the cell is sent
         for start, stop in results.missing(cell.key, trials):
             edges = [start, *range((start // block_size + 1) * block_size, stop, block_size), stop]
             for edge in itertools.pairwise(edges):
@@ -105,11 +107,6 @@ def run_task(task: Task) -> Iterator[str | tuple[int, Failure | None]]:
     task, and its failure if there was one: an exception fails its cell alone. Libraries are imported and models
     compiled before time is taken."""
     store, cells = Store(task.directory), _recalled(task)
-    if any(fingerprint(cell.components) != cell.made_by for cell in cells):
-        raise RuntimeError(
-            "the numerical source of ipe-bench or of a plugin is not what it was where the run began: "
-            "install the same versions on all machines, or start the run again"
-        )
     with _alone():
         block = block_of(cells[0].scenario, task.start, task.stop)
         block.share()  # which is not to be charged to the first of the cells
@@ -137,7 +134,21 @@ def _recalled(task: Task) -> tuple[ResultKey, ...]:
     trace a model and to describe what is constructed takes as long as some ten trials."""
     if len(_recent) > _MOST_RECENT:
         _recent.clear()
-    return tuple(_recent.setdefault(cell.key, cell) for cell in task.cells)
+    for cell in task.cells:
+        known = _recent.get(cell.key)
+        if known is None or component_classes(known.components) != component_classes(cell.components):
+            _require_same_source(cell)
+            _recent[cell.key] = cell
+    return tuple(_recent[cell.key] for cell in task.cells)
+
+
+def _require_same_source(cell: ResultKey) -> None:
+    """Raises RuntimeError if this process does not compute with what the run began with."""
+    if importable(cell.components) != cell.importable:
+        raise RuntimeError(
+            "the numerical source of ipe-bench or of a plugin is not what it was where the run began: "
+            "install the same versions on all machines, or start the run again"
+        )
 
 
 _warm: set[str] = set()
@@ -150,7 +161,7 @@ def _warm_up(block: Any, cell: ResultKey) -> None:
     model = cell.scenario.measurement
     by_equations = getattr(model, "by_differential_equations", False)
     compiled = describe(model) if by_equations else type(model).__qualname__
-    what = digest([describe(cell.estimator), compiled])
+    what = digest([describe(cell.estimator), compiled, cell.made_by["source"]])
     if what not in _warm:
         _warm.add(what)
         block.warm_up(cell.estimator)

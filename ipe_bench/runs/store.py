@@ -32,7 +32,7 @@ from ipe_bench.estimators.base import Estimator
 from ipe_bench.runs import parts
 from ipe_bench.runs.execution import Failure
 from ipe_bench.runs.parts import SCHEMA, TRUTH, StoredPart
-from ipe_bench.runs.provenance import describe, digest, fingerprint, identified
+from ipe_bench.runs.provenance import describe, digest, fingerprint, identified, importable
 from ipe_bench.states.trackers import Tracker
 from ipe_bench.trials.scenario import Scenario
 from ipe_bench.trials.theory import linear_correlation
@@ -78,6 +78,11 @@ class ResultKey:
     def made_by(self) -> dict[str, Any]:
         """The versions of the packages and the digest of the numerical source."""
         return fingerprint(self.components)
+
+    @cached_property
+    def importable(self) -> dict[str, Any]:
+        """The part of it that a process which computes this result has to agree with."""
+        return importable(self.components)
 
     @property
     def names(self) -> dict[str, Any]:

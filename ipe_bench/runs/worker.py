@@ -26,11 +26,14 @@ def main(handle: int) -> None:
     messages: queue.SimpleQueue[Any] = queue.SimpleQueue()
     # Reading in a thread, so that the end of the parent is noticed in the middle of a task.
     threading.Thread(target=_listen, args=(connection, messages), daemon=True).start()
+    imported: dict[str, Any] = {}
     while True:
         path, threads, memory_gb, payload = messages.get()
+        if _edited(imported):
+            os._exit(0)  # the task goes to a process that imports what the files say now
         sys.path[:] = path
         os.environ["IPE_BENCH_THREADS"] = str(threads)
-        connection.send(_perform(connection, memory_gb, payload))
+        connection.send(_perform(connection, memory_gb, payload, imported))
 
 
 def _listen(connection: Connection, messages: queue.SimpleQueue[Any]) -> None:
@@ -44,16 +47,43 @@ def _listen(connection: Connection, messages: queue.SimpleQueue[Any]) -> None:
             os._exit(0)
 
 
-def _perform(connection: Connection, memory_gb: float | None, payload: bytes) -> tuple[str, Any]:
+def _edited(imported: dict[str, Any]) -> bool:
+    """Tells whether a file is not what it was when it was imported."""
+    return any(_written(file) != written for file, written in imported.items())
+
+
+def _note_imports(imported: dict[str, Any]) -> None:
+    """Adds the files of modules that may be edited while this process waits for a task."""
+    from ipe_bench.basics.definitions import is_installed
+
+    for name, module in list(sys.modules.items()):
+        file = getattr(module, "__file__", None)
+        if file is not None and file not in imported and not is_installed(name):
+            imported[file] = _written(file)
+
+
+def _written(file: str) -> tuple[int, int] | None:
+    try:
+        about = os.stat(file)
+    except OSError:
+        return None
+    return about.st_mtime_ns, about.st_size
+
+
+def _perform(
+    connection: Connection, memory_gb: float | None, payload: bytes, imported: dict[str, Any]
+) -> tuple[str, Any]:
     """Does one task; returns the last message about it."""
     from ipe_bench.runs.execution import FATAL, Failure
 
     try:
         _limit_memory(memory_gb)
         work, task = pickle.loads(payload)
+        _note_imports(imported)
         connection.send(("started", None))
         for step in work(task):
             connection.send(("step", step))
+        _note_imports(imported)
     except FATAL as error:
         return "fatal", error
     except BaseException as error:  # sys.exit() in an estimator, too, fails that task only

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ipe_bench.basics.definitions import pinned
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.runs.execution import Execution
 from ipe_bench.runs.results import Results
@@ -95,6 +96,8 @@ def compute_until(
         UserError: what was asked for cannot be computed; nothing is computed then.
         StorageError: nothing can be stored any more.
     """
+    # Code that fills its variables while it computes is still what it was when the run began.
+    scenarios, estimators = pinned(list(scenarios)), {label: pinned(one) for label, one in estimators.items()}
     options: dict[str, Any] = {"execution": execution, "watch": watch, "command": command}
     if precision is None:
         if time_limit is not None:

@@ -19,6 +19,7 @@ from typing import cast
 
 import numpy as np
 
+from ipe_bench.basics.definitions import definition_digest
 from ipe_bench.basics.linalg import Array, Covariance, finite, information
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.problem import Problem
@@ -109,7 +110,7 @@ def fit_probability(squares: Array, spread: Spread, noise: Noise, H: Array, R: C
     if m <= n:
         return np.full(len(squares), np.nan)
     with np.errstate(all="ignore"):
-        reference = _reference(noise, m, _basis(H[None], R)[0].tobytes())
+        reference = _reference(noise, definition_digest(noise), m, _basis(H[None], R)[0].tobytes())
         if reference is None:
             ratio = spread.mean / spread.squares
             return chdtrc(spread.mean * ratio, squares * ratio)
@@ -120,8 +121,9 @@ def fit_probability(squares: Array, spread: Spread, noise: Noise, H: Array, R: C
 
 
 @functools.lru_cache(maxsize=16)
-def _reference(noise: Noise, m: int, basis: bytes) -> Array | None:
-    """Simulates ascending sums of squares of least-squares residuals of whitened noise; None where it is normal."""
+def _reference(noise: Noise, definition: str, m: int, basis: bytes) -> Array | None:
+    """Simulates ascending sums of squares of least-squares residuals of whitened noise by this definition; None where
+    it is normal."""
     Q = np.frombuffer(basis).reshape(m, -1)
     rng = np.random.Generator(np.random.Philox(0))
     sums = []

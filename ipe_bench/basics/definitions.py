@@ -1,0 +1,260 @@
+"""Digests classes and functions as they are in this process, whatever a file says of them.
+
+A cell of a notebook, `exec`, a factory, `importlib.reload` and an assignment to a module's constant change what a name
+stands for while the process runs. So a definition is digested with all that it reaches: code, constants, defaults,
+values of closures, bases, class attributes, and by name the functions, classes and variables of its module and of other
+modules that are not installed. Installed packages stand for themselves by name.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import dis
+import functools
+import hashlib
+import importlib.util
+import inspect
+import sys
+import sysconfig
+import types
+import uuid
+from collections.abc import Mapping, Set
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ipe_bench.basics.options import component_classes
+
+_BY_NAME = ("LOAD_GLOBAL", "LOAD_NAME", "LOAD_FROM_DICT_OR_GLOBALS", "IMPORT_NAME")
+"""Instructions that ask for a variable of the module, or for a module."""
+_PLAIN = (type(None), type(...), bool, int, float, complex, str, bytes)
+_DEFINED = (type, types.FunctionType, types.MethodType, types.ModuleType)
+_DEFINED += (staticmethod, classmethod, property, functools.cached_property)
+_BEYOND_NAMES = {"eval", "exec", "globals", "__import__"}
+"""Built-in functions by which code reaches what no name in it tells."""
+_PIN = "_definition"
+"""Attribute that holds the digest of a component's definition from when a run of it began."""
+_tokens: dict[int, tuple[Any, str]] = {}
+"""Tokens of what cannot be digested, by its id, with the thing itself, so that its id stays its own."""
+
+
+def definition_digest(component: Any) -> str:
+    """Computes a digest of what the numbers of a component depend on beside options and installed packages; empty if it
+    is of installed packages alone. That of a component that is `pinned` stays as it was then."""
+    held = getattr(component, "__dict__", {}).get(_PIN)
+    return _digest(component_classes(component), Definitions()) if held is None else held
+
+
+def importable_digest(component: Any) -> str:
+    """Computes a digest of the code that another process imports by name, whatever its variables hold."""
+    named = [thing for thing in component_classes(component) if _is_named(thing)]
+    return _digest(named, Definitions(values=False))
+
+
+def _digest(things: list[Any], definitions: Definitions) -> str:
+    own = [thing for thing in things if not _stands_by_name(thing)]
+    return hashlib.sha256(repr(definitions.of(own)).encode()).hexdigest()[:16] if own else ""
+
+
+def pinned(component: Any) -> Any:
+    """Copies a component with the digest of its definition, and without what it has worked out, its components alike:
+    code that it works with can have changed since. One of installed packages alone is returned as it is."""
+    if isinstance(component, tuple | list):
+        return type(component)(map(pinned, component))
+    if not dataclasses.is_dataclass(component) or isinstance(component, type):
+        return component
+    if not hasattr(component, "__dict__") or not (found := definition_digest(component)):
+        return component
+    if _PIN in vars(component):
+        return component
+    fresh = copy.copy(component)
+    state = {name: pinned(value) for name, value in _state_of(component).items()}
+    fresh.__dict__.clear()
+    fresh.__dict__.update(state, **{_PIN: found})
+    return fresh
+
+
+def _state_of(thing: Any) -> dict[str, Any]:
+    """Returns an object's attributes without the values of cached properties."""
+    cls, cached = type(thing), functools.cached_property
+    return {k: v for k, v in vars(thing).items() if not isinstance(inspect.getattr_static(cls, k, None), cached)}
+
+
+@functools.cache
+def is_installed(module: str) -> bool:
+    """Tells whether a module belongs to this package, to Python or to an installed package, which no session edits."""
+    top = module.partition(".")[0]
+    if top == "__main__":
+        return False
+    if top in sys.stdlib_module_names or top == "ipe_bench":
+        return True
+    loaded = sys.modules.get(top)
+    try:
+        spec = loaded.__spec__ if loaded is not None else importlib.util.find_spec(top)
+    except (ValueError, ImportError):
+        return False
+    origins = [] if spec is None else [spec.origin, *(spec.submodule_search_locations or ())]
+    homes = {Path(sysconfig.get_path(name)).resolve() for name in ("purelib", "platlib")}
+    return any(homes & set(Path(origin).resolve().parents) for origin in origins if origin)
+
+
+def _is_named(thing: Any) -> bool:
+    """Tells whether another process that imports the module finds this class or function by its name."""
+    module, name = getattr(thing, "__module__", None), getattr(thing, "__qualname__", None)
+    if not isinstance(module, str) or not isinstance(name, str) or module == "__main__":
+        return False
+    found: Any = sys.modules.get(module)
+    for part in name.split("."):
+        found = getattr(found, part, None)
+    return found is thing
+
+
+def _stands_by_name(thing: Any) -> bool:
+    """Tells whether a class or function is one of an installed package, and not one that a factory there made."""
+    return _is_named(thing) and is_installed(thing.__module__)
+
+
+class Definitions:
+    """Describes things as nested tuples of plain data, which are equal where definitions are.
+
+    With `values` False they hold code alone, and no variables.
+    """
+
+    def __init__(self, *, values: bool = True) -> None:
+        self.values = values
+        self.met: dict[int, tuple[int, Any]] = {}
+        """Place in the order of meeting of each thing by its id, with the thing itself, so that its id stays so."""
+
+    def of(self, thing: Any) -> Any:
+        """Describes one thing."""
+        if type(thing) in _PLAIN:
+            return type(thing).__name__, repr(thing)
+        if id(thing) in self.met:
+            return "met", self.met[id(thing)][0]
+        self.met[id(thing)] = len(self.met), thing
+        try:
+            return type(thing).__name__, self._described(thing)
+        except Exception:  # a foreign object may do anything when it is taken apart
+            return "token", _token(thing)
+
+    def _described(self, thing: Any) -> Any:
+        if isinstance(thing, types.ModuleType):
+            return thing.__name__
+        if _stands_by_name(thing):
+            return thing.__module__, thing.__qualname__
+        if isinstance(thing, type):
+            return self._class(thing)
+        if isinstance(thing, types.FunctionType):
+            return self._function(thing)
+        if isinstance(thing, types.MethodType | staticmethod | classmethod):
+            return self.of(thing.__func__), self.of(getattr(thing, "__self__", None))
+        if isinstance(thing, property):
+            return [self.of(part) for part in (thing.fget, thing.fset)]
+        if isinstance(thing, functools.cached_property):
+            return self.of(thing.func)
+        if hasattr(thing, "__wrapped__"):  # what functools or a compiler made of a function
+            return self.of(thing.__wrapped__)
+        return self._value(thing)
+
+    def _value(self, thing: Any) -> Any:
+        if isinstance(thing, np.ndarray):
+            content = thing.tolist() if thing.dtype.hasobject else thing.tobytes()
+            return thing.dtype.str, thing.shape, self.of(content)
+        if type(thing) in (tuple, list):
+            return [self.of(one) for one in thing]
+        if type(thing) in (dict, types.MappingProxyType):
+            return [(self.of(key), self.of(value)) for key, value in thing.items()]
+        if type(thing) in (set, frozenset):
+            return sorted(repr(Definitions().of(one)) for one in thing)
+        return self._object(thing)
+
+    def _object(self, thing: Any) -> Any:
+        """Describes an object as pickle takes it apart, without what it has worked out."""
+        taken = thing.__reduce_ex__(4)
+        if isinstance(taken, str):  # a constant of a module
+            return getattr(thing, "__module__", ""), taken
+        make, arguments, state, *several = (*taken, None, None, None)[:5]
+        if isinstance(state, dict) and hasattr(thing, "__dict__"):
+            state = {name: value for name, value in state.items() if name in _state_of(thing)}
+        return [self.of(part) for part in (make, arguments, state, *(each and list(each) for each in several))]
+
+    def _class(self, cls: type) -> Any:
+        slots = types.MemberDescriptorType | types.GetSetDescriptorType
+        own = {name: value for name, value in sorted(vars(cls).items()) if not isinstance(value, slots)}
+        attributes = self._kept(own, in_file=_is_named(cls))
+        # What Python and dataclasses note in a class is no number's: annotations, docstring, lines, fields.
+        noted = [name for name in attributes if name.startswith("__") and not isinstance(own[name], _DEFINED)]
+        for name in (*noted, "_abc_impl"):
+            attributes.pop(name, None)
+        return cls.__qualname__, [self.of(base) for base in cls.__bases__], self.of(attributes)
+
+    def _function(self, function: types.FunctionType) -> Any:
+        code, known = function.__code__, function.__globals__
+        text, names, attributes = _read(code)
+        if names & _BEYOND_NAMES - known.keys():
+            names = frozenset(name for name in known if not name.startswith("_"))
+        module = sys.modules.get(function.__module__)
+        in_file = function.__module__ != "__main__" and known is getattr(module, "__dict__", None)
+        found = {name: known.get(name, sys.modules.get(name)) for name in sorted(names)}
+        reached = self._kept(found, in_file=in_file)
+        cells = dict(zip(code.co_freevars, map(_content, function.__closure__ or ()), strict=True))
+        reached |= self._kept(cells, in_file=_is_named(function))
+        given = function.__defaults__, function.__kwdefaults__, vars(function) if self.values else None
+        return text, [(name, self._reached(reached[name], attributes)) for name in reached], self.of(given)
+
+    def _kept(self, variables: Mapping[str, Any], *, in_file: bool) -> dict[str, Any]:
+        """Keeps those variables that belong to a definition. What a file fills a container with is in its source, and
+        what is put in later is mostly a cache."""
+        kinds = (*_DEFINED, *(_PLAIN if self.values else ()), *((tuple, frozenset) if self.values else ()))
+        everything = self.values and not in_file
+        return {k: v for k, v in variables.items() if everything or isinstance(v, kinds) or hasattr(v, "__wrapped__")}
+
+    def _reached(self, value: Any, attributes: Set[str]) -> Any:
+        """Describes what a name stands for: of a module those of its attributes that the code asks for."""
+        if not isinstance(value, types.ModuleType) or is_installed(value.__name__):
+            return self.of(value)
+        asked = self._kept({k: vars(value)[k] for k in sorted(attributes & vars(value).keys())}, in_file=True)
+        return value.__name__, [(name, self._reached(one, attributes - {name})) for name, one in asked.items()]
+
+
+def _content(cell: Any) -> Any:
+    try:
+        return cell.cell_contents
+    except ValueError:  # it is empty as yet
+        return None
+
+
+def _token(thing: Any) -> str:
+    """Returns a token that is this very object's as long as the process lives."""
+    return _tokens.setdefault(id(thing), (thing, uuid.uuid4().hex))[1]
+
+
+@functools.lru_cache(maxsize=4096)
+def _read(code: types.CodeType) -> tuple[Any, frozenset[str], frozenset[str]]:
+    """Returns the instructions of code without its lines and docstring, the names of variables of the module that it
+    reads and of modules that it imports, and all names in it, attributes among them."""
+    arguments = code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount, code.co_flags
+    text: list[Any] = [arguments, code.co_varnames[: sum(arguments[:3])], code.co_exceptiontable]
+    names: set[str] = set()
+    attributes = set(code.co_names)
+    for step in dis.get_instructions(code):
+        argument: Any = step.argval
+        if step.opcode in dis.hasconst and step.arg is not None:
+            argument = code.co_consts[step.arg]
+        if isinstance(argument, types.CodeType):
+            argument, more, further = _read(argument)
+            names |= more
+            attributes |= further
+        elif step.opname in _BY_NAME:
+            names.add(argument)
+        text.append((step.opname, _constant(argument)))
+    return tuple(text), frozenset(names), frozenset(attributes)
+
+
+def _constant(value: Any) -> str:
+    """Writes a constant of code, whatever the order of a set in it."""
+    if isinstance(value, frozenset):
+        return f"frozenset({sorted(map(_constant, value))})"
+    return f"({', '.join(map(_constant, value))})" if isinstance(value, tuple) else repr(value)
