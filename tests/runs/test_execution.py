@@ -314,6 +314,7 @@ except StorageError as error:
 def test_source_that_changed_since_the_run_began_is_not_mixed_in(tmp_path, monkeypatch):
     import ipe_bench.runs.schedule as schedule
 
+    monkeypatch.setattr(schedule, "_recent", {})
     monkeypatch.setattr(schedule, "importable", lambda parts: {"versions": {}, "source": "other"})
     failures = compute([scenario()], {"linear_lse": LinearLSE()}, 10, tmp_path, execution=Serial())
     assert len(failures) == 2
