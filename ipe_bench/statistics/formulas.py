@@ -15,6 +15,7 @@ from scipy.special import betaincinv, gammaincinv, ndtri
 from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics.calibration import overall_words
 from ipe_bench.statistics.intervals import (
+    LEVEL,
     Squares,
     capped_interval,
     few_carry,
@@ -23,8 +24,10 @@ from ipe_bench.statistics.intervals import (
     rms_interval,
     rms_sequence,
     unseen,
+    verdict,
 )
 from ipe_bench.statistics.sample import AMBIGUOUS, FIT, FLOOR, NIS, Sample
+from ipe_bench.statistics.verdicts import Verdict
 from ipe_bench.trials.thresholds import FIT_LEVEL, gate
 
 T = TypeVar("T")
@@ -376,6 +379,12 @@ def coverage(s: Sample) -> Any:
         return np.nan
     each = mean(np.abs(s.error) / s.deviation <= NORMAL_95)
     return np.append(each, share(s.scalars["nees"] <= 2 * gammaincinv(s.n / 2, 0.95)))
+
+
+def verdict_on(nees: Array, degrees: int, s: Sample) -> Verdict:
+    """Words the NEES of the converged trials at a level that all error scales of the estimator share (Bonferroni): one
+    false verdict would end the scales up to which it is honest."""
+    return verdict(nees[s.converged], degrees, 1 - (1 - LEVEL) / s.scales)
 
 
 def calibration_p(s: Sample) -> Any:

@@ -14,7 +14,7 @@ import numpy as np
 import ipe_bench.statistics.formulas as f
 import ipe_bench.statistics.intervals as intervals
 import ipe_bench.statistics.tracks as t
-from ipe_bench.statistics.intervals import clopper_pearson, quantile, share_sequence, verdict
+from ipe_bench.statistics.intervals import clopper_pearson, quantile, share_sequence
 from ipe_bench.statistics.sample import CLOSE, NIS, Sample, iterations_to_limit, orders_of
 from ipe_bench.statistics.statistic import Statistic
 from ipe_bench.trials.thresholds import EVEN, EXPECTED, FEW, GATE, SAME_ROOT
@@ -433,7 +433,7 @@ STATISTICS: tuple[Statistic, ...] = (
         f" {intervals.UNSEEN_NEES:g} n in as many trials as may be unusual and unseen; consistent: neither; undecided:"
         " a few trials carry that mean, or it seems to lie below n and rare large errors may be missing. None for fewer"
         f" than {FEW} trials.",
-        lambda s: verdict(s.scalars["nees"][s.converged], s.n),
+        lambda s: f.verdict_on(s.scalars["nees"], s.n, s),
         kind="word",
         where=("calibration",),
     ),

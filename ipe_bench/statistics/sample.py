@@ -152,6 +152,14 @@ class Sample:
         return self.scalars["solved"]
 
     @cached_property
+    def scales(self) -> int:
+        """The number of error scales at which its estimator stands in the same setting."""
+        own = self.group
+        alike = [group for group in self.collection.groups if group.estimator == own.estimator]
+        there = (g for g in alike if _without_scale(g) == _without_scale(own))
+        return len({group.columns["error_scale"] for group in there})
+
+    @cached_property
     def converged(self) -> Array:
         """(trials,)"""
         return self.scalars["status"] == Status.CONVERGED.label
@@ -223,6 +231,10 @@ class Sample:
             History(iterates, distances_to_limit(iterates, crlb[row]), cost[row], K[row], M[row])
             for row, iterates in found
         ]
+
+
+def _without_scale(group: Group) -> dict[str, Any]:
+    return {name: value for name, value in group.columns.items() if name != "error_scale"}
 
 
 def label_of(number: Any) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics import formulas as f
-from ipe_bench.statistics.intervals import clopper_pearson, mean_limits, verdict
+from ipe_bench.statistics.intervals import clopper_pearson, mean_limits
 from ipe_bench.statistics.sample import NIS, Sample
 from ipe_bench.statistics.statistic import Statistic
 from ipe_bench.statistics.verdicts import NO_VERDICT, WRONG
@@ -78,7 +78,7 @@ def path_success(s: Sample) -> tuple[float, float, float]:
 
 
 def path_verdict(s: Sample) -> str:
-    return verdict(s.scalars["path_nees"][s.converged], s.n) if is_track(s) else NO_VERDICT
+    return f.verdict_on(s.scalars["path_nees"], s.n, s) if is_track(s) else NO_VERDICT
 
 
 def nis_verdict(s: Sample) -> str:
@@ -90,7 +90,7 @@ def nis_verdict(s: Sample) -> str:
     if surely_wrong > _TOLERATED:
         return WRONG
     m = int(s.group.footer["readings"])
-    return verdict(m * s.scalars[NIS][s.converged], m)
+    return f.verdict_on(m * s.scalars[NIS], m, s)
 
 
 def _white_p(s: Sample) -> Array:
