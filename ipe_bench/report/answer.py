@@ -412,9 +412,11 @@ def write_answer(
 
 def _drawings(answer: Answer) -> Iterator[Drawing]:
     from ipe_bench.report.figures.answers import draw_fit, draw_residuals
+    from ipe_bench.report.figures.views import looks_of
 
+    look = looks_of({one.label: one.estimator for one in answer.fits})
     if answer.examination is not None and answer[answer.examination.label].passes:
-        yield from draw_fit(answer.examination, answer.z)
+        yield from draw_fit(answer.examination, answer.z, look[answer.examination.label])
     yield from draw_residuals(answer.model, answer.fits)
 
 

@@ -63,19 +63,34 @@ def _direction(seen: Observability) -> str:
     return f"{'Least observable direction' if seen.observable else 'The readings do not determine'}: {seen.words}"
 
 
+def _no_others(design: Design) -> str:
+    """Says that no way takes other readings than today's; empty if one does."""
+    today = design.scenario.measurement.m
+    fewer = any(way.saving or way.sharpest.readings != today for way in design.ways)
+    if fewer or not design.ways or design.candidates.m != today:
+        return ""
+    return f"The candidates are today's {today} readings, so there is no other choice."
+
+
 def _design_sentences(design: Design) -> Iterator[str]:
     yield f"{_direction(design.observability)}."
-    if best := _best(design):
-        chosen, share = f"{best.sharpest.readings} readings chosen {best.title}", percent(best.sharpest.mean_bound)
-        gain = best.sharpest.mean_bound < 1 - _WORTH
-        yield f"{chosen} have {share} of today's mean bound." if gain else "No choice of as many readings says more."
+    same, best = _no_others(design), _best(design)
+    if same:
+        yield same
+    elif best:
+        choice, today = best.sharpest, design.scenario.measurement.m
+        if choice.readings == today and choice.mean_bound >= 1 - _WORTH:
+            yield "The present readings are already optimal for their number."
+        else:
+            share = percent(choice.mean_bound)
+            yield f"{choice.readings} readings chosen {best.title} have {share} of today's mean bound."
     yield from _unseen(design)
 
 
 def _draw_design(design: Design) -> Iterator[Drawing]:
     from ipe_bench.report.figures.answers import draw_bounds
 
-    best, scenario, after = _best(design), design.scenario, None
+    best, scenario, after = None if _no_others(design) else _best(design), design.scenario, None
     if best is not None:
         model = design.measurement(best.sharpest)
         after = Observability.at(model, scenario.noise.covariance(model.m), scenario.truths(0, TRUTHS))
@@ -151,6 +166,10 @@ def _ways(design: Design) -> Iterator[Part]:
     if not design.ways:
         why = "they are too few" if design.observability.observable else "they do not determine all parameters"
         yield f"The candidates offer no choice: {why}."
+        return
+    same = _no_others(design)
+    if same:
+        yield f"{same} `--readings NUMBER` chooses fewer of them."
         return
     today = design.scenario.measurement.m
     columns = [
@@ -296,7 +315,10 @@ class Comparison(Shown, pd.DataFrame):
             " Times are not tested."
         )
         margins = ", ".join(f"{name} {margin:g}" for name, margin in self.attrs["margins"].items())
-        yield f"better and worse are changes that p tells from none, by more than a margin: {margins}."
+        yield (
+            f"better and worse are changes that p tells from none, by more than a margin: {margins}. different is a"
+            " change that may be smaller than the margin."
+        )
         if self["quantity"].str.match("honesty|bias").any():
             yield (
                 "NEES (honesty) is the squared error over the claimed variance, by the number of parameters, where"
@@ -377,7 +399,7 @@ def _cells(row: dict[str, Any]) -> tuple[str, ...]:
         ends if math.isfinite(row["low"]) else "-",
         (p_value(p) if p >= _LEAST_P else f"<{_LEAST_P:g}") if math.isfinite(p) else "",
         (compact(e) if e <= _MOST_EVIDENCE else f">{_MOST_EVIDENCE}") if math.isfinite(e) else "",
-        row["finding"] or ("-" if quantity != "time" else ""),
+        row["finding"] or ("different" if row["different"] else "-" if quantity != "time" else ""),
     )
 
 

@@ -115,11 +115,7 @@ class ResultKey:
             "libraries": library_versions(),
             "names": self.names,
             "bound": "bayes" if "prior" in needs else "crlb",
-            "equation": getattr(self.estimator, "equation", None),
-            "family": getattr(self.estimator, "family", None),
-            "look": getattr(self.estimator, "look", None),
-            "sequential": "epochs" in needs,
-            "smooths": bool(getattr(self.estimator, "smooths", False)),
+            **traits(self.estimator),
             "jacobian_cost": float(getattr(model, "jacobian_cost", model.n)),
             "parameters": [describe(p) for p in model.parameters],
             "readings": model.m,
@@ -131,6 +127,17 @@ class ResultKey:
                 else {"times": scenario.model.times.tolist(), "states": scenario.model.n}
             ),
         }
+
+
+def traits(estimator: Any) -> dict[str, Any]:
+    """Returns the kind and the look of an estimator or tracker, by which reports tell families apart."""
+    return {
+        "equation": getattr(estimator, "equation", None),
+        "family": getattr(estimator, "family", None),
+        "look": getattr(estimator, "look", None),
+        "sequential": "epochs" in getattr(estimator, "needs", ()),
+        "smooths": bool(getattr(estimator, "smooths", False)),
+    }
 
 
 class Store:

@@ -27,9 +27,11 @@ JUDGED = ("success", "error", "cost")
 MARGINS = {"success": 0.01, "error": 0.02, "honesty": 0.05, "bias": 0.1, "cost": 0.05}
 """Quantities that can be tested, with the change that matters: a difference of success, and of bias in deviations of
 the bound; of the others a ratio less 1. Time is not: trials of a block share theirs evenly, and machines differ."""
+UNTESTED: Mapping[str, Any] = {"different": False, "finding": "", "loss": None, "discordant": 0}
+"""The end of a row on a quantity that is not tested."""
 NOT_SETTINGS = (
     *("first", "second", "trials", "matched_by", "quantity", "first_value", "second_value"),
-    *("change", "low", "high", "p", "e", "finding", *PLANNED),
+    *("change", "low", "high", "p", "e", "different", "finding", *PLANNED),
 )
 """The columns of a row that do not say what is compared."""
 
@@ -59,8 +61,8 @@ def compared(
     """Returns rows of every comparison that can be made: one per scenario, pair of estimators and quantity.
 
     Each p is corrected by Holm over all that are `tested`; with `anytime`, findings go by e-values, divided by their
-    number. A finding's own interval lies beyond the margin, too. With a `plan`, rows on success say how many trials it
-    takes, at the strictest level that Holm asks for.
+    number. Then the two are `different`; a finding's own interval lies beyond the margin, too. With a `plan`, rows on
+    success say how many trials it takes, at the strictest level that Holm asks for.
 
     Raises:
         UserError: there is nothing to compare.
@@ -72,7 +74,8 @@ def compared(
         if plan is not None and row["quantity"] == "success":
             row |= plan.row(discordant, row["trials"], alpha / len(judged))
         row["p"], kind = float(p), row["quantity"].partition(" ")[0]
-        if row["e"] >= len(judged) / alpha if anytime else p < alpha:
+        row["different"] = bool(row["e"] >= len(judged) / alpha if anytime else p < alpha)
+        if row["different"]:
             margin = margins[kind] if kind in ("success", "bias") else np.log1p(margins[kind])
             row["finding"] = "worse" if low > margin else "better" if high < -margin else ""
     return rows
@@ -100,11 +103,11 @@ def _rows(a: Sample, b: Sample, alpha: float, tested: Container[str]) -> Iterato
             )
             loss = _loss(kind, effect, first, a.n)
         effect = effect if kind in tested else replace(effect, p=np.nan, e=np.nan)
-        more = {"finding": "", "loss": loss, "discordant": int(np.sum(first != second))}
+        more = {"different": False, "finding": "", "loss": loss, "discordant": int(np.sum(first != second))}
         yield head | {"quantity": quantity} | asdict(effect) | more
     seconds = float(np.median(a.scalars["time_s"][one])), float(np.median(b.scalars["time_s"][other]))
     effect = Effect(*seconds, seconds[1] / seconds[0] if seconds[0] > 0 else np.nan)
-    yield head | {"quantity": "time"} | asdict(effect) | {"finding": "", "loss": None, "discordant": 0}
+    yield head | {"quantity": "time"} | asdict(effect) | dict(UNTESTED)
 
 
 def _columns(

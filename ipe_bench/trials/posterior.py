@@ -104,6 +104,7 @@ class Reference:
     truth: Array
     """(n,)"""
     posterior: Posterior
+    estimators: Mapping[str, Estimator]
     estimates: Mapping[str, Estimates]
     divergences: Mapping[str, Divergence]
 
@@ -122,7 +123,7 @@ def reference(
     sampled = sample_posterior(scenario.problem, drawn.z[0], particles=particles, seed=trial)
     estimates = {label: estimate_safely(e, scenario.problem, drawn.z) for label, e in estimators.items()}
     divergences = {label: divergence(sampled, e) for label, e in estimates.items()}
-    return Reference(trial, drawn.x[0], sampled, estimates, divergences)
+    return Reference(trial, drawn.x[0], sampled, estimators, estimates, divergences)
 
 
 def require_particles(problem: Problem, particles: int) -> None:

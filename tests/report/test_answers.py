@@ -3,17 +3,28 @@
 from __future__ import annotations
 
 import hashlib
+import re
+from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import pandas as pd
 import pytest
 from scipy.stats import t as student
+from shared.synthetic_store import Pretender, Synthetic
 
 import ipe_bench as ib
+from ipe_bench.basics.statuses import Status
 from ipe_bench.cli.main import main
-from ipe_bench.report.figures.answers import draw_fit, draw_residuals
-from ipe_bench.report.style import house_style
+from ipe_bench.estimators.base import Estimates
+from ipe_bench.report.figures.answers import draw_fit, draw_marginals, draw_pairs, draw_residuals
+from ipe_bench.report.figures.common import in_full
+from ipe_bench.report.figures.views import looks_of, views
+from ipe_bench.report.questions import _design_sentences, _draw_design, _ways
+from ipe_bench.report.style import FACES, house_style
 from ipe_bench.report.words import ends_in_percent, public
+from ipe_bench.statistics import analyse
+from ipe_bench.trials.posterior import Posterior, Reference
 
 
 def test_a_page_states_command_version_and_file_and_no_path_of_this_machine(tmp_path, capsys):
@@ -37,7 +48,7 @@ def test_the_band_of_a_straight_line_is_the_textbooks_and_equal_residuals_are_dr
     z = 1 + 2 * x + np.array([0.1, -0.2, 0.15, 0.05, -0.1])
     found = ib.estimate(ib.measurements.Formula("a + b*x", {"a": 0.0, "b": 1.0}, {"x": x.tolist()}), z)
     with house_style():
-        (fit,) = draw_fit(found.examination, z)
+        (fit,) = draw_fit(found.examination, z, FACES["auto"])
         (residuals,) = draw_residuals(found.model, found.fits)
     assert sum(bool(ax.get_title()) for ax in residuals.figure.axes) == 1
     band = fit.figure.axes[0].collections[0].get_paths()[0].vertices
@@ -51,7 +62,7 @@ def test_the_band_of_a_straight_line_is_the_textbooks_and_equal_residuals_are_dr
 def test_certified_readings_have_a_curve_over_their_input():
     found = ib.estimate(ib.measurements.Nist("Misra1a"))
     with house_style():
-        (fit,) = draw_fit(found.examination, found.z)
+        (fit,) = draw_fit(found.examination, found.z, FACES["auto"])
     assert fit.figure.axes[0].get_xlabel() == "x"
 
 
@@ -72,3 +83,105 @@ def test_ends_of_a_narrow_interval_have_decimals(low, high, ends):
 )
 def test_absolute_paths_are_shortened_and_formulas_are_not(text, shown):
     assert public(text) == shown
+
+
+# The axes of single questions ----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Pink(Pretender):
+    look = ("#ff1493", "s")
+
+
+def as_number(label: str) -> float:
+    digits, _, power = label.replace("−", "-").partition("·10")
+    return float(digits) * 10.0 ** int(power.translate(str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")) or 0)
+
+
+@pytest.mark.parametrize("step", [1e-9, 2e-6, 0.5, 20.0, 5e5])
+@pytest.mark.parametrize("start", [-1.0, 0.0, 3.0])
+def test_a_tick_says_its_whole_value(step, start):
+    ticks = start + step * np.arange(1, 4)
+    assert [as_number(label) for label in in_full(ticks)] == pytest.approx(list(ticks), rel=1e-12, abs=1e-3 * step)
+
+
+def crowded(ax) -> bool:
+    """Whether labels of the horizontal axis meet."""
+    boxes = [label.get_window_extent() for label in ax.get_xticklabels() if label.get_text()]
+    return any(left.x1 > right.x0 for left, right in pairwise(boxes))
+
+
+def test_the_axes_of_posteriors_set_no_part_aside_and_its_lines_are_those_of_a_run(synthetic):
+    """Marginals a millionth as wide as they are far from zero."""
+    scenario = synthetic.scenario()
+    estimators = {"gauss_newton": ib.baselines.GaussNewton(), "enkf": ib.baselines.EnKF(), "mine": Pink()}
+    for label, estimator in estimators.items():
+        synthetic.add(scenario, label, np.full((30, 3), 0.1), estimator=estimator)
+    assert looks_of(estimators) == views(analyse([synthetic.directory]))[1].look
+    model, far = scenario.measurement, np.array([0.03875, -1.9598, 26100.0])
+    x = far * (1 + 1e-6 * np.random.default_rng(0).standard_normal((200, 3)))
+    posterior = Posterior(x, x[:1], np.ones(1), 0.0, 0.0, np.zeros(2))
+    status = np.array([Status.CONVERGED])
+    estimates = {label: Estimates(x[:1], status, covariance=np.cov(x.T)[None]) for label in estimators}
+    with house_style():
+        (drawing,) = draw_marginals(model, [Reference(0, far, posterior, estimators, estimates, {})])
+    drawing.figure.draw_without_rendering()
+    for ax, middle in zip(drawing.figure.axes, far * [p.size for p in model.parameters], strict=True):
+        labels = [label.get_text() for label in ax.get_xticklabels()]
+        assert len(set(labels)) == len(labels) >= 2
+        assert [as_number(label) for label in labels] == pytest.approx(list(ax.get_xticks()), rel=1e-9)
+        assert as_number(labels[0]) == pytest.approx(middle, rel=1e-4)
+        assert ax.xaxis.get_offset_text().get_text() == ""
+        assert not crowded(ax)
+
+
+def test_a_design_has_the_units_of_its_table_and_says_where_candidates_are_what_is_read_today():
+    found = ib.design(ib.measurements.Ranging(), noise=ib.noise.Gaussian(0.1), error_scale=10.0)
+    with house_style():
+        (drawing,) = _draw_design(found)
+    (ax,) = drawing.figure.axes
+    drawing.figure.draw_without_rendering()
+    drawn = next(line for line in ax.lines if line.get_label() == "today").get_xdata()
+    table = next(part for part in found.parts() if getattr(part, "name", "") == "parameters")
+    bounds = next(column for column in table.columns if column.title == "bound")
+    assert drawn == pytest.approx([float(cell.text) for cell in bounds.cells], rel=1e-2)
+    assert [label.get_text() for label in ax.get_yticklabels()] == ["east [m]", "north [m]", "up [m]", "clock [m]"]
+    assert not crowded(ax)
+    assert "best choice" not in " ".join(ax.get_legend_handles_labels()[1])
+    said = "The candidates are today's 21 readings, so there is no other choice."
+    assert said in list(_design_sentences(found))
+    assert [part.startswith(said) for part in _ways(found)] == [True]
+    fewer = ib.design(ib.measurements.Ranging(), noise=ib.noise.Gaussian(0.1), error_scale=10.0, readings=15)
+    assert said not in list(_design_sentences(fewer))
+    assert "optimal" not in " ".join(_design_sentences(fewer))
+
+
+def test_a_change_that_is_found_but_may_be_below_the_margin_is_not_drawn_as_no_difference(tmp_path):
+    """All errors 1.5 % larger, where changes from 2 % on matter; costs 30 % larger; success alike."""
+    error = 0.03 * np.random.default_rng(0).standard_normal((1000, 3))
+    for name, factor, cost in (("a", 1.0, 5.0), ("b", 1.015, 6.5)):
+        filled = Synthetic(tmp_path / name)
+        filled.add(filled.scenario(), "it", factor * error, simulations=cost)
+    frame = ib.compare(tmp_path / "a", tmp_path / "b")
+    told = frame.set_index("quantity")[["different", "finding"]]
+    assert told.loc["error"].tolist() == [True, ""]
+    assert told.loc["cost"].tolist() == [True, "worse"]
+    assert told.loc["success"].tolist() == [False, ""]
+    with house_style():
+        (drawing,) = draw_pairs(frame)
+    marks = {ax.get_title().partition(",")[0]: ax.lines[1] for ax in drawing.figure.axes}
+    (legend,) = drawing.figure.legends
+    keys = dict(zip([text.get_text() for text in legend.get_texts()], legend.legend_handles, strict=True))
+    for kind, words in (
+        ("error", "different, perhaps by less than the margin"),
+        ("cost", "worse"),
+        ("success", "no difference found"),
+    ):
+        same = marks[kind], keys[words]
+        assert len({line.get_marker() for line in same}) == len({line.get_markerfacecolor() for line in same}) == 1
+    for ax, (low, high) in zip(drawing.figure.axes, ((-1.0, 1.0), (1 / 1.02, 1.02), (1 / 1.05, 1.05)), strict=True):
+        (band,) = ax.patches
+        assert (band.get_x(), band.get_x() + band.get_width()) == pytest.approx((low, high))
+        assert ax.get_xlim()[0] <= low < high <= ax.get_xlim()[1]
+    assert "different is a change that may be smaller than the margin" in " ".join(str(frame).split())
+    assert re.search(r"mean error .* different", str(frame))

@@ -11,6 +11,7 @@ from itertools import combinations, pairwise
 from unittest.mock import patch
 
 import numpy as np
+import pandas as pd
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PathCollection
@@ -485,3 +486,41 @@ def test_a_point_at_a_cap_is_hollow_with_an_arrow_and_what_is_dense_is_a_bitmap(
     page = Drawing("dense", "", "", fig).html()
     assert "<image" in page
     assert len(page) < 300_000
+
+
+def cut_ends(ax) -> list[tuple[float, float]]:
+    """Where the arrows of intervals stand that go on."""
+    arrows = [line for line in ax.lines if "arrow" in str(line.get_marker())]
+    return [(float(x), float(y)) for line in arrows for x, y in np.column_stack([line.get_xdata(), line.get_ydata()])]
+
+
+@pytest.mark.parametrize("scales", [(10.0,), SCALES])
+def test_an_interval_that_ends_beyond_the_axis_has_an_arrow_there_and_one_within_has_none(synthetic, scales):
+    """A tenth of the trials are lost, by 90 or by 132 bounds; the median is that of the others."""
+    most = errors.CEILING["error_q95"]
+    for label, lost in (("near", 90.0), ("far", 132.0), ("away", np.inf)):
+        error = np.full((60, 3), 0.1)
+        error[:6] *= lost
+        for scale in scales:
+            synthetic.add(synthetic.scenario(error_scale=scale), label, error, estimator=Seeker())
+    axes = drawn(errors, only_view(synthetic))["headline"].figure.axes
+    over = len(scales) == 1
+    found = [at if over else at[::-1] for at in cut_ends(axes[1])]
+    assert [value for value, _ in found] == [most] * 2 * len(scales)
+    assert common.BEYOND in axes[1].get_legend_handles_labels()[1]
+    assert cut_ends(axes[0]) == []
+    reached = [max(segment[:, 0 if over else 1]) for segment in bars(axes[1])]
+    assert sorted({round(float(end)) for end in reached}) == [90, 100]
+
+
+@pytest.mark.parametrize(("ends", "arrows"), [((0.5, 2.0), []), ((0.0, 2.0), [0.1]), ((1e-3, np.inf), [0.1, 10.0])])
+def test_an_interval_that_leaves_the_panel_has_an_arrow_at_its_edge(ends, arrows):
+    rows = pd.DataFrame({"estimator": "one", "error_scale": SCALES, "trials": 60, "y": 1.0})
+    rows["low"], rows["high"] = ends
+    with house_style():
+        ax = Figure().subplots()
+        ax.set(yscale="log", ylim=(0.1, 10.0))
+        common.curves(ax, rows, "y", looks(["one"]), SCALES, interval=("low", "high"))
+    assert sorted({y for _, y in cut_ends(ax)}) == arrows
+    assert len(cut_ends(ax)) == len(SCALES) * len(arrows)
+    assert all(0.0999 < y < 10.001 for segment in bars(ax) for y in segment[:, 1])

@@ -13,7 +13,8 @@ from ipe_bench.real.profiles import CONFIDENCE, half_width
 from ipe_bench.real.residuals import LEAST_P
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
-from ipe_bench.report.style import BOUND_COLOR, FAMILIES, looks
+from ipe_bench.report.figures.views import looks_of
+from ipe_bench.report.style import BOUND_COLOR, FAMILIES
 from ipe_bench.report.words import enumerate_few, p_value
 from ipe_bench.statistics.between import comparison_title
 
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from ipe_bench.measurements.base import Measurement
     from ipe_bench.real.examination import Examination
     from ipe_bench.real.fits import Fit
+    from ipe_bench.report.style import Look
     from ipe_bench.statistics.audit import Audit
     from ipe_bench.trials.observability import Observability
     from ipe_bench.trials.posterior import Reference
@@ -43,10 +45,17 @@ _GRID = 200
 """Points of a curve, where the model can be evaluated between the readings."""
 _FARTHEST = 4.5
 """Standard deviations about the middle that a distribution is drawn to."""
-_FINDINGS = {"better": FAMILIES["least squares"][0], "worse": FAMILIES["filters"][0], "": BOUND_COLOR}
+_GOOD, _BAD = FAMILIES["least squares"][0], FAMILIES["filters"][0]
+_FINDINGS: dict[str, tuple[str, dict[str, Any]]] = {
+    "better": ("better", {"marker": "o", "color": _GOOD}),
+    "worse": ("worse", {"marker": "o", "color": _BAD}),
+    "different": ("different, perhaps by less than the margin", {"marker": "D", "color": BOUND_COLOR}),
+    "": ("no difference found", {"marker": "o", "color": BOUND_COLOR, "markerfacecolor": "white"}),
+}
+"""The words and the mark of each outcome of a test."""
 
 
-def draw_fit(found: Examination, z: Array) -> Iterator[Drawing]:
+def draw_fit(found: Examination, z: Array, look: Look) -> Iterator[Drawing]:
     """Draws readings z (m,) with the fitted curve and its band, if one numeric column alone tells readings apart."""
     model = found.whole.measurement
     columns = {**model.index, **model.input_columns}
@@ -66,12 +75,11 @@ def draw_fit(found: Examination, z: Array) -> Iterator[Drawing]:
         dense = replace(found, whole=replace(found.whole, measurement=model.with_inputs(inputs, _GRID)))
         h, error = dense.fitted, dense.fitted_errors
     q = half_width(CONFIDENCE, None if found.freedom is None else float(np.min(found.freedom)))
-    look = looks([found.label])
     fig, (ax,) = common.panels(1, height=3.2)
     fig.set_figwidth(5.2)
     band = f"{100 * CONFIDENCE:.0f} % band of the curve"
-    ax.fill_between(at, h - q * error, h + q * error, color=look[found.label].color, alpha=0.2, linewidth=0, label=band)
-    ax.plot(at, h, color=look[found.label].color, label=common.text(found.label))
+    ax.fill_between(at, h - q * error, h + q * error, color=look.color, alpha=0.2, linewidth=0, label=band)
+    ax.plot(at, h, color=look.color, label=common.text(found.label))
     ax.plot(x, z, "o", color=BOUND_COLOR, markersize=3.5, rasterized=len(x) > _MANY, label="readings", zorder=3)
     unit = f" [{model.reading_unit}]" if model.reading_unit else ""
     ax.set(xlabel=common.text(name), ylabel=common.text(f"{model.reading_name}{unit}"))
@@ -97,7 +105,7 @@ def draw_residuals(model: Measurement, fits: Sequence[Fit]) -> Iterator[Drawing]
         return
     x, heading = _abscissa(model)
     shown = groups[:MOST_ESTIMATORS]
-    look, limit = looks([one.label for one in fits]), shown[0][0].outlier_limit
+    look, limit = looks_of({one.label: one.estimator for one in fits}), shown[0][0].outlier_limit
     fig, axes = common.panels(len(shown), height=2.6)
     for group, ax in zip(shown, axes, strict=True):
         one = group[0]
@@ -143,34 +151,32 @@ def _abscissa(model: Measurement) -> tuple[Array, str]:
 
 
 def draw_bounds(now: Observability, after: Observability | None, choice: str) -> Iterator[Drawing]:
-    """Draws the bound of each parameter today, and after a `choice` of readings."""
-    from matplotlib.ticker import NullLocator
-
-    fig, (ax,) = _rows([p.name for p in now.parameters], 1)
+    """Draws the bound of each parameter in its unit, today and after a `choice` of readings."""
+    sizes = np.array([p.size for p in now.parameters])
+    fig, (ax,) = _rows([f"{p.name} [{p.unit}]" if p.unit else p.name for p in now.parameters], 1)
     y = np.arange(len(now.parameters))
-    known = np.isfinite(now.bound)
+    known, today = np.isfinite(now.bound), sizes * now.bound
+    chosen = today if after is None else sizes * after.bound
+    common.decades(ax, np.append(today, chosen))
     if after is not None:
-        ax.hlines(y[known], now.bound[known], after.bound[known], color=BOUND_COLOR, linewidth=1.0, zorder=1)
+        ax.hlines(y[known], today[known], chosen[known], color=BOUND_COLOR, linewidth=1.0, zorder=1)
     hollow: Any = {"markerfacecolor": "white", "markersize": 8, "markeredgewidth": 1.0}
-    ax.plot(now.bound[known], y[known], "o", color=BOUND_COLOR, label="today", **hollow)
+    ax.plot(today[known], y[known], "o", color=BOUND_COLOR, label="today", **hollow)
     if after is not None:
-        ax.plot(after.bound, y, "o", color=FAMILIES["IPE"][0], label=choice)
-    ax.set_xscale("log")
-    low, high = ax.get_xlim()
-    common.log_ticks(ax.xaxis, low, high)
-    ax.yaxis.set_minor_locator(NullLocator())
-    ax.set_xlabel("bound, in multiples of the parameter's size")
+        ax.plot(chosen, y, "o", color=FAMILIES["IPE"][0], label=choice)
+    ax.set_xlabel("bound, in the unit of each row")
     common.legend(fig, [ax])
     caption = "Cramér-Rao bound of each parameter's standard deviation, root mean square over truths from the prior."
     if not known.all():
         caption += " Without a hollow mark: today's readings leave the parameter open."
-    yield Drawing("design", "Bounds today and after the best choice", caption, fig)
+    title = "Bounds today" if after is None else "Bounds today and after the best choice"
+    yield Drawing("design", title, caption, fig)
 
 
 def draw_marginals(model: Measurement, found: Sequence[Reference]) -> Iterator[Drawing]:
     """Draws marginals of the first trial's posterior beside the Gaussians of estimators, the worst parameters."""
     one = found[0]
-    mean, deviation, look = one.posterior.mean, one.posterior.deviation, looks(list(one.estimates))
+    mean, deviation, look = one.posterior.mean, one.posterior.deviation, looks_of(one.estimators)
     claims = {}
     for label, each in one.estimates.items():
         P = np.full((model.n, model.n), np.nan) if each.covariance is None else each.covariance[0]
@@ -195,7 +201,7 @@ def draw_marginals(model: Measurement, found: Sequence[Reference]) -> Iterator[D
         ax.set_xlim(low, high)
         ax.set_yticks([])
         common.title(ax, f"{p.name} [{p.unit}]" if p.unit else p.name)
-        ax.locator_params(axis="x", nbins=4)
+        common.full_ticks(ax)
     common.legend(fig, axes, {label: replace(each, marker="") for label, each in look.items()})
     more = f", the {len(chosen)} parameters in which they differ most" if len(chosen) < model.n else ""
     caption = f"Trial {one.trial}: draws of the posterior beside the Gaussians that estimators report{more}."
@@ -215,30 +221,39 @@ def draw_pairs(frame: pd.DataFrame) -> Iterator[Drawing]:
     kinds = list(dict.fromkeys(row["quantity"] for row in rows))[: common.most_panels()]
     fig, axes = _rows(labels[:MOST_ROWS], len(kinds))
     for kind, ax in zip(kinds, axes, strict=True):
-        ratio = kind != "success" and not kind.startswith("bias")
-        for row in (row for row in rows if row["quantity"] == kind and names[id(row)] in labels[:MOST_ROWS]):
-            y, color = labels.index(names[id(row)]), _FINDINGS[row["finding"]]
-            factor = 100 if kind == "success" else 1
-            ax.plot([factor * row["low"], factor * row["high"]], [y, y], color=color, linewidth=1.4)
-            ax.plot(factor * row["change"], y, "o", color=color, markerfacecolor=color if row["finding"] else "white")
-        if ratio:
-            low, high = min(ax.get_xlim()[0], 0.9), max(ax.get_xlim()[1], 1.1)
-            if high > 3 * max(low, 0.0):
-                ax.set_xscale("log")
-                low, high = ax.get_xlim()
-                low, high = min(low, 0.8), max(high, 1.25)
-                common.log_ticks(ax.xaxis, low, high)
-            ax.set_xlim(low, high)
-        ax.axvline(float(ratio), color=BOUND_COLOR, linewidth=0.8, linestyle=":")
-        common.title(ax, f"{kind}, {'ratio' if ratio else 'points' if kind == 'success' else 'difference'}")
-    for word, color in _FINDINGS.items():
-        face = color if word else "white"
-        axes[0].plot([], [], "o", color=color, markerfacecolor=face, label=word or "no difference found")
+        shown = [row for row in rows if row["quantity"] == kind and names[id(row)] in labels[:MOST_ROWS]]
+        places = [labels.index(names[id(row)]) for row in shown]
+        _draw_changes(ax, kind, shown, places, frame.attrs["margins"][kind.partition(" ")[0]])
+    for words, mark in _FINDINGS.values():
+        axes[0].plot([], [], linestyle="none", label=words, **mark)
     common.legend(fig, axes)
-    caption = "Second against first in the same trials, each with its own interval; filled marks are findings."
+    caption = "Second against first in the same trials, each with its own interval; grey: changes below the margin."
     if len(labels) > MOST_ROWS:
         caption += f" {len(labels) - MOST_ROWS} further comparisons are in the table."
     yield Drawing("comparison", "Changes trial by trial", caption, fig)
+
+
+def _draw_changes(ax: Axes, kind: str, rows: Sequence[Any], places: Sequence[int], margin: float) -> None:
+    """Draws the changes of one quantity at their places down the axis, beside the band of those below the margin."""
+    factor = 100 if kind == "success" else 1
+    for row, y in zip(rows, places, strict=True):
+        _, mark = _FINDINGS[row["finding"] or "different" * row["different"]]
+        ax.plot([factor * row["low"], factor * row["high"]], [y, y], color=mark["color"], linewidth=1.4)
+        ax.plot(factor * row["change"], y, **mark)
+    ratio = kind != "success" and not kind.startswith("bias")
+    same, least, most = (1.0, 1 / (1 + margin), 1 + margin) if ratio else (0.0, -factor * margin, factor * margin)
+    low, high = ax.get_xlim()
+    if ratio and high > 3 * max(low, 0.0):
+        ax.set_xscale("log")
+        low, high = ax.get_xlim()
+        low, high = min(low, 0.8), max(high, 1.25)
+        common.log_ticks(ax.xaxis, low, high)
+    elif ratio:
+        low, high = min(low, 0.9), max(high, 1.1)
+    ax.set_xlim(min(low, least), max(high, most))
+    common.band(ax, least, most, "smaller than the margin")
+    ax.axvline(same, color=BOUND_COLOR, linewidth=0.8, linestyle=":")
+    common.title(ax, f"{kind}, {'ratio' if ratio else 'points' if kind == 'success' else 'difference'}")
 
 
 def draw_audit(found: Audit) -> Iterator[Drawing]:

@@ -58,6 +58,15 @@ def name_axis(ax: Axes, names: Sequence[str]) -> None:
     ax.set_ylim(len(names) - 0.4, -0.6)
 
 
+def _limits(ax: Axes) -> tuple[float, float]:
+    """Returns the ends of the axis of values; none are known before they are set."""
+    across = _value(ax) == "x"
+    if ax.get_autoscalex_on() if across else ax.get_autoscaley_on():
+        return -np.inf, np.inf
+    low, high = sorted(ax.get_xlim() if across else ax.get_ylim())
+    return low, high
+
+
 def _value(ax: Axes) -> str:
     """Says on which axis values stand: the horizontal one where names stand downwards."""
     return "x" if ax.yaxis_inverted() else "y"
@@ -180,6 +189,33 @@ def log_ticks(axis: Axis, low: float, high: float) -> None:
     axis.set_minor_locator(NullLocator())
 
 
+def full_ticks(ax: Axes, most: int = 4) -> None:
+    """Labels the horizontal axis with whole numbers of a step, no part of which is set aside, as far as they fit."""
+    from matplotlib.ticker import MaxNLocator
+
+    (low, high), room = ax.get_xlim(), _room(ax, "xtick.labelsize")
+    ticks, labels = np.empty(0), list[str]()
+    for intervals in range(most, 1, -1):
+        ticks = np.asarray(MaxNLocator(intervals, steps=[1, 2, 5, 10]).tick_values(low, high))
+        ticks = ticks[(ticks >= low) & (ticks <= high)]
+        labels = in_full(ticks)
+        if sum(map(len, labels)) + 2 * len(labels) <= room:
+            break
+    ax.set_xticks(ticks, labels)
+
+
+def in_full(ticks: Any) -> list[str]:
+    """Writes equidistant numbers with all the digits that tell them apart: 0.0387555 or −1.9598, 2.5·10⁻⁷ if small."""
+    if len(ticks) < 2:
+        return [number(tick) for tick in ticks]
+    step, largest = ticks[1] - ticks[0], np.abs(ticks).max()
+    exponent = int(np.floor(np.log10(largest))) if largest < 1e-3 or step >= 1e4 else 0
+    digits = max(0, exponent - int(np.floor(np.log10(step) + 1e-9)))
+    power = f"·10{str(exponent).translate(_RAISED)}" if exponent else ""
+    written = [f"{tick / 10.0**exponent:.{digits}f}{power}" for tick in ticks]
+    return [label.replace("-", "\N{MINUS SIGN}") for label in written]
+
+
 def shares(ax: Axes) -> None:
     """Sets an axis of shares from 0 to 1."""
     axis = _value(ax)
@@ -199,18 +235,35 @@ def band(ax: Axes, low: float, high: float, label: str = "") -> None:
 
 def beyond(ax: Axes, x: Any, y: Any, one: Look) -> None:
     """Draws points that lie beyond the axis at its end: hollow, with an arrow."""
+    edge: dict[str, Any] = {"markeredgecolor": one.color, "markerfacecolor": "white", "markeredgewidth": 1.1}
+    ax.plot(x, y, marker=one.marker, linestyle="none", clip_on=False, zorder=3, **edge)
+    _arrows(ax, x, y, one.color, points=7)
+
+
+def _arrows(ax: Axes, x: Any, y: Any, color: str, *, points: float, downwards: bool = False) -> None:
+    """Draws arrows towards the end of the axis of values, their middles so many points farther out, and says in the
+    legend what they mean."""
     from matplotlib.transforms import ScaledTranslation
 
     across = _value(ax) == "x"
-    inches = (6 / 72, 0) if across else (0, 6 / 72)
-    outwards = ax.transData + ScaledTranslation(*inches, ax.figure.dpi_scale_trans)
-    edge: dict[str, Any] = {"markeredgecolor": one.color, "markerfacecolor": "white", "markeredgewidth": 1.1}
-    ax.plot(x, y, marker=one.marker, linestyle="none", clip_on=False, zorder=3, **edge)
-    arrow: dict[str, Any] = {"marker": r"$\rightarrow$" if across else r"$\uparrow$", "linestyle": "none"}
-    (arrows,) = ax.plot(x, y, transform=outwards, color=one.color, clip_on=False, zorder=3, **arrow)
-    arrows.set(in_layout=False, markeredgewidth=0.0)
+    back, forth = ("left", "right") if across else ("down", "up")
+    inches = (-points if downwards else points) / 72
+    outwards = ScaledTranslation(*((inches, 0) if across else (0, inches)), ax.figure.dpi_scale_trans)
+    marker = rf"$\{back if downwards else forth}arrow$"
+    arrow: dict[str, Any] = {"marker": marker, "markersize": 8, "linestyle": "none", "markeredgewidth": 0.0}
+    (drawn,) = ax.plot(x, y, transform=ax.transData + outwards, color=color, clip_on=False, zorder=3, **arrow)
+    drawn.set_in_layout(False)
     if BEYOND not in ax.get_legend_handles_labels()[1]:
-        ax.plot([], [], label=BEYOND, color=BOUND_COLOR, markeredgewidth=0.0, **arrow)
+        ax.plot([], [], label=BEYOND, color=BOUND_COLOR, **arrow)
+
+
+def _mark_cut(ax: Axes, place: Any, edge: float, color: str, *, downwards: bool) -> None:
+    """Draws an arrow at the ends of intervals that are cut at the edge, each at its place."""
+    if len(place) == 0:
+        return
+    edges = np.full(len(place), edge)
+    at = (edges, place) if _value(ax) == "x" else (place, edges)
+    _arrows(ax, *at, color, points=-4, downwards=downwards)
 
 
 def seaborn_style(look: Mapping[str, Look], by: str = "estimator") -> dict[str, Any]:
@@ -256,9 +309,11 @@ def curves(
     Labels stand side by side about their scale, so that points and intervals that coincide are seen. A line is broken
     where a value is missing; a point that some of the trials or fewer than `FEW` carry is hollow, and without an
     interval if they are fewer than `FEW`. Of an interval that lacks an end the other is drawn. What exceeds `most`
-    stands there.
+    stands there, and an interval that is cut there or at the end of the axis has an arrow.
     """
     across, one_scale = _value(ax) == "x", len(scales) == 1
+    least, top = _limits(ax)
+    top = min(top, most)
     if not one_scale:
         scale_axis(ax, scales)
     elif not across:
@@ -274,10 +329,13 @@ def curves(
         few, over = part[trials] < FEW, part[y] > most
         ends = None
         if interval and one.color != GREY:
-            low, high = (part[end].clip(upper=most) for end in interval)
-            sizes = np.array([values - low, high - values]).clip(min=0)
+            low, high = (part[end] for end in interval)
+            sizes = np.array([values - low.clip(lower=least), high.clip(upper=top) - values]).clip(min=0)
             known = np.isfinite(sizes) & ~few.to_numpy()
             ends = np.where(known, sizes, np.where(known.any(axis=0), 0.0, np.nan))
+            shown = ~over & ~few
+            _mark_cut(ax, place[shown & (low < least)], least, one.color, downwards=True)
+            _mark_cut(ax, place[shown & (high > top)], top, one.color, downwards=False)
         line: dict[str, Any] = {**one.line, "zorder": 2} | ({"linestyle": "none"} if one_scale else {})
         empty = few | (part[trials] < all_trials)
         if one.color == GREY and not one_scale:  # the background, where estimators are alike

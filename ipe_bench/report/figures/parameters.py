@@ -50,10 +50,12 @@ def _of_one(view: View, estimator: str) -> Drawing:
                 ax.plot(bound["error_scale"], bound["linear_bound"], **style)
             else:
                 ax.vlines(bound["linear_bound"], i - 0.3, i + 0.3, **style)
-        _curves(ax, part, look, view, group, inside[0]["unit"])
-        if len(inside) > 1 and several:
+        legend = len(inside) > 1 and several
+        if legend:
             low, high = ax.get_ylim()
             ax.set_ylim(low, high * (high / low) ** (0.05 * (len(inside) + 1)))
+        _curves(ax, part, look, view, group, inside[0]["unit"])
+        if legend:
             lines: list[Any] = [one.line | {"linestyle": "none"} for one in look.values()]
             handles = [ax.plot([], [], **line)[0] for line in lines]
             tight: Any = {"handlelength": 0.4, "handletextpad": 0.4, "columnspacing": 0.8, "borderaxespad": 0.2}

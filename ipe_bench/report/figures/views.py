@@ -14,13 +14,14 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.style import FACES, MOST_FACES, Look, Which, drawn_settings, looks
 from ipe_bench.report.words import value_text
+from ipe_bench.runs.store import traits
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.statistic import ALL
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
-    from ipe_bench.statistics.collect import Collection, Group
+    from ipe_bench.statistics.collect import Collection
 
 MOST_LETTERS = 70
 """Largest length of a setting in a file name; longer ones are cut and end in a number."""
@@ -171,7 +172,7 @@ def _looks(analysis: Analysis) -> dict[str, Look]:
     in colour, or if there is none the two best of each family."""
     labels = list(dict.fromkeys(g.estimator for g in analysis.collection.groups))
     families = {g.estimator: family_of(g.footer) for g in analysis.collection.groups}
-    own = {g.estimator: _named(g) for g in analysis.collection.groups if g.footer.get("look")}
+    own = _own_looks({g.estimator: g.footer for g in analysis.collection.groups})
     if len(labels) <= MOST_FACES or analysis.summary.empty:
         return looks(labels, families, own=own)
     totals = analysis.summary[analysis.summary["parameter"] == ALL]
@@ -181,19 +182,29 @@ def _looks(analysis: Analysis) -> dict[str, Look]:
     return looks(labels, families, () if FACES.keys() & set(labels) else best, own)
 
 
-def _named(group: Group) -> tuple[str, str]:
+def looks_of(estimators: Mapping[str, Any]) -> dict[str, Look]:
+    """Returns the looks that a run's figures give these estimators, where there is no run."""
+    traits_of = {label: traits(estimator) for label, estimator in estimators.items()}
+    families = {label: family_of(one) for label, one in traits_of.items()}
+    return looks(list(estimators), families, own=_own_looks(traits_of))
+
+
+def _own_looks(footers: Mapping[str, Mapping[str, Any]]) -> dict[str, tuple[str, str]]:
+    """Returns the colours and markers that classes name, by the labels of their estimators."""
+    return {label: _named(label, footer["look"]) for label, footer in footers.items() if footer.get("look")}
+
+
+def _named(label: str, look: Any) -> tuple[str, str]:
     """Returns the colour and marker that an estimator's class names; raises UserError if there are none such."""
     from matplotlib.colors import to_hex
     from matplotlib.markers import MarkerStyle
 
     try:
-        color, marker = group.footer["look"]
+        color, marker = look
         MarkerStyle(marker)
         return to_hex(color), marker
     except (TypeError, ValueError):
-        raise UserError(
-            f'{group.estimator}: look={group.footer["look"]} is no colour and marker; write look = ("#c51b7d", "s")'
-        ) from None
+        raise UserError(f'{label}: look={look} is no colour and marker; write look = ("#c51b7d", "s")') from None
 
 
 def family_of(footer: Mapping[str, Any]) -> str:
