@@ -151,6 +151,8 @@ class _OneByOne(_Filters):
         """Returns `action()`, or None if it raises."""
         try:
             return action()
+        except (MemoryError, UserError):
+            raise
         except Exception as error:
             known = {np.linalg.LinAlgError: Status.SINGULAR, OverflowError: Status.NONFINITE}
             self.end([trial], known.get(type(error), Status.ERROR), describe_exception(error))

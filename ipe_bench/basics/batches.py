@@ -1,6 +1,6 @@
 """Takes rows out of a batch, and puts rows into one.
 
-A batch is an array or a list with the trials in front, or a dataclass whose fields are batches. None stays None.
+A batch is an array or a list with the trials in front, or a dataclass, a tuple or a dict of batches. None stays None.
 """
 
 from __future__ import annotations
@@ -40,15 +40,38 @@ def put(batch: B, where: NDArray[Any], part: B) -> B:
 def gather(parts: Sequence[tuple[NDArray[np.intp], B]]) -> B:
     """Gathers the trials at each part's indices into one batch."""
     rows = np.concatenate([rows for rows, _ in parts])
-    return parts[0][1] if len(parts) == 1 else take(_join([part for _, part in parts]), np.argsort(rows))
+    return parts[0][1] if len(parts) == 1 else take(join([part for _, part in parts]), np.argsort(rows))
 
 
-def _join(batches: Sequence[B]) -> B:
-    """Joins batches one after another."""
-    first = batches[0]
-    if isinstance(first, list):
-        return [row for batch in batches for row in batch]  # type: ignore[return-value,union-attr]
-    return _each(lambda *parts: _join(parts), *batches) if is_dataclass(first) else np.concatenate(batches)  # type: ignore
+def join(batches: Sequence[B]) -> B:
+    """Joins batches one after another. Where some lack what others have, numbers of their trials are NaN, and lists of
+    rows are empty."""
+    first: Any = batches[0]
+    leading = fields(first)[0].name if is_dataclass(first) else ""
+    sizes = [len(getattr(batch, leading) if leading else batch) for batch in batches]  # type: ignore[arg-type]
+    return _joined(batches, sizes)
+
+
+def _joined(parts: Sequence[Any], sizes: Sequence[int]) -> Any:
+    known = next((part for part in parts if part is not None), None)
+    if known is None:
+        return None
+    if is_dataclass(known):
+        each = {f.name: [getattr(part, f.name) for part in parts] for f in fields(known) if f.init}
+        return replace(known, **{name: _joined(values, sizes) for name, values in each.items()})  # type: ignore[type-var]
+    if isinstance(known, dict):
+        names = dict.fromkeys(name for part in parts for name in part)
+        return {name: _joined([part.get(name) for part in parts], sizes) for name in names}
+    if isinstance(known, tuple):
+        return type(known)(*[_joined(values, sizes) for values in zip(*parts, strict=True)])
+    if isinstance(known, list):
+        empty = next((row[:0] for part in parts for row in part or ()), None)
+        rows = ([empty] * size if part is None else part for part, size in zip(parts, sizes, strict=True))
+        return [row for several in rows for row in several]
+    missing = (np.full((size, *known.shape[1:]), np.nan) for size in sizes)
+    # Filled first: np.concatenate takes masks off, and keeps what lies under them.
+    filled = (m if part is None else np.ma.filled(part, np.nan) for m, part in zip(missing, parts, strict=True))
+    return np.concatenate(list(filled))
 
 
 def _each(change: Callable[..., Any], *batches: Any) -> Any:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ipe_bench.basics.batches import join
 from ipe_bench.basics.errors import UserError, describe_exception, one_line
 from ipe_bench.basics.linalg import Array, plain_numbers, read_only
 from ipe_bench.basics.options import Component
@@ -67,31 +68,10 @@ class Estimates:
 
     @classmethod
     def join(cls, parts: Sequence[Estimates]) -> Estimates:
-        """Joins batches one after another."""
-        n, sizes = parts[0].x.shape[1], [len(part.x) for part in parts]
-        starts = np.cumsum([0, *sizes[:-1]]).tolist()
-
-        def joined(values: list[Any], *shape: int) -> Any:
-            """Joins values, NaN if a part has none, and None if no part has any."""
-            if all(value is None for value in values):
-                return None
-            pairs = zip(values, sizes, strict=True)
-            # Filled first: np.concatenate takes masks off, and keeps what lies under them.
-            blank = (np.full((size, *shape), np.nan) if v is None else np.ma.filled(v, np.nan) for v, size in pairs)
-            return np.concatenate(list(blank))
-
-        whole = ("x", "status", "iterations", "simulations", "jacobians", "seconds")
-        found: dict[str, Any] = {name: joined([getattr(part, name) for part in parts]) for name in whole}
-        found["covariance"] = joined([part.covariance for part in parts], n, n)
-        found["messages"] = {s + i: m for s, part in zip(starts, parts, strict=True) for i, m in part.messages.items()}
-        names = dict.fromkeys(name for part in parts for name in part.extras)
-        found["extras"] = {name: joined([part.extras.get(name) for part in parts]) for name in names}
-        if all(part.history is not None for part in parts):
-            found["history"] = [x for part in parts for x in part.history or ()]
-        if any(part.alternatives is not None for part in parts):
-            blank = np.zeros((0, n))
-            found["alternatives"] = [x for part in parts for x in part.alternatives or [blank] * len(part.x)]
-        return cls(**found)
+        """Joins batches one after another; what trials lack that others have is NaN, and none in their lists."""
+        starts = np.cumsum([0, *(len(part.x) for part in parts)]).tolist()
+        messages = {s + i: m for s, part in zip(starts, parts, strict=False) for i, m in part.messages.items()}
+        return replace(join([replace(part, messages={}) for part in parts]), messages=messages)
 
     @classmethod
     def failed(cls, trials: int, n: int, message: str) -> Estimates:
@@ -187,14 +167,7 @@ def _make_plain(estimator: Estimator, estimates: Any, trials: int, n: int) -> No
     if estimates.covariance is not None:
         estimates.covariance = plain_numbers(f"{name} covariance", estimates.covariance, (trials, n, n))
     for part in ("status", "iterations", "simulations", "jacobians", "seconds"):
-        values = plain_numbers(f"{name} {part}", getattr(estimates, part), (trials,))
-        if part == "status" and not np.isin(values, _ENDED).all():
-            raise ValueError(f"{name} a status that is not one of ipe_bench.Status, or means that it has not ended")
-        if not (np.isfinite(values) & (values >= 0)).all():
-            raise ValueError(f"{name} {part} that are not finite numbers from 0 up")
-        if part == "iterations" and ((values != np.rint(values)) | (values > _MOST)).any():
-            raise ValueError(f"{name} iterations that are not whole numbers up to {_MOST:g}")
-        setattr(estimates, part, values.astype({"status": np.int8, "iterations": np.int64}.get(part, float)))
+        setattr(estimates, part, plain_counts(name, part, getattr(estimates, part), trials))
     estimates.extras = {k: plain_numbers(f"{name} {k}", values, (trials,)) for k, values in estimates.extras.items()}
     for part in ("history", "alternatives"):
         if (each := getattr(estimates, part)) is not None:
@@ -202,6 +175,19 @@ def _make_plain(estimator: Estimator, estimates: Any, trials: int, n: int) -> No
                 raise ValueError(f"{name} {part} of {len(each)} trials, where {trials} belong")
             setattr(estimates, part, [plain_numbers(f"{name} {part}", x, (len(x), n)) for x in each])
     estimates.messages = {trial: one_line(message) for trial, message in estimates.messages.items()}
+
+
+def plain_counts(name: str, part: str, values: Any, trials: int) -> Any:
+    """Returns statuses, iterations, evaluations or seconds (trials,) as ordinary arrays; ValueError, which begins with
+    `name`, if they cannot be such."""
+    values = plain_numbers(f"{name} {part}", values, (trials,))
+    if part == "status" and not np.isin(values, _ENDED).all():
+        raise ValueError(f"{name} a status that is not one of ipe_bench.Status, or means that it has not ended")
+    if not (np.isfinite(values) & (values >= 0)).all():
+        raise ValueError(f"{name} {part} that are not finite numbers from 0 up")
+    if part == "iterations" and ((values != np.rint(values)) | (values > _MOST)).any():
+        raise ValueError(f"{name} iterations that are not whole numbers up to {_MOST:g}")
+    return values.astype({"status": np.int8, "iterations": np.int64}.get(part, float))
 
 
 def one_by_one(trials: Iterable[Any], estimate: Any, n: int) -> Estimates:

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ipe_bench.basics.batches import join
 from ipe_bench.basics.linalg import Array, Mask, multiply
 from ipe_bench.basics.options import Component, Count
 from ipe_bench.states.algebra import factor, lower_solve, symmetric, transposed, upper_solve
@@ -93,14 +94,14 @@ class Tracks:
 
     @classmethod
     def join(cls, parts: Sequence[Tracks]) -> Tracks:
-        """The trials of several batches one after another, without what smoothers need."""
-        names = ("mean", "covariance", "nis", "innovations", "degrees", "log_likelihood", "calls")
-        arrays: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-        start = Normal(*[np.concatenate(several) for several in zip(*(part.start for part in parts), strict=True)])
-        for name in ("cost", "status", "iterations"):
-            if all(getattr(part, name) is not None for part in parts):
-                arrays[name] = np.concatenate([getattr(part, name) for part in parts])
-        return cls(**arrays, start=start)
+        """The trials of several batches one after another, without what smoothers need; what trials lack that others
+        have is NaN, or the status and the iterations of none."""
+        joined = join([replace(part, moves=[], predicted=[], reads=[]) for part in parts])
+        if joined.status is not None:
+            joined.status = np.nan_to_num(joined.status).astype(np.int8)
+        if joined.iterations is not None:
+            joined.iterations = np.nan_to_num(joined.iterations).astype(np.int64)
+        return joined
 
 
 class Tracker(Component, ABC):

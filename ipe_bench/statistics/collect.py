@@ -111,14 +111,15 @@ def trials_frame(collection: Collection) -> pd.DataFrame:
     if not parts:
         return pd.DataFrame(columns=[*NAMES, "trial"])
     frame = pd.concat(parts, ignore_index=True)
-    scarce = frame.columns[frame.isna().mean() > 0.5]  # most rows have none
+    # What some estimator knows of most of its trials, whichever others there are.
+    ample = {name for part in parts for name in part.columns[part.notna().mean() >= 0.5]}
 
     def place(name: str) -> tuple[int, bool]:
         if name in first:
             return -1, False
         main = (i for i, begin in enumerate(_MAIN) if name == begin or (begin[-1] == "_" and name.startswith(begin)))
         at = next(main, len(_MAIN))
-        return at, at == len(_MAIN) and name in scarce
+        return at, at == len(_MAIN) and name not in ample
 
     return frame[sorted(frame.columns, key=place)]
 

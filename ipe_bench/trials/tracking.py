@@ -21,7 +21,7 @@ from ipe_bench.basics.errors import UserError, describe_exception
 from ipe_bench.basics.linalg import Array, Mask, deviations, finite, plain_numbers, read_only
 from ipe_bench.basics.options import in_lines
 from ipe_bench.basics.statuses import Status
-from ipe_bench.estimators.base import Estimates
+from ipe_bench.estimators.base import Estimates, plain_counts
 from ipe_bench.noise.base import Noise
 from ipe_bench.noise.kinds import Certified, ModelNoise
 from ipe_bench.priors import GaussianPrior, Prior
@@ -208,6 +208,8 @@ class PathBlock:
         finished = known.all(axis=1)
         status = np.where(finished | (ended != Status.CONVERGED), ended, Status.NONFINITE).astype(np.int8)
         status[list(messages)] = Status.ERROR
+        iterations = np.full(trials, K) if tracks.iterations is None else tracks.iterations.copy()
+        iterations[list(messages)] = 0
         for i in np.flatnonzero(~finished):
             messages.setdefault(int(i), f"the track is not finite from epoch {int(np.argmin(known[i])) + 1} on")
         status[~finite(self.paths.x)] = Status.NO_READINGS
@@ -217,7 +219,7 @@ class PathBlock:
             x=tracks.mean[:, -1, at],
             status=status,
             covariance=P[:, -1],
-            iterations=np.full(trials, K) if tracks.iterations is None else tracks.iterations,
+            iterations=iterations,
             simulations=tracks.calls,
             messages=messages,
             seconds=seconds,
@@ -299,9 +301,12 @@ def _make_plain(tracker: Tracker, tracks: Any, trials: int, model: StateModel) -
     shapes = {"mean": (K, n), "covariance": (K, n, n), "nis": (K,), "degrees": (K,), "log_likelihood": ()}
     for part, shape in {**shapes, "innovations": (K, model.readings_per_epoch)}.items():
         setattr(tracks, part, plain_numbers(f"{name} {part}", getattr(tracks, part), (trials, *shape)))
-    for part in ("cost", "status", "iterations"):
+    tracks.calls = plain_counts(name, "calls", tracks.calls, trials)
+    if tracks.cost is not None:
+        tracks.cost = plain_numbers(f"{name} cost", tracks.cost, (trials,))
+    for part in ("status", "iterations"):
         if (values := getattr(tracks, part)) is not None:
-            setattr(tracks, part, plain_numbers(f"{name} {part}", values, (trials,)))
+            setattr(tracks, part, plain_counts(name, part, values, trials))
 
 
 def packed(trials: int, sums: Sequence[Array]) -> Array:

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -93,7 +94,7 @@ class Session:
 
     def __init__(self, kind: str, way: str, v: float) -> None:
         self.kind, (self.edited, self.used) = kind, WAYS[way]
-        self.names = {"__name__": "__main__"}
+        self.names: dict[str, Any] = {"__name__": "__main__"}
         exec(SETUP, self.names)
         self.run_all(v)
 
@@ -106,7 +107,7 @@ class Session:
         exec(self.used, self.names)
         exec(KINDS[self.kind], self.names)
 
-    def asked(self) -> tuple:
+    def asked(self) -> tuple[Any, Any]:
         """The scenario and the estimators."""
         mine = self.names["Mine"](0.01) if self.kind == "noise" else self.names["Mine"]()
         if self.kind == "tracker":
@@ -122,8 +123,9 @@ class Session:
         return ResultKey(scenario, *next(iter(estimators.items()))).key
 
 
-def first(folder: Path, scenario, estimators, column: str) -> float:
+def first(folder: Path, asked: tuple[Any, Any], column: str) -> float:
     """That column of the first trial, as it is computed into or found in the folder."""
+    scenario, estimators = asked
     assert not compute([scenario], estimators, 2, folder)
     return float(ib.load(folder)[column].iloc[0])
 
@@ -131,24 +133,24 @@ def first(folder: Path, scenario, estimators, column: str) -> float:
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_helper_that_is_edited_in_another_cell_changes_numbers_in_any_folder(tmp_path, kind):
     session, column = Session(kind, "helper", 0.0), COLUMN.get(kind, "error_c0")
-    scenario, estimators = session.asked()
-    before = first(tmp_path / "one", scenario, estimators, column)
+    asked = session.asked()
+    before = first(tmp_path / "one", asked, column)
     session.edit(1000.0)
     # The same objects of the same classes: what they have worked out is the old helper's.
     for folder in ("one", "another"):
-        assert first(tmp_path / folder, scenario, estimators, column) == pytest.approx(before + 1000, abs=1e-6)
+        assert first(tmp_path / folder, asked, column) == pytest.approx(before + 1000, abs=1e-6)
     session.edit(0.0)
-    assert first(tmp_path / "one", scenario, estimators, column) == before
+    assert first(tmp_path / "one", asked, column) == before
 
 
 @pytest.mark.parametrize("way", WAYS)
 def test_a_cell_that_is_edited_changes_numbers_and_one_that_is_run_again_does_not(tmp_path, way):
     session = Session("estimator", way, 0.0)
-    before, key = first(tmp_path, *session.asked(), "error_c0"), session.key()
+    before, key = first(tmp_path, session.asked(), "error_c0"), session.key()
     session.run_all(0.0)
     assert session.key() == key
     session.run_all(1000.0)
-    assert first(tmp_path, *session.asked(), "error_c0") == pytest.approx(before + 1000)
+    assert first(tmp_path, session.asked(), "error_c0") == pytest.approx(before + 1000)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -189,7 +191,8 @@ def test_a_rerun_computes_nothing_though_the_code_fills_its_variables(tmp_path):
     session = Session("estimator", "constant", 1.0)
     exec("seen = []\nclass By:\n    def by(self):\n        seen.append(1)\n        return 1.0", session.names)
     exec(KINDS["estimator"], session.names)
-    table = ib.run(*session.asked(), trials=40, precision=1e-9, block_size=20, output=tmp_path)
+    scenario, estimators = session.asked()
+    table = ib.run(scenario, estimators, trials=40, precision=1e-9, block_size=20, output=tmp_path)
     assert table.attrs["stops"][0]["trials"] == 40
     assert len(Results.read([tmp_path]).stored) == 2
 
@@ -249,7 +252,7 @@ def test_a_module_that_is_edited_and_reloaded_has_new_numbers_and_known_ones_whe
         for name in ("helper", "mine") if apart else ("mine",):
             importlib.reload(importlib.import_module(name))
         mine = sys.modules["mine"].Reloaded()
-        shifts.append(first(importing / "out", SCENARIO, {"mine": mine}, "error_c0"))
+        shifts.append(first(importing / "out", (SCENARIO, {"mine": mine}), "error_c0"))
         keys.append(ResultKey(SCENARIO, "mine", mine).key)
     assert shifts[1] == pytest.approx(shifts[0] + 1000)
     assert shifts[2] == shifts[0]
@@ -266,11 +269,11 @@ def test_a_module_that_is_edited_and_not_imported_again_is_neither_the_old_one_n
     assert len(keys) == 3
 
 
-def test_a_constant_that_is_set_from_outside_is_part_of_the_key(importing):
+def test_what_is_set_in_a_module_from_outside_is_part_of_the_key(importing, monkeypatch):
     write(importing, "mine", 0.0)
     module = importlib.import_module("mine")
     key = ResultKey(SCENARIO, "mine", module.Reloaded()).key
-    module.shift = lambda: 1.0
+    monkeypatch.setattr(module, "shift", lambda: 1.0)
     assert ResultKey(SCENARIO, "mine", module.Reloaded()).key != key
 
 

@@ -8,10 +8,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+import ipe_bench as ib
 from ipe_bench.basics.errors import UserError
 from ipe_bench.runs import parts
 from ipe_bench.runs.execution import Failure
 from ipe_bench.runs.provenance import digest
+from ipe_bench.runs.run import compute
 from ipe_bench.statistics import analyse
 from ipe_bench.statistics.collect import collect
 
@@ -124,3 +126,12 @@ def test_the_truth_being_absent_is_a_problem_and_not_a_crash(filled):
     assert any("the truth" in line for line in analysis.collection.problems)
     assert analysis.summary["crlb"].isna().all()
     assert analysis.summary["rmse"].notna().all()
+
+
+def test_columns_stand_in_one_order_whichever_other_estimators_there_are(tmp_path):
+    scenario = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01))
+    few = {"linear": ib.baselines.LinearLSE(), "newton": ib.solvers.Newton()}
+    more = few | {"another": ib.baselines.LinearLSE()}
+    for folder, estimators in (("few", few), ("more", more)):
+        assert not compute([scenario], estimators, 4, tmp_path / folder)
+    assert ib.load(tmp_path / "few").columns.tolist() == ib.load(tmp_path / "more").columns.tolist()
