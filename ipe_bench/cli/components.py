@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 
 import ipe_bench as ib
 from ipe_bench.basics.errors import UserError, unknown
+from ipe_bench.basics.machine import library_versions
 from ipe_bench.cli import print_problems, renamed, say, show
 from ipe_bench.cli.main import main
 from ipe_bench.cli.parser import KINDS, MODELS
@@ -327,6 +328,10 @@ def _check_name(group: str, name: str) -> None:
         )
     if keyword.iskeyword(name):
         raise UserError(f"{name}: is a word of Python; choose another name")
+    if name in ("ipe_bench", *library_versions()):
+        raise UserError(f"{name}: is a package that ipe-bench imports; choose another name")
+    if re.fullmatch("con|prn|aux|nul|(com|lpt)[0-9]", name):
+        raise UserError(f"{name}: is no name of a folder on Windows; choose another name")
     rivals = plugins.ESTIMATOR_GROUPS if group in plugins.ESTIMATOR_GROUPS else (group,)
     for option in plugins.options():
         if option.group in rivals and option.name == name:

@@ -68,6 +68,12 @@ MISTAKES = {
     "unknown command": (["rum"], "did you mean run?"),
     "unknown flag": (["list", "--verbos"], "list: --verbos: there is no such flag; did you mean --verbose?"),
     "flag of another command": (["estimate", "-m"], "estimate: -m: there is no such flag"),
+    "name of a library": (
+        ["new", "solver", "numpy"],
+        "numpy: is a package that ipe-bench imports; choose",
+    ),
+    "our own name": (["new", "solver", "ipe_bench"], "ipe_bench: is a package that ipe-bench imports"),
+    "name of a device": (["new", "solver", "con"], "con: is no name of a folder on Windows; choose another name"),
     "word too few": (["new", "solver"], "new: the following arguments are required: NAME"),
     "no data set": (["run", "measurement=nist/boxbot"], "measurement=nist/boxbot: there is no such data set; did you"),
     "a solver among baselines": (["run", "baseline=[newton]"], "newton is no baseline but a solver; write solver"),
@@ -364,6 +370,14 @@ def test_the_help_of_run_explains_every_key_of_the_config_in_a_line(capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("word", ["parameters=pipe", "measurement.file=pipe", "readings=pipe"])
+def test_a_pipe_in_place_of_a_file_is_not_waited_for(ipe_bench, word):
+    os.mkfifo("pipe")
+    code, _, error = ipe_bench("estimate", "measurement=polynomial", word)
+    assert (code, error.count("\n")) == (2, 1)
+    assert "pipe: " in error
+
+
 def test_a_reader_that_closes_the_pipe_is_no_mistake(tmp_path):
     for words in (["list", "measurement", "-v"], ["run", *QUICK, "figures=none", f"output={tmp_path / 'out'}"]):
         command = [sys.executable, "-m", "ipe_bench", *words]
