@@ -130,7 +130,7 @@ def _groups(folder: Path | None) -> Groups:
     found: Groups = {}
     for option in plugins.options():
         found.setdefault(option.group, []).append(option.name)
-    for path in [] if folder is None else sorted(folder.glob("*/**/*.yaml")):
+    for path in [] if folder is None else sorted(filter(Path.is_file, folder.glob("*/**/*.yaml"))):
         group, *name = path.relative_to(folder).with_suffix("").parts  # type: ignore[arg-type]
         found.setdefault(group, []).append("/".join(name))
     found["measurement"] += [f"nist/{name.lower()}" for name in FORMULAS]

@@ -23,7 +23,7 @@ from typing import Any
 import yaml
 
 from ipe_bench.basics.errors import UserError, describe_exception, unknown
-from ipe_bench.basics.files import own_conf
+from ipe_bench.basics.files import own_conf, regular
 
 ENTRY_POINTS = "ipe_bench.plugins"
 ESTIMATOR_GROUPS = ("solver", "baseline")
@@ -91,7 +91,7 @@ def read_yaml(text: str) -> Any:
 def read_yaml_file(path: Path, key: str) -> Any:
     """Reads a file of YAML; `key` is the word of the command that names it."""
     try:
-        return read_yaml(path.read_text(encoding="utf-8"))
+        return read_yaml(regular(path).read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"{key}: cannot be read ({error.__class__.__name__}); name a YAML file") from None
     except yaml.YAMLError as error:

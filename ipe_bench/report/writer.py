@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from ipe_bench import __version__
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.files import write_text
+from ipe_bench.basics.files import regular, write_text
 from ipe_bench.report.style import PAGE, house_style
 from ipe_bench.report.table import Part, Table, environment
 from ipe_bench.report.words import CITATION, public
@@ -54,7 +54,7 @@ def _is_free(folder: Path, result: str, command: Any, files: Sequence[str]) -> b
     if not (folder / result).exists():
         return not any((folder / name).exists() for name in files)
     try:
-        return json.loads((folder / result).read_text(encoding="utf-8"))["command"] == command
+        return json.loads(regular(folder / result).read_text(encoding="utf-8"))["command"] == command
     except (OSError, ValueError, KeyError, TypeError):
         return False
 

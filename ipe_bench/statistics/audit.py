@@ -7,6 +7,7 @@ errors of Student's law with the stated covariance are honest, and chi-square li
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 FEWEST_RUNS = 20
+MOST_COLUMNS = 4096
 MATTERS = 1.1
 """A factor of the standard deviation below which a covariance can be believed."""
 _DRAWS = 1999
@@ -340,8 +342,10 @@ def read_claims(table: Path | str | pd.DataFrame) -> Claims:
     import pandas as pd
 
     name, frame = ("the frame", table) if isinstance(table, pd.DataFrame) else (str(table), _read(Path(table)))
+    _refuse_many(len(frame.columns), name, "columns")
     _refuse_twice(frame, name)
     if "parameter" in frame:
+        _refuse_many(frame["parameter"].nunique(), name, "parameters")
         frame = _widened(frame, name)
     ends = ("_true", "_error")
     names = tuple(dict.fromkeys(c.removesuffix(e) for e in ends for c in map(str, frame.columns) if c.endswith(e)))
@@ -375,11 +379,30 @@ def _read(path: Path) -> pd.DataFrame:
     try:
         if path.suffix == ".parquet":
             return pd.read_parquet(path)
-        # pandas 2 rounds the last digits of numbers if it finds the separator itself.
-        frame, texts = (pd.read_csv(path, sep=None, engine="python", dtype=dtype) for dtype in (None, str))
+        separator = _separator(path)
+        # pandas 2 rounds the last digits of numbers unless it reads texts.
+        frame, texts = (pd.read_csv(path, sep=separator, engine="python", dtype=dtype) for dtype in (None, str))
         return frame.assign(**{str(name): texts[name].astype(float) for name in frame.select_dtypes("float")})
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, csv.Error) as error:
         raise UserError(f"{path}: cannot be read as a table ({str(error).splitlines()[0]})") from None
+
+
+def _separator(path: Path) -> str:
+    """Finds what separates the columns of a file by its first line, which is refused if it is none or too long."""
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        heading = next((line for line in file if line.strip()), "")
+    if not heading:
+        raise UserError(f"{path}: is empty; give a table with a header and a row per run")
+    _refuse_many(1 + max(map(heading.count, ",;\t|")), str(path), "columns")
+    try:
+        return csv.Sniffer().sniff(heading).delimiter
+    except csv.Error:
+        return ","
+
+
+def _refuse_many(count: int, name: str, what: str) -> None:
+    if count > MOST_COLUMNS:
+        raise UserError(f"{name}: has {count:,} {what}; give at most {MOST_COLUMNS:,}")
 
 
 def _refuse_twice(frame: pd.DataFrame, name: str) -> None:
@@ -449,8 +472,11 @@ def _error_and_deviation(frame: pd.DataFrame, parameter: str, name: str) -> tupl
 
 def _correlation(frame: pd.DataFrame, names: Sequence[str], deviation: Array, name: str) -> Array | None:
     """Returns correlations (rows, n, n), 0 where a pair has no covariance; None if there is no covariance at all."""
+    columns = set(frame.columns)
+    stated = [(i, j) for i, a in enumerate(names) for j, b in enumerate(names) if i != j and f"cov_{a}_{b}" in columns]
+    if not stated:
+        return None
     found = np.tile(np.eye(len(names)), (len(frame), 1, 1))
-    stated = [(i, j) for i, a in enumerate(names) for j, b in enumerate(names) if i != j and f"cov_{a}_{b}" in frame]
     for i, j in stated:
         with np.errstate(all="ignore"):
             value = _numbers(frame, f"cov_{names[i]}_{names[j]}", name) / (deviation[:, i] * deviation[:, j])
@@ -459,4 +485,4 @@ def _correlation(frame: pd.DataFrame, names: Sequence[str], deviation: Array, na
             row, columns = bad[0] + 2, f"cov_{names[j]}_{names[i]} and cov_{names[i]}_{names[j]}"
             raise UserError(f"{name}: row {row}: {columns} differ; a covariance is symmetric, so give one of them")
         found[:, i, j] = found[:, j, i] = value
-    return found if stated else None
+    return found

@@ -4,6 +4,7 @@
 # (matplotlib's collections are not typed)
 from __future__ import annotations
 
+import os
 import re
 from colorsys import rgb_to_hls
 from dataclasses import dataclass, replace
@@ -407,6 +408,19 @@ def overlaps(fig) -> list[str]:
         if min(a.x1, b.x1) - max(a.x0, b.x0) > 1 and min(a.y1, b.y1) - max(a.y0, b.y0) > 1:
             found.append(f"{first} enters {second}")
     return found
+
+
+@pytest.mark.parametrize("content", [None, "", "3", "[3]", '[{"name": "../mine"}]', '[{"name": 5}]'])
+def test_a_list_of_figures_of_a_foreign_hand_removes_nothing(synthetic, tmp_path, content):
+    """Nor is one waited for that is a pipe."""
+    (tmp_path / "mine.png").touch()
+    (tmp_path / "drawn").mkdir()
+    index = tmp_path / "drawn" / "index.json"
+    os.mkfifo(index) if content is None else index.write_text(content)
+    fill(synthetic, scales=(1.0,))
+    with pytest.raises(UserError, match=r"index\.json: is no list of the figures beside it; remove it"):
+        draw_all(analyse([synthetic.directory]), tmp_path / "drawn", which="none")
+    assert (tmp_path / "mine.png").exists()
 
 
 def test_the_setting_with_most_failures_is_drawn_first_and_those_alike_keep_their_order(synthetic):

@@ -163,6 +163,31 @@ def test_wrong_tables_are_refused_in_one_line(table, said):
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "is empty"),
+        ("\n \n\n", "is empty"),
+        (";".join(f"p{i}_error;p{i}_std" for i in range(2049)), "has 4,098 columns; give at most 4,096"),
+        ("parameter,run,error,std\n" + "".join(f"p{i},1,1,1\n" for i in range(4097)), "has 4,097 parameters"),
+        ('x_error,x_std\n1,"2\n', "cannot be read as a table"),
+    ],
+    ids=["nothing", "blank lines", "columns", "parameters", "quotes"],
+)
+def test_files_without_a_table_or_with_too_large_a_one_are_refused(text, said, tmp_path):
+    (tmp_path / "runs.csv").write_text(text)
+    with pytest.raises(UserError, match=said):
+        read_claims(tmp_path / "runs.csv")
+
+
+def test_a_table_may_begin_with_blank_lines_and_have_4096_columns(tmp_path):
+    (tmp_path / "runs.csv").write_text("\n\nx_error;x_std\n1.5;2\n")
+    assert read_claims(tmp_path / "runs.csv").error.tolist() == [[1.5]]
+    others = ",".join(f"c{i}" for i in range(4094))
+    (tmp_path / "runs.csv").write_text(f"x_error,x_std,{others}\n{','.join(['1'] * 4096)}\n")
+    assert read_claims(tmp_path / "runs.csv").names == ("x",)
+
+
 def test_a_column_that_a_file_has_twice_is_refused(tmp_path):
     table = pd.concat([frame(), frame()[["x"]]], axis=1)
     table.to_csv(tmp_path / "runs.csv", index=False)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.files import make_folder, write_text
+from ipe_bench.basics.files import make_folder, regular, write_text
 from ipe_bench.plugins.extensions import added, require_type
 from ipe_bench.report.figures.drawing import Drawing, Drawn
 from ipe_bench.report.figures.views import Figure, View, views
@@ -40,18 +40,35 @@ def draw_all(
     `index.json` in the folder names each with its title and caption; figures of an earlier report are removed.
     """
     drawn: list[Drawn] = []
-    old = json.loads((folder / INDEX).read_text(encoding="utf-8")) if (folder / INDEX).exists() else []
+    old = _names_in(folder / INDEX)
     with nullcontext() if which == "none" else house_style():  # which takes a second to load
         for drawing in drawings(analysis, which):
             make_folder(folder)
             drawn.append(drawing.drawn(folder, formats))
     written = {path.name for one in drawn for path in one.files}
-    for name in {f"{entry['name']}.{kind}" for entry in old for kind in FORMATS} - written:
+    for name in {f"{name}.{kind}" for name in old for kind in FORMATS} - written:
         (folder / name).unlink(missing_ok=True)
     index = [{"name": one.name, "title": one.title, "caption": one.caption} for one in drawn]
     if index or old:
         write_text(folder / INDEX, json.dumps(index, indent=1, ensure_ascii=False) + "\n")
     return drawn
+
+
+def _names_in(index: Path) -> list[str]:
+    """Returns the names of the figures of an earlier report.
+
+    Raises:
+        UserError: the file is none of ours, such as a pipe or one that names files elsewhere.
+    """
+    try:
+        names = [entry["name"] for entry in json.loads(regular(index).read_text(encoding="utf-8"))]
+        if all(name == Path(name).name for name in names):
+            return names
+    except FileNotFoundError:
+        return []
+    except (OSError, ValueError, TypeError, KeyError):
+        pass
+    raise UserError(f"{index}: is no list of the figures beside it; remove it")
 
 
 def drawings(analysis: Analysis, which: Which = "all") -> Iterator[Drawing]:
