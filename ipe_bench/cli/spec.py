@@ -113,8 +113,10 @@ class Spec(Component):
     @property
     def aim(self) -> tuple[str, str]:
         """Label and column of the objective."""
+        from ipe_bench.statistics.registry import current_name
+
         label, _, column = str(self.objective).rpartition(".")
-        return label, column
+        return label, current_name(column)
 
     @property
     def count(self) -> int:

@@ -35,7 +35,7 @@ HONEST = 0.1
 SAME_LAW = 0.05
 """Energy distance up to which draws may come from one law: of Gaussians in few dimensions, some tenths of a nat."""
 _MOST_SUSPECTS = 12
-_TITLES = {"error": "mean error", "honesty": "mean NEES", "cost": "mean cost", "time": "median time"}
+_TITLES = {"error": "mean error", "honesty": "mean NEES", "cost": "mean cost", "time": "mean time"}
 """Names of a comparison's quantities, where the table of a run has other statistics of error and cost."""
 _LEAST_P, _MOST_EVIDENCE = 1e-6, 1000
 _WORTH = 0.005

@@ -32,8 +32,8 @@ _RECORDED: dict[Where, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
     ),
     "costs": (
         "Costs",
-        "Medians over all trials; a Jacobian counts as many simulations as its model states. The cost to 0.05 σ of the"
-        " limit and the order are over the converged trials with a stored history.",
+        "Over all trials, medians where no mean is named; a Jacobian counts as many simulations as its model states."
+        " The cost to 0.05 σ of the limit and the order are over the converged trials with a stored history.",
         lambda rows: rows["trials"] > 0,
     ),
     "parameters": (

@@ -8,7 +8,17 @@ from dataclasses import replace
 from typing import Any
 
 from ipe_bench.report.table import Cell, Column, Part, Table, column, interval, sort_key, words
-from ipe_bench.report.words import brief, duration, ends_in_percent, p_value, percent, scientific, short, value_text
+from ipe_bench.report.words import (
+    brief,
+    cost,
+    duration,
+    ends_in_percent,
+    p_value,
+    percent,
+    scientific,
+    short,
+    value_text,
+)
 from ipe_bench.statistics.formulas import CAP
 from ipe_bench.statistics.records import SCORES
 from ipe_bench.statistics.registry import all_statistics, summary_columns
@@ -23,7 +33,8 @@ _WIDE_ENOUGH = 100
 """Letters of a screen with room for failures, and for verdicts spelt out."""
 _LEGEND = (
     "success: % of all trials (95 % interval; bold may be the best){failed}; error: median / 95 % quantile over"
-    " {reference}; efficiency and NEES (median): 1 is right{sign}; cost: simulations. More: ipe-bench list statistic."
+    " {reference}; efficiency and NEES (median): 1 is right{sign}; cost: simulations of a trial, median/mean where they"
+    " differ; time: mean of a trial. More: ipe-bench list statistic."
 )
 _FAILED = "; failed: known / silent"
 _SIGNS = (
@@ -125,13 +136,14 @@ def overview_columns(rows: Sequence[Mapping[str, Any]], best: Sequence[bool], *,
         # Where half of the trials are capped, it is a limit and no value.
         return f"{'<' * (row['error_median'] > CAP)}{row['efficiency_capped']:.2f}"
 
+    slash = "/" if narrow else " / "
+
     def verdict(row: Mapping[str, Any]) -> str:
         return sign_of(row["verdict"]) if narrow else shown(row["verdict"])
 
     def failed(row: Mapping[str, Any]) -> str:
         return f"{points(row['failed_known'])} / {points(row['failed_silent'])}"
 
-    slash = "/" if narrow else " / "
     return [
         words("estimator", [row["estimator"] for row in rows], best),
         cells("success", "success", success, best),
@@ -140,8 +152,8 @@ def overview_columns(rows: Sequence[Mapping[str, Any]], best: Sequence[bool], *,
         cells("eff." if narrow else "efficiency", "efficiency_capped", efficiency),
         cells("NEES", "nees_median", lambda r: f"{brief(r['nees_median'])} {verdict(r) * narrow}".strip()),
         *([] if narrow else [words("verdict", map(verdict, rows))]),
-        cells("median cost", "simulations_median", lambda r: brief(r["simulations_median"])),
-        cells("median time", "time_median_s", lambda r: duration(r["time_median_s"], 2)),
+        cells("cost", "simulations_median", lambda r: cost(r["simulations_median"], r["simulations_mean"])),
+        cells("time", "time_mean_s", lambda r: duration(r["time_mean_s"], 2)),
     ]
 
 

@@ -87,6 +87,16 @@ def brief(value: float) -> str:
     return compact(value) if value >= 9.995 else f"{value:.2f}"
 
 
+_ALIKE = 0.05
+"""Part of a median by which a mean may differ and is not shown."""
+
+
+def cost(median: float, mean: float) -> str:
+    """Formats a median cost, with the mean behind it where a few trials carry that."""
+    alike = not abs(mean - median) > _ALIKE * median
+    return brief(median) if alike else f"{brief(median)}/{brief(mean)}"
+
+
 def compact(value: float) -> str:
     """Formats three figures in at most five characters if possible: thousands as k, millions as M."""
     if not math.isfinite(value):

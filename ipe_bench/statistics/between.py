@@ -105,7 +105,7 @@ def _rows(a: Sample, b: Sample, alpha: float, tested: Container[str]) -> Iterato
         effect = effect if kind in tested else replace(effect, p=np.nan, e=np.nan)
         more = {"different": False, "finding": "", "loss": loss, "discordant": int(np.sum(first != second))}
         yield head | {"quantity": quantity} | asdict(effect) | more
-    seconds = float(np.median(a.scalars["time_s"][one])), float(np.median(b.scalars["time_s"][other]))
+    seconds = float(np.mean(a.scalars["time_s"][one])), float(np.mean(b.scalars["time_s"][other]))
     effect = Effect(*seconds, seconds[1] / seconds[0] if seconds[0] > 0 else np.nan)
     yield head | {"quantity": "time"} | asdict(effect) | dict(UNTESTED)
 

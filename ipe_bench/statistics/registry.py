@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
 from ipe_bench.basics.errors import UserError, place_of
-from ipe_bench.statistics.records import MAIN, MAIN_OF_STATES, SCORES, STATISTICS
+from ipe_bench.statistics.records import MAIN, MAIN_OF_STATES, NOT_MAIN, RENAMED, SCORES, STATISTICS
 from ipe_bench.statistics.sample import Sample
 from ipe_bench.statistics.statistic import ALL, BEST, Condition, Kind, Statistic, Where, frame_columns, rows_of
 
@@ -83,11 +84,20 @@ def summary_columns() -> tuple[str, ...]:
     return (*frame_columns(all_statistics()), BEST)
 
 
+def current_name(column: str) -> str:
+    """Returns what a column of any version is called now, with a warning if it was renamed."""
+    if column not in RENAMED:
+        return column
+    now = RENAMED[column]
+    warnings.warn(f"{column}: is called {now} now; the old name goes with the next version", FutureWarning, 3)
+    return now
+
+
 def main_columns(summary: pd.DataFrame) -> pd.DataFrame:
     """Selects the columns of `summary.csv`: what a row is of, the main statistics, and those of plugins."""
     states = "noise" in summary and (summary["noise"] == "model").any()
     main = [s for s in STATISTICS if s.name in (MAIN_OF_STATES if states else MAIN)]
-    chosen = {*frame_columns([*main, *_of_plugins.values()]), BEST}
+    chosen = {*frame_columns([*main, *_of_plugins.values()]), BEST} - {*NOT_MAIN}
     return summary[[c for c in summary.columns if c in chosen or c not in summary_columns()]]
 
 

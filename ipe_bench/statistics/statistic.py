@@ -65,7 +65,7 @@ class Statistic:
     """
 
     name: str
-    """Names its column; the ends of its interval are `name_low` and `name_high`."""
+    """Names its column; the ends of its interval are `name_low` and `name_high`, with `limits_given` behind."""
     title: str
     """Heads its column in tables."""
     over: str
@@ -85,10 +85,14 @@ class Statistic:
     """Heads the interval in the tables that show it."""
     rare: bool = False
     """Leaves it out of tables in which no estimator reports it."""
+    limits_given: Literal["", "_if_honest"] = ""
+    """Ends the names of `limits` that are not of the value: values of a right covariance lie within them."""
 
     @property
     def columns(self) -> tuple[str, ...]:
-        return (self.name,) if self.limits is None else (self.name, f"{self.name}_low", f"{self.name}_high")
+        if self.limits is None:
+            return (self.name,)
+        return (self.name, *(f"{self.name}_{end}{self.limits_given}" for end in ("low", "high")))
 
     @property
     def count(self) -> str:

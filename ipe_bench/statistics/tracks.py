@@ -130,8 +130,8 @@ def epoch_curves(s: Sample) -> Iterator[dict[str, Any]]:
                 "posterior": size * np.sqrt(posterior[:, i]),
                 "posterior_smoothed": size * np.sqrt(posterior[:, n + i]),
                 "nees": nees / count / n,
-                "nees_low": low,
-                "nees_high": high,
+                "nees_low_if_honest": low,
+                "nees_high_if_honest": high,
             }
 
 
@@ -180,10 +180,10 @@ STATISTICS: tuple[Statistic, ...] = (
     ),
     Statistic(
         "path_nees",
-        "NEES / n, all epochs",
+        "mean NEES / n, all epochs",
         "solved trials of trackers",
-        "Mean over all epochs of e' P⁻¹ e / n with the covariance P that the tracker reports: 1 where it is right; none"
-        " where P is singular by the model.",
+        "Mean over trials and all epochs of e' P⁻¹ e / n with the covariance P that the tracker reports: 1 where it is"
+        " right; none where P is singular by the model.",
         lambda s: mean_score(s, "path_nees") / s.n,
         where=("tracks",),
     ),

@@ -338,9 +338,8 @@ def test_trials_in_common_alone_are_ranked(synthetic):
 )
 def test_only_a_sure_verdict_calls_an_estimator_overconfident(verdict):
     rows = pd.DataFrame({"estimator": "one", "error_scale": [1.0, 10.0], "nees_median": [1.0, 2.5], "success": 1.0})
-    rows = rows.assign(
-        trials=100, success_low=0.95, simulations_median=1.0, time_median_s=1.0, verdict=["consistent", verdict]
-    )
+    rows = rows.assign(trials=100, success_low=0.95, simulations_median=1.0, simulations_mean=1.0, time_mean_s=1.0)
+    rows = rows.assign(verdict=["consistent", verdict])
     ((_, honest, *_),) = cells(limits(rows, "limits"))
     expected = {"undecided": "1 or more", "-": "1 or more", "consistent": "10", "too cautious": "10"}
     assert honest == expected.get(verdict, "1")

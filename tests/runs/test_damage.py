@@ -50,7 +50,7 @@ def run(folder: Path) -> None:
 
 def summary(folder: Path) -> pd.DataFrame:
     add_statistics([])  # those of plugins in the working folder, which a report takes up
-    return summarize([folder]).drop(columns="time_median_s")
+    return summarize([folder]).drop(columns="time_mean_s")
 
 
 def said(folder: Path) -> list[str]:

@@ -272,7 +272,7 @@ def test_a_model_whose_parts_do_not_suit_one_another_is_refused(part, complaint)
 def test_nees_of_the_kalman_filter_lies_within_its_limits_as_often_as_is_said():
     """1,000 studies of 40 trials: the mean NEES at the last epoch, and the verdict on the whole path."""
     table = ib.run([StateScenario(LINEAR, seed=s) for s in range(2)], {"kf": ekf()}, 20)
-    low, high = row(table, "kf")["nees_low"], row(table, "kf")["nees_high"]
+    low, high = row(table, "kf")["nees_low_if_honest"], row(table, "kf")["nees_high_if_honest"]
     paths = LINEAR.draw(0, 40_000)
     tracks = ekf().track(LINEAR, paths.z)
     e = (tracks.mean - paths.x)[:, -1]

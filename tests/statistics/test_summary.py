@@ -84,7 +84,7 @@ def test_coverage_and_nees_of_an_estimator_that_boasts(synthetic):
     synthetic.add(synthetic.scenario(), "boaster", e, deviation=np.full(3, 0.05))
     frame = summarize([synthetic.directory])
     honest, boaster = row(frame, "honest"), row(frame, "boaster")
-    assert honest["nees_low"] < honest["nees"] < honest["nees_high"]
+    assert honest["nees_low_if_honest"] < honest["nees"] < honest["nees_high_if_honest"]
     assert honest["coverage95"] == pytest.approx(0.95, abs=0.015)
     assert boaster["nees"] == pytest.approx(4 * honest["nees"])
     # P(chi-square_3 < chi2_95 / 4)
@@ -96,7 +96,7 @@ def test_an_estimator_without_covariance_has_no_nees_and_no_coverage(synthetic):
     e = errors(50)
     synthetic.add(synthetic.scenario(), "mute", e, deviation=np.full(3, np.nan), nees=np.nan)
     frame = summarize([synthetic.directory])
-    assert frame[["nees", "nees_low", "nees_high", "coverage95"]].isna().all(axis=None)
+    assert frame[["nees", "nees_low_if_honest", "nees_high_if_honest", "coverage95"]].isna().all(axis=None)
 
 
 def test_estimators_with_a_prior_are_held_against_the_bayesian_bound(synthetic):
@@ -230,7 +230,7 @@ def test_the_median_of_honest_nees_lies_within_its_limits_in_95_per_cent_of_runs
     synthetic.add(synthetic.scenario(), "one", errors(40))
     total = row(summarize([synthetic.directory]), "one")
     medians = np.median(chi2.rvs(3, size=(4000, 40), random_state=1), axis=1) / chi2.median(3)
-    inside = np.mean((total["nees_median_low"] <= medians) & (medians <= total["nees_median_high"]))
+    inside = np.mean((total["nees_median_low_if_honest"] <= medians) & (medians <= total["nees_median_high_if_honest"]))
     # The median of an even number is the mean of two values, which scatters a little less than one.
     assert 0.94 < inside < 0.975
 

@@ -76,7 +76,7 @@ def _row(view: View, axes: Sequence[Any], look: Mapping[str, Look], family: str,
     for nees in axes[2:]:
         common.decades(nees, np.append(capped["nees_median"].clip(lower=0.5), 1.0), least=4.0)
         common.bound_line(nees, 1.0, best)
-        limits = claims["nees_median_low"].min(), claims["nees_median_high"].max()
+        limits = claims["nees_median_low_if_honest"].min(), claims["nees_median_high_if_honest"].max()
         common.band(nees, *limits, "95 % limits of the median if honest")
         words = {"heading": f"NEES{family}", "label": "median", "most": CEILING["nees_median"]}
         common.curves(nees, claims, "nees_median", *shown, **words)

@@ -140,7 +140,8 @@ def draw_tracks(view: View) -> Iterator[Drawing]:
         ax.set(xlabel="time [s]", ylabel=common.text(f"rms error{unit}"))
     first, ax = rows[rows["parameter"] == states[0]], axes[-1]
     common.lines(ax, first, "at", "nees", look, legend=False)
-    common.band(ax, first["nees_low"].iloc[0], first["nees_high"].iloc[0], "limits of an honest covariance, 95 %")
+    low, high = (first[f"nees_{end}_if_honest"].iloc[0] for end in ("low", "high"))
+    common.band(ax, low, high, "limits of an honest covariance, 95 %")
     common.decades(ax, first["nees"])
     common.title(ax, "NEES")
     ax.set(xlabel="time [s]", ylabel="NEES / n")
