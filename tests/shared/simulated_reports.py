@@ -32,7 +32,7 @@ HOLDING = 0.9
 """Success that an estimator holds."""
 _READ = {
     *("trials", "success", "failed_silent", "error_median", "efficiency_capped", "nees_median", "verdict"),
-    *("simulations_median", "time_median_s", "path_verdict"),
+    *("simulations_median", "simulations_mean", "time_mean_s", "path_verdict"),
 }
 """Statistics that sentences, boxes and verdicts are made of; their other intervals take long and are left out."""
 _KEPT = [s if s.name == "success" else replace(s, limits=None) for s in STATISTICS if s.name in _READ]

@@ -88,5 +88,5 @@ def test_simulated_trackers_are_wrong_where_surely_more_than_one_trial_in_a_hund
     nis = np.random.default_rng(0).chisquare(10, 200) / 10
     scalars = {"path_nees": nis, NIS: nis, "white_p": p}
     group = SimpleNamespace(footer={"readings": 10})
-    sample: Any = SimpleNamespace(scalars=scalars, group=group, converged=np.ones(200, dtype=bool))
+    sample: Any = SimpleNamespace(scalars=scalars, group=group, converged=np.ones(200, dtype=bool), scales=1)
     assert nis_verdict(sample) == verdict
