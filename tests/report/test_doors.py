@@ -1,5 +1,6 @@
 """Names are shown where texts leave, on a page and in a terminal: neither obeys what they say."""
 
+import contextlib
 import csv
 import io
 import re
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from ipe_bench.basics.visible import VisibleStream
 from ipe_bench.cli.main import main
 from ipe_bench.report.figures.page import page_figure
 from ipe_bench.report.progress import counting
@@ -69,6 +71,28 @@ def test_a_mistake_and_progress_name_what_they_are_about(capsys):
     written = capsys.readouterr().err
     assert written.count(SHOWN) == 3
     assert "\x1b" not in written
+
+
+class Glass(io.StringIO):
+    """A terminal that keeps what it is sent."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_bar_is_drawn_and_what_is_printed_above_it_is_shown(monkeypatch):
+    glass = Glass()
+    monkeypatch.setenv("TERM", "xterm")
+    with contextlib.redirect_stderr(VisibleStream(glass)), counting(ESCAPES, 2) as begin:
+        begin("one")(ESCAPES)
+        print(f"printed above {ESCAPES}", file=sys.stderr)
+        begin("two")("done")
+    written = glass.getvalue()
+    assert "\x1b[?25l" in written  # the bar hides the cursor
+    assert "\u2501" in written
+    assert [bit for bit in ("\\x1b[0m", "\x9b", "\u202e", "\x1b]", "\x1b[2J") if bit in written] == []
+    assert "\\x1b[31mr" in written
+    assert "printed above" in written
 
 
 @pytest.mark.slow
