@@ -23,8 +23,6 @@ from collections.abc import Mapping, Set
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ipe_bench.basics.options import component_classes
 
 _BY_NAME = ("LOAD_GLOBAL", "LOAD_NAME", "LOAD_FROM_DICT_OR_GLOBALS", "IMPORT_NAME")
@@ -32,6 +30,8 @@ _BY_NAME = ("LOAD_GLOBAL", "LOAD_NAME", "LOAD_FROM_DICT_OR_GLOBALS", "IMPORT_NAM
 _PLAIN = (type(None), type(...), bool, int, float, complex, str, bytes)
 _DEFINED = (type, types.FunctionType, types.MethodType, types.ModuleType)
 _DEFINED += (staticmethod, classmethod, property, functools.cached_property)
+_PARTS = ("__func__", "__self__", "__wrapped__", "fget", "func")
+"""Attributes that hold the functions of a method, of a property, and of what functools or a compiler makes of one."""
 _BEYOND_NAMES = {"eval", "exec", "globals", "__import__"}
 """Built-in functions by which code reaches what no name in it tells."""
 _PIN = "_definition"
@@ -63,11 +63,10 @@ def pinned(component: Any) -> Any:
     code that it works with can have changed since. One of installed packages alone is returned as it is."""
     if isinstance(component, tuple | list):
         return type(component)(map(pinned, component))
-    if not dataclasses.is_dataclass(component) or isinstance(component, type):
+    if not dataclasses.is_dataclass(component) or _PIN in getattr(component, "__dict__", {_PIN: ""}):
         return component
-    if not hasattr(component, "__dict__") or not (found := definition_digest(component)):
-        return component
-    if _PIN in vars(component):
+    found = definition_digest(component)
+    if not found:
         return component
     fresh = copy.copy(component)
     state = {name: pinned(value) for name, value in _state_of(component).items()}
@@ -116,6 +115,11 @@ def _stands_by_name(thing: Any) -> bool:
     return _is_named(thing) and is_installed(thing.__module__)
 
 
+def _wraps(thing: Any) -> bool:
+    """Tells whether an installed package made this of a function, with no numbers of its own."""
+    return hasattr(thing, "__wrapped__") and _stands_by_name(type(thing))
+
+
 class Definitions:
     """Describes things as nested tuples of plain data, which are equal where definitions are.
 
@@ -148,24 +152,10 @@ class Definitions:
             return self._class(thing)
         if isinstance(thing, types.FunctionType):
             return self._function(thing)
-        if isinstance(thing, types.MethodType | staticmethod | classmethod):
-            return self.of(thing.__func__), self.of(getattr(thing, "__self__", None))
-        if isinstance(thing, property):
-            return [self.of(part) for part in (thing.fget, thing.fset)]
-        if isinstance(thing, functools.cached_property):
-            return self.of(thing.func)
-        if hasattr(thing, "__wrapped__"):  # what functools or a compiler made of a function
-            return self.of(thing.__wrapped__)
-        return self._value(thing)
-
-    def _value(self, thing: Any) -> Any:
-        if isinstance(thing, np.ndarray):
-            content = thing.tolist() if thing.dtype.hasobject else thing.tobytes()
-            return thing.dtype.str, thing.shape, self.of(content)
+        if isinstance(thing, _DEFINED) or _wraps(thing):
+            return [self.of(getattr(thing, part, None)) for part in _PARTS]
         if type(thing) in (tuple, list):
             return [self.of(one) for one in thing]
-        if type(thing) in (dict, types.MappingProxyType):
-            return [(self.of(key), self.of(value)) for key, value in thing.items()]
         if type(thing) in (set, frozenset):
             return sorted(repr(Definitions().of(one)) for one in thing)
         return self._object(thing)
@@ -209,7 +199,7 @@ class Definitions:
         what is put in later is mostly a cache."""
         kinds = (*_DEFINED, *(_PLAIN if self.values else ()), *((tuple, frozenset) if self.values else ()))
         everything = self.values and not in_file
-        return {k: v for k, v in variables.items() if everything or isinstance(v, kinds) or hasattr(v, "__wrapped__")}
+        return {k: v for k, v in variables.items() if everything or isinstance(v, kinds) or _wraps(v)}
 
     def _reached(self, value: Any, attributes: Set[str]) -> Any:
         """Describes what a name stands for: of a module those of its attributes that the code asks for."""

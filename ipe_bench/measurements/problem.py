@@ -132,6 +132,8 @@ def _irregularity(model: Measurement, definition: str) -> str:
     rng = np.random.default_rng(11)
     x, other = (read_only(model.nominal + 0.1 * rng.standard_normal((trials, model.n))) for trials in (4, 7))
     fresh: Any = replace(cast(Any, model)) if is_dataclass(model) else copy.copy(model)
+    if component_classes(fresh) != component_classes(model):
+        return "what its options name was defined anew since it was made; make the model anew"
     for method, shape in (("simulate", (len(x), model.m)), ("jacobian", (len(x), model.m, model.n))):
         call = getattr(model, method)
         try:

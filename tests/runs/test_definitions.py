@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 import ipe_bench as ib
+from ipe_bench.basics.errors import UserError
+from ipe_bench.measurements.problem import require_function
 from ipe_bench.runs.execution import Processes, end_idle
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.run import compute
@@ -36,6 +38,12 @@ WAYS = {
     "list": ("V = [{v}]", "class By:\n    def by(self):\n        return V[0]"),
     "helper": ("def helper():\n    return {v}", "class By:\n    def by(self):\n        return helper()"),
     "kept helper": ("@functools.cache\ndef f():\n    return {v}", "class By:\n    def by(self):\n        return f()"),
+    "decorator": (
+        "class Times:\n    def __init__(self, f):\n        self.f, self.k = functools.update_wrapper(self, f), {v}\n"
+        "    def __call__(self):\n        return self.k * self.__wrapped__()\n@Times\ndef f():\n    return 1.0",
+        "class By:\n    def by(self):\n        return f()",
+    ),
+    "partial": ("f = functools.partial(max, {v})", "class By:\n    def by(self):\n        return f(-1.0)"),
     "other class": ("class Other:\n    v = {v}", "class By:\n    def by(self):\n        return Other.v"),
     "object": (
         "class Box:\n    def __init__(self, v):\n        self.v = v\nbox = Box({v})",
@@ -210,6 +218,21 @@ def test_the_test_of_residuals_follows_a_noise_whose_helper_was_edited():
     one = p()
     session.edit(0.1)
     assert p() < 0.01 < one
+
+
+def test_a_function_that_is_defined_anew_is_another_model_and_the_old_model_is_refused(tmp_path):
+    names: dict[str, Any] = {}
+    main, found, models = sys.modules["__main__"], [], []
+    for power in (1, 2):
+        exec(f"def line(t, a=1.0, b=2.0):\n    return a * t**{power} + b", vars(main), names)
+        main.__dict__["line"] = names["line"]
+        models.append(ib.measurements.function(names["line"], columns={"t": np.linspace(0, 1, 9)}))
+        scenario = ib.Scenario(models[-1], ib.noise.Gaussian(0.01))
+        found.append(first(tmp_path, (scenario, {"linear": ib.baselines.LinearLSE()}), "error_a"))
+    assert found[0] != found[1]
+    with pytest.raises(UserError, match="make the model anew"):
+        require_function(models[0])
+    del main.__dict__["line"]
 
 
 MODULE = """
