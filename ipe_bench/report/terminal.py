@@ -32,9 +32,10 @@ _HEAD = 4
 _WIDE_ENOUGH = 100
 """Letters of a screen with room for failures, and for verdicts spelt out."""
 _LEGEND = (
-    "success: % of all trials (95 % interval; bold may be the best){failed}; error: median / 95 % quantile over"
-    " {reference}; efficiency and NEES (median): 1 is right{sign}; cost: simulations of a trial, median/mean where they"
-    " differ; time: mean of a trial. More: ipe-bench list statistic."
+    "success: % of all trials (95 % interval; bold: no other succeeds significantly more often; nothing is bold where"
+    " this holds of all){failed}; error: median / 95 % quantile over {reference}; efficiency and NEES (median): 1 is"
+    " right{sign}; cost: simulations of a trial, median/mean where they differ; time: mean of a trial. More: ipe-bench"
+    " list statistic."
 )
 _FAILED = "; failed: known / silent"
 _SIGNS = (

@@ -430,11 +430,11 @@ STATISTICS: tuple[Statistic, ...] = (
         "verdict",
         "verdict",
         "converged trials with a reported covariance: a trial that the estimator itself gives up on makes no claim",
-        "Whether the reported covariance is right. Overconfident, too cautious: the mean NEES lies significantly (95 %,"
-        " for errors of any law) above or below n, and below it also with a NEES of"
-        f" {intervals.UNSEEN_NEES:g} n in as many trials as may be unusual and unseen; consistent: neither; undecided:"
-        " a few trials carry that mean, or it seems to lie below n and rare large errors may be missing. None for fewer"
-        f" than {FEW} trials.",
+        "Whether the reported covariance is right. Overconfident, too cautious: the mean NEES lies significantly (95 %"
+        " for all estimators and error scales of a setting together, for errors of any law) above or below n, and below"
+        f" it also with a NEES of {intervals.UNSEEN_NEES:g} n in as many trials as may be unusual and unseen;"
+        " consistent: neither; undecided: a few trials carry that mean, or it seems to lie below n and rare large"
+        f" errors may be missing. None for fewer than {FEW} trials.",
         lambda s: f.verdict_on(s.scalars["nees"], s.n, s),
         kind="word",
         where=("calibration",),

@@ -152,12 +152,10 @@ class Sample:
         return self.scalars["solved"]
 
     @cached_property
-    def scales(self) -> int:
-        """The number of error scales at which its estimator stands in the same setting."""
-        own = self.group
-        alike = [group for group in self.collection.groups if group.estimator == own.estimator]
-        there = (g for g in alike if _without_scale(g) == _without_scale(own))
-        return len({group.columns["error_scale"] for group in there})
+    def rows_of_setting(self) -> int:
+        """The number of estimators and error scales of its setting: the rows of one table, its own included."""
+        own = _without_scale(self.group)
+        return sum(_without_scale(group) == own for group in self.collection.groups)
 
     @cached_property
     def converged(self) -> Array:

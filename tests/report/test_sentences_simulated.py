@@ -26,8 +26,8 @@ from shared.simulated_reports import HOLDING, Report, board, simulated
 
 from ipe_bench.report.table import Table
 from ipe_bench.report.words import brief, percent
-from ipe_bench.statistics.verdicts import NO_VERDICT, OVERCONFIDENT, TOO_CAUTIOUS, UNDECIDED
-from ipe_bench.trials.thresholds import FEW
+from ipe_bench.statistics.verdicts import NO_VERDICT, OVERCONFIDENT, TOO_CAUTIOUS, UNDECIDED, WRONG
+from ipe_bench.trials.thresholds import FEW, FIT_LEVEL
 
 COUNTS, INFERS = "counts", "infers"
 TOLERATED = 0.05
@@ -160,39 +160,29 @@ def compared_by(report: Report) -> list[str]:
     return [label for label, family in report.board.family.items() if family in ("IPE", "filters")]
 
 
-@sentence(WHO + r" differ already at error scale (?P<scale>[\d.]+)\.")
-def who_differ(report: Report, match: Any) -> Iterator[tuple[str, str, bool]]:
-    """Infers that their success or errors are not all of one law at the least scale."""
-    laws = {report.population(float(match["scale"]), label) for label in compared_by(report)}
-    errors = {(p.law, p.spread, p.bias, p.lost) for p in laws}
-    yield "differ already at", INFERS, len(errors) == 1
-
-
 @sentence(
-    WHO + r" agree (?:at every error scale|up to error scale (?P<last>[\d.]+)): (?:all|at least (?P<least>\S+ %) of)"
-    r" their trials succeed there, with an efficiency of (?P<low>[\d.]+\d)(?: to (?P<high>[\d.]+\d))?\."
+    WHO + r" agree (?:at every error scale|up to error scale (?P<last>[\d.]+)): (?P<share>all|at least \S+ %) of"
+    r" (?P<trials>\d+) trials succeed at each, with an efficiency of (?P<low>[\d.]+\d)(?: to (?P<high>[\d.]+\d))?\."
 )
 def who_agree(report: Report, match: Any) -> Iterator[tuple[str, str, bool]]:
-    """Counts the least success and the range of efficiencies at these scales; infers that in the population success
-    differs by less than 10 points and efficiency by less than 10 % between any two at one scale."""
+    """Counts the least success and the range of efficiencies of so many trials at these scales; infers that in the
+    population success differs by less than 10 points, and the median error by less than 10 %, between any two at one
+    scale. Of errors too rare for so many trials it claims nothing."""
     drawn, labels = report.board, compared_by(report)
     last = drawn.scales.index(float(match["last"])) if match["last"] else len(drawn.scales) - 1
-    places = range(last + 1)
-    least = min(successes(report, at, label).mean() for at in places for label in labels)
-    efficiency = [
-        np.minimum((report.samples[at, label].error ** 2).mean(axis=1), 25.0).mean() ** -0.5
-        for at in places
-        for label in labels
-    ]
+    cells = [(at, label) for at in range(last + 1) for label in labels]
+    least = min(successes(report, *cell).mean() for cell in cells)
+    squares = [np.minimum((report.samples[cell].error ** 2).mean(axis=1), 25.0).mean() for cell in cells]
     ends = float(match["low"]), float(match["high"] or match["low"])
-    wrong = (match["least"] or "all") != ("all" if least == 1 else percent(least))
-    wrong = wrong or not np.allclose(ends, (min(efficiency), max(efficiency)), rtol=0, atol=0.00501)
+    wrong = match["share"] != ("all" if least == 1 else f"at least {percent(least)}")
+    wrong = wrong or int(match["trials"]) != drawn.trials
+    wrong = wrong or not np.allclose(ends, (max(squares) ** -0.5, min(squares) ** -0.5), rtol=0, atol=0.00501)
     yield "agree, in numbers", COUNTS, bool(wrong)
     false = False
-    for at in places:
+    for at in range(last + 1):
         truth = [drawn.populations[label][at] for label in labels]
-        success, good = [p.success(drawn.n) for p in truth], [p.efficiency(drawn.n) for p in truth]
-        false = false or max(success) - min(success) > 0.1 or max(good) > 1.1 * min(good)
+        success, error = [p.success(drawn.n) for p in truth], [p.median_error(drawn.n) for p in truth]
+        false = false or max(success) - min(success) > 0.1 or max(error) > 1.1 * min(error)
     yield "agree up to", INFERS, false
 
 
@@ -312,21 +302,25 @@ def box(report: Report) -> Iterator[Claim]:
 
 @entries
 def verdicts(report: Report) -> Iterator[Claim]:
-    """Overconfident: infers that the mean NEES of converged trials is above n; too cautious: that it is below; the
-    others count that neither was found, in enough trials."""
+    """Overconfident: infers that the mean NEES of converged trials is above n, or the mean NIS above the number of
+    readings; too cautious: that it is below; wrong: that more than 1 % of the trials have innovations whose whiteness
+    has a p below 0.001; the others count that nothing was found, in enough trials."""
     whole = report.analysis.summary.query("parameter == 'all'")
     for row in whole.to_dict("records"):
         there = report.population(row["error_scale"], row["estimator"])
         sample = report.trials_of(row["error_scale"], row["estimator"])
         enough = int(sample.converged.sum()) >= FEW
-        for column in ("verdict", "path_verdict")[: 1 + report.board.moving]:
-            word = row[column]
+        means = {"verdict": there.mean_nees, "path_verdict": there.mean_nees, "nis_verdict": there.innovations}
+        for column in list(means)[: 3 if report.board.moving else 1]:
+            word, kind = row[column], f"{column}: {row[column]}"
             if word == OVERCONFIDENT:
-                yield Claim(f"{column}: {word}", INFERS, word, there.mean_nees <= 1 + 1e-9)
+                yield Claim(kind, INFERS, word, means[column] <= 1 + 1e-9)
             elif word == TOO_CAUTIOUS:
-                yield Claim(f"{column}: {word}", INFERS, word, there.mean_nees >= 1 - 1e-9)
+                yield Claim(kind, INFERS, word, means[column] >= 1 - 1e-9)
+            elif word == WRONG:
+                yield Claim(kind, INFERS, word, there.correlated + FIT_LEVEL * (1 - there.correlated) <= 0.01)
             else:
-                yield Claim(f"{column}: {word}", COUNTS, word, enough != (word != NO_VERDICT))
+                yield Claim(kind, COUNTS, word, enough != (word != NO_VERDICT))
 
 
 @entries
@@ -365,6 +359,12 @@ def judged(seed: int, largest: bool = True) -> list[Claim]:
     return list(claims_of(simulated(board(seed, largest=largest))))
 
 
+def of_seeds(number: int) -> list[list[Claim]]:
+    """Judges so many reports, in two processes."""
+    with ProcessPoolExecutor(2) as pool:
+        return list(pool.map(judged, range(number), chunksize=5))
+
+
 def tallies(reports: list[list[Claim]]) -> list[Tally]:
     printed: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)
     for claims in reports:
@@ -396,7 +396,7 @@ def test_what_a_report_counts_is_so(first):
 
 @pytest.mark.slow
 def test_what_a_report_infers_is_false_in_few_of_those_that_say_it():
-    found = tallies([judged(seed) for seed in range(1000)])
+    found = tallies(of_seeds(1000))
     print("\n" + shown(found))
     assert [t for t in found if t.does == COUNTS and t.false_times] == []
     often = [t for t in found if t.does == INFERS and t.reports >= ENOUGH]
@@ -405,5 +405,4 @@ def test_what_a_report_infers_is_false_in_few_of_those_that_say_it():
 
 
 if __name__ == "__main__":
-    with ProcessPoolExecutor(2) as pool:
-        print(shown(tallies(list(pool.map(judged, range(int(sys.argv[1])), chunksize=5)))))
+    print(shown(tallies(of_seeds(int(sys.argv[1])))))
