@@ -76,6 +76,37 @@ def test_the_headline_says_who_agrees_who_is_honest_who_breaks_and_what_it_costs
     assert "s times group 0 1 m, group 1 0.1 m" in model
 
 
+def test_one_row_in_many_that_is_off_by_chance_does_not_end_who_is_honest(synthetic, tmp_path):
+    """A mean NEES of 2.3 standard errors above n is one in a hundred: much for one row, little for the worst of six."""
+    e = 0.1 * np.random.default_rng(3).normal(size=(100, 3))
+    e /= np.sqrt(((e / 0.1) ** 2).mean())
+    off = e * np.sqrt(1 + 2.3 * np.sqrt(2 / 300))
+    for scale in (1.0, 10.0, 100.0):
+        for label in ("newton", "ekf"):
+            synthetic.add(synthetic.scenario(error_scale=scale), label, off if scale == 10 else e)
+    (*_, table) = headline(analyse([synthetic.directory]))
+    assert [honest for _, honest, *_ in cells(table)] == ["100", "100"]
+    alone = Synthetic(tmp_path / "alone")
+    alone.add(alone.scenario(error_scale=10.0), "newton", off)
+    assert set(analyse([alone.directory]).summary["verdict"]) == {"overconfident"}
+
+
+def test_who_surely_holds_stands_above_who_is_undecided(synthetic):
+    """Of 100 trials 40 are lost at scale 10 alone, 8 at both scales, so that 90 % may hold or not, or 40 at both."""
+    e, trial = 0.1 * np.random.default_rng(1).normal(size=(100, 3)), np.arange(100)[:, None]
+    for scale in (1.0, 10.0):
+        scenario = synthetic.scenario(error_scale=scale)
+        synthetic.add(scenario, "open", np.where(trial < 8, 9.0, e))
+        synthetic.add(scenario, "lost", np.where(trial < (40 if scale == 10 else 0), 9.0, e))
+        synthetic.add(scenario, "none", np.where(trial < 40, 9.0, e))
+    (*_, table) = headline(analyse([synthetic.directory]))
+    assert [(label, holds) for label, _, holds, _ in cells(table)] == [
+        ("lost", "1"),
+        ("open", "undecided"),
+        ("none", "none"),
+    ]
+
+
 def test_few_trials_leave_open_who_is_honest_and_who_holds(synthetic):
     for scale in (1.0, 10.0):
         e, scenario = 0.1 * np.random.default_rng(1).normal(size=(10, 3)), synthetic.scenario(error_scale=scale)
