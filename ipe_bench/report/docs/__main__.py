@@ -35,7 +35,7 @@ from ipe_bench.report.table import environment, html
 from ipe_bench.report.tables import certified_tables
 from ipe_bench.report.words import brief, enumerate_few, percent
 from ipe_bench.statistics.analysis import Analysis, analyse
-from ipe_bench.statistics.records import MAIN, STATISTICS
+from ipe_bench.statistics.records import MAIN, NOT_MAIN, STATISTICS
 from ipe_bench.statistics.statistic import ALL
 from ipe_bench.statistics.verdicts import VERDICTS
 
@@ -138,7 +138,7 @@ def write_reference(folder: Path) -> None:
     statuses = [status for status in Status if status is not Status.RUNNING]
     write_page(folder / "statuses.md", "statuses", statuses=statuses)
     words = {"records": STATISTICS, "verdicts": VERDICTS, "definitions": DEFINITIONS.items()}
-    write_page(folder / "statistics.md", "statistics", main=MAIN, **words)
+    write_page(folder / "statistics.md", "statistics", main=MAIN, not_main=NOT_MAIN, **words)
     summary = printed_by(["--help"], columns=100).rstrip()
     names = re.findall(r"^    (\w+)(?:  |$)", summary, re.MULTILINE)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
