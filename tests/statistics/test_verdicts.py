@@ -1,7 +1,6 @@
 """Words of verdict: one table has all that is said, reads the words of older files, and decides who passes."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any, get_args
 
 import numpy as np
@@ -13,9 +12,8 @@ from ipe_bench.real.tracks import far_below
 from ipe_bench.report.table import plain_text
 from ipe_bench.report.terminal import overview_notes, summary_tables
 from ipe_bench.states import Formulas, Smoother, ekf, ukf
-from ipe_bench.statistics import analyse
+from ipe_bench.statistics import analyse, summarize
 from ipe_bench.statistics.sample import NIS
-from ipe_bench.statistics.tracks import nis_verdict
 from ipe_bench.statistics.verdicts import VERDICTS, Verdict, current, shown
 
 WHITE = Formulas(
@@ -81,12 +79,13 @@ def test_only_a_track_whose_innovations_fit_is_a_standard_for_others(worse, said
     assert far_below([replace(first, **worse), far]) == (lines if said else [])
 
 
-@pytest.mark.parametrize(("wrong", "verdict"), [(0, "consistent"), (5, "consistent"), (6, "wrong")])
-def test_simulated_trackers_are_wrong_where_surely_more_than_one_trial_in_a_hundred_is_not_white(wrong, verdict):
+def test_simulated_trackers_are_wrong_where_surely_more_than_one_trial_in_a_hundred_is_not_white(synthetic):
     """If the share is 1 %, 5 or more of 200 trials have a probability of .052, and 6 or more one of .016 < .025."""
-    p = np.where(np.arange(200) < wrong, 1e-4, 0.5)
-    nis = np.random.default_rng(0).chisquare(10, 200) / 10
-    scalars = {"path_nees": nis, NIS: nis, "white_p": p}
-    group = SimpleNamespace(footer={"readings": 10})
-    sample: Any = SimpleNamespace(scalars=scalars, group=group, converged=np.ones(200, dtype=bool), scales=1)
-    assert nis_verdict(sample) == verdict
+    rng = np.random.default_rng(0)
+    error, nis = 0.1 * rng.standard_normal((200, 1)), rng.chisquare(4, 200) / 4
+    of_path = {"path_nees": 1.0, "path_a": 0.1, "path_bound_a": 0.1, NIS: nis}
+    for wrong in (0, 5, 6):
+        p = np.where(np.arange(200) < wrong, 1e-4, 0.5)
+        synthetic.add(synthetic.scenario(names=("a",)), f"of {wrong}", error, white_p=p, **of_path)
+    found = summarize([synthetic.directory]).query("parameter == 'all'").set_index("estimator")["nis_verdict"]
+    assert found.to_dict() == {"of 0": "consistent", "of 5": "consistent", "of 6": "wrong"}
