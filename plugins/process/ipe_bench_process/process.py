@@ -8,6 +8,7 @@ import json
 import os
 import re
 import shutil
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,11 +22,13 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Positive
 from ipe_bench.estimators.base import Equation, Family, Need, one_by_one
-from ipe_bench_process.program import Program, ProgramError, written
+from ipe_bench_process.program import MOST, Program, ProgramError, written
 
 _running: dict[tuple[int, Process, str], Program] = {}
 """The programs of the last problems, by process, estimator and opening."""
 _KEPT, _STRIKES = 2, 3
+_TOGETHER = 4096
+"""Points of a question that are computed at the same time."""
 _COUNTS = ("iterations", "simulations", "jacobians")
 
 
@@ -123,16 +126,25 @@ class Process(Estimator):
         """Estimates from the readings z (m,) of one trial; what is asked counts besides what the program counts."""
         model, n, asked = problem.measurement, problem.measurement.n, dict.fromkeys(map(str, _COUNTS), 0.0)
 
-        def points(values: Array, count: str) -> Array:
+        def points(values: Array, count: str, size: int) -> Iterator[Array]:
+            """Yields the points asked for, a few at a time; each is answered by so many numbers."""
             if not len(values) or len(values) % n:
                 raise ProgramError(f"asked with {len(values)} numbers, and not a multiple of {n}")
-            asked[count] += len(values) // n
-            return values.reshape(-1, n)
+            number = len(values) // n
+            if number * size > MOST:
+                raise ProgramError(f"asked for {number * size} numbers at once; ask for {MOST // size} points at most")
+            asked[count] += number
+            yield from np.array_split(values.reshape(-1, n), -(-number // _TOGETHER))
 
-        replies = {
-            "simulate": lambda values: written({"h": model.near(model.simulate(points(values, "simulations")), z)}),
-            "jacobian": lambda values: written({"J": model.jacobian(points(values, "jacobians"))}),
-        }
+        def simulate(values: Array) -> str:
+            h = [model.simulate(x) for x in points(values, "simulations", model.m)]
+            return written({"h": model.near(np.concatenate(h), z)})
+
+        def jacobian(values: Array) -> str:
+            J = [model.jacobian(x) for x in points(values, "jacobians", model.m * n)]
+            return written({"J": np.concatenate(J)})
+
+        replies = {"simulate": simulate, "jacobian": jacobian}
         found = program.ask(f"{written({'z': z})}end\n", replies, self.trial_timeout_s)
         for name, values in found.items():
             if len(values) != (size := {"x": n, "P": n * n}.get(name, 1)):
@@ -144,6 +156,8 @@ class Process(Estimator):
             raise ProgramError(f"wrote status {status:g}, and not one of 0 to {max(Status).value}")
         if np.isfinite(P).all() and not np.allclose(P, P.T, rtol=1e-6, atol=1e-9 * np.abs(P).max()):
             raise ProgramError("wrote a P that is not symmetric")
+        if status <= Status.MAX_ITERATIONS and not np.isnan(P).all() and not _definite(P):
+            raise ProgramError("wrote a P that is not positive definite")
         counts = {name: found.pop(name, np.zeros(1)) + asked[name] for name in _COUNTS}
         for name, value in counts.items():
             if not 0 <= value[0] < 1e15 or (name == "iterations" and value[0] % 1):
@@ -151,6 +165,14 @@ class Process(Estimator):
         ended = np.array([status if np.isfinite(x).all() else Status.NONFINITE], np.int8)
         iterations, simulations, jacobians = counts.values()
         return Estimates(x[None], ended, P[None], iterations.astype(np.int64), simulations, jacobians, extras=found)
+
+
+def _definite(P: Array) -> bool:
+    """Tells if P (n, n) is a covariance, whatever the units of its parameters."""
+    with np.errstate(all="ignore"):
+        deviation = np.sqrt(np.diag(P))
+        correlation = P / np.outer(deviation, deviation)
+    return bool(np.isfinite(correlation).all() and np.linalg.eigvalsh(correlation)[0] > 0)
 
 
 def _opening(problem: Problem, needs: tuple[Need, ...]) -> str:

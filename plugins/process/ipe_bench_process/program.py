@@ -4,10 +4,14 @@ numbers, and the line `end` where one side has said all."""
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
+import secrets
 import select
 import signal
+import struct
 import subprocess
+import termios
 import time
 from collections.abc import Callable, Mapping, Sequence
 from subprocess import DEVNULL, PIPE
@@ -21,10 +25,20 @@ _BEGIN_S = 20.0
 """The first answer may take this long: some languages compile when they start."""
 _LONGEST = 1 << 26
 """Bytes of the longest line: a covariance of a thousand parameters has a third of that."""
+MOST = 2_500_000
+"""Numbers of the longest block, of up to 25 letters each."""
+_AT_ONCE = 1 << 16
+"""Numbers that are words at the same time."""
+_PAUSE_S = 5e-5
+"""Between two looks at whether a program has read on."""
 _QUOTED = 4
 """Last lines of a program that ended: R and Octave say why before the very last one."""
 _SPELT = {"nan": "NaN", "inf": "Inf", "-inf": "-Inf"}
 """R reads no others."""
+_MARK = "IPE_BENCH_PROGRAM"
+_END_MARKED = 'for p in $(grep -lsF "$1" /proc/[0-9]*/environ); do p=${p#/proc/}; kill -9 "${p%/environ}"; done'
+_END_ALL = f"{_END_MARKED}; {_END_MARKED}"
+"""Ends what has the mark in its environment, and what that has started in the meantime."""
 
 
 class ProgramError(Exception):
@@ -33,25 +47,44 @@ class ProgramError(Exception):
 
 def written(blocks: Mapping[str, Array]) -> str:
     """Writes blocks as text."""
-    words = {name: [_SPELT.get(word, word) for word in map(repr, v.ravel().tolist())] for name, v in blocks.items()}
-    return "".join(f"{name} {len(each)}\n{' '.join(each)}\n" for name, each in words.items())
+    return "".join(f"{name} {values.size}\n{_line(values.ravel())}\n" for name, values in blocks.items())
+
+
+def _line(values: Array) -> str:
+    parts = []
+    for start in range(0, len(values), _AT_ONCE):
+        words = map(repr, values[start : start + _AT_ONCE].tolist())
+        parts.append(" ".join(_SPELT.get(word, word) for word in words))
+    return " ".join(parts)
 
 
 class Program:
     """Holds a running program.
 
     Its process group begins with a shell that waits for the end of this process, and then ends the group: with the
-    program goes what it has started, however this process ends. POSIX only.
+    program goes what it has started, however this process ends. On Linux this holds for other groups and sessions too:
+    all that it starts inherits a mark in the environment. POSIX only.
     """
 
     def __init__(self, command: Sequence[str], folder: str, opening: str) -> None:
         self.opening, self.said, self.complaint, self.deadline = opening, bytearray(), b"", 0.0
-        shell = ("sh", "-c", "read _; kill -9 0")
+        self.begun = ""
+        """What the program has been sent of the next question."""
+        token = secrets.token_hex(16)
+        self.mark = f"{_MARK}={token}"
+        shell = ("sh", "-c", f"read _; {_END_ALL}; kill -9 0", "sh", self.mark)
         self.guard = subprocess.Popen(shell, stdin=PIPE, stdout=DEVNULL, stderr=DEVNULL, process_group=0)
         group = self.guard.pid
         try:
             self.process = subprocess.Popen(
-                command, cwd=folder, stdin=PIPE, stdout=PIPE, stderr=PIPE, bufsize=0, process_group=group
+                command,
+                cwd=folder,
+                env=os.environ | {_MARK: token},
+                stdin=PIPE,
+                stdout=PIPE,
+                stderr=PIPE,
+                bufsize=0,
+                process_group=group,
             )
         except OSError as error:
             self.guard.communicate()
@@ -64,6 +97,7 @@ class Program:
 
     def ask(self, text: str, replies: Mapping[str, Callable[[Array], str]], seconds: float) -> dict[str, Array]:
         """Sends a text, and returns the blocks up to `end`; those named in `replies` are questions, answered at once.
+        The first line of the text is that of the next one too.
 
         Raises:
             ProgramError: the program ended, took longer than these seconds, or wrote something else.
@@ -71,7 +105,8 @@ class Program:
         begins, found = bool(self.opening), dict[str, Array]()
         self.deadline = time.monotonic() + (max(seconds, _BEGIN_S) if begins else seconds)
         self.require_silence(0.0)
-        self.send(self.opening + text)
+        # Octave reads a line only if a character follows.
+        self.send(f"{self.opening}{text.removeprefix(self.begun)}\n")
         while (block := self.block()) is not None:
             name, values = block
             if name in found:
@@ -82,25 +117,40 @@ class Program:
             asked = time.monotonic()
             reply = replies[name](values)
             self.deadline += time.monotonic() - asked  # the bench's own time is not the program's
-            self.send(reply)
+            self.send(f"{reply}\n")
         if begins:  # one that always says more than it should is found out before any work
             self.require_silence(0.05)
         self.opening = ""
+        self.begun = text[: text.index("\n") + 1]
+        self.deadline = time.monotonic() + seconds
+        self.require_end()
         return found
 
+    def require_end(self) -> None:
+        """Waits until the program reads the first line of the next question: it does so once it has written all of this
+        answer. What comes after `end` until then would be taken for the next answer."""
+        self.send(self.begun)
+        pause = 0.0
+        while _unread(self.into) and not self.said:
+            if time.monotonic() > self.deadline:
+                raise ProgramError("answered, and did not read on within the time limit")
+            self.wait(pause)
+            pause = _PAUSE_S
+        self.require_silence(0.0)
+
     def require_silence(self, seconds: float) -> None:
-        """Refuses what is written before it is asked for, which would be taken for the next answer."""
+        """Refuses what is written before it is asked for."""
         if self.out in self.listening and select.select([self.out], [], [], seconds)[0]:
             self.said += os.read(self.out, 1 << 16)
         if self.said.strip():
             raise ProgramError(f"wrote {_shown(self.said.strip().splitlines()[0])} after `end`")
 
     def send(self, text: str) -> None:
-        data = memoryview(f"{text}\n".encode())  # Octave reads a line only if a character follows
+        data = memoryview(text.encode())
         while data:
-            data = data[self.wait(data) :]
+            data = data[self.wait(0.1, data) :]
 
-    def wait(self, data: memoryview | None = None) -> int:
+    def wait(self, seconds: float, data: memoryview | None = None) -> int:
         """Waits for the program, takes what it has written, and returns how much of the data it has read."""
         if (left := self.deadline - time.monotonic()) <= 0:
             hint = "" if self.said or data else "; does it flush its output after `end`?"
@@ -125,7 +175,7 @@ class Program:
         while (stop := self.said.find(b"\n", start)) < 0:
             if (start := len(self.said)) > _LONGEST:
                 raise ProgramError(f"wrote a line of more than {_LONGEST} letters")
-            self.wait()
+            self.wait(0.1)
         text = bytes(self.said[:stop]).strip()
         del self.said[: stop + 1]
         return text
@@ -137,8 +187,14 @@ class Program:
         name, count, *more = [*text.decode("ascii", "replace").split(), "", ""]
         if not (name.isidentifier() and name.isascii() and count.isdigit()) or any(more):
             raise ProgramError(f"wrote {_shown(text)}, where a line NAME COUNT or `end` belongs")
+        if len(count) > len(str(MOST)) or int(count) > MOST:
+            raise ProgramError(f"wrote {name} with {count[:20]} numbers; a block has at most {MOST}")
+        # More words than numbers are not worth their memory.
+        words = self.line().split(maxsplit=int(count))
         try:
-            values = np.array(self.line().split(), dtype=float)
+            if wrong := next((word for word in words if b"_" in word), None):
+                raise ValueError(f"could not convert string to float: {wrong[:80]}")
+            values = np.array(words, dtype=float)
         except ValueError as error:
             raise ProgramError(f"wrote {name} with what is no number: {error}") from None
         if str(len(values)) != count:
@@ -157,14 +213,24 @@ class Program:
         return how + (": " + " | ".join(_shown(line)[1:-1] for line in last) if last else "")
 
     def end(self) -> None:
-        """Ends the program with all that it has started in its process group."""
+        """Ends the program with all that it has started."""
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self.guard.pid, signal.SIGKILL)
         self.process.kill()
+        subprocess.run(
+            ("sh", "-c", _END_ALL, "sh", self.mark), stdin=DEVNULL, stdout=DEVNULL, stderr=DEVNULL, check=False
+        )
         for process in (self.guard, self.process):
             process.wait()
             for stream in filter(None, (process.stdin, process.stdout, process.stderr)):
                 stream.close()
+
+
+def _unread(pipe: int) -> int:
+    """Returns how many bytes wait in a pipe, as its writer; 0 where the system does not tell."""
+    with contextlib.suppress(OSError):
+        return struct.unpack("i", fcntl.ioctl(pipe, termios.FIONREAD, bytes(4)))[0]
+    return 0
 
 
 def _shown(text: bytes | bytearray) -> str:

@@ -10,7 +10,7 @@ RIGHT = "x  4 \n{} \nstatus 1\n0\niterations 1\n1\nsimulations 1\n1\njacobians 1
 
 
 def say(text: str) -> None:
-    sys.stdout.write(text)
+    sys.stdout.buffer.write(text.encode())
     sys.stdout.flush()
 
 
@@ -31,6 +31,20 @@ def fork(then) -> None:
     then()
 
 
+def flee(then) -> None:
+    """Leaves a child in a session of its own, without a parent."""
+    if os.fork() == 0:
+        os.setsid()
+        if os.fork() == 0:
+            time.sleep(1000)
+        os._exit(0)
+    then()
+
+
+def answer_with(P: str) -> str:
+    return f"x 4\n1 2 3 4\nP 16\n{P}\nstatus 1\n0\nend\n"
+
+
 WRONG = {
     "short": "x 4\n1 2\nstatus 1\n0\nend\n",
     "word": "x 4\n1 2 3 four\nstatus 1\n0\nend\n",
@@ -42,8 +56,17 @@ WRONG = {
     "half_status": "x 4\n1 2 3 4\nstatus 1\n0.5\nend\n",
     "twice": "x 4\n1 2 3 4\nx 4\n1 2 3 4\nstatus 1\n0\nend\n",
     "count": "x 4\n1 2 3 4\nstatus 1\n0\niterations 1\n-1\nend\n",
-    "skew": f"x 4\n1 2 3 4\nP 16\n{' '.join(map(str, range(16)))}\nstatus 1\n0\nend\n",
+    "skew": answer_with(" ".join(map(str, range(16)))),
+    "negative": answer_with("-1 0 0 0 0 -1 0 0 0 0 -1 0 0 0 0 -1"),
+    "indefinite": answer_with("1 2 0 0 2 1 0 0 0 0 1 0 0 0 0 1"),
+    "no_variance": answer_with("0 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"),
+    "infinite": answer_with("inf 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"),
+    "underscore": "x 4\n1_0 1_0 1_0 1_0\nstatus 1\n0\nend\n",
+    "hexadecimal": "x 4\n0x10 0 0 0\nstatus 1\n0\nend\n",
+    "digits": "x 4\n\u0661 0 0 0\nstatus 1\n0\nend\n",
     "question": "simulate 3\n1 2 3\n",
+    "crowd": "simulate 400000\n" + "0 " * 400000 + "\n",
+    "flood": "simulate 3000000\n",
     "nan": "x 4\nnan NaN inf 1\nstatus 1\n0\nend\n",
 }
 DONE = {
@@ -56,6 +79,8 @@ DONE = {
     "close": lambda: (sys.stdout.flush(), os.close(1), time.sleep(1000)),
     "fork": lambda: fork(lambda: None),
     "fork_and_exit": lambda: fork(lambda: os._exit(0)),
+    "flee": lambda: flee(lambda: None),
+    "flee_and_exit": lambda: flee(lambda: os._exit(0)),
 }
 
 
@@ -79,6 +104,9 @@ def main(fault: str) -> None:
             if bad and fault in WRONG
             else answer * (2 if fault == "DOUBLE" or (bad and fault == "more") else 1)
         )
+        if bad and fault == "late":
+            time.sleep(0.2)
+            say(RIGHT.format("0 0 0 0"))
         if fault == "ONCE":
             return
 

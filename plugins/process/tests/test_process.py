@@ -6,6 +6,7 @@ import pickle
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -104,20 +105,25 @@ def test_what_new_makes_keeps_its_promises_and_equals_gauss_newton(language, wor
 # Faults
 
 TRIALS, BAD = 6, 3
-STATUS = {"nan": ib.Status.NONFINITE, "fork": ib.Status.CONVERGED, "more": ib.Status.CONVERGED}
+STATUS = {"nan": ib.Status.NONFINITE, "fork": ib.Status.CONVERGED, "flee": ib.Status.CONVERGED}
 # fmt: off
 LINES = {
     "short": "wrote x with 2 numbers, and not 4", "word": "wrote x with what is no number",
-    "huge": "wrote x with 2 numbers, and not 99999999999", "nothing": "answered without x and status",
+    "huge": "wrote x with 99999999999 numbers; a block has at most 2500000", "nothing": "answered without x and status",
+    "underscore": "wrote x with what is no number", "hexadecimal": "no number", "digits": "no number",
     "print": "wrote 'Warning: step rejected', where a line NAME COUNT or `end` belongs",
     "no_status": "answered without status", "status": "wrote status 42, and not one of 0 to 8",
     "half_status": "wrote status 0.5", "twice": "wrote x twice in one answer",
     "count": "wrote iterations -1, which is no count", "skew": "wrote a P that is not symmetric",
+    **dict.fromkeys(("negative", "indefinite", "no_variance", "infinite"), "wrote a P that is not positive definite"),
+    "more": "wrote 'x  4' after `end`", "late": "wrote 'x  4' after `end`",
+    "crowd": "asked for 4000000 numbers at once; ask for 62500 points at most",
+    "flood": "wrote simulate with 3000000 numbers; a block has at most 2500000",
     "question": "asked with 3 numbers, and not a multiple of 4", "signal": "was ended by signal 11",
     "exit": "ended with exit code 2: reading settings | matrix is singular", "blocks": "wrote a twice in one answer",
     "sleep": "gave no whole answer within the time limit; does it flush its output after `end`?",
     "stderr": "gave no whole answer within the time limit", "close": "closed its output", "line": "",
-    "fork_and_exit": "ended with exit code 0",
+    "fork_and_exit": "ended with exit code 0", "flee_and_exit": "ended with exit code 0",
 }
 # fmt: on
 
@@ -143,16 +149,34 @@ def left(fault: str) -> list[str]:
 @pytest.mark.parametrize("fault", [pytest.param(each, marks=WAITS.get(each, ())) for each in (*LINES, *STATUS)])
 def test_a_fault_costs_its_own_trial_and_a_line(fault):
     found, right = answers(fault), answers("none")
-    spoilt = [BAD + 1] if fault == "more" else [BAD]  # it is seen when the next answer is asked for
-    others = np.setdiff1d(np.arange(TRIALS), spoilt)
+    others = np.setdiff1d(np.arange(TRIALS), [BAD])
     assert all(np.array_equal(a[others], b[others]) for a, b in ((found.x, right.x), (found.status, right.status)))
     assert found.status[BAD] == STATUS.get(fault, ib.Status.ERROR)
     if fault in LINES:
         assert LINES[fault] in found.messages[BAD]
-        assert list(found.messages) == spoilt
+        assert list(found.messages) == [BAD]
     while process._running:
         process._running.popitem()[1].end()
     assert not Path("/proc").exists() or left(fault) == []
+
+
+def test_what_a_program_has_started_ends_with_the_bench(tmp_path):
+    """Also in a session of its own, where the bench itself is killed."""
+    if not Path("/proc").exists():
+        pytest.skip("only Linux lists what is marked")
+    says = "import os; from ipe_bench_process.program import Program; "
+    says += "program = Program({!r}, '.', ''); input(); os.kill(os.getpid(), 9)"
+    mark = tmp_path / "orphan"
+    command = ["sh", "-c", f"setsid sh -c 'echo > {mark}; sleep 1000; :' {FAULTY} killed & sleep 1000"]
+    bench = subprocess.Popen([sys.executable, "-c", says.format(command)], stdin=subprocess.PIPE, cwd=HOME)
+    while not mark.exists():
+        time.sleep(0.01)
+    assert left("killed")
+    bench.communicate(b"\n")
+    until = time.monotonic() + 20.0
+    while left("killed") and time.monotonic() < until:
+        time.sleep(0.01)
+    assert left("killed") == []
 
 
 REFUSED = {
