@@ -75,11 +75,17 @@ def shortened(text: str, length: int = 120) -> str:
     return text if len(text) <= length else f"{text[: length - 24]}...{text[-20:]}"
 
 
-def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Returns '; did you mean ...?' with the nearest of the known names, capitals or not; empty if none is near."""
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Returns the nearest of the known names, capitals or not; empty if none is near."""
     cases = {one.lower(): one for one in known}
     close = difflib.get_close_matches(name.lower(), cases, 1)
-    return f"; did you mean {cases[close[0]]}?" if close else ""
+    return cases[close[0]] if close else ""
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Returns '; did you mean ...?' with the nearest of the known names; empty if none is near."""
+    meant = nearest(name, known)
+    return f"; did you mean {meant}?" if meant else ""
 
 
 ZOO = {
@@ -106,11 +112,12 @@ def moved(name: str) -> str:
 
 
 def unknown(name: str, known: Iterable[str], noun: str) -> str:
-    """Says that there is no such option; names the nearest, and all there are, or where it is now."""
+    """Says that there is no such option; names the nearest, or else all there are, or where it is now."""
     known = sorted(known)
     if noun in ("option", "estimator", "group") and (place := moved(name)):
         return place
-    return f"there is no such {noun}{did_you_mean(name, known)} (there are: {', '.join(known) or 'none'})"
+    listed = f" (there are: {', '.join(known) or 'none'})"
+    return f"there is no such {noun}{did_you_mean(name, known) or listed}"
 
 
 def without_modules(room: str, names: Sequence[str]) -> None:

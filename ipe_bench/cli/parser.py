@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
-from ipe_bench.basics.errors import UserError, unknown
+from ipe_bench.basics.errors import UserError, did_you_mean, unknown
 from ipe_bench.cli.keys import ROWS
 
 _ABOUT = """\
@@ -267,14 +267,15 @@ class Parser(argparse.ArgumentParser):
         if self.command == "run" and flag in ("-cp", "--config-path", "-cn", "--config-name"):
             remedy = "put options and experiments of your own into a folder and name it with --config-dir"
             raise UserError(f"run: {word}: is no flag any more; {remedy}")
+        flags = [flag for action in self._actions for flag in action.option_strings]
         takes_keys = equals or any(action.metavar == "KEY=VALUE" for action in self._actions)
         if word.startswith("-" if equals else "--") and takes_keys and flag.lstrip("-").isidentifier():
             after = list(words)[list(words).index(word) + 1 :]
             value = after[0] if after and "=" not in after[0] and not after[0].startswith("-") else "VALUE"
             said = word.lstrip("-") if equals else f"{word[2:]}={value}"
-            raise UserError(f"{self.command}: {word}: there is no such flag; keys have no dashes: write {said}")
+            meant = did_you_mean(flag, flags) or f"; keys have no dashes: write {said}"
+            raise UserError(f"{self.command}: {word}: there is no such flag{meant}")
         if word.startswith("-"):
-            flags = [flag for action in self._actions for flag in action.option_strings]
             raise UserError(f"{self.command}: {word}: {unknown(word, flags, 'flag')}")
         raise UserError(f"{self.command}: {word}: is a word too many; see `{self.prog} --help`")
 

@@ -236,14 +236,18 @@ def explain(error: BaseException) -> UserError:
 
 _EXTRAS = ("joblib", "submitit", "optuna")
 """Launchers and sweepers that are extras of our own distribution."""
+_HYDRAS = ("ax", "nevergrad", "ray", "rq")
+"""Further ones of Hydra's makers, each a package of its own."""
 
 
 def _no_such_option(name: str) -> str:
     group, _, option = name.rpartition("/") if name.startswith("hydra/") else name.partition("/")
     if group in ("hydra/launcher", "hydra/sweeper"):
         kind, first = group.partition("/")[2], option.partition("_")[0]  # submitit_local is submitit's
-        package = f'"ipe-bench[{first}]"' if first in _EXTRAS else f"hydra-{first}-{kind}"
-        return f"{group}={option}: this {kind} is not installed; pip install {package}, or choose basic"
+        packages = {name: f'"ipe-bench[{name}]"' for name in _EXTRAS}
+        packages |= {name: f"hydra-{name}-{kind}" for name in _HYDRAS}
+        remedy = f"pip install {packages[first]}, or " if first in packages else ""
+        return f"{group}={option}: this {kind} is not installed; {remedy}choose basic"
     return f"{group}={option}: {unknown(option, [o.name for o in plugins.options(group)], 'option')}"
 
 
@@ -254,7 +258,15 @@ def _no_such_key(name: str) -> str:
     return f"{name}: {unknown(key, known, 'key')}"
 
 
-_FORMS = {"measurement.of": "=MODULE:FUNCTION", "measurement.rates": ".STATE=FORMULA"}
+_FORMS = {
+    "measurement.of": "=MODULE:FUNCTION",
+    "measurement.expression": "=FORMULA",
+    "measurement.rates": ".STATE=FORMULA",
+    "state_model.next": ".STATE=FORMULA",
+    "state_model.readings": ".READING=FORMULA",
+    "state_model.deviation": ".READING=VALUE",
+    "state_model.spread": ".STATE=VALUE",
+}
 _EXPLAINED: tuple[tuple[str, Callable[..., str]], ...] = (
     (r"Could not (?:find|load) '([^']+)'", _no_such_option),
     (r"Could not override '([^']+)'", _no_such_key),

@@ -105,7 +105,8 @@ class Spec(Component):
         use_statistics()
         columns = frame_columns([s for s in (*all_statistics(), *SCORES) if s.kind != "word"])
         if not label:
-            raise UserError(f"objective={self.objective}: write LABEL.COLUMN, such as newton.capped_error")
+            example = f"{next(iter(self.estimators), 'LABEL')}.capped_error"
+            raise UserError(f"objective={self.objective}: write LABEL.COLUMN, such as {example}")
         for name, known, noun in ((label, self.estimators, "estimator"), (column, columns, "column")):
             if name not in known:
                 raise UserError(f"objective={self.objective}: {unknown(name, known, noun)}")
@@ -213,7 +214,7 @@ def _labelled(key: str, label: str, options: Any, known: Sequence[plugins.Option
     if TARGET not in options:
         keys = ", ".join(f"{where}.{key}" for key in options) or where
         groups = {option.label: option.group for option in known}
-        remedy = f"add it to {groups[label]}=" if label in groups else unknown(label, groups, "estimator")
+        remedy = f"add it, as in {groups[label]}=[{label}]" if label in groups else unknown(label, groups, "estimator")
         raise UserError(f"{keys}: is set, but {label} is not chosen; {remedy}")
     for option in known:
         if option.label == label and option.target != str(options[TARGET]):

@@ -19,7 +19,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep, Glob, Override, OverrideType, QuotedString
 from hydra.errors import HydraException
 
-from ipe_bench.basics.errors import UserError, unknown
+from ipe_bench.basics.errors import UserError, nearest, unknown
 from ipe_bench.cli import refuse_blanks, renamed
 from ipe_bench.cli.keys import SETTING_NOTHING, WHOLE
 from ipe_bench.cli.spec import KEYS
@@ -210,7 +210,7 @@ def _quoted(text: str) -> str:
 def _parse(command: str, word: str, groups: Groups) -> Override:
     key, equals, value = word.partition("=")
     if not equals and not word.startswith("~"):
-        remedies = [f"write {group}={word}" for group, names in groups.items() if word in names]
+        remedies = [f"write {_choosing(group, word)}" for group, names in groups.items() if word in names]
         remedy = " or ".join(remedies) or f"see `ipe-bench {command} --help`"
         if Path(word).suffix in (".csv", ".parquet"):
             remedy = f"write {'' if command == 'estimate' else 'ipe-bench estimate '}readings={word}"
@@ -241,8 +241,9 @@ def _parse(command: str, word: str, groups: Groups) -> Override:
 def _check(override: Override, groups: Groups) -> None:
     group, word = override.key_or_group, said(override)
     if group.startswith("hydra.sweeper.params"):
-        key = group.removeprefix("hydra.sweeper.params").lstrip(".") or "error_scale"
-        raise UserError(f"{word}: belongs in an experiment file; on the command line write -m {key}=VALUE,VALUE")
+        key = group.removeprefix("hydra.sweeper.params").lstrip(".")
+        swept = f"{key}={word.partition('=')[2]}" if key else "error_scale=VALUE,VALUE"
+        raise UserError(f"{word}: belongs in an experiment file; on the command line write -m {swept}")
     if re.split("[./]", group)[0] == "hydra":
         return
     if group in groups and not override.is_delete():
@@ -259,8 +260,7 @@ def _check(override: Override, groups: Groups) -> None:
     if override.package is not None or ("/" in group and first.split("/")[0] in groups):
         raise UserError(f"{word}: {unknown(group, groups, 'group')}")
     if first in plugins.PACKAGES:
-        remedy = f"{plugins.PACKAGES[first]}.{word.lstrip('+').partition('.')[2]}"
-        raise UserError(f"{word}: options are set by label; write {remedy}")
+        raise UserError(f"{word}: options are set by label; write {_by_label(first, word)}")
     if first in _GONE:
         raise UserError(f"{word}: is no key any more; {_GONE[first]}")
     if first not in KEYS:
@@ -274,22 +274,42 @@ def _check(override: Override, groups: Groups) -> None:
             raise UserError(f"{word}: cannot be null; give a whole number, or leave it out")
 
 
+def _choosing(group: str, name: str) -> str:
+    """Writes the word that chooses an option of a group."""
+    if group == "experiment":
+        return f"+experiment={name}"
+    return f"{group}=[{name}]" if group in plugins.PACKAGES else f"{group}={name}"
+
+
+def _by_label(group: str, word: str) -> str:
+    """Writes GROUP.NAME.OPTION=VALUE as the word that sets an option of that name, or the nearest there is."""
+    key, _, value = word.lstrip("+").partition("=")
+    _, name, *path = key.split(".")
+    if not path:
+        return f"{plugins.PACKAGES[group]}.LABEL.{name}={value}"
+    known = [key for option in plugins.options(group) if option.label == name for key in option.config]
+    path[0] = nearest(path[0], known) or path[0]
+    return f"{plugins.PACKAGES[group]}.{name}.{'.'.join(path)}={value}"
+
+
 def _check_place(override: Override) -> None:
     """Checks that a part has a place where the job looks for it."""
     group, package, word = override.key_or_group, override.package, said(override)
+    names = [name for name in values(override) if isinstance(name, str)]
+    name = names[0] if len(names) == 1 else "NAME"
     added = override.is_add() or override.is_force_add()
     if group == "experiment" and package is None:
         if not added:
-            raise UserError(f"{word}: an experiment is added, not overridden; write +experiment=NAME")
+            raise UserError(f"{word}: an experiment is added, not overridden; write +experiment={name}")
     elif package is None or (group, package) == ("measurement", TRUTH):
         if added:
             raise UserError(f"{word}: {package or group} is there to be chosen, not added; leave out the +")
     elif group not in plugins.PACKAGES:
-        raise UserError(f"{word}: goes nowhere; write {group}=NAME")
+        raise UserError(f"{word}: goes nowhere; write {group}={name}")
     elif not re.fullmatch(rf"{plugins.PACKAGES[group]}\.[^.]+", package):
-        raise UserError(f"{word}: goes nowhere; write +{group}@{plugins.PACKAGES[group]}.LABEL=NAME")
+        raise UserError(f"{word}: goes nowhere; write +{group}@{plugins.PACKAGES[group]}.LABEL={name}")
     elif not added:
-        raise UserError(f"{word}: a label of its own is added; write +{group}@{package}=NAME")
+        raise UserError(f"{word}: a label of its own is added; write +{group}@{package}={name}")
 
 
 def _check_choice(override: Override, groups: Groups) -> None:
@@ -305,7 +325,7 @@ def _check_choice(override: Override, groups: Groups) -> None:
         if value is None and (override.package == TRUTH or group == "state_model"):
             continue
         if isinstance(value, list) and not several:
-            raise UserError(f"{word}: choose one: {group}=NAME")
+            raise UserError(f"{word}: choose one: {_choosing(group, 'NAME')}")
         names = value if isinstance(value, list) else [value]
         for name in names:
             if not isinstance(name, str) or name not in groups[group]:
@@ -322,8 +342,7 @@ def no_option(group: str, name: str, groups: Groups) -> str:
     """Suggests a replacement of an option that its group lacks: its own group, where another group has it."""
     for other, names in groups.items():
         if name in names and other != group:
-            shown = f"[{name}]" if other in plugins.PACKAGES else name
-            return f"{name} is no {group} but a {other}; write {other}={shown}"
+            return f"{name} is no {group} but a {other}; write {_choosing(other, name)}"
     nist = group == "measurement" and name.lower().startswith("nist/")
     known = [one for one in groups[group] if one.startswith("nist/") == nist]
     meant = next((one for one in known if one.lower() == name.lower()), name)

@@ -176,8 +176,8 @@ class Formula(WrittenModel):
                 wanted = ", ".join(self.arithmetic.names)
                 raise UserError(f"start.{name}: does not appear in the expression, whose names are {wanted}")
         if not self.start:
-            name = f"start.{next(iter(self.arithmetic.names), 'NAME')}"
-            raise UserError(f"start: is empty, so no parameter is estimated; give each parameter a start: {name}=1")
+            start = f"measurement.start.{next(iter(self.arithmetic.names), 'NAME')}=1"
+            raise UserError(f"start: is empty, so no parameter is estimated; give each parameter a start: {start}")
         if self.reading in self.arithmetic.names:
             raise UserError(f"reading={self.reading}: stands in the expression too; what is measured cannot explain it")
         self.require_columns_and_parameters("own")

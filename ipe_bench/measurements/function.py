@@ -78,16 +78,17 @@ class Function(WrittenModel):
                 raise UserError(f"constants.{name}: {unknown(name, self._keywords, 'keyword-only argument')}")
         for name, default in self._keywords.items():
             if default is inspect.Parameter.empty and name not in self.constants:
-                raise UserError(f"constants.{name}: {self.of} needs it; give constants.{name}=VALUE")
+                raise UserError(f"constants.{name}: {self.of} needs it; give measurement.constants.{name}=VALUE")
         if not self.starts:
             given = f"(its arguments are {', '.join(arguments) or 'none'})"
-            remedy = f"give an argument a number as default, or start.NAME=VALUE {given}"
+            remedy = f"give an argument a number as default, or measurement.start.NAME=VALUE {given}"
             raise UserError(f"start: {self.of} has no parameter; {remedy}")
         if self.time and self.time not in self.headings:
             raise UserError(f"time={self.time}: {unknown(self.time, self.headings, 'column')}")
         for name in self.headings if self.columns else ():
             if name not in self.columns:
-                raise UserError(f"columns: {name} is missing; give columns.{name}=[...], or start.{name}=VALUE")
+                remedy = f"give measurement.columns.{name}=[...], or measurement.start.{name}=VALUE"
+                raise UserError(f"columns: {name} is missing; {remedy}")
         self.require_columns_and_parameters("size", "units")
 
     if typing.TYPE_CHECKING:

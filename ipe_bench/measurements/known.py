@@ -98,7 +98,7 @@ class ConstrainedModel(WrappedModel):
         for one, v0 in zip(self._known, self._v0, strict=True):
             if not one.bounds[0] < v0 < one.bounds[1]:
                 key = f"parameters.{one.name}"
-                raise UserError(f"{key}: its start, {v0:g}, is not inside of its bounds; give {key}.nominal")
+                raise UserError(f"{key}: its start, {v0:g}, is not inside of its bounds; give {key}.nominal=VALUE")
         if not len(self._free):
             raise UserError("parameters: all are fixed; leave at least one to be estimated")
 

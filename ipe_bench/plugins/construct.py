@@ -94,7 +94,8 @@ def instantiate(cls: type, options: Mapping[str, Any], where: str) -> Any:
             raise UserError(f"{required[0]}: is not given; give it a value")
         return cls(**options)
     except UserError as error:
-        raise UserError(f"{prefix}{error}") from None
+        # A class whose check is made later, too, names the whole key itself.
+        raise UserError(f"{prefix}{str(error).removeprefix(prefix)}") from None
     except ValueError as error:  # how classes that know nothing of ours refuse an option
         raise UserError(f"{where}: {' '.join(str(error).split())}") from error
     except (Exception, SystemExit) as error:

@@ -251,7 +251,7 @@ def _notes(found: Sequence[Reference]) -> Iterator[str]:
         if not one.posterior.settled:
             yield (
                 f"Trial {one.trial}: the populations differ by {one.posterior.apart:.2g} deviations, so its posterior"
-                " cannot be relied on; give more --particles."
+                " cannot be relied on; take more particles."
             )
         if len(one.posterior.modes) > 1:
             shares = ", ".join(percent(float(share)) for share in one.posterior.shares)
@@ -288,7 +288,7 @@ def _honest_sentences(found: Sequence[Reference]) -> list[str]:
             counts[label] += honest_word(d, one.posterior) == "yes"
     listed = enumerate_few([f"{label} in {count} of {len(found)}" for label, count in counts.items()], 12)
     unsettled = sum(not one.posterior.settled for one in found)
-    more = [f"In {unsettled} the posterior itself cannot be relied on; give more --particles."] if unsettled else []
+    more = [f"In {unsettled} the posterior itself cannot be relied on; take more particles."] if unsettled else []
     return [f"Trials in which an estimator's Gaussian can stand for the posterior: {listed}.", *more]
 
 

@@ -76,7 +76,7 @@ class Formulas(StateModel):
             ("deviation", self._deviations, known),
         ):
             if not formulas and key != "deviation":
-                raise UserError(f"{key}: is empty; write {key}.NAME=FORMULA")
+                raise UserError(f"{key}: is empty; write state_model.{key}.NAME=FORMULA")
             for label, formula in formulas.items():
                 for name in formula.names:
                     if name not in names:

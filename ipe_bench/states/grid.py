@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -45,8 +46,11 @@ class Grid(Tracker):
             return f"needs process noise at every step of {model.name}; leave it out"
         steps = [max(np.diff(grids[k + 1]).max(), np.abs(np.diff(_moved(model, grids, k))).max()) for k in epochs]
         if (excess := np.max(steps / noise)) > 1:
-            needed = np.ceil(1.1 * self.points * excess)
-            return f"its points are farther apart than process noise reaches; set points={needed:.0f}"
+            needed = math.ceil(1.1 * self.points * excess)
+            # The moves of so coarse a grid hardly tell how fine it has to be: the finer one is asked, too.
+            remedy = f"set trackers.LABEL.points={needed}"
+            finer = replace(self, points=needed).hindrance(model)
+            return finer or f"its points are farther apart than process noise reaches; {remedy}"
         return None
 
     def track(self, model: StateModel, z: Array) -> Tracks:

@@ -168,8 +168,8 @@ def stored(folder: Path) -> list[Path]:
     [
         ("error_scale=100,1000", "error_scale=100,1000: is a sweep; add -m for a job of each error_scale"),
         ("solver=newton,auto", "solver=newton,auto: is a sweep; add -m, or put a list in brackets"),
-        ("-m hydra.sweeper.params.error_scale=1,2", "write -m error_scale=VALUE,VALUE"),
-        ("-m +hydra.sweeper.params.error_scale='1,2'", "write -m error_scale=VALUE,VALUE"),
+        ("-m hydra.sweeper.params.error_scale=1,2", "write -m error_scale=1,2"),
+        ("-m +hydra.sweeper.params.error_scale='1,2'", "write -m error_scale='1,2'"),
         ("-m hydra.sweeper.params={error_scale:1}", "belongs in an experiment file"),
     ],
 )
