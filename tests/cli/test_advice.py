@@ -365,6 +365,12 @@ def templates():
                 yield text, ".*".join(map(re.escape, found[0].split("{}")))
 
 
+def test_what_python_shows_too_names_no_flag():
+    rooms = [path for path in Path(ipe_bench.__file__).parent.rglob("*.py") if path.parent.name not in ("cli", "docs")]
+    assert len(rooms) > 100
+    assert [path for path in rooms if re.search(r"(?:give|write|use|set|more) [^\"\n]*--[a-z]", path.read_text())] == []
+
+
 @pytest.mark.slow
 def test_every_word_that_an_error_of_the_package_advises_is_tried(command):
     said = " ".join(command(mistake)[1] for mistake, *_ in ADVICE)

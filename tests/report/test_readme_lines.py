@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,24 @@ def test_it_leads_somewhere():
     assert len(led_to) >= 8
     kept = [path for path in led_to if (ROOT / "plugins").is_dir() or not path.startswith("plugins/")]
     assert [path for path in kept if not (ROOT / path).exists()] == []
+
+
+def test_the_solver_that_it_writes_costs_what_newton_costs():
+    (code,) = re.findall(r"my_newton\.py <<'END'\n(.*?)\n    END", README, re.DOTALL)
+    names: dict = {"__name__": "__main__"}
+    exec(compile(textwrap.dedent(code), "my_newton", "exec", dont_inherit=True), names)
+    bench = ib.Scenario(ib.measurements.Gins(), ib.noise.Quantization(step=0.02286), error_scale=100.0)
+    estimators = {"newton": ib.solvers.Newton(), "my_newton": names["MyNewton"]()}
+    costs = ib.run(bench, estimators, 20).trials.groupby("estimator")["simulations"].apply(list)
+    assert costs["my_newton"] == costs["newton"]
+
+
+def test_the_columns_that_the_advice_on_choosing_names_are_there(tmp_path):
+    bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01))
+    table = ib.run(bench, {"auto": ib.solvers.Auto()}, 5, output=tmp_path)
+    page = (ROOT / "ipe_bench/report/docs/pages/choosing.md").read_text(encoding="utf-8")
+    assert re.search(r"The column `(\w+)` of its trials", page)[1] in ib.load(tmp_path)  # type: ignore[index]
+    assert re.search(r"`(\w+)` in `summary_all.csv`", page)[1] in table  # type: ignore[index]
 
 
 def recomputed(folder: Path) -> pd.DataFrame:
