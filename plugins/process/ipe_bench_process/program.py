@@ -131,7 +131,7 @@ class Program:
         answer. What comes after `end` until then would be taken for the next answer."""
         self.send(self.begun)
         pause = 0.0
-        while _unread(self.into) and not self.said:
+        while _unread(self.into) and not self.said.strip():
             if time.monotonic() > self.deadline:
                 raise ProgramError("answered, and did not read on within the time limit")
             self.wait(pause)
@@ -139,11 +139,12 @@ class Program:
         self.require_silence(0.0)
 
     def require_silence(self, seconds: float) -> None:
-        """Refuses what is written before it is asked for."""
+        """Refuses what is written before it is asked for, but for empty lines."""
         if self.out in self.listening and select.select([self.out], [], [], seconds)[0]:
             self.said += os.read(self.out, 1 << 16)
         if self.said.strip():
             raise ProgramError(f"wrote {_shown(self.said.strip().splitlines()[0])} after `end`")
+        self.said.clear()
 
     def send(self, text: str) -> None:
         data = memoryview(text.encode())

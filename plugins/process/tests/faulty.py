@@ -104,7 +104,10 @@ def main(fault: str) -> None:
             if bad and fault in WRONG
             else answer * (2 if fault == "DOUBLE" or (bad and fault == "more") else 1)
         )
-        if bad and fault == "late":
+        if bad and fault == "blank":
+            say("\n \n")
+        if bad and fault in ("late", "blank_and_late"):
+            say("\n" if fault == "blank_and_late" else "")
             time.sleep(0.2)
             say(RIGHT.format("0 0 0 0"))
         if fault == "ONCE":
