@@ -1,4 +1,4 @@
-"""How many changes on purpose the tests notice, room by room: `make mutants` writes outputs/mutants/score.md.
+"""How many random changes the tests notice, room by room: `make mutants SAMPLE=40` writes outputs/mutants/score.md.
 
 Cosmic Ray finds the places and makes the changes, one at a time, each in a copy of the project; the tests of the room
 must then fail. Of the changes at one place one is drawn at random; annotations are left out.

@@ -76,8 +76,11 @@ def test_the_maximum_of_the_likelihood_is_that_of_a_direct_search(case):
     found = start
     for _ in range(2):  # the second from the first, since the logarithm of a level is held a little at its start
         model = Levelled(DECAY, levels, found[3:], np.ones(60))
-        found = maximise_likelihood(Problem(model, Covariance(np.full(60, 0.2))), z[None], found[None]).x[0]
+        minima = maximise_likelihood(Problem(model, Covariance(np.full(60, 0.2))), z[None], found[None])
+        found = minima.x[0]
     assert found == pytest.approx(direct, abs=1e-8)
+    # Its value is -2 times the log likelihood over that of the deviations that R holds.
+    assert minima.chi_square[0] == pytest.approx(deviance(direct) - 60 * 2 * np.log(0.2), rel=1e-9)
 
 
 def test_levels_of_a_linear_model_maximise_the_restricted_likelihood():

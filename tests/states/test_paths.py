@@ -13,9 +13,20 @@ from shared.state_models import ConstantVelocity, CoordinatedTurn, Pendulum, pat
 from ipe_bench.basics.statuses import Status
 from ipe_bench.plugins.construct import construct
 from ipe_bench.plugins.discovery import options
-from ipe_bench.states import IteratedSmoother, LevenbergMarquardtSmoother, PathIPE, Smoother, Taylor, ekf, ukf
-from ipe_bench.states.damped import _linearised, _passed
+from ipe_bench.states import (
+    Cubature,
+    IteratedSmoother,
+    LevenbergMarquardtSmoother,
+    Normal,
+    PathIPE,
+    Smoother,
+    Taylor,
+    ekf,
+    ukf,
+)
+from ipe_bench.states.damped import _linearised, _passed, _Paths
 from ipe_bench.states.smoothers import path_p, smoothed, whole
+from ipe_bench.states.trackers import filtered, linearised_move
 from ipe_bench.trials.tracking import PathBlock, StateScenario
 
 NEAR = Pendulum(count=25, start=(1.0, 0.0), spread=0.2)
@@ -74,6 +85,75 @@ def bearings(scale):
     """`bearings_only`, its target unknown by so many multiples."""
     model = construct(next(o for o in options("state_model") if o.name == "bearings_only").config, "state_model")
     return replace(model, spread={name: scale * float(value) for name, value in model.spread.items()})
+
+
+def test_a_damped_step_is_the_same_in_any_unit_of_the_states():
+    """Damping is in variances of the states: with that of one unit the step depends on the units."""
+    sizes = np.array([1e-3, 50.0])
+
+    class Scaled(Pendulum):
+        """The same pendulum in other units of angle and rate."""
+
+        @property
+        def prior(self):
+            m, P = super().prior
+            return Normal(m * sizes, P * sizes * sizes[:, None])
+
+        def transition(self, x, k):
+            return super().transition(x / sizes, k) * sizes
+
+        def observe(self, x, k):
+            return super().observe(x / sizes, k)
+
+        def gain(self, k):
+            return sizes[:, None] * super().gain(k)
+
+    steps = []
+    for model in (NEAR, Scaled(count=25, start=(1.0, 0.0), spread=0.2)):
+        z = NEAR.draw(0, 4).z
+        paths = _Paths.of(model, z, smoothed(model, filtered(model, z, Taylor())))
+        steps.append(LevenbergMarquardtSmoother()._stepped(model, z, replace(paths, damping=np.ones(4))))
+    np.testing.assert_allclose(steps[1].x / sizes, steps[0].x, atol=1e-9)
+    np.testing.assert_allclose(steps[1].cost, steps[0].cost, rtol=1e-9)
+
+
+def test_levenberg_and_marquardt_begin_at_the_better_of_two_filters():
+    """No step raises the cost, so that the path after one of them costs no more than that of either smoother."""
+    model = Pendulum(count=40, start=(1.5, 0.0), spread=1.0)
+    z = model.draw(0, 40).z
+    found = LevenbergMarquardtSmoother(iterations=1, starts=0).track(model, z)
+    costs = []
+    for one in (ekf(), ukf()):
+        track = Smoother(one).track(model, z)
+        costs.append(path_cost(model, z, track.start.mean, track.mean))
+    assert min(np.min(costs[0] / costs[1]), np.min(costs[1] / costs[0])) < 0.9
+    assert (found.cost <= np.minimum(*costs) * (1 + 1e-9)).all()
+
+
+def test_further_starts_are_draws_of_the_prior_with_half_its_deviations():
+    """Readings that say nothing leave the start where it was drawn, with what it was given of the prior's variance."""
+    model = ConstantVelocity(count=2, spread=2.0, deviation=1e6)
+    z = model.draw(0, 400).z
+    drawn = LevenbergMarquardtSmoother(starts=1)._drawn(model, z)
+    np.testing.assert_allclose(drawn.P[:, 0], np.broadcast_to(4.0 / 4 * np.eye(2), (400, 2, 2)), atol=1e-6)
+    np.testing.assert_allclose(drawn.x[:, 0].std(axis=0), 2.0, rtol=5 / np.sqrt(800))
+
+
+def test_a_state_that_comes_round_is_followed_next_to_its_path():
+    class Heading(ConstantVelocity):
+        """A heading and its rate: whole turns of the first are one."""
+
+        @property
+        def state_periods(self):
+            return 2 * np.pi, 0.0
+
+    model, x = Heading(count=3), Normal(np.array([[3.0, 0.5], [3.0, -9.0]]), np.array([np.eye(2)] * 2))
+    turns = np.array([[2 * np.pi, 0.0], [-6 * np.pi, 0.0]])
+    to = model.transition(x.mean, 0) + turns + [0.4, 30.0]
+    for rule in (Taylor(), Cubature()):
+        move = linearised_move(model, rule, 0, x, to)
+        moved = np.einsum("tij,tj->ti", move.A, x.mean) + move.b
+        np.testing.assert_allclose(moved, model.transition(x.mean, 0) + turns, atol=1e-12)
 
 
 @pytest.mark.slow
@@ -166,3 +246,8 @@ def test_the_fit_of_a_linear_path_is_that_of_the_innovations():
     assert kstest(path, "uniform").pvalue > 1e-3
     cost = trackers[2].track(LINEAR, block.paths.z).cost
     np.testing.assert_allclose(path_p(block.paths.z, cost), chi2.sf(cost, 12), rtol=1e-9)
+    z = block.paths.z.copy()
+    z[:, 3:8] = np.nan
+    fewer = trackers[2].track(LINEAR, z)
+    np.testing.assert_allclose(path_p(z, fewer.cost), chi2.sf(fewer.cost, 7), rtol=1e-9)
+    assert kstest(path_p(z, fewer.cost), "uniform").pvalue > 1e-3

@@ -173,6 +173,19 @@ def test_missing_readings_are_as_if_they_had_never_been_taken(rule):
     np.testing.assert_allclose(tracks.covariance[0, 29], x.covariance, atol=1e-12)
 
 
+@pytest.mark.parametrize("rule", [Cubature(), Unscented(kappa=0.0), GaussHermite(2)], ids=lambda r: type(r).__name__)
+@pytest.mark.parametrize("m", [0.0, 1.0, 3.0, -3.1])
+def test_points_of_an_angle_lie_about_that_of_their_centre(rule, m):
+    """Two points .6 of half a turn to either side: next to each other they would be .8 of half a turn apart."""
+
+    def wrapped(x):
+        return (x + np.pi) % (2 * np.pi) - np.pi
+
+    P = np.array([[[(0.6 * np.pi) ** 2]]])
+    found = rule.linearise(wrapped, np.array([[m]]), P, lambda y, to: to + wrapped(y - to))
+    np.testing.assert_allclose([found.A[0, 0, 0], found.b[0, 0], found.W[0, 0, 0]], [1.0, 0.0, 0.0], atol=1e-9)
+
+
 def test_bearings_come_round():
     """A turn whose track crosses the negative x axis: without wrapping the filters lose it at once."""
     model = CoordinatedTurn(count=60)

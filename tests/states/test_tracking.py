@@ -222,6 +222,42 @@ def test_a_tracker_that_fails_in_one_trial_fails_in_that_alone():
     np.testing.assert_array_equal(columns["first_bad_epoch"], [np.nan, np.nan, 1, np.nan, 6, np.nan])
 
 
+@dataclass(frozen=True)
+class Astray(Tracker):
+    """The states themselves, but for the epochs `where`, at which the position is `by` deviations of the bound off."""
+
+    block: PathBlock
+    where: slice
+    by: float
+
+    def track(self, model, z):
+        tracks = ekf().track(model, z)
+        tracks.mean = self.block.paths.x.copy()
+        tracks.mean[:, self.where, 0] += self.by * np.sqrt(self.block.variances[:, self.where, 0])
+        return tracks
+
+
+@pytest.mark.parametrize(
+    ("where", "by", "success"),
+    [(slice(4, 5), 25.0, True), (slice(4, 5), 30.0, False), (slice(None), 5.0, True), (slice(None), 5.5, False)],
+)
+def test_a_path_succeeds_if_its_mean_square_error_is_within_the_gate(where, by, success):
+    """The gate of two states is at 27.6: 25^2 / 30 and 5^2 are inside, 30^2 / 30 and 5.5^2 are not."""
+    block = PathBlock.draw(StateScenario(LINEAR), 0, 3)
+    assert (block.estimate(Astray(block, where, by))[1]["path_success"] == success).all()
+
+
+def test_the_posterior_bound_tells_its_own_error():
+    """The scatter of the bound over 40 seeds, each with paths of its own, is known to 1 / sqrt(80), 11 %."""
+    found = []
+    for seed in range(40):
+        columns = PathBlock.draw(StateScenario(Pendulum(count=2, spread=0.5), seed=seed), 0, 1).truth_columns()
+        found.append([columns["van_trees_angle"][0], columns["van_trees_error_angle"][0]])
+    bounds, errors = np.array(found).T
+    assert bounds.std() > 0
+    assert np.sqrt(np.mean(errors**2)) == pytest.approx(bounds.std(ddof=1), rel=0.4)
+
+
 def test_filters_of_constants_and_of_states_are_told_apart():
     with pytest.raises(ib.UserError, match=r"estimators\.ekf: estimates constants; a state model takes trackers"):
         ib.run(StateScenario(LINEAR), {"ekf": ib.baselines.EKF()}, 3)

@@ -229,6 +229,14 @@ def test_an_error_is_unusual_beside_those_of_the_same_estimator():
     assert missed_capped("1 % ten times larger", 11, 100, 400, size=2.0) <= 0.05
 
 
+def test_an_error_that_the_bound_allows_is_not_unusual_however_small_the_others_are():
+    """A dozen errors of one deviation beside 188 of a hundredth: the rare ones of an efficient estimator are unseen."""
+    squares = np.where(np.arange(200) < 12, 1.0, 1e-4)[None]
+    _, high = capped_interval(squares, np.array([1]), 5.0)
+    _, seen = rms_interval(squares.T, np.ones(200, dtype=bool))
+    assert high**2 - seen**2 == pytest.approx((1 - 0.05 ** (1 / 200)) * 24)
+
+
 @pytest.mark.campaign
 @pytest.mark.parametrize("law", RARELY)
 @pytest.mark.parametrize("n", [1, 4, 11])

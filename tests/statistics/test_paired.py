@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
-from scipy.stats import chi, norm
+from scipy.stats import beta, chi, norm
 
 from ipe_bench.statistics.paired import fair_coin, mean_effect, no_lean, ratio_effect, success_effect
 
@@ -114,6 +114,10 @@ def test_an_interval_is_widened_only_where_nearly_all_trials_agree():
     same = ratio_effect(a, a, largest=6.0)
     assert 1 - same.low == pytest.approx(same.high - 1)
     assert same.high - 1 == pytest.approx((1 - 0.025 ** (1 / 200)) * 6.0 / a.mean())
+    # What the second may differ by is a part of the mean of the first, whichever is larger.
+    for factor in (3.0, 1 / 3):
+        ratio = ratio_effect(a, factor * a, largest=6.0)
+        assert ratio.high - factor == pytest.approx((1 - 0.025 ** (1 / 200)) * 6.0 / a.mean())
 
 
 def test_a_widened_interval_says_what_the_test_says():
@@ -145,6 +149,16 @@ def test_a_mean_difference_counts_trials_that_may_be_unseen():
     effect = mean_effect(first, first + 0.3, 0.05, 8.0)
     reach = 8 * (1 - 0.025 ** (1 / 200))
     assert (effect.low, effect.high) == pytest.approx((0.3 - reach, 0.3 + reach), rel=1e-6)
+
+
+@pytest.mark.parametrize(("others", "unseen"), [(1, True), (5, True), (6, False)])
+def test_of_a_dozen_trials_half_have_to_differ_before_nothing_is_unseen(others, unseen):
+    """Clopper and Pearson's upper limit of k in 12 has a chance of .025 of k or fewer."""
+    first, second = np.zeros(12), np.where(np.arange(12) < others, np.arange(12) + 1.5, 1.0)
+    effect = mean_effect(first, second, 0.05, 8.0)
+    normal = norm.isf(0.025) * second.std() / np.sqrt(12)
+    beyond = beta.isf(0.025, others + 1, 12 - others) - others / 12
+    assert effect.high - second.mean() == pytest.approx(normal + unseen * 8 * beyond)
 
 
 def test_success_is_mcnemar_s_test():

@@ -6,7 +6,10 @@ from scipy.optimize import minimize_scalar
 from scipy.stats import binom
 
 from ipe_bench.basics.errors import UserError
+from ipe_bench.statistics.collect import collect
+from ipe_bench.statistics.formulas import rmse_ends_anytime
 from ipe_bench.statistics.intervals import Squares, clopper_pearson, rms_sequence, share_sequence
+from ipe_bench.statistics.sample import samples
 from ipe_bench.statistics.stopping import next_trials, precision_of
 
 
@@ -75,6 +78,17 @@ def test_a_root_mean_square_scales_with_its_errors_and_narrows_with_trials():
     assert np.all(high - low < few[1] - few[0])
     assert np.isnan(ends(squares[:, :99])[0]).all()
     assert ends(np.zeros((1, 100)))[1] == 0
+
+
+@pytest.mark.parametrize(("trials", "known"), [(400, False), (20_000, True)])
+def test_the_upper_end_of_rmse_is_known_once_rare_errors_have_been_seen(synthetic, trials, known):
+    """One normal error in a thousand is beyond 3.29 deviations: ten of them are seen in 20,000 and not in 400."""
+    error = 0.1 * np.random.default_rng(1).standard_normal((trials, 1))
+    synthetic.add(synthetic.scenario(names=("a",)), "one", error)
+    collection = collect([synthetic.directory])
+    low, high = rmse_ends_anytime(next(samples(collection, collection.groups)))
+    assert np.isfinite(low).all()
+    assert np.isfinite(high).tolist() == [known] * 2
 
 
 @pytest.mark.parametrize("given", [0, 1, -0.1, 2, True, "x", float("nan"), {}, {"nees": 0.1}, {"rmse": 0}, None])

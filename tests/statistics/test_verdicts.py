@@ -79,6 +79,16 @@ def test_only_a_track_whose_innovations_fit_is_a_standard_for_others(worse, said
     assert far_below([replace(first, **worse), far]) == (lines if said else [])
 
 
+@pytest.mark.parametrize(("less", "said"), [(14.9, False), (15.1, True)])
+def test_far_less_likely_is_ten_and_a_tenth_of_the_number_of_readings(less, said):
+    model = ConstantVelocity(count=60)
+    z = model.draw(0, 1, 1).z[0]
+    z[7:17] = np.nan
+    (first,) = ib.estimate(model, z, {"ekf": ekf()})
+    other = replace(first, label="other", log_likelihood=first.log_likelihood - less)
+    assert bool(far_below([first, other])) == said
+
+
 def test_simulated_trackers_are_wrong_where_surely_more_than_one_trial_in_a_hundred_is_not_white(synthetic):
     """If the share is 1 %, 5 or more of 200 trials have a probability of .052, and 6 or more one of .016 < .025."""
     rng = np.random.default_rng(0)

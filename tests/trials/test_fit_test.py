@@ -73,6 +73,34 @@ def test_p_is_uniform_for_the_frozen_root_where_its_projection_is_oblique():
     assert kstest(chi2.sf(squares[solved], 8 - 3), "uniform").pvalue < 1e-6
 
 
+def spectrum(T, covariance):
+    """The eigenvalues of the covariance of residuals T e, without those that are 0."""
+    values = np.linalg.eigvalsh(T @ covariance @ T.T)
+    return values[values > 1e-9]
+
+
+@pytest.mark.parametrize("m", [4, 5, 6, 9])
+def test_residuals_of_the_frozen_root_scatter_as_their_projection_says(m):
+    """Of few readings the directions that both ranges share are spent, and the most oblique ones are left."""
+    rng, n = np.random.default_rng(m), 3
+    H, J = rng.normal(size=(2, m, n))
+    spread = frozen_spread(J[None], H, Covariance(np.ones(m)))
+    plus = np.linalg.pinv(H)
+    T = np.eye(m) - J @ np.linalg.inv(plus @ J) @ plus
+    assert np.sort([*[1.0] * spread.ones, *spread.others[0]]) == pytest.approx(spectrum(T, np.eye(m)))
+
+
+@pytest.mark.parametrize("inflation", [0.3, 1.0, 3.0])
+def test_residuals_of_an_inflated_prior_scatter_as_its_gain_says(inflation):
+    rng, m, n = np.random.default_rng(1), 5, 2
+    J, factor = rng.normal(size=(m, n)), np.array([0.5, 2.0])
+    P = np.diag((inflation * factor) ** 2)
+    T = np.eye(m) - J @ P @ J.T @ np.linalg.inv(J @ P @ J.T + np.eye(m))
+    spread = prior_spread((J.T @ J)[None], m, factor, inflation)
+    readings = J @ np.diag(factor**2) @ J.T + np.eye(m)
+    assert np.sort([*[1.0] * spread.ones, *spread.others[0]]) == pytest.approx(spectrum(T, readings))
+
+
 def test_least_squares_and_normal_noise_is_chi_square():
     H = np.random.default_rng(0).normal(size=(12, 3))
     squares = np.array([0.0, 3.0, 9.0, 40.0, np.inf, np.nan])

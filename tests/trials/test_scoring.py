@@ -54,6 +54,18 @@ def test_bounds_of_ill_conditioned_models_are_those_of_their_singular_values(mu)
     np.testing.assert_allclose(found, np.sqrt(np.sum((right / s[:, None]) ** 2, axis=0)), rtol=1e-8)
 
 
+def test_residuals_of_angles_are_within_half_a_turn():
+    """By a bearing of about pi, whose readings are on both sides of it; more turns of the model change nothing."""
+    bearing = ib.measurements.Formula(
+        "arctan2(b, a - s)", {"a": -1.0, "b": 0.001}, {"s": tuple(np.linspace(0, 5, 40))}, circular=("y",)
+    )
+    block = Block.draw(Scenario(bearing, Gaussian(0.1), error_scale=1e-3), 0, 5)
+    h = block.readings_at(block.trials.x)
+    assert np.abs(block.errors(h)).max() < 0.5
+    for turns in (-2, -1, 1, 3):
+        np.testing.assert_allclose(block.errors(h + 2 * np.pi * turns), block.errors(h), atol=1e-12)
+
+
 @dataclass(frozen=True)
 class Loud(GaussianPrior):
     """A prior that cannot be drawn from."""
