@@ -23,9 +23,12 @@ import numpy as np
 import pytest
 from scipy.stats import beta, binomtest
 from shared.simulated_reports import HOLDING, Report, board, simulated
+from shared.synthetic_store import Filter, Pretender, Seeker
 
+from ipe_bench.report.headline import headline
 from ipe_bench.report.table import Table
 from ipe_bench.report.words import brief, percent
+from ipe_bench.statistics import analyse
 from ipe_bench.statistics.verdicts import NO_VERDICT, OVERCONFIDENT, TOO_CAUTIOUS, UNDECIDED, WRONG
 from ipe_bench.trials.thresholds import FEW, FIT_LEVEL
 
@@ -392,6 +395,33 @@ def test_what_a_report_counts_is_so(first):
     found = [claim for seed in range(first, first + 10) for claim in judged(seed, largest=False)]
     assert len(found) > 100
     assert [claim for claim in found if claim.does == COUNTS and claim.false] == []
+
+
+def test_a_simulated_report_says_what_the_stored_trials_say(synthetic):
+    """The frames that are put together here are those that the product reads from files of the same trials."""
+    report = next(r for r in map(of_constants, range(100)) if r is not None)
+    kinds = {"IPE": Seeker(), "filters": Filter(), "least squares": Pretender()}
+    names = tuple(f"x{i}" for i in range(report.board.n))
+    for (at, label), sample in report.samples.items():
+        kept = {name: sample.scalars[name] for name in ("status", "fit_p", "simulations", "time_s")}
+        scenario = synthetic.scenario(report.board.scales[at], sigma=2.0, names=names, sizes_given=(1.0,))
+        estimator = kinds[report.board.family[label]]
+        synthetic.add(scenario, label, sample.error, estimator=estimator, deviation=sample.deviation, **kept)
+    assert list(map(shown_part, headline(analyse([synthetic.directory])))) == list(map(shown_part, report.parts))
+
+
+def of_constants(seed: int) -> Report | None:
+    """Simulates a report if it is on several scales, and opens with where estimators agree or lead."""
+    drawn = board(seed, largest=False)
+    cells = len(drawn.scales) * len(drawn.populations)
+    if drawn.moving or len(drawn.scales) == 1 or drawn.n == 1 or cells > 6:
+        return None
+    report = simulated(drawn)
+    return report if len(report.parts) > 2 else None
+
+
+def shown_part(part: Any) -> Any:
+    return [[cell.text for cell in row] for row in part.rows] if isinstance(part, Table) else part
 
 
 @pytest.mark.slow
