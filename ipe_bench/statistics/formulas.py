@@ -382,9 +382,9 @@ def coverage(s: Sample) -> Any:
 
 
 def verdict_on(nees: Array, degrees: int, s: Sample) -> Verdict:
-    """Words the NEES of the converged trials at a level that all estimators and error scales of a setting share
-    (Bonferroni): no verdict of a table is false in 95 % of tables where all is right."""
-    return verdict(nees[s.converged], degrees, 1 - (1 - LEVEL) / s.rows_of_setting)
+    """Words the NEES of the converged trials at a level that all verdicts of a setting share (Bonferroni): where all
+    covariances are right, none is called wrong in 95 % of the reports."""
+    return verdict(nees[s.converged], degrees, 1 - (1 - LEVEL) / s.verdicts)
 
 
 def calibration_p(s: Sample) -> Any:

@@ -21,6 +21,8 @@ from ipe_bench.trials.thresholds import FEW
 
 LEVEL = 0.95
 RESAMPLES = 2000
+_LAST = 10
+"""Resamples that an end of an interval leaves outside at least."""
 LARGEST_SAMPLE = 2000
 """Above this many trials, groups of consecutive trials are resampled in their place."""
 HEAVY = 0.01
@@ -83,7 +85,9 @@ def rms_interval(squares: Array, used: Array | None = None, level: float = LEVEL
         drawn, drawn_error = _log_ratio(_draws(len(counts)), scaled, counts)
         t = np.where(drawn_error > 0, (drawn - centre) / drawn_error, 0.0)
         tail = (1 - level) / 2
-        low, high = np.quantile(t, [tail, 1 - tail], axis=0)
+        # Resamples have no quantiles beyond the last few of them: those are longer as a normal law's are.
+        seen = max(tail, _LAST / RESAMPLES)
+        low, high = np.quantile(t, [seen, 1 - seen], axis=0) * (ndtri(tail) / ndtri(seen))
         widened = error[0] * (1 + error[0])
         ends = [np.sqrt(size) * np.exp((centre[0] - t * widened) / 2) for t in (high, low)]
     return np.where(size > 0, ends[0], 0.0), np.where(size > 0, ends[1], 0.0)

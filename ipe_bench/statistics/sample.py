@@ -152,10 +152,12 @@ class Sample:
         return self.scalars["solved"]
 
     @cached_property
-    def rows_of_setting(self) -> int:
-        """The number of estimators and error scales of its setting: the rows of one table, its own included."""
+    def verdicts(self) -> int:
+        """The number of verdicts in the tables of its setting: of each estimator and error scale one, and of states
+        that move one each on the last epoch, on the path and on innovations."""
         own = _without_scale(self.group)
-        return sum(_without_scale(group) == own for group in self.collection.groups)
+        rows = sum(_without_scale(group) == own for group in self.collection.groups)
+        return rows * (3 if "path_nees" in self.scalars else 1)
 
     @cached_property
     def converged(self) -> Array:

@@ -29,10 +29,13 @@ from ipe_bench.report.headline import headline
 from ipe_bench.report.table import Table
 from ipe_bench.report.words import brief, percent
 from ipe_bench.statistics import analyse
-from ipe_bench.statistics.verdicts import NO_VERDICT, OVERCONFIDENT, TOO_CAUTIOUS, UNDECIDED, WRONG
+from ipe_bench.statistics.verdicts import CONSISTENT, NO_VERDICT, OVERCONFIDENT, TOO_CAUTIOUS, UNDECIDED, WRONG
 from ipe_bench.trials.thresholds import FEW, FIT_LEVEL
 
-COUNTS, INFERS = "counts", "infers"
+COUNTS, INFERS, READ = "counts", "infers", "read"
+"""What a claim does. What is only read into a sentence is listed, to show how much so few trials leave open."""
+RIGHT = 1.5
+"""Mean NEES over n up to which, and down to whose inverse, a covariance that is called right is nearly so."""
 TOLERATED = 0.05
 """Share of the reports that say it in which what a kind infers may be false."""
 ENOUGH = 100
@@ -138,22 +141,28 @@ def who_leads(report: Report, match: Any) -> Iterator[tuple[str, str, bool]]:
     the leaders succeed more often, in the population, than those that they are said to beat."""
     at = report.board.scales.index(float(match["scale"]))
     beaten, others = shares_named(match["beaten"] or ""), shares_named(match["others"] or match["only"] or "")
-    families = set(report.board.family.values())
-    rivals = {"IPE", "filters"} <= families and not report.board.moving
-    compared = compared_by(report) if rivals else list(report.board.populations)
+    compared = compared_by(report) if has_rivals(report) else list(report.board.populations)
     share = {label: successes(report, at, label).mean() for label in compared}
-    leaders = [label for label, value in share.items() if value == max(share.values())]
+    leaders = most_successful(report, at, compared)
     told = "all" if max(share.values()) == 1 else percent(max(share.values()))
     wrong = told != match["share"] or int(match["trials"].replace(",", "")) != report.board.trials
     named = set(re.findall(r"e\d+", match["first"]))
     wrong = wrong or not named <= set(leaders) or not are_shares(report, at, beaten | others)
-    yield "who leads", COUNTS, bool(wrong)
     won = significant(report)
+    # Of rivals that agree at first, the sentence is on the first scale at which they part.
+    earlier = [(k, most_successful(report, k, compared)) for k in range(at)] if has_rivals(report) else []
+    parted = [k for k, best in earlier if any(all((k, a, b) in won for a in best) for b in compared)]
+    yield "who leads", COUNTS, bool(wrong or parted)
     yield "not significantly more often", COUNTS, any(all((at, a, b) in won for a in leaders) for b in others)
     if beaten:
         truth = {label: report.board.success(label)[at] for label in share}
         false = any(truth[a] <= truth[b] + 1e-12 for a in leaders for b in beaten)
         yield "significantly more often", INFERS, false
+
+
+def most_successful(report: Report, at: int, labels: list[str]) -> list[str]:
+    share = {label: successes(report, at, label).mean() for label in labels}
+    return [label for label, value in share.items() if value == max(share.values())]
 
 
 WHO = r"IPE \((?P<ipe>[^)]*)\) and filters \((?P<filters>[^)]*)\)"
@@ -163,14 +172,19 @@ def compared_by(report: Report) -> list[str]:
     return [label for label, family in report.board.family.items() if family in ("IPE", "filters")]
 
 
+def has_rivals(report: Report) -> bool:
+    """Whether IPE and filters of constants are compared, rather than all estimators at the largest scale."""
+    return {"IPE", "filters"} <= set(report.board.family.values()) and not report.board.moving
+
+
 @sentence(
     WHO + r" agree (?:at every error scale|up to error scale (?P<last>[\d.]+)): (?P<share>all|at least \S+ %) of"
     r" (?P<trials>\d+) trials succeed at each, with an efficiency of (?P<low>[\d.]+\d)(?: to (?P<high>[\d.]+\d))?\."
 )
 def who_agree(report: Report, match: Any) -> Iterator[tuple[str, str, bool]]:
     """Counts the least success and the range of efficiencies of so many trials at these scales; infers that in the
-    population success differs by less than 10 points, and the median error by less than 10 %, between any two at one
-    scale. Of errors too rare for so many trials it claims nothing."""
+    population success differs by less than 10 points, and efficiency by less than a quarter, between any two at one
+    scale: errors that are too rare for so many trials may make up as much."""
     drawn, labels = report.board, compared_by(report)
     last = drawn.scales.index(float(match["last"])) if match["last"] else len(drawn.scales) - 1
     cells = [(at, label) for at in range(last + 1) for label in labels]
@@ -184,8 +198,8 @@ def who_agree(report: Report, match: Any) -> Iterator[tuple[str, str, bool]]:
     false = False
     for at in range(last + 1):
         truth = [drawn.populations[label][at] for label in labels]
-        success, error = [p.success(drawn.n) for p in truth], [p.median_error(drawn.n) for p in truth]
-        false = false or max(success) - min(success) > 0.1 or max(error) > 1.1 * min(error)
+        success, good = [p.success(drawn.n) for p in truth], [p.efficiency(drawn.n) for p in truth]
+        false = false or max(success) - min(success) > 0.1 or max(good) > 1.25 * min(good)
     yield "agree up to", INFERS, false
 
 
@@ -292,6 +306,9 @@ def box(report: Report) -> Iterator[Claim]:
             verdicts = dict(zip(here["error_scale"], here["verdict"], strict=True))
             good = [verdicts[s] not in (OVERCONFIDENT, UNDECIDED, NO_VERDICT) for s in drawn.scales]
             yield Claim("honest up to, by the verdicts", COUNTS, honest, limit_of(good, drawn.scales) != low)
+            if low > -np.inf:
+                nearly = [p.mean_nees <= RIGHT for p in drawn.populations[label]]
+                yield Claim("honest up to, as proven", READ, honest, limit_of(nearly, drawn.scales) < low)
             if high < drawn.scales[-1]:
                 right = [p.mean_nees <= 1 + 1e-9 for p in drawn.populations[label]]
                 yield Claim("honest up to", INFERS, honest, limit_of(right, drawn.scales) > high)
@@ -301,6 +318,15 @@ def box(report: Report) -> Iterator[Claim]:
                 truth = limit_of([p >= HOLDING for p in drawn.success(label)], drawn.scales)
                 yield Claim("holds 90 % up to", INFERS, holds, not low <= truth <= high)
         yield Claim("order of the box", COUNTS, "", lows != sorted(lows, reverse=True))
+
+
+@entries
+def opening(report: Report) -> Iterator[Claim]:
+    """Counts that a page of several scales opens with who leads at the largest, unless IPE and filters are compared."""
+    scales = report.board.scales
+    if len(scales) > 1 and not has_rivals(report):
+        first = str(report.parts[0])
+        yield Claim("opening", COUNTS, first, not first.startswith(f"At error scale {scales[-1]:g}, "))
 
 
 @entries
@@ -324,6 +350,8 @@ def verdicts(report: Report) -> Iterator[Claim]:
                 yield Claim(kind, INFERS, word, there.correlated + FIT_LEVEL * (1 - there.correlated) <= 0.01)
             else:
                 yield Claim(kind, COUNTS, word, enough != (word != NO_VERDICT))
+            if word == CONSISTENT:
+                yield Claim(f"{kind}, as right", READ, word, not 1 / RIGHT <= means[column] <= RIGHT)
 
 
 @entries

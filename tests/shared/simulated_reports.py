@@ -18,7 +18,7 @@ from ipe_bench.report.headline import headline
 from ipe_bench.report.table import Part
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.comparisons import Outcomes, compare_pairs, corrected, may_be_best
-from ipe_bench.statistics.formulas import failed, share
+from ipe_bench.statistics.formulas import CAP, failed, share
 from ipe_bench.statistics.records import STATISTICS
 from ipe_bench.statistics.sample import Sample
 from ipe_bench.statistics.statistic import BEST, rows_of
@@ -78,10 +78,10 @@ class Population:
         square = self.mean_square
         return self.claim / square * (kept * (square + self.bias**2) + wrong * FAR**2) / (kept + wrong)
 
-    def median_error(self, n: int) -> float:
-        """Computes the median error over the bound (by 100,000 draws)."""
-        kept = _errors(self.law, self.spread, self.bias, n)
-        return float(np.quantile(kept, 0.5 / (1 - self.lost))) if self.lost < 0.5 else FAR
+    def efficiency(self, n: int) -> float:
+        """Computes the efficiency of errors that count at most `CAP` (by 100,000 draws)."""
+        squares = _capped_squares(self.law, self.spread, self.bias, n)
+        return ((1 - self.lost) * squares + self.lost * CAP**2) ** -0.5
 
 
 @lru_cache
@@ -94,10 +94,10 @@ def _inside(law: str, spread: float, bias: float, n: int) -> float:
 
 
 @lru_cache
-def _errors(law: str, spread: float, bias: float, n: int) -> np.ndarray:
+def _capped_squares(law: str, spread: float, bias: float, n: int) -> float:
     rng = np.random.default_rng(1)
     z = rng.normal(size=(100_000, n)) * _sizes(law, rng.random(100_000))[:, None]
-    return np.sqrt(((spread * z + bias) ** 2).mean(axis=1))
+    return float(np.minimum(((spread * z + bias) ** 2).mean(axis=1), CAP**2).mean())
 
 
 def _sizes(law: str, u: np.ndarray) -> np.ndarray:
