@@ -43,7 +43,8 @@ def read_sigma(text: str) -> Arithmetic:
         )
     levels = Levels(formula, np.ones(_PROBES), ("",), np.zeros(_PROBES, dtype=np.intp))
     slopes = levels.at(np.geomspace(1e-6, 1e6, _PROBES)[None], np.log(points[None, :-1, 0]))[2][0]
-    if np.linalg.matrix_rank(slopes[np.isfinite(slopes).all(axis=1)]) < len(names):
+    usable = slopes[np.isfinite(slopes).all(axis=1)]
+    if len(usable) == 0 or np.linalg.matrix_rank(usable) < len(names):
         raise UserError(
             f"noise.sigma={text}: no readings tell its levels {', '.join(names)} apart; leave some out"
             f" ({READING} is the reading's magnitude, all other names are levels)"

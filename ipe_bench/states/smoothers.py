@@ -159,7 +159,8 @@ def settled(model: StateModel, z: Array, x: Array) -> tuple[Array, Array]:
         if model.moves(k):
             G, moved = model.gain(k), model.nearest_state(model.transition(x[:, k], k), x[:, k + 1])
             w = multiply(np.linalg.pinv(G), x[:, k + 1] - moved)
-            if np.linalg.matrix_rank(G) < model.n:
+            # Without a column there is no noise, and NumPy 2.0 no rank.
+            if G.shape[1] < model.n or np.linalg.matrix_rank(G) < model.n:
                 x[:, k + 1] = moved + multiply(G, w)
             total = total + np.sum(w**2, axis=-1)
         total = total + misfit(model, z[:, k], x[:, k + 1, None], k)[0][:, 0]

@@ -262,6 +262,7 @@ def test_a_parameter_on_its_bound_is_held_there_beside_the_levels():
         ({"sigma": "0.1*h"}, "has no level to estimate"),
         ({"sigma": "a + b*h"}, "a is a parameter of the model; give the level another name"),
         ({"sigma": "a0 + b0*y"}, r"no readings tell its levels a0, b0, y apart; leave some out \(h is the reading"),
+        ({"sigma": "a*1e400"}, "no readings tell its levels a apart"),
         ({"sigma": "floor + "}, r"noise.sigma: 'floor \+ ' is not a formula"),
         ({"by": "output"}, "noise.by=output: there is no such column of the readings .*row, second, t"),
     ],

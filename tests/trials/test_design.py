@@ -90,7 +90,7 @@ def test_the_choice_is_near_that_of_brute_force(criterion, seed):
     (way,) = design(scenario(model), criterion=criterion).ways
     assert way.sharpest.mean_bound == pytest.approx(every[way.sharpest.rows])
     assert (1 - 1e-9) * min(every.values()) <= way.sharpest.mean_bound <= 1.25 * min(every.values())
-    assert way.sharpest.mean_bound <= 1
+    assert way.sharpest.mean_bound <= 1 + 1e-12  # that of today's readings, which may be the best, up to round-off
     if way.saving:
         assert way.saving.readings <= min(len(rows) for rows, bound in every.items() if bound <= 1) + 1
 
