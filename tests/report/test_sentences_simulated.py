@@ -438,6 +438,14 @@ def test_a_simulated_report_says_what_the_stored_trials_say(synthetic):
     assert list(map(shown_part, headline(analyse([synthetic.directory])))) == list(map(shown_part, report.parts))
 
 
+def test_all_verdicts_of_a_page_share_one_level():
+    for seed in (0, 2):
+        drawn = board(seed)
+        report = simulated(drawn)
+        each = 3 if drawn.moving else 1
+        assert {sample.verdicts for sample in report.samples.values()} == {each * len(report.samples)}
+
+
 def of_constants(seed: int) -> Report | None:
     """Simulates a report if it is on several scales, and opens with where estimators agree or lead."""
     drawn = board(seed, largest=False)

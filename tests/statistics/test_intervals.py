@@ -37,6 +37,14 @@ def test_bootstrap_interval_has_the_width_of_theory():
         np.testing.assert_allclose((high - low) / [1, 2, 3], 2 * 1.96 / np.sqrt(2 * trials), rtol=0.2)
 
 
+def test_a_bootstrap_interval_is_as_wide_as_theory_says_where_no_resample_reaches():
+    """Of 2000 resamples none lies beyond one in a million; nearly normal squares have a normal law's quantile there."""
+    x = np.random.default_rng(4).chisquare(30, (400, 1)) / 30
+    low, high = rms_interval(x, level=1 - 1e-6)
+    width = np.log(high[0] ** 2 / low[0] ** 2) / 2
+    assert width == pytest.approx(4.89 * np.sqrt(2 / 30 / 400), rel=0.1)
+
+
 def test_squares_of_any_size_have_an_interval():
     for size in (1e-300, 1e300):
         e = np.random.default_rng(0).normal(size=(50, 1)) ** 2 * size
