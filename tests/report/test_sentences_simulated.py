@@ -182,17 +182,18 @@ def has_rivals(report: Report) -> bool:
     r" (?P<trials>\d+) trials succeed at each, with an efficiency of (?P<low>[\d.]+\d)(?: to (?P<high>[\d.]+\d))?\."
 )
 def who_agree(report: Report, match: Any) -> Iterator[tuple[str, str, bool]]:
-    """Counts the least success and the range of efficiencies of so many trials at these scales; infers that in the
-    population success differs by less than 10 points, and efficiency by less than a quarter, between any two at one
-    scale: errors that are too rare for so many trials may make up as much."""
+    """Counts the least success and the range of efficiencies of so many trials at these scales, which lie within 5 % at
+    each; infers that in the population success differs by less than 10 points, and efficiency by less than a quarter,
+    between any two at one scale: errors that are too rare for so many trials may make up as much."""
     drawn, labels = report.board, compared_by(report)
     last = drawn.scales.index(float(match["last"])) if match["last"] else len(drawn.scales) - 1
     cells = [(at, label) for at in range(last + 1) for label in labels]
     least = min(successes(report, *cell).mean() for cell in cells)
     squares = [np.minimum((report.samples[cell].error ** 2).mean(axis=1), 25.0).mean() for cell in cells]
+    each = np.reshape(squares, (last + 1, len(labels)))
     ends = float(match["low"]), float(match["high"] or match["low"])
     wrong = match["share"] != ("all" if least == 1 else f"at least {percent(least)}")
-    wrong = wrong or int(match["trials"]) != drawn.trials
+    wrong = wrong or int(match["trials"]) != drawn.trials or bool((each.max(axis=1) > 1.1026 * each.min(axis=1)).any())
     wrong = wrong or not np.allclose(ends, (max(squares) ** -0.5, min(squares) ** -0.5), rtol=0, atol=0.00501)
     yield "agree, in numbers", COUNTS, bool(wrong)
     false = False
