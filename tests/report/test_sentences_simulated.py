@@ -286,6 +286,13 @@ def reach(text: str, scales: tuple[float, ...]) -> tuple[float, float]:
     return ends[0], ends[-1]
 
 
+def is_lost(report: Report, at: int, label: str) -> bool:
+    """Returns whether success is below 90 % at the level of all scales, by Clopper and Pearson's upper limit."""
+    success = successes(report, at, label)
+    tail = 0.025 / len(report.board.scales)
+    return not success.all() and bool(beta.ppf(1 - tail, success.sum() + 1, (~success).sum()) < 0.9)
+
+
 def limit_of(held: list[bool], scales: tuple[float, ...]) -> float:
     """Returns the largest scale up to which it is so at every scale."""
     return max(scales[: held.index(False)] if False in held else scales, default=-np.inf)
@@ -318,6 +325,13 @@ def box(report: Report) -> Iterator[Claim]:
             if (low, high) != (-np.inf, drawn.scales[-1]):
                 truth = limit_of([p >= HOLDING for p in drawn.success(label)], drawn.scales)
                 yield Claim("holds 90 % up to", INFERS, holds, not low <= truth <= high)
+        scale = float(table.columns[-1].title.rpartition(" ")[2])
+        spent = {label: cost for label, *_, cost in rows}
+        nobody = all(is_lost(report, at, label) for at, label in report.samples)
+        wrong = [
+            (cost == "-") != (is_lost(report, drawn.scales.index(scale), e) and not nobody) for e, cost in spent.items()
+        ]
+        yield Claim("cost of who may hold", COUNTS, str(spent), any(wrong))
         yield Claim("order of the box", COUNTS, "", lows != sorted(lows, reverse=True))
 
 
