@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: run test slow cluster campaigns plugins lowest newest mutants lint dist bench docs gallery clean
+.PHONY: run test slow cluster campaigns oracles plugins lowest newest mutants lint dist bench docs gallery clean
 
 # Draws README's figure too: cp outputs/headline/figures/headline.png .assets
 run: .venv/ready
@@ -23,6 +23,12 @@ cluster: .venv/ready
 # What takes the better part of an hour: hundreds of damaged files, wrong command lines, tables of error rates.
 campaigns: .venv/ready
 	$(BIN)/pytest -n auto -m campaign
+
+# How closely numbers agree with what they are checked against: tests/oracles.json and the page of it. TESTS="FILE ..."
+# runs the marked tests of these files alone; those of plugins run in their environment, after `make plugins`.
+oracles: .venv/ready
+	$(BIN)/pytest -m oracle --record-oracles $(TESTS)
+	$(if $(TESTS),,outputs/plugins/.venv/bin/python -m pytest -m "oracle and plugin" --record-oracles plugins)
 
 # The worked plugins that need a library of their own, with those libraries in an environment of their own.
 plugins: .venv/ready

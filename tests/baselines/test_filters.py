@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 from shared.linear_models import Linear, LinearGins, block_of_gins, linear_map
+from shared.oracles import agreed, assert_agrees
 from shared.small_models import Bent
 
 from ipe_bench.baselines import CKF, EKF, IPLF, UKF, EnKF, IteratedEKF
@@ -51,6 +52,11 @@ def maximum_a_posteriori(problem: Problem, z, x):
 # Against closed forms
 
 
+@pytest.mark.oracle(
+    "closed form: posterior of a linear model",
+    "estimates and covariances, in standard deviations",
+    1e-6,
+)
 @pytest.mark.parametrize(
     ("estimator", "apart", "scale"),
     [(one, 1e-8 if one in (EKF(), IteratedEKF()) else 1e-6, s) for one in (*KALMAN, *BATCHED) for s in (1.0, 10.0)]
@@ -64,8 +70,8 @@ def test_on_a_linear_model_a_filter_is_the_batch_map(model, estimator, apart, sc
     x, P = linear_map(problem, model.matrix, trials.z)
     found = estimator.estimate(problem, trials.z)
     assert (found.status == Status.CONVERGED).all()
-    assert np.abs((found.x - x) / deviations(P)).max() < apart
-    assert np.abs((found.covariance - P) / np.outer(deviations(P), deviations(P))).max() < apart
+    agreed(np.abs((found.x - x) / deviations(P)), apart)
+    agreed(np.abs((found.covariance - P) / np.outer(deviations(P), deviations(P))), apart)
 
 
 def test_ensemble_tends_to_the_kalman_filter():
@@ -147,6 +153,11 @@ ALIKE = [(LINEAR, {}), (LINEAR, {"process_noise": 0.1}), (LINEAR, {"prior_inflat
 ALIKE += [(Scenario(Gins(), Quantization(0.02286), GaussianPrior(), scale), {}) for scale in (10.0, 300.0)]
 
 
+@pytest.mark.oracle(
+    "library: filterpy's EKF, UKF and CKF",
+    "estimates and covariances, in the prior's standard deviations",
+    1e-9,
+)
 @pytest.mark.parametrize(("scenario", "changes"), ALIKE, ids=lambda given: getattr(given, "error_scale", given))
 @pytest.mark.parametrize("estimator", KALMAN, ids=label)
 def test_the_batched_engine_is_filterpy_within_a_billionth_of_the_prior(estimator, scenario, changes):
@@ -155,8 +166,8 @@ def test_the_batched_engine_is_filterpy_within_a_billionth_of_the_prior(estimato
     one, other = (engine.estimate(scenario.problem, z, history=True) for engine in engines)
     for name in ("status", "simulations", "jacobians", "iterations"):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
-    np.testing.assert_allclose(other.x / d, one.x / d, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(other.covariance / np.outer(d, d), one.covariance / np.outer(d, d), rtol=0, atol=1e-9)
+    assert_agrees(other.x / d, one.x / d, atol=1e-9)
+    assert_agrees(other.covariance / np.outer(d, d), one.covariance / np.outer(d, d), atol=1e-9)
     np.testing.assert_allclose(other.extras["nis"], one.extras["nis"], rtol=1e-7)
     for mine, theirs in zip(one.history, other.history, strict=True):
         # After the first epochs S is as ill-conditioned as the prior is wide, and both round.
@@ -166,6 +177,7 @@ def test_the_batched_engine_is_filterpy_within_a_billionth_of_the_prior(estimato
 # The contract
 
 
+@pytest.mark.oracle("own second implementation: Kalman filter of one state", "estimates and covariance", 1e-9)
 @pytest.mark.parametrize("estimator", KALMAN, ids=label)
 def test_process_noise_is_added_before_each_epoch(estimator):
     """Readings of one constant that walks: the scalar Kalman filter by hand."""
@@ -181,9 +193,9 @@ def test_process_noise_is_added_before_each_epoch(estimator):
         x, P = x + K @ (z[0, [row]] - H @ x), P - K @ H @ P
         path.append(x)
     found = replace(estimator, process_noise=q).estimate(problem, z, history=True)
-    assert found.history[0] == pytest.approx(np.array(path), abs=1e-9)
-    assert found.x[0] == pytest.approx(x, abs=1e-9)
-    assert found.covariance[0] == pytest.approx(P, abs=1e-9)
+    assert_agrees(found.history[0], path, atol=1e-9)
+    assert_agrees(found.x[0], x, atol=1e-9)
+    assert_agrees(found.covariance[0], P, atol=1e-9)
 
 
 @dataclass(frozen=True)
@@ -250,6 +262,11 @@ def textbook_iplf(model, z, variance, iterations):
     return x, P
 
 
+@pytest.mark.oracle(
+    "own second implementation: García-Fernández et al. (2015), in covariance form",
+    "estimates and standard deviations, in standard deviations",
+    0.02,
+)
 def test_posterior_linearization_has_the_fixed_point_of_the_textbook():
     """Damping and the order of the loops change the way, not the end. The bend is symmetric about the mean, so that
     Cholesky's square root and ours give the same regression to second order."""
@@ -257,8 +274,8 @@ def test_posterior_linearization_has_the_fixed_point_of_the_textbook():
     found = IPLF(tolerance=1e-9, max_iterations=300).estimate(problem, trials.z)
     for z, x_found, P_found in zip(trials.z, found.x, found.covariance, strict=True):
         x, P = textbook_iplf(problem.measurement, z, 0.01, 60)
-        np.testing.assert_allclose(x_found / np.sqrt(np.diag(P)), x / np.sqrt(np.diag(P)), atol=0.02)
-        np.testing.assert_allclose(np.sqrt(np.diag(P_found)), np.sqrt(np.diag(P)), rtol=0.02)
+        assert_agrees(x_found / np.sqrt(np.diag(P)), x / np.sqrt(np.diag(P)), atol=0.02)
+        assert_agrees(np.sqrt(np.diag(P_found)), np.sqrt(np.diag(P)), rtol=0.02)
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from shared.oracles import assert_agrees
 
 from ipe_bench.basics.linalg import Covariance, definite_factor, information, pseudo_inverse, read_only
 
@@ -31,13 +32,14 @@ def test_a_pseudo_inverse_loses_no_more_digits_than_its_matrix(condition, units)
         assert share < 100 * np.finfo(float).eps * min(condition, 1e3) * condition
 
 
+@pytest.mark.oracle("library: NumPy's solve", "weighted pseudo-inverses", 1e-9)
 def test_correlated_readings_are_whitened_first():
     L = np.linalg.cholesky(0.7 ** np.abs(np.subtract.outer(np.arange(M), np.arange(M))))
     H = conditioned(10.0)
     found, _ = pseudo_inverse(H, Covariance(L))
     inverse_R = np.linalg.inv(L @ L.T)
     for A, A_plus in zip(H, found, strict=True):
-        np.testing.assert_allclose(A_plus, np.linalg.solve(A.T @ inverse_R @ A, A.T @ inverse_R), rtol=1e-9, atol=1e-12)
+        assert_agrees(A_plus, np.linalg.solve(A.T @ inverse_R @ A, A.T @ inverse_R), rtol=1e-9, atol=1e-12)
 
 
 def test_a_matrix_without_full_rank_spoils_its_own_trial_only():
@@ -60,6 +62,7 @@ def test_a_factor_is_refused_where_too_few_digits_are_left():
     assert np.array_equal(U[0], np.triu(U[0]))
 
 
+@pytest.mark.oracle("library: NumPy's qr", "triangular factors", 1e-11)
 @pytest.mark.parametrize("n", [1, 5, 8, 11, 40])
 def test_a_factor_is_that_of_a_qr_decomposition_whatever_the_sizes_of_columns(n):
     rng = np.random.default_rng(n)
@@ -69,7 +72,7 @@ def test_a_factor_is_that_of_a_qr_decomposition_whatever_the_sizes_of_columns(n)
     columns = np.linalg.norm(J, axis=1)[:, None, :]
     R = np.linalg.qr(J, mode="r")
     R = R * np.sign(np.diagonal(R, axis1=1, axis2=2))[:, :, None]
-    np.testing.assert_allclose(U / columns, R / columns, rtol=1e-11, atol=1e-13)
+    assert_agrees(U / columns, R / columns, rtol=1e-11, atol=1e-13)
     np.testing.assert_allclose(np.matmul(U, inverse_U), np.broadcast_to(np.eye(n), U.shape), atol=1e-12)
     for A in (U, inverse_U):
         assert np.array_equal(A, np.triu(A))
@@ -88,13 +91,14 @@ def test_a_matrix_that_is_not_definite_has_no_factor_and_spoils_no_other(n):
     assert well.tolist() == [True, False, False, False, False, True]
 
 
+@pytest.mark.oracle("library: NumPy's einsum", "information matrices", 1e-12)
 @pytest.mark.parametrize("n", [1, 3, 8, 11, 12, 13, 14])
 @pytest.mark.parametrize("m", [1, 7, 240])
 def test_information_is_that_of_weighted_rows(n, m):
     rng = np.random.default_rng(n)
     J, R = rng.normal(size=(5, m, n)), Covariance(rng.uniform(0.1, 9.0, m))
     rows, G = J / R.factor[:, None], information(J, R)
-    np.testing.assert_allclose(G, np.einsum("tia,tib->tab", rows, rows), rtol=1e-12, atol=1e-12)
+    assert_agrees(G, np.einsum("tia,tib->tab", rows, rows), rtol=1e-12, atol=1e-12)
     assert np.array_equal(G, G.swapaxes(1, 2))
     assert np.array_equal(information(J[2:3], R), G[2:3])
     # How the numbers lie in memory is nothing to the bits, nor whether they may be written to.

@@ -1,9 +1,11 @@
 """Eqs. (2), (5), (11) = (19), (15), (17), (18) and (24) as identities, on random systems."""
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from shared.oracles import assert_agrees
 from shared.small_models import Bent
 
 from ipe_bench.baselines import LinearLSE
@@ -23,6 +25,7 @@ def problem_of(bend: float = 0.0, seed: int = 7, sigma: float = SIGMA) -> Proble
     return Problem(model, Covariance(np.full(model.m, sigma)), np.ones(3))
 
 
+@pytest.mark.oracle("library: NumPy's lstsq", "estimates of eq. (2)", 1e-9)
 @given(seeds, vectors)
 @settings(deadline=None, max_examples=30)
 def test_linear_lse_is_the_normal_equation_of_eq_2_and_its_covariance_eq_5(seed, x):
@@ -30,10 +33,11 @@ def test_linear_lse_is_the_normal_equation_of_eq_2_and_its_covariance_eq_5(seed,
     A = problem.measurement.A
     z = A @ x + np.random.default_rng(seed).normal(size=len(A))
     estimates = LinearLSE().estimate(problem, z[None])
-    np.testing.assert_allclose(estimates.x[0], np.linalg.lstsq(A, z, rcond=None)[0], atol=1e-9)
+    assert_agrees(estimates.x[0], np.linalg.lstsq(A, z, rcond=None)[0], atol=1e-9)
     np.testing.assert_allclose(estimates.covariance[0], SIGMA**2 * np.linalg.inv(A.T @ A), rtol=1e-8, atol=1e-12)
 
 
+@pytest.mark.oracle("own second implementation: eqs. (11) and (24) by plain matrices", "F of eq. (19)", 1e-8)
 @given(seeds, vectors, st.floats(-0.1, 0.1))
 @settings(deadline=None, max_examples=30)
 def test_eq_19_is_eq_11_with_the_nonlinear_term_of_eq_24(seed, x, bend):
@@ -44,18 +48,20 @@ def test_eq_19_is_eq_11_with_the_nonlinear_term_of_eq_24(seed, x, bend):
     N = model.simulate(x[None])[0] - A @ x  # eq. (24)
     expected = x - H_plus @ (z - N)  # eq. (19)
     F = FrozenSystem.at_nominal(problem, z[None]).F(x[None])[0]
-    np.testing.assert_allclose(F, expected, atol=1e-8)
+    assert_agrees(F, expected, atol=1e-8)
 
 
+@pytest.mark.oracle("own second implementation: eq. (11) by plain matrices", "root", 1e-11)
 def test_a_root_of_F_solves_eq_11():
     problem = problem_of(bend=0.02)
     model, A = problem.measurement, problem.measurement.A
     z = model.simulate(np.array([[1.0, -0.5, 0.8]])) + 0.01
     x = Newton(tolerance=1e-12).estimate(problem, z).x[0]
     N = model.simulate(x[None])[0] - A @ x
-    np.testing.assert_allclose(x, np.linalg.pinv(A) @ (z[0] - N), atol=1e-11)
+    assert_agrees(x, np.linalg.pinv(A) @ (z[0] - N), atol=1e-11)
 
 
+@pytest.mark.oracle("own second implementation: eqs. (16) and (17) by plain matrices", "iterates", 1e-12)
 def test_fixed_point_iterates_are_those_of_eqs_16_and_17():
     problem = problem_of(bend=0.02)
     model, A = problem.measurement, problem.measurement.A
@@ -64,7 +70,7 @@ def test_fixed_point_iterates_are_those_of_eqs_16_and_17():
     H_plus = np.linalg.pinv(A)
     x = H_plus @ z[0]
     for iterate in history[:4]:
-        np.testing.assert_allclose(iterate, x, atol=1e-12)
+        assert_agrees(iterate, x, atol=1e-12)
         x = H_plus @ (z[0] - (model.simulate(x[None])[0] - A @ x))
 
 

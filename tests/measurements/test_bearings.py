@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from shared.oracles import assert_agrees
 
 from ipe_bench.baselines import EKF, LevenbergMarquardt
 from ipe_bench.basics.linalg import Covariance
@@ -18,6 +19,7 @@ def problem(model):
     return Problem(model, Covariance(np.full(model.m, 0.5)))
 
 
+@pytest.mark.oracle("own second implementation: angles by NumPy", "bearings, deg", 1e-11)
 def test_bearings_are_clockwise_from_north():
     model = Bearings()
     x = model.nominal + np.random.default_rng(0).normal(size=(10, 4))
@@ -25,7 +27,7 @@ def test_bearings_are_clockwise_from_north():
     sight = east + v_east * model.times - model.observer[:, 0], north + v_north * model.times - model.observer[:, 1]
     expected = np.rad2deg(np.arctan2(*sight))
     apart = (model.simulate(x) - expected + 180.0) % 360.0 - 180.0
-    np.testing.assert_allclose(apart, 0.0, atol=1e-11)
+    assert_agrees(apart, 0.0, atol=1e-11)
 
 
 def test_bearings_do_not_jump_where_the_target_crosses_north_or_south():
@@ -49,6 +51,11 @@ def test_an_estimate_is_the_same_whichever_way_a_file_writes_an_angle(estimator)
         assert np.abs(residuals).max() < 0.5
 
 
+@pytest.mark.oracle(
+    "closed form: motions that bearings from one leg do not tell apart (Nardone and Aidala 1981)",
+    "bearings, deg",
+    1e-9,
+)
 @pytest.mark.parametrize("factor", [0.5, 2.0, 10.0])
 def test_on_one_leg_every_scaled_relative_motion_has_the_same_bearings(factor):
     model = Bearings(legs=STRAIGHT)
@@ -56,7 +63,7 @@ def test_on_one_leg_every_scaled_relative_motion_has_the_same_bearings(factor):
     truth = np.array([*model.target])
     x = np.stack([truth, own + factor * (truth - own)]) / model.sizes
     z = model.simulate(x)
-    np.testing.assert_allclose(z[0], z[1], atol=1e-9)
+    assert_agrees(z[0], z[1], atol=1e-9)
 
 
 ALONG_SIGHT = Bearings(legs=((900.0, 0.0, 3.0), (900.0, 0.0, 9.0)), target=(0.0, 20000.0, 0.0, -2.0))

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.optimize import curve_fit
+from shared.oracles import assert_agrees
 
 from ipe_bench.baselines import LevenbergMarquardt
 from ipe_bench.basics.errors import UserError
@@ -41,6 +42,7 @@ def file(tmp_path):
     return tmp_path / "a.csv", case[order], t[order], z[order]
 
 
+@pytest.mark.oracle("closed form: a linear differential equation", "readings of three cases", 1e-9)
 def test_cases_have_inputs_and_initial_states_of_their_own(file):
     path, case, t, z = file
     found = open_together([path], MODEL)
@@ -48,9 +50,10 @@ def test_cases_have_inputs_and_initial_states_of_their_own(file):
     x = np.array([[0.9, 1.3], [0.6, 0.8]])
     h = found.model.simulate(x)
     for row, (k, gain) in zip(h, x * [0.5, 1.0], strict=True):
-        assert row == pytest.approx(solution(case, t, k, gain), abs=1e-9)
+        assert_agrees(row, solution(case, t, k, gain), atol=1e-9)
 
 
+@pytest.mark.oracle("library: SciPy's curve_fit", "estimates and standard errors", 1e-6)
 def test_an_estimate_from_several_cases_is_scipys(file):
     path, case, t, z = file
     result = fit_of(open_together([path], MODEL))
@@ -58,8 +61,8 @@ def test_an_estimate_from_several_cases_is_scipys(file):
         lambda t, k, gain: solution(case, t, k, gain), t, z, (0.5, 1.0), np.full(15, 0.05), True,
         ftol=1e-15, xtol=1e-15, gtol=1e-15,
     )  # fmt: skip
-    assert result.x == pytest.approx(x, rel=1e-8)
-    assert result.standard_errors == pytest.approx(np.sqrt(np.diag(P)), rel=1e-6)
+    assert_agrees(result.x, x, rtol=1e-8)
+    assert_agrees(result.standard_errors, np.sqrt(np.diag(P)), rtol=1e-6)
     bounded = fit_of(open_together([path], ConstrainedModel(MODEL, (ParameterInfo("k", positive=True),))))
     assert bounded.x == pytest.approx(x, rel=1e-8)
 

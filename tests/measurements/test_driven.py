@@ -6,6 +6,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
+from shared.oracles import assert_agrees
 
 from ipe_bench.baselines import LevenbergMarquardt
 from ipe_bench.basics import compiled
@@ -45,13 +46,14 @@ def circuit(r0, r1, c1):
     return np.array(z)
 
 
+@pytest.mark.oracle("closed form: steps of a linear circuit", "voltages", 1e-10)
 @pytest.mark.parametrize("method", ["explicit", pytest.param("implicit", marks=pytest.mark.slow)])
 def test_a_battery_follows_its_current(method):
     model = replace(BATTERY, method=method)
     x = model.nominal * np.array([[1.0, 1.0, 1.0], [1.2, 0.8, 1.5]])
     z = model.simulate(x)
     for row, p in zip(z, x * model.sizes, strict=True):
-        np.testing.assert_allclose(row, circuit(*p), atol=1e-10)
+        assert_agrees(row, circuit(*p), atol=1e-10)
     np.testing.assert_allclose(model.jacobian(x), differentiate(model.simulate, x, analytic=False), atol=1e-9)
     assert np.array_equal(model.simulate(x[1:])[0], z[1])
     assert np.array_equal(model.simulate_until(x, 30), z[:, :30])
@@ -59,6 +61,7 @@ def test_a_battery_follows_its_current(method):
         np.testing.assert_allclose(replace(model).simulate(x), z, atol=1e-12)
 
 
+@pytest.mark.oracle("closed form: a state that follows a straight input", "readings", 1e-10)
 @pytest.mark.parametrize("method", ["explicit", pytest.param("implicit", marks=pytest.mark.slow)])
 def test_a_stiff_follower_of_a_straight_input_has_its_exact_solution(method):
     """y' = k (u - y), where u is straight between its rows."""
@@ -72,7 +75,7 @@ def test_a_stiff_follower_of_a_straight_input_has_its_exact_solution(method):
     model = Ode({"y": "k*(u-y)"}, {"k": k}, times=tuple(t), driven_by={"u": "linear"}, columns=columns, method=method,
                 tolerance=1e-11)  # fmt: skip
     x = model.nominal[None]
-    np.testing.assert_allclose(model.simulate(x)[0], exact, atol=1e-10)
+    assert_agrees(model.simulate(x)[0], exact, atol=1e-10)
     np.testing.assert_allclose(model.jacobian(x), differentiate(model.simulate, x, analytic=False), atol=1e-8)
     early = replace(
         model, columns={"time": [2.0, 3.0], "u": [1.0, 1.0]}
@@ -99,6 +102,7 @@ def test_readings_are_written_with_their_inputs_and_read_again(tmp_path):
         np.testing.assert_allclose(again.model.simulate(x), model.simulate(x), atol=1e-12)
 
 
+@pytest.mark.oracle("closed form: doses and a ramp into one compartment", "readings", 1e-10)
 @pytest.mark.parametrize("method", ["explicit", "implicit"])
 @pytest.mark.parametrize(
     "dose", ["(dose if 1 <= t and not begin + 1.3 <= t else 0)", "dose*(sign(t - 1) - sign(t - begin - 1.3))/2"]
@@ -117,7 +121,7 @@ def test_rates_in_pieces_of_time_have_their_exact_solution(method, dose):
 
     x = model.nominal[None]
     expected = [exact(t, dose) for dose in (2.0, 3.0) for t in model.times]
-    np.testing.assert_allclose(model.simulate(x)[0], expected, atol=1e-10)
+    assert_agrees(model.simulate(x)[0], expected, atol=1e-10)
     np.testing.assert_allclose(model.jacobian(x), differentiate(model.simulate, x, analytic=False), atol=1e-8)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from shared.oracles import agreed, assert_agrees
 
 import ipe_bench as ib
 from ipe_bench.baselines import LeastSquares, LevenbergMarquardt
@@ -39,6 +40,11 @@ NIST = {
 """Some of NIST's functions, as its files print them but for the names of functions."""
 
 
+@pytest.mark.oracle(
+    "certified: NIST Statistical Reference Datasets, as formulas",
+    "parameters, standard deviations and residual standard deviation",
+    1e-6,
+)
 @pytest.mark.parametrize("dataset", NIST)
 def test_nist_answers_come_from_the_formula_with_an_unknown_noise(dataset, tmp_path):
     """Certified parameters and standard deviations to 6 digits, from a file with columns and the text of the formula,
@@ -54,13 +60,13 @@ def test_nist_answers_come_from_the_formula_with_an_unknown_noise(dataset, tmp_p
     order = [[p.name for p in found.model.parameters].index(name) for name in start]
     estimators = {"lm": LeastSquares(method="lm", start="nominal", ftol=1e-15, xtol=1e-15, gtol=1e-15, max_nfev=5000)}
     result = fit(Problem(found.model, Unknown().covariance(len(found.z))), found.z, estimators, Unknown())[0]
-    assert digits(result.x[order], nist.certified.parameters) >= 6
+    agreed(10.0 ** -digits(result.x[order], nist.certified.parameters), 1e-6)
     if dataset == "Lanczos1":
         # Generated without noise to 14 digits: the certified sum of squares, 1.4e-25, is of their rounding.
         assert digits(result.standard_errors[order], nist.certified.deviations) >= 2
         return
-    assert digits(result.standard_errors[order], nist.certified.deviations) >= 6
-    assert result.level == pytest.approx(nist.certified.residual_deviation, rel=1e-6)
+    agreed(10.0 ** -digits(result.standard_errors[order], nist.certified.deviations), 1e-6)
+    assert_agrees(result.level, nist.certified.residual_deviation, rtol=1e-6)
 
 
 # fmt: off

@@ -9,6 +9,7 @@ import pytest
 from scipy.integrate import DOP853
 from scipy.stats import chi2
 from shared.gins_reference import velocities
+from shared.oracles import agreed, assert_agrees
 
 from ipe_bench.baselines import GaussNewton
 from ipe_bench.basics.errors import UserError
@@ -34,6 +35,7 @@ def draw(scale, trials=2, seed=0):
     return scale * np.random.default_rng(seed).normal(size=(trials, 11))
 
 
+@pytest.mark.oracle("closed form: Schuler's pendulum", "velocities, m/s", 1e-7)
 def test_an_accelerometer_bias_swings_at_the_schuler_period():
     # Without Earth rate the platform is a pendulum: v = b / w sin(w t), w^2 = g / R.
     model = Gins(earth_rate=0.0, injected=((0.0, 0.0),) * 4, step=60.0)
@@ -44,8 +46,8 @@ def test_an_accelerometer_bias_swings_at_the_schuler_period():
     velocity = model.simulate(x).reshape(2, 4, 30, 2)
     expected = 1e-4 * model.gravity / frequency * np.sin(frequency * model.times)
     for axis in range(2):
-        np.testing.assert_allclose(velocity[axis, :, :, axis], np.tile(expected, (4, 1)), atol=1e-7)
-        np.testing.assert_allclose(velocity[axis, :, :, 1 - axis], 0.0, atol=1e-7)
+        assert_agrees(velocity[axis, :, :, axis], np.tile(expected, (4, 1)), atol=1e-7)
+        assert_agrees(velocity[axis, :, :, 1 - axis], 0.0, atol=1e-7)
 
 
 def errors_beside_scipy(scale, trials):
@@ -59,11 +61,16 @@ QUICK = [(scale, 4, 1e-6) for scale in (1.0, 33.0, 300.0, 3000.0)]
 SLOW = [(scale, 60, 2e-6 if scale == 10000.0 else 1e-6) for scale in (300.0, 1000.0, 3000.0, 10000.0)]
 
 
+@pytest.mark.oracle(
+    "library: SciPy's DOP853 at a tolerance of 1e-13, on the equations in vectors",
+    "velocities to error scale 10,000, m/s",
+    2e-6,
+)
 @pytest.mark.parametrize(
     ("scale", "trials", "limit"), [*QUICK, *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW)]
 )
 def test_every_step_keeps_its_promise_whatever_the_scale(scale, trials, limit):
-    assert errors_beside_scipy(scale, trials).max() < limit
+    agreed(errors_beside_scipy(scale, trials), limit)
 
 
 def lopsided(trials, seed):
@@ -101,6 +108,11 @@ def test_bits_of_a_trial_depend_on_itself_alone_where_steps_differ(monkeypatch):
         assert (fresh.jacobian_until(x, 11) == J[:, rows]).all()
 
 
+@pytest.mark.oracle(
+    "own second implementation: complex arithmetic with SciPy's coefficients",
+    "slopes of velocities, over the largest",
+    1e-9,
+)
 def test_the_jacobian_is_that_of_the_same_formula_in_complex_arithmetic(gins):
     x = draw(33.0, 1, seed=2)[0]
     J = gins.jacobian(x[None])[0].reshape(4, 30, 2, 11)
@@ -114,7 +126,7 @@ def test_the_jacobian_is_that_of_the_same_formula_in_complex_arithmetic(gins):
                 slopes.append(np.array(gins.rhs(0.0, list(at), p, gins.cases[k])))
             y = y + 180.0 * sum(DOP853.B[s] * slopes[s] for s in range(12))
             exact = y[:2].imag / 1e-100
-            assert np.abs(J[k, i] - exact).max() < 1e-9 * np.abs(exact).max()
+            agreed(np.abs(J[k, i] - exact).max() / np.abs(exact).max(), 1e-9)
 
 
 class Plain(Gins):
@@ -256,6 +268,7 @@ def test_a_constant_walk_is_a_drift():
     np.testing.assert_allclose(z, model.simulate(drift), atol=1e-9)
 
 
+@pytest.mark.oracle("library: SciPy's DOP853", "velocities with a walk of the drifts, m/s", 1e-6)
 @pytest.mark.parametrize("scale", [33.0, 3000.0])
 def test_a_random_walk_keeps_the_tolerance_of_gins(scale):
     """Beside SciPy, from reading to reading."""
@@ -265,7 +278,7 @@ def test_a_random_walk_keeps_the_tolerance_of_gins(scale):
     x = np.concatenate([scale * rng.normal(size=11), increments])[None]
     walk = np.cumsum(increments[7:].reshape(1, 4, 30, 3), axis=2)
     reference = velocities(x[:, :11], walk) - velocities(np.zeros((1, 11)))
-    assert np.abs(rich.simulate(x) - reference).max() < 1e-6
+    agreed(np.abs(rich.simulate(x) - reference), 1e-6)
     assert (rich.simulate_until(x, 7) == rich.simulate(x)[:, rich.rows(7)]).all()
 
 

@@ -6,6 +6,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from shared.oracles import agreed
 
 from ipe_bench.measurements import Formula, Gins, Ode, identifiability
 from ipe_bench.measurements.arithmetic import parse
@@ -135,12 +136,17 @@ def model(rates, initial, outputs, constants):
     return Ode(rates=rates, start=start, initial=initial, outputs=outputs, times=times, constants=constants)
 
 
+@pytest.mark.oracle(
+    "published: structural identifiability of textbook models",
+    "parameters that no data tell, in number",
+    0,
+)
 @pytest.mark.parametrize("name", CASES)
 def test_published_answers(name):
     *described, expected = CASES[name]
     found = structure(model(*described))
     assert found is not None
-    assert set(found.lost) == expected
+    agreed(len(expected ^ {*found.lost}), 0)
     assert set().union(*found.groups) == expected
     assert len(found.sentences) == len(found.groups)
 
@@ -267,15 +273,25 @@ def require_the_same_of_compartments(seeds):
     for seed in seeds:
         drawn = compartments(seed)
         expected = {f"k{to}_{source}" for to, source in lost_by_transfer(*drawn)}
-        assert set(lost(model(*described(*drawn, inflow=bool(seed % 2))))) == expected, seed
+        agreed(len(expected ^ {*lost(model(*described(*drawn, inflow=bool(seed % 2))))}), 0)
         both.add(bool(expected))
     assert both == {True, False}
 
 
+@pytest.mark.oracle(
+    "closed form: rank of the transfer function, in fractions",
+    "parameters that no data tell, in number, of 4 drawn models",
+    0,
+)
 def test_compartments_by_their_transfer_function():
     require_the_same_of_compartments(range(4))
 
 
+@pytest.mark.oracle(
+    "closed form: rank of the transfer function, in fractions",
+    "parameters that no data tell, in number, of 300 drawn models",
+    0,
+)
 @pytest.mark.slow
 def test_many_compartments_by_their_transfer_function():
     require_the_same_of_compartments(range(4, 304))

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from shared.oracles import agreed, assert_agrees
 
 from ipe_bench.measurements import Nist
 from ipe_bench.measurements.nist import FORMULAS, digits, score
@@ -28,6 +29,11 @@ def test_all_27_problems_are_there_with_their_sizes():
     assert len(SIZES) == 27
 
 
+@pytest.mark.oracle(
+    "certified: NIST Statistical Reference Datasets, 27 problems",
+    "standard deviations and residual sum of squares at the certified parameters",
+    6.3e-10,
+)
 @pytest.mark.parametrize("dataset", FORMULAS)
 def test_certified_parameters_reproduce_the_certified_residuals_and_deviations(dataset):
     model = Nist(dataset)
@@ -37,17 +43,18 @@ def test_certified_parameters_reproduce_the_certified_residuals_and_deviations(d
     if dataset == "Lanczos1":
         # Residuals of 1e-13 from parameters near 1: eleven printed digits cannot reproduce their squares.
         residuals = model.readings - model.simulate(x[None])[0]
-        assert np.abs(residuals).max() < 1e-10
+        agreed(np.abs(residuals), 1e-10)
         return
-    assert reached.residual_sum_of_squares >= 9.9
-    assert reached.deviations >= 9.2
+    agreed(10.0**-reached.residual_sum_of_squares, 1.2e-10)
+    agreed(10.0**-reached.deviations, 6.3e-10)
 
 
+@pytest.mark.oracle("certified: NIST Statistical Reference Datasets, 27 problems", "residual standard deviation", 2e-10)
 @pytest.mark.parametrize("dataset", FORMULAS)
 def test_the_certified_residual_deviation_follows_from_m_minus_n_degrees_of_freedom(dataset):
     certified = Nist(dataset).certified
     deviation = np.sqrt(certified.residual_sum_of_squares / certified.degrees_of_freedom)
-    assert deviation == pytest.approx(certified.residual_deviation, rel=2e-10)
+    assert_agrees(deviation, certified.residual_deviation, rtol=2e-10)
 
 
 def test_known_errors_of_well_known_copies_are_corrected():

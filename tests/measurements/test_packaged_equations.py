@@ -7,6 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, curve_fit
 from scipy.special import expi
+from shared.oracles import assert_agrees
 
 from ipe_bench.baselines import MultiscaleLM
 from ipe_bench.basics.linalg import Covariance
@@ -66,13 +67,14 @@ def epidemics(model, x):
     return beta, gamma, 763.0 * odds / (1.0 + odds)
 
 
+@pytest.mark.oracle("closed form: first integral of the SIR equations", "what is conserved", 1e-8)
 def test_an_epidemic_conserves_what_its_equations_conserve_whatever_is_drawn():
     model = Sir(outputs=COUNTED)
     x = draw(model, scale=3.0)
     beta, gamma, infected = (value[:, None] for value in epidemics(model, x))
     S, I, R = np.moveaxis(model.simulate(x).reshape(len(x), -1, 3), 2, 0)  # noqa: E741
     start = 763.0 - 763.0 * gamma / beta * np.log(763.0 - infected)
-    np.testing.assert_allclose(S + I - 763.0 * gamma / beta * np.log(S), np.broadcast_to(start, S.shape), rtol=1e-8)
+    assert_agrees(S + I - 763.0 * gamma / beta * np.log(S), np.broadcast_to(start, S.shape), rtol=1e-8)
     np.testing.assert_allclose(S + I + R, 763.0, rtol=1e-14)
     far = np.vstack([draw(model, 200, scale=10.0), [[0.0, 0.0, 40.0], [0.0, 0.0, -40.0]]])
     z = model.simulate(far)
@@ -80,6 +82,7 @@ def test_an_epidemic_conserves_what_its_equations_conserve_whatever_is_drawn():
     assert ((z > -1e-3) & (z < 763.001)).all()
 
 
+@pytest.mark.oracle("library: SciPy's DOP853", "infected people of 763", 1e-6)
 def test_an_epidemic_that_is_over_has_its_final_size_and_another_is_that_of_scipy():
     final = brentq(lambda s: np.log(s / 762.0) - 1.66 / 0.44 / 763.0 * (s - 763.0), 1e-6, 500.0)
     over = Sir(outputs={"susceptible": "S"}, readings=200)
@@ -87,16 +90,17 @@ def test_an_epidemic_that_is_over_has_its_final_size_and_another_is_that_of_scip
     model = Sir()
     x = draw(model, 5, scale=3.0)
     for z, *values in zip(model.simulate(x), *epidemics(model, x), strict=True):
-        np.testing.assert_allclose(z, epidemic(model.whole.times, *values)[1], atol=1e-6)
+        assert_agrees(z, epidemic(model.whole.times, *values)[1], atol=1e-6)
 
 
+@pytest.mark.oracle("library: SciPy's curve_fit", "estimates from the boys in bed of a boarding school (1978)", 1e-4)
 def test_the_boarding_school_is_estimated_as_scipy_estimates_it():
     model = Sir()
     estimates = MultiscaleLM().estimate(Problem(model, Covariance(np.full(14, 20.0))), IN_BED[None])
     assert estimates.status[0] == 0
     days = np.arange(1.0, 15.0)
     theirs, _ = curve_fit(lambda t, *p: epidemic(t, *np.exp(p))[1], days, IN_BED, np.log([1.66, 0.44, 1.0]))
-    np.testing.assert_allclose(np.ravel(epidemics(model, estimates.x)), np.exp(theirs), rtol=1e-4)
+    assert_agrees(np.ravel(epidemics(model, estimates.x)), np.exp(theirs), rtol=1e-4)
     residuals = IN_BED - model.simulate(estimates.x)[0]
     assert 15.0 < np.sqrt(residuals @ residuals / 11) < 25.0
 
@@ -108,6 +112,7 @@ def altitude(t, h0, v0, b, gamma):
     return -np.log(brentq(time, u0, 700.0 / a, xtol=1e-18, rtol=1e-14)) / gamma
 
 
+@pytest.mark.oracle("closed form: separated equation, by the exponential integral", "ranges", 1e-9)
 def test_ranges_of_a_falling_body_are_those_of_the_closed_form():
     model = FallingBody(readings=20)
     x = np.vstack([model.nominal + PAPER, draw(model, 4)])
@@ -115,9 +120,10 @@ def test_ranges_of_a_falling_body_are_those_of_the_closed_form():
         h0, v0, log_b = row * model.sizes
         b = 3e-5 / FOOT * np.exp(log_b)
         h = np.array([altitude(t, h0, v0, b, 5e-5 / FOOT) for t in range(1, 21)])
-        np.testing.assert_allclose(z, np.hypot(1e5 * FOOT, h - 1e5 * FOOT), rtol=1e-9)
+        assert_agrees(z, np.hypot(1e5 * FOOT, h - 1e5 * FOOT), rtol=1e-9)
 
 
+@pytest.mark.oracle("library: SciPy's Radau", "ranges, m", 1e-3)
 @pytest.mark.parametrize("ln_ballistic", [*(pytest.param(far, marks=pytest.mark.slow) for far in (10.0, 17.0)), 18.0])
 def test_a_body_that_is_stopped_at_once_is_followed_as_well(ln_ballistic):
     """With steps of half a second the ranges are off by 13.5 m at 17, by 297 m at 17.4, and no numbers at 18."""
@@ -134,9 +140,10 @@ def test_a_body_that_is_stopped_at_once_is_followed_as_well(ln_ballistic):
         atol=1e-9,
     )
     ranges = np.hypot(1e5 * FOOT, solution.y[0] - 1e5 * FOOT)
-    np.testing.assert_allclose(model.simulate(x[None])[0], ranges, atol=1e-3)
+    assert_agrees(model.simulate(x[None])[0], ranges, atol=1e-3)
 
 
+@pytest.mark.oracle("library: SciPy's DOP853", "prey and predators", 1e-6)
 def test_predators_and_prey_conserve_what_their_equations_conserve_and_agree_with_scipy():
     model = LotkaVolterra()
     x = draw(model, 30, scale=3.0)
@@ -158,4 +165,4 @@ def test_predators_and_prey_conserve_what_their_equations_conserve_and_agree_wit
             rtol=1e-12,
             atol=1e-12,
         )
-        np.testing.assert_allclose(z.reshape(-1, 2), solution.y.T, atol=1e-6)
+        assert_agrees(z.reshape(-1, 2), solution.y.T, atol=1e-6)

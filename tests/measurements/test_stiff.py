@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from shared.oracles import assert_agrees
 
 from ipe_bench.measurements import Ode, OdeMeasurement, Parameter
 from ipe_bench.measurements.base import differentiate
@@ -42,6 +43,11 @@ def follower(**options):
 
 
 # F. Mazzia and C. Magherini, Test Set for Initial Value Problem Solvers, release 2.4, Bari, 2008.
+@pytest.mark.oracle(
+    "published: Mazzia and Magherini, Test Set for Initial Value Problem Solvers (2008)",
+    "end of Robertson's problem, Van der Pol's oscillator and HIRES",
+    2e-8,
+)
 @pytest.mark.parametrize(
     ("model", "expected", "left"),
     [
@@ -63,9 +69,10 @@ def follower(**options):
 )
 def test_the_digits_of_the_test_set(model, expected, left):
     z = Rodas5P(model.engine.stepped, 1e-8).simulate(model.nominal[None], len(model.times))[0]
-    np.testing.assert_allclose(z[-len(expected) :], expected, rtol=left)
+    assert_agrees(z[-len(expected) :], expected, rtol=left)
 
 
+@pytest.mark.oracle("closed form: a state that follows an exponential", "readings and slopes", 1e-8)
 def test_a_stiff_model_is_found_and_is_within_its_tolerance():
     model = follower()
     t, k = np.array(model.times), 100.0
@@ -75,11 +82,12 @@ def test_a_stiff_model_is_found_and_is_within_its_tolerance():
     assert said.startswith("the equations are stiff: an explicit method would need ")
     assert "measurement.method=" in said
     assert replace(model, method="implicit").remarks(model.nominal) == ()
-    np.testing.assert_allclose(model.simulate(np.array([[1.0]]))[0], exact, atol=1e-8)
+    assert_agrees(model.simulate(np.array([[1.0]]))[0], exact, atol=1e-8)
     slope = -0.01 / (k - 0.01) ** 2 * (np.exp(-0.01 * t) - np.exp(-k * t)) + k / (k - 0.01) * t * np.exp(-k * t)
-    np.testing.assert_allclose(model.jacobian(np.array([[1.0]]))[0, :, 0], k * slope, atol=1e-8)
+    assert_agrees(model.jacobian(np.array([[1.0]]))[0, :, 0], k * slope, atol=1e-8)
 
 
+@pytest.mark.oracle("library: SciPy's Radau", "readings of Robertson's problem", 1e-7)
 @pytest.mark.slow
 def test_readings_beside_radau_and_slopes_beside_differences():
     model = robertson(*np.logspace(0, 3, 4))
@@ -91,7 +99,7 @@ def test_readings_beside_radau_and_slopes_beside_differences():
             return model.engine.rhs(t, y, p, ())
 
         solved = solve_ivp(rhs, (0, 1e3), [1.0, 0.0, 0.0], "Radau", model.times, rtol=1e-10, atol=1e-16)
-        np.testing.assert_allclose(row.reshape(-1, 3), solved.y.T, rtol=1e-7)
+        assert_agrees(row.reshape(-1, 3), solved.y.T, rtol=1e-7)
     by_differences = differentiate(model.simulate, x, analytic=False)
     np.testing.assert_allclose(J, by_differences, atol=1e-7 * np.abs(by_differences).max())
 
@@ -145,16 +153,22 @@ def check_fast(shown, rate, times):
     mean, left = 1.2 + rate * (rate * np.sin(t) - np.cos(t)) / (rate**2 + 1), np.exp(-rate * t)
     slope = 0.5 * (mean - (1.2 - rate / (rate**2 + 1)) * left)
     y = 2 * k * slope + 0.2 * left
-    np.testing.assert_allclose(model.simulate(x), SHOWN[shown](y), atol=1e-7)
+    assert_agrees(model.simulate(x), SHOWN[shown](y), atol=1e-7)
     turned = (SHOWN[shown](y + 1e-6) - SHOWN[shown](y - 1e-6)) / 2e-6
-    np.testing.assert_allclose(model.jacobian(x)[:, :, 0], turned * slope, atol=1e-6)
+    assert_agrees(model.jacobian(x)[:, :, 0], turned * slope, atol=1e-6)
 
 
+@pytest.mark.oracle("closed form: a fast state that follows a sine", "readings and slopes of saturating outputs", 1e-6)
 @pytest.mark.parametrize(("shown", "rate", "times"), FAST[::40])
 def test_a_reading_that_saturates_is_that_of_the_solution(shown, rate, times):
     check_fast(shown, rate, times)
 
 
+@pytest.mark.oracle(
+    "closed form: a fast state that follows a sine",
+    "readings and slopes of saturating outputs, 120 models",
+    1e-6,
+)
 @pytest.mark.slow
 def test_every_reading_that_saturates_is_that_of_the_solution():
     assert len(FAST) == 120
@@ -192,6 +206,7 @@ def test_a_solution_that_no_step_follows_has_no_readings_however_they_saturate()
     assert "the equations need steps of 5e-05 s" in lost.hindrance(x[0])
 
 
+@pytest.mark.oracle("library: SciPy's Radau", "readings", 2e-8)
 def test_a_fast_state_that_saturates_in_another_rate_leaves_no_error_there():
     rates = {"fast": "-300*(fast-k*t)", "slow": "1/(1+fast**2)"}
     model = Ode(rates, {"k": 1.0}, outputs={"slow": "slow"}, times=(1.0, 2.0, 3.0))
@@ -201,15 +216,16 @@ def test_a_fast_state_that_saturates_in_another_rate_leaves_no_error_there():
         rtol=1e-11,
         atol=1e-13,
     )
-    np.testing.assert_allclose(model.simulate(model.nominal[None])[0], solved.y[1], atol=2e-8)
+    assert_agrees(model.simulate(model.nominal[None])[0], solved.y[1], atol=2e-8)
 
 
+@pytest.mark.oracle("closed form: a fast state that follows a sine", "readings", 1e-8)
 def test_two_levels_that_agree_on_what_is_wrong_are_found_out_by_the_implicit_method():
     """Beside 6e23 molecules, both leave the fast state at what may be rounding."""
     rates = {"n": "-0.001*n", "y": "-60*(y-(1.2+sin(t))*k)"}
     model = Ode(rates, {"k": 0.5}, {"n": 6e23, "y": 0.2}, {"z": "tanh(y)"}, times=(0.5,))
     mean = 0.5 * (1.2 + 60 * (60 * np.sin(0.5) - np.cos(0.5)) / 3601)
-    assert model.simulate(model.nominal[None])[0, 0] == pytest.approx(np.tanh(mean), abs=1e-8)
+    assert_agrees(model.simulate(model.nominal[None])[0, 0], np.tanh(mean), atol=1e-8)
     (said,) = model.remarks(model.nominal)
     assert said.startswith("the explicit method misses what happens: ")
     assert abs(replace(model, method="explicit").simulate(model.nominal[None])[0, 0] - np.tanh(mean)) > 0.1
@@ -222,11 +238,12 @@ def test_readings_at_the_start_alone_need_no_step():
     assert not model.hindrance(model.nominal)
 
 
+@pytest.mark.oracle("closed form: a fast state that follows a sine", "readings", 1e-8)
 @pytest.mark.slow
 def test_equations_that_the_shortest_explicit_steps_do_not_follow_are_integrated_by_the_implicit_method():
     model = Ode({"y": "-280*(y-k*sin(3*t))"}, {"k": 1.0}, outputs={"z": "tanh(y)"}, times=(20.0,))
     lag = 280 * (280 * np.sin(60.0) - 3 * np.cos(60.0)) / (280**2 + 9)
     assert not model.hindrance(model.nominal)
-    assert model.simulate(model.nominal[None])[0, 0] == pytest.approx(np.tanh(lag), abs=1e-8)
+    assert_agrees(model.simulate(model.nominal[None])[0, 0], np.tanh(lag), atol=1e-8)
     (said,) = model.remarks(model.nominal)
     assert said.startswith("the shortest steps of the explicit method are too long for these equations; they are")

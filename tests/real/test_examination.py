@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.stats import norm
+from shared.oracles import assert_agrees
 
 import ipe_bench as ib
 from ipe_bench.baselines import LevenbergMarquardt, MapLM
@@ -50,6 +51,11 @@ def test_bootstrap_with_an_estimated_level_is_as_wide_as_students_t(readings):
     assert found.bootstrap.high - found.bootstrap.low == pytest.approx(high - low, rel=0.1)
 
 
+@pytest.mark.oracle(
+    "closed form: chi-square over one parameter, the other eliminated",
+    "rise of chi-square at the ends of profiles",
+    2e-3,
+)
 def test_ends_of_a_profile_are_where_chi_square_has_risen_by_the_quantile():
     """Against a brute-force minimisation over the other parameter, on a grid."""
     z = SATURATION.simulate(np.ones((1, 2)))[0] + 0.4 * np.random.default_rng(2).standard_normal(6)
@@ -63,7 +69,7 @@ def test_ends_of_a_profile_are_where_chi_square_has_risen_by_the_quantile():
 
     least = chi_square(found.x[1])
     for end in np.transpose(found.profiles)[1]:
-        assert chi_square(end) - least == pytest.approx(1.959964**2, rel=2e-3)
+        assert_agrees(chi_square(end) - least, 1.959964**2, rtol=2e-3)
     assert found.bent.any()
 
 
@@ -107,6 +113,11 @@ def test_profile_intervals_cover_the_truth_as_often_as_they_say(unknown):
     assert short.min() < 0.93
 
 
+@pytest.mark.oracle(
+    "own second implementation: weighted least squares without each reading",
+    "shifts of the estimate, in standard errors",
+    1e-6,
+)
 @pytest.mark.parametrize("noise", [Gaussian(0.5), Correlated(0.5, correlation=0.6)])
 def test_the_reading_that_carries_the_answer_is_named(noise):
     """Without it the estimate moves by as much as leaving it out and fitting again moves it (a linear model)."""
@@ -120,9 +131,14 @@ def test_the_reading_that_carries_the_answer_is_named(noise):
         weights = np.linalg.inv(R[np.ix_(rest, rest)])
         without = np.linalg.solve(X[rest].T @ weights @ X[rest], X[rest].T @ weights @ z[rest])
         moved = np.abs((without - found.x) / found.standard_errors).max()
-        assert found.shift[i] == pytest.approx(moved, rel=1e-6)
+        assert_agrees(found.shift[i], moved, rtol=1e-6)
 
 
+@pytest.mark.oracle(
+    "closed form: errors of a straight line and of a further reading",
+    "prediction and its errors",
+    1e-5,
+)
 @pytest.mark.parametrize("unknown", [False, True])
 def test_rows_without_a_reading_are_predicted_with_their_band(unknown):
     """A straight line beyond its readings: the textbook's error of the line and of a further reading there."""
@@ -134,8 +150,8 @@ def test_rows_without_a_reading_are_predicted_with_their_band(unknown):
     assert found.fitted == pytest.approx(a + b * t, rel=1e-7)
     sigma = np.sqrt(np.sum((z[:4] - a - b * t[:4]) ** 2) / 2) if unknown else 0.5
     of_line = sigma * np.sqrt(1 / 4 + (t - 1.5) ** 2 / np.sum((t[:4] - 1.5) ** 2))
-    assert found.fitted_errors == pytest.approx(of_line, rel=1e-5)
-    assert found.new_errors == pytest.approx(np.hypot(of_line, sigma), rel=1e-5)
+    assert_agrees(found.fitted_errors, of_line, rtol=1e-5)
+    assert_agrees(found.new_errors, np.hypot(of_line, sigma), rtol=1e-5)
     assert np.isnan(found.shift).tolist() == [False] * 4 + [True] * 2
 
 

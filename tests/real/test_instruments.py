@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 from shared.instruments import EXACT, SATURATION, START, estimate, simulated, solution
+from shared.oracles import assert_agrees
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.statuses import Status
@@ -15,6 +16,7 @@ from ipe_bench.real.readings import open_together
 from ipe_bench.trials.scenario import Scenario
 
 
+@pytest.mark.oracle("library: SciPy's least_squares", "estimates and standard errors", 1e-8)
 @pytest.mark.parametrize(
     "known",
     [
@@ -29,12 +31,13 @@ def test_bounds_move_neither_a_minimum_inside_of_them_nor_its_standard_errors(tm
     result = estimate(open_together([path], ConstrainedModel(Formula(SATURATION, START), known)))
     x, deviations = solution(lambda p: (p[0] * (1 - np.exp(-p[1] * t)) - y) / sigma, [250, 5e-4])
     assert result.status is Status.CONVERGED
-    assert result.x == pytest.approx(x, rel=1e-8)
-    assert result.standard_errors == pytest.approx(deviations, rel=1e-8)
+    assert_agrees(result.x, x, rtol=1e-8)
+    assert_agrees(result.standard_errors, deviations, rtol=1e-8)
     for one, low, high in zip(known, *result.interval(0.999999), strict=True):
         assert one.bounds[0] <= low < high <= one.bounds[1]
 
 
+@pytest.mark.oracle("library: SciPy's least_squares within bounds", "estimates on a bound", 1e-5)
 @pytest.mark.parametrize("unknown", [False, True])
 @pytest.mark.parametrize("upper", [220.0, 231.0])
 def test_an_estimate_on_its_bound_is_the_minimum_within_the_bounds(tmp_path, upper, unknown):
@@ -54,7 +57,7 @@ def test_an_estimate_on_its_bound_is_the_minimum_within_the_bounds(tmp_path, upp
     )
     assert result.status is Status.CONVERGED
     assert result.held_at == {0: upper}
-    assert result.x == pytest.approx(bounded.x * [100, 1e-4], rel=1e-5)
+    assert_agrees(result.x, bounded.x * [100, 1e-4], rtol=1e-5)
     x, deviations = solution(lambda p: (upper * (1 - np.exp(-p[0] * t)) - y) / sigma, [5e-4])
     assert result.x[1] == pytest.approx(x[0], rel=1e-8)
     assert result.degrees_of_freedom == len(t) - 1

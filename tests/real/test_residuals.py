@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.stats import binom, chi2, kstest, norm
+from shared.oracles import assert_agrees
 
 from ipe_bench.basics.linalg import Covariance
 from ipe_bench.real.residuals import DRAWS, explained, normalised, outlier_limit, whiteness
@@ -104,6 +105,7 @@ def test_normalised_residuals_are_standard_normal_and_flag_a_gross_error(correla
     assert abs(own[17]) > outlier_limit(M)
 
 
+@pytest.mark.oracle("closed form: Baarda's w-test, by plain inverses", "normalised residuals", 1e-8)
 def test_normalised_residuals_of_correlated_readings_are_those_of_the_w_test():
     """(R^-1 r)_i over the root of the diagonal of R^-1 - R^-1 J (J' R^-1 J)^-1 J' R^-1, by plain inverses."""
     lag = np.abs(np.subtract.outer(np.arange(M), np.arange(M)))
@@ -114,7 +116,7 @@ def test_normalised_residuals_of_correlated_readings_are_those_of_the_w_test():
     spread = inverse - inverse @ J @ np.linalg.solve(J.T @ inverse @ J, J.T @ inverse)
     covariance = Covariance(np.linalg.cholesky(R))
     found = normalised(covariance.whiten(r), explained(J, covariance), covariance)
-    np.testing.assert_allclose(found, (inverse @ r) / np.sqrt(np.diag(spread)), rtol=1e-8)
+    assert_agrees(found, (inverse @ r) / np.sqrt(np.diag(spread)), rtol=1e-8)
 
 
 def test_nothing_is_said_of_a_reading_that_a_parameter_absorbs():
@@ -141,13 +143,15 @@ def test_one_of_many_good_readings_is_an_outlier_as_often_as_the_level_says(m):
     assert 2 * m * norm.sf(outlier_limit(m)) == pytest.approx(0.01, rel=1e-9)
 
 
+@pytest.mark.oracle("closed form: Ljung and Box (1978)", "statistic of whiteness", 1e-12)
 def test_the_statistic_of_whiteness_is_ljung_and_boxs():
     """n (n + 2) sum_k r_k^2 / (n - k), with the autocorrelations r_k to lag 10, about a mean of 0."""
     e, n = np.random.default_rng(4).standard_normal(60), 60
     r = [e[k:] @ e[: n - k] / (e @ e) for k in range(1, 11)]
     Q = n * (n + 2) * sum(one**2 / (n - k) for k, one in enumerate(r, 1))
     found, lags = ljung_box(e[None, None])
-    assert (found[0], lags[0]) == (pytest.approx(Q, rel=1e-12), 10)
+    assert_agrees(found[0], Q, rtol=1e-12)
+    assert lags[0] == 10
 
 
 def test_a_lag_without_two_readings_is_no_degree_of_freedom():

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy.stats import t as student
+from shared.oracles import assert_agrees
 from shared.synthetic_store import Pretender, Synthetic
 
 import ipe_bench as ib
@@ -42,6 +43,11 @@ def test_a_page_states_command_version_and_file_and_no_path_of_this_machine(tmp_
     assert "table-audit" in found._repr_html_()
 
 
+@pytest.mark.oracle(
+    "published: Draper and Smith, Applied Regression Analysis (1998), eq. (1.4.7)",
+    "width of the drawn band",
+    1e-4,
+)
 def test_the_band_of_a_straight_line_is_the_textbooks_and_equal_residuals_are_drawn_once():
     """Draper and Smith, Applied Regression Analysis, 3rd ed., 1998, eq. (1.4.7)."""
     x = np.array([1.0, 2.0, 3.0, 5.0, 8.0])
@@ -56,7 +62,7 @@ def test_the_band_of_a_straight_line_is_the_textbooks_and_equal_residuals_are_dr
     for at in (1.0, 8.0):
         half = student.ppf(0.975, 3) * s * np.sqrt(1 / 5 + (at - x.mean()) ** 2 / np.sum((x - x.mean()) ** 2))
         ends = band[np.isclose(band[:, 0], at)][:, 1]
-        assert np.ptp(ends) == pytest.approx(2 * half, rel=1e-4)
+        assert_agrees(np.ptp(ends), 2 * half, rtol=1e-4)
 
 
 def test_certified_readings_have_a_curve_over_their_input():

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 from scipy.stats import chi2
+from shared.oracles import agreed, assert_agrees
 from shared.small_models import Bent
 
 from ipe_bench.baselines import GaussNewton, LevenbergMarquardt
@@ -34,6 +35,7 @@ def gins(scale: float, trials: int = 20, model: Gins | None = None):
     return scenario.problem, scenario.draw(0, trials)
 
 
+@pytest.mark.oracle("library: SciPy's least_squares", "estimates", 1e-6)
 @pytest.mark.parametrize("estimator", LEAST_SQUARES, ids=repr)
 def test_the_minimum_is_that_of_scipy(estimator):
     scenario = Scenario(Polynomial(strength=0.02), Gaussian(0.1), GaussianPrior(), 3.0)
@@ -46,7 +48,7 @@ def test_the_minimum_is_that_of_scipy(estimator):
             return problem.R.whiten(problem.measurement.simulate(x[None])[0] - z)
 
         found = least_squares(residual, problem.x0, jac="3-point", xtol=1e-15, ftol=1e-15, gtol=1e-12)
-        assert np.abs(x - found.x).max() < 1e-6
+        agreed(np.abs(x - found.x), 1e-6)
         np.testing.assert_allclose(P, np.linalg.inv(found.jac.T @ found.jac), rtol=1e-4)
 
 
@@ -61,6 +63,7 @@ def exact_inverse_of_normal_matrix(J: Array) -> Array:
     return table[:, n:]
 
 
+@pytest.mark.oracle("closed form: normal equations in rational numbers", "steps, in standard deviations", 1e-8)
 def test_a_step_is_exact_however_badly_conditioned_the_jacobian_is():
     """Beside rational numbers, for conditions of 10 to 1e7 and columns of sizes 1e-100 to 1e100."""
     rng = np.random.default_rng(1)
@@ -72,7 +75,7 @@ def test_a_step_is_exact_however_badly_conditioned_the_jacobian_is():
         P = exact_inverse_of_normal_matrix(J)
         step = -P @ (np.vectorize(Fraction)(J).T @ np.vectorize(Fraction)(r))
         step, deviation = step.astype(float), np.sqrt(np.diag(P).astype(float))
-        np.testing.assert_allclose(slope.newton[0] * sizes / deviation, step / deviation, atol=1e-8)
+        assert_agrees(slope.newton[0] * sizes / deviation, step / deviation, atol=1e-8)
         assert slope.size[0] == pytest.approx(np.abs(step / deviation).max(), rel=1e-8)
         np.testing.assert_allclose(slope.Q[0] @ slope.U[0] / sizes, J, atol=1e-12)
 

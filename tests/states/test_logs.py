@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy.stats import chi2, multivariate_normal
+from shared.oracles import assert_agrees
 from shared.state_models import ConstantVelocity, CoordinatedTurn
 
 import ipe_bench as ib
@@ -48,6 +49,7 @@ class Feet(ConstantVelocity):
         return Parameter("position", "m"), Parameter("velocity", "ft/s", 1 / 0.3048)
 
 
+@pytest.mark.oracle("closed form: one step of the Kalman filter", "mean and covariance", 1e-9)
 def test_a_track_is_continued_from_its_covariance():
     long, short = Feet(count=6, step=2.0), Feet(count=5, step=2.0)
     z = np.arange(6.0)[:, None]
@@ -57,8 +59,8 @@ def test_a_track_is_continued_from_its_covariance():
     P = F @ before.covariance[-1] @ F.T + D @ [[8 / 3, 2.0], [2.0, 2.0]] @ D
     gain = P[:, 0] / (P[0, 0] + 1.0)
     predicted = F @ before.mean[-1]
-    np.testing.assert_allclose(after.mean[-1], predicted + gain * (z[5, 0] - predicted[0]), rtol=1e-12)
-    np.testing.assert_allclose(after.covariance[-1], P - np.outer(gain, P[0]), rtol=1e-9)
+    assert_agrees(after.mean[-1], predicted + gain * (z[5, 0] - predicted[0]), rtol=1e-12)
+    assert_agrees(after.covariance[-1], P - np.outer(gain, P[0]), rtol=1e-9)
     np.testing.assert_allclose(after.deviation**2, np.einsum("kii->ki", after.covariance), rtol=1e-12)
 
 
@@ -83,6 +85,7 @@ def test_a_log_is_tracked_with_the_bits_of_a_run(tmp_path):
     assert one.limits == pytest.approx(chi2.ppf([0.025, 0.975], 50) / 50, rel=1e-9)
 
 
+@pytest.mark.oracle("closed form: quadratic form of all readings", "mean NIS", 1e-6)
 def test_smoothers_are_judged_by_the_cost_of_their_path():
     """Of a linear model: z' S^-1 z, with S the covariance of all readings, is the cost and the NIS of the filter."""
     model = replace(DRIVEN, next={"x": "x + w"}, inputs={}, count=20)
@@ -98,19 +101,20 @@ def test_smoothers_are_judged_by_the_cost_of_their_path():
     for factor, right in ((1.0, True), (2.0, False)):
         cost = factor**2 * z[:, 0] @ np.linalg.solve(S, z[:, 0])
         for one in ib.estimate(model, factor * z, trackers):
-            assert one.mean_nis == pytest.approx(cost / 20, rel=1e-6)
+            assert_agrees(one.mean_nis, cost / 20, rtol=1e-6)
             assert one.fit_p == pytest.approx(chi2.sf(cost, 20), rel=1e-5)
             assert (one.verdict, one.passes) == (("consistent", True) if right else ("overconfident", False))
 
 
+@pytest.mark.oracle("closed form: posterior of one normal state", "mean and deviation", 1e-9)
 def test_a_model_without_process_noise_is_least_squares():
     """z = .9^k x with x ~ N(0, 1): the mean and the variance of all readings at once."""
     model = replace(DRIVEN, next={"x": "0.9*x"}, noise={}, inputs={}, count=8)
     z, h = model.draw(0, 1, 3).z[0], 0.9 ** np.arange(1, 9)
     variance = 1 / (1 + h @ h / 0.04)
     for one in ib.estimate(model, z, {"ukf": ukf(), "ieks": IteratedSmoother(), "ipe": PathIPE()}):
-        assert one.mean[-1, 0] == pytest.approx(h[-1] * variance * (h @ z[:, 0]) / 0.04, rel=1e-9)
-        assert one.deviation[-1, 0] == pytest.approx(h[-1] * np.sqrt(variance), rel=1e-9)
+        assert_agrees(one.mean[-1, 0], h[-1] * variance * (h @ z[:, 0]) / 0.04, rtol=1e-9)
+        assert_agrees(one.deviation[-1, 0], h[-1] * np.sqrt(variance), rtol=1e-9)
 
 
 def test_an_iteration_that_has_not_converged_says_so():
@@ -132,6 +136,7 @@ def test_particles_that_lose_a_log_are_named():
     assert (one.verdict, one.passes, one.lost_from) == ("lost from epoch 31", False, 31)
 
 
+@pytest.mark.oracle("closed form: Kalman filter of one state", "means and log likelihood", 1e-12)
 def test_known_inputs_and_unequal_steps_of_a_log_give_the_closed_form(tmp_path):
     rng = np.random.default_rng(5)
     h, u = rng.uniform(0.1, 3.0, 40), rng.normal(size=40)
@@ -147,9 +152,9 @@ def test_known_inputs_and_unequal_steps_of_a_log_give_the_closed_form(tmp_path):
             S = P + 0.04
             log_likelihood -= 0.5 * ((z[k] - m) ** 2 / S + np.log(2 * np.pi * S))
             m, P = m + P / S * (z[k] - m), P * 0.04 / S
-        assert one.mean[k, 0] == pytest.approx(m, abs=1e-12)
+        assert_agrees(one.mean[k, 0], m, atol=1e-12)
         assert one.deviation[k, 0] == pytest.approx(np.sqrt(P), rel=1e-12)
-    assert one.log_likelihood == pytest.approx(log_likelihood, rel=1e-12)
+    assert_agrees(one.log_likelihood, log_likelihood, rtol=1e-12)
     assert np.flatnonzero(np.isnan(one.nis)).tolist() == [7, 8]
     assert one.mean_nis == pytest.approx(np.nansum(one.nis) / 38, rel=1e-12)
 

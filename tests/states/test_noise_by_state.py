@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from shared.oracles import assert_agrees
 from shared.state_models import ConstantVelocity
 
 import ipe_bench as ib
@@ -135,14 +136,15 @@ def loop(rule, model, z):
     return np.array(means), np.array(covariances)
 
 
+@pytest.mark.oracle("own second implementation: loops over an augmented state", "means and covariances", 1e-9)
 @pytest.mark.parametrize("rule", [Taylor(), ukf().rule], ids=["ekf", "ukf"])
 def test_extended_and_unscented_filters_are_those_of_an_augmented_state(rule):
     z = ROVER.draw(0, 4).z
     tracks = Filter(rule).track(ROVER, z)
     for trial in range(4):
         means, covariances = loop(rule, ROVER, z[trial])
-        np.testing.assert_allclose(tracks.mean[trial], means, atol=1e-9)
-        np.testing.assert_allclose(tracks.covariance[trial], covariances, atol=1e-9)
+        assert_agrees(tracks.mean[trial], means, atol=1e-9)
+        assert_agrees(tracks.covariance[trial], covariances, atol=1e-9)
 
 
 def test_a_step_has_the_mean_and_the_covariance_of_many_draws():
@@ -248,18 +250,20 @@ def quadrature(model, z):
     return np.array(means), total
 
 
+@pytest.mark.oracle("own second implementation: quadrature on one grid", "means and log likelihood by the grid", 1e-5)
 @pytest.mark.parametrize("model", [VOLATILITY, GROWING], ids=["stochastic volatility", "growing"])
 def test_grid_and_particles_agree_with_quadrature(model):
     z = model.draw(0, 2).z
     grid, particles = Grid(800).track(model, z), Bootstrap(5_000).track(model, z)
     for trial in range(2):
         means, total = quadrature(model, z[trial])
-        np.testing.assert_allclose(grid.mean[trial, :, 0], means, atol=1e-5)
-        assert grid.log_likelihood[trial] == pytest.approx(total, abs=1e-5)
+        assert_agrees(grid.mean[trial, :, 0], means, atol=1e-5)
+        assert_agrees(grid.log_likelihood[trial], total, atol=1e-5)
         np.testing.assert_allclose(particles.mean[trial, :, 0], means, atol=0.1)
         assert particles.log_likelihood[trial] == pytest.approx(total, abs=0.2)
 
 
+@pytest.mark.oracle("own second implementation: loops over an augmented state", "covariances at the truth", 1e-9)
 def test_the_bound_at_the_truth_takes_the_noise_of_the_true_states():
     paths = ROVER.draw(0, 1)
     P = PathBlock.draw(StateScenario(ROVER), 0, 1).bound[0]
@@ -273,7 +277,7 @@ def test_the_bound_at_the_truth_takes_the_noise_of_the_true_states():
             Taylor(), lambda x: ROVER.observe(x, 0), lambda x: np.sqrt(ROVER.R_at(x, 0)), x[k + 1], moved
         )
         covariance = moved - C @ np.linalg.inv(S) @ C.T
-        np.testing.assert_allclose(P[k], covariance, atol=1e-9)
+        assert_agrees(P[k], covariance, atol=1e-9)
     with pytest.raises(ib.UserError, match="state_model=rover: R depends on the states; what takes R"):
         posterior_bounds(ROVER, paths)
 

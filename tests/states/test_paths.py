@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize._numdiff import approx_derivative
 from scipy.stats import chi2, kstest
+from shared.oracles import assert_agrees
 from shared.state_models import ConstantVelocity, CoordinatedTurn, Pendulum, path_cost
 
 from ipe_bench.basics.statuses import Status
@@ -60,6 +61,7 @@ def test_levenberg_and_marquardt_find_the_minimum_that_halved_steps_find():
     assert (found.status == Status.CONVERGED).all()
 
 
+@pytest.mark.oracle("closed form: one dense solve over all states", "states", 1e-9)
 def test_a_damped_step_reads_every_state_once_more():
     """One dense solution over all states of the linear model, each drawn towards a path."""
     n, K = LINEAR.n, LINEAR.epochs
@@ -78,7 +80,7 @@ def test_a_damped_step_reads_every_state_once_more():
     )
     affine = _linearised(LINEAR, z, about)
     mean, _ = whole(smoothed(LINEAR, _passed(LINEAR, z, *affine, about=(about, variances))))
-    np.testing.assert_allclose(mean.ravel(), exact, atol=1e-9)
+    assert_agrees(mean.ravel(), exact, atol=1e-9)
 
 
 def bearings(scale):
@@ -207,6 +209,7 @@ def test_eq_11_of_a_linear_path_is_its_smoother(method, singular):
     assert (found.iterations == 0).all()  # the linear estimate is the root
 
 
+@pytest.mark.oracle("own second implementation: eq. (11) by dense matrices", "what is left of the equation", 1e-6)
 def test_the_root_of_eq_11_and_its_covariance_are_those_of_a_dense_solution():
     z, n = NEAR.draw(0, 2).z, NEAR.n
     N = n * (NEAR.epochs + 1)
@@ -218,7 +221,7 @@ def test_the_root_of_eq_11_and_its_covariance_are_those_of_a_dense_solution():
         np.testing.assert_allclose(found.mean, tracks["newton"].mean, atol=1e-7)
     u = unknowns(NEAR, found.start.mean[0], found.mean[0])
     r = run(NEAR, u)[1] - z[0, :, 0] / np.sqrt(NEAR.variance)
-    np.testing.assert_allclose(H_plus @ np.concatenate([u, r]), 0.0, atol=1e-6)
+    assert_agrees(H_plus @ np.concatenate([u, r]), 0.0, atol=1e-6)
     assert found.cost[0] == pytest.approx(u @ u + r @ r, rel=1e-9)
     B = approx_derivative(lambda u: run(NEAR, u)[1], u, method="3-point", rel_step=1e-5)
     X = approx_derivative(lambda u: run(NEAR, u)[0][-1], u, method="3-point", rel_step=1e-5)
@@ -236,6 +239,7 @@ def test_eq_11_of_a_path_says_so_where_it_does_not_converge():
     np.testing.assert_array_equal(columns["solved"], converged)
 
 
+@pytest.mark.oracle("library: SciPy's chi2", "p of the cost of a path", 1e-9)
 def test_the_fit_of_a_linear_path_is_that_of_the_innovations():
     """The cost of the smoothed path of a linear model is the sum of the filter's NIS: chi-square."""
     block = PathBlock.draw(StateScenario(LINEAR), 0, 400)
@@ -245,9 +249,9 @@ def test_the_fit_of_a_linear_path_is_that_of_the_innovations():
     np.testing.assert_array_equal(smooth, filtered)
     assert kstest(path, "uniform").pvalue > 1e-3
     cost = trackers[2].track(LINEAR, block.paths.z).cost
-    np.testing.assert_allclose(path_p(block.paths.z, cost), chi2.sf(cost, 12), rtol=1e-9)
+    assert_agrees(path_p(block.paths.z, cost), chi2.sf(cost, 12), rtol=1e-9)
     z = block.paths.z.copy()
     z[:, 3:8] = np.nan
     fewer = trackers[2].track(LINEAR, z)
-    np.testing.assert_allclose(path_p(z, fewer.cost), chi2.sf(fewer.cost, 7), rtol=1e-9)
+    assert_agrees(path_p(z, fewer.cost), chi2.sf(fewer.cost, 7), rtol=1e-9)
     assert kstest(path_p(z, fewer.cost), "uniform").pvalue > 1e-3

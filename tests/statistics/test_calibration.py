@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pytest
 from scipy.stats import binom, kstest, norm, t
+from shared.oracles import assert_agrees
 from shared.synthetic_store import Seeker
 
 import ipe_bench as ib
@@ -41,11 +42,12 @@ def curves_of(u: np.ndarray):
 # The bands -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.oracle("closed form: one uniform draw", "coverage of the band of calibration", 1e-12)
 def test_one_trial_in_closed_form():
     """One draw u leaves 'tails above t' where a point p <= 1/2 has u < p <= t, or symmetrically: 2 floor(100 t) / 100
     of the unit interval, for a tail that is no multiple of 0.01."""
     tails = np.array([0.005, 0.015, 0.034, 0.105])
-    assert covered(1, tails) == pytest.approx(1 - 2 * np.floor(100 * tails) / 100, abs=1e-12)
+    assert_agrees(covered(1, tails), 1 - 2 * np.floor(100 * tails) / 100, atol=1e-12)
 
 
 @pytest.mark.parametrize("trials", [7, *(pytest.param(trials, marks=pytest.mark.slow) for trials in (150, 2500))])

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.optimize import brentq
+from shared.oracles import assert_agrees
 
 from ipe_bench.statistics.intervals import mean_limits, verdict
 from ipe_bench.trials.scoring import nees
@@ -16,11 +17,16 @@ def draw(trials: int, claimed: float = 1.0, seed: int = 0):
     return error, np.repeat(claimed**2 * (A @ A.T)[None], trials, axis=0)
 
 
+@pytest.mark.oracle(
+    "published: Bar-Shalom, Li and Kirubarajan, Estimation with Applications, example 5.4.2",
+    "limits of NEES over 50 runs",
+    5e-4,
+)
 def test_limits_are_those_of_the_textbook():
     """Bar-Shalom, Li, Kirubarajan, example 5.4.2: 50 runs of 2 degrees, [74.2, 129.6] / 50 for the sum over runs."""
     low, high = mean_limits(2, 50)
-    assert 2 * low == pytest.approx(74.22 / 50, abs=5e-4)
-    assert 2 * high == pytest.approx(129.56 / 50, abs=5e-4)
+    assert_agrees(2 * low, 74.22 / 50, atol=5e-4)
+    assert_agrees(2 * high, 129.56 / 50, atol=5e-4)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.stats import binom, chi2
+from shared.oracles import assert_agrees
 
 from ipe_bench.statistics.intervals import (
     Squares,
@@ -22,19 +23,29 @@ def test_clopper_pearson_covers_at_least_its_level(p):
     assert covered >= 0.95
 
 
+@pytest.mark.oracle(
+    "closed form: an interval of no and of all successes",
+    "ends of the Clopper-Pearson interval",
+    1e-12,
+)
 def test_clopper_pearson_has_closed_ends():
     # With no success the upper end solves (1 - p)^n = 0.025.
-    assert clopper_pearson(0, 50) == (0.0, pytest.approx(1 - 0.025 ** (1 / 50), rel=1e-12))
-    assert clopper_pearson(50, 50) == (pytest.approx(0.025 ** (1 / 50), rel=1e-12), 1.0)
+    assert_agrees(clopper_pearson(0, 50), (0.0, 1 - 0.025 ** (1 / 50)), rtol=1e-12)
+    assert_agrees(clopper_pearson(50, 50), (0.025 ** (1 / 50), 1.0), rtol=1e-12)
 
 
+@pytest.mark.oracle(
+    "closed form: scatter of a root mean square of normal errors",
+    "width of the bootstrap interval",
+    0.2,
+)
 def test_bootstrap_interval_has_the_width_of_theory():
     # The rms of N normal errors has a relative deviation of 1 / sqrt(2 N), whichever way it is resampled.
     rng = np.random.default_rng(1)
     for trials in (1500, 40_000):
         e = rng.normal(size=(trials, 3)) * [1.0, 2.0, 3.0]
         low, high = rms_interval(e**2, np.ones(trials, dtype=bool))
-        np.testing.assert_allclose((high - low) / [1, 2, 3], 2 * 1.96 / np.sqrt(2 * trials), rtol=0.2)
+        assert_agrees((high - low) / [1, 2, 3], 2 * 1.96 / np.sqrt(2 * trials), rtol=0.2)
 
 
 def test_a_bootstrap_interval_is_as_wide_as_theory_says_where_no_resample_reaches():
@@ -255,10 +266,11 @@ def test_1000_studies_of_an_efficiency(law, n):
         assert max(miss) <= 0.05 + 3 * np.sqrt(0.05 * 0.95 / 1000)
 
 
+@pytest.mark.oracle("library: NumPy's quantile", "quantiles", 1e-12)
 def test_quantiles_are_numpys_where_all_is_finite_and_infinite_where_it_is_not():
     values = np.random.default_rng(4).exponential(size=101)
     q = np.linspace(0, 1, 41)
-    np.testing.assert_allclose([quantile(values, p) for p in q], np.quantile(values, q), rtol=1e-12)
+    assert_agrees([quantile(values, p) for p in q], np.quantile(values, q), rtol=1e-12)
     half = np.array([1.0, 2.0, np.nan, np.inf])
     assert quantile(half, 0.0) == 1.0
     assert quantile(half, 1 / 3) == 2.0

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 from scipy.stats import beta, chi, norm
+from shared.oracles import assert_agrees
 
 from ipe_bench.statistics.paired import fair_coin, mean_effect, no_lean, ratio_effect, success_effect
 
@@ -161,13 +162,19 @@ def test_of_a_dozen_trials_half_have_to_differ_before_nothing_is_unseen(others, 
     assert effect.high - second.mean() == pytest.approx(normal + unseen * 8 * beyond)
 
 
+@pytest.mark.oracle("closed form: sum of binomial coefficients", "p of McNemar's test", 1e-9)
 def test_success_is_mcnemar_s_test():
     """12 against 3 discordant trials: 2 (C(15,0) + ... + C(15,3)) / 2^15."""
     effect = success_effect(*successes(50, 3, 12, 5))
-    assert effect.p == pytest.approx(2 * (1 + 15 + 105 + 455) / 2**15)
+    assert_agrees(effect.p, 2 * (1 + 15 + 105 + 455) / 2**15, rtol=1e-9)
     assert effect.change == pytest.approx(9 / 70)
 
 
+@pytest.mark.oracle(
+    "library: SciPy's minimize_scalar of the likelihood",
+    "score at the ends of an interval of a difference of success",
+    1e-3,
+)
 @pytest.mark.parametrize("counts", [(50, 3, 12, 5), (20, 8, 1, 3), (10, 0, 4, 30), (5, 30, 40, 5)])
 def test_the_ends_of_an_interval_of_success_have_the_score_of_the_quantile(counts):
     """At each end, the shares that are likeliest at that difference give a score of +-1.96: by maximising the
@@ -186,7 +193,7 @@ def test_the_ends_of_an_interval_of_success_have_the_score_of_the_quantile(count
 
     for end, side in ((effect.low, 1), (effect.high, -1)):
         if end != 0:
-            assert score(end) == pytest.approx(side * norm.isf(0.025), rel=1e-3)
+            assert_agrees(score(end), side * norm.isf(0.025), rtol=1e-3)
 
 
 @pytest.mark.parametrize(("gains", "widened"), [(5, True), (6, False)])
@@ -206,11 +213,12 @@ def test_no_trial_that_differs_is_no_evidence_and_a_p_of_1():
     assert effect.low < 0 < effect.high
 
 
+@pytest.mark.oracle("closed form: beta functions", "evidence after one and two tosses", 1e-9)
 def test_evidence_against_a_fair_coin_in_closed_form():
     """After one toss 1, whatever it showed; after two equal ones 2 B(2.5, 0.5) / B(0.5, 0.5) 2 = 3/2."""
-    assert fair_coin(1, 0) == pytest.approx(1.0)
-    assert fair_coin(2, 0) == pytest.approx(1.5)
-    assert fair_coin(1, 1) == pytest.approx(0.5)
+    assert_agrees(fair_coin(1, 0), 1.0, rtol=1e-9)
+    assert_agrees(fair_coin(2, 0), 1.5, rtol=1e-9)
+    assert_agrees(fair_coin(1, 1), 0.5, rtol=1e-9)
     assert fair_coin(10**6, 0) < np.inf
 
 

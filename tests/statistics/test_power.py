@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.stats import binom
+from shared.oracles import assert_agrees
 
 from ipe_bench.statistics.paired import PowerPlan, mcnemar_power, trials_needed
 
@@ -31,10 +32,11 @@ def test_the_power_is_that_of_simulated_tests(case, alpha):
     assert found >= 0.8 - 0.02
 
 
+@pytest.mark.oracle("library: SciPy's binom", "power of McNemar's test", 1e-12)
 def test_where_only_the_second_wins_six_wins_are_significant():
     """2 / 2^6 < .05 <= 2 / 2^5: the power is that of six discordant trials or more."""
     for trials in (20, 100, 500):
-        assert mcnemar_power(trials, 0.05, 0.05, 0.05) == pytest.approx(binom.sf(5, trials, 0.05), abs=1e-12)
+        assert_agrees(mcnemar_power(trials, 0.05, 0.05, 0.05), binom.sf(5, trials, 0.05), atol=1e-12)
 
 
 @pytest.mark.parametrize(("share", "difference"), [(0.3, 0.1), (1.0, 0.4), (0.06, 0.05)])

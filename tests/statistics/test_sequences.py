@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 from scipy.stats import binom
+from shared.oracles import assert_agrees
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.statistics.collect import collect
@@ -45,12 +46,14 @@ def test_an_interval_of_a_share_holds_what_was_seen_and_that_of_a_fixed_number(c
     assert (low, high) == (pytest.approx(1 - mirrored[1], abs=1e-9), pytest.approx(1 - mirrored[0], abs=1e-9))
 
 
+@pytest.mark.oracle("closed form: Robbins's normal mixture", "width of the interval that holds at all times", 0.02)
 def test_looking_costs_half_as_much_again_at_a_thousand_trials():
     """Robbins's normal mixture, tightest there, is 3.04 deviations wide where a fixed number has 1.96."""
     low, high = share_sequence(500, 1000)
-    assert (high - low) / 2 == pytest.approx(3.04 * np.sqrt(0.25 / 1000), rel=0.02)
+    assert_agrees((high - low) / 2, 3.04 * np.sqrt(0.25 / 1000), rtol=0.02)
 
 
+@pytest.mark.oracle("closed form: the narrowest normal mixture", "width of the sequence of a root mean square", 5e-3)
 def test_the_sequence_of_a_mean_is_as_narrow_as_a_mixture_can_be_at_a_thousand_trials():
     """Over all variances r of it: sqrt(2 (1000 r + 1) / (1000 r) ln(sqrt(1000 r + 1) / .05)) standard errors."""
 
@@ -62,7 +65,7 @@ def test_the_sequence_of_a_mean_is_as_narrow_as_a_mixture_can_be_at_a_thousand_t
     squares = np.random.default_rng(0).chisquare(11, (1, 1000))
     low, high = rms_sequence(Squares.of(squares), np.array([11]))
     reach = least * squares.std(ddof=1) / squares.mean() / np.sqrt(1000)
-    assert np.log(high / low) == pytest.approx(reach, rel=5e-3)
+    assert_agrees(np.log(high / low), reach, rtol=5e-3)
 
 
 def test_a_root_mean_square_scales_with_its_errors_and_narrows_with_trials():

@@ -6,6 +6,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 from scipy import stats
+from shared.oracles import agreed, assert_agrees
 
 import ipe_bench as ib
 from ipe_bench.basics.linalg import Array, Covariance
@@ -95,6 +96,11 @@ def test_the_choice_is_near_that_of_brute_force(criterion, seed):
         assert way.saving.readings <= min(len(rows) for rows, bound in every.items() if bound <= 1) + 1
 
 
+@pytest.mark.oracle(
+    "published: D-optimal points of Smith (1918) and Guest (1958)",
+    "times of readings, on a grid of 0.1",
+    0.06,
+)
 @pytest.mark.parametrize(("degree", "best"), [(2, (-1.0, 0.0, 1.0)), (3, (-1.0, -(5**-0.5), 5**-0.5, 1.0))])
 def test_polynomials_are_best_read_where_theory_says(degree, best):
     """The D-optimal points of degree p are the ends and the zeros of P_p', equally often (Smith, Biometrika 12, 1918;
@@ -102,17 +108,18 @@ def test_polynomials_are_best_read_where_theory_says(degree, best):
     (way,) = design(scenario(Curve(degree)), by=["time", "repeat"], readings=4 * len(best), criterion="D").ways
     entries = np.array([way.units.entries[u][0] for u in way.sharpest.taken])
     apart = np.abs(entries[:, None] - np.array(best))
-    assert apart.min(axis=1).max() < 0.06
+    agreed(apart.min(axis=1), 0.06)
     assert np.bincount(apart.argmin(axis=1)).tolist() == [4] * len(best)
 
 
+@pytest.mark.oracle("own second implementation: inverse of the normal matrix", "bounds and correlations", 1e-7)
 def test_bounds_and_correlations_are_those_of_the_covariance():
     model = Linear(count=9)
     R = Covariance(np.full(9, 0.1))
     seen = Observability.at(model, R, np.zeros((4, 3)))
     P = 0.01 * np.linalg.inv(model.A.T @ model.A)
-    np.testing.assert_allclose(seen.bound, np.sqrt(np.diag(P)))
-    np.testing.assert_allclose(seen.correlation, P / np.sqrt(np.outer(np.diag(P), np.diag(P))))
+    assert_agrees(seen.bound, np.sqrt(np.diag(P)), rtol=1e-7)
+    assert_agrees(seen.correlation, P / np.sqrt(np.outer(np.diag(P), np.diag(P))), rtol=1e-7)
     # The multiple correlation of one error with the others, by regression of draws upon draws.
     e = np.random.default_rng(0).multivariate_normal(np.zeros(3), P, size=200_000)
     for i in range(3):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.stats import chi2, kstest
+from shared.oracles import assert_agrees
 from shared.small_models import Bent
 
 from ipe_bench.baselines import EKF, GaussNewton, MapLM
@@ -101,11 +102,12 @@ def test_residuals_of_an_inflated_prior_scatter_as_its_gain_says(inflation):
     assert np.sort([*[1.0] * spread.ones, *spread.others[0]]) == pytest.approx(spectrum(T, readings))
 
 
+@pytest.mark.oracle("library: SciPy's chi2", "p of the test of fit", 1e-12)
 def test_least_squares_and_normal_noise_is_chi_square():
     H = np.random.default_rng(0).normal(size=(12, 3))
     squares = np.array([0.0, 3.0, 9.0, 40.0, np.inf, np.nan])
     p = fit_probability(squares, Spread(9, np.empty((6, 0))), Gaussian(1.0), H, Covariance(np.ones(12)))
-    np.testing.assert_allclose(p[:5], chi2.sf(squares[:5], 9), rtol=1e-12)
+    assert_agrees(p[:5], chi2.sf(squares[:5], 9), rtol=1e-12)
     assert np.isnan(p[5])
 
 
@@ -130,6 +132,11 @@ def test_no_noise_fits_perfectly():
     assert (p_values(Polynomial(), NoNoise(0.1), 1.0, GaussNewton(), 20) > 0.999).all()
 
 
+@pytest.mark.oracle(
+    "own second implementation: traces of plain matrices",
+    "mean and spread of the sum of squared residuals",
+    1e-8,
+)
 @pytest.mark.parametrize("m", [15, 6])
 def test_spreads_are_the_eigenvalues_of_the_residuals_covariance(m):
     rng, n = np.random.default_rng(1), 4
@@ -143,8 +150,8 @@ def test_spreads_are_the_eigenvalues_of_the_residuals_covariance(m):
         plus = np.linalg.pinv(Hw)
         B = Jw @ np.linalg.solve(plus @ Jw, plus)
         A = (np.eye(m) - B).T @ (np.eye(m) - B)
-        np.testing.assert_allclose([frozen.mean[i], frozen.squares[i]], [np.trace(A), np.trace(A @ A)], rtol=1e-8)
+        assert_agrees([frozen.mean[i], frozen.squares[i]], [np.trace(A), np.trace(A @ A)], rtol=1e-8)
         S = np.linalg.inv(Jw.T @ Jw + np.diag((1.7 * d) ** -2))
         left = np.eye(m) - Jw @ S @ Jw.T
         C = left @ (Jw @ np.diag(d**2) @ Jw.T + np.eye(m)) @ left.T
-        np.testing.assert_allclose([prior.mean[i], prior.squares[i]], [np.trace(C), np.trace(C @ C)], rtol=1e-8)
+        assert_agrees([prior.mean[i], prior.squares[i]], [np.trace(C), np.trace(C @ C)], rtol=1e-8)

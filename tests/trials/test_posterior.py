@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from shared.oracles import agreed, assert_agrees
 from shared.small_models import Bent, Written
 
 import ipe_bench as ib
@@ -41,11 +42,12 @@ def linear(request):
     return problem, z, sample_posterior(problem, z, particles=2000)
 
 
+@pytest.mark.oracle("closed form: posterior of a linear model", "mean of 2000 draws, in standard deviations", 0.08)
 def test_on_a_linear_model_it_is_the_closed_form(linear):
     problem, z, found = linear
     mean, P, evidence = exact(problem, z)
     deviation = np.sqrt(np.diag(P))
-    assert np.abs((found.mean - mean) / deviation).max() < 0.08
+    agreed(np.abs((found.mean - mean) / deviation), 0.08)
     np.testing.assert_allclose(found.deviation, deviation, rtol=0.06)
     np.testing.assert_allclose(
         found.covariance / np.outer(deviation, deviation), P / np.outer(deviation, deviation), atol=0.1
@@ -85,6 +87,7 @@ def square(tilt: float = 0.0) -> Written:
     return Written(lambda x: (x**2, tilt * x))
 
 
+@pytest.mark.oracle("own second implementation: integration on a grid", "share of one of two modes", 0.08)
 @pytest.mark.parametrize("tilt", [0.0, 0.01])
 def test_two_modes_are_found_with_their_weights(tilt):
     """Beside integration on a grid."""
@@ -96,7 +99,7 @@ def test_two_modes_are_found_with_their_weights(tilt):
     log = -0.5 * np.sum(((z - model.simulate(grid[:, None])) / 0.05) ** 2, axis=1) - 0.5 * (grid / 2) ** 2
     weight = np.exp(log - log.max())
     right = weight[grid > 0].sum() / weight.sum()
-    assert np.mean(found.x > 0) == pytest.approx(right, abs=0.08)
+    assert_agrees(np.mean(found.x > 0), right, atol=0.08)
     assert len(found.modes) == 2
     np.testing.assert_allclose(np.sort(found.modes[:, 0]), [-1.5, 1.5], atol=0.02)
     assert found.shares.sum() == pytest.approx(1.0)

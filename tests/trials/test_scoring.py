@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from shared.oracles import assert_agrees
 from shared.small_models import Bent, bock
 from shared.synthetic_store import Repeated
 
@@ -101,12 +102,13 @@ def test_another_root_is_one_that_lies_a_thousandth_of_a_deviation_away(by, solv
     np.testing.assert_allclose(columns["root_distance"], by, rtol=0.05, atol=1e-5)
 
 
+@pytest.mark.oracle("closed form: one normal reading of a normal parameter", "Cramér-Rao and Bayesian bounds", 1e-9)
 def test_the_bayesian_bound_has_the_prior_in_it_and_so_has_its_gate():
     """Linear, one reading of each parameter: the variance is 1 / (1 / sigma^2 + 1 / d^2), sigma = d = 1."""
     scenario = Scenario(Repeated(names=("a", "b"), repeats=1), Gaussian(1.0), GaussianPrior(), 1.0)
     block = Block.draw(scenario, 0, 4)
     columns = block.truth_columns()
-    np.testing.assert_allclose([columns["crlb_a"], columns["bayes_a"]], [[1.0] * 4, [np.sqrt(0.5)] * 4], rtol=1e-9)
+    assert_agrees([columns["crlb_a"], columns["bayes_a"]], [[1.0] * 4, [np.sqrt(0.5)] * 4], rtol=1e-9)
 
     @dataclass(frozen=True)
     class Off(Estimator):
@@ -120,12 +122,13 @@ def test_the_bayesian_bound_has_the_prior_in_it_and_so_has_its_gate():
     assert block.estimate(Off())[1]["success"].tolist() == [True, True, False, False]
 
 
+@pytest.mark.oracle("closed form: one normal reading of a normal parameter", "Van Trees's bound", 1e-9)
 def test_van_trees_bound_is_that_of_the_mean_information():
     """In closed form where h is linear, the same at every truth; and below the mean of the local bounds where it is
     not, as Jensen's inequality has it."""
     linear = Scenario(Repeated(names=("a", "b"), repeats=1), Gaussian(1.0), GaussianPrior(), 1.0)
     columns = Block.draw(linear, 0, 4).truth_columns()
-    assert columns["van_trees_a"][0] == pytest.approx(np.sqrt(0.5))
+    assert_agrees(columns["van_trees_a"][0], np.sqrt(0.5), rtol=1e-9)
     assert columns["van_trees_error_a"][0] == pytest.approx(0.0, abs=1e-12)
     assert np.isnan(columns["van_trees_a"][1:]).all()
     assert np.isnan(Block.draw(linear, 4, 8).truth_columns()["van_trees_a"]).all()

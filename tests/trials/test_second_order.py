@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from shared.oracles import assert_agrees
 from shared.small_models import Bent, Written
 
 import ipe_bench as ib
@@ -26,33 +27,37 @@ def curvatures(model: Measurement, x: Array, sigma: float = 1.0) -> tuple[Array,
     return relative_curvatures(model.jacobian(x), second_derivatives(model, x), R)
 
 
+@pytest.mark.oracle("closed form: curvature of a circle (Bates and Watts 1980)", "intrinsic curvature", 1e-5)
 def test_a_circle_bends_by_its_radius_and_runs_evenly():
     model = Written(lambda t: (5 * np.cos(t), 5 * np.sin(t)))
     intrinsic, parametric = curvatures(model, np.array([[0.3], [2.0]]), sigma=0.5)
-    np.testing.assert_allclose(intrinsic, RADIUS * 0.5 / 5, rtol=1e-5)
+    assert_agrees(intrinsic, RADIUS * 0.5 / 5, rtol=1e-5)
     np.testing.assert_allclose(parametric, 0.0, atol=1e-6)
 
 
+@pytest.mark.oracle("closed form: a cubic scale on a line", "curvature of the parameter", 1e-5)
 def test_a_bent_scale_on_a_straight_line_is_all_parameter_effects():
     model = Written(lambda t: (3 * t**3, 4 * t**3))
     intrinsic, parametric = curvatures(model, np.array([[2.0]]))
     # h = 5 t^3 along a line: h'' / h'^2.
-    np.testing.assert_allclose(parametric, RADIUS * 30 * 2 / (15 * 4) ** 2, rtol=1e-5)
+    assert_agrees(parametric, RADIUS * 30 * 2 / (15 * 4) ** 2, rtol=1e-5)
     np.testing.assert_allclose(intrinsic, 0.0, atol=1e-8)
 
 
+@pytest.mark.oracle("closed form: curvature of a sphere", "intrinsic curvature", 1e-4)
 def test_a_sphere_bends_alike_in_all_directions():
     model = Written(lambda a, b: (7 * np.cos(a) * np.cos(b), 7 * np.sin(a) * np.cos(b), 7 * np.sin(b)), 2, 3)
     intrinsic, _ = curvatures(model, np.array([[0.4, 0.3]]))
-    np.testing.assert_allclose(intrinsic, np.sqrt(5.991465) / 7, rtol=1e-4)
+    assert_agrees(intrinsic, np.sqrt(5.991465) / 7, rtol=1e-4)
 
 
+@pytest.mark.oracle("closed form: second order of a logarithm (Box 1971)", "bias", 1e-5)
 def test_the_bias_of_a_logarithm_is_half_its_variance():
     """z = exp(t) + v is fitted by log z: -sigma^2 exp(-2 t) / 2 to second order."""
     model = Written(lambda t: (np.exp(t),), count=1)
     x = np.array([[0.0], [1.0]])
     found = box_bias(model.jacobian(x), second_derivatives(model, x), Covariance(np.array([0.1])))
-    np.testing.assert_allclose(found[:, 0], -(0.1**2) * np.exp(-2 * x[:, 0]) / 2, rtol=1e-5)
+    assert_agrees(found[:, 0], -(0.1**2) * np.exp(-2 * x[:, 0]) / 2, rtol=1e-5)
 
 
 def test_the_mean_error_of_least_squares_is_the_bias_of_box():
@@ -69,13 +74,14 @@ def test_the_mean_error_of_least_squares_is_the_bias_of_box():
     np.testing.assert_allclose(error.mean(axis=0), expected, atol=4 * spread.max(), rtol=0.15)
 
 
+@pytest.mark.oracle("closed form: least squares of a linear model", "bias under a wrong model", 1e-9)
 def test_under_a_wrong_linear_model_the_bias_is_h_plus_times_what_is_left_out():
     model, R = Bent(), Covariance(np.full(12, 0.3))
     x, left_out = np.zeros((2, 3)), np.random.default_rng(1).normal(size=(2, 12))
     bias, deviation = misspecified(
         Problem(model, R), left_out, x, least_squares_root(Problem(model, R), left_out, x, prior=None)
     )
-    np.testing.assert_allclose(bias, left_out @ np.linalg.pinv(model.A).T, atol=1e-9)
+    assert_agrees(bias, left_out @ np.linalg.pinv(model.A).T, atol=1e-9)
     crlb = np.sqrt(np.diag(np.linalg.inv(information(model.A, R))))
     np.testing.assert_allclose(deviation, np.broadcast_to(crlb, (2, 3)), rtol=1e-9)
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from rich.console import Console
+from shared.oracles import assert_agrees
 
 import ipe_bench as ib
 from ipe_bench.measurements import Formula
@@ -17,6 +18,11 @@ NOISE = Unknown(sigma="floor + share*h", levels=(0.1, 0.08))
 SCENARIO = ib.Scenario(DECAY, NOISE, error_scale=0.1)
 
 
+@pytest.mark.oracle(
+    "closed form: information of a normal law (Kay 1993, eq. 3.31)",
+    "bounds of parameters beside unknown levels",
+    1e-10,
+)
 def test_the_bound_is_that_of_parameters_and_levels_together():
     """By the information of any normal law, from its mean and covariance (Kay 1993, eq. 3.31)."""
     block = Block.draw(SCENARIO, 0, 3)
@@ -28,7 +34,7 @@ def test_the_bound_is_that_of_parameters_and_levels_together():
         variance = [(np.exp(v[2]) + np.exp(v[3]) * m) ** 2 for v, m in zip((u, *steps), h, strict=True)]
         dh, dR = (np.array([value.imag for value in a[1:]]) / 1e-30 for a in (h, variance))
         fisher = (dh / variance[0]) @ dh.T + 0.5 * (dR / variance[0] ** 2) @ dR.T
-        assert bound == pytest.approx(np.sqrt(np.diag(np.linalg.inv(fisher)))[:2], rel=1e-10)
+        assert_agrees(bound, np.sqrt(np.diag(np.linalg.inv(fisher)))[:2], rtol=1e-10)
 
 
 def test_a_level_that_no_reading_depends_on_leaves_the_bound_as_it_is():

@@ -10,6 +10,7 @@ pytest.importorskip("jax")
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from ipe_bench_gins_jax import GinsJax
+from shared.oracles import agreed
 
 import ipe_bench as ib
 from ipe_bench.plugins.conformance import check_component
@@ -22,19 +23,21 @@ def test_keeps_its_promises():
     assert [finding for finding in check_component("gins_jax", model) if finding.complaint] == []
 
 
+@pytest.mark.oracle("own second implementation: JAX", "velocities, m/s", 1e-8)
 @pytest.mark.parametrize("scale", [1.0, 33.0, 100.0])
 def test_readings_agree_to_1e_8(scale):
     x = scale * np.random.default_rng(1).standard_normal((20, 11))
     ours, theirs = ib.measurements.Gins(step=180.0 / 64), GinsJax()
-    assert np.abs(theirs.simulate(x) - ours.simulate(x)).max() < 1e-8
+    agreed(np.abs(theirs.simulate(x) - ours.simulate(x)), 1e-8)
     assert np.abs(theirs.offset - ours.offset).max() < 1e-8
 
 
+@pytest.mark.oracle("own second implementation: JAX", "slopes of velocities, m/s", 1e-8)
 @pytest.mark.parametrize("scale", [1.0, 100.0])
 def test_slopes_agree_to_1e_8(scale):
     x = scale * np.random.default_rng(2).standard_normal((4, 11))
     ours, theirs = ib.measurements.Gins(step=180.0 / 64), GinsJax(chunk=4)
-    assert np.abs(theirs.jacobian(x) - ours.jacobian(x)).max() < 1e-8
+    agreed(np.abs(theirs.jacobian(x) - ours.jacobian(x)), 1e-8)
 
 
 def test_readings_are_ordered_and_named_alike():

@@ -10,6 +10,7 @@ pytest.importorskip("optimistix")
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from ipe_bench_optimistix import Optimistix
+from shared.oracles import agreed, assert_agrees
 
 import ipe_bench as ib
 from ipe_bench.basics.statuses import Status
@@ -25,6 +26,7 @@ def test_keeps_its_promises(method):
     assert [finding for finding in findings if finding.complaint] == []
 
 
+@pytest.mark.oracle("library: Optimistix", "estimates, in standard deviations", 1e-6)
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("model", [ib.measurements.Ranging(), ib.measurements.Sir()], ids=lambda model: model.name)
 def test_ends_where_ours_end(model, method):
@@ -34,15 +36,16 @@ def test_ends_where_ours_end(model, method):
     ours = ib.baselines.LevenbergMarquardt(tolerance=1e-9).estimate(bench.problem, drawn.z)
     assert (theirs.status == Status.CONVERGED).all()
     deviations = np.sqrt(np.diagonal(ours.covariance, axis1=1, axis2=2))
-    assert (np.abs(theirs.x - ours.x) < 1e-6 * deviations).all()
+    agreed(np.abs(theirs.x - ours.x) / deviations, 1e-6)
     np.testing.assert_allclose(theirs.covariance, ours.covariance, rtol=1e-5)
 
 
+@pytest.mark.oracle("certified: NIST Statistical Reference Datasets: Misra1a", "parameters by Optimistix", 1e-8)
 def test_finds_what_nist_certifies():
     bench = ib.Scenario(ib.measurements.Nist("Misra1a", start=2), ib.noise.Certified())
     drawn = bench.draw(0, 1)
     found = Optimistix(rtol=1e-13, atol=1e-13).estimate(bench.problem, drawn.z)
-    np.testing.assert_allclose(found.x, drawn.x, rtol=1e-8)
+    assert_agrees(found.x, drawn.x, rtol=1e-8)
 
 
 def test_counts_what_it_computes():

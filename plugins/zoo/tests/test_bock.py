@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from ipe_bench_zoo import Bock
+from shared.oracles import assert_agrees
 from shared.small_models import bock
 
 from ipe_bench.baselines import MultiscaleLM
@@ -42,11 +43,12 @@ def test_forward_integration_keeps_bocks_true_trajectory_for_a_mild_rate_and_los
     assert (estimates.x[0] * mild.sizes)[0] == pytest.approx(np.pi, abs=1e-9)
 
 
+@pytest.mark.oracle("closed form: a sine", "readings of Bock's problem", 1e-14)
 def test_bocks_recorded_readings_are_the_sine_and_the_answer_is_pi():
     model = replace(bock(60.0), readings=4, interval=0.25)
     half = np.sqrt(0.5)
     expected = [half, np.pi * half, 1.0, 0.0, half, -np.pi * half, 0.0, -np.pi]
-    np.testing.assert_allclose(model.recorded.z, expected, atol=1e-14)
+    assert_agrees(model.recorded.z, expected, atol=1e-14)
     np.testing.assert_allclose(model.recorded.x * model.sizes, [np.pi, 0.0, np.pi], rtol=1e-15)
     np.testing.assert_array_equal(model.recorded.R.deviations, np.full(8, 0.05))
     assert replace(model, answer={"p": np.pi}).recorded is None

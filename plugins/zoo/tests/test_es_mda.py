@@ -5,6 +5,7 @@ import pytest
 from ipe_bench_zoo import EsMda
 from ipe_bench_zoo.es_mda import assimilated
 from shared.linear_models import Linear, block_of_gins, linear_map
+from shared.oracles import assert_agrees
 
 from ipe_bench.baselines import MapLM
 from ipe_bench.basics.linalg import deviations
@@ -21,6 +22,7 @@ def linear(trials: int):
     return (problem, z, *linear_map(problem, model.matrix, z))
 
 
+@pytest.mark.oracle("published: Emerick and Reynolds (2013), eq. (12)", "members after an assimilation", 1e-12)
 @pytest.mark.parametrize("members", [20, 5])
 def test_gain_is_that_of_the_paper(members):
     """C_sh (C_hh + alpha R)^-1 (z - h), Emerick and Reynolds (2013), eq. (12), by inverting a matrix of readings."""
@@ -30,7 +32,7 @@ def test_gain_is_that_of_the_paper(members):
     for k in range(3):
         C = np.cov(s[k], h[k], rowvar=False)
         gain = C[:4, 4:] @ np.linalg.inv(C[4:, 4:] + 3.0 * np.eye(7))
-        np.testing.assert_allclose(found[k], s[k] + (z[k] - h[k]) @ gain.T, atol=1e-12)
+        assert_agrees(found[k], s[k] + (z[k] - h[k]) @ gain.T, atol=1e-12)
 
 
 def test_a_member_that_overflows_is_left_out():
@@ -41,12 +43,13 @@ def test_a_member_that_overflows_is_left_out():
     np.testing.assert_allclose(assimilated(s, h, z, 3.0)[:, 1:], others, atol=1e-12)
 
 
+@pytest.mark.oracle("closed form: posterior of a linear model", "estimates and covariance", 1e-9)
 def test_polish_ends_at_the_maximum_a_posteriori():
     problem, z, x, P = linear(6)
     found = EsMda(members=20).estimate(problem, z, history=True)
     assert (found.status == Status.CONVERGED).all()
-    np.testing.assert_allclose(found.x, x, atol=1e-9)
-    np.testing.assert_allclose(found.covariance[0], P, atol=1e-9)
+    assert_agrees(found.x, x, atol=1e-9)
+    assert_agrees(found.covariance[0], P, atol=1e-9)
     # 16 assimilations and one or two Gauss-Newton steps after the first mean.
     assert all(len(path) - 1 == count for path, count in zip(found.history, found.iterations, strict=True))
     assert (found.simulations - 16 * 20 <= 3).all()

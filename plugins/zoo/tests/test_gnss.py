@@ -6,6 +6,7 @@ from ipe_bench_zoo import Gnss
 from ipe_bench_zoo.gnss import east_north_up
 from scipy.optimize import brentq, least_squares
 from shared.instruments import solution
+from shared.oracles import assert_agrees
 
 from ipe_bench.baselines import GaussNewton
 from ipe_bench.basics.linalg import Covariance
@@ -50,21 +51,23 @@ def given(model, **others):
     return Gnss(tuple((epoch, name, *place) for epoch, name, place in labels), **others)
 
 
+@pytest.mark.oracle("own second implementation: flight of light in inertial axes", "pseudo-ranges, m", 1e-6)
 def test_distances_are_those_of_light_in_axes_that_do_not_turn():
     model = Gnss(frame="ecef")
     x = model.nominal + np.random.default_rng(0).normal(size=(3, model.n))
     for row, z in zip(x, model.simulate(x), strict=True):
         p = row * model.sizes
         clock = p[3] + np.where(np.array(model.index["constellation"]) == "galileo", p[4], 0.0)
-        np.testing.assert_allclose(z - clock, [flight(s, p[:3]) for s in sky(model)], atol=1e-6)
+        assert_agrees(z - clock, [flight(s, p[:3]) for s in sky(model)], atol=1e-6)
 
 
+@pytest.mark.oracle("closed form: Sagnac's term", "difference of pseudo-ranges, m", 1e-3)
 def test_the_rotation_is_worth_the_sagnac_term():
     turning, still = Gnss(), Gnss(earth_rate=0.0)
     x, y, _ = sky(turning).T
     px, py, _ = turning.position
     difference = (turning.simulate(turning.nominal[None]) - still.simulate(still.nominal[None]))[0]
-    np.testing.assert_allclose(difference, EARTH_RATE / LIGHT * (x * py - y * px), atol=1e-3)
+    assert_agrees(difference, EARTH_RATE / LIGHT * (x * py - y * px), atol=1e-3)
     assert 10.0 < np.abs(difference).max() < 45.0
 
 
@@ -111,6 +114,7 @@ def test_without_rotation_and_with_one_clock_it_is_ranging():
     )
 
 
+@pytest.mark.oracle("library: SciPy's least_squares", "position and clocks, m", 1e-3)
 def test_an_epoch_of_two_constellations_from_the_centre_of_the_earth_is_scipys_solution():
     model = Gnss()
     truth = np.array([*on_ellipsoid(0.6344, 2.2230, 120.0), 3e5, -25.0])
@@ -125,7 +129,7 @@ def test_an_epoch_of_two_constellations_from_the_centre_of_the_earth_is_scipys_s
     centre = given(model, frame="ecef", position=(0.0, 0.0, 0.0))
     estimates = GaussNewton(start="nominal").estimate(Problem(centre, Covariance(np.ones(model.m))), z[None])
     assert estimates.status[0] == 0
-    np.testing.assert_allclose((estimates.x * centre.sizes)[0], theirs, atol=1e-3)
+    assert_agrees((estimates.x * centre.sizes)[0], theirs, atol=1e-3)
     assert np.linalg.norm(theirs[:3] - truth[:3]) < 10.0
 
 
@@ -157,6 +161,7 @@ def bancroft(beacons, pseudoranges):
     return min(solutions, key=misfit)
 
 
+@pytest.mark.oracle("closed form: Bancroft (1985)", "position and clock, m", 1e-6)
 def test_the_iterated_estimate_is_bancrofts_and_the_truth_where_readings_are_exact():
     model = Ranging(rounds=1)
     x = model.nominal + 3.0 * np.random.default_rng(4).normal(size=(20, 4))
@@ -165,7 +170,7 @@ def test_the_iterated_estimate_is_bancrofts_and_the_truth_where_readings_are_exa
     assert (estimates.status == 0).all()
     closed = np.stack([bancroft(np.array(model.beacons), ranges) for ranges in z])
     np.testing.assert_allclose(closed, x * model.sizes, atol=1e-6)
-    np.testing.assert_allclose(estimates.x * model.sizes, closed, atol=1e-6)
+    assert_agrees(estimates.x * model.sizes, closed, atol=1e-6)
 
 
 def test_a_clock_bias_adds_to_every_range_and_rounds_repeat():

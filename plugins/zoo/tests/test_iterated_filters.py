@@ -6,6 +6,7 @@ from ipe_bench_zoo import LMIEKF, EsMda, MultipleShooting, RecursiveUpdate
 from scipy.optimize import least_squares
 from shared.estimator_checks import check_bits, check_failures
 from shared.linear_models import Linear, linear_map
+from shared.oracles import assert_agrees
 from shared.small_models import Bent
 
 from ipe_bench.basics.linalg import Covariance, deviations
@@ -17,6 +18,11 @@ from ipe_bench.priors import GaussianPrior
 from ipe_bench.trials.scenario import Scenario
 
 
+@pytest.mark.oracle(
+    "own second implementation: recursive update filter in covariance form",
+    "estimates and covariances",
+    1e-9,
+)
 def test_recursive_steps_are_updates_with_inflated_noise():
     """The textbook loop in covariance form: at each step the gain for R / w_k, linearised at the last estimate."""
     scenario = Scenario(Bent(0.05), Gaussian(0.3), GaussianPrior(), 1.0, seed=2)
@@ -32,10 +38,11 @@ def test_recursive_steps_are_updates_with_inflated_noise():
                 H = model.jacobian(x[None])[0, rows]
                 K = P @ H.T @ np.linalg.inv(H @ P @ H.T + 0.09 / w * np.eye(len(rows)))
                 x, P = x + K @ (z[rows] - model.simulate(x[None])[0, rows]), P - K @ H @ P
-        np.testing.assert_allclose(x_found, x, atol=1e-9)
-        np.testing.assert_allclose(P_found, P, atol=1e-9)
+        assert_agrees(x_found, x, atol=1e-9)
+        assert_agrees(P_found, P, atol=1e-9)
 
 
+@pytest.mark.oracle("library: SciPy's least_squares", "estimates", 1e-6)
 def test_damped_iterations_end_at_the_maximum_a_posteriori_of_the_epoch():
     """One epoch: SciPy minimises the same sum of squares."""
     model = Linear(sizes=(8,), unknowns=3)
@@ -63,7 +70,7 @@ def test_damped_iterations_end_at_the_maximum_a_posteriori_of_the_epoch():
 
         other = least_squares(residual, curved.nominal, xtol=1e-15, ftol=1e-15, gtol=1e-12)
         again = least_squares(residual, x_found, xtol=1e-15, ftol=1e-15, gtol=1e-12)
-        np.testing.assert_allclose(x_found, again.x, atol=1e-6)
+        assert_agrees(x_found, again.x, atol=1e-6)
         # It never ends higher than where it began, and nearly always where SciPy does.
         assert np.sum(residual(x_found) ** 2) <= np.sum(residual(curved.nominal) ** 2)
         assert np.sum(residual(x_found) ** 2) <= 2 * other.cost + 1e-6 or again.cost > other.cost

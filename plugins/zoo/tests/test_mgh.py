@@ -8,6 +8,7 @@ import pytest
 from ipe_bench_zoo import Mgh
 from ipe_bench_zoo.mgh import PROBLEMS, score
 from scipy.optimize import least_squares
+from shared.oracles import agreed, assert_agrees
 
 from ipe_bench.baselines import LevenbergMarquardt, LinearLSE
 from ipe_bench.measurements.problem import Problem
@@ -91,19 +92,29 @@ def test_23_functions_have_the_dimensions_of_the_paper():
     assert len(SIZES) == 23
 
 
+@pytest.mark.oracle(
+    "published: reference values of MINPACK's tests (Argonne 1980), and by hand",
+    "norms of residuals at the starts",
+    1e-12,
+)
 @pytest.mark.parametrize("function", NORMS := MINPACK_NORMS | BY_HAND)
 def test_residuals_at_the_starts_have_known_norms(function):
     for start, norm in zip((1.0, 10.0, 100.0), NORMS[function], strict=False):
         model = Mgh(function, start)
-        assert np.linalg.norm(model.simulate(model.nominal[None])) == pytest.approx(norm, rel=1e-12)
+        assert_agrees(np.linalg.norm(model.simulate(model.nominal[None])), norm, rtol=1e-12)
 
 
+@pytest.mark.oracle(
+    "published: Moré, Garbow and Hillstrom, ACM TOMS 7(1) (1981)",
+    "sums of squares of the minima of 23 functions",
+    1e-5,
+)
 @pytest.mark.parametrize("function", PROBLEMS)
 def test_minima_are_those_that_the_paper_prints(function):
     values = [m.sum_of_squares for m in Mgh(function).minima]
     printed = PRINTED.get(function, (0.0,))
     # Six digits, some of them cut and not rounded.
-    np.testing.assert_allclose(values[: len(printed)], printed, rtol=1e-5)
+    assert_agrees(values[: len(printed)], printed, rtol=1e-5)
     assert values[0] == min(values)
 
 
@@ -134,10 +145,15 @@ def test_scipy_finds_nothing_lower_beside_the_least_minimum(function):
     assert score(model, found.x / model.sizes).solved
 
 
+@pytest.mark.oracle(
+    "published: Moré, Garbow and Hillstrom, ACM TOMS 7(1) (1981)",
+    "sums of squares where they print zeros",
+    1e-28,
+)
 @pytest.mark.parametrize(("function", "zero"), [(f, zero) for f, zeros in ZEROS.items() for zero in zeros])
 def test_every_printed_zero_is_a_solution(function, zero):
     model = Mgh(function)
-    assert sum_of_squares(model, zero) < 1e-28
+    agreed(sum_of_squares(model, zero), 1e-28)
     assert score(model, np.array(zero) / model.sizes).solved
 
 

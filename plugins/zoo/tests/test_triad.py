@@ -5,6 +5,7 @@ import pytest
 from ipe_bench_zoo import Accelerometer, Triad
 from scipy.linalg import polar
 from scipy.optimize import least_squares
+from shared.oracles import assert_agrees
 
 from ipe_bench.baselines import GaussNewton
 from ipe_bench.basics.linalg import Covariance
@@ -59,19 +60,21 @@ def estimate(model, z, deviation):
     return p[0, :3], np.array([[kx, xy, xz], [xy, ky, yz], [xz, yz, kz]])
 
 
+@pytest.mark.oracle("published: calibration in the tests of the PX4 autopilot", "bias, gauss, and scale factors", 0.01)
 def test_a_recorded_magnetometer_calibration_gives_the_known_answer():
     # Newton needs a rough centre: the middle of the extremes, as calibrations begin.
     centre = tuple(((RECORDED.max(axis=0) + RECORDED.min(axis=0)) / 2).tolist())
     model = Triad(outputs=tuple(map(tuple, RECORDED.tolist())), field=0.4, unit="gauss", bias=centre)
     b, M = estimate(model, np.full((1, model.m), 0.4), 0.002)
-    np.testing.assert_allclose(b, ANSWER["bias"], atol=0.01)
+    assert_agrees(b, ANSWER["bias"], atol=0.01)
     # The answer's field is its own estimate, so scale factors are compared by their ratios.
     scale = np.diag(M) / np.diag(M).mean()
-    np.testing.assert_allclose(scale, ANSWER["scale"], atol=0.01)
+    assert_agrees(scale, ANSWER["scale"], atol=0.01)
     residual = np.linalg.norm((RECORDED - b) @ M.T, axis=1) - 0.4
     assert np.mean(residual**2) < 1e-3  # the fit that the recorded test asks for
 
 
+@pytest.mark.oracle("closed form: algebraic fit of a quadric", "bias and matrix", 1e-8)
 def test_exact_magnitudes_give_the_algebraic_fit_of_the_quadric():
     rng = np.random.default_rng(0)
     M = np.eye(3) + 0.03 * (lambda a: a + a.T)(rng.normal(size=(3, 3)))
@@ -83,7 +86,7 @@ def test_exact_magnitudes_give_the_algebraic_fit_of_the_quadric():
     own = estimate(model, np.full((1, 40), 9.8), 1e-4)
     for values in zip(own, quadric(outputs, 9.8), (b, M), strict=True):
         for value in values[:2]:
-            np.testing.assert_allclose(value, values[2], atol=1e-8)
+            assert_agrees(value, values[2], atol=1e-8)
 
 
 def test_nothing_but_magnitude_and_bias_is_seen_without_errors():
@@ -135,6 +138,7 @@ def test_magnitudes_are_those_of_the_matrices_and_of_the_symmetric_form(held):
     np.testing.assert_allclose(triad.simulate((values / triad.sizes)[None])[0] * 0.0024, z, rtol=1e-12)
 
 
+@pytest.mark.oracle("library: SciPy's least_squares", "estimates", 1e-6)
 def test_a_calibration_with_noise_is_scipys(held):
     counts = held + np.random.default_rng(1).normal(size=held.shape)
     model = model_of(counts)
@@ -149,7 +153,7 @@ def test_a_calibration_with_noise_is_scipys(held):
     start = np.array([3.2768, 3.2768, 3.2768, 2.4, 2.4, 2.4, 0.0, 0.0, 0.0])
     p = least_squares(residuals, start, xtol=1e-15, ftol=1e-15, gtol=1e-15).x
     theirs = x_of(model, 1e4 * p[:3], np.diag(1e-3 * p[3:6]), np.array([[1, -p[6], p[7]], [0, 1, -p[8]], [0, 0, 1]]))
-    np.testing.assert_allclose(estimates.x[0], theirs, atol=1e-6)
+    assert_agrees(estimates.x[0], theirs, atol=1e-6)
     # One count is 2.4e-3 m/s^2, and 35 attitudes average it.
     np.testing.assert_allclose((estimates.x[0] * model.sizes)[:3], BIAS, atol=2.0)
 

@@ -1,0 +1,30 @@
+"""Every mark `oracle` has its row, every row its mark, and every link to a row leads there."""
+
+from __future__ import annotations
+
+import re
+
+from shared.oracles import PAGE, ROOT, Oracle, anchor, in_page, marked, rows, tables
+
+PAGES = PAGE.parents[1]
+
+
+def test_marks_and_rows_say_the_same():
+    recorded = {row.test: Oracle(row.source, row.what, row.tolerance) for row in rows()}
+    assert recorded == marked(), "`make oracles TESTS=FILE` records what the marks of a file say"
+    assert len({anchor(test) for test in recorded}) == len(recorded)
+
+
+def test_the_page_shows_what_is_recorded():
+    assert in_page()[1] == tables(rows())
+
+
+def test_a_claim_that_links_to_a_row_has_it():
+    there = set(re.findall(r'<a id="([^"]+)">', PAGE.read_text(encoding="utf-8")))
+    links = [
+        (path.name, link)
+        for path in (ROOT / "README.md", ROOT / "plugins" / "zoo" / "README.md", *PAGES.rglob("*.md"))
+        for link in re.findall(r"checked\.md#([^)]+)\)", path.read_text(encoding="utf-8"))
+    ]
+    assert len(links) >= 1
+    assert [one for one in links if one[1] not in there] == []
