@@ -180,7 +180,7 @@ def certified_digits(dataset, start):
 
 
 @pytest.mark.oracle(
-    "certified: NIST Statistical Reference Datasets: BoxBOD, MGH10, MGH17, Eckerle4, Bennett5",
+    "certified: NIST Statistical Reference Datasets (BoxBOD, MGH10, MGH17, Eckerle4, Bennett5)",
     "parameters from the far start",
     1e-9,
 )

@@ -109,7 +109,7 @@ def test_levels_of_a_linear_model_maximise_the_restricted_likelihood():
 
 
 @pytest.mark.oracle(
-    "certified: NIST Statistical Reference Datasets: Misra1a, Thurber, Chwirut2",
+    "certified: NIST Statistical Reference Datasets (Misra1a, Thurber, Chwirut2)",
     "residual standard deviation, parameters and their deviations",
     1e-5,
 )

@@ -40,7 +40,7 @@ def test_ends_where_ours_end(model, method):
     np.testing.assert_allclose(theirs.covariance, ours.covariance, rtol=1e-5)
 
 
-@pytest.mark.oracle("certified: NIST Statistical Reference Datasets: Misra1a", "parameters by Optimistix", 1e-8)
+@pytest.mark.oracle("certified: NIST Statistical Reference Datasets (Misra1a)", "parameters by Optimistix", 1e-8)
 def test_finds_what_nist_certifies():
     bench = ib.Scenario(ib.measurements.Nist("Misra1a", start=2), ib.noise.Certified())
     drawn = bench.draw(0, 1)
