@@ -138,7 +138,7 @@ def model(rates, initial, outputs, constants):
 
 @pytest.mark.oracle(
     "published: structural identifiability of textbook models",
-    "parameters that no data tell, in number",
+    "parameters judged wrongly, counted",
     0,
 )
 @pytest.mark.parametrize("name", CASES)
@@ -280,7 +280,7 @@ def require_the_same_of_compartments(seeds):
 
 @pytest.mark.oracle(
     "closed form: rank of the transfer function, in fractions",
-    "parameters that no data tell, in number, of 4 drawn models",
+    "parameters judged wrongly, counted, of 4 drawn models",
     0,
 )
 def test_compartments_by_their_transfer_function():
@@ -289,7 +289,7 @@ def test_compartments_by_their_transfer_function():
 
 @pytest.mark.oracle(
     "closed form: rank of the transfer function, in fractions",
-    "parameters that no data tell, in number, of 300 drawn models",
+    "parameters judged wrongly, counted, of 300 drawn models",
     0,
 )
 @pytest.mark.slow

@@ -1,8 +1,12 @@
 """Fits of one file of readings: what they find, and what they say of the model."""
 
+from importlib.resources import files
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.stats import binom, chi2, kstest
+from shared.oracles import assert_agrees
 from shared.state_models import ConstantVelocity
 
 import ipe_bench as ib
@@ -16,6 +20,8 @@ from ipe_bench.real.tracks import Log
 from ipe_bench.report.answer import with_error
 from ipe_bench.solvers import Newton, Progressive
 from ipe_bench.trials.scenario import Scenario
+
+SAMPLES = Path(str(files("ipe_bench.real") / "samples"))
 
 
 def test_missing_readings_are_no_obstacle_to_any_estimator():
@@ -50,6 +56,20 @@ def test_masked_readings_are_missing_whatever_lies_under_the_mask():
     model = ConstantVelocity(count=12)
     log = np.ma.masked_array(model.draw(0, 1).z[0], mask=np.arange(12)[:, None] == 3)
     assert np.array_equal(Log.of(model, log).z, log.filled(np.nan), equal_nan=True)
+
+
+@pytest.mark.oracle(
+    "published: R's nls of BOD, the data of Bates and Watts, Nonlinear Regression Analysis (1988)",
+    "estimates, standard errors and residual standard deviation of the oxygen demand",
+    5e-4,
+)
+def test_the_oxygen_demand_of_bates_and_watts_is_estimated_as_r_estimates_it():
+    """R prints A = 19.1426 (2.4959), lrc = log b2 = -0.6328 (0.3824), and 2.549."""
+    t, y = np.loadtxt(SAMPLES / "oxygen.csv", delimiter=",", skiprows=1).T
+    model = ib.measurements.Formula("b1*(1-exp(-b2*t))", {"b1": 20.0, "b2": 0.5}, {"t": t.tolist()})
+    (found,) = fit(Scenario(model, Unknown()).problem, y, {"lm": LevenbergMarquardt(tolerance=1e-9)}, Unknown())
+    (b1, b2), (e1, e2) = found.x, found.standard_errors
+    assert_agrees([b1, np.log(b2), e1, e2 / b2, found.level], [19.1426, -0.6328, 2.4959, 0.3824, 2.549], rtol=5e-4)
 
 
 def test_the_chi_square_test_rejects_a_true_model_as_often_as_it_says_and_a_wrong_deviation_always():

@@ -138,7 +138,7 @@ def record() -> None:
         if asked != marks[test].tolerance:
             print(f"\n{test}: not recorded, as its loosest tolerance was {asked:g}, not {marks[test].tolerance:g}")
             continue
-        largest = short(f"{max(one.difference for one in seen):.0e}")
+        largest = one_digit(max(one.difference for one in seen))
         relative = all(one.relative for one in seen)
         known[anchor(test)] = Row(**asdict(marks[test]), test=test, relative=relative, agreed=largest)
     kept = [
@@ -168,8 +168,12 @@ def marked() -> dict[str, Oracle]:
     return found
 
 
-def short(number: str) -> str:
-    return number.replace("e-0", "e-").replace("e+00", "")
+def short(number: float) -> str:
+    return f"{number:g}".replace("e-0", "e-")
+
+
+def one_digit(number: float) -> str:
+    return short(float(f"{number:.0e}"))
 
 
 def sentence(test: str) -> str:
@@ -192,7 +196,7 @@ def tables(recorded: Iterable[Row]) -> str:
         claim = f'<a id="{anchor(row.test)}"></a>{sentence(row.test)}'
         measure = " relative" if row.relative else ""
         where = f"`{row.test.partition('::')[0]}`"
-        cells = (claim, row.source, row.what, short(f"{row.tolerance:g}") + measure, row.agreed, where)
+        cells = (claim, row.source, row.what, short(row.tolerance) + measure, row.agreed, where)
         by_subject[subject].append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n")
     head = "| claim | source | compared | tolerance | agreed to | test |\n|---|---|---|--:|--:|---|\n"
     return "".join(f"\n## {name}\n\n{head}{''.join(lines)}\n" for name, lines in by_subject.items() if lines)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.stats import binom, chi2
+from scipy.stats import binom, binomtest, chi2
 from shared.oracles import assert_agrees
 
 from ipe_bench.statistics.intervals import (
@@ -32,6 +32,12 @@ def test_clopper_pearson_has_closed_ends():
     # With no success the upper end solves (1 - p)^n = 0.025.
     assert_agrees(clopper_pearson(0, 50), (0.0, 1 - 0.025 ** (1 / 50)), rtol=1e-12)
     assert_agrees(clopper_pearson(50, 50), (0.025 ** (1 / 50), 1.0), rtol=1e-12)
+
+
+@pytest.mark.oracle("library: SciPy's binomtest", "ends of the Clopper-Pearson interval", 1e-9)
+@pytest.mark.parametrize("seen", [(60, 60), (200, 200), (166, 200), (0, 100), (11, 200), (363, 2500)], ids=str)
+def test_clopper_pearson_is_scipys_exact_interval(seen):
+    assert_agrees(clopper_pearson(*seen), binomtest(*seen).proportion_ci(method="exact"), atol=1e-9)
 
 
 @pytest.mark.oracle(
@@ -191,6 +197,7 @@ def test_1000_studies_of_a_root_mean_square(law):
 # What no trial has shown ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.oracle("closed form: upper limit of a share that no trial shows", "share that may be unseen", 1e-9)
 def test_what_may_be_unseen_is_the_upper_limit_of_unusual_errors_less_those_seen():
     """Of none in N, 1 - .05^(1/N); of k the share whose binomial law gives k or fewer with .05, less k / N; of ten or
     more nothing. Unusual is 3.29 normal deviations, and the median absolute deviation is .6745 of them."""
@@ -199,9 +206,9 @@ def test_what_may_be_unseen_is_the_upper_limit_of_unusual_errors_less_those_seen
     for k in (0, 1, 9, 10):
         squares[:k], squares[k] = (3.292 * 7) ** 2, (3.289 * 7) ** 2
         seen[k] = float(unseen(squares[None], np.array([1]))[0])
-    assert seen[0] == pytest.approx(1 - 0.05 ** (1 / 200), rel=1e-12)
+    assert_agrees(seen[0], 1 - 0.05 ** (1 / 200), rtol=1e-12)
     for k in (1, 9):
-        assert binom.cdf(k, 200, seen[k] + k / 200) == pytest.approx(0.05, rel=1e-9)
+        assert_agrees(binom.cdf(k, 200, seen[k] + k / 200), 0.05, rtol=1e-9)
     assert seen[10] == 0.0
     # In a unit of at least 10 none is unusual.
     assert unseen(squares[None], np.array([1]), least=100.0)[0] == pytest.approx(seen[0])
