@@ -82,7 +82,7 @@ def agreed(difference: ArrayLike, tolerance: float) -> None:
     _held.append(Held(largest, tolerance))
 
 
-def assert_agrees(actual: ArrayLike, desired: ArrayLike, rtol: float = 0.0, atol: float = 0.0) -> None:
+def assert_agrees(actual: Any, desired: Any, rtol: float = 0.0, atol: float = 0.0) -> None:
     """Asserts what NumPy's assert_allclose does with these tolerances, and records the largest difference.
 
     The difference is relative to the desired value, and to `atol / rtol` beside it; it is absolute if `rtol` is 0.
