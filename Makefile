@@ -75,13 +75,14 @@ bench: .venv/ready
 	$(if $(PEERS),$(BIN)/uv pip install --quiet --python $(BIN)/python --editable ".[peers]")
 	IPE_BENCH_THREADS=1 OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/table.py outputs/bench $(PARTS)
 
-# The documentation, in outputs/docs/html. Its gallery shows what is stored of the experiments.
+# The documentation, in outputs/docs/html. Its gallery is drawn from what is stored of the experiments.
 docs: .venv/ready
 	$(BIN)/uv pip install --quiet --python $(BIN)/python --editable ".[docs]"
 	$(BIN)/python -m ipe_bench.report.docs outputs/docs
 
-# Computes the gallery again and stores it with the pages, in the better part of an hour: all experiments with their own
-# trials, or NAMES="headline paper" of them. TRIALS=100 takes a tenth of them.
+# Draws the gallery's pages again, in outputs/docs/source/gallery, and says what is stored of each experiment, in seconds.
+# NAMES="headline paper" computes these anew and stores them, with their own trials: `filters`, `beyond` and `states` take
+# the better part of an hour. TRIALS=100 takes a tenth of the trials, which their pages then say.
 gallery: .venv/ready
 	$(BIN)/python -m ipe_bench.report.docs outputs/docs --store $(NAMES) $(if $(TRIALS),--trials $(TRIALS))
 

@@ -2,27 +2,43 @@
 
 from __future__ import annotations
 
-import json
+import lzma
 import os
 import re
 import shlex
 import subprocess
 import sys
+from collections import Counter
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
+from shared.synthetic_store import Pretender, Seeker, Synthetic
 
 import ipe_bench
 from ipe_bench.baselines import EKF
+from ipe_bench.cli import words
 from ipe_bench.cli.main import COMMANDS
+from ipe_bench.cli.session import jobs_of, session
 from ipe_bench.measurements import Polynomial
 from ipe_bench.noise import Gaussian
 from ipe_bench.plugins import discovery
 from ipe_bench.plugins.construct import described
 from ipe_bench.report.docs import __main__ as pages
 from ipe_bench.report.docs import show_type, type_of
+from ipe_bench.report.docs.frames import KEPT, SUFFIX, Computed, read
+from ipe_bench.report.style import house_style
+from ipe_bench.runs.parts import TRUTH
+from ipe_bench.runs.provenance import canonical_json
+from ipe_bench.runs.run import result_keys
+from ipe_bench.statistics import analyse
+from ipe_bench.statistics.registry import summary_columns
+from ipe_bench.statistics.statistic import ALL
+from ipe_bench.statistics.verdicts import NO_VERDICT, VERDICTS
 
 PAGES = Path(str(files("ipe_bench.report.docs"))) / "pages"
 WRITTEN = sorted(PAGES.rglob("*.md"))
@@ -32,18 +48,14 @@ def ids(path: Path) -> str:
     return str(path.relative_to(PAGES))
 
 
-def nothing_new(option, folder, *_):
-    """Stands for an experiment of which nothing is stored."""
-    empty = {"command": "", "version": "", "trials": "", "html": "", "figures": [], "best": []}
-    (folder / f"{option.name}.json").write_text(json.dumps(empty))
-
-
 @pytest.fixture(scope="module")
 def generated(tmp_path_factory) -> Path:
-    """The pages that nobody writes; of the gallery its list alone, as no experiment is run."""
+    """The pages that nobody writes; of the gallery their names and words alone, as nothing is drawn."""
     folder = tmp_path_factory.mktemp("generated")
+    blank = pages.Page("", [], SimpleNamespace(savefig=lambda *_, **__: None))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pages, "store", nothing_new)
+        patch.setattr(pages, "store", lambda option, *_: next(iter(STORED)))
+        patch.setattr(pages.Page, "of", lambda *_: blank)
         pages.write_reference(folder / "reference")
         pages.write_gallery(folder / "gallery", folder, 1)
     return folder
@@ -56,23 +68,116 @@ def blocks(page: Path, language: str) -> list[str]:
 FILTERS = blocks(PAGES / "howto" / "write_filter.md", "python")
 
 
-STORED = sorted((PAGES.parent / "gallery").glob("*.json"))
+# The gallery ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("path", STORED, ids=lambda path: path.stem)
-def test_what_is_stored_of_an_experiment_says_what_computed_it_and_shows_it_first(path):
-    found = json.loads(path.read_text(encoding="utf-8"))
-    assert path.stem in [option.name for option in discovery.options("experiment")]
-    assert found["command"].startswith(f"run +experiment={path.stem}")
-    assert re.fullmatch(r"\d+\.\d+\.\d+\S*", found["version"])
-    assert found["html"].index("<p>") < found["html"].index("<table")  # the answer, then the numbers
-    counts = {int(count.replace(",", "")) for count in found["trials"].split(" to ")}
-    assert min(counts) >= 100 or counts == {1}
-    pictures = [f"{path.stem}.png", *(f"{path.stem}_{one['name']}.png" for one in found["figures"])]
-    sizes = [(path.parent / name).stat().st_size for name in pictures]
-    assert max(sizes) < 100_000
-    assert path.stat().st_size < 100_000
-    assert not re.search(r"(/home|/root|/tmp|outputs)/", path.read_text(encoding="utf-8"))
+STORED = sorted(pages.STORED.glob(f"*{SUFFIX}"))
+LONG = ("nist",)
+"""Experiments of so many jobs that to compose them takes longer than a second."""
+every_experiment = pytest.mark.parametrize(
+    "path",
+    [pytest.param(p, marks=[pytest.mark.slow] * p.name.startswith(LONG), id=p.name.partition(".")[0]) for p in STORED],
+)
+
+
+def asked(experiment: str) -> tuple[Counter[str], int]:
+    """The names of the results that an experiment asks for today, and its trials in each."""
+    with session():
+        jobs = jobs_of(words.read("run", [f"+experiment={experiment}"]), multirun=False)
+    keys = [key for one in jobs.specs for key in result_keys(one.scenario, one.estimators) if key.label != TRUTH]
+    (trials,) = {one.count for one in jobs.specs}
+    return Counter(canonical_json(key.names) for key in keys), trials
+
+
+@every_experiment
+def test_a_page_has_the_results_that_its_experiment_asks_for_today_or_says_how_many_it_lacks(path):
+    name = path.name.removesuffix(SUFFIX)
+    found, (wanted, trials) = read(path), asked(name)
+    there = Counter(canonical_json(group.footer["names"]) for group in found.analysis.collection.groups)
+    assert there <= wanted, "rows of another experiment"
+    assert (found.asked_results, found.asked_trials) == (wanted.total(), trials)
+    assert found.complete == (there == wanted and set(totals(found)["trials"]) == {trials})
+    assert found.command.startswith(f"run +experiment={name}")
+    assert re.fullmatch(r"\d+\.\d+\.\d+\S*", found.version)
+
+
+@every_experiment
+def test_what_is_stored_has_todays_columns_and_words_and_is_small(path):
+    text = lzma.decompress(path.read_bytes()).decode()
+    assert not re.search(r"(/home|/root|/tmp|outputs)/", text)
+    assert path.stat().st_size < 150_000
+    found = read(path)
+    own = {*found.analysis.setting_columns, *("error_scale", "scenario", "estimator", "parameter", "unit")}
+    assert set(found.analysis.summary) - own == set(summary_columns())
+    assert set(totals(found)["verdict"]) <= {word.value for word in VERDICTS} | {NO_VERDICT}
+
+
+def totals(found: Computed) -> pd.DataFrame:
+    summary = found.analysis.summary
+    return summary[summary["parameter"] == ALL]
+
+
+def two_scales(store: Synthetic, trials: int = 30) -> Computed:
+    """Results of two estimators at two error scales."""
+    for scale in (1.0, 10.0):
+        error = 0.1 * np.random.default_rng(0).standard_normal((trials, 3))
+        for label, estimator in (("linear_lse", Pretender()), ("mine", Seeker())):
+            store.add(store.scenario(error_scale=scale), label, scale * error, estimator=estimator)
+    return Computed("run +experiment=two", "1.2.3", 4, 30, analyse([store.directory]))
+
+
+def test_a_page_drawn_from_what_is_kept_is_the_page_of_the_results(synthetic, tmp_path):
+    """Its sentences, tables, captions, looks and curves."""
+    computed = two_scales(synthetic)
+    computed.write(tmp_path / f"two{SUFFIX}", parameters=False)
+    again = read(tmp_path / f"two{SUFFIX}")
+    assert (again.command, again.version, again.extent) == (computed.command, "1.2.3", computed.extent)
+    with house_style():
+        first, second = (pages.Page.of("two", one.analysis) for one in (computed, again))
+    assert second.words == first.words
+    assert first.html.index("<p>") < first.html.index("<table")  # the answer, then the numbers
+    assert first.html.count("<tr") >= 1 + 4
+    curves = [
+        [(line.get_color(), line.get_xydata().tolist()) for ax in one.figures[0].figure.axes for line in ax.lines]
+        for one in (first, second)
+    ]
+    assert str(curves[0]) == str(curves[1])  # as NaN is no number
+
+
+@pytest.mark.parametrize(("results", "trials", "complete"), [(4, 30, True), (5, 30, False), (4, 31, False)])
+def test_a_page_and_its_thumbnail_say_what_is_incomplete(synthetic, tmp_path, results, trials, complete):
+    computed = replace(two_scales(synthetic), asked_results=results, asked_trials=trials)
+    extent = f"30 of {trials} trials; 4 of {results} results"
+    option = SimpleNamespace(name="two", summary="", text="")
+    shown = {"option": option, "computed": computed, "page": SimpleNamespace(html="", figures=[])}
+    pages.write_page(tmp_path / "two.md", "experiment", **shown)
+    pages.write_page(tmp_path / "index.md", "gallery", experiments=[(option, computed)])
+    for name in ("two.md", "index.md"):
+        page = (tmp_path / name).read_text(encoding="utf-8")
+        assert extent in page
+        assert ("ncomplete" in page) == (not complete)
+    assert "Computed by ipe-bench 1.2.3" in (tmp_path / "two.md").read_text(encoding="utf-8")
+
+
+def test_the_table_of_the_best_names_who_was_not_run_at_a_scale(synthetic):
+    summary = two_scales(synthetic).analysis.summary
+    lacking = summary[(summary["estimator"] != "mine") | (summary["error_scale"] < 10)]
+    assert [row[2] for row in pages._best("two", summary)] == ["linear_lse, mine", "linear_lse, mine"]
+    assert [row[2] for row in pages._best("two", lacking)] == ["linear_lse, mine", "linear_lse (not run: mine)"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["bearings", "pendulum_book", "polynomial", "ranging"])
+def test_what_is_stored_is_what_the_program_computes_today(name, tmp_path):
+    """Trials, statistics and words; times are those of a machine."""
+    (option,) = (option for option in discovery.options("experiment") if option.name == name)
+    stored = read(pages.STORED / f"{name}{SUFFIX}")
+    now = read(pages.store(option, tmp_path, tmp_path / "results", pages.ORDINARY))
+    assert (now.command, now.extent) == (stored.command, stored.extent)
+    for frame in KEPT:
+        one, other = (getattr(each.analysis, frame) for each in (now, stored))
+        timed = [column for column in one if "time" in column]
+        pd.testing.assert_frame_equal(one.drop(columns=timed), other.drop(columns=timed), rtol=1e-5, atol=1e-9)
 
 
 @pytest.mark.parametrize("page", WRITTEN, ids=ids)
@@ -169,7 +274,7 @@ def test_the_whole_site_builds_without_a_warning_and_fetches_nothing(tmp_path):
     assert "100 trials per row" in (html / "howto" / "notebook.html").read_text(encoding="utf-8")
     for name in ours:
         ran = f"{name}: no result of it is stored; it runs now" in done.stdout
-        assert ran == (not (PAGES.parent / "gallery" / f"{name}.json").exists())
+        assert ran == (not (pages.STORED / f"{name}{SUFFIX}").exists())
         page = (html / "gallery" / f"{name}.html").read_text(encoding="utf-8")
         assert f"experiment={name}" in re.sub("<[^>]*>", "", page)  # without the marks of colours
         assert "<table" in page

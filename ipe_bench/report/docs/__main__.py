@@ -1,10 +1,9 @@
 """`python -m ipe_bench.report.docs [OUTPUT] [--trials N]`: builds the site by Sphinx, of written pages, of what the
-program says of itself, and of what is stored of its experiments, which `--store` computes."""
+program says of itself, and of what is stored of its experiments, which `--store NAME` computes."""
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import re
 import shlex
@@ -13,9 +12,12 @@ import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from importlib.metadata import version
 from importlib.resources import as_file, files
+from itertools import islice
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pandas as pd
@@ -26,7 +28,9 @@ from ipe_bench.basics.files import make_folder, write_text
 from ipe_bench.basics.statuses import Status
 from ipe_bench.plugins.construct import described
 from ipe_bench.plugins.discovery import CONTRACTS, PACKAGES, Option, options
+from ipe_bench.report.docs.frames import SUFFIX, Computed, read
 from ipe_bench.report.figures import common, drawings
+from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.views import views
 from ipe_bench.report.headline import headline
 from ipe_bench.report.sections import report_tables
@@ -88,6 +92,10 @@ _STORED = {"states": ["state_model=bearings_only"]}
 """The part of an experiment that is stored where its whole takes hours; the command on its page says so."""
 _FIGURES = {"paper": ("figure_2", "figure_3")}
 """The figures of an experiment's page, where they are not the first."""
+_OF_PARAMETERS = ("paper", "pendulum_book")
+"""Experiments whose pages show single parameters."""
+STORED = Path(str(files("ipe_bench.report.docs"))) / "gallery"
+"""The folder of what pages of the gallery are drawn from."""
 
 
 def build(output: Path, trials: int) -> int:
@@ -152,26 +160,53 @@ def write_reference(folder: Path) -> None:
     write_page(folder / "python.md", "python", names=kinds)
 
 
+@dataclass(frozen=True)
+class Page:
+    """Shows an experiment in the gallery."""
+
+    html: str
+    figures: list[Drawing]
+    small: Any
+    """The figure of its thumbnail."""
+
+    @classmethod
+    def of(cls, name: str, analysis: Analysis) -> Page:
+        """Draws the page of an experiment, in the house style."""
+        chosen = _FIGURES.get(name)
+        drawn = drawings(analysis, "all" if chosen else "main")
+        figures = [one for one in drawn if one.name in chosen] if chosen else list(islice(drawn, 1))
+        parts = [*headline(analysis), *report_tables(analysis)[:1]]
+        return cls(html(parts).strip(), figures, _small(analysis))
+
+    @property
+    def words(self) -> list[str]:
+        """All that is read on it, besides what stands in figures."""
+        return [self.html, *(word for one in self.figures for word in (one.name, one.title, one.caption))]
+
+
 def write_gallery(folder: Path, results: Path, trials: int) -> None:
-    """Writes a page per experiment, their list, and a table of the best estimators by model, of what is stored; of an
+    """Draws a page per experiment, their list, and a table of the best estimators by model, of what is stored; of an
     experiment without a stored result, `trials` replaces the default of 1000."""
     chosen, found = _ours("experiment"), {}
     make_folder(pictures := folder / "pictures")
     for option in chosen:
-        with as_file(files("ipe_bench.report.docs") / "gallery") as stored:
-            for path in stored.glob(f"{option.name}*"):
-                shutil.copyfile(path, pictures / path.name)
-        if not (pictures / f"{option.name}.json").exists():
+        path = STORED / f"{option.name}{SUFFIX}"
+        if not path.exists():
             print(f"{option.name}: no result of it is stored; it runs now, with few trials ...", flush=True)
-            store(option, pictures, results / option.name, trials, _PARTS.get(option.name, ()))
-        found[option.name] = json.loads((pictures / f"{option.name}.json").read_text(encoding="utf-8"))
-        write_page(folder / f"{option.name}.md", "experiment", option=option, **found[option.name])
+            path = store(option, results, results / option.name, trials, _PARTS.get(option.name, ()))
+        found[option.name] = computed = read(path)
+        with house_style():
+            page = Page.of(option.name, computed.analysis)
+            for file, figure in (("", page.small), *((f"_{one.name}", one.figure) for one in page.figures)):
+                figure.savefig(pictures / f"{option.name}{file}.png", dpi=150)
+        write_page(folder / f"{option.name}.md", "experiment", option=option, computed=computed, page=page)
     write_page(folder / "index.md", "gallery", experiments=[(option, found[option.name]) for option in chosen])
-    write_page(folder / "best.inc", "best", rows=[row for one in found.values() for row in one["best"]])
+    best = [row for name, computed in found.items() for row in _best(name, computed.analysis.summary)]
+    write_page(folder / "best.inc", "best", rows=best)
 
 
-def store(option: Option, folder: Path, results: Path, trials: int, part: Sequence[str] = ()) -> None:
-    """Runs an experiment, or a part of it, and writes what the gallery shows: NAME.json, its pictures, a small one."""
+def store(option: Option, folder: Path, results: Path, trials: int, part: Sequence[str] = ()) -> Path:
+    """Runs an experiment, or a part of it, and keeps what its page is drawn from; returns the file."""
     name, command = option.name, ["run", f"+experiment={option.name}", *part]
     own = (option.config or {}).get("trials", ORDINARY)
     number = min(own, max(round(own * trials / ORDINARY), min(trials, LEAST)))
@@ -184,31 +219,20 @@ def store(option: Option, folder: Path, results: Path, trials: int, part: Sequen
             raise
         print(f"{name}: {str(error).strip().splitlines()[-1]}", flush=True)
     analysis = analyse([results])
+    computed = Computed(shlex.join(command), version("ipe-bench"), _asked(name) // own, own, analysis)
+    computed.write(path := folder / f"{name}{SUFFIX}", parameters=name in _OF_PARAMETERS)
     with house_style():
-        drawn = {one.name: one for one in drawings(analysis, "all" if name in _FIGURES else "main")}
-        figures = [drawn[one] for one in _FIGURES.get(name, list(drawn)[:1])]
-        for file, figure in (*((f"{name}_{one.name}", one.figure) for one in figures), (name, _small(analysis))):
-            save_small(figure, folder / f"{file}.png")
-    counts = sorted(set(analysis.summary["trials"]))
-    text = {
-        "command": shlex.join(command),
-        "version": version("ipe-bench"),
-        "trials": " to ".join(dict.fromkeys(f"{count:,}" for count in (counts[0], counts[-1]))),
-        "html": html([*headline(analysis), *report_tables(analysis)[:1]]).strip(),
-        "figures": [{"name": one.name, "title": one.title, "caption": one.caption} for one in figures],
-        "best": list(_best(name, analysis.summary)),
-    }
-    write_text(folder / f"{name}.json", json.dumps(text, indent=1, ensure_ascii=False) + "\n")
+        if Page.of(name, read(path).analysis).words != Page.of(name, analysis).words:
+            raise AssertionError(f"{path}: what is kept is not all that the page of {name} is drawn from")
+    print(f"{name}: {computed.extent}", flush=True)
+    return path
 
 
-def save_small(figure: Any, path: Path) -> None:
-    """Saves a figure as a PNG of at most 64 colours, a quarter of the size; a tall one is a little coarser."""
-    from PIL import Image
-
-    figure.savefig(path, dpi=150 if figure.get_figheight() < 6 else 120)
-    with Image.open(path) as picture:
-        few = picture.convert("RGB").quantize(64)
-    few.save(path, optimize=True)
+def _asked(experiment: str) -> int:
+    """Counts the estimates that an experiment asks for, over all its trials."""
+    with TemporaryDirectory() as empty:
+        told = printed_by(["run", f"+experiment={experiment}", f"output={empty}/none", "--dry-run"])
+    return int(re.findall(r"(\d+) would be computed", told)[-1])
 
 
 def _small(analysis: Analysis) -> Any:
@@ -235,27 +259,33 @@ def _small(analysis: Analysis) -> Any:
 
 def _best(experiment: str, summary: pd.DataFrame) -> Iterator[tuple[str, ...]]:
     """Yields who succeeds most often, and at what cost, at the least and the largest error scale of a simulated
-    experiment."""
+    experiment, and who is not there."""
     if "truth" in summary or not {"measurement", "noise", "success"} <= set(summary):
         return
     totals = summary[(summary["parameter"] == ALL) & (summary["noise"] != "certified")]
+    every = list(dict.fromkeys(totals["estimator"]))
     for scale in sorted({totals["error_scale"].min(), totals["error_scale"].max()} if len(totals) else ()):
         here = totals[totals["error_scale"] == scale].sort_values("simulations_median", kind="stable")
         best = here[here["success"] == here["success"].max()]
         names = dict.fromkeys((str(best["measurement"].iloc[0]), experiment))
         link = f"[{', '.join(names)}](gallery/{experiment}.md)"
+        lacking = [label for label in every if label not in set(here["estimator"])]
+        told = f"{enumerate_few(list(best['estimator']), 5)}{f' (not run: {enumerate_few(lacking)})' * bool(lacking)}"
         share = f"{percent(best['success'].iloc[0])} of {best['trials'].iloc[0]}"
         cost = brief(best["simulations_median"].iloc[0])
-        yield link, f"{scale:g}", enumerate_few(list(best["estimator"]), 5), share, cost
+        yield link, f"{scale:g}", told, share, cost
 
 
-def store_all(results: Path, trials: int, names: Sequence[str]) -> int:
-    """Computes what the gallery shows of these experiments, or of all, and stores it with the documentation's pages."""
-    make_folder(folder := Path(str(files("ipe_bench.report.docs"))) / "gallery")
+def store_all(output: Path, trials: int, names: Sequence[str]) -> int:
+    """Computes the experiments that are named and keeps what their pages are drawn from; draws all pages again."""
     for option in _ours("experiment"):
-        if not names or option.name in names:
+        if option.name in names:
             print(f"{option.name} ...", flush=True)
-            store(option, folder, results / option.name, trials, _STORED.get(option.name, ()))
+            store(option, STORED, output / "results" / option.name, trials, _STORED.get(option.name, ()))
+    write_gallery(output / "source" / "gallery", output / "results", trials)
+    for option in _ours("experiment"):
+        computed = read(STORED / f"{option.name}{SUFFIX}")
+        print(f"{option.name}: {computed.extent}, by ipe-bench {computed.version}")
     return 0
 
 
@@ -263,10 +293,9 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("output", nargs="?", default="outputs/docs", type=Path)
     parser.add_argument("--trials", type=int, help="of an experiment that has 1000 by itself")
-    parser.add_argument(
-        "--store", nargs="*", metavar="NAME", help="compute the gallery of these experiments, or of all"
-    )
+    words = "compute these experiments for the gallery, and draw its pages alone"
+    parser.add_argument("--store", nargs="*", metavar="NAME", help=words)
     given = parser.parse_args()
     if given.store is not None:
-        sys.exit(store_all(given.output / "results", given.trials or ORDINARY, given.store))
+        sys.exit(store_all(given.output, given.trials or ORDINARY, given.store))
     sys.exit(build(given.output, given.trials or 10))
