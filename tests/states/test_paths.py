@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize._numdiff import approx_derivative
 from scipy.stats import chi2, kstest
 from shared.oracles import assert_agrees
-from shared.state_models import ConstantVelocity, CoordinatedTurn, Pendulum, path_cost
+from shared.state_models import ConstantVelocity, CoordinatedTurn, Growth, Pendulum, path_cost
 
 from ipe_bench.basics.statuses import Status
 from ipe_bench.plugins.construct import construct
@@ -121,7 +121,7 @@ def test_a_damped_step_is_the_same_in_any_unit_of_the_states():
 
 def test_levenberg_and_marquardt_begin_at_the_better_of_two_filters():
     """No step raises the cost, so that the path after one of them costs no more than that of either smoother."""
-    model = Pendulum(count=40, start=(1.5, 0.0), spread=1.0)
+    model = Growth(count=15)
     z = model.draw(0, 40).z
     found = LevenbergMarquardtSmoother(iterations=1, starts=0).track(model, z)
     costs = []
