@@ -42,6 +42,13 @@ def test_correlated_readings_are_whitened_first():
         assert_agrees(A_plus, np.linalg.solve(A.T @ inverse_R @ A, A.T @ inverse_R), rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.parametrize("rows", [[4, 1, 7], [0, 1, 2], [9]])
+def test_the_covariance_of_some_readings_is_their_part_of_that_of_all(rows):
+    A = np.random.default_rng(2).normal(size=(10, 10))
+    for R in (Covariance(np.linalg.cholesky(A @ A.T)), Covariance(np.abs(A[0]))):
+        np.testing.assert_allclose(R.restricted(np.array(rows)).matrix(), R.matrix()[np.ix_(rows, rows)], rtol=1e-12)
+
+
 def test_a_matrix_without_full_rank_spoils_its_own_trial_only():
     H = conditioned(10.0, 3)
     H[1, :, 2] = H[1, :, 0]

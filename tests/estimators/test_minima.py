@@ -103,3 +103,10 @@ def test_a_slope_for_the_report_ends_no_trial():
     assert np.isnan(found.covariance).all()
     assert (found.x != 0).all()
     assert found.jacobians[0] == pytest.approx(2 * 0.2 + 1)
+
+
+def test_no_start_begins_beyond_a_budget():
+    """A step on three parameters costs 1 + 3: whatever was begun within 6 ends before two more of them."""
+    z = LINEAR.draw(0, 6).z
+    found = Multistart(starts=8, confirmations=8, budget=6.0).estimate(LINEAR.problem, z)
+    assert (found.simulations + 3 * found.jacobians <= 6 + 2 * (1 + 3)).all()

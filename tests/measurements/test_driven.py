@@ -61,6 +61,39 @@ def test_a_battery_follows_its_current(method):
         np.testing.assert_allclose(replace(model).simulate(x), z, atol=1e-12)
 
 
+@pytest.mark.parametrize("method", ["explicit", "implicit"])
+@pytest.mark.parametrize("there", [True, False])
+def test_a_rate_that_depends_on_time_has_its_exact_solution(method, there):
+    """y' = cos t - k y from 0, with its slope by k; without a compiler, too."""
+    times = np.array([0.3, 2.0, 5.5])
+    model = Ode({"y": "cos(t) - k*y"}, {"k": 0.7}, times=tuple(times), method=method, tolerance=1e-11)
+    x = np.array([[1.0], [1.5]])
+
+    def exact(k):
+        return (k * np.cos(times) + np.sin(times) - k * np.exp(-k * times)) / (1 + k**2)
+
+    with patch.object(compiled, "available", lambda: there):
+        z, J = model.simulate(x), model.jacobian(x)
+    for i, k in enumerate(0.7 * x[:, 0]):
+        np.testing.assert_allclose(z[i], exact(k), atol=1e-9)
+        np.testing.assert_allclose(J[i, :, 0], 0.7 * np.imag(exact(k + 1e-30j)) / 1e-30, atol=1e-8)
+
+
+@pytest.mark.parametrize("method", ["explicit", "implicit"])
+def test_a_reading_at_a_jump_shows_the_input_from_then_on(method):
+    columns = {"time": [0.0, 1.0, 2.0], "u": [3.0, -1.0, 0.5]}
+    model = Ode(
+        {"y": "u - k*y"}, {"k": 0.7}, outputs={"z": "y + 10*u"}, times=(0.0, 0.5, 1.0, 1.5, 2.0, 3.0),
+        driven_by={"u": "hold"}, columns=columns, method=method, tolerance=1e-11,
+    )  # fmt: skip
+    y, k, exact = 0.0, 0.7, []
+    for step, u in ((0.0, 3.0), (0.5, 3.0), (0.5, 3.0), (0.5, -1.0), (0.5, -1.0), (1.0, 0.5)):
+        y = u / k + (y - u / k) * np.exp(-k * step)
+        exact.append(y)
+    shown = np.array([3.0, 3.0, -1.0, -1.0, 0.5, 0.5])
+    np.testing.assert_allclose(model.simulate(model.nominal[None])[0], exact + 10 * shown, atol=1e-9)
+
+
 @pytest.mark.oracle("closed form: a state that follows a straight input", "readings", 1e-10)
 @pytest.mark.parametrize("method", ["explicit", pytest.param("implicit", marks=pytest.mark.slow)])
 def test_a_stiff_follower_of_a_straight_input_has_its_exact_solution(method):

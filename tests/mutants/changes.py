@@ -274,7 +274,7 @@ CHANGES = {
         "a temporary file of a write that fails stays",
         "temporary.unlink(missing_ok=True)",
         "temporary.exists()",
-        "test_store.py test_fire.py",
+        "test_files.py",
     ),
     "safety-forgotten": Change(
         "engine",
@@ -498,7 +498,7 @@ CHANGES = {
         "multistart begins again beyond its budget",
         "(confirmed < self.confirmations) & affordable & ~hopeless",
         "(confirmed < self.confirmations) & ~hopeless",
-        "test_least_squares.py test_costs.py",
+        "test_minima.py test_least_squares.py",
     ),
     "worse-of-two": Change(
         "baselines",

@@ -8,11 +8,13 @@ import pytest
 from scipy.optimize import least_squares
 from shared.instruments import EXACT, SATURATION, START, estimate, simulated, solution
 from shared.oracles import assert_agrees
+from shared.small_models import Bent
 
 import ipe_bench as ib
 from ipe_bench.baselines import LevenbergMarquardt
 from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Formula, Sir
+from ipe_bench.measurements.joint import Joint
 from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo
 from ipe_bench.noise import Gaussian, ModelNoise
 from ipe_bench.real.readings import Readings, open_together
@@ -53,6 +55,12 @@ def test_a_parameter_of_one_file_may_be_known_there(files):
     assert of(result, result.standard_errors) == pytest.approx({"b1_1": deviations[0], "b2": deviations[1]}, rel=1e-8)
     assert result.model.fixed == {"b1_2": 181.0}
     assert result.degrees_of_freedom == sum(map(len, data)) - 2
+
+
+def test_the_epochs_of_files_are_those_of_one_after_those_of_another():
+    one, other = Bent(count=6), Bent(count=9)
+    rows = [part.tolist() for part in Joint((one, other)).epochs or ()]
+    assert rows == [[0, 1, 2], [3, 4, 5], [6, 7, 8], [9, 10, 11], [12, 13, 14]]
 
 
 @pytest.mark.oracle("library: SciPy's least_squares within bounds", "standard errors of two files together", 1e-6)

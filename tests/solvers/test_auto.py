@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from shared.small_models import Written
 
 from ipe_bench.baselines import GaussNewton, LevenbergMarquardt
 from ipe_bench.basics.linalg import Covariance, deviations
@@ -31,6 +32,19 @@ def off_the_minimum(scenario: Scenario, trials: int):
 def test_it_finds_the_least_squares_minimum_next_to_the_truth(scale):
     _, off = off_the_minimum(Scenario(Gins(), Quantization(0.02286), error_scale=scale), 20)
     assert off.max() < 1e-3
+
+
+def test_of_minima_that_fit_alike_the_most_probable_one_counts():
+    """A cubic has three roots; the answer is the one of them, of those found, whose posterior density is largest."""
+    model = Written(lambda a: (a**3 - 3 * a, 2 * (a**3 - 3 * a)), first=0.9)
+    problem = Problem(model, Covariance(np.full(2, 0.01)), np.array([1.0]))
+    level = np.linspace(-1.8, 1.8, 25)
+    found = Auto(confirmations=8).estimate(problem, level[:, None] * [1.0, 2.0])
+    several = 0
+    for x, others in zip(found.x, found.alternatives or (), strict=True):
+        several += len(others) > 0
+        assert (np.abs(x - 0.9) <= np.abs(others - 0.9) + 1e-6).all()
+    assert several > 5
 
 
 def test_what_is_nearly_linear_costs_no_more_than_fixed_point_iteration_and_half_again():

@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 from shared.oracles import agreed, assert_agrees
-from shared.small_models import Bent
+from shared.small_models import Bent, Written
 
 from ipe_bench.baselines import GaussNewton, LevenbergMarquardt
 from ipe_bench.basics.linalg import Array, Covariance, deviations, information, quadratic_form
@@ -50,6 +50,18 @@ def test_the_minimum_is_that_of_scipy(estimator):
         found = least_squares(residual, problem.x0, jac="3-point", xtol=1e-15, ftol=1e-15, gtol=1e-12)
         agreed(np.abs(x - found.x), 1e-6)
         np.testing.assert_allclose(P, np.linalg.inv(found.jac.T @ found.jac), rtol=1e-4)
+
+
+@pytest.mark.parametrize("bend", [0.05, -0.05])
+def test_geodesic_acceleration_makes_the_second_order_of_a_step_right(bend):
+    """Along a parabola z = x + b x^2 the plain step from 0 is z, and the bent one z - b z^2; the root is
+    z - b z^2 + 2 b^2 z^3 - ..."""
+    model = Written(lambda a: (a + bend * a**2, 2 * (a + bend * a**2)))
+    problem = Problem(model, Covariance(np.ones(2)), np.array([1.0]))
+    z = np.array([[1.0, 2.0], [-0.5, -1.0]])
+    for geodesic, expected in ((False, z[:, 0]), (True, z[:, 0] - bend * z[:, 0] ** 2)):
+        method = LevenbergMarquardt("nominal", damping=1e-12, geodesic=geodesic, max_iterations=1)
+        np.testing.assert_allclose(method.estimate(problem, z).x[:, 0], expected, rtol=1e-9)
 
 
 def exact_inverse_of_normal_matrix(J: Array) -> Array:

@@ -13,7 +13,7 @@ from ipe_bench.measurements import Gins, Measurement, Polynomial
 from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.noise import Gaussian, Quantization
 from ipe_bench.priors import GaussianPrior
-from ipe_bench.solvers import Anderson, Broyden, DampedNewton, FixedPoint, Newton, SteepestDescent
+from ipe_bench.solvers import Anderson, Broyden, DampedNewton, FixedPoint, Newton, Relinearized, SteepestDescent
 from ipe_bench.statistics.sample import orders_of
 from ipe_bench.trials.roots import frozen_root
 from ipe_bench.trials.scenario import Scenario
@@ -62,6 +62,39 @@ def test_every_solver_finds_the_root_of_a_contraction(solver):
     roots, _ = roots_of(CUBIC, solver, starts)
     assert (roots.status == Status.CONVERGED).all()
     np.testing.assert_allclose(roots.x, 0.0, atol=1e-8)
+
+
+@pytest.mark.parametrize("depth", [1, 2, 3])
+def test_anderson_s_method_of_full_depth_solves_linear_equations_in_one_step_per_unknown(depth):
+    """With n differences of F behind it the next step is the root (Walker and Ni 2011: as GMRES is); with fewer it is
+    not there yet."""
+    A = np.array([[1.3, 0.4, -0.2], [0.1, 0.8, 0.3], [-0.3, 0.2, 1.1]])
+    model = Written(lambda *x: tuple(A @ np.array(x)), 3, 3)
+    start = np.array([[1.0, -2.0, 0.5], [3.0, 1.0, 4.0]])
+    roots, _ = roots_of(model, Anderson(depth), start, tolerance=1e-10, max_iterations=4)
+    assert (roots.status == (Status.CONVERGED if depth == 3 else Status.MAX_ITERATIONS)).all()
+
+
+def test_a_line_search_takes_no_step_that_decreases_nothing():
+    """Newton's steps on sign(a) sqrt(abs(a)) lead from a to -a, for ever; half of one leads to the root."""
+
+    def signed_root(a):
+        at = np.real(a)
+        size = np.sqrt(np.abs(at))
+        return (np.sign(at) * size + (a - at) / np.maximum(2 * size, 1e-300),)
+
+    model = Written(signed_root, 1, 1)
+    start = np.array([[0.5], [-3.0]])
+    assert (roots_of(model, Newton(), start, max_iterations=50)[0].status == Status.MAX_ITERATIONS).all()
+    damped, _ = roots_of(model, DampedNewton(), start, max_iterations=50)
+    np.testing.assert_allclose(damped.x, 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("solver", [Newton(), FixedPoint(), Broyden()], ids=repr)
+def test_rounds_of_relinearized_count_the_steps_within_them(solver):
+    scenario = Scenario(Polynomial(strength=0.05), Gaussian(0.1), error_scale=3.0)
+    found = Relinearized(solver).estimate(scenario.problem, scenario.draw(0, 6).z, history=True)
+    assert found.iterations.tolist() == [len(path) - 1 for path in found.history or ()]
 
 
 @pytest.mark.oracle(

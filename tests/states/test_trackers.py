@@ -35,6 +35,7 @@ from ipe_bench.states import (
     posterior_bounds,
     ukf,
 )
+from ipe_bench.states.particles import _resampled
 
 BOOK = {
     "EKF": (Taylor(), 1, 0.16830859061153763, 0.057446202494837),
@@ -290,6 +291,33 @@ def test_a_grid_gives_the_kalman_filter_and_its_smoother_of_a_linear_model(moved
         np.testing.assert_allclose(found.log_likelihood, filtered.log_likelihood, atol=1e-6)
         np.testing.assert_allclose(found.innovations, filtered.innovations, atol=1e-5)
         np.testing.assert_array_equal(found.mean[26:], grid.track(model, z[26:]).mean)
+
+
+def test_an_iterated_update_is_the_most_probable_state_after_a_reading():
+    """Of one prediction and one reading: the minimum of both misfits (Bell and Cathey 1993), by SciPy."""
+    model = Pendulum(count=1, start=(1.2, 0.0), spread=0.5, variance=1e-3)
+    z = np.array([[[0.6]], [[0.85]], [[0.99]]])
+    tracks = Filter(Taylor(), 60).track(model, z)
+    (m, P), first = tracks.predicted[0], Filter(Taylor()).track(model, z)
+    for trial in range(3):
+        root = np.linalg.inv(np.linalg.cholesky(P[trial]))
+
+        def misfits(x, trial=trial, root=root):
+            return [*(root @ (x - m[trial])), (z[trial, 0, 0] - np.sin(x[0])) / np.sqrt(model.variance)]
+
+        found = least_squares(misfits, m[trial], xtol=1e-14, ftol=1e-14, gtol=1e-14).x
+        np.testing.assert_allclose(tracks.mean[trial, 0], found, atol=1e-5)
+    assert np.abs(first.mean - tracks.mean).max() > 0.01
+
+
+def test_particles_are_copied_as_often_as_their_weights_say():
+    """The whole part of N w or one more, and on average over all offsets N w (Kitagawa 1996)."""
+    w, offset = np.array([0.05, 0.31, 0.0, 0.14, 0.5]), (np.arange(2000) + 0.5) / 2000
+    x = np.broadcast_to(np.arange(5.0)[None, :, None], (2000, 5, 1)).copy()
+    copied = _resampled(x, np.broadcast_to(w, (2000, 5)), offset)[..., 0]
+    counts = (copied[:, :, None] == np.arange(5.0)).sum(axis=1)
+    assert (np.abs(counts - 5 * w) < 1).all()
+    np.testing.assert_allclose(counts.mean(axis=0), 5 * w, atol=2e-3)
 
 
 def test_particles_have_the_likelihood_of_the_kalman_filter_of_a_linear_model():
