@@ -9,7 +9,7 @@ import pytest
 
 from ipe_bench.cli.main import main
 from ipe_bench.plugins import discovery
-from ipe_bench.plugins.conformance import check_option
+from ipe_bench.plugins.conformance import check_option, left_of_skeleton
 
 _numbers = itertools.count()
 
@@ -96,3 +96,13 @@ def test_the_generated_test_of_a_model_with_an_option_that_it_cannot_do_without(
     config.write_text(config.read_text() + "\nlevel: 2.0\n")
     done = subprocess.run(run, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stdout
+
+
+def test_texts_of_a_skeleton_are_found_in_its_code_and_its_config(ipe_bench):
+    assert ipe_bench("new", "measurement", "tank")[0] == 0
+    own = discovery.options_in(Path("plugins/tank"))
+    found = {finding.component for finding in left_of_skeleton(own)}
+    assert found == {"tank.py", "tank.yaml"}
+    for path in Path("plugins/tank").rglob("tank.*"):
+        path.write_text(path.read_text().replace("One line that", "What").replace("Replace", "These are"))
+    assert not list(left_of_skeleton(own))

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import pytest
+import yaml
 from annotated_types import Ge, Gt, Le, Lt, MinLen
 from omegaconf import OmegaConf
 
@@ -24,6 +25,13 @@ from ipe_bench.runs.execution import Processes
 from ipe_bench.solvers import Newton, Relinearized, SteepestDescent
 
 inf, nan = np.inf, np.nan
+
+
+@pytest.mark.parametrize(("text", "wrong"), [("a: 1\nb: 2\na: 3", "a is there twice"), ("a: &x 1\nb: *x", "an alias")])
+def test_yaml_that_would_lose_or_hide_a_value_is_refused(text, wrong):
+    assert discovery.read_yaml("a: 1e-6\nb: [2, x]") == {"a": 1e-6, "b": [2, "x"]}
+    with pytest.raises(yaml.YAMLError, match=wrong):
+        discovery.read_yaml(text)
 
 
 @pytest.mark.parametrize(

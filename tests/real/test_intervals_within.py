@@ -5,6 +5,7 @@ import pytest
 from scipy.optimize import brentq, least_squares
 from scipy.stats import norm
 from shared.oracles import assert_agrees
+from shared.synthetic_store import Repeated
 
 from ipe_bench.baselines import GaussNewton, LevenbergMarquardt
 from ipe_bench.measurements import Formula
@@ -43,6 +44,16 @@ def test_the_interval_of_a_linear_parameter_on_its_bound_is_known(beyond, side):
     assert (one.parameter.name, one.bound) == ("b", bound)
     expected = bound - side * s * (-beyond + np.sqrt(beyond**2 + Q**2))
     assert_agrees(one.other / s, expected / s, atol=1e-3)
+
+
+@pytest.mark.parametrize("sizes", [(1.0, 10.0), (-2.0, 0.1), (-1.0, -3.0)])
+def test_the_interval_of_a_linear_parameter_has_its_ends_in_order_in_any_unit(sizes):
+    """Four readings of each, of deviation .4 in its unit: plus or minus 1.96 times .2, whatever sign the unit has."""
+    model, x = Repeated(names=("a", "b"), sizes_given=sizes), np.array([3.0, 7.0])
+    z = np.tile(x, 4) + 0.1 * np.array([-1, 2, -1, 2, 1, -2, 1, -2])
+    low, high = profiles(Scenario(model, Gaussian(0.4)).problem, z, x, 0.04 * np.eye(2))
+    reach = 0.2 * Q * np.abs(sizes)
+    np.testing.assert_allclose([low, high], [x * sizes - reach, x * sizes + reach], rtol=1e-4)
 
 
 @pytest.mark.parametrize("side", [-1, 1])

@@ -25,7 +25,7 @@ from ipe_bench.report.html import DEFINITIONS, render_page
 from ipe_bench.report.table import Strong, Table, column, comma_separated, html, latex, markdown, terminal, texts, words
 from ipe_bench.report.tables import all_tables, differing
 from ipe_bench.report.terminal import reported, summary_tables
-from ipe_bench.report.words import compact, duration, percent, short
+from ipe_bench.report.words import compact, cost, duration, percent, short
 from ipe_bench.statistics import analyse
 from ipe_bench.statistics.records import SCORES, STATISTICS
 from ipe_bench.statistics.statistic import frame_columns
@@ -150,6 +150,8 @@ def test_numbers_are_written_for_readers():
     assert [short(v) for v in (1.00234, 14520.3, 3.0, float("inf"))] == ["1.002", "14,520", "3", "inf"]
     assert [duration(v) for v in (2.0, 0.0123, 9.4e-6)] == ["2.00 s", "12.3 ms", "9.40 µs"]
     assert [duration(v, 2) for v in (0.00096, 0.123, 0.9996, 0.0)] == ["960 µs", "120 ms", "1.0 s", "0 s"]
+    # The mean stands behind a median from which it differs by more than a twentieth, to either side.
+    assert [cost(100.0, v) for v in (60.0, 96.0, 104.0, 250.0)] == ["100/60", "100", "100", "100/250"]
     assert [compact(v) for v in (0.945, 12195, 999.7, 1.6e6, 3e-5)] == ["0.945", "12.2k", "1.00k", "1.60M", "3.0e-5"]
 
 

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from ipe_bench import Scenario
 from ipe_bench.baselines import LinearLSE
 from ipe_bench.basics.errors import UserError
 from ipe_bench.noise import Gaussian
-from ipe_bench.runs.execution import Auto, Processes, Serial
+from ipe_bench.runs.execution import Auto, Event, Failure, Processes, Serial
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.run import compute
 from ipe_bench.solvers import Newton
@@ -66,6 +67,32 @@ def reference(tmp_path_factory) -> dict[str, np.ndarray]:
     folder = tmp_path_factory.mktemp("serial")
     assert compute([scenario()], GOOD, 40, folder, execution=Serial(), block_size=10) == ()
     return stored(folder)
+
+
+class Dying(Serial):
+    """An execution in which the process of every task with an estimator of this name ends before it is computed."""
+
+    def run(self, work, tasks):
+        for index, task in enumerate(tasks):
+            labels = [cell.label for cell in task.cells]
+            if "newton" in labels:
+                asked.append(labels)
+                yield Event(index, ended=True, failure=Failure("died", "the worker process was ended by SIGKILL"))
+            else:
+                yield from (replace(event, index=index) for event in super().run(work, [task]))
+
+
+asked: list[list[str]] = []
+
+
+def test_what_takes_its_process_with_it_is_tried_twice_alone_and_the_rest_goes_on(tmp_path):
+    asked.clear()
+    (said,) = compute([scenario()], GOOD, 10, tmp_path, execution=Dying())
+    assert said.startswith("newton on bent")
+    assert said.endswith("trials 0 to 10: the worker process was ended by SIGKILL")
+    assert asked.count(["newton"]) == 2
+    (lacking,) = [cell for cell in Results.read([tmp_path]).cells if not cell.complete]
+    assert lacking.names["estimator"] == "newton"
 
 
 def test_a_run_completes_when_a_worker_is_killed(tmp_path, reference):
