@@ -62,6 +62,7 @@ def test_a_formula_and_a_file_are_enough_where_nobody_knows_the_noise(estimate, 
     chosen."""
     code, printed, answer = estimate(*SATURATION, "readings=my.csv", "figures=all")
     assert code == 0, printed
+    assert list(Path("outputs").rglob("*.png"))
     assert list(answer["estimators"]) == ["auto", "linear_lse", "levenberg_marquardt"]
     assert "The noise level is estimated from the residuals" in printed
     # Chi-square is the degrees of freedom where the level is estimated: the level is told instead.
@@ -82,6 +83,7 @@ def test_a_column_of_deviations_weighs_the_readings(estimate, misra, words, abso
     sigma = 0.05 + 0.01 * np.arange(len(t))
     code, printed, answer = estimate(*SATURATION, *LM, "readings=weighted.csv", *words)
     assert code == 0, printed
+    assert not list(Path("outputs").rglob("*.png"))
     x, P = curve_fit(curve, t, y, (250, 5e-4), sigma, absolute, ftol=1e-14, xtol=1e-14, gtol=1e-14)
     assert list(of(answer, "estimates").values()) == pytest.approx(x, rel=1e-6)
     assert list(of(answer, "standard_errors").values()) == pytest.approx(np.sqrt(np.diag(P)), rel=1e-5)

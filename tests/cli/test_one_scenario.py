@@ -1,11 +1,13 @@
 """`ipe-bench design` and `ipe-bench posterior`: tables and files."""
 
 import csv
+from types import SimpleNamespace
 
 import pandas as pd
 import pytest
 
 import ipe_bench as ib
+from ipe_bench.report import questions
 
 SMALL = ("measurement=polynomial", "noise=gaussian", "noise.deviation=0.01")
 
@@ -61,3 +63,13 @@ def test_a_table_and_files_for_each_trial(ipe_bench, tmp_path):
     assert max(diverging["newton"]) < 0.3 < min(diverging["linear_lse"])
     assert [row[-5] for row in rows if "newton" in row] == ["yes", "yes"]
     assert [row[-5] for row in rows if "linear_lse" in row] == ["NO", "NO"]
+
+
+@pytest.mark.parametrize("settled", [(True, True), (True, False), (False, True), (False, False)])
+def test_posteriors_exit_with_1_unless_the_populations_of_every_trial_agree(ipe_bench, monkeypatch, settled):
+    """Of two trials: what they agree on is made up here."""
+    found = [SimpleNamespace(posterior=SimpleNamespace(settled=one)) for one in settled]
+    monkeypatch.setattr(ib, "posterior", lambda *args, **options: found)
+    monkeypatch.setattr(questions, "write_posteriors", lambda folder, *args: [folder / "posterior.json"])
+    monkeypatch.setattr(questions, "posterior_parts", lambda *args: [])
+    assert ipe_bench("posterior", *SMALL, "trials=2")[0] == (0 if all(settled) else 1)
