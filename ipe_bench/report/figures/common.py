@@ -190,30 +190,19 @@ def log_ticks(axis: Axis, low: float, high: float) -> None:
 
 
 def full_ticks(ax: Axes, most: int = 4) -> None:
-    """Labels the horizontal axis with whole numbers of a step, no part of which is set aside, as far as they fit."""
+    """Labels the horizontal axis with whole numbers, of which no part is set aside at its end, as many as fit."""
     from matplotlib.ticker import MaxNLocator
 
     (low, high), room = ax.get_xlim(), _room(ax, "xtick.labelsize")
-    ticks, labels = np.empty(0), list[str]()
     for intervals in range(most, 1, -1):
         ticks = np.asarray(MaxNLocator(intervals, steps=[1, 2, 5, 10]).tick_values(low, high))
         ticks = ticks[(ticks >= low) & (ticks <= high)]
-        labels = in_full(ticks)
-        if sum(map(len, labels)) + 2 * len(labels) <= room:
+        step = np.diff(ticks).min(initial=1.0)
+        decimals = -int(np.floor(np.log10(step) + 1e-9))
+        labels = [f"{tick:.{decimals}f}".replace("-", "\N{MINUS SIGN}") for tick in ticks]
+        ax.set_xticks(ticks.tolist(), labels)
+        if sum(len(label) + 2 for label in labels) <= room:
             break
-    ax.set_xticks(ticks, labels)
-
-
-def in_full(ticks: Any) -> list[str]:
-    """Writes equidistant numbers with all the digits that tell them apart: 0.0387555 or −1.9598, 2.5·10⁻⁷ if small."""
-    if len(ticks) < 2:
-        return [number(tick) for tick in ticks]
-    step, largest = ticks[1] - ticks[0], np.abs(ticks).max()
-    exponent = int(np.floor(np.log10(largest))) if largest < 1e-3 or step >= 1e4 else 0
-    digits = max(0, exponent - int(np.floor(np.log10(step) + 1e-9)))
-    power = f"·10{str(exponent).translate(_RAISED)}" if exponent else ""
-    written = [f"{tick / 10.0**exponent:.{digits}f}{power}" for tick in ticks]
-    return [label.replace("-", "\N{MINUS SIGN}") for label in written]
 
 
 def shares(ax: Axes) -> None:
