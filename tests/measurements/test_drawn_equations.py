@@ -47,6 +47,11 @@ def test_scipy_has_an_answer_for_nearly_all_drawn_equations():
     assert sum(len(z) == 0 for z in stored) < 0.05 * COUNT
 
 
+@pytest.mark.oracle(
+    "library: SciPy's solve_ivp, on the text of the equations",
+    "readings of 500 drawn models, in tolerances of the model",
+    3.0,
+)
 @pytest.mark.slow
 @pytest.mark.parametrize("start", range(10))
 def test_readings_of_all_drawn_equations_are_those_of_scipy(start):
