@@ -27,7 +27,7 @@ campaigns: .venv/ready
 # How closely numbers agree with what they are checked against: tests/oracles.json and the page of it. TESTS="FILE ..."
 # runs the marked tests of these files alone; those of plugins run in their environment, after `make plugins`.
 oracles: .venv/ready
-	$(BIN)/pytest -m oracle --record-oracles $(TESTS)
+	RECORD_ORACLES=1 $(BIN)/pytest -m oracle $(TESTS)
 	$(if $(TESTS),,outputs/plugins/.venv/bin/python -m pytest -m "oracle and plugin" --record-oracles plugins)
 
 # The worked plugins that need a library of their own, with those libraries in an environment of their own.

@@ -4,11 +4,16 @@ import sys
 from pathlib import Path
 
 import pytest
+from shared import oracles
 from shared.chromium import browser  # noqa: F401
 from shared.synthetic_store import Synthetic
 
 from ipe_bench.cli.main import main
 from ipe_bench.plugins import discovery
+
+
+def pytest_configure(config):
+    oracles.join(config)
 
 
 @pytest.fixture

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import ast
 import json
+import os
 import re
+import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -97,8 +99,10 @@ def assert_agrees(actual: Any, desired: Any, rtol: float = 0.0, atol: float = 0.
     _held.append(Held(float(np.max(gaps, initial=0.0)), rtol or atol, bool(rtol)))
 
 
-def pytest_addoption(parser: Any) -> None:
-    parser.addoption("--record-oracles", action="store_true", help="writes tests/oracles.json and its page")
+def join(config: Any) -> None:
+    """Lets pytest call what stands below; the conftest.py of the tests and that of the plugins ask for it."""
+    if not config.pluginmanager.has_plugin(__name__):
+        config.pluginmanager.register(sys.modules[__name__], __name__)
 
 
 @pytest.hookimpl(wrapper=True)
@@ -126,7 +130,7 @@ def pytest_runtest_logreport(report: Any) -> None:
 
 
 def pytest_sessionfinish(session: Any) -> None:
-    if session.config.getoption("--record-oracles"):
+    if os.environ.get("RECORD_ORACLES") and not hasattr(session.config, "workerinput"):
         record()
 
 
