@@ -36,10 +36,10 @@ def test_run_shows_what_it_asked_for_and_counts_the_rest(ipe_bench):
 
 def test_a_folder_with_results_of_other_settings_is_said_to_hold_them(ipe_bench):
     words = (*SMALL, "solver=[newton]", "output=mixed")
-    assert "holds" not in ipe_bench("run", *words, "trials=4")[1]
+    assert "mixed: holds" not in ipe_bench("run", *words, "trials=4")[1]
     # More trials, and a sweep that includes what is there, have nothing beside them.
-    assert "holds" not in ipe_bench("run", *words, "trials=8")[1]
-    assert "holds" not in ipe_bench("run", "-m", *words, "trials=8", "error_scale=1,3")[1]
+    assert "mixed: holds" not in ipe_bench("run", *words, "trials=8")[1]
+    assert "mixed: holds" not in ipe_bench("run", "-m", *words, "trials=8", "error_scale=1,3")[1]
     _, out, _ = ipe_bench("run", *words, "trials=8", "seed=5")
     assert "mixed: holds 2 results of other settings or older code; they stay beside the new" in out
 
