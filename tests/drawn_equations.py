@@ -1,11 +1,13 @@
 """Differential equations that are drawn, and the readings that SciPy computes of them.
 
-`python tests/drawn_equations.py` draws them all and stores the readings, in ten minutes.
+`python tests/drawn_equations.py` draws them all and stores the readings, in ten minutes. Those from `HARD` on have
+poles, pulses, or outputs that magnify the states, and ten readings far apart.
 """
 
 from __future__ import annotations
 
 import itertools
+import multiprocessing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +18,7 @@ from scipy.integrate import solve_ivp
 from ipe_bench.measurements import Ode
 
 ANSWERS = Path(__file__).with_name("drawn_equations.npz")
-COUNT = 500
+COUNT, HARD = 1000, 500
 _MOST = 500_000
 """Rates in one interval beyond which SciPy is not waited for."""
 _KNOWN = {name: getattr(np, name) for name in ("sin", "cos", "exp", "log", "sqrt", "tanh")}
@@ -26,6 +28,7 @@ _SHOWN = (
     *("{y}**4/(0.0625+{y}**4)", "1/(1+{y}**2)", "sin({y})", "cos(3*{y})", "min(max({y},0.1),0.8)", "{y}*{z}+k0*t"),
 )
 _FELT = ("{z}", "tanh({z})", "{z}/(1+{z}**2)", "1/(1+{z}**2)", "sin({z})", "k1", "sin(3*t)", "exp(-t)", "c")
+_PULSES = ("exp(-((t-{m})/{w})**2)/{w}", "1/(1+((t-{m})/{w})**2)**2/{w}", "exp(-abs(t-{m})/{w})/{w}")
 
 
 @dataclass(frozen=True)
@@ -34,9 +37,78 @@ class Drawn:
 
     model: Ode
     x: np.ndarray
+    halts: tuple[float, ...] = ()
+    """Times at which SciPy begins anew, so that it meets a pulse."""
+    exact: Any = None
+    """The readings (m,) where a formula tells them; not numbers where they are below the last digit of a state."""
 
 
 def drawn(number: int) -> Drawn:
+    """Draws a model of the first kind, or, from `HARD` on, one with a pole, a pulse or an output that magnifies."""
+    if HARD <= number < COUNT:
+        r = np.random.default_rng(number)
+        return (with_pole, with_pulse, magnifying)[number % 3](r)
+    return easy(number)
+
+
+def _far_apart(r: np.random.Generator) -> tuple[float, ...]:
+    return tuple((float(r.choice([0.5, 1.0, 4.0])) * np.arange(1.0, 11.0)).tolist())
+
+
+def with_pole(r: np.random.Generator) -> Drawn:
+    """Saturating kinetics, whose fast decay ends at a pole just below 0, fed steadily, for a while or in waves, from 0
+    or from a dose; and a slower state behind it."""
+    times = _far_apart(r)
+    constants = {"L": float(f"{10 ** r.uniform(1.5, 3.7):.4g}"), "K": float(f"{10 ** r.uniform(-3.0, -0.5):.3g}")}
+    loss = str(r.choice(["L*y/(K+y)", "L*y/(K+y)", "L*y/(K+y+y**2/20)", "L*y**2/(K**2+y**2)", "L*y*(K+y)**-1"]))
+    fed = str(r.choice(["k0", "k0", f"(k0 if t < {0.43 * times[-1]:.3f} else 0)", "k0*(1+sin(t))"]))
+    rates = {"y": f"{fed}-{loss}", "z": f"{loss}-k1*z"}
+    initial = {"y": str(r.choice(["0", "0", "2", "10"]))}
+    shown = ("z", "z/(0.3+z)", "z/(0.3+z)", "tanh(z)", "1/(1+z)", "y/(K+y)", "exp(-z)")
+    outputs = {f"z{i}": str(r.choice(shown)) for i in range(r.integers(1, 3))}
+    start = {"k0": float(f"{r.uniform(0.5, 3.0):.3g}"), "k1": float(f"{r.uniform(0.3, 2.0):.3g}")}
+    model = Ode(rates, start, initial, outputs, times, constants=constants)  # type: ignore[arg-type]
+    return Drawn(model, np.exp(r.choice([0.05, 0.3, 1.0]) * r.standard_normal(2)))
+
+
+def with_pulse(r: np.random.Generator) -> Drawn:
+    """One or two short pulses, of a fifth to a thousandth of the interval between readings, and a slower state."""
+    times = _far_apart(r)
+    pulses, halts = [], list[float]()
+    for _ in range(r.integers(1, 3)):
+        width, middle = float(f"{times[0] * 10 ** r.uniform(-3.0, -0.7):.3g}"), float(f"{r.uniform(0, times[4]):.5g}")
+        pulses.append(str(r.choice(_PULSES)).format(m=middle, w=width))
+        halts += [middle + share * width for share in (-25, -12, -6, -3, -1, 0, 1, 3, 6, 12, 25)]
+    rates = {"y": f"k0*({'+'.join(pulses)})-k1*y"}
+    if r.random() < 0.5:
+        rates["z"] = str(r.choice(["y-0.5*z", "k1*y-z", "y*(1-z)"]))
+    shown = ("{y}", "{y}/(0.5+{y})", "tanh({y})", "exp(-{y})")
+    outputs = {f"z{i}": str(r.choice(shown)).format(y=r.choice(list(rates))) for i in range(r.integers(1, 3))}
+    start = {"k0": float(f"{r.uniform(0.5, 3.0):.3g}"), "k1": float(f"{r.uniform(0.05, 1.0):.3g}")}
+    model = Ode(rates, start, {}, outputs, times)  # type: ignore[arg-type]
+    x = np.exp(r.choice([0.05, 0.3, 1.0]) * r.standard_normal(2))
+    return Drawn(model, x, tuple(sorted(halt for halt in halts if 0.0 < halt < times[-1])))
+
+
+def magnifying(r: np.random.Generator) -> Drawn:
+    """Outputs that tell apart what states of double precision do not: of a state that grows, or turns."""
+    times, x = _far_apart(r), np.exp(r.choice([0.05, 0.3, 1.0]) * r.standard_normal(1))
+    t, wide = np.array(times, dtype=np.longdouble), np.longdouble
+    if r.random() < 0.5:
+        k = float(f"{r.uniform(1.0, 60.0) / times[-1]:.3g}")
+        rates, initial, y = {"y": "k*y"}, {"y": 1.0}, np.exp(wide(k) * wide(x[0]) * t)
+    else:
+        k = float(f"{r.uniform(0.3, 3.0):.3g}")
+        rates, initial, y = {"y": "k*v", "v": "-k*y"}, {"y": 1.0}, np.cos(wide(k) * wide(x[0]) * t)
+    factor = float(f"{10 ** r.uniform(0.0, 9.0):.3g}")
+    outputs = {"z": str(r.choice([f"cos({factor}*y)", f"sin({factor}*y)", f"1/(1.5+cos({factor}*y))"]))}
+    told = np.array(eval(outputs["z"], {"cos": np.cos, "sin": np.sin}, {"y": y}), dtype=float)
+    hidden = np.abs(factor * y) > 1e13
+    model = Ode(rates, {"k": k}, initial, outputs, times)  # type: ignore[arg-type]
+    return Drawn(model, x, exact=np.where(hidden, np.nan, told))
+
+
+def easy(number: int) -> Drawn:
     """Fast and slow states, readings that saturate, turn and are clipped, one reading and many, at t = 0, too, cases,
     inputs that are held or straight between rows, and rates that jump at known times."""
     r = np.random.default_rng(number)
@@ -98,11 +170,12 @@ def solved(one: Drawn, method: str, rtol: float) -> np.ndarray:
         known = _KNOWN | p
         for name, value in model.constants.items():
             known[name] = value[case] if isinstance(value, tuple) else value
-        z.append(_case(model, known, method, rtol))
+        z.append(_case(one, known, method, rtol))
     return np.concatenate(z)
 
 
-def _case(model: Ode, known: dict[str, Any], method: str, rtol: float) -> np.ndarray:
+def _case(one: Drawn, known: dict[str, Any], method: str, rtol: float) -> np.ndarray:
+    model = one.model
     names, rows = list(model.rates), model.columns
     rates, outputs = ([_compiled(str(f)) for f in part.values()] for part in (model.rates, model.outputs))
 
@@ -115,9 +188,10 @@ def _case(model: Ode, known: dict[str, Any], method: str, rtol: float) -> np.nda
             found["u"] = rows["u"][k] if held else np.interp(t, rows["time"], rows["u"])
         return found
 
-    y = np.array([float(eval(_compiled(str(model.initial[name])), {}, known)) for name in names])
+    y = np.array([float(eval(_compiled(str(model.initial.get(name, 0.0))), {}, known)) for name in names])
     jumps = [float(text.split("t < ")[1].split()[0]) for text in map(str, model.rates.values()) if "t < " in text]
-    ends = sorted({*model.times, *(t for t in (*rows.get("time", ()), *jumps) if t < model.times[-1])})
+    changes = (*rows.get("time", ()), *jumps, *one.halts)
+    ends = sorted({*model.times, *(t for t in changes if t < model.times[-1])})
     found, t = {}, 0.0
     for end in ends:
         if end > t:
@@ -147,6 +221,8 @@ def _compiled(formula: str) -> Any:
 def answer(number: int) -> np.ndarray:
     """The readings (m,); none where SciPy does not get there, or two of its methods do not agree."""
     one = drawn(number)
+    if one.exact is not None:
+        return one.exact
     try:
         with np.errstate(all="ignore"):
             z, other = (solved(one, method, rtol) for method, rtol in (("LSODA", 1e-11), ("Radau", 1e-7)))
@@ -157,7 +233,8 @@ def answer(number: int) -> np.ndarray:
 
 def store() -> None:
     """Writes the readings of all draws."""
-    answers = [answer(number) for number in range(COUNT)]
+    with multiprocessing.Pool() as pool:
+        answers = pool.map(answer, range(COUNT), chunksize=5)
     np.savez_compressed(ANSWERS, z=np.concatenate(answers), count=list(map(len, answers)))
 
 

@@ -228,7 +228,7 @@ def test_two_levels_that_agree_on_what_is_wrong_are_found_out_by_the_implicit_me
     assert_agrees(model.simulate(model.nominal[None])[0, 0], np.tanh(mean), atol=1e-8)
     (said,) = model.remarks(model.nominal)
     assert said.startswith("the explicit method misses what happens: ")
-    assert abs(replace(model, method="explicit").simulate(model.nominal[None])[0, 0] - np.tanh(mean)) > 0.1
+    assert np.isnan(replace(model, method="explicit").simulate(model.nominal[None])).all()
 
 
 def test_readings_at_the_start_alone_need_no_step():

@@ -6,7 +6,8 @@
 
 Lane l is the problem of trial rows[l / n_cases] in case l % n_cases, for first <= l < last; a group that is not full
 repeats its last lane. Where constants are driven, `cases` holds those of every interval, and those after the last time.
-`states` takes those of every lane at the start and at each time, unless it is null.
+`states` takes those of every lane at the start and at each time, unless it is null; behind them, where steps are
+watched, whether one was in doubt.
 Every operation is IEEE arithmetic in a fixed order, so the bits of a lane do not depend on the number of lanes.
 `basics.compiled` makes machine code of such modules; this file is imported only where something is compiled.
 """
@@ -21,7 +22,7 @@ from typing import Any
 
 from llvmlite import ir
 
-from ipe_bench.measurements.ode.plan import StepPlan
+from ipe_bench.measurements.ode.plan import ROUGH, StepPlan
 from ipe_bench.measurements.ode.trace import Program
 
 F64, I32, I64, PTR, VOID = ir.DoubleType(), ir.IntType(32), ir.IntType(64), ir.PointerType(), ir.VoidType()
@@ -115,13 +116,48 @@ class _Writer:
         plan, weights = self.plan, self._weights(v, frame)
         y, fixed = v.load(frame, plan.y), v.load(frame, [*plan.driven, *plan.fixed])
         slopes: list[list[Value]] = []
+        sides: list[Value] = []
+        times: list[Value] = []
         for s, row in enumerate(plan.tableau.weights[:-1]):
             at = v.combine(y, weights[s], [slopes[j] for j, _ in row])
             time = v.call("fma", v.spread(h), v.constant(plan.tableau.C[s]), v.spread(t))
+            times.append(time)
             result = v.run(plan.step, [time, *at, *fixed])
             slopes.append(result[: len(plan.y)])
-            v.store(result[len(plan.y) :], frame, plan.kept[s])
-        v.store(v.combine(y, weights[-1], [slopes[j] for j, _ in plan.tableau.weights[-1]]), frame, plan.y)
+            if plan.doubt:
+                sides.append(result[-1])
+            else:
+                v.store(result[len(plan.y) :], frame, plan.kept[s])
+        ended = v.combine(y, weights[-1], [slopes[j] for j, _ in plan.tableau.weights[-1]])
+        v.store(ended, frame, plan.y)
+        if plan.doubt:
+            moved = slopes
+            if plan.timed:
+                alone = [v.run(plan.rates, [time, *y, *fixed]) for time in times]
+                moved = [list(map(v.builder.fsub, *pair)) for pair in zip(slopes, alone, strict=True)]
+            self._watch(v, frame, v.spread(h), ended, moved, sides)
+
+    def _watch(
+        self, v: _Vectors, frame: Value, h: Value, y: list[Value], slopes: list[list[Value]], sides: list[Value]
+    ) -> None:
+        """Writes whether the step that ends at y crossed a pole or was rough; see `ROUGH`. The slopes are what the
+        motion of the states adds to them."""
+        plan, b, zero = self.plan, v.builder, v.constant(0.0)
+        began, doubt = v.load(frame, [*plan.side, *plan.doubt])
+        for side in sides:
+            doubt = b.select(b.fcmp_ordered("!=", side, began), v.constant(1.0), doubt)
+        errors = [zero for _ in y]
+        for weight, slope in zip(plan.tableau.E, slopes, strict=True):
+            if weight:
+                errors = v.combine(errors, [v.constant(weight)], [slope])
+        reach = [
+            v.call("maxnum", r, v.call("fabs", value)) for r, value in zip(v.load(frame, plan.reach), y, strict=True)
+        ]
+        for r, error, slope in zip(reach, errors, slopes[-1], strict=True):
+            size = b.fadd(r, v.call("fabs", b.fmul(h, slope)))
+            rough = b.fcmp_ordered(">", v.call("fabs", b.fmul(h, error)), b.fmul(v.constant(ROUGH), size))
+            doubt = b.select(rough, v.constant(1.0), doubt)
+        v.store([*reach, doubt], frame, [*plan.reach, *plan.doubt])
 
     def _read(self, v: _Vectors, frame: Value, t: Value) -> None:
         plan = self.plan
@@ -156,7 +192,7 @@ class _Writer:
         x, si, cases, n_cases, rows, first, last, times, steps, n_times, offset, stride, out, states, frame = made.args
         b, plan, width = ir.IRBuilder(made.append_basic_block()), self.plan, self.width
         n, nc, no = len(plan.x), len(plan.constants), len(plan.shown)
-        columns = n if plan.tangents else 1
+        columns, rows_kept = n if plan.tangents else 1, len(plan.y) + len(plan.doubt)
         target, shift, own, kept = (room(b, I64, width) for _ in range(4))
         t, taken = room(b, F64), room(b, F64)
 
@@ -175,7 +211,7 @@ class _Writer:
             asked = b.icmp_signed("!=", b.ptrtoint(states, I64), integer(0))
             with b.if_then(asked), loop(b, integer(0), integer(width)) as lane:
                 row = b.add(number_at(b, kept, lane, I64), k)
-                for place in plan.y:
+                for place in (*plan.y, *plan.doubt):
                     put(b, number_at(b, frame, at(place, lane)), states, row)
                     row = b.add(row, b.add(n_times, integer(1)))
 
@@ -194,7 +230,7 @@ class _Writer:
                 put(b, b.mul(b.mul(place, n_times), integer(no * columns)), target, lane)
                 put(b, b.mul(case, stride), shift, lane)
                 put(b, constants, own, lane)
-                put(b, b.mul(b.mul(place, b.add(n_times, integer(1))), integer(len(plan.y))), kept, lane)
+                put(b, b.mul(b.mul(place, b.add(n_times, integer(1))), integer(rows_kept)), kept, lane)
             b.call(self.begin, [frame])
             keep(integer(0))
             b.store(ir.Constant(F64, 0.0), t)
@@ -301,7 +337,7 @@ class _Vectors:
         return self._each(name.replace("arctan", "atan"), *args)
 
     def call(self, name: str, *args: Value) -> Value:
-        """Writes an instruction of the processor: fma (rounded once), sqrt or floor."""
+        """Writes an instruction of the processor: fma (rounded once), sqrt, floor, fabs or maxnum."""
         return self.builder.call(self._declared(f"llvm.{name}.v{self.width}f64", self.type, len(args)), args)
 
     def _each(self, name: str, *args: Value) -> Value:

@@ -34,8 +34,9 @@ LONGEST = 5
 """Times that the steps of tangents may be longer than those of the readings."""
 STATES = 1e-4
 """Tolerance of the states, as a share of a state's largest magnitude in a trial."""
-LOST = 0.1
-"""Move between the two finest rungs from which on the solution is not followed at all, as the same share."""
+NOT_FOLLOWED = 1e3
+"""Tolerances, of readings and of states, by which the two finest rungs may differ, or two methods: beyond them the
+solution is not followed at all."""
 _ROUNDING = 1e-12
 """Allowance for rounding errors of a state that should be 0, as a share of the largest state."""
 _LARGEST_CLIMB = 4.0
@@ -62,12 +63,14 @@ def by_rung(places: Indices, rows: Indices) -> Iterator[tuple[int, Indices]]:
 
 class Found(NamedTuple):
     """Holds places on the ladder (trials,), the readings (trials, m) that the search has computed there, those of the
-    trials `computed` in their order, and whether a trial is `lost`: the finest rung does not follow its states."""
+    trials `computed` in their order, and whether a trial is `lost`: no rung follows it; and whether it is `doubtful`: a
+    step at its place was rough, or crossed a pole, so that agreement of two rungs proves nothing."""
 
     places: Indices
     computed: Indices
     z: Array
     lost: Mask
+    doubtful: Mask
 
 
 def apart(fine: Array, coarse: Array) -> Array:
@@ -85,6 +88,7 @@ def search(
     simulate: Callable[[Indices, int, Array, Array], None],
     start: Indices,
     unturned: Callable[[Array, Array], Array] = lambda h, z: h,
+    in_doubt: Callable[[Array], Mask] = lambda states: np.zeros(len(states), dtype=bool),
 ) -> Found:
     """Finds the coarsest rung at which readings hold `tolerance` (m,) and states `STATES`; compares rungs n and n/2.
 
@@ -92,10 +96,11 @@ def search(
     eighth-order formula then has left, 16 d / (2^8 - 1), is; else n grows as that formula says. Trials that do not get
     there end at the top of the ladder. The search begins at the places `start` (trials,), and those at the top are
     accepted as they are; `simulate` fills these rows of arrays (trials, m) and (trials, *states) with readings and
-    states (cases, states, times) at one rung, and `unturned` shifts readings that are angles next to others.
+    states (cases, states, times) at one rung, `unturned` shifts readings that are angles next to others, and `in_doubt`
+    selects trials by their states; a row behind these is held against nothing.
     """
     places, final, top = start.copy(), start.copy(), len(rungs) - 1
-    lost = np.zeros(len(start), dtype=bool)
+    lost, doubtful = np.zeros((2, len(start)), dtype=bool)
     fine, coarse = (np.empty((len(start), len(tolerance))) for _ in range(2))
     y, near = (np.empty((len(start), *states)) for _ in range(2))
     held = np.full(len(start), -1)  # the place whose readings are in `fine`
@@ -108,7 +113,7 @@ def search(
             if not known.all():
                 simulate(rows[~known], int(rungs[below]), coarse, near)
             simulate(rows, int(rungs[place]), fine, y)
-            astray = apart(y[rows], near[rows])
+            astray = apart(y[rows, :, :-1], near[rows, :, :-1])
             with np.errstate(all="ignore"):
                 moved = (np.abs(fine[rows] - unturned(coarse[rows], fine[rows])) / tolerance).max(axis=1)
                 moved = SAFETY * np.maximum(moved, astray / STATES)
@@ -119,12 +124,13 @@ def search(
             enough, good = moved <= 1.0, (left <= 1.0) | (place == top)
             fine[rows[enough]] = coarse[rows[enough]]
             final[rows] = np.where(enough, below, place)
-            lost[rows] = (place == top) & ~(astray <= LOST)
+            lost[rows] = (place == top) & (moved > SAFETY * NOT_FOLLOWED)
+            doubtful[rows] = in_doubt(np.where(enough[:, None, None, None], near[rows], y[rows]))
             held[rows] = place
             places[rows] = np.clip(np.searchsorted(rungs, wanted), place + 1, top)
             still.append(rows[~(enough | good)])
         pending = np.concatenate(still)
-    return Found(final, computed, fine[computed], lost)
+    return Found(final, computed, fine[computed], lost, doubtful)
 
 
 def tangent_contraction(coarse: Array, J: Array) -> float:

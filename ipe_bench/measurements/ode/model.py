@@ -4,23 +4,31 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ipe_bench.basics import compiled
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Mask, own
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.ode import ladder
 from ipe_bench.measurements.ode.integrator import Kernel, compiled_rates
-from ipe_bench.measurements.ode.plan import DOP853, RK4, Equations, Variation, jumps
-from ipe_bench.measurements.ode.rodas import MOST_STEPS, SHAPE, STABLE, Rodas5P, Stepped
+from ipe_bench.measurements.ode.plan import DOP853, RK4, Equations, Recording, Variation, jumps
+from ipe_bench.measurements.ode.rodas import MOST_STEPS, SHAPE, STABLE, Effort, Rodas5P, Stepped
 from ipe_bench.measurements.ode.trace import Graph, Program
 
-_NOT_FOLLOWED = 1e3
-"""Tolerances by which readings with the shortest steps are off where the integrator cannot follow the equations."""
+_IN_HAND = 0.3
+"""Error of a step of the implicit method, as a share of the tolerance."""
+_ROUGHER = 10.0
+"""Tolerances of the implicit method whose readings are held against each other, the larger over the smaller."""
+_MAGNIFIED = 300.0
+"""Tolerances of a reading that a change of the states by the least tolerance, as a share of each, may make."""
+_IN_NUMPY = 64
+"""The finest steps to each reading that are tried at the nominal point where no machine code can be made."""
 _ANGLE_AT_START = 0.7
 """Radians over which the first step that is tried lets the solution turn."""
 _REMEMBERED = 100_000
@@ -175,18 +183,9 @@ class OdeMeasurement(Measurement):
 
     def hindrance(self, x: Array) -> str:
         x = own(x[None, : self.n])
-        if self.step is not None:
-            shortest, held = self.step, bool(np.isfinite(self.simulate(x)).all())
-        else:
-            top = len(self._rungs) - 1
-            z, y = np.empty((2, 1, self.m)), np.empty((2, 1, *self._kept))
-            for i, place in enumerate((top, ladder.coarser(top))):
-                self._simulate(x, np.arange(1), self._rungs[place] * self._parts, self._zeros, z[i], y[i])
-            with np.errstate(all="ignore"):
-                left = ladder.SAFETY * np.abs(z[0] - self.near(z[1], z[0])) / (2.0**ladder.ORDER - 1.0)
-            held = bool((left <= _NOT_FOLLOWED * self._tolerances).all() and ladder.apart(*y)[0] <= ladder.LOST)
-            shortest = self._usual_interval / self._rungs[top]
-        return "" if held else self._diagnosis(x, float(shortest))
+        if np.isfinite(self.simulate(x)).all():
+            return ""
+        return self._diagnosis(x, float(self.step or self._usual_interval / self._rungs[-1]))
 
     def _diagnosis(self, x: Array, shortest: float) -> str:
         """Says what hinders the integrator at x (1, n), whose shortest step is `shortest`."""
@@ -196,6 +195,11 @@ class OdeMeasurement(Measurement):
             if effort.steps >= MOST_STEPS:
                 return f"the solution takes more than {MOST_STEPS} steps, by the implicit method, too"
             return f"the solution itself leaves all numbers near t = {effort.reached:.4g}{unit}"
+        if self.step is None and not np.isfinite(self._told(x, len(self.times))).all():
+            return (
+                f"neither steps of {shortest:.2g}{unit}, the shortest, nor the implicit method tell these readings: "
+                "outputs magnify what any step leaves of the states, or the solution parts from those next to it"
+            )
         needed, t = STABLE / max(effort.fastest, 1e-300), effort.met
         if needed >= shortest:
             return f"steps of {shortest:.2g}{unit}, the shortest, are too long for these equations"
@@ -231,8 +235,9 @@ class OdeMeasurement(Measurement):
 
     @property
     def _kept(self) -> tuple[int, int, int]:
-        """Cases, states and times that are held against each other. A stated rate needs none: no step is unstable."""
-        return self.tables.shape[1], self.states if self.fastest_rate is None else 0, len(self._times) + 1
+        """Cases, states and times that are held against each other, with a row behind the states that tells whether a
+        step was in doubt. A stated rate needs none: no step is unstable."""
+        return self.tables.shape[1], self.states + 1 if self.fastest_rate is None else 0, len(self._times) + 1
 
     @cached_property
     def _remembered(self) -> dict[bytes, tuple[int, bool]]:
@@ -253,20 +258,121 @@ class OdeMeasurement(Measurement):
         new = np.flatnonzero(places[unknown] < 0)
         unknown = unknown[new]
         if not len(unknown):
-            return ladder.Found(places, unknown, np.empty((0, self.m)), lost)
+            return ladder.Found(places, unknown, np.empty((0, self.m)), lost, np.zeros_like(lost))
         found = self._find(x[unknown], self._first_guess(x[unknown]), offset)
         if len(remembered) + len(unknown) > _REMEMBERED:
             remembered.clear()
         known = zip(found.places.tolist(), found.lost.tolist(), strict=True)
         remembered.update(zip([bits[i] for i in new], known, strict=True))
         places[unknown], lost[unknown] = found.places, found.lost
-        return ladder.Found(places, unknown[found.computed], found.z, lost)
+        return ladder.Found(places, unknown[found.computed], found.z, lost, np.zeros_like(lost))
 
     def _find(self, x: Array, start: ladder.Indices, offset: Array) -> ladder.Found:
+        """Finds rungs; a trial with a step in doubt is lost unless its readings are those of the implicit method."""
+
         def simulate(rows: ladder.Indices, rung: int, z: Array, y: Array) -> None:
             self._simulate(x, rows, rung * self._parts, offset, z, y)
 
-        return ladder.search(self._rungs, self._tolerances, self._kept, simulate, start, self.near)
+        found = ladder.search(self._rungs, self._tolerances, self._kept, simulate, start, self.near, self._in_doubt)
+        doubtful = np.flatnonzero(found.doubtful & ~found.lost)
+        if len(doubtful):
+            z = found.z[np.searchsorted(found.computed, doubtful)] + offset
+            found.lost[doubtful] = ~self._alike(z, self._implicit.simulate(x[doubtful], len(self.times)))
+        return found
+
+    def _alike(self, z: Array, other: Array) -> Mask:
+        """Selects the trials whose readings (trials, m) by two methods are alike."""
+        with np.errstate(all="ignore"):
+            off = np.abs(z - self.near(other, z)) / self._tolerances
+        return off.max(axis=1) <= ladder.NOT_FOLLOWED
+
+    @cached_property
+    def shape(self) -> tuple[Array, Effort]:
+        """The nominal readings (1, m) by the implicit method, near enough to show their size, and what they took."""
+        return Rodas5P(self.stepped, SHAPE).measured(own(self.nominal[None]))
+
+    @cached_property
+    def _implicit(self) -> Rodas5P:
+        return Rodas5P(self.stepped, float(np.clip(_IN_HAND * np.min(self._tolerances) / self._largest, 1e-10, 1e-4)))
+
+    @cached_property
+    def _largest(self) -> float:
+        """The largest nominal reading."""
+        return float(np.nanmax(np.abs(self.shape[0]), initial=0.0)) or 1.0
+
+    def _in_doubt(self, states: Array) -> Mask:
+        """Selects the trials of states (trials, cases, states + 1, times + 1) in which a step was in doubt, or one that
+        the rates divide by is negative though it never is at the nominal point."""
+        below = (states[:, :, :-1].min(axis=(1, 3), initial=np.inf) < 0.0) & self._positive
+        return (states[:, :, -1:, -1].max(axis=(1, 2), initial=0.0) > 0.0) | below.any(axis=1)
+
+    @cached_property
+    def _positive(self) -> Mask:
+        """Selects the states that the rates divide by, and that are not negative with the shortest steps."""
+        return self._divided_by & (self._with_shortest_steps[1] >= 0.0)
+
+    @cached_property
+    def _divided_by(self) -> Mask:
+        """Selects the states that the rates divide by; none where no state is held against another."""
+        return np.array(Recording(self.equations).divided_by[: self._kept[1]], dtype=bool)
+
+    @cached_property
+    def _finest(self) -> Array:
+        """The nominal readings (1, m) with the shortest steps, which meet what longer ones may pass over; not numbers
+        if a step was in doubt, one that the rates divide by changes its sign, or none is watched."""
+        return self._with_shortest_steps[0]
+
+    def _told(self, x: Array, stop: int) -> Array:
+        """Computes readings at the first `stop` times by the implicit method; not numbers from where on outputs magnify
+        what its steps leave of the states, nor anywhere if at the nominal point other steps lead to other readings."""
+        return self._judged(*self._implicit.with_reach(x, stop), stop)
+
+    def _judged(self, z: Array, reach: Array, stop: int) -> Array:
+        along = len(z), self.tables.shape[1], stop, len(self.outputs)
+        with np.errstate(all="ignore"):
+            moved = reach / self._largest * np.min(self._tolerances)
+            astray = moved > _MAGNIFIED * self._tolerances[self.rows(stop)]
+        lost = np.logical_or.accumulate(astray.reshape(along).any(axis=3, keepdims=True), axis=2)
+        return np.where(lost | (not self._is_held), np.nan, z.reshape(along)).reshape(z.shape)
+
+    @cached_property
+    def _nominal_reached(self) -> tuple[Array, Array]:
+        return self._implicit.with_reach(own(self.nominal[None]), len(self.times))
+
+    @cached_property
+    def _nominal_told(self) -> Array:
+        """The nominal readings (1, m) by the implicit method."""
+        return self._judged(*self._nominal_reached, len(self.times))
+
+    @cached_property
+    def _is_held(self) -> bool:
+        """Whether steps of the implicit method, ten times as accurate or not, lead to the same nominal readings."""
+        rougher = replace(self._implicit, rtol=_ROUGHER * self._implicit.rtol)
+        z, rough = self._nominal_reached[0], rougher.simulate(own(self.nominal[None]), len(self.times))
+        return bool(self._alike(z, rough)[0] or not np.isfinite(z).all())
+
+    @cached_property
+    def _with_shortest_steps(self) -> tuple[Array, Array]:
+        """The nominal readings (1, m) and the lowest value of each state, at the readings, with the shortest steps."""
+        z, y = np.full((1, self.m), np.nan), np.ones((1, *self._kept))
+        if self.fastest_rate is None:
+            rung = self._rungs[-1] if compiled.available() else min(self._rungs[-1], _IN_NUMPY)
+            self._simulate(own(self.nominal[None]), np.arange(1), rung * self._parts, self._zeros, z, y)
+        lowest, highest = y[0, :, :-1].min(axis=(0, 2)), y[0, :, :-1].max(axis=(0, 2))
+        if y[:, :, -1:, -1].any() or ((lowest < 0.0) & (highest > 0.0) & self._divided_by).any():
+            z[:] = np.nan
+        return z, lowest
+
+    @cached_property
+    def _nominal(self) -> ladder.Found:
+        """The rung of the nominal point: with steps that are short enough to meet what the shortest meet."""
+        place = 1
+        while True:
+            found = self._find(own(self.nominal[None]), np.array([place]), self._zeros)
+            place = max(place, int(found.places[0])) + 1
+            passed_over = np.isfinite(self._finest).all() and not self._alike(found.z, self._finest)[0]
+            if found.lost[0] or not passed_over or place >= len(self._rungs) - 1:
+                return found
 
     def _trusted(self, x: Array) -> Mask:
         """Selects the trials whose steps are fixed, or whose coarsest rung is known to suffice."""
@@ -301,7 +407,7 @@ class OdeMeasurement(Measurement):
 
     @cached_property
     def _nominal_place(self) -> int:
-        return max(1, int(self._find(own(self.nominal[None]), np.array([1]), self._zeros).places[0]))
+        return max(1, int(self._nominal.places[0]))
 
     @cached_property
     def _parts(self) -> NDArray[np.int64]:
@@ -426,7 +532,8 @@ class OdeMeasurement(Measurement):
     def equations(self) -> Equations:
         """Equations to integrate; refused where a rate jumps when the solution decides."""
         constants, driven = self.tables.shape[2], self.tables.shape[2] - self.cases.shape[1]
-        arithmetic = (self.start, self.rhs, self.read, self.variation, driven)
+        watched = self.fastest_rate is None
+        arithmetic = (self.start, self.rhs, self.read, self.variation, driven, watched)
         equations = Equations(self.states, self.n, constants, len(self.outputs), *arithmetic)
         if jumps(equations):
             what = "a rate jumps at a moment that a state or a parameter decides, which no step can end at"

@@ -15,6 +15,10 @@ from ipe_bench.measurements.ode.trace import Expression, Graph, Program
 Recordable = Callable[..., Sequence[Any]]
 _POINTS, _NEWTON = 64, 30
 """Points at which a comparison is examined, and the steps that move them to where it changes."""
+ROUGH = 0.005
+"""Error of a single step, by the embedded formula of fifth order, that puts a trial in doubt, as a share of the state's
+largest magnitude so far and of its next change. Right steps to 1e-8 leave 1e-6, one that jumps 0.007. What changes with
+t alone, as a pulse does, is no doubt."""
 
 
 @dataclass(frozen=True)
@@ -25,6 +29,8 @@ class Tableau:
     A: tuple[tuple[float, ...], ...]
     B: tuple[float, ...]
     C: tuple[float, ...]
+    E: tuple[float, ...] = ()
+    """Weights of the difference from an embedded formula of lower order; none: there is no such formula."""
 
     @property
     def stages(self) -> int:
@@ -75,6 +81,10 @@ DOP853 = Tableau(
         0.0, 0.05260015195876773, 0.0789002279381516, 0.1183503419072274, 0.2816496580927726, 0.3333333333333333, 0.25,
         0.3076923076923077, 0.6512820512820513, 0.6, 0.8571428571428571, 1.0,
     ),
+    E=(
+        0.01312004499419488, 0.0, 0.0, 0.0, 0.0, -1.2251564463762044, -0.4957589496572502, 1.6643771824549864,
+        -0.3503288487499737, 0.3341791187130175, 0.08192320648511571, -0.0223553078638863,
+    ),
 )
 # fmt: on
 """Eighth order in twelve stages (Dormand and Prince; Hairer, Norsett, Wanner, Solving Ordinary Differential Equations
@@ -109,6 +119,8 @@ class Equations:
     variation: Variation | None = None
     driven: int = 0
     """Number of constants, the last ones, that change from one interval between readings to the next."""
+    watched: bool = False
+    """Whether simulations note a step that is rough, or that crosses a pole."""
 
 
 class Recording:
@@ -130,6 +142,45 @@ class Recording:
         if len(values) != count:
             raise ValueError(f"{name} returns {len(values)} values where {count} are declared")
         return values
+
+    @property
+    def timed(self) -> bool:
+        """Whether the rates depend on t itself."""
+        return not trace.dependent(self.slope, [self.t]).isdisjoint(self.slope)
+
+    @cached_property
+    def divisors(self) -> list[Expression]:
+        """What the rates divide by, where it changes along a solution."""
+        varying, divisors = trace.dependent(self.slope, self.moving), list[Expression]()
+        for e in trace.in_order(self.slope):
+            base, *others = trace.operands(e) or [e]
+            if e.operation == "div":
+                divisors += others
+            elif e.operation == "pow" and (others[0].value or 0.0) < 0.0:
+                divisors.append(base)
+            elif e.operation == "tan":
+                divisors.append(np.cos(base))  # type: ignore[arg-type]
+        return [e for e in _distinct(divisors) if e in varying or e.operation == "cos"]
+
+    @cached_property
+    def divided_by(self) -> list[bool]:
+        """Whether the rates divide by something that a state is part of, for each state."""
+        return [not trace.dependent(self.divisors, [y]).isdisjoint(self.divisors) for y in self.y]
+
+    @cached_property
+    def side(self) -> Expression:
+        """A number that tells the signs of all that the rates divide by: where it changes, a pole has been crossed."""
+        side = self.graph.constant(0.0)
+        for i, divisor in enumerate(self.divisors):
+            side = side + 2.0**i * self.graph.apply("less", divisor, 0.0)
+        return side
+
+    @cached_property
+    def watched(self) -> list[Expression]:
+        """What is noted of the start, before the first step: magnitudes, the side, and no doubt."""
+        at_start = {self.t: self.graph.constant(0.0)} | dict(zip(self.y, self.start, strict=True))
+        sizes = [self.graph.apply("add", np.abs(y), 0.0) for y in self.start]
+        return [*sizes, trace.substitute(self.side, at_start), self.graph.constant(0.0)]
 
     @cached_property
     def tangents(self) -> tuple[Any, Any, list[Expression], list[Expression], list[Expression]]:
@@ -230,12 +281,22 @@ class StepPlan:
     """Places of the tangents; none if readings are computed, and not Jacobians."""
     motion: Tangents
     reading: Tangents
+    rates: Program
+    """What `step` computes but for the side of the poles: what a step costs is what the solution needs."""
+    timed: bool
+    """Whether the rates depend on t itself."""
+    reach: range
+    """Places of the largest magnitude of each state so far; none if no step is watched."""
+    side: range
+    """Place of the side of the poles on which the trial began."""
+    doubt: range
+    """Place of 1 once a step was rough or crossed a pole."""
 
     @property
     def operations(self) -> int:
         """Arithmetic operations of a step of one lane: its cost on any machine."""
         weighed, total = sum(map(len, self.tableau.weights)), 0
-        for program, place in [(self.step, self.y), *((self.motion.program, place) for place in self.tangents)]:
+        for program, place in [(self.rates, self.y), *((self.motion.program, place) for place in self.tangents)]:
             counted = sum(name not in ("constant", "neg") for name, *_ in program.operations)
             total += self.tableau.stages * counted + len(place) * weighed
         return total
@@ -282,20 +343,29 @@ def planned(equations: Equations, tableau: Tableau, *, sensitive: bool) -> StepP
         return range(size - count, size)
 
     d, dp, slopes, shown, starts = tape.tangents if sensitive else ([], [], [], [], [])
+    watched = equations.watched and not sensitive
     motion, reading = _Linear(tape, d, dp, slopes), _Linear(tape, d, dp, shown)
     saved = [*motion.saved, *motion.driving]
     noted = [*reading.saved, *reading.driving] if sensitive else tape.shown
-    fixed = _distinct([*tape.fixed(*tape.slope, *saved, *noted), *motion.fixed, *reading.fixed])
-    step, read = (Program.of(found, [*tape.moving, *fixed]) for found in ([*tape.slope, *saved], noted))
+    sides = [tape.side] if watched else []
+    fixed = _distinct([*tape.fixed(*tape.slope, *saved, *noted, *sides), *motion.fixed, *reading.fixed])
+    given = [*tape.moving, *fixed]
+    rates, step, read = (
+        Program.of(found, given) for found in ([*tape.slope, *saved], [*tape.slope, *saved, *sides], noted)
+    )
     k, r = len(saved), len(noted)
     x, constants, y, fixed_at = map(room, (equations.parameters, equations.constants, equations.states, len(fixed)))
     lie = tuple(room(len(d)) for _ in dp)
     stages = [room(k + len(motion.constant)) for _ in tableau.B]
     noted_at = room(r + len(reading.constant))
     shown_at = room(equations.outputs) if sensitive else noted_at
+    reach, side, doubt = map(room, (equations.states, 1, 1) if watched else (0, 0, 0))
     begun = [i for place in (y, fixed_at, *lie, *(stage[k:] for stage in stages), noted_at[r:]) for i in place]
     started = [*tape.start, *fixed, *(e for row in tape.along_each(dp, starts) for e in row)]
     started += [*motion.constant * tableau.stages, *reading.constant]
+    if watched:
+        begun += [*reach, *side, *doubt]
+        started += tape.watched
     return StepPlan(
         tableau=tableau,
         x=x, constants=constants, begin=Program.of(started, [*tape.p, *tape.c]), begun=tuple(begun),
@@ -303,4 +373,5 @@ def planned(equations: Equations, tableau: Tableau, *, sensitive: bool) -> StepP
         step=step, kept=tuple(stage[:k] for stage in stages), stage_size=len(stages[0]),
         read=read, noted=noted_at[:r], shown=shown_at, size=size,
         tangents=lie, motion=motion.placed(stages[0], fixed), reading=reading.placed(noted_at, fixed),
+        rates=rates, timed=tape.timed, reach=reach, side=side, doubt=doubt,
     )  # fmt: skip

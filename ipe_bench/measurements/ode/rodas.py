@@ -63,6 +63,9 @@ SHAPE = 1e-4
 _SMALLEST = 1e-9
 """Absolute tolerance over the relative one, in units of the states."""
 _SAFETY, _SHRINK, _GROW = 0.9, 0.2, 6.0
+_LOOKS, _UNSEEN = 1024, 0.01
+"""Moments within the usual interval at which rates that depend on t are looked at, lest a step misses a pulse; and the
+share of a state by which a step may miss what is seen there."""
 
 
 @dataclass(frozen=True)
@@ -126,6 +129,11 @@ class Rodas5P:
         }
         return {name: Program.of(outputs, inputs) for name, (outputs, inputs) in recorded.items()}
 
+    @cached_property
+    def timed(self) -> bool:
+        """Whether the rates depend on t itself."""
+        return Recording(self.of.equations).timed
+
     def measured(self, x: Array) -> tuple[Array, Effort]:
         """Computes the readings (1, m) at x (1, n), and the effort; a tolerance that shows the shape will do."""
         run = _Run(self, x, len(self.of.times), stretched=True)
@@ -137,6 +145,11 @@ class Rodas5P:
         """Computes readings (trials, cases x stop x outputs) at the first `stop` times; NaN from where a trial breaks
         down, or exceeds the limit on steps."""
         return _Run(self, x, stop, most).readings
+
+    def with_reach(self, x: Array, stop: int) -> tuple[Array, Array]:
+        """Computes the same readings, and how far each is moved by states that move by their largest magnitudes."""
+        run = _Run(self, x, stop, reaching=True)
+        return run.readings, run.reach.transpose(2, 1, 0).reshape(len(x), -1)
 
     def jacobian(self, x: Array, stop: int) -> Array:
         """Computes their derivatives by x (trials, cases x stop x outputs, n)."""
@@ -157,11 +170,14 @@ class _Run:
         *,
         sensitive: bool = False,
         stretched: bool = False,
+        reaching: bool = False,
     ) -> None:
         of, equations = method.of, method.of.equations
         self.do, self.rtol, self.atol = method._programs, method.rtol, _SMALLEST * method.rtol
         self.tables, self.end = of.tables, float(of.times[-1]) or 1.0
         self.times, self.most, self.stretched = np.asarray(of.times, dtype=float)[:stop], most, stretched
+        self.timed, intervals = method.timed, np.diff(np.asarray(of.times, dtype=float), prepend=0.0)
+        self.look = float(np.median(intervals[intervals > 0.0])) / _LOOKS if intervals.any() else 1.0
         cases, self.q = of.tables.shape[1], equations.parameters if sensitive else 0
         lanes = len(x) * cases
         self.p = np.repeat(x * of.sizes, cases, axis=0).T.copy()
@@ -169,11 +185,13 @@ class _Run:
         self.t, self.place, self.steps = np.zeros(lanes), np.zeros(lanes, int), np.zeros(lanes, int)
         self.stretch, self.fastest, self.met = np.zeros((3, lanes))
         self.z = np.full((equations.outputs, stop, lanes), np.nan)
+        self.reaching, self.reach = reaching, np.full((equations.outputs, stop, lanes), np.nan)
         self.J = np.full((equations.outputs, stop, self.q, lanes), np.nan)
         self.S = np.zeros((equations.states, 0, lanes))
         c = self._constants(np.arange(lanes))
         with np.errstate(all="ignore"):
             self.y = self._values("start", [*self.p, *c], lanes)
+            self.largest = np.abs(self.y)
             if sensitive:
                 self.S = self._values("dstart", [*self.p, *c, *self.directions], self.q, lanes)
             self._integrate()
@@ -210,6 +228,7 @@ class _Run:
             done = live[good]
             self.t[done] = np.where(now[good] == left[good], self.times[self.place[done]], self.t[done] + now[good])
             self.y[:, done], self.S[:, :, done] = y[:, good], S[:, :, good]
+            self.largest[:, done] = np.fmax(self.largest[:, done], np.abs(y[:, good]))
 
     def _read(self, here: Array) -> None:
         """Takes the readings whose time has come, at t = 0 too, in these lanes."""
@@ -220,6 +239,11 @@ class _Run:
                 return
             at = (self.t[here], *self.y[:, here], *self.p[:, here], *self._constants(here, 1))
             self.z[:, self.place[here], here] = self._values("read", at, len(here))
+            if self.reaching:
+                n = len(self.y)
+                sizes = self.largest[:, here] * np.eye(n)[:, :, None]
+                moved = self._values("dread", [*at, *sizes, *np.zeros(self.p.shape[0])], n, len(here))
+                self.reach[:, self.place[here], here] = np.abs(moved).sum(axis=1)
             if self.q:
                 slopes = self._values("dread", [*at, *self.S[:, :, here], *self.directions], self.q, len(here))
                 self.J[:, self.place[here], :, here] = slopes.transpose(2, 0, 1)
@@ -262,8 +286,27 @@ class _Run:
                 rest = rest + self._values("dJk", [*at, *K[-1], *ways], q, lanes)
                 D.append(_solve(W, exchanged, rest))
         y1 = u + K[-1]  # stiffly accurate: the last stage is the error of the embedded solution
-        size = self.atol + self.rtol * np.maximum(np.abs(y), np.abs(y1))
-        return y1, V + D[-1] if q else S, (np.abs(K[-1]) / size).max(axis=0)
+        largest = np.maximum(np.abs(y), np.abs(y1))
+        error = (np.abs(K[-1]) / (self.atol + self.rtol * largest)).max(axis=0)
+        if self.timed:
+            unseen = _solve(W, exchanged, self._unseen(live, h)[:, None])[:, 0]
+            missed = (np.abs(unseen) / (self.atol + _UNSEEN * largest)).max(axis=0)
+            error = np.where(missed > 1.0, np.fmax(missed, error), error)
+        return y1, V + D[-1] if q else S, error
+
+    def _unseen(self, live: Array, h: Array) -> Array:
+        """Computes the mean of the rates over a step with the states held, less what its ends and its middle say, each
+        (states, lanes)."""
+        found = np.zeros((len(self.y), len(live)))
+        looks = np.minimum(np.ceil(np.log2(np.maximum(h / self.look, 1.0))), np.log2(_LOOKS)).astype(int)
+        for power in sorted(set(looks[looks > 0].tolist())):
+            here, count = looks == power, 2**power
+            lanes, y = live[here], self.y[:, live[here]]
+            shares = np.append([0.0, 0.5, 1.0], (np.arange(count) + 0.5) / count)[:, None]
+            at = (self.t[lanes] + shares * h[here], *y, *self.p[:, lanes], *self._constants(lanes))
+            f = self._values("f", at, len(shares), len(lanes))
+            found[:, here] = f[:, 3:].mean(axis=1) - (f[:, 0] + 4.0 * f[:, 1] + f[:, 2]) / 6.0
+        return found
 
     def _first_step(self) -> Array:
         lanes = len(self.t)

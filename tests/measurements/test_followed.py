@@ -1,0 +1,122 @@
+"""Readings are those of the solution, or there are none: poles, wells, pulses, and outputs that magnify states."""
+
+from dataclasses import replace
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+
+from ipe_bench.basics import compiled
+from ipe_bench.measurements import Ode
+
+FAR = (8.0, 16.0, 24.0)
+"""Times so far apart that what is fast has settled long before each."""
+
+
+def kinetics(start="0", loss="L*y/(K+y)", **options):
+    """Saturating loss of y, fed by 2 a unit of time, and z behind it: they settle where L y/(K+y) = 2 and z = 2/k1.
+    Steps that are not stable jump beyond y = -K, where y runs off smoothly."""
+    options = {"constants": {"L": 1000.0, "K": 0.05}, "times": FAR} | options
+    rates = {"y": f"2-{loss}", "z": f"{loss}-k1*z"}
+    return Ode(rates, {"k1": 1.0}, {"y": start}, {"z": "z/(0.3+z)"}, **options)
+
+
+def settled(k1):
+    return 2 / k1 / (0.3 + 2 / k1)
+
+
+JUMPED = [("0", "L*y/(K+y)", 0.05), ("10", "L*y/(K+y)", 0.01), ("2", "L*y**2/(K**2+y**2)", 0.005)]
+JUMPED.append(("10", "L*y*(K+y)**-1", 0.05))
+
+
+@pytest.mark.parametrize(("start", "loss", "K"), JUMPED)
+def test_what_explicit_steps_jump_over_is_integrated_by_the_implicit_method(start, loss, K):
+    x = np.array([[1.0], [2.0]])
+    z = kinetics(start, loss, constants={"L": 1000.0, "K": K}).simulate(x)
+    np.testing.assert_allclose(z[:, -1], settled(x[:, 0]), rtol=1e-7)
+
+
+@pytest.mark.parametrize(("start", "loss", "K"), JUMPED)
+def test_explicit_steps_that_jump_over_a_pole_or_a_well_tell_no_readings(start, loss, K):
+    model = kinetics(start, loss, constants={"L": 1000.0, "K": K}, method="explicit")
+    assert np.isnan(model.simulate(np.array([[1.0], [2.0]]))).all()
+
+
+def test_a_truth_that_explicit_steps_do_not_follow_has_no_readings_though_the_nominal_point_has():
+    rates = {"y": "2-L*y/(0.05+y)", "z": "L*y/(0.05+y)-z"}
+    model = Ode(rates, {"L": 3.0}, outputs={"z": "z/(0.3+z)"}, times=FAR)
+    x = np.array([[1.0], [4.0], [400.0], [1000.0]])
+    z = model.simulate(x)
+    np.testing.assert_allclose(z[:2, -1], settled(1.0), rtol=1e-7)
+    assert np.isnan(z[2:]).all()
+    assert [bool(model.hindrance(row)) for row in x] == [False, False, True, True]
+    assert "measurement.method=implicit follows them" in model.hindrance(x[3])
+    np.testing.assert_allclose(replace(model, method="implicit").simulate(x)[:, -1], settled(1.0), rtol=1e-7)
+
+
+@pytest.mark.parametrize(("rate", "doubt"), [(0.5, 0.0), (500.0, 1.0)])
+def test_numpy_notes_the_same_steps_in_doubt_as_machine_code(rate, doubt):
+    engine = kinetics(times=(1.0, 2.0), constants={"L": rate, "K": 1.0}).engine
+    for available in (True, False):
+        z, states = np.empty((1, engine.m)), np.empty((1, 1, 3, 3))
+        with patch.object(compiled, "available", lambda available=available: available):
+            engine._simulate(np.ones((1, 1)), np.arange(1), np.array([4, 4]), np.zeros(engine.m), z, states)
+        assert states[0, 0, -1, -1] == doubt
+
+
+def test_a_solution_that_ends_at_a_pole_has_no_readings_behind_it():
+    """y^2 = 1 - 2 k t, and with a rate that has a place to settle beyond the pole."""
+    model = Ode({"y": "-k/y"}, {"k": 0.5}, {"y": 1.0}, times=(0.2, 0.6, 2.0))
+    x = np.array([[1.0], [0.4]])
+    z = model.simulate(x)
+    assert np.isnan(z[0]).all()
+    np.testing.assert_allclose(z[1], np.sqrt(1 - 0.4 * np.array(model.times)), atol=1e-8)
+    assert model.hindrance(x[0]) == "the solution itself leaves all numbers near t = 1"
+    beyond = Ode({"y": "-k/y-0.3*(y+1)"}, {"k": 0.5}, {"y": 1.0}, times=tuple(np.arange(0.5, 10.0)))
+    assert np.isnan(beyond.simulate(x)).all()
+
+
+@pytest.mark.parametrize("method", ["auto", "explicit", "implicit"])
+@pytest.mark.parametrize("width", [0.03, 0.003, 0.001])
+def test_a_pulse_is_met_by_both_methods(width, method):
+    rates = {"y": f"k0*exp(-((t-0.247)/{width})**2)/{width}-k1*y"}
+    model = Ode(rates, {"k0": 1.0, "k1": 0.1}, times=(0.5, 1.0), method=method)
+    x = np.array([[1.0, 1.0], [1.3, 0.5]])
+    k0, k1 = x[:, :1], 0.1 * x[:, 1:]
+    left = np.exp(-k1 * (np.array(model.times) - 0.247) + (k1 * width / 2) ** 2)
+    np.testing.assert_allclose(model.simulate(x), k0 * np.sqrt(np.pi) * left, rtol=1e-7, atol=1e-4 * width)
+    assert not model.hindrance(model.nominal)
+
+
+@pytest.mark.parametrize("method", ["auto", "explicit", "implicit"])
+def test_an_output_that_magnifies_a_state_beyond_its_digits_has_no_reading(method):
+    """cos(y) of y = e^(4 x): the last digit of y is 5e-6 at x = 6, and more than a turn at 11."""
+    model = Ode({"y": "k*y"}, {"k": 0.1}, {"y": 1.0}, {"z": "cos(y)"}, (40.0,), method=method)
+    x = np.array([[1.0], [6.0], [11.0]])
+    z = model.simulate(x)[:, 0]
+    assert z[0] == pytest.approx(np.cos(np.exp(4.0)), abs=1e-6)
+    assert np.isnan(z[1:]).all()
+    for row, value in zip(x, z, strict=True):
+        assert bool(model.hindrance(row)) == np.isnan(value)
+    assert model.hindrance(x[2]).startswith("neither steps of ")
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        Ode({"y": "k*y-sin(t)"}, {"k": 1.0}, {"y": 0.5}, times=(40.0,)),
+        pytest.param(
+            Ode(
+                {"x": "s*(y-x)", "y": "x*(28-z)-y", "z": "x*y-8/3*z"},
+                {"s": 10.0},
+                {"x": 1.0, "y": 1.0, "z": 1.0},
+                times=(60.0,),
+            ),
+            marks=pytest.mark.slow,
+        ),
+    ],
+    ids=["unstable", "lorenz"],
+)
+def test_equations_that_no_method_follows_are_not_handed_to_the_implicit_one(model):
+    """Solutions that begin a rounding error apart end as far apart as they are large, as e^t or e^(0.9 t)."""
+    assert np.isnan(model.simulate(model.nominal[None])).all()
