@@ -100,7 +100,7 @@ def assert_agrees(actual: Any, desired: Any, rtol: float = 0.0, atol: float = 0.
 
 
 def join(config: Any) -> None:
-    """Lets pytest call what stands below; the conftest.py of the tests and that of the plugins ask for it."""
+    """Lets pytest call what stands below, for the tests of plugins too where those of the package are named."""
     if not config.pluginmanager.has_plugin(__name__):
         config.pluginmanager.register(sys.modules[__name__], __name__)
 
