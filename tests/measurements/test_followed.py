@@ -26,7 +26,7 @@ def settled(k1):
 
 
 JUMPED = [("0", "L*y/(K+y)", 0.05), ("10", "L*y/(K+y)", 0.01), ("2", "L*y**2/(K**2+y**2)", 0.005)]
-JUMPED.append(("10", "L*y*(K+y)**-1", 0.05))
+JUMPED += [("10", "L*y*(K+y)**-1", 0.05), ("10", "L*y*(K+y)**-1", 0.0003)]
 
 
 @pytest.mark.parametrize(("start", "loss", "K"), JUMPED)
@@ -74,6 +74,15 @@ def test_a_solution_that_ends_at_a_pole_has_no_readings_behind_it():
     assert model.hindrance(x[0]) == "the solution itself leaves all numbers near t = 1"
     beyond = Ode({"y": "-k/y-0.3*(y+1)"}, {"k": 0.5}, {"y": 1.0}, times=tuple(np.arange(0.5, 10.0)))
     assert np.isnan(beyond.simulate(x)).all()
+
+
+@pytest.mark.parametrize("method", ["auto", "explicit", "implicit"])
+def test_a_divisor_that_passes_zero_without_a_pole_is_passed(method):
+    """(1 - e^-y) / y is 1 at y = 0, and y settles where it is 2."""
+    model = Ode({"y": "k*(1-exp(-y))/y-2"}, {"k": 1.0}, {"y": 2.0}, times=(1.0, 2.0, 40.0), method=method)
+    z = model.simulate(model.nominal[None])[0]
+    assert z[1] < 0 < z[0]
+    assert (1 - np.exp(-z[2])) / z[2] == pytest.approx(2.0, rel=1e-7)
 
 
 @pytest.mark.parametrize("method", ["auto", "explicit", "implicit"])

@@ -63,6 +63,9 @@ SHAPE = 1e-4
 _SMALLEST = 1e-9
 """Absolute tolerance over the relative one, in units of the states."""
 _SAFETY, _SHRINK, _GROW = 0.9, 0.2, 6.0
+_THROUGH = 1e-5
+"""Share of the usual interval below which a step may change the sign of what the rates divide by: longer ones would
+jump over a pole."""
 _LOOKS, _UNSEEN = 1024, 0.01
 """Moments within the usual interval at which rates that depend on t are looked at, lest a step misses a pulse; and the
 share of a state by which a step may miss what is seen there."""
@@ -122,6 +125,7 @@ class Rodas5P:
             "df": (tangent(f, along), point + ways),
             "dft": (tangent(in_time, along), point + ways),
             "dJk": (tangent(turned, along), [*point, *k, *ways]),
+            "side": ([tape.side], point),
             "start": (tape.start, [*p, *c]),
             "dstart": (tangent(tape.start, along), [*p, *c, *d]),
             "read": (tape.shown, point),
@@ -133,6 +137,11 @@ class Rodas5P:
     def timed(self) -> bool:
         """Whether the rates depend on t itself."""
         return Recording(self.of.equations).timed
+
+    @cached_property
+    def divided(self) -> bool:
+        """Whether the rates divide by anything that changes along a solution."""
+        return bool(Recording(self.of.equations).divisors)
 
     def measured(self, x: Array) -> tuple[Array, Effort]:
         """Computes the readings (1, m) at x (1, n), and the effort; a tolerance that shows the shape will do."""
@@ -176,8 +185,9 @@ class _Run:
         self.do, self.rtol, self.atol = method._programs, method.rtol, _SMALLEST * method.rtol
         self.tables, self.end = of.tables, float(of.times[-1]) or 1.0
         self.times, self.most, self.stretched = np.asarray(of.times, dtype=float)[:stop], most, stretched
-        self.timed, intervals = method.timed, np.diff(np.asarray(of.times, dtype=float), prepend=0.0)
-        self.look = float(np.median(intervals[intervals > 0.0])) / _LOOKS if intervals.any() else 1.0
+        self.timed, self.divided = method.timed, method.divided
+        intervals = np.diff(np.asarray(of.times, dtype=float), prepend=0.0)
+        self.interval = float(np.median(intervals[intervals > 0.0])) if intervals.any() else 1.0
         cases, self.q = of.tables.shape[1], equations.parameters if sensitive else 0
         lanes = len(x) * cases
         self.p = np.repeat(x * of.sizes, cases, axis=0).T.copy()
@@ -292,13 +302,17 @@ class _Run:
             unseen = _solve(W, exchanged, self._unseen(live, h)[:, None])[:, 0]
             missed = (np.abs(unseen) / (self.atol + _UNSEEN * largest)).max(axis=0)
             error = np.where(missed > 1.0, np.fmax(missed, error), error)
+        if self.divided:
+            before, after = (self._values("side", one, lanes)[0] for one in (at, (t + h, *y1, *p, *c)))
+            error = np.where((before != after) & (h > _THROUGH * self.interval), np.inf, error)
         return y1, V + D[-1] if q else S, error
 
     def _unseen(self, live: Array, h: Array) -> Array:
         """Computes the mean of the rates over a step with the states held, less what its ends and its middle say, each
         (states, lanes)."""
         found = np.zeros((len(self.y), len(live)))
-        looks = np.minimum(np.ceil(np.log2(np.maximum(h / self.look, 1.0))), np.log2(_LOOKS)).astype(int)
+        wanted = np.maximum(_LOOKS * h / self.interval, 1.0)
+        looks = np.minimum(np.ceil(np.log2(wanted)), np.log2(_LOOKS)).astype(int)
         for power in sorted(set(looks[looks > 0].tolist())):
             here, count = looks == power, 2**power
             lanes, y = live[here], self.y[:, live[here]]
