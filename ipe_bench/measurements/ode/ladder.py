@@ -124,8 +124,11 @@ def search(
             enough, good = moved <= 1.0, (left <= 1.0) | (place == top)
             fine[rows[enough]] = coarse[rows[enough]]
             final[rows] = np.where(enough, below, place)
-            lost[rows] = (place == top) & (moved > SAFETY * NOT_FOLLOWED)
-            doubtful[rows] = in_doubt(np.where(enough[:, None, None, None], near[rows], y[rows]))
+            # Where rounding shows, what finer steps move is what they leave; a stated rate promises the eighth order.
+            off = moved / SAFETY if states[1] else left
+            lost[rows] = (place == top) & (off > NOT_FOLLOWED)
+            if states[1]:
+                doubtful[rows] = np.where(enough, in_doubt(near[rows]), in_doubt(y[rows]))
             held[rows] = place
             places[rows] = np.clip(np.searchsorted(rungs, wanted), place + 1, top)
             still.append(rows[~(enough | good)])
