@@ -1,5 +1,6 @@
 """What a command answers is about what it asked for: its scenarios, a folder of its own, what it would do."""
 
+import signal
 from pathlib import Path
 
 import pandas as pd
@@ -195,3 +196,17 @@ def test_an_experiment_has_no_function_called(ipe_bench, below_hydra):
     assert "hydra." in err
     assert Path("mine").read_text() == "kept"
     assert not Path("copy").exists()
+
+
+@pytest.mark.parametrize(("command", "said"), [("run", "goes on from there"), ("estimate", "begins anew")])
+def test_a_command_that_is_stopped_exits_as_a_shell_says_of_ctrl_c(ipe_bench, monkeypatch, command, said):
+    """128 and the number of SIGINT, 2; a failure is 1, a mistake 2."""
+
+    def stop(words):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("ipe_bench.cli.main._dispatch", stop)
+    code, _, error = ipe_bench(command)
+    assert code == 128 + signal.SIGINT
+    assert "stopped" in error
+    assert said in error

@@ -765,7 +765,7 @@ CHANGES = {
         "Ctrl-C exits as a failure does",
         'return 130, f"stopped;',
         'return 1, f"stopped;',
-        "test_this_command.py test_screens.py test_fire.py",
+        "test_this_command.py",
     ),
     "any-settled": Change(
         "cli",
