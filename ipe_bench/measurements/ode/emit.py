@@ -22,7 +22,7 @@ from typing import Any
 
 from llvmlite import ir
 
-from ipe_bench.measurements.ode.plan import ROUGH, StepPlan
+from ipe_bench.measurements.ode.plan import StepPlan
 from ipe_bench.measurements.ode.trace import Program
 
 F64, I32, I64, PTR, VOID = ir.DoubleType(), ir.IntType(32), ir.IntType(64), ir.PointerType(), ir.VoidType()
@@ -131,33 +131,10 @@ class _Writer:
         ended = v.combine(y, weights[-1], [slopes[j] for j, _ in plan.tableau.weights[-1]])
         v.store(ended, frame, plan.y)
         if plan.doubt:
-            moved = slopes
-            if plan.timed:
-                alone = [v.run(plan.rates, [time, *y, *fixed]) for time in times]
-                moved = [list(map(v.builder.fsub, *pair)) for pair in zip(slopes, alone, strict=True)]
-            self._watch(v, frame, v.spread(h), ended, moved, sides)
-
-    def _watch(
-        self, v: _Vectors, frame: Value, h: Value, y: list[Value], slopes: list[list[Value]], sides: list[Value]
-    ) -> None:
-        """Writes whether the step that ends at y crossed a pole or was rough; see `ROUGH`. The slopes are what the
-        motion of the states adds to them."""
-        plan, b, zero = self.plan, v.builder, v.constant(0.0)
-        began, doubt = v.load(frame, [*plan.side, *plan.doubt])
-        for side in sides:
-            doubt = b.select(b.fcmp_ordered("!=", side, began), v.constant(1.0), doubt)
-        errors = [zero for _ in y]
-        for weight, slope in zip(plan.tableau.E, slopes, strict=True):
-            if weight:
-                errors = v.combine(errors, [v.constant(weight)], [slope])
-        reach = [
-            v.call("maxnum", r, v.call("fabs", value)) for r, value in zip(v.load(frame, plan.reach), y, strict=True)
-        ]
-        for r, error, slope in zip(reach, errors, slopes[-1], strict=True):
-            size = b.fadd(r, v.call("fabs", b.fmul(h, slope)))
-            rough = b.fcmp_ordered(">", v.call("fabs", b.fmul(h, error)), b.fmul(v.constant(ROUGH), size))
-            doubt = b.select(rough, v.constant(1.0), doubt)
-        v.store([*reach, doubt], frame, [*plan.reach, *plan.doubt])
+            held = [v.run(plan.rates, [time, *y, *fixed]) for time in times] if plan.timed else []
+            places = [*plan.reach, *plan.side, *plan.doubt]
+            given = [v.spread(h), *ended, *itertools.chain(*slopes, *held), *sides, *v.load(frame, places)]
+            v.store(v.run(plan.watch, given), frame, places)
 
     def _read(self, v: _Vectors, frame: Value, t: Value) -> None:
         plan = self.plan
@@ -337,7 +314,7 @@ class _Vectors:
         return self._each(name.replace("arctan", "atan"), *args)
 
     def call(self, name: str, *args: Value) -> Value:
-        """Writes an instruction of the processor: fma (rounded once), sqrt, floor, fabs or maxnum."""
+        """Writes an instruction of the processor: fma (rounded once), sqrt or floor."""
         return self.builder.call(self._declared(f"llvm.{name}.v{self.width}f64", self.type, len(args)), args)
 
     def _each(self, name: str, *args: Value) -> Value:

@@ -23,7 +23,7 @@ from ipe_bench.basics import compiled
 from ipe_bench.basics.compiled import INTEGER, POINTER, WHOLE, aligned, at
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.machine import cores
-from ipe_bench.measurements.ode.plan import ROUGH, Equations, Recording, StepPlan, Tableau, planned
+from ipe_bench.measurements.ode.plan import Equations, Recording, StepPlan, Tableau, planned
 from ipe_bench.measurements.ode.trace import Program
 
 if TYPE_CHECKING:
@@ -136,10 +136,6 @@ class Kernel:
         for other in others:
             other.result()
 
-    @property
-    def _watched(self) -> bool:
-        return self.equations.watched and not self.sensitive
-
     @functools.cached_property
     def _programs(self) -> tuple[Program, Program, Program]:
         """Evaluates from the time, the state with its tangents, and constants: their starts, their slopes, and
@@ -148,8 +144,10 @@ class Kernel:
         d, dp, slopes, shown, starts = tape.tangents if self.sensitive else ([], [], [], tape.shown, [])
         stays = [*tape.p, *tape.c, *dp]
         at = [tape.t, *tape.y, *d, *stays]
-        moving = Program.of([*tape.slope, *slopes, *([tape.side] if self._watched else [])], at)
-        return Program.of([*tape.start, *starts], stays), moving, Program.of(shown, at)
+        watched = self.equations.watched and not self.sensitive
+        moving = Program.of([*tape.slope, *slopes, *([tape.side] if watched else [])], at)
+        noted = tape.noted if watched else []
+        return Program.of([*tape.start, *starts, *noted], stays), moving, Program.of(shown, at)
 
     def _interpret(
         self,
@@ -175,29 +173,28 @@ class Kernel:
             return [*p, *intervals[min(k, len(intervals) - 1), case].T, *directions]
 
         with np.errstate(all="ignore"):
-            y, t = begin(stays(0)), np.float64(0.0)
-            kept, watch = [y], None
-            if self._watched:
-                watch = _Watch([np.abs(a) for a in y], slope([t, *y, *stays(0)])[-1], np.zeros(len(trial), dtype=bool))
+            begun, t, size = begin(stays(0)), np.float64(0.0), len(slope.outputs) - bool(self.plan.doubt)
+            y, noted = begun[:size], begun[size:]
+            kept = [y]
             for k, to in enumerate(times):
                 h = (to - t) / max(int(steps[k]), 1)
                 for s in range(int(steps[k]) if to != t else 0):
-                    slopes, sides, moved = list[list[Any]](), list[Any](), list[list[Any]]()
+                    slopes, held, sides = list[list[Any]](), list[Any](), list[Any]()
                     at = y
                     for node, row in zip((*self.tableau.C, 1.0), self.tableau.weights, strict=True):
                         at = y
                         for j, weight in row:
                             at = [a + h * weight * k for a, k in zip(at, slopes[j], strict=True)]
                         if len(slopes) < self.tableau.stages:
-                            found = slope([t + s * h + node * h, *at, *stays(k)])
-                            slopes.append(found[: len(y)])
-                            sides += found[len(y) :]
-                            if watch:
-                                alone = slope([t + s * h + node * h, *y, *stays(k)])
-                                moved.append([a - b for a, b in zip(slopes[-1], alone[:-1], strict=True)])
+                            moment = t + s * h + node * h
+                            found = slope([moment, *at, *stays(k)])
+                            slopes.append(found[:size])
+                            sides += found[size:]
+                            if noted and self.plan.timed:
+                                held += slope([moment, *y, *stays(k)])[:size]
                     y = at
-                    if watch:
-                        watch.see(self.tableau, h, y, moved, sides)
+                    if noted:
+                        noted = self.plan.watch([h, *y, *itertools.chain(*slopes), *held, *sides, *noted])
                 t = to
                 kept.append(y)
                 for i, value in enumerate(read([t, *y, *stays(k + 1)])):
@@ -208,28 +205,8 @@ class Kernel:
             if states is not None:
                 for k, i in np.ndindex(len(kept), len(kept[0])):
                     states[trial, case, i, k] = kept[k][i]
-                if watch:
-                    states[trial, case, -1] = watch.doubt[:, None]
-
-
-@dataclass
-class _Watch:
-    """Notes, lane by lane, whether a step was rough or crossed a pole."""
-
-    reach: list[Any]
-    """The largest magnitude of each state so far."""
-    began: Any
-    """The side of the poles at the start."""
-    doubt: NDArray[np.bool_]
-
-    def see(self, formula: Tableau, h: float, y: list[Any], slopes: list[list[Any]], sides: list[Any]) -> None:
-        """Looks at a step that ends at y; the slopes are what the motion of the states adds to them."""
-        for side in sides:
-            self.doubt |= (side != self.began) & (side == side)
-        self.reach = [np.fmax(reach, np.abs(a)) for reach, a in zip(self.reach, y, strict=True)]
-        for i, reach in enumerate(self.reach):
-            error = h * sum(weight * slope[i] for weight, slope in zip(formula.E, slopes, strict=True))
-            self.doubt |= np.abs(error) > ROUGH * (reach + np.abs(h * slopes[-1][i]))
+                if noted:
+                    states[trial, case, -1] = np.broadcast_to(noted[-1], len(trial))[:, None]
 
 
 def compiled_rates(program: Program) -> Callable[[Array, Array, Array], None]:

@@ -158,9 +158,7 @@ class Recording:
                 divisors += others
             elif e.operation == "pow" and (others[0].value or 0.0) < 0.0:
                 divisors.append(base)
-            elif e.operation == "tan":
-                divisors.append(np.cos(base))  # type: ignore[arg-type]
-        return [e for e in _distinct(divisors) if e in varying or e.operation == "cos"]
+        return [e for e in _distinct(divisors) if e in varying]
 
     @cached_property
     def divided_by(self) -> list[bool]:
@@ -176,11 +174,32 @@ class Recording:
         return side
 
     @cached_property
-    def watched(self) -> list[Expression]:
-        """What is noted of the start, before the first step: magnitudes, the side, and no doubt."""
+    def noted(self) -> list[Expression]:
+        """What is noted of the start: magnitudes of the states, the side of the poles, and no doubt."""
         at_start = {self.t: self.graph.constant(0.0)} | dict(zip(self.y, self.start, strict=True))
         sizes = [self.graph.apply("add", np.abs(y), 0.0) for y in self.start]
         return [*sizes, trace.substitute(self.side, at_start), self.graph.constant(0.0)]
+
+    def watch(self, formula: Tableau) -> Program:
+        """Notes whether a step crossed a pole or was rough, from its length, the states at its end, the slopes of its
+        stages, where the rates depend on t those with the states held, the sides of its stages, and what was noted."""
+        g, n, stages = self.graph, self.equations.states, formula.stages
+        h, ended, slopes = g.input("h"), g.inputs("ended", n), g.inputs("k", n * stages)
+        held = g.inputs("held", n * stages) if self.timed else ()
+        sides, reach = g.inputs("side", stages), g.inputs("reach", n)
+        began, doubt = g.inputs("noted", 2)
+        given = [h, *ended, *slopes, *held, *sides, *reach, began, doubt]
+        size: Any = np.abs
+        larger = [g.apply("where", a < size(b), size(b), a) for a, b in zip(reach, ended, strict=True)]
+        moved = [k - alone for k, alone in zip(slopes, held, strict=True)] if held else slopes
+        for side in sides:
+            doubt = g.apply("where", (side < began) + (began < side), 1.0, doubt)
+        for i, largest in enumerate(larger):
+            own = moved[i::n]
+            error = sum(weight * k for weight, k in zip(formula.E, own, strict=True) if weight)
+            rough = ROUGH * (largest + size(h * own[-1])) < size(h * error)
+            doubt = g.apply("where", rough, 1.0, doubt)
+        return Program.of([*larger, began, doubt], given)
 
     @cached_property
     def tangents(self) -> tuple[Any, Any, list[Expression], list[Expression], list[Expression]]:
@@ -285,6 +304,8 @@ class StepPlan:
     """What `step` computes but for the side of the poles: what a step costs is what the solution needs."""
     timed: bool
     """Whether the rates depend on t itself."""
+    watch: Program
+    """Program that notes what a step shows; see `Recording.watch`."""
     reach: range
     """Places of the largest magnitude of each state so far; none if no step is watched."""
     side: range
@@ -365,7 +386,7 @@ def planned(equations: Equations, tableau: Tableau, *, sensitive: bool) -> StepP
     started += [*motion.constant * tableau.stages, *reading.constant]
     if watched:
         begun += [*reach, *side, *doubt]
-        started += tape.watched
+        started += tape.noted
     return StepPlan(
         tableau=tableau,
         x=x, constants=constants, begin=Program.of(started, [*tape.p, *tape.c]), begun=tuple(begun),
@@ -373,5 +394,6 @@ def planned(equations: Equations, tableau: Tableau, *, sensitive: bool) -> StepP
         step=step, kept=tuple(stage[:k] for stage in stages), stage_size=len(stages[0]),
         read=read, noted=noted_at[:r], shown=shown_at, size=size,
         tangents=lie, motion=motion.placed(stages[0], fixed), reading=reading.placed(noted_at, fixed),
-        rates=rates, timed=tape.timed, reach=reach, side=side, doubt=doubt,
+        rates=rates, timed=tape.timed, watch=tape.watch(tableau) if watched else Program.of([], []),
+        reach=reach, side=side, doubt=doubt,
     )  # fmt: skip
