@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from ipe_bench.basics.errors import UserError, unknown
-from ipe_bench.measurements.ode import trace
+from ipe_bench.engine import trace
 
 
 def choose(condition: Any, a: Any, b: Any) -> Any:

@@ -13,9 +13,9 @@ import numpy as np
 from ipe_bench.basics.errors import UserError, did_you_mean, unknown
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Finite
+from ipe_bench.engine.trace import Graph, Program, slopes
 from ipe_bench.measurements.arithmetic import Arithmetic, never_switching, parse
 from ipe_bench.measurements.base import Input, Measurement, Parameter
-from ipe_bench.measurements.ode.trace import Graph, Program, slopes
 
 _FARTHER = (0.3, -0.3, 1.0, -1.0)
 """Changes of a parameter without a slope, in multiples of its magnitude, at which readings are looked at again."""

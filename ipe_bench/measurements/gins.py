@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Finite, NonNegative, Positive
+from ipe_bench.engine.integrator import Kernel
+from ipe_bench.engine.plan import DOP853, Equations, Variation
+from ipe_bench.engine.trace import tangent
 from ipe_bench.measurements.base import Measurement, Parameter, UsualNoise, parameter_table
-from ipe_bench.measurements.ode.integrator import Kernel
 from ipe_bench.measurements.ode.model import OdeMeasurement
-from ipe_bench.measurements.ode.plan import DOP853, Equations, Variation
-from ipe_bench.measurements.ode.trace import tangent
 
 FOOT = 0.3048
 """Metres in a foot."""

@@ -20,11 +20,11 @@ from typing import Any
 
 import numpy as np
 
+from ipe_bench.engine.trace import Expression, Graph, in_order, tangent
 from ipe_bench.measurements.arithmetic import Arithmetic
 from ipe_bench.measurements.base import Forwarding, Measurement
 from ipe_bench.measurements.formula import Formula
 from ipe_bench.measurements.ode.described import Ode
-from ipe_bench.measurements.ode.trace import Expression, Graph, in_order, tangent
 
 _PRIME = (1 << 61) - 1
 _POWERS = tuple(float(k) for k in range(3, 9))

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance
+from ipe_bench.engine.trace import Graph, Program, slopes
 from ipe_bench.measurements.arithmetic import Arithmetic, parse
 from ipe_bench.measurements.base import Parameter
-from ipe_bench.measurements.ode.trace import Graph, Program, slopes
 
 READING = "h"
 """Name of the error-free reading's magnitude in a formula of the standard deviation."""

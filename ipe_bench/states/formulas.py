@@ -13,9 +13,9 @@ import numpy as np
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Finite, NonNegative, Positive
+from ipe_bench.engine.trace import Expression, Graph, Program, dependent, slopes
 from ipe_bench.measurements.arithmetic import Arithmetic, parse
 from ipe_bench.measurements.base import Parameter, differentiate
-from ipe_bench.measurements.ode.trace import Expression, Graph, Program, dependent, slopes
 from ipe_bench.states.base import Normal, Paths, StateModel
 
 

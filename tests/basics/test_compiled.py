@@ -7,9 +7,9 @@ import sys
 import numpy as np
 import pytest
 
-from ipe_bench.basics import compiled
-from ipe_bench.basics.compiled import POINTER, at
 from ipe_bench.basics.files import cache_folder
+from ipe_bench.engine import compiled
+from ipe_bench.engine.compiled import POINTER, at
 from ipe_bench.measurements import LotkaVolterra
 from ipe_bench.runs import provenance
 
@@ -129,7 +129,7 @@ from ipe_bench.measurements import LotkaVolterra
 
 model = LotkaVolterra()
 model.jacobian(model.nominal[None])
-print("ipe_bench.measurements.ode.emit" in sys.modules)
+print("ipe_bench.engine.emit" in sys.modules)
 """
     environment = os.environ | {"IPE_BENCH_CACHE": str(tmp_path)}
     said = [

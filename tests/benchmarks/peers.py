@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from ipe_bench.basics.linalg import Array
+from ipe_bench.engine.plan import DOP853, Recording
+from ipe_bench.engine.trace import Program
 from ipe_bench.measurements.ode.model import OdeMeasurement
-from ipe_bench.measurements.ode.plan import DOP853, Recording
-from ipe_bench.measurements.ode.trace import Program
 
 Simulate = Callable[[Array], Array]
 _FUSED = {

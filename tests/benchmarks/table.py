@@ -24,7 +24,7 @@ from scipy.integrate import solve_ivp
 
 import ipe_bench as ib
 from ipe_bench.basics.machine import library_versions
-from ipe_bench.measurements.ode.rodas import Rodas5P
+from ipe_bench.engine.rodas import Rodas5P
 from ipe_bench.trials.scoring import Block
 
 STEP_S = 180.0

@@ -5,7 +5,7 @@ import pytest
 from drawn_equations import ANSWERS, COUNT, HARD, drawn
 from shared.oracles import agreed
 
-from ipe_bench.measurements.ode.ladder import NOT_FOLLOWED
+from ipe_bench.engine.ladder import NOT_FOLLOWED
 
 _WITHIN = 3.0
 """Tolerances: step doubling says what is left of an error as if all of it were of eighth order."""

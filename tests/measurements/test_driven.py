@@ -9,8 +9,8 @@ import pytest
 from shared.oracles import assert_agrees
 
 from ipe_bench.baselines import LevenbergMarquardt
-from ipe_bench.basics import compiled
 from ipe_bench.basics.errors import UserError
+from ipe_bench.engine import compiled
 from ipe_bench.measurements import Ode
 from ipe_bench.measurements.base import differentiate
 from ipe_bench.measurements.ode.driven import course

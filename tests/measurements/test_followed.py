@@ -6,7 +6,7 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from ipe_bench.basics import compiled
+from ipe_bench.engine import compiled
 from ipe_bench.measurements import Ode
 
 FAR = (8.0, 16.0, 24.0)

@@ -10,11 +10,11 @@ from scipy.integrate import DOP853
 from shared.oracles import agreed, assert_agrees
 
 from ipe_bench.basics.errors import UserError
+from ipe_bench.engine import plan
+from ipe_bench.engine.ladder import tangent_contraction
+from ipe_bench.engine.trace import Graph
 from ipe_bench.measurements import Ode, OdeMeasurement, Parameter
 from ipe_bench.measurements.base import differentiate
-from ipe_bench.measurements.ode import plan
-from ipe_bench.measurements.ode.ladder import tangent_contraction
-from ipe_bench.measurements.ode.trace import Graph
 
 
 @dataclass(frozen=True)

@@ -15,13 +15,13 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.special import erf, erfc
 
-from ipe_bench.basics import compiled
+from ipe_bench.engine import compiled
+from ipe_bench.engine.ladder import tangent_contraction
+from ipe_bench.engine.plan import DOP853
 from ipe_bench.measurements import LotkaVolterra, Ode, OdeMeasurement, Parameter, SubsetModel
 from ipe_bench.measurements.arithmetic import FUNCTIONS, PAIRS, SEVERAL
 from ipe_bench.measurements.joint import Joint
 from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo
-from ipe_bench.measurements.ode.ladder import tangent_contraction
-from ipe_bench.measurements.ode.plan import DOP853
 
 BATCHES = (1, 7, 8, 9, 64, 250)
 TOLERANCE = 1e-8

@@ -8,9 +8,9 @@ import pytest
 from scipy.integrate import solve_ivp
 from shared.oracles import assert_agrees
 
+from ipe_bench.engine.rodas import Rodas5P
 from ipe_bench.measurements import Ode, OdeMeasurement, Parameter
 from ipe_bench.measurements.base import differentiate
-from ipe_bench.measurements.ode.rodas import Rodas5P
 
 # fmt: off
 HIRES = {

@@ -85,7 +85,7 @@ def surroundings(task):
     """What a worker sees: its process, its BLAS threads, and the threads that compiled models may use."""
     from threadpoolctl import threadpool_info
 
-    from ipe_bench.measurements.ode.integrator import threads
+    from ipe_bench.engine.integrator import threads
 
     np.linalg.inv(np.eye(3))
     yield os.getpid(), [pool["num_threads"] for pool in threadpool_info()], threads()

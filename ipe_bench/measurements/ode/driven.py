@@ -14,8 +14,8 @@ import numpy as np
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
+from ipe_bench.engine import trace
 from ipe_bench.measurements.arithmetic import COMPARISONS, CONSTANTS, Arithmetic, Tree, evaluate, parts
-from ipe_bench.measurements.ode import trace
 
 PIECEWISE = ("min", "max", "abs", "sign", *COMPARISONS)
 _REMEDY = "compare t itself with a constant, so that the moment of the switch is known"

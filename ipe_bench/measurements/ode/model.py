@@ -11,15 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.basics import compiled
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Mask, own
+from ipe_bench.engine import compiled, ladder
+from ipe_bench.engine.integrator import Kernel, compiled_rates
+from ipe_bench.engine.plan import DOP853, RK4, Equations, Recording, Variation, jumps
+from ipe_bench.engine.rodas import MOST_STEPS, SHAPE, STABLE, Effort, Rodas5P, Stepped
+from ipe_bench.engine.trace import Graph, Program
 from ipe_bench.measurements.base import Measurement
-from ipe_bench.measurements.ode import ladder
-from ipe_bench.measurements.ode.integrator import Kernel, compiled_rates
-from ipe_bench.measurements.ode.plan import DOP853, RK4, Equations, Recording, Variation, jumps
-from ipe_bench.measurements.ode.rodas import MOST_STEPS, SHAPE, STABLE, Effort, Rodas5P, Stepped
-from ipe_bench.measurements.ode.trace import Graph, Program
 
 _IN_HAND = 0.3
 """Error of a step of the implicit method, as a share of the tolerance."""

@@ -22,8 +22,8 @@ from typing import Any
 
 from llvmlite import ir
 
-from ipe_bench.measurements.ode.plan import StepPlan
-from ipe_bench.measurements.ode.trace import Program
+from ipe_bench.engine.plan import StepPlan
+from ipe_bench.engine.trace import Program
 
 F64, I32, I64, PTR, VOID = ir.DoubleType(), ir.IntType(32), ir.IntType(64), ir.PointerType(), ir.VoidType()
 _ARITHMETIC = {"add": "fadd", "sub": "fsub", "mul": "fmul", "div": "fdiv"}

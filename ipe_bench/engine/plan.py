@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ipe_bench.measurements.ode import trace
-from ipe_bench.measurements.ode.trace import Expression, Graph, Program
+from ipe_bench.engine import trace
+from ipe_bench.engine.trace import Expression, Graph, Program
 
 Recordable = Callable[..., Sequence[Any]]
 _POINTS, _NEWTON = 64, 30

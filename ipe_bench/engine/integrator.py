@@ -19,16 +19,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.basics import compiled
-from ipe_bench.basics.compiled import INTEGER, POINTER, WHOLE, aligned, at
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.machine import cores
-from ipe_bench.measurements.ode.plan import Equations, Recording, StepPlan, Tableau, planned
-from ipe_bench.measurements.ode.trace import Program
+from ipe_bench.engine import compiled
+from ipe_bench.engine.compiled import INTEGER, POINTER, WHOLE, aligned, at
+from ipe_bench.engine.plan import Equations, Recording, StepPlan, Tableau, planned
+from ipe_bench.engine.trace import Program
 
 if TYPE_CHECKING:
     # Imported where something is compiled, and here so that results are known to depend on it.
-    from ipe_bench.measurements.ode import emit as emit
+    from ipe_bench.engine import emit as emit
 
 _WORTH_THREADS = 40_000
 """Steps times lanes times states from which a second thread gains more than it costs, some 150 microseconds."""
@@ -54,7 +54,7 @@ def _compiled(name: str, source: StepPlan | Program, width: int, arguments: tupl
     """Returns the compiled function of `emit` by that name."""
 
     def write() -> str:
-        return getattr(importlib.import_module("ipe_bench.measurements.ode.emit"), name)(source, width)
+        return getattr(importlib.import_module("ipe_bench.engine.emit"), name)(source, width)
 
     return compiled.load(f"{source} {width} {compiled.digest_of(_EMIT)}", write, name, arguments)
 

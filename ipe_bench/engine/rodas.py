@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 
 from ipe_bench.basics.linalg import Array
-from ipe_bench.measurements.ode.plan import Equations, Recording
-from ipe_bench.measurements.ode.trace import Program, tangent
+from ipe_bench.engine.plan import Equations, Recording
+from ipe_bench.engine.trace import Program, tangent
 
 GAMMA = 0.21193756319429014
 _SIXTH = (-7.502846399306121, 2.561846144803919, -11.627539656261098, -0.18268767659942256, 0.030198172008377946)

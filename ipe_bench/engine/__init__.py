@@ -1,0 +1,4 @@
+"""Integrates differential equations with their tangents in machine code. It knows nothing of a bench.
+
+Equations are functions of expressions, recorded once; a `Kernel` of them integrates many trials at a time.
+"""
