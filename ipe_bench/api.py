@@ -30,14 +30,15 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from ipe_bench.plugins.conformance import Finding
+    from ipe_bench.questions.audit.answer import AuditAnswer
+    from ipe_bench.questions.compare.answer import Comparison
+    from ipe_bench.questions.design.maths import Criterion, Design
+    from ipe_bench.questions.posterior.maths import Reference
     from ipe_bench.report.answer import Answer
-    from ipe_bench.report.questions import AuditAnswer, Comparison
     from ipe_bench.report.run import ReportResult
     from ipe_bench.report.style import Which
     from ipe_bench.report.summary import Summary
     from ipe_bench.report.tracked import LogAnswer
-    from ipe_bench.trials.design import Criterion, Design
-    from ipe_bench.trials.posterior import Reference
 
 Directories = Path | str | Sequence[Path | str]
 Shows = bool | Literal["lines"]
@@ -226,11 +227,11 @@ def compare(
     >>> rows.set_index("quantity")["finding"].to_dict()
     {'success': 'better', 'error': 'better', 'cost': 'worse', 'time': ''}
     """
-    from ipe_bench.report.questions import Comparison, write_comparison
+    from ipe_bench.questions.compare import maths as between
+    from ipe_bench.questions.compare.answer import Comparison, write_comparison
+    from ipe_bench.questions.compare.effects import PowerPlan
     from ipe_bench.report.writer import digests
-    from ipe_bench.statistics import between
     from ipe_bench.statistics.collect import collect
-    from ipe_bench.statistics.paired import PowerPlan
 
     plan = PowerPlan.of(power, difference, anytime=anytime)
     if not 0 < alpha < 1:
@@ -276,7 +277,7 @@ def audit(table: Path | str | pd.DataFrame, *, output: Path | str | None = None)
 
     Parameters:
         table: a CSV or Parquet file, or a frame, with a row per run: NAME_true and NAME (or NAME_error), NAME_std (or
-            NAME_var), and cov_A_B as far as there are any; see `ipe_bench.statistics.audit.read_claims`.
+            NAME_var), and cov_A_B as far as there are any; see `ipe_bench.questions.audit.maths.read_claims`.
         output: folder for audit.csv and audit.html.
 
     Returns:
@@ -292,10 +293,10 @@ def audit(table: Path | str | pd.DataFrame, *, output: Path | str | None = None)
     """
     import pandas as pd
 
-    from ipe_bench.report.questions import AuditAnswer, write_audit
+    from ipe_bench.questions.audit.answer import AuditAnswer, write_audit
+    from ipe_bench.questions.audit.maths import audit as examined
+    from ipe_bench.questions.audit.maths import read_claims
     from ipe_bench.report.writer import digests
-    from ipe_bench.statistics.audit import audit as examined
-    from ipe_bench.statistics.audit import read_claims
 
     found = AuditAnswer(**vars(examined(read_claims(table))))
     if output is not None:
@@ -502,8 +503,8 @@ def design(
     (5, 20)
     """
     from ipe_bench.plugins.extensions import richer_models
-    from ipe_bench.report.questions import DesignAnswer
-    from ipe_bench.trials.design import design as designed
+    from ipe_bench.questions.design.answer import DesignAnswer
+    from ipe_bench.questions.design.maths import design as designed
 
     scenario = _scenario(scenario, noise=noise, prior=prior, error_scale=error_scale)
     errors = richer_models(scenario) if errors is None else errors
@@ -542,8 +543,8 @@ def posterior(
     >>> found.divergences["newton"].kl < 1 < found.divergences["linear"].kl
     True
     """
-    from ipe_bench.report.questions import PosteriorAnswer
-    from ipe_bench.trials.posterior import reference, require_particles
+    from ipe_bench.questions.posterior.answer import PosteriorAnswer
+    from ipe_bench.questions.posterior.maths import reference, require_particles
 
     scenario = _scenario(scenario, noise=noise, prior=prior, error_scale=error_scale)
     estimators = _labelled(estimators)

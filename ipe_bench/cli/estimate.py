@@ -28,7 +28,7 @@ from ipe_bench.runs.run import validate
 from ipe_bench.states.base import StateModel
 
 if TYPE_CHECKING:
-    from ipe_bench.trials.design import Criterion
+    from ipe_bench.questions.design.maths import Criterion
 
 STANDARD_ESTIMATORS = ("solver=[auto]", "baseline=[linear_lse,levenberg_marquardt]")
 """Estimators of `estimate`: one that chooses its method itself, and two to compare it with."""
@@ -167,7 +167,7 @@ def design_command(
     arguments: Sequence[str], by: Sequence[str] | None, readings: int | None, criterion: Criterion
 ) -> int:
     """Prints tables and writes files; exit code 1 where the readings do not determine every parameter."""
-    from ipe_bench.report.questions import READINGS, design_parts, write_design
+    from ipe_bench.questions.design.answer import READINGS, design_parts, write_design
 
     if any(word.lstrip("+").startswith("readings=") for word in arguments):
         raise UserError("readings: is for `ipe-bench estimate`; the number to choose is --readings NUMBER")
@@ -191,7 +191,7 @@ def design_command(
 
 def posterior_command(arguments: Sequence[str], particles: int) -> int:
     """Samples, prints a table and writes files; returns 1 if the populations of a trial do not agree."""
-    from ipe_bench.report.questions import posterior_parts, write_posteriors
+    from ipe_bench.questions.posterior.answer import posterior_parts, write_posteriors
 
     asked = single("posterior", arguments, run=of("run", "figures"), estimate=OF_FILES)
     job, name, scenario = asked.spec, asked.measurement, asked.spec.scenario

@@ -60,7 +60,7 @@ def bundle_command(arguments: Sequence[str]) -> int:
 
 def compare_command(arguments: Sequence[str]) -> int:
     """Prints the table; exit code 1 where the second is worse, or lacks what was asked for."""
-    from ipe_bench.statistics.between import MARGINS
+    from ipe_bench.questions.compare.maths import MARGINS
 
     margins = {f"margin.{name}": float for name in MARGINS}
     folders, keys = places_and_keys("compare", arguments, _COMPARE | margins)

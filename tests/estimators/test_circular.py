@@ -17,7 +17,7 @@ from ipe_bench.measurements.base import SubsetModel, differentiate
 from ipe_bench.measurements.joint import Joint
 from ipe_bench.measurements.known import ParameterInfo, informed
 from ipe_bench.noise import Gaussian, Quantization
-from ipe_bench.trials.posterior import sample_posterior
+from ipe_bench.questions.posterior.maths import sample_posterior
 from ipe_bench.trials.scenario import Scenario
 
 TURN = 2 * np.pi

@@ -19,10 +19,10 @@ from ipe_bench.noise import Gaussian
 from ipe_bench.plugins import discovery
 from ipe_bench.plugins.conformance import check_component
 from ipe_bench.priors import Prior
+from ipe_bench.questions.posterior.maths import reference
 from ipe_bench.report import figures
 from ipe_bench.runs.execution import Event, Execution, Serial
 from ipe_bench.statistics.registry import add_statistics
-from ipe_bench.trials.posterior import reference
 
 SMALL = ("measurement=polynomial", "noise=gaussian", "trials=8", "execution=serial", "output=out")
 MAIN = "figures=main"

@@ -10,8 +10,8 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.noise import Gaussian
 from ipe_bench.plugins.conformance import check_component
 from ipe_bench.priors import GaussianPrior
+from ipe_bench.questions.posterior.maths import sample_posterior
 from ipe_bench.trials.fit_test import spread_of
-from ipe_bench.trials.posterior import sample_posterior
 from ipe_bench.trials.scenario import Scenario
 from ipe_bench.trials.scoring import Block
 

@@ -19,14 +19,16 @@ import ipe_bench as ib
 from ipe_bench.basics.statuses import Status
 from ipe_bench.cli.main import main
 from ipe_bench.estimators.base import Estimates
-from ipe_bench.report.figures.answers import draw_fit, draw_marginals, draw_pairs, draw_residuals
+from ipe_bench.questions.compare.figure import draw_pairs
+from ipe_bench.questions.design.answer import _design_sentences, _draw_design, _ways
+from ipe_bench.questions.posterior.figure import draw_marginals
+from ipe_bench.questions.posterior.maths import Posterior, Reference
+from ipe_bench.report.figures.answers import draw_fit, draw_residuals
 from ipe_bench.report.figures.common import full_ticks
 from ipe_bench.report.figures.views import looks_of, views
-from ipe_bench.report.questions import _design_sentences, _draw_design, _ways
 from ipe_bench.report.style import FACES, house_style
 from ipe_bench.report.words import ends_in_percent, public
 from ipe_bench.statistics import analyse
-from ipe_bench.trials.posterior import Posterior, Reference
 
 
 def test_a_page_states_command_version_and_file_and_no_path_of_this_machine(tmp_path, capsys):

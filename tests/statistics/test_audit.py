@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli.results import audit_command
-from ipe_bench.statistics.audit import Claims, _tails, _worst_direction, audit, read_claims
+from ipe_bench.questions.audit.maths import Claims, _tails, _worst_direction, audit, read_claims
 
 
 def claims(rng, runs=200, n=4, *, factor=1.0, law="normal", stretched=1.0):

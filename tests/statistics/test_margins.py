@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from ipe_bench.statistics.between import _loss, compared
+from ipe_bench.questions.compare.effects import Effect
+from ipe_bench.questions.compare.maths import _loss, compared
 from ipe_bench.statistics.collect import collect
-from ipe_bench.statistics.paired import Effect
 from ipe_bench.trials.thresholds import GATE
 
 DEVIATES = np.random.default_rng(0).standard_normal((1000, 3))

@@ -8,7 +8,7 @@ from scipy.optimize import minimize_scalar
 from scipy.stats import beta, chi, norm
 from shared.oracles import assert_agrees
 
-from ipe_bench.statistics.paired import fair_coin, mean_effect, no_lean, ratio_effect, success_effect
+from ipe_bench.questions.compare.effects import fair_coin, mean_effect, no_lean, ratio_effect, success_effect
 
 
 def successes(both: int, only_first: int, only_second: int, neither: int):

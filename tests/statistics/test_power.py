@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import binom
 from shared.oracles import assert_agrees
 
-from ipe_bench.statistics.paired import PowerPlan, mcnemar_power, trials_needed
+from ipe_bench.questions.compare.effects import PowerPlan, mcnemar_power, trials_needed
 
 CASES = [(0.9, 0.95, 0.0), (0.9, 0.95, 0.6), (0.5, 0.6, 0.0), (0.5, 0.6, 0.7), (0.97, 1.0, 0.0), (0.73, 0.67, 0.3)]
 """Success of the first and of the second, and the correlation of both."""

@@ -11,7 +11,7 @@ from shared.oracles import agreed, assert_agrees
 import ipe_bench as ib
 from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.measurements import Gins, Measurement, Parameter, RicherGins
-from ipe_bench.trials.design import design
+from ipe_bench.questions.design.maths import design
 from ipe_bench.trials.observability import Observability, suspects
 
 NOISE = ib.noise.Quantization()

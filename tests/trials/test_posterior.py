@@ -13,8 +13,8 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates
 from ipe_bench.measurements import Gins
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.report.questions import honest_word
-from ipe_bench.trials.posterior import Divergence, Posterior, divergence, reference, sample_posterior
+from ipe_bench.questions.posterior.answer import honest_word
+from ipe_bench.questions.posterior.maths import Divergence, Posterior, divergence, reference, sample_posterior
 
 PRIOR = np.array([1.0, 0.5, 2.0])
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,27 +14,17 @@ from ipe_bench.real.residuals import LEAST_P
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.views import looks_of
-from ipe_bench.report.style import BOUND_COLOR, FAMILIES
+from ipe_bench.report.style import BOUND_COLOR
 from ipe_bench.report.words import enumerate_few, p_value
-from ipe_bench.statistics.between import comparison_title
 
 if TYPE_CHECKING:
-    import pandas as pd
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
     from ipe_bench.measurements.base import Measurement
     from ipe_bench.real.examination import Examination
     from ipe_bench.real.fits import Fit
     from ipe_bench.report.style import Look
-    from ipe_bench.statistics.audit import Audit
-    from ipe_bench.trials.observability import Observability
-    from ipe_bench.trials.posterior import Reference
 
 MOST_ESTIMATORS = 12
 """Estimators with a panel of residuals; `residuals.csv` has all."""
-MOST_ROWS = 30
-"""Comparisons in a figure; its table has all."""
 _MANY = 5000
 """Points from which on they are pixels in the PDF, too."""
 _BENT = 30.0
@@ -43,16 +33,6 @@ _ALIKE = 0.01
 """Residuals, in their deviations, that differ by less are drawn once."""
 _GRID = 200
 """Points of a curve, where the model can be evaluated between the readings."""
-_FARTHEST = 4.5
-"""Standard deviations about the middle that a distribution is drawn to."""
-_GOOD, _BAD = FAMILIES["least squares"][0], FAMILIES["filters"][0]
-_FINDINGS: dict[str, tuple[str, dict[str, Any]]] = {
-    "better": ("better", {"marker": "o", "color": _GOOD}),
-    "worse": ("worse", {"marker": "o", "color": _BAD}),
-    "different": ("different, perhaps by less than the margin", {"marker": "D", "color": BOUND_COLOR}),
-    "": ("no difference found", {"marker": "o", "color": BOUND_COLOR, "markerfacecolor": "white"}),
-}
-"""The words and the mark of each outcome of a test."""
 
 
 def draw_fit(found: Examination, z: Array, look: Look) -> Iterator[Drawing]:
@@ -148,144 +128,3 @@ def _abscissa(model: Measurement) -> tuple[Array, str]:
         if np.issubdtype(values.dtype, np.number) and not several and (np.diff(values) >= 0).all():
             return values.astype(float), name
     return np.arange(1.0, model.m + 1), "reading"
-
-
-def draw_bounds(now: Observability, after: Observability | None, choice: str) -> Iterator[Drawing]:
-    """Draws the bound of each parameter in its unit, today and after a `choice` of readings."""
-    sizes = np.array([p.size for p in now.parameters])
-    fig, (ax,) = _rows([f"{p.name} [{p.unit}]" if p.unit else p.name for p in now.parameters], 1)
-    y = np.arange(len(now.parameters))
-    known, today = np.isfinite(now.bound), sizes * now.bound
-    chosen = today if after is None else sizes * after.bound
-    common.decades(ax, np.append(today, chosen))
-    if after is not None:
-        ax.hlines(y[known], today[known], chosen[known], color=BOUND_COLOR, linewidth=1.0, zorder=1)
-    hollow: Any = {"markerfacecolor": "white", "markersize": 8, "markeredgewidth": 1.0}
-    ax.plot(today[known], y[known], "o", color=BOUND_COLOR, label="today", **hollow)
-    if after is not None:
-        ax.plot(chosen, y, "o", color=FAMILIES["IPE"][0], label=choice)
-    ax.set_xlabel("bound, in the unit of each row")
-    common.legend(fig, [ax])
-    caption = "Cramér-Rao bound of each parameter's standard deviation, root mean square over truths from the prior."
-    if not known.all():
-        caption += " Without a hollow mark: today's readings leave the parameter open."
-    title = "Bounds today" if after is None else "Bounds today and after the best choice"
-    yield Drawing("design", title, caption, fig)
-
-
-def draw_marginals(model: Measurement, found: Sequence[Reference]) -> Iterator[Drawing]:
-    """Draws marginals of the first trial's posterior beside the Gaussians of estimators, the worst parameters."""
-    one = found[0]
-    mean, deviation, look = one.posterior.mean, one.posterior.deviation, looks_of(one.estimators)
-    claims = {}
-    for label, each in one.estimates.items():
-        P = np.full((model.n, model.n), np.nan) if each.covariance is None else each.covariance[0]
-        claims[label] = each.x[0], np.sqrt(np.diag(P))
-    with np.errstate(all="ignore"):
-        apart = [np.abs(x - mean) / deviation + np.abs(np.log(s / deviation)) for x, s in claims.values()]
-    worst = np.nan_to_num(np.max(apart, axis=0), nan=np.inf) if apart else np.zeros(model.n)
-    chosen = np.sort(np.argsort(-worst, kind="stable")[: common.most_panels()])
-    fig, axes = common.panels(len(chosen), look, height=2.4)
-    for i, ax in zip(chosen, axes, strict=True):
-        p = model.parameters[i]
-        low, high = (p.size * (mean[i] + side * _FARTHEST * deviation[i]) for side in (-1, 1))
-        at, filled = np.linspace(low, high, 300), {"color": BOUND_COLOR, "alpha": 0.25, "label": "posterior"}
-        ax.hist(p.size * one.posterior.x[:, i], bins=40, range=(low, high), density=True, **filled)
-        for label, (x, s) in claims.items():
-            value, width = p.size * x[i], p.size * s[i]
-            line = {"color": look[label].color, "linestyle": look[label].line["linestyle"]}
-            if width > 0 and np.isfinite(value):
-                density = np.exp(-0.5 * ((at - value) / width) ** 2) / (width * np.sqrt(2 * np.pi))
-                ax.plot(at, density, **line)
-        ax.axvline(p.size * one.truth[i], color=BOUND_COLOR, linestyle=":", label="truth")
-        ax.set_xlim(low, high)
-        ax.set_yticks([])
-        common.title(ax, f"{p.name} [{p.unit}]" if p.unit else p.name)
-        common.full_ticks(ax)
-    common.legend(fig, axes, {label: replace(each, marker="") for label, each in look.items()})
-    more = f", the {len(chosen)} parameters in which they differ most" if len(chosen) < model.n else ""
-    caption = f"Trial {one.trial}: draws of the posterior beside the Gaussians that estimators report{more}."
-    yield Drawing("posterior", "Marginals", caption, fig)
-
-
-def draw_pairs(frame: pd.DataFrame) -> Iterator[Drawing]:
-    """Draws the change of each tested quantity with its interval, a row per comparison."""
-    listed: list[Any] = frame.to_dict("records")
-    rows = [row for row in listed if np.isfinite(row["low"]) and np.isfinite(row["high"])]
-    if not rows:
-        return
-    parts = [[row["second"], *comparison_title(row).split(", ")] for row in rows]
-    shared = set.intersection(*map(set, parts)) if len(set(map(tuple, parts))) > 1 else set()
-    names = {id(row): ", ".join(w for w in words if w not in shared) for row, words in zip(rows, parts, strict=True)}
-    labels = list(dict.fromkeys(names.values()))
-    kinds = list(dict.fromkeys(row["quantity"] for row in rows))[: common.most_panels()]
-    fig, axes = _rows(labels[:MOST_ROWS], len(kinds))
-    for kind, ax in zip(kinds, axes, strict=True):
-        shown = [row for row in rows if row["quantity"] == kind and names[id(row)] in labels[:MOST_ROWS]]
-        places = [labels.index(names[id(row)]) for row in shown]
-        _draw_changes(ax, kind, shown, places, frame.attrs["margins"][kind.partition(" ")[0]])
-    for words, mark in _FINDINGS.values():
-        axes[0].plot([], [], linestyle="none", label=words, **mark)
-    common.legend(fig, axes)
-    caption = "Second against first in the same trials, each with its own interval; grey: changes below the margin."
-    if len(labels) > MOST_ROWS:
-        caption += f" {len(labels) - MOST_ROWS} further comparisons are in the table."
-    yield Drawing("comparison", "Changes trial by trial", caption, fig)
-
-
-def _draw_changes(ax: Axes, kind: str, rows: Sequence[Any], places: Sequence[int], margin: float) -> None:
-    """Draws the changes of one quantity at their places down the axis, beside the band of those below the margin."""
-    factor = 100 if kind == "success" else 1
-    for row, y in zip(rows, places, strict=True):
-        _, mark = _FINDINGS[row["finding"] or "different" * row["different"]]
-        ax.plot([factor * row["low"], factor * row["high"]], [y, y], color=mark["color"], linewidth=1.4)
-        ax.plot(factor * row["change"], y, **mark)
-    ratio = kind != "success" and not kind.startswith("bias")
-    same, least, most = (1.0, 1 / (1 + margin), 1 + margin) if ratio else (0.0, -factor * margin, factor * margin)
-    low, high = ax.get_xlim()
-    if ratio and high > 3 * max(low, 0.0):
-        ax.set_xscale("log")
-        low, high = ax.get_xlim()
-        low, high = min(low, 0.8), max(high, 1.25)
-        common.log_ticks(ax.xaxis, low, high)
-    elif ratio:
-        low, high = min(low, 0.9), max(high, 1.1)
-    ax.set_xlim(min(low, least), max(high, most))
-    common.band(ax, least, most, "smaller than the margin")
-    ax.axvline(same, color=BOUND_COLOR, linewidth=0.8, linestyle=":")
-    common.title(ax, f"{kind}, {'ratio' if ratio else 'points' if kind == 'success' else 'difference'}")
-
-
-def draw_audit(found: Audit) -> Iterator[Drawing]:
-    """Draws the errors in reported standard deviations beside the law that the report claims, the worst parameters."""
-    claims, n = found.claims, found.claims.n
-    worst = np.argsort([-abs(np.log(max(f.value, 1e-300))) for f in found.each], kind="stable")
-    chosen = np.sort(worst[: common.most_panels()])
-    fig, axes = common.panels(len(chosen), height=2.4)
-    at = np.linspace(-_FARTHEST, _FARTHEST, 300)
-    for i, ax in zip(chosen, axes, strict=True):
-        values = np.clip(claims.z[:, i], -_FARTHEST, _FARTHEST)
-        style = {"color": FAMILIES["IPE"][0], "alpha": 0.45, "label": "errors"}
-        ax.hist(values, bins=30, range=(-_FARTHEST, _FARTHEST), density=True, **style)
-        claimed = np.exp(-0.5 * at**2) / np.sqrt(2 * np.pi)
-        ax.plot(at, claimed, color=BOUND_COLOR, linestyle="--", linewidth=1.0, label="as claimed")
-        ax.set_yticks([])
-        common.title(ax, f"{claims.names[i]}: {found.each[i].value:.2f} times")
-    common.axis_labels(fig, "error / reported deviation", "")
-    common.legend(fig, axes)
-    more = f" The {len(chosen)} of {n} parameters farthest from 1." if len(chosen) < n else ""
-    caption = f"Errors beyond ±{_FARTHEST:g} reported deviations stand at the edge.{more}"
-    yield Drawing("audit", "Errors beside what is claimed", caption, fig)
-
-
-def _rows(labels: Sequence[str], panels: int) -> tuple[Figure, list[Axes]]:
-    """Makes a figure of panels that share labelled rows."""
-    from matplotlib.figure import Figure
-
-    words = [common.text(label) for label in labels]
-    width = 0.07 * max(map(len, words)) + max(2.2 * panels, 4.5)
-    fig = Figure(figsize=(min(width, 11.0), 1.1 + 0.26 * len(words)), layout="constrained")
-    axes = list(fig.subplots(1, panels, sharey=True, squeeze=False).flat)
-    axes[0].set_yticks(range(len(words)), words)
-    axes[0].set_ylim(len(words) - 0.5, -0.5)
-    return fig, axes

@@ -13,11 +13,11 @@ import numpy as np
 
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array
+from ipe_bench.questions.compare.effects import PLANNED, Effect, PowerPlan, mean_effect, ratio_effect, success_effect
 from ipe_bench.runs.provenance import canonical_json
 from ipe_bench.statistics.collect import Collection, Group, config_leaves, differing, scenario_of, shown_leaf
 from ipe_bench.statistics.comparisons import ALPHA, differences, holm
 from ipe_bench.statistics.intervals import verdict
-from ipe_bench.statistics.paired import PLANNED, Effect, PowerPlan, mean_effect, ratio_effect, success_effect
 from ipe_bench.statistics.sample import Sample, samples
 from ipe_bench.statistics.verdicts import CONSISTENT
 from ipe_bench.trials.thresholds import gate

@@ -1,0 +1,1 @@
+"""Whether the covariance that another program reports describes its errors."""

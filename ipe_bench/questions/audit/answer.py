@@ -1,0 +1,44 @@
+"""Shows an audit: sentences, table, picture, files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from ipe_bench.questions.audit.maths import Audit
+from ipe_bench.report.table import Part, Shown, Table, texts, words
+from ipe_bench.report.writer import write_files
+
+
+class AuditAnswer(Shown, Audit):
+    """Shows an audit."""
+
+    def parts(self) -> list[Part]:
+        """Returns the sentences of an audit, and a row per parameter."""
+        names = self.claims.names
+        columns = [
+            words("parameter", names),
+            texts("true over reported", [f"{f.value:.2f}" for f in self.each]),
+            texts("97.5 % interval", [f"{f.low:.2f} to {f.high:.2f}" for f in self.each]),
+            words("reported", [f.verdict for f in self.each]),
+            texts("bias", [f"{value:+.2f}" for value in self.bias[:, 0]]),
+            texts("95 % of bias", [f"{low:+.2f} to {high:+.2f}" for low, high in self.bias[:, 1:]]),
+        ]
+        runs, left_out = self.claims.runs, self.claims.left_out
+        notes = [
+            "true over reported is the root mean square of errors in reported standard deviations, 1 if the report is"
+            " right; bias is their mean. Intervals hold for all parameters together, and for heavy tails."
+        ]
+        joint = "The first sentence is of all parameters together, by the whole covariance."
+        notes.append(joint if self.claims.joint else "No covariances are reported, so directions are not judged.")
+        title = f"Audit of {runs} runs" + (f", {left_out} rows without an estimate left out" if left_out else "")
+        return [*self.sentences, Table("audit", title, "", columns, notes=notes)]
+
+
+def write_audit(folder: Path, found: AuditAnswer, sources: Sequence[tuple[str, str]]) -> None:
+    """Writes audit.csv and its page."""
+    from ipe_bench.questions.audit.figure import draw_audit
+
+    parts = [part for part in found.parts() if isinstance(part, Table)]
+    shown = found.sentences, parts, draw_audit(found)
+    write_files(folder, "audit", ("audit.csv", found.table()), "Audit", *shown, sources=sources)

@@ -1,0 +1,108 @@
+"""Shows posteriors beside estimators: sentences, table, picture, files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+
+from ipe_bench.basics.statuses import Status
+from ipe_bench.questions.posterior.maths import Divergence, Posterior, Reference
+from ipe_bench.report.table import Shown, Table, texts, words
+from ipe_bench.report.words import compact, enumerate_few, percent
+from ipe_bench.report.writer import write_files
+
+if TYPE_CHECKING:
+    from ipe_bench.measurements.base import Measurement
+    from ipe_bench.trials.scenario import Scenario
+
+
+HONEST = 0.1
+"""Nats up to which a Gaussian may stand for another: a deviation is 40 % too large, or a mean half a deviation off."""
+SAME_LAW = 0.05
+"""Energy distance up to which draws may come from one law: of Gaussians in few dimensions, some tenths of a nat."""
+
+
+class PosteriorAnswer(Shown, list[Reference]):
+    """Shows the posteriors of a scenario's trials."""
+
+    def __init__(self, scenario: Scenario, found: Sequence[Reference]) -> None:
+        super().__init__(found)
+        self.name = f"{scenario.measurement.name}, {scenario.noise.name}, error scale {scenario.error_scale:g}"
+
+    def parts(self) -> list[Table]:
+        return posterior_parts(self.name, self)
+
+
+def posterior_parts(name: str, found: Sequence[Reference]) -> list[Table]:
+    """Returns a row per trial and estimator, under the `name` of the scenario."""
+    rows = [(one, label, d) for one in found for label, d in one.divergences.items()]
+    columns = [
+        texts("trial", [str(one.trial) for one, *_ in rows]),
+        texts("modes", [str(len(one.posterior.modes)) for one, *_ in rows]),
+        texts("noise", [compact(one.posterior.noise) for one, *_ in rows]),
+        words("estimator", [label for _, label, _ in rows]),
+        words("status", [Status(int(one.estimates[label].status[0])).label for one, label, _ in rows]),
+        words("honest", [honest_word(d, one.posterior) for one, _, d in rows]),
+    ]
+    numbers = {"kl": "divergence", "shift": "shift", "width": "width", "energy": "energy"}
+    columns += [texts(title, [compact(getattr(d, key)) for *_, d in rows]) for key, title in numbers.items()]
+    title = f"{name}: estimators beside the posterior"
+    return [Table("posterior", title, "", columns, notes=list(_notes(found)), grouped=3)]
+
+
+def _notes(found: Sequence[Reference]) -> Iterator[str]:
+    yield (
+        "divergence is that of the estimator's Gaussian from the moments of the posterior, in nats; noise is"
+        " the same between two populations of particles, so a divergence below it is chance. shift is that of the"
+        " mean, in standard deviations of the posterior per root of the number of parameters. width is the geometric"
+        " mean of the standard deviations over those of the posterior. energy is the distance between draws. An"
+        f" estimate is honest if there is a single mode, the divergence is at most {HONEST:g} or twice the noise, and"
+        f" the energy is at most {SAME_LAW:g}."
+    )
+    for one in found:
+        if not one.posterior.settled:
+            yield (
+                f"Trial {one.trial}: the populations differ by {one.posterior.apart:.2g} deviations, so its posterior"
+                " cannot be relied on; take more particles."
+            )
+        if len(one.posterior.modes) > 1:
+            shares = ", ".join(percent(float(share)) for share in one.posterior.shares)
+            yield f"Trial {one.trial}: {len(one.posterior.modes)} modes, with {shares} of the draws."
+
+
+def honest_word(d: Divergence, sampled: Posterior) -> str:
+    """Words whether a Gaussian can stand for the posterior; a wide one over two modes, with its moments, cannot."""
+    if not np.isfinite(d.kl):
+        return "-"
+    near = d.kl <= max(HONEST, 2 * sampled.noise) and d.energy <= SAME_LAW
+    return "yes" if near and len(sampled.modes) == 1 else "NO"
+
+
+def write_posteriors(folder: Path, name: str, title: str, model: Measurement, found: Sequence[Reference]) -> list[Path]:
+    """Writes a page, and posterior.csv with a row per trial and parameter; returns the files."""
+    from ipe_bench.questions.posterior.figure import draw_marginals
+
+    frames = []
+    for one in found:
+        names = {"parameter": [p.name for p in model.parameters], "unit": [p.unit for p in model.parameters]}
+        values = {"truth": one.truth, "mean": one.posterior.mean, "deviation": one.posterior.deviation}
+        sized = {key: model.sizes * value for key, value in values.items()}
+        frames.append(pd.DataFrame({"trial": one.trial, **names, **sized}))
+    shown = _honest_sentences(found), posterior_parts(title, found), draw_marginals(model, found)
+    return write_files(folder, "posterior", ("posterior.csv", pd.concat(frames)), f"{name}: posteriors", *shown)
+
+
+def _honest_sentences(found: Sequence[Reference]) -> list[str]:
+    """Says in how many trials each estimator's Gaussian can stand for the posterior, and if that is settled."""
+    counts = dict.fromkeys(found[0].divergences, 0)
+    for one in found:
+        for label, d in one.divergences.items():
+            counts[label] += honest_word(d, one.posterior) == "yes"
+    listed = enumerate_few([f"{label} in {count} of {len(found)}" for label, count in counts.items()], 12)
+    unsettled = sum(not one.posterior.settled for one in found)
+    more = [f"In {unsettled} the posterior itself cannot be relied on; take more particles."] if unsettled else []
+    return [f"Trials in which an estimator's Gaussian can stand for the posterior: {listed}.", *more]
