@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
 
-from ipe_bench.basics.errors import UserError, unknown
+from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.base import Measurement
@@ -227,49 +227,22 @@ def compare(
     >>> rows.set_index("quantity")["finding"].to_dict()
     {'success': 'better', 'error': 'better', 'cost': 'worse', 'time': ''}
     """
-    from ipe_bench.questions.compare import maths as between
-    from ipe_bench.questions.compare.answer import Comparison, write_comparison
-    from ipe_bench.questions.compare.effects import PowerPlan
-    from ipe_bench.report.writer import digests
-    from ipe_bench.statistics.collect import collect
+    from ipe_bench.questions.compare.answer import compared_folders
 
-    plan = PowerPlan.of(power, difference, anytime=anytime)
-    if not 0 < alpha < 1:
-        raise UserError(f"alpha={alpha}: give a number between 0 and 1")
-    tested, margins = tuple(fail_on or between.JUDGED), between.MARGINS | dict(margins or {})
-    if wrong := [name for name in (*tested, *margins) if name not in between.MARGINS]:
-        raise UserError(f"fail_on={wrong[0]}: {unknown(wrong[0], between.MARGINS, 'quantity')}")
-    if wrong := [f"{name}={margin}" for name, margin in margins.items() if not 0 <= margin < np.inf]:
-        raise UserError(f"margin.{wrong[0]}: give a number from 0 on")
-    if plan is not None and "success" not in tested:
-        raise UserError("power: is that of success, which fail_on does not name; add it, or leave out power")
-    paths = [_paths(first_directory), _paths(first_directory if second_directory is None else second_directory)]
-    with opened(paths[0]) as one, opened(paths[1]) as other:
-        if second_directory is None and (first is None or second is None):
-            raise UserError("compare: one folder is given; name another, or first=LABEL and second=LABEL")
-        if first == second and {path.resolve() for path in paths[0]} == {path.resolve() for path in paths[1]}:
-            label = "one folder" if first is None else f"{first} of one folder"
-            raise UserError(f"compare: {label} is compared with itself; name another, or first=LABEL and second=LABEL")
-        asked, read = (collect(one), collect(other)), digests(dict.fromkeys([*one, *other]))
-        options: dict[str, Any] = {"anytime": anytime, "plan": plan, "tested": tested, "margins": margins}
-        found = between.compared(*asked, (first, second), alpha=alpha, **options)
-        frame, few = Comparison(found), [] if anytime else list(between.too_few(found, alpha))
-        lacking = list(between.gone(*asked, (first, second))) if complete else []
-    if plan is not None:
-        whole = ["discordant", "trials_needed"]
-        frame[whole] = frame[whole].astype("Int64")
-    failing = ("success", "error") if fail_on is None else fail_on
-    worse = frame[(frame["finding"] == "worse") & frame["quantity"].str.split(" ").str[0].isin(list(failing))]
-    rows = [{str(name): value for name, value in row.items()} for row in worse.to_dict("records")]
-    frame.attrs["worse"] = [f"{row['second']} in {row['quantity']}, {between.comparison_title(row)}" for row in rows]
-    for name in ("problems", "stale"):
-        frame.attrs[name] = list(dict.fromkeys(line for c in asked for line in getattr(c, name)))
-    frame.attrs["problems"] += lacking
-    frame.attrs["notes"] = [*few, *between.left_out(*asked), *between.other_sources(*asked)]
-    frame.attrs["margins"], frame.attrs["alpha"] = margins, alpha
-    if output is not None:
-        write_comparison(Path(output), frame, read)
-    return frame
+    return compared_folders(
+        _paths(first_directory),
+        None if second_directory is None else _paths(second_directory),
+        first=first,
+        second=second,
+        alpha=alpha,
+        anytime=anytime,
+        fail_on=fail_on,
+        margins=margins,
+        complete=complete,
+        power=power,
+        difference=difference,
+        output=output,
+    )
 
 
 def audit(table: Path | str | pd.DataFrame, *, output: Path | str | None = None) -> AuditAnswer:
@@ -291,17 +264,9 @@ def audit(table: Path | str | pd.DataFrame, *, output: Path | str | None = None)
     >>> found.verdict, round(found.scale.value, 1)
     ('too small', 2.9)
     """
-    import pandas as pd
+    from ipe_bench.questions.audit.answer import audited
 
-    from ipe_bench.questions.audit.answer import AuditAnswer, write_audit
-    from ipe_bench.questions.audit.maths import audit as examined
-    from ipe_bench.questions.audit.maths import read_claims
-    from ipe_bench.report.writer import digests
-
-    found = AuditAnswer(**vars(examined(read_claims(table))))
-    if output is not None:
-        write_audit(Path(output), found, [] if isinstance(table, pd.DataFrame) else digests([Path(table)]))
-    return found
+    return audited(table, output)
 
 
 def status(directories: Directories) -> pd.DataFrame:
@@ -502,14 +467,10 @@ def design(
     >>> ib.Scenario(found.measurement(half), bench.noise, error_scale=3.0).draw(0, 5).z.shape
     (5, 20)
     """
-    from ipe_bench.plugins.extensions import richer_models
-    from ipe_bench.questions.design.answer import DesignAnswer
-    from ipe_bench.questions.design.maths import design as designed
+    from ipe_bench.questions.design.answer import designed
 
     scenario = _scenario(scenario, noise=noise, prior=prior, error_scale=error_scale)
-    errors = richer_models(scenario) if errors is None else errors
-    scenario = dataclasses.replace(scenario, truth=None)
-    return DesignAnswer(**vars(designed(scenario, by=by, readings=readings, criterion=criterion, errors=errors)))
+    return designed(scenario, by=by, readings=readings, criterion=criterion, errors=errors)
 
 
 def posterior(
@@ -543,19 +504,12 @@ def posterior(
     >>> found.divergences["newton"].kl < 1 < found.divergences["linear"].kl
     True
     """
-    from ipe_bench.questions.posterior.answer import PosteriorAnswer
-    from ipe_bench.questions.posterior.maths import reference, require_particles
+    from ipe_bench.questions.posterior.answer import sampled
 
     scenario = _scenario(scenario, noise=noise, prior=prior, error_scale=error_scale)
     estimators = _labelled(estimators)
     validate([scenario], estimators, trials)
-    require_particles(scenario.problem, particles)
-    found = []
-    for trial in range(trials):
-        if watch is not None:
-            watch(trial)
-        found.append(reference(scenario, estimators, trial, particles))
-    return PosteriorAnswer(scenario, found)
+    return sampled(scenario, estimators, trials, particles, watch)
 
 
 def check(component: Any) -> list[Finding]:

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
     from ipe_bench.report.table import Part
 
-NAMES = tuple[str, ...]
-"""The type of a key that takes names, as in fail_on=success,error."""
 _WIDTH_WITHOUT_TERMINAL = 120
 
 
@@ -61,9 +59,16 @@ def show(parts: Iterable[Part]) -> None:
     out.print(terminal(parts, out.width))
 
 
+def say_files(files: Sequence[Path]) -> None:
+    """Says which files a command has written into its folder."""
+    say(f"\nIn {files[0].parent}:")
+    console().print(", ".join(path.name for path in files))
+
+
 def places_and_keys(command: str, words: Sequence[str], kinds: Mapping[str, Any]) -> tuple[list[str], dict[str, Any]]:
     """Splits off the files and folders after a command that Hydra does not read, and keys' values by their types."""
-    from ipe_bench.basics.options import checked
+    from ipe_bench.basics.options import Count, checked
+    from ipe_bench.questions.question import NAMES
 
     refuse_blanks(words)
     places = [word for word in words if "=" not in word or Path(word).is_dir()]
@@ -81,9 +86,9 @@ def places_and_keys(command: str, words: Sequence[str], kinds: Mapping[str, Any]
             value = [name.strip() for name in text.strip("[]").split(",") if name.strip()]
         elif kinds[key] is bool:
             value = {"true": True, "false": False}.get(text, text)
-        elif kinds[key] is float:
+        elif kinds[key] in (float, Count):
             with contextlib.suppress(ValueError):
-                value = float(text)
+                value = float(text) if kinds[key] is float else int(text)
         found[key] = checked(value, kinds[key], key)
     return places, found
 

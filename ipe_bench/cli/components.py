@@ -185,7 +185,7 @@ def check_command(words: Sequence[str]) -> int:
 
 
 def _check_chosen(words: Sequence[str]) -> list[Finding]:
-    from ipe_bench.cli.estimate import single
+    from ipe_bench.cli.single import single
     from ipe_bench.cli.spec import PARTS
     from ipe_bench.plugins.conformance import check_component
 

@@ -17,16 +17,17 @@ from ipe_bench import __version__
 from ipe_bench.basics.errors import StorageError, UserError, shortened, unknown
 from ipe_bench.basics.visible import VisibleStream
 from ipe_bench.cli import discard_output
-from ipe_bench.cli.parser import COMMANDS, parsers
+from ipe_bench.cli.parser import COMMANDS, parser_of, program
+from ipe_bench.cli.questions import QUESTIONS, question_command
 from ipe_bench.report.writer import COMMAND
 
 HOMES = {
     "run": "run",
-    **dict.fromkeys(("estimate", "design", "posterior"), "estimate"),
-    **dict.fromkeys(("report", "compare", "audit", "bundle", "status"), "results"),
+    "estimate": "estimate",
+    **dict.fromkeys(("report", "bundle", "status"), "results"),
     **dict.fromkeys(("list", "check", "new"), "components"),
 }
-"""The module of each command, which is loaded when the command is given."""
+"""The module of each command that is no question, which is loaded when the command is given."""
 GONE = {
     "completion": 'eval "$(ipe-bench -sc install=bash)" lets bash complete (install=zsh, install=fish likewise); names '
     "inside of lists are no longer completed",
@@ -103,7 +104,7 @@ def _dispatch(words: list[str]) -> int:
     if command == "help" and rest:
         command, rest = rest[0], ["--help"]
     if command in ("-h", "--help", "help"):
-        parsers()[0].print_help()
+        program().print_help()
         return 0
     if command == "--version":
         print(f"ipe-bench {__version__}")
@@ -115,9 +116,11 @@ def _dispatch(words: list[str]) -> int:
     if command not in COMMANDS:
         known, noun = (("--help", "--version"), "flag") if command.startswith("-") else (COMMANDS, "command")
         raise UserError(f"{command}: {unknown(command, known, noun)}")
-    parser = parsers()[1][command]
+    parser = parser_of(command)
     if any(word in ("-h", "--help") for word in rest):
         parser.print_help()
         return 0
+    if command in QUESTIONS:
+        return question_command(command, rest)
     begin = getattr(importlib.import_module(f"ipe_bench.cli.{HOMES[command]}"), f"{command}_command")
     return begin(rest) if command == "run" else begin(**vars(parser.parse(rest)))

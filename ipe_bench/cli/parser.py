@@ -8,6 +8,7 @@ from typing import Any, NoReturn
 
 from ipe_bench.basics.errors import UserError, did_you_mean, unknown
 from ipe_bench.cli.keys import ROWS
+from ipe_bench.cli.questions import QUESTIONS, question
 
 _ABOUT = """\
 ipe-bench: which estimator to trust with nonlinear measurements
@@ -39,7 +40,7 @@ def _several(metavar: str, what: str) -> dict[str, Any]:
     return {"metavar": metavar, "nargs": "*", "help": what}
 
 
-COMMANDS: dict[str, tuple[str, str, str, Arguments]] = {
+COMMANDS: dict[str, tuple[str, str, str, Arguments] | None] = {
     "run": (
         "simulate, estimate, store and report",
         "0 done; 1 done, but something failed",
@@ -91,45 +92,8 @@ output=DIR          folder of the files, which are listed at the end: by default
 """,
         {"arguments": _several("KEY=VALUE", "any key of `ipe-bench run`")},
     ),
-    "design": (
-        "what the readings will say of each parameter, and which to take instead",
-        "0 the readings determine every parameter; 1 they do not",
-        """
-  ipe-bench design measurement=ranging error_scale=10
-  ipe-bench design measurement=gins --by time                   the same cases and axes, at other times
-  ipe-bench design measurement=gins truth_measurement=gins_tilted
-
-The analysis uses the model's Jacobians at true parameters drawn from the prior, without noise or estimates.
-Unmodelled errors are those of truth_measurement=, or of every option of measurement= that is the same model with
-more errors. output=DIR sets the folder of the files.
-""",
-        {
-            "arguments": _several("KEY=VALUE", "the scenario, as for `ipe-bench run`"),
-            "--by": {"metavar": "COLUMN", "action": "append", "help": "choose by this column of the readings alone"},
-            "--readings": {"metavar": "NUMBER", "type": int, "help": "largest number of readings; by default today's"},
-            "--criterion": {
-                "choices": ("A", "D"),
-                "default": "A",
-                "help": "mean squared bound (A) or volume of the ellipsoid (D)",
-            },
-        },
-    ),
-    "posterior": (
-        "the posterior of a few trials, and how far estimators are from it",
-        "0 the populations of particles agree; 1 in some trial they do not",
-        """
-  ipe-bench posterior error_scale=300 "solver=[newton]" "baseline=[gauss_newton,ekf]"
-  ipe-bench posterior measurement=ranging noise=gaussian noise.deviation=0.1 error_scale=100 trials=1
-
-Samples the posterior of the first trials of a scenario (trials=3 by default) by sequential Monte Carlo, without
-linearisation: particles move from the prior to the posterior as the likelihood is tempered. Each estimator's
-estimate and covariance are then compared with it. A trial takes seconds to a minute. output=DIR sets the folder.
-""",
-        {
-            "arguments": _several("KEY=VALUE", "any key of `ipe-bench run`"),
-            "--particles": {"metavar": "NUMBER", "type": int, "default": 1000, "help": "1000 unless given"},
-        },
-    ),
+    "design": None,
+    "posterior": None,
     "report": (
         "tables, figures and report of what is stored",
         _MISSING,
@@ -149,38 +113,8 @@ formats=pdf,md,tex   file formats besides PNG of figures (pdf, svg) and CSV of t
 """,
         {"arguments": _several("DIR", "folders of results, such as outputs/paper")},
     ),
-    "compare": (
-        "whether a second version, setting or estimator is better or worse than a first",
-        "0 not worse; 1 the second is worse, or something that was asked for is missing",
-        """
-Stored results are compared, so run both first. Equal trials are paired; those of other seeds, in their order.
-
-  ipe-bench compare outputs/before outputs/after               two versions, or two settings, of the same estimators
-  ipe-bench compare outputs/a outputs/b first=newton second=my_solver
-  ipe-bench compare outputs/a first=fixed_point second=newton  two estimators of one folder
-
-alpha=0.05           significance level: probability of any finding if there is no difference
-anytime=true         tests by e-values, which remain valid at any number of looks while trials are added
-fail_on=success,error  what is tested and must not be worse: success, error, cost, honesty (NEES farther from 1), bias
-margin.cost=0.1      the change that matters: success 0.01, error 0.02, cost 0.05, honesty 0.05, bias 0.1 deviations
-complete=true        fails on what the second lacks, too: estimators, scenarios, trials, a covariance
-power=0.9            computes the trials that find a difference of success, such as difference=0.05, with this power
-output=DIR           writes comparison.csv and comparison.html there
-""",
-        {"arguments": _several("DIR", "one or two folders of results")},
-    ),
-    "audit": (
-        "whether the covariance that another program reports describes its errors",
-        "0 it may; 1 it is surely too small or too large",
-        """
-  ipe-bench audit runs.csv
-  ipe-bench audit runs.parquet output=outputs/audit       audit.csv and audit.html, too
-
-A row per run, with columns NAME_true and NAME (or NAME_error), NAME_std (or NAME_var), and cov_A_B as far as there are
-any; or long: run, parameter, true, estimate, std. Rows of one run have its number in the column run.
-""",
-        {"arguments": _several("FILE", "a table of truths, estimates and reported covariances")},
-    ),
+    "compare": None,
+    "audit": None,
     "bundle": (
         "results in one archive to share, or whether such an archive is whole",
         _MISSING,
@@ -241,7 +175,7 @@ The same results give the same file, so that the digest may stand in a paper. Ot
         },
     ),
 }
-"""Each command's line, its exit codes besides 2, what its help says more, and its arguments."""
+"""Each command's line, its exit codes besides 2, what its help says more, and its arguments; None for a question."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -280,17 +214,26 @@ class Parser(argparse.ArgumentParser):
         raise UserError(f"{self.command}: {word}: is a word too many; see `{self.prog} --help`")
 
 
-def parsers() -> tuple[Parser, dict[str, Parser]]:
-    """Builds the parser of the bare program, and those of its commands by name."""
-    program = Parser(prog="ipe-bench", description=_ABOUT, epilog=_CODES, usage="ipe-bench COMMAND ...")
-    program.add_argument("--version", action="store_true", help="print the version")
-    commands = program.add_subparsers(metavar="COMMAND", title="commands", prog="ipe-bench", parser_class=Parser)
-    found: dict[str, Parser] = {}
-    for name, (what, codes, more, arguments) in COMMANDS.items():
-        epilog = f"Exit codes: {codes}; 2 a mistake in what was asked for." if codes else None
-        found[name] = commands.add_parser(
-            name, help=what, description=f"ipe-bench {name}: {what}\n{more}", epilog=epilog
-        )
-        for names, options in arguments.items():
-            found[name].add_argument(*names.split(), **options)
-    return program, found
+def program() -> Parser:
+    """Builds the parser of the bare program, with a line for each command."""
+    found = Parser(prog="ipe-bench", description=_ABOUT, epilog=_CODES, usage="ipe-bench COMMAND ...")
+    found.add_argument("--version", action="store_true", help="print the version")
+    commands = found.add_subparsers(metavar="COMMAND", title="commands", prog="ipe-bench", parser_class=Parser)
+    for name, row in COMMANDS.items():
+        commands.add_parser(name, help=QUESTIONS[name].line if row is None else row[0])
+    return found
+
+
+def parser_of(name: str) -> Parser:
+    """Builds the parser of a command."""
+    what, codes, more, arguments = COMMANDS[name] or _of_question(name)
+    epilog = f"Exit codes: {codes}; 2 a mistake in what was asked for." if codes else None
+    found = Parser(prog=f"ipe-bench {name}", description=f"ipe-bench {name}: {what}\n{more}", epilog=epilog)
+    for names, options in arguments.items():
+        found.add_argument(*names.split(), **options)
+    return found
+
+
+def _of_question(name: str) -> tuple[str, str, str, Arguments]:
+    record = question(name)
+    return QUESTIONS[name].line, record.codes, record.more, {"arguments": _several(*record.argument)}

@@ -1,4 +1,4 @@
-"""Defines the commands on stored results: report, status, compare and bundle; and audit, on another program's table."""
+"""Defines the commands on stored results: report, status and bundle."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import ipe_bench as ib
 from ipe_bench.basics.errors import UserError
-from ipe_bench.cli import NAMES, console, places_and_keys, print_problems, say, show
+from ipe_bench.cli import console, places_and_keys, print_problems, say, show
+from ipe_bench.questions.question import NAMES
 from ipe_bench.report.style import PAGE, Which, drawn_settings
 from ipe_bench.report.table import Table, texts, words
 from ipe_bench.runs.bundles import BUNDLES, SUFFIX, is_bundle, opened, read_bundle, write_bundle
@@ -19,20 +19,6 @@ from ipe_bench.runs.results import CellState, Results
 _REPORT = {"output": str, "figures": str, "formats": str}
 _PAPER = {"output": str, "paper": NAMES, "columns": NAMES, "width": float}
 """Keys of tables and figures for a paper."""
-_COMPARE = {"first": str, "second": str, "alpha": float, "anytime": bool, "fail_on": NAMES}
-_COMPARE |= {"power": float, "difference": float, "output": str, "complete": bool}
-
-
-def audit_command(arguments: Sequence[str]) -> int:
-    """Prints whether reported covariances describe the errors; exit code 1 if they surely do not."""
-    files, keys = places_and_keys("audit", arguments, {"output": str})
-    if len(files) != 1:
-        raise UserError("audit: name one table of truths, estimates and deviations, such as runs.csv")
-    found = ib.audit(files[0], **keys)
-    show(found.parts())
-    if "output" in keys:
-        say(f"\nTable   {keys['output']}/audit.csv", f"Page    {keys['output']}/audit.html")
-    return 1 if found.scale.wrong else 0
 
 
 def bundle_command(arguments: Sequence[str]) -> int:
@@ -56,24 +42,6 @@ def bundle_command(arguments: Sequence[str]) -> int:
     say(f"{'Whole' if checked else 'Bundle':<8}{found.path} ({held})")
     say(f"Digest  sha256:{found.digest}")
     return 1 if problems else 0
-
-
-def compare_command(arguments: Sequence[str]) -> int:
-    """Prints the table; exit code 1 where the second is worse, or lacks what was asked for."""
-    from ipe_bench.questions.compare.maths import MARGINS
-
-    margins = {f"margin.{name}": float for name in MARGINS}
-    folders, keys = places_and_keys("compare", arguments, _COMPARE | margins)
-    keys["margins"] = {key.partition(".")[2]: keys.pop(key) for key in margins if key in keys}
-    if not 1 <= len(folders) <= 2:
-        raise UserError("compare: name one or two folders of results, such as outputs/before outputs/after")
-    frame = ib.compare(*folders, **keys)
-    show(frame.parts())
-    print_problems([*frame.attrs["problems"], *frame.attrs["stale"], *frame.attrs["notes"]])
-    if "output" in keys:
-        say(f"\nTable   {keys['output']}/comparison.csv", f"Page    {keys['output']}/comparison.html")
-    say(*(f"worse: {line}" for line in frame.attrs["worse"]))
-    return 1 if frame.attrs["worse"] or frame.attrs["problems"] else 0
 
 
 def status_command(arguments: Sequence[str], verbose: bool = False) -> int:

@@ -17,11 +17,11 @@ from omegaconf import DictConfig
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import say
 from ipe_bench.cli import words as w
-from ipe_bench.cli.estimate import require_one_kind
 from ipe_bench.cli.keys import OF_FILES, SETTING_NOTHING
-from ipe_bench.cli.parser import parsers
+from ipe_bench.cli.parser import parser_of
 from ipe_bench.cli.results import counted, show_report
 from ipe_bench.cli.session import Jobs, complete, jobs_of, session, show, spec_of
+from ipe_bench.cli.single import require_one_kind
 from ipe_bench.cli.spec import STANDARD_FILTERS, Spec
 from ipe_bench.plugins.discovery import PACKAGES, options
 from ipe_bench.report.progress import watching
@@ -149,7 +149,7 @@ def _left_out(jobs: Sequence[Spec]) -> list[str]:
 
 
 def _flags(arguments: Sequence[str]) -> Namespace:
-    flags = parsers()[1]["run"].parse(arguments)
+    flags = parser_of("run").parse(arguments)
     asked = [f"--{name}" for name in ("multirun", "cfg", "info", "shell_completion") if vars(flags)[name]]
     if len(asked) > 1:
         raise UserError(f"run: {' '.join(asked).replace('_', '-')}: do not go together; choose one")

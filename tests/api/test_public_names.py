@@ -128,7 +128,8 @@ def test_a_file_and_an_array_are_estimated_alike(tmp_path, polynomial):
 
 
 def test_without_estimators_they_are_those_of_the_command(polynomial):
-    from ipe_bench.cli.estimate import STANDARD_ESTIMATORS, single
+    from ipe_bench.cli.estimate import STANDARD_ESTIMATORS
+    from ipe_bench.cli.single import single
 
     asked = ["measurement=polynomial", "readings=z.csv"]
     command = single("estimate", asked, STANDARD_ESTIMATORS).spec.estimators

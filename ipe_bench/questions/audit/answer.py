@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-from ipe_bench.questions.audit.maths import Audit
+import pandas as pd
+
+from ipe_bench.questions.audit.maths import Audit, audit, read_claims
 from ipe_bench.report.table import Part, Shown, Table, texts, words
-from ipe_bench.report.writer import write_files
+from ipe_bench.report.writer import digests, write_files
 
 
 class AuditAnswer(Shown, Audit):
@@ -42,3 +45,12 @@ def write_audit(folder: Path, found: AuditAnswer, sources: Sequence[tuple[str, s
     parts = [part for part in found.parts() if isinstance(part, Table)]
     shown = found.sentences, parts, draw_audit(found)
     write_files(folder, "audit", ("audit.csv", found.table()), "Audit", *shown, sources=sources)
+
+
+def audited(table: Any, output: Path | str | None = None) -> AuditAnswer:
+    """Audits a file or a frame, and writes audit.csv and its page into a folder if one is named."""
+    found = AuditAnswer(**vars(audit(read_claims(table))))
+    if output is not None:
+        sources = [] if isinstance(table, pd.DataFrame) else digests([Path(table)])
+        write_audit(Path(output), found, sources)
+    return found

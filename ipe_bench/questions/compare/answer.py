@@ -3,17 +3,32 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain, groupby
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
-from ipe_bench.questions.compare.maths import NOT_SETTINGS, comparison_title
+from ipe_bench.basics.errors import UserError, unknown
+from ipe_bench.questions.compare.effects import PowerPlan
+from ipe_bench.questions.compare.maths import (
+    JUDGED,
+    MARGINS,
+    NOT_SETTINGS,
+    compared,
+    comparison_title,
+    gone,
+    left_out,
+    other_sources,
+    too_few,
+)
 from ipe_bench.report.table import Cell, Column, Part, Shown, Table, texts, words
 from ipe_bench.report.words import compact, duration, p_value, percent, value_text
-from ipe_bench.report.writer import write_files
+from ipe_bench.report.writer import digests, write_files
+from ipe_bench.runs.bundles import opened
+from ipe_bench.statistics.collect import collect
+from ipe_bench.statistics.comparisons import ALPHA
 
 _TITLES = {"error": "mean error", "honesty": "mean NEES", "cost": "mean cost", "time": "mean time"}
 """Names of a comparison's quantities, where the table of a run has other statistics of error and cost."""
@@ -130,3 +145,79 @@ def _cells(row: dict[str, Any]) -> tuple[str, ...]:
 
 def _ratio(value: float) -> str:
     return f"{value:.3f}" if 0.1 <= value < 9.9995 else compact(value)
+
+
+def compared_folders(
+    first_folders: Sequence[Path],
+    second_folders: Sequence[Path] | None = None,
+    *,
+    first: str | None = None,
+    second: str | None = None,
+    alpha: float = ALPHA,
+    anytime: bool = False,
+    fail_on: Sequence[str] | None = None,
+    margins: Mapping[str, float] | None = None,
+    complete: bool = False,
+    power: float | None = None,
+    difference: float | None = None,
+    output: Path | str | None = None,
+) -> Comparison:
+    """Compares what is stored, as `ipe_bench.compare` says; folders without a second hold both versions."""
+    plan = PowerPlan.of(power, difference, anytime=anytime)
+    tested = tuple(fail_on or JUDGED)
+    widened = MARGINS | dict(margins or {})
+    _require_known(alpha, tested, widened)
+    if plan is not None and "success" not in tested:
+        raise UserError("power: is that of success, which fail_on does not name; add it, or leave out power")
+    versions = (first, second)
+    with opened(first_folders) as one, opened(second_folders or first_folders) as other:
+        _require_two(first_folders, second_folders, versions)
+        asked = collect(one), collect(other)
+        read = digests(dict.fromkeys([*one, *other]))
+        found = compared(*asked, versions, alpha=alpha, anytime=anytime, plan=plan, tested=tested, margins=widened)
+        few = [] if anytime else list(too_few(found, alpha))
+        lacking = list(gone(*asked, versions)) if complete else []
+    frame = Comparison(found)
+    if plan is not None:
+        whole = ["discordant", "trials_needed"]
+        frame[whole] = frame[whole].astype("Int64")
+    for name in ("problems", "stale"):
+        frame.attrs[name] = list(dict.fromkeys(line for one in asked for line in getattr(one, name)))
+    frame.attrs["problems"] += lacking
+    frame.attrs["worse"] = _worse(frame, ("success", "error") if fail_on is None else fail_on)
+    frame.attrs["notes"] = [*few, *left_out(*asked), *other_sources(*asked)]
+    frame.attrs["margins"] = widened
+    frame.attrs["alpha"] = alpha
+    if output is not None:
+        write_comparison(Path(output), frame, read)
+    return frame
+
+
+def _require_known(alpha: float, tested: Sequence[str], margins: Mapping[str, float]) -> None:
+    if not 0 < alpha < 1:
+        raise UserError(f"alpha={alpha}: give a number between 0 and 1")
+    for name in (*tested, *margins):
+        if name not in MARGINS:
+            raise UserError(f"fail_on={name}: {unknown(name, MARGINS, 'quantity')}")
+    for name, margin in margins.items():
+        if not 0 <= margin < math.inf:
+            raise UserError(f"margin.{name}={margin}: give a number from 0 on")
+
+
+def _require_two(first: Sequence[Path], second: Sequence[Path] | None, versions: tuple[str | None, str | None]) -> None:
+    """Refuses to compare a version with itself."""
+    if second is None and None in versions:
+        raise UserError("compare: one folder is given; name another, or first=LABEL and second=LABEL")
+    same = {path.resolve() for path in first} == {path.resolve() for path in second or first}
+    label = versions[0]
+    if same and label == versions[1]:
+        named = "one folder" if label is None else f"{label} of one folder"
+        raise UserError(f"compare: {named} is compared with itself; name another, or first=LABEL and second=LABEL")
+
+
+def _worse(frame: Comparison, failing: Sequence[str]) -> list[str]:
+    """Returns a line for each finding that fails the comparison."""
+    quantity = frame["quantity"].str.split(" ").str[0]
+    worse = frame[(frame["finding"] == "worse") & quantity.isin(list(failing))]
+    rows = [{str(name): value for name, value in row.items()} for row in worse.to_dict("records")]
+    return [f"{row['second']} in {row['quantity']}, {comparison_title(row)}" for row in rows]

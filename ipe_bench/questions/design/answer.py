@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
 from ipe_bench.measurements.identifiability import structure
-from ipe_bench.questions.design.maths import Design, Way, entry_in_words
+from ipe_bench.plugins.extensions import richer_models
+from ipe_bench.questions.design.maths import Design, Way, design, entry_in_words
 from ipe_bench.report.table import Part, Shown, Strong, Table, texts, words
 from ipe_bench.report.words import enumerate_few, percent, scientific, short
 from ipe_bench.report.writer import write_files
@@ -18,7 +20,9 @@ from ipe_bench.trials.observability import TRUTHS, Observability
 from ipe_bench.trials.thresholds import FIT_LEVEL
 
 if TYPE_CHECKING:
+    from ipe_bench.measurements.base import Measurement
     from ipe_bench.report.figures.drawing import Drawing
+    from ipe_bench.trials.scenario import Scenario
 
 
 READINGS = "readings.csv"
@@ -152,7 +156,7 @@ def _ways(design: Design) -> Iterator[Part]:
         return
     same = _no_others(design)
     if same:
-        yield f"{same} `--readings NUMBER` chooses fewer of them."
+        yield f"{same} `readings=NUMBER` chooses fewer of them."
         return
     today = design.scenario.measurement.m
     columns = [
@@ -188,3 +192,9 @@ def write_design(folder: Path, name: str, design: Design) -> list[Path]:
     table = pd.concat(chosen)[columns] if chosen else pd.DataFrame(columns=columns)
     answer, parts = list(_design_sentences(design)), design_parts(name, design)
     return write_files(folder, "design", (READINGS, table), f"{name}: design", answer, parts, _draw_design(design))
+
+
+def designed(scenario: Scenario, errors: Sequence[Measurement] | None = None, **options: Any) -> DesignAnswer:
+    """Designs readings of a scenario; `errors` are richer models, by default those that the options offer."""
+    known = richer_models(scenario) if errors is None else errors
+    return DesignAnswer(**vars(design(replace(scenario, truth=None), errors=known, **options)))

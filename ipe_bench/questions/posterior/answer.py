@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,12 +10,13 @@ import numpy as np
 import pandas as pd
 
 from ipe_bench.basics.statuses import Status
-from ipe_bench.questions.posterior.maths import Divergence, Posterior, Reference
+from ipe_bench.questions.posterior.maths import Divergence, Posterior, Reference, reference, require_particles
 from ipe_bench.report.table import Shown, Table, texts, words
 from ipe_bench.report.words import compact, enumerate_few, percent
 from ipe_bench.report.writer import write_files
 
 if TYPE_CHECKING:
+    from ipe_bench.estimators.base import Estimator
     from ipe_bench.measurements.base import Measurement
     from ipe_bench.trials.scenario import Scenario
 
@@ -106,3 +107,20 @@ def _honest_sentences(found: Sequence[Reference]) -> list[str]:
     unsettled = sum(not one.posterior.settled for one in found)
     more = [f"In {unsettled} the posterior itself cannot be relied on; take more particles."] if unsettled else []
     return [f"Trials in which an estimator's Gaussian can stand for the posterior: {listed}.", *more]
+
+
+def sampled(
+    scenario: Scenario,
+    estimators: Mapping[str, Estimator],
+    trials: int,
+    particles: int,
+    watch: Callable[[int], None] | None = None,
+) -> PosteriorAnswer:
+    """Samples the posteriors of the first trials; `watch` is called with the number of each before that."""
+    require_particles(scenario.problem, particles)
+    found = []
+    for trial in range(trials):
+        if watch is not None:
+            watch(trial)
+        found.append(reference(scenario, estimators, trial, particles))
+    return PosteriorAnswer(scenario, found)

@@ -1,0 +1,102 @@
+"""Runs the commands of `ipe_bench.questions`: the table of their names, composed scenarios, and what they show."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.cli import places_and_keys, print_problems, say, say_files, show
+from ipe_bench.cli.keys import OF_FILES, of
+from ipe_bench.questions.question import NAMES, Answered, Asked, Question
+
+
+class Row(NamedTuple):
+    """Says what the command line knows of a question before its folder is loaded."""
+
+    line: str
+    """Its line in `ipe-bench --help`."""
+    without: tuple[str, ...] | None = None
+    """Keys of a scenario that have no meaning for it; None if it takes folders or files in place of a scenario."""
+    moving: str = ""
+    """What serves in its place for states that move."""
+
+
+QUESTIONS = {
+    "design": Row(
+        "what the readings will say of each parameter, and which to take instead",
+        (*of("run", "figures", "estimators"), "trials"),
+        "the bounds of states are those of `ipe-bench run state_model=NAME`",
+    ),
+    "posterior": Row(
+        "the posterior of a few trials, and how far estimators are from it",
+        of("run", "figures"),
+        "use `ipe-bench run state_model=NAME`, with tracker=[grid] for one state, or tracker=[bootstrap]",
+    ),
+    "compare": Row("whether a second version, setting or estimator is better or worse than a first"),
+    "audit": Row("whether the covariance that another program reports describes its errors"),
+}
+"""A question is a folder of `ipe_bench.questions` and its row here."""
+
+
+def question(name: str) -> Question:
+    """Loads the record of a question's command."""
+    return importlib.import_module(f"ipe_bench.questions.{name}.command").QUESTION
+
+
+def question_command(name: str, arguments: Sequence[str]) -> int:
+    """Answers a question, shows the answer, and returns the exit code."""
+    row = QUESTIONS[name]
+    record = question(name)
+    words = without_flags(name, arguments, record)
+    if row.without is None:
+        places, options = places_and_keys(name, words, record.options)
+        return _shown(record.run(places, **options))
+    own = [word for word in words if word.partition("=")[0] in record.options]
+    options = places_and_keys(name, own, record.options)[1]
+    asked = _asked(name, [word for word in words if word not in own], row)
+    return _shown(record.run(asked, **options))
+
+
+def without_flags(name: str, arguments: Sequence[str], record: Question) -> list[str]:
+    """Writes --KEY VALUE of earlier versions as KEY=VALUE, and says so in a line on stderr."""
+    words: list[str] = []
+    values: dict[str, list[str]] = {}
+    rest = list(arguments)
+    while rest:
+        word = rest.pop(0)
+        flag, equals, value = word.partition("=")
+        key = flag.removeprefix("--")
+        if key == flag or key not in record.options:
+            words.append(word)
+            continue
+        if not equals:
+            if not rest:
+                raise UserError(f"{name}: {word}: give it a value, as in {key}=VALUE")
+            value = rest.pop(0)
+        values.setdefault(key, []).append(value)
+    for key, given in values.items():
+        several = record.options[key] is NAMES and len(given) > 1
+        new = f"{key}=[{','.join(given)}]" if several else f"{key}={given[-1]}"
+        print_problems([f"{name}: --{key}: options have no dashes any more; write {new}"])
+        words.append(new)
+    return words
+
+
+def _asked(name: str, arguments: Sequence[str], row: Row) -> Asked:
+    from ipe_bench.cli.single import single
+
+    refused = tuple(row.without or ())
+    found = single(name, arguments, moving=row.moving, run=refused, estimate=OF_FILES)
+    trials = found.spec.count if "trials" in found.words.keys else None
+    return Asked(found.measurement, found.spec.scenario, found.spec.estimators, trials, found.folder)
+
+
+def _shown(found: Answered) -> int:
+    show(found.parts)
+    print_problems(found.problems)
+    if found.files:
+        say_files(found.files)
+    say(*found.lines)
+    return found.code

@@ -1,0 +1,76 @@
+"""Composes the one scenario that a command is about, with one folder of files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.cli import words as w
+from ipe_bench.cli.keys import OF_CONSTANTS, OF_STATES
+from ipe_bench.cli.session import composed, jobs_of, session
+from ipe_bench.cli.spec import Spec
+from ipe_bench.cli.words import Words
+from ipe_bench.measurements import Nist
+from ipe_bench.report.writer import reserve_output_folder
+
+
+@dataclass(frozen=True)
+class Single:
+    """Holds the request of a command."""
+
+    command: str
+    words: Words
+    spec: Spec
+    config: dict[str, Any]
+    """Config as Hydra composed it."""
+
+    @property
+    def measurement(self) -> str:
+        """Measurement model of the request."""
+        spec, group = self.spec, "measurement" if self.spec.state_model is None else "state_model"
+        model = spec.measurement if spec.state_model is None else spec.state_model
+        if isinstance(model, Nist):
+            return f"nist/{model.dataset.lower()}"
+        return self.words.chosen(group) or model.name
+
+    def folder(self, name: str, identity: Any, files: Sequence[str] = ()) -> Path:
+        """Reserves the named folder, or one named after the command and the model, for a command that `identity` tells
+        from others in NAME.json, and for its further `files`."""
+        output, named = Path(self.spec.output), not {"name", "output"}.isdisjoint(self.words.keys)
+        folder = output if named else output.with_name(f"{self.command}-{self.measurement.replace('/', '-')}")
+        return reserve_output_folder(folder, name, identity, elsewhere=not named, files=files)
+
+
+def single(
+    command: str, arguments: Sequence[str], standard: Sequence[str] = (), moving: str = "", **refused: Sequence[str]
+) -> Single:
+    """Composes the one job that the arguments of a command ask for; `standard` are default words, and `refused` are
+    keys without meaning for it, by whom they are for; `moving` says what else serves for states that move."""
+    with session():
+        words = w.read(command, arguments)
+        for whose, keys in refused.items():
+            words.refuse(keys, f"is for `ipe-bench {whose}`, and has no meaning in `ipe-bench {command}`")
+        given = w.read(command, [one for one in standard if one.partition("=")[0] not in words.keys])
+        jobs = jobs_of(Words(given.overrides + words.overrides), multirun=False)
+        require_one_kind(words, jobs.specs[0])
+        model = jobs.specs[0].state_model
+        if moving and model is not None:
+            raise UserError(f"state_model={model.name}: states move, and {command} is of constants; {moving}")
+        return Single(command, words, jobs.specs[0], composed(jobs.words))
+
+
+def require_one_kind(words: Words, spec: Spec) -> None:
+    """Refuses a tracker without a state model, and a state model together with a key of measurements, typed or from an
+    experiment."""
+    if spec.state_model is None:
+        words.refuse((*OF_STATES[1:], "find"), "goes with state_model=NAME")
+        return
+    why = "is of a measurement, and state_model= chooses states that move"
+    words.refuse(OF_CONSTANTS, why)
+    for one in (one for one in words.overrides if one.key_or_group == "experiment"):
+        config, without = composed(Words((one,))), composed(Words(()))
+        if changed := [key for key in OF_CONSTANTS if config.get(key) != without.get(key)]:
+            raise UserError(f"{w.said(one)}: sets {changed[0]}, which {why}; leave out one of them")

@@ -1,0 +1,56 @@
+"""Describes the command `ipe-bench design`."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, Literal
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.options import Count
+from ipe_bench.plugins.extensions import richer_models
+from ipe_bench.questions.design.answer import READINGS, design_parts, designed, write_design
+from ipe_bench.questions.question import NAMES, Answered, Asked, Question
+from ipe_bench.runs.provenance import describe
+
+_MORE = """
+  ipe-bench design measurement=ranging error_scale=10
+  ipe-bench design measurement=gins by=time                     the same cases and axes, at other times
+  ipe-bench design measurement=gins truth_measurement=gins_tilted
+
+The analysis uses the model's Jacobians at true parameters drawn from the prior, without noise or estimates.
+Unmodelled errors are those of truth_measurement=, or of every option of measurement= that is the same model with
+more errors.
+
+by=COLUMN            chooses by this column of the readings alone; by=[A,B] by these together
+readings=NUMBER      largest number of readings; by default today's
+criterion=D          what is small: mean squared bound (A, the default) or volume of the ellipsoid (D)
+output=DIR           folder of the files
+"""
+
+
+def answer(asked: Asked, **options: Any) -> Answered:
+    """Returns the tables of a design, whose files are written; exit code 1 where a parameter is not determined."""
+    scenario = asked.scenario
+    if scenario.noise.real:
+        raise UserError("noise=certified: a design is of readings that are still to be taken; choose another noise")
+    errors = richer_models(scenario)
+    found = designed(scenario, errors=errors, **options)
+    identity = {
+        "scenario": describe(dataclasses.replace(scenario, truth=None)),
+        "errors": [describe(error) for error in errors],
+        "by": options.get("by"),
+        "readings": options.get("readings"),
+        "criterion": options.get("criterion", "A"),
+    }
+    files = write_design(asked.folder("design", identity, (READINGS,)), asked.measurement, found)
+    code = 0 if found.observability.observable else 1
+    return Answered(design_parts(asked.measurement, found), code, files=files)
+
+
+QUESTION = Question(
+    codes="0 the readings determine every parameter; 1 they do not",
+    more=_MORE,
+    argument=("KEY=VALUE", "the scenario, as for `ipe-bench run`"),
+    run=answer,
+    options={"by": NAMES, "readings": Count, "criterion": Literal["A", "D"]},
+)
