@@ -103,11 +103,11 @@ MISTAKES = {
     "no readings": (["estimate"], "readings: is not given"),
     "design of trials": (["design", *SMALL, "trials=5"], "trials: is for `ipe-bench run`"),
     "design of a solver": (["design", *SMALL, "solver=[newton]"], "solver: is for `ipe-bench run`"),
-    "design of a file": (["design", *SMALL, "readings=a.csv"], "--readings NUMBER"),
-    "no such column": (["design", *SMALL, "--by", "colour"], "by=colour: there is no such column"),
-    "no such criterion": (["design", *SMALL, "--criterion", "E"], "--criterion: invalid choice"),
-    "too few readings": (["design", *SMALL, "--readings", "3"], "readings=3: 4 parameters want"),
-    "too many readings": (["design", *SMALL, "--readings", "500"], "readings=500: polynomial has 40 readings"),
+    "design of a file": (["design", *SMALL, "readings=a.csv"], "readings=a.csv: give a whole number above 0"),
+    "no such column": (["design", *SMALL, "by=colour"], "by=colour: there is no such column"),
+    "no such criterion": (["design", *SMALL, "criterion=E"], "criterion=E: choose one of A, D"),
+    "too few readings": (["design", *SMALL, "readings=3"], "readings=3: 4 parameters want"),
+    "too many readings": (["design", *SMALL, "readings=500"], "readings=500: polynomial has 40 readings"),
     "design to a precision": (["design", *SMALL, "precision=0.1"], "precision: is for `ipe-bench run`"),
     "no richer truth": (["design", *SMALL, "truth_measurement=polynomial"], "has no errors besides the parameters"),
     "posterior of a file": (
@@ -116,8 +116,8 @@ MISTAKES = {
     ),
     "posterior to a precision": (["posterior", *SMALL, "precision=0.1"], "precision: is for `ipe-bench run`, and has"),
     "a thousand posteriors": (["posterior", *SMALL, "trials=1000"], "trials=1000: each takes up to a minute"),
-    "few particles": (["posterior", *SMALL, "baseline=[]", "--particles", "20"], "particles=20: give at least 80"),
-    "particles in words": (["posterior", *SMALL, "--particles", "many"], "--particles: invalid int value"),
+    "few particles": (["posterior", *SMALL, "baseline=[]", "particles=20"], "particles=20: give at least 80"),
+    "particles in words": (["posterior", *SMALL, "particles=many"], "particles=many: give a whole number above 0"),
     "no posterior": (["posterior", *SMALL, "trials=0"], "trials=0: give a whole number above 0"),
 }
 

@@ -13,8 +13,9 @@ SMALL = ("measurement=polynomial", "noise=gaussian", "noise.deviation=0.01")
 
 
 def test_tables_and_files_say_the_same(ipe_bench, tmp_path):
-    code, out, _ = ipe_bench("design", *SMALL, "--readings", "20")
+    code, out, err = ipe_bench("design", *SMALL, "--readings", "20")
     assert code == 0
+    assert err == "ipe-bench: design: --readings: options have no dashes any more; write readings=20\n"
     assert "what 40 readings say" in out
     folder = tmp_path / "outputs" / "design-polynomial"
     found = ib.design(ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01)), readings=20)
@@ -28,14 +29,14 @@ def test_tables_and_files_say_the_same(ipe_bench, tmp_path):
     assert len(rows) == best.readings == 20
     assert {path.name for path in folder.iterdir()} == {"design.json", "design.png", "readings.csv", "design.html"}
     # The same command writes there again, another one elsewhere.
-    assert ipe_bench("design", *SMALL, "--readings", "20")[0] == 0
+    assert ipe_bench("design", *SMALL, "readings=20")[0] == 0
     assert not (tmp_path / "outputs" / "design-polynomial-2").exists()
-    assert ipe_bench("design", *SMALL, "--readings", "25")[0] == 0
+    assert ipe_bench("design", *SMALL, "readings=25")[0] == 0
     assert (tmp_path / "outputs" / "design-polynomial-2" / "design.json").exists()
 
 
 def test_every_richer_version_of_the_model_is_suspected(ipe_bench):
-    code, out, _ = ipe_bench("design", "measurement=gins", "error_scale=33", "--by", "axis", "output=here")
+    code, out, _ = ipe_bench("design", "measurement=gins", "error_scale=33", "by=axis", "output=here")
     assert code == 0
     rows = {line.strip().split("  ")[0]: line for line in out.splitlines()}
     for name in ("tilt x", "tilt y", "gyro random walk", "misalignment xy", "quadratic x"):
@@ -46,7 +47,7 @@ def test_every_richer_version_of_the_model_is_suspected(ipe_bench):
 
 
 def test_a_table_and_files_for_each_trial(ipe_bench, tmp_path):
-    words = ("error_scale=3", "solver=[newton]", "baseline=[linear_lse]", "trials=2", "--particles", "400")
+    words = ("error_scale=3", "solver=[newton]", "baseline=[linear_lse]", "trials=2", "particles=400")
     code, out, error = ipe_bench("posterior", *SMALL, *words)
     assert code == 0
     assert error.splitlines() == ["polynomial: trial 1 of 2", "polynomial: trial 2 of 2"]
