@@ -29,7 +29,6 @@ from ipe_bench.trials.tracking import AnyScenario, StateScenario
 if TYPE_CHECKING:
     import pandas as pd
 
-    from ipe_bench.plugins.conformance import Finding
     from ipe_bench.questions.audit.answer import AuditAnswer
     from ipe_bench.questions.compare.answer import Comparison
     from ipe_bench.questions.design.maths import Criterion, Design
@@ -39,6 +38,7 @@ if TYPE_CHECKING:
     from ipe_bench.report.style import Which
     from ipe_bench.report.summary import Summary
     from ipe_bench.report.tracked import LogAnswer
+    from ipe_bench.workshop.conformance import Finding
 
 Directories = Path | str | Sequence[Path | str]
 Shows = bool | Literal["lines"]
@@ -523,16 +523,9 @@ def check(component: Any) -> list[Finding]:
     >>> [f.check for f in findings if f.complaint]
     []
     """
-    from ipe_bench.plugins.conformance import check_component, check_option, left_of_skeleton
-    from ipe_bench.plugins.discovery import RECORD_GROUPS, options_in
-    from ipe_bench.report.conformance import check_records
+    from ipe_bench.workshop.check import findings
 
-    if isinstance(component, Path | str):
-        chosen = options_in(Path(component))
-        findings = [finding for o in chosen if o.group not in RECORD_GROUPS for finding in check_option(o)]
-        findings += check_records([o for o in chosen if o.group in RECORD_GROUPS])
-        return [*findings, *left_of_skeleton(chosen)]
-    return list(check_component(getattr(component, "name", type(component).__name__), component))
+    return findings(component)
 
 
 def _scenario(given: Any, **stated: Any) -> Scenario:

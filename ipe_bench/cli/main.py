@@ -25,7 +25,8 @@ HOMES = {
     "run": "run",
     "estimate": "estimate",
     **dict.fromkeys(("report", "bundle", "status"), "results"),
-    **dict.fromkeys(("list", "check", "new"), "components"),
+    "list": "listing",
+    **dict.fromkeys(("check", "new"), "workshop"),
 }
 """The module of each command that is no question, which is loaded when the command is given."""
 GONE = {

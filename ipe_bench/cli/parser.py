@@ -9,6 +9,7 @@ from typing import Any, NoReturn
 from ipe_bench.basics.errors import UserError, did_you_mean, unknown
 from ipe_bench.cli.keys import ROWS
 from ipe_bench.cli.questions import QUESTIONS, question
+from ipe_bench.workshop.kinds import KINDS, MODELS
 
 _ABOUT = """\
 ipe-bench: which estimator to trust with nonlinear measurements
@@ -24,11 +25,6 @@ _CODES = """\
 `ipe-bench COMMAND --help` says more of one command.
 Exit codes: 0 done; 1 done, but some pieces failed or are missing; 2 a mistake in what was asked for; 130 Ctrl-C.
 """
-MODELS = ("function", "ode")
-"""Models of one file."""
-KINDS = ("solver", "baseline", "filter", "measurement", "state_model", "tracker", "noise", "prior")
-KINDS += ("execution", "statistic", "figure", "table", "section", "experiment")
-"""Of plugins that `new` makes."""
 INFO_TOPICS = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
 _MISSING = "0 done; 1 done, but something that was asked for is missing"
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from ipe_bench.cli.components import PAGES
 from ipe_bench.cli.main import main
+from ipe_bench.workshop.skill import PAGES
 
 pytestmark = pytest.mark.slow  # to write the pages is to make and to check a component of each kind
 

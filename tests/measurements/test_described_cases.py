@@ -13,10 +13,10 @@ from ipe_bench.measurements import Ode
 from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo
 from ipe_bench.measurements.ode.described import packaged
 from ipe_bench.noise import Gaussian
-from ipe_bench.plugins.conformance import check_component
 from ipe_bench.real.fits import fit
 from ipe_bench.real.readings import open_together, write_readings
 from ipe_bench.trials.scenario import Scenario
+from ipe_bench.workshop.conformance import check_component
 
 FEED, BEGIN = (2.0, 0.0, 5.0), (1.0, 9.0, 4.0)
 MODEL = Ode({"y": "feed - k*y"}, {"k": 0.5, "gain": 1.0}, {"y": "begin"}, {"shown": "gain*y"}, tolerance=1e-11)

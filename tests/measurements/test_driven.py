@@ -15,10 +15,10 @@ from ipe_bench.measurements import Ode
 from ipe_bench.measurements.base import differentiate
 from ipe_bench.measurements.ode.driven import course
 from ipe_bench.noise import Gaussian
-from ipe_bench.plugins.conformance import check_component
 from ipe_bench.real.estimation import Question
 from ipe_bench.real.fits import fit
 from ipe_bench.real.readings import open_together, write_readings
+from ipe_bench.workshop.conformance import check_component
 
 T = np.arange(0.0, 600.0, 10.0)
 CURRENT = np.repeat(np.random.default_rng(0).choice([0.0, 1.0, 2.5, -1.0], 12), 5)

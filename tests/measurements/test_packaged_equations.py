@@ -15,7 +15,7 @@ from ipe_bench.cli.session import jobs_of, session
 from ipe_bench.cli.words import read
 from ipe_bench.measurements import FallingBody, LotkaVolterra, Ode, Sir
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.plugins.conformance import check_component
+from ipe_bench.workshop.conformance import check_component
 
 FOOT = 0.3048
 # Boys confined to bed, 22 January to 4 February 1978 (British Medical Journal, 4 March 1978, p. 587).

@@ -9,7 +9,7 @@ import pytest
 
 from ipe_bench.cli.main import main
 from ipe_bench.plugins import discovery
-from ipe_bench.plugins.conformance import check_option, left_of_skeleton
+from ipe_bench.workshop.conformance import check_option, left_of_skeleton
 
 _numbers = itertools.count()
 

@@ -18,10 +18,10 @@ from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo
 from ipe_bench.measurements.nist import FORMULAS
 from ipe_bench.noise import Colored, Gaussian, Quantization
 from ipe_bench.plugins import discovery as plugins
-from ipe_bench.plugins.conformance import check_component
 from ipe_bench.plugins.construct import construct
 from ipe_bench.solvers import Newton, State
 from ipe_bench.states import Filter
+from ipe_bench.workshop.conformance import check_component
 
 GROUPS = ("measurement", "noise", "prior", "solver", "baseline", "state_model", "tracker")
 OURS = [

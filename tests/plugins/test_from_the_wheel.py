@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import ipe_bench
-from ipe_bench.cli.parser import KINDS
+from ipe_bench.workshop.kinds import KINDS
 
 ROOT = Path(ipe_bench.__file__).parents[1]
 pytestmark = pytest.mark.slow

@@ -13,16 +13,17 @@ import pytest
 from shared.small_models import Bent
 
 from ipe_bench import Scenario, check
-from ipe_bench.cli.components import KINDS, RECORDS
+from ipe_bench.cli.listing import KINDS
 from ipe_bench.cli.main import main
 from ipe_bench.noise import Gaussian
 from ipe_bench.plugins import discovery
-from ipe_bench.plugins.conformance import check_component
 from ipe_bench.priors import Prior
 from ipe_bench.questions.posterior.maths import reference
 from ipe_bench.report import figures
 from ipe_bench.runs.execution import Event, Execution, Serial
 from ipe_bench.statistics.registry import add_statistics
+from ipe_bench.workshop.conformance import check_component
+from ipe_bench.workshop.kinds import RECORDS
 
 SMALL = ("measurement=polynomial", "noise=gaussian", "trials=8", "execution=serial", "output=out")
 MAIN = "figures=main"

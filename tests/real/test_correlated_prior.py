@@ -8,12 +8,12 @@ from shared.small_models import Bent
 from ipe_bench.baselines import CKF, EKF, IPLF, UKF, EnKF, IteratedEKF, MapLM
 from ipe_bench.basics.errors import UserError
 from ipe_bench.noise import Gaussian
-from ipe_bench.plugins.conformance import check_component
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.questions.posterior.maths import sample_posterior
 from ipe_bench.trials.fit_test import spread_of
 from ipe_bench.trials.scenario import Scenario
 from ipe_bench.trials.scoring import Block
+from ipe_bench.workshop.conformance import check_component
 
 CORRELATIONS = ((1.0, 0.9, -0.3), (0.9, 1.0, 0.1), (-0.3, 0.1, 1.0))
 DEVIATIONS = (2.0, 1.0, 0.5)

@@ -11,7 +11,6 @@ from shared.state_models import ConstantVelocity
 
 import ipe_bench as ib
 from ipe_bench.measurements import Parameter
-from ipe_bench.plugins.conformance import check_component
 from ipe_bench.plugins.construct import construct
 from ipe_bench.plugins.discovery import composed, options
 from ipe_bench.real.tracks import _numbers
@@ -30,6 +29,7 @@ from ipe_bench.states import (
 )
 from ipe_bench.states.trackers import filtered
 from ipe_bench.trials.tracking import PathBlock, StateScenario
+from ipe_bench.workshop.conformance import check_component
 
 TRACKERS = {o.name: construct(composed(o), o.package or o.group) for o in options("tracker")}
 ALONG, TURN = 0.3, 0.1

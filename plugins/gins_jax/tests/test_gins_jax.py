@@ -13,7 +13,7 @@ from ipe_bench_gins_jax import GinsJax
 from shared.oracles import agreed
 
 import ipe_bench as ib
-from ipe_bench.plugins.conformance import check_component
+from ipe_bench.workshop.conformance import check_component
 
 pytestmark = pytest.mark.plugin
 

@@ -14,7 +14,7 @@ from shared.oracles import agreed, assert_agrees
 
 import ipe_bench as ib
 from ipe_bench.basics.statuses import Status
-from ipe_bench.plugins.conformance import check_component
+from ipe_bench.workshop.conformance import check_component
 
 pytestmark = pytest.mark.plugin
 METHODS = ("levenberg_marquardt", "dogleg", "gauss_newton")

@@ -13,8 +13,8 @@ from ipe_bench_pendulum import Pendulum
 
 import ipe_bench as ib
 from ipe_bench.noise import Gaussian
-from ipe_bench.plugins.conformance import check_component
 from ipe_bench.solvers import Progressive
+from ipe_bench.workshop.conformance import check_component
 
 
 def test_keeps_its_promises():

@@ -13,7 +13,7 @@ from ipe_bench_stonesoup import StoneSoupEKF, StoneSoupUKF
 from shared.oracles import agreed, assert_agrees
 
 import ipe_bench as ib
-from ipe_bench.plugins.conformance import check_component
+from ipe_bench.workshop.conformance import check_component
 
 pytestmark = pytest.mark.plugin
 PAIRS = {"EKF": (StoneSoupEKF(), ib.baselines.EKF()), "UKF": (StoneSoupUKF(), ib.baselines.UKF())}

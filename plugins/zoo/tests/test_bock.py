@@ -10,7 +10,7 @@ from shared.small_models import bock
 
 from ipe_bench.baselines import MultiscaleLM
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.plugins.conformance import check_component
+from ipe_bench.workshop.conformance import check_component
 
 
 def _draw(model, trials=20):

@@ -12,8 +12,8 @@ from shared.oracles import agreed, assert_agrees
 
 from ipe_bench.baselines import LevenbergMarquardt, LinearLSE
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.plugins.conformance import check_component
 from ipe_bench.real.fits import fit
+from ipe_bench.workshop.conformance import check_component
 
 # m and n, as the paper states them.
 SIZES = {

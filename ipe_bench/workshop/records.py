@@ -9,7 +9,6 @@ from tempfile import TemporaryDirectory
 from ipe_bench.baselines import EKF, LinearLSE
 from ipe_bench.measurements.polynomial import Polynomial
 from ipe_bench.noise import Gaussian
-from ipe_bench.plugins.conformance import Finding
 from ipe_bench.plugins.discovery import Option
 from ipe_bench.plugins.extensions import use_statistics
 from ipe_bench.report.figures import added_drawings
@@ -20,6 +19,7 @@ from ipe_bench.runs.run import compute
 from ipe_bench.solvers import FixedPoint, Newton
 from ipe_bench.statistics import analyse
 from ipe_bench.trials.scenario import Scenario
+from ipe_bench.workshop.conformance import Finding
 
 
 def check_records(options: Sequence[Option]) -> list[Finding]:

@@ -1,0 +1,117 @@
+"""Defines `ipe-bench list`, which shows the options of each group."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+
+from ipe_bench.basics.errors import UserError, unknown
+from ipe_bench.cli import print_problems, renamed, say, show
+from ipe_bench.measurements.base import Measurement
+from ipe_bench.plugins import discovery as plugins
+from ipe_bench.plugins.construct import construct, described
+from ipe_bench.report.table import Table, words
+
+_GONE = {"keys": "`ipe-bench run --help` explains every key of a run"}
+"""Lists of earlier versions, and what to use instead."""
+
+
+def list_command(names: Sequence[str], verbose: bool) -> int:
+    """Prints one line per option of each group, with its own options if `verbose`; for GROUP/NAME only that option."""
+    print_problems(plugins.take_problems())
+    known = [*plugins.groups(), *({"statistic", "figure"} - set(plugins.groups()))]
+    for name in renamed(names) or plugins.groups():
+        group, slash, option = name.partition("/")
+        if group not in known:
+            homes = " or ".join(f"{o.group}/{o.name}" for o in plugins.options() if o.name == name)
+            remedy = f"write {homes}" if homes else unknown(group, known, "group")
+            raise UserError(f"{name}: {_GONE.get(name, remedy)}")
+        options, ours = {o.name: o for o in plugins.options(group)}, _ours(group)
+        if slash and option not in {**options, **ours}:
+            raise UserError(f"{name}: {unknown(option, [*options, *ours], 'option')}")
+        if slash and option in ours:
+            say(f"{name}  {ours[option]}")
+            continue
+        if slash:
+            _describe(options[option])
+            continue
+        rows = [(name, text.partition(". ")[0], "built in") for name, text in ours.items()]
+        rows += [(o.name, o.summary, o.source.origin) for o in options.values()]
+        for origin, part in itertools.groupby(rows, lambda row: row[2]):
+            names_here, texts, _ = zip(*part, strict=True)
+            title = group if origin == "built in" else f"{group}, from {origin}"
+            _show(title, {"option": names_here, "what it is": texts})
+        print()
+        for one in options.values() if verbose else [o for o in options.values() if o.fault is not None]:
+            try:
+                _describe(one)
+            except UserError as error:
+                print_problems([str(error)])
+    return 0
+
+
+def _ours(group: str) -> dict[str, str]:
+    """Returns the statistics and figures that come with the bench, which are no options, with descriptions."""
+    if group == "statistic":
+        from ipe_bench.statistics.records import SCORES, STATISTICS
+
+        return {one.name: one.definition for one in (*STATISTICS, *SCORES)}
+    if group == "figure":
+        from ipe_bench.report.figures import NAMES
+
+        return NAMES
+    return {}
+
+
+def _show(title: str, columns: Mapping[str, Sequence[str]]) -> None:
+    show([Table("list", title, "", [words(heading, list(cells)) for heading, cells in columns.items()])])
+
+
+def _describe(option: plugins.Option) -> None:
+    """Describes every option of a component with its value, its type, and its meaning."""
+    if option.fault is not None:
+        raise UserError(f"{option.group}={option.name}: {option.fault}")
+    prefix = "" if option.group == "experiment" else f"{option.group}."
+    if option.group in plugins.PACKAGES:
+        prefix = f"{plugins.PACKAGES[option.group]}.{option.label}."
+    title = f"{option.group}={option.name}  {option.summary}"
+    if rows := described(option):
+        columns = {
+            "key": [f"{prefix}{row.name}" for row in rows],
+            "value": [row.value for row in rows],
+            "takes": [row.kind for row in rows],
+            "meaning": [row.meaning for row in rows],
+        }
+        _show(title, columns)
+    else:
+        say(title)
+    print()
+    if option.group == "measurement":
+        _describe_measurement(option)
+
+
+def _describe_measurement(option: plugins.Option) -> None:
+    """Describes the parameters of a measurement model, and the file of readings that it takes."""
+    from ipe_bench.real.readings import header, labels
+
+    try:
+        if "???" in option.config.values():
+            raise UserError("an option is to be given")
+        model = construct(option.config, "measurement")
+        assert isinstance(model, Measurement)
+        columns = ",".join(header(model))
+    except UserError:
+        say(f"measurement={option.name}: what it has depends on its options:", option.text)
+        return
+    parameters = {
+        "parameter": [p.name for p in model.parameters],
+        "size": [f"{p.size:g}" for p in model.parameters],
+        "unit": [p.unit for p in model.parameters],
+    }
+    _show(f"measurement={option.name}", parameters)
+    first = ",".join(str(column[0]) for column in labels(model).values())
+    say(f"readings={{FILE}}: {model.m} rows, header: {columns}", f"first row: {first},<reading>")
+    if model.inputs:
+        known = ", ".join(i.heading for i in model.inputs)
+        say(f"A file's own {known} take the place of these; so it may have any number of rows.")
+    say("A column sigma, if there is one, holds the standard deviation of each reading.\n")
