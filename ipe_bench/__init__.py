@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from ipe_bench.measurements.ode.model import OdeMeasurement
     from ipe_bench.measurements.problem import Problem
     from ipe_bench.noise.base import Noise
+    from ipe_bench.trials.paths import StateScenario
     from ipe_bench.trials.scenario import Scenario
-    from ipe_bench.trials.tracking import StateScenario
 
 _HOMES = {
     "api": ("audit", "check", "compare", "design", "estimate", "load", "posterior", "report", "run", "status"),
@@ -44,7 +44,7 @@ _HOMES = {
     "measurements.problem": ("Problem",),
     "noise.base": ("Noise",),
     "trials.scenario": ("Scenario",),
-    "trials.tracking": ("StateScenario",),
+    "trials.paths": ("StateScenario",),
 }
 """Public names, by the module that they are in."""
 _RENAMED = {"Track": "ConstantFilter", "Tracking": "StateScenario"}

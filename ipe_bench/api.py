@@ -23,8 +23,8 @@ from ipe_bench.runs.run import validate
 from ipe_bench.runs.schedule import Watcher
 from ipe_bench.states.base import StateModel
 from ipe_bench.states.trackers import Tracker
+from ipe_bench.trials.paths import AnyScenario, StateScenario
 from ipe_bench.trials.scenario import Scenario
-from ipe_bench.trials.tracking import AnyScenario, StateScenario
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -33,11 +33,11 @@ if TYPE_CHECKING:
     from ipe_bench.questions.compare.answer import Comparison
     from ipe_bench.questions.design.maths import Criterion, Design
     from ipe_bench.questions.posterior.maths import Reference
-    from ipe_bench.report.answer import Answer
-    from ipe_bench.report.run import ReportResult
+    from ipe_bench.report.page.answer import Answer
+    from ipe_bench.report.page.log import LogAnswer
+    from ipe_bench.report.page.run import ReportResult
     from ipe_bench.report.style import Which
     from ipe_bench.report.summary import Summary
-    from ipe_bench.report.tracked import LogAnswer
     from ipe_bench.workshop.conformance import Finding
 
 Directories = Path | str | Sequence[Path | str]
@@ -173,7 +173,7 @@ def report(
     Traceback (most recent call last):
     ipe_bench.basics.errors.UserError: outputs/nowhere: holds no results of ipe-bench; give the output folder of a run
     """
-    from ipe_bench.report.run import begin_report
+    from ipe_bench.report.page.run import begin_report
 
     paths = _paths(directories)
     if output is None and any(map(is_bundle, paths)):
@@ -353,7 +353,7 @@ def estimate(
 
     Returns:
         The sequence of the fits, each with its estimates by name in `values`, and `x` and `covariance` in the
-        parameters' own units; of a state model a track of each (see `ipe_bench.real.tracks`). It shows itself in a
+        parameters' own units; of a state model a track of each (see `ipe_bench.real.logs`). It shows itself in a
         notebook, and `table()` is a frame.
 
     Raises:
@@ -371,7 +371,7 @@ def estimate(
     from ipe_bench.baselines import LevenbergMarquardt, LinearLSE
     from ipe_bench.plugins.construct import known_parameters
     from ipe_bench.real.estimation import Question
-    from ipe_bench.report.answer import Answer
+    from ipe_bench.report.page.answer import Answer
     from ipe_bench.report.progress import counting
     from ipe_bench.solvers import Auto
 
@@ -406,9 +406,9 @@ def _tracked(
     find: str | Sequence[str],
     progress: Shows,
 ) -> LogAnswer:
-    from ipe_bench.real.tracks import Log, LogTracks, found_and_tracked
+    from ipe_bench.real.logs import Log, LogTracks, found_and_tracked
+    from ipe_bench.report.page.log import LogAnswer
     from ipe_bench.report.progress import counting
-    from ipe_bench.report.tracked import LogAnswer
     from ipe_bench.states.trackers import ckf, ekf, ukf
 
     if isinstance(readings, Sequence) and not isinstance(readings, str):

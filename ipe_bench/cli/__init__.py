@@ -16,7 +16,7 @@ from ipe_bench.basics.errors import UserError, unknown
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from ipe_bench.report.table import Part
+    from ipe_bench.report.tables.table import Part
 
 _WIDTH_WITHOUT_TERMINAL = 120
 
@@ -53,7 +53,7 @@ def print_problems(lines: Iterable[str]) -> None:
 
 def show(parts: Iterable[Part]) -> None:
     """Prints tables and sentences."""
-    from ipe_bench.report.table import terminal
+    from ipe_bench.report.tables.table import terminal
 
     out = console()
     out.print(terminal(parts, out.width))

@@ -25,7 +25,7 @@ def _described(estimators: Any) -> dict[str, Any]:
 
 def estimate_command(arguments: Sequence[str]) -> int:
     """Estimates with every chosen estimator, prints tables and writes files; returns 1 if no fit passes."""
-    from ipe_bench.report.answer import FILES, NAME, Answer, write_answer
+    from ipe_bench.report.page.answer import FILES, NAME, Answer, write_answer
     from ipe_bench.report.progress import counting
 
     asked = single("estimate", arguments, STANDARD_ESTIMATORS, run=(*of("run", "trials"), w.TRUTH))
@@ -53,7 +53,7 @@ def estimate_command(arguments: Sequence[str]) -> int:
 
 def _track(asked: Single, model: StateModel) -> int:
     """Tracks the states by every chosen tracker, prints tables and writes files; exit code 1 where no track passes."""
-    from ipe_bench.report.tracked import NAME, TABLE, write_tracks
+    from ipe_bench.report.page.log import NAME, TABLE, write_tracks
 
     asked.words.refuse(("error_scale",), "is of simulated trials; give the state model another prior")
     given, trackers = asked.spec.readings, asked.spec.estimators

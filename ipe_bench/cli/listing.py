@@ -10,7 +10,7 @@ from ipe_bench.cli import print_problems, renamed, say, show
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.construct import construct, described
-from ipe_bench.report.table import Table, words
+from ipe_bench.report.tables.table import Table, words
 
 _GONE = {"keys": "`ipe-bench run --help` explains every key of a run"}
 """Lists of earlier versions, and what to use instead."""

@@ -19,7 +19,7 @@ from ipe_bench.basics.visible import VisibleStream
 from ipe_bench.cli import discard_output
 from ipe_bench.cli.parser import COMMANDS, parser_of, program
 from ipe_bench.cli.questions import QUESTIONS, question_command
-from ipe_bench.report.writer import COMMAND
+from ipe_bench.report.page.writer import COMMAND
 
 HOMES = {
     "run": "run",

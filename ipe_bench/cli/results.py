@@ -11,7 +11,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import console, places_and_keys, print_problems, say, show
 from ipe_bench.questions.question import NAMES
 from ipe_bench.report.style import PAGE, Which, drawn_settings
-from ipe_bench.report.table import Table, texts, words
+from ipe_bench.report.tables.table import Table, texts, words
 from ipe_bench.runs.bundles import BUNDLES, SUFFIX, is_bundle, opened, read_bundle, write_bundle
 from ipe_bench.runs.parts import TRUTH
 from ipe_bench.runs.results import CellState, Results
@@ -99,7 +99,7 @@ def show_report(
 ) -> int:
     """Writes the report on all that folders hold, and prints it, or its rows of the `cells`, whose keys have a line for
     people each; returns the exit code."""
-    from ipe_bench.report.run import begin_report
+    from ipe_bench.report.page.run import begin_report
     from ipe_bench.statistics.analysis import Begun
     from ipe_bench.statistics.collect import collect
 
@@ -132,12 +132,12 @@ def show_report(
 
 
 def _print_table(rows: Sequence[Mapping[str, Any]], collection: Any) -> None:
-    from ipe_bench.report.table import terminal
-    from ipe_bench.report.terminal import summary_tables
+    from ipe_bench.report.tables.table import terminal
+    from ipe_bench.report.tables.terminal import summary_tables
 
     totals = []
     if any(row["noise"] == "certified" for row in rows):
-        from ipe_bench.report.tables import certified_tables  # which loads pandas
+        from ipe_bench.report.tables.reports import certified_tables
 
         totals = [table for table in certified_tables(collection) if table.whole]
     out = console()

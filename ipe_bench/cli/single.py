@@ -14,7 +14,7 @@ from ipe_bench.cli.session import composed, jobs_of, session
 from ipe_bench.cli.spec import Spec
 from ipe_bench.cli.words import Words
 from ipe_bench.measurements import Nist
-from ipe_bench.report.writer import reserve_output_folder
+from ipe_bench.report.page.writer import reserve_output_folder
 
 
 @dataclass(frozen=True)

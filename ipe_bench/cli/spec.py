@@ -25,8 +25,8 @@ from ipe_bench.runs.execution import Execution
 from ipe_bench.runs.provenance import TARGET, canonical_json, describe
 from ipe_bench.states.base import StateModel
 from ipe_bench.states.trackers import Tracker
+from ipe_bench.trials.paths import StateScenario
 from ipe_bench.trials.scenario import MOST_TRIALS, TRIALS, Scenario
-from ipe_bench.trials.tracking import StateScenario
 
 if TYPE_CHECKING:
     from ipe_bench.real.estimation import Question

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from ipe_bench.estimators.base import Estimator
-    from ipe_bench.report.table import Part
+    from ipe_bench.report.tables.table import Part
     from ipe_bench.trials.scenario import Scenario
 
 NAMES = tuple[str, ...]

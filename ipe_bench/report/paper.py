@@ -10,7 +10,7 @@ from pathlib import Path
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.files import write_text
 from ipe_bench.report.sections import report_tables
-from ipe_bench.report.table import COLUMN, PAGE, Column, Table, latex
+from ipe_bench.report.tables.table import COLUMN, PAGE, Column, Table, latex
 from ipe_bench.statistics.analysis import Analysis
 
 

@@ -12,11 +12,11 @@ import pandas as pd
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.report.figures import drawings
-from ipe_bench.report.run import ReportResult, begin_report
+from ipe_bench.report.page.run import ReportResult, begin_report
 from ipe_bench.report.style import PAGE, house_style
-from ipe_bench.report.table import html, plain_text
-from ipe_bench.report.tables import certified_tables
-from ipe_bench.report.terminal import summary_tables
+from ipe_bench.report.tables.reports import certified_tables
+from ipe_bench.report.tables.table import html, plain_text
+from ipe_bench.report.tables.terminal import summary_tables
 from ipe_bench.statistics.analysis import analyse
 from ipe_bench.statistics.collect import collect, trials_frame
 from ipe_bench.statistics.registry import current_name, summary_columns

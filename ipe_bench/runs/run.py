@@ -27,8 +27,8 @@ from ipe_bench.runs.results import Results
 from ipe_bench.runs.schedule import Watcher, block_size_for, plan, run_tasks
 from ipe_bench.runs.store import ResultKey, Store
 from ipe_bench.states.trackers import Tracker
+from ipe_bench.trials.paths import AnyScenario, StateScenario
 from ipe_bench.trials.scenario import Scenario
-from ipe_bench.trials.tracking import AnyScenario, StateScenario
 
 log = logging.getLogger(__name__)
 

@@ -26,8 +26,8 @@ from ipe_bench.runs.execution import FATAL, PREPARED, Execution, Failure
 from ipe_bench.runs.provenance import describe, digest, importable
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.store import ResultKey, Store, describe_names
+from ipe_bench.trials.paths import block_of
 from ipe_bench.trials.thresholds import HISTORIES
-from ipe_bench.trials.tracking import block_of
 
 log = logging.getLogger(__name__)
 

@@ -39,7 +39,7 @@ from ipe_bench.trials.theory import linear_correlation
 from ipe_bench.trials.thresholds import HISTORIES
 
 if TYPE_CHECKING:
-    from ipe_bench.trials.tracking import AnyScenario
+    from ipe_bench.trials.paths import AnyScenario
 
 _ABANDONED_S = 3600.0
 """Age in s from which a temporary file counts as abandoned."""

@@ -17,11 +17,11 @@ from ipe_bench.statistics.collect import Collection, Group, collect
 from ipe_bench.statistics.comparisons import Outcomes, compare_pairs, corrected, may_be_best
 from ipe_bench.statistics.formulas import failed, share
 from ipe_bench.statistics.intervals import quantile, quantiles
+from ipe_bench.statistics.path_columns import epoch_curves
 from ipe_bench.statistics.records import SCORES
 from ipe_bench.statistics.registry import summary_rows, to_frame
 from ipe_bench.statistics.sample import CONTRACTION, Sample, label_of, median_distances, samples
 from ipe_bench.statistics.statistic import BEST, rows_of
-from ipe_bench.statistics.tracks import epoch_curves
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -13,7 +13,7 @@ import numpy as np
 
 import ipe_bench.statistics.formulas as f
 import ipe_bench.statistics.intervals as intervals
-import ipe_bench.statistics.tracks as t
+import ipe_bench.statistics.path_columns as t
 from ipe_bench.statistics.intervals import clopper_pearson, quantile, share_sequence
 from ipe_bench.statistics.sample import CLOSE, NIS, Sample, iterations_to_limit, orders_of
 from ipe_bench.statistics.statistic import Statistic

@@ -24,8 +24,8 @@ from ipe_bench.statistics.records import SCORES
 from ipe_bench.statistics.registry import summary_rows
 from ipe_bench.statistics.sample import Sample, samples
 from ipe_bench.statistics.statistic import rows_of
+from ipe_bench.trials.paths import AnyScenario
 from ipe_bench.trials.scenario import MOST_TRIALS, TRIALS
-from ipe_bench.trials.tracking import AnyScenario
 
 NARROW = "every interval is narrow enough"
 """Reason of a scenario that stops because it has the requested precision."""

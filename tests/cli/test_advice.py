@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import ipe_bench
-from ipe_bench.real import tracks
+from ipe_bench.real import logs as tracks
 from ipe_bench.real.estimation import Question
 
 FORMULA = "run measurement=formula measurement.expression=b1*t measurement.columns.t=[1,2,3]"

@@ -12,7 +12,7 @@ import ipe_bench as ib
 import ipe_bench.cli
 from ipe_bench.cli.main import main
 from ipe_bench.report import figures
-from ipe_bench.report.table import terminal
+from ipe_bench.report.tables.table import terminal
 
 WIDTHS = (80, 120)
 SHORT = ("linear_lse", "fixed_point", "levenberg_marquardt", "scipy_least_squares")

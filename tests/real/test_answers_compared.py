@@ -17,7 +17,7 @@ from ipe_bench.estimators import Estimates, Estimator
 from ipe_bench.measurements import Formula
 from ipe_bench.noise import Gaussian, Unknown
 from ipe_bench.real.examination import Examination
-from ipe_bench.report.answer import estimate_content
+from ipe_bench.report.page.answer import estimate_content
 
 T = np.linspace(0, 10, 41)
 

@@ -16,8 +16,8 @@ from ipe_bench.measurements import Gins, Polynomial
 from ipe_bench.noise import Gaussian, Quantization, Unknown
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.real.fits import fit
-from ipe_bench.real.tracks import Log
-from ipe_bench.report.answer import with_error
+from ipe_bench.real.logs import Log
+from ipe_bench.report.page.answer import with_error
 from ipe_bench.solvers import Newton, Progressive
 from ipe_bench.trials.scenario import Scenario
 

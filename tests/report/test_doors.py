@@ -13,10 +13,10 @@ from matplotlib.figure import Figure
 
 from ipe_bench.basics.visible import VisibleStream
 from ipe_bench.cli.main import main
-from ipe_bench.report.figures.page import page_figure
+from ipe_bench.report.figures.svg import page_figure
 from ipe_bench.report.progress import counting
 from ipe_bench.report.screen import Screen
-from ipe_bench.report.table import Strong, Table, plain_text, terminal, words
+from ipe_bench.report.tables.table import Strong, Table, plain_text, terminal, words
 
 STYLE = 'x style="fill:red}body{display:none}.q{color:red" transform="rotate(-0 1)" d="1.2345"'
 ESCAPES = "\x1b[31mred\x1b[2J\x1b]0;title \x9b1m \u202eback :bug: [bold]"

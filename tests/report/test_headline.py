@@ -25,15 +25,15 @@ from ipe_bench.cli.words import read
 from ipe_bench.measurements import Recorded
 from ipe_bench.noise import Certified
 from ipe_bench.plugins import discovery
-from ipe_bench.report.headline import about, headline, in_common, limits
-from ipe_bench.report.table import Table
-from ipe_bench.report.tables import all_tables
+from ipe_bench.report.page.headline import about, headline, in_common, limits
+from ipe_bench.report.tables.reports import all_tables
+from ipe_bench.report.tables.table import Table
 from ipe_bench.report.words import percent
 from ipe_bench.states import Smoother, ekf
 from ipe_bench.statistics import analyse
+from ipe_bench.trials.paths import StateScenario
 from ipe_bench.trials.scenario import Scenario
 from ipe_bench.trials.thresholds import GATE
-from ipe_bench.trials.tracking import StateScenario
 
 IPE, FILTERS, OTHER = ("newton", "chord"), ("ekf",), ("direct",)
 KINDS = {**dict.fromkeys(IPE, Seeker()), **dict.fromkeys(FILTERS, Filter()), **dict.fromkeys(OTHER, Pretender())}

@@ -11,7 +11,7 @@ from shared.reports import HOSTILE, fill
 from ipe_bench.basics.errors import UserError
 from ipe_bench.report import figures
 from ipe_bench.report.paper import export
-from ipe_bench.report.table import COLUMN, PAGE, Table, interval, latex, words
+from ipe_bench.report.tables.table import COLUMN, PAGE, Table, interval, latex, words
 from ipe_bench.report.words import percent, short
 from ipe_bench.statistics import analyse
 

@@ -20,11 +20,22 @@ from shared.synthetic_store import Seeker, Synthetic
 from ipe_bench.api import report as write_report
 from ipe_bench.noise import Quantization
 from ipe_bench.report import figures
-from ipe_bench.report.headline import about, headline
-from ipe_bench.report.html import DEFINITIONS, render_page
-from ipe_bench.report.table import Strong, Table, column, comma_separated, html, latex, markdown, terminal, texts, words
-from ipe_bench.report.tables import all_tables, differing
-from ipe_bench.report.terminal import reported, summary_tables
+from ipe_bench.report.page.headline import about, headline
+from ipe_bench.report.page.html import DEFINITIONS, render_page
+from ipe_bench.report.tables.reports import all_tables, differing
+from ipe_bench.report.tables.table import (
+    Strong,
+    Table,
+    column,
+    comma_separated,
+    html,
+    latex,
+    markdown,
+    terminal,
+    texts,
+    words,
+)
+from ipe_bench.report.tables.terminal import reported, summary_tables
 from ipe_bench.report.words import compact, cost, duration, percent, short
 from ipe_bench.statistics import analyse
 from ipe_bench.statistics.records import SCORES, STATISTICS

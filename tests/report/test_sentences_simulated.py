@@ -25,8 +25,8 @@ from scipy.stats import beta, binomtest
 from shared.simulated_reports import HOLDING, Report, board, simulated
 from shared.synthetic_store import Filter, Pretender, Seeker
 
-from ipe_bench.report.headline import headline
-from ipe_bench.report.table import Table
+from ipe_bench.report.page.headline import headline
+from ipe_bench.report.tables.table import Table
 from ipe_bench.report.words import brief, percent
 from ipe_bench.statistics import analyse
 from ipe_bench.statistics.verdicts import CONSISTENT, NO_VERDICT, OVERCONFIDENT, TOO_CAUTIOUS, UNDECIDED, WRONG

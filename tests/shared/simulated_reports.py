@@ -14,8 +14,8 @@ from scipy.special import ndtr
 from scipy.stats import chi2, ncx2
 from scipy.stats import f as fisher
 
-from ipe_bench.report.headline import headline
-from ipe_bench.report.table import Part
+from ipe_bench.report.page.headline import headline
+from ipe_bench.report.tables.table import Part
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.comparisons import Outcomes, compare_pairs, corrected, may_be_best
 from ipe_bench.statistics.formulas import CAP, failed, share

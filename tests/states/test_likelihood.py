@@ -14,7 +14,7 @@ from shared.oracles import assert_agrees
 from shared.state_models import ConstantVelocity
 
 import ipe_bench as ib
-from ipe_bench.real import tracks
+from ipe_bench.real import logs as tracks
 from ipe_bench.report import progress
 from ipe_bench.states import Bootstrap, Formulas, Grid, Smoother, ekf
 

@@ -13,7 +13,7 @@ import ipe_bench as ib
 from ipe_bench.measurements import Parameter
 from ipe_bench.plugins.construct import construct
 from ipe_bench.plugins.discovery import composed, options
-from ipe_bench.real.tracks import _numbers
+from ipe_bench.real.logs import _numbers
 from ipe_bench.states import (
     Bootstrap,
     Filter,
@@ -28,7 +28,7 @@ from ipe_bench.states import (
     ukf,
 )
 from ipe_bench.states.trackers import filtered
-from ipe_bench.trials.tracking import PathBlock, StateScenario
+from ipe_bench.trials.paths import PathBlock, StateScenario
 from ipe_bench.workshop.conformance import check_component
 
 TRACKERS = {o.name: construct(composed(o), o.package or o.group) for o in options("tracker")}

@@ -28,7 +28,7 @@ from ipe_bench.states import (
 from ipe_bench.states.damped import _linearised, _passed, _Paths
 from ipe_bench.states.smoothers import path_p, smoothed, whole
 from ipe_bench.states.trackers import filtered, linearised_move
-from ipe_bench.trials.tracking import PathBlock, StateScenario
+from ipe_bench.trials.paths import PathBlock, StateScenario
 
 NEAR = Pendulum(count=25, start=(1.0, 0.0), spread=0.2)
 LINEAR = ConstantVelocity(count=12, spread=2.0)

@@ -28,7 +28,7 @@ from ipe_bench.states import (
     ukf,
 )
 from ipe_bench.states.algebra import mahalanobis
-from ipe_bench.trials.tracking import StateScenario
+from ipe_bench.trials.paths import StateScenario
 
 
 @dataclass(frozen=True)

@@ -17,13 +17,13 @@ from ipe_bench.cli.session import jobs_of, session
 from ipe_bench.cli.words import read
 from ipe_bench.plugins.construct import construct
 from ipe_bench.plugins.discovery import composed, options
-from ipe_bench.report.headline import headline
+from ipe_bench.report.page.headline import headline
 from ipe_bench.states import Bootstrap, Cubature, Formulas, IteratedSmoother, Smoother, Tracker, ckf, ekf, ukf
 from ipe_bench.states.algebra import root
 from ipe_bench.statistics import analyse
 from ipe_bench.statistics.certified import published_table
 from ipe_bench.statistics.collect import collect
-from ipe_bench.trials.tracking import PathBlock, StateScenario, packed, unpacked
+from ipe_bench.trials.paths import PathBlock, StateScenario, packed, unpacked
 
 LINEAR = ConstantVelocity(count=30, spread=3.0)
 

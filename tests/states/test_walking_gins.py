@@ -10,7 +10,7 @@ import ipe_bench as ib
 from ipe_bench.measurements import Gins
 from ipe_bench.states import Cubature, IteratedSmoother, Smoother, Taylor, WalkingGins, ekf, ukf
 from ipe_bench.statistics.intervals import mean_limits
-from ipe_bench.trials.tracking import StateScenario
+from ipe_bench.trials.paths import StateScenario
 
 
 @pytest.mark.oracle("own second implementation: Runge-Kutta steps of NumPy", "velocities, m/s", 5e-4)

@@ -12,7 +12,7 @@ import ipe_bench as ib
 from ipe_bench.report.figures import errors as figure
 from ipe_bench.report.figures.views import views
 from ipe_bench.report.style import house_style
-from ipe_bench.report.tables import all_tables
+from ipe_bench.report.tables.reports import all_tables
 from ipe_bench.statistics import analyse
 from ipe_bench.statistics.calibration import (
     INSIDE,

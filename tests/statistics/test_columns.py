@@ -12,8 +12,8 @@ from scipy.stats import beta, chi2, norm
 from shared.synthetic_store import Pretender, Seeker, Synthetic
 
 from ipe_bench.report.summary import Stored, Summary
-from ipe_bench.report.table import plain_text
-from ipe_bench.report.terminal import summary_tables
+from ipe_bench.report.tables.table import plain_text
+from ipe_bench.report.tables.terminal import summary_tables
 from ipe_bench.runs.store import ResultKey
 from ipe_bench.statistics import summarize
 from ipe_bench.statistics.records import RENAMED

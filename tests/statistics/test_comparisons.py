@@ -8,7 +8,7 @@ from scipy import stats
 from shared.oracles import agreed, assert_agrees
 from shared.synthetic_store import Pretender
 
-from ipe_bench.report.tables import all_tables
+from ipe_bench.report.tables.reports import all_tables
 from ipe_bench.statistics import analyse
 from ipe_bench.statistics.comparisons import Outcomes, compare_pairs, corrected, differences, holm, may_be_best, mcnemar
 from ipe_bench.statistics.sample import distances_to_limit, iterations_to_limit

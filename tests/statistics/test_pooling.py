@@ -12,9 +12,9 @@ from shared.synthetic_store import Pretender, Repeated
 import ipe_bench as ib
 from ipe_bench.cli.main import main
 from ipe_bench.noise import Correlated, Gaussian
-from ipe_bench.report.table import terminal
-from ipe_bench.report.tables import overview
-from ipe_bench.report.terminal import summary_tables
+from ipe_bench.report.tables.reports import overview
+from ipe_bench.report.tables.table import terminal
+from ipe_bench.report.tables.terminal import summary_tables
 from ipe_bench.runs.store import ResultKey
 from ipe_bench.statistics import analyse
 from ipe_bench.statistics.collect import collect

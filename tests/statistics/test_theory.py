@@ -13,7 +13,7 @@ from ipe_bench.measurements import Gins, Polynomial
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian, Quantization
 from ipe_bench.priors import GaussianPrior
-from ipe_bench.report.tables import all_tables
+from ipe_bench.report.tables.reports import all_tables
 from ipe_bench.runs.run import compute
 from ipe_bench.solvers import FixedPoint, Newton
 from ipe_bench.statistics import analyse

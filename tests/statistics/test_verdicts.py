@@ -8,9 +8,9 @@ import pytest
 from shared.state_models import ConstantVelocity
 
 import ipe_bench as ib
-from ipe_bench.real.tracks import far_below
-from ipe_bench.report.table import plain_text
-from ipe_bench.report.terminal import overview_notes, summary_tables
+from ipe_bench.real.logs import far_below
+from ipe_bench.report.tables.table import plain_text
+from ipe_bench.report.tables.terminal import overview_notes, summary_tables
 from ipe_bench.states import Formulas, Smoother, ekf, ukf
 from ipe_bench.statistics import analyse, summarize
 from ipe_bench.statistics.sample import NIS

@@ -13,7 +13,7 @@ from ipe_bench.basics.batches import take
 from ipe_bench.estimators.base import estimate_safely
 from ipe_bench.runs.run import compute
 from ipe_bench.states.trackers import Tracks
-from ipe_bench.trials.tracking import block_of, track_safely
+from ipe_bench.trials.paths import block_of, track_safely
 
 TRIALS = 12
 OPTIONAL = ("covariance", "history", "alternatives", "nis", "stage", "cost", "status", "iterations", "effective")

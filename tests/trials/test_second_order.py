@@ -11,7 +11,7 @@ import ipe_bench as ib
 from ipe_bench.basics.linalg import Array, Covariance, information
 from ipe_bench.measurements import Gins, Measurement, RicherGins
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.report.tables import all_tables
+from ipe_bench.report.tables.reports import all_tables
 from ipe_bench.runs.run import compute
 from ipe_bench.statistics import analyse
 from ipe_bench.trials.roots import least_squares_root

@@ -8,8 +8,8 @@ from shared.oracles import assert_agrees
 import ipe_bench as ib
 from ipe_bench.measurements import Formula
 from ipe_bench.noise import Gaussian, Unknown
-from ipe_bench.report.table import terminal
-from ipe_bench.report.terminal import summary_tables
+from ipe_bench.report.tables.table import terminal
+from ipe_bench.report.tables.terminal import summary_tables
 from ipe_bench.trials.scoring import Block
 
 TIMES = tuple(np.linspace(0.2, 8.0, 12))

@@ -9,8 +9,8 @@ from typing import Any
 import pandas as pd
 
 from ipe_bench.questions.audit.maths import Audit, audit, read_claims
-from ipe_bench.report.table import Part, Shown, Table, texts, words
-from ipe_bench.report.writer import digests, write_files
+from ipe_bench.report.page.writer import digests, write_files
+from ipe_bench.report.tables.table import Part, Shown, Table, texts, words
 
 
 class AuditAnswer(Shown, Audit):

@@ -23,9 +23,9 @@ from ipe_bench.questions.compare.maths import (
     other_sources,
     too_few,
 )
-from ipe_bench.report.table import Cell, Column, Part, Shown, Table, texts, words
+from ipe_bench.report.page.writer import digests, write_files
+from ipe_bench.report.tables.table import Cell, Column, Part, Shown, Table, texts, words
 from ipe_bench.report.words import compact, duration, p_value, percent, value_text
-from ipe_bench.report.writer import digests, write_files
 from ipe_bench.runs.bundles import opened
 from ipe_bench.statistics.collect import collect
 from ipe_bench.statistics.comparisons import ALPHA

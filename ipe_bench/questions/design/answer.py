@@ -13,9 +13,9 @@ import pandas as pd
 from ipe_bench.measurements.identifiability import structure
 from ipe_bench.plugins.extensions import richer_models
 from ipe_bench.questions.design.maths import Design, Way, design, entry_in_words
-from ipe_bench.report.table import Part, Shown, Strong, Table, texts, words
+from ipe_bench.report.page.writer import write_files
+from ipe_bench.report.tables.table import Part, Shown, Strong, Table, texts, words
 from ipe_bench.report.words import enumerate_few, percent, scientific, short
-from ipe_bench.report.writer import write_files
 from ipe_bench.trials.observability import TRUTHS, Observability
 from ipe_bench.trials.thresholds import FIT_LEVEL
 

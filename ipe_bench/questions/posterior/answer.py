@@ -11,9 +11,9 @@ import pandas as pd
 
 from ipe_bench.basics.statuses import Status
 from ipe_bench.questions.posterior.maths import Divergence, Posterior, Reference, reference, require_particles
-from ipe_bench.report.table import Shown, Table, texts, words
+from ipe_bench.report.page.writer import write_files
+from ipe_bench.report.tables.table import Shown, Table, texts, words
 from ipe_bench.report.words import compact, enumerate_few, percent
-from ipe_bench.report.writer import write_files
 
 if TYPE_CHECKING:
     from ipe_bench.estimators.base import Estimator

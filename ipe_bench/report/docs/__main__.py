@@ -32,11 +32,11 @@ from ipe_bench.report.docs.frames import SUFFIX, Computed, read
 from ipe_bench.report.figures import common, drawings
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.views import views
-from ipe_bench.report.headline import headline
+from ipe_bench.report.page.headline import headline
 from ipe_bench.report.sections import report_tables
 from ipe_bench.report.style import house_style
-from ipe_bench.report.table import environment, html
-from ipe_bench.report.tables import certified_tables
+from ipe_bench.report.tables.reports import certified_tables
+from ipe_bench.report.tables.table import environment, html
 from ipe_bench.report.words import brief, enumerate_few, percent
 from ipe_bench.statistics.analysis import Analysis, analyse
 from ipe_bench.statistics.records import MAIN, NOT_MAIN, STATISTICS
@@ -138,7 +138,7 @@ def _ours(group: str) -> list[Option]:
 
 def write_reference(folder: Path) -> None:
     """Adds pages of options, commands, statuses, statistics and Python names to a folder."""
-    from ipe_bench.report.html import DEFINITIONS
+    from ipe_bench.report.page.html import DEFINITIONS
 
     for group, title in GROUPS.items():
         rows = [(option, described(option)) for option in _ours(group)]

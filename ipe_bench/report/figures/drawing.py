@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ipe_bench.basics.files import write_atomically
-from ipe_bench.report.figures.page import page_figure
+from ipe_bench.report.figures.svg import page_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas

@@ -13,7 +13,7 @@ from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.views import Figure, View
 from ipe_bench.report.sections import Section
-from ipe_bench.report.table import Part, Table, column, words
+from ipe_bench.report.tables.table import Part, Table, column, words
 from ipe_bench.report.words import enumerate_few, short, value_text
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.certified import certified_cells, certified_estimate

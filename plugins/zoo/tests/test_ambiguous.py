@@ -7,7 +7,7 @@ from ipe_bench_zoo import Triad
 import ipe_bench as ib
 from ipe_bench.baselines import LevenbergMarquardt, Multistart
 from ipe_bench.noise import Gaussian
-from ipe_bench.report.tables import all_tables
+from ipe_bench.report.tables.reports import all_tables
 from ipe_bench.runs.run import compute
 from ipe_bench.solvers import Auto
 from ipe_bench.statistics import analyse

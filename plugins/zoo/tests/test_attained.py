@@ -9,7 +9,7 @@ from rich.console import Console
 from ipe_bench.api import report as write_report
 from ipe_bench.baselines import LeastSquares, LevenbergMarquardt
 from ipe_bench.noise import Certified
-from ipe_bench.report.table import terminal
+from ipe_bench.report.tables.table import terminal
 from ipe_bench.runs.run import compute
 from ipe_bench.solvers import Auto, Progressive
 from ipe_bench.statistics import analyse

@@ -137,7 +137,7 @@ def epoch_curves(s: Sample) -> Iterator[dict[str, Any]]:
 
 def _sums(s: Sample, cells: Sequence[StoredCell], epochs: int, columns: int) -> list[Array]:
     """Reads the sums (K, columns) of each stored block."""
-    from ipe_bench.trials.tracking import unpacked  # late: it knows every tracker
+    from ipe_bench.trials.paths import unpacked
 
     stored = (s.collection.load(cell, (), ("curves",)).get("curves", np.empty(0)) for cell in cells)
     return [block for texts in stored for block in unpacked(texts, epochs, columns)]

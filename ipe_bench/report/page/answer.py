@@ -24,9 +24,9 @@ from ipe_bench.real.estimation import Question
 from ipe_bench.real.examination import CONFIDENCE, Examination
 from ipe_bench.real.fits import TOO_WELL, Fit
 from ipe_bench.real.residuals import LEAST_P
-from ipe_bench.report.table import Part, Shown, Strong, Table, texts, words
+from ipe_bench.report.page.writer import write_files
+from ipe_bench.report.tables.table import Part, Shown, Strong, Table, texts, words
 from ipe_bench.report.words import enumerate_few, p_value
-from ipe_bench.report.writer import write_files
 from ipe_bench.trials.fit_test import DRAWS
 from ipe_bench.trials.thresholds import FIT_LEVEL
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from ipe_bench.basics.files import regular, write_text
 from ipe_bench.plugins.extensions import files_of_records, use_statistics
 from ipe_bench.report.style import FIGURES, PAGE, Which, file_formats, which_figures
-from ipe_bench.report.table import Part, Shown
+from ipe_bench.report.tables.table import Part, Shown
 from ipe_bench.runs.store import Store
 
 if TYPE_CHECKING:
@@ -80,10 +80,10 @@ class Pending:
     def written(self) -> ReportResult:
         """Writes all files."""
         from ipe_bench.report.figures import draw_all
-        from ipe_bench.report.headline import headline
-        from ipe_bench.report.html import render_page
+        from ipe_bench.report.page.headline import headline
+        from ipe_bench.report.page.html import render_page
         from ipe_bench.report.sections import CURVES, report_tables, written
-        from ipe_bench.report.table import write_table
+        from ipe_bench.report.tables.table import write_table
         from ipe_bench.statistics.registry import main_columns
 
         analysis, output = self.begun.finish(), self.output
@@ -142,7 +142,7 @@ def begin_report(
 
 def _made_from(directories: Sequence[Path], output: Path, *choices: object) -> str:
     """Computes a digest of the report's sources before they are read: results that come meanwhile change it."""
-    sources = [p for p in Path(__file__).parents[1].rglob("*") if p.suffix in {".py", ".j2", ".css", ".js"}]
+    sources = [p for p in Path(__file__).parents[2].rglob("*") if p.suffix in {".py", ".j2", ".css", ".js"}]
     stores = [Store(directory) for directory in directories]
     stored = [p for s in stores for folder in (s.trials, s.runs, s.failed) for p in folder.glob("*")]
     libraries = [version(name) for name in ("jinja2", "matplotlib", "numpy", "pandas", "scipy", "seaborn")]

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ipe_bench.basics.files import write_text
-from ipe_bench.real.tracks import SEARCHES, Log, LogTracks, far_below
-from ipe_bench.report.answer import as_json, labelled, read_from, with_error
-from ipe_bench.report.table import Part, Shown, Strong, Table, interval, texts, words
+from ipe_bench.real.logs import SEARCHES, Log, LogTracks, far_below
+from ipe_bench.report.page.answer import as_json, labelled, read_from, with_error
+from ipe_bench.report.page.writer import write_files
+from ipe_bench.report.tables.table import Part, Shown, Strong, Table, interval, texts, words
 from ipe_bench.report.words import enumerate_few, p_value, short
-from ipe_bench.report.writer import write_files
 from ipe_bench.statistics.verdicts import NO_VERDICT, shown
 
 if TYPE_CHECKING:

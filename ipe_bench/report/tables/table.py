@@ -256,7 +256,7 @@ def environment() -> Environment:
     from markupsafe import Markup, escape
 
     made = Environment(
-        loader=PackageLoader("ipe_bench.report", "templates"),
+        loader=PackageLoader("ipe_bench.report.page", "templates"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

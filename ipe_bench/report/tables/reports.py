@@ -8,8 +8,8 @@ from typing import Any
 
 import pandas as pd
 
-from ipe_bench.report.table import Column, Table, column, words
-from ipe_bench.report.terminal import leading, overview_columns, overview_notes, statistics
+from ipe_bench.report.tables.table import Column, Table, column, words
+from ipe_bench.report.tables.terminal import leading, overview_columns, overview_notes, statistics
 from ipe_bench.report.words import p_value, percent, short, value_text
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.certified import certified_averages, certified_table, published_table

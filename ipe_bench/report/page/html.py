@@ -6,10 +6,10 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from ipe_bench.report.headline import about, headline
-from ipe_bench.report.table import Part, Table, environment, words
+from ipe_bench.report.page.headline import about, headline
+from ipe_bench.report.page.writer import Page, digests
+from ipe_bench.report.tables.table import Part, Table, environment, words
 from ipe_bench.report.words import public
-from ipe_bench.report.writer import Page, digests
 from ipe_bench.runs.parts import TRUTH
 from ipe_bench.statistics.comparisons import TIE
 from ipe_bench.statistics.records import SCORES, STATISTICS

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from ipe_bench.report.table import Cell, Column, Part, Table, column, interval, sort_key, words
+from ipe_bench.report.tables.table import Cell, Column, Part, Table, column, interval, sort_key, words
 from ipe_bench.report.words import (
     brief,
     cost,

@@ -18,7 +18,7 @@ from ipe_bench import __version__
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.files import regular, write_text
 from ipe_bench.report.style import PAGE, house_style
-from ipe_bench.report.table import Part, Table, environment
+from ipe_bench.report.tables.table import Part, Table, environment
 from ipe_bench.report.words import CITATION, public
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ class Page:
         """Renders it, with the style, the script and the citation of every page."""
         from markupsafe import Markup
 
-        templates = resources.files("ipe_bench.report") / "templates"
+        templates = resources.files("ipe_bench.report.page") / "templates"
         style, script = (Markup((templates / f"report.{kind}").read_text(encoding="utf-8")) for kind in ("css", "js"))
         constant = {"style": style, "script": script, "citation": CITATION, "version": __version__, "public": public}
         return environment().get_template("page.html.j2").render(**vars(self), **constant)

@@ -34,8 +34,8 @@ from ipe_bench.statistics.verdicts import (
     TOO_CAUTIOUS,
     WRONG,
 )
+from ipe_bench.trials.paths import track_safely
 from ipe_bench.trials.thresholds import FIT_LEVEL, GATE
-from ipe_bench.trials.tracking import track_safely
 from ipe_bench.trials.whiteness import white_p
 
 _SAME_TIME = 1e-3
