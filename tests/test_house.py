@@ -12,13 +12,14 @@ HOUSE = Path(ipe_bench.__file__).parent
 LINE = [
     *(
         ["basics"],
+        ["engine"],
         ["measurements"],
         ["noise", "priors", "states"],
         ["estimators"],
         ["solvers", "baselines"],
         ["trials"],
     ),
-    *(["runs"], ["statistics"], ["real", "plugins"], ["report"], ["api"], ["cli"]),
+    *(["runs"], ["statistics"], ["real", "plugins"], ["report"], ["questions", "workshop"], ["api"], ["cli"]),
 ]
 PLACE = {room: place for place, rooms in enumerate(LINE) for room in rooms}
 HEAVY_BELOW = {"matplotlib": "report", "seaborn": "report", "hydra": "cli", "omegaconf": "cli", "rich": "report"}

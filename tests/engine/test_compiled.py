@@ -139,7 +139,7 @@ print("ipe_bench.engine.emit" in sys.modules)
     assert [run.stdout.strip() for run in said] == ["True", "False"]
 
 
-@pytest.mark.parametrize("module", ["basics.compiled", "measurements.ode.emit"])
+@pytest.mark.parametrize("module", ["engine.compiled", "engine.emit"])
 def test_what_machine_code_comes_from_is_part_of_the_source_that_results_depend_on(monkeypatch, module):
     """It is imported only where something is compiled, and yet a change to it makes stored results those of other
     code."""
