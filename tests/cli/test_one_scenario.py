@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 import ipe_bench as ib
-from ipe_bench.report import questions
+from ipe_bench.questions.posterior import answer
 
 SMALL = ("measurement=polynomial", "noise=gaussian", "noise.deviation=0.01")
 
@@ -71,6 +71,6 @@ def test_posteriors_exit_with_1_unless_the_populations_of_every_trial_agree(ipe_
     """Of two trials: what they agree on is made up here."""
     found = [SimpleNamespace(posterior=SimpleNamespace(settled=one)) for one in settled]
     monkeypatch.setattr(ib, "posterior", lambda *args, **options: found)
-    monkeypatch.setattr(questions, "write_posteriors", lambda folder, *args: [folder / "posterior.json"])
-    monkeypatch.setattr(questions, "posterior_parts", lambda *args: [])
+    monkeypatch.setattr(answer, "write_posteriors", lambda folder, *args: [folder / "posterior.json"])
+    monkeypatch.setattr(answer, "posterior_parts", lambda *args: [])
     assert ipe_bench("posterior", *SMALL, "trials=2")[0] == (0 if all(settled) else 1)

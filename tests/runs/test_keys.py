@@ -115,7 +115,7 @@ def test_the_source_of_a_result_is_in_the_rooms_that_draw_estimate_and_score():
     modules = {cls.__module__ for cls in component_classes(Scenario(Polynomial(), Gaussian(0.01)))}
     covered = set[str]().union(*map(provenance._import_closure, ["ipe_bench.trials.scoring", *modules]))
     rooms = {module.split(".")[1] for module in covered}
-    assert rooms == {"basics", "measurements", "noise", "priors", "estimators", "solvers", "trials"}
+    assert rooms == {"basics", "engine", "measurements", "noise", "priors", "estimators", "solvers", "trials"}
     assert {"ipe_bench.trials.scenario", "ipe_bench.measurements.polynomial"} <= covered
 
 

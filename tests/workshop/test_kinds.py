@@ -13,7 +13,6 @@ import pytest
 from shared.small_models import Bent
 
 from ipe_bench import Scenario, check
-from ipe_bench.cli.listing import KINDS
 from ipe_bench.cli.main import main
 from ipe_bench.noise import Gaussian
 from ipe_bench.plugins import discovery
@@ -23,7 +22,7 @@ from ipe_bench.report import figures
 from ipe_bench.runs.execution import Event, Execution, Serial
 from ipe_bench.statistics.registry import add_statistics
 from ipe_bench.workshop.conformance import check_component
-from ipe_bench.workshop.kinds import RECORDS
+from ipe_bench.workshop.kinds import KINDS, RECORDS
 
 SMALL = ("measurement=polynomial", "noise=gaussian", "trials=8", "execution=serial", "output=out")
 MAIN = "figures=main"

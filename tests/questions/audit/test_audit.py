@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.cli.results import audit_command
+from ipe_bench.cli.questions import question_command
 from ipe_bench.questions.audit.maths import Claims, _tails, _worst_direction, audit, read_claims
 
 
@@ -211,7 +211,7 @@ def test_an_infinite_error_is_the_worst_there_is(far, tmp_path):
     assert found.table()["covariance"].tolist() == ["too small", whole.each[1].verdict]
     assert found.claims.left_out == 0
     table.to_csv(tmp_path / "runs.csv", index=False)
-    assert audit_command([str(tmp_path / "runs.csv")]) == 1
+    assert question_command("audit", [str(tmp_path / "runs.csv")]) == 1
     assert audit(read_claims(table.head(15))).sentences[0].endswith("in 1 of 15 runs: the covariance is too small.")
 
 
@@ -265,7 +265,7 @@ def test_sentence_verdict_and_exit_code_say_the_same(tmp_path, capsys):
         assert (f"the covariance is {found.verdict}" in found.sentences[0]) == wrong
         assert wrong == (not found.scale.low <= 1 <= found.scale.high)
         assert [f.verdict for f in found.each] == [found.verdict] == found.table()["covariance"].tolist()
-        assert audit_command([str(tmp_path / "runs.csv")]) == wrong
+        assert question_command("audit", [str(tmp_path / "runs.csv")]) == wrong
         assert found.sentences[0] in " ".join(capsys.readouterr().out.split())
         seen.add(found.verdict)
     assert {"too small", "undecided"} <= seen
