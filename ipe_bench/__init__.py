@@ -47,7 +47,6 @@ _HOMES = {
     "trials.paths": ("StateScenario",),
 }
 """Public names, by the module that they are in."""
-_RENAMED = {"Track": "ConstantFilter", "Tracking": "StateScenario"}
 _ROOMS = ("baselines", "measurements", "noise", "priors", "solvers", "states")
 __all__ = sorted(["__version__", *_ROOMS, *itertools.chain(*_HOMES.values())])  # pyright: ignore[reportUnsupportedDunderAll]
 
@@ -59,10 +58,6 @@ del globals()["report"]
 def __getattr__(name: str) -> Any:
     if name in _ROOMS:
         return importlib.import_module(f"{__name__}.{name}")
-    if name in _RENAMED:
-        from ipe_bench.basics.errors import renamed
-
-        return renamed(__name__, name, _RENAMED[name])
     for module, names in _HOMES.items():
         if name in names:
             return getattr(importlib.import_module(f"{__name__}.{module}"), name)

@@ -5,7 +5,6 @@ import inspect
 import os
 import sys
 import traceback
-import warnings
 from collections.abc import Iterable, Sequence
 from types import ModuleType
 from typing import Any
@@ -130,9 +129,3 @@ def without_modules(room: str, names: Sequence[str]) -> None:
         raise AttributeError(f"{room}.{name}: {moved(name) or unknown(name, names, 'name')}")
 
     content["__getattr__"] = missing
-
-
-def renamed(room: str, old: str, new: str) -> Any:
-    """Returns what a room calls `new` now, and warns that its `old` name goes with the next version."""
-    warnings.warn(f"{room}.{old}: is called {new} now; the old name goes with the next version", FutureWarning, 3)
-    return getattr(sys.modules[room], new)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
-import re
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -91,14 +90,6 @@ def places_and_keys(command: str, words: Sequence[str], kinds: Mapping[str, Any]
                 value = float(text) if kinds[key] is float else int(text)
         found[key] = checked(value, kinds[key], key)
     return places, found
-
-
-def renamed(words: Sequence[str]) -> list[str]:
-    """Writes state_model for `model`, the name of this group in earlier versions, and says so in a line on stderr."""
-    new = [re.sub(r"^(\+*)model(?=$|/|(\.[\w.]+)?=)", r"\1state_model", word) for word in words]
-    if old := " ".join(word for word in words if word not in new):
-        print_problems([f"{old}: model is called state_model now; write {' '.join(w for w in new if w not in words)}"])
-    return new
 
 
 def refuse_blanks(words: Sequence[str]) -> None:

@@ -2,6 +2,8 @@
 
 from typing import NamedTuple
 
+from ipe_bench.report.formats import MEANING
+
 
 class Key(NamedTuple):
     """A key of the config, or a word that stands for several."""
@@ -52,7 +54,7 @@ _ROWS = (
     ),
     ("folder", "default_name=NAME", ""),
     ("figures", "figures=main", "figures to draw: main, all or none"),
-    ("run", "formats=pdf,md,tex", "file formats besides PNG of figures (pdf, svg) and CSV of tables (md, tex)"),
+    ("run", "formats=pdf,md,tex", MEANING),
     ("run", "block_size=N", "trials that are computed at once; it changes no number"),
     (
         "run",

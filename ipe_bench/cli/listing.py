@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Mapping, Sequence
 
 from ipe_bench.basics.errors import UserError, unknown
-from ipe_bench.cli import print_problems, renamed, say, show
+from ipe_bench.cli import print_problems, say, show
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.construct import construct, described
@@ -20,7 +20,7 @@ def list_command(names: Sequence[str], verbose: bool) -> int:
     """Prints one line per option of each group, with its own options if `verbose`; for GROUP/NAME only that option."""
     print_problems(plugins.take_problems())
     known = [*plugins.groups(), *({"statistic", "figure"} - set(plugins.groups()))]
-    for name in renamed(names) or plugins.groups():
+    for name in names or plugins.groups():
         group, slash, option = name.partition("/")
         if group not in known:
             homes = " or ".join(f"{o.group}/{o.name}" for o in plugins.options() if o.name == name)

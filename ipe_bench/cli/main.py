@@ -18,7 +18,7 @@ from ipe_bench.basics.errors import StorageError, UserError, shortened, unknown
 from ipe_bench.basics.visible import VisibleStream
 from ipe_bench.cli import discard_output
 from ipe_bench.cli.parser import COMMANDS, parser_of, program
-from ipe_bench.cli.questions import QUESTIONS, question_command
+from ipe_bench.cli.questions import QUESTIONS, question_command, without_flags
 from ipe_bench.report.page.writer import COMMAND
 
 HOMES = {
@@ -122,6 +122,6 @@ def _dispatch(words: list[str]) -> int:
         parser.print_help()
         return 0
     if command in QUESTIONS:
-        return question_command(command, rest)
+        return question_command(command, parser.parse(without_flags(command, rest)).arguments)
     begin = getattr(importlib.import_module(f"ipe_bench.cli.{HOMES[command]}"), f"{command}_command")
     return begin(rest) if command == "run" else begin(**vars(parser.parse(rest)))

@@ -9,6 +9,7 @@ from typing import Any, NoReturn
 from ipe_bench.basics.errors import UserError, did_you_mean, unknown
 from ipe_bench.cli.keys import ROWS
 from ipe_bench.cli.questions import QUESTIONS, question
+from ipe_bench.report.formats import MEANING
 from ipe_bench.workshop.kinds import KINDS, MODELS
 
 _ABOUT = """\
@@ -93,7 +94,7 @@ output=DIR          folder of the files, which are listed at the end: by default
     "report": (
         "tables, figures and report of what is stored",
         _MISSING,
-        """
+        f"""
 The report is made from stored results alone.
 
   ipe-bench report DIR                            into DIR itself
@@ -105,7 +106,7 @@ columns=NAMES        columns of the tables, in this order; an unknown name is re
 width=INCHES         width of a figure or table: 3.5 for one column, 7.16 for two
 
 figures=all          figures to draw: all, main (the few that answer the question; the default) or none
-formats=pdf,md,tex   file formats besides PNG of figures (pdf, svg) and CSV of tables (md, tex)
+formats=pdf,md,tex   {MEANING}
 """,
         {"arguments": _several("DIR", "folders of results, such as outputs/paper")},
     ),

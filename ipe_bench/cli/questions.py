@@ -49,18 +49,18 @@ def question_command(name: str, arguments: Sequence[str]) -> int:
     """Answers a question, shows the answer, and returns the exit code."""
     row = QUESTIONS[name]
     record = question(name)
-    words = without_flags(name, arguments, record)
     if row.without is None:
-        places, options = places_and_keys(name, words, record.options)
+        places, options = places_and_keys(name, arguments, record.options)
         return _shown(record.run(places, **options))
-    own = [word for word in words if word.partition("=")[0] in record.options]
+    own = [word for word in arguments if word.partition("=")[0] in record.options]
     options = places_and_keys(name, own, record.options)[1]
-    asked = _asked(name, [word for word in words if word not in own], row)
+    asked = _asked(name, [word for word in arguments if word not in own], row)
     return _shown(record.run(asked, **options))
 
 
-def without_flags(name: str, arguments: Sequence[str], record: Question) -> list[str]:
+def without_flags(name: str, arguments: Sequence[str]) -> list[str]:
     """Writes --KEY VALUE of earlier versions as KEY=VALUE, and says so in a line on stderr."""
+    record = question(name)
     words: list[str] = []
     values: dict[str, list[str]] = {}
     rest = list(arguments)

@@ -10,7 +10,8 @@ from typing import Any
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import console, places_and_keys, print_problems, say, show
 from ipe_bench.questions.question import NAMES
-from ipe_bench.report.style import PAGE, Which, drawn_settings
+from ipe_bench.report.formats import PAGE
+from ipe_bench.report.style import Which, drawn_settings
 from ipe_bench.report.tables.table import Table, texts, words
 from ipe_bench.runs.bundles import BUNDLES, SUFFIX, is_bundle, opened, read_bundle, write_bundle
 from ipe_bench.runs.parts import TRUTH

@@ -66,11 +66,6 @@ def session(folder: Path | None = None) -> Iterator[None]:
     for name in FORMULAS:
         node = {"_target_": "ipe_bench.measurements.Nist", "dataset": name}
         store.store(name.lower(), node, group="measurement/nist", package="measurement", provider="ipe-bench")
-    for option in plugins.options("state_model"):  # which earlier versions call model, in experiments and plugins
-        home = option.path.relative_to(option.source.conf).parts[0]
-        for group in {"model", "state_model"} - {home}:
-            node = {"defaults": [f"/{home}/{option.name}@_here_"]}
-            store.store(option.name, node, group=group, package="state_model", provider="ipe-bench")
     if PluginConfigs not in registry.discover(SearchPathPlugin):
         registry.register(PluginConfigs)
     PluginConfigs.folder = folder
@@ -161,17 +156,8 @@ def _spec(job: Sequence[Override]) -> Spec:
 def _composed(words: tuple[str, ...], *, whole: bool = False) -> DictConfig:
     try:
         config = compose("config", list(words), return_hydra_config=True)
-        if "model" in config:  # the key of state_model in experiments of earlier versions
-            content: Any = OmegaConf.to_container(config.model)
-            old = w.options_of("state_model", content, "model")
-            config = compose("config", [*(f"++{word}" for word in old), *words], return_hydra_config=True)
-            with open_dict(config):
-                del config["model"]
     except Exception as error:  # what Hydra makes of overrides raises nearly anything
         raise explain(error) from error
-    chosen = config.hydra.runtime.choices
-    if chosen.get("model") and chosen.state_model:
-        raise UserError(f"state_model={chosen.state_model}: the experiment overrides /model; write /state_model there")
     if not whole:
         with open_dict(config):
             del config["hydra"]

@@ -20,7 +20,8 @@ from ipe_bench.noise import ModelNoise, Noise
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.construct import construct, instantiate, known_parameters
 from ipe_bench.priors import GaussianPrior, Prior
-from ipe_bench.report.style import PAGE, Which, file_formats, which_figures
+from ipe_bench.report.formats import PAGE
+from ipe_bench.report.style import Which, file_formats, which_figures
 from ipe_bench.runs.execution import Execution
 from ipe_bench.runs.provenance import TARGET, canonical_json, describe
 from ipe_bench.states.base import StateModel

@@ -20,7 +20,7 @@ from hydra.core.override_parser.types import ChoiceSweep, Glob, Override, Overri
 from hydra.errors import HydraException
 
 from ipe_bench.basics.errors import UserError, nearest, unknown
-from ipe_bench.cli import refuse_blanks, renamed
+from ipe_bench.cli import refuse_blanks
 from ipe_bench.cli.keys import SETTING_NOTHING, WHOLE
 from ipe_bench.cli.spec import KEYS
 from ipe_bench.measurements.nist import FORMULAS
@@ -112,7 +112,7 @@ def read(command: str, words: Sequence[str], folder: Path | None = None) -> Word
     groups = _groups(folder)
     found: list[Override] = []
     files: dict[str, str] = {}
-    for word in renamed(words):
+    for word in words:
         parts = [_parse(command, part, groups) for part in _expanded(word)]
         found += parts
         if _FILE.fullmatch(word):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import ipe_bench as ib
 from ipe_bench.basics.errors import UserError
-from ipe_bench.cli import print_problems, renamed, say
+from ipe_bench.cli import print_problems, say
 from ipe_bench.cli.main import main
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.workshop.ci import write_ci
@@ -86,6 +86,5 @@ def new_command(kind: str, name: str | None, language: str | None = None) -> int
         written = write_skill(Path(name), main)
         print(f"{name} is ready: {', '.join(path.name for path in written)}")
         return 0
-    (known,) = renamed([kind])
-    print(new(known, name, language))
+    print(new(kind, name, language))
     return 0

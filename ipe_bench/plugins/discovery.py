@@ -295,9 +295,6 @@ def options(group: str | None = None) -> list[Option]:
     for source in sources():
         for path in sorted(source.conf.glob("*/**/*.yaml")):
             folder, *name = path.relative_to(source.conf).with_suffix("").parts
-            if folder == "model":  # its name in earlier versions
-                folder = "state_model"
-                _problems[f"plugin {path.parent}: model is called state_model now; rename the folder"] = None
             option = Option(folder, "/".join(name), path, source)
             # Solvers and baselines share their labels: of two with one label, only one would run.
             place = ("estimator", option.label) if folder in ESTIMATOR_GROUPS else (folder, option.name)

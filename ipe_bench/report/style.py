@@ -11,18 +11,12 @@ from typing import Any, Literal, cast, get_args
 from zlib import crc32
 
 from ipe_bench.basics.errors import UserError
+from ipe_bench.report.formats import FORMATS, PAGE, TABLES
 
 Which = Literal["all", "main", "none"]
 """All figures that the data allow, the few that answer the question, or none."""
 MOST_SETTINGS, FIRST_SETTINGS = 6, 2
 """Settings with figures of their own: that many, or of more the first few unless all figures are asked for."""
-PAGE = "png"
-"""The format that is always written, as the page shows it."""
-FIGURES = (PAGE, "pdf", "svg")
-"""Formats of figures."""
-TABLES = ("csv", "md", "tex")
-"""Formats of tables: the first is always written."""
-FORMATS = (*FIGURES, *TABLES)
 FAMILIES: dict[str, tuple[str, ...]] = {
     "IPE": ("#0f7f8f", "#86a9e0", "#5b76b8", "#3648c9"),
     "filters": ("#8c2d04", "#c08a00", "#c2273d", "#f08a6c"),

@@ -12,8 +12,9 @@ import pandas as pd
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.report.figures import drawings
+from ipe_bench.report.formats import PAGE
 from ipe_bench.report.page.run import ReportResult, begin_report
-from ipe_bench.report.style import PAGE, house_style
+from ipe_bench.report.style import house_style
 from ipe_bench.report.tables.reports import certified_tables
 from ipe_bench.report.tables.table import html, plain_text
 from ipe_bench.report.tables.terminal import summary_tables

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 import re
 import tempfile
 import zipfile
@@ -22,8 +21,6 @@ from ipe_bench.runs.results import Results
 from ipe_bench.runs.store import Store
 
 MANIFEST = "SHA256SUMS"
-_OLDER = "manifest.json"
-"""The manifest of bundles of version 0.2, in JSON."""
 SUFFIX = ".zip"
 BUNDLES = "bundles"
 """Folder of unpacked bundles, below a report on them."""
@@ -31,7 +28,7 @@ _FILE = re.compile(r"(trials|runs|failed)/[A-Za-z0-9][A-Za-z0-9._-]{0,150}\.(par
 _FOLDER = re.compile(r"(?!(?i:con|prn|aux|nul|com\d|lpt\d)(\.|$))[A-Za-z0-9]([A-Za-z0-9._=,+-]{0,98}[A-Za-z0-9])?")
 """Names that mean the same on every system."""
 _MOST_COMPRESSED = 100
-"""Bytes that a byte of a bundle may stand for; in bundles of version 0.2 those of records stand for 10."""
+"""Bytes that a byte of a bundle may stand for; those of records stand for 10."""
 
 
 @dataclass(frozen=True)
@@ -105,13 +102,10 @@ def read_bundle(path: Path) -> Bundle:
                     f"{path}: would unpack to over {_MOST_COMPRESSED} times its size; the bundle is not read"
                 )
             there = set(archive.namelist())
-            kind = MANIFEST if MANIFEST in there else _OLDER
-            manifest = archive.read(kind)
+            manifest = archive.read(MANIFEST)
             lines = [line.partition("  ") for line in manifest.decode().splitlines()]
             digests = {name: digest for digest, _, name in lines}
-            if kind == _OLDER:
-                digests = dict(json.loads(manifest)["files"])
-            for name in sorted({*digests, *there} - {kind}):
+            for name in sorted({*digests, *there} - {MANIFEST}):
                 folder, _, file = name.partition("/")
                 if not (_FOLDER.fullmatch(folder) and _FILE.fullmatch(file)):
                     raise UserError(f"{path}: {name!r} is no name of a result; the bundle is not read")

@@ -25,15 +25,10 @@ WITHOUT_NUMBERS = tuple(
     f"ipe_bench.{name}"
     for name in (
         *("basics.definitions", "basics.errors", "basics.files", "basics.machine", "basics.statuses"),
-        *("runs", "statistics", "real", "plugins", "report", "api", "cli"),
+        *("runs", "statistics", "real", "plugins", "report", "questions", "workshop", "api", "cli"),
     )
 )
 """Modules and rooms that no number of a trial comes from: they word messages, name, store, summarise and show."""
-_RENAMED = {
-    "ipe_bench.states.Recorded": "ipe_bench.states.RecordedFormulas",
-    "ipe_bench.trials.Tracking": "ipe_bench.trials.StateScenario",
-}
-"""Classes that results of version 0.2 call otherwise."""
 
 
 def describe(value: Any) -> Any:
@@ -65,8 +60,7 @@ def identified(value: Any) -> Any:
 
 def _found_by(target: str) -> str:
     package, *modules, name = target.split(".")
-    target = ".".join((package, *modules[:1], name)) if package == "ipe_bench" else target
-    return _RENAMED.get(target, target)
+    return ".".join((package, *modules[:1], name)) if package == "ipe_bench" else target
 
 
 def canonical_json(value: Any) -> str:

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from ipe_bench.basics.errors import renamed, unknown
+from ipe_bench.basics.errors import unknown
 from ipe_bench.states.base import Fault, Normal, Paths, StateModel
 from ipe_bench.states.bounds import bound_at_truth, posterior_bounds
 from ipe_bench.states.damped import LevenbergMarquardtSmoother
@@ -43,10 +43,7 @@ __all__ = [
     "posterior_bounds",
     "ukf",
 ]
-_RENAMED = {"Gaussian": "Normal", "Recorded": "RecordedFormulas"}
 
 
 def __getattr__(name: str) -> Any:
-    if name in _RENAMED:
-        return renamed(__name__, name, _RENAMED[name])
     raise AttributeError(f"{__name__}.{name}: {unknown(name, __all__, 'name')}")

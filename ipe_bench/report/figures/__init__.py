@@ -14,7 +14,8 @@ from ipe_bench.basics.files import make_folder, regular, write_text
 from ipe_bench.plugins.extensions import added, require_type
 from ipe_bench.report.figures.drawing import Drawing, Drawn
 from ipe_bench.report.figures.views import Figure, View, views
-from ipe_bench.report.style import FORMATS, PAGE, Which, house_style
+from ipe_bench.report.formats import FORMATS, PAGE
+from ipe_bench.report.style import Which, house_style
 from ipe_bench.statistics.analysis import Analysis
 
 FIGURES = ("errors", "costs", "parameters")

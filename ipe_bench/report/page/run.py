@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 from ipe_bench.basics.files import regular, write_text
 from ipe_bench.plugins.extensions import files_of_records, use_statistics
-from ipe_bench.report.style import FIGURES, PAGE, Which, file_formats, which_figures
+from ipe_bench.report.formats import FIGURES, PAGE
+from ipe_bench.report.style import Which, file_formats, which_figures
 from ipe_bench.report.tables.table import Part, Shown
 from ipe_bench.runs.store import Store
 

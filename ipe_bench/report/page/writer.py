@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, Any
 from ipe_bench import __version__
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.files import regular, write_text
-from ipe_bench.report.style import PAGE, house_style
+from ipe_bench.report.formats import PAGE
+from ipe_bench.report.style import house_style
 from ipe_bench.report.tables.table import Part, Table, environment
 from ipe_bench.report.words import CITATION, public
 

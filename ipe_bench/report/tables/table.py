@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ipe_bench.basics.files import write_text
+from ipe_bench.report.formats import TABLES
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -279,7 +280,7 @@ def html(parts: Iterable[Part]) -> str:
 
 def write_table(table: Table, folder: Path, formats: Sequence[str]) -> list[Path]:
     """Writes one table in those of the formats that are of tables; as CSV unless another file has it whole."""
-    writers = {"csv": comma_separated, "md": markdown, "tex": latex}
+    writers: dict[str, Any] = dict(zip(TABLES, (comma_separated, markdown, latex), strict=True))
     own = table.whole in ("", f"{folder.name}/{table.name}.csv")
     files = {kind: folder / f"{table.name}.{kind}" for kind in writers if kind in formats and (own or kind != "csv")}
     for kind, path in files.items():
