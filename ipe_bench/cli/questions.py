@@ -49,18 +49,19 @@ def question_command(name: str, arguments: Sequence[str]) -> int:
     """Answers a question, shows the answer, and returns the exit code."""
     row = QUESTIONS[name]
     record = question(name)
+    known = record.options()
     if row.without is None:
-        places, options = places_and_keys(name, arguments, record.options)
+        places, options = places_and_keys(name, arguments, known)
         return _shown(record.run(places, **options))
-    own = [word for word in arguments if word.partition("=")[0] in record.options]
-    options = places_and_keys(name, own, record.options)[1]
+    own = [word for word in arguments if word.partition("=")[0] in known]
+    options = places_and_keys(name, own, known)[1]
     asked = _asked(name, [word for word in arguments if word not in own], row)
     return _shown(record.run(asked, **options))
 
 
 def without_flags(name: str, arguments: Sequence[str]) -> list[str]:
     """Writes --KEY VALUE of earlier versions as KEY=VALUE, and says so in a line on stderr."""
-    record = question(name)
+    known = question(name).options()
     words: list[str] = []
     values: dict[str, list[str]] = {}
     rest = list(arguments)
@@ -68,7 +69,7 @@ def without_flags(name: str, arguments: Sequence[str]) -> list[str]:
         word = rest.pop(0)
         flag, equals, value = word.partition("=")
         key = flag.removeprefix("--")
-        if key == flag or key not in record.options:
+        if key == flag or key not in known:
             words.append(word)
             continue
         if not equals:
@@ -77,7 +78,7 @@ def without_flags(name: str, arguments: Sequence[str]) -> list[str]:
             value = rest.pop(0)
         values.setdefault(key, []).append(value)
     for key, given in values.items():
-        several = record.options[key] is NAMES and len(given) > 1
+        several = known[key] is NAMES and len(given) > 1
         new = f"{key}=[{','.join(given)}]" if several else f"{key}={given[-1]}"
         print_problems([f"{name}: --{key}: options have no dashes any more; write {new}"])
         words.append(new)

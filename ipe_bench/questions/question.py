@@ -1,9 +1,12 @@
-"""Defines what the command line needs to know of a question: its help, its options, and what answers it."""
+"""Defines what the command line needs to know of a question: its help, its options, and what answers it.
+
+A `command.py` imports what answers only when it is asked, so that help is quick.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -56,5 +59,5 @@ class Question:
     """Placeholder of its arguments, and their meaning."""
     run: Callable[..., Answered]
     """Answers, given the scenario that was `Asked` or the folders and files, and the options by name."""
-    options: Mapping[str, Any] = field(default_factory=dict)
-    """Types of its own options KEY=VALUE."""
+    options: Callable[[], Mapping[str, Any]]
+    """Returns the types of its own options KEY=VALUE."""

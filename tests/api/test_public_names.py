@@ -33,21 +33,6 @@ def test_every_public_name_is_there_and_explains_itself():
         assert name == "__version__" or inspect.getdoc(thing), name
 
 
-@pytest.mark.parametrize(
-    ("room", "old", "new"),
-    [
-        (ib, "Track", "ConstantFilter"),
-        (ib, "Tracking", "StateScenario"),
-        (ib.states, "Gaussian", "Normal"),
-        (ib.states, "Recorded", "RecordedFormulas"),
-    ],
-)
-def test_a_name_of_the_version_before_works_and_says_what_it_is_called_now(room, old, new):
-    with pytest.warns(FutureWarning, match=rf"{old}: is called {new} now") as warned:
-        assert getattr(room, old) is getattr(room, new)
-    assert warned[0].filename == __file__, "the line of the user"
-
-
 CONTRACTS = {place: resolve_name(place) for places in discovery.CONTRACTS.values() for place in places}
 
 

@@ -19,7 +19,6 @@ from ipe_bench.cli.keys import ROWS, WHOLE
 from ipe_bench.cli.main import COMMANDS, main
 from ipe_bench.cli.spec import KEYS, PARTS, Spec
 from ipe_bench.report import figures
-from ipe_bench.statistics.collect import collect
 from ipe_bench.statistics.records import SCORES, STATISTICS
 
 ROOT = Path(__file__).parents[2]
@@ -259,27 +258,6 @@ def test_help_is_quick_to_load_and_names_the_commands():
     result = subprocess.run([sys.executable, "-c", LOADED], capture_output=True, text=True, check=True)
     assert "ipe-bench estimate" in result.stdout
     assert result.stdout.strip().endswith("[]")
-
-
-@pytest.mark.slow
-def test_the_word_model_of_earlier_versions_chooses_and_sets_a_state_model_still(tmp_path, ipe_bench):
-    _, now, _ = ipe_bench("run", "state_model=pendulum", "state_model.count=9", "tracker=[ekf]", "--cfg=job")
-    code, old, err = ipe_bench("run", "model=pendulum", "model.count=9", "tracker=[ekf]", "--cfg=job")
-    assert (code, old) == (0, now)
-    assert err.endswith("model is called state_model now; write state_model=pendulum state_model.count=9\n")
-    (tmp_path / "experiment").mkdir()
-    text = "# @package _global_\ndefaults: [override /model: pendulum]\nname: old\nmodel: {count: 9, start: {angle: 1}}"
-    (tmp_path / "experiment" / "old.yaml").write_text(text)
-    words = ("+experiment=old", "state_model.start.angle=2", "tracker=[ekf]", "trials=2", "figures=none")
-    code, _, err = ipe_bench("run", "-cd", str(tmp_path), *words)
-    assert code == 0
-    assert err.startswith("ipe-bench: +experiment=old: model is called state_model now; write that there\n")
-    (group,) = collect([tmp_path / "outputs" / "old"]).groups
-    model = group.footer["identity"]["scenario"]["model"]
-    assert (model["count"], model["start"]["angle"]) == (9, 2)
-    code, _, err = ipe_bench("run", "-cd", str(tmp_path), "+experiment=old", "state_model=growth")
-    assert code == 2
-    assert "state_model=growth: the experiment overrides /model; write /state_model there" in err
 
 
 def test_a_plugin_without_its_header_or_with_a_taken_name_is_refused(tmp_path):

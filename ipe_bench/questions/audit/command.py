@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.questions.audit.answer import audited
 from ipe_bench.questions.question import Answered, Question
 
 _MORE = """
@@ -19,6 +19,8 @@ any; or long: run, parameter, true, estimate, std. Rows of one run have its numb
 
 def answer(files: Sequence[str], output: str | None = None) -> Answered:
     """Returns whether reported covariances describe the errors; exit code 1 if there is evidence that they do not."""
+    from ipe_bench.questions.audit.answer import audited
+
     if len(files) != 1:
         raise UserError("audit: name one table of truths, estimates and deviations, such as runs.csv")
     found = audited(files[0], output)
@@ -26,10 +28,15 @@ def answer(files: Sequence[str], output: str | None = None) -> Answered:
     return Answered(found.parts(), 1 if found.scale.wrong else 0, lines=lines)
 
 
+def options() -> Mapping[str, Any]:
+    """Returns the types of its options."""
+    return {"output": str}
+
+
 QUESTION = Question(
     codes="0 it may; 1 it is surely too small or too large",
     more=_MORE,
     argument=("FILE", "a table of truths, estimates and reported covariances"),
     run=answer,
-    options={"output": str},
+    options=options,
 )

@@ -2,27 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.questions.compare.answer import compared_folders
-from ipe_bench.questions.compare.maths import MARGINS
 from ipe_bench.questions.question import NAMES, Answered, Question
 
-_OPTIONS = {
-    "first": str,
-    "second": str,
-    "alpha": float,
-    "anytime": bool,
-    "fail_on": NAMES,
-    "power": float,
-    "difference": float,
-    "output": str,
-    "complete": bool,
-    **{f"margin.{name}": float for name in MARGINS},
-}
 _MORE = """
 Stored results are compared, so run both first. Equal trials are paired; those of other seeds, in their order.
 
@@ -40,20 +26,40 @@ output=DIR           writes comparison.csv and comparison.html there
 """
 
 
-def answer(folders: Sequence[str], **options: Any) -> Answered:
+def answer(folders: Sequence[str], **given: Any) -> Answered:
     """Returns the tables; exit code 1 where the second is worse, or lacks what was asked for."""
+    from ipe_bench.questions.compare.answer import compared_folders
+
     if not 1 <= len(folders) <= 2:
         raise UserError("compare: name one or two folders of results, such as outputs/before outputs/after")
-    margins = {key.partition(".")[2]: options.pop(key) for key in list(options) if key.startswith("margin.")}
+    margins = {key.partition(".")[2]: given.pop(key) for key in list(given) if key.startswith("margin.")}
     first, *others = ([Path(folder)] for folder in folders)
-    frame = compared_folders(first, *others, margins=margins, **options)
+    frame = compared_folders(first, *others, margins=margins, **given)
     told = frame.attrs
     lines = [f"worse: {line}" for line in told["worse"]]
-    if "output" in options:
-        output = options["output"]
+    if "output" in given:
+        output = given["output"]
         lines = [f"\nTable   {output}/comparison.csv", f"Page    {output}/comparison.html", *lines]
     problems = [*told["problems"], *told["stale"], *told["notes"]]
     return Answered(frame.parts(), 1 if told["worse"] or told["problems"] else 0, problems, lines=lines)
+
+
+def options() -> Mapping[str, Any]:
+    """Returns the types of its options."""
+    from ipe_bench.questions.compare.maths import MARGINS
+
+    return {
+        "first": str,
+        "second": str,
+        "alpha": float,
+        "anytime": bool,
+        "fail_on": NAMES,
+        "power": float,
+        "difference": float,
+        "output": str,
+        "complete": bool,
+        **{f"margin.{name}": float for name in MARGINS},
+    }
 
 
 QUESTION = Question(
@@ -61,5 +67,5 @@ QUESTION = Question(
     more=_MORE,
     argument=("DIR", "one or two folders of results"),
     run=answer,
-    options=_OPTIONS,
+    options=options,
 )

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any, Literal
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.options import Count
-from ipe_bench.plugins.extensions import richer_models
-from ipe_bench.questions.design.answer import READINGS, design_parts, designed, write_design
 from ipe_bench.questions.question import NAMES, Answered, Asked, Question
-from ipe_bench.runs.provenance import describe
 
 _MORE = """
   ipe-bench design measurement=ranging error_scale=10
@@ -28,23 +25,34 @@ output=DIR           folder of the files
 """
 
 
-def answer(asked: Asked, **options: Any) -> Answered:
+def answer(asked: Asked, **given: Any) -> Answered:
     """Returns the tables of a design, whose files are written; exit code 1 where a parameter is not determined."""
+    from ipe_bench.plugins.extensions import richer_models
+    from ipe_bench.questions.design.answer import READINGS, design_parts, designed, write_design
+    from ipe_bench.runs.provenance import describe
+
     scenario = asked.scenario
     if scenario.noise.real:
         raise UserError("noise=certified: a design is of readings that are still to be taken; choose another noise")
     errors = richer_models(scenario)
-    found = designed(scenario, errors=errors, **options)
+    found = designed(scenario, errors=errors, **given)
     identity = {
         "scenario": describe(dataclasses.replace(scenario, truth=None)),
         "errors": [describe(error) for error in errors],
-        "by": options.get("by"),
-        "readings": options.get("readings"),
-        "criterion": options.get("criterion", "A"),
+        "by": given.get("by"),
+        "readings": given.get("readings"),
+        "criterion": given.get("criterion", "A"),
     }
     files = write_design(asked.folder("design", identity, (READINGS,)), asked.measurement, found)
     code = 0 if found.observability.observable else 1
     return Answered(design_parts(asked.measurement, found), code, files=files)
+
+
+def options() -> Mapping[str, Any]:
+    """Returns the types of its options."""
+    from ipe_bench.basics.options import Count
+
+    return {"by": NAMES, "readings": Count, "criterion": Literal["A", "D"]}
 
 
 QUESTION = Question(
@@ -52,5 +60,5 @@ QUESTION = Question(
     more=_MORE,
     argument=("KEY=VALUE", "the scenario, as for `ipe-bench run`"),
     run=answer,
-    options={"by": NAMES, "readings": Count, "criterion": Literal["A", "D"]},
+    options=options,
 )

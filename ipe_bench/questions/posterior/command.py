@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
+from typing import Any
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.options import Count
-from ipe_bench.questions.posterior.answer import posterior_parts, sampled, write_posteriors
 from ipe_bench.questions.question import Answered, Asked, Question
-from ipe_bench.runs.provenance import describe
-from ipe_bench.runs.run import validate
 
 _TRIALS = 3
 """Number of trials unless given."""
@@ -30,7 +28,12 @@ output=DIR           folder of the files
 
 def answer(asked: Asked, particles: int = 1000) -> Answered:
     """Returns the table of the posteriors, whose files are written; exit code 1 where populations do not agree."""
-    name, scenario = asked.measurement, asked.scenario
+    from ipe_bench.questions.posterior.answer import posterior_parts, sampled, write_posteriors
+    from ipe_bench.runs.provenance import describe
+    from ipe_bench.runs.run import validate
+
+    name = asked.measurement
+    scenario = asked.scenario
     trials = _TRIALS if asked.trials is None else asked.trials
     if trials > _MOST_TRIALS:
         raise UserError(f"trials={trials}: each takes up to a minute; give at most {_MOST_TRIALS}")
@@ -55,10 +58,17 @@ def answer(asked: Asked, particles: int = 1000) -> Answered:
     return Answered(posterior_parts(title, found), 0 if settled else 1, files=files)
 
 
+def options() -> Mapping[str, Any]:
+    """Returns the types of its options."""
+    from ipe_bench.basics.options import Count
+
+    return {"particles": Count}
+
+
 QUESTION = Question(
     codes="0 the populations of particles agree; 1 in some trial they do not",
     more=_MORE,
     argument=("KEY=VALUE", "any key of `ipe-bench run`"),
     run=answer,
-    options={"particles": Count},
+    options=options,
 )
