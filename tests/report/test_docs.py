@@ -10,13 +10,15 @@ import subprocess
 import sys
 from collections import Counter
 from dataclasses import replace
-from importlib.resources import files
 from pathlib import Path
 from types import SimpleNamespace
 
+import make_docs as pages
 import numpy as np
 import pandas as pd
 import pytest
+from docs_types import show_type, type_of
+from gallery_frames import KEPT, SUFFIX, Computed, read
 from shared.synthetic_store import Pretender, Seeker, Synthetic
 
 import ipe_bench
@@ -28,9 +30,6 @@ from ipe_bench.measurements import Polynomial
 from ipe_bench.noise import Gaussian
 from ipe_bench.plugins import discovery
 from ipe_bench.plugins.construct import described
-from ipe_bench.report.docs import __main__ as pages
-from ipe_bench.report.docs import show_type, type_of
-from ipe_bench.report.docs.frames import KEPT, SUFFIX, Computed, read
 from ipe_bench.report.style import house_style
 from ipe_bench.runs.parts import TRUTH
 from ipe_bench.runs.provenance import canonical_json
@@ -39,7 +38,7 @@ from ipe_bench.statistics import analyse
 from ipe_bench.statistics.statistic import ALL
 from ipe_bench.statistics.verdicts import NO_VERDICT, VERDICTS
 
-PAGES = Path(str(files("ipe_bench.report.docs"))) / "pages"
+PAGES = pages.SOURCES / "pages"
 WRITTEN = sorted(PAGES.rglob("*.md"))
 
 
@@ -273,7 +272,7 @@ def test_the_whole_site_builds_without_a_warning_and_fetches_nothing(tmp_path):
     """Every experiment, and a line about each that runs without a stored result."""
     pytest.importorskip("pydata_sphinx_theme")
     # In a process of its own, as a user builds it: what its libraries will do away with is no error of ours.
-    command = [sys.executable, "-m", "ipe_bench.report.docs", str(tmp_path), "--trials=1"]
+    command = [sys.executable, pages.__file__, str(tmp_path), "--trials=1"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     html = tmp_path / "html"

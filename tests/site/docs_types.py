@@ -1,6 +1,6 @@
 """Builds the documentation: pages about ipe-bench, a reference read from the code, and a gallery of experiments.
 
-`make docs` builds the site into outputs/docs/html by the extra `docs`. As an extension of Sphinx this package writes
+`make docs` builds the site into outputs/docs/html by the extra `docs`. As an extension of Sphinx this module writes
 formulas as MathML, which needs no script and no network.
 """
 

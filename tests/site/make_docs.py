@@ -1,4 +1,4 @@
-"""`python -m ipe_bench.report.docs [OUTPUT] [--trials N]`: builds the site by Sphinx, of written pages, of what the
+"""`python tests/site/make_docs.py [OUTPUT] [--trials N]`: builds the site by Sphinx, of written pages, of what the
 program says of itself, and of what is stored of its experiments, which `--store NAME` computes."""
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib.metadata import version
-from importlib.resources import as_file, files
 from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import pandas as pd
+from gallery_frames import SUFFIX, Computed, read
 
 import ipe_bench
 from ipe_bench.basics.errors import UserError
@@ -28,7 +28,6 @@ from ipe_bench.basics.files import make_folder, write_text
 from ipe_bench.basics.statuses import Status
 from ipe_bench.plugins.construct import described
 from ipe_bench.plugins.discovery import CONTRACTS, PACKAGES, Option, options
-from ipe_bench.report.docs.frames import SUFFIX, Computed, read
 from ipe_bench.report.figures import common, drawings
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.views import views
@@ -48,7 +47,7 @@ SETTINGS = {
     "version": version("ipe-bench"),
     "release": version("ipe-bench"),
     "copyright": "the authors of ipe-bench",
-    "extensions": ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "ipe_bench.report.docs"],
+    "extensions": ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "docs_types"],
     "myst_enable_extensions": ["attrs_inline", "dollarmath", "deflist", "colon_fence"],
     "myst_heading_anchors": 3,
     "suppress_warnings": ["myst.xref_missing"],  # of links to rows of checked.md, which tests/test_oracles.py follows
@@ -94,7 +93,9 @@ _FIGURES = {"paper": ("figure_2", "figure_3")}
 """The figures of an experiment's page, where they are not the first."""
 _OF_PARAMETERS = ("paper", "pendulum_book")
 """Experiments whose pages show single parameters."""
-STORED = Path(str(files("ipe_bench.report.docs"))) / "gallery"
+SOURCES = Path(ipe_bench.__file__).parent / "report" / "docs"
+"""The folder of what the site is made of."""
+STORED = SOURCES / "gallery"
 """The folder of what pages of the gallery are drawn from."""
 
 
@@ -104,8 +105,7 @@ def build(output: Path, trials: int) -> int:
 
     source = output / "source"
     shutil.rmtree(source, ignore_errors=True)
-    with as_file(files("ipe_bench.report.docs") / "pages") as pages:
-        shutil.copytree(pages, source)
+    shutil.copytree(SOURCES / "pages", source)
     print("reference pages ...", flush=True)
     write_reference(source / "reference")
     write_gallery(source / "gallery", output / "results", trials)
