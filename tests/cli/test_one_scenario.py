@@ -70,7 +70,7 @@ def test_a_table_and_files_for_each_trial(ipe_bench, tmp_path):
 def test_posteriors_exit_with_1_unless_the_populations_of_every_trial_agree(ipe_bench, monkeypatch, settled):
     """Of two trials: what they agree on is made up here."""
     found = [SimpleNamespace(posterior=SimpleNamespace(settled=one)) for one in settled]
-    monkeypatch.setattr(ib, "posterior", lambda *args, **options: found)
+    monkeypatch.setattr(answer, "sampled", lambda *args: found)
     monkeypatch.setattr(answer, "write_posteriors", lambda folder, *args: [folder / "posterior.json"])
     monkeypatch.setattr(answer, "posterior_parts", lambda *args: [])
     assert ipe_bench("posterior", *SMALL, "trials=2")[0] == (0 if all(settled) else 1)
