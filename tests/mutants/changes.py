@@ -293,8 +293,8 @@ CHANGES = {
     "stages-at-start": Change(
         "engine",
         "the stages of an explicit step are all at its beginning",
-        "slope([t + s * h + node * h, *at, *stays(k)])",
-        "slope([t + s * h, *at, *stays(k)])",
+        "moment = t + s * h + node * h",
+        "moment = t + s * h",
         "test_ode_integrator.py test_driven.py test_compiled.py",
     ),
     "rodas-autonomous": Change(
