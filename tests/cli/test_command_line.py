@@ -260,6 +260,7 @@ def test_help_is_quick_to_load_and_names_the_commands():
     assert result.stdout.strip().endswith("[]")
 
 
+@pytest.mark.slow
 def test_a_plugin_without_its_header_or_with_a_taken_name_is_refused(tmp_path):
     conf = tmp_path / "plugins/mine/mine/conf/solver"
     conf.mkdir(parents=True)
@@ -359,6 +360,7 @@ def test_a_pipe_in_place_of_a_file_is_not_waited_for(ipe_bench, word):
     assert "pipe: " in error
 
 
+@pytest.mark.slow
 def test_a_reader_that_closes_the_pipe_is_no_mistake(tmp_path):
     for words in (["list", "measurement", "-v"], ["run", *QUICK, "figures=none", f"output={tmp_path / 'out'}"]):
         command = [sys.executable, "-m", "ipe_bench", *words]

@@ -35,6 +35,7 @@ def test_tables_and_files_say_the_same(ipe_bench, tmp_path):
     assert (tmp_path / "outputs" / "design-polynomial-2" / "design.json").exists()
 
 
+@pytest.mark.slow
 def test_every_richer_version_of_the_model_is_suspected(ipe_bench):
     code, out, _ = ipe_bench("design", "measurement=gins", "error_scale=33", "by=axis", "output=here")
     assert code == 0

@@ -44,7 +44,10 @@ def test_the_cost_of_an_estimator_is_what_it_evaluates(name, scenario):
     check_cost(ESTIMATORS[name], *SCENARIOS[scenario])
 
 
-@pytest.mark.parametrize("name", ["auto", "progressive", "relinearized", "levenberg_marquardt", "multistart"])
+@pytest.mark.parametrize(
+    "name",
+    ["auto", "progressive", "relinearized", "levenberg_marquardt", pytest.param("multistart", marks=pytest.mark.slow)],
+)
 def test_failures_cost_what_they_evaluate(name):
     """Where a search ends far from a minimum, the Jacobian for the covariance there is an evaluation of its own."""
     check_cost(ESTIMATORS[name], Scenario(Gins(readings_per_case=6), NOISE, error_scale=1e4), 1)

@@ -165,6 +165,7 @@ def test_a_formula_is_evaluated_or_refused_however_long():
             parse(text, "expression")
 
 
+@pytest.mark.slow
 def test_a_formula_of_thousands_of_names_has_its_slopes_in_seconds():
     texts = names = [f"b{i}" for i in range(3000)]
     while len(texts) > 1:

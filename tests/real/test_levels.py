@@ -200,6 +200,7 @@ def test_levels_stand_beside_the_parameters_of_every_estimator():
     assert answer["lm"].fits is None
 
 
+@pytest.mark.slow
 def test_only_the_profile_stands_beside_a_level():
     z = readings("by output", 1)
     answer = ib.estimate(DECAY, z, LM, noise=NOISES["by output"][0])

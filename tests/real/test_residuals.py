@@ -79,7 +79,7 @@ def test_a_single_degree_of_freedom_says_nothing_of_succession():
     assert np.isfinite(whiteness(np.array([1.0, -2.0, 1.0]), Q[:, :1], np.arange(3)[None]))
 
 
-@pytest.mark.parametrize("correlated", [False, True])
+@pytest.mark.parametrize("correlated", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_normalised_residuals_are_standard_normal_and_flag_a_gross_error(correlated):
     deviations = np.linspace(0.5, 2.0, M)
     R = np.diag(deviations**2)

@@ -129,6 +129,7 @@ def test_a_tick_says_its_whole_value(start, width):
     assert len(set(said)) == len(said) >= 2
 
 
+@pytest.mark.slow
 def test_the_axes_of_posteriors_set_no_part_aside_and_its_lines_are_those_of_a_run(synthetic):
     """Marginals a millionth as wide as they are far from zero."""
     scenario = synthetic.scenario()

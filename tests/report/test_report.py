@@ -166,6 +166,7 @@ def test_numbers_are_written_for_readers():
     assert [compact(v) for v in (0.945, 12195, 999.7, 1.6e6, 3e-5)] == ["0.945", "12.2k", "1.00k", "1.60M", "3.0e-5"]
 
 
+@pytest.mark.slow
 def test_settings_that_differ_have_figures_of_their_own(synthetic, tmp_path, monkeypatch):
     rng = np.random.default_rng(1)
     gaussian = [synthetic.scenario(sigma=s, error_scale=e) for s in (0.2, 0.4) for e in (1.0, 10.0)]

@@ -185,6 +185,7 @@ def test_an_estimator_cannot_change_the_readings_and_the_problem_of_the_others(t
         assert all("read-only" in message for message in rows["message"])
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="sends POSIX signals")
 def test_ctrl_c_stops_a_serial_run(tmp_path):
     code = f"""

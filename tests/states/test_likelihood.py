@@ -198,6 +198,7 @@ def test_maxima_that_differ_are_named(deviation, verdict):
     assert (one.verdict, one.passes) == (verdict, verdict == "consistent")
 
 
+@pytest.mark.slow
 def test_an_option_of_a_model_in_python_is_found_as_that_of_its_formulas():
     written = ConstantVelocity(count=30, deviation=2.0)
     formulas = Formulas(

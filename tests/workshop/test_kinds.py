@@ -157,6 +157,7 @@ def ours(reported) -> dict[str, str]:
     return files("out")
 
 
+@pytest.mark.slow
 def test_those_that_raise_are_named_and_the_rest_is_whole(ours, capsys):
     for kind in RECORDS:
         write(kind, f"bad_{kind}", RAISING[kind], plugin="bad")

@@ -83,6 +83,7 @@ def test_a_program_equals_the_same_estimator_in_python(name, scale, within, prog
     assert list(found.extras) == (["nis"] if name == "ekf" else [])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("language", NEEDED)
 def test_what_new_makes_keeps_its_promises_and_equals_gauss_newton(language, workplace, capsys):
     """Its dialogue holds; readings that are angles come round; what it asks is counted."""
