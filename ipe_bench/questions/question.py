@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from ipe_bench.trials.scenario import Scenario
 
 NAMES = tuple[str, ...]
-"""The type of an option that takes names, as in fail_on=success,error."""
+"""The type of an option that takes several names with commas between."""
 
 
 @dataclass(frozen=True)

@@ -87,7 +87,7 @@ ADVICE = [
     ("run --multirn error_scale=1,2", MEANT, "run {} error_scale=1,2"),
     ("run --resolve", r"such as (.*)", "run {}"),
     ("run name=a(b", r'such as (".*?")', "run {}"),
-    ("run model=growth", WORD, "run {}"),
+    ("run model=growth", MEANT, "run {}=growth"),
     ("run name=paper", r"or write (\S+)", "run {}"),
     ("run name=../x", r"folder as (output=)", "run {}../x"),
     ("run +noise@estimators.x=gaussian", WORD, "run {}"),
@@ -209,6 +209,7 @@ ADVICE = [
     ),
     ("estimate state_model=pendulum_book find=[gravty]", MEANT, "estimate state_model=pendulum_book find=[{}]"),
     ("estimate state_model=growth", WORD, "estimate state_model=growth {}", {"FILE": "z.csv"}),
+    ("design measurement=polynomial --by", r"as in (\S+)", "design measurement=polynomial {}", {"VALUE": "time"}),
     ("design measurement=polynomial by=tim", MEANT, "design measurement=polynomial by={}"),
     ("design measurement=polynomial noise=unknown", r"as in (.*)", "design measurement=polynomial {}"),
     ("design state_model=growth", r"`ipe-bench (.*?)`", "{}", {"NAME": "growth"}),
@@ -261,7 +262,7 @@ SOME = [pytest.param(one, id=one[0], marks=[] if i % 4 == 0 else pytest.mark.slo
 _TYPED = re.compile(r"(?:write|such as|as in|give|set|start[:,]|choose|use|see|add) [^;]*(?:=|`ipe-bench).*")
 """What advises a word with an equals sign, or a command."""
 ELSEWHERE = {
-    "no advice": ("The kinds of plugins", "The type of a key", "upper={}: give a number"),
+    "no advice": ("The kinds of plugins", "upper={}: give a number"),
     "of readings that are fitted": (
         "By noise that is so far overstated",
         "noise: is not given and cannot be",
