@@ -38,7 +38,7 @@ def draw(view: View) -> Iterator[Drawing]:
         fig,
         "deadline",
         "How long the slowest trials take",
-        "The cost by which 99 % of trials are done, well or not, with its 95 % interval, and over the median.",
+        "The cost by which 99 % of trials are done, with its 95 % interval, and over the median.",
         f"At the largest scale: {told}.",
     )
 
