@@ -1,7 +1,8 @@
 """How large and how dense each room is, as the table that `make lint` prints: for a maintainer to read, and no test.
 
 Content is counted in nodes of the syntax tree, without docstrings, annotations, imports and signatures, so that neither
-lines nor prose weigh. A dense statement has more than fifteen nodes; two to four in a hundred files of the field have.
+lines nor prose weigh. A dense statement has more than fifteen nodes; in well-kept libraries of the field three to
+nine statements in a hundred are dense.
 """
 
 from __future__ import annotations

@@ -88,8 +88,7 @@ def without_flags(name: str, arguments: Sequence[str]) -> list[str]:
 def _asked(name: str, arguments: Sequence[str], row: Row) -> Asked:
     from ipe_bench.cli.single import single
 
-    refused = tuple(row.without or ())
-    found = single(name, arguments, moving=row.moving, run=refused, estimate=OF_FILES)
+    found = single(name, arguments, moving=row.moving, run=row.without or (), estimate=OF_FILES)
     trials = found.spec.count if "trials" in found.words.keys else None
     return Asked(found.measurement, found.spec.scenario, found.spec.estimators, trials, found.folder)
 
