@@ -16,6 +16,7 @@ import sys
 import tomllib
 import traceback
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -351,6 +352,18 @@ def options_in(folder: Path) -> list[Option]:
     if not found:
         raise UserError(f"{folder}: has no option to check; its conf has none of {', '.join(CHECKED_GROUPS)}")
     return found
+
+
+@contextmanager
+def added_for_now() -> Iterator[None]:
+    """Forgets at its end the plugins' folders that are added within it."""
+    before = dict(_added)
+    try:
+        yield
+    finally:
+        _added.clear()
+        _added.update(before)
+        sources.cache_clear()
 
 
 def groups() -> list[str]:

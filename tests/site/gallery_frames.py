@@ -20,6 +20,7 @@ from ipe_bench.report.figures.views import FRAMES
 from ipe_bench.runs.results import StoredCell
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.collect import Collection, Group
+from ipe_bench.statistics.registry import add_statistics
 from ipe_bench.statistics.statistic import ALL
 
 SUFFIX = ".json.xz"
@@ -92,7 +93,8 @@ class Computed:
 
 
 def read(path: Path) -> Computed:
-    """Reads what `Computed.write` wrote."""
+    """Reads what `Computed.write` wrote: statistics of the bench alone, so that those of plugins are forgotten."""
+    add_statistics([])
     content = json.loads(lzma.decompress(path.read_bytes()))
     groups = tuple(_group(one) for one in content["groups"])
     frames = {name: pd.DataFrame(content["frames"].get(name)) for name in FRAMES}

@@ -23,6 +23,8 @@ def test_keeps_the_promises_of_statistics_and_figures():
     findings = ib.check(PLUGIN)
     assert {finding.component for finding in findings} == {"statistic=deadline", "figure=deadline"}
     assert not [finding for finding in findings if finding.complaint]
+    # A report that the same process writes later does without the plugin.
+    assert "ipe_bench_deadline" not in [source.name for source in discovery.sources()]
 
 
 @pytest.mark.parametrize(("trials", "q"), [(1000, 0.99), (400, 0.99), (60, 0.9)])
