@@ -19,7 +19,18 @@ __version__ = "0.3.0"
 
 if TYPE_CHECKING:
     from ipe_bench import baselines, measurements, noise, priors, solvers, states
-    from ipe_bench.api import audit, check, compare, design, estimate, load, posterior, report, run, status
+    from ipe_bench.api import (
+        audit,
+        check,
+        compare,
+        design,
+        estimate,
+        load,
+        posterior,
+        report,
+        run,
+        status,
+    )
     from ipe_bench.baselines.sequential import ConstantFilter, Sequential
     from ipe_bench.basics.errors import UserError
     from ipe_bench.basics.statuses import Status
@@ -33,7 +44,18 @@ if TYPE_CHECKING:
     from ipe_bench.trials.scenario import Scenario
 
 _HOMES = {
-    "api": ("audit", "check", "compare", "design", "estimate", "load", "posterior", "report", "run", "status"),
+    "api": (
+        "audit",
+        "check",
+        "compare",
+        "design",
+        "estimate",
+        "load",
+        "posterior",
+        "report",
+        "run",
+        "status",
+    ),
     "baselines.sequential": ("Sequential", "ConstantFilter"),
     "basics.errors": ("UserError",),
     "basics.statuses": ("Status",),

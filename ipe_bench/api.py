@@ -177,7 +177,9 @@ def report(
 
     paths = _paths(directories)
     if output is None and any(map(is_bundle, paths)):
-        raise UserError(f"{paths[0]}: a bundle is read and not written to; give output=, where the report goes")
+        raise UserError(
+            f"{paths[0]}: a bundle is read and not written to; give output=, where the report goes"
+        )
     with opened(paths, None if output is None else Path(output) / BUNDLES) as folders:
         return begin_report(folders, output, figures=figures, formats=formats).written()
 
@@ -290,7 +292,9 @@ def status(directories: Directories) -> pd.DataFrame:
     with opened(_paths(directories)) as paths:
         results = Results.read(paths)
     counts = ("expected", "done", "missing", "failed", "stale")
-    rows = [{**cell.names, **{name: getattr(cell, name) for name in counts}} for cell in results.cells]
+    rows = [
+        {**cell.names, **{name: getattr(cell, name) for name in counts}} for cell in results.cells
+    ]
     frame = pd.DataFrame(rows).assign(messages=["; ".join(cell.messages) for cell in results.cells])
     frame.attrs["problems"] = results.problems
     return frame
@@ -376,25 +380,44 @@ def estimate(
     from ipe_bench.solvers import Auto
 
     if isinstance(model, StateModel):
-        stated = {"noise": noise, "prior": prior, "error_scale": error_scale, "parameters": parameters}
+        stated = {
+            "noise": noise,
+            "prior": prior,
+            "error_scale": error_scale,
+            "parameters": parameters,
+        }
         if other := [name for name, value in stated.items() if value is not None]:
-            raise UserError(f"{other[0]}=: is of a measurement, and this is a model of states that move; leave it out")
+            raise UserError(
+                f"{other[0]}=: is of a measurement, and this is a model of states that move; leave it out"
+            )
         return _tracked(model, readings, estimators, ignore_columns, find, progress)
     if find:
-        raise UserError("find=: is for models of states that move; all parameters of a measurement are found")
+        raise UserError(
+            "find=: is for models of states that move; all parameters of a measurement are found"
+        )
     if not isinstance(model, Measurement):
         scenario = _scenario(model, noise=noise, prior=prior, error_scale=error_scale)
         model, noise = scenario.measurement, None if scenario.noise.real else scenario.noise
         prior, error_scale = scenario.prior, scenario.error_scale
     if estimators is None:
         # In the order of the command line, whose solvers come before baselines.
-        estimators = {"auto": Auto(), "linear_lse": LinearLSE(), "levenberg_marquardt": LevenbergMarquardt()}
+        estimators = {
+            "auto": Auto(),
+            "linear_lse": LinearLSE(),
+            "levenberg_marquardt": LevenbergMarquardt(),
+        }
     estimators = _labelled(estimators, Estimator)
-    given = readings if readings is None or isinstance(readings, np.ndarray) else tuple(_paths(readings))
+    given = (
+        readings
+        if readings is None or isinstance(readings, np.ndarray)
+        else tuple(_paths(readings))
+    )
     stated: dict[str, Any] = {"noise": noise, "prior": prior, "error_scale": error_scale}
     stated |= {"known": known_parameters(parameters or {}), "ignored": tuple(ignore_columns)}
     question = Question(model=model, readings=given, estimators=estimators, **stated).checked()
-    with counting("estimate", len(estimators), lines=progress == "lines", off=not progress) as begin:
+    with counting(
+        "estimate", len(estimators), lines=progress == "lines", off=not progress
+    ) as begin:
         return Answer.to(question, watch=begin)
 
 
@@ -413,9 +436,13 @@ def _tracked(
 
     if isinstance(readings, Sequence) and not isinstance(readings, str):
         if len(readings) != 1:
-            raise UserError(f"readings=[{','.join(map(str, readings))}]: a track has one log; name one file")
+            raise UserError(
+                f"readings=[{','.join(map(str, readings))}]: a track has one log; name one file"
+            )
         (readings,) = readings
-    trackers = {"ekf": ekf(), "ukf": ukf(), "ckf": ckf()} if trackers is None else _labelled(trackers)
+    trackers = (
+        {"ekf": ekf(), "ukf": ukf(), "ckf": ckf()} if trackers is None else _labelled(trackers)
+    )
     log = Log.of(model, Path(readings) if isinstance(readings, str) else readings, ignored)
     validate([StateScenario(log.model)], trackers, 1)
     names = [find] if isinstance(find, str) else list(find)
@@ -533,10 +560,14 @@ def _scenario(given: Any, **stated: Any) -> Scenario:
     stated = {name: value for name, value in stated.items() if value is not None}
     if isinstance(given, Scenario):
         if stated:
-            raise UserError(f"{next(iter(stated))}=: is part of the scenario; leave it out, or give the model alone")
+            raise UserError(
+                f"{next(iter(stated))}=: is part of the scenario; leave it out, or give the model alone"
+            )
         return given
     if not isinstance(given, Measurement):
-        raise UserError(f"{_described(given)}; give a scenario, ib.Scenario(model, noise), or a measurement model")
+        raise UserError(
+            f"{_described(given)}; give a scenario, ib.Scenario(model, noise), or a measurement model"
+        )
     return Scenario(given, **stated)
 
 
@@ -545,7 +576,9 @@ def _tracking(given: Any, **stated: Any) -> StateScenario | None:
     stated = {name: value for name, value in stated.items() if value is not None}
     if not isinstance(given, StateModel | StateScenario):
         return None
-    if other := [name for name in stated if name != "error_scale" or isinstance(given, StateScenario)]:
+    if other := [
+        name for name in stated if name != "error_scale" or isinstance(given, StateScenario)
+    ]:
         raise UserError(f"{other[0]}=: is part of the state model or its scenario; leave it out")
     return given if isinstance(given, StateScenario) else StateScenario(given, **stated)
 
@@ -556,7 +589,9 @@ def _labelled(estimators: Any, kind: Any = Estimator | Tracker) -> Mapping[str, 
         raise UserError('estimators: give each a label, as in {"newton": ib.solvers.Newton()}')
     for label, one in estimators.items():
         if not isinstance(one, kind):
-            raise UserError(f"estimators: {label}: {_described(one)}; give an estimator such as ib.solvers.Newton()")
+            raise UserError(
+                f"estimators: {label}: {_described(one)}; give an estimator such as ib.solvers.Newton()"
+            )
     return estimators
 
 
@@ -568,7 +603,9 @@ def _described(given: Any) -> str:
 
 
 def _paths(directories: Directories) -> list[Path]:
-    return [Path(d) for d in ([directories] if isinstance(directories, Path | str) else directories)]
+    return [
+        Path(d) for d in ([directories] if isinstance(directories, Path | str) else directories)
+    ]
 
 
 def _warn(problems: Iterable[str]) -> None:

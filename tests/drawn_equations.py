@@ -24,11 +24,40 @@ _MOST = 500_000
 _KNOWN = {name: getattr(np, name) for name in ("sin", "cos", "exp", "log", "sqrt", "tanh")}
 _KNOWN |= {"min": np.minimum, "max": np.maximum, "abs": np.abs}
 _SHOWN = (
-    *("{y}", "{y}/(0.5+abs({y}))", "tanh({y})", "exp(-{y})", "1/(1+exp(-{y}))", "max({y},0)", "exp(0.2*{y})"),
-    *("{y}**4/(0.0625+{y}**4)", "1/(1+{y}**2)", "sin({y})", "cos(3*{y})", "min(max({y},0.1),0.8)", "{y}*{z}+k0*t"),
+    *(
+        "{y}",
+        "{y}/(0.5+abs({y}))",
+        "tanh({y})",
+        "exp(-{y})",
+        "1/(1+exp(-{y}))",
+        "max({y},0)",
+        "exp(0.2*{y})",
+    ),
+    *(
+        "{y}**4/(0.0625+{y}**4)",
+        "1/(1+{y}**2)",
+        "sin({y})",
+        "cos(3*{y})",
+        "min(max({y},0.1),0.8)",
+        "{y}*{z}+k0*t",
+    ),
 )
-_FELT = ("{z}", "tanh({z})", "{z}/(1+{z}**2)", "1/(1+{z}**2)", "sin({z})", "k1", "sin(3*t)", "exp(-t)", "c")
-_PULSES = ("exp(-((t-{m})/{w})**2)/{w}", "1/(1+((t-{m})/{w})**2)**2/{w}", "exp(-abs(t-{m})/{w})/{w}")
+_FELT = (
+    "{z}",
+    "tanh({z})",
+    "{z}/(1+{z}**2)",
+    "1/(1+{z}**2)",
+    "sin({z})",
+    "k1",
+    "sin(3*t)",
+    "exp(-t)",
+    "c",
+)
+_PULSES = (
+    "exp(-((t-{m})/{w})**2)/{w}",
+    "1/(1+((t-{m})/{w})**2)**2/{w}",
+    "exp(-abs(t-{m})/{w})/{w}",
+)
 
 
 @dataclass(frozen=True)
@@ -59,8 +88,15 @@ def with_pole(r: np.random.Generator) -> Drawn:
     """Saturating kinetics, whose fast decay ends at a pole just below 0, fed steadily, for a while or in waves, from 0
     or from a dose; and a slower state behind it."""
     times = _far_apart(r)
-    constants = {"L": float(f"{10 ** r.uniform(1.5, 3.7):.4g}"), "K": float(f"{10 ** r.uniform(-3.0, -0.5):.3g}")}
-    loss = str(r.choice(["L*y/(K+y)", "L*y/(K+y)", "L*y/(K+y+y**2/20)", "L*y**2/(K**2+y**2)", "L*y*(K+y)**-1"]))
+    constants = {
+        "L": float(f"{10 ** r.uniform(1.5, 3.7):.4g}"),
+        "K": float(f"{10 ** r.uniform(-3.0, -0.5):.3g}"),
+    }
+    loss = str(
+        r.choice(
+            ["L*y/(K+y)", "L*y/(K+y)", "L*y/(K+y+y**2/20)", "L*y**2/(K**2+y**2)", "L*y*(K+y)**-1"]
+        )
+    )
     fed = str(r.choice(["k0", "k0", f"(k0 if t < {0.43 * times[-1]:.3f} else 0)", "k0*(1+sin(t))"]))
     rates = {"y": f"{fed}-{loss}", "z": f"{loss}-k1*z"}
     initial = {"y": str(r.choice(["0", "0", "2", "10"]))}
@@ -76,14 +112,20 @@ def with_pulse(r: np.random.Generator) -> Drawn:
     times = _far_apart(r)
     pulses, halts = [], list[float]()
     for _ in range(r.integers(1, 3)):
-        width, middle = float(f"{times[0] * 10 ** r.uniform(-3.0, -0.7):.3g}"), float(f"{r.uniform(0, times[4]):.5g}")
+        width, middle = (
+            float(f"{times[0] * 10 ** r.uniform(-3.0, -0.7):.3g}"),
+            float(f"{r.uniform(0, times[4]):.5g}"),
+        )
         pulses.append(str(r.choice(_PULSES)).format(m=middle, w=width))
         halts += [middle + share * width for share in (-25, -12, -6, -3, -1, 0, 1, 3, 6, 12, 25)]
     rates = {"y": f"k0*({'+'.join(pulses)})-k1*y"}
     if r.random() < 0.5:
         rates["z"] = str(r.choice(["y-0.5*z", "k1*y-z", "y*(1-z)"]))
     shown = ("{y}", "{y}/(0.5+{y})", "tanh({y})", "exp(-{y})")
-    outputs = {f"z{i}": str(r.choice(shown)).format(y=r.choice(list(rates))) for i in range(r.integers(1, 3))}
+    outputs = {
+        f"z{i}": str(r.choice(shown)).format(y=r.choice(list(rates)))
+        for i in range(r.integers(1, 3))
+    }
     start = {"k0": float(f"{r.uniform(0.5, 3.0):.3g}"), "k1": float(f"{r.uniform(0.05, 1.0):.3g}")}
     model = Ode(rates, start, {}, outputs, times)  # type: ignore[arg-type]
     x = np.exp(r.choice([0.05, 0.3, 1.0]) * r.standard_normal(2))
@@ -101,7 +143,9 @@ def magnifying(r: np.random.Generator) -> Drawn:
         k = float(f"{r.uniform(0.3, 3.0):.3g}")
         rates, initial, y = {"y": "k*v", "v": "-k*y"}, {"y": 1.0}, np.cos(wide(k) * wide(x[0]) * t)
     factor = float(f"{10 ** r.uniform(0.0, 9.0):.3g}")
-    outputs = {"z": str(r.choice([f"cos({factor}*y)", f"sin({factor}*y)", f"1/(1.5+cos({factor}*y))"]))}
+    outputs = {
+        "z": str(r.choice([f"cos({factor}*y)", f"sin({factor}*y)", f"1/(1.5+cos({factor}*y))"]))
+    }
     told = np.array(eval(outputs["z"], {"cos": np.cos, "sin": np.sin}, {"y": y}), dtype=float)
     hidden = np.abs(factor * y) > 1e13
     model = Ode(rates, {"k": k}, initial, outputs, times)  # type: ignore[arg-type]
@@ -120,7 +164,11 @@ def easy(number: int) -> Drawn:
         driven = {"u": str(r.choice(["hold", "linear"]))}
         at = np.unique(np.round(np.append(0.0, r.uniform(0, span, 3)), 3))
         columns = {"time": tuple(at), "u": tuple(np.round(r.uniform(-1, 1, len(at)), 3))}
-    jumps = f"({r.uniform(0, span):.3f} if t < {r.uniform(0.2, 0.8) * span:.3f} else 0.5)" if r.random() < 0.15 else "1"
+    jumps = (
+        f"({r.uniform(0, span):.3f} if t < {r.uniform(0.2, 0.8) * span:.3f} else 0.5)"
+        if r.random() < 0.15
+        else "1"
+    )
     felt = [*_FELT, *(["u"] if driven else []), jumps]
 
     def term(i: int) -> str:
@@ -139,7 +187,8 @@ def easy(number: int) -> Drawn:
         rates[y] = f"-L*({y} - k0*({target}))" if fast else str(r.choice(forms))
     initial = {y: str(r.choice(["0", "k1", "0.2", "2", "c"])) for y in states}
     outputs = {
-        f"z{i}": str(r.choice(_SHOWN)).format(y=r.choice(states), z=r.choice(states)) for i in range(r.integers(1, 3))
+        f"z{i}": str(r.choice(_SHOWN)).format(y=r.choice(states), z=r.choice(states))
+        for i in range(r.integers(1, 3))
     }
     grids = (
         np.linspace(span / 12, span, 12),
@@ -158,7 +207,16 @@ def easy(number: int) -> Drawn:
         constants["c"] = (0.5, 1.5) if r.random() < 0.5 and not driven else 0.7
     if "u" not in names:
         driven, columns = {}, {}
-    model = Ode(rates, start, initial, outputs, times, constants=constants, driven_by=driven, columns=columns)  # type: ignore[arg-type]
+    model = Ode(
+        rates,
+        start,
+        initial,
+        outputs,
+        times,
+        constants=constants,
+        driven_by=driven,
+        columns=columns,
+    )  # type: ignore[arg-type]
     return Drawn(model, 1.0 + r.choice([0.05, 0.2]) * r.standard_normal(len(start)))
 
 
@@ -177,7 +235,9 @@ def solved(one: Drawn, method: str, rtol: float) -> np.ndarray:
 def _case(one: Drawn, known: dict[str, Any], method: str, rtol: float) -> np.ndarray:
     model = one.model
     names, rows = list(model.rates), model.columns
-    rates, outputs = ([_compiled(str(f)) for f in part.values()] for part in (model.rates, model.outputs))
+    rates, outputs = (
+        [_compiled(str(f)) for f in part.values()] for part in (model.rates, model.outputs)
+    )
 
     def values(t: float, y: Any, inside: float) -> dict[str, Any]:
         """`inside` lies in the interval: what jumps at its ends is taken from within."""
@@ -188,8 +248,14 @@ def _case(one: Drawn, known: dict[str, Any], method: str, rtol: float) -> np.nda
             found["u"] = rows["u"][k] if held else np.interp(t, rows["time"], rows["u"])
         return found
 
-    y = np.array([float(eval(_compiled(str(model.initial.get(name, 0.0))), {}, known)) for name in names])
-    jumps = [float(text.split("t < ")[1].split()[0]) for text in map(str, model.rates.values()) if "t < " in text]
+    y = np.array(
+        [float(eval(_compiled(str(model.initial.get(name, 0.0))), {}, known)) for name in names]
+    )
+    jumps = [
+        float(text.split("t < ")[1].split()[0])
+        for text in map(str, model.rates.values())
+        if "t < " in text
+    ]
     changes = (*rows.get("time", ()), *jumps, *one.halts)
     ends = sorted({*model.times, *(t for t in changes if t < model.times[-1])})
     found, t = {}, 0.0
@@ -225,7 +291,9 @@ def answer(number: int) -> np.ndarray:
         return one.exact
     try:
         with np.errstate(all="ignore"):
-            z, other = (solved(one, method, rtol) for method, rtol in (("LSODA", 1e-11), ("Radau", 1e-7)))
+            z, other = (
+                solved(one, method, rtol) for method, rtol in (("LSODA", 1e-11), ("Radau", 1e-7))
+            )
     except ValueError:
         return np.empty(0)
     return z if np.abs(z - other).max() < 1e-4 * np.abs(z).max(initial=1e-9) else np.empty(0)

@@ -66,13 +66,21 @@ def gauges(path: Path) -> Counter[str]:
     tree = without_prose(ast.parse(source))
     nodes = list(ast.walk(tree))
     assigned = [node for node in nodes if isinstance(node, ast.Assign)]
-    tables = {id(one) for one in tree.body if isinstance(one, ast.Assign | ast.AnnAssign) and _is_table(one)}
+    tables = {
+        id(one)
+        for one in tree.body
+        if isinstance(one, ast.Assign | ast.AnnAssign) and _is_table(one)
+    }
     simple = [
         own_nodes(node)
         for node in nodes
         if isinstance(node, ast.stmt) and not isinstance(node, _COMPOUND) and id(node) not in tables
     ]
-    packed = [one for one in assigned if isinstance(one.value, ast.Tuple) and isinstance(one.targets[0], ast.Tuple)]
+    packed = [
+        one
+        for one in assigned
+        if isinstance(one.value, ast.Tuple) and isinstance(one.targets[0], ast.Tuple)
+    ]
     return Counter(
         files=1,
         lines=len(source.splitlines()),

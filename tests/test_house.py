@@ -19,10 +19,24 @@ LINE = [
         ["solvers", "baselines"],
         ["trials"],
     ),
-    *(["runs"], ["statistics"], ["real", "plugins"], ["report"], ["questions", "workshop"], ["api"], ["cli"]),
+    *(
+        ["runs"],
+        ["statistics"],
+        ["real", "plugins"],
+        ["report"],
+        ["questions", "workshop"],
+        ["api"],
+        ["cli"],
+    ),
 ]
 PLACE = {room: place for place, rooms in enumerate(LINE) for room in rooms}
-HEAVY_BELOW = {"matplotlib": "report", "seaborn": "report", "hydra": "cli", "omegaconf": "cli", "rich": "report"}
+HEAVY_BELOW = {
+    "matplotlib": "report",
+    "seaborn": "report",
+    "hydra": "cli",
+    "omegaconf": "cli",
+    "rich": "report",
+}
 MODULES = [
     (path, path.relative_to(HOUSE).with_suffix("").parts[0])
     for path in sorted(HOUSE.rglob("*.py"))
@@ -53,7 +67,11 @@ def statements(path: Path) -> list[tuple[frozenset[str], bool, bool]]:
 
 def imported(path: Path, *, checked_types: bool, late: bool = True) -> set[str]:
     """The modules that a file imports: late ones too unless told otherwise, those for type checkers where asked for."""
-    kept = (names for names, types, inside in statements(path) if types <= checked_types and inside <= late)
+    kept = (
+        names
+        for names, types, inside in statements(path)
+        if types <= checked_types and inside <= late
+    )
     return {name for names in kept for name in names}
 
 
@@ -62,21 +80,31 @@ def test_nothing_is_imported_against_the_line():
         for name in imported(path, checked_types=True):
             parts = name.split(".")
             if parts[0] == "ipe_bench" and len(parts) > 1 and parts[1] in PLACE:
-                assert PLACE[parts[1]] <= PLACE[room], f"{path} imports {name}, which stands later in the line"
+                assert PLACE[parts[1]] <= PLACE[room], (
+                    f"{path} imports {name}, which stands later in the line"
+                )
                 rooms = LINE[PLACE[room]]
-                assert parts[1] == room or parts[1] not in rooms, f"{path} imports {name}, its neighbour in the line"
+                assert parts[1] == room or parts[1] not in rooms, (
+                    f"{path} imports {name}, its neighbour in the line"
+                )
 
 
 def test_rooms_know_only_the_libraries_that_are_theirs():
     for path, room in MODULES:
         for name in imported(path, checked_types=False):
             home = HEAVY_BELOW.get(name.split(".")[0])
-            assert home is None or PLACE[room] >= PLACE[home], f"{path} knows {name}, which belongs to {home} and above"
+            assert home is None or PLACE[room] >= PLACE[home], (
+                f"{path} knows {name}, which belongs to {home} and above"
+            )
 
 
 def test_all_texts_of_consoles_leave_by_one_door():
     """Rich's own console obeys what a name says to a terminal."""
-    homes = {path.name for path, _ in MODULES if "rich.console.Console" in imported(path, checked_types=False)}
+    homes = {
+        path.name
+        for path, _ in MODULES
+        if "rich.console.Console" in imported(path, checked_types=False)
+    }
     assert homes == {"screen.py"}
 
 
@@ -87,12 +115,20 @@ def test_the_package_imports_no_plugin():
 
 def edges(*, late: bool) -> dict[str, set[str]]:
     """Which modules of the package each module imports."""
-    paths = {".".join(("ipe_bench", *p.relative_to(HOUSE).with_suffix("").parts)): p for p in HOUSE.rglob("*.py")}
-    paths = {name.removesuffix(".__init__"): path for name, path in paths.items() if name != "ipe_bench.__init__"}
+    paths = {
+        ".".join(("ipe_bench", *p.relative_to(HOUSE).with_suffix("").parts)): p
+        for p in HOUSE.rglob("*.py")
+    }
+    paths = {
+        name.removesuffix(".__init__"): path
+        for name, path in paths.items()
+        if name != "ipe_bench.__init__"
+    }
     found = {name: imported(path, checked_types=False, late=late) for name, path in paths.items()}
     # A package imports its own modules, which may name it in turn only through another room.
     return {
-        name: {n for n in found[name] if n in paths and n != name and not name.startswith(f"{n}.")} for name in paths
+        name: {n for n in found[name] if n in paths and n != name and not name.startswith(f"{n}.")}
+        for name in paths
     }
 
 

@@ -74,7 +74,11 @@ def arrivals(problem: Problem) -> Iterator[Epoch]:
     model = problem.measurement
     assert model.epochs is not None
     # A model some of whose readings are missing is measured through the whole one, which can stop early.
-    whole, kept = (model.whole, np.array(model.kept)) if isinstance(model, SubsetModel) else (model, np.arange(model.m))
+    whole, kept = (
+        (model.whole, np.array(model.kept))
+        if isinstance(model, SubsetModel)
+        else (model, np.arange(model.m))
+    )
     stop, arrived = 0, np.empty(0, dtype=np.intp)
     assert whole.epochs is not None
     for number, rows in enumerate(model.epochs, start=1):
@@ -136,7 +140,9 @@ class Walk(ABC):
             self.status[trial] = status
             self.messages[int(trial)] = message
 
-    def read(self, epoch: Epoch, s: Array, at: Rows, *, slopes: bool) -> tuple[Rows, Array, Array | None]:
+    def read(
+        self, epoch: Epoch, s: Array, at: Rows, *, slopes: bool
+    ) -> tuple[Rows, Array, Array | None]:
         """Reads whitened h (trials, points, m) at the states s (trials, points, n) of the trials `at`, and dh/dx
         (trials, m, n), for those that the model does not end."""
         model, x = epoch.counted(self.tally), self.problem.x0 + s * self.d
@@ -147,7 +153,9 @@ class Walk(ABC):
             kept &= finite(H)
         raised = self.tally.failed(at)
         self.status[at[raised]] = Status.ERROR
-        self.end(at[~kept & ~raised], Status.NONFINITE, f"the model overflowed at epoch {epoch.number}")
+        self.end(
+            at[~kept & ~raised], Status.NONFINITE, f"the model overflowed at epoch {epoch.number}"
+        )
         kept &= ~raised
         return at[kept], h[kept], None if H is None else H[kept]
 
@@ -163,7 +171,9 @@ class Walk(ABC):
             taken[at] += 1
             path.append(x)
             lost = at[~(finite(self.x[at]) & finite(self.P[at]))]
-            self.end(lost, Status.NONFINITE, f"the filter's state overflowed at epoch {epoch.number}")
+            self.end(
+                lost, Status.NONFINITE, f"the filter's state overflowed at epoch {epoch.number}"
+            )
         self.status[self.going] = Status.CONVERGED
         finished = np.flatnonzero(self.status == Status.CONVERGED)
         P = np.full((*x.shape, len(self.d)), np.nan)

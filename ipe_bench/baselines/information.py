@@ -80,7 +80,10 @@ class EpochReadings:
 
     def slope(self, x: Array) -> Array:
         """Computes dh/dx (trials, m, n), whitened."""
-        return self.epoch.R.whiten_jacobian(self.model.jacobian(self.physical(x), self.rows)) * self.deviation
+        return (
+            self.epoch.R.whiten_jacobian(self.model.jacobian(self.physical(x), self.rows))
+            * self.deviation
+        )
 
     def misfits(self, points: Array) -> Array:
         """Computes h - z (trials, points, m) at points (trials, points, n), whitened."""
@@ -130,7 +133,9 @@ class _Beliefs(Walk):
 
     def take_in(self, epoch: Epoch, at: Rows) -> None:
         z, model = self.z[at][:, epoch.rows], epoch.counted(self.tally)
-        readings = EpochReadings(epoch, model, self.problem.x0, self.d, z, at, take(self.belief, at))
+        readings = EpochReadings(
+            epoch, model, self.problem.x0, self.d, z, at, take(self.belief, at)
+        )
         after, nis = self.filter.update(readings)
         raised, singular = self.tally.failed(at), ~finite(after.root()) & after.usable
         good = after.usable & np.isfinite(nis) & ~raised & ~singular
@@ -138,7 +143,11 @@ class _Beliefs(Walk):
         self.nis[at[good]] += nis[good]
         lost = f"the model or the filter overflowed at epoch {epoch.number}"
         self.end(at[~good & ~raised & ~singular], Status.NONFINITE, lost)
-        self.end(at[singular & ~raised], Status.SINGULAR, f"the information became singular at epoch {epoch.number}")
+        self.end(
+            at[singular & ~raised],
+            Status.SINGULAR,
+            f"the information became singular at epoch {epoch.number}",
+        )
         self.status[at[raised]] = Status.ERROR
         S = self.belief.root()
         self.x, self.P = self.belief.mean, np.matmul(S, S.swapaxes(1, 2))
@@ -192,7 +201,9 @@ class Linearized:
         W = _whitener(Omega)
         proposal, innovations = readings.belief.given(np.matmul(W, A), multiply(W, r), x)
         cost = _cost(readings, W, r, x)
-        return cls(x, U, r, A, W, cost, proposal, innovations, np.ones(len(x)), np.zeros(len(x)), change)
+        return cls(
+            x, U, r, A, W, cost, proposal, innovations, np.ones(len(x)), np.zeros(len(x)), change
+        )
 
 
 @dataclass(frozen=True)
@@ -254,7 +265,9 @@ class IPLF(InformationFilter, Method[EpochReadings, Linearized]):
             state = put(state, settled, replace(renewed, innovations=part.innovations))
         return state
 
-    def check(self, system: EpochReadings, before: Linearized | None, state: Linearized) -> ConvergenceCheck:
+    def check(
+        self, system: EpochReadings, before: Linearized | None, state: Linearized
+    ) -> ConvergenceCheck:
         """Ends a trial if bringing the covariance up to date has changed neither it nor the mean."""
         growth = np.where(np.isfinite(state.cost) & state.proposal.usable, 1.0, np.nan)
         return ConvergenceCheck(state.change, growth, np.full(len(state.x), np.inf))

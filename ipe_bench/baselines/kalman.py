@@ -164,7 +164,9 @@ class UKF(Sequential):
         n = len(P0)
         points = MerweScaledSigmaPoints(n, self.alpha, self.beta, self.kappa)
         # hx differs from epoch to epoch, so update is given it.
-        filter = UnscentedKalmanFilter(dim_x=n, dim_z=1, dt=1.0, hx=None, fx=lambda x, dt: x, points=points)
+        filter = UnscentedKalmanFilter(
+            dim_x=n, dim_z=1, dt=1.0, hx=None, fx=lambda x, dt: x, points=points
+        )
         filter.x, filter.P, filter.Q = np.zeros(n), P0, Q
         return FilterpyFilter(filter)
 
@@ -194,7 +196,9 @@ class _CKFTrack(FilterpyFilter):
 
         n = len(P0)
         self.reference = np.zeros(n)
-        self.filter: Any = CubatureKalmanFilter(dim_x=n, dim_z=1, dt=1.0, hx=None, fx=lambda x, dt: x)
+        self.filter: Any = CubatureKalmanFilter(
+            dim_x=n, dim_z=1, dt=1.0, hx=None, fx=lambda x, dt: x
+        )
         self.filter.x, self.filter.P, self.filter.Q = np.zeros((n, 1)), P0, Q
 
     @property
@@ -247,7 +251,9 @@ class _EnKFTrack(FilterpyFilter):
         self.stream = stream
         with _drawing_from(stream):
             x = np.zeros(len(P0))
-            self.filter: Any = EnsembleKalmanFilter(x=x, P=P0, dim_z=1, dt=1.0, N=members, hx=None, fx=lambda x, dt: x)
+            self.filter: Any = EnsembleKalmanFilter(
+                x=x, P=P0, dim_z=1, dt=1.0, N=members, hx=None, fx=lambda x, dt: x
+            )
         self.filter.Q = Q
 
     def predict(self) -> None:

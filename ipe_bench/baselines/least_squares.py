@@ -32,7 +32,9 @@ _OUT_OF_EVALUATIONS = 0
 _SCIPYS = ("method", "loss", "f_scale", "ftol", "xtol", "gtol", "max_nfev")
 """The options that are SciPy's own."""
 
-Rounding = Annotated[float, Ge(float(np.finfo(float).eps)), doc("a number of at least 2.3e-16, the rounding of a 1")]
+Rounding = Annotated[
+    float, Ge(float(np.finfo(float).eps)), doc("a number of at least 2.3e-16, the rounding of a 1")
+]
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,9 @@ class GaussNewton(Batch):
     """The initial lambda of Levenberg-Marquardt with Marquardt's scaling; None: no damping."""
 
     def method(self, objective: Objective) -> Method[Objective, LeastSquaresSystem]:
-        return GaussNewtonMethod() if self.damping is None else LevenbergMarquardtMethod(self.damping)
+        return (
+            GaussNewtonMethod() if self.damping is None else LevenbergMarquardtMethod(self.damping)
+        )
 
 
 @dataclass(frozen=True)
@@ -133,7 +137,9 @@ class MapLM(Batch):
         return Objective.of(problem, z, self.prior_inflation)
 
     def method(self, objective: Objective) -> Method[Objective, LeastSquaresSystem]:
-        return LevenbergMarquardtMethod(self.damping, objective.prior and objective.prior.deviations)
+        return LevenbergMarquardtMethod(
+            self.damping, objective.prior and objective.prior.deviations
+        )
 
 
 @dataclass(frozen=True)
@@ -161,7 +167,9 @@ class MultiscaleLM(Estimator):
         limits = Limits(self.tolerance, self.max_iterations, history=history)
         methods = (LevenbergMarquardtMethod(self.damping, metric) for metric in (size, None))
         by_size, by_columns = (minimize(objective, method, start, limits) for method in methods)
-        costs = [np.where(np.isfinite(m.chi_square), m.chi_square, np.inf) for m in (by_size, by_columns)]
+        costs = [
+            np.where(np.isfinite(m.chi_square), m.chi_square, np.inf) for m in (by_size, by_columns)
+        ]
         # The first where they fit alike to round-off; without a finite fit anywhere it keeps its status.
         best = by_size.replaced(np.arange(len(z)), by_columns, costs[1] < costs[0] * (1 - 1e-12))
         return best.estimates(objective.model.tally, z.shape[1])
@@ -251,7 +259,9 @@ class LeastSquares(Estimator):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.method == "lm" and self.loss != "linear":
-            raise UserError(f"loss={self.loss}: method=lm knows loss=linear only; choose method=trf or dogbox")
+            raise UserError(
+                f"loss={self.loss}: method=lm knows loss=linear only; choose method=trf or dogbox"
+            )
 
     @property
     def equation(self) -> Equation | None:  # type: ignore[override]
@@ -263,8 +273,12 @@ class LeastSquares(Estimator):
         x = starting_points(problem, z, self.start, tally)
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)
-            trials = [_Residuals(problem, *trial) for trial in zip(z, x, tally.simulations, strict=True)]
-            return one_by_one(trials, lambda trial: self._search(trial, history=history), problem.measurement.n)
+            trials = [
+                _Residuals(problem, *trial) for trial in zip(z, x, tally.simulations, strict=True)
+            ]
+            return one_by_one(
+                trials, lambda trial: self._search(trial, history=history), problem.measurement.n
+            )
 
     def _search(self, residuals: _Residuals, *, history: bool) -> Estimates:
         """Runs one trial, as a batch of one."""
@@ -272,8 +286,14 @@ class LeastSquares(Estimator):
 
         jacobian: Any = residuals.J  # SciPy's stubs know its finite differences only
         options: Any = {name: getattr(self, name) for name in _SCIPYS}
-        x, covariance = residuals.start, np.full((1, len(residuals.start), len(residuals.start)), np.nan)
-        status, message = Status.NONFINITE, "a reading, or the model at the start, is not a finite number"
+        x, covariance = (
+            residuals.start,
+            np.full((1, len(residuals.start), len(residuals.start)), np.nan),
+        )
+        status, message = (
+            Status.NONFINITE,
+            "a reading, or the model at the start, is not a finite number",
+        )
         try:
             if np.isfinite(residuals.r(x)).all():
                 found = least_squares(residuals.r, x, jac=jacobian, x_scale="jac", **options)

@@ -100,7 +100,9 @@ class Sequential(Estimator):
         super().__post_init__()
         for engine, method in (("batched", "rule"), ("filterpy", "track")):
             if self.engine == engine and getattr(type(self), method) is getattr(Sequential, method):
-                raise UserError(f"engine={engine}: this filter has no {method}; choose the other engine")
+                raise UserError(
+                    f"engine={engine}: this filter has no {method}; choose the other engine"
+                )
 
     def track(self, P0: Array, Q: Array, z: Array) -> ConstantFilter:
         """Makes the filter of one trial before its first reading, at x = 0 with covariance P0 (n, n) and process noise
@@ -145,7 +147,9 @@ class _OneByOne(_Filters):
         super().__init__(filter, problem, z)
         self.tracks: dict[int, ConstantFilter] = {}
         for t in self.going.tolist():
-            self.tracks[t] = self.attempt(t, lambda t=t: filter.track(self.P[t].copy(), self.Q.copy(), z[t]))
+            self.tracks[t] = self.attempt(
+                t, lambda t=t: filter.track(self.P[t].copy(), self.Q.copy(), z[t])
+            )
 
     def attempt(self, trial: int, action: Callable[[], Any]) -> Any:
         """Returns `action()`, or None if it raises."""
@@ -166,11 +170,16 @@ class _OneByOne(_Filters):
             points, waiting = {t: s for t, s in tried.items() if s is not None}, []
             if points:
                 s = np.stack(list(points.values()))
-                kept, h, H = self.read(epoch, s, np.array(list(points), dtype=np.intp), slopes=self.filter.slopes)
+                kept, h, H = self.read(
+                    epoch, s, np.array(list(points), dtype=np.intp), slopes=self.filter.slopes
+                )
                 for i, trial in enumerate(kept.tolist()):
                     z, slope = epoch.whitened(self.z[trial]), None if H is None else H[i]
                     update = self.tracks[trial].update
-                    if self.attempt(trial, lambda u=update, z=z, h=h[i], H=slope: u(z, h, H)) is False:
+                    if (
+                        self.attempt(trial, lambda u=update, z=z, h=h[i], H=slope: u(z, h, H))
+                        is False
+                    ):
                         waiting.append(trial)
         for trial in self.going.tolist():
             track = self.tracks[trial]
@@ -191,7 +200,9 @@ class _Stack(_Filters):
             found = update(Normal(x[at], P[at]), read, np.eye(read.b.shape[-1]), readings.z)
             self.x[at], self.P[at] = found.x
             if iteration == 0:
-                self.nis[at] += found.nis  # the innovation of the prediction; later ones have seen z
+                self.nis[at] += (
+                    found.nis
+                )  # the innovation of the prediction; later ones have seen z
             lost = ~finite(found.x.mean)
             singular = lost & (self.status[at] == Status.RUNNING)
             self.end(at[singular], Status.SINGULAR, f"S is singular at epoch {epoch.number}")
@@ -231,10 +242,18 @@ class _TurnedReadings:
     def _read(self, x: Array, *, slopes: bool) -> tuple[Array, Array]:
         """Returns h (trials, points, m) as it is and, for one point, dh/dx (trials, m, n)."""
         known, number = finite(x), self.epoch.number
-        self.walk.end(self.at[~known], Status.SINGULAR, f"the filter's P is not positive definite at epoch {number}")
+        self.walk.end(
+            self.at[~known],
+            Status.SINGULAR,
+            f"the filter's P is not positive definite at epoch {number}",
+        )
         kept, h, H = self.walk.read(self.epoch, x[known], self.at[known], slopes=slopes)
         beyond = ~(np.abs(h if H is None else H).max(axis=(1, 2), initial=0) < LARGEST)
-        self.walk.end(kept[beyond], Status.NONFINITE, "what the filter is to take in is beyond the range of numbers")
+        self.walk.end(
+            kept[beyond],
+            Status.NONFINITE,
+            "what the filter is to take in is beyond the range of numbers",
+        )
         rows, (trials, points, n), m = np.isin(self.at, kept[~beyond]), x.shape, self.z.shape[1]
         values, tangents = np.full((trials, points, m), np.nan), np.full((trials, m, n), np.nan)
         values[rows] = h[~beyond]

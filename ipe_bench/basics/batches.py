@@ -40,7 +40,11 @@ def put(batch: B, where: NDArray[Any], part: B) -> B:
 def gather(parts: Sequence[tuple[NDArray[np.intp], B]]) -> B:
     """Gathers the trials at each part's indices into one batch."""
     rows = np.concatenate([rows for rows, _ in parts])
-    return parts[0][1] if len(parts) == 1 else take(join([part for _, part in parts]), np.argsort(rows))
+    return (
+        parts[0][1]
+        if len(parts) == 1
+        else take(join([part for _, part in parts]), np.argsort(rows))
+    )
 
 
 def join(batches: Sequence[B]) -> B:
@@ -66,18 +70,29 @@ def _joined(parts: Sequence[Any], sizes: Sequence[int]) -> Any:
         return type(known)(*[_joined(values, sizes) for values in zip(*parts, strict=True)])
     if isinstance(known, list):
         empty = next((row[:0] for part in parts for row in part or ()), None)
-        rows = ([empty] * size if part is None else part for part, size in zip(parts, sizes, strict=True))
+        rows = (
+            [empty] * size if part is None else part
+            for part, size in zip(parts, sizes, strict=True)
+        )
         return [row for several in rows for row in several]
     missing = (np.full((size, *known.shape[1:]), np.nan) for size in sizes)
     # Filled first: np.concatenate takes masks off, and keeps what lies under them.
-    filled = (m if part is None else np.ma.filled(part, np.nan) for m, part in zip(missing, parts, strict=True))
+    filled = (
+        m if part is None else np.ma.filled(part, np.nan)
+        for m, part in zip(missing, parts, strict=True)
+    )
     return np.concatenate(list(filled))
 
 
 def _each(change: Callable[..., Any], *batches: Any) -> Any:
     first = batches[0]
-    parts = {f.name: tuple(getattr(batch, f.name) for batch in batches) for f in fields(first) if f.init}
-    return replace(first, **{name: None if values[0] is None else change(*values) for name, values in parts.items()})
+    parts = {
+        f.name: tuple(getattr(batch, f.name) for batch in batches) for f in fields(first) if f.init
+    }
+    return replace(
+        first,
+        **{name: None if values[0] is None else change(*values) for name, values in parts.items()},
+    )
 
 
 def _indices(rows: NDArray[Any]) -> list[int]:

@@ -63,7 +63,9 @@ def pinned(component: Any) -> Any:
     code that it works with can have changed since. One of installed packages alone is returned as it is."""
     if isinstance(component, tuple | list):
         return type(component)(map(pinned, component))
-    if not dataclasses.is_dataclass(component) or _PIN in getattr(component, "__dict__", {_PIN: ""}):
+    if not dataclasses.is_dataclass(component) or _PIN in getattr(
+        component, "__dict__", {_PIN: ""}
+    ):
         return component
     found = definition_digest(component)
     if not found:
@@ -78,7 +80,11 @@ def pinned(component: Any) -> Any:
 def _state_of(thing: Any) -> dict[str, Any]:
     """Returns an object's attributes without the values of cached properties."""
     cls, cached = type(thing), functools.cached_property
-    return {k: v for k, v in vars(thing).items() if not isinstance(inspect.getattr_static(cls, k, None), cached)}
+    return {
+        k: v
+        for k, v in vars(thing).items()
+        if not isinstance(inspect.getattr_static(cls, k, None), cached)
+    }
 
 
 @functools.cache
@@ -168,14 +174,23 @@ class Definitions:
         make, arguments, state, *several = (*taken, None, None, None)[:5]
         if isinstance(state, dict) and hasattr(thing, "__dict__"):
             state = {name: value for name, value in state.items() if name in _state_of(thing)}
-        return [self.of(part) for part in (make, arguments, state, *(each and list(each) for each in several))]
+        return [
+            self.of(part)
+            for part in (make, arguments, state, *(each and list(each) for each in several))
+        ]
 
     def _class(self, cls: type) -> Any:
         slots = types.MemberDescriptorType | types.GetSetDescriptorType
-        own = {name: value for name, value in sorted(vars(cls).items()) if not isinstance(value, slots)}
+        own = {
+            name: value for name, value in sorted(vars(cls).items()) if not isinstance(value, slots)
+        }
         attributes = self._kept(own, in_file=_is_named(cls))
         # What Python and dataclasses note in a class is no number's: annotations, docstring, lines, fields.
-        noted = [name for name in attributes if name.startswith("__") and not isinstance(own[name], _DEFINED)]
+        noted = [
+            name
+            for name in attributes
+            if name.startswith("__") and not isinstance(own[name], _DEFINED)
+        ]
         for name in (*noted, "_abc_impl"):
             attributes.pop(name, None)
         return cls.__qualname__, [self.of(base) for base in cls.__bases__], self.of(attributes)
@@ -191,22 +206,40 @@ class Definitions:
         reached = self._kept(found, in_file=in_file)
         cells = dict(zip(code.co_freevars, map(_content, function.__closure__ or ()), strict=True))
         reached |= self._kept(cells, in_file=_is_named(function))
-        given = function.__defaults__, function.__kwdefaults__, vars(function) if self.values else None
-        return text, [(name, self._reached(reached[name], attributes)) for name in reached], self.of(given)
+        given = (
+            function.__defaults__,
+            function.__kwdefaults__,
+            vars(function) if self.values else None,
+        )
+        return (
+            text,
+            [(name, self._reached(reached[name], attributes)) for name in reached],
+            self.of(given),
+        )
 
     def _kept(self, variables: Mapping[str, Any], *, in_file: bool) -> dict[str, Any]:
         """Keeps those variables that belong to a definition. What a file fills a container with is in its source, and
         what is put in later is mostly a cache."""
-        kinds = (*_DEFINED, *(_PLAIN if self.values else ()), *((tuple, frozenset) if self.values else ()))
+        kinds = (
+            *_DEFINED,
+            *(_PLAIN if self.values else ()),
+            *((tuple, frozenset) if self.values else ()),
+        )
         everything = self.values and not in_file
-        return {k: v for k, v in variables.items() if everything or isinstance(v, kinds) or _wraps(v)}
+        return {
+            k: v for k, v in variables.items() if everything or isinstance(v, kinds) or _wraps(v)
+        }
 
     def _reached(self, value: Any, attributes: Set[str]) -> Any:
         """Describes what a name stands for: of a module those of its attributes that the code asks for."""
         if not isinstance(value, types.ModuleType) or is_installed(value.__name__):
             return self.of(value)
-        asked = self._kept({k: vars(value)[k] for k in sorted(attributes & vars(value).keys())}, in_file=True)
-        return value.__name__, [(name, self._reached(one, attributes - {name})) for name, one in asked.items()]
+        asked = self._kept(
+            {k: vars(value)[k] for k in sorted(attributes & vars(value).keys())}, in_file=True
+        )
+        return value.__name__, [
+            (name, self._reached(one, attributes - {name})) for name, one in asked.items()
+        ]
 
 
 def _content(cell: Any) -> Any:

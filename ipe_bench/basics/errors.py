@@ -63,9 +63,14 @@ def _shown(filename: str) -> str:
 def definition(function: Any) -> str:
     """Returns the file and line in which a function or method is written, if they are known, and its name."""
     function = inspect.unwrap(getattr(function, "__func__", function))
-    code, name = getattr(function, "__code__", None), getattr(function, "__qualname__", str(function))
+    code, name = (
+        getattr(function, "__code__", None),
+        getattr(function, "__qualname__", str(function)),
+    )
     return (
-        f"{code.co_filename.removeprefix(os.getcwd() + os.sep)}, line {code.co_firstlineno}: {name}" if code else name
+        f"{code.co_filename.removeprefix(os.getcwd() + os.sep)}, line {code.co_firstlineno}: {name}"
+        if code
+        else name
     )
 
 
@@ -106,7 +111,9 @@ def moved(name: str) -> str:
     if name not in (*ZOO, *ZOO.values()):
         return ""
     what = "" if name in ZOO else f"ipe_bench_zoo.{name} "
-    place = "in the plugin zoo now; work in a clone of ipe-bench, or `pip install CLONE/plugins/zoo`"
+    place = (
+        "in the plugin zoo now; work in a clone of ipe-bench, or `pip install CLONE/plugins/zoo`"
+    )
     return f"is {what}{place}"
 
 

@@ -23,7 +23,9 @@ def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
     Raises:
         StorageError: the disk is full, or the folder cannot be written to any more.
     """
-    temporary = path.with_name(f".{path.name}.{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex[:8]}.tmp")
+    temporary = path.with_name(
+        f".{path.name}.{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex[:8]}.tmp"
+    )
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write(temporary)
@@ -59,7 +61,9 @@ def make_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise StorageError(f"{path}: cannot be made a folder ({error.strerror or error}); move what is there") from None
+        raise StorageError(
+            f"{path}: cannot be made a folder ({error.strerror or error}); move what is there"
+        ) from None
 
 
 def write_text(path: Path, text: str) -> None:
@@ -71,7 +75,9 @@ def cache_folder() -> Path:
     """Returns the folder of compiled files: `IPE_BENCH_CACHE`, or the user's cache; if that cannot be written to, a
     folder of the user's own among temporary files."""
     for place in (_chosen_cache, _spare_cache):
-        with contextlib.suppress(OSError, KeyError, RuntimeError):  # of homes that are not known, too
+        with contextlib.suppress(
+            OSError, KeyError, RuntimeError
+        ):  # of homes that are not known, too
             folder = place()
             with tempfile.TemporaryFile(dir=folder):
                 return folder
@@ -88,10 +94,14 @@ def _chosen_cache() -> Path:
 
 def _spare_cache() -> Path:
     """Returns a folder that belongs to this user alone, whoever may write to the folder of temporary files."""
-    folder = Path(tempfile.gettempdir()) / f"ipe-bench-{os.geteuid() if os.name == 'posix' else 'cache'}"
+    folder = (
+        Path(tempfile.gettempdir()) / f"ipe-bench-{os.geteuid() if os.name == 'posix' else 'cache'}"
+    )
     folder.mkdir(mode=0o700, exist_ok=True)
     about = folder.lstat()
-    if os.name == "posix" and (about.st_uid != os.geteuid() or about.st_mode & 0o77 or not stat.S_ISDIR(about.st_mode)):
+    if os.name == "posix" and (
+        about.st_uid != os.geteuid() or about.st_mode & 0o77 or not stat.S_ISDIR(about.st_mode)
+    ):
         raise OSError(errno.EPERM, "belongs to others")
     return folder
 
@@ -102,4 +112,6 @@ def own_conf() -> Path:
     for folder in (package / "conf", package.parent / "conf"):
         if (folder / "config.yaml").is_file():
             return folder
-    raise FileNotFoundError("the configs of ipe-bench are neither in the package nor beside it; install it again")
+    raise FileNotFoundError(
+        "the configs of ipe-bench are neither in the package nor beside it; install it again"
+    )

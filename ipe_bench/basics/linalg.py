@@ -200,7 +200,9 @@ def definite_factor(G: Array) -> tuple[Array, Array, Mask]:
         size = np.sqrt(np.diagonal(G, axis1=1, axis2=2))
         scaled = G / (size[:, :, None] * size[:, None, :])
         usable = finite(scaled)
-        U = _of_each(np.linalg.cholesky, np.where(usable[:, None, None], scaled, np.eye(n))).swapaxes(1, 2)
+        U = _of_each(
+            np.linalg.cholesky, np.where(usable[:, None, None], scaled, np.eye(n))
+        ).swapaxes(1, 2)
         inverse_U = _inverse_of_upper(U)
         well = usable & (np.linalg.norm(inverse_U, axis=(1, 2)) * np.sqrt(n) <= _WELL_CONDITIONED)
         return U * size[:, None, :], inverse_U / size[:, :, None], well

@@ -7,7 +7,17 @@ import importlib.metadata
 import os
 import platform
 
-_LIBRARIES = ("numpy", "scipy", "llvmlite", "filterpy", "hydra-core", "pandas", "pyarrow", "seaborn", "matplotlib")
+_LIBRARIES = (
+    "numpy",
+    "scipy",
+    "llvmlite",
+    "filterpy",
+    "hydra-core",
+    "pandas",
+    "pyarrow",
+    "seaborn",
+    "matplotlib",
+)
 
 
 def cores() -> int:
@@ -19,4 +29,6 @@ def cores() -> int:
 @functools.cache
 def library_versions() -> dict[str, str]:
     """Returns Python and the libraries that results depend on, with their versions."""
-    return {"python": platform.python_version()} | {name: importlib.metadata.version(name) for name in _LIBRARIES}
+    return {"python": platform.python_version()} | {
+        name: importlib.metadata.version(name) for name in _LIBRARIES
+    }

@@ -54,7 +54,13 @@ _BOUNDED = {
     (Ge, Le): "{} from {} to {}",
     (MinLen,): "{} of at least {}",
 }
-_NOUNS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text", type(None): "null"}
+_NOUNS = {
+    int: "a whole number",
+    float: "a number",
+    bool: "true or false",
+    str: "a text",
+    type(None): "null",
+}
 
 
 def as_python(value: Any) -> str:
@@ -72,7 +78,9 @@ def as_python(value: Any) -> str:
 def in_lines(self: Any) -> str:
     """Writes a dataclass with a line for each field that is not None."""
     values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-    lines = [f"    {name}={as_python(value)},\n" for name, value in values.items() if value is not None]
+    lines = [
+        f"    {name}={as_python(value)},\n" for name, value in values.items() if value is not None
+    ]
     return f"{type(self).__name__}(\n{''.join(lines)})"
 
 
@@ -87,7 +95,9 @@ class Component:
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        if "name" not in {*cls.__dict__, *cls.__annotations__} and not isinstance(cls.name, property):
+        if "name" not in {*cls.__dict__, *cls.__annotations__} and not isinstance(
+            cls.name, property
+        ):
             cls.name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", cls.__name__).lower()
 
     def __new__(cls, *_: Any, **options: Any) -> Self:
@@ -95,7 +105,9 @@ class Component:
         takes = inspect.signature(cls.__init__).parameters
         if not any(one.kind is one.VAR_KEYWORD for one in takes.values()):
             for name in options.keys() - takes.keys():
-                raise UserError(f"{cls.__name__}: {name}=: {unknown(name, takes.keys() - {'self'}, 'option')}")
+                raise UserError(
+                    f"{cls.__name__}: {name}=: {unknown(name, takes.keys() - {'self'}, 'option')}"
+                )
         return super().__new__(cls)
 
     def __post_init__(self) -> None:
@@ -117,8 +129,16 @@ def component_classes(component: Any) -> list[Any]:
         return [cls for item in component for cls in component_classes(item)]
     if not dataclasses.is_dataclass(component) or isinstance(component, type):
         return []
-    inner = [cls for f in dataclasses.fields(component) for cls in component_classes(getattr(component, f.name))]
-    own = (cls for cls in type(component).__mro__ if cls.__module__ not in ("builtins", "abc", "typing"))
+    inner = [
+        cls
+        for f in dataclasses.fields(component)
+        for cls in component_classes(getattr(component, f.name))
+    ]
+    own = (
+        cls
+        for cls in type(component).__mro__
+        if cls.__module__ not in ("builtins", "abc", "typing")
+    )
     return [*own, *getattr(component, "functions", ()), *inner]
 
 
@@ -160,7 +180,9 @@ def checked(value: Any, hint: Any, key: str) -> Any:
     if not isinstance(plain, type):
         return value
     if issubclass(plain, Mapping) and isinstance(value, Mapping) and arguments:
-        entries = {name: checked(entry, arguments[1], f"{key}.{name}") for name, entry in value.items()}
+        entries = {
+            name: checked(entry, arguments[1], f"{key}.{name}") for name, entry in value.items()
+        }
         return value if all(entries[name] is entry for name, entry in value.items()) else entries
     # True and false are not numbers; NumPy's are.
     abstract = {int: numbers.Integral, float: numbers.Real}.get(plain)
@@ -181,7 +203,10 @@ def _refusal(value: Any, wanted: str, key: str) -> UserError:
 def _constrained(value: Any, kind: Any, metadata: Sequence[Any], key: str) -> Any:
     try:
         value = checked(value, kind, key)
-        if all(_COMPARISONS[type(bound)](value, dataclasses.astuple(bound)[0]) for bound in _bounds(metadata)):
+        if all(
+            _COMPARISONS[type(bound)](value, dataclasses.astuple(bound)[0])
+            for bound in _bounds(metadata)
+        ):
             return value
     except UserError:
         if typing.get_origin(kind) is tuple:
@@ -216,12 +241,21 @@ def _one_of(value: Any, alternatives: Sequence[Any], key: str) -> Any:
 
 
 def _is_tuple(hint: Any) -> bool:
-    return typing.get_origin(typing.get_args(hint)[0] if typing.get_origin(hint) is Annotated else hint) is tuple
+    return (
+        typing.get_origin(
+            typing.get_args(hint)[0] if typing.get_origin(hint) is Annotated else hint
+        )
+        is tuple
+    )
 
 
 def _choice(value: Any, choices: Sequence[Any], key: str) -> Any:
     for choice in choices:
-        if isinstance(value, type(choice)) and isinstance(value, bool) == isinstance(choice, bool) and value == choice:
+        if (
+            isinstance(value, type(choice))
+            and isinstance(value, bool) == isinstance(choice, bool)
+            and value == choice
+        ):
             return choice
     text = " ".join(str(value).split())
     raise UserError(f"{key}={text}: choose one of {', '.join(map(str, choices))}")
@@ -232,7 +266,9 @@ def _entries(value: Any, arguments: Sequence[Any], key: str) -> tuple[Any, ...]:
         arguments = [arguments[0]] * len(value)
     if len(arguments) != len(value):
         raise _refusal(value, _list_of(arguments), key)
-    return tuple(checked(v, a, f"{key}[{i}]") for i, (v, a) in enumerate(zip(value, arguments, strict=True)))
+    return tuple(
+        checked(v, a, f"{key}[{i}]") for i, (v, a) in enumerate(zip(value, arguments, strict=True))
+    )
 
 
 def describe_type(hint: Any) -> str:
@@ -240,7 +276,9 @@ def describe_type(hint: Any) -> str:
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
         bounds = [bound for bound in _bounds(arguments[1:]) if not isinstance(bound, Predicate)]
-        noun = "a finite number" if FINITE in arguments and not bounds else describe_type(arguments[0])
+        noun = (
+            "a finite number" if FINITE in arguments and not bounds else describe_type(arguments[0])
+        )
         limits = [dataclasses.astuple(bound)[0] for bound in bounds]
         return _BOUNDED[tuple(map(type, bounds))].format(noun, *limits)
     if origin in (typing.Union, types.UnionType):

@@ -64,7 +64,9 @@ def say_files(files: Sequence[Path]) -> None:
     console().print(", ".join(path.name for path in files))
 
 
-def places_and_keys(command: str, words: Sequence[str], kinds: Mapping[str, Any]) -> tuple[list[str], dict[str, Any]]:
+def places_and_keys(
+    command: str, words: Sequence[str], kinds: Mapping[str, Any]
+) -> tuple[list[str], dict[str, Any]]:
     """Splits off the files and folders after a command that Hydra does not read, and keys' values by their types."""
     from ipe_bench.basics.options import Count, checked
     from ipe_bench.questions.question import NAMES
@@ -95,6 +97,10 @@ def places_and_keys(command: str, words: Sequence[str], kinds: Mapping[str, Any]
 def refuse_blanks(words: Sequence[str]) -> None:
     """Refuses KEY = VALUE, of which a shell makes several words."""
     for i, (first, second) in enumerate(itertools.pairwise(words)):
-        if (second.startswith("=") and "=" not in first) or (first.endswith("=") and "=" not in second):
+        if (second.startswith("=") and "=" not in first) or (
+            first.endswith("=") and "=" not in second
+        ):
             parts = words[i : i + 3] if second == "=" else (first, second)
-            raise UserError(f"{' '.join(parts)}: has a blank beside the equals sign; write {''.join(parts)}")
+            raise UserError(
+                f"{' '.join(parts)}: has a blank beside the equals sign; write {''.join(parts)}"
+            )

@@ -55,19 +55,33 @@ def _track(asked: Single, model: StateModel) -> int:
     """Tracks the states by every chosen tracker, prints tables and writes files; exit code 1 where no track passes."""
     from ipe_bench.report.page.log import NAME, TABLE, write_tracks
 
-    asked.words.refuse(("error_scale",), "is of simulated trials; give the state model another prior")
+    asked.words.refuse(
+        ("error_scale",), "is of simulated trials; give the state model another prior"
+    )
     given, trackers = asked.spec.readings, asked.spec.estimators
     find = asked.spec.find or ()
-    answer = ib.estimate(model, given, trackers, ignore_columns=asked.spec.ignored, find=find, progress="lines")
-    command = {"readings": given, "find": find, "model": describe(model), "trackers": _described(trackers)}
-    files, parts = [answer.log.file] if answer.log.file else [], [answer.log.model, *trackers.values()]
+    answer = ib.estimate(
+        model, given, trackers, ignore_columns=asked.spec.ignored, find=find, progress="lines"
+    )
+    command = {
+        "readings": given,
+        "find": find,
+        "model": describe(model),
+        "trackers": _described(trackers),
+    }
+    files, parts = (
+        [answer.log.file] if answer.log.file else [],
+        [answer.log.model, *trackers.values()],
+    )
     folder = asked.folder(NAME, command, [TABLE])
     show(answer.parts())
     say_files(write_tracks(folder, answer, command, _provenance(asked, files, parts)))
     return 0 if answer.passes else 1
 
 
-def _provenance(asked: Single, files: Sequence[tuple[str, str]], parts: Sequence[Any]) -> dict[str, Any]:
+def _provenance(
+    asked: Single, files: Sequence[tuple[str, str]], parts: Sequence[Any]
+) -> dict[str, Any]:
     return {
         "measurement": asked.measurement,
         "config": asked.config,

@@ -30,14 +30,22 @@ class Guarded(ConfigLoaderImpl):
         from_shell: bool = True,
         validate_sweep_overrides: bool = True,
     ) -> DictConfig:
-        config = super().load_configuration(config_name, overrides, run_mode, from_shell, validate_sweep_overrides)
+        config = super().load_configuration(
+            config_name, overrides, run_mode, from_shell, validate_sweep_overrides
+        )
         require_listed(config.hydra, overrides)
         return config
 
 
 def _leaves(node: Any, key: str = "") -> Iterator[tuple[str, Any]]:
     """Yields the values in a config, each with its key; empty lists and dictionaries are values, too."""
-    items = enumerate(node) if isinstance(node, list) else node.items() if isinstance(node, dict) else ()
+    items = (
+        enumerate(node)
+        if isinstance(node, list)
+        else node.items()
+        if isinstance(node, dict)
+        else ()
+    )
     if not items or not node:
         yield key, node
         return
@@ -53,7 +61,9 @@ _PLAIN = dict(_leaves(_OURS))
 """Values of our own config, which stay."""
 _TYPED = re.compile(r"(job|output_subdir|searchpath)\b.*")
 """Those of these keys that the command line may set."""
-_WRITTEN = re.compile(r"(help|hydra_help|overrides|runtime|job\.(override_dirname|id|num|config_name|config))\b.*")
+_WRITTEN = re.compile(
+    r"(help|hydra_help|overrides|runtime|job\.(override_dirname|id|num|config_name|config))\b.*"
+)
 """Keys that Hydra writes, or that only its own help shows."""
 _FREE = re.compile(r"mode|(verbose|launcher|sweeper)\b.*|run\.dir|sweep\.(sub)?dir")
 _LIST = "only mode, verbose, launcher, sweeper, run.dir and sweep.dir may be set here"
@@ -63,7 +73,14 @@ _CLASS = re.compile(
     r"|optuna\.(samplers|pruners)\.[A-Z]\w*"
 )
 """Classes of Hydra, of the launchers and sweepers that are installed, and those by which Optuna chooses trials."""
-_COMMANDS = {"_args_", "additional_parameters", "custom_search_space", "python", "setup", "srun_args"}
+_COMMANDS = {
+    "_args_",
+    "additional_parameters",
+    "custom_search_space",
+    "python",
+    "setup",
+    "srun_args",
+}
 """Parameters of launchers and sweepers that name a function or hold lines of a shell."""
 _OF_HYDRA = r"\$\{hydra\.(job\.(name|num|id|override_dirname)|run\.dir|sweep\.(sub)?dir|runtime\.(cwd|output_dir))\}"
 _TEXTS = re.compile(_OF_HYDRA)

@@ -22,18 +22,38 @@ class Key(NamedTuple):
 
 
 _ROWS = (
-    ("still", "measurement=NAME", "the measurement model; `ipe-bench list measurement` shows which there are"),
+    (
+        "still",
+        "measurement=NAME",
+        "the measurement model; `ipe-bench list measurement` shows which there are",
+    ),
     ("still", "noise=NAME", "the errors of the readings"),
     ("still", "prior=NAME", "the distribution of the true parameters about the nominal point"),
     ("estimators", "solver=[A,B]", "iterative solvers of the estimating equation"),
     ("estimators", "baseline=[A,B]", "other estimators, on the same trials"),
     ("moving", "state_model=NAME", "states that move, in place of a measurement"),
-    ("moving", "tracker=[A,B]", "filters and smoothers of such states; trackers.NAME.KEY=X sets an option of one"),
+    (
+        "moving",
+        "tracker=[A,B]",
+        "filters and smoothers of such states; trackers.NAME.KEY=X sets an option of one",
+    ),
     ("moving", "trackers.NAME.KEY=X", ""),
-    ("run", "execution=NAME", "where blocks of trials are computed: in this process, or in several at once"),
-    ("", "GROUP.KEY=VALUE", "an option of one of these; `ipe-bench list GROUP/NAME` shows its type and default"),
+    (
+        "run",
+        "execution=NAME",
+        "where blocks of trials are computed: in this process, or in several at once",
+    ),
+    (
+        "",
+        "GROUP.KEY=VALUE",
+        "an option of one of these; `ipe-bench list GROUP/NAME` shows its type and default",
+    ),
     ("estimators", "estimators.NAME.KEY=X", "an option of a solver or a baseline that is chosen"),
-    ("still", "truth_measurement=NAME", "the model that simulates the readings, if estimators assume another one"),
+    (
+        "still",
+        "truth_measurement=NAME",
+        "the model that simulates the readings, if estimators assume another one",
+    ),
     (
         "scale",
         "error_scale=X",
@@ -42,10 +62,22 @@ _ROWS = (
     ),
     ("trials", "seed=N", "number that all random draws follow from (0)"),
     ("trials", "trials=N", "number of trials (1000); with precision= the largest number"),
-    ("run", "precision=X", "adds trials until the success shares are known to within X, as in 0.01"),
+    (
+        "run",
+        "precision=X",
+        "adds trials until the success shares are known to within X, as in 0.01",
+    ),
     ("run", "time_limit=SECONDS", "ends this earlier"),
-    ("run", "objective=NAME.COLUMN", "the statistic that a sweeper minimises, as in newton.capped_error"),
-    ("still", "parameters.NAME.KEY=X", "knowledge of a parameter: fixed, nominal, deviation, lower, upper, positive"),
+    (
+        "run",
+        "objective=NAME.COLUMN",
+        "the statistic that a sweeper minimises, as in newton.capped_error",
+    ),
+    (
+        "still",
+        "parameters.NAME.KEY=X",
+        "knowledge of a parameter: fixed, nominal, deviation, lower, upper, positive",
+    ),
     ("folder", "output=DIR", "folder of the results; the same command in the same folder resumes"),
     (
         "folder",
@@ -65,7 +97,11 @@ _ROWS = (
     ("files", "readings=FILE", "is for `ipe-bench estimate`, as are ignore_columns= and find="),
     ("files", "ignore_columns=[A]", ""),
     ("files", "find=[A,B]", ""),
-    ("", "+experiment=NAME", "an experiment of `ipe-bench list experiment`, which sets some of these keys"),
+    (
+        "",
+        "+experiment=NAME",
+        "an experiment of `ipe-bench list experiment`, which sets some of these keys",
+    ),
 )
 ROWS = tuple(Key(*row) for row in _ROWS)
 WHOLE = tuple(key.name for key in ROWS if key.written.endswith("=N"))

@@ -42,7 +42,9 @@ def list_command(names: Sequence[str], verbose: bool) -> int:
             title = group if origin == "built in" else f"{group}, from {origin}"
             _show(title, {"option": names_here, "what it is": texts})
         print()
-        for one in options.values() if verbose else [o for o in options.values() if o.fault is not None]:
+        for one in (
+            options.values() if verbose else [o for o in options.values() if o.fault is not None]
+        ):
             try:
                 _describe(one)
             except UserError as error:
@@ -64,7 +66,16 @@ def _ours(group: str) -> dict[str, str]:
 
 
 def _show(title: str, columns: Mapping[str, Sequence[str]]) -> None:
-    show([Table("list", title, "", [words(heading, list(cells)) for heading, cells in columns.items()])])
+    show(
+        [
+            Table(
+                "list",
+                title,
+                "",
+                [words(heading, list(cells)) for heading, cells in columns.items()],
+            )
+        ]
+    )
 
 
 def _describe(option: plugins.Option) -> None:

@@ -41,7 +41,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command; returns the exit code."""
     words = list(sys.argv[1:] if argv is None else argv)
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # one that knows no Greek letters shows question marks
+        if isinstance(
+            stream, io.TextIOWrapper
+        ):  # one that knows no Greek letters shows question marks
             stream.reconfigure(errors="replace")
     # Batched linear algebra is small per trial: more BLAS threads only get in each other's way.
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -49,7 +51,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     # Arrow's own allocator keeps what it was given back: of a million rows, as much again as is in use.
     os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
     COMMAND.set(shlex.join(["ipe-bench", *words]))
-    with contextlib.redirect_stdout(_door(sys.stdout)), contextlib.redirect_stderr(_door(sys.stderr)):
+    with (
+        contextlib.redirect_stdout(_door(sys.stdout)),
+        contextlib.redirect_stderr(_door(sys.stderr)),
+    ):
         return _answer(words)
 
 
@@ -88,8 +93,14 @@ def _explain(error: BaseException, command: Sequence[str]) -> tuple[int, str]:
         reason = error.strerror or str(error)
         where = "a file" if error.filename is None else shortened(str(error.filename))
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            return 1, f"{where}: {reason}; what was stored before is whole, and the same command goes on from there"
-        return 2, f"{where}: cannot be used ({reason}); choose another file or folder, for results with output="
+            return (
+                1,
+                f"{where}: {reason}; what was stored before is whole, and the same command goes on from there",
+            )
+        return (
+            2,
+            f"{where}: cannot be used ({reason}); choose another file or folder, for results with output=",
+        )
     line = blame(error)
     if line is None:
         raise error
@@ -110,12 +121,17 @@ def _dispatch(words: list[str]) -> int:
     if command == "--version":
         print(f"ipe-bench {__version__}")
         return 0
-    if command in ("-sc", "--shell-completion"):  # asked of the bare program; only `run` has anything to complete
+    if command in (
+        "-sc",
+        "--shell-completion",
+    ):  # asked of the bare program; only `run` has anything to complete
         command, rest = "run", words
     if command in GONE:
         raise UserError(f"{command}: is no command any more; {GONE[command]}")
     if command not in COMMANDS:
-        known, noun = (("--help", "--version"), "flag") if command.startswith("-") else (COMMANDS, "command")
+        known, noun = (
+            (("--help", "--version"), "flag") if command.startswith("-") else (COMMANDS, "command")
+        )
         raise UserError(f"{command}: {unknown(command, known, noun)}")
     parser = parser_of(command)
     if any(word in ("-h", "--help") for word in rest):
@@ -123,5 +139,7 @@ def _dispatch(words: list[str]) -> int:
         return 0
     if command in QUESTIONS:
         return question_command(command, parser.parse(without_flags(command, rest)).arguments)
-    begin = getattr(importlib.import_module(f"ipe_bench.cli.{HOMES[command]}"), f"{command}_command")
+    begin = getattr(
+        importlib.import_module(f"ipe_bench.cli.{HOMES[command]}"), f"{command}_command"
+    )
     return begin(rest) if command == "run" else begin(**vars(parser.parse(rest)))

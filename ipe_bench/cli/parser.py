@@ -51,14 +51,31 @@ COMMANDS: dict[str, tuple[str, str, str, Arguments] | None] = {
         + "".join(f"{key.written:<22} {key.meaning}\n" for key in ROWS if key.meaning),
         {
             "overrides": _several("KEY=VALUE", "see above"),
-            "--dry-run": {"action": "store_true", "help": "list stored and missing trials, and forecast the time"},
+            "--dry-run": {
+                "action": "store_true",
+                "help": "list stored and missing trials, and forecast the time",
+            },
             "-m --multirun": {"action": "store_true", "help": "run all jobs of a sweep"},
-            "-c --cfg": {"choices": ("job", "hydra", "all"), "help": "print the config instead of running it"},
+            "-c --cfg": {
+                "choices": ("job", "hydra", "all"),
+                "help": "print the config instead of running it",
+            },
             "-p --package": {"help": "with --cfg: the part of the config to print"},
             "--resolve": {"action": "store_true", "help": "with --cfg: replace interpolations"},
-            "-i --info": {"nargs": "?", "const": "all", "choices": INFO_TOPICS, "help": "what Hydra finds where"},
-            "-cd --config-dir": {"metavar": "DIR", "help": "a folder with options and experiments of your own"},
-            "-sc --shell-completion": {"action": "store_true", "help": "install=SHELL or uninstall=SHELL"},
+            "-i --info": {
+                "nargs": "?",
+                "const": "all",
+                "choices": INFO_TOPICS,
+                "help": "what Hydra finds where",
+            },
+            "-cd --config-dir": {
+                "metavar": "DIR",
+                "help": "a folder with options and experiments of your own",
+            },
+            "-sc --shell-completion": {
+                "action": "store_true",
+                "help": "install=SHELL or uninstall=SHELL",
+            },
         },
     ),
     "estimate": (
@@ -141,15 +158,24 @@ The same results give the same file, so that the digest may stand in a paper. Ot
         "",
         "",
         {
-            "names": _several("GROUP", "solver, measurement, ... or keys; solver/newton: its options"),
-            "-v --verbose": {"action": "store_true", "help": "with the options of each, and the files of models"},
+            "names": _several(
+                "GROUP", "solver, measurement, ... or keys; solver/newton: its options"
+            ),
+            "-v --verbose": {
+                "action": "store_true",
+                "help": "with the options of each, and the files of models",
+            },
         },
     ),
     "check": (
         "whether a plugin keeps the promises that every component makes",
         "0 all checks passed; 1 some failed",
         "",
-        {"words": _several("DIR", "folders of plugins, or KEY=VALUE: measurement=ode measurement.file=my.yaml")},
+        {
+            "words": _several(
+                "DIR", "folders of plugins, or KEY=VALUE: measurement=ode measurement.file=my.yaml"
+            )
+        },
     ),
     "new": (
         "a working model of one file, or a plugin in plugins/NAME, to start from",
@@ -167,7 +193,11 @@ The same results give the same file, so that the digest may stand in a paper. Ot
 """,
         {
             "kind": {"metavar": "KIND", "help": f"{', '.join((*MODELS, *KINDS))}, skill or ci"},
-            "name": {"metavar": "NAME", "nargs": "?", "help": "small letters, digits and underscores; none for ci"},
+            "name": {
+                "metavar": "NAME",
+                "nargs": "?",
+                "help": "small letters, digits and underscores; none for ci",
+            },
             "--language": {"help": "of a plugin's kind that has several"},
         },
     ),
@@ -179,7 +209,9 @@ class Parser(argparse.ArgumentParser):
     """Raises a UserError where argparse would print its usage and exit."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False, **options)
+        super().__init__(
+            formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False, **options
+        )
 
     def error(self, message: str) -> NoReturn:
         raise UserError(f"{self.command}: {message}; see `{self.prog} --help`")
@@ -200,9 +232,17 @@ class Parser(argparse.ArgumentParser):
             raise UserError(f"run: {word}: is no flag any more; {remedy}")
         flags = [flag for action in self._actions for flag in action.option_strings]
         takes_keys = equals or any(action.metavar == "KEY=VALUE" for action in self._actions)
-        if word.startswith("-" if equals else "--") and takes_keys and flag.lstrip("-").isidentifier():
+        if (
+            word.startswith("-" if equals else "--")
+            and takes_keys
+            and flag.lstrip("-").isidentifier()
+        ):
             after = list(words)[list(words).index(word) + 1 :]
-            value = after[0] if after and "=" not in after[0] and not after[0].startswith("-") else "VALUE"
+            value = (
+                after[0]
+                if after and "=" not in after[0] and not after[0].startswith("-")
+                else "VALUE"
+            )
             said = word.lstrip("-") if equals else f"{word[2:]}={value}"
             meant = did_you_mean(flag, flags) or f"; keys have no dashes: write {said}"
             raise UserError(f"{self.command}: {word}: there is no such flag{meant}")
@@ -213,9 +253,13 @@ class Parser(argparse.ArgumentParser):
 
 def program() -> Parser:
     """Builds the parser of the bare program, with a line for each command."""
-    found = Parser(prog="ipe-bench", description=_ABOUT, epilog=_CODES, usage="ipe-bench COMMAND ...")
+    found = Parser(
+        prog="ipe-bench", description=_ABOUT, epilog=_CODES, usage="ipe-bench COMMAND ..."
+    )
     found.add_argument("--version", action="store_true", help="print the version")
-    commands = found.add_subparsers(metavar="COMMAND", title="commands", prog="ipe-bench", parser_class=Parser)
+    commands = found.add_subparsers(
+        metavar="COMMAND", title="commands", prog="ipe-bench", parser_class=Parser
+    )
     for name, row in COMMANDS.items():
         commands.add_parser(name, help=QUESTIONS[name].line if row is None else row[0])
     return found
@@ -225,7 +269,9 @@ def parser_of(name: str) -> Parser:
     """Builds the parser of a command."""
     what, codes, more, arguments = COMMANDS[name] or _of_question(name)
     epilog = f"Exit codes: {codes}; 2 a mistake in what was asked for." if codes else None
-    found = Parser(prog=f"ipe-bench {name}", description=f"ipe-bench {name}: {what}\n{more}", epilog=epilog)
+    found = Parser(
+        prog=f"ipe-bench {name}", description=f"ipe-bench {name}: {what}\n{more}", epilog=epilog
+    )
     for names, options in arguments.items():
         found.add_argument(*names.split(), **options)
     return found
@@ -233,4 +279,9 @@ def parser_of(name: str) -> Parser:
 
 def _of_question(name: str) -> tuple[str, str, str, Arguments]:
     record = question(name)
-    return QUESTIONS[name].line, record.codes, record.more, {"arguments": _several(*record.argument)}
+    return (
+        QUESTIONS[name].line,
+        record.codes,
+        record.more,
+        {"arguments": _several(*record.argument)},
+    )

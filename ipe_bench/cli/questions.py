@@ -34,7 +34,9 @@ QUESTIONS = {
         of("run", "figures"),
         "use `ipe-bench run state_model=NAME`, with tracker=[grid] for one state, or tracker=[bootstrap]",
     ),
-    "compare": Row("whether a second version, setting or estimator is better or worse than a first"),
+    "compare": Row(
+        "whether a second version, setting or estimator is better or worse than a first"
+    ),
     "audit": Row("whether the covariance that another program reports describes its errors"),
 }
 """A question is a folder of `ipe_bench.questions` and its row here."""
@@ -90,7 +92,9 @@ def _asked(name: str, arguments: Sequence[str], row: Row) -> Asked:
 
     found = single(name, arguments, moving=row.moving, run=row.without or (), estimate=OF_FILES)
     trials = found.spec.count if "trials" in found.words.keys else None
-    return Asked(found.measurement, found.spec.scenario, found.spec.estimators, trials, found.folder)
+    return Asked(
+        found.measurement, found.spec.scenario, found.spec.estimators, trials, found.folder
+    )
 
 
 def _shown(found: Answered) -> int:

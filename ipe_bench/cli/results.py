@@ -27,7 +27,9 @@ def bundle_command(arguments: Sequence[str]) -> int:
     places, keys = places_and_keys("bundle", arguments, {"output": str})
     paths = [Path(place) for place in places]
     if not paths:
-        raise UserError("bundle: name at least one folder of results, such as outputs/paper, or a bundle to check")
+        raise UserError(
+            "bundle: name at least one folder of results, such as outputs/paper, or a bundle to check"
+        )
     checked = any(map(is_bundle, paths))
     if checked and (len(paths) > 1 or keys):
         raise UserError("bundle: one file is checked by itself; name folders to make a bundle of")
@@ -57,7 +59,9 @@ def status_command(arguments: Sequence[str], verbose: bool = False) -> int:
         cells = [cell for cell in results.cells if verbose or not cell.complete or cell.stale]
         if cells:
             show([_states(name, cells)])
-        verdict = "not complete; the same command as before computes what is missing, failed or damaged"
+        verdict = (
+            "not complete; the same command as before computes what is missing, failed or damaged"
+        )
         if not results.problems:
             estimates = [cell for cell in results.cells if cell.names["estimator"] != TRUTH]
             trials = sum(cell.done for cell in estimates)
@@ -74,7 +78,9 @@ def _states(directory: str, cells: Sequence[CellState]) -> Table:
         texts("done", [f"{cell.done} of {cell.expected or cell.done}" for cell in cells]),
     ]
     counts = ("missing", "failed", "stale")
-    columns += [texts(count, [str(getattr(cell, count) or "") for cell in cells]) for count in counts]
+    columns += [
+        texts(count, [str(getattr(cell, count) or "") for cell in cells]) for count in counts
+    ]
     return Table("status", directory, "", columns, grouped=1)
 
 
@@ -86,17 +92,27 @@ def report_command(arguments: Sequence[str]) -> int:
     if not named:
         raise UserError("report: name at least one directory of results, such as outputs/paper")
     if output is None and (bundles := [name for name in named if is_bundle(name)]):
-        raise UserError(f"report: {bundles[0]}: is a bundle; say where the report goes with output=DIR")
+        raise UserError(
+            f"report: {bundles[0]}: is a bundle; say where the report goes with output=DIR"
+        )
     if output is None and len(named) > 1 and not for_paper:
-        raise UserError("report: several directories need output=DIR, as the report on all is not that of the first")
+        raise UserError(
+            "report: several directories need output=DIR, as the report on all is not that of the first"
+        )
     with opened(named, None if output is None else output / BUNDLES) as folders:
         if for_paper:
             return _paper(folders, keys)
-        return show_report(folders, output or folders[0], keys.get("figures", "main"), keys.get("formats", PAGE))
+        return show_report(
+            folders, output or folders[0], keys.get("figures", "main"), keys.get("formats", PAGE)
+        )
 
 
 def show_report(
-    folders: Sequence[Path], output: Path, figures: Which, formats: Any, cells: Mapping[str, str] | None = None
+    folders: Sequence[Path],
+    output: Path,
+    figures: Which,
+    formats: Any,
+    cells: Mapping[str, str] | None = None,
 ) -> int:
     """Writes the report on all that folders hold, and prints it, or its rows of the `cells`, whose keys have a line for
     people each; returns the exit code."""
@@ -107,7 +123,11 @@ def show_report(
     pending = begin_report(folders, output, figures=figures, formats=formats)
     collection, rows = pending.begun.collection, pending.begun.summary
     shown = collection
-    others = sum(cell.key not in cells and cell.label != TRUTH for cell in collection.current) if cells else 0
+    others = (
+        sum(cell.key not in cells and cell.label != TRUTH for cell in collection.current)
+        if cells
+        else 0
+    )
     if cells and others:
         shown = collect(folders, cells.keys())
         rows = Begun(shown).summary
@@ -121,14 +141,20 @@ def show_report(
         told = [line for line in told if line not in elsewhere]
         if elsewhere:
             number = counted(len(elsewhere), "problem")
-            told.append(f"{output}: {number} of other commands; `ipe-bench status {output}` lists them")
+            told.append(
+                f"{output}: {number} of other commands; `ipe-bench status {output}` lists them"
+            )
     print_problems(told)
     drawn = f"\nFigures  {output / 'figures'}" if any(output.glob("figures/*.png")) else ""
     if drawn and (left_out := drawn_settings(collection.settings, figures)[1]):
         drawn += f" ({left_out})"
-    say(f"\nSummary  {output / 'summary.csv'}\nTables   {output / 'tables'}{drawn}\nReport   {output / 'report.html'}")
+    say(
+        f"\nSummary  {output / 'summary.csv'}\nTables   {output / 'tables'}{drawn}\nReport   {output / 'report.html'}"
+    )
     if others:
-        print(f"Here too  {counted(others, 'result')} of other commands; `ipe-bench report {output}` shows all")
+        print(
+            f"Here too  {counted(others, 'result')} of other commands; `ipe-bench report {output}` shows all"
+        )
     return 1 if collection.problems else 0
 
 
@@ -162,6 +188,13 @@ def _paper(folders: Sequence[Path], keys: Mapping[str, Any]) -> int:
     faults = use_statistics()
     analysis = analyse(folders)
     analysis.collection.extra_problems += faults
-    say(*map(str, export(analysis, Path(keys.get("output", folders[0] / "paper")), keys["paper"], **chosen)))
+    say(
+        *map(
+            str,
+            export(
+                analysis, Path(keys.get("output", folders[0] / "paper")), keys["paper"], **chosen
+            ),
+        )
+    )
     print_problems([*analysis.collection.problems, *analysis.collection.stale])
     return 1 if analysis.collection.problems else 0

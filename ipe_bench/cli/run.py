@@ -59,13 +59,16 @@ class Outcome:
         """Words that may tell the job from the others of a sweep, or the name of its folder."""
         words = [word.lstrip("+~").replace(w.HYDRAS_TRUTH, w.TRUTH) for word in self.words]
         return (
-            ", ".join(word for word in words if re.split("[.=]", word)[0] not in _NOT_TELLING) or Path(self.output).name
+            ", ".join(word for word in words if re.split("[.=]", word)[0] not in _NOT_TELLING)
+            or Path(self.output).name
         )
 
     def __float__(self) -> float:
         """Returns the objective of sweepers that optimise; they cannot go on from a job that was refused."""
         if self.mistake or self.objective is None:
-            raise UserError(self.mistake or "objective: is not given; a sweeper that optimises needs it")
+            raise UserError(
+                self.mistake or "objective: is not given; a sweeper that optimises needs it"
+            )
         return self.objective
 
 
@@ -96,7 +99,9 @@ def run_command(arguments: Sequence[str]) -> int:
         say(*_there_already(jobs))
         if words.standard_baselines:
             say(*_left_out(jobs.specs))
-        task = Task(shlex.join(["ipe-bench", "run", *arguments]), words.files, words.standard_baselines)
+        task = Task(
+            shlex.join(["ipe-bench", "run", *arguments]), words.files, words.standard_baselines
+        )
         if jobs.told:
             for told, spec in zip(jobs.told, jobs.specs, strict=True):
                 task.compute(told, spec)
@@ -111,15 +116,22 @@ def _missing(jobs: Jobs) -> list[str]:
     for told, job in zip(jobs.told or [jobs.words.text] * len(jobs.specs), jobs.specs, strict=True):
         validate([job.scenario], job.estimators, job.count, job.block_size)
         cells, output = result_keys(job.scenario, job.estimators)[1:], Path(job.output)
-        results = Results.read([output] if output.is_dir() else [], keys={cell.key for cell in cells})
-        lacking = sum(stop - start for cell in cells for start, stop in results.missing(cell.key, job.count))
+        results = Results.read(
+            [output] if output.is_dir() else [], keys={cell.key for cell in cells}
+        )
+        lacking = sum(
+            stop - start for cell in cells for start, stop in results.missing(cell.key, job.count)
+        )
         asked = job.count * len(cells)
         most = "" if job.precision is None else "at most "
         more = f", {most}{lacking} are missing" if lacking else ""
         name = Outcome(job.output, w.as_typed(told, jobs.words.files)).job
         lines.append(f"{name}: {asked - lacking} of {asked} estimates are stored{more}")
         stored, missing = stored + asked - lacking, missing + lacking
-    return [*lines, f"{stored} estimates are stored, {missing} would be computed; none was computed now"]
+    return [
+        *lines,
+        f"{stored} estimates are stored, {missing} would be computed; none was computed now",
+    ]
 
 
 def _there_already(jobs: Jobs) -> list[str]:
@@ -127,7 +139,12 @@ def _there_already(jobs: Jobs) -> list[str]:
     lines = []
     for output in dict.fromkeys(job.output for job in jobs.specs if job.write_readings is None):
         found = Results.read([output], keys=()).runs if (Path(output) / "runs").is_dir() else ()
-        there = {one["identity_key"] for run in found for one in run["cells"] if one["names"]["estimator"] != TRUTH}
+        there = {
+            one["identity_key"]
+            for run in found
+            for one in run["cells"]
+            if one["names"]["estimator"] != TRUTH
+        }
         for job in jobs.specs:
             there -= {cell.identity_key for cell in result_keys(job.scenario, job.estimators)}
         if there:
@@ -136,21 +153,33 @@ def _there_already(jobs: Jobs) -> list[str]:
     name, own = jobs.words.chosen("name"), jobs.words.chosen("experiment")
     if name != own and name in [option.name for option in options("experiment")]:
         remedy = f"choose another, or write output=outputs/{name} in its place to mix them"
-        raise UserError(f"name={name}: is that of an experiment, whose results these would join; {remedy}")
+        raise UserError(
+            f"name={name}: is that of an experiment, whose results these would join; {remedy}"
+        )
     return lines
 
 
 def _left_out(jobs: Sequence[Spec]) -> list[str]:
     """Names the standard filters that do not suit every job."""
-    lacking = [job for job in jobs if job.state_model is None and not set(STANDARD_FILTERS) <= job.estimators.keys()]
+    lacking = [
+        job
+        for job in jobs
+        if job.state_model is None and not set(STANDARD_FILTERS) <= job.estimators.keys()
+    ]
     models = dict.fromkeys(job.measurement.name for job in lacking)
     filters = " and ".join(STANDARD_FILTERS)
-    return [f"{filters} are left out for {', '.join(models)}: filters need epochs and a prior"] if models else []
+    return (
+        [f"{filters} are left out for {', '.join(models)}: filters need epochs and a prior"]
+        if models
+        else []
+    )
 
 
 def _flags(arguments: Sequence[str]) -> Namespace:
     flags = parser_of("run").parse(arguments)
-    asked = [f"--{name}" for name in ("multirun", "cfg", "info", "shell_completion") if vars(flags)[name]]
+    asked = [
+        f"--{name}" for name in ("multirun", "cfg", "info", "shell_completion") if vars(flags)[name]
+    ]
     if len(asked) > 1:
         raise UserError(f"run: {' '.join(asked).replace('_', '-')}: do not go together; choose one")
     if flags.resolve and not flags.cfg:
@@ -177,14 +206,20 @@ class Task:
         """Computes a job that Hydra has composed and launched."""
         hydra = HydraConfig.get()
         # Where a launcher plugin (joblib, submitit) runs the jobs, the cores are its to share out.
-        elsewhere = hydra.mode == RunMode.MULTIRUN and not hydra.launcher["_target_"].endswith(".BasicLauncher")
+        elsewhere = hydra.mode == RunMode.MULTIRUN and not hydra.launcher["_target_"].endswith(
+            ".BasicLauncher"
+        )
         try:
             spec = spec_of(config)
         except UserError as error:
-            self.outcomes.append(Outcome(str(config.output), tuple(hydra.overrides.task), mistake=str(error)))
+            self.outcomes.append(
+                Outcome(str(config.output), tuple(hydra.overrides.task), mistake=str(error))
+            )
             return self.outcomes[-1]
         spec = spec.suited() if self.standard else spec
-        return self.compute(hydra.overrides.task, replace(spec, execution=Serial()) if elsewhere else spec)
+        return self.compute(
+            hydra.overrides.task, replace(spec, execution=Serial()) if elsewhere else spec
+        )
 
     def compute(self, words: Sequence[str], spec: Spec) -> Outcome:
         """Computes a job."""
@@ -204,7 +239,11 @@ def _computed(job: Spec, begun: Outcome, command: str) -> Outcome:
         write_trial(job, Path(job.write_readings), job.write_readings_trial)
         return begun
     asked: Any = ([job.scenario], job.estimators, job.count, job.output)
-    options: dict[str, Any] = {"execution": job.execution, "block_size": job.block_size, "command": command}
+    options: dict[str, Any] = {
+        "execution": job.execution,
+        "block_size": job.block_size,
+        "command": command,
+    }
     done = replace(begun, remarks=job.measurement.remarks(job.measurement.nominal))
     with watching(begun.job, lines=True) as watch:
         if job.precision is None:
@@ -216,13 +255,19 @@ def _computed(job: Spec, begun: Outcome, command: str) -> Outcome:
             failures, (stop,) = compute_until(*asked, **options, watch=watch)
             missed = stop["reason"] != NARROW
             verdict = "the precision is not reached: " if missed else ""
-            said = f"{done.job}: {stop['trials']} trials; {verdict}{stop['reason']} ({stop['widest']})"
+            said = (
+                f"{done.job}: {stop['trials']} trials; {verdict}{stop['reason']} ({stop['widest']})"
+            )
             done = replace(done, failures=failures, stop=said, precision_missed=missed)
     if job.objective is not None:
         from ipe_bench.statistics.stopping import objective
 
-        done = replace(done, objective=objective(job.scenario, job.estimators, *job.aim, job.output))
-    cells = {one.key: describe_names(one.names) for one in result_keys(job.scenario, job.estimators)}
+        done = replace(
+            done, objective=objective(job.scenario, job.estimators, *job.aim, job.output)
+        )
+    cells = {
+        one.key: describe_names(one.names) for one in result_keys(job.scenario, job.estimators)
+    }
     return replace(done, cells=cells)
 
 
@@ -243,7 +288,9 @@ def _conclude(jobs: Jobs, outcomes: list[Outcome]) -> int:
         folders.setdefault(one.output, {}).update(one.cells)
     for output, cells in folders.items():
         if (Path(output) / "trials").is_dir() and first.write_readings is None:
-            code = max(code, show_report([Path(output)], Path(output), first.figures, first.formats, cells))
+            code = max(
+                code, show_report([Path(output)], Path(output), first.figures, first.formats, cells)
+            )
     say(*dict.fromkeys(f"Note: {remark}" for one in outcomes for remark in one.remarks))
     say(*_best(outcomes, jobs.maximises), *(one.stop for one in outcomes if one.stop))
     if refused:
@@ -256,8 +303,13 @@ def _refused(outcomes: Sequence[Outcome], *, told: bool) -> str:
     which: dict[str, list[str]] = {}
     for one in outcomes:
         which.setdefault(one.mistake, []).append(one.job)
-    more = {reason: f" and {len(jobs) - 1} more" if len(jobs) > 1 else "" for reason, jobs in which.items()}
-    return "; ".join(f"{r} (refused: {jobs[0]}{more[r]})" if told else r for r, jobs in which.items())
+    more = {
+        reason: f" and {len(jobs) - 1} more" if len(jobs) > 1 else ""
+        for reason, jobs in which.items()
+    }
+    return "; ".join(
+        f"{r} (refused: {jobs[0]}{more[r]})" if told else r for r, jobs in which.items()
+    )
 
 
 def _best(outcomes: Sequence[Outcome], maximises: bool) -> list[str]:
@@ -266,7 +318,11 @@ def _best(outcomes: Sequence[Outcome], maximises: bool) -> list[str]:
     if not known:
         return []
     best = (max if maximises else min)(known, key=float)
-    of = f", the {'greatest' if maximises else 'least'} of {len(known)} jobs" if len(known) > 1 else ""
+    of = (
+        f", the {'greatest' if maximises else 'least'} of {len(known)} jobs"
+        if len(known) > 1
+        else ""
+    )
     common = set.intersection(*(set(one.words) for one in known))
     own = " ".join(word.lstrip("+") for word in best.words if word not in common)
     return [f"Objective {float(best):.6g}{of}" + (own and f": {own}")]
@@ -279,7 +335,9 @@ def write_trial(job: Spec, path: Path, trial: int) -> None:
     drawn, model = job.scenario.draw(trial, trial + 1), job.scenario.measurement
     truth = path.with_name(f"{path.stem}.truth.csv")
     if truth.exists():
-        raise UserError(f"{truth}: is there already and is not overwritten; name another file or remove it")
+        raise UserError(
+            f"{truth}: is there already and is not overwritten; name another file or remove it"
+        )
     write_readings(path, model, drawn.z[0])
     write_truth(truth, model, drawn.x[0])
     print(f"Readings of trial {trial}: {path}\nTrue parameters:     {truth}")

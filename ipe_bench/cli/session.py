@@ -60,12 +60,20 @@ def session(folder: Path | None = None) -> Iterator[None]:
     print_problems(plugins.take_problems())
     for name in ("config.yaml", "schema.yaml", "hydra/config.yaml"):
         if folder is not None and (folder / name).exists():
-            raise UserError(f"{folder / name}: would replace ipe-bench's own config; move it to experiment/NAME.yaml")
+            raise UserError(
+                f"{folder / name}: would replace ipe-bench's own config; move it to experiment/NAME.yaml"
+            )
     store, registry = ConfigStore.instance(), Plugins.instance()
     store.store("schema", node=DEFAULTS, provider="ipe-bench")
     for name in FORMULAS:
         node = {"_target_": "ipe_bench.measurements.Nist", "dataset": name}
-        store.store(name.lower(), node, group="measurement/nist", package="measurement", provider="ipe-bench")
+        store.store(
+            name.lower(),
+            node,
+            group="measurement/nist",
+            package="measurement",
+            provider="ipe-bench",
+        )
     if PluginConfigs not in registry.discover(SearchPathPlugin):
         registry.register(PluginConfigs)
     PluginConfigs.folder = folder
@@ -112,14 +120,22 @@ def jobs_of(words: Words, *, multirun: bool) -> Jobs:
     config = _composed(tuple(map(w.forced, w.settled(words.overrides))), whole=True)
     hydra = config.hydra
     if hydra.runtime.choices.get("model"):
-        print_problems([f"+experiment={words.chosen('experiment')}: model is called state_model now; write that there"])
+        print_problems(
+            [
+                f"+experiment={words.chosen('experiment')}: model is called state_model now; write that there"
+            ]
+        )
     params = [f"{key}={value}" for key, value in (hydra.sweeper.get("params") or {}).items()]
     multirun = multirun or hydra.mode == RunMode.MULTIRUN or bool(params)
     optimises = not hydra.sweeper["_target_"].endswith(".BasicSweeper")
     for one in words.overrides:
         if one.is_sweep_override() and not multirun:
             listed = "." in one.key_or_group or one.key_or_group in plugins.PACKAGES
-            remedy = ", or put a list in brackets" if listed else f" for a job of each {one.key_or_group}"
+            remedy = (
+                ", or put a list in brackets"
+                if listed
+                else f" for a job of each {one.key_or_group}"
+            )
             raise UserError(f"{w.said(one)}: is a sweep; add -m{remedy}")
         if one.is_interval_sweep() and not optimises:
             raise UserError(
@@ -127,18 +143,24 @@ def jobs_of(words: Words, *, multirun: bool) -> Jobs:
                 "such as 1,10,100"
             )
     if multirun and optimises:
-        return Jobs(words, [spec_of(config)], True, "maximize" in str(hydra.sweeper.get("direction", "")))
+        return Jobs(
+            words, [spec_of(config)], True, "maximize" in str(hydra.sweeper.get("direction", ""))
+        )
     jobs, specs = [list(words.overrides)], [spec_of(config)] if not multirun else []
     if multirun:
         own = [OverridesParser.create().parse_override(word) for word in params]
         jobs = list(itertools.islice(w.jobs([*own, *words.overrides]), w.MOST_JOBS + 1))
         if not 0 < len(jobs) <= w.MOST_JOBS:
             number = f"more than {w.MOST_JOBS}" if jobs else "no"
-            raise UserError(f"the sweep has {number} jobs: give 1 to {w.MOST_JOBS}, and check its patterns")
+            raise UserError(
+                f"the sweep has {number} jobs: give 1 to {w.MOST_JOBS}, and check its patterns"
+            )
         specs = [_spec(job) for job in jobs]
     told = any(one.is_hydra_override() for one in words.overrides)
     ours = hydra.launcher["_target_"].endswith(".BasicLauncher") and not told
-    return Jobs(words, specs, multirun, told=[list(map(w.forced, job)) for job in jobs] if ours else [])
+    return Jobs(
+        words, specs, multirun, told=[list(map(w.forced, job)) for job in jobs] if ours else []
+    )
 
 
 def _spec(job: Sequence[Override]) -> Spec:
@@ -146,7 +168,9 @@ def _spec(job: Sequence[Override]) -> Spec:
     config = copy.deepcopy(_composed(tuple(w.forced(one) for one in job if w.chooses(one))))
     try:
         for one in (one for one in job if not w.chooses(one)):
-            OmegaConf.update(config, one.key_or_group, w.plain(one.value()), merge=True, force_add=True)
+            OmegaConf.update(
+                config, one.key_or_group, w.plain(one.value()), merge=True, force_add=True
+            )
     except Exception as error:
         raise explain(error) from error
     return spec_of(config)
@@ -197,8 +221,12 @@ def complete(words: Sequence[str]) -> None:
     line = os.environ.get("COMP_LINE")
     if asked is None or (asked[1] == "query" and line is None):
         shown = " ".join(words) or "nothing"
-        raise UserError(f"-sc {shown}: write -sc install=SHELL or -sc uninstall=SHELL, SHELL being bash, fish, zsh")
-    if line is not None:  # Hydra completes the words after the program's name; ours has the command in between
+        raise UserError(
+            f"-sc {shown}: write -sc install=SHELL or -sc uninstall=SHELL, SHELL being bash, fish, zsh"
+        )
+    if (
+        line is not None
+    ):  # Hydra completes the words after the program's name; ours has the command in between
         os.environ["COMP_LINE"] = line.replace(" run ", " ", 1)
         os.environ["COMP_POINT"] = str(len(os.environ["COMP_LINE"]))
     _hydra().shell_completion("config", list(words))
@@ -216,8 +244,14 @@ def explain(error: BaseException) -> UserError:
             return UserError(explained(*found.groups()))
     full_key = re.search(r"full_key: (\S+)", text)
     lines = dict.fromkeys(line.strip() for line in text.splitlines() if line.strip())
-    kept = [line for line in lines if not line.startswith(("object_type=", "full_key:", "reference_type=", "See "))]
-    return UserError(f"{full_key.group(1) + ': ' if full_key else ''}{' '.join(kept) or describe_exception(error)}")
+    kept = [
+        line
+        for line in lines
+        if not line.startswith(("object_type=", "full_key:", "reference_type=", "See "))
+    ]
+    return UserError(
+        f"{full_key.group(1) + ': ' if full_key else ''}{' '.join(kept) or describe_exception(error)}"
+    )
 
 
 _EXTRAS = ("joblib", "submitit", "optuna")
@@ -229,12 +263,17 @@ _HYDRAS = ("ax", "nevergrad", "ray", "rq")
 def _no_such_option(name: str) -> str:
     group, _, option = name.rpartition("/") if name.startswith("hydra/") else name.partition("/")
     if group in ("hydra/launcher", "hydra/sweeper"):
-        kind, first = group.partition("/")[2], option.partition("_")[0]  # submitit_local is submitit's
+        kind, first = (
+            group.partition("/")[2],
+            option.partition("_")[0],
+        )  # submitit_local is submitit's
         packages = {name: f'"ipe-bench[{name}]"' for name in _EXTRAS}
         packages |= {name: f"hydra-{name}-{kind}" for name in _HYDRAS}
         remedy = f"pip install {packages[first]}, or " if first in packages else ""
         return f"{group}={option}: this {kind} is not installed; {remedy}choose basic"
-    return f"{group}={option}: {unknown(option, [o.name for o in plugins.options(group)], 'option')}"
+    return (
+        f"{group}={option}: {unknown(option, [o.name for o in plugins.options(group)], 'option')}"
+    )
 
 
 def _no_such_key(name: str) -> str:

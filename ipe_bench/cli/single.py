@@ -40,25 +40,39 @@ class Single:
         """Reserves the named folder, or one named after the command and the model, for a command that `identity` tells
         from others in NAME.json, and for its further `files`."""
         output, named = Path(self.spec.output), not {"name", "output"}.isdisjoint(self.words.keys)
-        folder = output if named else output.with_name(f"{self.command}-{self.measurement.replace('/', '-')}")
+        folder = (
+            output
+            if named
+            else output.with_name(f"{self.command}-{self.measurement.replace('/', '-')}")
+        )
         return reserve_output_folder(folder, name, identity, elsewhere=not named, files=files)
 
 
 def single(
-    command: str, arguments: Sequence[str], standard: Sequence[str] = (), moving: str = "", **refused: Sequence[str]
+    command: str,
+    arguments: Sequence[str],
+    standard: Sequence[str] = (),
+    moving: str = "",
+    **refused: Sequence[str],
 ) -> Single:
     """Composes the one job that the arguments of a command ask for; `standard` are default words, and `refused` are
     keys without meaning for it, by whom they are for; `moving` says what else serves for states that move."""
     with session():
         words = w.read(command, arguments)
         for whose, keys in refused.items():
-            words.refuse(keys, f"is for `ipe-bench {whose}`, and has no meaning in `ipe-bench {command}`")
-        given = w.read(command, [one for one in standard if one.partition("=")[0] not in words.keys])
+            words.refuse(
+                keys, f"is for `ipe-bench {whose}`, and has no meaning in `ipe-bench {command}`"
+            )
+        given = w.read(
+            command, [one for one in standard if one.partition("=")[0] not in words.keys]
+        )
         jobs = jobs_of(Words(given.overrides + words.overrides), multirun=False)
         require_one_kind(words, jobs.specs[0])
         model = jobs.specs[0].state_model
         if moving and model is not None:
-            raise UserError(f"state_model={model.name}: states move, and {command} is of constants; {moving}")
+            raise UserError(
+                f"state_model={model.name}: states move, and {command} is of constants; {moving}"
+            )
         return Single(command, words, jobs.specs[0], composed(jobs.words))
 
 

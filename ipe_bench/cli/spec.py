@@ -87,13 +87,19 @@ class Spec(Component):
             if Path(getattr(self, key)).name in ("", ".."):
                 raise UserError(f"{key}={getattr(self, key)}: name a folder")
         if ".." in Path(self.name).parts:
-            raise UserError(f"name={self.name}: leaves the folder outputs; give another name, or the folder as output=")
+            raise UserError(
+                f"name={self.name}: leaves the folder outputs; give another name, or the folder as output="
+            )
         if "://" in self.output or self.output.startswith("file:"):
             raise UserError(f"output={self.output}: is an address; name a folder of this machine")
         if self.time_limit is not None and self.precision is None:
-            raise UserError(f"time_limit={self.time_limit:g}: goes with precision=; give that, or leave it out")
+            raise UserError(
+                f"time_limit={self.time_limit:g}: goes with precision=; give that, or leave it out"
+            )
         if self.write_readings is None and self.write_readings_trial:
-            raise UserError(f"write_readings_trial={self.write_readings_trial}: goes with write_readings=FILE")
+            raise UserError(
+                f"write_readings_trial={self.write_readings_trial}: goes with write_readings=FILE"
+            )
         if self.objective is not None:
             self._check_objective(*self.aim)
 
@@ -108,7 +114,10 @@ class Spec(Component):
         if not label:
             example = f"{next(iter(self.estimators), 'LABEL')}.capped_error"
             raise UserError(f"objective={self.objective}: write LABEL.COLUMN, such as {example}")
-        for name, known, noun in ((label, self.estimators, "estimator"), (column, columns, "column")):
+        for name, known, noun in (
+            (label, self.estimators, "estimator"),
+            (column, columns, "column"),
+        ):
             if name not in known:
                 raise UserError(f"objective={self.objective}: {unknown(name, known, noun)}")
         current_name(str(self.objective).rpartition(".")[2])
@@ -137,7 +146,9 @@ class Spec(Component):
         """Simulated trials: a `Scenario`, or a `StateScenario` if there is a state model."""
         if self.state_model is not None:
             return pinned(StateScenario(self.state_model, self.seed, self.error_scale))
-        measurement, truth = (m and informed(m, self.known) for m in (self.measurement, self.truth_measurement))
+        measurement, truth = (
+            m and informed(m, self.known) for m in (self.measurement, self.truth_measurement)
+        )
         assert measurement is not None
         prior = self.prior
         if self.known:
@@ -151,7 +162,11 @@ class Spec(Component):
         if isinstance(self.scenario, StateScenario):
             return self
         problem = self.scenario.problem
-        unsuited = {label for label in STANDARD_FILTERS if (e := self.estimators.get(label)) and e.hindrance(problem)}
+        unsuited = {
+            label
+            for label in STANDARD_FILTERS
+            if (e := self.estimators.get(label)) and e.hindrance(problem)
+        }
         kept = {label: one for label, one in self.estimators.items() if label not in unsuited}
         return replace(self, estimators=kept) if unsuited else self
 
@@ -182,7 +197,9 @@ class Spec(Component):
 
 
 KEYS = tuple(field.name for field in fields(Spec))
-DEFAULTS = {field.name: "???" if field.default is MISSING else field.default for field in fields(Spec)}
+DEFAULTS = {
+    field.name: "???" if field.default is MISSING else field.default for field in fields(Spec)
+}
 DEFAULTS |= {"estimators": {}, "trackers": {}}
 
 
@@ -191,19 +208,27 @@ def spec(plain: Mapping[Any, Any]) -> Spec:
     for key in plain:
         if key not in KEYS:
             raise UserError(f"{key}: {unknown(str(key), KEYS, 'key')}")
-    made = {key: construct(value, key) for key, value in plain.items() if key not in ("estimators", "trackers", *PARTS)}
+    made = {
+        key: construct(value, key)
+        for key, value in plain.items()
+        if key not in ("estimators", "trackers", *PARTS)
+    }
     for key, kind in PARTS.items():
         config = plain.get(key)
         if key in OPTIONAL and config is None:
             made[key] = None
         elif not isinstance(config, Mapping) or TARGET not in config:
-            raise UserError(f"{key}={config}: is not a part that can be used; choose one, see `ipe-bench list`")
+            raise UserError(
+                f"{key}={config}: is not a part that can be used; choose one, see `ipe-bench list`"
+            )
         else:
             made[key] = _of_kind(construct(config, key), key, kind)
     made["trackers"] = {}
     chosen = "estimators" if made["state_model"] is None else "trackers"
     known = [option for option in plugins.options() if plugins.PACKAGES.get(option.group) == chosen]
-    labelled = {str(k): _labelled(chosen, str(k), one, known) for k, one in (plain[chosen] or {}).items()}
+    labelled = {
+        str(k): _labelled(chosen, str(k), one, known) for k, one in (plain[chosen] or {}).items()
+    }
     made["estimators"] = {label: pinned(one) for label, one in labelled.items()}
     return instantiate(Spec, made, "")
 
@@ -215,13 +240,19 @@ def _labelled(key: str, label: str, options: Any, known: Sequence[plugins.Option
     if TARGET not in options:
         keys = ", ".join(f"{where}.{key}" for key in options) or where
         groups = {option.label: option.group for option in known}
-        remedy = f"add it, as in {groups[label]}=[{label}]" if label in groups else unknown(label, groups, "estimator")
+        remedy = (
+            f"add it, as in {groups[label]}=[{label}]"
+            if label in groups
+            else unknown(label, groups, "estimator")
+        )
         raise UserError(f"{keys}: is set, but {label} is not chosen; {remedy}")
     for option in known:
         if option.label == label and option.target != str(options[TARGET]):
             # One estimator would be tabled under the name of another.
             name = f"{option.group}={label}"
-            raise UserError(f"{where}: is {options[TARGET]}, under the name of {name}; choose another label")
+            raise UserError(
+                f"{where}: is {options[TARGET]}, under the name of {name}; choose another label"
+            )
     return _of_kind(construct(options, where), where, Estimator if key == "estimators" else Tracker)
 
 
@@ -229,7 +260,9 @@ def _of_kind(part: Any, key: str, kind: type) -> Any:
     """Returns the part, if it is of the right kind and can be stored and sent to other processes."""
     if not isinstance(part, kind):
         name = type(part).__name__
-        raise UserError(f"{key}: {name} is not a {kind.__name__.lower()}; choose one, see `ipe-bench list`")
+        raise UserError(
+            f"{key}: {name} is not a {kind.__name__.lower()}; choose one, see `ipe-bench list`"
+        )
     try:
         canonical_json(describe(part))
         cloudpickle.dumps(part)

@@ -37,7 +37,9 @@ _TEXT = re.compile(
     re.DOTALL,
 )
 """Texts that the shell has taken the quotes from; a list of units is none."""
-_FILE = re.compile(rf"\+*(?:(measurement|state_model|{TRUTH})\.file|(parameters))=(?![{{$]|null$)(.*)", re.DOTALL)
+_FILE = re.compile(
+    rf"\+*(?:(measurement|state_model|{TRUTH})\.file|(parameters))=(?![{{$]|null$)(.*)", re.DOTALL
+)
 
 _GONE = {
     "ignore_rows": "empty the cells of these readings in the file",
@@ -80,7 +82,9 @@ class Words:
         """Refuses a word whose key is one of these, or below one."""
         for one in self.overrides:
             if (first := _first(one)) in keys:
-                raise UserError(f"{one.key_or_group if '.' in one.key_or_group else first}: {why}; leave it out")
+                raise UserError(
+                    f"{one.key_or_group if '.' in one.key_or_group else first}: {why}; leave it out"
+                )
 
 
 def _first(override: Override) -> str:
@@ -97,7 +101,10 @@ def forced(override: Override) -> str:
 
 def chooses(override: Override) -> bool:
     """Returns whether a word chooses configs, rather than values in them."""
-    chosen = override.key_or_group in (*plugins.COMPONENT_GROUPS, "experiment") or override.package is not None
+    chosen = (
+        override.key_or_group in (*plugins.COMPONENT_GROUPS, "experiment")
+        or override.package is not None
+    )
     return chosen or override.is_delete() or override.is_hydra_override()
 
 
@@ -122,7 +129,9 @@ def read(command: str, words: Sequence[str], folder: Path | None = None) -> Word
     _check_labels(found)
     experiments = [said(one) for one in found if one.key_or_group == "experiment"]
     if len(experiments) > 1:
-        raise UserError(f"{' '.join(experiments)}: one command runs one experiment; run them one by one")
+        raise UserError(
+            f"{' '.join(experiments)}: one command runs one experiment; run them one by one"
+        )
     return Words(tuple(found), files)
 
 
@@ -210,10 +219,14 @@ def _quoted(text: str) -> str:
 def _parse(command: str, word: str, groups: Groups) -> Override:
     key, equals, value = word.partition("=")
     if not equals and not word.startswith("~"):
-        remedies = [f"write {_choosing(group, word)}" for group, names in groups.items() if word in names]
+        remedies = [
+            f"write {_choosing(group, word)}" for group, names in groups.items() if word in names
+        ]
         remedy = " or ".join(remedies) or f"see `ipe-bench {command} --help`"
         if Path(word).suffix in (".csv", ".parquet"):
-            remedy = f"write {'' if command == 'estimate' else 'ipe-bench estimate '}readings={word}"
+            remedy = (
+                f"write {'' if command == 'estimate' else 'ipe-bench estimate '}readings={word}"
+            )
         raise UserError(f"{word}: is not KEY=VALUE; {remedy}")
     try:
         found = OverridesParser.create().parse_override(word)
@@ -243,7 +256,9 @@ def _check(override: Override, groups: Groups) -> None:
     if group.startswith("hydra.sweeper.params"):
         key = group.removeprefix("hydra.sweeper.params").lstrip(".")
         swept = f"{key}={word.partition('=')[2]}" if key else "error_scale=VALUE,VALUE"
-        raise UserError(f"{word}: belongs in an experiment file; on the command line write -m {swept}")
+        raise UserError(
+            f"{word}: belongs in an experiment file; on the command line write -m {swept}"
+        )
     if re.split("[./]", group)[0] == "hydra":
         return
     if group in groups and not override.is_delete():
@@ -255,7 +270,9 @@ def _check(override: Override, groups: Groups) -> None:
         if group in plugins.PACKAGES:
             raise UserError(f"{word}: cannot be left out; {group}=[] chooses none")
         if not group.startswith(("estimators.", "trackers.")):
-            raise UserError(f"{word}: only estimators.LABEL can be left out; give the key another value")
+            raise UserError(
+                f"{word}: only estimators.LABEL can be left out; give the key another value"
+            )
         return
     if override.package is not None or ("/" in group and first.split("/")[0] in groups):
         raise UserError(f"{word}: {unknown(group, groups, 'group')}")
@@ -266,7 +283,9 @@ def _check(override: Override, groups: Groups) -> None:
     if first not in KEYS:
         raise UserError(f"{word}: {unknown(first, {*KEYS, *groups, 'experiment'}, 'key')}")
     if group == "estimators":
-        raise UserError(f"{word}: choose with solver= and baseline=, and set options by estimators.LABEL.KEY=VALUE")
+        raise UserError(
+            f"{word}: choose with solver= and baseline=, and set options by estimators.LABEL.KEY=VALUE"
+        )
     for value in values(override):
         if group in WHOLE and isinstance(value, float) and value.is_integer():
             raise UserError(f"{word}: is not written as a whole number; write {group}={value:.0f}")
@@ -287,7 +306,9 @@ def _by_label(group: str, word: str) -> str:
     _, name, *path = key.split(".")
     if not path:
         return f"{plugins.PACKAGES[group]}.LABEL.{name}={value}"
-    known = [key for option in plugins.options(group) if option.label == name for key in option.config]
+    known = [
+        key for option in plugins.options(group) if option.label == name for key in option.config
+    ]
     path[0] = nearest(path[0], known) or path[0]
     return f"{plugins.PACKAGES[group]}.{name}.{'.'.join(path)}={value}"
 
@@ -300,14 +321,20 @@ def _check_place(override: Override) -> None:
     added = override.is_add() or override.is_force_add()
     if group == "experiment" and package is None:
         if not added:
-            raise UserError(f"{word}: an experiment is added, not overridden; write +experiment={name}")
+            raise UserError(
+                f"{word}: an experiment is added, not overridden; write +experiment={name}"
+            )
     elif package is None or (group, package) == ("measurement", TRUTH):
         if added:
-            raise UserError(f"{word}: {package or group} is there to be chosen, not added; leave out the +")
+            raise UserError(
+                f"{word}: {package or group} is there to be chosen, not added; leave out the +"
+            )
     elif group not in plugins.PACKAGES:
         raise UserError(f"{word}: goes nowhere; write {group}={name}")
     elif not re.fullmatch(rf"{plugins.PACKAGES[group]}\.[^.]+", package):
-        raise UserError(f"{word}: goes nowhere; write +{group}@{plugins.PACKAGES[group]}.LABEL={name}")
+        raise UserError(
+            f"{word}: goes nowhere; write +{group}@{plugins.PACKAGES[group]}.LABEL={name}"
+        )
     elif not added:
         raise UserError(f"{word}: a label of its own is added; write +{group}@{package}={name}")
 
@@ -318,7 +345,9 @@ def _check_choice(override: Override, groups: Groups) -> None:
     several = group in plugins.PACKAGES and override.package is None
     key = word.partition("=")[0].lstrip("+")
     if group == "experiment" and override.is_sweep_override():
-        raise UserError(f"{word}: a sweep over experiments would ignore their own sweeps; run them one by one")
+        raise UserError(
+            f"{word}: a sweep over experiments would ignore their own sweeps; run them one by one"
+        )
     if override.is_range_sweep() or override.is_interval_sweep():
         raise UserError(f"{word}: write the names of options of {group}")
     for value in values(override):
@@ -331,7 +360,9 @@ def _check_choice(override: Override, groups: Groups) -> None:
             if not isinstance(name, str) or name not in groups[group]:
                 shown = "null" if name is None else str(name)
                 raise UserError(f"{key}={shown}: {no_option(group, shown, groups)}")
-            if faults := [o.fault for o in plugins.options(group) if o.name == name and o.fault is not None]:
+            if faults := [
+                o.fault for o in plugins.options(group) if o.name == name and o.fault is not None
+            ]:
                 raise UserError(f"{key}={name}: {faults[0]}")
             if names.count(name) > 1:
                 remedy = f"+{group}@{plugins.PACKAGES[group]}.{name}_2={name} runs it again under a label of its own"
@@ -357,11 +388,15 @@ def _check_labels(overrides: Sequence[Override]) -> None:
         if group not in plugins.PACKAGES or override.is_delete():
             continue
         value = plain(override.value())
-        for label in [package.partition(".")[2]] if package else value if isinstance(value, list) else []:
+        for label in (
+            [package.partition(".")[2]] if package else value if isinstance(value, list) else []
+        ):
             place = f"{plugins.PACKAGES[group]}.{label}"
             if place in taken and (package or taken[place] is not override):
                 word = said(override)
-                raise UserError(f"{word}: {label} is the label of {said(taken[place])} already; choose another label")
+                raise UserError(
+                    f"{word}: {label} is the label of {said(taken[place])} already; choose another label"
+                )
             taken[place] = override
 
 
@@ -370,7 +405,10 @@ def _check_labels(overrides: Sequence[Override]) -> None:
 
 def jobs(overrides: Sequence[Override]) -> Iterator[list[Override]]:
     """Expands the overrides of each job of a sweep, as Hydra's basic sweeper does."""
-    axes = {one.get_key_element(): _swept(one) if one.is_discrete_sweep() else [one] for one in overrides}
+    axes = {
+        one.get_key_element(): _swept(one) if one.is_discrete_sweep() else [one]
+        for one in overrides
+    }
     return map(list, itertools.product(*axes.values()))
 
 
@@ -380,8 +418,13 @@ def _swept(override: Override) -> list[Override]:
     except (HydraException, ValueError, ArithmeticError, TypeError):
         values = []
     if not 0 < len(values) <= MOST_JOBS:
-        raise UserError(f"{said(override)}: has no value, or too many; give 1 to {MOST_JOBS} finite values")
-    return [OverridesParser.create().parse_override(f"{override.get_key_element()}={value}") for value in values]
+        raise UserError(
+            f"{said(override)}: has no value, or too many; give 1 to {MOST_JOBS} finite values"
+        )
+    return [
+        OverridesParser.create().parse_override(f"{override.get_key_element()}={value}")
+        for value in values
+    ]
 
 
 def settled(overrides: Sequence[Override]) -> list[Override]:
@@ -407,15 +450,28 @@ def default_name(words: Words) -> str:
         if file := words.files.get(forced(override)):
             line, held = f"file={Path(file.partition('=')[2]).name}", held + line
         key, _, value = line.partition("=")
-        key = key.lstrip("+~").replace(HYDRAS_TRUTH, "truth").rpartition("@estimators.")[2].rpartition("@trackers.")[2]
-        text = re.sub(r"[\[\]'\" ]", "", value.replace("],[", ";").replace(",", "+") if "[" in value else value)
+        key = (
+            key.lstrip("+~")
+            .replace(HYDRAS_TRUTH, "truth")
+            .rpartition("@estimators.")[2]
+            .rpartition("@trackers.")[2]
+        )
+        text = re.sub(
+            r"[\[\]'\" ]",
+            "",
+            value.replace("],[", ";").replace(",", "+") if "[" in value else value,
+        )
         if _first(override) not in SETTING_NOTHING:
             parts[key] = text or f"no_{key}"
     experiment = parts.pop("experiment", None)
-    names = [parts.pop("measurement", None) or parts.pop("state_model", None) or experiment or "gins"]
+    names = [
+        parts.pop("measurement", None) or parts.pop("state_model", None) or experiment or "gins"
+    ]
     for key in (*(key for key in _BARE if key in parts), *sorted(parts.keys() - set(_BARE))):
         bare = key in _BARE and key != "truth"
-        names.append(parts[key] if bare else f"{re.sub('^(estimators|trackers)[.]', '', key)}={parts[key]}")
+        names.append(
+            parts[key] if bare else f"{re.sub('^(estimators|trackers)[.]', '', key)}={parts[key]}"
+        )
     full = "-".join(names).replace("/", "-")
     short = re.sub(r"[^\w.,=+-]", "_", full, flags=re.ASCII)
     if short == full and len(full) <= _LONGEST_NAME and not held:

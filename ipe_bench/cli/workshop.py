@@ -26,17 +26,25 @@ def check_command(words: Sequence[str]) -> int:
     if not words:
         raise UserError("check: name the folder of a plugin, such as plugins/my_plugin")
     for folder in folders:
-        plugins.options_in(Path(folder))  # a mistake in the second is said before the first is checked
+        plugins.options_in(
+            Path(folder)
+        )  # a mistake in the second is said before the first is checked
     print_problems(plugins.take_problems())
     failed = 0
     for folder in [*folders, *([" ".join(keys)] if keys else [])]:
-        findings = [*ib.check(folder), *_check_experiments(folder)] if folder in folders else _check_chosen(keys)
+        findings = (
+            [*ib.check(folder), *_check_experiments(folder)]
+            if folder in folders
+            else _check_chosen(keys)
+        )
         for one in findings:
             outcome = "FAILED" if one.complaint else "-" if one.note else "ok"
             said = f" -- {one.complaint or one.note}" if one.complaint or one.note else ""
             say(f"{outcome:7}{one.component}: {one.check}{said}")
         wrong = sum(bool(finding.complaint) for finding in findings)
-        say(f"{folder}: {f'{wrong} of {len(findings)} checks failed' if wrong else 'all checks passed'}")
+        say(
+            f"{folder}: {f'{wrong} of {len(findings)} checks failed' if wrong else 'all checks passed'}"
+        )
         failed += wrong
     return 1 if failed else 0
 
@@ -65,7 +73,9 @@ def _check_experiments(folder: str) -> Iterator[Finding]:
             complaint = ""
             try:
                 with session():
-                    jobs = jobs_of(w.read("run", [f"+experiment={option.name}"]), multirun=False).specs
+                    jobs = jobs_of(
+                        w.read("run", [f"+experiment={option.name}"]), multirun=False
+                    ).specs
                 for job in jobs:
                     validate([job.scenario], job.estimators, job.count, job.block_size)
             except UserError as error:

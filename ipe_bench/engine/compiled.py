@@ -26,7 +26,20 @@ from ipe_bench.basics.files import cache_folder, write_atomically
 
 _LOG = logging.getLogger(__name__)
 
-_IN_LIBRARY = ("sin", "cos", "tan", "atan", "exp", "log", "sinh", "cosh", "tanh", "erf", "erfc", "pow")
+_IN_LIBRARY = (
+    "sin",
+    "cos",
+    "tan",
+    "atan",
+    "exp",
+    "log",
+    "sinh",
+    "cosh",
+    "tanh",
+    "erf",
+    "erfc",
+    "pow",
+)
 _IN_LIBRARY += ("fma", "memset", "memcpy")
 """Functions of the C library that machine code may call: those of recorded programs, and those LLVM puts in place of
 an instruction that the processor lacks or of a loop."""
@@ -42,7 +55,10 @@ def available() -> bool:
         _target()
         _addresses()
     except (ImportError, OSError, RuntimeError) as error:
-        _LOG.warning("models run in NumPy, tens of times slower: no machine code can be made here (%s)", error)
+        _LOG.warning(
+            "models run in NumPy, tens of times slower: no machine code can be made here (%s)",
+            error,
+        )
         return False
     return True
 
@@ -82,7 +98,9 @@ def width() -> int:
 
 
 @functools.lru_cache(maxsize=256)
-def load(key: str, write: Callable[[], str], name: str, arguments: tuple[Any, ...]) -> Callable[..., None]:
+def load(
+    key: str, write: Callable[[], str], name: str, arguments: tuple[Any, ...]
+) -> Callable[..., None]:
     """Loads the function `name` of the module that `write` writes and `key` identifies, compiled once per machine.
 
     A kept file is used only if it was made of this key for this processor, is whole, and belongs to this user or the
@@ -99,7 +117,9 @@ def load(key: str, write: Callable[[], str], name: str, arguments: tuple[Any, ..
         code = _object_code(write())
         content = made_of + hashlib.sha256(code).digest() + code
         with contextlib.suppress(StorageError):
-            write_atomically(path, lambda temporary: (temporary.write_bytes(content), temporary.chmod(0o600)))
+            write_atomically(
+                path, lambda temporary: (temporary.write_bytes(content), temporary.chmod(0o600))
+            )
     library = llvm.JITLibraryBuilder().add_object_img(code).export_symbol(name)
     for called, address in _addresses().items():
         library.import_symbol(called, address)
@@ -116,7 +136,9 @@ def _own_bytes(path: Path) -> bytes:
         return b""
     with path.open("rb") as file:
         about = os.fstat(file.fileno())
-        foreign = os.name == "posix" and (about.st_uid not in (0, os.geteuid()) or about.st_mode & 0o022)
+        foreign = os.name == "posix" and (
+            about.st_uid not in (0, os.geteuid()) or about.st_mode & 0o022
+        )
         return b"" if foreign else file.read()
 
 
@@ -126,7 +148,9 @@ def _object_code(text: str) -> bytes:
     module = llvm.parse_assembly(text)
     module.triple, module.data_layout = _target().triple, str(_target().target_data)
     options = llvm.create_pipeline_tuning_options(speed_level=2)
-    options.loop_vectorization = options.slp_vectorization = options.loop_unrolling = False  # vectors are explicit
+    options.loop_vectorization = options.slp_vectorization = options.loop_unrolling = (
+        False  # vectors are explicit
+    )
     builder = llvm.create_pass_builder(_target(), options)
     builder.getModulePassManager().run(module, builder)
     return _target().emit_object(module)
@@ -138,7 +162,12 @@ def _machine() -> tuple[str, ...]:
     import llvmlite.binding as llvm
 
     version = importlib.metadata.version("llvmlite")
-    return version, _target().triple, llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
+    return (
+        version,
+        _target().triple,
+        llvm.get_host_cpu_name(),
+        llvm.get_host_cpu_features().flatten(),
+    )
 
 
 @functools.cache

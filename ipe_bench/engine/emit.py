@@ -25,7 +25,13 @@ from llvmlite import ir
 from ipe_bench.engine.plan import StepPlan
 from ipe_bench.engine.trace import Program
 
-F64, I32, I64, PTR, VOID = ir.DoubleType(), ir.IntType(32), ir.IntType(64), ir.PointerType(), ir.VoidType()
+F64, I32, I64, PTR, VOID = (
+    ir.DoubleType(),
+    ir.IntType(32),
+    ir.IntType(64),
+    ir.PointerType(),
+    ir.VoidType(),
+)
 _ARITHMETIC = {"add": "fadd", "sub": "fsub", "mul": "fmul", "div": "fdiv"}
 _FILLED = 4
 """Numbers of a tangent from which on one alone keeps the processor busy; below, two advance side by side."""
@@ -42,14 +48,18 @@ def integrate(plan: StepPlan, width: int) -> str:
 def rates(program: Program, width: int) -> str:
     """Writes void rates(double *x, double *si, double *out, int64 trials): one number from the parameters x[i] times
     si, for one trial at a time, a width of 1."""
-    made: Any = ir.Function(ir.Module("rates"), ir.FunctionType(VOID, [PTR, PTR, PTR, I64]), "rates")
+    made: Any = ir.Function(
+        ir.Module("rates"), ir.FunctionType(VOID, [PTR, PTR, PTR, I64]), "rates"
+    )
     x, si, out, trials = made.args
     b: Any = ir.IRBuilder(made.append_basic_block())
     n = program.inputs
     with loop(b, integer(0), trials) as i:
         v = _Vectors(b, width)
         row, size = v.load(v.place(x, b.mul(i, integer(n))), range(n)), v.load(si, range(n))
-        (rate,) = v.run(program, [b.fmul(value, unit) for value, unit in zip(row, size, strict=True)])
+        (rate,) = v.run(
+            program, [b.fmul(value, unit) for value, unit in zip(row, size, strict=True)]
+        )
         put(b, rate, out, i)
     b.ret_void()
     return str(made.module)
@@ -71,10 +81,17 @@ class _Writer:
         if plan.tangents:
             kinds, n = [PTR, PTR, PTR], len(plan.tangents)
             paired = n - n % 2 if len(plan.tangents[0]) < _FILLED else 0
-            self.groups = [group for group in ((0, paired, 2), (paired, n, 1)) if group[0] < group[1]]
-            self.move = {by: self._function(f"move{by}", kinds, partial(self._move, by)) for *_, by in self.groups}
+            self.groups = [
+                group for group in ((0, paired, 2), (paired, n, 1)) if group[0] < group[1]
+            ]
+            self.move = {
+                by: self._function(f"move{by}", kinds, partial(self._move, by))
+                for *_, by in self.groups
+            }
             self.show = self._function("show", kinds, self._show)
-            self.sources = self._constant("sources", I64, [i for row in plan.motion.sources for i in row] or [0], 8)
+            self.sources = self._constant(
+                "sources", I64, [i for row in plan.motion.sources for i in row] or [0], 8
+            )
             shown = [i for row in plan.reading.sources for i in row] or [0]
             self.show_sources = self._constant("show_sources", I64, shown, 8)
         kinds = [PTR, PTR, PTR, I64, PTR, I64, I64, PTR, PTR, I64, PTR, I64, PTR, PTR, PTR]
@@ -86,7 +103,9 @@ class _Writer:
         made.initializer, made.type = ir.Constant(made.value_type, values), PTR
         return made
 
-    def _function(self, name: str, kinds: Sequence[ir.Type], body: Callable[..., None]) -> ir.Function:
+    def _function(
+        self, name: str, kinds: Sequence[ir.Type], body: Callable[..., None]
+    ) -> ir.Function:
         """Writes a function of its own, never inlined, whose stack is aligned: registers that spill would else lie
         across cache lines, which takes half as long again."""
         made: Any = ir.Function(self.module, ir.FunctionType(VOID, kinds), name)
@@ -105,12 +124,17 @@ class _Writer:
     def _weigh(self, v: _Vectors, frame: Value, h: Value) -> None:
         """Writes h times the weights of the formula, behind the vectors of the frame, a vector at a time."""
         share = v.spread(h)
-        weighed = [v.builder.fmul(share, weight) for weight in v.load(self.table, range(self.count))]
+        weighed = [
+            v.builder.fmul(share, weight) for weight in v.load(self.table, range(self.count))
+        ]
         v.store(weighed, frame, range(self.plan.size, self.plan.size + self.count))
 
     def _weights(self, v: _Vectors, frame: Value) -> list[list[Value]]:
         rows, place = self.plan.tableau.weights, itertools.count(self.plan.size * self.width)
-        return [[v.spread(number_at(v.builder, frame, integer(next(place)))) for _ in row] for row in rows]
+        return [
+            [v.spread(number_at(v.builder, frame, integer(next(place)))) for _ in row]
+            for row in rows
+        ]
 
     def _step(self, v: _Vectors, frame: Value, t: Value, h: Value) -> None:
         plan, weights = self.plan, self._weights(v, frame)
@@ -133,7 +157,13 @@ class _Writer:
         if plan.doubt:
             held = [v.run(plan.rates, [time, *y, *fixed]) for time in times] if plan.timed else []
             places = [*plan.reach, *plan.side, *plan.doubt]
-            given = [v.spread(h), *ended, *itertools.chain(*slopes, *held), *sides, *v.load(frame, places)]
+            given = [
+                v.spread(h),
+                *ended,
+                *itertools.chain(*slopes, *held),
+                *sides,
+                *v.load(frame, places),
+            ]
             v.store(v.run(plan.watch, given), frame, places)
 
     def _read(self, v: _Vectors, frame: Value, t: Value) -> None:
@@ -147,26 +177,54 @@ class _Writer:
         one, d, count = range(together), len(plan.tangents[0]), len(move.sources[0])
         own = [range(k * d, (k + 1) * d) for k in one]
         y, fixed = [v.load(first, place) for place in own], v.load(frame, plan.fixed)
-        places = [[number_at(v.builder, driving, integer(k * count + i), I64) for i in range(count)] for k in one]
+        places = [
+            [number_at(v.builder, driving, integer(k * count + i), I64) for i in range(count)]
+            for k in one
+        ]
         slopes: list[list[list[Value]]] = [[] for _ in one]
         for s, row in enumerate(plan.tableau.weights[:-1]):
             at = [v.combine(y[k], weights[s], [slopes[k][j] for j, _ in row]) for k in one]
             stage = v.place(frame, s * plan.stage_size)
             saved = v.load(stage, move.saved)
             for k in one:
-                slopes[k].append(v.run(move.program, [*at[k], *v.load(stage, places[k]), *saved, *fixed]))
+                slopes[k].append(
+                    v.run(move.program, [*at[k], *v.load(stage, places[k]), *saved, *fixed])
+                )
         for k in one:
-            ended = v.combine(y[k], weights[-1], [slopes[k][j] for j, _ in plan.tableau.weights[-1]])
+            ended = v.combine(
+                y[k], weights[-1], [slopes[k][j] for j, _ in plan.tableau.weights[-1]]
+            )
             v.store(ended, first, own[k])
 
     def _show(self, v: _Vectors, frame: Value, first: Value, driving: Value) -> None:
         plan, show = self.plan, self.plan.reading
-        places = [number_at(v.builder, driving, integer(i), I64) for i in range(len(show.sources[0]))]
-        given = [*v.load(first, range(len(plan.tangents[0]))), *v.load(frame, [*places, *show.saved, *plan.fixed])]
+        places = [
+            number_at(v.builder, driving, integer(i), I64) for i in range(len(show.sources[0]))
+        ]
+        given = [
+            *v.load(first, range(len(plan.tangents[0]))),
+            *v.load(frame, [*places, *show.saved, *plan.fixed]),
+        ]
         v.store(v.run(show.program, given), frame, plan.shown)
 
     def _integrate(self, made: Any) -> None:
-        x, si, cases, n_cases, rows, first, last, times, steps, n_times, offset, stride, out, states, frame = made.args
+        (
+            x,
+            si,
+            cases,
+            n_cases,
+            rows,
+            first,
+            last,
+            times,
+            steps,
+            n_times,
+            offset,
+            stride,
+            out,
+            states,
+            frame,
+        ) = made.args
         b, plan, width = ir.IRBuilder(made.append_basic_block()), self.plan, self.width
         n, nc, no = len(plan.x), len(plan.constants), len(plan.shown)
         columns, rows_kept = n if plan.tangents else 1, len(plan.y) + len(plan.doubt)
@@ -177,7 +235,9 @@ class _Writer:
             """Returns the pointer to one number in a vector of the frame."""
             return b.add(integer(place * width), lane)
 
-        def tangent(j: Value, table: Value, sources: Sequence[Sequence[int]]) -> tuple[Value, Value]:
+        def tangent(
+            j: Value, table: Value, sources: Sequence[Sequence[int]]
+        ) -> tuple[Value, Value]:
             """Returns pointers to tangent j and to the list of its sources."""
             lies = b.add(integer(plan.tangents[0].start), b.mul(j, integer(len(plan.tangents[0]))))
             place = _Vectors(b, width).place(frame, lies)
@@ -196,26 +256,42 @@ class _Writer:
             with loop(b, integer(0), integer(width)) as lane:
                 here, end = b.add(group, lane), b.sub(last, integer(1))
                 problem = b.select(b.icmp_signed("<", here, end), here, end)
-                trial, case = number_at(b, rows, b.udiv(problem, n_cases), I64), b.urem(problem, n_cases)
+                trial, case = (
+                    number_at(b, rows, b.udiv(problem, n_cases), I64),
+                    b.urem(problem, n_cases),
+                )
                 row, constants = b.mul(trial, integer(n)), b.mul(case, integer(nc))
                 for j, place in enumerate(plan.x):
-                    value = b.fmul(number_at(b, x, b.add(row, integer(j))), number_at(b, si, integer(j)))
+                    value = b.fmul(
+                        number_at(b, x, b.add(row, integer(j))), number_at(b, si, integer(j))
+                    )
                     put(b, value, frame, at(place, lane))
                 for j, place in enumerate(plan.constants):
-                    put(b, number_at(b, cases, b.add(constants, integer(j))), frame, at(place, lane))
+                    put(
+                        b, number_at(b, cases, b.add(constants, integer(j))), frame, at(place, lane)
+                    )
                 place = b.add(b.mul(trial, n_cases), case)
                 put(b, b.mul(b.mul(place, n_times), integer(no * columns)), target, lane)
                 put(b, b.mul(case, stride), shift, lane)
                 put(b, constants, own, lane)
-                put(b, b.mul(b.mul(place, b.add(n_times, integer(1))), integer(rows_kept)), kept, lane)
+                put(
+                    b,
+                    b.mul(b.mul(place, b.add(n_times, integer(1))), integer(rows_kept)),
+                    kept,
+                    lane,
+                )
             b.call(self.begin, [frame])
             keep(integer(0))
             b.store(ir.Constant(F64, 0.0), t)
-            b.store(ir.Constant(F64, float("nan")), taken)  # unlike any step, so that the weights are always written
+            b.store(
+                ir.Constant(F64, float("nan")), taken
+            )  # unlike any step, so that the weights are always written
             with loop(b, integer(0), n_times) as k:
                 to, since = number_at(b, times, k), b.load(t, typ=F64)
                 # No step to a time that is reached already: at the start, or where two readings share a time.
-                count = b.select(b.fcmp_ordered("==", to, since), integer(0), number_at(b, steps, k, I64))
+                count = b.select(
+                    b.fcmp_ordered("==", to, since), integer(0), number_at(b, steps, k, I64)
+                )
                 h = b.fdiv(b.fsub(to, since), b.sitofp(count, F64))
                 with b.if_then(b.fcmp_unordered("!=", h, b.load(taken, typ=F64))):
                     b.call(self.weigh, [frame, h])
@@ -224,7 +300,10 @@ class _Writer:
                     b.call(self.step, [frame, b.fadd(since, b.fmul(b.sitofp(s, F64), h)), h])
                     for begin, end, by in self.groups if plan.tangents else ():
                         with loop(b, integer(begin), integer(end), by) as j:
-                            b.call(self.move[by], [frame, *tangent(j, self.sources, plan.motion.sources)])
+                            b.call(
+                                self.move[by],
+                                [frame, *tangent(j, self.sources, plan.motion.sources)],
+                            )
                 b.store(to, t)
                 keep(b.add(k, integer(1)))
                 if plan.driven:
@@ -232,14 +311,24 @@ class _Writer:
                     with loop(b, integer(0), integer(width)) as lane:
                         row = b.add(later, number_at(b, own, lane, I64))
                         for j, place in enumerate(plan.driven, start=nc - len(plan.driven)):
-                            put(b, number_at(b, cases, b.add(row, integer(j))), frame, at(place, lane))
+                            put(
+                                b,
+                                number_at(b, cases, b.add(row, integer(j))),
+                                frame,
+                                at(place, lane),
+                            )
                 b.call(self.read, [frame, to])
                 done = b.mul(k, integer(no))
                 with loop(b, integer(0), integer(columns)) as j:
                     if plan.tangents:
-                        b.call(self.show, [frame, *tangent(j, self.show_sources, plan.reading.sources)])
+                        b.call(
+                            self.show, [frame, *tangent(j, self.show_sources, plan.reading.sources)]
+                        )
                     with loop(b, integer(0), integer(width)) as lane:
-                        begin, less = number_at(b, target, lane, I64), b.add(number_at(b, shift, lane, I64), done)
+                        begin, less = (
+                            number_at(b, target, lane, I64),
+                            b.add(number_at(b, shift, lane, I64), done),
+                        )
                         for i, place in enumerate(plan.shown):
                             value = number_at(b, frame, at(place, lane))
                             if plan.tangents:
@@ -263,7 +352,10 @@ class _Vectors:
         return self.builder.gep(frame, [index], source_etype=self.type)
 
     def load(self, frame: Value, places: Iterable[int | Value]) -> list[Value]:
-        return [self.builder.load(self.place(frame, i), typ=self.type, align=8 * self.width) for i in places]
+        return [
+            self.builder.load(self.place(frame, i), typ=self.type, align=8 * self.width)
+            for i in places
+        ]
 
     def store(self, values: Sequence[Value], frame: Value, places: Iterable[int]) -> None:
         for value, i in zip(values, places, strict=True):
@@ -276,17 +368,25 @@ class _Vectors:
         """Makes a vector of equal numbers."""
         nothing = ir.Constant(self.type, ir.Undefined)
         single = self.builder.insert_element(nothing, number, ir.Constant(I32, 0))
-        return self.builder.shuffle_vector(single, nothing, ir.Constant(ir.VectorType(I32, self.width), None))
+        return self.builder.shuffle_vector(
+            single, nothing, ir.Constant(ir.VectorType(I32, self.width), None)
+        )
 
     def run(self, program: Program, inputs: Sequence[Value]) -> list[Value]:
         values = list(inputs)
         assert len(values) == program.inputs
         for name, *numbers in program.operations:
             constant = name == "constant"
-            values.append(self.constant(*numbers) if constant else self.apply(name, *[values[i] for i in numbers]))
+            values.append(
+                self.constant(*numbers)
+                if constant
+                else self.apply(name, *[values[i] for i in numbers])
+            )
         return [values[i] for i in program.outputs]
 
-    def combine(self, start: list[Value], weights: list[Value], slopes: list[list[Value]]) -> list[Value]:
+    def combine(
+        self, start: list[Value], weights: list[Value], slopes: list[list[Value]]
+    ) -> list[Value]:
         """Computes start + sum of weight times slope."""
         for weight, slope in zip(weights, slopes, strict=True):
             start = [self.call("fma", weight, k, y) for k, y in zip(slope, start, strict=True)]
@@ -310,25 +410,33 @@ class _Vectors:
                 holds = builder.fcmp_ordered("<" if name == "less" else "<=", a, b)
                 return builder.select(holds, self.constant(1.0), self.constant(0.0))
             case "where", [condition, a, b]:
-                return builder.select(builder.fcmp_unordered("!=", condition, self.constant(0.0)), a, b)
+                return builder.select(
+                    builder.fcmp_unordered("!=", condition, self.constant(0.0)), a, b
+                )
         return self._each(name.replace("arctan", "atan"), *args)
 
     def call(self, name: str, *args: Value) -> Value:
         """Writes an instruction of the processor: fma (rounded once), sqrt or floor."""
-        return self.builder.call(self._declared(f"llvm.{name}.v{self.width}f64", self.type, len(args)), args)
+        return self.builder.call(
+            self._declared(f"llvm.{name}.v{self.width}f64", self.type, len(args)), args
+        )
 
     def _each(self, name: str, *args: Value) -> Value:
         """Calls a function of the C library, lane by lane."""
         function = self._declared(name, F64, len(args))
         result = ir.Constant(self.type, ir.Undefined)
         for lane in (ir.Constant(I32, i) for i in range(self.width)):
-            number = self.builder.call(function, [self.builder.extract_element(a, lane) for a in args])
+            number = self.builder.call(
+                function, [self.builder.extract_element(a, lane) for a in args]
+            )
             result = self.builder.insert_element(result, number, lane)
         return result
 
     def _declared(self, name: str, kind: ir.Type, count: int) -> ir.Function:
         module = self.builder.module
-        return module.globals.get(name) or ir.Function(module, ir.FunctionType(kind, [kind] * count), name)
+        return module.globals.get(name) or ir.Function(
+            module, ir.FunctionType(kind, [kind] * count), name
+        )
 
 
 @contextmanager

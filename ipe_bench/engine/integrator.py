@@ -50,7 +50,9 @@ def _pool(workers: int, process: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(workers, thread_name_prefix="ode")
 
 
-def _compiled(name: str, source: StepPlan | Program, width: int, arguments: tuple[Any, ...]) -> Callable[..., None]:
+def _compiled(
+    name: str, source: StepPlan | Program, width: int, arguments: tuple[Any, ...]
+) -> Callable[..., None]:
     """Returns the compiled function of `emit` by that name."""
 
     def write() -> str:
@@ -82,7 +84,9 @@ class Kernel:
     def _machine_code(self, width: int) -> tuple[Callable[..., None], int]:
         """Returns the function for groups of so many lanes, and the numbers that it needs room for."""
         weights = -(-sum(map(len, self.plan.tableau.weights)) // width)
-        return _compiled("integrate", self.plan, width, _ARGUMENTS), (self.plan.size + weights) * width
+        return _compiled("integrate", self.plan, width, _ARGUMENTS), (
+            self.plan.size + weights
+        ) * width
 
     def run(
         self,
@@ -112,7 +116,14 @@ class Kernel:
         function, size = self._narrow if lanes <= _NARROW else self._wide
         given = (at(x), at(si), at(cases), count, at(rows, WHOLE))
         stride = len(offset[0]) // count if offset else 0
-        taken = (at(times), at(steps, WHOLE), len(times), at(offset[0]) if offset else None, stride, at(out))
+        taken = (
+            at(times),
+            at(steps, WHOLE),
+            len(times),
+            at(offset[0]) if offset else None,
+            stride,
+            at(out),
+        )
         kept = None if states is None else at(states)
 
         def work_on(pieces: Sequence[tuple[int, int]] | Any) -> None:
@@ -122,7 +133,12 @@ class Kernel:
             del memory
 
         width = compiled.width()
-        work = lanes * int(steps[: len(times)].sum()) * self.equations.states * (1 if offset else x.shape[1])
+        work = (
+            lanes
+            * int(steps[: len(times)].sum())
+            * self.equations.states
+            * (1 if offset else x.shape[1])
+        )
         workers = min(threads(), lanes // width) if work >= _WORTH_THREADS else 1
         if workers <= 1:
             work_on([(0, lanes)])
@@ -131,7 +147,9 @@ class Kernel:
         shares = min(lanes // width, workers * min(4, max(1, work // _WORTH_THREADS)))
         bounds = [width * (i * (lanes // width) // shares) for i in range(shares)] + [lanes]
         pieces = iter(list(itertools.pairwise(bounds)))
-        others = [_pool(workers - 1, os.getpid()).submit(work_on, pieces) for _ in range(workers - 1)]
+        others = [
+            _pool(workers - 1, os.getpid()).submit(work_on, pieces) for _ in range(workers - 1)
+        ]
         work_on(pieces)
         for other in others:
             other.result()
@@ -141,7 +159,9 @@ class Kernel:
         """Evaluates from the time, the state with its tangents, and constants: their starts, their slopes, and
         readings."""
         tape = Recording(self.equations)
-        d, dp, slopes, shown, starts = tape.tangents if self.sensitive else ([], [], [], tape.shown, [])
+        d, dp, slopes, shown, starts = (
+            tape.tangents if self.sensitive else ([], [], [], tape.shown, [])
+        )
         stays = [*tape.p, *tape.c, *dp]
         at = [tape.t, *tape.y, *d, *stays]
         watched = self.equations.watched and not self.sensitive
@@ -173,7 +193,11 @@ class Kernel:
             return [*p, *intervals[min(k, len(intervals) - 1), case].T, *directions]
 
         with np.errstate(all="ignore"):
-            begun, t, size = begin(stays(0)), np.float64(0.0), len(slope.outputs) - bool(self.plan.doubt)
+            begun, t, size = (
+                begin(stays(0)),
+                np.float64(0.0),
+                len(slope.outputs) - bool(self.plan.doubt),
+            )
             y, noted = begun[:size], begun[size:]
             kept = [y]
             for k, to in enumerate(times):
@@ -194,14 +218,18 @@ class Kernel:
                                 held += slope([moment, *y, *stays(k)])[:size]
                     y = at
                     if noted:
-                        noted = self.plan.watch([h, *y, *itertools.chain(*slopes), *held, *sides, *noted])
+                        noted = self.plan.watch(
+                            [h, *y, *itertools.chain(*slopes), *held, *sides, *noted]
+                        )
                 t = to
                 kept.append(y)
                 for i, value in enumerate(read([t, *y, *stays(k + 1)])):
                     if self.sensitive:
                         out[trial, case, k, i] = np.broadcast_to(value, (n, len(trial))).T * si
                     else:
-                        out[trial, case, k, i, 0] = value - more[0].reshape(count, -1, out.shape[3])[case, k, i]
+                        out[trial, case, k, i, 0] = (
+                            value - more[0].reshape(count, -1, out.shape[3])[case, k, i]
+                        )
             if states is not None:
                 for k, i in np.ndindex(len(kept), len(kept[0])):
                     states[trial, case, i, k] = kept[k][i]

@@ -78,7 +78,9 @@ def apart(fine: Array, coarse: Array) -> Array:
     with np.errstate(all="ignore"):
         largest, gap = (np.abs(y).max(axis=3).max(axis=1) for y in (fine, fine - coarse))
         scale = np.maximum(largest, _ROUNDING * largest.max(axis=1, keepdims=True, initial=0.0))
-        return np.nan_to_num(np.where(gap == 0.0, 0.0, gap / scale), nan=np.inf).max(axis=1, initial=0.0)
+        return np.nan_to_num(np.where(gap == 0.0, 0.0, gap / scale), nan=np.inf).max(
+            axis=1, initial=0.0
+        )
 
 
 def search(
@@ -115,7 +117,9 @@ def search(
             simulate(rows, int(rungs[place]), fine, y)
             astray = apart(y[rows, :, :-1], near[rows, :, :-1])
             with np.errstate(all="ignore"):
-                moved = (np.abs(fine[rows] - unturned(coarse[rows], fine[rows])) / tolerance).max(axis=1)
+                moved = (np.abs(fine[rows] - unturned(coarse[rows], fine[rows])) / tolerance).max(
+                    axis=1
+                )
                 moved = SAFETY * np.maximum(moved, astray / STATES)
                 left = moved / ((rungs[place] / rungs[below]) ** ORDER - 1.0)
                 # Not a number where an iterate overflows: such a trial climbs to the top, in bounded time.
@@ -142,7 +146,11 @@ def tangent_contraction(coarse: Array, J: Array) -> float:
         return np.inf
     size = np.linalg.norm(J, axis=0)
     size[size == 0] = 1.0
-    return float(np.linalg.norm(np.eye(J.shape[1]) - np.linalg.lstsq(coarse / size, J / size, rcond=None)[0], 2))
+    return float(
+        np.linalg.norm(
+            np.eye(J.shape[1]) - np.linalg.lstsq(coarse / size, J / size, rcond=None)[0], 2
+        )
+    )
 
 
 class Coarseness(NamedTuple):

@@ -90,7 +90,11 @@ DOP853 = Tableau(
 """Eighth order in twelve stages (Dormand and Prince; Hairer, Norsett, Wanner, Solving Ordinary Differential Equations
 I, 2nd ed. 1993, II.5, table 5.4 and the code DOP853)."""
 
-RK4 = Tableau(A=((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)), B=(1 / 6, 1 / 3, 1 / 3, 1 / 6), C=(0.0, 0.5, 0.5, 1.0))
+RK4 = Tableau(
+    A=((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)),
+    B=(1 / 6, 1 / 3, 1 / 3, 1 / 6),
+    C=(0.0, 0.5, 0.5, 1.0),
+)
 """The classical formula of fourth order (Kutta, 1901)."""
 
 
@@ -130,12 +134,19 @@ class Recording:
         self.equations = equations
         graph = self.graph = Graph()
         self.t = graph.input("t")
-        self.y, self.p = graph.inputs("y", equations.states), graph.inputs("p", equations.parameters)
+        self.y, self.p = (
+            graph.inputs("y", equations.states),
+            graph.inputs("p", equations.parameters),
+        )
         self.c = graph.inputs("c", equations.constants)
         self.moving = self.t, *self.y, *self.c[equations.constants - equations.driven :]
         self.start = self._values(equations.start(self.p, self.c), equations.states, "start")
-        self.slope = self._values(equations.rhs(self.t, self.y, self.p, self.c), equations.states, "rhs")
-        self.shown = self._values(equations.read(self.t, self.y, self.p, self.c), equations.outputs, "read")
+        self.slope = self._values(
+            equations.rhs(self.t, self.y, self.p, self.c), equations.states, "rhs"
+        )
+        self.shown = self._values(
+            equations.read(self.t, self.y, self.p, self.c), equations.outputs, "read"
+        )
 
     def _values(self, result: Iterable[Any], count: int, name: str) -> list[Expression]:
         values = [self.graph.apply("add", v, 0.0) for v in result]
@@ -190,7 +201,9 @@ class Recording:
         began, doubt = g.inputs("noted", 2)
         given = [h, *ended, *slopes, *held, *sides, *reach, began, doubt]
         size: Any = np.abs
-        larger = [g.apply("where", a < size(b), size(b), a) for a, b in zip(reach, ended, strict=True)]
+        larger = [
+            g.apply("where", a < size(b), size(b), a) for a, b in zip(reach, ended, strict=True)
+        ]
         moved = [k - alone for k, alone in zip(slopes, held, strict=True)] if held else slopes
         for side in sides:
             doubt = g.apply("where", (side < began) + (began < side), 1.0, doubt)
@@ -213,17 +226,27 @@ class Recording:
         else:
             d = graph.inputs("d", variation.freedoms)
             if any(e.value != 0.0 for e in starts):
-                raise ValueError("equations of small deviations need a start that does not depend on the parameters")
+                raise ValueError(
+                    "equations of small deviations need a start that does not depend on the parameters"
+                )
             dy = variation.moved(self.y, d)
-            slopes = self._values(variation.slope(self.t, self.y, self.p, self.c, d, dp), variation.freedoms, "slope")
+            slopes = self._values(
+                variation.slope(self.t, self.y, self.p, self.c, d, dp), variation.freedoms, "slope"
+            )
             starts = [graph.constant(0.0)] * variation.freedoms
-        along = dict(zip(self.y + self.p, (*(graph.apply("add", v, 0.0) for v in dy), *dp), strict=True))
+        along = dict(
+            zip(self.y + self.p, (*(graph.apply("add", v, 0.0) for v in dy), *dp), strict=True)
+        )
         return d, dp, slopes, trace.tangent(self.shown, along), starts
 
-    def along_each(self, directions: Sequence[Expression], tangents: Sequence[Expression]) -> list[list[Expression]]:
+    def along_each(
+        self, directions: Sequence[Expression], tangents: Sequence[Expression]
+    ) -> list[list[Expression]]:
         """Returns the tangents along each direction alone."""
         one, zero = self.graph.constant(1.0), self.graph.constant(0.0)
-        units = [{other: one if other is along else zero for other in directions} for along in directions]
+        units = [
+            {other: one if other is along else zero for other in directions} for along in directions
+        ]
         return [[trace.substitute(e, unit) for e in tangents] for unit in units]
 
     def fixed(self, *outputs: Expression) -> list[Expression]:
@@ -235,7 +258,11 @@ class _Linear:
     """Holds tangents of some outputs: their program, its inputs from the state, and the sources of each direction."""
 
     def __init__(
-        self, tape: Recording, d: Sequence[Expression], dp: Sequence[Expression], tangents: Sequence[Expression]
+        self,
+        tape: Recording,
+        d: Sequence[Expression],
+        dp: Sequence[Expression],
+        tangents: Sequence[Expression],
     ) -> None:
         outputs, sources = trace.separate(tangents, d, dp)
         names = [tape.graph.input(f"source{i}") for i in range(len(sources))]
@@ -252,9 +279,13 @@ class _Linear:
 
     def placed(self, at: range, fixed: Sequence[Expression]) -> Tangents:
         """Places the program: saved, driving and constant inputs lie one after another from the start of `at`."""
-        order = {e: at.start + i for i, e in enumerate([*self.saved, *self.driving, *self.constant])}
+        order = {
+            e: at.start + i for i, e in enumerate([*self.saved, *self.driving, *self.constant])
+        }
         sources = tuple(tuple(order[e] for e in row) for row in self.sources)
-        return Tangents(Program.of(self.outputs, [*self.inputs, *fixed]), sources, at[: len(self.saved)])
+        return Tangents(
+            Program.of(self.outputs, [*self.inputs, *fixed]), sources, at[: len(self.saved)]
+        )
 
 
 def _distinct(expressions: Iterable[Expression]) -> list[Expression]:
@@ -317,7 +348,10 @@ class StepPlan:
     def operations(self) -> int:
         """Arithmetic operations of a step of one lane: its cost on any machine."""
         weighed, total = sum(map(len, self.tableau.weights)), 0
-        for program, place in [(self.rates, self.y), *((self.motion.program, place) for place in self.tangents)]:
+        for program, place in [
+            (self.rates, self.y),
+            *((self.motion.program, place) for place in self.tangents),
+        ]:
             counted = sum(name not in ("constant", "neg") for name, *_ in program.operations)
             total += self.tableau.stages * counted + len(place) * weighed
         return total
@@ -332,13 +366,21 @@ def jumps(equations: Equations) -> bool:
     moving = trace.dependent(tape.slope, (tape.t, *tape.y))
     if any(e.operation == "floor" for e in moving):
         return True
-    for e in (e for e in trace.in_order(tape.slope) if e.operation in trace.COMPARING and e in moving):
+    for e in (
+        e for e in trace.in_order(tape.slope) if e.operation in trace.COMPARING and e in moving
+    ):
         if e.operands[0] is e.operands[1]:  # asks whether it is a number
             continue
         gap = graph.apply("sub", *e.operands)
-        sides = [trace.substitute(f, {e: graph.constant(side)}) for side in (1.0, 0.0) for f in tape.slope]
+        sides = [
+            trace.substitute(f, {e: graph.constant(side)})
+            for side in (1.0, 0.0)
+            for f in tape.slope
+        ]
         for place, along in enumerate(inputs[: 1 + equations.states]):
-            program = Program.of([gap, *trace.tangent([gap], {along: graph.constant(1.0)}), *sides], inputs)
+            program = Program.of(
+                [gap, *trace.tangent([gap], {along: graph.constant(1.0)}), *sides], inputs
+            )
             point = list(np.random.default_rng(1).uniform(-2.0, 2.0, (len(inputs), _POINTS)))
             with np.errstate(all="ignore"):
                 for _ in range(_NEWTON):
@@ -346,7 +388,10 @@ def jumps(equations: Equations) -> bool:
                     point[place] = point[place] - value / slope
                 value, _, *shown = program(point)
                 half = equations.states
-                a, b = (np.stack(np.broadcast_arrays(value, *side)) for side in (shown[:half], shown[half:]))
+                a, b = (
+                    np.stack(np.broadcast_arrays(value, *side))
+                    for side in (shown[:half], shown[half:])
+                )
                 apart = np.abs(a - b) > 1e-6 * (1.0 + np.abs(a) + np.abs(b))
                 if (apart & (np.abs(value) < 1e-9)).any():
                     return True
@@ -369,19 +414,28 @@ def planned(equations: Equations, tableau: Tableau, *, sensitive: bool) -> StepP
     saved = [*motion.saved, *motion.driving]
     noted = [*reading.saved, *reading.driving] if sensitive else tape.shown
     sides = [tape.side] if watched else []
-    fixed = _distinct([*tape.fixed(*tape.slope, *saved, *noted, *sides), *motion.fixed, *reading.fixed])
+    fixed = _distinct(
+        [*tape.fixed(*tape.slope, *saved, *noted, *sides), *motion.fixed, *reading.fixed]
+    )
     given = [*tape.moving, *fixed]
     rates, step, read = (
-        Program.of(found, given) for found in ([*tape.slope, *saved], [*tape.slope, *saved, *sides], noted)
+        Program.of(found, given)
+        for found in ([*tape.slope, *saved], [*tape.slope, *saved, *sides], noted)
     )
     k, r = len(saved), len(noted)
-    x, constants, y, fixed_at = map(room, (equations.parameters, equations.constants, equations.states, len(fixed)))
+    x, constants, y, fixed_at = map(
+        room, (equations.parameters, equations.constants, equations.states, len(fixed))
+    )
     lie = tuple(room(len(d)) for _ in dp)
     stages = [room(k + len(motion.constant)) for _ in tableau.B]
     noted_at = room(r + len(reading.constant))
     shown_at = room(equations.outputs) if sensitive else noted_at
     reach, side, doubt = map(room, (equations.states, 1, 1) if watched else (0, 0, 0))
-    begun = [i for place in (y, fixed_at, *lie, *(stage[k:] for stage in stages), noted_at[r:]) for i in place]
+    begun = [
+        i
+        for place in (y, fixed_at, *lie, *(stage[k:] for stage in stages), noted_at[r:])
+        for i in place
+    ]
     started = [*tape.start, *fixed, *(e for row in tape.along_each(dp, starts) for e in row)]
     started += [*motion.constant * tableau.stages, *reading.constant]
     if watched:

@@ -23,7 +23,13 @@ from ipe_bench.engine.plan import Equations, Recording
 from ipe_bench.engine.trace import Program, tangent
 
 GAMMA = 0.21193756319429014
-_SIXTH = (-7.502846399306121, 2.561846144803919, -11.627539656261098, -0.18268767659942256, 0.030198172008377946)
+_SIXTH = (
+    -7.502846399306121,
+    2.561846144803919,
+    -11.627539656261098,
+    -0.18268767659942256,
+    0.030198172008377946,
+)
 # fmt: off
 A: tuple[tuple[float, ...], ...] = (
     (),
@@ -52,8 +58,26 @@ C: tuple[tuple[float, ...], ...] = (
     ),
 )
 # fmt: on
-NODES = (0.0, 0.6358126895828704, 0.4095798393397535, 0.9769306725060716, 0.4288403609558664, 1.0, 1.0, 1.0)
-TIME_WEIGHTS = (GAMMA, -0.42387512638858027, -0.3384627126235924, 1.8046452872882734, 2.325825639765069, 0.0, 0.0, 0.0)
+NODES = (
+    0.0,
+    0.6358126895828704,
+    0.4095798393397535,
+    0.9769306725060716,
+    0.4288403609558664,
+    1.0,
+    1.0,
+    1.0,
+)
+TIME_WEIGHTS = (
+    GAMMA,
+    -0.42387512638858027,
+    -0.3384627126235924,
+    1.8046452872882734,
+    2.325825639765069,
+    0.0,
+    0.0,
+    0.0,
+)
 _REACH, STABLE = 6.0, 5.0
 """About where the stability region of DOP853 ends on the negative real axis, and a step over the fastest rate to which
 it is stable."""
@@ -148,7 +172,9 @@ class Rodas5P:
         run = _Run(self, x, len(self.of.times), stretched=True)
         k = int(np.argmax(run.stretch))
         explicit, fastest, met = (float(a[k]) for a in (run.stretch, run.fastest, run.met))
-        return run.readings, Effort(int(run.steps.max()), explicit, fastest, met, float(run.t.min()))
+        return run.readings, Effort(
+            int(run.steps.max()), explicit, fastest, met, float(run.t.min())
+        )
 
     def simulate(self, x: Array, stop: int, most: int = MOST_STEPS) -> Array:
         """Computes readings (trials, cases x stop x outputs) at the first `stop` times; NaN from where a trial breaks
@@ -184,14 +210,21 @@ class _Run:
         of, equations = method.of, method.of.equations
         self.do, self.rtol, self.atol = method._programs, method.rtol, _SMALLEST * method.rtol
         self.tables, self.end = of.tables, float(of.times[-1]) or 1.0
-        self.times, self.most, self.stretched = np.asarray(of.times, dtype=float)[:stop], most, stretched
+        self.times, self.most, self.stretched = (
+            np.asarray(of.times, dtype=float)[:stop],
+            most,
+            stretched,
+        )
         self.timed, self.divided = method.timed, method.divided
         intervals = np.diff(np.asarray(of.times, dtype=float), prepend=0.0)
         self.interval = float(np.median(intervals[intervals > 0.0])) if intervals.any() else 1.0
         cases, self.q = of.tables.shape[1], equations.parameters if sensitive else 0
         lanes = len(x) * cases
         self.p = np.repeat(x * of.sizes, cases, axis=0).T.copy()
-        self.case, self.directions = np.tile(np.arange(cases), len(x)), np.eye(equations.parameters)[:, :, None]
+        self.case, self.directions = (
+            np.tile(np.arange(cases), len(x)),
+            np.eye(equations.parameters)[:, :, None],
+        )
         self.t, self.place, self.steps = np.zeros(lanes), np.zeros(lanes, int), np.zeros(lanes, int)
         self.stretch, self.fastest, self.met = np.zeros((3, lanes))
         self.z = np.full((equations.outputs, stop, lanes), np.nan)
@@ -220,13 +253,19 @@ class _Run:
         live = np.arange(len(self.t))
         while True:
             self._read(live)
-            going = (self.place[live] < len(self.times)) & (self.steps[live] < self.most) & np.isfinite(h[live])
+            going = (
+                (self.place[live] < len(self.times))
+                & (self.steps[live] < self.most)
+                & np.isfinite(h[live])
+            )
             live = live[going]
             if not len(live):
                 return
             left = self.times[self.place[live]] - self.t[live]
             # A step that would leave a sliver before the next reading is halved, one that overshoots is cut.
-            now = np.where(h[live] >= left * (1 - 1e-9), left, np.where(2 * h[live] > left, left / 2, h[live]))
+            now = np.where(
+                h[live] >= left * (1 - 1e-9), left, np.where(2 * h[live] > left, left / 2, h[live])
+            )
             y, S, error = self._step(live, now)
             self.steps[live] += 1
             good = error <= 1
@@ -236,7 +275,9 @@ class _Run:
             h[live] = np.where(good & (now < h[live]), np.maximum(wanted, h[live]), wanted)
             h[live] = np.where(self.t[live] + 8 * h[live] == self.t[live], np.nan, h[live])
             done = live[good]
-            self.t[done] = np.where(now[good] == left[good], self.times[self.place[done]], self.t[done] + now[good])
+            self.t[done] = np.where(
+                now[good] == left[good], self.times[self.place[done]], self.t[done] + now[good]
+            )
             self.y[:, done], self.S[:, :, done] = y[:, good], S[:, :, good]
             self.largest[:, done] = np.fmax(self.largest[:, done], np.abs(y[:, good]))
 
@@ -252,21 +293,33 @@ class _Run:
             if self.reaching:
                 n = len(self.y)
                 sizes = self.largest[:, here] * np.eye(n)[:, :, None]
-                moved = self._values("dread", [*at, *sizes, *np.zeros(self.p.shape[0])], n, len(here))
+                moved = self._values(
+                    "dread", [*at, *sizes, *np.zeros(self.p.shape[0])], n, len(here)
+                )
                 self.reach[:, self.place[here], here] = np.abs(moved).sum(axis=1)
             if self.q:
-                slopes = self._values("dread", [*at, *self.S[:, :, here], *self.directions], self.q, len(here))
+                slopes = self._values(
+                    "dread", [*at, *self.S[:, :, here], *self.directions], self.q, len(here)
+                )
                 self.J[:, self.place[here], :, here] = slopes.transpose(2, 0, 1)
             self.place[here] += 1
 
     def _constants(self, lanes: Array, later: int = 0) -> Array:
         """Returns the constants of the interval to the next time of each lane, or those that hold from that time on."""
-        return self.tables[np.minimum(self.place[lanes] + later, len(self.tables) - 1), self.case[lanes]].T
+        return self.tables[
+            np.minimum(self.place[lanes] + later, len(self.tables) - 1), self.case[lanes]
+        ].T
 
     def _step(self, live: Array, h: Array) -> tuple[Array, Array, Array]:
         """Computes states, sensitivities and the error in units of the tolerance after a step h of the lanes `live`."""
         q, lanes = self.q, len(live)
-        t, y, p, c, S = self.t[live], self.y[:, live], self.p[:, live], self._constants(live), self.S[:, :, live]
+        t, y, p, c, S = (
+            self.t[live],
+            self.y[:, live],
+            self.p[:, live],
+            self._constants(live),
+            self.S[:, :, live],
+        )
         n, at = len(y), (t, *y, *p, *c)
         J = self._values("J", at, lanes).reshape(n, n, lanes)
         if self.stretched:
@@ -291,7 +344,9 @@ class _Run:
             K.append(_solve(W, exchanged, rest[:, None])[:, 0])
             if q:
                 V = S + sum(w * k for w, k in zip(a, D, strict=True))
-                rest = self._values("df", [*inside, *V, *self.directions], q, lanes) + h * weight * dft
+                rest = (
+                    self._values("df", [*inside, *V, *self.directions], q, lanes) + h * weight * dft
+                )
                 rest = rest + sum(w * k for w, k in zip(b, D, strict=True)) / h
                 rest = rest + self._values("dJk", [*at, *K[-1], *ways], q, lanes)
                 D.append(_solve(W, exchanged, rest))
@@ -303,7 +358,9 @@ class _Run:
             missed = (np.abs(unseen) / (self.atol + _UNSEEN * largest)).max(axis=0)
             error = np.where(missed > 1.0, np.fmax(missed, error), error)
         if self.divided:
-            before, after = (self._values("side", one, lanes)[0] for one in (at, (t + h, *y1, *p, *c)))
+            before, after = (
+                self._values("side", one, lanes)[0] for one in (at, (t + h, *y1, *p, *c))
+            )
             error = np.where((before != after) & (h > _THROUGH * self.interval), np.inf, error)
         return y1, V + D[-1] if q else S, error
 
@@ -327,7 +384,11 @@ class _Run:
         scale = self.atol + self.rtol * np.abs(self.y)
         f = self._values("f", [self.t, *self.y, *self.p, *self._constants(np.arange(lanes))], lanes)
         speed, size = (np.abs(f) / scale).max(axis=0), (np.abs(self.y) / scale).max(axis=0)
-        return np.where((speed > 1e-5) & (size > 1e-5), np.minimum(1e-3 * size / speed, self.end), 1e-6 * self.end)
+        return np.where(
+            (speed > 1e-5) & (size > 1e-5),
+            np.minimum(1e-3 * size / speed, self.end),
+            1e-6 * self.end,
+        )
 
 
 def _factor(W: Array) -> list[Array]:

@@ -18,14 +18,25 @@ from typing import Any, TypeAlias
 import numpy as np
 
 FUNCTIONS: dict[str, Callable[[Any], Any]] = {
-    name: getattr(np, name) for name in ("sin", "cos", "tan", "arctan", "exp", "log", "sqrt", "sinh", "cosh", "tanh")
+    name: getattr(np, name)
+    for name in ("sin", "cos", "tan", "arctan", "exp", "log", "sqrt", "sinh", "cosh", "tanh")
 }
 FUNCTIONS |= {
-    name: lambda a, name=name: getattr(importlib.import_module("scipy.special"), name)(a) for name in ("erf", "erfc")
+    name: lambda a, name=name: getattr(importlib.import_module("scipy.special"), name)(a)
+    for name in ("erf", "erfc")
 }
 """The elementary functions that can be recorded, of numbers, arrays and expressions; log is the natural logarithm."""
-_UFUNCS = {"add": "add", "subtract": "sub", "multiply": "mul", "divide": "div", "true_divide": "div", "power": "pow"}
-_UFUNCS |= {"negative": "neg"} | {name: name for name in ("less", "less_equal", "floor", "arctan2", *FUNCTIONS)}
+_UFUNCS = {
+    "add": "add",
+    "subtract": "sub",
+    "multiply": "mul",
+    "divide": "div",
+    "true_divide": "div",
+    "power": "pow",
+}
+_UFUNCS |= {"negative": "neg"} | {
+    name: name for name in ("less", "less_equal", "floor", "arctan2", *FUNCTIONS)
+}
 COMPARING = ("less", "less_equal")
 """Operations that are 1 where they hold and 0 elsewhere."""
 FLAT = (*COMPARING, "floor")
@@ -125,7 +136,9 @@ class Expression:
 
     def __bool__(self) -> bool:
         remedy = "np.where, np.minimum and np.maximum are recorded"
-        raise TypeError(f"a recorded expression has no truth value: write the model without if, min and max; {remedy}")
+        raise TypeError(
+            f"a recorded expression has no truth value: write the model without if, min and max; {remedy}"
+        )
 
     __lt__, __gt__ = _operator("less"), _operator("less", reflected=True)
     __le__, __ge__ = _operator("less_equal"), _operator("less_equal", reflected=True)
@@ -137,12 +150,18 @@ class Expression:
             return _COMPOSED[ufunc.__name__](self.graph.apply, *inputs)
         if ufunc.__name__ not in _UFUNCS:
             known = ", ".join((*FUNCTIONS, "arctan2", "floor", *_COMPOSED))
-            raise TypeError(f"np.{ufunc.__name__} cannot be recorded; use + - * / **, np.where and {known}")
+            raise TypeError(
+                f"np.{ufunc.__name__} cannot be recorded; use + - * / **, np.where and {known}"
+            )
         return self.graph.apply(_UFUNCS[ufunc.__name__], *inputs)
 
-    def __array_function__(self, function: Any, types: Any, args: tuple[Any, ...], kwargs: Any) -> Any:
+    def __array_function__(
+        self, function: Any, types: Any, args: tuple[Any, ...], kwargs: Any
+    ) -> Any:
         if function is not np.where or len(args) != 3:
-            raise TypeError(f"np.{function.__name__} cannot be recorded; apply it to numbers, or write it out")
+            raise TypeError(
+                f"np.{function.__name__} cannot be recorded; apply it to numbers, or write it out"
+            )
         return self.graph.apply("where", *args)
 
     def __getattr__(self, name: str) -> Any:
@@ -159,10 +178,17 @@ _COMPOSED: dict[str, Callable[..., Any]] = {
     "not_equal": lambda apply, a, b: apply("add", apply("less", a, b), apply("less", b, a)),
     "absolute": lambda apply, a: apply("where", apply("less", a, 0.0), apply("neg", a), a),
     "sign": lambda apply, a: apply(
-        "where", apply("less_equal", a, a), apply("sub", apply("less", 0.0, a), apply("less", a, 0.0)), a
+        "where",
+        apply("less_equal", a, a),
+        apply("sub", apply("less", 0.0, a), apply("less", a, 0.0)),
+        a,
     ),
-    "remainder": lambda apply, a, b: apply("sub", a, apply("mul", b, apply("floor", apply("div", a, b)))),
-    "hypot": lambda apply, a, b: apply("sqrt", apply("add", apply("mul", a, a), apply("mul", b, b))),
+    "remainder": lambda apply, a, b: apply(
+        "sub", a, apply("mul", b, apply("floor", apply("div", a, b)))
+    ),
+    "hypot": lambda apply, a, b: apply(
+        "sqrt", apply("add", apply("mul", a, a), apply("mul", b, b))
+    ),
     "minimum": lambda apply, a, b: _first_if(apply, apply("less", a, b), a, b),
     "maximum": lambda apply, a, b: _first_if(apply, apply("less", b, a), a, b),
 }
@@ -300,7 +326,9 @@ def tangent(
             along[e.order] = direction.get(e, zero)
             continue
         along[e.order] = zero
-        moving = [(along[a.order], i) for i, a in enumerate(e.operands) if along[a.order] is not zero]
+        moving = [
+            (along[a.order], i) for i, a in enumerate(e.operands) if along[a.order] is not zero
+        ]
         if not moving or e.operation in FLAT:
             continue
         if e.operation == "where":  # a branch that is not taken may have no slope
@@ -365,7 +393,11 @@ def _linear(e: Expression, own: Sequence[_Parts], joined: Callable[[_Parts], Exp
         return apply(e.operation, *(value if i == place else a for i, a in enumerate(given)))
 
     moved, source = part
-    return (None, scaled(source)) if moved is None and source is not None else (scaled(joined(part)), None)
+    return (
+        (None, scaled(source))
+        if moved is None and source is not None
+        else (scaled(joined(part)), None)
+    )
 
 
 @dataclass(frozen=True)
@@ -418,7 +450,11 @@ class Program:
         """Computes the outputs by NumPy, entry by entry; a formula on a million rows keeps few arrays."""
         values = list(inputs)
         for (name, *numbers), released in zip(self.operations, self._released, strict=True):
-            result = np.float64(numbers[0]) if name == "constant" else _ARRAYS[name](*[values[i] for i in numbers])
+            result = (
+                np.float64(numbers[0])
+                if name == "constant"
+                else _ARRAYS[name](*[values[i] for i in numbers])
+            )
             values.append(result)
             for i in released:
                 values[i] = None

@@ -63,21 +63,32 @@ class Estimates:
     def of(cls, ended: Any, tally: EvaluationCount, **further: Any) -> Estimates:
         """Makes the estimates of an ended iteration, with its cost; `further` are fields of the estimator's own."""
         counts = {"simulations": tally.simulations.copy(), "jacobians": tally.jacobians.copy()}
-        found = {"x": ended.x, "status": ended.status, "iterations": ended.iterations, "history": ended.history}
+        found = {
+            "x": ended.x,
+            "status": ended.status,
+            "iterations": ended.iterations,
+            "history": ended.history,
+        }
         return cls(**{**found, **counts, "messages": dict(tally.messages), **further})
 
     @classmethod
     def join(cls, parts: Sequence[Estimates]) -> Estimates:
         """Joins batches one after another; what trials lack that others have is NaN, and none in their lists."""
         starts = np.cumsum([0, *(len(part.x) for part in parts)]).tolist()
-        messages = {s + i: m for s, part in zip(starts, parts, strict=False) for i, m in part.messages.items()}
+        messages = {
+            s + i: m
+            for s, part in zip(starts, parts, strict=False)
+            for i, m in part.messages.items()
+        }
         return replace(join([replace(part, messages={}) for part in parts]), messages=messages)
 
     @classmethod
     def failed(cls, trials: int, n: int, message: str) -> Estimates:
         """Makes the estimates of trials that ended in an exception."""
         status = np.full(trials, Status.ERROR, dtype=np.int8)
-        return cls(np.full((trials, n), np.nan), status, messages=dict.fromkeys(range(trials), message))
+        return cls(
+            np.full((trials, n), np.nan), status, messages=dict.fromkeys(range(trials), message)
+        )
 
 
 class Estimator(Component, ABC):
@@ -124,7 +135,11 @@ class Estimator(Component, ABC):
             "prior": problem.prior_deviation is not None,
         }
         lacking = " and ".join(need for need in sorted(self.needs) if not has[need])
-        return f"needs {lacking}, which measurement={problem.measurement.name} does not have" if lacking else None
+        return (
+            f"needs {lacking}, which measurement={problem.measurement.name} does not have"
+            if lacking
+            else None
+        )
 
     def require_suited(self, problem: Problem) -> None:
         """Raises UserError if there is a hindrance."""
@@ -132,7 +147,9 @@ class Estimator(Component, ABC):
             raise UserError(f"{self.name}: {why}")
 
 
-def estimate_safely(estimator: Estimator, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
+def estimate_safely(
+    estimator: Estimator, problem: Problem, z: Array, *, history: bool = False
+) -> Estimates:
     """Calls `estimator.estimate`, timed; an exception becomes the status of the trials that cause it.
 
     A batch that raises is estimated again trial by trial. Readings and problem are read-only. A UserError, which
@@ -147,7 +164,9 @@ def estimate_safely(estimator: Estimator, problem: Problem, z: Array, *, history
     except Exception as error:
         if len(z) == 1:
             return Estimates.failed(1, problem.measurement.n, describe_exception(error))
-        return Estimates.join([estimate_safely(estimator, problem, row[None], history=history) for row in z])
+        return Estimates.join(
+            [estimate_safely(estimator, problem, row[None], history=history) for row in z]
+        )
     _make_plain(estimator, estimates, len(z), problem.measurement.n)
     if not estimates.seconds.any():
         estimates.seconds = np.full(len(z), (time.perf_counter() - began) / max(1, len(z)))
@@ -165,15 +184,21 @@ def _make_plain(estimator: Estimator, estimates: Any, trials: int, n: int) -> No
         raise ValueError(f"{name} {type(estimates).__name__}, where Estimates are asked for")
     estimates.x = plain_numbers(f"{name} x", estimates.x, (trials, n))
     if estimates.covariance is not None:
-        estimates.covariance = plain_numbers(f"{name} covariance", estimates.covariance, (trials, n, n))
+        estimates.covariance = plain_numbers(
+            f"{name} covariance", estimates.covariance, (trials, n, n)
+        )
     for part in ("status", "iterations", "simulations", "jacobians", "seconds"):
         setattr(estimates, part, plain_counts(name, part, getattr(estimates, part), trials))
-    estimates.extras = {k: plain_numbers(f"{name} {k}", values, (trials,)) for k, values in estimates.extras.items()}
+    estimates.extras = {
+        k: plain_numbers(f"{name} {k}", values, (trials,)) for k, values in estimates.extras.items()
+    }
     for part in ("history", "alternatives"):
         if (each := getattr(estimates, part)) is not None:
             if len(each) != trials:
                 raise ValueError(f"{name} {part} of {len(each)} trials, where {trials} belong")
-            setattr(estimates, part, [plain_numbers(f"{name} {part}", x, (len(x), n)) for x in each])
+            setattr(
+                estimates, part, [plain_numbers(f"{name} {part}", x, (len(x), n)) for x in each]
+            )
     estimates.messages = {trial: one_line(message) for trial, message in estimates.messages.items()}
 
 
@@ -182,7 +207,9 @@ def plain_counts(name: str, part: str, values: Any, trials: int) -> Any:
     `name`, if they cannot be such."""
     values = plain_numbers(f"{name} {part}", values, (trials,))
     if part == "status" and not np.isin(values, _ENDED).all():
-        raise ValueError(f"{name} a status that is not one of ipe_bench.Status, or means that it has not ended")
+        raise ValueError(
+            f"{name} a status that is not one of ipe_bench.Status, or means that it has not ended"
+        )
     if not (np.isfinite(values) & (values >= 0)).all():
         raise ValueError(f"{name} {part} that are not finite numbers from 0 up")
     if part == "iterations" and ((values != np.rint(values)) | (values > _MOST)).any():

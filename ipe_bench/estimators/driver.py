@@ -136,7 +136,10 @@ def iterate(equations: E, method: Method[E, S], start: Array | S, limits: Limits
             (check.stuck, check.ending),
             (check.growth > FAR * begun, Status.DIVERGED),
             (check.moved < TINY_STEP * limits.tolerance, check.ending),
-            (limits.budget is not None and tally.of_search(n)[rows] >= limits.budget, Status.BUDGET),
+            (
+                limits.budget is not None and tally.of_search(n)[rows] >= limits.budget,
+                Status.BUDGET,
+            ),
             (iteration == limits.max_iterations, Status.MAX_ITERATIONS),
         )
         holds, ending = zip(*endings, strict=True)

@@ -102,7 +102,10 @@ class FrozenSystem:
                 "parameters cannot be told apart there, so there is no linear estimate to start from; give another "
                 "nominal point, start=nominal or best for least squares, or an estimator with a prior"
             )
-        model, H_plus = CountingModel(problem.measurement, EvaluationCount.zeros(len(z))), problem.H_plus[None]
+        model, H_plus = (
+            CountingModel(problem.measurement, EvaluationCount.zeros(len(z))),
+            problem.H_plus[None],
+        )
         deviation = deviations(frozen_covariance(H_plus, problem.R))
         return cls(model, H_plus, deviation, problem.R, z, np.arange(len(z)))
 
@@ -120,7 +123,11 @@ class FrozenSystem:
         return x
 
     def subset(self, kept: Mask) -> FrozenSystem:
-        slopes = {} if len(self.H_plus) == 1 else {"H_plus": self.H_plus[kept], "deviation": self.deviation[kept]}
+        slopes = (
+            {}
+            if len(self.H_plus) == 1
+            else {"H_plus": self.H_plus[kept], "deviation": self.deviation[kept]}
+        )
         return dataclasses.replace(self, z=self.z[kept], rows=self.rows[kept], **slopes)
 
     def relinearized(self, x: Array) -> FrozenSystem:
@@ -128,7 +135,9 @@ class FrozenSystem:
         J = self.model.jacobian(x, self.rows)
         H_plus, deficient = pseudo_inverse(J, self.R)
         self.model.tally.singular[self.rows[deficient & finite(J)]] = True
-        return dataclasses.replace(self, H_plus=H_plus, deviation=deviations(frozen_covariance(H_plus, self.R)))
+        return dataclasses.replace(
+            self, H_plus=H_plus, deviation=deviations(frozen_covariance(H_plus, self.R))
+        )
 
     def covariance(self) -> Array:
         """Computes the covariance (1, n, n) or (trials, n, n) of the linear LSE, eq. (5)."""
@@ -230,7 +239,9 @@ class IPE(Method[FrozenSystem, S], Estimator, Generic[S]):
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         x, system = begin(problem, z, self.start)
-        ended = iterate(system, self, x, Limits(self.tolerance, self.max_iterations, self.budget, history))
+        ended = iterate(
+            system, self, x, Limits(self.tolerance, self.max_iterations, self.budget, history)
+        )
         return Estimates.of(ended, system.model.tally, covariance=system.sandwich(ended.x))
 
 

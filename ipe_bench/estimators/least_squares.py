@@ -10,7 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import put
-from ipe_bench.basics.linalg import Array, Covariance, Mask, definite_factor, finite, inverse, multiply, solve, squared
+from ipe_bench.basics.linalg import (
+    Array,
+    Covariance,
+    Mask,
+    definite_factor,
+    finite,
+    inverse,
+    multiply,
+    solve,
+    squared,
+)
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.driver import ConvergenceCheck
 from ipe_bench.measurements.counted import CountingModel, EvaluationCount
@@ -120,12 +130,22 @@ class NormalEquations:
         well = well & finite(r)
         Q = np.matmul(A, inverse_U) if keep_Q else None
         if not well.all():
-            QU, U[~well], inverse_U[~well], gradient[~well] = _orthogonal_factors(J[~well], r[~well])
+            QU, U[~well], inverse_U[~well], gradient[~well] = _orthogonal_factors(
+                J[~well], r[~well]
+            )
             if Q is not None:
                 Q[~well] = QU
         columns = np.sqrt(np.sum(U**2, axis=1))
         along = np.abs(multiply(U.swapaxes(1, 2), gradient)) / np.where(columns > 0, columns, 1.0)
-        return cls(U, inverse_U, gradient, columns, *_newton_step(inverse_U, gradient), along.max(axis=1), Q)
+        return cls(
+            U,
+            inverse_U,
+            gradient,
+            columns,
+            *_newton_step(inverse_U, gradient),
+            along.max(axis=1),
+            Q,
+        )
 
     def towards(self, r: Array) -> NormalEquations:
         """Returns the same Jacobian with another residual r (trials, m): a chord. It needs Q."""
@@ -139,7 +159,9 @@ class NormalEquations:
         with np.errstate(over="ignore"):  # an overflowing damping is treated by the other way
             squares = weights[:, :, None] ** 2 * np.eye(self.U.shape[1])
         _, root, well = definite_factor(np.matmul(self.U.swapaxes(1, 2), self.U) + squares)
-        step = -multiply(root, multiply(root.swapaxes(1, 2), multiply(self.U.swapaxes(1, 2), self.gradient)))
+        step = -multiply(
+            root, multiply(root.swapaxes(1, 2), multiply(self.U.swapaxes(1, 2), self.gradient))
+        )
         if not well.all():
             step[~well] = _damped_step(self.U[~well], weights[~well], self.gradient[~well])
         change = multiply(self.U, step)
@@ -189,7 +211,9 @@ def slope_at(
     slope = NormalEquations.of(objective.jacobian(x, coarse=~exact), r, keep_Q=keep_Q)
     lost = ~exact & ~np.isfinite(slope.size)
     if lost.any():
-        again, _ = slope_at(objective.subset(lost), x[lost], r[lost], np.ones(lost.sum(), dtype=bool), keep_Q=keep_Q)
+        again, _ = slope_at(
+            objective.subset(lost), x[lost], r[lost], np.ones(lost.sum(), dtype=bool), keep_Q=keep_Q
+        )
         slope = put(slope, lost, again)
     return slope, exact | lost
 
@@ -222,7 +246,9 @@ class LeastSquaresSystem:
     """True if Jacobians are exact from now on, since the minimum is near."""
 
     @classmethod
-    def at(cls, objective: Objective, x: Array, lam: float = 0.0, *, keep_Q: bool = False) -> LeastSquaresSystem:
+    def at(
+        cls, objective: Objective, x: Array, lam: float = 0.0, *, keep_Q: bool = False
+    ) -> LeastSquaresSystem:
         """Returns the state at the start."""
         r = objective.residual(x)
         trials = len(x)

@@ -30,16 +30,31 @@ class GaussNewtonMethod(Method[Objective, LeastSquaresSystem]):
         return LeastSquaresSystem.at(objective, x)
 
     def step(self, objective: Objective, state: LeastSquaresSystem) -> LeastSquaresSystem:
-        slope, lost = state.slope, state.rankless & finite(state.slope.U) & finite(state.slope.gradient)
+        slope, lost = (
+            state.slope,
+            state.rankless & finite(state.slope.U) & finite(state.slope.gradient),
+        )
         step = slope.newton.copy()
         if lost.any():
-            step[lost] = -multiply(np.linalg.pinv(slope.U[lost], rcond=_SMALL), slope.gradient[lost])
+            step[lost] = -multiply(
+                np.linalg.pinv(slope.U[lost], rcond=_SMALL), slope.gradient[lost]
+            )
         x = state.x + step
         r, near = objective.residual(x), state.nearly(objective)
         slope, exact = slope_at(objective, x, r, near)
         regular, moved = state.regular | np.isfinite(slope.size), state.reach(step)
         cost = objective.cost(x, r)
-        return replace(state, x=x, r=r, cost=cost, slope=slope, moved=moved, regular=regular, exact=exact, near=near)
+        return replace(
+            state,
+            x=x,
+            r=r,
+            cost=cost,
+            slope=slope,
+            moved=moved,
+            regular=regular,
+            exact=exact,
+            near=near,
+        )
 
     def check(
         self, objective: Objective, before: LeastSquaresSystem | None, state: LeastSquaresSystem
@@ -90,7 +105,9 @@ class LevenbergMarquardtMethod(Method[Objective, LeastSquaresSystem]):
         r = objective.residual(tried)
         cost = objective.cost(tried, r)
         gain = (state.cost - cost) / predicted
-        invisible = (predicted <= _ROUND_OFF * state.cost) & (np.abs(cost - state.cost) <= 2 * _ROUND_OFF * state.cost)
+        invisible = (predicted <= _ROUND_OFF * state.cost) & (
+            np.abs(cost - state.cost) <= 2 * _ROUND_OFF * state.cost
+        )
         taken = (gain > 0) | invisible
         factor = np.maximum(1 / 3, 1 - (2 * np.clip(np.where(invisible, 1.0, gain), 0, 1) - 1) ** 3)
         factor = np.where(believed, factor, np.maximum(factor, 1.0))
@@ -111,9 +128,13 @@ class LevenbergMarquardtMethod(Method[Objective, LeastSquaresSystem]):
             cost,
             slope,
             state.reach(step),
-            np.where(taken, state.lam * factor, np.where(doubted, state.lam, state.lam * state.growth)),
+            np.where(
+                taken, state.lam * factor, np.where(doubted, state.lam, state.lam * state.growth)
+            ),
             np.where(taken, 2.0, 2.0 * state.growth),
-            np.fmax(state.scale, slope.columns) if self.deviation is None and self.sizes is None else state.scale,
+            np.fmax(state.scale, slope.columns)
+            if self.deviation is None and self.sizes is None
+            else state.scale,
             state.regular | np.isfinite(slope.size),
             *state.watched(cost),
             exact,
@@ -135,7 +156,9 @@ class LevenbergMarquardtMethod(Method[Objective, LeastSquaresSystem]):
         Q = state.slope.Q
         assert Q is not None
         probe = objective.residual(state.x + _PROBE * step)
-        curvature = multiply(Q.swapaxes(1, 2), probe - state.r) / _PROBE - multiply(state.slope.U, step)
+        curvature = multiply(Q.swapaxes(1, 2), probe - state.r) / _PROBE - multiply(
+            state.slope.U, step
+        )
         curvature = np.where(finite(curvature)[:, None], 2.0 / _PROBE * curvature, 0.0)
         a, _ = replace(state.slope, gradient=curvature).damped(weights)
         length, correction = (np.linalg.norm(v * state.scale, axis=1) for v in (step, a))

@@ -13,7 +13,12 @@ from ipe_bench.basics.linalg import Array, Mask, deviations, finite, inverse, sq
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates
 from ipe_bench.estimators.driver import Limits, Method, SolveResult, iterate
-from ipe_bench.estimators.least_squares import LeastSquaresSystem, NormalEquations, Objective, slope_at
+from ipe_bench.estimators.least_squares import (
+    LeastSquaresSystem,
+    NormalEquations,
+    Objective,
+    slope_at,
+)
 from ipe_bench.measurements.counted import EvaluationCount
 from ipe_bench.measurements.problem import Problem
 
@@ -46,7 +51,9 @@ class Minima:
     def of(cls, ended: SolveResult[Any], covariance: Array, r: Array) -> Minima:
         """Makes the minima of an iteration that has ended, with whitened residuals r (trials, m) there."""
         bulk = np.median(np.abs(r), axis=1)
-        return cls(ended.x, ended.status, ended.iterations, ended.history, covariance, squared(r), bulk)
+        return cls(
+            ended.x, ended.status, ended.iterations, ended.history, covariance, squared(r), bulk
+        )
 
     @classmethod
     def nowhere(cls, x: Array, history: bool) -> Minima:
@@ -54,7 +61,9 @@ class Minima:
         trials, n = x.shape
         status, none = np.full(trials, Status.MAX_ITERATIONS, np.int8), np.zeros(trials, np.int64)
         unknown, far = np.full((trials, n, n), np.nan), np.full(trials, np.inf)
-        return cls(x, status, none, [row[None] for row in x] if history else None, unknown, far, far)
+        return cls(
+            x, status, none, [row[None] for row in x] if history else None, unknown, far, far
+        )
 
     @property
     def converged(self) -> Mask:
@@ -79,10 +88,17 @@ class Minima:
 
     def estimates(self, tally: EvaluationCount, readings: int) -> Estimates:
         """Makes the estimates of an estimator that ends here."""
-        return Estimates.of(self, tally, covariance=self.covariance, extras={"fit_p": self.fit_probability(readings)})
+        return Estimates.of(
+            self,
+            tally,
+            covariance=self.covariance,
+            extras={"fit_p": self.fit_probability(readings)},
+        )
 
 
-def minimize(objective: Objective, method: Method[Objective, LeastSquaresSystem], x: Array, limits: Limits) -> Minima:
+def minimize(
+    objective: Objective, method: Method[Objective, LeastSquaresSystem], x: Array, limits: Limits
+) -> Minima:
     """Minimises the objective from x (trials, n), by coarse Jacobians on the way if the model has any that are cheaper.
 
     Converged is where the Gauss-Newton step, which is the gradient in whitened units, is at most `limits.tolerance`
@@ -98,8 +114,12 @@ def minima_of(ended: SolveResult[Any], slope: NormalEquations, readings: int) ->
     """Makes the minima of an iteration that has ended with that slope."""
     # U^-1 U^-T: inverting U'U would lose twice the digits, and with them the sign of a variance.
     lost = ~finite(slope.inverse_U)
-    inverse_U = put(slope.inverse_U, lost, inverse(slope.U[lost])[0]) if lost.any() else slope.inverse_U
-    return Minima.of(ended, np.matmul(inverse_U, inverse_U.swapaxes(1, 2)), ended.state.r[:, :readings])
+    inverse_U = (
+        put(slope.inverse_U, lost, inverse(slope.U[lost])[0]) if lost.any() else slope.inverse_U
+    )
+    return Minima.of(
+        ended, np.matmul(inverse_U, inverse_U.swapaxes(1, 2)), ended.state.r[:, :readings]
+    )
 
 
 def _exact_slope(objective: Objective, state: LeastSquaresSystem) -> NormalEquations:
@@ -109,7 +129,9 @@ def _exact_slope(objective: Objective, state: LeastSquaresSystem) -> NormalEquat
         return state.slope
     report = replace(objective, model=objective.model.reporting()).subset(coarse)
     x, r, keep_Q = state.x[coarse], state.r[coarse], state.slope.Q is not None
-    return put(state.slope, coarse, slope_at(report, x, r, np.ones(len(x), dtype=bool), keep_Q=keep_Q)[0])
+    return put(
+        state.slope, coarse, slope_at(report, x, r, np.ones(len(x), dtype=bool), keep_Q=keep_Q)[0]
+    )
 
 
 @dataclass(frozen=True)

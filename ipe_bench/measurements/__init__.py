@@ -1,7 +1,14 @@
 """Measurement models: what a parameter vector makes the instruments read. Config group `measurement`."""
 
 from ipe_bench.basics.errors import without_modules
-from ipe_bench.measurements.base import Input, Measurement, Parameter, Recorded, SubsetModel, UsualNoise
+from ipe_bench.measurements.base import (
+    Input,
+    Measurement,
+    Parameter,
+    Recorded,
+    SubsetModel,
+    UsualNoise,
+)
 from ipe_bench.measurements.formula import Formula
 from ipe_bench.measurements.function import Function, function
 from ipe_bench.measurements.gins import Gins, RicherGins

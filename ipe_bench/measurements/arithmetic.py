@@ -47,7 +47,9 @@ FUNCTIONS: dict[str, Callable[[Any], Any]] = trace.FUNCTIONS | {
     "log10": lambda a: np.log(a) / math.log(10.0),
     "floor": lambda a: np.floor(_real(a)),
     "sign": lambda a: np.sign(_real(a)),
-    "abs": lambda a: choose(np.less(a, 0.0) * 1.0, -a, a),  # NumPy's drops the imaginary part of a complex step
+    "abs": lambda a: choose(
+        np.less(a, 0.0) * 1.0, -a, a
+    ),  # NumPy's drops the imaginary part of a complex step
 }
 """Functions of one argument."""
 SEVERAL: dict[str, Callable[[Any, Any], Any]] = {"min": np.minimum, "max": np.maximum}
@@ -61,7 +63,15 @@ COMPARISONS = {"<": np.less, "<=": np.less_equal, ">": np.greater, ">=": np.grea
 COMPARISONS |= {"==": np.equal, "!=": np.not_equal}
 """They are 1 where they hold and 0 elsewhere."""
 CONSTANTS = {"pi": math.pi}
-_SIGNS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.Pow: "**", ast.And: "and", ast.Or: "or"}
+_SIGNS = {
+    ast.Add: "+",
+    ast.Sub: "-",
+    ast.Mult: "*",
+    ast.Div: "/",
+    ast.Pow: "**",
+    ast.And: "and",
+    ast.Or: "or",
+}
 _SIGNS |= {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
 _MOST_IN_A_ROW = 400
 """Operations that build on one another, as in a sum of so many terms."""
@@ -114,17 +124,25 @@ def parse(text: str, where: str) -> Arithmetic:
             raise RecursionError
     except (RecursionError, MemoryError):
         remedy = f"group terms by parentheses, or {_IN_PYTHON}"
-        raise UserError(f"{where}: has more than {_MOST_IN_A_ROW} operations one after another; {remedy}") from None
+        raise UserError(
+            f"{where}: has more than {_MOST_IN_A_ROW} operations one after another; {remedy}"
+        ) from None
     except SyntaxError as error:
         rest = re.sub(r"\b_", "", source[(error.offset or 1) - 1 :].strip())
         place = f"at '{rest[:20]}'" if rest else "at its end"
         known = "numbers, names, + - * / ** ( ), comparisons and `A if C else B` are understood"
         reason = error.msg.partition(". ")[0]
-        raise UserError(f"{where}: {text[:60]!r} is not a formula {place}: {reason}; {known}") from None
+        raise UserError(
+            f"{where}: {text[:60]!r} is not a formula {place}: {reason}; {known}"
+        ) from None
     except NameError as error:
-        raise UserError(f"{where}: {error.name}(...): {unknown(str(error.name), _CALLED, 'function')}") from None
+        raise UserError(
+            f"{where}: {error.name}(...): {unknown(str(error.name), _CALLED, 'function')}"
+        ) from None
     if size > _MOST_OPERATIONS:
-        raise UserError(f"{where}: has more than {_MOST_OPERATIONS} numbers, names and operations; {_IN_PYTHON}")
+        raise UserError(
+            f"{where}: has more than {_MOST_OPERATIONS} numbers, names and operations; {_IN_PYTHON}"
+        )
     names = dict.fromkeys(part[1] for part in parts(tree) if part[0] == "name")
     return Arithmetic(text, tree, tuple(name for name in names if name not in CONSTANTS), where)
 
@@ -138,7 +156,9 @@ def _tree(node: ast.expr, source: str) -> Tree:
     """
     reason = "this is Python, and not of this language"
     match node:
-        case ast.Constant() if _NUMBER.fullmatch(number := source[node.col_offset : node.end_col_offset]):
+        case ast.Constant() if _NUMBER.fullmatch(
+            number := source[node.col_offset : node.end_col_offset]
+        ):
             return ("number", float(number))
         case ast.Name(name):
             return ("name", name[1:])
@@ -156,10 +176,15 @@ def _tree(node: ast.expr, source: str) -> Tree:
             return _in_a_row(_SIGNS[type(sign)], [_tree(value, source) for value in values])
         case ast.Compare(left, signs, others) if all(type(sign) in _SIGNS for sign in signs):
             operands = [left, *others]
-            texts = [re.sub(r"\b_", "", source[one.col_offset : one.end_col_offset]) for one in operands]
+            texts = [
+                re.sub(r"\b_", "", source[one.col_offset : one.end_col_offset]) for one in operands
+            ]
             sides = list(zip([_tree(one, source) for one in operands], texts, strict=True))
             signed = zip(sides, [_SIGNS[type(sign)] for sign in signs], sides[1:], strict=False)
-            return _in_a_row("and", [(sign, a, b, f"{left} {sign} {right}") for (a, left), sign, (b, right) in signed])
+            return _in_a_row(
+                "and",
+                [(sign, a, b, f"{left} {sign} {right}") for (a, left), sign, (b, right) in signed],
+            )
         case ast.Call(ast.Name(name), arguments, []):
             if name[1:] not in _CALLED:
                 raise NameError(name=name[1:])
@@ -189,7 +214,9 @@ def parts(tree: Tree) -> list[Tree]:
 
 def never_switching(formulas: Iterable[Arithmetic], values: Mapping[str, Any]) -> list[str]:
     """Words each comparison in some formulas that holds for all readings, or for none, at these values."""
-    where = {part: one.where for one in formulas for part in parts(one.tree) if part[0] in COMPARISONS}
+    where = {
+        part: one.where for one in formulas for part in parts(one.tree) if part[0] in COMPARISONS
+    }
     met = {one: np.asarray(evaluate(one, values), dtype=bool) for one in where}
     silent = "so these readings say nothing of the other branch"
     return [

@@ -36,7 +36,9 @@ class Parameter:
 
 def parameter_table(*groups: tuple[Iterable[str], str, float, str]) -> tuple[Parameter, ...]:
     """Builds the parameters of several groups, each of which is names, unit, size and the group's name."""
-    return tuple(Parameter(name, unit, size, group) for names, unit, size, group in groups for name in names)
+    return tuple(
+        Parameter(name, unit, size, group) for names, unit, size, group in groups for name in names
+    )
 
 
 @dataclass(frozen=True)
@@ -160,7 +162,10 @@ class Measurement(Component, ABC):
     @property
     def nuisances(self) -> tuple[Parameter, ...]:
         """Names, units and groups of the k numbers of `nuisance_deviation`, each a multiple of its `size`."""
-        return tuple(Parameter(f"nuisance_{i + 1}", group="nuisances") for i in range(len(self.nuisance_deviation)))
+        return tuple(
+            Parameter(f"nuisance_{i + 1}", group="nuisances")
+            for i in range(len(self.nuisance_deviation))
+        )
 
     @property
     def candidates(self) -> Measurement:
@@ -441,7 +446,11 @@ class SubsetModel(Forwarding):
         for k, epoch in enumerate(self.whole.epochs):
             place[epoch] = k
         order = np.argsort(place[self._rows], kind="stable")
-        return tuple(np.split(order, np.flatnonzero(np.diff(place[self._rows][order])) + 1)) if len(order) else ()
+        return (
+            tuple(np.split(order, np.flatnonzero(np.diff(place[self._rows][order])) + 1))
+            if len(order)
+            else ()
+        )
 
     @cached_property
     def _rows(self) -> NDArray[np.intp]:
@@ -451,7 +460,11 @@ class SubsetModel(Forwarding):
     def _among_arrived(self) -> NDArray[np.intp] | slice:
         """Places of the kept rows in what the whole model returns; a slice if they are all of it."""
         arrived = np.arange(self.whole.m) if self.stop is None else self.whole.rows(self.stop)
-        return slice(None) if np.array_equal(arrived, self._rows) else np.searchsorted(arrived, self._rows)
+        return (
+            slice(None)
+            if np.array_equal(arrived, self._rows)
+            else np.searchsorted(arrived, self._rows)
+        )
 
     def _computed(self, name: str, x: Array) -> Array:
         """Computes that method of the whole model, in the kept rows."""
@@ -460,7 +473,9 @@ class SubsetModel(Forwarding):
         return getattr(self.whole, f"{name}_until")(x, self.stop)[:, self._among_arrived]
 
     def simulate(self, x: Array) -> Array:
-        return self._computed("coarse_simulate" if self.coarse and self.stop is not None else "simulate", x)
+        return self._computed(
+            "coarse_simulate" if self.coarse and self.stop is not None else "simulate", x
+        )
 
     def jacobian(self, x: Array) -> Array:
         return self._computed("jacobian", x)
@@ -486,7 +501,9 @@ def differentiate(h: Any, x: Array, *, analytic: bool, near: Any = lambda h, z: 
         parts, begun, few = [], 0, 1
         while begun < trials or not parts:
             part = x[begun : begun + few, None, :] + np.eye(n) * _COMPLEX_STEP * 1j
-            parts.append(np.imag(h(read_only(part.reshape(-1, n)))).reshape(len(part), n, -1).swapaxes(1, 2))
+            parts.append(
+                np.imag(h(read_only(part.reshape(-1, n)))).reshape(len(part), n, -1).swapaxes(1, 2)
+            )
             begun, few = begun + few, max(1, int(_SMALL / max(parts[0][:1].nbytes, 1)))
         return np.ascontiguousarray(np.concatenate(parts)) / _COMPLEX_STEP
     size = _CENTRAL_STEP * np.maximum(1.0, np.abs(x))
@@ -494,7 +511,9 @@ def differentiate(h: Any, x: Array, *, analytic: bool, near: Any = lambda h, z: 
     steps = np.eye(n)[None] * (above - below)[:, None, :] / 2
     points = np.stack([x[:, None] + steps, x[:, None] - steps])
     z = h(read_only(points.reshape(-1, n))).reshape(2, trials, n, -1)
-    width = (np.diagonal(points[0], axis1=1, axis2=2) - np.diagonal(points[1], axis1=1, axis2=2))[:, :, None]
+    width = (np.diagonal(points[0], axis1=1, axis2=2) - np.diagonal(points[1], axis1=1, axis2=2))[
+        :, :, None
+    ]
     return np.ascontiguousarray(((near(z[0], z[1]) - z[1]) / width).swapaxes(1, 2))
 
 
@@ -506,13 +525,20 @@ def contradicted(h: Any, x: Array, J: Array, near: Any) -> NDArray[np.bool_]:
     """
     trials, n = x.shape
     unit = np.maximum(1.0, np.abs(x))
-    size = np.nan_to_num(np.fmax.reduce(np.abs(J), axis=1), posinf=0.0) * unit + np.finfo(float).tiny
+    size = (
+        np.nan_to_num(np.fmax.reduce(np.abs(J), axis=1), posinf=0.0) * unit + np.finfo(float).tiny
+    )
     weight = 1.0 / np.maximum(size, 1e-4 * size.max(axis=1, keepdims=True))
     weight *= np.random.default_rng(1).uniform(0.5, 1.0, n) / weight.max(axis=1, keepdims=True)
     above, below = x + _CENTRAL_STEP * unit * weight, x - _CENTRAL_STEP * unit * weight
     z = h(read_only(np.concatenate([above, below])))
     with np.errstate(all="ignore"):
-        change, expected = near(z[:trials], z[trials:]) - z[trials:], (J * (above - below)[:, None]).sum(axis=2)
+        change, expected = (
+            near(z[:trials], z[trials:]) - z[trials:],
+            (J * (above - below)[:, None]).sum(axis=2),
+        )
         rounding = 100 * np.finfo(float).eps * np.fmax.reduce(np.abs(z[:trials]), axis=1)
         tolerated = 1e-5 * _CENTRAL_STEP * (size * weight).sum(axis=1) + rounding
-        return (np.isfinite(change) & ~(np.abs(change - expected) <= tolerated[:, None])).any(axis=1)
+        return (np.isfinite(change) & ~(np.abs(change - expected) <= tolerated[:, None])).any(
+            axis=1
+        )

@@ -89,14 +89,18 @@ class CountingModel:
         if exact.all():
             return self._jacobian(self.measurement.jacobian, 1.0, x, rows)
         J = np.empty((len(x), self.measurement.m, self.measurement.n))
-        J[~exact] = self._jacobian(self.measurement.coarse_jacobian, self.coarse_share, x[~exact], rows[~exact])
+        J[~exact] = self._jacobian(
+            self.measurement.coarse_jacobian, self.coarse_share, x[~exact], rows[~exact]
+        )
         # Far away the longer steps of a coarse one may overflow where those of the readings do not.
         exact[~exact] = ~finite(J[~exact])
         if exact.any():
             J[exact] = self._jacobian(self.measurement.jacobian, 1.0, x[exact], rows[exact])
         return J
 
-    def _jacobian(self, method: Callable[[Array], Array], cost: float, x: Array, rows: NDArray[np.intp]) -> Array:
+    def _jacobian(
+        self, method: Callable[[Array], Array], cost: float, x: Array, rows: NDArray[np.intp]
+    ) -> Array:
         self.tally.jacobians[rows] += self.share * cost
         if self.for_report:
             self.tally.reported[rows] += self.share * cost
@@ -109,7 +113,11 @@ class CountingModel:
         return coarse / exact if coarse < exact else 1.0
 
     def _each_if_raising(
-        self, function: Callable[[Array], Array], x: Array, rows: NDArray[np.intp], shape: tuple[int, ...]
+        self,
+        function: Callable[[Array], Array],
+        x: Array,
+        rows: NDArray[np.intp],
+        shape: tuple[int, ...],
     ) -> Array:
         x = read_only(x)
         try:

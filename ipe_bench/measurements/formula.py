@@ -66,7 +66,10 @@ class WrittenModel(Measurement):
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
         sizes = {name: abs(value) or 1.0 for name, value in self.starts.items()} | dict(self.size)
-        return tuple(Parameter(name, self.parameter_units.get(name, ""), float(sizes[name])) for name in self.starts)
+        return tuple(
+            Parameter(name, self.parameter_units.get(name, ""), float(sizes[name]))
+            for name in self.starts
+        )
 
     @cached_property
     def nominal(self) -> Array:
@@ -115,12 +118,20 @@ class WrittenModel(Measurement):
             steps = np.outer(_FARTHER, np.eye(self.n)[i]) * np.maximum(1.0, np.abs(x))
             with contextlib.suppress(UserError):  # where a function cannot be called
                 moved = np.nan_to_num(np.abs(self.simulate(x + steps) - z))
-                names += [self.parameters[i].name] if (moved > _FARTHER_BY * np.abs(z).max(initial=0.0)).any() else []
+                names += (
+                    [self.parameters[i].name]
+                    if (moved > _FARTHER_BY * np.abs(z).max(initial=0.0)).any()
+                    else []
+                )
         if not names:
             return ()
-        found = f"readings do not change with small changes of {', '.join(names)}, but with larger ones"
+        found = (
+            f"readings do not change with small changes of {', '.join(names)}, but with larger ones"
+        )
         why = "they are constant in pieces, as by floor, round, sign or a comparison, where every slope is 0"
-        return (f"{found}: {why}, and no estimator that follows slopes moves from there; blend the pieces, as by tanh",)
+        return (
+            f"{found}: {why}, and no estimator that follows slopes moves from there; blend the pieces, as by tanh",
+        )
 
     def require_columns_and_parameters(self, *keys: str, readings: Sequence[str] = ()) -> None:
         """Refuses columns of different lengths, names in the options `keys` that are no parameters, and angles that are
@@ -129,14 +140,18 @@ class WrittenModel(Measurement):
             if name not in (known := [*readings, self.reading]):
                 raise UserError(f"circular={name}: {unknown(name, known, 'reading')}")
             if self.unit not in ("", "rad", "deg", "°"):
-                raise UserError(f"unit={self.unit}: circular={name} is an angle, in rad or deg; give one of these")
+                raise UserError(
+                    f"unit={self.unit}: circular={name} is an angle, in rad or deg; give one of these"
+                )
         lengths = {name: len(column) for name, column in self.columns.items()}
         if len(set(lengths.values())) > 1:
             raise UserError(f"columns: have different lengths: {lengths}")
         for key in keys:
             for name in getattr(self, key):
                 if name not in self.starts:
-                    known = f"{did_you_mean(name, self.starts)} (these are {', '.join(self.starts)})"
+                    known = (
+                        f"{did_you_mean(name, self.starts)} (these are {', '.join(self.starts)})"
+                    )
                     raise UserError(f"{key}: {name} is not a parameter{known}")
 
 
@@ -174,12 +189,18 @@ class Formula(WrittenModel):
         for name in self.start:
             if name not in self.arithmetic.names:
                 wanted = ", ".join(self.arithmetic.names)
-                raise UserError(f"start.{name}: does not appear in the expression, whose names are {wanted}")
+                raise UserError(
+                    f"start.{name}: does not appear in the expression, whose names are {wanted}"
+                )
         if not self.start:
             start = f"measurement.start.{next(iter(self.arithmetic.names), 'NAME')}=1"
-            raise UserError(f"start: is empty, so no parameter is estimated; give each parameter a start: {start}")
+            raise UserError(
+                f"start: is empty, so no parameter is estimated; give each parameter a start: {start}"
+            )
         if self.reading in self.arithmetic.names:
-            raise UserError(f"reading={self.reading}: stands in the expression too; what is measured cannot explain it")
+            raise UserError(
+                f"reading={self.reading}: stands in the expression too; what is measured cannot explain it"
+            )
         self.require_columns_and_parameters("own")
 
     @cached_property
@@ -215,7 +236,9 @@ class Formula(WrittenModel):
         except (ArithmeticError, ValueError, TypeError) as error:
             numbers = "a part that is made of numbers alone has no real value"
             raise UserError(f"measurement.expression: {numbers} ({error})") from None
-        return Program.of([value], list(known.values())), Program.of(by_parameter, list(known.values()))
+        return Program.of([value], list(known.values())), Program.of(
+            by_parameter, list(known.values())
+        )
 
     def _values(self, x: Array) -> list[Array]:
         p = dict(zip(self.start, (x * self.sizes).T[:, :, None], strict=True))
@@ -223,7 +246,13 @@ class Formula(WrittenModel):
 
     def remarks(self, x: Array) -> tuple[str, ...]:
         """Says which conditionals never switch at x, or else which parameters have no slope there."""
-        values = dict(zip(self.arithmetic.names, (value[0] for value in self._values(x[None, : self.n])), strict=True))
+        values = dict(
+            zip(
+                self.arithmetic.names,
+                (value[0] for value in self._values(x[None, : self.n])),
+                strict=True,
+            )
+        )
         with np.errstate(all="ignore"):
             return tuple(never_switching([self.arithmetic], values)) or self.flat(x)
 

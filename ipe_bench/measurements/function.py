@@ -75,13 +75,19 @@ class Function(WrittenModel):
                 raise UserError(f"start.{name}: {unknown(name, arguments, 'argument')}")
         for name in self.constants:
             if name not in self._keywords:
-                raise UserError(f"constants.{name}: {unknown(name, self._keywords, 'keyword-only argument')}")
+                raise UserError(
+                    f"constants.{name}: {unknown(name, self._keywords, 'keyword-only argument')}"
+                )
         for name, default in self._keywords.items():
             if default is inspect.Parameter.empty and name not in self.constants:
-                raise UserError(f"constants.{name}: {self.of} needs it; give measurement.constants.{name}=VALUE")
+                raise UserError(
+                    f"constants.{name}: {self.of} needs it; give measurement.constants.{name}=VALUE"
+                )
         if not self.starts:
             given = f"(its arguments are {', '.join(arguments) or 'none'})"
-            remedy = f"give an argument a number as default, or measurement.start.NAME=VALUE {given}"
+            remedy = (
+                f"give an argument a number as default, or measurement.start.NAME=VALUE {given}"
+            )
             raise UserError(f"start: {self.of} has no parameter; {remedy}")
         if self.time and self.time not in self.headings:
             raise UserError(f"time={self.time}: {unknown(self.time, self.headings, 'column')}")
@@ -107,8 +113,12 @@ class Function(WrittenModel):
             found = sys.modules.get(module) or importlib.import_module(module)
         except Exception as error:
             if isinstance(error, ModuleNotFoundError) and error.name == module.partition(".")[0]:
-                raise UserError(f"of={self.of}: there is no module {module} here; {module}.py would be one") from None
-            raise UserError(f"of={self.of}: {module} cannot be imported: {place_of(error)}") from None
+                raise UserError(
+                    f"of={self.of}: there is no module {module} here; {module}.py would be one"
+                ) from None
+            raise UserError(
+                f"of={self.of}: {module} cannot be imported: {place_of(error)}"
+            ) from None
         if not callable(getattr(found, name, None)):
             functions = [key for key, value in vars(found).items() if inspect.isfunction(value)]
             raise UserError(f"of={self.of}: {unknown(name, functions, 'function')}")
@@ -122,7 +132,9 @@ class Function(WrittenModel):
     @cached_property
     def _signature(self) -> Mapping[str, inspect.Parameter]:
         arguments = inspect.signature(self.function).parameters
-        if starred := [str(a) for a in arguments.values() if a.kind in (a.VAR_POSITIONAL, a.VAR_KEYWORD)]:
+        if starred := [
+            str(a) for a in arguments.values() if a.kind in (a.VAR_POSITIONAL, a.VAR_KEYWORD)
+        ]:
             raise UserError(f"of={self.of}: takes {starred[0]}; give every argument a name")
         return arguments
 
@@ -147,7 +159,11 @@ class Function(WrittenModel):
 
     @cached_property
     def headings(self) -> tuple[str, ...]:
-        return tuple(name for name in self._signature if name not in self.starts and name not in self._keywords)
+        return tuple(
+            name
+            for name in self._signature
+            if name not in self.starts and name not in self._keywords
+        )
 
     @cached_property
     def parameter_units(self) -> dict[str, str]:
@@ -156,7 +172,10 @@ class Function(WrittenModel):
         except Exception:  # of names that the function's module does not hold
             hints = {}
         extras = {name: getattr(hint, "__metadata__", ()) for name, hint in hints.items()}
-        texts = {name: next((one for one in found if isinstance(one, str)), "") for name, found in extras.items()}
+        texts = {
+            name: next((one for one in found if isinstance(one, str)), "")
+            for name, found in extras.items()
+        }
         return texts | dict(self.units)
 
     @property
@@ -164,7 +183,9 @@ class Function(WrittenModel):
         return bool(self.columns) or not self.headings
 
     def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Function:
-        return replace(self, columns={name: tuple(map(float, columns[name])) for name in self.headings})
+        return replace(
+            self, columns={name: tuple(map(float, columns[name])) for name in self.headings}
+        )
 
     @cached_property
     def m(self) -> int:
@@ -174,7 +195,11 @@ class Function(WrittenModel):
 
     @cached_property
     def epochs(self) -> tuple[NDArray[np.intp], ...] | None:
-        chosen = next((name for name in _TIMES if name in self.headings), "") if self.time is None else self.time
+        chosen = (
+            next((name for name in _TIMES if name in self.headings), "")
+            if self.time is None
+            else self.time
+        )
         if not chosen:
             return None
         times = self.column(chosen)
@@ -213,7 +238,9 @@ class Function(WrittenModel):
     @cached_property
     def _jax(self) -> tuple[Callable[[Array], Array], Callable[[Array], Array]] | None:
         """Compiled readings and slopes of a function that returns arrays of JAX; None if it does not."""
-        if "jax" not in sys.modules or not type(self._at(self.starts.values())).__module__.startswith("jax"):
+        if "jax" not in sys.modules or not type(
+            self._at(self.starts.values())
+        ).__module__.startswith("jax"):
             return None
         import jax  # pyright: ignore[reportMissingImports]
 
@@ -248,7 +275,9 @@ class Function(WrittenModel):
         if not self._is_analytic:
             return differentiate(self._rows, x, analytic=False, near=self.near)
         J = self._by_complex_step(x)
-        if (wrong := contradicted(self._rows, x, J, self.near)).any():  # in a branch that is not analytic
+        if (
+            wrong := contradicted(self._rows, x, J, self.near)
+        ).any():  # in a branch that is not analytic
             J[wrong] = differentiate(self._rows, x[wrong], analytic=False, near=self.near)
         return J
 
@@ -259,12 +288,16 @@ class Function(WrittenModel):
         return float(self.n + 2 if self._is_analytic else 2 * self.n)
 
 
-def function(h: Callable[..., Any], start: Mapping[str, float] | None = None, **options: Any) -> Function:
+def function(
+    h: Callable[..., Any], start: Mapping[str, float] | None = None, **options: Any
+) -> Function:
     """Makes the measurement model of a function that a module holds by name, with the options of `Function`; UserError
     for a lambda or an inner function."""
     module, name = getattr(h, "__module__", ""), getattr(h, "__qualname__", "")
     if not name.isidentifier() or getattr(sys.modules.get(module), name, None) is not h:
-        raise UserError(f"{name or h!r}: give a function that stands in a module by its own name, not inside another")
+        raise UserError(
+            f"{name or h!r}: give a function that stands in a module by its own name, not inside another"
+        )
     return Function(of=f"{module}:{name}", start=start or {}, **options)
 
 

@@ -79,7 +79,11 @@ class Gins(OdeMeasurement):
     def trusted_angle(self) -> float:
         """0.32 for the paper's span, interval and velocities, and for less: of 9,000 draws, sparse and lopsided ones
         among them, the worst is off by 2.5e-8 m/s."""
-        tried = self.times[-1] <= 5400.0 and self.interval_min >= 3.0 and self._fastest <= 1500.0 * FOOT * (1 + 1e-9)
+        tried = (
+            self.times[-1] <= 5400.0
+            and self.interval_min >= 3.0
+            and self._fastest <= 1500.0 * FOOT * (1 + 1e-9)
+        )
         return 0.32 if tried else 0.0
 
     @cached_property
@@ -100,7 +104,12 @@ class Gins(OdeMeasurement):
     @cached_property
     def si_sizes(self) -> Array:
         """m/s^2 for biases, 1 for scale factors, rad/s for drifts and for unbalances (per specific force in g)."""
-        si = {"g": self.gravity, "ppm": 1e-6, "deg/h": _DEGREE_PER_HOUR, "deg/h/g": _DEGREE_PER_HOUR}
+        si = {
+            "g": self.gravity,
+            "ppm": 1e-6,
+            "deg/h": _DEGREE_PER_HOUR,
+            "deg/h/g": _DEGREE_PER_HOUR,
+        }
         return np.array([p.size * si[p.unit] for p in self.parameters])
 
     @cached_property
@@ -124,23 +133,37 @@ class Gins(OdeMeasurement):
         often. The cases of this set-up come first, under their own numbers."""
         top = self._fastest / FOOT
         turns = 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
-        rays = [(size * np.cos(turn), size * np.sin(turn)) for size in (top, top / 2) for turn in turns] + [(0.0, 0.0)]
-        here = np.isclose(rays, np.array(self.injected)[:, None], atol=1e-6 * max(top, 1.0)).all(axis=2)
-        new = [(round(x, 3) + 0.0, round(y, 3) + 0.0) for x, y in np.array(rays)[~here.any(axis=0)].tolist()]
-        often = {"interval_min": self.interval_min / 2, "readings_per_case": 2 * self.readings_per_case}
+        rays = [
+            (size * np.cos(turn), size * np.sin(turn)) for size in (top, top / 2) for turn in turns
+        ] + [(0.0, 0.0)]
+        here = np.isclose(rays, np.array(self.injected)[:, None], atol=1e-6 * max(top, 1.0)).all(
+            axis=2
+        )
+        new = [
+            (round(x, 3) + 0.0, round(y, 3) + 0.0)
+            for x, y in np.array(rays)[~here.any(axis=0)].tolist()
+        ]
+        often = {
+            "interval_min": self.interval_min / 2,
+            "readings_per_case": 2 * self.readings_per_case,
+        }
         return replace(self, injected=(*self.injected, *new), **often)
 
     @property
     def entry_words(self) -> Mapping[str, Mapping[Any, str]]:
         """The injected velocity of each case."""
-        return {"case": {k: f"{x:.0f}, {y:.0f} ft/s" for k, (x, y) in enumerate(self.injected, start=1)}}
+        return {
+            "case": {k: f"{x:.0f}, {y:.0f} ft/s" for k, (x, y) in enumerate(self.injected, start=1)}
+        }
 
     def taking(self, rows: Sequence[int]) -> Measurement:
         """Restricts the model to the cases that the readings need."""
         each = 2 * self.readings_per_case
         cases = sorted({row // each for row in rows})
         fewer = replace(self, injected=tuple(self.injected[case] for case in cases))
-        return super(Gins, fewer).taking([cases.index(row // each) * each + row % each for row in rows])
+        return super(Gins, fewer).taking(
+            [cases.index(row // each) * each + row % each for row in rows]
+        )
 
     def start(self, p: Sequence[Any], c: Sequence[Any]) -> Sequence[Any]:
         latitude = np.deg2rad(self.latitude_deg)
@@ -178,7 +201,9 @@ class Gins(OdeMeasurement):
     def acceleration(self, u: Sequence[Any], p: Sequence[Any]) -> tuple[Any, Any]:
         """Computes the output of the accelerometers x and y, m/s^2."""
         bx, by, kx, ky = p[:4]
-        return (self.gravity + self.gravity * kx) * u[0] + bx, (self.gravity + self.gravity * ky) * u[1] + by
+        return (self.gravity + self.gravity * kx) * u[0] + bx, (
+            self.gravity + self.gravity * ky
+        ) * u[1] + by
 
     @property
     def variation(self) -> Variation:
@@ -192,7 +217,11 @@ class Gins(OdeMeasurement):
             along = dict(zip([*y, *p], [*moved(y, d), *dp], strict=True))
             slopes, rate = self.rhs(t, y, p, c), self.platform_rate(y, p)
             turned = zip(_cross(d[2:5], rate), tangent(rate, along), strict=True)
-            return [*tangent(slopes[:2], along), *(w - dw for w, dw in turned), *tangent(slopes[8:], along)]
+            return [
+                *tangent(slopes[:2], along),
+                *(w - dw for w, dw in turned),
+                *tangent(slopes[8:], along),
+            ]
 
         return Variation(8, slope, moved)
 
@@ -202,7 +231,12 @@ class Gins(OdeMeasurement):
         bx, by, kx, ky = p[:4]
         swing = np.sqrt(self.gravity / self.earth_radius * (1.0 + _length(kx, ky)))
         velocity = self._fastest + _length(bx, by) * self.times[-1]
-        return swing + _length(*p[4:7]) + _length(*p[7:11]) + (self.earth_rate + velocity * (1.0 / self.earth_radius))
+        return (
+            swing
+            + _length(*p[4:7])
+            + _length(*p[7:11])
+            + (self.earth_rate + velocity * (1.0 / self.earth_radius))
+        )
 
     def read(self, t: Any, y: Sequence[Any], p: Sequence[Any], c: Sequence[Any]) -> Sequence[Any]:
         return y[0], y[1]
@@ -264,10 +298,25 @@ class RicherGins(Gins):
         """Nuisances in the units of the options that set their deviations; the walk's increments in deg/h."""
         steps = product(range(1, len(self.cases) + 1), range(1, self.readings_per_case + 1), "xyz")
         return parameter_table(
-            (("quadratic x", "quadratic y"), "micro-g/g^2", self.gravity / 1e-6, "accelerometer quadratic"),
-            (("misalignment xy", "misalignment yx"), "arcsec", 1 / _ARCSEC, "accelerometer misalignment"),
+            (
+                ("quadratic x", "quadratic y"),
+                "micro-g/g^2",
+                self.gravity / 1e-6,
+                "accelerometer quadratic",
+            ),
+            (
+                ("misalignment xy", "misalignment yx"),
+                "arcsec",
+                1 / _ARCSEC,
+                "accelerometer misalignment",
+            ),
             (("tilt x", "tilt y", "tilt z"), "arcsec", 1 / _ARCSEC, "platform tilt"),
-            ([f"walk d{a} {case}.{k}" for case, k, a in steps], "deg/h", 1 / self._drift, "gyro random walk"),
+            (
+                [f"walk d{a} {case}.{k}" for case, k, a in steps],
+                "deg/h",
+                1 / self._drift,
+                "gyro random walk",
+            ),
         )
 
     def _simulate(
@@ -295,12 +344,16 @@ class RicherGins(Gins):
 
     def _walk(self, x: Array) -> Array:
         """Computes the walk of the drifts: (trials x cases, intervals, axes) in rad/s."""
-        return np.cumsum(x[:, self.n + _CONSTANT :].reshape(len(x) * len(self.cases), -1, 3), axis=1)
+        return np.cumsum(
+            x[:, self.n + _CONSTANT :].reshape(len(x) * len(self.cases), -1, 3), axis=1
+        )
 
     def _walked(self, x: Array, steps: NDArray[np.int64], stop: int) -> Array:
         """Integrates from reading to reading, with the drifts of each interval: (trials, readings)."""
         walk, cases = self._walk(x), len(self.cases)
-        constant = np.concatenate([x[:, : self.n] * self.si_sizes, x[:, self.n : self.n + _CONSTANT]], axis=1)
+        constant = np.concatenate(
+            [x[:, : self.n] * self.si_sizes, x[:, self.n : self.n + _CONSTANT]], axis=1
+        )
         p = np.repeat(constant, cases, axis=0)
         y = self._tilted(p, np.tile(self.cases, (len(x), 1)))
         interval = np.array([60.0 * self.interval_min])
@@ -309,7 +362,14 @@ class RicherGins(Gins):
             inputs = np.concatenate([p[:, : self.n + _SENSED], y], axis=1)
             inputs[:, 4:7] += walk[:, k]  # dx, dy, dz
             # The right-hand side does not depend on time, so every interval may begin at 0.
-            given = inputs, np.ones(inputs.shape[1]), np.zeros((1, 0)), np.arange(len(p)), interval, steps[k : k + 1]
+            given = (
+                inputs,
+                np.ones(inputs.shape[1]),
+                np.zeros((1, 0)),
+                np.arange(len(p)),
+                interval,
+                steps[k : k + 1],
+            )
             self._motion.run(*given, np.zeros(self.states), y.reshape(-1))
             z[:, k] = y[:, :2]
         return z.reshape(len(x), cases * stop * 2)
@@ -337,7 +397,9 @@ class RicherGins(Gins):
         given = self.n + _SENSED
 
         arithmetic = (lambda p, c: p[given:]), self.rhs, (lambda t, y, p, c: y)
-        return Kernel(Equations(self.states, given + self.states, 0, self.states, *arithmetic), DOP853)
+        return Kernel(
+            Equations(self.states, given + self.states, 0, self.states, *arithmetic), DOP853
+        )
 
 
 def _turned(v: Sequence[Any], angles: Sequence[NDArray[Any]]) -> list[Any]:

@@ -72,10 +72,15 @@ def structure(model: Measurement) -> Structure | None:
     if isinstance(described, Ode) and not described.driven_by:
         formulas = (described.rate_formulas, described.initial_formulas, described.output_formulas)
         cases = [{**case, **fixed} for case in described.known_of_cases]
-    elif isinstance(described, Formula):  # without time: rows stand for cases, at any values of the columns
+    elif isinstance(
+        described, Formula
+    ):  # without time: rows stand for cases, at any values of the columns
         formulas, draw = ({}, {}, {"reading": described.arithmetic}), random.Random(1)
         headings = [i.heading for i in described.inputs]
-        rows = [{name: float(draw.randrange(2, 1 << 20)) for name in headings} for _ in range(len(unknowns) + 1)]
+        rows = [
+            {name: float(draw.randrange(2, 1 << 20)) for name in headings}
+            for _ in range(len(unknowns) + 1)
+        ]
         cases = [{**row, **fixed} for row in rows]
     else:
         return None
@@ -106,7 +111,11 @@ def _rank(model: Measurement) -> int:
         return 0
     lengths = np.linalg.norm(J, axis=0)
     moving = lengths > _SEEN * np.linalg.norm(z)
-    return int(np.linalg.matrix_rank(J[:, moving] / lengths[moving], rtol=_SEEN)) if moving.any() else 0
+    return (
+        int(np.linalg.matrix_rank(J[:, moving] / lengths[moving], rtol=_SEEN))
+        if moving.any()
+        else 0
+    )
 
 
 class _Free(dict[Any, int]):
@@ -128,12 +137,18 @@ class _Free(dict[Any, int]):
         for apart in (1, -1):
             other = ("pow", base, (exponent + apart) % self.prime)
             if other in self:
-                self.setdefault(("pow", base, exponent), self[other] * pow(base, -apart, self.prime) % self.prime)
+                self.setdefault(
+                    ("pow", base, exponent),
+                    self[other] * pow(base, -apart, self.prime) % self.prime,
+                )
         return self["pow", base, exponent]
 
 
 def _independent(
-    free: _Free, unknowns: Sequence[str], formulas: Iterable[Mapping[str, Arithmetic]], cases: list[dict[str, float]]
+    free: _Free,
+    unknowns: Sequence[str],
+    formulas: Iterable[Mapping[str, Arithmetic]],
+    cases: list[dict[str, float]],
 ) -> _Basis:
     """Finds the independent ones among the derivatives by the unknowns of the outputs' Taylor coefficients, modulo the
     prime, where the formulas are rates, initial states and outputs."""
@@ -143,7 +158,9 @@ def _independent(
     def record(formulas: Iterable[Arithmetic]) -> list[Expression]:
         return [graph.apply("add", formula(names), 0.0) for formula in formulas]
 
-    slopes, shown, starts = (record(one.values()) for one in (rates, outputs, {name: initial[name] for name in rates}))
+    slopes, shown, starts = (
+        record(one.values()) for one in (rates, outputs, {name: initial[name] for name in rates})
+    )
     equations, states, columns = (slopes[:], starts[:]), [names[name] for name in rates], []
     for unknown in unknowns:
         moved = graph.inputs(f"{unknown} moves state ", len(rates))
@@ -170,7 +187,9 @@ def _independent(
             rows = [[series[column[i].order][k] for column in columns] for i in range(len(shown))]
             yield rows, all(any(series.given[y.order]) for y in moving)
             for state, slope in zip(states, slopes, strict=True):
-                series.given[state.order].append(series[slope.order][k] * pow(k + 1, -1, free.prime) % free.prime)
+                series.given[state.order].append(
+                    series[slope.order][k] * pow(k + 1, -1, free.prime) % free.prime
+                )
 
     basis = _Basis(free.prime)
     grown = moved = 0
@@ -184,7 +203,11 @@ def _independent(
         # The slopes of a linear model of n states, driven by constants, satisfy a linear equation of order 2 n + 2: as
         # many zeros are followed by zeros alone. What begins at order k begins to depart from its beginning, as
         # y^4 / (K + y^4) does from y^4 / K, at order 2 k.
-        if len(basis) == len(unknowns) or not rates or k - max(grown, moved) > 2 * len(rates) + 2 + moved:
+        if (
+            len(basis) == len(unknowns)
+            or not rates
+            or k - max(grown, moved) > 2 * len(rates) + 2 + moved
+        ):
             break
         if k * len(everything) * len(cases) > _LONGEST:
             raise NotImplementedError("a model of this size")
@@ -225,7 +248,11 @@ class _Series(dict[int, list[int]]):
             return known[k] if k < len(known) else 0
         if e.operation == "constant":
             return 0 if k else _modulo(e.value or 0.0, self.p)
-        u, (a, *_), b = self[e.order], [self[o.order] for o in e.operands], self[e.operands[-1].order]
+        u, (a, *_), b = (
+            self[e.order],
+            [self[o.order] for o in e.operands],
+            self[e.operands[-1].order],
+        )
         match e.operation:
             case "add":
                 return a[k] + b[k]
@@ -242,14 +269,20 @@ class _Series(dict[int, list[int]]):
                     b = self[e.operands[1].operands[0].order]
                 return (a[k] - _product(b[1:], u, k - 1)) * self._inverse(b[0])
             case "exp":
-                return _product(_derivative(a), u, k - 1) * pow(k, -1, self.p) if k else self.free["exp", a[0]]
+                return (
+                    _product(_derivative(a), u, k - 1) * pow(k, -1, self.p)
+                    if k
+                    else self.free["exp", a[0]]
+                )
             case "log":
                 rest = _derivative(a)[k - 1] - _product(_derivative(u), a[1:], k - 2) if k else 0
                 return rest * self._inverse(k * a[0]) if k else self.free["log", a[0]]
             case "where" if a[0]:  # of a power's derivative: what is not 0 here is not 0 nearby
                 return self[e.operands[1].order][k]
             case "pow" if e.operands[1].value in _POWERS:
-                powers = self.powers.setdefault(e.order, [[] for _ in range(1, int(e.operands[1].value or 0))])
+                powers = self.powers.setdefault(
+                    e.order, [[] for _ in range(1, int(e.operands[1].value or 0))]
+                )
                 for lower, higher in itertools.pairwise([a, *powers]):
                     higher.append(_product(lower, a, k) % self.p)
                 return powers[-1][k]
@@ -262,7 +295,9 @@ class _Series(dict[int, list[int]]):
     def _power(self, u: list[int], a: list[int], exponent: int, k: int) -> int:
         """Computes a coefficient of u = a^exponent, by a u' = exponent u a'."""
         inverse = self._inverse(max(k, 1) * a[0])
-        rest = exponent * _product(_derivative(a), u, k - 1) - _product(_derivative(u), a[1:], k - 2)
+        rest = exponent * _product(_derivative(a), u, k - 1) - _product(
+            _derivative(u), a[1:], k - 2
+        )
         return rest * inverse if k else self.free.power(a[0], exponent)
 
     def _inverse(self, value: int) -> int:
@@ -308,4 +343,6 @@ class _Basis(dict[int, list[int]]):
     def _without(self, pivot: int, row: list[int], known: list[int]) -> list[int]:
         """Subtracts what makes a row 0 in the pivot column of a known one."""
         factor = row[pivot]
-        return [(v - factor * w) % self.p for v, w in zip(row, known, strict=True)] if factor else row
+        return (
+            [(v - factor * w) % self.p for v, w in zip(row, known, strict=True)] if factor else row
+        )

@@ -30,7 +30,9 @@ class Joint(Measurement):
         super().__post_init__()
         units = {part.reading_unit for part in self.parts}
         if len(units) > 1:
-            raise UserError(f"readings: the files have readings in different units: {', '.join(sorted(units))}")
+            raise UserError(
+                f"readings: the files have readings in different units: {', '.join(sorted(units))}"
+            )
 
     @property
     def name(self) -> str:
@@ -48,7 +50,9 @@ class Joint(Measurement):
     def copies(self) -> dict[str, list[str]]:
         """Names in this model of the parameters of which every file has its own, by their names in the parts."""
         found: dict[str, list[str]] = {}
-        for name, k in ((name, k) for k, part in enumerate(self.parts, 1) for name in part.own_parameters):
+        for name, k in (
+            (name, k) for k, part in enumerate(self.parts, 1) for name in part.own_parameters
+        ):
             found.setdefault(name, []).append(f"{name}_{k}")
         return found
 
@@ -57,7 +61,12 @@ class Joint(Measurement):
         """Places of each part's parameters among all."""
         numbers: dict[str, int] = {}
         return [
-            np.array([numbers.setdefault(self._named(p, p, k).name, len(numbers)) for p in part.physical_parameters])
+            np.array(
+                [
+                    numbers.setdefault(self._named(p, p, k).name, len(numbers))
+                    for p in part.physical_parameters
+                ]
+            )
             for k, part in enumerate(self.parts)
         ]
 
@@ -69,14 +78,21 @@ class Joint(Measurement):
     @cached_property
     def _first(self) -> list[tuple[int, int]]:
         """The part in which each parameter appears first, and its place there."""
-        places = [(place, k, i) for k, own in enumerate(self._places) for i, place in enumerate(own.tolist())]
+        places = [
+            (place, k, i)
+            for k, own in enumerate(self._places)
+            for i, place in enumerate(own.tolist())
+        ]
         found = {place: (k, i) for place, k, i in reversed(places)}
         return [found[place] for place in sorted(found)]
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
         parts = self.parts
-        return tuple(self._named(parts[k].parameters[i], parts[k].physical_parameters[i], k) for k, i in self._first)
+        return tuple(
+            self._named(parts[k].parameters[i], parts[k].physical_parameters[i], k)
+            for k, i in self._first
+        )
 
     @cached_property
     def physical_parameters(self) -> tuple[Parameter, ...]:
@@ -118,9 +134,14 @@ class Joint(Measurement):
     @property
     def index(self) -> Mapping[str, Sequence[Any]]:
         columns = [part.index for part in self.parts]
-        joined: dict[str, list[Any]] = {"file": [k for k, part in enumerate(self.parts, 1) for _ in range(part.m)]}
+        joined: dict[str, list[Any]] = {
+            "file": [k for k, part in enumerate(self.parts, 1) for _ in range(part.m)]
+        }
         for name in dict.fromkeys(name for column in columns for name in column):
-            each = (column.get(name, [""] * part.m) for column, part in zip(columns, self.parts, strict=True))
+            each = (
+                column.get(name, [""] * part.m)
+                for column, part in zip(columns, self.parts, strict=True)
+            )
             joined[name] = list(chain.from_iterable(each))
         return joined
 
@@ -135,7 +156,11 @@ class Joint(Measurement):
         parts = [part.epochs for part in self.parts]
         if any(epochs is None for epochs in parts):
             return None
-        return tuple(rows + start for epochs, start in zip(parts, self._starts, strict=False) for rows in epochs or ())
+        return tuple(
+            rows + start
+            for epochs, start in zip(parts, self._starts, strict=False)
+            for rows in epochs or ()
+        )
 
     @property
     def offset(self) -> Array:

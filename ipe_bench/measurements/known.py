@@ -39,12 +39,16 @@ class ParameterInfo(Component):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.positive and self.lower is not None:
-            raise UserError(f"lower={self.lower}: is given with positive=true, which is lower=0; leave one of them out")
+            raise UserError(
+                f"lower={self.lower}: is given with positive=true, which is lower=0; leave one of them out"
+            )
         lower, upper = self.bounds
         if not lower < upper:
             raise UserError(f"upper={upper}: give a number above lower={lower:g}")
         if self.fixed is not None and (others := self.stated.keys() - {"name", "fixed"}):
-            raise UserError(f"fixed={self.fixed}: a fixed parameter has no {min(others)}; leave one out")
+            raise UserError(
+                f"fixed={self.fixed}: a fixed parameter has no {min(others)}; leave one out"
+            )
 
     @property
     def bounds(self) -> tuple[float, float]:
@@ -54,7 +58,9 @@ class ParameterInfo(Component):
     @property
     def stated(self) -> dict[str, Any]:
         """Stated options with their values."""
-        return {f.name: value for f in fields(self) if (value := getattr(self, f.name)) != f.default}
+        return {
+            f.name: value for f in fields(self) if (value := getattr(self, f.name)) != f.default
+        }
 
 
 def informed(model: Measurement, known: Sequence[ParameterInfo]) -> Measurement:
@@ -98,7 +104,9 @@ class ConstrainedModel(WrappedModel):
         for one, v0 in zip(self._known, self._v0, strict=True):
             if not one.bounds[0] < v0 < one.bounds[1]:
                 key = f"parameters.{one.name}"
-                raise UserError(f"{key}: its start, {v0:g}, is not inside of its bounds; give {key}.nominal=VALUE")
+                raise UserError(
+                    f"{key}: its start, {v0:g}, is not inside of its bounds; give {key}.nominal=VALUE"
+                )
         if not len(self._free):
             raise UserError("parameters: all are fixed; leave at least one to be estimated")
 
@@ -117,7 +125,9 @@ class ConstrainedModel(WrappedModel):
         """Starts and fixed values of all parameters, in their units."""
         starts = self.whole.nominal * self.whole.sizes
         given = [one.nominal if one.fixed is None else one.fixed for one in self._known]
-        return np.array([s if g is None else g for s, g in zip(starts, given, strict=True)], dtype=float)
+        return np.array(
+            [s if g is None else g for s, g in zip(starts, given, strict=True)], dtype=float
+        )
 
     @cached_property
     def _coordinates(self) -> _Coordinates:
@@ -131,7 +141,9 @@ class ConstrainedModel(WrappedModel):
         prefixes = c.choose("", "ln_", "ln_", "logit_").tolist()
         return tuple(
             Parameter(prefix + p.name, size=size, group=p.group or p.name) if prefix else p
-            for p, prefix, size in zip(self.physical_parameters, prefixes, c.inner_size.tolist(), strict=True)
+            for p, prefix, size in zip(
+                self.physical_parameters, prefixes, c.inner_size.tolist(), strict=True
+            )
         )
 
     @cached_property
@@ -143,7 +155,9 @@ class ConstrainedModel(WrappedModel):
         """Standard deviations (n,) of x at error scale 1, as far as is known; 1 where nothing is."""
         given = [self._known[i].deviation for i in self._free]
         sizes = self.whole.sizes[self._free]
-        return tuple(1.0 if d is None else float(d / size) for d, size in zip(given, sizes, strict=True))
+        return tuple(
+            1.0 if d is None else float(d / size) for d, size in zip(given, sizes, strict=True)
+        )
 
     @property
     def fixed(self) -> dict[str, float]:
@@ -167,13 +181,17 @@ class ConstrainedModel(WrappedModel):
         c, values = self._coordinates, self.physical(x[None])[0]
         found: dict[int, float] = {}
         for bounds in (c.lower, c.upper):
-            near = np.abs(values - bounds) <= np.where(np.isfinite(bounds), _NEAR * np.abs(c.v0 - bounds), -1.0)
+            near = np.abs(values - bounds) <= np.where(
+                np.isfinite(bounds), _NEAR * np.abs(c.v0 - bounds), -1.0
+            )
             found |= {k: float(bounds[k]) for k in np.flatnonzero(near).tolist()}
         return dict(sorted(found.items()))
 
     def stating(self, key: str, values: Mapping[int, float]) -> Measurement:
         names = {self.physical_parameters[k].name: value for k, value in values.items()}
-        stated = {name: replace(ParameterInfo(name), **{key: value}) for name, value in names.items()}
+        stated = {
+            name: replace(ParameterInfo(name), **{key: value}) for name, value in names.items()
+        }
         return replace(self, known=tuple(({one.name: one for one in self.known} | stated).values()))
 
     def whole_x(self, x: Array) -> Array:
@@ -196,7 +214,9 @@ class ConstrainedModel(WrappedModel):
     def recorded(self) -> Recorded | None:
         """The whole model's readings, and its answer in the parameters that are left."""
         found = self.whole.recorded
-        return found and Recorded(found.z, found.R, self.inner((found.x * self.whole.sizes)[self._free]))
+        return found and Recorded(
+            found.z, found.R, self.inner((found.x * self.whole.sizes)[self._free])
+        )
 
 
 @dataclass(frozen=True)
@@ -214,7 +234,9 @@ class _Coordinates:
 
     def choose(self, free: Any, above: Any, below: Any, between: Any) -> Array:
         """Chooses by parameter what holds: without bounds, above a lower one, below an upper one, or between both."""
-        within = np.where(self.upper == np.inf, above, np.where(self.lower == -np.inf, below, between))
+        within = np.where(
+            self.upper == np.inf, above, np.where(self.lower == -np.inf, below, between)
+        )
         return np.where(self.bounded, within, free)
 
     @cached_property
@@ -241,11 +263,15 @@ class _Coordinates:
         with np.errstate(all="ignore"):
             u = self._origin + x * self.inner_size
             within = self.lower + (self.upper - self.lower) / (1.0 + np.exp(-u))
-            return self.choose(x * self.size, self.lower + np.exp(u), self.upper - np.exp(-u), within)
+            return self.choose(
+                x * self.size, self.lower + np.exp(u), self.upper - np.exp(-u), within
+            )
 
     def slope(self, x: Array) -> Array:
         """Computes dv/dx."""
         return self._slope_at(self.value(x)) * self.inner_size
 
     def inner(self, v: Array) -> Array:
-        return np.where(self.bounded, (self._coordinate(v) - self._origin) / self.inner_size, v / self.size)
+        return np.where(
+            self.bounded, (self._coordinate(v) - self._origin) / self.inner_size, v / self.size
+        )

@@ -87,7 +87,9 @@ arrays (trials, 1), and the predictors x, arrays (m,), to (trials, m). All are a
 
 @cache
 def _tables() -> dict[str, dict[str, Any]]:
-    return json.loads(files("ipe_bench.measurements").joinpath("nist.json").read_text(encoding="utf-8"))
+    return json.loads(
+        files("ipe_bench.measurements").joinpath("nist.json").read_text(encoding="utf-8")
+    )
 
 
 @dataclass(frozen=True)
@@ -123,7 +125,9 @@ class Nist(Measurement):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.dataset not in FORMULAS:
-            raise UserError(f"dataset={self.dataset}: {unknown(self.dataset, FORMULAS, 'data set')}")
+            raise UserError(
+                f"dataset={self.dataset}: {unknown(self.dataset, FORMULAS, 'data set')}"
+            )
 
     def _numbers(self, key: str) -> Array:
         return np.array(_tables()[self.dataset][key], dtype=float)
@@ -135,7 +139,9 @@ class Nist(Measurement):
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
-        return tuple(Parameter(f"b{i + 1}", size=float(abs(b))) for i, b in enumerate(self.start_values))
+        return tuple(
+            Parameter(f"b{i + 1}", size=float(abs(b))) for i, b in enumerate(self.start_values)
+        )
 
     @property
     def nominal(self) -> Array:
@@ -162,7 +168,9 @@ class Nist(Measurement):
     def certified(self) -> CertifiedAnswer:
         table = _tables()[self.dataset]
         residuals = table["residual_sum_of_squares"], table["residual_deviation"]
-        return CertifiedAnswer(self._numbers("certified"), self._numbers("deviations"), *residuals, self.m - self.n)
+        return CertifiedAnswer(
+            self._numbers("certified"), self._numbers("deviations"), *residuals, self.m - self.n
+        )
 
     def simulate(self, x: Array) -> Array:
         b = (x * self.sizes).T[:, :, None]

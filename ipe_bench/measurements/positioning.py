@@ -13,7 +13,14 @@ from annotated_types import MinLen
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Positive
-from ipe_bench.measurements.base import Epochs, Measurement, Parameter, UsualNoise, parameter_table, single_epochs
+from ipe_bench.measurements.base import (
+    Epochs,
+    Measurement,
+    Parameter,
+    UsualNoise,
+    parameter_table,
+    single_epochs,
+)
 
 _BEACONS = (
     (1000.0, 0.0, 300.0), (500.0, 866.0, 20.0), (-500.0, 866.0, 300.0), (-1000.0, 0.0, 20.0), (-500.0, -866.0, 300.0),
@@ -68,7 +75,9 @@ class Ranging(Measurement):
     def simulate(self, x: Array) -> Array:
         p = x * self.sizes
         towards = np.asarray(self.beacons, dtype=float) - p[:, None, :3]
-        ranges = np.sqrt(towards[..., 0] ** 2 + towards[..., 1] ** 2 + towards[..., 2] ** 2) + p[:, 3:]
+        ranges = (
+            np.sqrt(towards[..., 0] ** 2 + towards[..., 1] ** 2 + towards[..., 2] ** 2) + p[:, 3:]
+        )
         return np.tile(ranges, (1, self.rounds))
 
 
@@ -86,7 +95,10 @@ class Bearings(Measurement):
     Electronic Systems 17, 1981).
     """
 
-    legs: Annotated[tuple[tuple[float, float, float], ...], MinLen(1)] = ((900.0, 90.0, 6.0), (900.0, 330.0, 6.0))
+    legs: Annotated[tuple[tuple[float, float, float], ...], MinLen(1)] = (
+        (900.0, 90.0, 6.0),
+        (900.0, 330.0, 6.0),
+    )
     """The observer's legs: duration in s, course in degrees from north, speed in m/s."""
     interval: Positive = 60.0
     """Time between bearings in s; the first is taken at time 0."""
@@ -121,7 +133,9 @@ class Bearings(Measurement):
     @cached_property
     def times(self) -> Array:
         """Times of the bearings (m,), in s."""
-        return self.interval * np.arange(int(sum(leg[0] for leg in self.legs) / self.interval + 1e-9) + 1)
+        return self.interval * np.arange(
+            int(sum(leg[0] for leg in self.legs) / self.interval + 1e-9) + 1
+        )
 
     @cached_property
     def observer(self) -> Array:
@@ -144,7 +158,9 @@ class Bearings(Measurement):
         """Unit vectors (m, 2) towards the nominal target, and their bearings (m,) in rad without jumps."""
         sight = self._sight(self.nominal[None])[0]
         bearing = np.unwrap(np.arctan2(sight[:, 0], sight[:, 1]))
-        return sight / np.linalg.norm(sight, axis=1)[:, None], bearing - 2 * np.pi * np.floor(bearing[0] / (2 * np.pi))
+        return sight / np.linalg.norm(sight, axis=1)[:, None], bearing - 2 * np.pi * np.floor(
+            bearing[0] / (2 * np.pi)
+        )
 
     def simulate(self, x: Array) -> Array:
         sight = self._sight(x)

@@ -65,7 +65,11 @@ class Problem:
     def prior_used(self, inflation: float = 1.0) -> Array | None:
         """Computes the prior's standard deviations (n,) times `inflation`; one that is fixed gets nearly none."""
         deviation = self.prior_deviation
-        return None if deviation is None else inflation * np.maximum(deviation, _FIXED * deviation.max())
+        return (
+            None
+            if deviation is None
+            else inflation * np.maximum(deviation, _FIXED * deviation.max())
+        )
 
     def prior_covariance(self, inflation: float = 1.0) -> Covariance | None:
         """Computes P0 with its deviations times `inflation`, as `prior_used` has them."""
@@ -77,7 +81,11 @@ class Problem:
     @property
     def scaled_prior(self) -> Array:
         """P0 (n, n) in the prior's own deviations: what a filter begins with that counts in them."""
-        return np.eye(self.measurement.n) if self.prior_correlation is None else np.array(self.prior_correlation)
+        return (
+            np.eye(self.measurement.n)
+            if self.prior_correlation is None
+            else np.array(self.prior_correlation)
+        )
 
     def without_prior(self) -> Problem:
         return replace(self, prior_deviation=None, prior_correlation=None)
@@ -86,9 +94,13 @@ class Problem:
 def require_nominal(model: Measurement) -> None:
     """Refuses a model whose nominal point is not (n,)."""
     if np.shape(model.nominal) != (model.n,):
-        wanted = f"({model.n},), one number for each of {', '.join(p.name for p in model.parameters)}"
+        wanted = (
+            f"({model.n},), one number for each of {', '.join(p.name for p in model.parameters)}"
+        )
         shape = np.shape(model.nominal)
-        raise UserError(f"measurement={model.name}: nominal has shape {shape}; let it return {wanted}")
+        raise UserError(
+            f"measurement={model.name}: nominal has shape {shape}; let it return {wanted}"
+        )
 
 
 def require_numbers(owner: str, method: Any, values: Any, shape: tuple[int, ...]) -> None:
@@ -101,10 +113,17 @@ def _unfit(method: Any, values: Any, shape: tuple[int, ...]) -> str:
     """Says what is wrong with what a method returned, and where it is written; empty if it is right."""
     array = np.asarray(values)
     if isinstance(values, np.ndarray) and type(values) is not np.ndarray:
-        found, remedy = f"a {type(values).__name__}", "return an ordinary array, with NaN for what is masked"
+        found, remedy = (
+            f"a {type(values).__name__}",
+            "return an ordinary array, with NaN for what is masked",
+        )
     elif array.shape != shape or array.dtype.kind not in "fiub":
         numbers = array.dtype.kind in "fiub"
-        found = f"an array of shape {array.shape}" if numbers and array.ndim else f"{type(values).__name__}"
+        found = (
+            f"an array of shape {array.shape}"
+            if numbers and array.ndim
+            else f"{type(values).__name__}"
+        )
         remedy = f"let it return numbers of shape {shape}"
     else:
         return ""
@@ -130,11 +149,16 @@ def _irregularity(model: Measurement, definition: str) -> str:
     """Says what is irregular of a model by this definition; empty if the model is regular, and where a call raises,
     which its trials report."""
     rng = np.random.default_rng(11)
-    x, other = (read_only(model.nominal + 0.1 * rng.standard_normal((trials, model.n))) for trials in (4, 7))
+    x, other = (
+        read_only(model.nominal + 0.1 * rng.standard_normal((trials, model.n))) for trials in (4, 7)
+    )
     fresh: Any = replace(cast(Any, model)) if is_dataclass(model) else copy.copy(model)
     if component_classes(fresh) != component_classes(model):
         return "what its options name was defined anew since it was made; make the model anew"
-    for method, shape in (("simulate", (len(x), model.m)), ("jacobian", (len(x), model.m, model.n))):
+    for method, shape in (
+        ("simulate", (len(x), model.m)),
+        ("jacobian", (len(x), model.m, model.n)),
+    ):
         call = getattr(model, method)
         try:
             if wrong := _unfit(call, call(x), shape):  # the first call may compile
@@ -152,7 +176,11 @@ def _irregularity(model: Measurement, definition: str) -> str:
         except SystemExit as error:
             return f"{place_of(error)}; raise an exception where there are no readings"
         except Exception as error:
-            return place_of(error) if isinstance(error, ValueError) and "read-only" in str(error) else ""
+            return (
+                place_of(error)
+                if isinstance(error, ValueError) and "read-only" in str(error)
+                else ""
+            )
         differing = [way for way, z in ways.items() if not np.array_equal(z, first, equal_nan=True)]
         if differing:
             return f"{method}(x) has other bits {' and '.join(differing)}; let h(x) depend on x and the options alone"

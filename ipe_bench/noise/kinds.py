@@ -28,7 +28,9 @@ class ScaledNoise(Noise):
 
     def completed(self, usual: UsualNoise | None) -> Self:
         known = usual or UsualNoise()
-        deviation = self.deviation or known.deviation or (known.step and known.step * UNIFORM_DEVIATION)
+        deviation = (
+            self.deviation or known.deviation or (known.step and known.step * UNIFORM_DEVIATION)
+        )
         found = replace(self, deviation=deviation)
         _ = found.stated
         return found
@@ -65,7 +67,9 @@ class Gaussian(ScaledNoise):
         if not isinstance(self.deviation, tuple):
             return super().covariance(m)
         if len(self.deviation) != m:
-            raise UserError(f"noise.deviation: has {len(self.deviation)} numbers; give one for each of {m} readings")
+            raise UserError(
+                f"noise.deviation: has {len(self.deviation)} numbers; give one for each of {m} readings"
+            )
         return Covariance(np.asarray(self.deviation))
 
 
@@ -130,7 +134,11 @@ class Outliers(ScaledNoise):
     @property
     def _excess(self) -> float:
         """The standard deviation that R states over that of a good reading."""
-        return 1.0 if self.assumed == "nominal" else float(np.sqrt(1 - self.share + self.share * self.factor**2))
+        return (
+            1.0
+            if self.assumed == "nominal"
+            else float(np.sqrt(1 - self.share + self.share * self.factor**2))
+        )
 
     def covariance(self, m: int) -> Covariance:
         return Covariance(np.full(m, self.stated * self._excess))
@@ -197,7 +205,9 @@ class Colored(ScaledNoise):
         """Divides m readings: (series after one another, length, channels)."""
         length = m // self.channels if self.length is None else self.length
         if length == 0 or m % (length * self.channels):
-            raise UserError(f"channels={self.channels}, length={self.length}: {m} readings do not divide into these")
+            raise UserError(
+                f"channels={self.channels}, length={self.length}: {m} readings do not divide into these"
+            )
         return m // (length * self.channels), length, self.channels
 
     @property
@@ -277,7 +287,9 @@ class _StandIn(Noise):
     """Stands for a noise that draws no errors itself."""
 
     def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
-        raise UserError(f"noise={self.name}: simulates no readings of its own; choose another noise")
+        raise UserError(
+            f"noise={self.name}: simulates no readings of its own; choose another noise"
+        )
 
     def covariance(self, m: int) -> Covariance:
         raise UserError(f"noise={self.name}: knows no R of its own; choose another noise")

@@ -31,12 +31,18 @@ def read_sigma(text: str) -> Arithmetic:
     formula = parse(text, "noise.sigma")
     names = level_names(formula)
     if not names:
-        raise UserError(f"noise.sigma={text}: has no level to estimate; give one, as in a + b*{READING}")
+        raise UserError(
+            f"noise.sigma={text}: has no level to estimate; give one, as in a + b*{READING}"
+        )
     points = 10.0 ** np.random.default_rng(0).uniform(-2, 2, (len(names) + 1, _PROBES))
     with np.errstate(all="ignore"):
-        values = np.broadcast_to(formula(dict(zip((*names, READING), points, strict=True))), _PROBES)
+        values = np.broadcast_to(
+            formula(dict(zip((*names, READING), points, strict=True))), _PROBES
+        )
     if len(wrong := np.flatnonzero(~(values >= 0))):
-        where = ", ".join(f"{n} = {v:.3g}" for n, v in zip((*names, READING), points[:, wrong[0]], strict=True))
+        where = ", ".join(
+            f"{n} = {v:.3g}" for n, v in zip((*names, READING), points[:, wrong[0]], strict=True)
+        )
         raise UserError(
             f"noise.sigma={text}: can be negative ({values[wrong[0]]:.3g} where {where}); give a formula that is"
             f" positive for all positive levels, such as a + b*{READING}, where {READING} is the reading's magnitude"
@@ -79,7 +85,9 @@ class Levels:
     def parameters(self) -> tuple[Parameter, ...]:
         """The levels, group by group."""
         alone = len(self.formula.names) == 1
-        named = [f"{name}_{group}" if group else name for group in self.groups for name in self.names]
+        named = [
+            f"{name}_{group}" if group else name for group in self.groups for name in self.names
+        ]
         return tuple(Parameter(name, self.unit if alone else "") for name in named)
 
     def restricted(self, rows: NDArray[np.intp]) -> Levels:
@@ -109,7 +117,9 @@ class Levels:
         levels = np.exp(theta).reshape(trials, len(self.groups), -1)[:, self.group]
         values = [np.abs(h), *(levels[:, :, i] for i in range(len(self.names)))]
         with np.errstate(all="ignore"):
-            s, by_h, *by_level = (np.broadcast_to(a, h.shape) for a in _recorded(self.formula)(values))
+            s, by_h, *by_level = (
+                np.broadcast_to(a, h.shape) for a in _recorded(self.formula)(values)
+            )
             by_theta = np.zeros((trials, m, len(self.groups), len(self.names)))
             for i, slope in enumerate(by_level):
                 by_theta[:, np.arange(m), self.group, i] = slope * levels[:, :, i] / s

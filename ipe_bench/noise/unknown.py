@@ -15,7 +15,8 @@ from ipe_bench.noise.kinds import Gaussian
 from ipe_bench.noise.levels import READING, Levels, level_names, read_sigma
 
 NO_LEVEL = (
-    "noise=unknown: has no level to simulate with; choose another noise, give noise.levels=[...], or use `estimate`"
+    "noise=unknown: has no level to simulate with; choose another noise, give noise.levels=[...],"
+    " or use `estimate`"
 )
 
 
@@ -43,9 +44,13 @@ class Unknown(Noise):
         super().__post_init__()
         names = level_names(read_sigma(self.sigma))
         if self.levels is not None and len(self.levels) != len(names):
-            raise UserError(f"noise.levels: has {len(self.levels)} numbers; give one for each of {', '.join(names)}")
+            raise UserError(
+                f"noise.levels: has {len(self.levels)} numbers; give one for each of {', '.join(names)}"
+            )
         if self.levels is not None and self.by is not None:
-            raise UserError("noise.by: does not go with noise.levels; state what is known, as in noise=gaussian")
+            raise UserError(
+                "noise.by: does not go with noise.levels; state what is known, as in noise=gaussian"
+            )
 
     def levels_of(self, model: Measurement) -> Levels | None:
         """Returns the levels of a model's readings; None if a single one multiplies all standard deviations.
@@ -56,7 +61,9 @@ class Unknown(Noise):
         if self.by is None and self.sigma == "sigma":
             return None
         if self.by is not None and self.by not in model.index:
-            raise UserError(f"noise.by={self.by}: {unknown(self.by, model.index, 'column of the readings')}")
+            raise UserError(
+                f"noise.by={self.by}: {unknown(self.by, model.index, 'column of the readings')}"
+            )
         column = [""] * model.m if self.by is None else model.index[self.by]
         entries = [f"{entry:g}" if isinstance(entry, float) else str(entry) for entry in column]
         groups = tuple(dict.fromkeys(entries))
@@ -64,7 +71,9 @@ class Unknown(Noise):
         weights = self.covariance(model.m).factor
         found = Levels(read_sigma(self.sigma), weights, groups, group, model.reading_unit)
         if both := {p.name for p in found.parameters} & {p.name for p in model.physical_parameters}:
-            raise UserError(f"noise.sigma: {min(both)} is a parameter of the model; give the level another name")
+            raise UserError(
+                f"noise.sigma: {min(both)} is a parameter of the model; give the level another name"
+            )
         return found
 
     def true_levels(self, m: int) -> tuple[Levels, Array] | None:
@@ -94,4 +103,6 @@ class Unknown(Noise):
         return h + self._true_covariance(h).factor * rng.standard_normal(h.shape)
 
     def covariance(self, m: int) -> Covariance:
-        return Covariance(np.ones(m)) if self.weights is None else Gaussian(self.weights).covariance(m)
+        return (
+            Covariance(np.ones(m)) if self.weights is None else Gaussian(self.weights).covariance(m)
+        )

@@ -27,7 +27,11 @@ def construct(config: Any, where: str) -> Any:
     if not isinstance(config, Mapping):
         return config
     options = {str(k): construct(v, f"{where}.{k}") for k, v in config.items() if k != TARGET}
-    return instantiate(find_class(config[TARGET], where), options, where) if TARGET in config else options
+    return (
+        instantiate(find_class(config[TARGET], where), options, where)
+        if TARGET in config
+        else options
+    )
 
 
 def find_class(target: Any, where: str) -> type:
@@ -85,7 +89,9 @@ def instantiate(cls: type, options: Mapping[str, Any], where: str) -> Any:
     for name in options:
         if name not in fields:
             raise UserError(f"{prefix}{name}: {unknown(name, fields, 'option')}")
-    required = [f.name for f in fields.values() if f.default is f.default_factory and f.name not in options]
+    required = [
+        f.name for f in fields.values() if f.default is f.default_factory and f.name not in options
+    ]
     try:
         # A class of a plugin need not be a `Component`, nor call its `__post_init__`.
         types = option_types(cls)
@@ -123,7 +129,11 @@ def described(option: discovery.Option) -> list[Described]:
     if option.group in discovery.RECORD_GROUPS:
         return []
     if option.target is None:
-        return [Described(str(key), _written(value), "", "") for key, value in config.items() if key != "defaults"]
+        return [
+            Described(str(key), _written(value), "", "")
+            for key, value in config.items()
+            if key != "defaults"
+        ]
     cls = find_class(option.target, f"{option.group}.{option.name}")
     kinds, texts = option_types(cls), {**option.comments, **_meanings(cls)}
     found = []
@@ -158,6 +168,8 @@ def _meanings(cls: type) -> dict[str, str]:
         assert isinstance(body, ast.ClassDef)
         for field, text in zip(body.body, body.body[1:], strict=False):
             match field, text:
-                case ast.AnnAssign(target=ast.Name(name)), ast.Expr(value=ast.Constant(value=str(words))):
+                case ast.AnnAssign(target=ast.Name(name)), ast.Expr(
+                    value=ast.Constant(value=str(words))
+                ):
                     found[name] = " ".join(words.split())
     return found

@@ -30,14 +30,26 @@ ENTRY_POINTS = "ipe_bench.plugins"
 ESTIMATOR_GROUPS = ("solver", "baseline")
 PACKAGES = {**dict.fromkeys(ESTIMATOR_GROUPS, "estimators"), "tracker": "trackers"}
 """Groups of which several options are chosen, each under a label of its own, by the key that holds them."""
-COMPONENT_GROUPS = ("measurement", "noise", "prior", *ESTIMATOR_GROUPS, "state_model", "tracker", "execution")
+COMPONENT_GROUPS = (
+    "measurement",
+    "noise",
+    "prior",
+    *ESTIMATOR_GROUPS,
+    "state_model",
+    "tracker",
+    "execution",
+)
 RECORD_GROUPS = ("statistic", "figure", "table", "section")
 """Config groups of the elements of a report."""
 CHECKED_GROUPS = (*COMPONENT_GROUPS, *RECORD_GROUPS, "experiment")
 CONTRACTS = {
     "solver": ("ipe_bench.IPE",),
     "baseline": ("ipe_bench.Estimator",),
-    "filter": ("ipe_bench.Sequential", "ipe_bench.ConstantFilter", "ipe_bench.baselines.FilterpyFilter"),
+    "filter": (
+        "ipe_bench.Sequential",
+        "ipe_bench.ConstantFilter",
+        "ipe_bench.baselines.FilterpyFilter",
+    ),
     "measurement": ("ipe_bench.Measurement", "ipe_bench.OdeMeasurement"),
     "state_model": ("ipe_bench.states.StateModel",),
     "tracker": ("ipe_bench.states.Tracker",),
@@ -62,20 +74,26 @@ class _Loader(yaml.SafeLoader):
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.AliasEvent):
             mark = self.peek_event().start_mark
-            raise yaml.MarkedYAMLError(problem="an alias (*NAME); write out what is meant", problem_mark=mark)
+            raise yaml.MarkedYAMLError(
+                problem="an alias (*NAME); write out what is meant", problem_mark=mark
+            )
         return super().compose_node(parent, index)
 
     def construct_mapping(self, node: Any, deep: bool = False) -> Any:
         known: set[str] = set()
         for key in (key for key, _ in node.value if isinstance(key.value, str)):
             if key.value in known:
-                raise yaml.MarkedYAMLError(problem=f"the key {key.value} is there twice", problem_mark=key.start_mark)
+                raise yaml.MarkedYAMLError(
+                    problem=f"the key {key.value} is there twice", problem_mark=key.start_mark
+                )
             known.add(key.value)
         return super().construct_mapping(node, deep)
 
 
 _Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"^[-+]?\d[\d_]*(\.\d*)?[eE][-+]?\d+$"), list("-+0123456789")
+    "tag:yaml.org,2002:float",
+    re.compile(r"^[-+]?\d[\d_]*(\.\d*)?[eE][-+]?\d+$"),
+    list("-+0123456789"),
 )
 
 
@@ -94,7 +112,9 @@ def read_yaml_file(path: Path, key: str) -> Any:
     try:
         return read_yaml(regular(path).read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{key}: cannot be read ({error.__class__.__name__}); name a YAML file") from None
+        raise UserError(
+            f"{key}: cannot be read ({error.__class__.__name__}); name a YAML file"
+        ) from None
     except yaml.YAMLError as error:
         raise UserError(f"{key}: {explain_yaml(error, path)}") from None
 
@@ -105,7 +125,11 @@ def explain_yaml(error: Any, path: Path | None = None) -> str:
     where = str(path or getattr(mark, "name", "config"))
     if mark is not None:
         where += f", line {mark.line + 1}"
-    what = getattr(error, "problem", None) or getattr(error, "reason", None) or describe_exception(error)
+    what = (
+        getattr(error, "problem", None)
+        or getattr(error, "reason", None)
+        or describe_exception(error)
+    )
     return f"{where}: is not YAML that can be read ({what})"
 
 
@@ -146,7 +170,9 @@ class Option:
     def summary(self) -> str:
         """The first line of comment in the file that is not a header."""
         comments = (line for line in self.text.splitlines() if line.startswith("#"))
-        return next((line.lstrip("# ").strip() for line in comments if not _PACKAGE_HEADER.match(line)), "")
+        return next(
+            (line.lstrip("# ").strip() for line in comments if not _PACKAGE_HEADER.match(line)), ""
+        )
 
     @functools.cached_property
     def config(self) -> Any:
@@ -178,7 +204,11 @@ class Option:
         if (key := PACKAGES.get(self.group)) is not None and self.package != f"{key}.{self.label}":
             return f"{self.path}: its first line must be '# @package {key}.{self.label}', or it never runs"
         try:
-            return None if isinstance(self.config, dict) else f"{self.path}: holds no keys; write KEY: VALUE lines"
+            return (
+                None
+                if isinstance(self.config, dict)
+                else f"{self.path}: holds no keys; write KEY: VALUE lines"
+            )
         except yaml.YAMLError as error:
             return explain_yaml(error, self.path)
 
@@ -209,7 +239,9 @@ def sources() -> tuple[Source, ...]:
     for source in installed_sources():
         _take(found, source)
     installed = dict(found)
-    for source in (source for folder in dict.fromkeys([*folders, *_added]) for source in _in_folder(folder)):
+    for source in (
+        source for folder in dict.fromkeys([*folders, *_added]) for source in _in_folder(folder)
+    ):
         twin = installed.pop(source.name, None)
         one = twin is not None and twin.distribution == source.distribution is not None
         if one and not _imported_elsewhere(source):
@@ -264,7 +296,9 @@ def installed_sources() -> list[Source]:
         packages.add(entry.value.split(".")[0])
         origin = f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.name
         name = _normal(entry.dist.name) if entry.dist else None
-        found.append(Source(entry.value, Path(spec.submodule_search_locations[0]) / "conf", origin, name))
+        found.append(
+            Source(entry.value, Path(spec.submodule_search_locations[0]) / "conf", origin, name)
+        )
     return found
 
 
@@ -272,13 +306,17 @@ def _in_folder(folder: Path) -> Iterator[Source]:
     for conf in sorted(folder.resolve().glob("*/conf")):
         if (conf.parent / "__init__.py").is_file():
             packages.add(conf.parent.name)
-            yield Source(conf.parent.name, conf, f"{folder.parent.name}/{folder.name}", _stated_name(folder))
+            yield Source(
+                conf.parent.name, conf, f"{folder.parent.name}/{folder.name}", _stated_name(folder)
+            )
 
 
 def _stated_name(folder: Path) -> str | None:
     """Reads the name of the distribution that a folder's pyproject.toml describes."""
     try:
-        project = tomllib.loads((folder / "pyproject.toml").read_text(encoding="utf-8")).get("project")
+        project = tomllib.loads((folder / "pyproject.toml").read_text(encoding="utf-8")).get(
+            "project"
+        )
     except (OSError, ValueError):  # none, or none that can be read
         return None
     name = project.get("name") if isinstance(project, Mapping) else None
@@ -298,7 +336,9 @@ def options(group: str | None = None) -> list[Option]:
             folder, *name = path.relative_to(source.conf).with_suffix("").parts
             option = Option(folder, "/".join(name), path, source)
             # Solvers and baselines share their labels: of two with one label, only one would run.
-            place = ("estimator", option.label) if folder in ESTIMATOR_GROUPS else (folder, option.name)
+            place = (
+                ("estimator", option.label) if folder in ESTIMATOR_GROUPS else (folder, option.name)
+            )
             known = found.setdefault(place, option)
             if known is not option and known.rival is None:
                 found[place] = dataclasses.replace(known, rival=path)
@@ -325,14 +365,18 @@ def composed(option: Option) -> dict[str, Any]:
     for entry in entries if "_self_" in entries else [*entries, "_self_"]:
         name = entry.removesuffix("@_here_").removeprefix(f"/{option.group}/")
         if entry != "_self_" and name not in known:
-            raise UserError(f"{option.path}: defaults: {unknown(name, known, f'option of {option.group}')}")
+            raise UserError(
+                f"{option.path}: defaults: {unknown(name, known, f'option of {option.group}')}"
+            )
         found = _merged(found, config if entry == "_self_" else composed(known[name]))
     return found
 
 
 def _merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
     """Merges both, the second in the place of the first but where both are mappings."""
-    both = {k for k, v in second.items() if isinstance(v, Mapping) and isinstance(first.get(k), Mapping)}
+    both = {
+        k for k, v in second.items() if isinstance(v, Mapping) and isinstance(first.get(k), Mapping)
+    }
     return {**first, **second, **{key: _merged(first[key], second[key]) for key in both}}
 
 
@@ -350,7 +394,9 @@ def options_in(folder: Path) -> list[Option]:
     own = [o for o in options() if home in (*o.path.parents, *(o.rival.parents if o.rival else ()))]
     found = [option for option in own if option.group in CHECKED_GROUPS]
     if not found:
-        raise UserError(f"{folder}: has no option to check; its conf has none of {', '.join(CHECKED_GROUPS)}")
+        raise UserError(
+            f"{folder}: has no option to check; its conf has none of {', '.join(CHECKED_GROUPS)}"
+        )
     return found
 
 

@@ -25,16 +25,26 @@ def richer_models(scenario: Scenario) -> list[Measurement]:
     if truth is not None:
         if not truth.nuisance_deviation.any():
             remedy = "leave it out, or choose a richer one"
-            raise UserError(f"truth_measurement={truth.name}: has no errors besides the parameters; {remedy}")
+            raise UserError(
+                f"truth_measurement={truth.name}: has no errors besides the parameters; {remedy}"
+            )
         return [truth]
     own = {f.name: getattr(model, f.name) for f in dataclasses.fields(model) if f.init}  # type: ignore[arg-type]
     found: list[Any] = []
     for option in options("measurement"):
         try:
-            other = None if option.fault is not None else construct(option.config, f"measurement={option.name}")
+            other = (
+                None
+                if option.fault is not None
+                else construct(option.config, f"measurement={option.name}")
+            )
         except UserError:
             continue  # `ipe-bench list` tells of options that cannot be made
-        if isinstance(other, type(model)) and type(other) is not type(model) and other.nuisance_deviation.any():
+        if (
+            isinstance(other, type(model))
+            and type(other) is not type(model)
+            and other.nuisance_deviation.any()
+        ):
             found.append(dataclasses.replace(other, **own))  # type: ignore[type-var]
     return found
 
@@ -46,10 +56,14 @@ def find_record(option: Option) -> Any:
         raise UserError(f"{where}: {option.fault}")
     config = option.config
     if not isinstance(config, Mapping) or set(config) != {TARGET}:
-        raise UserError(f"{where}: {option.path}: has other keys than {TARGET}, which names a {option.group}")
+        raise UserError(
+            f"{where}: {option.path}: has other keys than {TARGET}, which names a {option.group}"
+        )
     record = find_object(config[TARGET], where)
     if option.group == "statistic" and getattr(record, "name", option.name) != option.name:
-        raise UserError(f"{where}: {config[TARGET]} is called {record.name}; give file and record one name")
+        raise UserError(
+            f"{where}: {config[TARGET]} is called {record.name}; give file and record one name"
+        )
     return record
 
 
@@ -81,11 +95,21 @@ def use_statistics() -> list[str]:
     from ipe_bench.statistics.statistic import Statistic
 
     problems: list[str] = []
-    found = [one for _, one in added("statistic", problems, lambda record: require_type(record, Statistic, "is"))]
+    found = [
+        one
+        for _, one in added(
+            "statistic", problems, lambda record: require_type(record, Statistic, "is")
+        )
+    ]
     return problems + add_statistics(found)
 
 
 def files_of_records() -> list[Path]:
     """Lists the files of every plugin that adds to reports."""
     homes = {option.source.conf.parent for group in RECORD_GROUPS for option in options(group)}
-    return [path for home in homes for path in home.rglob("*") if path.is_file() and path.suffix != ".pyc"]
+    return [
+        path
+        for home in homes
+        for path in home.rglob("*")
+        if path.is_file() and path.suffix != ".pyc"
+    ]

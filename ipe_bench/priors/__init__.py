@@ -81,7 +81,9 @@ class GaussianPrior(Prior):
         if self.correlations is not None:
             C = np.array(self.correlations)
             if not np.allclose(np.diag(C), 1.0, atol=_SYMMETRIC):
-                raise UserError("correlations: has a diagonal that is not 1; give correlations, deviations aside")
+                raise UserError(
+                    "correlations: has a diagonal that is not 1; give correlations, deviations aside"
+                )
             if (np.abs(C - C.T) > _SYMMETRIC).any():
                 i, j = np.unravel_index(np.abs(C - C.T).argmax(), C.shape)
                 raise UserError(
@@ -99,7 +101,9 @@ class GaussianPrior(Prior):
             raise UserError(
                 f"prior.deviations: has {len(self.deviations)} numbers; give one for each of {n} parameters"
             )
-        return error_scale * (np.ones(n) if self.deviations is None else np.asarray(self.deviations, dtype=float))
+        return error_scale * (
+            np.ones(n) if self.deviations is None else np.asarray(self.deviations, dtype=float)
+        )
 
     def correlation(self, n: int) -> Array | None:
         if self.correlations is None:
@@ -114,4 +118,6 @@ class GaussianPrior(Prior):
     def draw(self, x0: Array, error_scale: float, rng: np.random.Generator) -> Array:
         n = len(x0)
         white, C = rng.standard_normal(n), self.correlation(n)
-        return x0 + self.deviation(n, error_scale) * (white if C is None else np.linalg.cholesky(C) @ white)
+        return x0 + self.deviation(n, error_scale) * (
+            white if C is None else np.linalg.cholesky(C) @ white
+        )

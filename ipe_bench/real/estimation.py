@@ -51,13 +51,19 @@ class Question:
         if isinstance(given, tuple):
             names = [str(path) for path in given]
             if len(set(names)) < len(names):
-                raise UserError(f"readings=[{','.join(names)}]: names a file twice, and would count its readings twice")
+                raise UserError(
+                    f"readings=[{','.join(names)}]: names a file twice, and would count its readings twice"
+                )
             return open_together(given, model, self.known, self.ignored)
         if self.ignored:
-            raise UserError("ignore_columns: are columns of a file; give readings=FILE, or leave them out")
+            raise UserError(
+                "ignore_columns: are columns of a file; give readings=FILE, or leave them out"
+            )
         if given is None:
             if model.recorded is None:
-                raise UserError("readings: is not given; write readings=FILE (see `ipe-bench list measurement -v`)")
+                raise UserError(
+                    "readings: is not given; write readings=FILE (see `ipe-bench list measurement -v`)"
+                )
             return Readings(informed(model, self.known), model.recorded.z)
         if given.shape != (model.m,):
             raise UserError(
@@ -71,8 +77,12 @@ class Question:
         prior = prior_stated(self.prior or GaussianPrior(), model)
         require_function(model)
         if hindrance := model.hindrance(model.nominal):
-            raise UserError(f"measurement={model.name}: cannot be computed where estimation starts: {hindrance}")
-        return Scenario(model, self._noise(), prior, 1.0 if self.error_scale is None else self.error_scale)
+            raise UserError(
+                f"measurement={model.name}: cannot be computed where estimation starts: {hindrance}"
+            )
+        return Scenario(
+            model, self._noise(), prior, 1.0 if self.error_scale is None else self.error_scale
+        )
 
     @cached_property
     def problem(self) -> Problem:
@@ -133,7 +143,9 @@ def prior_stated(prior: Prior, model: Measurement) -> Prior:
     if not isinstance(model, ConstrainedModel):
         return prior
     if not isinstance(prior, GaussianPrior):
-        raise UserError(f"parameters: goes with prior=gaussian, which is told of each; prior={prior.name} is not")
+        raise UserError(
+            f"parameters: goes with prior=gaussian, which is told of each; prior={prior.name} is not"
+        )
     if prior.deviations is None:
         return replace(prior, deviations=model.prior_deviations)
     names = [p.name for p in model.whole.parameters]
@@ -144,4 +156,6 @@ def prior_stated(prior: Prior, model: Measurement) -> Prior:
     general = dict(zip(names, prior.deviations, strict=True))
     own = {one.name for one in model.known if one.deviation is not None}
     known = zip(model.physical_parameters, model.prior_deviations, strict=True)
-    return replace(prior, deviations=tuple(d if p.name in own else general[p.name] for p, d in known))
+    return replace(
+        prior, deviations=tuple(d if p.name in own else general[p.name] for p, d in known)
+    )

@@ -145,7 +145,9 @@ class Examination:
     def wald(self) -> tuple[Array, Array]:
         """The intervals (n,), (n,) from the standard errors; NaN for levels of the noise."""
         q = half_width(CONFIDENCE, self.freedom)
-        return self._without_levels(*wald_interval(self.model, self.inner, np.sqrt(np.diag(self.P)), q))
+        return self._without_levels(
+            *wald_interval(self.model, self.inner, np.sqrt(np.diag(self.P)), q)
+        )
 
     def _without_levels(self, low: Array, high: Array) -> tuple[Array, Array]:
         """Intervals (n,), (n,) without those of levels of the noise: only a profile holds a level as often as it
@@ -159,7 +161,9 @@ class Examination:
         # The logarithm of a level does not follow a straight line.
         n, P = self._mean.n, np.diag(np.diag(self.P))
         P[:n, :n] = self.P[:n, :n]
-        return profiles(self.problem, self.z, self.inner, P, freedom=self.freedom, released=self.released)
+        return profiles(
+            self.problem, self.z, self.inner, P, freedom=self.freedom, released=self.released
+        )
 
     @property
     def bent(self) -> Mask:
@@ -167,7 +171,9 @@ class Examination:
         (low, high), (low_wald, high_wald) = self.profiles, self.wald
         with np.errstate(invalid="ignore"):
             apart = np.maximum(np.abs(low - low_wald), np.abs(high - high_wald))
-            return ~(apart <= _BENT * (high_wald - low_wald) / 2) & (np.arange(len(low)) < self._mean.n)
+            return ~(apart <= _BENT * (high_wald - low_wald) / 2) & (
+                np.arange(len(low)) < self._mean.n
+            )
 
     @cached_property
     def fitted(self) -> Array:
@@ -187,7 +193,9 @@ class Examination:
         known = self.problem.R.deviations
         # If all readings are as good, so is one that is missing.
         same = np.ptp(known) <= 1e-12 * known[0]
-        return np.hypot(self.fitted_errors, known[0] if same else at_rows(self.rows, known, self.whole.R.m))
+        return np.hypot(
+            self.fitted_errors, known[0] if same else at_rows(self.rows, known, self.whole.R.m)
+        )
 
     @cached_property
     def shift(self) -> Array:
@@ -199,7 +207,9 @@ class Examination:
         slopes = self._J if R.factor.ndim == 1 else R.whiten(np.eye(len(w))) @ self._J
         with np.errstate(all="ignore"):
             moved = P @ slopes.T * (statistic / variance)
-            return at_rows(self.rows, np.abs(moved / np.sqrt(np.diag(P))[:, None]).max(axis=0), self.whole.R.m)
+            return at_rows(
+                self.rows, np.abs(moved / np.sqrt(np.diag(P))[:, None]).max(axis=0), self.whole.R.m
+            )
 
     @cached_property
     def bootstrap(self) -> BootstrapIntervals:
@@ -209,7 +219,11 @@ class Examination:
         If the level of the noise is estimated, each set has a level that the true one may be, given the estimate, so
         that intervals are those of Student's t if the model is linear.
         """
-        rng, draws, free = np.random.Generator(np.random.Philox(0)), self._affordable(self.bootstraps), self.released
+        rng, draws, free = (
+            np.random.Generator(np.random.Philox(0)),
+            self._affordable(self.bootstraps),
+            self.released,
+        )
         e = rng.standard_normal((draws, len(self.z)))
         if isinstance(self.freedom, int):
             e *= np.sqrt(self.freedom / rng.chisquare(self.freedom, draws))[:, None]
@@ -239,7 +253,11 @@ class Examination:
         starts = np.concatenate([self.inner[None], drawn])
         minima = maximise_likelihood(problem, np.repeat(self.z[None], len(starts), axis=0), starts)
         limit = joint_region(n, CONFIDENCE, self.freedom if isinstance(self.freedom, int) else None)
-        usable = minima.converged & np.isfinite(minima.chi_square) & np.isfinite(minima.covariance).all(axis=(1, 2))
+        usable = (
+            minima.converged
+            & np.isfinite(minima.chi_square)
+            & np.isfinite(minima.covariance).all(axis=(1, 2))
+        )
         found: list[Minimum] = []
         places: list[tuple[Array, Array]] = []
         for i in np.flatnonzero(usable)[np.argsort(minima.chi_square[usable], kind="stable")]:
@@ -252,7 +270,11 @@ class Examination:
             with np.errstate(all="ignore"):
                 moved = self._mean.simulate(x[None, : self._mean.n])[0] - self._present
             same = bool((np.abs(self.problem.R.whiten(moved)) < _SAME_READINGS).all())
-            found.append(Minimum(self.model.physical(x[None])[0], chi_square, chi_square - least <= limit, same))
+            found.append(
+                Minimum(
+                    self.model.physical(x[None])[0], chi_square, chi_square - least <= limit, same
+                )
+            )
         return found or [Minimum(self.x, self.chi_square, True)]
 
     @property
@@ -264,20 +286,28 @@ class Examination:
     def ambiguous(self) -> list[Minimum]:
         """Other minima that fit as well."""
         apart = _SAME * self.standard_errors
-        return [one for one in self.minima if one.as_good and (np.abs(one.x - self.x) > apart).any()]
+        return [
+            one for one in self.minima if one.as_good and (np.abs(one.x - self.x) > apart).any()
+        ]
 
 
-def examine(problem: Problem, z: Array, fits: list[Fit], *, bootstraps: int = BOOTSTRAPS) -> Examination | None:
+def examine(
+    problem: Problem, z: Array, fits: list[Fit], *, bootstraps: int = BOOTSTRAPS
+) -> Examination | None:
     """Examines the least of the minima that estimators without a prior found, of several that found it the first that
     passes; None if none of them found one."""
     told = [
-        one for one in fits if one.status is Status.CONVERGED and np.isfinite(one.chi_square) and not one.with_prior
+        one
+        for one in fits
+        if one.status is Status.CONVERGED and np.isfinite(one.chi_square) and not one.with_prior
     ]
     best = min(told, key=lambda one: one.deviance, default=None)
     if best is None:
         return None
     near = best.deviance + _LOWER * max(1.0, abs(best.deviance))
-    best = next((one for one in told if one.passes and one.deviance <= near and _least_squares(one)), best)
+    best = next(
+        (one for one in told if one.passes and one.deviance <= near and _least_squares(one)), best
+    )
     values, rows = best.held_at, np.flatnonzero(np.isfinite(z))
     if values:
         problem = holding(problem, values)
@@ -285,7 +315,9 @@ def examine(problem: Problem, z: Array, fits: list[Fit], *, bootstraps: int = BO
         levelled = maximum(best.estimated, z[rows])
         inner, assumed, P, freedom = levelled.x, levelled.problem, levelled.P, levelled.freedom
         converged = levelled.converged
-        chi_square = float(np.sum(assumed.R.whiten(z[rows] - levelled.model.near(levelled.fitted, z[rows])) ** 2))
+        chi_square = float(
+            np.sum(assumed.R.whiten(z[rows] - levelled.model.near(levelled.fitted, z[rows])) ** 2)
+        )
     else:
         assumed = best.assumed
         minima = maximise_likelihood(assumed, z[None, rows], best.inner[None])
@@ -314,7 +346,11 @@ def examine(problem: Problem, z: Array, fits: list[Fit], *, bootstraps: int = BO
     if not values:
         return found
     outer = Problem(best.model, best.assumed.R)
-    return replace(found, released=_released(outer, found, values), on_bounds=tuple(_on_bounds(outer, found, values)))
+    return replace(
+        found,
+        released=_released(outer, found, values),
+        on_bounds=tuple(_on_bounds(outer, found, values)),
+    )
 
 
 def _least_squares(one: Fit) -> bool:
@@ -335,7 +371,9 @@ def _released(problem: Problem, found: Examination, values: Mapping[int, float])
     return Released(given, x, inverse_U @ inverse_U.T, places, np.sign(start[places] - bounds))
 
 
-def _on_bounds(problem: Problem, found: Examination, values: Mapping[int, float]) -> Iterator[OnBound]:
+def _on_bounds(
+    problem: Problem, found: Examination, values: Mapping[int, float]
+) -> Iterator[OnBound]:
     """Computes the interval of each parameter on its bound, the others being held on theirs."""
     lower, upper = natural_limits(problem.measurement)
     for place, bound in values.items():
@@ -346,24 +384,33 @@ def _on_bounds(problem: Problem, found: Examination, values: Mapping[int, float]
             sign, freedom = int(part.inwards[0]), found.freedom
             if isinstance(freedom, np.ndarray):
                 freedom = np.insert(freedom, k, freedom.min())
-            ends = profiles(part.problem, found.z, part.x, part.P, freedom=freedom, places=(k,), signs=(sign,))
+            ends = profiles(
+                part.problem, found.z, part.x, part.P, freedom=freedom, places=(k,), signs=(sign,)
+            )
             other = float(np.clip(ends[int(sign > 0)][0], lower[place], upper[place]))
         yield OnBound(problem.measurement.physical_parameters[place], bound, other)
 
 
-def answers(problem: Problem, z: Array, x: Array, released: Released | None = None) -> tuple[Array, Mask]:
+def answers(
+    problem: Problem, z: Array, x: Array, released: Released | None = None
+) -> tuple[Array, Mask]:
     """Computes the least-squares estimates (sets, n) within the bounds, in the parameters' own units, for readings z
     (sets, m) from x (sets, n), and the sets that have one; `released` parameters keep their bounds."""
     minima, model = maximise_likelihood(problem, z, x), problem.measurement
     values, found = model.physical(minima.x), minima.converged.copy()
     outside, bounds = np.zeros((len(x), 0), dtype=bool), np.zeros(0)
     if released is not None:
-        outside, bounds = ~released.inside(minima.x), model.physical(released.x[None])[0, released.places]
+        outside, bounds = (
+            ~released.inside(minima.x),
+            model.physical(released.x[None])[0, released.places],
+        )
     on_bounds: dict[tuple[tuple[int, float], ...], list[int]] = {}
     for i in np.flatnonzero(~found | outside.any(axis=1)):
         near = dict(model.near_bounds(minima.x[i]))
         if released is not None:
-            near |= dict(zip(released.places[outside[i]].tolist(), bounds[outside[i]].tolist(), strict=True))
+            near |= dict(
+                zip(released.places[outside[i]].tolist(), bounds[outside[i]].tolist(), strict=True)
+            )
         found[i] = False
         if 0 < len(near) < model.n:
             on_bounds.setdefault(tuple(sorted(near.items())), []).append(int(i))

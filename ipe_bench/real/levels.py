@@ -79,10 +79,14 @@ class Levelled(WrappedModel):
 
     def physical(self, x: Array) -> Array:
         with np.errstate(over="ignore"):
-            return np.concatenate([self.whole.physical(self.whole_x(x)), np.exp(self._logarithms(x))], axis=1)
+            return np.concatenate(
+                [self.whole.physical(self.whole_x(x)), np.exp(self._logarithms(x))], axis=1
+            )
 
     def physical_slope(self, x: Array) -> Array:
-        return np.concatenate([self.whole.physical_slope(self.whole_x(x)), np.exp(self._logarithms(x))], axis=1)
+        return np.concatenate(
+            [self.whole.physical_slope(self.whole_x(x)), np.exp(self._logarithms(x))], axis=1
+        )
 
     def near_bounds(self, x: Array) -> Mapping[int, float]:
         return self.whole.near_bounds(x[: self.whole.n])
@@ -102,7 +106,11 @@ class Levelled(WrappedModel):
         _, by_h, by_theta = self.noise.at(self.whole.simulate(self.whole_x(x)), theta)
         trials, m, n = J.shape
         whole = np.zeros((trials, self.m, n + theta.shape[1]))
-        whole[:, :m, :n], whole[:, m : 2 * m, :n], whole[:, m : 2 * m, n:] = J, by_h[:, :, None] * J, by_theta
+        whole[:, :m, :n], whole[:, m : 2 * m, :n], whole[:, m : 2 * m, n:] = (
+            J,
+            by_h[:, :, None] * J,
+            by_theta,
+        )
         whole[:, 2 * m :, n:] = np.eye(theta.shape[1])
         return whole
 
@@ -139,8 +147,14 @@ class Likelihood(Objective):
 
     def _split(self, x: Array) -> tuple[Array, Array, Array]:
         """Splits residuals into whitened ones (trials, m), log sigma, and the levels' logarithms less their start."""
-        h, log, theta = np.split(self.model.simulate(x, self.rows), [self.readings, 2 * self.readings], axis=1)
-        return (self.levelled.near(h, self.z) - self.z) * np.exp(-log), log, theta - self.levelled.theta
+        h, log, theta = np.split(
+            self.model.simulate(x, self.rows), [self.readings, 2 * self.readings], axis=1
+        )
+        return (
+            (self.levelled.near(h, self.z) - self.z) * np.exp(-log),
+            log,
+            theta - self.levelled.theta,
+        )
 
     def residual(self, x: Array) -> Array:
         w, _, moved = self._split(x)
@@ -164,7 +178,10 @@ class Likelihood(Objective):
 def objective_of(problem: Problem, z: Array, model: CountingModel | None = None) -> Objective:
     """Returns the objective for readings z (trials, m): -2 times the log likelihood if x has levels, else the sum of
     squares. `model` replaces the problem's."""
-    model, whole = model or CountingModel(problem.measurement, EvaluationCount.zeros(len(z))), problem.measurement
+    model, whole = (
+        model or CountingModel(problem.measurement, EvaluationCount.zeros(len(z))),
+        problem.measurement,
+    )
     given = model, problem.R, z, np.arange(len(z)), problem.x0
     return Likelihood(*given, levelled=whole) if isinstance(whole, Levelled) else Objective(*given)
 
@@ -173,7 +190,9 @@ def maximise_likelihood(problem: Problem, z: Array, x: Array) -> Minima:
     """Minimises `objective_of` for readings z (trials, m) from x (trials, n), with its values as `chi_square`."""
     with np.errstate(all="ignore"):
         objective = objective_of(problem, z)
-        minima = minimize(objective, LevenbergMarquardtMethod(1e-3), x, Limits(_TOLERANCE, _MOST_STEPS))
+        minima = minimize(
+            objective, LevenbergMarquardtMethod(1e-3), x, Limits(_TOLERANCE, _MOST_STEPS)
+        )
         value = objective.cost(minima.x, objective.residual(minima.x))
         model = problem.measurement
         shift = 2 * _SHIFT * model.spare.sum() if isinstance(model, Levelled) else 0.0
@@ -223,10 +242,14 @@ def levels_at(problem: Problem, levels: Levels, theta: Array, z: Array, x: Array
     Raises:
         UserError: a group has too few readings for its levels, or residuals of zero.
     """
-    h = problem.measurement.near(CountingModel.uncounted(problem.measurement, 1).simulate(x[None], np.arange(1))[0], z)
+    h = problem.measurement.near(
+        CountingModel.uncounted(problem.measurement, 1).simulate(x[None], np.arange(1))[0], z
+    )
     if not np.isfinite(h).all():
         none = np.full_like(theta, np.nan)
-        joint = replace(problem, measurement=Levelled(problem.measurement, levels, none, np.ones(len(z))))
+        joint = replace(
+            problem, measurement=Levelled(problem.measurement, levels, none, np.ones(len(z)))
+        )
         unknown = np.full((len(x) + len(none),) * 2, np.nan)
         return Estimated(joint, np.concatenate([x, none]), False, unknown, unknown[0], np.inf)
     J = problem.measurement.jacobian(x[None])[0]
@@ -235,8 +258,12 @@ def levels_at(problem: Problem, levels: Levels, theta: Array, z: Array, x: Array
     w = levels.covariance(h, theta).whiten(z - h)
     theta = theta + first_levels(levels, w * levels.weights)
     known = Levelled(_Known(h), levels, theta, spare)
-    found = maximise_likelihood(Problem(known, _covariance(levels, known.whole, theta)), z[None], theta[None])
-    return _estimated(problem, levels, spare, z, np.concatenate([x, found.x[0]]), bool(found.converged[0]))
+    found = maximise_likelihood(
+        Problem(known, _covariance(levels, known.whole, theta)), z[None], theta[None]
+    )
+    return _estimated(
+        problem, levels, spare, z, np.concatenate([x, found.x[0]]), bool(found.converged[0])
+    )
 
 
 def maximum(start: Estimated, z: Array) -> Estimated:
@@ -250,10 +277,14 @@ def maximum(start: Estimated, z: Array) -> Estimated:
         if not np.isfinite(x).all():
             return replace(found, converged=False)
         J = model.whole.jacobian(x[None, :n])[0]
-        _require_residuals(model.noise, z, z - model.near(model.whole.simulate(x[None, :n])[0], z), J)
+        _require_residuals(
+            model.noise, z, z - model.near(model.whole.simulate(x[None, :n])[0], z), J
+        )
         R = _covariance(model.noise, model.whole, x)
         spare = _spare(J, R)
-        found = _estimated(replace(problem, R=R), model.noise, spare, z, x, bool(minima.converged[0]))
+        found = _estimated(
+            replace(problem, R=R), model.noise, spare, z, x, bool(minima.converged[0])
+        )
         if np.abs(spare - last).max() < _SAME_LEVERAGE:
             break
     return replace(found, maximal=True)
@@ -269,13 +300,18 @@ def _spare(J: Array, R: Covariance) -> Array:
     return np.maximum(1.0 - np.sum(explained(J, R) ** 2, axis=1), _LEAST_SPARE)
 
 
-def _estimated(problem: Problem, levels: Levels, spare: Array, z: Array, x: Array, converged: bool) -> Estimated:
+def _estimated(
+    problem: Problem, levels: Levels, spare: Array, z: Array, x: Array, converged: bool
+) -> Estimated:
     n, whole = problem.measurement.n, problem.measurement
     model, R = Levelled(whole, levels, x[n:], spare), _covariance(levels, whole, x)
     deviation = problem.prior_deviation
     starts = None if deviation is None else np.concatenate([deviation[:n], np.ones(len(x) - n)])
     joint = replace(problem, measurement=model, R=R, prior_deviation=starts, prior_correlation=None)
-    w, slopes = R.whiten(z - whole.near(whole.simulate(x[None, :n])[0], z)), model.jacobian(x[None])[0]
+    w, slopes = (
+        R.whiten(z - whole.near(whole.simulate(x[None, :n])[0], z)),
+        model.jacobian(x[None])[0],
+    )
     J, L = R.whiten_jacobian(slopes[: len(z)]), slopes[len(z) : 2 * len(z)]
     with np.errstate(all="ignore"):
         inverse_U = inverse_factor(np.concatenate([J, np.sqrt(2 * spare)[:, None] * L])[None])[0]
@@ -285,7 +321,9 @@ def _estimated(problem: Problem, levels: Levels, spare: Array, z: Array, x: Arra
         change = 2 * ((J[:, :n] @ inner) ** 2).T @ by_theta / np.diag(inner)[:, None]
         freedom = 2.0 / np.einsum("ik,kl,il->i", change, P[n:, n:], change)
     deviance = float(np.sum(w**2 + 2 * np.log(R.factor)))
-    return Estimated(joint, x, converged, P, np.concatenate([freedom, np.full(len(x) - n, np.inf)]), deviance)
+    return Estimated(
+        joint, x, converged, P, np.concatenate([freedom, np.full(len(x) - n, np.inf)]), deviance
+    )
 
 
 def _require_residuals(levels: Levels, z: Array, r: Array, J: Array) -> None:
@@ -293,7 +331,11 @@ def _require_residuals(levels: Levels, z: Array, r: Array, J: Array) -> None:
     size = np.linalg.norm(J, axis=0)
     for k, name in enumerate(levels.groups):
         rows, told = np.flatnonzero(levels.group == k), f"of {name} " if name else ""
-        rank = np.linalg.matrix_rank(J[rows] / np.where(size > 0, size, 1.0)) if np.isfinite(J).all() else 0
+        rank = (
+            np.linalg.matrix_rank(J[rows] / np.where(size > 0, size, 1.0))
+            if np.isfinite(J).all()
+            else 0
+        )
         if len(rows) - rank < len(levels.names):
             raise UserError(
                 f"noise=unknown: the {len(rows)} readings {told}are too few to tell {', '.join(levels.names)} beside"

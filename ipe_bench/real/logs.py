@@ -74,7 +74,9 @@ class Log:
     """The file with the SHA-256 of the bytes that were read."""
 
     @classmethod
-    def of(cls, model: StateModel, readings: Path | Array | None, ignored: Sequence[str] = ()) -> Log:
+    def of(
+        cls, model: StateModel, readings: Path | Array | None, ignored: Sequence[str] = ()
+    ) -> Log:
         """Reads a CSV or Parquet file without the columns `ignored`, an array z (K, m), or the readings that come with
         the model.
 
@@ -84,7 +86,9 @@ class Log:
         if isinstance(readings, Path):
             return _read(read_tables([readings], ignored)[0], model)
         if readings is None and not isinstance(model, RecordedFormulas):
-            raise UserError(f"readings: is not given; write readings=FILE, with the columns {','.join(_wanted(model))}")
+            raise UserError(
+                f"readings: is not given; write readings=FILE, with the columns {','.join(_wanted(model))}"
+            )
         z = model.draw(0, 1).z[0] if readings is None else unmasked(readings).copy()
         if z.shape != (shape := (model.epochs, len(model.reading_names))):
             raise UserError(
@@ -103,23 +107,34 @@ def _wanted(model: StateModel) -> list[str]:
 
 def _read(table: TextTable, model: StateModel) -> Log:
     wanted = _wanted(model)
-    columns = {name: heading for name in ("epoch", "time", *wanted) if (heading := table.find(name))}
+    columns = {
+        name: heading for name in ("epoch", "time", *wanted) if (heading := table.find(name))
+    }
     for name in wanted:
         if name not in columns:
             raise table.error(f"column {name} is missing (the header must be {','.join(wanted)})")
     if columns.get("time", "time") not in ("time", "time [s]"):
-        raise table.error(f"column {columns['time']}: the unit must be that of time [s]; convert the values")
+        raise table.error(
+            f"column {columns['time']}: the unit must be that of time [s]; convert the values"
+        )
     table.require_known(list(columns.values()), wanted)
     if not table.rows:
         raise table.error("has a header and no rows")
     if gap := next((a + 1 for (a, _), (b, _) in pairwise(table.rows) if b > a + 1), None):
-        raise table.error(f"row {gap}: is empty; if a reading is missing there, number the rows in a column epoch")
+        raise table.error(
+            f"row {gap}: is empty; if a reading is missing there, number the rows in a column epoch"
+        )
 
     def refuse(bad: Array, name: str, what: str) -> None:
         if bad.any():
-            raise table.error(f"row {table.rows[int(np.argmax(bad))][0]}, column {columns[name]}: {what}")
+            raise table.error(
+                f"row {table.rows[int(np.argmax(bad))][0]}, column {columns[name]}: {what}"
+            )
 
-    cells = {name: np.array([table.value(*cell) for cell in table.column(at)]) for name, at in columns.items()}
+    cells = {
+        name: np.array([table.value(*cell) for cell in table.column(at)])
+        for name, at in columns.items()
+    }
     z = np.stack([cells[name] for name in model.reading_names], axis=1)
     for name in model.log_inputs:
         refuse(np.isnan(cells[name]), name, "is empty; a known input has a value at each epoch")
@@ -127,12 +142,21 @@ def _read(table: TextTable, model: StateModel) -> Log:
         refuse(fault.where, fault.column, fault.reason)
     if "time" in model.log_inputs:
         back = np.diff(cells["time"], prepend=-np.inf) <= 0
-        refuse(back, "time", "is not after that of the row before; give rows in the order of their times")
+        refuse(
+            back,
+            "time",
+            "is not after that of the row before; give rows in the order of their times",
+        )
     model = model.with_log(len(z), {name: cells[name] for name in model.log_inputs})
     if len(z) != model.epochs:
-        raise table.error(f"has {len(z)} rows, and {model.name} {model.epochs} epochs; give a row for each of them")
+        raise table.error(
+            f"has {len(z)} rows, and {model.name} {model.epochs} epochs; give a row for each of them"
+        )
     near = _SAME_TIME * (model.times[-1] - model.times[0]) / len(z)
-    for name, right, off in (("epoch", np.arange(1.0, len(z) + 1), 0.0), ("time", model.times, near)):
+    for name, right, off in (
+        ("epoch", np.arange(1.0, len(z) + 1), 0.0),
+        ("time", model.times, near),
+    ):
         wrong = ~(np.abs(cells.get(name, right) - right) <= off)
         said = f"{right[np.argmax(wrong)]:g} belongs here; give a row for each epoch, in order, or set ignore_columns"
         refuse(wrong, name, f"{said}=[{name}]")
@@ -199,7 +223,10 @@ class LogTracks:
     @classmethod
     def of(cls, log: Log, label: str, tracker: Tracker) -> LogTracks:
         tracks, messages = track_safely(tracker, log.model, log.z[None])
-        sizes, innovations = np.array([state.size for state in log.model.states]), tracks.innovations.swapaxes(1, 2)
+        sizes, innovations = (
+            np.array([state.size for state in log.model.states]),
+            tracks.innovations.swapaxes(1, 2),
+        )
         mean, deviation = tracks.mean[0] * sizes, deviations(tracks.covariance[0]) * sizes
         covariance = tracks.covariance[0] * np.outer(sizes, sizes)
         nis = np.where(tracks.degrees[0] > 0, tracks.nis[0], np.nan)
@@ -228,7 +255,9 @@ class LogTracks:
             and not size < _COLLAPSED
             and lost_from is None
             and ended == Status.CONVERGED,
-            message=messages.get(0, "" if ended == Status.CONVERGED else f"{ended.label}: {ended.reason}"),
+            message=messages.get(
+                0, "" if ended == Status.CONVERGED else f"{ended.label}: {ended.reason}"
+            ),
             lost_from=lost_from,
             effective=size,
         )
@@ -276,7 +305,11 @@ def far_below(tracks: Sequence[LogTracks]) -> list[str]:
     A filter that linearises has the likelihood of its own approximation, so that the largest one may be of a track that
     is lost: an overconfident track, or one whose innovations are not white, is no standard for others.
     """
-    sound = [one for one in tracks if one.verdict in (CONSISTENT, TOO_CAUTIOUS) and np.isfinite(one.log_likelihood)]
+    sound = [
+        one
+        for one in tracks
+        if one.verdict in (CONSISTENT, TOO_CAUTIOUS) and np.isfinite(one.log_likelihood)
+    ]
     if not sound:
         return []
     best = max(sound, key=lambda one: one.log_likelihood)
@@ -293,7 +326,11 @@ def far_below(tracks: Sequence[LogTracks]) -> list[str]:
 
 
 def found_and_tracked(
-    log: Log, label: str, tracker: Tracker, find: Sequence[str], watch: Callable[[str], object] = str
+    log: Log,
+    label: str,
+    tracker: Tracker,
+    find: Sequence[str],
+    watch: Callable[[str], object] = str,
 ) -> LogTracks:
     """Finds the constants `find` under which a tracker finds the log most likely, and its track with them; `watch` is
     told at each evaluation of the likelihood how far the search is.
@@ -304,12 +341,16 @@ def found_and_tracked(
     model = log.model
     numbers = _numbers(model)
     places = [_place(list(numbers), name) for name in find]
-    if twice := next((name for name, place in zip(find, places, strict=True) if places.count(place) > 1), None):
+    if twice := next(
+        (name for name, place in zip(find, places, strict=True) if places.count(place) > 1), None
+    ):
         raise UserError(f"find={twice}: is named twice; name it once")
     start = np.array([numbers[place][0] for place in places])
     positive = np.array([numbers[place][1] for place in places])
     if (positive & ~(start > 0)).any():
-        raise UserError(f"find={find[int(np.argmax(positive & ~(start > 0)))]}: is 0; give a value above to start from")
+        raise UserError(
+            f"find={find[int(np.argmax(positive & ~(start > 0)))]}: is 0; give a value above to start from"
+        )
     size = np.where(start == 0, 1.0, np.abs(start))
 
     def values(u: Array) -> Array:
@@ -329,7 +370,9 @@ def found_and_tracked(
         return value if tracks.degrees.any() and np.isfinite(value) else np.inf
 
     if isinstance(tracker, Bootstrap) or not np.isfinite(cost(np.zeros(len(find)))):
-        raise UserError(f"find: trackers.{label} has no likelihood that can be maximised; choose a filter")
+        raise UserError(
+            f"find: trackers.{label} has no likelihood that can be maximised; choose a filter"
+        )
     with np.errstate(invalid="ignore"):
         best, *others = _minima(cost, positive, watch)
     if not np.isfinite(best.error).all():
@@ -338,9 +381,17 @@ def found_and_tracked(
             f" search ended after {best.evaluations} evaluations at {_written(find, values(best.u))}, and the track is"
             " that of the model's own values"
         )
-        return replace(LogTracks.of(log, label, tracker), message=message, found=NO_MAXIMUM, passes=False)
+        return replace(
+            LogTracks.of(log, label, tracker), message=message, found=NO_MAXIMUM, passes=False
+        )
     ends = [values(best.u + sign * float(ndtri(0.975)) * best.error) for sign in (-1, 1)]
-    rows = zip(find, values(best.u), np.where(positive, values(best.u), size) * best.error, *ends, strict=True)
+    rows = zip(
+        find,
+        values(best.u),
+        np.where(positive, values(best.u), size) * best.error,
+        *ends,
+        strict=True,
+    )
     track = LogTracks.of(replace(log, model=model_at(best.u)), label, tracker)
     notes = [
         f"another maximum, of a log likelihood {one.cost - best.cost:.3g} lower, is at {_written(find, values(one.u))}"
@@ -379,7 +430,11 @@ def _numbers(model: StateModel) -> dict[tuple[str, str], tuple[float, bool]]:
             for name, value in getattr(model, key).items()
             if not isinstance(value, str)
         }
-    options = [(name, hint) for name, hint in option_types(type(model)).items() if hint in (*_POSITIVE, float, Finite)]
+    options = [
+        (name, hint)
+        for name, hint in option_types(type(model)).items()
+        if hint in (*_POSITIVE, float, Finite)
+    ]
     return {(name, ""): (getattr(model, name), hint in _POSITIVE) for name, hint in options}
 
 
@@ -387,9 +442,13 @@ def _place(known: Sequence[tuple[str, str]], name: str) -> tuple[str, str]:
     """Returns the key and the name of a number, which may be written KEY.NAME."""
     found = [one for one in known if name in (one[1] or one[0], ".".join(one))]
     if len(found) > 1:
-        raise UserError(f"find={name}: is a name of two numbers; write {' or '.join(map('.'.join, found))}")
+        raise UserError(
+            f"find={name}: is a name of two numbers; write {' or '.join(map('.'.join, found))}"
+        )
     if not found:
-        raise UserError(f"find={name}: {unknown(name, [label or key for key, label in known], 'constant')}")
+        raise UserError(
+            f"find={name}: {unknown(name, [label or key for key, label in known], 'constant')}"
+        )
     return found[0]
 
 
@@ -431,7 +490,9 @@ class _Search:
         return EVALUATIONS - 1 - self.evaluations
 
 
-def _minima(cost: Callable[[Array], float], positive: Mask, watch: Callable[[str], object] = str) -> list[_Minimum]:
+def _minima(
+    cost: Callable[[Array], float], positive: Mask, watch: Callable[[str], object] = str
+) -> list[_Minimum]:
     """The different ends of `SEARCHES` searches, the lowest first. They begin at 0 and at draws of N(0, I), or nearer
     to 0 if the cost is infinite there. Those that are `positive` are logarithms."""
     n = len(positive)

@@ -66,7 +66,9 @@ def natural_limits(model: Measurement) -> tuple[Array, Array]:
     return ends.min(axis=0), ends.max(axis=0)
 
 
-def wald_interval(model: Measurement, x: Array, deviation: Array, q: float | Array) -> tuple[Array, Array]:
+def wald_interval(
+    model: Measurement, x: Array, deviation: Array, q: float | Array
+) -> tuple[Array, Array]:
     """Computes the interval (n,), (n,) of q standard deviations (n,) about x (n,), in the parameters' own units.
 
     It is symmetric in x, such as the logarithm of a distance to a bound. If three times q standard errors reach a
@@ -75,7 +77,10 @@ def wald_interval(model: Measurement, x: Array, deviation: Array, q: float | Arr
     """
     with np.errstate(all="ignore"):
         ends = model.physical(np.stack([x - q * deviation, x + q * deviation]))
-        value, error = model.physical(x[None])[0], deviation * np.abs(model.physical_slope(x[None])[0])
+        value, error = (
+            model.physical(x[None])[0],
+            deviation * np.abs(model.physical_slope(x[None])[0]),
+        )
     lower, upper = natural_limits(model)
     with np.errstate(invalid="ignore"):
         reached = (value - 3 * q * error <= lower) | (value + 3 * q * error >= upper)
@@ -134,11 +139,14 @@ def profiles(
     start, limits, found = model.physical(model.nominal[None])[0], natural_limits(model), []
     for k in range(len(x)) if places is None else places:
         sides = (
-            _Side(problem, z, x, P, k, s, float(q[k]), float(behind[k]), least, objective, released) for s in (-1, 1)
+            _Side(problem, z, x, P, k, s, float(q[k]), float(behind[k]), least, objective, released)
+            for s in (-1, 1)
         )
         ends = np.repeat(x[None], 2, axis=0)
         try:
-            ends[:, k] += [side.sign * (side.end() if side.sign in signs else np.inf) for side in sides]
+            ends[:, k] += [
+                side.sign * (side.end() if side.sign in signs else np.inf) for side in sides
+            ]
         except _BetterFit:
             ends[:, k] = np.nan
         with np.errstate(invalid="ignore"):
@@ -185,13 +193,20 @@ class _Side:
         near, far = 0.0, half / 8
         for _ in range(_STRETCHES):
             if (risen := self.rise(far)) >= self.q:
-                far = cast(float, brentq(lambda d: self.rise(d) - self.q, near, far, xtol=_PRECISION * half))
+                far = cast(
+                    float,
+                    brentq(lambda d: self.rise(d) - self.q, near, far, xtol=_PRECISION * half),
+                )
                 if (risen := self.rise(far, around=True)) >= (1 - _JUMP) * self.q:
                     return far if self.rise((1 - _STEP) * far) >= (1 - _JUMP) * self.q else np.nan
                 self.seen = {far: self.seen[far]}
             # Small steps where the profile bends, since it may rise beyond q and fall again within a large one.
             straight = abs(risen * half / (far * self.q) - 1) < _STRAIGHT
-            near, far = far, far * float(np.clip(1.05 * self.q / max(risen, 1e-3), 1.1, 9.0 if straight else 2.0))
+            near, far = (
+                far,
+                far
+                * float(np.clip(1.05 * self.q / max(risen, 1e-3), 1.1, 9.0 if straight else 2.0)),
+            )
             if far > _FARTHEST * half:
                 break
         return np.inf
@@ -202,7 +217,9 @@ class _Side:
         if distance in self.seen and not around:
             return self.seen[distance][0]
         at = float(self.x[self.place] + self.sign * distance)
-        usable = sorted((abs(d - distance), d) for d, (zeta, _) in self.seen.items() if zeta < 2.0 * self.q)
+        usable = sorted(
+            (abs(d - distance), d) for d, (zeta, _) in self.seen.items() if zeta < 2.0 * self.q
+        )
         nearest = usable[0][1]
         beyond = [d for _, d in usable if (d - distance) * (nearest - distance) < 0]
         points = [self.seen[d][1] for d in (nearest, *beyond[:1])]
@@ -262,7 +279,9 @@ def _ahead(objective: Objective, near: Array, place: int, at: float) -> Array:
     if not np.isfinite(J).all():
         return near
     step = np.full(len(near), at - near[place])
-    step[np.arange(len(near)) != place] *= -np.linalg.lstsq(np.delete(J, place, axis=1), J[:, place], rcond=None)[0]
+    step[np.arange(len(near)) != place] *= -np.linalg.lstsq(
+        np.delete(J, place, axis=1), J[:, place], rcond=None
+    )[0]
     return near + step
 
 

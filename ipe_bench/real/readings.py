@@ -82,8 +82,12 @@ class TextTable:
         if value is not None and math.isfinite(value):
             return value
         if text.strip().lstrip("+-").lower() in ("nan", "inf", "infinity") or value is not None:
-            raise self.error(f"{where}: {text.strip()} is not a reading; leave the cell empty if it is missing")
-        said = f"'{' '.join(text.split())}' is not a number" + (", with decimal commas" if self.decimal == "," else "")
+            raise self.error(
+                f"{where}: {text.strip()} is not a reading; leave the cell empty if it is missing"
+            )
+        said = f"'{' '.join(text.split())}' is not a number" + (
+            ", with decimal commas" if self.decimal == "," else ""
+        )
         raise self.error(f"{where}: {said}; correct it, or leave the cell empty if it is missing")
 
     def column(self, name: str) -> list[tuple[str, str]]:
@@ -95,25 +99,42 @@ class TextTable:
         """Finds the column of that heading; a heading without a unit is found with one, too."""
         if wanted in self.heading:
             return wanted
-        return next((name for name in self.heading if " [" not in wanted and _quantity(name) == wanted), None)
+        return next(
+            (name for name in self.heading if " [" not in wanted and _quantity(name) == wanted),
+            None,
+        )
 
     def require_known(self, known: Collection[str], wanted: Sequence[str]) -> None:
         """Refuses columns that are not known."""
         for name in self.heading:
             if name not in known:
                 meant = did_you_mean(name, [one for one in wanted if one not in self.heading])
-                what = f"column {name}" if name else f"column {self.heading.index(name) + 1}, which has no name,"
-                remedy = f"remove it, or set ignore_columns=[{name.split(' [')[0]}]" if name else "remove it"
+                what = (
+                    f"column {name}"
+                    if name
+                    else f"column {self.heading.index(name) + 1}, which has no name,"
+                )
+                remedy = (
+                    f"remove it, or set ignore_columns=[{name.split(' [')[0]}]"
+                    if name
+                    else "remove it"
+                )
                 hint = f"{meant} Otherwise" if meant else ";"
-                raise self.error(f"{what} is not understood{hint} {remedy} (the header must be {','.join(wanted)})")
+                raise self.error(
+                    f"{what} is not understood{hint} {remedy} (the header must be {','.join(wanted)})"
+                )
 
     def refuse_other_unit(self, name: str) -> None:
         """Refuses a column that is there with another unit, or with none."""
         for other in self.heading:
             if _quantity(other) == _quantity(name):
                 if not _unit(other):
-                    raise self.error(f"column {other}: has no unit; call it {name} if that is the unit of its values")
-                raise self.error(f"column {other}: the unit must be that of {name}; convert the values")
+                    raise self.error(
+                        f"column {other}: has no unit; call it {name} if that is the unit of its values"
+                    )
+                raise self.error(
+                    f"column {other}: the unit must be that of {name}; convert the values"
+                )
 
 
 def _number(text: str) -> float | None:
@@ -159,7 +180,9 @@ def _read_table(path: Path) -> TextTable:
     table = TextTable(path, digest=hashlib.sha256(data).hexdigest())
     table = (_with_parquet if path.suffix == ".parquet" else _with_text)(table, data)
     if all(table.number(name) is not None for name in table.heading):
-        raise table.error("the first row has only numbers and is no header; write the names of the columns above it")
+        raise table.error(
+            "the first row has only numbers and is no header; write the names of the columns above it"
+        )
     for name, count in Counter(table.heading).items():
         if count > 1:
             what = f"column {name} stands there" if name else "columns without a name stand there"
@@ -167,11 +190,15 @@ def _read_table(path: Path) -> TextTable:
     for number, row in table.rows:
         if len(row) == len(table.heading):
             continue
-        if number == table.rows[0][0] and all(cell.strip() and table.number(cell) is None for cell in row):
+        if number == table.rows[0][0] and all(
+            cell.strip() and table.number(cell) is None for cell in row
+        ):
             text = "looks like the header, which must be the first row; remove what stands above it"
         else:
             decimal = len(row) > len(table.heading) and table.decimal == "."
-            remedy = "with decimal commas, separate the cells by semicolons" if decimal else _MISSING
+            remedy = (
+                "with decimal commas, separate the cells by semicolons" if decimal else _MISSING
+            )
             text = f"has {len(row)} cells and the header {len(table.heading)}; {remedy}"
         raise table.error(f"row {number}: {text}")
     return table
@@ -185,9 +212,17 @@ def _with_parquet(table: TextTable, data: bytes) -> TextTable:
         found = pq.read_table(pa.BufferReader(data))
     except (pa.ArrowException, OSError) as error:
         raise table.error("is not a readable Parquet file") from error
-    found = found.select([n for n in found.column_names if not n.startswith("__index_level_")])  # pandas' row numbers
-    columns = [["" if v is None else str(v) for v in column.to_pylist()] for column in found.columns]
-    return replace(table, heading=found.column_names, rows=list(enumerate(map(list, zip(*columns, strict=True)), 1)))
+    found = found.select(
+        [n for n in found.column_names if not n.startswith("__index_level_")]
+    )  # pandas' row numbers
+    columns = [
+        ["" if v is None else str(v) for v in column.to_pylist()] for column in found.columns
+    ]
+    return replace(
+        table,
+        heading=found.column_names,
+        rows=list(enumerate(map(list, zip(*columns, strict=True)), 1)),
+    )
 
 
 def _with_text(table: TextTable, data: bytes) -> TextTable:
@@ -195,19 +230,27 @@ def _with_text(table: TextTable, data: bytes) -> TextTable:
         text = data.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
     except UnicodeDecodeError as error:
         row = data.count(b"\n", 0, error.start) + 1
-        raise table.error(f"row {row}: is not a readable CSV file ({error.reason}); save it as CSV in UTF-8") from error
+        raise table.error(
+            f"row {row}: is not a readable CSV file ({error.reason}); save it as CSV in UTF-8"
+        ) from error
     first = next((line for line in text.splitlines() if line.strip()), "")
     separator = next((sign for sign in ";\t" if sign in first), ",")
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
     try:
         lines = [(reader.line_num, row) for row in reader if any(c.strip() for c in row)]
     except csv.Error as error:
-        raise table.error(f"row {reader.line_num}: is not a readable CSV file ({error}); mend the quotes") from error
+        raise table.error(
+            f"row {reader.line_num}: is not a readable CSV file ({error}); mend the quotes"
+        ) from error
     if not lines:
         raise table.error("is empty")
     (_, heading), *rows = lines
-    comma = separator == ";" and any(_WITH_COMMA.fullmatch(cell.strip()) for _, row in rows for cell in row)
-    return replace(table, heading=[name.strip() for name in heading], rows=rows, decimal="," if comma else ".")
+    comma = separator == ";" and any(
+        _WITH_COMMA.fullmatch(cell.strip()) for _, row in rows for cell in row
+    )
+    return replace(
+        table, heading=[name.strip() for name in heading], rows=rows, decimal="," if comma else "."
+    )
 
 
 # Files of a model -----------------------------------------------------------------------------------------------------
@@ -229,27 +272,39 @@ def write_readings(path: Path, model: Measurement, z: Array) -> None:
     Raises:
         UserError: the file is there already.
     """
-    rows = zip(*labels(model).values(), ["" if math.isnan(value) else repr(float(value)) for value in z], strict=True)
+    rows = zip(
+        *labels(model).values(),
+        ["" if math.isnan(value) else repr(float(value)) for value in z],
+        strict=True,
+    )
     _write(path, [header(model), *rows])
 
 
 def write_truth(path: Path, model: Measurement, x: Array) -> None:
     """Writes parameters x (n,), given in multiples of their sizes, in physical units."""
     values = model.physical(x[None])[0]
-    rows = [[p.name, p.unit, repr(float(v))] for p, v in zip(model.physical_parameters, values, strict=True)]
+    rows = [
+        [p.name, p.unit, repr(float(v))]
+        for p, v in zip(model.physical_parameters, values, strict=True)
+    ]
     _write(path, [["parameter", "unit", "value"], *rows])
 
 
 def _write(path: Path, rows: Sequence[Sequence[Any]]) -> None:
     if path.exists():
-        raise UserError(f"{path}: is there already and is not overwritten; name another file or remove it")
+        raise UserError(
+            f"{path}: is there already and is not overwritten; name another file or remove it"
+        )
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     write_text(path, text.getvalue())
 
 
 def open_together(
-    paths: Sequence[Path], model: Measurement, known: Sequence[ParameterInfo] = (), without: Sequence[str] = ()
+    paths: Sequence[Path],
+    model: Measurement,
+    known: Sequence[ParameterInfo] = (),
+    without: Sequence[str] = (),
 ) -> Readings:
     """Opens one file of readings or several, which share the parameters that are not a file's own.
 
@@ -264,7 +319,10 @@ def open_together(
         return open_together(paths, model.whole, (*model.known, *known), without)
     tables = read_tables(paths, without)
     found = _together(paths, [_readings_in(table, model) for table in tables])
-    model, files = informed(found.model, known), tuple((str(table.path), table.digest) for table in tables)
+    model, files = (
+        informed(found.model, known),
+        tuple((str(table.path), table.digest) for table in tables),
+    )
     if (there := int(np.isfinite(found.z).sum())) < model.n:
         shown = str(paths[0]) if len(paths) == 1 else f"[{','.join(map(str, paths))}]"
         raise UserError(f"readings={shown}: {there} readings are too few for {model.n} parameters")
@@ -279,14 +337,22 @@ def _together(paths: Sequence[Path], found: Sequence[Readings]) -> Readings:
     for one, path in zip(found, paths, strict=True):
         if (one.deviations is None) != (first.deviations is None):
             with_sigma, without = (paths[0], path) if one.deviations is None else (path, paths[0])
-            raise UserError(f"readings={without}: has no column {SIGMA}, as {with_sigma} has; give it one, too")
+            raise UserError(
+                f"readings={without}: has no column {SIGMA}, as {with_sigma} has; give it one, too"
+            )
         for name in one.columns:  # one formula is made of all files
             other = units.get(_quantity(name))
             if other and _unit(name) and _unit(name) != other:
-                raise UserError(f"readings={path}: column {name}: {paths[0]} has it in {other}; convert the values")
+                raise UserError(
+                    f"readings={path}: column {name}: {paths[0]} has it in {other}; convert the values"
+                )
     deviations = [one.deviations for one in found if one.deviations is not None]
     joint = Joint(tuple(one.model for one in found))
-    return Readings(joint, np.concatenate([one.z for one in found]), np.concatenate(deviations) if deviations else None)
+    return Readings(
+        joint,
+        np.concatenate([one.z for one in found]),
+        np.concatenate(deviations) if deviations else None,
+    )
 
 
 def _readings_in(table: TextTable, model: Measurement) -> Readings:
@@ -296,7 +362,9 @@ def _readings_in(table: TextTable, model: Measurement) -> Readings:
     there = [c for i, c in zip(model.inputs, columns, strict=True) if c is not None and not i.label]
     known = bool(model.inputs) and model.input_columns_known and not there
     # An input that tells readings apart, such as the time, is in every file.
-    if not model.inputs or (known and not any(i.heading in model.index for i in model.inputs if not i.label)):
+    if not model.inputs or (
+        known and not any(i.heading in model.index for i in model.inputs if not i.label)
+    ):
         rows, shown = _rows_of(table, model, [sigma] if sigma else []), header(model)[-1]
         cells = table.column(shown)
         z = np.array([table.value(*cells[row]) for row in rows], dtype=float)
@@ -322,7 +390,9 @@ def _readings_in(table: TextTable, model: Measurement) -> Readings:
     except UserError as error:
         raise table.error(str(error)) from None
     headings = [wanted.heading for wanted in model.inputs]
-    table.require_known((*used, *sampled.index), tuple(dict.fromkeys((*headings, _shown_as(model)[0], SIGMA))))
+    table.require_known(
+        (*used, *sampled.index), tuple(dict.fromkeys((*headings, _shown_as(model)[0], SIGMA)))
+    )
     for name, values in sampled.index.items():
         if name not in headings and name in table.heading:
             for (text, where), label in zip(table.column(name), values, strict=True):
@@ -349,9 +419,13 @@ def _rows_of(table: TextTable, model: Measurement, also: Sequence[str]) -> list[
         if place is None or place in found:
             said = ", ".join(f"{table.heading[at]}={row[at].strip()}" for at in columns)
             if place is None:
-                raise table.error(f"row {number}: {model.name} has no reading {said}; correct or remove the row")
+                raise table.error(
+                    f"row {number}: {model.name} has no reading {said}; correct or remove the row"
+                )
             earlier = table.rows[found[place]][0]
-            raise table.error(f"row {number}: {said} stands in row {earlier} already; keep one of them")
+            raise table.error(
+                f"row {number}: {said} stands in row {earlier} already; keep one of them"
+            )
         found[place] = k
     if len(found) < model.m:
         absent = next(label for i, label in enumerate(every) if i not in found)
@@ -386,12 +460,16 @@ def _reading_column(table: TextTable, model: Measurement) -> str:
     other = free[0] if len(free) == 1 else "COLUMN"
     remedy = f"set measurement.reading={other}" if hasattr(model, "reading") else f"rename {other}"
     there = ", ".join(table.heading)
-    raise table.error(f"column {names[0]} is missing, which holds the readings; there are {there}; {remedy}")
+    raise table.error(
+        f"column {names[0]} is missing, which holds the readings; there are {there}; {remedy}"
+    )
 
 
 def _input(table: TextTable, wanted: Input, text: str, where: str) -> Any:
     if not text.strip():
-        raise table.error(f"{where}: is empty; what is known of a reading keeps its value, even where it is missing")
+        raise table.error(
+            f"{where}: is empty; what is known of a reading keeps its value, even where it is missing"
+        )
     if wanted.kind is str:
         return text.strip()
     value = table.value(text, where)
@@ -400,7 +478,9 @@ def _input(table: TextTable, wanted: Input, text: str, where: str) -> Any:
     return wanted.kind(value)
 
 
-def _sigmas(table: TextTable, column: str | None, rows: Sequence[int], z: Array, shown: str) -> Array | None:
+def _sigmas(
+    table: TextTable, column: str | None, rows: Sequence[int], z: Array, shown: str
+) -> Array | None:
     """Reads the standard deviations (m,) in `rows` of that column, `shown` being the readings' name; None without
     it."""
     if column is None:
@@ -412,5 +492,7 @@ def _sigmas(table: TextTable, column: str | None, rows: Sequence[int], z: Array,
         text, where = cells[row]
         values.append(table.value(text, where))
         if values[-1] <= 0 or (math.isnan(values[-1]) and not math.isnan(reading)):
-            raise table.error(f"{where}: '{text}' is not a standard deviation; give a number above 0")
+            raise table.error(
+                f"{where}: '{text}' is not a standard deviation; give a number above 0"
+            )
     return np.array(values)

@@ -15,7 +15,11 @@ from ipe_bench.statistics.analysis import Analysis
 
 
 def export(
-    analysis: Analysis, folder: Path, names: Sequence[str], columns: Sequence[str] = (), width: float = COLUMN
+    analysis: Analysis,
+    folder: Path,
+    names: Sequence[str],
+    columns: Sequence[str] = (),
+    width: float = COLUMN,
 ) -> list[Path]:
     """Writes the tables and figures of these names into the folder, and returns the files: NAME.tex, or NAME.pdf and
     NAME.png, and the figures' captions.
@@ -24,12 +28,18 @@ def export(
         UserError: there is no such table, figure or column, or the width is none of paper.
     """
     if not 2 <= width <= 20:
-        raise UserError(f"width={width:g}: give inches, such as {COLUMN:g} for one column and {PAGE:g} for two")
+        raise UserError(
+            f"width={width:g}: give inches, such as {COLUMN:g} for one column and {PAGE:g} for two"
+        )
     tables = {table.name: table for table in report_tables(analysis)}
     chosen = [_with_columns(tables[name], columns) for name in names if name in tables]
     if columns and not chosen:
-        raise UserError(f"columns={','.join(columns)}: goes with a table; paper={','.join(names)} names none")
-    files = _figures(analysis, folder, [name for name in names if name not in tables], width, tables)
+        raise UserError(
+            f"columns={','.join(columns)}: goes with a table; paper={','.join(names)} names none"
+        )
+    files = _figures(
+        analysis, folder, [name for name in names if name not in tables], width, tables
+    )
     for table in chosen:
         files.append(folder / f"{table.name}.tex")
         write_text(files[-1], latex(table, width))
@@ -50,7 +60,9 @@ def _with_columns(table: Table, names: Sequence[str]) -> Table:
     return replace(table, columns=[known[name] for name in names or known])
 
 
-def _figures(analysis: Analysis, folder: Path, names: Sequence[str], width: float, tables: Iterable[str]) -> list[Path]:
+def _figures(
+    analysis: Analysis, folder: Path, names: Sequence[str], width: float, tables: Iterable[str]
+) -> list[Path]:
     """Writes figures, and captions.md with their captions; returns the files."""
     from ipe_bench.report.figures import drawings
     from ipe_bench.report.style import print_style
@@ -65,7 +77,9 @@ def _figures(analysis: Analysis, folder: Path, names: Sequence[str], width: floa
                 break
     for name in names:
         if name not in captions:
-            raise UserError(f"paper={name}: {unknown(name, [*tables, *captions], 'table or figure')}")
+            raise UserError(
+                f"paper={name}: {unknown(name, [*tables, *captions], 'table or figure')}"
+            )
     if names:
         files.append(folder / "captions.md")
         write_text(files[-1], "\n\n".join(captions[name] for name in names) + "\n")

@@ -48,7 +48,9 @@ def counting(
         yield begin
 
 
-def _telling(title: str, *, lines: bool = False, kept: bool = False, off: bool = False) -> AbstractContextManager[Tell]:
+def _telling(
+    title: str, *, lines: bool = False, kept: bool = False, off: bool = False
+) -> AbstractContextManager[Tell]:
     """Yields a callback that shows progress in a notebook, in a terminal or, by `lines`, anywhere."""
     if _in_notebook() and not off:
         return _line_of_notebook(title)
@@ -96,9 +98,15 @@ def _bar(title: str, *, lines: bool, kept: bool) -> Iterator[Tell]:
     from ipe_bench.report.screen import Screen
 
     console = Screen(stderr=True)
-    name, state_of = (TextColumn(field, markup=False) for field in ("{task.description}", "{task.fields[state]}"))
+    name, state_of = (
+        TextColumn(field, markup=False) for field in ("{task.description}", "{task.fields[state]}")
+    )
     columns = name, BarColumn(10), state_of
-    options: dict[str, Any] = {"console": console, "disable": not console.is_terminal, "transient": not kept}
+    options: dict[str, Any] = {
+        "console": console,
+        "disable": not console.is_terminal,
+        "transient": not kept,
+    }
     bar = Bar(*columns, TimeElapsedColumn(), **options)
     line = bar.add_task(shortened(title, max(30, console.width - 80)), total=None, state="")
     spoken = time.monotonic()
@@ -106,7 +114,11 @@ def _bar(title: str, *, lines: bool, kept: bool) -> Iterator[Tell]:
     def tell(done: float, total: float, state: str) -> None:
         nonlocal spoken
         bar.update(line, total=total or 1, completed=done if total else 1, state=state)
-        if lines and not console.is_terminal and (done >= total or time.monotonic() - spoken >= _LINE_EVERY_S):
+        if (
+            lines
+            and not console.is_terminal
+            and (done >= total or time.monotonic() - spoken >= _LINE_EVERY_S)
+        ):
             spoken = time.monotonic()
             console.print(f"{title}: {state}", soft_wrap=True)
 
@@ -135,5 +147,7 @@ def _state(progress: Progress) -> str:
     if rate := progress.trials / max(seconds, 1e-9):
         state += f", {rate:.0f} estimates/s" if rate >= 10 else f", {rate:.2g} estimates/s"
     if 0 < progress.done < progress.tasks:
-        state += f", {timedelta(seconds=round(seconds * (progress.tasks / progress.done - 1)))} left"
+        state += (
+            f", {timedelta(seconds=round(seconds * (progress.tasks / progress.done - 1)))} left"
+        )
     return state

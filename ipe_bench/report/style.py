@@ -50,18 +50,29 @@ def which_figures(asked: Any) -> Which:
 
 def drawn_settings(number: int, which: Which) -> tuple[int, str]:
     """Returns how many of the settings have figures of their own, and a sentence on the others if there are any."""
-    drawn = min(number, MOST_SETTINGS if which == "all" or number <= MOST_SETTINGS else FIRST_SETTINGS)
+    drawn = min(
+        number, MOST_SETTINGS if which == "all" or number <= MOST_SETTINGS else FIRST_SETTINGS
+    )
     more = f"; figures=all draws {MOST_SETTINGS} of the {number}" if which == "main" else ""
-    return drawn, f"{number - drawn} further settings are in the tables{more}" if drawn < number else ""
+    return (
+        drawn,
+        f"{number - drawn} further settings are in the tables{more}" if drawn < number else "",
+    )
 
 
 def file_formats(asked: Any) -> tuple[str, ...]:
     """Returns the formats asked for, in one word or several, with those that are always written; raises UserError if
     one is unknown."""
-    words = asked if isinstance(asked, Sequence) and not isinstance(asked, str) else str(asked).strip("[]").split(",")
+    words = (
+        asked
+        if isinstance(asked, Sequence) and not isinstance(asked, str)
+        else str(asked).strip("[]").split(",")
+    )
     names = [str(word).strip() for word in words]
     if not names or not set(names) <= set(FORMATS):
-        raise UserError(f"formats={','.join(names)}: choose among {', '.join(FORMATS[:-1])} and {FORMATS[-1]}")
+        raise UserError(
+            f"formats={','.join(names)}: choose among {', '.join(FORMATS[:-1])} and {FORMATS[-1]}"
+        )
     return tuple(kind for kind in FORMATS if kind in {PAGE, TABLES[0], *names})
 
 
@@ -77,7 +88,12 @@ class Look:
     def line(self) -> dict[str, Any]:
         """Arguments of a line with markers."""
         dashes = (0, self.dash) if self.dash else "-"
-        return {"color": self.color, "marker": self.marker, "linestyle": dashes, "markeredgecolor": "white"}
+        return {
+            "color": self.color,
+            "marker": self.marker,
+            "linestyle": dashes,
+            "markeredgecolor": "white",
+        }
 
 
 FACES = {
@@ -93,8 +109,27 @@ FACES = {
 """The looks of those that the bench is about, which no other has and which are never grey. They differ from each other
 in hue, marker and lightness, also for the colour-blind and in grey."""
 POOL = (
-    *("gauss_newton", "relinearized", "ukf_rts", "ekf_rts", "progressive", "levenberg_marquardt", "iterated_ekf"),
-    *("ckf", "map_lm", "enkf", "iplf", "ukf_wide", "anderson", "damped_newton", "minpack", "dogbox", "least_squares"),
+    *(
+        "gauss_newton",
+        "relinearized",
+        "ukf_rts",
+        "ekf_rts",
+        "progressive",
+        "levenberg_marquardt",
+        "iterated_ekf",
+    ),
+    *(
+        "ckf",
+        "map_lm",
+        "enkf",
+        "iplf",
+        "ukf_wide",
+        "anderson",
+        "damped_newton",
+        "minpack",
+        "dogbox",
+        "least_squares",
+    ),
     *("geodesic_lm", "multiscale_lm", "multistart", "ghkf", "ieks", "ipls", "grid", "bootstrap"),
 )
 """Our others, of which each has its own place among the markers and dashes; a name from elsewhere has one by chance."""
@@ -131,7 +166,10 @@ def looks(
 
 def _from_pool(at: int, family: Sequence[str]) -> Look:
     places = len(MARKERS) * len(DASHES)
-    color, dash = family[(at + at // places) % len(family)], DASHES[at // len(MARKERS) % len(DASHES)]
+    color, dash = (
+        family[(at + at // places) % len(family)],
+        DASHES[at // len(MARKERS) % len(DASHES)],
+    )
     return Look(color, MARKERS[at % len(MARKERS)], dash)
 
 
@@ -192,7 +230,10 @@ def house_style(scale: float = 0.95, more: Mapping[str, Any] | None = None) -> I
     import matplotlib as mpl
     import seaborn as sns
 
-    settings: dict[Any, Any] = {**sns.axes_style("whitegrid"), **sns.plotting_context("paper", font_scale=scale)}
+    settings: dict[Any, Any] = {
+        **sns.axes_style("whitegrid"),
+        **sns.plotting_context("paper", font_scale=scale),
+    }
     settings |= {**_HOUSE, **(more or {})}
     with mpl.rc_context(settings):
         yield

@@ -78,7 +78,9 @@ class Summary(pd.DataFrame):
             drawn = drawings(analyse([self._folder]))
             return {drawing.name: drawing.shown() for drawing in drawn}
 
-    def report(self, output: Path | str | None = None, *, figures: Any = "main", formats: Any = PAGE) -> ReportResult:
+    def report(
+        self, output: Path | str | None = None, *, figures: Any = "main", formats: Any = PAGE
+    ) -> ReportResult:
         """Writes the report into `output`, or else into the folder of the run; see `ib.report`."""
         if output is None and not (self._stored and self._stored.named):
             raise UserError("report: the run has no folder; give output=, or run with output=")
@@ -87,12 +89,16 @@ class Summary(pd.DataFrame):
     @property
     def _folder(self) -> Path:
         if self._stored is None or not self._stored.folder.is_dir():
-            raise UserError("this frame does not know its trials; take them from the one that `ib.run` returned")
+            raise UserError(
+                "this frame does not know its trials; take them from the one that `ib.run` returned"
+            )
         return self._stored.folder
 
     @property
     def _is_whole(self) -> bool:
-        return {"parameter", "noise", *summary_columns()} <= set(self.columns) and ALL in set(self["parameter"])
+        return {"parameter", "noise", *summary_columns()} <= set(self.columns) and ALL in set(
+            self["parameter"]
+        )
 
     def _tables(self, width: int) -> list[Any]:
         rows: Any = self.to_dict("records")

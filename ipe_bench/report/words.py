@@ -48,7 +48,9 @@ def percent(share: float) -> str:
 def ends_in_percent(low: float, high: float) -> tuple[str, str]:
     """Formats the ends of an interval of a share, with a decimal more for each tenth of its width below 2 per cent."""
     figures = max(0, math.ceil(math.log10(0.02 / (high - low)))) if low < high else 0
-    low_text, high_text = (f"{100 * end:.{0 if end in (0, 1) else figures}f}" for end in (low, high))
+    low_text, high_text = (
+        f"{100 * end:.{0 if end in (0, 1) else figures}f}" for end in (low, high)
+    )
     return low_text, high_text
 
 
@@ -104,7 +106,9 @@ def compact(value: float) -> str:
     rounded = float(f"{value:.2e}")
     if rounded == 0 or not 1e-2 <= abs(rounded) < 1e9:
         return _powered(f"{value:.1e}") if rounded else "0"
-    size, letter = next(((s, u) for s, u in ((1e6, "M"), (1e3, "k")) if abs(rounded) >= s), (1.0, ""))
+    size, letter = next(
+        ((s, u) for s, u in ((1e6, "M"), (1e3, "k")) if abs(rounded) >= s), (1.0, "")
+    )
     return f"{rounded / size:.{_decimals(rounded / size, 3)}f}{letter}"
 
 
@@ -115,7 +119,9 @@ def duration(seconds: float, figures: int = 3) -> str:
     if seconds <= 0:
         return "0 s"
     rounded = float(f"{seconds:.{figures - 1}e}")
-    size, unit = next(((s, u) for s, u in ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs")) if rounded >= s), (1e-9, "ns"))
+    size, unit = next(
+        ((s, u) for s, u in ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs")) if rounded >= s), (1e-9, "ns")
+    )
     return f"{rounded / size:.{_decimals(rounded / size, figures)}f} {unit}"
 
 

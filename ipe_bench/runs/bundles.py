@@ -25,7 +25,9 @@ SUFFIX = ".zip"
 BUNDLES = "bundles"
 """Folder of unpacked bundles, below a report on them."""
 _FILE = re.compile(r"(trials|runs|failed)/[A-Za-z0-9][A-Za-z0-9._-]{0,150}\.(parquet|json)")
-_FOLDER = re.compile(r"(?!(?i:con|prn|aux|nul|com\d|lpt\d)(\.|$))[A-Za-z0-9]([A-Za-z0-9._=,+-]{0,98}[A-Za-z0-9])?")
+_FOLDER = re.compile(
+    r"(?!(?i:con|prn|aux|nul|com\d|lpt\d)(\.|$))[A-Za-z0-9]([A-Za-z0-9._=,+-]{0,98}[A-Za-z0-9])?"
+)
 """Names that mean the same on every system."""
 _MOST_COMPRESSED = 100
 """Bytes that a byte of a bundle may stand for; those of records stand for 10."""
@@ -57,18 +59,27 @@ def write_bundle(directories: Sequence[Path | str], path: Path) -> Bundle:
     contents: dict[str, bytes] = {}
     for directory in map(Path, directories):
         _require_results(directory)
-        name = re.sub(r"[^A-Za-z0-9._=,+-]+", "_", directory.resolve().name)[:100].strip("._=,+-") or "results"
+        name = (
+            re.sub(r"[^A-Za-z0-9._=,+-]+", "_", directory.resolve().name)[:100].strip("._=,+-")
+            or "results"
+        )
         if any(known.startswith(f"{name}/") for known in contents):
-            raise UserError(f"{directory}: another folder has the name {name} too; bundle them apart, or rename one")
+            raise UserError(
+                f"{directory}: another folder has the name {name} too; bundle them apart, or rename one"
+            )
         contents |= {f"{name}/{file}": content for file, content in _contents(directory).items()}
     if not contents:
-        raise UserError(f"{', '.join(map(str, directories))}: holds no whole results to bundle; run something first")
+        raise UserError(
+            f"{', '.join(map(str, directories))}: holds no whole results to bundle; run something first"
+        )
     digests = {name: _digest(content) for name, content in sorted(contents.items())}
     contents[MANIFEST] = "".join(f"{digest}  {name}\n" for name, digest in digests.items()).encode()
     if path.exists():
         found = read_bundle(path)
         if found.files != digests:
-            raise UserError(f"{path}: is there and holds other results; choose another name with output=, or remove it")
+            raise UserError(
+                f"{path}: is there and holds other results; choose another name with output=, or remove it"
+            )
         return found
 
     def write(temporary: Path) -> None:
@@ -87,17 +98,28 @@ def _contents(directory: Path) -> dict[str, bytes]:
     store = Store(directory)
     while True:
         damaged = Results.read([directory]).damaged
-        files = [p for folder in (store.trials, store.runs, store.failed) for p in folder.glob("[!.]*.*")]
-        names = {f"{file.parent.name}/{file.name}": file for file in files if file not in damaged and file.is_file()}
+        files = [
+            p for folder in (store.trials, store.runs, store.failed) for p in folder.glob("[!.]*.*")
+        ]
+        names = {
+            f"{file.parent.name}/{file.name}": file
+            for file in files
+            if file not in damaged and file.is_file()
+        }
         with contextlib.suppress(FileNotFoundError):
-            return {name: file.read_bytes() for name, file in names.items() if _FILE.fullmatch(name)}
+            return {
+                name: file.read_bytes() for name, file in names.items() if _FILE.fullmatch(name)
+            }
 
 
 def read_bundle(path: Path) -> Bundle:
     """Reads all files of a bundle; raises UserError unless they are as its manifest says."""
     try:
         with zipfile.ZipFile(path) as archive:
-            if sum(one.file_size for one in archive.infolist()) > _MOST_COMPRESSED * path.stat().st_size:
+            if (
+                sum(one.file_size for one in archive.infolist())
+                > _MOST_COMPRESSED * path.stat().st_size
+            ):
                 raise UserError(
                     f"{path}: would unpack to over {_MOST_COMPRESSED} times its size; the bundle is not read"
                 )
@@ -108,13 +130,21 @@ def read_bundle(path: Path) -> Bundle:
             for name in sorted({*digests, *there} - {MANIFEST}):
                 folder, _, file = name.partition("/")
                 if not (_FOLDER.fullmatch(folder) and _FILE.fullmatch(file)):
-                    raise UserError(f"{path}: {name!r} is no name of a result; the bundle is not read")
+                    raise UserError(
+                        f"{path}: {name!r} is no name of a result; the bundle is not read"
+                    )
                 if name not in there or digests.get(name) != _digest_of(archive, name):
-                    raise UserError(f"{path}: was damaged or changed: {name} is not as its manifest says; get it anew")
+                    raise UserError(
+                        f"{path}: was damaged or changed: {name} is not as its manifest says; get it anew"
+                    )
     except UserError:
         raise
-    except Exception as error:  # an archive that is cut short, changed, encrypted or none at all raises many kinds
-        raise UserError(f"{path}: is not a whole bundle of ipe-bench ({error or type(error).__name__})") from None
+    except (
+        Exception
+    ) as error:  # an archive that is cut short, changed, encrypted or none at all raises many kinds
+        raise UserError(
+            f"{path}: is not a whole bundle of ipe-bench ({error or type(error).__name__})"
+        ) from None
     return Bundle(path, _digest(manifest), digests)
 
 
@@ -129,7 +159,9 @@ def opened(paths: Sequence[Path | str], into: Path | None = None) -> Iterator[li
                 found.append(path)
                 continue
             bundle = read_bundle(path)  # nothing is written of one that is not whole
-            place = into or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ipe-bench-")))
+            place = into or Path(
+                stack.enter_context(tempfile.TemporaryDirectory(prefix="ipe-bench-"))
+            )
             place = place / f"{path.name.removesuffix(SUFFIX)}-{bundle.digest[:8]}"
             with zipfile.ZipFile(path) as archive:
                 archive.extractall(place, bundle.files)

@@ -135,7 +135,9 @@ class Processes(Execution):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.memory_limit_gb is not None and not sys.platform.startswith("linux"):
-            raise UserError(f"memory_limit_gb={self.memory_limit_gb}: can be enforced on Linux only; give null")
+            raise UserError(
+                f"memory_limit_gb={self.memory_limit_gb}: can be enforced on Linux only; give null"
+            )
 
     def run(self, work: Work, tasks: Sequence[Any]) -> Iterator[Event]:
         workers = min(self.workers or cores(), len(tasks))
@@ -174,7 +176,9 @@ def supervise(
         while waiting or busy:
             while waiting and len(busy) < workers:
                 index = waiting.popleft()
-                worker = _begun(index, (sys.path, threads, memory_gb, cloudpickle.dumps((work, tasks[index]))))
+                worker = _begun(
+                    index, (sys.path, threads, memory_gb, cloudpickle.dumps((work, tasks[index])))
+                )
                 busy[worker.connection] = worker
             deadline = min(worker.deadline for worker in busy.values())
             patience = None if deadline == math.inf else max(0.0, deadline - time.monotonic())
@@ -187,7 +191,9 @@ def supervise(
                 elif kind == "step":
                     worker.extend(timeout_s if value == PREPARED else prepares_s)
                     yield Event(worker.index, value)
-                elif kind == "died" and not worker.fresh:  # it was ending while it was handed this task
+                elif (
+                    kind == "died" and not worker.fresh
+                ):  # it was ending while it was handed this task
                     del busy[connection]  # pyright: ignore[reportArgumentType]
                     waiting.appendleft(worker.index)
                 else:
@@ -198,7 +204,9 @@ def supervise(
                         raise value
                     yield Event(worker.index, ended=True, failure=value)
             now = time.monotonic()
-            for worker in [w for w in busy.values() if w.deadline <= now and not w.connection.poll()]:
+            for worker in [
+                w for w in busy.values() if w.deadline <= now and not w.connection.poll()
+            ]:
                 del busy[worker.connection]
                 worker.end()
                 failure = Failure("timeout", f"exceeded block_timeout_s={timeout_s:g}")
@@ -224,7 +232,11 @@ class _Worker:
         self.process = subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,
-            env={**os.environ, **{f"{name}_NUM_THREADS": "1" for name in _THREADED}, "PYTHONPATH": path},
+            env={
+                **os.environ,
+                **{f"{name}_NUM_THREADS": "1" for name in _THREADED},
+                "PYTHONPATH": path,
+            },
             start_new_session=True,
             **options,
         )
@@ -243,7 +255,9 @@ class _Worker:
             return self.connection.recv()
         except (EOFError, OSError, pickle.UnpicklingError):
             self.end()
-            return "died", Failure("died", f"the worker process {_describe_exit(self.process.returncode)}")
+            return "died", Failure(
+                "died", f"the worker process {_describe_exit(self.process.returncode)}"
+            )
 
     def end(self) -> None:
         """Ends the process, and those that it started in its session, without waiting for the task."""

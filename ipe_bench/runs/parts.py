@@ -41,10 +41,24 @@ _OLDER = tuple(f'"schema":{number},'.encode() for number in range(1, SCHEMA))
 
 
 _NUMBER = (int, float)
-_NAMES = {"measurement": str, "noise": str, "prior": str, "error_scale": _NUMBER, "seed": int, "estimator": str}
+_NAMES = {
+    "measurement": str,
+    "noise": str,
+    "prior": str,
+    "error_scale": _NUMBER,
+    "seed": int,
+    "estimator": str,
+}
 RUN = {"started": str, "trials": int, "cells": [{"key": str, "identity_key": str, "names": _NAMES}]}
 FAILED = {"key": str, "start": int, "stop": int, "status": str, "message": str}
-_FOOTER = {"key": str, "identity_key": str, "names": _NAMES, "versions": dict, "source": str, "bound": str}
+_FOOTER = {
+    "key": str,
+    "identity_key": str,
+    "names": _NAMES,
+    "versions": dict,
+    "source": str,
+    "bound": str,
+}
 _FOOTER |= {"identity": {"scenario": dict, "estimator": (dict, type(None))}, "linear_bound": list}
 _FOOTER |= {"parameters": [{"name": str, "unit": str, "size": _NUMBER}]}
 """What readers take for granted: keys, and the types of their values."""
@@ -86,7 +100,9 @@ class StoredPart:
         footers, tables = zip(*self.groups(columns), strict=True)
         return footers[0], pa.concat_tables(tables)
 
-    def groups(self, columns: Keys[str] | None = None) -> Iterator[tuple[Mapping[str, Any], pa.Table]]:
+    def groups(
+        self, columns: Keys[str] | None = None
+    ) -> Iterator[tuple[Mapping[str, Any], pa.Table]]:
         """Reads the same, at most `GROUP` rows at a time: those of a million trials take gigabytes."""
         with _opened(self.path) as file:
             footer, names, reached = self._footer(file), file.schema_arrow.names, self.start
@@ -107,7 +123,9 @@ class StoredPart:
 
     @property
     def _miscounted(self) -> Unusable:
-        return Unusable(f"damaged: its column trial does not count from {self.start} to {self.stop}")
+        return Unusable(
+            f"damaged: its column trial does not count from {self.start} to {self.stop}"
+        )
 
     def _footer(self, file: pq.ParquetFile) -> Mapping[str, Any]:
         footer = _parsed(file.metadata.metadata[FOOTER])
@@ -119,7 +137,11 @@ class StoredPart:
         """Reads the iterates of its first trials, by column; None if there are none. Raises what `read` does."""
         with _opened(self.path) as file:
             text = file.metadata.metadata.get(HISTORY)
-        return None if text is None else {name: np.array(x, dtype=float) for name, x in json.loads(text).items()}
+        return (
+            None
+            if text is None
+            else {name: np.array(x, dtype=float) for name, x in json.loads(text).items()}
+        )
 
 
 def join_histories(several: Iterable[Mapping[str, Array] | None]) -> dict[str, Array] | None:
@@ -127,7 +149,10 @@ def join_histories(several: Iterable[Mapping[str, Array] | None]) -> dict[str, A
     found: dict[str, Array] = {}
     for one in several:
         new = None if one is None else ~np.isin(one["trial"], found.get("trial", ()))
-        found = {name: np.append(found.get(name, ()), values[new]) for name, values in (one or found).items()}
+        found = {
+            name: np.append(found.get(name, ()), values[new])
+            for name, values in (one or found).items()
+        }
     return found or None
 
 
@@ -194,11 +219,17 @@ def write_groups(
     # Texts are few different ones, numbers are all different and alike in their first bytes.
     texts = [field.name for field in schema if pa.types.is_string(field.type)]
     floats = [field.name for field in schema if pa.types.is_floating(field.type)]
-    how: dict[str, Any] = {"compression": "lz4", "use_dictionary": texts, "use_byte_stream_split": floats}
+    how: dict[str, Any] = {
+        "compression": "lz4",
+        "use_dictionary": texts,
+        "use_byte_stream_split": floats,
+    }
     how |= {"write_page_checksum": True, "write_statistics": False, "store_schema": False}
     metadata = {FOOTER: canonical_json(footer)}
     if history is not None:
-        metadata[HISTORY] = canonical_json({name: values.tolist() for name, values in history.items()})
+        metadata[HISTORY] = canonical_json(
+            {name: values.tolist() for name, values in history.items()}
+        )
 
     def written(temporary: Path) -> None:
         with temporary.open("w+b") as file:
@@ -232,7 +263,9 @@ def _grouped(tables: Iterable[pa.Table]) -> Iterator[pa.Table]:
 
 def table_of(columns: Mapping[str, Array]) -> pa.Table:
     """Converts columns to Arrow's types: numbers, flags or texts."""
-    return pa.Table.from_arrays([_arrow(np.ascontiguousarray(values)) for values in columns.values()], list(columns))
+    return pa.Table.from_arrays(
+        [_arrow(np.ascontiguousarray(values)) for values in columns.values()], list(columns)
+    )
 
 
 def _arrow(values: Array) -> pa.Array:
@@ -252,7 +285,9 @@ def as_array(column: pa.ChunkedArray) -> Array:
     if pa.types.is_string(column.type):
         # A million words are few different ones, each kept once.
         coded = column.combine_chunks().dictionary_encode(null_encoding="encode")
-        return np.array(coded.dictionary.to_pylist(), dtype=object)[np.asarray(np.from_dlpack(coded.indices), int)]
+        return np.array(coded.dictionary.to_pylist(), dtype=object)[
+            np.asarray(np.from_dlpack(coded.indices), int)
+        ]
     if column.null_count or pa.types.is_null(column.type):
         return column.to_numpy()
     if pa.types.is_boolean(column.type):

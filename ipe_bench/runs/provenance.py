@@ -24,7 +24,13 @@ TARGET = "_target_"
 WITHOUT_NUMBERS = tuple(
     f"ipe_bench.{name}"
     for name in (
-        *("basics.definitions", "basics.errors", "basics.files", "basics.machine", "basics.statuses"),
+        *(
+            "basics.definitions",
+            "basics.errors",
+            "basics.files",
+            "basics.machine",
+            "basics.statuses",
+        ),
         *("runs", "statistics", "real", "plugins", "report", "questions", "workshop", "api", "cli"),
     )
 )
@@ -35,7 +41,9 @@ def describe(value: Any) -> Any:
     """Describes a component as plain JSON data: its class and all fields that count in a comparison; 10.0 is 10."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         cls = type(value)
-        fields = {f.name: describe(getattr(value, f.name)) for f in dataclasses.fields(value) if f.compare}
+        fields = {
+            f.name: describe(getattr(value, f.name)) for f in dataclasses.fields(value) if f.compare
+        }
         return {TARGET: f"{cls.__module__}.{cls.__qualname__}", **fields}
     if isinstance(value, np.ndarray):
         return describe(value.tolist())
@@ -101,7 +109,9 @@ def _modules_of(homes: Iterable[str]) -> set[str]:
 
 
 def _versions_of(modules: Iterable[str]) -> dict[str, str]:
-    return {package: _package_version(package) for package in sorted({m.split(".")[0] for m in modules})}
+    return {
+        package: _package_version(package) for package in sorted({m.split(".")[0] for m in modules})
+    }
 
 
 def _source_digest(modules: Iterable[str], defined: Iterable[str]) -> str:
@@ -138,7 +148,9 @@ def _closure(module: str) -> frozenset[str]:
             continue
         found.add(name)
         own = {name.split(".")[0], "ipe_bench"}
-        waiting += [n for n in _source_of(name)[1] if n.split(".")[0] in own and _spec_of(n) is not None]
+        waiting += [
+            n for n in _source_of(name)[1] if n.split(".")[0] in own and _spec_of(n) is not None
+        ]
     return frozenset(found)
 
 
@@ -151,7 +163,9 @@ def _spec_of(module: str) -> ModuleSpec | None:
     parent = module.rpartition(".")[0]
     try:
         # To look for something in a module would import the module; and only a package has modules in it.
-        if parent and ((package := _spec_of(parent)) is None or package.submodule_search_locations is None):
+        if parent and (
+            (package := _spec_of(parent)) is None or package.submodule_search_locations is None
+        ):
             return None
         return importlib.util.find_spec(module)
     except (ValueError, ImportError):
@@ -163,7 +177,9 @@ def _source_of(module: str) -> tuple[str, frozenset[str]]:
     the names of modules, and of what may be modules, that it imports."""
     path = None if is_installed(module) else _file_of(module)
     files = () if path is None else (path, *_tables_beside(path))
-    return _source_when(module, tuple((about.st_mtime_ns, about.st_size) for about in map(Path.stat, files)))
+    return _source_when(
+        module, tuple((about.st_mtime_ns, about.st_size) for about in map(Path.stat, files))
+    )
 
 
 @functools.lru_cache(maxsize=4096)
@@ -175,7 +191,9 @@ def _source_when(module: str, written: tuple[tuple[int, int], ...]) -> tuple[str
     content = path.read_bytes()
     if path.suffix == ".py":
         tree = ast.parse(content)
-        imported = _imported(tree, module if path.name == "__init__.py" else module.rpartition(".")[0])
+        imported = _imported(
+            tree, module if path.name == "__init__.py" else module.rpartition(".")[0]
+        )
         content = numerical_code(tree).encode()
     tables = b"".join(table.read_bytes() for table in _tables_beside(path))
     return hashlib.sha256(content + tables).hexdigest(), imported

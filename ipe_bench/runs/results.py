@@ -166,7 +166,9 @@ class Results:
     """Problems that are not one file's: a line for each."""
     _kept: dict[Path, pa.Table] = field(default_factory=dict, repr=False)
     """Rows of the first files, which hundreds of small runs would otherwise read a dozen times each."""
-    _arrays: dict[Path, dict[str, Array]] = field(default_factory=lambda: defaultdict(dict), repr=False)
+    _arrays: dict[Path, dict[str, Array]] = field(
+        default_factory=lambda: defaultdict(dict), repr=False
+    )
     """Those of their columns that were loaded, which cannot be written into."""
     _kept_bytes: int = 0
 
@@ -183,7 +185,9 @@ class Results:
 
     def _read_directory(self, store: Store, keys: Keys[str] | None) -> None:
         for folder in (store.trials, store.runs, store.failed):
-            if os.path.lexists(folder) and not (folder.is_dir() and os.access(folder, os.R_OK | os.X_OK)):
+            if os.path.lexists(folder) and not (
+                folder.is_dir() and os.access(folder, os.R_OK | os.X_OK)
+            ):
                 self.extra_problems.append(f"{folder}: cannot be listed; what is in it is left out")
         listed: set[Path] = set()
         # What is gone before it is read is in a larger file, which may not have been there when these were listed.
@@ -198,8 +202,13 @@ class Results:
                         continue
                     identity = identified(footer["identity"])
                     footer = {**footer, "identity": identity, "identity_key": digest(identity)}
-                    self.stored[part.key] = StoredCell(footer, tuple(sorted([*known, part], key=lambda p: p.order)))
-                    if len(table) == part.stop - part.start and self._kept_bytes + table.nbytes <= _MOST_KEPT:
+                    self.stored[part.key] = StoredCell(
+                        footer, tuple(sorted([*known, part], key=lambda p: p.order))
+                    )
+                    if (
+                        len(table) == part.stop - part.start
+                        and self._kept_bytes + table.nbytes <= _MOST_KEPT
+                    ):
                         self._kept_bytes += table.nbytes
                         self._kept[part.path] = table
         self.runs += tuple(self._records(store.runs, RUN))
@@ -207,7 +216,9 @@ class Results:
         if keys is None and not listed and not self.runs:
             self.extra_problems.append(f"{store.directory}: holds no results of ipe-bench")
         if (self.outdated or self.moved) and not self.stored and keys is None:
-            self.extra_problems.append(f"{store.directory}: was written by an older version of ipe-bench; {_AGAIN}")
+            self.extra_problems.append(
+                f"{store.directory}: was written by an older version of ipe-bench; {_AGAIN}"
+            )
 
     def _records(self, folder: Path, shape: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
         for path in sorted(folder.glob("[!.]*.json")):
@@ -228,7 +239,11 @@ class Results:
     def problems(self) -> list[str]:
         """A line for everything that is missing, failed, refused or damaged."""
         lines = [f"{path}: {reason}; left out" for path, reason in self.damaged.items()]
-        lines += [f"refused: {run.get('job', run['file'])}: {why}" for run in self.runs if (why := run.get("refused"))]
+        lines += [
+            f"refused: {run.get('job', run['file'])}: {why}"
+            for run in self.runs
+            if (why := run.get("refused"))
+        ]
         lines += [line for cell in self.cells for line in cell.problems if not cell.refused]
         truths = {cell.scenario_id for cell in self.current if cell.label == TRUTH}
         lines += [
@@ -246,7 +261,9 @@ class Results:
             for name, count in Counter(self.moved.values()).items()
         ]
         for cell in (cell for _, stale in self._rivals.values() for cell in stale):
-            versions = ", ".join(f"{package} {version}" for package, version in cell.footer["versions"].items())
+            versions = ", ".join(
+                f"{package} {version}" for package, version in cell.footer["versions"].items()
+            )
             made_by = f"({versions}, source {cell.footer['source']}, key {cell.key})"
             what = f"{describe_names(cell.names)}: {cell.trials} trials were computed by other code"
             lines.append(f"stale: {what} {made_by}; left out")
@@ -259,7 +276,9 @@ class Results:
     @property
     def expected(self) -> int:
         """Cells that the records of runs announce, and refused jobs that came to none."""
-        return len(self._asked_for) + sum(not run["cells"] for run in self.runs if run.get("refused"))
+        return len(self._asked_for) + sum(
+            not run["cells"] for run in self.runs if run.get("refused")
+        )
 
     @property
     def complete(self) -> int:
@@ -269,7 +288,9 @@ class Results:
     def announces(self, cells: Iterable[ResultKey], trials: int) -> bool:
         """Tells whether the records of runs ask for all this already, and a further one would change none."""
         asked = [(cell, self._asked_for.get(cell.identity_key)) for cell in cells]
-        return all(a and (a.key, a.refused) == (cell.key, "") and a.trials >= trials for cell, a in asked)
+        return all(
+            a and (a.key, a.refused) == (cell.key, "") and a.trials >= trials for cell, a in asked
+        )
 
     @cached_property
     def _asked_for(self) -> dict[str, _Asked]:
@@ -279,7 +300,9 @@ class Results:
             for cell in (one for one in run["cells"] if one["identity_key"] not in self.moved):
                 new = _Asked(cell["key"], run["trials"], cell["names"], run.get("refused", ""))
                 # Earlier versions made it of the files of classes, too.
-                identity = (self.stored[new.key].footer if new.key in self.stored else cell)["identity_key"]
+                identity = (self.stored[new.key].footer if new.key in self.stored else cell)[
+                    "identity_key"
+                ]
                 known = asked.get(identity, new)
                 trials = max(new.trials, known.trials) if known.key == new.key else new.trials
                 asked[identity] = new._replace(trials=trials)
@@ -295,7 +318,10 @@ class Results:
         result: dict[str, tuple[StoredCell | None, list[StoredCell]]] = {}
         for identity, cells in rivals.items():
             asked = self._asked_for.get(identity) or max(cells, key=lambda cell: cell.written)
-            result[identity] = self.stored.get(asked.key), [cell for cell in cells if cell.key != asked.key]
+            result[identity] = (
+                self.stored.get(asked.key),
+                [cell for cell in cells if cell.key != asked.key],
+            )
         return result
 
     @property
@@ -306,8 +332,13 @@ class Results:
     @cached_property
     def cells(self) -> tuple[CellState, ...]:
         """States of all cells: those that runs asked for in their order, then others that are there."""
-        others, states = [cell for cell in self.current if cell.footer["identity_key"] not in self._asked_for], []
-        unasked = {cell.footer["identity_key"]: _Asked(cell.key, 0, cell.names, "") for cell in others}
+        others, states = (
+            [cell for cell in self.current if cell.footer["identity_key"] not in self._asked_for],
+            [],
+        )
+        unasked = {
+            cell.footer["identity_key"]: _Asked(cell.key, 0, cell.names, "") for cell in others
+        }
         for identity, (key, trials, names, refused) in (self._asked_for | unasked).items():
             covered, tried = self._covered(key), [f for f in self.attempts if f["key"] == key]
             lost = [f for f in tried if gaps(covered, f["start"], f["stop"])]
@@ -319,14 +350,19 @@ class Results:
             counts = trials, done, lacking - missing, missing, stale
             states.append(CellState(names, *counts, messages, key, refused if missing else ""))
         alike = Counter(describe_names(state.names) for state in states)
-        return tuple(replace(s, tag=f" (#{s.key[:6]})") if alike[describe_names(s.names)] > 1 else s for s in states)
+        return tuple(
+            replace(s, tag=f" (#{s.key[:6]})") if alike[describe_names(s.names)] > 1 else s
+            for s in states
+        )
 
     def set_aside(self) -> list[str]:
         """Renames what is damaged, so that it is computed again under its own name; returns a line for each file."""
         lines = []
         for path, reason in self.damaged.items():
             aside = path.with_name(f"{path.stem}.damaged-{uuid.uuid4().hex[:8]}")
-            with contextlib.suppress(FileNotFoundError):  # another run may have done so at this moment
+            with contextlib.suppress(
+                FileNotFoundError
+            ):  # another run may have done so at this moment
                 path.rename(aside)
                 lines.append(f"{path}: {reason}; set aside as {aside.name} and computed again")
         return lines
@@ -338,28 +374,43 @@ class Results:
         """Returns the ranges of trials 0 to `trials` that no usable file of the cell with this key covers."""
         return gaps(self._covered(key), 0, trials)
 
-    def load(self, cell: StoredCell, columns: Sequence[str] | None, optional: Sequence[str] = ()) -> dict[str, Array]:
+    def load(
+        self, cell: StoredCell, columns: Sequence[str] | None, optional: Sequence[str] = ()
+    ) -> dict[str, Array]:
         """Loads the rows of a cell as arrays, by ascending trial, each trial once; all columns if `columns` is None. A
         part that cannot be used any more, or lacks one of the `columns`, is named in `problems`, and left out. What
         some parts lack of the `optional` columns is NaN or None there."""
         names = None if columns is None else list(dict.fromkeys(["trial", *columns, *optional]))
-        if len(cell.parts) == 1 and (kept := self._kept.get(path := cell.parts[0].path)) is not None:
+        if (
+            len(cell.parts) == 1
+            and (kept := self._kept.get(path := cell.parts[0].path)) is not None
+        ):
             there, known = set(kept.column_names), self._arrays[path]
             if there.issuperset(columns or ()):
-                for name in there.difference(known) if names is None else there.intersection(names).difference(known):
+                for name in (
+                    there.difference(known)
+                    if names is None
+                    else there.intersection(names).difference(known)
+                ):
                     known[name] = as_array(kept[name])
                     known[name].flags.writeable = False
                 return {name: known[name] for name in names or kept.column_names if name in there}
         tables = self._of_parts(cell, lambda parts: list(self._tables(parts, names, columns or ())))
-        if sum(map(len, tables)) < cell.trials and self.damaged.keys().isdisjoint(p.path for p in cell.parts):
-            self.extra_problems.append(f"missing: {describe_names(cell.names)}: trials went away while they were read")
+        if sum(map(len, tables)) < cell.trials and self.damaged.keys().isdisjoint(
+            p.path for p in cell.parts
+        ):
+            self.extra_problems.append(
+                f"missing: {describe_names(cell.names)}: trials went away while they were read"
+            )
         if not tables:
             return {name: np.empty(0) for name in names or ("trial",)}
         table, loaded = pa.concat_tables(tables, promote_options="default"), {}
         tables.clear()
         for name in [one for one in names or table.column_names if one in table.column_names]:
             loaded[name] = as_array(table[name])
-            table = table.drop_columns(name)  # so that no two copies of all columns are there at once
+            table = table.drop_columns(
+                name
+            )  # so that no two copies of all columns are there at once
             pa.default_memory_pool().release_unused()
         return loaded
 
@@ -379,8 +430,14 @@ class Results:
             try:
                 return read(parts)
             except FileNotFoundError:
-                found = [part for directory in self.directories for part in Store(directory).parts({cell.key})]
-                parts = sorted((part for part in found if part.path not in self.damaged), key=lambda p: p.order)
+                found = [
+                    part
+                    for directory in self.directories
+                    for part in Store(directory).parts({cell.key})
+                ]
+                parts = sorted(
+                    (part for part in found if part.path not in self.damaged), key=lambda p: p.order
+                )
 
     def _tables(
         self, parts: Sequence[StoredPart], names: Sequence[str] | None, needed: Sequence[str]
@@ -390,8 +447,12 @@ class Results:
         for part in parts:
             if part.stop > reached:
                 with self._naming(part.path):
-                    table = self._kept[part.path] if part.path in self._kept else part.read(names)[1]
-                    table = table.select([n for n in table.column_names if names is None or n in names])
+                    table = (
+                        self._kept[part.path] if part.path in self._kept else part.read(names)[1]
+                    )
+                    table = table.select(
+                        [n for n in table.column_names if names is None or n in names]
+                    )
                     there = table.column_names
                     if lacking := [name for name in needed if name not in there]:
                         raise Unusable(f"damaged: has no column {lacking[0]}")

@@ -60,7 +60,10 @@ def compute(
     """
     # Absolute: workers may have another working folder.
     store = Store(Path(output).absolute())
-    scenarios, estimators = pinned(list(scenarios)), {label: pinned(one) for label, one in estimators.items()}
+    scenarios, estimators = (
+        pinned(list(scenarios)),
+        {label: pinned(one) for label, one in estimators.items()},
+    )
     # What is stored of a scenario shows that its numbers can be computed with, without drawing any.
     stored = {part.key for part in store.parts()}
     untried = [scenario for scenario in scenarios if ResultKey(scenario).key not in stored]
@@ -71,10 +74,19 @@ def compute(
     cells = [cell for several in of_scenarios for cell in several]
     results = Results.read([store.directory], keys={cell.key for cell in cells})
     aside = results.set_aside()
-    tasks = [task for several in of_scenarios for task in plan(store.directory, several, results, trials, block_size)]
+    tasks = [
+        task
+        for several in of_scenarios
+        for task in plan(store.directory, several, results, trials, block_size)
+    ]
     record = None
     if tasks or aside or not results.announces(cells, trials):
-        facts = {**_record(scenarios, estimators, trials), **(further or {}), "command": command, "blocks": len(tasks)}
+        facts = {
+            **_record(scenarios, estimators, trials),
+            **(further or {}),
+            "command": command,
+            "blocks": len(tasks),
+        }
         record = store.write_run(record_as or new_name(), facts)
     for line in aside:
         log.warning(line)
@@ -85,7 +97,9 @@ def compute(
         except (Unusable, StorageError) as error:
             log.warning(f"{store.directory}: the files of {key} stay as they are: {error}")
     if record is not None and not record.is_file():
-        raise StorageError(f"{store.directory}: lost the record of this run; the same command computes what is missing")
+        raise StorageError(
+            f"{store.directory}: lost the record of this run; the same command computes what is missing"
+        )
     return failures
 
 
@@ -110,19 +124,29 @@ def validate(
     if not scenarios:
         mistakes.append("there is no scenario; give at least one")
     if TRUTH in estimators:
-        mistakes.append(f"estimators.{TRUTH}: is what the truth itself is stored under; choose another label")
+        mistakes.append(
+            f"estimators.{TRUTH}: is what the truth itself is stored under; choose another label"
+        )
     if not estimators:
-        mistakes.append("there is no estimator; choose with solver= and baseline=, or with tracker= for a state model")
+        mistakes.append(
+            "there is no estimator; choose with solver= and baseline=, or with tracker= for a state model"
+        )
     for scenario in scenarios:
         if scenario.noise.real and trials != 1:
             mistakes.append(f"trials={trials}: certified readings are one trial; set trials=1")
         kind, what = Tracker, "estimates constants; a state model takes trackers"
         if not isinstance(scenario, StateScenario):
             kind, what = Estimator, "tracks states that move; a measurement model takes estimators"
-        other = [f"estimators.{label}: {what}" for label, one in estimators.items() if not isinstance(one, kind)]
+        other = [
+            f"estimators.{label}: {what}"
+            for label, one in estimators.items()
+            if not isinstance(one, kind)
+        ]
         mistakes += other
         if isinstance(scenario, StateScenario) and not other:
-            found = {label: tracker.hindrance(scenario.assumed) for label, tracker in estimators.items()}
+            found = {
+                label: tracker.hindrance(scenario.assumed) for label, tracker in estimators.items()
+            }
             mistakes += [f"trackers.{label}: {why}" for label, why in found.items() if why]
         if isinstance(scenario, StateScenario) or other:
             continue
@@ -132,8 +156,12 @@ def validate(
             require_function(scenario.measurement)
             mistakes += _beyond_numbers(scenario)
             require_function(scenario.simulator)
-        found = {label: estimator.hindrance(scenario.problem) for label, estimator in estimators.items()}
-        mistakes += [f"estimators.{label}: {why}; leave it out" for label, why in found.items() if why]
+        found = {
+            label: estimator.hindrance(scenario.problem) for label, estimator in estimators.items()
+        }
+        mistakes += [
+            f"estimators.{label}: {why}; leave it out" for label, why in found.items() if why
+        ]
     if mistakes:
         raise UserError("; ".join(dict.fromkeys(mistakes)))
 
@@ -161,8 +189,14 @@ def _beyond_numbers(scenario: Scenario) -> Iterator[str]:
         return  # J lacks rank at the start, or is not finite there: that is a hard start, and no mistake
     if np.isnan(bound).any():
         H = scenario.problem.H
-        still = [parameter.name for i, parameter in enumerate(model.parameters) if not H[:, i].any()]
-        where = f"no reading changes with {', '.join(still)}" if still else "its Jacobian has not full column rank"
+        still = [
+            parameter.name for i, parameter in enumerate(model.parameters) if not H[:, i].any()
+        ]
+        where = (
+            f"no reading changes with {', '.join(still)}"
+            if still
+            else "its Jacobian has not full column rank"
+        )
         yield (
             f"measurement={model.name}: {where} at the nominal point, so that readings do not determine its "
             "parameters; choose another nominal point, or try `ipe-bench check` if the slopes are wrong"
@@ -177,7 +211,10 @@ def _beyond_numbers(scenario: Scenario) -> Iterator[str]:
 
 def result_keys(scenario: AnyScenario, estimators: Mapping[str, Any]) -> list[ResultKey]:
     """Returns the keys of what a run stores of one scenario: its truth, and each estimator."""
-    return [ResultKey(scenario), *(ResultKey(scenario, label, estimator) for label, estimator in estimators.items())]
+    return [
+        ResultKey(scenario),
+        *(ResultKey(scenario, label, estimator) for label, estimator in estimators.items()),
+    ]
 
 
 def new_name() -> str:
@@ -211,7 +248,9 @@ def _refusal(job: str) -> str:
     return f"refused-{digest(job)}"
 
 
-def _record(scenarios: Sequence[AnyScenario], estimators: Mapping[str, Any], trials: int) -> dict[str, Any]:
+def _record(
+    scenarios: Sequence[AnyScenario], estimators: Mapping[str, Any], trials: int
+) -> dict[str, Any]:
     cells = [cell for scenario in scenarios for cell in result_keys(scenario, estimators)]
     return {
         "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="microseconds"),
@@ -231,6 +270,8 @@ def _git_commit(folder: Path) -> str | None:
     """Returns the commit of the folder, if any; asked once per process, as a sweep records it per job."""
     command = ["git", "rev-parse", "HEAD"]
     try:
-        return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=5, check=True).stdout.strip()
+        return subprocess.run(
+            command, cwd=folder, capture_output=True, text=True, timeout=5, check=True
+        ).stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return None

@@ -90,7 +90,9 @@ def block_size_for(trials: int) -> int:
     return min(max(trials // _WORTH_BLOCKS // BLOCK_SIZE, 1) * BLOCK_SIZE, LARGEST_BLOCK)
 
 
-def plan(directory: Path, cells: Sequence[ResultKey], results: Results, trials: int, block_size: int) -> list[Task]:
+def plan(
+    directory: Path, cells: Sequence[ResultKey], results: Results, trials: int, block_size: int
+) -> list[Task]:
     """Cuts missing trials into blocks on a fixed grid, each with the cells of one scenario that lack some of them."""
     lacking: dict[tuple[int, int], list[ResultKey]] = {}
     for cell in cells:
@@ -111,7 +113,10 @@ def run_task(task: Task) -> Iterator[str | tuple[int, Failure | None]]:
         block = block_of(cells[0].scenario, task.start, task.stop)
         block.share()  # which is not to be charged to the first of the cells
     for index, cell in enumerate(cells):
-        with contextlib.suppress(Exception, SystemExit), _alone():  # what it raises now, it raises again below
+        with (
+            contextlib.suppress(Exception, SystemExit),
+            _alone(),
+        ):  # what it raises now, it raises again below
             _warm_up(block, cell)
         yield PREPARED
         failure = None
@@ -136,7 +141,9 @@ def _recalled(task: Task) -> tuple[ResultKey, ...]:
         _recent.clear()
     for cell in task.cells:
         known = _recent.get(cell.key)
-        if known is None or component_classes(known.components) != component_classes(cell.components):
+        if known is None or component_classes(known.components) != component_classes(
+            cell.components
+        ):
             _require_same_source(cell)
             _recent[cell.key] = cell
     return tuple(_recent[cell.key] for cell in task.cells)
@@ -193,7 +200,9 @@ def _compute_cell(store: Store, block: Any, cell: ResultKey) -> None:
             names = (f"x_{parameter.name}" for parameter in cell.scenario.measurement.parameters)
             history |= dict(zip(names, np.concatenate(paths).T, strict=True))
     if not store.trials.is_dir():  # what it held is missing, and would not be missed
-        raise StorageError(f"{store.directory}: went away while it was being filled; the same command starts anew")
+        raise StorageError(
+            f"{store.directory}: went away while it was being filled; the same command starts anew"
+        )
     store.write(cell, start, stop, columns, history)
 
 
@@ -218,7 +227,9 @@ class _Run:
             self.store.write_failure(cell, task.start, task.stop, failure)
         self.watch(self.progress)
 
-    def tried_again(self, task: Task, cells: Sequence[ResultKey], failure: Failure) -> Iterator[Task]:
+    def tried_again(
+        self, task: Task, cells: Sequence[ResultKey], failure: Failure
+    ) -> Iterator[Task]:
         """Closes the cells that a task failed of, and yields tasks for those of its `cells` that are tried again."""
         left = []
         for cell in cells:
@@ -240,7 +251,9 @@ class _Run:
             yield replace(task, cells=tuple(left[blamed:]))
 
 
-def run_tasks(tasks: Sequence[Task], execution: Execution, store: Store, watch: Watcher) -> tuple[str, ...]:
+def run_tasks(
+    tasks: Sequence[Task], execution: Execution, store: Store, watch: Watcher
+) -> tuple[str, ...]:
     """Runs tasks until each of their cells is stored or has failed; returns the messages of those that failed."""
     run = _Run(tasks, store, watch)
     while tasks:
@@ -253,7 +266,9 @@ def run_tasks(tasks: Sequence[Task], execution: Execution, store: Store, watch: 
                 index, failure = event.step
                 waiting[event.index].pop(index, None)
                 if failure is None and not store.has(task.cells[index], task.start, task.stop):
-                    failure = Failure("died", "was said to be stored and is not; run the same command again")
+                    failure = Failure(
+                        "died", "was said to be stored and is not; run the same command again"
+                    )
                 run.close(task, task.cells[index], failure)
             if event.failure is not None:
                 again += run.tried_again(task, list(waiting[event.index].values()), event.failure)

@@ -61,13 +61,19 @@ class ResultKey:
     @cached_property
     def identity(self) -> dict[str, Any]:
         """Identity of what was computed, without the version of the program."""
-        return {"scenario": describe(self.scenario), "label": self.label, "estimator": describe(self.estimator)}
+        return {
+            "scenario": describe(self.scenario),
+            "label": self.label,
+            "estimator": describe(self.estimator),
+        }
 
     @cached_property
     def key(self) -> str:
         """Sixteen hexadecimal digits that stand for the identity, the schema and the numerical source, but not for the
         version: a release that changes no number leaves what is stored valid."""
-        return digest({"schema": SCHEMA, "identity": self.identity, "source": self.made_by["source"]})
+        return digest(
+            {"schema": SCHEMA, "identity": self.identity, "source": self.made_by["source"]}
+        )
 
     @cached_property
     def identity_key(self) -> str:
@@ -105,7 +111,11 @@ class ResultKey:
         needs = () if self.estimator is None else self.estimator.needs
         docstring = " ".join((type(model).__doc__ or "").split())
         # What a dataclass writes where there is no docstring says nothing.
-        about = "" if docstring.startswith(f"{type(model).__name__}(") else docstring.partition(". ")[0].rstrip(".")
+        about = (
+            ""
+            if docstring.startswith(f"{type(model).__name__}(")
+            else docstring.partition(". ")[0].rstrip(".")
+        )
         return {
             "schema": SCHEMA,
             "key": self.key,
@@ -167,8 +177,15 @@ class Store:
 
     def parts(self, keys: Keys[str] | None = None) -> list[StoredPart]:
         """Returns the parts that lie here, or those of these keys, by key and in the order of reading."""
-        found = [part for path in self.trials.glob("*.parquet") if (part := StoredPart.parse(path)) is not None]
-        return sorted((p for p in found if keys is None or p.key in keys), key=lambda part: (part.key, part.order))
+        found = [
+            part
+            for path in self.trials.glob("*.parquet")
+            if (part := StoredPart.parse(path)) is not None
+        ]
+        return sorted(
+            (p for p in found if keys is None or p.key in keys),
+            key=lambda part: (part.key, part.order),
+        )
 
     def write(
         self,
@@ -179,7 +196,9 @@ class Store:
         history: Mapping[str, Array] | None = None,
     ) -> None:
         """Stores the rows of trials start to stop, with the iterates of the first trials of all if there are any."""
-        table = parts.table_of({name: _typed(name, np.asarray(values)) for name, values in columns.items()})
+        table = parts.table_of(
+            {name: _typed(name, np.asarray(values)) for name, values in columns.items()}
+        )
         parts.write(self._path(result, start, stop), table, result.footer, history)
         with contextlib.suppress(OSError):
             self._failure(result, start, stop).unlink()
@@ -236,10 +255,14 @@ def _typed(name: str, values: Array) -> Array:
     return values.astype(np.int64) if values.dtype.kind in "iu" else values
 
 
-def _join(footer: Mapping[str, Any], group: Sequence[StoredPart], schemas: Sequence[pa.Schema]) -> int:
+def _join(
+    footer: Mapping[str, Any], group: Sequence[StoredPart], schemas: Sequence[pa.Schema]
+) -> int:
     """Writes one part with the rows of a group, unless there is one, and removes the others; returns their number."""
     first, stop = group[0], max(part.stop for part in group)
-    whole = replace(first, path=first.path.with_name(f"{first.key}-{first.start}-{stop}.parquet"), stop=stop)
+    whole = replace(
+        first, path=first.path.with_name(f"{first.key}-{first.start}-{stop}.parquet"), stop=stop
+    )
     if whole not in group:
         schema = pa.unify_schemas(schemas)
         history = parts.join_histories(part.history() for part in group if part.start < HISTORIES)
@@ -248,7 +271,9 @@ def _join(footer: Mapping[str, Any], group: Sequence[StoredPart], schemas: Seque
         pass
     others = [part.path for part in group if part != whole]
     for path in others:
-        with contextlib.suppress(OSError):  # another run may have done so; what stays is read once all the same
+        with contextlib.suppress(
+            OSError
+        ):  # another run may have done so; what stays is read once all the same
             path.unlink()
     return len(others)
 

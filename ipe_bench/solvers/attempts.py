@@ -87,7 +87,9 @@ class Attempts(ABC):
         """Minimises from x (candidates, n), on all data unless another objective is given, charged to the trials
         `owner` (candidates,)."""
         objective = self.whole(owner) if objective is None else objective
-        limits = replace(self.limits, max_iterations=steps, tolerance=tolerance or self.limits.tolerance)
+        limits = replace(
+            self.limits, max_iterations=steps, tolerance=tolerance or self.limits.tolerance
+        )
         minima = minimize(objective, method, x, limits)
         self.charge(owner, objective.model.tally)
         return minima
@@ -95,7 +97,9 @@ class Attempts(ABC):
     def whole(self, owner: Rows) -> Objective:
         """Makes the objective on all data for candidates of the trials `owner`."""
         model = self.counted(self.problem.measurement, owner)
-        return Objective(model, self.problem.R, self.z[owner], np.arange(len(owner)), self.problem.x0)
+        return Objective(
+            model, self.problem.R, self.z[owner], np.arange(len(owner)), self.problem.x0
+        )
 
     def counted(self, measurement: Measurement, owner: Rows, share: float = 1.0) -> CountingModel:
         """Makes a model for candidates of the trials `owner`, whose tally begins at what each trial has cost so far."""
@@ -112,7 +116,9 @@ class Attempts(ABC):
 
 _FROM_AFAR = LevenbergMarquardtMethod(1e-2, sizes=1e-3)
 _SHORT = 60
-_RAYS = np.array([sign * 10.0**exponent for exponent in np.arange(-3, 1.01, 0.25) for sign in (1, -1)])
+_RAYS = np.array(
+    [sign * 10.0**exponent for exponent in np.arange(-3, 1.01, 0.25) for sign in (1, -1)]
+)
 """Multiples of the nominal point that are looked at as starts."""
 _APART = 0.6
 """Two starts on one ray are different where their sizes are, by this power of ten."""
@@ -145,11 +151,15 @@ class Stages(Attempts):
         if k in _HALVING:
             found = self._halved(k, rows)
         else:
-            found = self.minimize(rows, _FROM_AFAR, self._start(k, rows), max(_SHORT, self.limits.max_iterations))
+            found = self.minimize(
+                rows, _FROM_AFAR, self._start(k, rows), max(_SHORT, self.limits.max_iterations)
+            )
         promising = ~found.converged & (found.chi_square < before.chi_square * (1 - _PROMISING))
         if promising.any():
             first = take(found, promising)
-            on = self.minimize(rows[promising], _FROM_AFAR, first.x, max(_LONG, self.limits.max_iterations))
+            on = self.minimize(
+                rows[promising], _FROM_AFAR, first.x, max(_LONG, self.limits.max_iterations)
+            )
             found = put(found, promising, continued(first, on))
         return found
 
@@ -165,7 +175,9 @@ class Stages(Attempts):
         chosen = np.argmin(cost, axis=1)
         if k == 3:
             best = _RAYS[chosen][:, None]
-            alike = (np.sign(best) == np.sign(_RAYS)) & (np.abs(np.log10(np.abs(_RAYS / best))) < _APART)
+            alike = (np.sign(best) == np.sign(_RAYS)) & (
+                np.abs(np.log10(np.abs(_RAYS / best))) < _APART
+            )
             chosen = np.argmin(np.where(alike, np.inf, cost), axis=1)
         return points[chosen]
 
@@ -177,11 +189,15 @@ class Stages(Attempts):
         if self.prior is not None:
             return x0 + self.prior * rng.standard_normal((_LOOKS, n))
         if wide:
-            sign = np.where(rng.uniform(size=(_LOOKS, n)) < 0.8, 1.0, -1.0) * np.where(x0 < 0, -1.0, 1.0)
+            sign = np.where(rng.uniform(size=(_LOOKS, n)) < 0.8, 1.0, -1.0) * np.where(
+                x0 < 0, -1.0, 1.0
+            )
             return sign * 10 ** rng.normal(0.0, 1.0, (_LOOKS, n))
         if k % 2 == 0:
             return 10 ** rng.uniform(-2, 0.5, (_LOOKS, n)) * rng.choice([-1.0, 1.0], (_LOOKS, n))
-        return 10 ** rng.uniform(-2.5, 0.5, (_LOOKS, 1)) * (x0 + 0.5 * rng.standard_normal((_LOOKS, n)))
+        return 10 ** rng.uniform(-2.5, 0.5, (_LOOKS, 1)) * (
+            x0 + 0.5 * rng.standard_normal((_LOOKS, n))
+        )
 
     def _halved(self, k: int, rows: Rows) -> Minima:
         """Starts from 20 wide draws and drops the worst after few steps: how well a start fits says little."""
@@ -189,14 +205,19 @@ class Stages(Attempts):
         found = Minima.nowhere(x, False)
         for steps, kept in _HALVINGS:
             found = self.minimize(owner, _FROM_AFAR, found.x, steps)
-            chosen = _kept(owner, found.x, _finite(found.chi_square), np.full(len(owner), np.inf), most=kept)
+            chosen = _kept(
+                owner, found.x, _finite(found.chi_square), np.full(len(owner), np.inf), most=kept
+            )
             found, owner = take(found, chosen), owner[chosen]
         return found
 
     def _look(self, rows: Rows, points: Array) -> Array:
         """Computes the objective (trials, points) at points (points, n), counted; infinite where there is none."""
         objective = self.whole(rows)
-        cost = [squared(objective.residual(np.repeat(point[None], len(rows), axis=0))) for point in points]
+        cost = [
+            squared(objective.residual(np.repeat(point[None], len(rows), axis=0)))
+            for point in points
+        ]
         self.charge(rows, objective.model.tally)
         return _finite(np.stack(cost, axis=1))
 
@@ -273,7 +294,9 @@ class Windows(Attempts):
         x = starting_points(self.problem, self.z[rows], "linear_lse", tally)
         self.tally.simulations[rows] += tally.simulations
         distance = np.median(np.abs(x - self.problem.x0), axis=1)
-        return 10.0 ** np.ceil(np.log10(np.clip(np.where(np.isfinite(distance), distance, 1.0), 1.0, 1e9)))
+        return 10.0 ** np.ceil(
+            np.log10(np.clip(np.where(np.isfinite(distance), distance, 1.0), 1.0, 1e9))
+        )
 
     def _grown(self, k: int, rows: Rows, before: Minima | None, last: bool) -> Minima:
         """Fits window after window, then all data without a prior. If none is known, draws reach as far as `before`."""
@@ -287,13 +310,17 @@ class Windows(Attempts):
         draws, n = np.zeros((1, len(metric))), len(metric)
         if k > 1:
             draws = np.random.Generator(np.random.Philox(k)).standard_normal((_draws(k), n))
-        start = (problem.x0 + np.broadcast_to(spread, (len(rows), n))[:, None] * draws).reshape(-1, n)
+        start = (problem.x0 + np.broadcast_to(spread, (len(rows), n))[:, None] * draws).reshape(
+            -1, n
+        )
         owner = np.repeat(rows, _draws(k))
         found = Minima.nowhere(start, self.limits.history)
         method = LevenbergMarquardtMethod(_DAMPING, metric, by_residual=k > 0, geodesic=k > 0)
         known = np.zeros(len(self.z))
         if before is not None:
-            known[rows] = np.where(before.converged, _AS_BAD * before.chi_square / self.z.shape[1], 0.0)
+            known[rows] = np.where(
+                before.converged, _AS_BAD * before.chi_square / self.z.shape[1], 0.0
+            )
         growth = min(self.growth, _SLOW_GROWTH) if k else self.growth
         for number, stop in enumerate(window_stops(len(epochs), growth)):
             centre = start if number < _RANDOMISED + max(0, k - 2) else problem.x0
@@ -306,7 +333,15 @@ class Windows(Attempts):
             fit = _finite(fit) / objective.readings
             useless = np.maximum(known[owner], _GIVEN_UP[min(number, 2)])
             most = max(1, _draws(k) // _THINNING[min(number, 6)])
-            kept = _kept(owner, minima.x / metric, fit, useless, most=most, alike=_ONE[min(number, 1)], last=last)
+            kept = _kept(
+                owner,
+                minima.x / metric,
+                fit,
+                useless,
+                most=most,
+                alike=_ONE[min(number, 1)],
+                last=last,
+            )
             found, start, owner = take(continued(found, minima), kept), start[kept], owner[kept]
         method = LevenbergMarquardtMethod(_DAMPING, metric)
         found = continued(found, self.minimize(owner, method, found.x, self.limits.max_iterations))
@@ -314,7 +349,9 @@ class Windows(Attempts):
 
     def _best(self, rows: Rows, owner: Rows, found: Minima) -> Minima:
         """Returns each trial's best candidate; a trial that has none left has not arrived."""
-        result = Minima.nowhere(np.repeat(self.problem.x0[None], len(rows), axis=0), self.limits.history)
+        result = Minima.nowhere(
+            np.repeat(self.problem.x0[None], len(rows), axis=0), self.limits.history
+        )
         order = np.lexsort((_finite(found.chi_square), ~found.converged, owner))
         owners, first = np.unique(owner[order], return_index=True)
         return put(result, np.searchsorted(rows, owners), take(found, order[first]))
@@ -331,7 +368,14 @@ class Windows(Attempts):
 
 
 def _kept(
-    owner: Rows, x: Array, fit: Array, useless: Array, *, most: int, alike: float = -1.0, last: bool = False
+    owner: Rows,
+    x: Array,
+    fit: Array,
+    useless: Array,
+    *,
+    most: int,
+    alike: float = -1.0,
+    last: bool = False,
 ) -> Rows:
     """Selects the candidates that go on: of each trial the best few that are not alike and whose `fit` (candidates,) is
     not above `useless` (candidates,); one in any case in the `last` attempt, and where there is no fit at all: that
@@ -343,7 +387,11 @@ def _kept(
         chosen: list[int] = []
         for i in group:
             good = fit[i] <= useless[i] or (not chosen and (last or np.isinf(fit[i])))
-            if len(chosen) < most and good and not any(np.abs(x[i] - x[j]).max() <= alike for j in chosen):
+            if (
+                len(chosen) < most
+                and good
+                and not any(np.abs(x[i] - x[j]).max() <= alike for j in chosen)
+            ):
                 chosen.append(i)
         kept += chosen
     return np.array(sorted(kept), dtype=np.intp)
@@ -356,5 +404,7 @@ def _draws(k: int) -> int:
 
 def window_stops(epochs: int, growth: float) -> list[int]:
     """Computes the number of epochs of each window, the last one short of all: 1, 2, 4, 8, 16 of 30 for growth 2."""
-    lengths = itertools.takewhile(lambda length: length < epochs, (growth**i for i in itertools.count()))
+    lengths = itertools.takewhile(
+        lambda length: length < epochs, (growth**i for i in itertools.count())
+    )
     return sorted({round(length) for length in lengths} - {epochs})

@@ -62,7 +62,9 @@ class Auto(Estimator):
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         everyone, m = np.arange(len(z)), z.shape[1]
         objective = Objective.of(problem, z)
-        best, contracts = by_chords(objective, problem.H, self.tolerance, self.budget, history=history)
+        best, contracts = by_chords(
+            objective, problem.H, self.tolerance, self.budget, history=history
+        )
         fitting = Fitting.none(len(z), m)
         fits = fitting.note(best, everyone)
         answered = accepted(best, m, max(WRONG_MINIMUM, problem.doubted))
@@ -70,7 +72,9 @@ class Auto(Estimator):
         left = np.flatnonzero(~answered)
         if len(left):
             thorough = Progressive(tolerance=self.tolerance, budget=self.budget)
-            found, spent = thorough.search(problem, z[left], before=take(best, left), history=history)
+            found, spent = thorough.search(
+                problem, z[left], before=take(best, left), history=history
+            )
             best = put(best, left, found)
             tally.simulations[left] += spent.simulations
             tally.jacobians[left] += spent.jacobians
@@ -78,7 +82,9 @@ class Auto(Estimator):
             tally.messages.update({int(left[i]): message for i, message in spent.messages.items()})
         fits[left] = fitting.note(take(best, left), left)
         dear = problem.measurement.by_differential_equations or problem.prior_deviation is None
-        count = (0 if dear else _CONFIRMATIONS) if self.confirmations is None else self.confirmations
+        count = (
+            (0 if dear else _CONFIRMATIONS) if self.confirmations is None else self.confirmations
+        )
         looked = fits & ~(answered & contracts) & (count > 0)
         if looked.any():
             rows, model = np.flatnonzero(looked), CountingModel(problem.measurement, tally)
@@ -90,7 +96,13 @@ class Auto(Estimator):
         return estimates
 
     def _confirmed(
-        self, problem: Problem, objective: Objective, best: Minima, fitting: Fitting, count: int, history: bool
+        self,
+        problem: Problem,
+        objective: Objective,
+        best: Minima,
+        fitting: Fitting,
+        count: int,
+        history: bool,
     ) -> Minima:
         """Returns the answers, after `count` looks for others in the trials of the objective."""
         rows, n = objective.rows, len(problem.x0)
@@ -98,9 +110,13 @@ class Auto(Estimator):
         method = LevenbergMarquardtMethod(_DAMPING, problem.prior_used())
         limits = Limits(self.tolerance, _STEPS, self.budget, history)
         for k in range(count):
-            again = minimize(objective, method, problem.x0 + spread_of_starts(problem) * draws[:, k], limits)
+            again = minimize(
+                objective, method, problem.x0 + spread_of_starts(problem) * draws[:, k], limits
+            )
             known = take(best, rows)
-            better = fitting.note(again, rows) & (_improbability(problem, again) < _improbability(problem, known))
+            better = fitting.note(again, rows) & (
+                _improbability(problem, again) < _improbability(problem, known)
+            )
             best = best.replaced(rows, again, better)
         return best
 

@@ -46,5 +46,7 @@ class Broyden(IPE[BroydenState]):
         scale = np.einsum("ti,ti->t", s, By)
         # s'By = 0 would make the new Jacobian singular: the old one is kept for a step.
         usable = np.abs(scale) > np.finfo(float).eps * np.einsum("ti,ti->t", s, s)
-        change = (s - By)[:, :, None] * sB[:, None, :] / np.where(usable, scale, np.inf)[:, None, None]
+        change = (
+            (s - By)[:, :, None] * sB[:, None, :] / np.where(usable, scale, np.inf)[:, None, None]
+        )
         return BroydenState(x, F, state.B + change)

@@ -9,7 +9,14 @@ import numpy as np
 from ipe_bench.basics.batches import put, take
 from ipe_bench.basics.linalg import Array, Mask, finite, multiply, squared
 from ipe_bench.basics.statuses import Status
-from ipe_bench.estimators.driver import ConvergenceCheck, Limits, Method, SolveResult, continued, iterate
+from ipe_bench.estimators.driver import (
+    ConvergenceCheck,
+    Limits,
+    Method,
+    SolveResult,
+    continued,
+    iterate,
+)
 from ipe_bench.estimators.least_squares import NormalEquations, Objective
 from ipe_bench.estimators.minima import Minima, minima_of
 from ipe_bench.solvers.anderson import accelerated, push
@@ -60,7 +67,19 @@ class OnChord:
     def at(cls, x: Array, r: Array, slope: NormalEquations, turn: Array) -> OnChord:
         nothing = np.zeros((*x.shape, min(_DEPTH, x.shape[1])))
         unknown, far = np.full(len(x), np.nan), np.full(len(x), np.inf)
-        return cls(x, r, slope.towards(r), nothing, nothing, x, turn, far, unknown, unknown, np.full(len(x), -1))
+        return cls(
+            x,
+            r,
+            slope.towards(r),
+            nothing,
+            nothing,
+            x,
+            turn,
+            far,
+            unknown,
+            unknown,
+            np.full(len(x), -1),
+        )
 
     @property
     def off(self) -> Array:
@@ -113,13 +132,17 @@ class Chord(Method[Objective, OnChord]):
             steps=state.steps + 1,
         )
 
-    def check(self, objective: Objective, before: OnChord | None, state: OnChord) -> ConvergenceCheck:
+    def check(
+        self, objective: Objective, before: OnChord | None, state: OnChord
+    ) -> ConvergenceCheck:
         rankless, decades = ~np.isfinite(state.slope.size), (state.steps - _TRIED / 2) / _PER_DECADE
         wanders = (state.steps >= _TRIED) & (state.slope.size > state.begun * 10.0**-decades)
         useless = wanders if np.isinf(self.bent) else state.off > self.bent
         size = np.where(useless, np.inf, state.slope.size)
         ending = np.where(rankless, Status.SINGULAR, Status.MAX_ITERATIONS)
-        return ConvergenceCheck(size, np.sqrt(squared(state.r)), state.moved, rankless | useless, ending)
+        return ConvergenceCheck(
+            size, np.sqrt(squared(state.r)), state.moved, rankless | useless, ending
+        )
 
 
 def by_chords(
@@ -129,7 +152,9 @@ def by_chords(
     fixed-point iteration contracts well there, eq. (18). Trials that do not arrive have not converged."""
     x0 = np.repeat(objective.x0[None], len(objective.rows), axis=0)
     minima, contracts = Minima.nowhere(x0, history), np.zeros(len(x0), dtype=bool)
-    nominal = NormalEquations.of(objective.R.whiten_jacobian(H[None]), np.zeros((1, len(H))), keep_Q=True)
+    nominal = NormalEquations.of(
+        objective.R.whiten_jacobian(H[None]), np.zeros((1, len(H))), keep_Q=True
+    )
     if not np.isfinite(nominal.size).all():  # H lacks rank, which says nothing of other points
         return minima, contracts
     frozen = take(nominal, np.zeros(len(x0), np.intp))
@@ -144,7 +169,9 @@ def by_chords(
     return minima, contracts
 
 
-def _renewed(objective: Objective, found: SolveResult[OnChord], origin: Array, limits: Limits) -> SolveResult[OnChord]:
+def _renewed(
+    objective: Objective, found: SolveResult[OnChord], origin: Array, limits: Limits
+) -> SolveResult[OnChord]:
     """Takes chord steps for near trials, with a new Jacobian as long as that of the start is not that of the end."""
     bent, rows, off = _BENT * limits.tolerance, np.arange(len(origin)), np.full(len(origin), np.inf)
     for _ in range(_JACOBIANS):
@@ -169,7 +196,9 @@ def _radius(nominal: NormalEquations, slope: NormalEquations) -> Array:
     """Computes the spectral radius (trials,) of I - H+ J, the rate at which fixed-point iteration converges."""
     assert nominal.Q is not None
     assert slope.Q is not None
-    J_F = np.matmul(np.matmul(nominal.inverse_U, np.matmul(nominal.Q.swapaxes(1, 2), slope.Q)), slope.U)
+    J_F = np.matmul(
+        np.matmul(nominal.inverse_U, np.matmul(nominal.Q.swapaxes(1, 2), slope.Q)), slope.U
+    )
     usable = finite(J_F)
     rates = np.linalg.eigvals(np.where(usable[:, None, None], np.eye(J_F.shape[1]) - J_F, 0.0))
     return np.where(usable, np.abs(rates).max(axis=1), np.inf)

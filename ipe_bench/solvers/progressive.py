@@ -119,9 +119,13 @@ class Progressive(Estimator):
                 count[rows] = np.where(better & ~same, 0, count[rows] + led)
             best = put(best, rows[better], take(again, better))
         raised = tally.failed(everyone) & ~best.converged
-        for i in np.flatnonzero(best.converged & ~accepted(best, m, significance) & (tried > 0)).tolist():
+        for i in np.flatnonzero(
+            best.converged & ~accepted(best, m, significance) & (tried > 0)
+        ).tolist():
             tally.messages[i] = _words(tried[i], drawn[i], repeats[i])
-        return replace(best, status=np.where(raised, Status.ERROR, best.status).astype(np.int8)), tally
+        return replace(
+            best, status=np.where(raised, Status.ERROR, best.status).astype(np.int8)
+        ), tally
 
 
 def _same(one: Minima, other: Minima) -> Mask:

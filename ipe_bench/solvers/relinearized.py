@@ -14,7 +14,15 @@ from ipe_bench.basics.options import Count, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.estimators.driver import ConvergenceCheck, Limits, Method, iterate
-from ipe_bench.estimators.ipe import IPE, FrozenSystem, Start, State, begin, frozen_covariance, root_check
+from ipe_bench.estimators.ipe import (
+    IPE,
+    FrozenSystem,
+    Start,
+    State,
+    begin,
+    frozen_covariance,
+    root_check,
+)
 from ipe_bench.estimators.least_squares import inverse_factor
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.solvers.fixed_point import FixedPoint
@@ -69,20 +77,31 @@ class Relinearized(Method[FrozenSystem, Round], Estimator):
         super().__post_init__()
         for option in fields(self.solver):
             if option.name in _ONLY_A_STEP and getattr(self.solver, option.name) != option.default:
-                raise UserError(f"solver.{option.name}: has no effect inside relinearized; set {option.name} beside it")
+                raise UserError(
+                    f"solver.{option.name}: has no effect inside relinearized; set {option.name} beside it"
+                )
 
     def begin(self, system: FrozenSystem, x: Array) -> Round:
         none = np.zeros(len(x), np.int64)
-        return self._relinearize(system, x, np.full(len(x), Status.RUNNING, np.int8), none, [row[None] for row in x])
+        return self._relinearize(
+            system, x, np.full(len(x), Status.RUNNING, np.int8), none, [row[None] for row in x]
+        )
 
     def step(self, system: FrozenSystem, state: Round) -> Round:
         """Runs one round: inner steps from the last linearisation, then a new one where they end."""
         linearized = replace(system, H_plus=state.H_plus, deviation=state.deviation)
         limits = Limits(self.tolerance, self.inner_iterations, self.budget, history=True)
-        ended = iterate(linearized, self.solver, self.solver.init(linearized, state.x, state.F), limits)
+        ended = iterate(
+            linearized, self.solver, self.solver.init(linearized, state.x, state.F), limits
+        )
         assert ended.history is not None
-        path = [np.concatenate([old, new[1:]]) for old, new in zip(state.path, ended.history, strict=True)]
-        return self._relinearize(system, ended.x, ended.status, state.steps + ended.iterations, path)
+        path = [
+            np.concatenate([old, new[1:]])
+            for old, new in zip(state.path, ended.history, strict=True)
+        ]
+        return self._relinearize(
+            system, ended.x, ended.status, state.steps + ended.iterations, path
+        )
 
     def check(self, system: FrozenSystem, before: Round | None, state: Round) -> ConvergenceCheck:
         """Measures F at its own linearisation; an inner root, stall or limit is only the end of a round."""
@@ -95,17 +114,32 @@ class Relinearized(Method[FrozenSystem, Round], Estimator):
         ended = iterate(system, self, x, Limits(self.tolerance, self.max_iterations, self.budget))
         state, P = ended.state, _bound(system, ended.state)
         path = state.path if history else None
-        return Estimates.of(ended, system.model.tally, iterations=state.steps, history=path, covariance=P)
+        return Estimates.of(
+            ended, system.model.tally, iterations=state.steps, history=path, covariance=P
+        )
 
     def _relinearize(
-        self, system: FrozenSystem, x: Array, inner: NDArray[np.int8], steps: NDArray[np.int64], path: list[Array]
+        self,
+        system: FrozenSystem,
+        x: Array,
+        inner: NDArray[np.int8],
+        steps: NDArray[np.int64],
+        path: list[Array],
     ) -> Round:
         """Returns the state at x with a new H; a trial whose round failed keeps its x, and has no F any more."""
         going, (n, m) = np.isin(inner, _ROUND_ENDS) & finite(x), (x.shape[1], system.z.shape[1])
-        F, H_plus, deviation = np.full(x.shape, _NO_ROOT), np.zeros((len(x), n, m)), np.ones(x.shape)
+        F, H_plus, deviation = (
+            np.full(x.shape, _NO_ROOT),
+            np.zeros((len(x), n, m)),
+            np.ones(x.shape),
+        )
         if going.any():
             part = system.subset(going).relinearized(x[going])
-            F[going], H_plus[going], deviation[going] = part.F(x[going]), part.H_plus, part.deviation
+            F[going], H_plus[going], deviation[going] = (
+                part.F(x[going]),
+                part.H_plus,
+                part.deviation,
+            )
         return Round(x, F, H_plus, deviation, inner, steps, path)
 
 

@@ -45,7 +45,13 @@ class SteepestDescent(IPE):
         # alpha_0: the minimum of the parabola through g at 0, alpha_2 = alpha_3 / 2 and alpha_3.
         if downhill.any():
             rows = system.subset(downhill)
-            x_d, d_d, a3, g1, g3 = x[downhill], d[downhill], alpha[downhill], g[downhill], squared(F[downhill])
+            x_d, d_d, a3, g1, g3 = (
+                x[downhill],
+                d[downhill],
+                alpha[downhill],
+                g[downhill],
+                squared(F[downhill]),
+            )
             a2 = a3 / 2
             h1 = (squared(rows.F(x_d - a2[:, None] * d_d)) - g1) / a2
             h2 = (g3 - g1 - h1 * a2) / (a3 - a2)

@@ -270,10 +270,16 @@ def widened(model: StateModel, scale: float) -> StateModel:
     if scale == 1:
         return model
     if type(model).draw is not StateModel.draw:
-        raise UserError(f"error_scale={scale:g}: state_model={model.name} has stored paths; leave error_scale out")
+        raise UserError(
+            f"error_scale={scale:g}: state_model={model.name} has stored paths; leave error_scale out"
+        )
     m, P = model.prior
     wider = Normal(m, scale**2 * P)
-    parts = {"__doc__": type(model).__doc__, "name": model.name, "prior": property(lambda self: wider)}
+    parts = {
+        "__doc__": type(model).__doc__,
+        "name": model.name,
+        "prior": property(lambda self: wider),
+    }
     other = copy.copy(model)
     object.__setattr__(other, "__class__", type(type(model).__name__, (type(model),), parts))
     return other
@@ -283,12 +289,18 @@ def require_sound(model: StateModel) -> None:
     """Raises UserError unless the parts of a model suit one another: times, prior, Q, R, f and h."""
     n, name = model.n, f"state_model={model.name}"
     if absent := [one for one in model.scored if one not in [state.name for state in model.states]]:
-        raise UserError(f"{name}: scored: {unknown(absent[0], [state.name for state in model.states], 'state')}")
+        raise UserError(
+            f"{name}: scored: {unknown(absent[0], [state.name for state in model.states], 'state')}"
+        )
     if not model.epochs or not (np.diff(model.times) > 0).all():
-        raise UserError(f"{name}: its times do not increase from epoch to epoch; give epochs in order")
+        raise UserError(
+            f"{name}: its times do not increase from epoch to epoch; give epochs in order"
+        )
     for one in ("gain", "R"):
         if all(getattr(type(model), own) is getattr(StateModel, own) for own in (one, f"{one}_at")):
-            raise UserError(f"{name}: it has no {one}; write {one}(k), or {one}_at(x, k) if it depends on the states")
+            raise UserError(
+                f"{name}: it has no {one}; write {one}(k), or {one}_at(x, k) if it depends on the states"
+            )
     m, x = model.readings_per_epoch, model.prior.mean
     shapes = {
         "the mean of the prior": (x, (n,)),
@@ -299,7 +311,9 @@ def require_sound(model: StateModel) -> None:
     }
     for k in {0, model.epochs - 1}:
         G = model.gain_at(x[None], k)
-        shapes |= {f"the gain of epoch {k + 1}": (G, (1,) * model.gain_by_state + (n, np.shape(G)[-1]))}
+        shapes |= {
+            f"the gain of epoch {k + 1}": (G, (1,) * model.gain_by_state + (n, np.shape(G)[-1]))
+        }
     for what, (value, shape) in shapes.items():
         if np.shape(value) != shape:
             raise UserError(f"{name}: {what} has shape {np.shape(value)}, where {shape} belongs")
@@ -310,9 +324,13 @@ def require_sound(model: StateModel) -> None:
         matrices |= {f"Q of epoch {k + 1}": (Q, n), f"R of epoch {k + 1}": (R, m)}
     for what, (P, size) in matrices.items():
         if not np.isfinite(P).all():
-            raise UserError(f"{name}: {what} is not finite at the mean of the prior; give another mean or noise")
+            raise UserError(
+                f"{name}: {what} is not finite at the mean of the prior; give another mean or noise"
+            )
         if what[0] == "R" and np.shape(P) == (m, m) and half(P).singular:
-            raise UserError(f"{name}: {what} is singular; give every reading a standard deviation above 0")
+            raise UserError(
+                f"{name}: {what} is singular; give every reading a standard deviation above 0"
+            )
         if np.shape(P) != (size, size):
             raise UserError(f"{name}: {what} has shape {np.shape(P)}, where {(size, size)} belongs")
         if not np.allclose(P, P.T, rtol=1e-9, atol=0):

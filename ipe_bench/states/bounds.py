@@ -64,5 +64,7 @@ def bound_at_truth(model: StateModel, paths: Paths, smooths: bool = False) -> Ar
     path = Tracks.empty(model, len(paths.x))
     path.mean, path.covariance[:] = paths.x, model.prior.covariance
     path.start = Normal(paths.start, path.start.covariance)
-    tracks = filtered(model, np.zeros((*paths.x.shape[:2], model.readings_per_epoch)), Taylor(), path=path)
+    tracks = filtered(
+        model, np.zeros((*paths.x.shape[:2], model.readings_per_epoch)), Taylor(), path=path
+    )
     return (smoothed(model, tracks) if smooths else tracks).covariance

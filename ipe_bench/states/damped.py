@@ -17,7 +17,15 @@ from ipe_bench.states.algebra import root
 from ipe_bench.states.base import Normal, StateModel
 from ipe_bench.states.linearisation import Affine, Taylor, Unscented
 from ipe_bench.states.smoothers import path_p, settled, smoothed, whole
-from ipe_bench.states.trackers import Tracker, Tracks, filtered, linearised_move, linearised_reading, predict, update
+from ipe_bench.states.trackers import (
+    Tracker,
+    Tracks,
+    filtered,
+    linearised_move,
+    linearised_reading,
+    predict,
+    update,
+)
 
 _TRIES, _FACTOR = 15, 10.0
 """Dampings that are tried about one path, and the factor between them."""
@@ -93,15 +101,27 @@ class LevenbergMarquardtSmoother(Tracker):
 
     def track(self, model: StateModel, z: Array) -> Tracks:
         first, other = (
-            _Paths.of(model, z, smoothed(model, filtered(model, z, rule))) for rule in (Taylor(), Unscented())
+            _Paths.of(model, z, smoothed(model, filtered(model, z, rule)))
+            for rule in (Taylor(), Unscented())
         )
         paths = self._descended(model, z, first.improved(other, np.arange(len(z))))
         rows = np.flatnonzero(~(path_p(z, paths.cost) >= self.level))
         if self.starts and len(rows):
-            paths = paths.improved(self._descended(model, z[rows], self._drawn(model, z[rows])), rows)
+            paths = paths.improved(
+                self._descended(model, z[rows], self._drawn(model, z[rows])), rows
+            )
         out = Tracks.empty(model, len(z))
-        out.start, out.mean, out.covariance = Normal(paths.x[:, 0], paths.P[:, 0]), paths.x[:, 1:], paths.P[:, 1:]
-        out.calls, out.cost, out.status, out.iterations = paths.calls, paths.cost, paths.status, paths.iterations
+        out.start, out.mean, out.covariance = (
+            Normal(paths.x[:, 0], paths.P[:, 0]),
+            paths.x[:, 1:],
+            paths.P[:, 1:],
+        )
+        out.calls, out.cost, out.status, out.iterations = (
+            paths.calls,
+            paths.cost,
+            paths.status,
+            paths.iterations,
+        )
         return out
 
     def _drawn(self, model: StateModel, z: Array) -> _Paths:
@@ -111,8 +131,12 @@ class LevenbergMarquardtSmoother(Tracker):
         draws = normals(generators, self.starts, spread.shape[1])
         best = None
         for i in range(self.starts):
-            start = Normal(m + multiply(spread, draws[:, i]), np.repeat(_SHARE**2 * P[None], len(z), 0))
-            found = _Paths.of(model, z, smoothed(model, filtered(model, z, Unscented(), start=start)))
+            start = Normal(
+                m + multiply(spread, draws[:, i]), np.repeat(_SHARE**2 * P[None], len(z), 0)
+            )
+            found = _Paths.of(
+                model, z, smoothed(model, filtered(model, z, Unscented(), start=start))
+            )
             best = found if best is None else best.improved(found, np.arange(len(z)))
         assert best is not None
         return best
@@ -125,7 +149,10 @@ class LevenbergMarquardtSmoother(Tracker):
             active = active[paths.status[active] == Status.RUNNING]
             if not len(active):
                 break
-        return replace(paths, status=np.where(paths.status == Status.RUNNING, Status.MAX_ITERATIONS, paths.status))
+        return replace(
+            paths,
+            status=np.where(paths.status == Status.RUNNING, Status.MAX_ITERATIONS, paths.status),
+        )
 
     def _stepped(self, model: StateModel, z: Array, paths: _Paths) -> _Paths:
         """The paths after one step, at the least damping that does not raise the cost."""
@@ -144,7 +171,10 @@ class LevenbergMarquardtSmoother(Tracker):
                     blind = whole(_passed(model, np.full_like(z, np.nan), moves, reads))[1]
                     scale = np.diagonal(blind, axis1=2, axis2=3)
                 about = paths.x[rows], scale[rows] / damping[rows, None, None]
-                some = ([Affine(*[part[rows] for part in law]) for law in laws] for laws in (moves, reads))
+                some = (
+                    [Affine(*[part[rows] for part in law]) for law in laws]
+                    for laws in (moves, reads)
+                )
                 new[damped] = whole(smoothed(model, _passed(model, z[rows], *some, about=about)))[0]
             new, found = settled(model, z[todo], new)
             calls[todo] += model.evaluations
@@ -165,9 +195,14 @@ def _linearised(model: StateModel, z: Array, x: Array) -> tuple[list[Affine], li
     """The tangents of transitions and readings along paths x (trials, 1 + K, n)."""
     rule, P = Taylor(), np.empty(0)
     moves = [
-        linearised_move(model, rule, k, Normal(x[:, k], P), x[:, k + 1]) for k in range(model.epochs) if model.moves(k)
+        linearised_move(model, rule, k, Normal(x[:, k], P), x[:, k + 1])
+        for k in range(model.epochs)
+        if model.moves(k)
     ]
-    reads = [linearised_reading(model, rule, k, z[:, k], Normal(x[:, k + 1], P)) for k in range(model.epochs)]
+    reads = [
+        linearised_reading(model, rule, k, z[:, k], Normal(x[:, k + 1], P))
+        for k in range(model.epochs)
+    ]
     return moves, reads
 
 
@@ -195,7 +230,9 @@ def _passed(
             again, _, there = _read_again(about, k + 1)
             W = np.zeros((len(z), m + n, m + n))
             W[:, :m, :m], W[:, m:, m:] = R, again.W
-            H, b = (np.concatenate(parts, axis=1) for parts in ((read.A, again.A), (read.b, again.b)))
+            H, b = (
+                np.concatenate(parts, axis=1) for parts in ((read.A, again.A), (read.b, again.b))
+            )
             read = Affine(H, b, W)
             R, y = np.zeros((m + n, m + n)), np.concatenate([y, there], axis=1)
         x = out.note(k, update(x, read, R, y))

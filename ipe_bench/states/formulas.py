@@ -83,8 +83,15 @@ class Formulas(StateModel):
                         raise UserError(f"{key}.{label}: {unknown(name, names, 'name')}")
         moved = {name for formula in self._transitions.values() for name in formula.names}
         if idle := next((name for name in self.noise if name not in moved), None):
-            raise UserError(f"noise.{idle}: stands in no formula of next; add it to one, or leave it out")
-        owners = {"deviation": self.readings, "period": self.readings, "spread": self.next, "start": self.next}
+            raise UserError(
+                f"noise.{idle}: stands in no formula of next; add it to one, or leave it out"
+            )
+        owners = {
+            "deviation": self.readings,
+            "period": self.readings,
+            "spread": self.next,
+            "start": self.next,
+        }
         owners["state_period"] = self.next
         for key, labels in owners.items():
             given = getattr(self, key)
@@ -99,7 +106,9 @@ class Formulas(StateModel):
                     f"inputs.{label}: has {number} numbers; give one, or one for each of {self.count} epochs"
                 )
         known, factors = self._factors
-        if found := next((name for name in self.noise if dependent(factors, [known[name]]) & {*factors}), None):
+        if found := next(
+            (name for name in self.noise if dependent(factors, [known[name]]) & {*factors}), None
+        ):
             raise UserError(
                 f"next: depends on {found} by more than a factor; write FACTOR*{found} + ... of process noise"
             )
@@ -117,12 +126,17 @@ class Formulas(StateModel):
         """The formulas of standard deviations, if any is one and no number."""
         if not any(isinstance(value, str) for value in self.deviation.values()):
             return {}
-        return {name: parse(str(self.deviation[name]), f"deviation.{name}") for name in self.readings}
+        return {
+            name: parse(str(self.deviation[name]), f"deviation.{name}") for name in self.readings
+        }
 
     @cached_property
     def _inputs(self) -> dict[str, Array]:
         """Each input (K,)."""
-        return {name: np.broadcast_to(np.array(given, dtype=float), self.count) for name, given in self.inputs.items()}
+        return {
+            name: np.broadcast_to(np.array(given, dtype=float), self.count)
+            for name, given in self.inputs.items()
+        }
 
     @property
     def reading_names(self) -> tuple[str, ...]:
@@ -141,7 +155,11 @@ class Formulas(StateModel):
         return tuple(self.inputs)
 
     def with_log(self, count: int, inputs: Mapping[str, Array]) -> Formulas:
-        return replace(self, count=count, inputs={name: tuple(values.tolist()) for name, values in inputs.items()})
+        return replace(
+            self,
+            count=count,
+            inputs={name: tuple(values.tolist()) for name, values in inputs.items()},
+        )
 
     @property
     def states(self) -> tuple[Parameter, ...]:
@@ -153,7 +171,11 @@ class Formulas(StateModel):
 
     @property
     def state_periods(self) -> tuple[float, ...]:
-        return tuple(self.state_period.get(name, 0.0) for name in self.next) if self.state_period else ()
+        return (
+            tuple(self.state_period.get(name, 0.0) for name in self.next)
+            if self.state_period
+            else ()
+        )
 
     @property
     def prior(self) -> Normal:
@@ -170,11 +192,16 @@ class Formulas(StateModel):
     def _factors(self) -> tuple[dict[str, Expression], list[Expression]]:
         """What the transitions name besides constants, and the factor of each noise in each state, as recordings."""
         graph = Graph()
-        known = {name: graph.input(name) for name in (*self.next, *self.inputs, "k", "t", *self.noise)}
+        known = {
+            name: graph.input(name) for name in (*self.next, *self.inputs, "k", "t", *self.noise)
+        }
         moved = (
-            graph.apply("add", formula({**self.constants, **known}), 0.0) for formula in self._transitions.values()
+            graph.apply("add", formula({**self.constants, **known}), 0.0)
+            for formula in self._transitions.values()
         )
-        return known, [factor for one in moved for factor in slopes(one, [known[name] for name in self.noise])]
+        return known, [
+            factor for one in moved for factor in slopes(one, [known[name] for name in self.noise])
+        ]
 
     @property
     def gain_by_state(self) -> bool:
@@ -196,7 +223,9 @@ class Formulas(StateModel):
         inputs = (float(values[k]) for values in self._inputs.values())
         with np.errstate(all="ignore"):
             G = self._program([*np.moveaxis(x, -1, 0), *inputs, k + 1.0, float(self._times[k])])
-        G = np.stack(np.broadcast_arrays(x[..., 0], *G)[1:], axis=-1).reshape(*x.shape, len(self.noise))
+        G = np.stack(np.broadcast_arrays(x[..., 0], *G)[1:], axis=-1).reshape(
+            *x.shape, len(self.noise)
+        )
         return G * np.array([float(value) for value in self.noise.values()])
 
     def gain(self, k: int) -> Array:
@@ -214,12 +243,16 @@ class Formulas(StateModel):
         if not self.noise:
             return np.zeros((self.n, 0))
         x = self.prior.mean
-        factors = differentiate(lambda w: self._moved(x, w, k), np.zeros((1, len(self.noise))), analytic=True)[0]
+        factors = differentiate(
+            lambda w: self._moved(x, w, k), np.zeros((1, len(self.noise))), analytic=True
+        )[0]
         return factors * np.array([float(value) for value in self.noise.values()])
 
     @property
     def R_by_state(self) -> bool:
-        return any(name in self.next for formula in self._deviations.values() for name in formula.names)
+        return any(
+            name in self.next for formula in self._deviations.values() for name in formula.names
+        )
 
     def R_at(self, x: Array, k: int) -> Array:
         if not self.R_by_state:
@@ -234,15 +267,21 @@ class Formulas(StateModel):
         return np.diag([float(self.deviation[name]) ** 2 for name in self.readings])
 
     def _moved(self, x: Array, w: Array, k: int) -> Array:
-        return self._values(self._transitions, x, k, dict(zip(self.noise, np.moveaxis(w, -1, 0), strict=True)))
+        return self._values(
+            self._transitions, x, k, dict(zip(self.noise, np.moveaxis(w, -1, 0), strict=True))
+        )
 
-    def _values(self, formulas: Mapping[str, Arithmetic], x: Array, k: int, noise: Mapping[str, Any]) -> Array:
+    def _values(
+        self, formulas: Mapping[str, Arithmetic], x: Array, k: int, noise: Mapping[str, Any]
+    ) -> Array:
         """Those formulas (..., number) at states x (..., n) at epoch k."""
         known = dict(zip(self.next, np.moveaxis(x, -1, 0), strict=True)) | dict(noise)
         known |= {name: float(values[k]) for name, values in self._inputs.items()}
         known |= {**self.constants, "k": k + 1.0, "t": float(self._times[k])}
         with np.errstate(all="ignore"):
-            values = np.broadcast_arrays(x[..., 0], *(formula(known) for formula in formulas.values()))[1:]
+            values = np.broadcast_arrays(
+                x[..., 0], *(formula(known) for formula in formulas.values())
+            )[1:]
         return np.stack(np.broadcast_arrays(*values), axis=-1)
 
 
@@ -261,6 +300,8 @@ class RecordedFormulas(Formulas):
         """The stored path; its state before the first epoch is not stored, and the first one stands for it."""
         if (start, stop) != (0, 1):
             raise UserError(f"state_model={self.name}: has one path; set trials=1")
-        rows = np.loadtxt(Path(__file__).with_name(f"{self.recorded}.csv"), delimiter=",", skiprows=1)[None]
+        rows = np.loadtxt(
+            Path(__file__).with_name(f"{self.recorded}.csv"), delimiter=",", skiprows=1
+        )[None]
         x = np.ascontiguousarray(rows[..., 1 : 1 + self.n])
         return Paths(x[:, 0], x, np.ascontiguousarray(rows[..., 1 + self.n :]))

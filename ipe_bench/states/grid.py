@@ -39,12 +39,17 @@ class Grid(Tracker):
         if model.n > 1:
             return f"is exact for one state, and {model.name} has {model.n}; leave it out"
         if model.state_periods:
-            return f"has no place for a state that comes round, as that of {model.name}; leave it out"
+            return (
+                f"has no place for a state that comes round, as that of {model.name}; leave it out"
+            )
         grids, epochs = self._grids(model), [k for k in range(model.epochs) if model.moves(k)]
         noise = np.sqrt([_COARSE * _variances(model, grids, k).min() for k in epochs])
         if not (noise > 0).all():
             return f"needs process noise at every step of {model.name}; leave it out"
-        steps = [max(np.diff(grids[k + 1]).max(), np.abs(np.diff(_moved(model, grids, k))).max()) for k in epochs]
+        steps = [
+            max(np.diff(grids[k + 1]).max(), np.abs(np.diff(_moved(model, grids, k))).max())
+            for k in epochs
+        ]
         if (excess := np.max(steps / noise)) > 1:
             needed = math.ceil(1.1 * self.points * excess)
             # The moves of so coarse a grid hardly tell how fine it has to be: the finer one is asked, too.
@@ -55,7 +60,9 @@ class Grid(Tracker):
 
     def track(self, model: StateModel, z: Array) -> Tracks:
         if self.smooths and len(z) > _AT_ONCE:  # whose densities are kept for all epochs
-            return Tracks.join([self.track(model, z[i : i + _AT_ONCE]) for i in range(0, len(z), _AT_ONCE)])
+            return Tracks.join(
+                [self.track(model, z[i : i + _AT_ONCE]) for i in range(0, len(z), _AT_ONCE)]
+            )
         out, grids = Tracks.empty(model, len(z)), self._grids(model)
         again = (model.epochs - 1) * self.smooths  # transitions on the way back
         out.calls += (self.points + _PATHS) * model.evaluations + self.points * again
@@ -68,7 +75,9 @@ class Grid(Tracker):
                 p = multiply(_kernel(model, grids, k), p)
                 p /= p.sum(axis=1, keepdims=True)
             predicted = p
-            p = weighed(model, np.repeat(grids[k + 1][None, :, None], len(z), 0), k, z[:, k], p, out)
+            p = weighed(
+                model, np.repeat(grids[k + 1][None, :, None], len(z), 0), k, z[:, k], p, out
+            )
             _require_resolved(p, k)
             _describe(out, k, p, grids)
             if self.smooths:
@@ -119,7 +128,9 @@ def _require_resolved(p: Array, k: int) -> None:
     bend = np.log(p[rows, peak] ** 2 / np.maximum(p[rows, peak - 1] * p[rows, peak + 1], 1e-300))
     ends = np.maximum(p[:, 0], p[:, -1]) / p[rows, peak]
     if not (bend < _COARSE).all():
-        raise ArithmeticError(f"the density of epoch {k + 1} falls between the points of the grid; set more points")
+        raise ArithmeticError(
+            f"the density of epoch {k + 1} falls between the points of the grid; set more points"
+        )
     if not (ends < _CUT).all():
         raise ArithmeticError(
             f"the density of epoch {k + 1} runs over an end of the grid: the model draws no such path"

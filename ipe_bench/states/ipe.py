@@ -58,7 +58,10 @@ class PathIPE(Tracker):
     def track(self, model: StateModel, z: Array) -> Tracks:
         out = Tracks.empty(model, len(z))
         out.cost = np.empty(len(z))
-        out.status, out.iterations = np.full(len(z), Status.RUNNING, np.int8), np.zeros(len(z), np.int64)
+        out.status, out.iterations = (
+            np.full(len(z), Status.RUNNING, np.int8),
+            np.zeros(len(z), np.int64),
+        )
         seen, pattern = np.unique(np.isfinite(z), axis=0, return_inverse=True)
         at_once = max(1, int(_NUMBERS / (sum(_widths(model)) * model.n * model.epochs)))
         for i, there in enumerate(seen):
@@ -153,11 +156,16 @@ class _Frozen:
     def run(self, u: Array, z: Array) -> tuple[Array, Array]:
         """The states x (trials, 1 + K, n) of u (trials, N), and h(u) - z (trials, M), whitened."""
         ends = np.cumsum([G.shape[1] for G in self.gains])
-        noise = [multiply(G, part) for G, part in zip(self.gains, np.split(u, ends[:-1], axis=1), strict=True)]
+        noise = [
+            multiply(G, part)
+            for G, part in zip(self.gains, np.split(u, ends[:-1], axis=1), strict=True)
+        ]
         x = [self.model.prior.mean + noise[0]]
         r = []
         for k in range(self.model.epochs):
-            x.append((self.model.transition(x[-1], k) if self.model.moves(k) else x[-1]) + noise[k + 1])
+            x.append(
+                (self.model.transition(x[-1], k) if self.model.moves(k) else x[-1]) + noise[k + 1]
+            )
             e = np.where(self.seen[k], self.model.observe_near(x[-1], k, z[:, k]) - z[:, k], 0.0)
             r.append(lower_solve(self.L[k], e[..., None])[..., 0])
         return np.stack(x, axis=1), np.concatenate(r, axis=1)
@@ -169,13 +177,21 @@ class _Frozen:
         for k, G in enumerate(self.gains, -1):
             if upto:  # the start and noises up to here
                 before = X[:, k, :, :upto]
-                F = slope(lambda at, k=k: model.transition(at, k), x[:, k])[1] if model.moves(k) else None
+                F = (
+                    slope(lambda at, k=k: model.transition(at, k), x[:, k])[1]
+                    if model.moves(k)
+                    else None
+                )
                 X[:, k + 1, :, :upto] = before if F is None else np.matmul(F, before)
             X[:, k + 1, :, upto : upto + G.shape[1]] = G
             upto += G.shape[1]
             if k >= 0:
                 H = slope(lambda at, k=k: model.observe(at, k), x[:, k + 1])[1]
-                B.append(lower_solve(self.L[k], np.matmul(np.where(self.seen[k][:, None], H, 0.0), X[:, k + 1])))
+                B.append(
+                    lower_solve(
+                        self.L[k], np.matmul(np.where(self.seen[k][:, None], H, 0.0), X[:, k + 1])
+                    )
+                )
         return X, np.concatenate(B, axis=1)
 
     def F(self, u: Array, r: Array) -> Array:

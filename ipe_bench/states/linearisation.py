@@ -145,8 +145,12 @@ class GaussHermite(SigmaPoints):
     def points(self, n: int) -> tuple[Array, Array]:
         s, w = self._line
         if self.order**n > _MOST_POINTS:
-            raise UserError(f"order={self.order}: {self.order}^{n} points for {n} states; choose the rule Cubature")
-        return np.array(list(product(s, repeat=n))), np.array([np.prod(c) for c in product(w, repeat=n)])
+            raise UserError(
+                f"order={self.order}: {self.order}^{n} points for {n} states; choose the rule Cubature"
+            )
+        return np.array(list(product(s, repeat=n))), np.array(
+            [np.prod(c) for c in product(w, repeat=n)]
+        )
 
     @cached_property
     def _line(self) -> tuple[Array, Array]:

@@ -42,7 +42,9 @@ class Bootstrap(Tracker):
             if model.moves(k):
                 G = model.gain_at(x, k)
                 w = normals(G.shape[-1])
-                x = model.transition(x, k) + (multiply(G, w) if model.gain_by_state else np.matmul(w, G.T))
+                x = model.transition(x, k) + (
+                    multiply(G, w) if model.gain_by_state else np.matmul(w, G.T)
+                )
             w = weighed(model, x, k, z[:, k], 1.0, out)
             out.effective[:, k] = 1 / np.sum(w**2, axis=1)
             x = model.nearest_state(x, x[np.arange(trials), w.argmax(axis=1)][:, None])
@@ -55,7 +57,9 @@ class Bootstrap(Tracker):
         return out
 
 
-def weighed(model: StateModel, x: Array, k: int, z: Array, before: Array | float, out: Tracks) -> Array:
+def weighed(
+    model: StateModel, x: Array, k: int, z: Array, before: Array | float, out: Tracks
+) -> Array:
     """The weights `before` (trials, N) of states x (trials, N, n) times the likelihood of readings z (trials, m), with
     sum 1. The track notes the logarithm of their sum, and the innovation by the mean and covariance of h(x) before."""
     r, R, seen = residuals(model, z, x, k), model.R_at(x, k), np.isfinite(z)
@@ -66,9 +70,15 @@ def weighed(model: StateModel, x: Array, k: int, z: Array, before: Array | float
         R = np.sum(p[..., None] * R, axis=1)
     y = np.sum(p * r, axis=1)
     d = r - y[:, None]
-    S = np.matmul(transposed(d * p), d) + np.where(seen[:, :, None] & seen[:, None, :], R, np.eye(R.shape[-1]))
+    S = np.matmul(transposed(d * p), d) + np.where(
+        seen[:, :, None] & seen[:, None, :], R, np.eye(R.shape[-1])
+    )
     found = Update.of(Normal(y, S), y, factor(S), seen)
-    out.nis[:, k], out.innovations[:, k], out.degrees[:, k] = found.nis, found.innovation, found.degrees
+    out.nis[:, k], out.innovations[:, k], out.degrees[:, k] = (
+        found.nis,
+        found.innovation,
+        found.degrees,
+    )
     least = square.min(axis=1, keepdims=True)
     w = before * np.exp(-0.5 * (square - least))
     total = w.sum(axis=1, keepdims=True)
@@ -88,4 +98,6 @@ def _resampled(x: Array, w: Array, offset: Array) -> Array:
     upto = np.ceil(N * np.cumsum(w, axis=1) - offset[:, None]).clip(0, N)
     upto[:, -1] = N
     counts = np.diff(upto, axis=1, prepend=0.0).astype(int)
-    return x.reshape(trials * N, n)[np.repeat(np.arange(trials * N), counts.ravel())].reshape(trials, N, n)
+    return x.reshape(trials * N, n)[np.repeat(np.arange(trials * N), counts.ravel())].reshape(
+        trials, N, n
+    )

@@ -60,7 +60,9 @@ class IteratedSmoother(Tracker):
     """Ends where no trial's path moves by more than so many of its own standard deviations."""
 
     def hindrance(self, model: StateModel) -> str | None:
-        tangents = self.damped or isinstance(self.rule, Taylor)  # steps on a cost, which knows Q and R alone
+        tangents = self.damped or isinstance(
+            self.rule, Taylor
+        )  # steps on a cost, which knows Q and R alone
         return (super() if tangents else self.first).hindrance(model)
 
     def track(self, model: StateModel, z: Array) -> Tracks:
@@ -103,7 +105,9 @@ def smoothed(model: StateModel, tracks: Tracks) -> Tracks:
         singular |= parts.singular
         G = parts.over(parts.whitened(np.matmul(before.covariance, transposed(move.A))))
         P = np.matmul(np.matmul(G, x.covariance - predicted.covariance), transposed(G))
-        x = Normal(before.mean + multiply(G, x.mean - predicted.mean), symmetric(before.covariance + P))
+        x = Normal(
+            before.mean + multiply(G, x.mean - predicted.mean), symmetric(before.covariance + P)
+        )
         if k:
             out.mean[:, k - 1], out.covariance[:, k - 1] = x
     out.start = x
@@ -182,7 +186,9 @@ def path_p(z: Array, cost: Array) -> Array:
     return chdtrc(np.isfinite(z).sum(axis=(1, 2)), cost)
 
 
-def _halved(old: Array, new: Array, settle: Callable[[Array], tuple[Array, Array]]) -> tuple[Array, Array]:
+def _halved(
+    old: Array, new: Array, settle: Callable[[Array], tuple[Array, Array]]
+) -> tuple[Array, Array]:
     """The step from `old` to `new` (trials, ...), settled, and halved in each trial until its cost (trials,) is not
     above that of `old`; and how many costs (trials,) that took."""
     best, share = settle(old)[1], np.ones((len(old),) + (1,) * (old.ndim - 1))

@@ -79,7 +79,11 @@ class Tracks:
     def note(self, k: int, found: Update) -> Normal:
         """The states after the readings of epoch k, which the tracks keep with what the innovation says."""
         self.mean[:, k], self.covariance[:, k] = found.x
-        self.nis[:, k], self.innovations[:, k], self.degrees[:, k] = found.nis, found.innovation, found.degrees
+        self.nis[:, k], self.innovations[:, k], self.degrees[:, k] = (
+            found.nis,
+            found.innovation,
+            found.degrees,
+        )
         self.log_likelihood += found.log_likelihood
         if found.read is not None:
             self.reads.append(found.read)
@@ -160,10 +164,14 @@ def predict(x: Normal, move: Affine, Q: Array) -> Normal:
     return Normal(multiply(move.A, x.mean) + move.b, symmetric(P))
 
 
-def linearised_move(model: StateModel, rule: Rule, k: int, x: Normal, to: Array | None = None) -> Affine:
+def linearised_move(
+    model: StateModel, rule: Rule, k: int, x: Normal, to: Array | None = None
+) -> Affine:
     """Linearises f about the states x; periodic states next to those of `to` (trials, n), if these are given."""
     periodic = bool(model.state_periods)
-    move = rule.linearise(lambda at: model.transition(at, k), *x, model.nearest_state if periodic else None)
+    move = rule.linearise(
+        lambda at: model.transition(at, k), *x, model.nearest_state if periodic else None
+    )
     if to is None or not periodic:
         return move
     value = multiply(move.A, x.mean) + move.b
@@ -172,7 +180,9 @@ def linearised_move(model: StateModel, rule: Rule, k: int, x: Normal, to: Array 
 
 def linearised_reading(model: StateModel, rule: Rule, k: int, z: Array, x: Normal) -> Affine:
     """Linearises h about the states x, periodic readings next to the readings z (trials, m)."""
-    A, b, W = rule.linearise(lambda at: model.observe(at, k), *x, model.nearest if model.periods else None)
+    A, b, W = rule.linearise(
+        lambda at: model.observe(at, k), *x, model.nearest if model.periods else None
+    )
     value = multiply(A, x.mean) + b
     return Affine(A, b + model.nearest(value, np.where(np.isfinite(z), z, value)) - value, W)
 
@@ -220,7 +230,9 @@ def update(x: Normal, read: Affine, R: Array, z: Array) -> Update:
     L = factor(np.matmul(H, PH) + noise)
     K = transposed(upper_solve(L, lower_solve(L, transposed(PH))))
     rest = np.eye(m.shape[-1]) - np.matmul(K, H)
-    covariance = np.matmul(np.matmul(rest, P), transposed(rest)) + np.matmul(np.matmul(K, noise), transposed(K))
+    covariance = np.matmul(np.matmul(rest, P), transposed(rest)) + np.matmul(
+        np.matmul(K, noise), transposed(K)
+    )
     return Update.of(Normal(m + multiply(K, y), symmetric(covariance)), y, L, seen, H)
 
 
@@ -270,7 +282,11 @@ def filtered(
         if model.moves(k):
             at, to = (x, None) if path is None else (path.at(k - 1), path.mean[:, k])
             move = linearised_move(model, rule, k, at, to)
-            x = predict(x, move, rule.mean(partial(model.Q_at, k=k), *at) if model.gain_by_state else model.Q(k))
+            x = predict(
+                x,
+                move,
+                rule.mean(partial(model.Q_at, k=k), *at) if model.gain_by_state else model.Q(k),
+            )
             out.moves.append(move)
             out.predicted.append(x)
         at = x if path is None else path.at(k)
@@ -281,7 +297,10 @@ def filtered(
         assert found is not None
         x = out.note(k, found)
     read = rule.calls(model.n, bool(model.periods))
-    out.calls += rule.calls(model.n, bool(model.state_periods)) * len(out.moves) + read * iterations * model.epochs
+    out.calls += (
+        rule.calls(model.n, bool(model.state_periods)) * len(out.moves)
+        + read * iterations * model.epochs
+    )
     return out
 
 
@@ -294,7 +313,9 @@ def misfit(model: StateModel, z: Array, x: Array, k: int) -> tuple[Array, Array]
 def residuals(model: StateModel, z: Array, x: Array, k: int) -> Array:
     """z - h (trials, N, m) of states x (trials, N, n) at epoch k; 0 of missing readings."""
     seen = np.isfinite(z)
-    return np.where(seen[:, None], z[:, None] - model.observe_near(x, k, np.where(seen, z, 0.0)), 0.0)
+    return np.where(
+        seen[:, None], z[:, None] - model.observe_near(x, k, np.where(seen, z, 0.0)), 0.0
+    )
 
 
 def squares(r: Array, z: Array, R: Array) -> tuple[Array, Array]:
@@ -303,11 +324,15 @@ def squares(r: Array, z: Array, R: Array) -> tuple[Array, Array]:
     seen = np.isfinite(z)
     if R.ndim > 3:
         each, size = squares(
-            r.reshape(-1, 1, z.shape[1]), np.repeat(z, r.shape[1], axis=0), R.reshape(-1, *R.shape[2:])
+            r.reshape(-1, 1, z.shape[1]),
+            np.repeat(z, r.shape[1], axis=0),
+            R.reshape(-1, *R.shape[2:]),
         )
         return (each[:, 0] + size).reshape(r.shape[:2]), np.zeros(len(z))
     L = factor(np.where(seen[:, :, None] & seen[:, None, :], R, np.eye(z.shape[1])))
-    size = 2 * np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1) + np.log(2 * np.pi) * seen.sum(axis=1)
+    size = 2 * np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1) + np.log(2 * np.pi) * seen.sum(
+        axis=1
+    )
     return np.sum(lower_solve(L, transposed(r)) ** 2, axis=1), size
 
 

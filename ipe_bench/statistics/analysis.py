@@ -26,7 +26,9 @@ from ipe_bench.statistics.statistic import BEST, rows_of
 if TYPE_CHECKING:
     import pandas as pd
 
-PROBABILITIES = np.unique(np.concatenate([np.linspace(0, 1, 101), [0.001, 0.005, 0.025, 0.975, 0.995, 0.999]]))
+PROBABILITIES = np.unique(
+    np.concatenate([np.linspace(0, 1, 101), [0.001, 0.005, 0.025, 0.975, 0.995, 0.999]])
+)
 """Probabilities at which the distribution of errors is tabulated."""
 MESSAGES = 20
 """Different messages of one estimator on one scenario that are listed one by one."""
@@ -119,17 +121,30 @@ class Begun:
             label, present = {"estimator": sample.group.estimator}, sample.present
             numbered = where | label
             summary += summary_rows(sample)
-            outcomes[sample.group.estimator] = Outcomes(sample.distance[present], sample.inside_gate[present])
-            found["endings"] += [dict(sample.group.columns) | label | row for row in _ending_rows(sample)]
+            outcomes[sample.group.estimator] = Outcomes(
+                sample.distance[present], sample.inside_gate[present]
+            )
+            found["endings"] += [
+                dict(sample.group.columns) | label | row for row in _ending_rows(sample)
+            ]
             found["scores"].append(numbered | rows_of(SCORES, sample)[-1] | _shared(sample))
             distances = quantiles(sample.distance, PROBABILITIES)
-            found["distributions"].append(numbered | {"probability": PROBABILITIES, "distance": distances})
+            found["distributions"].append(
+                numbered | {"probability": PROBABILITIES, "distance": distances}
+            )
             if sample.histories and sample.group.footer.get("equation") is not None:
                 medians = median_distances(sample.histories)
-                found["convergence"].append(numbered | {"iteration": np.arange(len(medians)), "distance": medians})
+                found["convergence"].append(
+                    numbered | {"iteration": np.arange(len(medians)), "distance": medians}
+                )
             for whole in sample.calibrations[-1:]:
                 low, high = band(len(whole.z), whole.level)
-                curve = {"at": POINTS, "difference": whole.size.difference, "low": low, "high": high}
+                curve = {
+                    "at": POINTS,
+                    "difference": whole.size.difference,
+                    "low": low,
+                    "high": high,
+                }
                 found["calibration"].append(numbered | curve)
             found["tracks"] += [numbered | row for row in epoch_curves(sample)]
             del sample  # before the next one takes as much memory
@@ -144,7 +159,9 @@ class Begun:
         import pandas as pd
 
         # Corrected over all scenarios: a sweep asks all its questions at once.
-        pairs = [where | pair for where, outcomes in self._compared for pair in compare_pairs(outcomes)]
+        pairs = [
+            where | pair for where, outcomes in self._compared for pair in compare_pairs(outcomes)
+        ]
         rows = self._rows
         return Analysis(
             collection=self.collection,
@@ -196,7 +213,8 @@ def _ending_rows(sample: Sample) -> list[dict[str, Any]]:
     lost, reasons = np.flatnonzero(~sample.converged), {s.label: s.reason for s in Status}
     messages = sample.scalars.get("message", np.full(len(sample), ""))[lost]
     ended = [
-        (str(s), str(m or reasons.get(s, ""))) for s, m in zip(sample.scalars["status"][lost], messages, strict=True)
+        (str(s), str(m or reasons.get(s, "")))
+        for s, m in zip(sample.scalars["status"][lost], messages, strict=True)
     ]
     first = dict(zip(reversed(ended), reversed(sample.number[lost]), strict=True))
     counts = Counter(ended).most_common()
@@ -204,6 +222,11 @@ def _ending_rows(sample: Sample) -> list[dict[str, Any]]:
     if rest := sum(count for _, count in counts[MESSAGES:]):
         rows.append(("others", "further messages, each rarer", rest, ""))
     if count := len(sample.unread):
-        rows.append((Status.NO_READINGS.label, Status.NO_READINGS.reason, count, label_of(sample.unread[0])))
-    columns, trials = ("status", "message", "trials", "first", "share"), len(sample) + len(sample.unread)
+        rows.append(
+            (Status.NO_READINGS.label, Status.NO_READINGS.reason, count, label_of(sample.unread[0]))
+        )
+    columns, trials = (
+        ("status", "message", "trials", "first", "share"),
+        len(sample) + len(sample.unread),
+    )
     return [dict(zip(columns, (*row, row[2] / trials), strict=True)) for row in rows]

@@ -180,7 +180,9 @@ class Calibration:
             return "of another shape"
         at = POINTS[np.argmax(np.abs(self.size.difference))]
         usual = float(np.sqrt(chdtri(self.degrees, 1 - at)))
-        return _shifted(middle) if place else _scaled(float(np.quantile(np.abs(self.z), at)) / usual)
+        return (
+            _shifted(middle) if place else _scaled(float(np.quantile(np.abs(self.z), at)) / usual)
+        )
 
 
 def calibrations(error: Array, deviation: Array, nees: Array, claimed: Array) -> list[Calibration]:
@@ -197,7 +199,11 @@ def calibrations(error: Array, deviation: Array, nees: Array, claimed: Array) ->
     each = [_normalised(e[claimed], s[claimed]) for e, s in zip(error.T, deviation.T, strict=True)]
     together = np.sort(np.sqrt(nees[claimed]))
     # Each u is below a point where z is beyond that point's quantile: 99 quantiles are had sooner than every u.
-    least, radius, whole = -ndtri(POINTS), np.sqrt(chdtri(1, 1 - POINTS)), np.sqrt(chdtri(n, 1 - POINTS))
+    least, radius, whole = (
+        -ndtri(POINTS),
+        np.sqrt(chdtri(1, 1 - POINTS)),
+        np.sqrt(chdtri(n, 1 - POINTS)),
+    )
     place = [trials - np.searchsorted(z, least) for z in each]
     size = [np.searchsorted(z, radius, side="right") - np.searchsorted(z, -radius) for z in each]
     found = curves([*place, *size, np.searchsorted(together, whole, side="right")], trials)
@@ -221,7 +227,9 @@ def overall_words(parts: Sequence[Calibration], names: Sequence[str]) -> str:
     if not outside:
         return together
     worst = min(outside, key=lambda k: (parts[k].p, -parts[k].excursion, names[k]))
-    others = "" if len(outside) == 1 else f"{len(outside)} of {len(names)} parameters outside, most "
+    others = (
+        "" if len(outside) == 1 else f"{len(outside)} of {len(names)} parameters outside, most "
+    )
     return f"{'' if together == INSIDE else together + '; '}{others}{names[worst]}: {said[worst]}"
 
 
@@ -253,7 +261,13 @@ def _scaled(scale: float) -> str:
     times, fault = (scale, "larger") if scale > 1 else (1 / scale, "smaller")
     shown = f"{times:.1e}".replace("e+0", "e").replace("e+", "e")
     if times < 1e6:
-        shown = f"{times:.2f}" if times < 1.095 else f"{times:.1f}" if times < 9.95 else f"{float(f'{times:.2g}'):,.0f}"
+        shown = (
+            f"{times:.2f}"
+            if times < 1.095
+            else f"{times:.1f}"
+            if times < 9.95
+            else f"{float(f'{times:.2g}'):,.0f}"
+        )
     return f"most errors {shown} times {fault} than claimed"
 
 

@@ -78,7 +78,11 @@ class Collection(Results):
     @property
     def settings(self) -> int:
         """Number of settings of simulated trials: scenarios that differ in more than the error scale."""
-        simulated = [key for key, groups in self.scenarios.items() if groups[0].columns["noise"] != "certified"]
+        simulated = [
+            key
+            for key, groups in self.scenarios.items()
+            if groups[0].columns["noise"] != "certified"
+        ]
         return len({key[:-1] for key in simulated})
 
 
@@ -103,9 +107,15 @@ def trials_frame(collection: Collection) -> pd.DataFrame:
             rows = pd.DataFrame(collection.load(cell, None))
             known = {} if truth is None else collection.load(truth, None)
             rows = rows.merge(pd.DataFrame(known), on="trial", how="left") if known else rows
-            belongs = {name: cell.names[name] for name in NAMES} | dict(group.columns) | dict(group.options)
+            belongs = (
+                {name: cell.names[name] for name in NAMES}
+                | dict(group.columns)
+                | dict(group.options)
+            )
             rows.insert(0, "trial", rows.pop("trial"))
-            rows = rows.loc[:, ~rows.columns.str.startswith("curves")]  # sums over trials, and no trial's
+            rows = rows.loc[
+                :, ~rows.columns.str.startswith("curves")
+            ]  # sums over trials, and no trial's
             parts.append(pd.concat([pd.DataFrame(belongs, index=rows.index), rows], axis=1))
             first |= belongs
     if not parts:
@@ -117,7 +127,11 @@ def trials_frame(collection: Collection) -> pd.DataFrame:
     def place(name: str) -> tuple[int, bool]:
         if name in first:
             return -1, False
-        main = (i for i, begin in enumerate(_MAIN) if name == begin or (begin[-1] == "_" and name.startswith(begin)))
+        main = (
+            i
+            for i, begin in enumerate(_MAIN)
+            if name == begin or (begin[-1] == "_" and name.startswith(begin))
+        )
         at = next(main, len(_MAIN))
         return at, at == len(_MAIN) and name not in ample
 
@@ -134,9 +148,16 @@ def config_leaves(description: Any, prefix: str = "") -> dict[str, tuple[str, An
         description = {str(i): v for i, v in enumerate(description)}
     if not isinstance(description, Mapping):
         # A list is one value, however long: two of different lengths differ.
-        return {prefix: ("", canonical_json(description) if isinstance(description, list) else description)}
+        return {
+            prefix: (
+                "",
+                canonical_json(description) if isinstance(description, list) else description,
+            )
+        }
     holder = str(description.get(TARGET, ""))
-    result: dict[str, tuple[str, Any]] = {prefix or TARGET: ("", holder)} if TARGET in description else {}
+    result: dict[str, tuple[str, Any]] = (
+        {prefix or TARGET: ("", holder)} if TARGET in description else {}
+    )
     for key, value in description.items():
         if key != TARGET:
             inner = config_leaves(value, f"{prefix}.{key}" if prefix else str(key))
@@ -153,7 +174,11 @@ def differing(descriptions: Sequence[Mapping[str, Any]]) -> list[str]:
     for description in descriptions:
         for key, (holder, value) in config_leaves(description).items():
             by_key.setdefault(key, {}).setdefault(holder, set()).add(canonical_json(value))
-    return [key for key, holders in by_key.items() if any(len(values) > 1 for values in holders.values())]
+    return [
+        key
+        for key, holders in by_key.items()
+        if any(len(values) > 1 for values in holders.values())
+    ]
 
 
 def _groups(cells: Sequence[StoredCell], runs: Sequence[Mapping[str, Any]]) -> tuple[Group, ...]:
@@ -171,28 +196,48 @@ def _groups(cells: Sequence[StoredCell], runs: Sequence[Mapping[str, Any]]) -> t
     extra = [k for k in differing([scenario_of(cell) for cell in firsts]) if k != "error_scale"]
     extra = [k for k in extra if not _stands_in_a_name(k, firsts)]
     options = {label: differing(list(several.values())) for label, several in configs.items()}
-    labels = dict.fromkeys(str(cell["names"].get("estimator")) for run in runs for cell in run["cells"])
+    labels = dict.fromkeys(
+        str(cell["names"].get("estimator")) for run in runs for cell in run["cells"]
+    )
     order = {label: i for i, label in enumerate(labels)}
     groups = []
     for members in found.values():
         first = members[0]
         chosen = _shown(first.footer["identity"]["estimator"], options[first.label])
-        columns = {k: first.names[k] for k in ("measurement", "noise")} | _shown(scenario_of(first), extra)
+        columns = {k: first.names[k] for k in ("measurement", "noise")} | _shown(
+            scenario_of(first), extra
+        )
         columns["error_scale"] = first.names["error_scale"]
-        label = first.label + (f" ({', '.join(f'{k}={v}' for k, v in chosen.items())})" if chosen else "")
+        label = first.label + (
+            f" ({', '.join(f'{k}={v}' for k, v in chosen.items())})" if chosen else ""
+        )
         members.sort(key=lambda cell: (cell.seed, cell.key))
         known = tuple(truths.get(cell.scenario_id) for cell in members)
-        groups.append(Group(columns, label, {f"estimator.{k}": v for k, v in chosen.items()}, tuple(members), known))
+        groups.append(
+            Group(
+                columns,
+                label,
+                {f"estimator.{k}": v for k, v in chosen.items()},
+                tuple(members),
+                known,
+            )
+        )
 
     def place(group: Group) -> tuple[Any, ...]:
-        return (*map(_sortable, group.columns.values()), order.get(group.label, len(order)), group.estimator)
+        return (
+            *map(_sortable, group.columns.values()),
+            order.get(group.label, len(order)),
+            group.estimator,
+        )
 
     return tuple(sorted(groups, key=place))
 
 
 def scenario_of(cell: StoredCell) -> dict[str, Any]:
     """Returns the construction of a scenario without its seed: only seeds are pooled."""
-    return {key: value for key, value in cell.footer["identity"]["scenario"].items() if key != "seed"}
+    return {
+        key: value for key, value in cell.footer["identity"]["scenario"].items() if key != "seed"
+    }
 
 
 def _shown(description: Any, keys: Iterable[str]) -> dict[str, Any]:
@@ -207,7 +252,10 @@ def _stands_in_a_name(key: str, cells: Sequence[StoredCell]) -> bool:
     if component not in ("measurement", "noise"):
         return False
     leaves = [canonical_json(config_leaves(scenario_of(cell)).get(key)) for cell in cells]
-    said = {(cell.footer["names"].get(component), leaf) for cell, leaf in zip(cells, leaves, strict=True)}
+    said = {
+        (cell.footer["names"].get(component), leaf)
+        for cell, leaf in zip(cells, leaves, strict=True)
+    }
     return len(said) == len({name for name, _ in said})
 
 

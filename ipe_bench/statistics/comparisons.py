@@ -48,20 +48,33 @@ def compare_pairs(outcomes: Mapping[str, Outcomes]) -> list[dict[str, Any]]:
         side = float(np.sign(differing) @ rankdata(np.abs(differing)))
         alone = int((a.success & ~b.success).sum()), int((b.success & ~a.success).sum())
         row = {"first": first, "second": second, "trials": len(d)}
-        row |= {"wins": int((d < 0).sum()), "ties": len(d) - len(differing), "losses": int((d > 0).sum())}
+        row |= {
+            "wins": int((d < 0).sum()),
+            "ties": len(d) - len(differing),
+            "losses": int((d > 0).sum()),
+        }
         row["median_difference"] = float(np.median(d)) if len(d) else float("nan")
         row["p_error"] = float(np.asarray(wilcoxon(differing))[1]) if len(differing) else 1.0
         row["favours"] = first if side < 0 else second if side > 0 else ""
-        rows.append(row | {"only_first": alone[0], "only_second": alone[1], "p_success": mcnemar(*alone)})
+        rows.append(
+            row | {"only_first": alone[0], "only_second": alone[1], "p_success": mcnemar(*alone)}
+        )
     return rows
 
 
 def corrected(pairs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Corrects each kind of p by Holm over all rows, and adds `closer`: the estimator that is significantly closer to
     the truth, or empty."""
-    p_error, p_success = (holm([pair[name] for pair in pairs]).tolist() for name in ("p_error", "p_success"))
+    p_error, p_success = (
+        holm([pair[name] for pair in pairs]).tolist() for name in ("p_error", "p_success")
+    )
     return [
-        {**pair, "p_error": error, "p_success": success, "closer": pair["favours"] if error < ALPHA else ""}
+        {
+            **pair,
+            "p_error": error,
+            "p_success": success,
+            "closer": pair["favours"] if error < ALPHA else "",
+        }
         for pair, error, success in zip(pairs, p_error, p_success, strict=True)
     ]
 

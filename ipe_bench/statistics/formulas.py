@@ -126,7 +126,11 @@ def _unit(s: Sample) -> Array:
 def std(s: Sample) -> Array:
     """Computes the standard deviation (n - 1)."""
     count = int(s.solved.sum())
-    return _unit(s) * np.sqrt(np.diag(products(s)) / (count - 1)) if count > 1 else np.full(s.n, np.nan)
+    return (
+        _unit(s) * np.sqrt(np.diag(products(s)) / (count - 1))
+        if count > 1
+        else np.full(s.n, np.nan)
+    )
 
 
 @once
@@ -193,7 +197,9 @@ def ends_in_units(ends: Callable[[Sample], tuple[Array, Array]]) -> Callable[[Sa
 
 def error_quantile(s: Sample, q: float) -> Array:
     """Computes a quantile of each parameter's absolute error, and of `together` (n + 1,)."""
-    return np.append(np.array([quantile(np.abs(e), q) for e in s.error.T]) * s.sizes, quantile(together(s), q))
+    return np.append(
+        np.array([quantile(np.abs(e), q) for e in s.error.T]) * s.sizes, quantile(together(s), q)
+    )
 
 
 def over_bound(s: Sample) -> Array:
@@ -283,7 +289,9 @@ def efficiency_limits(s: Sample) -> Ends:
 
 def efficiency_all(s: Sample) -> Array:
     bound, error = rms_columns(s.of_truth(s.group.footer["bound"])), rmse_all(s)
-    return np.append(ratio(bound, error), ratio(rms(bound / s.linear_bound), rms(error / s.linear_bound)))
+    return np.append(
+        ratio(bound, error), ratio(rms(bound / s.linear_bound), rms(error / s.linear_bound))
+    )
 
 
 @once
@@ -293,13 +301,17 @@ def van_trees(s: Sample) -> tuple[Array, Array]:
     bound, error = s.of_truth("van_trees"), s.of_truth("van_trees_error")
     drawn: Array = np.asarray(~np.isnan(bound[:, 0]))
     middle = np.sqrt(mean(bound**2, drawn))
-    return middle, np.sqrt(mean((2 * bound * error) ** 2, drawn) / max(1, int(drawn.sum()))) / (2 * middle)
+    return middle, np.sqrt(mean((2 * bound * error) ** 2, drawn) / max(1, int(drawn.sum()))) / (
+        2 * middle
+    )
 
 
 def van_trees_limits(s: Sample) -> Ends:
     """Computes limits of the bound for infinitely many truths, by the scatter of the information among those used."""
     bound, error = van_trees(s)
-    return in_units(np.maximum(bound - NORMAL_95 * error, 0.0), s), in_units(bound + NORMAL_95 * error, s)
+    return in_units(np.maximum(bound - NORMAL_95 * error, 0.0), s), in_units(
+        bound + NORMAL_95 * error, s
+    )
 
 
 def eq_14(s: Sample) -> Array:
@@ -324,12 +336,16 @@ def predicted(s: Sample) -> tuple[Array, Array]:
         return np.full(s.n, np.nan), np.full(s.n, np.nan)
     if s.group.footer["identity"]["scenario"].get("truth") is not None:
         wrong, scatter = s.of_truth("pseudo_bias"), s.of_truth("misspecified")
-        used: Array = np.asarray(s.solved & np.isfinite(wrong).all(axis=1) & np.isfinite(scatter).all(axis=1))
+        used: Array = np.asarray(
+            s.solved & np.isfinite(wrong).all(axis=1) & np.isfinite(scatter).all(axis=1)
+        )
         return mean(wrong, used), np.sqrt(mean(wrong**2 + scatter**2, used))
     box = s.of_truth("box_bias")
     known: Array = np.asarray(np.isfinite(box).all(axis=1))
     square = mean(box**2, known)
-    return mean(box, known), np.sqrt(mean(s.of_truth("crlb") ** 2, s.solved) + np.where(np.isnan(square), 0.0, square))
+    return mean(box, known), np.sqrt(
+        mean(s.of_truth("crlb") ** 2, s.solved) + np.where(np.isnan(square), 0.0, square)
+    )
 
 
 def median_of_truth(s: Sample, name: str) -> float:
@@ -361,7 +377,11 @@ def nees_limits(s: Sample) -> Ends:
 
 
 def nees_median(s: Sample) -> float:
-    return quantile(s.scalars["nees"], 0.5) / (2 * gammaincinv(s.n / 2, 0.5)) if reports_covariance(s) else np.nan
+    return (
+        quantile(s.scalars["nees"], 0.5) / (2 * gammaincinv(s.n / 2, 0.5))
+        if reports_covariance(s)
+        else np.nan
+    )
 
 
 def nees_median_limits(s: Sample) -> Ends:
@@ -438,7 +458,9 @@ def observed_constant(iterates: Array) -> float:
 def fixed_point_bounds(s: Sample) -> Array:
     """Computes `fixed_point_bound` (histories, 2) of each history of fixed-point iteration whose K is below 1."""
     histories = s.histories if _uses(s, "FixedPoint") else ()
-    return np.array([fixed_point_bound(h.iterates, h.K) for h in histories if h.K < 1]).reshape(-1, 2)
+    return np.array([fixed_point_bound(h.iterates, h.K) for h in histories if h.K < 1]).reshape(
+        -1, 2
+    )
 
 
 @once

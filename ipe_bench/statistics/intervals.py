@@ -16,7 +16,14 @@ import numpy as np
 from scipy.special import betaincinv, betaln, chdtri, ndtri
 
 from ipe_bench.basics.linalg import Array
-from ipe_bench.statistics.verdicts import CONSISTENT, NO_VERDICT, OVERCONFIDENT, TOO_CAUTIOUS, UNDECIDED, Verdict
+from ipe_bench.statistics.verdicts import (
+    CONSISTENT,
+    NO_VERDICT,
+    OVERCONFIDENT,
+    TOO_CAUTIOUS,
+    UNDECIDED,
+    Verdict,
+)
 from ipe_bench.trials.thresholds import FEW
 
 LEVEL = 0.95
@@ -63,7 +70,9 @@ def clopper_pearson(count: int, trials: int, level: float = LEVEL) -> tuple[floa
 # Root mean squares of a fixed number of trials -----------------------------------------------------------------------
 
 
-def rms_interval(squares: Array, used: Array | None = None, level: float = LEVEL) -> tuple[Array, Array]:
+def rms_interval(
+    squares: Array, used: Array | None = None, level: float = LEVEL
+) -> tuple[Array, Array]:
     """Computes the bootstrap-t interval of the root mean square over the trials used, per column; NaN below `FEW`.
 
     squares is (trials, k), used (trials,) boolean, all where it is not given. The logarithm of the mean square is
@@ -98,7 +107,9 @@ def grouped(values: Array, groups: int = LARGEST_SAMPLE) -> Array:
     themselves where there are no more trials than groups."""
     trials = values.shape[1]
     if trials > groups:
-        values = np.add.reduceat(values, np.linspace(0, trials, groups, endpoint=False).astype(int), axis=1)
+        values = np.add.reduceat(
+            values, np.linspace(0, trials, groups, endpoint=False).astype(int), axis=1
+        )
     return np.ascontiguousarray(values.T)
 
 
@@ -180,7 +191,9 @@ def _heaviest(trials: int, degrees: int) -> float:
         return math.prod((x + i for i in range(k)), start=Fraction(1))
 
     def moment(*powers: int) -> Fraction:
-        return math.prod((rising(a, k) for k in powers), start=Fraction(1)) / rising(trials * a, sum(powers))
+        return math.prod((rising(a, k) for k in powers), start=Fraction(1)) / rising(
+            trials * a, sum(powers)
+        )
 
     pairs = trials * (trials - 1)
     mean = trials * moment(2)
@@ -197,7 +210,9 @@ def _heaviest(trials: int, degrees: int) -> float:
 # What no trial has shown ----------------------------------------------------------------------------------------------
 
 
-def unseen(squares: Array, degrees: Array, least: float | Array = 0.0, level: float = LEVEL) -> Array:
+def unseen(
+    squares: Array, degrees: Array, least: float | Array = 0.0, level: float = LEVEL
+) -> Array:
     """Computes the share (k,) of trials that may be unusual beyond those that are: the upper limit of Clopper and
     Pearson less the share seen, 0 from `RARE` unusual trials on; about 3 / N where N trials show none.
 
@@ -211,7 +226,9 @@ def unseen(squares: Array, degrees: Array, least: float | Array = 0.0, level: fl
         return np.full(len(squares), np.nan)
     units = np.maximum(np.median(squares, axis=1) / chdtri(degrees, 0.5), least)
     unusual = (squares > (units * chdtri(degrees, UNUSUAL))[:, None]).sum(axis=1)
-    limits = [clopper_pearson(int(k), count, 2 * level - 1)[1] if k < RARE else 0.0 for k in unusual]
+    limits = [
+        clopper_pearson(int(k), count, 2 * level - 1)[1] if k < RARE else 0.0 for k in unusual
+    ]
     return np.maximum(np.array(limits) - unusual / count, 0.0)
 
 
@@ -289,7 +306,9 @@ def share_sequence(count: int, trials: int, level: float = LEVEL) -> tuple[float
     def beaten(p: float) -> bool:
         a, b, failures = _WEIGHT * p, _WEIGHT * (1 - p), trials - count
         mixture = float(betaln(a + count, b + failures) - betaln(a, b))
-        own = (count * math.log(p) if count else 0.0) + (failures * math.log1p(-p) if failures else 0.0)
+        own = (count * math.log(p) if count else 0.0) + (
+            failures * math.log1p(-p) if failures else 0.0
+        )
         return mixture - own > -math.log(1 - level)
 
     low = first_that(beaten, count / trials, 0.0) if count else 0.0
@@ -321,7 +340,11 @@ def rms_sequence(squares: Squares, degrees: Array, level: float = LEVEL) -> tupl
     grown = count * rho2 + 1
     with np.errstate(all="ignore"):
         deviation = np.sqrt(squares.deviations / (count - 1)) / mean
-        reach = deviation * math.sqrt(2 * grown / (count**2 * rho2) * math.log(math.sqrt(grown) / alpha)) / 2
+        reach = (
+            deviation
+            * math.sqrt(2 * grown / (count**2 * rho2) * math.log(math.sqrt(grown) / alpha))
+            / 2
+        )
         root = np.sqrt(size * mean)
         ends = [np.where(size > 0, root * np.exp(side * reach), 0.0) for side in (-1, 1)]
     few = few_carry(squares, degrees)
@@ -344,7 +367,10 @@ def quantile(values: Array, q: float) -> float:
 
 def quantiles(values: Array, q: Array) -> Array:
     """Computes many such quantiles (k,) of one or more numbers from one sort."""
-    ordered, position = np.sort(np.where(np.isfinite(values), values, np.inf)), (len(values) - 1) * q
+    ordered, position = (
+        np.sort(np.where(np.isfinite(values), values, np.inf)),
+        (len(values) - 1) * q,
+    )
     a, b = (ordered[place(position).astype(int)] for place in (np.floor, np.ceil))
     with np.errstate(invalid="ignore"):
         return np.where(a < b, a + (b - a) * (position - np.floor(position)), a)

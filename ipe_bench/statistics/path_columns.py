@@ -50,7 +50,9 @@ def path(s: Sample) -> PathSample:
 
 def of_path(formula: Callable[[Sample], Array]) -> Callable[[Sample], Array]:
     """Turns a formula (n,) of errors over all epochs into its shown form (n + 1,); NaN if no state is tracked."""
-    return lambda s: f.in_units(formula(path(s)), path(s)) if is_track(s) else np.full(s.n + 1, np.nan)
+    return lambda s: (
+        f.in_units(formula(path(s)), path(s)) if is_track(s) else np.full(s.n + 1, np.nan)
+    )
 
 
 rmse = of_path(f.rmse)
@@ -115,7 +117,9 @@ def epoch_curves(s: Sample) -> Iterator[dict[str, Any]]:
     own = sum(_sums(s, s.group.cells, K, 2 * n + 4), np.zeros((K, 2 * n + 4)))
     truths = _sums(s, [truth for truth in s.group.truths if truth is not None], K, 2 * n)
     errors, nees, total, count = own[:, :n], own[:, n], own[:, n + 3 : -1], own[:, -1]
-    posterior = next((block for block in truths if np.isfinite(block).all()), np.full((K, 2 * n), np.nan))
+    posterior = next(
+        (block for block in truths if np.isfinite(block).all()), np.full((K, 2 * n), np.nan)
+    )
     with np.errstate(all="ignore"):
         low, high = mean_limits(n, int(count[0]))
         for i, name in enumerate(s.names):

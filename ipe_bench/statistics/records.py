@@ -20,18 +20,24 @@ from ipe_bench.statistics.statistic import Statistic
 from ipe_bench.trials.thresholds import EVEN, EXPECTED, FEW, GATE, SAME_ROOT
 
 
-def _all(name: str, title: str, meaning: str, values: Callable[[Sample], Any], **shown: Any) -> Statistic:
+def _all(
+    name: str, title: str, meaning: str, values: Callable[[Sample], Any], **shown: Any
+) -> Statistic:
     """Defines a statistic over all trials."""
     return Statistic(name, title, "all trials", meaning, values, **shown)
 
 
-def _solved(name: str, title: str, meaning: str, values: Callable[[Sample], Any], **shown: Any) -> Statistic:
+def _solved(
+    name: str, title: str, meaning: str, values: Callable[[Sample], Any], **shown: Any
+) -> Statistic:
     """Defines a statistic over the solved trials."""
     return Statistic(name, title, "solved trials", meaning, values, given="solved", **shown)
 
 
 STATISTICS: tuple[Statistic, ...] = (
-    Statistic("trials", "trials", "all trials", "Their number.", len, kind="count", where=("all_trials",)),
+    Statistic(
+        "trials", "trials", "all trials", "Their number.", len, kind="count", where=("all_trials",)
+    ),
     Statistic(
         "no_readings",
         "no readings",
@@ -336,7 +342,9 @@ STATISTICS: tuple[Statistic, ...] = (
         "reported",
         "Root mean square of the standard deviation that the estimator itself reports: eq. (5) for the linear LSE, the"
         " sandwich (H⁺J)⁻¹ H⁺RH⁺' (H⁺J)⁻ᵀ at the estimate for the frozen root.",
-        f.of_each(lambda s: f.rms_columns(s.deviation, s.solved & np.isfinite(s.deviation).all(axis=1))),
+        f.of_each(
+            lambda s: f.rms_columns(s.deviation, s.solved & np.isfinite(s.deviation).all(axis=1))
+        ),
         kind="physical",
         where=("covariances",),
     ),
@@ -554,8 +562,24 @@ STATISTICS: tuple[Statistic, ...] = (
 """The columns of `summary_all.csv`, in order."""
 
 MAIN = (
-    *("trials", "success", "failed_known", "failed_silent", "error_median", "error_q95", "efficiency_capped", "rmse"),
-    *("nees_median", "coverage95", "verdict", "iterations_median", "simulations_median", "simulations_mean"),
+    *(
+        "trials",
+        "success",
+        "failed_known",
+        "failed_silent",
+        "error_median",
+        "error_q95",
+        "efficiency_capped",
+        "rmse",
+    ),
+    *(
+        "nees_median",
+        "coverage95",
+        "verdict",
+        "iterations_median",
+        "simulations_median",
+        "simulations_mean",
+    ),
     "time_mean_s",
 )
 """The statistics of estimators of constants that `summary.csv` has, with their intervals."""
@@ -583,7 +607,13 @@ SCORES: tuple[Statistic, ...] = (
         f.capped_error,
         where=("all_trials",),
     ),
-    Statistic("cost_median", "cost", "all trials", "Median cost of a trial.", lambda s: quantile(s.cost, 0.5)),
+    Statistic(
+        "cost_median",
+        "cost",
+        "all trials",
+        "Median cost of a trial.",
+        lambda s: quantile(s.cost, 0.5),
+    ),
     Statistic(
         "cost_to_limit_median",
         f"to {CLOSE:g} σ of limit",
@@ -591,7 +621,13 @@ SCORES: tuple[Statistic, ...] = (
         f"Median cost until all further iterates are within {CLOSE:g} standard deviations of the last, in every"
         " parameter; iterate k of K is taken to cost (k + 1) / (K + 1) of the trial.",
         lambda s: quantile(
-            np.array([h.cost * (iterations_to_limit(h.distances) + 1) / len(h.distances) for h in s.histories]), 0.5
+            np.array(
+                [
+                    h.cost * (iterations_to_limit(h.distances) + 1) / len(h.distances)
+                    for h in s.histories
+                ]
+            ),
+            0.5,
         ),
         where=("costs",),
     ),
@@ -609,7 +645,9 @@ SCORES: tuple[Statistic, ...] = (
         "order",
         "converged trials with a stored history",
         "Median of the last observed order of convergence: 1 linear, 2 quadratic.",
-        lambda s: quantile(np.array([o[-1] for h in s.histories if len(o := orders_of(h.distances))]), 0.5),
+        lambda s: quantile(
+            np.array([o[-1] for h in s.histories if len(o := orders_of(h.distances))]), 0.5
+        ),
         where=("costs",),
     ),
     Statistic(
@@ -663,7 +701,11 @@ SCORES: tuple[Statistic, ...] = (
         "eq. (23) holds",
         "the same trials",
         "Share in which the least M that explains the history is at most M at the truth.",
-        lambda s: f.share(constants[:, 0] <= constants[:, 1]) if len(constants := f.constants(s)) else np.nan,
+        lambda s: (
+            f.share(constants[:, 0] <= constants[:, 1])
+            if len(constants := f.constants(s))
+            else np.nan
+        ),
         kind="share",
         where=("iterations",),
     ),

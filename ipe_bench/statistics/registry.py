@@ -11,12 +11,32 @@ import numpy as np
 from ipe_bench.basics.errors import UserError, place_of
 from ipe_bench.statistics.records import MAIN, MAIN_OF_STATES, NOT_MAIN, RENAMED, SCORES, STATISTICS
 from ipe_bench.statistics.sample import Sample
-from ipe_bench.statistics.statistic import ALL, BEST, Condition, Kind, Statistic, Where, frame_columns, rows_of
+from ipe_bench.statistics.statistic import (
+    ALL,
+    BEST,
+    Condition,
+    Kind,
+    Statistic,
+    Where,
+    frame_columns,
+    rows_of,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
 
-_RESERVED = (BEST, "measurement", "noise", "prior", "error_scale", "seed", "estimator", "parameter", "unit", "scenario")
+_RESERVED = (
+    BEST,
+    "measurement",
+    "noise",
+    "prior",
+    "error_scale",
+    "seed",
+    "estimator",
+    "parameter",
+    "unit",
+    "scenario",
+)
 _of_plugins: dict[str, Statistic] = {}
 
 
@@ -75,7 +95,9 @@ def columns_of_added(record: Statistic, sample: Sample) -> dict[str, list[Any]]:
             )
         for value in values:
             if not isinstance(value, str if record.kind == "word" else int | float | np.number):
-                raise UserError(f"{name}: a value is a {type(value).__name__}; return a float, or NaN for none")
+                raise UserError(
+                    f"{name}: a value is a {type(value).__name__}; return a float, or NaN for none"
+                )
     return columns
 
 
@@ -89,7 +111,9 @@ def current_name(column: str) -> str:
     if column not in RENAMED:
         return column
     now = RENAMED[column]
-    warnings.warn(f"{column}: is called {now} now; the old name goes with the next version", FutureWarning, 3)
+    warnings.warn(
+        f"{column}: is called {now} now; the old name goes with the next version", FutureWarning, 3
+    )
     return now
 
 
@@ -114,13 +138,19 @@ def summary_rows(sample: Sample) -> list[dict[str, Any]]:
         except UserError as error:
             line = f"statistic={record.name}: {error}; it is missing where that is so"
             sample.collection.extra_problems.append(line)
-            columns = {name: ["-" if record.kind == "word" else np.nan] * len(rows) for name in record.columns}
+            columns = {
+                name: ["-" if record.kind == "word" else np.nan] * len(rows)
+                for name in record.columns
+            }
         for i, row in enumerate(rows):
             row |= {name: values[i] for name, values in columns.items()}
     group = sample.group
     head = dict(group.columns) | {"estimator": group.estimator} | dict(group.options)
     labels = [*((p["name"], p["unit"]) for p in sample.parameters), (ALL, "linear bound")]
-    return [head | {"parameter": p, "unit": unit} | row for (p, unit), row in zip(labels, rows, strict=True)]
+    return [
+        head | {"parameter": p, "unit": unit} | row
+        for (p, unit), row in zip(labels, rows, strict=True)
+    ]
 
 
 def to_frame(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
@@ -129,7 +159,17 @@ def to_frame(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
 
     frame, known = pd.DataFrame(list(rows)), summary_columns()
     if frame.empty:
-        return pd.DataFrame(columns=["measurement", "noise", "error_scale", "estimator", "parameter", "unit", *known])
+        return pd.DataFrame(
+            columns=[
+                "measurement",
+                "noise",
+                "error_scale",
+                "estimator",
+                "parameter",
+                "unit",
+                *known,
+            ]
+        )
     keys = [c for c in frame.columns if c not in (*known, "parameter", "unit")]
     first = [c for c in ("measurement", "noise") if c in keys]
     last = ["error_scale", "estimator"]

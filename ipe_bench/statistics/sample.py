@@ -24,7 +24,17 @@ NIS = "extra_nis"
 """The column of the normalised innovations squared that filters report."""
 AMBIGUOUS = "extra_ambiguous"
 """The column in which estimators that look for several minima report 1 if they found some, else 0."""
-SCALARS = ("status", "solved", "success", "iterations", "simulations", "jacobians", "time_s", "nees", "crlb_distance")
+SCALARS = (
+    "status",
+    "solved",
+    "success",
+    "iterations",
+    "simulations",
+    "jacobians",
+    "time_s",
+    "nees",
+    "crlb_distance",
+)
 PATH = ("path_nees", "path_success", "white_p", "log_likelihood", "first_bad_epoch")
 """Scores of a tracker over the whole path."""
 OPTIONAL_COLUMNS = ("message", FIT, NIS, AMBIGUOUS, "root_distance", *PATH)
@@ -86,9 +96,16 @@ class Sample:
         """Loads the stored trials of a group; `present` and `solved` are the numbers of those that all rivals have, and
         all solved."""
         names = [p["name"] for p in group.footer["parameters"]]
-        errors, deviations = ([f"{kind}_{name}" for name in names] for kind in ("error", "deviation"))
-        parts = [collection.load(cell, [*errors, *deviations, *SCALARS], OPTIONAL_COLUMNS) for cell in group.cells]
-        every = np.concatenate([_numbers(cell, part["trial"]) for cell, part in zip(group.cells, parts, strict=True)])
+        errors, deviations = (
+            [f"{kind}_{name}" for name in names] for kind in ("error", "deviation")
+        )
+        parts = [
+            collection.load(cell, [*errors, *deviations, *SCALARS], OPTIONAL_COLUMNS)
+            for cell in group.cells
+        ]
+        every = np.concatenate(
+            [_numbers(cell, part["trial"]) for cell, part in zip(group.cells, parts, strict=True)]
+        )
         status = np.concatenate([part["status"] for part in parts])
         used: Array = np.asarray(status != Status.NO_READINGS.label)
 
@@ -96,7 +113,9 @@ class Sample:
             """Concatenates the column, which is removed from its parts."""
             return np.concatenate([part.pop(name) for part in parts])[used]
 
-        there = [name for name in (*SCALARS, *OPTIONAL_COLUMNS) if all(name in part for part in parts)]
+        there = [
+            name for name in (*SCALARS, *OPTIONAL_COLUMNS) if all(name in part for part in parts)
+        ]
         number, scalars = every[used], {name: joined(name) for name in there}
         for name in ("solved", "success"):
             scalars[name] = scalars[name].astype(bool)
@@ -197,7 +216,9 @@ class Sample:
         for cell in filter(None, cells):
             stored = self.collection.load(cell, (), names)
             numbers = _numbers(cell, stored["trial"])
-            _, mine, theirs = np.intersect1d(self.number, numbers, assume_unique=True, return_indices=True)
+            _, mine, theirs = np.intersect1d(
+                self.number, numbers, assume_unique=True, return_indices=True
+            )
             for row, name in zip(values, names, strict=True):
                 if name in stored:
                     row[mine] = stored[name][theirs]
@@ -261,7 +282,11 @@ def samples(collection: Collection, groups: Sequence[Group]) -> Iterator[Sample]
 
 def _in_all(several: Sequence[Array]) -> Array:
     """Returns the numbers that all have, ascending."""
-    return reduce(np.intersect1d, several[1:], np.unique(several[0])) if several else np.empty(0, dtype=np.int64)
+    return (
+        reduce(np.intersect1d, several[1:], np.unique(several[0]))
+        if several
+        else np.empty(0, dtype=np.int64)
+    )
 
 
 def _numbers(cell: StoredCell, trial: Array) -> Array:

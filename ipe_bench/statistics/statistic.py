@@ -106,7 +106,9 @@ class Statistic:
         """Returns its columns, a value for each parameter and one for all together."""
         with np.errstate(all="ignore"):
             found = [self.values(sample), *(() if self.limits is None else self.limits(sample))]
-        columns = [np.asarray(one).tolist() if np.ndim(one) else [one] * (sample.n + 1) for one in found]
+        columns = [
+            np.asarray(one).tolist() if np.ndim(one) else [one] * (sample.n + 1) for one in found
+        ]
         return dict(zip(self.columns, columns, strict=True))
 
 

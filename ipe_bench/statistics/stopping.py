@@ -41,7 +41,9 @@ def precision_of(given: float | Mapping[str, float]) -> Mapping[str, float]:
     Raises:
         UserError: it is neither.
     """
-    named = {str(k): v for k, v in given.items()} if isinstance(given, Mapping) else {"success": given}
+    named = (
+        {str(k): v for k, v in given.items()} if isinstance(given, Mapping) else {"success": given}
+    )
     for name, value in named.items():
         if name not in WITH_PRECISION:
             raise UserError(f"precision.{name}: {unknown(name, WITH_PRECISION, 'statistic')}")
@@ -65,10 +67,17 @@ def _distances(sample: Sample, wanted: Mapping[str, float]) -> Iterator[tuple[fl
             low, high = (float(end[sample.n]) for end in rmse_sequence(sample))
             width = float(np.sqrt(high / low)) - 1 if low > 0 else np.inf
         known = math.isfinite(width)
-        shown = f"{100 * width:.2g} %" if known else "anything, since a few trials carry it or there are too few"
+        shown = (
+            f"{100 * width:.2g} %"
+            if known
+            else "anything, since a few trials carry it or there are too few"
+        )
         if known and statistic == "rmse" and (rare := float(rmse_unseen(sample)[sample.n])) > 0:
             shown += f", unless errors are larger in 1 of {1 / rare:.0f} trials or fewer"
-        yield width / precision if known else np.inf, f"{sample.group.estimator}: {statistic} ± {shown}"
+        yield (
+            width / precision if known else np.inf,
+            f"{sample.group.estimator}: {statistic} ± {shown}",
+        )
 
 
 def compute_until(
@@ -97,14 +106,23 @@ def compute_until(
         StorageError: nothing can be stored any more.
     """
     # Code that fills its variables while it computes is still what it was when the run began.
-    scenarios, estimators = pinned(list(scenarios)), {label: pinned(one) for label, one in estimators.items()}
+    scenarios, estimators = (
+        pinned(list(scenarios)),
+        {label: pinned(one) for label, one in estimators.items()},
+    )
     options: dict[str, Any] = {"execution": execution, "watch": watch, "command": command}
     if precision is None:
         if time_limit is not None:
-            raise UserError(f"time_limit={time_limit}: goes with precision; give that, or leave it out")
+            raise UserError(
+                f"time_limit={time_limit}: goes with precision; give that, or leave it out"
+            )
         trials = TRIALS if most is None else most
         return compute(scenarios, estimators, trials, output, block_size=block_size, **options), []
-    wanted, budget, began = precision_of(precision), MOST_TRIALS if most is None else most, time.monotonic()
+    wanted, budget, began = (
+        precision_of(precision),
+        MOST_TRIALS if most is None else most,
+        time.monotonic(),
+    )
     if time_limit is not None and not time_limit > 0:
         raise UserError(f"time_limit={time_limit}: give a number of seconds above 0")
     if any(scenario.noise.real for scenario in scenarios):
@@ -117,15 +135,22 @@ def compute_until(
     stops: dict[int, dict[str, Any]] = {}
     while len(stops) < len(scenarios):
         for i in [i for i in range(len(scenarios)) if i not in stops]:
-            failed = compute([scenarios[i]], estimators, at[i], output, record_as=names[i], **options)
-            ratios = [one for sample in _stored(scenarios[i], estimators, output) for one in _distances(sample, wanted)]
+            failed = compute(
+                [scenarios[i]], estimators, at[i], output, record_as=names[i], **options
+            )
+            ratios = [
+                one
+                for sample in _stored(scenarios[i], estimators, output)
+                for one in _distances(sample, wanted)
+            ]
             ratio, widest = max(ratios, key=lambda one: one[0], default=(np.inf, ""))
             reasons = {
                 "some blocks failed": failed,
                 "no trial has readings": not ratios,
                 NARROW: ratio <= 1,
                 "there are as many trials as there may be": at[i] >= budget,
-                "the time is over": time_limit is not None and time.monotonic() - began >= time_limit,
+                "the time is over": time_limit is not None
+                and time.monotonic() - began >= time_limit,
             }
             if reason := next((words for words, applies in reasons.items() if applies), ""):
                 failures += failed
@@ -139,7 +164,9 @@ def compute_until(
 def next_trials(trials: int, ratio: float, block: int, most: int) -> int:
     """Computes how many trials to have before looking again: what the widths ask for, at most twice as many as now, in
     whole blocks. Widths shrink with the root of the number."""
-    wanted = 2.0 * trials if not math.isfinite(ratio) else min(2.0 * trials, 1.02 * trials * ratio**2)
+    wanted = (
+        2.0 * trials if not math.isfinite(ratio) else min(2.0 * trials, 1.02 * trials * ratio**2)
+    )
     return min(most, max(trials // block + 1, math.ceil(wanted / block)) * block)
 
 
@@ -149,18 +176,26 @@ def _first_trials(
     """Returns the number to begin with: what is stored of every estimator, or one block."""
     cells = result_keys(scenario, estimators)
     results = Results.read([output] if output.is_dir() else [], keys={cell.key for cell in cells})
-    stored = min(gaps[0][0] if (gaps := results.missing(cell.key, most)) else most for cell in cells)
+    stored = min(
+        gaps[0][0] if (gaps := results.missing(cell.key, most)) else most for cell in cells
+    )
     return min(most, max(stored, block_size))
 
 
-def _stored(scenario: AnyScenario, estimators: Mapping[str, Any], output: Path | str) -> Iterator[Sample]:
+def _stored(
+    scenario: AnyScenario, estimators: Mapping[str, Any], output: Path | str
+) -> Iterator[Sample]:
     """Returns the stored trials of every estimator that has some."""
     collection = collect([output], {cell.key for cell in result_keys(scenario, estimators)})
     return samples(collection, collection.groups)
 
 
 def objective(
-    scenario: AnyScenario, estimators: Mapping[str, Any], label: str, column: str, output: Path | str
+    scenario: AnyScenario,
+    estimators: Mapping[str, Any],
+    label: str,
+    column: str,
+    output: Path | str,
 ) -> float:
     """Returns one number for an estimator: a column of its row over all parameters, of all stored trials.
 

@@ -91,9 +91,24 @@ VERDICTS = (
         "!",
         "From the named epoch of a log on, most innovations are larger than all but one in a million by chance.",
     ),
-    Word(COLLAPSED, "collapsed", "!", "The particles of a log have a median effective sample size below 2."),
-    Word(NO_MAXIMUM, "no maximum", "!", "The likelihood of a log has no maximum in the constants that `find=` names."),
-    Word(SEVERAL_MAXIMA, "several maxima", "!", "The log hardly tells several maxima of the likelihood apart."),
+    Word(
+        COLLAPSED,
+        "collapsed",
+        "!",
+        "The particles of a log have a median effective sample size below 2.",
+    ),
+    Word(
+        NO_MAXIMUM,
+        "no maximum",
+        "!",
+        "The likelihood of a log has no maximum in the constants that `find=` names.",
+    ),
+    Word(
+        SEVERAL_MAXIMA,
+        "several maxima",
+        "!",
+        "The log hardly tells several maxima of the likelihood apart.",
+    ),
 )
 """The words of verdict, those on covariances first."""
 _WORDS = {name: word for word in VERDICTS for name in (word.value, *word.replaces)}

@@ -83,12 +83,18 @@ def prior_spread(inner: Array, m: int, factor: Array, inflation: float = 1.0) ->
     """Computes the spread for an estimate from m readings with J' R^-1 J = inner (trials, n, n) and a prior of
     deviations `factor` (n,), or with that Cholesky factor (n, n), widened by `inflation` for the estimator."""
     n = len(factor)
-    values = inner * np.outer(factor, factor) if factor.ndim == 1 else np.matmul(np.matmul(factor.T, inner), factor)
+    values = (
+        inner * np.outer(factor, factor)
+        if factor.ndim == 1
+        else np.matmul(np.matmul(factor.T, inner), factor)
+    )
     usable = finite(values)
     values = np.maximum(np.linalg.eigvalsh(np.where(usable[:, None, None], values, 0.0)), 0.0)
     values = np.where(usable[:, None], values, np.nan)
     # Of m < n readings only the m largest have directions of their own.
-    return Spread(max(m - n, 0), ((1 + values) / (1 + inflation**2 * values) ** 2)[:, max(n - m, 0) :])
+    return Spread(
+        max(m - n, 0), ((1 + values) / (1 + inflation**2 * values) ** 2)[:, max(n - m, 0) :]
+    )
 
 
 def _basis(J: Array, R: Covariance) -> Array:
@@ -117,7 +123,11 @@ def fit_probability(squares: Array, spread: Spread, noise: Noise, H: Array, R: C
         degrees = m - n
         alike = degrees + (squares - spread.mean) * np.sqrt(degrees / spread.squares)
     larger = len(reference) - np.searchsorted(reference, alike)
-    return np.where(np.isfinite(alike), (larger + 1) / (len(reference) + 1), np.where(alike == np.inf, 0.0, np.nan))
+    return np.where(
+        np.isfinite(alike),
+        (larger + 1) / (len(reference) + 1),
+        np.where(alike == np.inf, 0.0, np.nan),
+    )
 
 
 @functools.lru_cache(maxsize=16)

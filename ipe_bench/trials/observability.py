@@ -137,7 +137,9 @@ class Suspect:
         return self.bounds > 1 and self.noticed < 0.5
 
 
-def suspects(model: Measurement, R: Covariance, truth: Measurement, x: Array) -> tuple[Suspect, ...]:
+def suspects(
+    model: Measurement, R: Covariance, truth: Measurement, x: Array
+) -> tuple[Suspect, ...]:
     """Finds the errors that `truth` has and `model` has not, at the truths x (truths, n), the largest shift first.
 
     Each is a nuisance of `truth`; those of a group of many are taken together.
@@ -162,7 +164,9 @@ def suspects(model: Measurement, R: Covariance, truth: Measurement, x: Array) ->
         visible = float(np.sum(kept**2) / np.sum(whole**2)) if np.any(whole) else 0.0
         noticed = _noticed(kept, model.m - model.n)
         bounds = float(relative[worst])
-        found.append(Suspect(name, unit, deviation, rms, bounds, names[worst], visible, noticed, words))
+        found.append(
+            Suspect(name, unit, deviation, rms, bounds, names[worst], visible, noticed, words)
+        )
     return tuple(sorted(found, key=lambda suspect: -suspect.bounds))
 
 
@@ -175,7 +179,9 @@ def nuisance_slopes(truth: Measurement, x: Array) -> Array:
     slopes = []
     for one in x:  # a truth at a time: there may be hundreds of nuisances
         fixed = np.broadcast_to(one, (len(active), len(one)))
-        above, below = (truth.simulate(np.concatenate([fixed, sign * steps], axis=1)) for sign in (1.0, -1.0))
+        above, below = (
+            truth.simulate(np.concatenate([fixed, sign * steps], axis=1)) for sign in (1.0, -1.0)
+        )
         slopes.append((above - below).T / (2 * _STEP))
     return np.stack(slopes)
 
@@ -190,7 +196,12 @@ def _told(truth: Measurement) -> Iterator[tuple[str, str, float, list[int]]]:
     for group, columns in groups.items():
         if len(columns) <= _SINGLE:
             for i in columns:
-                yield active[i][0].name, active[i][0].unit, float(active[i][1] * active[i][0].size), [i]
+                yield (
+                    active[i][0].name,
+                    active[i][0].unit,
+                    float(active[i][1] * active[i][0].size),
+                    [i],
+                )
         else:
             first, size = active[columns[0]]
             yield group, first.unit, float(size * first.size), columns

@@ -87,7 +87,9 @@ class StateScenario:
         for k in range(model.epochs):
             x = path[:, k] = model.transition(x, k) if model.moves(k) else x
         with np.errstate(all="ignore"):
-            return deviations(bound_at_truth(model, Paths(start, path, np.empty(0)))[0, -1])[self.scored]
+            return deviations(bound_at_truth(model, Paths(start, path, np.empty(0)))[0, -1])[
+                self.scored
+            ]
 
     @cached_property
     def scored(self) -> Array:
@@ -173,7 +175,9 @@ class PathBlock:
                 parts = [posterior_bounds(model, group)[0][-1] for group in groups]
                 posterior[0] = deviations(filtered[-1])[at]
                 error[0] = deviations(np.array(parts)).std(axis=0, ddof=1)[at] / np.sqrt(_PARTS)
-                curves = np.stack([np.diagonal(P, axis1=1, axis2=2)[:, at] for P in (filtered, smoothed)])
+                curves = np.stack(
+                    [np.diagonal(P, axis1=1, axis2=2)[:, at] for P in (filtered, smoothed)]
+                )
         return {
             "trial": np.arange(self.start, self.start + len(self)),
             **by_parameter("x", names, self.paths.x[:, -1, at]),
@@ -206,12 +210,16 @@ class PathBlock:
         trials, K, n = e.shape
         ended = np.full(trials, Status.CONVERGED) if tracks.status is None else tracks.status
         finished = known.all(axis=1)
-        status = np.where(finished | (ended != Status.CONVERGED), ended, Status.NONFINITE).astype(np.int8)
+        status = np.where(finished | (ended != Status.CONVERGED), ended, Status.NONFINITE).astype(
+            np.int8
+        )
         status[list(messages)] = Status.ERROR
         iterations = np.full(trials, K) if tracks.iterations is None else tracks.iterations.copy()
         iterations[list(messages)] = 0
         for i in np.flatnonzero(~finished):
-            messages.setdefault(int(i), f"the track is not finite from epoch {int(np.argmin(known[i])) + 1} on")
+            messages.setdefault(
+                int(i), f"the track is not finite from epoch {int(np.argmin(known[i])) + 1} on"
+            )
         status[~finite(self.paths.x)] = Status.NO_READINGS
         converged = status == Status.CONVERGED
         finished &= status != Status.NO_READINGS
@@ -290,7 +298,9 @@ def track_safely(tracker: Tracker, model: StateModel, z: Array) -> tuple[Tracks,
         _make_plain(tracker, tracks, len(z), model)
         return tracks, {}
     parts = [track_safely(tracker, model, row[None]) for row in z]
-    return Tracks.join([part for part, _ in parts]), {i: m[0] for i, (_, m) in enumerate(parts) if m}
+    return Tracks.join([part for part, _ in parts]), {
+        i: m[0] for i, (_, m) in enumerate(parts) if m
+    }
 
 
 def _make_plain(tracker: Tracker, tracks: Any, trials: int, model: StateModel) -> None:
@@ -298,9 +308,17 @@ def _make_plain(tracker: Tracker, tracks: Any, trials: int, model: StateModel) -
     name, (K, n) = f"{type(tracker).__name__}.track returns", (model.epochs, model.n)
     if not isinstance(tracks, Tracks):
         raise ValueError(f"{name} {type(tracks).__name__}, where Tracks are asked for")
-    shapes = {"mean": (K, n), "covariance": (K, n, n), "nis": (K,), "degrees": (K,), "log_likelihood": ()}
+    shapes = {
+        "mean": (K, n),
+        "covariance": (K, n, n),
+        "nis": (K,),
+        "degrees": (K,),
+        "log_likelihood": (),
+    }
     for part, shape in {**shapes, "innovations": (K, model.readings_per_epoch)}.items():
-        setattr(tracks, part, plain_numbers(f"{name} {part}", getattr(tracks, part), (trials, *shape)))
+        setattr(
+            tracks, part, plain_numbers(f"{name} {part}", getattr(tracks, part), (trials, *shape))
+        )
     tracks.calls = plain_counts(name, "calls", tracks.calls, trials)
     if tracks.cost is not None:
         tracks.cost = plain_numbers(f"{name} cost", tracks.cost, (trials,))

@@ -73,7 +73,9 @@ def frozen_root(problem: Problem, z: Array, x_start: Array, known: Known = ()) -
     return _first_root(system, problem, x_start, known, (_Chord(), 8), (Newton(), 20))
 
 
-def least_squares_root(problem: Problem, z: Array, x_start: Array, *, prior: float | None, known: Known = ()) -> Array:
+def least_squares_root(
+    problem: Problem, z: Array, x_start: Array, *, prior: float | None, known: Known = ()
+) -> Array:
     """Finds the minimum (trials, n) of |h(x) - z| in the metric of R next to x_start (trials, n); MAP where `prior`
     says by how much to widen the prior's deviations. NaN where none is found. `known` is that of `frozen_root`.
 
@@ -99,7 +101,9 @@ def _first_root(
     for method, limit in attempts:
         if len(missing):
             start, tally = x_start[missing], EvaluationCount.zeros(len(missing))
-            model = _Informed(problem.measurement, tally, start=start, known=tuple(a[missing] for a in known))
+            model = _Informed(
+                problem.measurement, tally, start=start, known=tuple(a[missing] for a in known)
+            )
             ended = iterate(equations(missing, model), method, start, Limits(_TOLERANCE, limit))
             x = put(x, missing[ended.converged], ended.x[ended.converged])
             missing = missing[~ended.converged]

@@ -75,7 +75,10 @@ class Scenario:
                 f"noise=certified: measurement={self.measurement.name} comes with no readings of its own; choose "
                 "another noise, or measurement=nist"
             )
-        if self.truth is not None and (self.truth.n, self.truth.m) != (self.measurement.n, self.measurement.m):
+        if self.truth is not None and (self.truth.n, self.truth.m) != (
+            self.measurement.n,
+            self.measurement.m,
+        ):
             raise UserError(
                 f"truth_measurement={self.truth.name}: has {self.truth.n} parameters and {self.truth.m} readings, "
                 f"measurement={self.measurement.name} has {self.measurement.n} and {self.measurement.m}; choose a "
@@ -88,13 +91,18 @@ class Scenario:
         model = self.measurement
         if self.noise.real and model.recorded is not None:  # nothing was drawn from a prior
             return Problem(model, model.recorded.R)
-        deviation, correlation = self.prior.deviation(model.n, self.error_scale), self.prior.correlation(model.n)
+        deviation, correlation = (
+            self.prior.deviation(model.n, self.error_scale),
+            self.prior.correlation(model.n),
+        )
         require_numbers(f"prior={self.prior.name}", self.prior.deviation, deviation, (model.n,))
         R = self.noise.nominal_covariance(model)
         if not isinstance(R, Covariance) or R.m != model.m:
             found = f"that of {R.m} readings" if isinstance(R, Covariance) else type(R).__name__
             complaint = f"{definition(self.noise.covariance)} returns {found}"
-            raise UserError(f"noise={self.noise.name}: {complaint}; let it return a Covariance of {model.m} readings")
+            raise UserError(
+                f"noise={self.noise.name}: {complaint}; let it return a Covariance of {model.m} readings"
+            )
         return Problem(model, R, deviation, correlation)
 
     @cached_property
@@ -139,14 +147,20 @@ class Scenario:
         """Computes the readings (trials, m) at x and nuisances (trials, n + k)."""
         h = self.simulator.simulate(read_only(drawn))
         require_numbers(
-            f"measurement={self.simulator.name}", self.simulator.simulate, h, (len(drawn), self.simulator.m)
+            f"measurement={self.simulator.name}",
+            self.simulator.simulate,
+            h,
+            (len(drawn), self.simulator.m),
         )
         return read_only(h)
 
     def _drawn(self, start: int, stop: int) -> Array:
         """Draws x (trials, n), and behind it the nuisances (trials, k), from each trial's stream of parameters."""
         n, deviation = self.simulator.n, self.simulator.nuisance_deviation
-        nominal, drawn = read_only(self.simulator.nominal), np.empty((stop - start, n + len(deviation)))
+        nominal, drawn = (
+            read_only(self.simulator.nominal),
+            np.empty((stop - start, n + len(deviation))),
+        )
         for row, rng in zip(drawn, numbered(self.seed, start, stop, _PARAMETERS), strict=True):
             x = self.prior.draw(nominal, self.error_scale, rng)
             if type(x) is not np.ndarray or x.shape != (n,):

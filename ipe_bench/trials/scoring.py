@@ -56,7 +56,9 @@ class Block:
 
     scenario: Scenario
     trials: Trials
-    _roots: dict[tuple[Equation, float], Array] = field(default_factory=dict, repr=False, compare=False)
+    _roots: dict[tuple[Equation, float], Array] = field(
+        default_factory=dict, repr=False, compare=False
+    )
     _spreads: dict[tuple[Any, ...], Spread] = field(default_factory=dict, repr=False, compare=False)
 
     @classmethod
@@ -83,7 +85,9 @@ class Block:
     def _white(self) -> Array:
         """R^-1/2 J (trials, m, n) at the truth; see `informative_rows`."""
         with np.errstate(all="ignore"):
-            return informative_rows(self.scenario.noise, self.problem.R, self.jacobian, self.readings)
+            return informative_rows(
+                self.scenario.noise, self.problem.R, self.jacobian, self.readings
+            )
 
     @cached_property
     def crlb_information(self) -> Array:
@@ -107,7 +111,9 @@ class Block:
         """Standard deviations (trials, n) of the Bayesian bound at the truth."""
         prior = self.problem.prior_covariance()
         with np.errstate(all="ignore"):
-            return bound_deviations(self.bayes_information, _below(self._white, prior) if prior else self._white)
+            return bound_deviations(
+                self.bayes_information, _below(self._white, prior) if prior else self._white
+            )
 
     def truth_columns(self) -> Columns:
         """Returns the truth and its bounds, in multiples of the parameters' units, what the noise alone makes of the
@@ -138,7 +144,12 @@ class Block:
         No errors are known where few of the truths carry the mean."""
         bound, error = np.full((2, *self.trials.x.shape), np.nan)
         prior = self.problem.prior_covariance()
-        if self.trials.start == 0 and len(bound) and prior is not None and not self.scenario.noise.real:
+        if (
+            self.trials.start == 0
+            and len(bound)
+            and prior is not None
+            and not self.scenario.noise.real
+        ):
             x = self.scenario.truths(0, EXPECTED)
             with np.errstate(all="ignore"):
                 J = self.problem.measurement.jacobian(x)
@@ -150,13 +161,17 @@ class Block:
                 bound[0] = bound_deviations(expected, _below(together, prior))[0]
                 P = inverse(expected)[0][0]
                 variances = np.einsum("ij,tjk,ki->ti", P, each, P)
-                if (variances.sum(axis=0) ** 2 >= EVEN * EXPECTED * (variances**2).sum(axis=0)).all():
+                if (
+                    variances.sum(axis=0) ** 2 >= EVEN * EXPECTED * (variances**2).sum(axis=0)
+                ).all():
                     error[0] = variances.std(axis=0, ddof=1) / np.sqrt(EXPECTED) / (2 * bound[0])
         return bound, error
 
     def readings_at(self, x: Array) -> Array:
         """Computes h(x) (trials, m) for x (trials, n); NaN where the model fails."""
-        return CountingModel.uncounted(self.problem.measurement, len(x)).simulate(read_only(x), np.arange(len(x)))
+        return CountingModel.uncounted(self.problem.measurement, len(x)).simulate(
+            read_only(x), np.arange(len(x))
+        )
 
     def errors(self, h: Array) -> Array:
         """Computes the readings (trials, m) less the error-free h, angles within half a turn."""
@@ -173,7 +188,10 @@ class Block:
             with np.errstate(all="ignore"):
                 second = second_derivatives(self.problem.measurement, self.trials.x[:kept])
                 usable = finite(J) & finite(second)
-                J, second = (np.where(usable.reshape(-1, *[1] * (a.ndim - 1)), a, np.nan) for a in (J, second))
+                J, second = (
+                    np.where(usable.reshape(-1, *[1] * (a.ndim - 1)), a, np.nan)
+                    for a in (J, second)
+                )
                 bias[:kept] = box_bias(J, second, R)
                 intrinsic[:kept], parametric[:kept] = relative_curvatures(J, second, R)
                 M[:kept] = curvature(J, second, self.problem.H_plus[None])
@@ -193,7 +211,9 @@ class Block:
         with np.errstate(all="ignore"):
             closest = least_squares_root(self.problem, h, self.trials.x, prior=None)
             bias, deviation = misspecified(self.problem, h, self.trials.x, closest)
-        return by_parameter("pseudo_bias", names, bias) | by_parameter("misspecified", names, deviation)
+        return by_parameter("pseudo_bias", names, bias) | by_parameter(
+            "misspecified", names, deviation
+        )
 
     def reference_root(self, equation: Equation, inflation: float = 1.0) -> Array:
         """Finds the root (trials, n) that an estimating equation reaches from the truth; NaN where it reaches none.
@@ -201,12 +221,19 @@ class Block:
         `inflation` widens the prior of the equation `map`.
         """
         if (key := (equation, inflation)) not in self._roots:
-            problem, z, x, known = self.problem, self.trials.z, self.trials.x, (self.readings, self.jacobian)
+            problem, z, x, known = (
+                self.problem,
+                self.trials.z,
+                self.trials.x,
+                (self.readings, self.jacobian),
+            )
             with np.errstate(all="ignore"):
                 if equation != "frozen":
                     prior = inflation if equation == "map" else None
                     root = least_squares_root(problem, z, x, prior=prior, known=known)
-                elif problem.rankless:  # there is no such equation; the estimators that solve it say so
+                elif (
+                    problem.rankless
+                ):  # there is no such equation; the estimators that solve it say so
                     root = np.full(x.shape, np.nan)
                 else:
                     root = frozen_root(problem, z, x, known)
@@ -237,13 +264,18 @@ class Block:
 
     def _fit_probability(self, estimator: Estimator, x: Array) -> Array:
         """Computes the test of fit at x (trials, n); see `fit_test`."""
-        problem, key = self.problem, (estimator.equation, "prior" in estimator.needs, inflation_of(estimator))
+        problem, key = (
+            self.problem,
+            (estimator.equation, "prior" in estimator.needs, inflation_of(estimator)),
+        )
         if key not in self._spreads:
             self._spreads[key] = spread_of(estimator, problem, self.jacobian)
         r = problem.R.whiten(self.errors(self.readings_at(x)))
         with np.errstate(all="ignore"):
             squares = np.sum(r**2, axis=1)
-        return fit_probability(squares, self._spreads[key], self.scenario.noise, problem.H, problem.R)
+        return fit_probability(
+            squares, self._spreads[key], self.scenario.noise, problem.H, problem.R
+        )
 
     def score(self, estimator: Estimator, estimates: Estimates) -> Columns:
         """Scores each trial's error, cost, status and distances, as columns."""
@@ -261,13 +293,19 @@ class Block:
             solved = solved & (apart <= SAME_ROOT)
         bound = self.bayes_information if "prior" in estimator.needs else self.crlb_information
         labels = {s: Status(s).label for s in np.unique(status).tolist()}
-        P = np.full((trials, model.n, model.n), np.nan) if estimates.covariance is None else estimates.covariance
+        P = (
+            np.full((trials, model.n, model.n), np.nan)
+            if estimates.covariance is None
+            else estimates.covariance
+        )
         return {
             "trial": np.arange(self.trials.start, self.trials.stop),
             **by_parameter("error", names, error),
             **by_parameter("deviation", names, deviations(P)),
             "status": np.array([labels[s] for s in status.tolist()], dtype=object),
-            "message": np.array([estimates.messages.get(i, "") for i in range(trials)], dtype=object),
+            "message": np.array(
+                [estimates.messages.get(i, "") for i in range(trials)], dtype=object
+            ),
             "iterations": estimates.iterations,
             "simulations": estimates.simulations,
             "jacobians": estimates.jacobians,
@@ -277,7 +315,8 @@ class Block:
             "fit_p": self._fit_probability(estimator, estimates.x),
             "root_distance": apart,
             "solved": solved,
-            "success": np.maximum(quadratic_form(bound, error), 0.0) <= gate(model.n),  # round-off where J lacks rank
+            "success": np.maximum(quadratic_form(bound, error), 0.0)
+            <= gate(model.n),  # round-off where J lacks rank
             **{f"extra_{name}": values for name, values in estimates.extras.items()},
         }
 
@@ -306,7 +345,10 @@ def nees(error: Array, P: Array) -> Array:
         deviation = deviations(P)
         e, C = error / deviation, P / (deviation[:, :, None] * deviation[:, None, :])
         usable = finite(e) & finite(C)
-        C, e = np.where(usable[:, None, None], C, np.eye(error.shape[1])), np.where(usable[:, None], e, 0.0)
+        C, e = (
+            np.where(usable[:, None, None], C, np.eye(error.shape[1])),
+            np.where(usable[:, None], e, 0.0),
+        )
         _, inverse_U, definite = definite_factor(C)
         squared = np.sum(multiply(inverse_U.swapaxes(1, 2), e) ** 2, axis=1)
     if not definite.all():

@@ -8,7 +8,16 @@ from collections.abc import Iterator
 import numpy as np
 
 from ipe_bench.basics.batches import put
-from ipe_bench.basics.linalg import Array, Covariance, definite_factor, deviations, finite, inverse, multiply, solve
+from ipe_bench.basics.linalg import (
+    Array,
+    Covariance,
+    definite_factor,
+    deviations,
+    finite,
+    inverse,
+    multiply,
+    solve,
+)
 from ipe_bench.estimators.ipe import frozen_covariance
 from ipe_bench.estimators.least_squares import inverse_factor
 from ipe_bench.measurements.base import Measurement
@@ -43,7 +52,8 @@ def informative_rows(noise: Noise, R: Covariance, J: Array, h: Array) -> Array:
     transposed = by_theta.swapaxes(1, 2)
     explained, _ = solve(np.matmul(transposed, by_theta), np.matmul(transposed, varying))
     return np.concatenate(
-        [J * np.exp(-log)[:, :, None], np.sqrt(2) * (varying - np.matmul(by_theta, explained))], axis=1
+        [J * np.exp(-log)[:, :, None], np.sqrt(2) * (varying - np.matmul(by_theta, explained))],
+        axis=1,
     )
 
 
@@ -98,7 +108,9 @@ def _bends(model: Measurement, x: Array) -> Iterator[Array]:
     for k in range(x.shape[1]):
         shift = np.zeros_like(x)
         shift[:, k] = step[:, k]
-        yield (model.jacobian(x + shift) - model.jacobian(x - shift)) / (2 * step[:, k])[:, None, None]
+        yield (model.jacobian(x + shift) - model.jacobian(x - shift)) / (2 * step[:, k])[
+            :, None, None
+        ]
 
 
 def box_bias(J: Array, second: Array, R: Covariance) -> Array:
@@ -131,7 +143,9 @@ def relative_curvatures(J: Array, second: Array, R: Covariance) -> tuple[Array, 
     from scipy.special import chdtri
 
     radius = np.sqrt(chdtri(n, 0.05))
-    found = tuple(radius * np.where(singular, np.nan, _mean_square(part)) for part in (across, along))
+    found = tuple(
+        radius * np.where(singular, np.nan, _mean_square(part)) for part in (across, along)
+    )
     return found[0], found[1]
 
 
@@ -157,9 +171,15 @@ def misspecified(problem: Problem, h: Array, x: Array, root: Array) -> tuple[Arr
     bias, deviation = root - x, np.full(x.shape, np.nan)
     if found.any():
         model, R, at = problem.measurement, problem.R, root[found]
-        Jw, r = R.whiten_jacobian(model.jacobian(at)), R.whiten(h[found] - model.near(model.simulate(at), h[found]))
+        Jw, r = (
+            R.whiten_jacobian(model.jacobian(at)),
+            R.whiten(h[found] - model.near(model.simulate(at), h[found])),
+        )
         B = np.matmul(Jw.swapaxes(1, 2), Jw)
-        bent = np.stack([np.einsum("tmi,tm->ti", R.whiten_jacobian(one), r) for one in _bends(model, at)], axis=2)
+        bent = np.stack(
+            [np.einsum("tmi,tm->ti", R.whiten_jacobian(one), r) for one in _bends(model, at)],
+            axis=2,
+        )
         inverted = inverse(B - (bent + bent.swapaxes(1, 2)) / 2)[0]
         deviation[found] = deviations(np.matmul(np.matmul(inverted, B), inverted))
     return bias, deviation

@@ -16,7 +16,9 @@ def write_ci() -> str:
     Returns what to try next.
     """
     ours, place = {"solver": "", "baseline": ""}, Path("plugins").resolve()
-    for option in (o for o in plugins.options() if o.group in ours and place in o.path.resolve().parents):
+    for option in (
+        o for o in plugins.options() if o.group in ours and place in o.path.resolve().parents
+    ):
         ours[option.group] += ", " * bool(ours[option.group]) + option.name
     if not any(ours.values()):
         raise UserError(

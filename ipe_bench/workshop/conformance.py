@@ -49,7 +49,9 @@ _IMPROBABLE = 1e-6
 _ROUND_OFF = 1e-9
 _NO_LAW = "it draws no errors of a covariance that it states as the true one"
 _TURN = 360.0
-_PLACEHOLDER = re.compile(r"One line that (says|`ipe-bench list)[^.]*|Replace (it|them) by your own[^.]*")
+_PLACEHOLDER = re.compile(
+    r"One line that (says|`ipe-bench list)[^.]*|Replace (it|them) by your own[^.]*"
+)
 """Texts of the skeletons of `ipe-bench new`."""
 _READINGS = 6
 """Readings that a noise is tried on, unless it is made for another number."""
@@ -72,12 +74,19 @@ def check_component(name: str, component: Any) -> Iterator[Finding]:
     from a file is tried with columns that are made up."""
     checks = next((c for kind, c in _CHECKS.items() if isinstance(component, kind)), None)
     if checks is None:
-        yield Finding(name, "is a component", "it is neither measurement, noise, prior, solver, baseline nor execution")
+        yield Finding(
+            name,
+            "is a component",
+            "it is neither measurement, noise, prior, solver, baseline nor execution",
+        )
         return
     if isinstance(component, Measurement) and not component.input_columns_known:
         component = _with_columns(component)
         if component is None:
-            yield Finding(name, "Takes columns of a file that cannot be made up, and is tried where there is one")
+            yield Finding(
+                name,
+                "Takes columns of a file that cannot be made up, and is tried where there is one",
+            )
             return
     if isinstance(component, Noise):
         component = component.completed(_USUAL_NOISE)
@@ -105,7 +114,9 @@ def check_option(option: Option) -> Iterator[Finding]:
     try:
         config = composed(option)
         if required := _required(config, option.package or option.group):
-            yield Finding(name, f"Names what is to be given, {', '.join(required)}, and is tried where it is")
+            yield Finding(
+                name, f"Names what is to be given, {', '.join(required)}, and is tried where it is"
+            )
             return
         yield from check_component(name, construct(config, option.package or option.group))
     except UserError as error:
@@ -120,8 +131,12 @@ def check_option(option: Option) -> Iterator[Finding]:
 def left_of_skeleton(options: Sequence[Option]) -> Iterator[Finding]:
     """Finds the texts of `ipe-bench new` that authors replace, in the packages of these options."""
     homes = dict.fromkeys(option.source.conf.parent for option in options)
-    for path in (p for home in homes for p in sorted(home.rglob("*")) if p.suffix in (".py", ".yaml")):
-        for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+    for path in (
+        p for home in homes for p in sorted(home.rglob("*")) if p.suffix in (".py", ".yaml")
+    ):
+        for number, line in enumerate(
+            path.read_text(encoding="utf-8", errors="replace").splitlines(), 1
+        ):
             if found := _PLACEHOLDER.search(line):
                 note = f'line {number} still says "{found[0].strip()}": say what yours is'
                 yield Finding(path.name, "Describes itself", note=note)
@@ -178,7 +193,9 @@ def steps_to_a_state(estimator: Estimator) -> str | None:
     x, system = begin(*_readings(estimator), "linear_lse")
     after = estimator.step(system, estimator.begin(system, x))
     remedy = "return State(x, system.F(x))"
-    assert isinstance(after, State), f"step returns {type(after).__name__}, and not a State: {remedy}"
+    assert isinstance(after, State), (
+        f"step returns {type(after).__name__}, and not a State: {remedy}"
+    )
     for name in ("x", "F"):
         _shaped(f"step returns a State whose {name}", getattr(after, name), x.shape)
 
@@ -188,7 +205,9 @@ def finds_the_parameters(estimator: Estimator) -> None:
     scenario = _scenario(estimator, strength=0.0005)
     drawn, n = scenario.draw(0, SCATTERED), scenario.measurement.n
     estimates = estimator.estimate(scenario.problem, drawn.z)
-    assert isinstance(estimates, Estimates), f"estimate returns {type(estimates).__name__}, and not Estimates"
+    assert isinstance(estimates, Estimates), (
+        f"estimate returns {type(estimates).__name__}, and not Estimates"
+    )
     _shaped("x", estimates.x, drawn.x.shape)
     error = estimates.x - drawn.x
     worst = float((np.abs(error) / _bound(scenario.problem)).max())
@@ -211,7 +230,9 @@ def _agrees(what: str, squared: Array, n: int) -> None:
     """Tells whether the mean NEES of trials (trials,) is about n."""
     ratio = float(squared.mean()) / n
     size = f"{max(ratio, 1 / ratio):.3g} times too {'small' if ratio > 1 else 'large'}"
-    assert 0.5 < ratio < 2, f"{what} {size}: the mean NEES of {len(squared)} trials is {n * ratio:.3g} for {n} numbers"
+    assert 0.5 < ratio < 2, (
+        f"{what} {size}: the mean NEES of {len(squared)} trials is {n * ratio:.3g} for {n} numbers"
+    )
 
 
 def answers_alike(estimator: Estimator) -> None:
@@ -227,8 +248,12 @@ def answers_alike(estimator: Estimator) -> None:
         for name in ("x", "status", "iterations", "simulations", "covariance"):
             a, b = getattr(whole, name), getattr(alone, name)
             remedy = "more than rounding: what it does to a trial must not depend on the others of the batch"
-            if a is not None and np.allclose(a[i], b[0], rtol=_ROUND_OFF, atol=_ROUND_OFF, equal_nan=True):
-                remedy = "rounding alone: use stacked matmul, einsum or batched solve, one per trial"
+            if a is not None and np.allclose(
+                a[i], b[0], rtol=_ROUND_OFF, atol=_ROUND_OFF, equal_nan=True
+            ):
+                remedy = (
+                    "rounding alone: use stacked matmul, einsum or batched solve, one per trial"
+                )
             same = a is None or np.array_equal(a[i], b[0], equal_nan=True)
             assert same, f"{name} of trial {i} differs, by {remedy}"
 
@@ -254,7 +279,9 @@ def turns_with_its_angles(estimator: Estimator) -> str | None:
     x, other = (estimator.estimate(scenario.problem, readings).x for readings in (z, turned))
     apart = np.abs(other - x) / _bound(scenario.problem)
     remedy = "take residuals from z - model.near(model.simulate(x), z)"
-    assert (apart < 8).all(), f"whole turns move it by {apart.max():.3g} standard deviations of the bound: {remedy}"
+    assert (apart < 8).all(), (
+        f"whole turns move it by {apart.max():.3g} standard deviations of the bound: {remedy}"
+    )
 
 
 def takes_process_noise(estimator: Estimator) -> str | None:
@@ -264,19 +291,27 @@ def takes_process_noise(estimator: Estimator) -> str | None:
     problem, z = _readings(estimator)
     still, walking = (replace(estimator, process_noise=q).estimate(problem, z) for q in (0.0, 0.3))
     message = "; ".join(dict.fromkeys(walking.messages.values()))
-    assert (walking.status == Status.CONVERGED).all(), f"with process_noise=0.3 trials end: {message}"
+    assert (walking.status == Status.CONVERGED).all(), (
+        f"with process_noise=0.3 trials end: {message}"
+    )
     P = [one.covariance for one in (still, walking) if one.covariance is not None]
     assert len(P) == 2, "it reports no covariance"
     small, large = (np.einsum("tii->ti", one).mean(axis=0) for one in P)
-    assert (large > small).all(), "with process_noise=0.3 a variance is not larger: add Q to P in predict"
+    assert (large > small).all(), (
+        "with process_noise=0.3 a variance is not larger: add Q to P in predict"
+    )
 
 
 def a_bad_trial_disturbs_no_other(estimator: Estimator) -> None:
     """Ends a trial of NaN readings as a status, and leaves the others as they were."""
     problem, z = _readings(estimator)
     bad = np.arange(len(z)) == 2
-    before, after = (estimate_safely(estimator, problem, zs) for zs in (z, np.where(bad[:, None], np.nan, z)))
-    assert (after.status[bad] != Status.CONVERGED).all(), "a trial of NaN readings counts as converged"
+    before, after = (
+        estimate_safely(estimator, problem, zs) for zs in (z, np.where(bad[:, None], np.nan, z))
+    )
+    assert (after.status[bad] != Status.CONVERGED).all(), (
+        "a trial of NaN readings counts as converged"
+    )
     assert np.array_equal(before.x[~bad], after.x[~bad], equal_nan=True), "the other trials changed"
 
 
@@ -303,7 +338,9 @@ def keeps_a_history_if_asked(estimator: Estimator) -> str | None:
     assert len(history) == len(estimates.x), "history has not one entry per trial"
     for x, iterates in zip(estimates.x, history, strict=True):
         assert iterates.ndim == 2, "an entry of history is not (iterations + 1, n)"
-        assert np.array_equal(iterates[-1], x, equal_nan=True), "the last iterate is not the estimate"
+        assert np.array_equal(iterates[-1], x, equal_nan=True), (
+            "the last iterate is not the estimate"
+        )
 
 
 # Measurement models
@@ -339,11 +376,20 @@ def names_its_readings(model: Measurement) -> None:
     """Has at least as many readings as parameters, each with its own label, and units."""
     assert model.m >= model.n, f"{model.m} readings are too few for {model.n} parameters"
     lengths = {name: len(column) for name, column in model.index.items()}
-    assert set(lengths.values()) == {model.m}, f"the columns of index have lengths {lengths}, and not {model.m}"
-    assert len(set(zip(*model.index.values(), strict=True))) == model.m, "two readings have one label in index"
+    assert set(lengths.values()) == {model.m}, (
+        f"the columns of index have lengths {lengths}, and not {model.m}"
+    )
+    assert len(set(zip(*model.index.values(), strict=True))) == model.m, (
+        "two readings have one label in index"
+    )
     assert len({p.name for p in model.parameters}) == model.n, "two parameters have one name"
     _shaped("nominal", model.nominal, (model.n,), "one number for each parameter")
-    _shaped("periods", model.periods, (model.m if len(model.periods) else 0,), "one number for each reading")
+    _shaped(
+        "periods",
+        model.periods,
+        (model.m if len(model.periods) else 0,),
+        "one number for each reading",
+    )
     assert (model.sizes > 0).all(), "a parameter's size is not above 0"
 
 
@@ -355,7 +401,9 @@ def simulates_batches(model: Measurement) -> None:
     assert np.isfinite(z).all(), "a reading near the nominal point is not finite"
     for i in range(len(x)):
         alone = model.simulate(x[i : i + 1])[0]
-        assert np.array_equal(alone, z[i]), f"trial {i} alone has other bits: compute each trial by itself"
+        assert np.array_equal(alone, z[i]), (
+            f"trial {i} alone has other bits: compute each trial by itself"
+        )
 
 
 def differentiates(model: Measurement) -> None:
@@ -391,15 +439,25 @@ def orders_its_epochs(model: Measurement) -> str | None:
     assert np.array_equal(rows, np.arange(model.m)), "the epochs do not hold every reading once"
     x, stop = _points(model), max(1, len(model.epochs or ()) // 2)
     whole = model.simulate(x)[:, model.rows(stop)]
-    prefix, coarse, largest = model.simulate_until(x, stop), model.coarse_simulate_until(x, stop), np.abs(whole).max()
-    assert np.allclose(prefix, whole, rtol=1e-12, atol=1e-12 * largest), "a prefix differs from the whole"
-    assert np.allclose(coarse, whole, rtol=1e-3, atol=1e-3 * largest), "a coarse prefix is far from the whole"
+    prefix, coarse, largest = (
+        model.simulate_until(x, stop),
+        model.coarse_simulate_until(x, stop),
+        np.abs(whole).max(),
+    )
+    assert np.allclose(prefix, whole, rtol=1e-12, atol=1e-12 * largest), (
+        "a prefix differs from the whole"
+    )
+    assert np.allclose(coarse, whole, rtol=1e-3, atol=1e-3 * largest), (
+        "a coarse prefix is far from the whole"
+    )
 
 
 # Noises and priors
 
 
-def _repeatable(name: str, given: Array, draw: Callable[[Array, np.random.Generator], Array]) -> None:
+def _repeatable(
+    name: str, given: Array, draw: Callable[[Array, np.random.Generator], Array]
+) -> None:
     """Tells whether a function draws alike from one stream."""
     given.flags.writeable = False
     first, second = (draw(given, np.random.default_rng(3)) for _ in range(2))
@@ -416,7 +474,9 @@ def _scatter_as_stated(w: Array, C: Array, slack: float, noun: str) -> None:
     near = (mean < slack + chance * w.std(axis=0)).all()
     assert near, f"the mean of the draws is off by up to {mean.max():.3g} of the stated deviation"
     i, (j, k) = int(np.diag(off).argmax()), _largest(off)
-    assert off[i, i] <= slack, f"the draws of {noun} {i + 1} have {w[:, i].std():.3g} times the stated deviation"
+    assert off[i, i] <= slack, (
+        f"the draws of {noun} {i + 1} have {w[:, i].std():.3g} times the stated deviation"
+    )
     said = f"the correlation {moments[j, k]:.2f}, and {C[j, k]:.2f} is stated"
     assert off[j, k] <= slack, f"the draws of {noun}s {j + 1} and {k + 1} have {said}"
 
@@ -454,7 +514,9 @@ def corrupts_reproducibly(noise: Noise) -> str | None:
     assert R.m == m, f"covariance({m}) is for {R.m} readings"
     assert (R.deviations > 0).all(), "a standard deviation is not above 0"
     if _draws(noise):
-        _repeatable("corrupt", np.linspace(-1.0, 1.0, m), lambda h, rng: noise.corrupt(h, np.zeros(m), rng))
+        _repeatable(
+            "corrupt", np.linspace(-1.0, 1.0, m), lambda h, rng: noise.corrupt(h, np.zeros(m), rng)
+        )
 
 
 def draws_what_it_states(noise: Noise) -> str | None:
@@ -463,7 +525,9 @@ def draws_what_it_states(noise: Noise) -> str | None:
         return _NO_LAW
     v, _ = _errors(noise, DRAWS, np.random.default_rng(7))
     R = noise.covariance(v.shape[1])
-    _scatter_as_stated(v / R.deviations, R.matrix() / np.outer(R.deviations, R.deviations), 0.02, "reading")
+    _scatter_as_stated(
+        v / R.deviations, R.matrix() / np.outer(R.deviations, R.deviations), 0.02, "reading"
+    )
 
 
 def states_its_law(noise: Noise) -> str | None:
@@ -478,7 +542,10 @@ def states_its_law(noise: Noise) -> str | None:
     law = rng.standard_normal(w.shape) if stated is None else stated
     words = "normal, since there is no `whitened`" if stated is None else "what `whitened` draws"
     # Of each trial its chi-square, which is what the test of fit looks at, and one reading: trials are independent.
-    for what, found, said in (("reading", w[:, 0], law[:, 0]), ("chi-square", (w**2).sum(1), (law**2).sum(1))):
+    for what, found, said in (
+        ("reading", w[:, 0], law[:, 0]),
+        ("chi-square", (w**2).sum(1), (law**2).sum(1)),
+    ):
         p = float(tuple(ks_2samp(found, said))[1])  # type: ignore[arg-type]
         distributed = f"distributed as {words} (Kolmogorov-Smirnov, p = {p:.1g})"
         assert p > _IMPROBABLE, f"the {what} of whitened errors is not {distributed}"
@@ -523,7 +590,9 @@ def draws_what_is_told(prior: Prior) -> None:
     w = x[:, varies] / deviation[varies]
     _scatter_as_stated(w, C, 0.0, "parameter")
     p = min(float(kstest(column, "norm").pvalue) for column in w.T)
-    assert not prior.normal or p > _IMPROBABLE, f"the draws are not normal (p = {p:.1g}); set `normal` to False"
+    assert not prior.normal or p > _IMPROBABLE, (
+        f"the draws are not normal (p = {p:.1g}); set `normal` to False"
+    )
 
 
 # States that move
@@ -542,24 +611,39 @@ def moves_batches(model: StateModel) -> None:
         function = getattr(model, name)
         values = function(x, k)
         alone = np.concatenate([function(one[None], k) for one in x])
-        assert np.array_equal(values, alone), f"{name} gives a state alone other bits: compute each by itself"
+        assert np.array_equal(values, alone), (
+            f"{name} gives a state alone other bits: compute each by itself"
+        )
         if name in by_state:
             continue
-        exact, rough = (differentiate(lambda u, f=function: f(u, k), x, analytic=how) for how in (True, False))
+        exact, rough = (
+            differentiate(lambda u, f=function: f(u, k), x, analytic=how) for how in (True, False)
+        )
         close = np.allclose(exact, rough, rtol=1e-4, atol=1e-6 * np.abs(rough).max())
-        assert close, f"{name} is not analytic: write np.where(u.real < 0, -u, u) for np.abs(u), and the like"
+        assert close, (
+            f"{name} is not analytic: write np.where(u.real < 0, -u, u) for np.abs(u), and the like"
+        )
 
 
 def wraps_its_angles(model: StateModel) -> None:
     """States the periods of readings and states that jump by a whole turn."""
     x = StateModel.draw(model, 0, TRIALS).x[:, -1]
-    ways = np.linspace(x, -np.roll(x, 1, axis=0), 2001)  # from each state to the far side of another
-    sides = ("reading", model.observe, model.periods), ("state", model.transition, model.state_periods)
+    ways = np.linspace(
+        x, -np.roll(x, 1, axis=0), 2001
+    )  # from each state to the far side of another
+    sides = (
+        ("reading", model.observe, model.periods),
+        ("state", model.transition, model.state_periods),
+    )
     for what, function, periods in sides:
         steps = np.abs(np.diff(function(ways, model.epochs - 1), axis=0)).max(axis=(0, 1))
-        for i, (step, period) in enumerate(zip(steps, periods or np.zeros(len(steps)), strict=True)):
+        for i, (step, period) in enumerate(
+            zip(steps, periods or np.zeros(len(steps)), strict=True)
+        ):
             turns = any(0.98 * turn < step < 1.02 * turn for turn in (2 * np.pi, 360.0))
-            assert period or not turns, f"{what} {i + 1} jumps by {step:.3g}: it is an angle; state its period"
+            assert period or not turns, (
+                f"{what} {i + 1} jumps by {step:.3g}: it is an angle; state its period"
+            )
 
 
 def tracks_its_trials(tracker: Tracker) -> None:
@@ -571,7 +655,9 @@ def tracks_its_trials(tracker: Tracker) -> None:
     _shaped("mean", tracks.mean, paths.x.shape)
     _shaped("covariance", tracks.covariance, (*paths.x.shape, model.n))
     alone = tracker.track(model, paths.z[:1])
-    assert np.array_equal(alone.mean[0], tracks.mean[0], equal_nan=True), "trial 0 alone has other bits than in a batch"
+    assert np.array_equal(alone.mean[0], tracks.mean[0], equal_nan=True), (
+        "trial 0 alone has other bits than in a batch"
+    )
     last = nees((tracks.mean - paths.x)[:, -1], tracks.covariance[:, -1])
     _agrees("the reported variances of the last epoch are", last, model.n)
 
@@ -590,7 +676,9 @@ def does_every_task(execution: Execution) -> None:
     """Tells of every step of every task in order, once of its end, and of a task that raises as a failure."""
     told = _told(execution)
     for i, right in _told(Serial()).items():
-        assert told[i] == right, f"of task {i} it tells {', '.join(told[i]) or 'nothing'}; right is {', '.join(right)}"
+        assert told[i] == right, (
+            f"of task {i} it tells {', '.join(told[i]) or 'nothing'}; right is {', '.join(right)}"
+        )
 
 
 def _told(execution: Execution) -> dict[int, list[str]]:
@@ -606,7 +694,9 @@ def ends_with_the_run(execution: Execution) -> None:
     """Hands on what ends the whole run, a UserError or StorageError, and can be closed before its end."""
     with suppress(UserError):
         list(execution.run(_work, (UserError("wrong"), range(3))))
-        raise AssertionError("a UserError does not end the run; raise what is in ipe_bench.runs.execution.FATAL")
+        raise AssertionError(
+            "a UserError does not end the run; raise what is in ipe_bench.runs.execution.FATAL"
+        )
     events = execution.run(_work, (range(3), range(3)))
     next(iter(events))
     assert isinstance(events, Generator), "run returns no generator, which could be closed"

@@ -15,7 +15,10 @@ from ipe_bench.plugins import discovery as plugins
 from ipe_bench.workshop.kinds import KINDS, MODELS, RECORDS
 
 ALONE = {
-    "function": ("{name}.py", 'measurement=function measurement.of={name}:{name} "measurement.columns.t=[0,1,2,3,4]"'),
+    "function": (
+        "{name}.py",
+        'measurement=function measurement.of={name}:{name} "measurement.columns.t=[0,1,2,3,4]"',
+    ),
     "ode": ("{name}.yaml", "measurement=ode measurement.file={name}.yaml"),
 }
 """Models that are one file and no plugin, and how to choose them."""
@@ -30,7 +33,9 @@ def new(kind: str, name: str, language: str | None = None) -> str:
         raise UserError(f"--language={language}: {kind} has no languages; leave it out")
     if kind not in (*MODELS, *KINDS):
         hint = "; `pip install plugins/process` in a checkout adds it" if kind == "process" else ""
-        raise UserError(f"{kind}: {unknown(kind, (*MODELS, *KINDS, *added, 'skill', 'ci'), 'kind')}{hint}")
+        raise UserError(
+            f"{kind}: {unknown(kind, (*MODELS, *KINDS, *added, 'skill', 'ci'), 'kind')}{hint}"
+        )
     group = "baseline" if kind == "filter" else kind
     _check_name(group, name)
     if kind in ALONE:
@@ -43,7 +48,13 @@ def new(kind: str, name: str, language: str | None = None) -> str:
     folder, package = Path("plugins") / name, f"ipe_bench_{name}"
     require_absent(folder)
     class_name = "".join(part.title() for part in name.split("_"))
-    words = {"kind": kind, "name": name, "package": package, "Class": class_name, "record": RECORDS.get(kind, "")}
+    words = {
+        "kind": kind,
+        "name": name,
+        "package": package,
+        "Class": class_name,
+        "record": RECORDS.get(kind, ""),
+    }
     family = "record_" if kind in RECORDS else "experiment_" if kind == "experiment" else ""
     texts = {
         "pyproject.toml": "pyproject.toml",
@@ -62,7 +73,9 @@ def new(kind: str, name: str, language: str | None = None) -> str:
     choices["tracker"] = f'state_model=pendulum "tracker=[{name}]" '
     choices["figure"] = "figures=all "  # the figures of main are chosen among our own
     choose = choices.get(group, f"{group}={name} ")
-    return f"{folder} is ready. Try:\n  ipe-bench check {folder}\n  ipe-bench run {choose}trials=100"
+    return (
+        f"{folder} is ready. Try:\n  ipe-bench check {folder}\n  ipe-bench run {choose}trials=100"
+    )
 
 
 def copy_kind(kind: str, home: Path, name: str, language: str | None) -> str:
@@ -73,8 +86,15 @@ def copy_kind(kind: str, home: Path, name: str, language: str | None) -> str:
         why = "is not given" if language is None else unknown(language, languages, "language")
         raise UserError(f"--language={language or ''}: {why}; choose one of {', '.join(languages)}")
     sources = (home / kind, *([home / f"{kind}-{language}"] if language else ()))
-    texts = {path: path.relative_to(source) for source in sources for path in source.rglob("*") if path.is_file()}
-    group = next((place.parts[2] for place in texts.values() if place.parts[1:2] == ("conf",)), kind)
+    texts = {
+        path: path.relative_to(source)
+        for source in sources
+        for path in source.rglob("*")
+        if path.is_file()
+    }
+    group = next(
+        (place.parts[2] for place in texts.values() if place.parts[1:2] == ("conf",)), kind
+    )
     _check_name(group, name)
     folder = Path("plugins") / name
     require_absent(folder)
@@ -95,7 +115,9 @@ def require_absent(path: Path) -> None:
 def fill(path: Path, source: str, words: Mapping[str, str]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     template = files("ipe_bench.workshop") / "templates" / f"{source}.template"
-    path.write_text(Template(template.read_text(encoding="utf-8")).substitute(words), encoding="utf-8")
+    path.write_text(
+        Template(template.read_text(encoding="utf-8")).substitute(words), encoding="utf-8"
+    )
 
 
 def _check_name(group: str, name: str) -> None:
@@ -113,4 +135,6 @@ def _check_name(group: str, name: str) -> None:
     for option in plugins.options():
         if option.group in rivals and option.name == name:
             origin = option.source.origin
-            raise UserError(f"{name}: {option.group}={name} is there already ({origin}); choose another name")
+            raise UserError(
+                f"{name}: {option.group}={name} is there already ({origin}); choose another name"
+            )

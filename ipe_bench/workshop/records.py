@@ -28,8 +28,15 @@ def check_records(options: Sequence[Option]) -> list[Finding]:
         return []
     problems = use_statistics()
     # The fixed point fails at the largest scale.
-    scenarios = [Scenario(Polynomial(), Gaussian(0.01), error_scale=scale) for scale in (1.0, 10.0, 100.0)]
-    estimators = {"linear_lse": LinearLSE(), "fixed_point": FixedPoint(), "newton": Newton(), "ekf": EKF()}
+    scenarios = [
+        Scenario(Polynomial(), Gaussian(0.01), error_scale=scale) for scale in (1.0, 10.0, 100.0)
+    ]
+    estimators = {
+        "linear_lse": LinearLSE(),
+        "fixed_point": FixedPoint(),
+        "newton": Newton(),
+        "ekf": EKF(),
+    }
     with TemporaryDirectory(prefix="ipe-bench-") as folder, house_style():
         for name, some, trials in (("sweep", scenarios, 25), ("single", scenarios[-1:], 1)):
             compute(some, estimators, trials, f"{folder}/{name}")
@@ -41,5 +48,11 @@ def check_records(options: Sequence[Option]) -> list[Finding]:
     findings = []
     for name in (f"{option.group}={option.name}" for option in options):
         own = [line.removeprefix(f"{name}: ") for line in problems if line.startswith(f"{name}: ")]
-        findings.append(Finding(name, "Is part of reports on a small sweep and on a single trial", "; ".join(own[:1])))
+        findings.append(
+            Finding(
+                name,
+                "Is part of reports on a small sweep and on a single trial",
+                "; ".join(own[:1]),
+            )
+        )
     return findings

@@ -45,12 +45,19 @@ def write_skill(folder: Path, run: Callable[[list[str]], int]) -> list[Path]:
     folder = folder.resolve()
     with tempfile.TemporaryDirectory(prefix="ipe-bench-") as place, contextlib.chdir(place):
         plugins.sources.cache_clear()  # no plugins are known there but those that are installed or made
-        known = [f"- {group}: {', '.join(o.name for o in plugins.options(group))}" for group in plugins.groups()]
+        known = [
+            f"- {group}: {', '.join(o.name for o in plugins.options(group))}"
+            for group in plugins.groups()
+        ]
         texts = {f"new-{kind}": _page(kind, run) for kind in PAGES}
     plugins.sources.cache_clear()
     pages = [f"- a new {kind}: `new-{kind}.md`" for kind in PAGES]
     words = {"version": ib.__version__, "bent": BENT, "small": SMALL}
-    fill(folder / "SKILL.md", "skill.md", {**words, "pages": "\n".join(pages), "options": "\n".join(known)})
+    fill(
+        folder / "SKILL.md",
+        "skill.md",
+        {**words, "pages": "\n".join(pages), "options": "\n".join(known)},
+    )
     for name, text in texts.items():
         (folder / f"{name}.md").write_text(text, encoding="utf-8")
     return sorted(folder.iterdir())
@@ -59,16 +66,38 @@ def write_skill(folder: Path, run: Callable[[list[str]], int]) -> list[Path]:
 def _page(kind: str, run: Callable[[list[str]], int]) -> str:
     """Returns instructions for a component of a kind: its contract, the skeleton, and what `check` tests."""
     name = f"my_{kind}"
-    tried = [line.strip() for line in _said(f"new {kind} {name}", run).splitlines() if "ipe-bench check" in line]
+    tried = [
+        line.strip()
+        for line in _said(f"new {kind} {name}", run).splitlines()
+        if "ipe-bench check" in line
+    ]
     check = tried[0].removeprefix("ipe-bench ")
-    promises = [line.partition(": ")[2] for line in _said(check, run).splitlines() if line.startswith("ok")]
+    promises = [
+        line.partition(": ")[2] for line in _said(check, run).splitlines() if line.startswith("ok")
+    ]
     lines = [f"# A new {kind}", ""]
     lines += [f"    ipe-bench {command}" for command in (f"new {kind} {name}", check, PAGES[kind])]
     for place in plugins.CONTRACTS.get(kind, ()):
-        lines += ["", f"The contract of `{place}`:", "", "```text", inspect.getdoc(resolve_name(place)) or "", "```"]
+        lines += [
+            "",
+            f"The contract of `{place}`:",
+            "",
+            "```text",
+            inspect.getdoc(resolve_name(place)) or "",
+            "```",
+        ]
     for path in (p for p in sorted(Path().rglob(f"{name}.*")) if p.suffix in (".py", ".yaml")):
-        lines += ["", f"`{path}`", "", f"```{path.suffix[1:]}", path.read_text(encoding="utf-8").strip(), "```"]
-    return "\n".join([*lines, "", "`check` asks of it:", "", *(f"- {promise}" for promise in promises), ""])
+        lines += [
+            "",
+            f"`{path}`",
+            "",
+            f"```{path.suffix[1:]}",
+            path.read_text(encoding="utf-8").strip(),
+            "```",
+        ]
+    return "\n".join(
+        [*lines, "", "`check` asks of it:", "", *(f"- {promise}" for promise in promises), ""]
+    )
 
 
 def _said(command: str, run: Callable[[list[str]], int]) -> str:

@@ -11,8 +11,14 @@ import ipe_bench
 
 PLUGINS = Path(__file__).parents[1]
 TEMPLATES = Path(ipe_bench.__file__).parent / "plugins/templates"
-TABLE = (PLUGINS / "README.md").read_text(encoding="utf-8").partition("## What a plugin may import")[2]
-ROWS = [line.strip("| ").split(" | ") for line in TABLE.partition("\n## ")[0].splitlines() if line.startswith("| `")]
+TABLE = (
+    (PLUGINS / "README.md").read_text(encoding="utf-8").partition("## What a plugin may import")[2]
+)
+ROWS = [
+    line.strip("| ").split(" | ")
+    for line in TABLE.partition("\n## ")[0].splitlines()
+    if line.startswith("| `")
+]
 PROMISED = {
     module: re.findall(r"`(\w+)`", names) or importlib.import_module(module).__all__
     for modules, names in ROWS
@@ -28,7 +34,9 @@ def written(folder: Path, suffix: str = ".py") -> list[Path]:
 
 def imported(path: Path) -> set[tuple[str, str]]:
     """The modules of ipe_bench and the names that a file imports from them."""
-    text = re.sub(r"\$\{?(\w+)\}?", r"\1", path.read_text(encoding="utf-8"))  # of a template, filled in
+    text = re.sub(
+        r"\$\{?(\w+)\}?", r"\1", path.read_text(encoding="utf-8")
+    )  # of a template, filled in
     found: set[tuple[str, str]] = set()
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.ImportFrom) and node.module:

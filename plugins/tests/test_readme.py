@@ -13,7 +13,11 @@ from ipe_bench.plugins import discovery
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "plugins/README.md").read_text(encoding="utf-8")
-ANSWERS = [line for line in README.partition("## Where things are")[2].splitlines() if line.startswith("| Where")]
+ANSWERS = [
+    line
+    for line in README.partition("## Where things are")[2].splitlines()
+    if line.startswith("| Where")
+]
 
 
 def test_questions_are_answered():
@@ -25,7 +29,9 @@ def test_an_answer_names_what_is_there(answer):
     paths = [ROOT / path for path in re.findall(r"`(ipe_bench/[\w/]+\.py)`", answer)]
     assert paths
     assert all(path.is_file() or (path.stem == "NAME" and path.parent.is_dir()) for path in paths)
-    for name, path in re.findall(r"`(?:\w+\.)*(\w+)(?:\([\w, ]*\))?` in `(ipe_bench/[\w/]+\.py)`", answer):
+    for name, path in re.findall(
+        r"`(?:\w+\.)*(\w+)(?:\([\w, ]*\))?` in `(ipe_bench/[\w/]+\.py)`", answer
+    ):
         defined = rf"^ *(def|class) {name}\b|^{name}\b"
         assert re.search(defined, (ROOT / path).read_text(encoding="utf-8"), re.MULTILINE), name
 
@@ -36,7 +42,11 @@ def test_the_classes_that_it_names_have_contracts():
     assert named == {**discovery.CONTRACTS, "experiment": ()}
 
 
-BASES = {"solver": ipe_bench.IPE, "measurement model": ipe_bench.Measurement, "noise": ipe_bench.Noise}
+BASES = {
+    "solver": ipe_bench.IPE,
+    "measurement model": ipe_bench.Measurement,
+    "noise": ipe_bench.Noise,
+}
 """What a new one of the thing that a question asks after derives from."""
 MADE = [
     (thing, kind)
@@ -51,13 +61,17 @@ def test_every_thing_that_a_plugin_may_hold_has_its_command():
 
 
 @pytest.mark.parametrize(("thing", "kind"), MADE)
-def test_the_command_that_the_map_names_makes_what_the_question_asks_for(thing, kind, tmp_path, monkeypatch):
+def test_the_command_that_the_map_names_makes_what_the_question_asks_for(
+    thing, kind, tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     name = f"map_{kind}"
     assert main(["new", kind, name]) == 0
     monkeypatch.syspath_prepend(tmp_path / "plugins" / name)
     module = importlib.import_module(f"ipe_bench_{name}.{name}")
-    written = [one for one in vars(module).values() if getattr(one, "__module__", "") == module.__name__]
+    written = [
+        one for one in vars(module).values() if getattr(one, "__module__", "") == module.__name__
+    ]
     assert any(isinstance(one, type) and issubclass(one, BASES[thing]) for one in written)
     for each in (module.__name__, f"ipe_bench_{name}"):
         del sys.modules[each]

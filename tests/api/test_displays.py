@@ -39,14 +39,25 @@ def test_a_summary_shows_the_table_of_the_terminal_and_is_a_frame(table):
     part = table[["estimator", "rmse"]]
     assert repr(part) == repr(pd.DataFrame(part))
     assert part._repr_html_() == pd.DataFrame(part)._repr_html_()
-    assert "linear" not in repr(table.query("estimator == 'newton'").sort_values("rmse").assign(mine=1.0))
-    for again in (table.copy(), copy.deepcopy(table), pickle.loads(pickle.dumps(table)), table.head(3)):
+    assert "linear" not in repr(
+        table.query("estimator == 'newton'").sort_values("rmse").assign(mine=1.0)
+    )
+    for again in (
+        table.copy(),
+        copy.deepcopy(table),
+        pickle.loads(pickle.dumps(table)),
+        table.head(3),
+    ):
         assert len(again.trials) == 40
-    pd.testing.assert_frame_equal(pd.DataFrame(table), pd.DataFrame(pickle.loads(pickle.dumps(table))))
+    pd.testing.assert_frame_equal(
+        pd.DataFrame(table), pd.DataFrame(pickle.loads(pickle.dumps(table)))
+    )
 
 
 @pytest.mark.slow
-def test_trials_and_figures_are_those_of_the_folder_which_goes_with_the_last_frame(table, tmp_path, monkeypatch):
+def test_trials_and_figures_are_those_of_the_folder_which_goes_with_the_last_frame(
+    table, tmp_path, monkeypatch
+):
     monkeypatch.setattr(figures, "FIGURES", ("errors", "costs"))
     kept = ib.run(BENCH, ESTIMATORS, trials=20, output=tmp_path / "kept")
     pd.testing.assert_frame_equal(kept.trials, ib.load(tmp_path / "kept"))
@@ -84,18 +95,39 @@ def test_a_model_with_its_noise_is_a_scenario(table):
     z = BENCH.draw(0, 1).z[0]
     stated = ib.estimate(MODEL, z, ESTIMATORS, noise=NOISE, error_scale=3.0).table()
     pd.testing.assert_frame_equal(ib.estimate(BENCH, z, ESTIMATORS).table(), stated)
-    assert ib.design(MODEL, noise=NOISE, error_scale=3.0).ways[0].sharpest == ib.design(BENCH).ways[0].sharpest
+    assert (
+        ib.design(MODEL, noise=NOISE, error_scale=3.0).ways[0].sharpest
+        == ib.design(BENCH).ways[0].sharpest
+    )
 
 
 @pytest.mark.parametrize(
     ("call", "said"),
     [
-        (lambda: ib.run(BENCH, [ib.solvers.Newton()]), 'give each a label, as in {"newton": ib.solvers.Newton()}'),
-        (lambda: ib.run(BENCH, {"n": ib.solvers.Newton}), "Newton is a class, whose objects are written Newton()"),
-        (lambda: ib.run(ib.measurements.Gins, ESTIMATORS), "Gins is a class, whose objects are written Gins()"),
-        (lambda: ib.run(BENCH, ESTIMATORS, error_scale=2.0), "error_scale=: is part of the scenario"),
-        (lambda: ib.solvers.Newton(max_iter=3), "Newton: max_iter=: there is no such option; did you mean max_iter"),
-        (lambda: ib.measurements.gins(), "ipe_bench.measurements.gins: there is no such name; did you mean Gins?"),
+        (
+            lambda: ib.run(BENCH, [ib.solvers.Newton()]),
+            'give each a label, as in {"newton": ib.solvers.Newton()}',
+        ),
+        (
+            lambda: ib.run(BENCH, {"n": ib.solvers.Newton}),
+            "Newton is a class, whose objects are written Newton()",
+        ),
+        (
+            lambda: ib.run(ib.measurements.Gins, ESTIMATORS),
+            "Gins is a class, whose objects are written Gins()",
+        ),
+        (
+            lambda: ib.run(BENCH, ESTIMATORS, error_scale=2.0),
+            "error_scale=: is part of the scenario",
+        ),
+        (
+            lambda: ib.solvers.Newton(max_iter=3),
+            "Newton: max_iter=: there is no such option; did you mean max_iter",
+        ),
+        (
+            lambda: ib.measurements.gins(),
+            "ipe_bench.measurements.gins: there is no such name; did you mean Gins?",
+        ),
         (lambda: ib.estimate(3, "my.csv"), "3 is a int; give a scenario"),
     ],
 )
@@ -117,7 +149,9 @@ def test_a_seed_draws_the_trials_of_a_scenario_with_that_seed(table):
 
 
 def test_what_is_stated_holds_for_each_of_several_models():
-    stated = ib.run([MODEL, ib.measurements.Polynomial(count=30)], ESTIMATORS, 5, noise=NOISE, error_scale=3.0)
+    stated = ib.run(
+        [MODEL, ib.measurements.Polynomial(count=30)], ESTIMATORS, 5, noise=NOISE, error_scale=3.0
+    )
     assert set(stated.trials["noise"]) == {"gaussian"}
     assert set(stated.trials["error_scale"]) == {3.0}
     with pytest.raises(ib.UserError, match="noise=: is part of the scenario"):
@@ -126,14 +160,21 @@ def test_what_is_stated_holds_for_each_of_several_models():
 
 def test_a_mistake_is_one_line_where_a_notebook_asks_how_to_show_it():
     for kind in (ib.UserError, StorageError):
-        assert kind("trials=0:\n give 1")._render_traceback_() == [f"{kind.__name__}: trials=0: give 1"]
+        assert kind("trials=0:\n give 1")._render_traceback_() == [
+            f"{kind.__name__}: trials=0: give 1"
+        ]
     assert not hasattr(ValueError(), "_render_traceback_")
 
 
 def test_an_answer_is_asked_by_label_or_place_and_names_its_labels():
     fits = ib.estimate(BENCH, BENCH.draw(0, 1).z[0], ESTIMATORS)
     level = ib.states.Formulas(
-        next={"x": "x + w"}, readings={"z": "x"}, noise={"w": 1.0}, deviation={"z": 1.0}, spread={"x": 1.0}, count=9
+        next={"x": "x + w"},
+        readings={"z": "x"},
+        noise={"w": 1.0},
+        deviation={"z": 1.0},
+        spread={"x": 1.0},
+        count=9,
     )
     tracks = ib.estimate(level, np.ones((9, 1)), {"newton": ekf(), "linear": ukf()})
     assert len(fits) == len(tracks) == 2

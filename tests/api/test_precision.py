@@ -26,7 +26,10 @@ def test_there_are_as_many_trials_as_the_precision_takes_and_they_are_those_of_a
     assert stop["reason"] == "every interval is narrow enough"
     rows = table[table["parameter"] == "all"]
     assert set(rows["trials"]) == {stop["trials"]}
-    widths = rows[["success_anytime_high", "success"]].to_numpy() - rows[["success", "success_anytime_low"]].to_numpy()
+    widths = (
+        rows[["success_anytime_high", "success"]].to_numpy()
+        - rows[["success", "success_anytime_low"]].to_numpy()
+    )
     assert widths.max() <= 0.04
     whole = ib.run(BENCH, ESTIMATORS, stop["trials"], block_size=50, output=tmp_path / "b")
     for name in (c for c in table.columns if not c.startswith("time")):
@@ -37,7 +40,10 @@ def test_there_are_as_many_trials_as_the_precision_takes_and_they_are_those_of_a
     # A block less would not have been enough, or is all that was looked at.
     fewer = ib.run(BENCH, ESTIMATORS, stop["trials"] // 2, output=tmp_path / "c")
     wide = fewer["success_anytime_high"] - fewer["success"]
-    assert max(wide.max(), (fewer["success"] - fewer["success_anytime_low"]).max()) > 0.04 or stop["trials"] == 50
+    assert (
+        max(wide.max(), (fewer["success"] - fewer["success_anytime_low"]).max()) > 0.04
+        or stop["trials"] == 50
+    )
 
 
 @pytest.mark.slow
@@ -63,12 +69,16 @@ def test_it_goes_on_from_what_is_stored_and_leaves_one_record_that_is_complete(t
     assert finer["trials"] > first["trials"]
     # A trial that is computed again takes another time.
     later = ib.load(tmp_path)
-    pd.testing.assert_frame_equal(later[later["trial"] < first["trials"]].reset_index(drop=True), rows)
+    pd.testing.assert_frame_equal(
+        later[later["trial"] < first["trials"]].reset_index(drop=True), rows
+    )
     assert ib.status(tmp_path).attrs["problems"] == []
 
 
 def test_the_root_mean_square_is_known_as_well_as_is_asked(tmp_path):
-    table = ib.run(BENCH, {"newton": ib.solvers.Newton()}, precision={"rmse": 0.06}, output=tmp_path)
+    table = ib.run(
+        BENCH, {"newton": ib.solvers.Newton()}, precision={"rmse": 0.06}, output=tmp_path
+    )
     row = table[table["parameter"] == "all"].iloc[0]
     assert row["rmse"] / row["rmse_anytime_low"] <= 1.06 + 1e-9
     assert row["rmse_anytime_low"] < row["rmse_low"] < row["rmse"]
@@ -76,7 +86,8 @@ def test_the_root_mean_square_is_known_as_well_as_is_asked(tmp_path):
     assert np.isnan(row["rmse_high"])
     assert np.isnan(row["rmse_anytime_high"])
     (unless,) = re.findall(
-        r"± [\d.]+ %, unless errors are larger in 1 of (\d+) trials or fewer", stop_of(table)["widest"]
+        r"± [\d.]+ %, unless errors are larger in 1 of (\d+) trials or fewer",
+        stop_of(table)["widest"],
     )
     assert int(unless) == round(1 / row["rmse_unseen"])
     assert row["trials"] / 5 < int(unless) < row["trials"] / 2
@@ -119,7 +130,13 @@ def test_mistakes_are_told_before_anything_is_computed(tmp_path, given, remedy):
 @pytest.mark.slow
 def test_the_command_says_how_many_trials_it_took_and_why(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    words = ["measurement=polynomial", "noise=gaussian", "noise.deviation=0.01", "error_scale=3", "solver=[newton]"]
+    words = [
+        "measurement=polynomial",
+        "noise=gaussian",
+        "noise.deviation=0.01",
+        "error_scale=3",
+        "solver=[newton]",
+    ]
     words += ["baseline=[]", "execution=serial", "block_size=50", "output=out", "figures=none"]
     assert main(["run", *words, "precision=0.05"]) == 0
     out = capsys.readouterr().out

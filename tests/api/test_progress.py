@@ -28,10 +28,14 @@ def test_a_bar_is_shown_on_a_stderr_that_is_a_terminal(terminal, shown):
 
     ours, theirs = pty.openpty() if terminal else os.pipe()
     os.set_blocking(ours, False)
-    environment = {name: text for name, text in os.environ.items() if name not in ("NO_COLOR", "FORCE_COLOR")}
+    environment = {
+        name: text for name, text in os.environ.items() if name not in ("NO_COLOR", "FORCE_COLOR")
+    }
     command = [sys.executable, "-c", SCRIPT.replace("PROGRESS", str(shown))]
     environment |= {"TERM": "xterm", "COLUMNS": "100"}
-    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=theirs, env=environment, check=False)
+    done = subprocess.run(
+        command, stdout=subprocess.PIPE, stderr=theirs, env=environment, check=False
+    )
     try:
         said = os.read(ours, 100_000).decode()
     except BlockingIOError:

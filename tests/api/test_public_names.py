@@ -17,13 +17,28 @@ from ipe_bench.plugins import discovery
 from ipe_bench.runs.store import ResultKey
 
 HEAVY = ("pandas", "matplotlib", "seaborn", "hydra", "omegaconf", "filterpy", "llvmlite", "rich")
-FUNCTIONS = ("audit", "check", "compare", "design", "estimate", "load", "posterior", "report", "run", "status")
+FUNCTIONS = (
+    "audit",
+    "check",
+    "compare",
+    "design",
+    "estimate",
+    "load",
+    "posterior",
+    "report",
+    "run",
+    "status",
+)
 
 
-@pytest.mark.parametrize("use", ["pass", "ib.Scenario, ib.Status, ib.UserError, ib.Estimator", "ib.noise.Gaussian"])
+@pytest.mark.parametrize(
+    "use", ["pass", "ib.Scenario, ib.Status, ib.UserError, ib.Estimator", "ib.noise.Gaussian"]
+)
 def test_nothing_heavy_is_imported_until_it_is_used(use):
     script = f"import sys, ipe_bench as ib\n{use}\nprint(*[name for name in {HEAVY} if name in sys.modules])"
-    loaded = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+    loaded = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    ).stdout
     assert loaded.split() == []
 
 
@@ -33,7 +48,9 @@ def test_every_public_name_is_there_and_explains_itself():
         assert name == "__version__" or inspect.getdoc(thing), name
 
 
-CONTRACTS = {place: resolve_name(place) for places in discovery.CONTRACTS.values() for place in places}
+CONTRACTS = {
+    place: resolve_name(place) for places in discovery.CONTRACTS.values() for place in places
+}
 
 
 @pytest.mark.parametrize("place", CONTRACTS)
@@ -56,7 +73,9 @@ def test_the_examples_in_the_docstrings_come_out_as_they_say(place):
         runner.run(test)
     counts = runner.summarize(verbose=False)
     assert counts.failed == 0
-    needed = name in FUNCTIONS or (place in CONTRACTS and name != "ConstantFilter")  # which a `Sequential` makes
+    needed = name in FUNCTIONS or (
+        place in CONTRACTS and name != "ConstantFilter"
+    )  # which a `Sequential` makes
     assert counts.attempted > 0 or not needed, f"{place} has no example"
 
 
@@ -68,7 +87,9 @@ def test_the_python_of_the_readme_runs_as_it_stands(tmp_path, monkeypatch):
     names: dict = {}
     exec(code.replace("trials=200", "trials=20"), names)
     assert set(names["table"]["estimator"]) == {"newton", "ekf"}
-    assert names["rows"].groupby("estimator")["nees"].mean().loc["ekf"] > names["rows"]["nees"].min()
+    assert (
+        names["rows"].groupby("estimator")["nees"].mean().loc["ekf"] > names["rows"]["nees"].min()
+    )
     assert [fit.label for fit in names["fits"]] == ["auto", "linear_lse", "levenberg_marquardt"]
 
 
@@ -78,19 +99,32 @@ def polynomial() -> ib.Scenario:
 
 
 def test_rows_of_trials_say_what_they_belong_to(tmp_path, polynomial):
-    bent = ib.Scenario(ib.measurements.Polynomial(strength=0.001), ib.noise.Gaussian(0.01), error_scale=3.0, seed=1)
+    bent = ib.Scenario(
+        ib.measurements.Polynomial(strength=0.001), ib.noise.Gaussian(0.01), error_scale=3.0, seed=1
+    )
     estimators = {"newton": ib.solvers.Newton(), "linear": ib.baselines.LinearLSE()}
     ib.run([polynomial, bent], estimators, 12, output=tmp_path, block_size=5)
     rows = ib.load(tmp_path)
     assert len(rows) == 2 * 2 * 12
-    belongs = ["measurement", "noise", "error_scale", "seed", "estimator", "measurement.strength", "trial"]
+    belongs = [
+        "measurement",
+        "noise",
+        "error_scale",
+        "seed",
+        "estimator",
+        "measurement.strength",
+        "trial",
+    ]
     assert not rows[belongs].isna().any().any()
     order, few = [*rows.columns], [*rows.columns[rows.isna().mean() > 0.5]]
     assert {*order[: len(belongs) + 1]} == {*belongs, "prior"}
     assert order[len(belongs) :][:5] == ["trial", "status", "success", "solved", "error_c0"]
     assert order[-len(few) :] == few
     assert not rows.duplicated(belongs).any()
-    assert rows.groupby("seed")["measurement.strength"].unique().map(list).to_dict() == {0: [0.005], 1: [0.001]}
+    assert rows.groupby("seed")["measurement.strength"].unique().map(list).to_dict() == {
+        0: [0.005],
+        1: [0.001],
+    }
     drawn = polynomial.draw(0, 12).x
     found = rows[(rows["estimator"] == "newton") & (rows["seed"] == 0)].sort_values("trial")
     names = [p.name for p in polynomial.measurement.parameters]
@@ -128,7 +162,11 @@ def test_without_estimators_they_are_those_of_the_command(polynomial):
         ((np.zeros(3),), {}, "give the 40 readings"),
         (("nowhere.csv",), {}, "no such file"),
         ((np.zeros(40), {"map": ib.baselines.MapLM()}), {}, "needs prior"),
-        ((np.zeros(40),), {"noise": ib.noise.Unknown()}, "noise: is not given and cannot be estimated"),
+        (
+            (np.zeros(40),),
+            {"noise": ib.noise.Unknown()},
+            "noise: is not given and cannot be estimated",
+        ),
     ],
 )
 def test_mistakes_in_an_estimate_are_one_line(polynomial, arguments, options, words):
@@ -136,7 +174,9 @@ def test_mistakes_in_an_estimate_are_one_line(polynomial, arguments, options, wo
         ib.estimate(polynomial.measurement, *arguments, **options)
 
 
-def test_status_and_report_agree_and_the_report_is_still_a_function_afterwards(tmp_path, polynomial):
+def test_status_and_report_agree_and_the_report_is_still_a_function_afterwards(
+    tmp_path, polynomial
+):
     ib.run(polynomial, {"newton": ib.solvers.Newton()}, 10, output=tmp_path, block_size=5)
     assert ib.status(tmp_path).attrs["problems"] == []
     newton = ResultKey(polynomial, "newton", ib.solvers.Newton())

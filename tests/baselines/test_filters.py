@@ -59,7 +59,11 @@ def maximum_a_posteriori(problem: Problem, z, x):
 )
 @pytest.mark.parametrize(
     ("estimator", "apart", "scale"),
-    [(one, 1e-8 if one in (EKF(), IteratedEKF()) else 1e-6, s) for one in (*KALMAN, *BATCHED) for s in (1.0, 10.0)]
+    [
+        (one, 1e-8 if one in (EKF(), IteratedEKF()) else 1e-6, s)
+        for one in (*KALMAN, *BATCHED)
+        for s in (1.0, 10.0)
+    ]
     + [(one, 1e-6, scale) for one in INFORMATION for scale in (1.0, 100.0)],
     ids=str,
 )
@@ -94,7 +98,9 @@ def test_readings_correlated_within_an_epoch(estimator):
     problem = Problem(model, Covariance(np.linalg.cholesky(R)), np.ones(2))
     z = np.linspace(-2.0, 3.0, 7)[None]
     x, P = linear_map(problem, model.matrix, z)
-    found = (replace(estimator, members=4000) if isinstance(estimator, EnKF) else estimator).estimate(problem, z)
+    found = (
+        replace(estimator, members=4000) if isinstance(estimator, EnKF) else estimator
+    ).estimate(problem, z)
     apart = 0.1 if isinstance(estimator, EnKF) else 1e-9
     assert np.abs((found.x[0] - x[0]) / deviations(P)).max() < apart
 
@@ -139,18 +145,26 @@ def test_gins_at_scale_10_is_near_the_map_and_consistent(estimator):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("scale", "extended", "iterated"),
-    [(300.0, (0.32, 0.45), (0.99, 1.0)), (600.0, (0.02, 0.08), (0.93, 1.0)), (1000.0, (0.0, 0.03), (0.72, 0.9))],
+    [
+        (300.0, (0.32, 0.45), (0.99, 1.0)),
+        (600.0, (0.02, 0.08), (0.93, 1.0)),
+        (1000.0, (0.0, 0.03), (0.72, 0.9)),
+    ],
 )
 def test_where_linearising_once_fails_and_iterating_holds(scale, extended, iterated):
     block = block_of_gins(scale, 400)
-    once, again = (block.estimate(estimator)[1]["success"].mean() for estimator in (EKF(), IteratedEKF()))
+    once, again = (
+        block.estimate(estimator)[1]["success"].mean() for estimator in (EKF(), IteratedEKF())
+    )
     assert extended[0] <= once <= extended[1]
     assert iterated[0] <= again <= iterated[1]
 
 
 LINEAR = Scenario(Linear(), Gaussian(0.1), GaussianPrior(), 3.0)
 ALIKE = [(LINEAR, {}), (LINEAR, {"process_noise": 0.1}), (LINEAR, {"prior_inflation": 2.0})]
-ALIKE += [(Scenario(Gins(), Quantization(0.02286), GaussianPrior(), scale), {}) for scale in (10.0, 300.0)]
+ALIKE += [
+    (Scenario(Gins(), Quantization(0.02286), GaussianPrior(), scale), {}) for scale in (10.0, 300.0)
+]
 
 
 @pytest.mark.oracle(
@@ -158,9 +172,13 @@ ALIKE += [(Scenario(Gins(), Quantization(0.02286), GaussianPrior(), scale), {}) 
     "estimates and covariances, in the prior's standard deviations",
     1e-9,
 )
-@pytest.mark.parametrize(("scenario", "changes"), ALIKE, ids=lambda given: getattr(given, "error_scale", given))
+@pytest.mark.parametrize(
+    ("scenario", "changes"), ALIKE, ids=lambda given: getattr(given, "error_scale", given)
+)
 @pytest.mark.parametrize("estimator", KALMAN, ids=label)
-def test_the_batched_engine_is_filterpy_within_a_billionth_of_the_prior(estimator, scenario, changes):
+def test_the_batched_engine_is_filterpy_within_a_billionth_of_the_prior(
+    estimator, scenario, changes
+):
     d, z = scenario.problem.prior_deviation, scenario.draw(0, 5).z
     engines = (replace(estimator, engine=engine, **changes) for engine in ("filterpy", "batched"))
     one, other = (engine.estimate(scenario.problem, z, history=True) for engine in engines)
@@ -177,7 +195,9 @@ def test_the_batched_engine_is_filterpy_within_a_billionth_of_the_prior(estimato
 # The contract
 
 
-@pytest.mark.oracle("own second implementation: Kalman filter of one state", "estimates and covariance", 1e-9)
+@pytest.mark.oracle(
+    "own second implementation: Kalman filter of one state", "estimates and covariance", 1e-9
+)
 @pytest.mark.parametrize("estimator", KALMAN, ids=label)
 def test_process_noise_is_added_before_each_epoch(estimator):
     """Readings of one constant that walks: the scalar Kalman filter by hand."""
@@ -213,7 +233,11 @@ def test_what_overflows_ends_its_own_trial(estimator):
     z = np.random.default_rng(1).standard_normal((3, model.m))
     z[1] = model.matrix @ [1e8, 0, 0, 0]
     found = estimator.estimate(problem, z)
-    assert [Status(s) for s in found.status] == [Status.CONVERGED, Status.NONFINITE, Status.CONVERGED]
+    assert [Status(s) for s in found.status] == [
+        Status.CONVERGED,
+        Status.NONFINITE,
+        Status.CONVERGED,
+    ]
     assert set(found.messages) == {1}
     assert np.isnan(found.covariance[1]).all()
     z[1] = 1e308
@@ -249,7 +273,9 @@ def textbook_iplf(model, z, variance, iterations):
     for rows in model.epochs:
         mean, cov = x, P
         for _ in range(iterations):
-            points = mean + np.sqrt(n) * np.concatenate([np.linalg.cholesky(cov).T, -np.linalg.cholesky(cov).T])
+            points = mean + np.sqrt(n) * np.concatenate(
+                [np.linalg.cholesky(cov).T, -np.linalg.cholesky(cov).T]
+            )
             h = model.simulate(points)[:, rows]
             centre = h.mean(axis=0)
             Psi = (points - mean).T @ (h - centre) / (2 * n)
@@ -298,7 +324,9 @@ def test_ukf_wants_the_hx_of_each_epoch():
     x, P = linear_map(problem, model.matrix, z)
     first, second = model.epochs
     points = MerweScaledSigmaPoints(4, 0.1, 2.0, 0.0)
-    naive = UnscentedKalmanFilter(4, 3, 1.0, lambda x: model.matrix[first] @ x, lambda x, dt: x, points)
+    naive = UnscentedKalmanFilter(
+        4, 3, 1.0, lambda x: model.matrix[first] @ x, lambda x, dt: x, points
+    )
     naive.x, naive.Q = model.nominal, np.zeros((4, 4))
     for rows in (first, second):
         naive.predict()
@@ -317,7 +345,9 @@ def test_ukf_with_a_small_alpha_loses_digits():
     deviation = np.sqrt(np.diag(P))
     apart = np.abs((near.x - x) / deviation).max()
     assert apart < 1e-8
-    lost = (far.status != Status.CONVERGED).any() or np.abs((far.x - x) / deviation).max() > 100 * apart
+    lost = (far.status != Status.CONVERGED).any() or np.abs(
+        (far.x - x) / deviation
+    ).max() > 100 * apart
     assert lost
 
 

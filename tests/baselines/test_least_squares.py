@@ -8,7 +8,13 @@ from scipy.optimize import curve_fit
 from shared.oracles import agreed
 from shared.small_models import Bent, Written
 
-from ipe_bench.baselines import GaussNewton, LeastSquares, LevenbergMarquardt, MultiscaleLM, Multistart
+from ipe_bench.baselines import (
+    GaussNewton,
+    LeastSquares,
+    LevenbergMarquardt,
+    MultiscaleLM,
+    Multistart,
+)
 from ipe_bench.basics.linalg import Array, Covariance, deviations
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.ipe import begin
@@ -50,7 +56,9 @@ def decay(deviation: float = 0.02, trials: int = 6):
 METHODS = ["trf", "lm", "dogbox"]
 
 
-@pytest.mark.oracle("library: MINPACK, by SciPy's curve_fit", "estimates, in standard deviations", 1e-4)
+@pytest.mark.oracle(
+    "library: MINPACK, by SciPy's curve_fit", "estimates, in standard deviations", 1e-4
+)
 @pytest.mark.parametrize("start", ["linear_lse", "nominal"])
 @pytest.mark.parametrize("method", METHODS)
 def test_agrees_with_minpack_through_curve_fit(method, start):
@@ -59,7 +67,14 @@ def test_agrees_with_minpack_through_curve_fit(method, start):
     assert (found.status == Status.CONVERGED).all()
     for i, z in enumerate(trials.z):
         x, P = curve_fit(
-            lambda t, a, b: a * np.exp(-b * t), T, z, trials.x[i], np.full(25, 0.02), True, ftol=1e-14, xtol=1e-14
+            lambda t, a, b: a * np.exp(-b * t),
+            T,
+            z,
+            trials.x[i],
+            np.full(25, 0.02),
+            True,
+            ftol=1e-14,
+            xtol=1e-14,
         )
         agreed(np.abs(found.x[i] - x) / np.sqrt(np.diag(P).min()), 1e-4)
         assert found.covariance[i] == pytest.approx(P, rel=1e-3)
@@ -92,7 +107,9 @@ def test_a_robust_loss_shrugs_off_a_bad_reading():
     z[:, 10] += 100 * 0.02
     plain, robust = (LeastSquares(loss=loss).estimate(problem, z) for loss in ("linear", "soft_l1"))
     assert (robust.status == Status.CONVERGED).all()
-    assert (np.abs(robust.x - trials.x).max(axis=1) < np.abs(plain.x - trials.x).max(axis=1) / 5).all()
+    assert (
+        np.abs(robust.x - trials.x).max(axis=1) < np.abs(plain.x - trials.x).max(axis=1) / 5
+    ).all()
 
 
 def test_the_root_of_a_robust_loss_is_not_that_of_least_squares():
@@ -109,7 +126,9 @@ def test_runs_out_of_evaluations():
 
 def test_parameters_that_cannot_be_told_apart_are_singular():
     model = Written(lambda a, b: tuple((a + b) * (1.0 + t) for t in T), 2, 25)
-    found = LeastSquares(start="nominal").estimate(Problem(model, Covariance(np.ones(25))), 1.0 + T[None] ** 2)
+    found = LeastSquares(start="nominal").estimate(
+        Problem(model, Covariance(np.ones(25))), 1.0 + T[None] ** 2
+    )
     assert found.status[0] == Status.SINGULAR
 
 
@@ -144,7 +163,8 @@ def test_an_estimator_that_starts_at_the_best_is_one_of_its_two_selves(estimator
     z[3] = np.nan
     with np.errstate(all="ignore"):
         best, lse, nominal = (
-            replace(estimator, start=start).estimate(problem, z) for start in ("best", "linear_lse", "nominal")
+            replace(estimator, start=start).estimate(problem, z)
+            for start in ("best", "linear_lse", "nominal")
         )
         alone = replace(estimator, start="best").estimate(problem, z[5:6])
     same = [np.all(best.x == other.x, axis=1) | (np.arange(12) == 3) for other in (lse, nominal)]
@@ -208,7 +228,9 @@ def test_the_hardest_certified_problems_are_solved_from_the_far_start(dataset):
     ids=lambda one: getattr(one, "name", str(one)),
 )
 def test_all_27_certified_problems_are_solved_from_both_starts(estimator, mean):
-    reached = [[certified_digits(dataset, start, estimator) for dataset in FORMULAS] for start in (1, 2)]
+    reached = [
+        [certified_digits(dataset, start, estimator) for dataset in FORMULAS] for start in (1, 2)
+    ]
     parameters = np.array([[d.parameters for d in row] for row in reached])
     deviations = np.array([[d.deviations for d in row] for row in reached])
     agreed(10.0**-parameters, 1e-4)
@@ -233,7 +255,9 @@ def draw(model: Measurement, deviation: float, scale: float, trials: int):
 
 def test_minima_that_fit_alike_are_counted_and_listed():
     problem, trials = draw(MIRRORED, 0.01, 0.3, 12)
-    found = Multistart(starts=30, confirmations=29, seed=4).estimate(Problem(problem.measurement, problem.R), trials.z)
+    found = Multistart(starts=30, confirmations=29, seed=4).estimate(
+        Problem(problem.measurement, problem.R), trials.z
+    )
     assert (found.status == Status.CONVERGED).all()
     np.testing.assert_array_equal(found.extras["minima"], 2)
     np.testing.assert_array_equal(found.extras["ambiguous"], 1)
@@ -279,7 +303,9 @@ def test_it_stops_at_the_first_fit_if_nothing_is_to_be_confirmed():
 @pytest.mark.slow
 def test_a_budget_ends_the_search():
     problem, trials = draw(WAVE, 0.1, 3.0, 20)
-    free, bounded = (Multistart(starts=20, budget=b).estimate(problem, trials.z) for b in (None, 40.0))
+    free, bounded = (
+        Multistart(starts=20, budget=b).estimate(problem, trials.z) for b in (None, 40.0)
+    )
     assert (free.simulations + free.jacobians).max() > 100
     assert (bounded.simulations + bounded.jacobians).max() <= 42
 
@@ -298,7 +324,9 @@ def test_no_fit_is_believed_where_the_level_of_the_noise_is_unknown():
     """Under an assumed deviation far too wide any minimum fits; the lowest of all starts counts."""
     problem, trials = draw(WAVE, 0.1, 1.0, 12)
     wide = Problem(problem.measurement, Covariance(np.full(40, 10.0)), problem.prior_deviation)
-    believed, doubted = (Multistart(starts=40).estimate(replace(wide, doubted=d), trials.z) for d in (0.0, 1.0))
+    believed, doubted = (
+        Multistart(starts=40).estimate(replace(wide, doubted=d), trials.z) for d in (0.0, 1.0)
+    )
     wanted = np.array([lowest_of_a_grid(z) for z in trials.z])
     hits = [(np.abs(found.x[:, 0] - wanted) < 2e-3).mean() for found in (believed, doubted)]
     assert hits[0] < 0.8 < hits[1]

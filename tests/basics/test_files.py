@@ -6,7 +6,9 @@ from ipe_bench.basics.errors import StorageError
 from ipe_bench.basics.files import write_atomically, write_text
 
 
-@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt(), ValueError("odd")])
+@pytest.mark.parametrize(
+    "error", [OSError(28, "No space left on device"), KeyboardInterrupt(), ValueError("odd")]
+)
 def test_a_write_that_fails_leaves_what_was_there(tmp_path, error):
     path = tmp_path / "folder" / "a.txt"
     write_text(path, "whole")

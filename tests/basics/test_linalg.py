@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 from shared.oracles import assert_agrees
 
-from ipe_bench.basics.linalg import Covariance, definite_factor, information, pseudo_inverse, read_only
+from ipe_bench.basics.linalg import (
+    Covariance,
+    definite_factor,
+    information,
+    pseudo_inverse,
+    read_only,
+)
 
 M, N = 30, 5
 
@@ -39,14 +45,18 @@ def test_correlated_readings_are_whitened_first():
     found, _ = pseudo_inverse(H, Covariance(L))
     inverse_R = np.linalg.inv(L @ L.T)
     for A, A_plus in zip(H, found, strict=True):
-        assert_agrees(A_plus, np.linalg.solve(A.T @ inverse_R @ A, A.T @ inverse_R), rtol=1e-9, atol=1e-12)
+        assert_agrees(
+            A_plus, np.linalg.solve(A.T @ inverse_R @ A, A.T @ inverse_R), rtol=1e-9, atol=1e-12
+        )
 
 
 @pytest.mark.parametrize("rows", [[4, 1, 7], [0, 1, 2], [9]])
 def test_the_covariance_of_some_readings_is_their_part_of_that_of_all(rows):
     A = np.random.default_rng(2).normal(size=(10, 10))
     for R in (Covariance(np.linalg.cholesky(A @ A.T)), Covariance(np.abs(A[0]))):
-        np.testing.assert_allclose(R.restricted(np.array(rows)).matrix(), R.matrix()[np.ix_(rows, rows)], rtol=1e-12)
+        np.testing.assert_allclose(
+            R.restricted(np.array(rows)).matrix(), R.matrix()[np.ix_(rows, rows)], rtol=1e-12
+        )
 
 
 def test_a_matrix_without_full_rank_spoils_its_own_trial_only():
@@ -80,7 +90,9 @@ def test_a_factor_is_that_of_a_qr_decomposition_whatever_the_sizes_of_columns(n)
     R = np.linalg.qr(J, mode="r")
     R = R * np.sign(np.diagonal(R, axis1=1, axis2=2))[:, :, None]
     assert_agrees(U / columns, R / columns, rtol=1e-11, atol=1e-13)
-    np.testing.assert_allclose(np.matmul(U, inverse_U), np.broadcast_to(np.eye(n), U.shape), atol=1e-12)
+    np.testing.assert_allclose(
+        np.matmul(U, inverse_U), np.broadcast_to(np.eye(n), U.shape), atol=1e-12
+    )
     for A in (U, inverse_U):
         assert np.array_equal(A, np.triu(A))
     alone = definite_factor(np.matmul(J[3:4].swapaxes(1, 2), J[3:4]))

@@ -39,7 +39,9 @@ def simulators(model: OdeMeasurement, steps: int) -> Iterator[tuple[str, Simulat
 
 def one_thread() -> None:
     """For XLA, which must be told before it is loaded."""
-    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
+    os.environ.setdefault(
+        "XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+    )
 
 
 def _run(program: Program, inputs: list[Any], library: Any) -> list[Any]:
@@ -76,7 +78,9 @@ def _shown(model: OdeMeasurement, shown: Program, y: Array, fixed: Array) -> Arr
     t = model.times[:, None]
     z = np.stack(np.broadcast_arrays(*_run(shown, [t, *y.swapaxes(0, 1), *fixed], np)), axis=-1)
     problems, outputs = y.shape[2], len(model.outputs)
-    z = z.swapaxes(0, 1).reshape(problems // len(model.cases), len(model.cases) * len(model.times) * outputs)
+    z = z.swapaxes(0, 1).reshape(
+        problems // len(model.cases), len(model.cases) * len(model.times) * outputs
+    )
     return z - model.offset
 
 
@@ -87,9 +91,15 @@ def _by_heyoka(model: OdeMeasurement, tolerance: float) -> Simulate:
     names = [f"y{i}" for i in range(states)]
     held = slope.inputs - states - 1
     rates = _run(slope, [hy.time, *hy.make_vars(*names), *(hy.par[i] for i in range(held))], hy)
-    system = [(hy.expression(name), hy.expression(rate)) for name, rate in zip(names, rates, strict=True)]
+    system = [
+        (hy.expression(name), hy.expression(rate)) for name, rate in zip(names, rates, strict=True)
+    ]
     integrator = hy.taylor_adaptive_batch(
-        system, np.zeros((states, lanes)), tol=tolerance, pars=np.zeros((held, lanes)), compact_mode=False
+        system,
+        np.zeros((states, lanes)),
+        tol=tolerance,
+        pars=np.zeros((held, lanes)),
+        compact_mode=False,
     )
     grid = np.repeat(np.concatenate([[0.0], model.times])[:, None], lanes, axis=1)
 
@@ -150,7 +160,9 @@ def jax_readings(model: OdeMeasurement, steps: int) -> Callable[[Any], Any]:
 
 def _moved(y: list[Any], h: Any, weights: Sequence[float], k: list[list[Any]]) -> list[Any]:
     terms = [(w, slope) for w, slope in zip(weights, k, strict=False) if w]
-    return [v + h * sum(w * slope[i] for w, slope in terms) if terms else v for i, v in enumerate(y)]
+    return [
+        v + h * sum(w * slope[i] for w, slope in terms) if terms else v for i, v in enumerate(y)
+    ]
 
 
 def _jax() -> Any:

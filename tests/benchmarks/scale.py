@@ -15,7 +15,13 @@ from pathlib import Path
 TRIALS = int(os.environ.get("SCALE", "1000000"))
 WORKERS = 2
 BENCH = [sys.executable, "-m", "ipe_bench"]
-RUN = ("run", "solver=[fixed_point]", "baseline=[linear_lse]", "error_scale=10", "execution=processes")
+RUN = (
+    "run",
+    "solver=[fixed_point]",
+    "baseline=[linear_lse]",
+    "error_scale=10",
+    "execution=processes",
+)
 _LOOK_S = 0.2
 _MB = 1e6
 
@@ -40,11 +46,21 @@ def used(command: list[str]) -> Usage:
 
     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     own = others = together = 0.0
-    environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONDONTWRITEBYTECODE", "IPE_BENCH_THREADS")}
-    with subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+    environment = {
+        k: v
+        for k, v in os.environ.items()
+        if k not in ("PYTHONDONTWRITEBYTECODE", "IPE_BENCH_THREADS")
+    }
+    with subprocess.Popen(
+        command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    ) as process:
         while process.poll() is None:
             first, *rest = [_resident_mb(pid) for pid in _family(process.pid)]
-            own, others, together = max(own, first), max([others, *rest]), max(together, first + sum(rest))
+            own, others, together = (
+                max(own, first),
+                max([others, *rest]),
+                max(together, first + sum(rest)),
+            )
             time.sleep(_LOOK_S)
     if process.returncode:
         raise subprocess.CalledProcessError(process.returncode, command)
@@ -66,7 +82,11 @@ def _family(pid: int) -> Iterator[int]:
 
 def _resident_mb(pid: int) -> float:
     try:
-        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / _MB
+        return (
+            int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+            * os.sysconf("SC_PAGE_SIZE")
+            / _MB
+        )
     except OSError:
         return 0.0
 
@@ -85,7 +105,9 @@ class Measured:
 def measured(trials: int) -> Measured:
     with tempfile.TemporaryDirectory(prefix="ipe-bench-") as folder:
         output = Path(folder) / "out"
-        run = used([*BENCH, *RUN, f"execution.workers={WORKERS}", f"trials={trials}", f"output={output}"])
+        run = used(
+            [*BENCH, *RUN, f"execution.workers={WORKERS}", f"trials={trials}", f"output={output}"]
+        )
         report = used([*BENCH, "report", str(output), f"output={folder}/again"])
         sizes = [path.stat().st_size for path in (output / "trials").iterdir()]
     return Measured(trials, run, report, sum(sizes), len(sizes))

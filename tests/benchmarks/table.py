@@ -67,29 +67,49 @@ def least(*calls: Callable[[], Any], rounds: int = 5, at_least: float = 0.1) -> 
 
 
 def scenario(scale: float) -> ib.Scenario:
-    return ib.Scenario(ib.measurements.Gins(), ib.noise.Quantization(step=0.02286), error_scale=scale)
+    return ib.Scenario(
+        ib.measurements.Gins(), ib.noise.Quantization(step=0.02286), error_scale=scale
+    )
 
 
 def simulation() -> Iterator[Row]:
-    model, x = ib.measurements.Gins(step=STEP_S), 33.0 * np.random.default_rng(0).normal(size=(BATCH, 11))
+    model, x = (
+        ib.measurements.Gins(step=STEP_S),
+        33.0 * np.random.default_rng(0).normal(size=(BATCH, 11)),
+    )
     adaptive = ib.measurements.Gins()
     for batch in (64, 8, 1):
         part = x[:batch]
         ours, whole = least(lambda part=part: model.simulate(part), lambda: model.simulate(x))
         what = f"one simulation, batch {batch}"
-        yield Row("simulation", what, 1e6 * ours / batch, "µs", f"batch {BATCH}", 1e6 * whole / BATCH)
+        yield Row(
+            "simulation", what, 1e6 * ours / batch, "µs", f"batch {BATCH}", 1e6 * whole / BATCH
+        )
     ours, fixed = least(lambda: adaptive.simulate(x), lambda: model.simulate(x))
     name = f"one simulation, batch {BATCH}, step by tolerance"
-    yield Row("simulation", name, 1e6 * ours / BATCH, "µs", f"steps of {STEP_S:g} s", 1e6 * fixed / BATCH)
+    yield Row(
+        "simulation", name, 1e6 * ours / BATCH, "µs", f"steps of {STEP_S:g} s", 1e6 * fixed / BATCH
+    )
     what = f"one simulation, batch {BATCH}"
     for beside, simulate in peers.simulators(model, 1):
         if not np.abs(simulate(x) - model.simulate(x)).max() < adaptive.tolerance:
             raise AssertionError(f"{beside}: integrates something else, or less accurately")
-        ours, theirs = least(lambda: model.simulate(x), lambda simulate=simulate: simulate(x), rounds=3)
+        ours, theirs = least(
+            lambda: model.simulate(x), lambda simulate=simulate: simulate(x), rounds=3
+        )
         yield Row("simulation", what, 1e6 * ours / BATCH, "µs", beside, 1e6 * theirs / BATCH)
     few = x[:2]
-    ours, theirs = least(lambda: model.simulate(x), lambda: [by_scipy(model, row) for row in few], rounds=2)
-    yield Row("simulation", what, 1e6 * ours / BATCH, "µs", "SciPy DOP853, rtol 1e-9", 1e6 * theirs / len(few))
+    ours, theirs = least(
+        lambda: model.simulate(x), lambda: [by_scipy(model, row) for row in few], rounds=2
+    )
+    yield Row(
+        "simulation",
+        what,
+        1e6 * ours / BATCH,
+        "µs",
+        "SciPy DOP853, rtol 1e-9",
+        1e6 * theirs / len(few),
+    )
 
 
 def by_scipy(model: Any, x: np.ndarray) -> np.ndarray:
@@ -117,7 +137,14 @@ def jacobians() -> Iterator[Row]:
         simulate, exact, coarse = least(*(partial(call, x) for call in calls), rounds=3)
         for name, seconds in (("exact Jacobian", exact), ("Jacobian inside iterations", coarse)):
             what = f"{name}, scale {scale:g}"
-            yield Row("Jacobian", what, 1e6 * seconds / BATCH, "µs", "own simulation", 1e6 * simulate / BATCH)
+            yield Row(
+                "Jacobian",
+                what,
+                1e6 * seconds / BATCH,
+                "µs",
+                "own simulation",
+                1e6 * simulate / BATCH,
+            )
 
 
 def stiff() -> Iterator[Row]:
@@ -125,17 +152,24 @@ def stiff() -> Iterator[Row]:
     rates = {"a": "-k1*a + k3*b*c", "b": "k1*a - k3*b*c - k2*b*b", "c": "k2*b*b"}
     times = tuple(np.logspace(0, np.log10(4e5), 20).tolist())
     model = ib.measurements.Ode(rates, {"k1": 0.04, "k2": 3e7, "k3": 1e4}, {"a": 1.0}, times=times)
-    method, x = Rodas5P(model.engine.stepped, 1e-8), 1 + 0.01 * np.random.default_rng(0).normal(size=(BATCH, 3))
+    method, x = (
+        Rodas5P(model.engine.stepped, 1e-8),
+        1 + 0.01 * np.random.default_rng(0).normal(size=(BATCH, 3)),
+    )
 
     def scipy(name: str) -> Any:
         p = (x[0] * model.sizes).tolist()
         tolerances = {"rtol": 1e-8, "atol": [1e-12, 1e-16, 1e-12]}
         rhs = partial(model.engine.rhs, p=p, c=())
-        return solve_ivp(rhs, (0.0, times[-1]), [1.0, 0.0, 0.0], method=name, t_eval=times, **tolerances)
+        return solve_ivp(
+            rhs, (0.0, times[-1]), [1.0, 0.0, 0.0], method=name, t_eval=times, **tolerances
+        )
 
     for batch in (1, BATCH):
         for name in ("LSODA", "Radau"):
-            ours, theirs = least(partial(method.simulate, x[:batch], len(times)), partial(scipy, name), rounds=2)
+            ours, theirs = least(
+                partial(method.simulate, x[:batch], len(times)), partial(scipy, name), rounds=2
+            )
             what = f"Rodas5P on Robertson's equations, batch {batch}"
             yield Row("stiff", what, 1e3 * ours / batch, "ms", f"SciPy {name}", 1e3 * theirs)
 
@@ -145,20 +179,38 @@ def estimation() -> Iterator[Row]:
     block = Block.draw(s, 0, BATCH)
     problem, z, x = s.problem, block.trials.z, block.trials.x
     S, B = ib.solvers, ib.baselines
-    estimators = [B.LinearLSE(), S.FixedPoint(), S.Anderson(), S.Broyden(), S.Newton(), S.Progressive()]
+    estimators = [
+        B.LinearLSE(),
+        S.FixedPoint(),
+        S.Anderson(),
+        S.Broyden(),
+        S.Newton(),
+        S.Progressive(),
+    ]
     estimators += [B.GaussNewton(), B.LevenbergMarquardt()]
     for estimator in estimators:
         name = type(estimator).__name__
         seconds, once = least(
-            lambda e=estimator: e.estimate(problem, z), lambda: problem.measurement.simulate(x), rounds=3
+            lambda e=estimator: e.estimate(problem, z),
+            lambda: problem.measurement.simulate(x),
+            rounds=3,
         )
-        yield Row("estimation", name, 1e6 * seconds / BATCH, "µs", "one simulation", 1e6 * once / BATCH)
+        yield Row(
+            "estimation", name, 1e6 * seconds / BATCH, "µs", "one simulation", 1e6 * once / BATCH
+        )
     few = z[:10]
     seconds, theirs = least(
-        lambda: B.LevenbergMarquardt().estimate(problem, z), lambda: B.LeastSquares().estimate(problem, few), rounds=2
+        lambda: B.LevenbergMarquardt().estimate(problem, z),
+        lambda: B.LeastSquares().estimate(problem, few),
+        rounds=2,
     )
     yield Row(
-        "estimation", "LevenbergMarquardt", 1e6 * seconds / BATCH, "µs", "SciPy least_squares", 1e6 * theirs / len(few)
+        "estimation",
+        "LevenbergMarquardt",
+        1e6 * seconds / BATCH,
+        "µs",
+        "SciPy least_squares",
+        1e6 * theirs / len(few),
     )
 
     def scored() -> None:
@@ -179,10 +231,14 @@ def filters() -> Iterator[Row]:
     for cls, trials in ((B.EKF, 100), (B.IteratedEKF, 100), (B.UKF, 100), (B.CKF, 100)):
         z = s.draw(0, trials).z
         few = z[:10]
-        (batched,) = least(lambda cls=cls, z=z: cls(engine="batched").estimate(s.problem, z), rounds=2)
+        (batched,) = least(
+            lambda cls=cls, z=z: cls(engine="batched").estimate(s.problem, z), rounds=2
+        )
         (plain,) = least(lambda cls=cls, few=few: cls().estimate(s.problem, few), rounds=1)
         beside = "filterpy, trial by trial"
-        yield Row("filters", cls.__name__, 1e6 * batched / trials, "µs", beside, 1e6 * plain / len(few))
+        yield Row(
+            "filters", cls.__name__, 1e6 * batched / trials, "µs", beside, 1e6 * plain / len(few)
+        )
 
 
 def trackers() -> Iterator[Row]:
@@ -235,7 +291,9 @@ def trackers() -> Iterator[Row]:
         (batch,) = least(lambda ours=ours: ours.track(model, z), rounds=2)
         (plain,) = least(lambda theirs=theirs: theirs(z[0]), rounds=2)
         what = f"{name} of states, {BATCH} trials of 500 epochs"
-        yield Row("trackers", what, 1e3 * batch / BATCH, "ms", "filterpy, trial by trial", 1e3 * plain)
+        yield Row(
+            "trackers", what, 1e3 * batch / BATCH, "ms", "filterpy, trial by trial", 1e3 * plain
+        )
 
 
 def loop() -> Iterator[Row]:
@@ -243,7 +301,14 @@ def loop() -> Iterator[Row]:
     with tempfile.TemporaryDirectory(prefix="ipe-bench-") as folder:
         runs: dict[str, list[Usage]] = {}
         for attempt in range(3):
-            run = [sys.executable, "-m", "ipe_bench", "run", "trials=2", f"output={folder}/{attempt}"]
+            run = [
+                sys.executable,
+                "-m",
+                "ipe_bench",
+                "run",
+                "trials=2",
+                f"output={folder}/{attempt}",
+            ]
             for name, command in (
                 ("libraries", [sys.executable, "-c", LIBRARIES]),
                 ("run trials=2, all figures", run),
@@ -253,20 +318,41 @@ def loop() -> Iterator[Row]:
     beside = runs.pop("libraries")
     for name, found in runs.items():
         for unit, seconds in (("s wall", lambda one: one.wall_s), ("s CPU", lambda one: one.cpu_s)):
-            yield Row("loop", name, min(map(seconds, found)), unit, LIBRARIES, min(map(seconds, beside)))
+            yield Row(
+                "loop", name, min(map(seconds, found)), unit, LIBRARIES, min(map(seconds, beside))
+            )
 
 
 def scale() -> Iterator[Row]:
     """Many trials with their report, beside a tenth of them; not among the parts unless it is asked for."""
     few, many = measured(TRIALS // 10), measured(TRIALS)
     what, tenth = f"{TRIALS:,} trials, two estimators", f"{few.trials:,} trials"
-    for name, a, b in (("run with report", many.run, few.run), ("report alone", many.report, few.report)):
+    for name, a, b in (
+        ("run with report", many.run, few.run),
+        ("report alone", many.report, few.report),
+    ):
         yield Row("scale", f"{what}: {name}", a.wall_s, "s wall", tenth, b.wall_s)
         yield Row("scale", f"{what}: {name}", a.cpu_s, "s CPU", tenth, b.cpu_s)
         yield Row("scale", f"{what}: {name}, its own peak", a.own_mb, "MB", tenth, b.own_mb)
-    yield Row("scale", f"{what}: largest of {WORKERS} workers", many.run.others_mb, "MB", tenth, few.run.others_mb)
-    yield Row("scale", f"{what}: all processes at once", many.run.together_mb, "MB", tenth, few.run.together_mb)
-    yield Row("scale", f"{what}: on disk", many.bytes_stored / 1e6, "MB", tenth, few.bytes_stored / 1e6)
+    yield Row(
+        "scale",
+        f"{what}: largest of {WORKERS} workers",
+        many.run.others_mb,
+        "MB",
+        tenth,
+        few.run.others_mb,
+    )
+    yield Row(
+        "scale",
+        f"{what}: all processes at once",
+        many.run.together_mb,
+        "MB",
+        tenth,
+        few.run.together_mb,
+    )
+    yield Row(
+        "scale", f"{what}: on disk", many.bytes_stored / 1e6, "MB", tenth, few.bytes_stored / 1e6
+    )
     yield Row("scale", f"{what}: on disk", many.files, "files", tenth, few.files)
 
 
@@ -277,9 +363,15 @@ LONG = {"scale": scale}
 
 def markdown(facts: dict[str, Any], rows: list[Row]) -> str:
     head = ", ".join(f"{k} {v}" for k, v in facts.items())
-    lines = [head, "", "| part | what | here | beside | there | ratio |", "|---|---|--:|---|--:|--:|"]
+    lines = [
+        head,
+        "",
+        "| part | what | here | beside | there | ratio |",
+        "|---|---|--:|---|--:|--:|",
+    ]
     lines += [
-        f"| {r.part} | {r.what} | {r.value:.3g} {r.unit} | {r.beside} | {r.other:.3g} | {r.ratio:.3g} |" for r in rows
+        f"| {r.part} | {r.what} | {r.value:.3g} {r.unit} | {r.beside} | {r.other:.3g} | {r.ratio:.3g} |"
+        for r in rows
     ]
     return "\n".join(lines) + "\n"
 
@@ -291,11 +383,15 @@ def main(folder: Path, parts: list[str]) -> None:
     for part in parts or list(PARTS):
         for row in (PARTS | LONG)[part]():
             rows.append(row)
-            print(f"{row.part:11s} {row.what:52s} {row.value:9.3g} {row.unit:7s} x{row.ratio:<8.3g} {row.beside}")
+            print(
+                f"{row.part:11s} {row.what:52s} {row.value:9.3g} {row.unit:7s} x{row.ratio:<8.3g} {row.beside}"
+            )
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "bench.md").write_text(markdown(facts, rows), encoding="utf-8")
     content = {"machine": facts, "rows": [asdict(row) | {"ratio": row.ratio} for row in rows]}
-    (folder / "bench.json").write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    (folder / "bench.json").write_text(
+        json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
+    )
     print(f"\n{folder / 'bench.md'}\n{folder / 'bench.json'}")
 
 

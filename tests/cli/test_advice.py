@@ -55,13 +55,30 @@ ADVICE = [
         "run noise.deviation=1 measurement=nist measurement.dataset={}",
     ),
     ("run error_scal=3", MEANT, "run {}=3"),
-    ("run measurement=polynomial measurement.counts=9", MEANT, "run measurement=polynomial measurement.{}=9"),
-    ("run solver=[newton] estimators.newton.max_iter=5", MEANT, "run solver=[newton] estimators.newton.{}=5"),
+    (
+        "run measurement=polynomial measurement.counts=9",
+        MEANT,
+        "run measurement=polynomial measurement.{}=9",
+    ),
+    (
+        "run solver=[newton] estimators.newton.max_iter=5",
+        MEANT,
+        "run solver=[newton] estimators.newton.{}=5",
+    ),
     ("run solver=[newton] solver.newton.max_iter=5", WORD, "run solver=[newton] {}"),
     ("run baseline.ekf.process_noise=1", WORD, "run {}"),
-    ("run solver=[newton] solver.max_iterations=5", WORD, "run solver=[newton] {}", {"LABEL": "newton"}),
+    (
+        "run solver=[newton] solver.max_iterations=5",
+        WORD,
+        "run solver=[newton] {}",
+        {"LABEL": "newton"},
+    ),
     ("run estimators.newton.max_iterations=5", WORD, "run estimators.newton.max_iterations=5 {}"),
-    ("run estimators.newtn.max_iterations=5", MEANT, "run solver=[newton] estimators.{}.max_iterations=5"),
+    (
+        "run estimators.newtn.max_iterations=5",
+        MEANT,
+        "run solver=[newton] estimators.{}.max_iterations=5",
+    ),
     (
         "run solver=[newton] estimators.newton=5",
         r"such as (\S+)",
@@ -102,11 +119,29 @@ ADVICE = [
     ("run hydra/launcher=joblib", r"or (choose basic)", "run hydra/launcher=basic"),
     ("run ~solver", r"; (\S+) chooses none", "run {}"),
     ("run time_limit=5", r"goes with (precision=);", "run time_limit=5 {}0.1"),
-    ("run write_readings_trial=3", r"goes with (\S+)", "run write_readings_trial=3 {}", {"FILE": "new.csv"}),
+    (
+        "run write_readings_trial=3",
+        r"goes with (\S+)",
+        "run write_readings_trial=3 {}",
+        {"FILE": "new.csv"},
+    ),
     ("run objective=newton", r"such as (\S+)", "run objective={}"),
-    ("run solver=[newton] objective=newtn.cost_median", MEANT, "run solver=[newton] objective={}.cost_median"),
-    ("run solver=[newton] objective=newton.cost_medium", MEANT, "run solver=[newton] objective=newton.{}"),
-    ("run prior_covariance=1", r"give (\S+) and", "run measurement=polynomial {}=1", {"NAME": "c0"}),
+    (
+        "run solver=[newton] objective=newtn.cost_median",
+        MEANT,
+        "run solver=[newton] objective={}.cost_median",
+    ),
+    (
+        "run solver=[newton] objective=newton.cost_medium",
+        MEANT,
+        "run solver=[newton] objective=newton.{}",
+    ),
+    (
+        "run prior_covariance=1",
+        r"give (\S+) and",
+        "run measurement=polynomial {}=1",
+        {"NAME": "c0"},
+    ),
     ("run solver=[] baseline=[]", r"choose with (solver=)", "run baseline=[] {}[newton]"),
     ("run figures=some", r"one of \w+, (\w+)", "run figures={}"),
     ("run formats=tiff", r"among .* and (\w+)", "run formats={}"),
@@ -160,7 +195,12 @@ ADVICE = [
         "run state_model=formulas {} state_model.readings.z=x state_model.deviation.z=1 state_model.spread.x=1",
         {"STATE": "x", "FORMULA": "x"},
     ),
-    (STATES, WORD, f"{STATES} {{}} state_model.deviation.z=1 state_model.spread.x=1", {"READING": "z", "FORMULA": "x"}),
+    (
+        STATES,
+        WORD,
+        f"{STATES} {{}} state_model.deviation.z=1 state_model.spread.x=1",
+        {"READING": "z", "FORMULA": "x"},
+    ),
     (
         f"{STATES} state_model.readings.z=x",
         WORD,
@@ -174,11 +214,16 @@ ADVICE = [
         {"STATE": "x"},
     ),
     (f"{FORMULA} noise.deviation=1", WORD, f"{FORMULA} noise.deviation=1 {{}}"),
-    (f"{FITTED} measurement.start.b1=1 readings=r.csv", WORD, f"{FITTED} measurement.start.b1=1 readings=r.csv {{}}"),
+    (
+        f"{FITTED} measurement.start.b1=1 readings=r.csv",
+        WORD,
+        f"{FITTED} measurement.start.b1=1 readings=r.csv {{}}",
+    ),
     (
         FORMULA.partition(" measurement.col")[0] + " measurement.start.b1=1 noise.deviation=1",
         r"or (measurement.columns.t=)",
-        FORMULA.partition(" measurement.col")[0] + " measurement.start.b1=1 noise.deviation=1 {}[1,2]",
+        FORMULA.partition(" measurement.col")[0]
+        + " measurement.start.b1=1 noise.deviation=1 {}[1,2]",
     ),
     (SWUNG.format("goode"), MEANT, SWUNG),
     (SWUNG.format("bare"), r"or (\S+)", SWUNG.format("bare") + " {}", {"NAME": "length"}),
@@ -201,19 +246,41 @@ ADVICE = [
         f"{STARTED} readings=[r.csv,s.csv]",
     ),
     (f"{STARTED}", WORD, f"{STARTED} {{}}"),
-    (f"{STARTED} readings=r.csv baseline=[map_lm]", WORD, f"{STARTED} readings=r.csv baseline=[map_lm] {{}}"),
+    (
+        f"{STARTED} readings=r.csv baseline=[map_lm]",
+        WORD,
+        f"{STARTED} readings=r.csv baseline=[map_lm] {{}}",
+    ),
     (
         f"{ROBUST}.method=lm",
         WORD,
         f"{ROBUST}.{{}}",
     ),
-    ("estimate state_model=pendulum_book find=[gravty]", MEANT, "estimate state_model=pendulum_book find=[{}]"),
+    (
+        "estimate state_model=pendulum_book find=[gravty]",
+        MEANT,
+        "estimate state_model=pendulum_book find=[{}]",
+    ),
     ("estimate state_model=growth", WORD, "estimate state_model=growth {}", {"FILE": "z.csv"}),
-    ("design measurement=polynomial --by", r"as in (\S+)", "design measurement=polynomial {}", {"VALUE": "time"}),
+    (
+        "design measurement=polynomial --by",
+        r"as in (\S+)",
+        "design measurement=polynomial {}",
+        {"VALUE": "time"},
+    ),
     ("design measurement=polynomial by=tim", MEANT, "design measurement=polynomial by={}"),
-    ("design measurement=polynomial noise=unknown", r"as in (.*)", "design measurement=polynomial {}"),
+    (
+        "design measurement=polynomial noise=unknown",
+        r"as in (.*)",
+        "design measurement=polynomial {}",
+    ),
     ("design state_model=growth", r"`ipe-bench (.*?)`", "{}", {"NAME": "growth"}),
-    ("posterior state_model=growth", r"`ipe-bench (.*?)`, with (?:\S+)", "{} tracker=[grid]", {"NAME": "growth"}),
+    (
+        "posterior state_model=growth",
+        r"`ipe-bench (.*?)`, with (?:\S+)",
+        "{} tracker=[grid]",
+        {"NAME": "growth"},
+    ),
     ("completion", r"eval \"\$\(ipe-bench (.*?)\)", "{}"),
     ("-sc install=nope", r"write (\S+ \S+)", "{}", {"SHELL": "bash"}),
     ("schema", r"`ipe-bench (.*?)`", "{}", {"GROUP": "solver", "NAME": "newton"}),
@@ -258,8 +325,13 @@ ADVICE = [
     ("new ci", r"such as `ipe-bench (.*?)`", "{}"),
 ]
 
-SOME = [pytest.param(one, id=one[0], marks=[] if i % 4 == 0 else pytest.mark.slow) for i, one in enumerate(ADVICE)]
-_TYPED = re.compile(r"(?:write|such as|as in|give|set|start[:,]|choose|use|see|add) [^;]*(?:=|`ipe-bench).*")
+SOME = [
+    pytest.param(one, id=one[0], marks=[] if i % 4 == 0 else pytest.mark.slow)
+    for i, one in enumerate(ADVICE)
+]
+_TYPED = re.compile(
+    r"(?:write|such as|as in|give|set|start[:,]|choose|use|see|add) [^;]*(?:=|`ipe-bench).*"
+)
 """What advises a word with an equals sign, or a command."""
 ELSEWHERE = {
     "no advice": ("The kinds of plugins", "upper={}: give a number"),
@@ -351,9 +423,20 @@ def templates():
     """The texts of the package that advise a word to type: each with a pattern of what it says."""
     for path in sorted(Path(ipe_bench.__file__).parent.rglob("*.py")):
         tree = ast.parse(path.read_text(encoding="utf-8"))
-        inner = {id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in node.values}
+        inner = {
+            id(part)
+            for node in ast.walk(tree)
+            if isinstance(node, ast.JoinedStr)
+            for part in node.values
+        }
         for node in ast.walk(tree):
-            parts = node.values if isinstance(node, ast.JoinedStr) else [] if id(node) in inner else [node]
+            parts = (
+                node.values
+                if isinstance(node, ast.JoinedStr)
+                else []
+                if id(node) in inner
+                else [node]
+            )
             texts = [one.value if isinstance(one, ast.Constant) else "{}" for one in parts]
             text = "".join(one for one in texts if isinstance(one, str))
             if "\n" not in text and (found := _TYPED.search(text)):
@@ -361,9 +444,17 @@ def templates():
 
 
 def test_what_python_shows_too_names_no_flag():
-    rooms = [path for path in Path(ipe_bench.__file__).parent.rglob("*.py") if path.parent.name not in ("cli", "docs")]
+    rooms = [
+        path
+        for path in Path(ipe_bench.__file__).parent.rglob("*.py")
+        if path.parent.name not in ("cli", "docs")
+    ]
     assert len(rooms) > 100
-    assert [path for path in rooms if re.search(r"(?:give|write|use|set|more) [^\"\n]*--[a-z]", path.read_text())] == []
+    assert [
+        path
+        for path in rooms
+        if re.search(r"(?:give|write|use|set|more) [^\"\n]*--[a-z]", path.read_text())
+    ] == []
 
 
 @pytest.mark.slow
@@ -374,4 +465,6 @@ def test_every_word_that_an_error_of_the_package_advises_is_tried(command):
     assert len(texts) > 60
     known = {start for several in ELSEWHERE.values() for start in several}
     assert {text for text in untried if not text.startswith(tuple(known))} == set()
-    assert {start for start in known if not any(text.startswith(start) for text in untried)} == set()
+    assert {
+        start for start in known if not any(text.startswith(start) for text in untried)
+    } == set()

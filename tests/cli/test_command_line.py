@@ -28,7 +28,9 @@ def alone(*arguments: str, folder: Path, **environment: str) -> subprocess.Compl
     """Runs a command as users do, in a process of its own."""
     command = [sys.executable, "-m", "ipe_bench", *arguments]
     variables = {**os.environ, "PYTHONPATH": str(ROOT), **environment}
-    return subprocess.run(command, cwd=folder, env=variables, capture_output=True, text=True, timeout=300, check=False)
+    return subprocess.run(
+        command, cwd=folder, env=variables, capture_output=True, text=True, timeout=300, check=False
+    )
 
 
 @pytest.fixture(scope="module")
@@ -58,65 +60,152 @@ def test_a_sweep_leaves_tables_figures_and_a_report(tmp_path, ipe_bench, monkeyp
 DEVIATION = ("noise=gaussian", "noise.deviation=0.01")
 SMALL = ("measurement=polynomial", *DEVIATION)
 MISTAKES = {
-    "unknown estimator": (["run", "solver=[newtn]"], "solver=newtn: there is no such option; did you mean newton?"),
+    "unknown estimator": (
+        ["run", "solver=[newtn]"],
+        "solver=newtn: there is no such option; did you mean newton?",
+    ),
     "unknown key": (["run", "eror_scale=1"], "did you mean error_scale?"),
-    "noise that is not a number": (["run", "noise=gaussian", "noise.deviation=nan"], "noise.deviation=nan"),
+    "noise that is not a number": (
+        ["run", "noise=gaussian", "noise.deviation=nan"],
+        "noise.deviation=nan",
+    ),
     "taken name": (["new", "solver", "newton"], "newton: solver=newton is there already"),
     "two experiments": (["run", "-m", "+experiment=paper,paper"], "run them one by one"),
     "added key": (["run", "+trails=3"], "did you mean trials?"),
     "unknown command": (["rum"], "did you mean run?"),
-    "unknown flag": (["list", "--verbos"], "list: --verbos: there is no such flag; did you mean --verbose?"),
+    "unknown flag": (
+        ["list", "--verbos"],
+        "list: --verbos: there is no such flag; did you mean --verbose?",
+    ),
     "flag of another command": (["estimate", "-m"], "estimate: -m: there is no such flag"),
     "name of a library": (
         ["new", "solver", "numpy"],
         "numpy: is a package that ipe-bench imports; choose",
     ),
-    "our own name": (["new", "solver", "ipe_bench"], "ipe_bench: is a package that ipe-bench imports"),
-    "name of a device": (["new", "solver", "con"], "con: is no name of a folder on Windows; choose another name"),
+    "our own name": (
+        ["new", "solver", "ipe_bench"],
+        "ipe_bench: is a package that ipe-bench imports",
+    ),
+    "name of a device": (
+        ["new", "solver", "con"],
+        "con: is no name of a folder on Windows; choose another name",
+    ),
     "word too few": (["new", "solver"], "new: the following arguments are required: NAME"),
-    "no data set": (["run", "measurement=nist/boxbot"], "measurement=nist/boxbot: there is no such data set; did you"),
-    "a solver among baselines": (["run", "baseline=[newton]"], "newton is no baseline but a solver; write solver"),
-    "a baseline among solvers": (["run", "solver=[gauss_newton]"], "is no solver but a baseline; write baseline"),
-    "a group for a place": (["run", "baseline.ekf.process_noise=1"], "write estimators.ekf.process_noise=1"),
+    "no data set": (
+        ["run", "measurement=nist/boxbot"],
+        "measurement=nist/boxbot: there is no such data set; did you",
+    ),
+    "a solver among baselines": (
+        ["run", "baseline=[newton]"],
+        "newton is no baseline but a solver; write solver",
+    ),
+    "a baseline among solvers": (
+        ["run", "solver=[gauss_newton]"],
+        "is no solver but a baseline; write baseline",
+    ),
+    "a group for a place": (
+        ["run", "baseline.ekf.process_noise=1"],
+        "write estimators.ekf.process_noise=1",
+    ),
     "not chosen": (
         ["run", "estimators.newton.max_iterations=9"],
         "newton is not chosen; add it, as in solver=[newton]",
     ),
     "a name that leaves": (["run", "name=../../x"], "name=../../x: leaves the folder outputs"),
-    "an address": (["run", "output=s3://bucket/x"], "output=s3://bucket/x: is an address; name a folder"),
-    "a label that is misspelt": (["run", "estimators.newtn.max_iterations=9"], "did you mean newton?"),
-    "a file for its key": (["estimate", "my.csv"], "my.csv: is not KEY=VALUE; write readings=my.csv"),
+    "an address": (
+        ["run", "output=s3://bucket/x"],
+        "output=s3://bucket/x: is an address; name a folder",
+    ),
+    "a label that is misspelt": (
+        ["run", "estimators.newtn.max_iterations=9"],
+        "did you mean newton?",
+    ),
+    "a file for its key": (
+        ["estimate", "my.csv"],
+        "my.csv: is not KEY=VALUE; write readings=my.csv",
+    ),
     "a file for another command": (["run", "my.csv"], "write ipe-bench estimate readings=my.csv"),
-    "an option without its group": (["run", "newton"], "newton: is not KEY=VALUE; write solver=[newton]"),
+    "an option without its group": (
+        ["run", "newton"],
+        "newton: is not KEY=VALUE; write solver=[newton]",
+    ),
     "a flag for a key": (["run", "--trials", "10"], "keys have no dashes: write trials=10"),
-    "a flag with a value for a key": (["run", "--trials=10"], "keys have no dashes: write trials=10"),
-    "a blank behind": (["run", "error_scale=", "33"], "has a blank beside the equals sign; write error_scale=33"),
-    "a blank before": (["run", "error_scale", "=33"], "has a blank beside the equals sign; write error_scale=33"),
-    "blanks about": (["report", ".", "figures", "=", "none"], "figures = none: has a blank beside the equals sign"),
-    "an exponent": (["run", "trials=1e3"], "trials=1e3: is not written as a whole number; write trials=1000"),
+    "a flag with a value for a key": (
+        ["run", "--trials=10"],
+        "keys have no dashes: write trials=10",
+    ),
+    "a blank behind": (
+        ["run", "error_scale=", "33"],
+        "has a blank beside the equals sign; write error_scale=33",
+    ),
+    "a blank before": (
+        ["run", "error_scale", "=33"],
+        "has a blank beside the equals sign; write error_scale=33",
+    ),
+    "blanks about": (
+        ["report", ".", "figures", "=", "none"],
+        "figures = none: has a blank beside the equals sign",
+    ),
+    "an exponent": (
+        ["run", "trials=1e3"],
+        "trials=1e3: is not written as a whole number; write trials=1000",
+    ),
     "a command that is gone": (["completion", "bash"], "completion: is no command any more"),
-    "the list that is gone": (["list", "keys"], "keys: `ipe-bench run --help` explains every key of a run"),
-    "the schema that is gone": (["schema"], "schema: is no command any more; `ipe-bench list GROUP/NAME` shows every"),
+    "the list that is gone": (
+        ["list", "keys"],
+        "keys: `ipe-bench run --help` explains every key of a run",
+    ),
+    "the schema that is gone": (
+        ["schema"],
+        "schema: is no command any more; `ipe-bench list GROUP/NAME` shows every",
+    ),
     "a flag that is gone": (["run", "--config-path", "x"], "name it with --config-dir"),
-    "no function": (["run", "measurement=function"], "measurement.of: is not given; write measurement.of=MODULE:FUNC"),
+    "no function": (
+        ["run", "measurement=function"],
+        "measurement.of: is not given; write measurement.of=MODULE:FUNC",
+    ),
     "no readings": (["estimate"], "readings: is not given"),
     "design of trials": (["design", *SMALL, "trials=5"], "trials: is for `ipe-bench run`"),
     "design of a solver": (["design", *SMALL, "solver=[newton]"], "solver: is for `ipe-bench run`"),
-    "design of a file": (["design", *SMALL, "readings=a.csv"], "readings=a.csv: give a whole number above 0"),
+    "design of a file": (
+        ["design", *SMALL, "readings=a.csv"],
+        "readings=a.csv: give a whole number above 0",
+    ),
     "no such column": (["design", *SMALL, "by=colour"], "by=colour: there is no such column"),
     "no such criterion": (["design", *SMALL, "criterion=E"], "criterion=E: choose one of A, D"),
     "too few readings": (["design", *SMALL, "readings=3"], "readings=3: 4 parameters want"),
-    "too many readings": (["design", *SMALL, "readings=500"], "readings=500: polynomial has 40 readings"),
-    "design to a precision": (["design", *SMALL, "precision=0.1"], "precision: is for `ipe-bench run`"),
-    "no richer truth": (["design", *SMALL, "truth_measurement=polynomial"], "has no errors besides the parameters"),
+    "too many readings": (
+        ["design", *SMALL, "readings=500"],
+        "readings=500: polynomial has 40 readings",
+    ),
+    "design to a precision": (
+        ["design", *SMALL, "precision=0.1"],
+        "precision: is for `ipe-bench run`",
+    ),
+    "no richer truth": (
+        ["design", *SMALL, "truth_measurement=polynomial"],
+        "has no errors besides the parameters",
+    ),
     "posterior of a file": (
         ["posterior", *SMALL, "readings=a.csv"],
         "readings: is for `ipe-bench estimate`, and has no",
     ),
-    "posterior to a precision": (["posterior", *SMALL, "precision=0.1"], "precision: is for `ipe-bench run`, and has"),
-    "a thousand posteriors": (["posterior", *SMALL, "trials=1000"], "trials=1000: each takes up to a minute"),
-    "few particles": (["posterior", *SMALL, "baseline=[]", "particles=20"], "particles=20: give at least 80"),
-    "particles in words": (["posterior", *SMALL, "particles=many"], "particles=many: give a whole number above 0"),
+    "posterior to a precision": (
+        ["posterior", *SMALL, "precision=0.1"],
+        "precision: is for `ipe-bench run`, and has",
+    ),
+    "a thousand posteriors": (
+        ["posterior", *SMALL, "trials=1000"],
+        "trials=1000: each takes up to a minute",
+    ),
+    "few particles": (
+        ["posterior", *SMALL, "baseline=[]", "particles=20"],
+        "particles=20: give at least 80",
+    ),
+    "particles in words": (
+        ["posterior", *SMALL, "particles=many"],
+        "particles=many: give a whole number above 0",
+    ),
     "no posterior": (["posterior", *SMALL, "trials=0"], "trials=0: give a whole number above 0"),
 }
 
@@ -127,28 +216,64 @@ IN_A_SWEEP = [
     (["seed=1,first"], "seed=first: give a whole number from 0 up"),
     (["error_scale=1,-1"], "error_scale=-1.0: give a number above 0"),
     (["measurement.strength=0.1,[1]"], "measurement.strength=[1]: give a finite number"),
-    (["measurement=ranging,polynomial", "measurement.rounds=5"], "measurement.rounds: there is no such option"),
-    (["estimators.fixed_point.start=nominal,here"], "estimators.fixed_point.start=here: choose one of"),
-    (["+baseline@estimators.a=ekf,ukf", "estimators.a.engine=x,y"], "estimators.a.engine=x: choose one of"),
+    (
+        ["measurement=ranging,polynomial", "measurement.rounds=5"],
+        "measurement.rounds: there is no such option",
+    ),
+    (
+        ["estimators.fixed_point.start=nominal,here"],
+        "estimators.fixed_point.start=here: choose one of",
+    ),
+    (
+        ["+baseline@estimators.a=ekf,ukf", "estimators.a.engine=x,y"],
+        "estimators.a.engine=x: choose one of",
+    ),
     (["execution.threads=1,2"], "execution.threads: there is no such option"),
     (["+prior.width=1,2"], "prior.width: there is no such option"),
 ]
 """No job begins where one would be refused."""
 OF_STATES = [
-    (["state_model=pendulum", "baseline=[ekf]"], "baseline: is of a measurement, and state_model= chooses"),
-    (["state_model=pendulum", "write_readings=a.csv"], "write_readings: is of a measurement, and state_model="),
+    (
+        ["state_model=pendulum", "baseline=[ekf]"],
+        "baseline: is of a measurement, and state_model= chooses",
+    ),
+    (
+        ["state_model=pendulum", "write_readings=a.csv"],
+        "write_readings: is of a measurement, and state_model=",
+    ),
     (
         ["state_model=pendulum_book", "error_scale=3", "trials=1"],
         "error_scale=3: state_model=pendulum_book has stored paths",
     ),
     (["measurement=polynomial", "tracker=[ekf]"], "tracker: goes with state_model=NAME"),
-    (["state_model=pendulum", "tracker=[newton]"], "tracker=newton: newton is no tracker but a solver"),
-    (["state_model=pendulum", "trackers.ukf.iterations=0"], "trackers.ukf.iterations=0: give a whole number above 0"),
-    (["state_model=pendulum", "trackers.bootstrap.particles=5"], "trackers.bootstrap.particles: is set, but bootstrap"),
-    (["state_model=pendulum", "tracker=[grid]"], "trackers.grid: is exact for one state, and pendulum has 2"),
-    (["state_model=growth", "state_model.next.state=x"], "state_model.next.state: there is no such name"),
-    (["+experiment=polynomial", "state_model=growth"], "+experiment=polynomial: sets measurement, which is of"),
-    (["+experiment=headline", "state_model=growth"], "+experiment=headline: sets noise, which is of a measurement"),
+    (
+        ["state_model=pendulum", "tracker=[newton]"],
+        "tracker=newton: newton is no tracker but a solver",
+    ),
+    (
+        ["state_model=pendulum", "trackers.ukf.iterations=0"],
+        "trackers.ukf.iterations=0: give a whole number above 0",
+    ),
+    (
+        ["state_model=pendulum", "trackers.bootstrap.particles=5"],
+        "trackers.bootstrap.particles: is set, but bootstrap",
+    ),
+    (
+        ["state_model=pendulum", "tracker=[grid]"],
+        "trackers.grid: is exact for one state, and pendulum has 2",
+    ),
+    (
+        ["state_model=growth", "state_model.next.state=x"],
+        "state_model.next.state: there is no such name",
+    ),
+    (
+        ["+experiment=polynomial", "state_model=growth"],
+        "+experiment=polynomial: sets measurement, which is of",
+    ),
+    (
+        ["+experiment=headline", "state_model=growth"],
+        "+experiment=headline: sets noise, which is of a measurement",
+    ),
     (["state_model=pendulum_book", "trials=2"], "trials=2: certified readings are one trial"),
 ]
 MISTAKES |= {
@@ -163,24 +288,45 @@ MISTAKES |= {
     for word in ("state_model=growth", "+experiment=pendulum_book")
 }
 COMMON = ("measurement=polynomial", "noise=gaussian", "execution=serial", "output=out", "trials=5")
-MISTAKES |= {" ".join(words): (["run", "-m", *COMMON, *words], f"ipe-bench: {said}") for words, said in IN_A_SWEEP}
-MISTAKES |= {" ".join(words): (["run", *words, "output=out"], f"ipe-bench: {said}") for words, said in OF_STATES}
+MISTAKES |= {
+    " ".join(words): (["run", "-m", *COMMON, *words], f"ipe-bench: {said}")
+    for words, said in IN_A_SWEEP
+}
+MISTAKES |= {
+    " ".join(words): (["run", *words, "output=out"], f"ipe-bench: {said}")
+    for words, said in OF_STATES
+}
 OBJECTIVES = [
-    ("newton.cost_medium", "objective=newton.cost_medium: there is no such column; did you mean cost_median?"),
-    ("newtn.cost_median", "objective=newtn.cost_median: there is no such estimator; did you mean newton?"),
+    (
+        "newton.cost_medium",
+        "objective=newton.cost_medium: there is no such column; did you mean cost_median?",
+    ),
+    (
+        "newtn.cost_median",
+        "objective=newtn.cost_median: there is no such estimator; did you mean newton?",
+    ),
     ("cost_median", "objective=cost_median: write LABEL.COLUMN, such as newton.capped_error"),
     ("newton.equation", "objective=newton.equation: there is no such column"),
 ]
-MISTAKES |= {name: (["run", *COMMON, f"objective={name}", "solver=[newton]"], said) for name, said in OBJECTIVES}
+MISTAKES |= {
+    name: (["run", *COMMON, f"objective={name}", "solver=[newton]"], said)
+    for name, said in OBJECTIVES
+}
 MANY = ["measurement=ranging", "measurement.rounds=many"]
 MISTAKES |= {
-    f"many rounds in {command}": ([command, *MANY], "measurement.rounds=many: give a whole number above 0")
+    f"many rounds in {command}": (
+        [command, *MANY],
+        "measurement.rounds=many: give a whole number above 0",
+    )
     for command in ("estimate", "design", "posterior")
 }
 QUICK = (*SMALL, "trials=4", "execution=serial")
 
 
-SOME = [pytest.param(case, marks=() if i % 3 == 0 else pytest.mark.slow) for i, case in enumerate(MISTAKES)]
+SOME = [
+    pytest.param(case, marks=() if i % 3 == 0 else pytest.mark.slow)
+    for i, case in enumerate(MISTAKES)
+]
 
 
 @pytest.mark.parametrize("case", SOME)
@@ -225,7 +371,10 @@ def test_nothing_is_overwritten(readings, ipe_bench):
         (["-m", "measurement=nist/danwood, nist/enso"], ["=nist/danwood", "=nist/enso"]),
         (["-m", "measurement=glob(nist/mgh1*)"], ["=nist/mgh17", "=nist/mgh10"]),
         (["measurement=nist", "measurement.dataset=ENSO"], ["=nist, measurement.dataset=ENSO"]),
-        (["-m", "measurement=polynomial,nist/enso", "noise.deviation=1"], ["=polynomial", "=nist/enso"]),
+        (
+            ["-m", "measurement=polynomial,nist/enso", "noise.deviation=1"],
+            ["=polynomial", "=nist/enso"],
+        ),
     ],
 )
 def test_a_data_set_may_be_written_as_an_option_of_its_own(words, expected, tmp_path, capsys):
@@ -233,7 +382,10 @@ def test_a_data_set_may_be_written_as_an_option_of_its_own(words, expected, tmp_
     assert main(["run", *words, *noise, "trials=1", f"output={tmp_path}", "--dry-run"]) == 0
     *lines, _ = capsys.readouterr().out.splitlines()
     assert len(lines) == len(expected)
-    assert all(line.startswith(f"measurement{name}, noise") for line, name in zip(lines, expected, strict=True))
+    assert all(
+        line.startswith(f"measurement{name}, noise")
+        for line, name in zip(lines, expected, strict=True)
+    )
 
 
 def test_hydras_own_flags_work_after_run(tmp_path, ipe_bench, monkeypatch):
@@ -255,7 +407,9 @@ print(sorted(m for m in ("pandas", "seaborn", "filterpy", "llvmlite", "hydra", "
 
 
 def test_help_is_quick_to_load_and_names_the_commands():
-    result = subprocess.run([sys.executable, "-c", LOADED], capture_output=True, text=True, check=True)
+    result = subprocess.run(
+        [sys.executable, "-c", LOADED], capture_output=True, text=True, check=True
+    )
     assert "ipe-bench estimate" in result.stdout
     assert result.stdout.strip().endswith("[]")
 
@@ -273,13 +427,21 @@ def test_a_plugin_without_its_header_or_with_a_taken_name_is_refused(tmp_path):
 
 
 @pytest.mark.slow
-def test_estimate_leaves_numbers_residuals_and_figures_from_csv_and_parquet_alike(readings, tmp_path, ipe_bench):
+def test_estimate_leaves_numbers_residuals_and_figures_from_csv_and_parquet_alike(
+    readings, tmp_path, ipe_bench
+):
     # By themselves, both engines of pandas 2 round the last digit of some numbers.
     exact = dict.fromkeys(("time [min]", "reading [m/s]"), float)
     pd.read_csv(readings, converters=exact).to_parquet(tmp_path / "trial.parquet")
     results = []
-    for file, drawn in ((readings, "none"), (tmp_path / "trial.parquet", "none"), (readings, "all")):
-        code, out, error = ipe_bench("estimate", f"readings={file}", "error_scale=10", f"figures={drawn}")
+    for file, drawn in (
+        (readings, "none"),
+        (tmp_path / "trial.parquet", "none"),
+        (readings, "all"),
+    ):
+        code, out, error = ipe_bench(
+            "estimate", f"readings={file}", "error_scale=10", f"figures={drawn}"
+        )
         assert code == 0, error
         assert all(len(line) <= 120 for line in out.splitlines())
     # The second file is another command, and the third run is the first command again.
@@ -300,13 +462,19 @@ def test_estimate_leaves_numbers_residuals_and_figures_from_csv_and_parquet_alik
     assert {"numpy", "scipy"} <= set(results[0]["libraries"])
 
 
-def test_an_estimate_draws_nothing_where_no_figures_are_asked_for_and_overwrites_no_other_command(tmp_path, ipe_bench):
+def test_an_estimate_draws_nothing_where_no_figures_are_asked_for_and_overwrites_no_other_command(
+    tmp_path, ipe_bench
+):
     words = ("estimate", "measurement=nist/misra1a", "solver=[]", "output=out")
     assert ipe_bench(*words, "baseline=[levenberg_marquardt]")[0] == 0
     drawn = {path.name for path in (tmp_path / "out").iterdir() if path.suffix in (".png", ".pdf")}
     assert "residuals.png" in drawn
     assert ipe_bench(*words, "baseline=[levenberg_marquardt]", "figures=none")[0] == 0
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"estimate.json", "residuals.csv", "estimate.html"}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "estimate.json",
+        "residuals.csv",
+        "estimate.html",
+    }
     assert "<img" not in (tmp_path / "out" / "estimate.html").read_text(encoding="utf-8")
     (tmp_path / "out" / "residuals.csv").write_text("mine")
     code, _, error = ipe_bench(*words, "baseline=[gauss_newton]")
@@ -333,13 +501,19 @@ def test_the_table_of_keys_names_every_field_of_a_job_and_every_group_that_jobs_
     names = [key.name for key in ROWS]
     several = {"solver", "baseline", "tracker"}
     differing = {*names} ^ {*KEYS, *several, "experiment", "GROUP"}
-    assert not differing, f"{differing}: a field of Spec without a row in cli/keys.py, or a row without a field"
+    assert not differing, (
+        f"{differing}: a field of Spec without a row in cli/keys.py, or a row without a field"
+    )
     assert len({*names}) == len(names)
     defaults = yaml.safe_load((ROOT / "conf/config.yaml").read_text(encoding="utf-8"))["defaults"]
-    groups = {key.rpartition("@")[2] for one in defaults if isinstance(one, dict) for key in one} - {"model"}
+    groups = {
+        key.rpartition("@")[2] for one in defaults if isinstance(one, dict) for key in one
+    } - {"model"}
     assert {group for group in groups if not group.startswith("override ")} == {*PARTS, *several}
     kinds = get_type_hints(Spec, include_extras=True)
-    assert {*WHOLE} == {name for name, kind in kinds.items() if {kind, *get_args(kind)} & {Count, Whole}}
+    assert {*WHOLE} == {
+        name for name, kind in kinds.items() if {kind, *get_args(kind)} & {Count, Whole}
+    }
     assert all(key.kind for key in ROWS if key.name in KEYS)
 
 
@@ -362,26 +536,42 @@ def test_a_pipe_in_place_of_a_file_is_not_waited_for(ipe_bench, word):
 
 @pytest.mark.slow
 def test_a_reader_that_closes_the_pipe_is_no_mistake(tmp_path):
-    for words in (["list", "measurement", "-v"], ["run", *QUICK, "figures=none", f"output={tmp_path / 'out'}"]):
+    for words in (
+        ["list", "measurement", "-v"],
+        ["run", *QUICK, "figures=none", f"output={tmp_path / 'out'}"],
+    ):
         command = [sys.executable, "-m", "ipe_bench", *words]
-        with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        with subprocess.Popen(
+            command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        ) as process:
             assert process.stdout is not None
             assert process.stderr is not None
             process.stdout.close()
-            assert not [line for line in process.stderr.read().decode().splitlines() if "block" not in line]
+            assert not [
+                line for line in process.stderr.read().decode().splitlines() if "block" not in line
+            ]
         assert process.returncode == 0
     assert (tmp_path / "out/summary.csv").is_file()
 
 
 @pytest.mark.slow
 def test_a_stream_that_knows_no_greek_letters_shows_question_marks(tmp_path):
-    result = alone("run", *QUICK, "figures=none", "output=out", folder=tmp_path, PYTHONIOENCODING="ascii")
+    result = alone(
+        "run", *QUICK, "figures=none", "output=out", folder=tmp_path, PYTHONIOENCODING="ascii"
+    )
     assert result.returncode == 0, result.stderr
     assert result.stdout.isascii()
 
 
 def test_filters_that_nobody_chose_are_left_out_where_the_model_has_no_use_for_them(ipe_bench):
-    words = ["run", "measurement=nist/boxbod", "noise=certified", "trials=1", "figures=none", "output=out"]
+    words = [
+        "run",
+        "measurement=nist/boxbod",
+        "noise=certified",
+        "trials=1",
+        "figures=none",
+        "output=out",
+    ]
     code, out, _ = ipe_bench(*words)
     assert code in (0, 1)
     assert "ekf and ukf are left out for nist" in " ".join(out.split())
@@ -392,9 +582,18 @@ def test_filters_that_nobody_chose_are_left_out_where_the_model_has_no_use_for_t
 
 
 CASES = {
-    "one case": ("measurement=gins", "measurement.injected=[[1500,0]]", "measurement.readings_per_case=6"),
+    "one case": (
+        "measurement=gins",
+        "measurement.injected=[[1500,0]]",
+        "measurement.readings_per_case=6",
+    ),
     "one reading": (
-        *("measurement=formula", "measurement.expression=a*t", "measurement.start.a=1", "measurement.columns.t=[1]"),
+        *(
+            "measurement=formula",
+            "measurement.expression=a*t",
+            "measurement.start.a=1",
+            "measurement.columns.t=[1]",
+        ),
         "noise.deviation=0.1",
     ),
 }
@@ -410,7 +609,14 @@ def test_a_model_of_one_case_or_one_reading_warns_of_nothing(ipe_bench, case):
 
 
 def test_a_model_that_brings_its_own_certified_readings_has_a_table(ipe_bench):
-    words = ("measurement=nist", "noise=certified", "trials=1", "figures=none", "output=out", "solver=[]")
+    words = (
+        "measurement=nist",
+        "noise=certified",
+        "trials=1",
+        "figures=none",
+        "output=out",
+        "solver=[]",
+    )
     code, out, _ = ipe_bench("run", *words, "baseline=[gauss_newton]")
     assert code == 0
     assert "gauss_newton" in out
@@ -419,7 +625,10 @@ def test_a_model_that_brings_its_own_certified_readings_has_a_table(ipe_bench):
 
 def test_the_list_names_our_statistics_and_figures_too(capsys):
     """Also where no plugin adds any; without a name they are left out, since they are no options."""
-    for group, names in (("statistic", [one.name for one in (*STATISTICS, *SCORES)]), ("figure", list(figures.NAMES))):
+    for group, names in (
+        ("statistic", [one.name for one in (*STATISTICS, *SCORES)]),
+        ("figure", list(figures.NAMES)),
+    ):
         assert main(["list", group]) == 0
         assert set(names) <= set(capsys.readouterr().out.split())
     assert main(["list", "statistic/success"]) == 0
@@ -429,9 +638,12 @@ def test_the_list_names_our_statistics_and_figures_too(capsys):
 
 
 @pytest.mark.parametrize(
-    ("launcher", "package"), [("submitit_local", '"ipe-bench[submitit]"'), ("rq", "hydra-rq-launcher")]
+    ("launcher", "package"),
+    [("submitit_local", '"ipe-bench[submitit]"'), ("rq", "hydra-rq-launcher")],
 )
-def test_a_launcher_that_is_missing_is_installed_under_the_name_that_it_has(launcher, package, capsys):
+def test_a_launcher_that_is_missing_is_installed_under_the_name_that_it_has(
+    launcher, package, capsys
+):
     package_of_plugin = f"hydra-{launcher.partition('_')[0]}-launcher"
     if package_of_plugin in {found.name for found in distributions()}:
         pytest.skip(f"{launcher} is installed")

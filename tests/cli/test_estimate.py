@@ -31,8 +31,12 @@ def estimate(ipe_bench):
     """
 
     def run(*words: str) -> tuple[int, str, dict]:
-        code, out, error = ipe_bench("estimate", *([] if "figures=all" in words else ["figures=none"]), *words)
-        files = sorted(Path().glob("outputs/*/estimate.json"), key=lambda path: path.stat().st_mtime_ns)
+        code, out, error = ipe_bench(
+            "estimate", *([] if "figures=all" in words else ["figures=none"]), *words
+        )
+        files = sorted(
+            Path().glob("outputs/*/estimate.json"), key=lambda path: path.stat().st_mtime_ns
+        )
         return code, out + error, json.loads(files[-1].read_text()) if files and code != 2 else {}
 
     return run
@@ -70,13 +74,17 @@ def test_a_formula_and_a_file_are_enough_where_nobody_knows_the_noise(estimate, 
     assert heading == ["estimator", "status", "fits", "dof", "white", "p", "outliers", "deviation"]
     certified = MISRA.certified
     assert list(of(answer, "estimates").values()) == pytest.approx(certified.parameters, rel=1e-6)
-    assert list(of(answer, "standard_errors").values()) == pytest.approx(certified.deviations, rel=1e-5)
+    assert list(of(answer, "standard_errors").values()) == pytest.approx(
+        certified.deviations, rel=1e-5
+    )
     assert of(answer, "p") is None
     assert of(answer, "fits") is None
 
 
 @pytest.mark.parametrize(
-    ("words", "absolute"), [((), True), (("noise=unknown",), False)], ids=["weights", "relative weights"]
+    ("words", "absolute"),
+    [((), True), (("noise=unknown",), False)],
+    ids=["weights", "relative weights"],
 )
 def test_a_column_of_deviations_weighs_the_readings(estimate, misra, words, absolute):
     t, y = misra
@@ -86,7 +94,9 @@ def test_a_column_of_deviations_weighs_the_readings(estimate, misra, words, abso
     assert not list(Path("outputs").rglob("*.png"))
     x, P = curve_fit(curve, t, y, (250, 5e-4), sigma, absolute, ftol=1e-14, xtol=1e-14, gtol=1e-14)
     assert list(of(answer, "estimates").values()) == pytest.approx(x, rel=1e-6)
-    assert list(of(answer, "standard_errors").values()) == pytest.approx(np.sqrt(np.diag(P)), rel=1e-5)
+    assert list(of(answer, "standard_errors").values()) == pytest.approx(
+        np.sqrt(np.diag(P)), rel=1e-5
+    )
 
 
 def test_a_fixed_parameter_is_named_and_costs_no_degree_of_freedom(estimate, misra):
@@ -95,14 +105,21 @@ def test_a_fixed_parameter_is_named_and_costs_no_degree_of_freedom(estimate, mis
     assert answer["fixed"] == {"b1": 240.0}
     assert of(answer, "degrees_of_freedom") == 13
     t, y = misra
-    x, P = curve_fit(lambda t, b2: curve(t, 240.0, b2), t, y, (5e-4,), ftol=1e-14, xtol=1e-14, gtol=1e-14)
+    x, P = curve_fit(
+        lambda t, b2: curve(t, 240.0, b2), t, y, (5e-4,), ftol=1e-14, xtol=1e-14, gtol=1e-14
+    )
     assert of(answer, "estimates")["b2"] == pytest.approx(x[0], rel=1e-7)
     assert of(answer, "standard_errors")["b2"] == pytest.approx(np.sqrt(P[0, 0]), rel=1e-5)
 
 
 def test_exit_code_1_where_no_estimator_has_an_answer_that_passes(estimate, misra):
     """A straight line through a curve, with deviations that are known: converged, and no answer."""
-    line = ("measurement=formula", "measurement.expression=a+b*t", "measurement.start.a=1", "measurement.start.b=1")
+    line = (
+        "measurement=formula",
+        "measurement.expression=a+b*t",
+        "measurement.start.a=1",
+        "measurement.start.b=1",
+    )
     code, printed, answer = estimate(*line, *LM, "readings=my.csv", "noise.deviation=0.1")
     assert code == 1
     assert of(answer, "status") == "converged"
@@ -113,7 +130,9 @@ def test_exit_code_1_where_no_estimator_has_an_answer_that_passes(estimate, misr
 
 def test_what_is_known_of_all_parameters_stands_in_small_files(estimate, misra, tmp_path):
     """Starts, and a prior of both together, against SciPy with both as readings of a covariance."""
-    (tmp_path / "known.yaml").write_text("b1: {nominal: 240, deviation: 1}\nb2: {nominal: 5.5e-4, deviation: 1e-5}\n")
+    (tmp_path / "known.yaml").write_text(
+        "b1: {nominal: 240, deviation: 1}\nb2: {nominal: 5.5e-4, deviation: 1e-5}\n"
+    )
     words = ("solver=[]", "baseline=[map_lm]", "readings=weighted.csv", "parameters=known.yaml")
     code, printed, answer = estimate(*SATURATION, *words, "prior.correlations=[[1,-0.9],[-0.9,1]]")
     assert code == 0, printed
@@ -125,7 +144,9 @@ def test_what_is_known_of_all_parameters_stands_in_small_files(estimate, misra, 
         lambda _, b1, b2: np.append(curve(t, b1, 1e-4 * b2), [b1, b2]), np.append(t, [0.0, 0.0]),
         np.append(y, [240.0, 5.5]), (240.0, 5.5), V, True, ftol=1e-14, xtol=1e-14, gtol=1e-14,
     )  # fmt: skip
-    assert list(of(answer, "estimates", "map_lm").values()) == pytest.approx(x * [1, 1e-4], rel=1e-6)
+    assert list(of(answer, "estimates", "map_lm").values()) == pytest.approx(
+        x * [1, 1e-4], rel=1e-6
+    )
     errors = np.sqrt(np.diag(P)) * [1, 1e-4]
     assert list(of(answer, "standard_errors", "map_lm").values()) == pytest.approx(errors, rel=1e-4)
 
@@ -133,7 +154,9 @@ def test_what_is_known_of_all_parameters_stands_in_small_files(estimate, misra, 
 def test_columns_are_left_out_on_purpose(estimate, misra, tmp_path):
     rows = (tmp_path / "my.csv").read_text().splitlines()
     remarks = ["remark", *(f"n{k}" for k in range(14))]
-    (tmp_path / "odd.csv").write_text("\n".join(f"{row},{r}" for row, r in zip(rows, remarks, strict=True)))
+    (tmp_path / "odd.csv").write_text(
+        "\n".join(f"{row},{r}" for row, r in zip(rows, remarks, strict=True))
+    )
     code, printed, _ = estimate(*SATURATION, *LM, "readings=odd.csv")
     assert code == 2
     assert "ignore_columns=[remark]" in printed
@@ -148,8 +171,15 @@ def test_columns_are_left_out_on_purpose(estimate, misra, tmp_path):
 
 def test_a_unit_as_it_stands_and_a_row_without_a_reading_that_is_predicted(estimate, tmp_path):
     (tmp_path / "a.csv").write_text("t [s],y [m/s^2]\n0,0.8\n1,2.3\n2,2.9\n3,4.2\n20,\n")
-    line = ("measurement=formula", "measurement.expression=a+b*t", "measurement.start.a=1", "measurement.start.b=1")
-    code, printed, answer = estimate(*line, *LM, "readings=a.csv", "measurement.unit=m/s^2", "noise.deviation=0.5")
+    line = (
+        "measurement=formula",
+        "measurement.expression=a+b*t",
+        "measurement.start.a=1",
+        "measurement.start.b=1",
+    )
+    code, printed, answer = estimate(
+        *line, *LM, "readings=a.csv", "measurement.unit=m/s^2", "noise.deviation=0.5"
+    )
     assert code == 0, printed
     assert answer["reading_unit"] == "m/s^2"
     rows = (tmp_path / "outputs/estimate-formula/residuals.csv").read_text().splitlines()
@@ -203,13 +233,26 @@ def ranges(tmp_path):
 
 
 @pytest.mark.parametrize("label", ["ekf", "map_lm"])
-def test_a_prior_that_nobody_states_is_refused_by_command_and_python_alike(estimate, ranges, tmp_path, label):
+def test_a_prior_that_nobody_states_is_refused_by_command_and_python_alike(
+    estimate, ranges, tmp_path, label
+):
     estimator = {"ekf": ib.baselines.EKF(), "map_lm": ib.baselines.MapLM()}[label]
-    words = ("measurement=ranging", "readings=ranges.csv", "solver=[]", f"baseline=[{label}]", "noise.deviation=0.1")
+    words = (
+        "measurement=ranging",
+        "readings=ranges.csv",
+        "solver=[]",
+        f"baseline=[{label}]",
+        "noise.deviation=0.1",
+    )
     code, printed, _ = estimate(*words)
     assert code == 2
     with pytest.raises(ib.UserError) as refused:
-        ib.estimate(ib.measurements.Ranging(), "ranges.csv", {label: estimator}, noise=ib.noise.Gaussian(0.1))
+        ib.estimate(
+            ib.measurements.Ranging(),
+            "ranges.csv",
+            {label: estimator},
+            noise=ib.noise.Gaussian(0.1),
+        )
     assert printed.strip() == f"ipe-bench: {refused.value}"
     assert "give error_scale=X" in printed
     assert "leave it out" not in printed
@@ -258,4 +301,6 @@ def test_noise_that_is_overstated_is_said_and_rounded_intervals_hold_the_estimat
     # A straight line, with b near zero and a as large as one likes to both sides, is within the stated noise.
     assert "a -2.34 … 6.70 −∞ … ∞" in less
     assert "b -3.12 … 4.78 −∞ … ∞" in less
-    assert "c -1.92 … 2.53 −∞ … ∞ -10.52 … 1.61" in less  # to tens, as the width is, the upper end would be 0
+    assert (
+        "c -1.92 … 2.53 −∞ … ∞ -10.52 … 1.61" in less
+    )  # to tens, as the width is, the upper end would be 0

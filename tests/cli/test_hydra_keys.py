@@ -42,16 +42,39 @@ ATTACKS = {
     "a part of a launcher": (f"launcher: {{x: {COPY}}}", r"hydra.launcher.x._target_"),
     "a part that is decoded": (f"launcher: {{x: {DECODED}}}", r"hydra.launcher.x"),
     "a part from another key": ("launcher: {x: '${parameters}'}", r"hydra.launcher.x"),
-    "lines of a shell": ("launcher: {setup: ['rm -rf x']}", r"hydra.launcher.setup.0=rm -rf x: runs"),
+    "lines of a shell": (
+        "launcher: {setup: ['rm -rf x']}",
+        r"hydra.launcher.setup.0=rm -rf x: runs",
+    ),
     "a sweeper": (f"sweeper: {COPY}", "hydra.sweeper._target_=shutil.copyfile"),
-    "a function of a sweeper": ("sweeper: {custom_search_space: os.abort}", "custom_search_space=os.abort: runs"),
-    "a sweep of Hydra's keys": ("sweeper: {params: {+hydra.job.chdir: 'true'}}", r"hydra.sweeper.params.\+hydra"),
-    "a sweep into them": ("sweeper: {params: {noise@hydra.env: none}}", "hydra.sweeper.params.noise@hydra"),
+    "a function of a sweeper": (
+        "sweeper: {custom_search_space: os.abort}",
+        "custom_search_space=os.abort: runs",
+    ),
+    "a sweep of Hydra's keys": (
+        "sweeper: {params: {+hydra.job.chdir: 'true'}}",
+        r"hydra.sweeper.params.\+hydra",
+    ),
+    "a sweep into them": (
+        "sweeper: {params: {noise@hydra.env: none}}",
+        "hydra.sweeper.params.noise@hydra",
+    ),
     "a folder by a resolver": ("sweep: {dir: '${oc.env:HOME}/x'}", "hydra.sweep.dir="),
     "loggers by a resolver": ("verbose: ['${oc.env:HOME}']", "hydra.verbose.0="),
 }
-TYPED = ("job.chdir=true", "+job.env_set.A=b", "+job.env_set={A:b}", "job.name=a", "output_subdir=null")
-TYPED += ("verbose=true", "run.dir='${oc.env:HOME}/x'", "+launcher.setup=[module load x]", "searchpath=[file:///tmp]")
+TYPED = (
+    "job.chdir=true",
+    "+job.env_set.A=b",
+    "+job.env_set={A:b}",
+    "job.name=a",
+    "output_subdir=null",
+)
+TYPED += (
+    "verbose=true",
+    "run.dir='${oc.env:HOME}/x'",
+    "+launcher.setup=[module load x]",
+    "searchpath=[file:///tmp]",
+)
 FREE = "defaults: [override /hydra/launcher: free, override /hydra/sweeper: free]"
 
 
@@ -91,7 +114,9 @@ def test_options_of_a_folder_are_held_to_the_list(name, word):
     file.write_text(f"# @package _global_\nhydra: {{callbacks: {{x: {COPY}}}}}\n")
     with session(Path("conf")):
         loader = GlobalHydra.instance().config_loader()
-        plain = OmegaConf.create({"hydra": {"overrides": {"hydra": []}, "job": {"config_name": "config"}}})
+        plain = OmegaConf.create(
+            {"hydra": {"overrides": {"hydra": []}, "job": {"config_name": "config"}}}
+        )
         with pytest.raises(UserError, match=r"hydra\.callbacks\.x"):
             loader.load_sweep_config(plain, [word])
 
@@ -121,7 +146,9 @@ def test_the_command_line_says_more(word):
 
 
 def test_what_the_command_line_says_brings_nothing_else_in():
-    with pytest.raises(UserError, match=r"hydra\.job\.env_set\.B=c: .* or write it on the command line"):
+    with pytest.raises(
+        UserError, match=r"hydra\.job\.env_set\.B=c: .* or write it on the command line"
+    ):
         planned("job: {env_set: {B: c}}", "+hydra.job.env_set.A=b")
     with pytest.raises(UserError, match=r"hydra\.callbacks"):
         planned("verbose: false", "+hydra.callbacks.x._target_=shutil.copyfile")

@@ -30,7 +30,10 @@ def test_rows_are_those_of_a_serial_sweep(launcher, tmp_path, monkeypatch, capsy
     needs(launcher)
     monkeypatch.chdir(tmp_path)
     assert main(["run", "-m", *SWEEP, "execution=serial", "output=serial"]) == 0
-    assert main(["run", "-m", *SWEEP, f"hydra/launcher={launcher}", f"output={tmp_path}/launched"]) == 0
+    assert (
+        main(["run", "-m", *SWEEP, f"hydra/launcher={launcher}", f"output={tmp_path}/launched"])
+        == 0
+    )
     serial = rows("serial")
     assert len(serial) == 2 * 12 * 2
     pd.testing.assert_frame_equal(rows("launched"), serial, check_exact=True)
@@ -38,7 +41,9 @@ def test_rows_are_those_of_a_serial_sweep(launcher, tmp_path, monkeypatch, capsy
 
 @pytest.mark.parametrize("launcher", EACH)
 @pytest.mark.filterwarnings("default")
-def test_a_job_that_is_refused_is_told_and_stands_in_the_books(launcher, tmp_path, monkeypatch, capsys):
+def test_a_job_that_is_refused_is_told_and_stands_in_the_books(
+    launcher, tmp_path, monkeypatch, capsys
+):
     needs(launcher)
     monkeypatch.chdir(tmp_path)
     # Workers of joblib's that are there already have another working folder.

@@ -17,15 +17,51 @@ LONG = "x" * 300
 GROUPS = ("measurement", "noise", "prior", "execution", "truth_measurement")
 ESTIMATORS = ("solver", "baseline")
 KEYS = {
-    "trials": ("null", "many", "1.5", "[1]", "{a: 1}", "true", "0", "-1", "99999999999", "1e400", "nan", "''"),
+    "trials": (
+        "null",
+        "many",
+        "1.5",
+        "[1]",
+        "{a: 1}",
+        "true",
+        "0",
+        "-1",
+        "99999999999",
+        "1e400",
+        "nan",
+        "''",
+    ),
     "block_size": ("null", "many", "1.5", "[1]", "0", "-5", "inf"),
     "seed": ("null", "first", "1.5", "[]", "-1", "99999999999999999999"),
-    "error_scale": ("null", "big", "[1,2]", "0", "-1", "nan", "inf", "-inf", "1e101", "1e308", "true"),
+    "error_scale": (
+        "null",
+        "big",
+        "[1,2]",
+        "0",
+        "-1",
+        "nan",
+        "inf",
+        "-inf",
+        "1e101",
+        "1e308",
+        "true",
+    ),
     "figures": ("null", "some", "1", "[all]", "true"),
     "formats": ("null", "tiff", "1", "[]", "''", "{a: 1}", "[png,eps]", "true"),
     "write_readings_trial": ("null", "1.5", "-1", "3", "last"),
     "name": ("", ".", "..", "null", "[a]", "{a: 1}"),
-    "output": ("", ".", "null", "[a]", LONG, "/proc/x", "/dev/null/x", "${nothing}", "'${nothing}'", "loop/x"),
+    "output": (
+        "",
+        ".",
+        "null",
+        "[a]",
+        LONG,
+        "/proc/x",
+        "/dev/null/x",
+        "${nothing}",
+        "'${nothing}'",
+        "loop/x",
+    ),
     "estimators": ("null", "5", "[newton]", "newton", "{}"),
     "readings": ("absent.csv", "/", LONG),
 }
@@ -34,10 +70,21 @@ OPTIONS = {
     "estimators.fixed_point.max_iterations": ("0", "-1", "1.5", "many", "[1]", "true", "null"),
     "estimators.fixed_point.tolerance": ("0", "-1", "nan", "inf", "small", "[1]", "null"),
     "estimators.fixed_point.start": ("here", "1", "null", "[nominal]"),
-    "estimators.fixed_point._target_": ("ipe_bench.solvers.Newton", "os.system", "5", "ipe_bench.solvers.Newtn"),
+    "estimators.fixed_point._target_": (
+        "ipe_bench.solvers.Newton",
+        "os.system",
+        "5",
+        "ipe_bench.solvers.Newtn",
+    ),
     "estimators.newton.tolerance": ("1e-3",),
     "noise.step": ("0", "-1", "nan", "inf", "wide", "[1]"),
-    "noise._target_": ("os.system", "null", "5", "ipe_bench.measurements.Gins", "ipe_bench.noise.Nothing"),
+    "noise._target_": (
+        "os.system",
+        "null",
+        "5",
+        "ipe_bench.measurements.Gins",
+        "ipe_bench.noise.Nothing",
+    ),
     "noise.nothing": ("1",),
     "measurement.nothing": ("1",),
     "prior.deviations": ("abc", "[1,2]", "[-1]", "[a]", "5"),
@@ -119,7 +166,10 @@ def command_lines() -> dict[str, list[str]]:
     for group in (*GROUPS, *ESTIMATORS):
         choices = [c for c in CHOICES if (group, c) not in HARMLESS]
         lines += [["run", f"{group}={choice}"] for choice in choices]
-        lines += [["run", f"{group}=[{choice},newton]"] for choice in ("null", "5", "nothing", "../x", "[]")]
+        lines += [
+            ["run", f"{group}=[{choice},newton]"]
+            for choice in ("null", "5", "nothing", "../x", "[]")
+        ]
     lines += [[command, *words.split()] for command, several in FLAGS.items() for words in several]
     lines += [["run", word] for word in SYNTAX]
     lines += [["estimate", "measurement=nist/misra1a", word] for word in SYNTAX]
@@ -127,8 +177,25 @@ def command_lines() -> dict[str, list[str]]:
     lines += [["run", "-m", *words.split()] for words in BAD_SWEEPS]
     lines += [["run", *words.split()] for words in PLACES]
     lines += [["run", f"~{key}"] for key in DELETED]
-    lines += [[word] for word in ("rum", "--nope", "-x", "runs", "Run", "", " ", LONG, "-sc", "--shell-completion=x")]
-    return {" ".join(line)[:90] + (f" ({len(line[-1])})" if len(" ".join(line)) > 90 else ""): line for line in lines}
+    lines += [
+        [word]
+        for word in (
+            "rum",
+            "--nope",
+            "-x",
+            "runs",
+            "Run",
+            "",
+            " ",
+            LONG,
+            "-sc",
+            "--shell-completion=x",
+        )
+    ]
+    return {
+        " ".join(line)[:90] + (f" ({len(line[-1])})" if len(" ".join(line)) > 90 else ""): line
+        for line in lines
+    }
 
 
 HARMLESS = {("truth_measurement", "null"), ("solver", "[]"), ("baseline", "[]")}
@@ -139,7 +206,13 @@ LINES = command_lines()
 @pytest.fixture
 def answer(monkeypatch, capsys, tmp_path):
     """The exit code and the lines on stderr of a command that runs in this process."""
-    for variable in ("HYDRA_FULL_ERROR", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "PYTHONPATH"):
+    for variable in (
+        "HYDRA_FULL_ERROR",
+        "OPENBLAS_NUM_THREADS",
+        "OMP_NUM_THREADS",
+        "MKL_NUM_THREADS",
+        "PYTHONPATH",
+    ):
         monkeypatch.setenv(variable, "1" if variable != "PYTHONPATH" else "")
     monkeypatch.delenv("COMP_LINE", raising=False)
     monkeypatch.setattr(sys, "path", list(sys.path))
@@ -166,7 +239,10 @@ def stored(folder: Path) -> list[Path]:
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        ("error_scale=100,1000", "error_scale=100,1000: is a sweep; add -m for a job of each error_scale"),
+        (
+            "error_scale=100,1000",
+            "error_scale=100,1000: is a sweep; add -m for a job of each error_scale",
+        ),
         ("solver=newton,auto", "solver=newton,auto: is a sweep; add -m, or put a list in brackets"),
         ("-m hydra.sweeper.params.error_scale=1,2", "write -m error_scale=1,2"),
         ("-m +hydra.sweeper.params.error_scale='1,2'", "write -m error_scale='1,2'"),
@@ -185,7 +261,9 @@ def test_there_are_four_hundred_wrong_command_lines():
 
 def one_in(count: int, cases: Iterable[str], rest: pytest.MarkDecorator) -> list[Any]:
     """The cases, of which the quick tests try one of so many."""
-    return [pytest.param(case, marks=() if i % count == 0 else rest) for i, case in enumerate(cases)]
+    return [
+        pytest.param(case, marks=() if i % count == 0 else rest) for i, case in enumerate(cases)
+    ]
 
 
 @pytest.mark.parametrize("line", one_in(16, LINES, pytest.mark.campaign))
@@ -194,7 +272,10 @@ def test_a_wrong_command_line_is_answered_in_one_line(answer, tmp_path, line):
     assert code == 2
     assert len(error) == 1
     assert error[0].startswith("ipe-bench: ")
-    assert not any(word in error[0] for word in ("Traceback", "Lexer", "Hydra", "omegaconf", "in struct", "NoneType"))
+    assert not any(
+        word in error[0]
+        for word in ("Traceback", "Lexer", "Hydra", "omegaconf", "in struct", "NoneType")
+    )
     assert len(error[0]) < 1500
     assert stored(tmp_path) == []
 
@@ -251,13 +332,18 @@ BROKEN_WHEN_READ: dict[str, dict[str, str | bytes]] = {
     "duplicate key": config(YAML + "start: nominal\nstart: nominal\n"),
     "python tag": config(YAML + "start: !!python/object:os.system 5\n"),
     "own tag": config(YAML + "start: !thing 5\n"),
-    "Latin-1": config(YAML.encode().replace(b"broken", b"kaputte \xfcble") if isinstance(YAML, str) else b""),  # type: ignore[arg-type]
+    "Latin-1": config(
+        YAML.encode().replace(b"broken", b"kaputte \xfcble") if isinstance(YAML, str) else b""
+    ),  # type: ignore[arg-type]
     "UTF-16": config(("\ufeff" + YAML).encode("utf-16")),  # type: ignore[arg-type]
     "zeros": config(b"\0" * 40),  # type: ignore[arg-type]
     "bomb": config(
         YAML
         + "a: &a [1,1,1,1,1,1,1,1,1,1]\n"
-        + "".join(f"{n}: &{n} [{', '.join(['*' + p] * 10)}]\n" for p, n in zip("abcdefgh", "bcdefghi", strict=True))
+        + "".join(
+            f"{n}: &{n} [{', '.join(['*' + p] * 10)}]\n"
+            for p, n in zip("abcdefgh", "bcdefghi", strict=True)
+        )
     ),
     "a loop of aliases": config(YAML + "start: &a [*a]\n"),
     "deep": config(YAML + "start: " + "[" * 3000 + "]" * 3000 + "\n"),
@@ -276,10 +362,33 @@ BROKEN_WHEN_READ: dict[str, dict[str, str | bytes]] = {
     "a group of defaults": config(YAML.replace("_target_", "defaults: [nothing]\n_target_")),
 }
 RAISED = (
-    *("RuntimeError('a\\nb')", "ValueError(3)", "KeyError('k')", "OSError(2, 'no', 'file')", "TypeError()"),
-    *("ImportError('a\\nb')", "ModuleNotFoundError('x')", "AttributeError('x')", "NameError('x')", "Warning('x')"),
-    *("RecursionError()", "MemoryError()", "AssertionError()", "StopIteration()", "GeneratorExit()", "SystemExit(5)"),
-    *("BaseException('x')", "UnicodeDecodeError('utf-8', b'', 0, 1, 'x')", "ExceptionGroup('g', [ValueError()])"),
+    *(
+        "RuntimeError('a\\nb')",
+        "ValueError(3)",
+        "KeyError('k')",
+        "OSError(2, 'no', 'file')",
+        "TypeError()",
+    ),
+    *(
+        "ImportError('a\\nb')",
+        "ModuleNotFoundError('x')",
+        "AttributeError('x')",
+        "NameError('x')",
+        "Warning('x')",
+    ),
+    *(
+        "RecursionError()",
+        "MemoryError()",
+        "AssertionError()",
+        "StopIteration()",
+        "GeneratorExit()",
+        "SystemExit(5)",
+    ),
+    *(
+        "BaseException('x')",
+        "UnicodeDecodeError('utf-8', b'', 0, 1, 'x')",
+        "ExceptionGroup('g', [ValueError()])",
+    ),
 )
 BROKEN_WHEN_IMPORTED: dict[str, dict[str, str | bytes]] = {
     **{f"raises {what.partition('(')[0]}": imports(f"raise {what}\n") for what in RAISED},
@@ -287,7 +396,9 @@ BROKEN_WHEN_IMPORTED: dict[str, dict[str, str | bytes]] = {
     "syntax": imports("def (:\n"),
     "indentation of code": imports("  x = 1\n y = 2\n"),
     "null byte": imports("x = 1\0\n"),
-    "Latin-1 code": {"code": "NAME = '\xfcbel'\n".encode("latin-1") + CODE.format(fields="", step="").encode()},
+    "Latin-1 code": {
+        "code": "NAME = '\xfcbel'\n".encode("latin-1") + CODE.format(fields="", step="").encode()
+    },
     "absent library": imports("import a_library_that_is_nowhere\n"),
     "circle": imports("from ipe_bench_no import thing\n"),
     "not a dataclass": {"code": "class Bad:\n    pass\n"},
@@ -313,20 +424,30 @@ def plugin(tmp_path, request):
     """Writes a plugin with the solver `bad` and returns its folder."""
     package = f"broken_{abs(hash(request.node.name)) % 10**9}"
 
-    def write(yaml: str | bytes = YAML, code: str | bytes = CODE.format(fields="", step="")) -> Path:
+    def write(
+        yaml: str | bytes = YAML, code: str | bytes = CODE.format(fields="", step="")
+    ) -> Path:
         folder = tmp_path / "plugins/mine"
         conf = folder / package / "conf/solver"
         conf.mkdir(parents=True)
         raw = yaml if isinstance(yaml, bytes) else yaml.replace("{package}", package).encode()
         (conf / "bad.yaml").write_bytes(raw.replace(b"{package}", package.encode()))
-        (folder / package / "__init__.py").write_bytes(code if isinstance(code, bytes) else code.encode())
+        (folder / package / "__init__.py").write_bytes(
+            code if isinstance(code, bytes) else code.encode()
+        )
         return folder
 
     yield write
     sys.modules.pop(package, None)
 
 
-SMALL = ("measurement=polynomial", "noise=gaussian", "noise.deviation=0.01", "trials=2", "execution=serial")
+SMALL = (
+    "measurement=polynomial",
+    "noise=gaussian",
+    "noise.deviation=0.01",
+    "trials=2",
+    "execution=serial",
+)
 SMALL += ("figures=none",)
 
 

@@ -7,7 +7,13 @@ import pytest
 
 from ipe_bench.cli.main import main
 
-SMALL = ("measurement=polynomial", "noise=gaussian", "execution=serial", "solver=[newton]", "output=out")
+SMALL = (
+    "measurement=polynomial",
+    "noise=gaussian",
+    "execution=serial",
+    "solver=[newton]",
+    "output=out",
+)
 SMALL += ("figures=none",)
 
 
@@ -39,7 +45,13 @@ def test_a_number_that_is_not_known_is_no_objective(capsys):
 @pytest.mark.skipif(importlib.util.find_spec("optuna") is None, reason="needs the extra optuna")
 @pytest.mark.filterwarnings("default")  # what Optuna 2 uses of its libraries is no error of ours
 def test_optuna_finds_cheaper_windows_for_progressive_than_the_default(capsys):
-    common = ["measurement=bearings", "noise=gaussian", "error_scale=10", "baseline=[]", "solver=[progressive]"]
+    common = [
+        "measurement=bearings",
+        "noise=gaussian",
+        "error_scale=10",
+        "baseline=[]",
+        "solver=[progressive]",
+    ]
     common += ["trials=100", "execution=serial", "objective=progressive.cost_median"]
     assert main(["run", *common, "output=default"]) == 0
     default = said(capsys.readouterr().out)
@@ -57,5 +69,10 @@ def test_optuna_finds_cheaper_windows_for_progressive_than_the_default(capsys):
 def test_a_column_of_an_older_version_is_an_objective_with_a_line(capsys):
     assert main(["run", *SMALL, "trials=4", "objective=newton.time_median_s"]) == 0
     told = capsys.readouterr()
-    assert told.err.count("time_median_s: is called time_mean_s now; the old name goes with the next version") == 1
+    assert (
+        told.err.count(
+            "time_median_s: is called time_mean_s now; the old name goes with the next version"
+        )
+        == 1
+    )
     assert said(told.out) > 0

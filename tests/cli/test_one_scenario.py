@@ -15,10 +15,14 @@ SMALL = ("measurement=polynomial", "noise=gaussian", "noise.deviation=0.01")
 def test_tables_and_files_say_the_same(ipe_bench, tmp_path):
     code, out, err = ipe_bench("design", *SMALL, "--readings", "20")
     assert code == 0
-    assert err == "ipe-bench: design: --readings: options have no dashes any more; write readings=20\n"
+    assert (
+        err == "ipe-bench: design: --readings: options have no dashes any more; write readings=20\n"
+    )
     assert "what 40 readings say" in out
     folder = tmp_path / "outputs" / "design-polynomial"
-    found = ib.design(ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01)), readings=20)
+    found = ib.design(
+        ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01)), readings=20
+    )
     best = found.ways[0].sharpest
     assert f"Least observable direction: {found.observability.words}" in out
     assert f"{best.mean_bound:.3f}" in out
@@ -27,7 +31,12 @@ def test_tables_and_files_say_the_same(ipe_bench, tmp_path):
     times = found.candidates.index["time"]
     assert [float(row["time"]) for row in rows] == pytest.approx([times[k] for k in best.rows])
     assert len(rows) == best.readings == 20
-    assert {path.name for path in folder.iterdir()} == {"design.json", "design.png", "readings.csv", "design.html"}
+    assert {path.name for path in folder.iterdir()} == {
+        "design.json",
+        "design.png",
+        "readings.csv",
+        "design.html",
+    }
     # The same command writes there again, another one elsewhere.
     assert ipe_bench("design", *SMALL, "readings=20")[0] == 0
     assert not (tmp_path / "outputs" / "design-polynomial-2").exists()
@@ -37,7 +46,9 @@ def test_tables_and_files_say_the_same(ipe_bench, tmp_path):
 
 @pytest.mark.slow
 def test_every_richer_version_of_the_model_is_suspected(ipe_bench):
-    code, out, _ = ipe_bench("design", "measurement=gins", "error_scale=33", "by=axis", "output=here")
+    code, out, _ = ipe_bench(
+        "design", "measurement=gins", "error_scale=33", "by=axis", "output=here"
+    )
     assert code == 0
     rows = {line.strip().split("  ")[0]: line for line in out.splitlines()}
     for name in ("tilt x", "tilt y", "gyro random walk", "misalignment xy", "quadratic x"):
@@ -48,19 +59,28 @@ def test_every_richer_version_of_the_model_is_suspected(ipe_bench):
 
 
 def test_a_table_and_files_for_each_trial(ipe_bench, tmp_path):
-    words = ("error_scale=3", "solver=[newton]", "baseline=[linear_lse]", "trials=2", "particles=400")
+    words = (
+        "error_scale=3",
+        "solver=[newton]",
+        "baseline=[linear_lse]",
+        "trials=2",
+        "particles=400",
+    )
     code, out, error = ipe_bench("posterior", *SMALL, *words)
     assert code == 0
     assert error.splitlines() == ["polynomial: trial 1 of 2", "polynomial: trial 2 of 2"]
     folder = tmp_path / "outputs" / "posterior-polynomial"
-    assert {path.name for path in folder.iterdir()} == {f"posterior.{kind}" for kind in ("json", "csv", "html", "png")}
+    assert {path.name for path in folder.iterdir()} == {
+        f"posterior.{kind}" for kind in ("json", "csv", "html", "png")
+    }
     found = pd.read_csv(folder / "posterior.csv")
     assert list(found["trial"]) == [0] * 4 + [1] * 4
     assert (abs(found["mean"] - found["truth"]) < 5 * found["deviation"]).all()
     assert "cannot be relied on" not in out
     rows = [line.split() for line in out.splitlines()]
     diverging = {
-        name: [float(row[-4].replace("k", "e3")) for row in rows if name in row] for name in ("newton", "linear_lse")
+        name: [float(row[-4].replace("k", "e3")) for row in rows if name in row]
+        for name in ("newton", "linear_lse")
     }
     assert max(diverging["newton"]) < 0.3 < min(diverging["linear_lse"])
     assert [row[-5] for row in rows if "newton" in row] == ["yes", "yes"]
@@ -68,10 +88,14 @@ def test_a_table_and_files_for_each_trial(ipe_bench, tmp_path):
 
 
 @pytest.mark.parametrize("settled", [(True, True), (True, False), (False, True), (False, False)])
-def test_posteriors_exit_with_1_unless_the_populations_of_every_trial_agree(ipe_bench, monkeypatch, settled):
+def test_posteriors_exit_with_1_unless_the_populations_of_every_trial_agree(
+    ipe_bench, monkeypatch, settled
+):
     """Of two trials: what they agree on is made up here."""
     found = [SimpleNamespace(posterior=SimpleNamespace(settled=one)) for one in settled]
     monkeypatch.setattr(answer, "sampled", lambda *args: found)
-    monkeypatch.setattr(answer, "write_posteriors", lambda folder, *args: [folder / "posterior.json"])
+    monkeypatch.setattr(
+        answer, "write_posteriors", lambda folder, *args: [folder / "posterior.json"]
+    )
     monkeypatch.setattr(answer, "posterior_parts", lambda *args: [])
     assert ipe_bench("posterior", *SMALL, "trials=2")[0] == (0 if all(settled) else 1)

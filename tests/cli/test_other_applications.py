@@ -33,13 +33,22 @@ def test_it_composes_our_configs_behind_its_own(tmp_path):
     (tmp_path / "my_conf" / "noise").mkdir(parents=True)
     (tmp_path / "app.py").write_text(APP)
     (tmp_path / "my_conf" / "config.yaml").write_text(CONFIG)
-    (tmp_path / "my_conf" / "noise" / "gaussian.yaml").write_text("_target_: builtins.dict\nown: 9\n")
+    (tmp_path / "my_conf" / "noise" / "gaussian.yaml").write_text(
+        "_target_: builtins.dict\nown: 9\n"
+    )
     # As an installation has them.
     shutil.copytree(ROOT / "ipe_bench", tmp_path / "ipe_bench")
     shutil.copytree(ROOT / "conf", tmp_path / "ipe_bench" / "conf", dirs_exist_ok=True)
-    command = [sys.executable, "app.py", "measurement.rounds=7", "estimators.newton.max_iterations=9"]
+    command = [
+        sys.executable,
+        "app.py",
+        "measurement.rounds=7",
+        "estimators.newton.max_iterations=9",
+    ]
     variables = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=variables, check=False)
+    done = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, env=variables, check=False
+    )
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""  # where Hydra says that a path is not available
     assert done.stdout.splitlines() == ["Ranging 49 7 {'own': 9} ['fixed_point', 'newton']", "9"]

@@ -29,7 +29,11 @@ def folders(tmp_path_factory):
         for scale in (1.0, 1000.0):
             for sigma in (0.2, 0.4):
                 for label in (*SHORT, LONG):
-                    store.add(store.scenario(error_scale=scale, sigma=sigma), label, factor * rng.normal(size=(30, 3)))
+                    store.add(
+                        store.scenario(error_scale=scale, sigma=sigma),
+                        label,
+                        factor * rng.normal(size=(30, 3)),
+                    )
         store.record(30 if name == "a" else 40)
         found.append(str(store.directory))
     return found
@@ -74,12 +78,19 @@ def test_a_report_of_many_settings_takes_two_screens_and_names_what_is_left_out(
     for sigma in range(1, 9):
         for scale in (1.0, 3.0, 10.0, 30.0, 100.0):
             for label in SHORT[:2]:
-                store.add(store.scenario(error_scale=scale, sigma=0.1 * sigma), label, rng.normal(size=(30, 3)))
+                store.add(
+                    store.scenario(error_scale=scale, sigma=0.1 * sigma),
+                    label,
+                    rng.normal(size=(30, 3)),
+                )
     store.record(30)
     assert main(["report", str(store.directory)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) <= 60
-    shown, titles = sum(rows(lines, name) for name in SHORT[:2]), sum("30 trials per row" in line for line in lines)
+    shown, titles = (
+        sum(rows(lines, name) for name in SHORT[:2]),
+        sum("30 trials per row" in line for line in lines),
+    )
     left_out = f"{80 - shown} of 80 rows are left out here, {8 - titles} of 8 settings whole; summary.csv and"
     assert any(line.startswith(left_out) for line in lines)
     drawn = set((store.directory / "figures").glob("headline_*.png"))
@@ -120,7 +131,10 @@ def test_lists_name_every_option(screen):
 def answer():
     model = ib.measurements.Polynomial()
     z = ib.Scenario(model, ib.noise.Gaussian(0.01), error_scale=3.0).draw(0, 1).z[0]
-    estimators = {"levenberg_marquardt": ib.baselines.LevenbergMarquardt(), LONG: ib.solvers.Newton()}
+    estimators = {
+        "levenberg_marquardt": ib.baselines.LevenbergMarquardt(),
+        LONG: ib.solvers.Newton(),
+    }
     return ib.estimate(model, z, estimators, noise=ib.noise.Gaussian(0.01))
 
 

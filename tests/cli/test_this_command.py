@@ -8,7 +8,13 @@ import pytest
 
 from ipe_bench.cli.words import default_name, read
 
-SMALL = ("measurement=polynomial", "noise=gaussian", "noise.deviation=0.01", "execution=serial", "baseline=[]")
+SMALL = (
+    "measurement=polynomial",
+    "noise=gaussian",
+    "noise.deviation=0.01",
+    "execution=serial",
+    "baseline=[]",
+)
 SMALL += ("figures=none",)
 
 
@@ -26,7 +32,12 @@ def test_run_shows_what_it_asked_for_and_counts_the_rest(ipe_bench):
     assert "1 result of other commands; `ipe-bench report both` shows all" in out
     # Another setting of one label gives the label no other name, and it is not shown with this one.
     _, out, _ = ipe_bench(
-        "run", *SMALL, "solver=[newton]", "estimators.newton.max_iterations=50", "trials=8", "output=both"
+        "run",
+        *SMALL,
+        "solver=[newton]",
+        "estimators.newton.max_iterations=50",
+        "trials=8",
+        "output=both",
     )
     assert rows_of(out, "newton") == 1
     assert "max_iterations" not in out
@@ -51,7 +62,11 @@ def test_the_name_of_an_experiment_is_for_the_experiment(ipe_bench):
     assert "name=headline: is that of an experiment" in error
     assert "write output=outputs/headline" in error
     assert not Path("outputs/headline").exists()
-    for words in (["+experiment=polynomial", "name=polynomial"], ["+experiment=polynomial", "name=mine"], ["name=b"]):
+    for words in (
+        ["+experiment=polynomial", "name=polynomial"],
+        ["+experiment=polynomial", "name=mine"],
+        ["name=b"],
+    ):
         code, out, _ = ipe_bench("run", *words, "--dry-run")
         assert (code, "none was computed" in out) == (0, True)
 
@@ -81,7 +96,14 @@ def test_a_folder_is_named_after_what_was_asked(words):
 
 def test_a_model_of_a_file_is_told_by_the_name_of_the_file(ipe_bench):
     assert ipe_bench("new", "ode", "decay")[0] == 0
-    words = ("run", "measurement=ode", "measurement.file=decay.yaml", "baseline=[]", "trials=4", "figures=none")
+    words = (
+        "run",
+        "measurement=ode",
+        "measurement.file=decay.yaml",
+        "baseline=[]",
+        "trials=4",
+        "figures=none",
+    )
     code, _, error = ipe_bench(*words)
     assert code == 0
     assert "measurement.file=decay.yaml" in error
@@ -94,7 +116,9 @@ def test_a_model_of_a_file_is_told_by_the_name_of_the_file(ipe_bench):
 
 
 def test_a_long_name_is_cut_and_stays_one_of_a_kind():
-    names = [default_name(read("run", [f"prior.deviations=[{'1,' * 60}{last}]"])) for last in (1, 2)]
+    names = [
+        default_name(read("run", [f"prior.deviations=[{'1,' * 60}{last}]"])) for last in (1, 2)
+    ]
     assert names[0] != names[1]
     assert all(len(name) <= 80 for name in names)
 
@@ -123,7 +147,9 @@ def test_a_dry_run_says_what_is_missing_and_computes_nothing(ipe_bench):
     assert "16 estimates are stored, 24 would be computed" in out
     assert set(Path("dry").rglob("*")) == stored
     # Each job is told from the others.
-    _, out, _ = ipe_bench("run", *SMALL, "solver=[newton]", "-m", "noise.deviation=0.01,0.02", "trials=8", "--dry-run")
+    _, out, _ = ipe_bench(
+        "run", *SMALL, "solver=[newton]", "-m", "noise.deviation=0.01,0.02", "trials=8", "--dry-run"
+    )
     lines = out.splitlines()[:-1]
     assert [line.split("noise.deviation=")[1].split(":")[0] for line in lines] == ["0.01", "0.02"]
 
@@ -171,7 +197,9 @@ def test_an_experiment_of_ones_own_sweeps_as_ours_do(ipe_bench):
     folder = Path("conf/experiment")
     folder.mkdir(parents=True)
     (folder / "mine.yaml").write_text(EXPERIMENT)
-    code, out, _ = ipe_bench("run", "--config-dir", "conf", "+experiment=mine", "execution=serial", "figures=none")
+    code, out, _ = ipe_bench(
+        "run", "--config-dir", "conf", "+experiment=mine", "execution=serial", "figures=none"
+    )
     assert code == 0
     assert rows_of(out, "newton") == 3
     assert [path.name for path in Path("outputs").iterdir()] == ["mine"]
@@ -189,7 +217,9 @@ def test_an_experiment_has_no_function_called(ipe_bench, below_hydra):
     Path("mine").write_text("kept")
     folder = Path("conf/experiment")
     folder.mkdir(parents=True)
-    (folder / "mine.yaml").write_text(f"# @package _global_\nhydra:\n  job: {{env_set: {{A: b}}}}\n  {below_hydra}\n")
+    (folder / "mine.yaml").write_text(
+        f"# @package _global_\nhydra:\n  job: {{env_set: {{A: b}}}}\n  {below_hydra}\n"
+    )
     words = ("--config-dir", "conf", "+experiment=mine", *SMALL, "solver=[newton]", "trials=2")
     code, _, err = ipe_bench("run", *words)
     assert (code, err.count("\n")) == (2, 1)
@@ -198,8 +228,12 @@ def test_an_experiment_has_no_function_called(ipe_bench, below_hydra):
     assert not Path("copy").exists()
 
 
-@pytest.mark.parametrize(("command", "said"), [("run", "goes on from there"), ("estimate", "begins anew")])
-def test_a_command_that_is_stopped_exits_as_a_shell_says_of_ctrl_c(ipe_bench, monkeypatch, command, said):
+@pytest.mark.parametrize(
+    ("command", "said"), [("run", "goes on from there"), ("estimate", "begins anew")]
+)
+def test_a_command_that_is_stopped_exits_as_a_shell_says_of_ctrl_c(
+    ipe_bench, monkeypatch, command, said
+):
     """128 and the number of SIGINT, 2; a failure is 1, a mistake 2."""
 
     def stop(words):

@@ -27,7 +27,9 @@ def times(factor, name="scale"):
             }}"""
 
     out = np.empty(1)
-    compiled.load.__wrapped__(f"times {factor}", write, name, (POINTER, POINTER))(at(np.array([3.0])), at(out))
+    compiled.load.__wrapped__(f"times {factor}", write, name, (POINTER, POINTER))(
+        at(np.array([3.0])), at(out)
+    )
     return out[0]
 
 
@@ -89,7 +91,9 @@ def test_machine_code_that_others_may_have_written_is_not_run(folder, caplog):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="files have owners otherwise there")
-def test_where_the_cache_cannot_be_written_to_one_folder_per_user_is_used(tmp_path, monkeypatch, caplog):
+def test_where_the_cache_cannot_be_written_to_one_folder_per_user_is_used(
+    tmp_path, monkeypatch, caplog
+):
     (tmp_path / "file").touch()
     monkeypatch.setenv("IPE_BENCH_CACHE", str(tmp_path / "file"))
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
@@ -133,14 +137,22 @@ print("ipe_bench.engine.emit" in sys.modules)
 """
     environment = os.environ | {"IPE_BENCH_CACHE": str(tmp_path)}
     said = [
-        subprocess.run([sys.executable, "-c", script], env=environment, check=True, capture_output=True, text=True)
+        subprocess.run(
+            [sys.executable, "-c", script],
+            env=environment,
+            check=True,
+            capture_output=True,
+            text=True,
+        )
         for _ in range(2)
     ]
     assert [run.stdout.strip() for run in said] == ["True", "False"]
 
 
 @pytest.mark.parametrize("module", ["engine.compiled", "engine.emit"])
-def test_what_machine_code_comes_from_is_part_of_the_source_that_results_depend_on(monkeypatch, module):
+def test_what_machine_code_comes_from_is_part_of_the_source_that_results_depend_on(
+    monkeypatch, module
+):
     """It is imported only where something is compiled, and yet a change to it makes stored results those of other
     code."""
     before = provenance.fingerprint([LotkaVolterra()])["source"]

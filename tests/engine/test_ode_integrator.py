@@ -76,7 +76,9 @@ def test_few_lanes_and_many_have_the_same_bits(cases):
     x = np.random.default_rng(5).normal(size=(3, 2))
     for method in ("simulate", "jacobian"):
         whole = getattr(Several(0.7), method)(x)
-        np.testing.assert_array_equal(np.split(whole, cases, axis=1), cases * [getattr(Pulse(0.7), method)(x)])
+        np.testing.assert_array_equal(
+            np.split(whole, cases, axis=1), cases * [getattr(Pulse(0.7), method)(x)]
+        )
         np.testing.assert_array_equal(whole[:1], getattr(Several(0.7), method)(x[:1]))
 
 
@@ -117,7 +119,9 @@ def test_a_coarse_jacobian_contracts_where_it_was_measured_and_beyond():
 def test_a_stiff_start_read_unevenly_holds_the_tolerance():
     """y' = -a (y - cos t), y(0) = 0, read often at first and rarely later."""
     a, t = np.array([[0.5], [2.0], [30.0], [200.0]]), np.array([0.01, 0.02, 0.05, 0.1, 2.0, 10.0])
-    model = Ode({"y": "-a*(y-cos(t))"}, {"a": 2.0}, times=tuple(t), tolerance=1e-8, method="explicit")
+    model = Ode(
+        {"y": "-a*(y-cos(t))"}, {"a": 2.0}, times=tuple(t), tolerance=1e-8, method="explicit"
+    )
     exact = a / (1 + a * a) * (a * np.cos(t) + np.sin(t) - a * np.exp(-a * t))
     agreed(np.abs(model.simulate(a / 2.0) - exact), 1e-8)
 
@@ -134,7 +138,9 @@ def test_without_a_tolerance_or_a_step_the_model_says_what_is_missing():
     class Silent(Pulse):
         tolerance = None
 
-    with pytest.raises(UserError, match=r"^measurement.step=null: silent states neither .*; give one"):
+    with pytest.raises(
+        UserError, match=r"^measurement.step=null: silent states neither .*; give one"
+    ):
         Silent(step=None).simulate(np.ones((1, 2)))
 
 
@@ -156,4 +162,6 @@ def test_the_example_in_the_docs_of_ode_works():
     z = pendulum.simulate(x)
     # A pendulum of 1 m that swings by half a radian takes 2.0382 s (series of the elliptic integral): a turning point.
     assert z[0, 3] == pytest.approx(0.5 * np.cos(2 * np.pi / 2.0382 * 2.0), abs=2e-3)
-    np.testing.assert_allclose(pendulum.jacobian(x), differentiate(pendulum.simulate, x, analytic=False), atol=1e-8)
+    np.testing.assert_allclose(
+        pendulum.jacobian(x), differentiate(pendulum.simulate, x, analytic=False), atol=1e-8
+    )

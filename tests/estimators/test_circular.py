@@ -30,7 +30,9 @@ PASSING = Ode(
     size=SIZE, circular=("bearing",), tolerance=1e-10,
 )  # fmt: skip
 """A target that passes west of the observer, where arctan2 jumps by a whole turn."""
-UNCUT = replace(PASSING, outputs={"bearing": "pi + arctan2(-y, -x)", "range": "hypot(x, y)"}, circular=())
+UNCUT = replace(
+    PASSING, outputs={"bearing": "pi + arctan2(-y, -x)", "range": "hypot(x, y)"}, circular=()
+)
 """The same, with the jump in the east, where nothing is seen."""
 NOISE = Gaussian(0.01)
 LAW = """
@@ -56,7 +58,9 @@ def turned(z, model=PASSING):
 
 
 @pytest.mark.parametrize("estimator", [*ALL, LinearLSE()], ids=str)
-def test_an_estimate_is_that_of_a_model_without_the_jump_however_readings_are_turned(passing, estimator):
+def test_an_estimate_is_that_of_a_model_without_the_jump_however_readings_are_turned(
+    passing, estimator
+):
     problem, uncut, z = passing
     within, besides = turned(z)
     assert (np.ptp(within[:, ::2], axis=1) > 6).sum() >= 5
@@ -67,7 +71,9 @@ def test_an_estimate_is_that_of_a_model_without_the_jump_however_readings_are_tu
             found = estimator.estimate(problem, given)
             drawn = isinstance(estimator, EnKF)  # whose draws depend on the bits of the readings
             assert (np.abs(found.x - expected.x) / scale).max() < (4.0 if drawn else 1e-5)
-            assert found.covariance == pytest.approx(expected.covariance, rel=3.0 if drawn else 1e-5, abs=1e-3)
+            assert found.covariance == pytest.approx(
+                expected.covariance, rel=3.0 if drawn else 1e-5, abs=1e-3
+            )
             assert found.status.tolist() == expected.status.tolist()
             for name in expected.extras:
                 assert found.extras[name] == pytest.approx(
@@ -76,7 +82,11 @@ def test_an_estimate_is_that_of_a_model_without_the_jump_however_readings_are_tu
 
 
 def test_a_run_scores_the_trials_as_without_the_jump():
-    estimators = {"lm": LevenbergMarquardt(), "ekf": ib.baselines.EKF(), "newton": ib.solvers.Newton()}
+    estimators = {
+        "lm": LevenbergMarquardt(),
+        "ekf": ib.baselines.EKF(),
+        "newton": ib.solvers.Newton(),
+    }
     tables = [ib.run(Scenario(model, NOISE), estimators, 40) for model in (PASSING, UNCUT)]
     for column in ("success", "efficiency", "rmse", "crlb", "linear_bound", "nees"):
         one, other = (table[column].to_numpy(dtype=float) for table in tables)
@@ -103,7 +113,11 @@ def test_subsets_files_together_and_bounded_parameters_keep_their_angles():
     z = PASSING.simulate(x)[0]
     odd = SubsetModel(PASSING, tuple(range(1, PASSING.m - 4)))
     bounded = informed(PASSING, (ParameterInfo("u", lower=0.1),))
-    for model, h in ((odd, z[1:-4]), (bounded, z), (Joint((PASSING, odd)), np.concatenate([z, z[1:-4]]))):
+    for model, h in (
+        (odd, z[1:-4]),
+        (bounded, z),
+        (Joint((PASSING, odd)), np.concatenate([z, z[1:-4]])),
+    ):
         angles = np.array(model.periods) > 0
         assert angles.tolist() == [name == "bearing" for name in model.index["output"]]
         shifted = h + TURN * 2 * angles
@@ -114,18 +128,28 @@ def test_slopes_by_differences_do_not_see_the_jump(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("west.py").write_text(LAW)
     t = np.arange(0.0, 10.0)
-    model = Function("west:bearing", columns={"t": t, "s": 0 * t}, unit="deg", circular=("reading",))
+    model = Function(
+        "west:bearing", columns={"t": t, "s": 0 * t}, unit="deg", circular=("reading",)
+    )
     at = replace(model, start={"b": 0.0, "v": 0.0}, size={"b": 1.0, "v": 1.0})
     exact = np.rad2deg(1.0 / (-40.0 + 2.0 * t))
     assert at.jacobian(at.nominal[None])[0, :, 1] == pytest.approx(exact, rel=1e-8)
     assert set(model.periods) == {360.0}
-    formula = Formula("arctan2(b, a - s)", {"a": -40.0, "b": 0.0}, {"s": t.tolist()}, circular=("y",))
-    by_differences = differentiate(formula.simulate, formula.nominal[None], analytic=False, near=formula.near)
-    assert formula.jacobian(formula.nominal[None]) == pytest.approx(by_differences, rel=1e-6, abs=1e-9)
+    formula = Formula(
+        "arctan2(b, a - s)", {"a": -40.0, "b": 0.0}, {"s": t.tolist()}, circular=("y",)
+    )
+    by_differences = differentiate(
+        formula.simulate, formula.nominal[None], analytic=False, near=formula.near
+    )
+    assert formula.jacobian(formula.nominal[None]) == pytest.approx(
+        by_differences, rel=1e-6, abs=1e-9
+    )
 
 
 @pytest.mark.slow
-def test_estimates_of_files_their_residuals_and_predictions_are_those_without_turns(tmp_path, monkeypatch):
+def test_estimates_of_files_their_residuals_and_predictions_are_those_without_turns(
+    tmp_path, monkeypatch
+):
     """By a function in deg, whose readings are written with whole turns, or without; one is missing."""
     monkeypatch.chdir(tmp_path)
     Path("west.py").write_text(LAW)
@@ -137,7 +161,12 @@ def test_estimates_of_files_their_residuals_and_predictions_are_those_without_tu
         shown = np.where(np.arange(len(t)) == 7, np.nan, z + 360 * turns)
         columns = pd.DataFrame({"t": t, "s": s, "reading [deg]": shown, "sigma": 0.2})
         columns.to_csv(f"{k}.csv", index=False)
-        words = ["measurement=function", "measurement.of=west:bearing", "measurement.unit=deg", f"output=out{k}"]
+        words = [
+            "measurement=function",
+            "measurement.of=west:bearing",
+            "measurement.unit=deg",
+            f"output=out{k}",
+        ]
         words += [
             "measurement.circular=[reading]",
             "solver=[auto,newton]",
@@ -154,12 +183,18 @@ def test_estimates_of_files_their_residuals_and_predictions_are_those_without_tu
 def test_levels_of_noise_and_the_posterior_are_those_without_turns(passing):
     problem, uncut, z = passing
     within, besides = turned(z)
-    found = [ib.estimate(m, r[0], noise=None) for m, r in ((UNCUT, z), (PASSING, within), (PASSING, besides))]
+    found = [
+        ib.estimate(m, r[0], noise=None)
+        for m, r in ((UNCUT, z), (PASSING, within), (PASSING, besides))
+    ]
     for one in found[1:]:
         for fit, other in zip(one.fits, found[0].fits, strict=True):
             assert fit.x == pytest.approx(other.x, rel=1e-5)
             assert fit.residual == pytest.approx(other.residual, abs=1e-6)
-    sampled = [sample_posterior(p, r[0], particles=400, seed=1) for p, r in ((uncut, z), (problem, besides))]
+    sampled = [
+        sample_posterior(p, r[0], particles=400, seed=1)
+        for p, r in ((uncut, z), (problem, besides))
+    ]
     assert sampled[1].mean == pytest.approx(sampled[0].mean, rel=1e-4)
 
 
@@ -167,7 +202,10 @@ def test_levels_of_noise_and_the_posterior_are_those_without_turns(passing):
     ("options", "message"),
     [
         ({"circular": ("beering",)}, "circular=beering: .*did you mean bearing"),
-        ({"circular": ("bearing",), "unit": "m"}, "unit=m: circular=bearing is an angle, in rad or deg"),
+        (
+            {"circular": ("bearing",), "unit": "m"},
+            "unit=m: circular=bearing is an angle, in rad or deg",
+        ),
     ],
 )
 def test_what_is_no_angle_is_refused(options, message):

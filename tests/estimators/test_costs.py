@@ -46,7 +46,13 @@ def test_the_cost_of_an_estimator_is_what_it_evaluates(name, scenario):
 
 @pytest.mark.parametrize(
     "name",
-    ["auto", "progressive", "relinearized", "levenberg_marquardt", pytest.param("multistart", marks=pytest.mark.slow)],
+    [
+        "auto",
+        "progressive",
+        "relinearized",
+        "levenberg_marquardt",
+        pytest.param("multistart", marks=pytest.mark.slow),
+    ],
 )
 def test_failures_cost_what_they_evaluate(name):
     """Where a search ends far from a minimum, the Jacobian for the covariance there is an evaluation of its own."""
@@ -79,7 +85,9 @@ class Exact(ConstantVelocity):
         return super().gain(k)[:, :1]
 
 
-MODELS = {"exact": Exact()} | {model.name: model for model in (Growth(), CoordinatedTurn(), ConstantVelocity())}
+MODELS = {"exact": Exact()} | {
+    model.name: model for model in (Growth(), CoordinatedTurn(), ConstantVelocity())
+}
 
 
 def watched(model: StateModel, seen: Counter[str], first: bool) -> StateModel:
@@ -101,8 +109,12 @@ def watched(model: StateModel, seen: Counter[str], first: bool) -> StateModel:
     return copy
 
 
-@pytest.mark.oracle("own second implementation: calls counted from outside", "evaluations of every tracker", 0.0)
-@pytest.mark.parametrize(("model", "moved_first"), [*((name, True) for name in MODELS), ("growth", False)])
+@pytest.mark.oracle(
+    "own second implementation: calls counted from outside", "evaluations of every tracker", 0.0
+)
+@pytest.mark.parametrize(
+    ("model", "moved_first"), [*((name, True) for name in MODELS), ("growth", False)]
+)
 @pytest.mark.parametrize("name", TRACKERS)
 def test_the_cost_of_a_tracker_is_what_it_evaluates(name, model, moved_first):
     tracker, seen = TRACKERS[name], Counter()

@@ -34,10 +34,14 @@ def test_linear_lse_is_the_normal_equation_of_eq_2_and_its_covariance_eq_5(seed,
     z = A @ x + np.random.default_rng(seed).normal(size=len(A))
     estimates = LinearLSE().estimate(problem, z[None])
     assert_agrees(estimates.x[0], np.linalg.lstsq(A, z, rcond=None)[0], atol=1e-9)
-    np.testing.assert_allclose(estimates.covariance[0], SIGMA**2 * np.linalg.inv(A.T @ A), rtol=1e-8, atol=1e-12)
+    np.testing.assert_allclose(
+        estimates.covariance[0], SIGMA**2 * np.linalg.inv(A.T @ A), rtol=1e-8, atol=1e-12
+    )
 
 
-@pytest.mark.oracle("own second implementation: eqs. (11) and (24) by plain matrices", "F of eq. (19)", 1e-8)
+@pytest.mark.oracle(
+    "own second implementation: eqs. (11) and (24) by plain matrices", "F of eq. (19)", 1e-8
+)
 @given(seeds, vectors, st.floats(-0.1, 0.1))
 @settings(deadline=None, max_examples=30)
 def test_eq_19_is_eq_11_with_the_nonlinear_term_of_eq_24(seed, x, bend):
@@ -61,7 +65,9 @@ def test_a_root_of_F_solves_eq_11():
     assert_agrees(x, np.linalg.pinv(A) @ (z[0] - N), atol=1e-11)
 
 
-@pytest.mark.oracle("own second implementation: eqs. (16) and (17) by plain matrices", "iterates", 1e-12)
+@pytest.mark.oracle(
+    "own second implementation: eqs. (16) and (17) by plain matrices", "iterates", 1e-12
+)
 def test_fixed_point_iterates_are_those_of_eqs_16_and_17():
     problem = problem_of(bend=0.02)
     model, A = problem.measurement, problem.measurement.A
@@ -83,7 +89,9 @@ def test_sandwich_is_the_spread_of_the_roots():
     assert (estimates.status == Status.CONVERGED).all()
     system = FrozenSystem.at_nominal(problem, model.simulate(truth))
     P = system.sandwich(truth)[0]
-    np.testing.assert_allclose(np.cov(estimates.x.T), P, atol=4 * np.sqrt(2 / 40_000) * np.abs(P).max())
+    np.testing.assert_allclose(
+        np.cov(estimates.x.T), P, atol=4 * np.sqrt(2 / 40_000) * np.abs(P).max()
+    )
     assert np.trace(P) > np.trace(system.covariance()[0]) * 0.1
 
 

@@ -26,7 +26,11 @@ SCENARIOS = {
 
 def test_these_are_all_estimators():
     ours = {getattr(room, name) for room in (baselines, solvers) for name in room.__all__}
-    ours = {kind for kind in ours if isinstance(kind, type) and issubclass(kind, Estimator) and kind is not IPE}
+    ours = {
+        kind
+        for kind in ours
+        if isinstance(kind, type) and issubclass(kind, Estimator) and kind is not IPE
+    }
     assert ours == {*map(type, ALL), baselines.LinearLSE}
 
 
@@ -45,7 +49,9 @@ def test_a_trial_that_fails_has_a_status_and_disturbs_no_other(estimator):
 def test_what_an_estimator_needs_is_asked_for(estimator):
     problem = Problem(Bent(), Covariance(np.ones(12)))
     assert estimator.hindrance(problem) == "needs prior, which measurement=bent does not have"
-    with pytest.raises(UserError, match=f"^{estimator.name}: needs prior, which measurement=bent does not have"):
+    with pytest.raises(
+        UserError, match=f"^{estimator.name}: needs prior, which measurement=bent does not have"
+    ):
         estimator.estimate(problem, np.zeros((1, 12)))
 
 

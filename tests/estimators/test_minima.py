@@ -22,9 +22,13 @@ def minima(chi_square, converged=True, x=0.0):
     """Minima of trials of one parameter with a deviation of 2."""
     chi_square = np.atleast_1d(np.asarray(chi_square, dtype=float))
     trials = len(chi_square)
-    status = np.where(np.broadcast_to(converged, trials), Status.CONVERGED, Status.STALLED).astype(np.int8)
+    status = np.where(np.broadcast_to(converged, trials), Status.CONVERGED, Status.STALLED).astype(
+        np.int8
+    )
     found = Minima.nowhere(np.full((trials, 1), float(x)), history=False)
-    return replace(found, status=status, covariance=np.full((trials, 1, 1), 4.0), chi_square=chi_square)
+    return replace(
+        found, status=status, covariance=np.full((trials, 1, 1), 4.0), chi_square=chi_square
+    )
 
 
 @pytest.mark.parametrize(
@@ -54,7 +58,9 @@ def test_iterations_add_up_whether_a_search_was_of_use_or_not():
 
 def test_every_start_of_a_linear_model_finds_the_one_minimum_and_costs_iterations():
     problem, z = LINEAR.problem, LINEAR.draw(0, 6).z
-    found = [Multistart(starts=starts, confirmations=starts).estimate(problem, z) for starts in (1, 3, 5)]
+    found = [
+        Multistart(starts=starts, confirmations=starts).estimate(problem, z) for starts in (1, 3, 5)
+    ]
     for one in found:
         assert (one.extras["minima"] == 1).all()
         assert (one.extras["ambiguous"] == 0).all()
@@ -97,7 +103,9 @@ class Coarse(Bent):
 def test_a_slope_for_the_report_ends_no_trial():
     """The search ends far away, by coarse slopes; the covariance there would take an exact one, which raises."""
     z = Bent(0.3).simulate(np.array([[1.0, 0.5, -0.5]]))
-    found = LevenbergMarquardt(max_iterations=1).estimate(replace(LINEAR, measurement=Coarse(0.3)).problem, z)
+    found = LevenbergMarquardt(max_iterations=1).estimate(
+        replace(LINEAR, measurement=Coarse(0.3)).problem, z
+    )
     assert found.status.tolist() == [Status.MAX_ITERATIONS]
     assert found.messages == {}
     assert np.isnan(found.covariance).all()

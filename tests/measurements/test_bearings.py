@@ -24,7 +24,10 @@ def test_bearings_are_clockwise_from_north():
     model = Bearings()
     x = model.nominal + np.random.default_rng(0).normal(size=(10, 4))
     east, north, v_east, v_north = (x * model.sizes).T[:, :, None]
-    sight = east + v_east * model.times - model.observer[:, 0], north + v_north * model.times - model.observer[:, 1]
+    sight = (
+        east + v_east * model.times - model.observer[:, 0],
+        north + v_north * model.times - model.observer[:, 1],
+    )
     expected = np.rad2deg(np.arctan2(*sight))
     apart = (model.simulate(x) - expected + 180.0) % 360.0 - 180.0
     assert_agrees(apart, 0.0, atol=1e-11)
@@ -36,7 +39,9 @@ def test_bearings_do_not_jump_where_the_target_crosses_north_or_south():
         assert np.abs(np.diff(model.simulate(model.nominal[None])[0])).max() < 20.0
 
 
-@pytest.mark.parametrize("estimator", [Newton(), LevenbergMarquardt(), EKF()], ids=["newton", "lm", "ekf"])
+@pytest.mark.parametrize(
+    "estimator", [Newton(), LevenbergMarquardt(), EKF()], ids=["newton", "lm", "ekf"]
+)
 def test_an_estimate_is_the_same_whichever_way_a_file_writes_an_angle(estimator):
     """North is crossed, so readings from 0 to 360 jump; the prior is one unit of each parameter."""
     model = Bearings(target=(-600.0, 9000.0, 3.0, 0.0))
@@ -66,11 +71,15 @@ def test_on_one_leg_every_scaled_relative_motion_has_the_same_bearings(factor):
     assert_agrees(z[0], z[1], atol=1e-9)
 
 
-ALONG_SIGHT = Bearings(legs=((900.0, 0.0, 3.0), (900.0, 0.0, 9.0)), target=(0.0, 20000.0, 0.0, -2.0))
+ALONG_SIGHT = Bearings(
+    legs=((900.0, 0.0, 3.0), (900.0, 0.0, 9.0)), target=(0.0, 20000.0, 0.0, -2.0)
+)
 """The observer accelerates, but the bearing stays what it would have been (Nardone and Aidala 1981)."""
 
 
-@pytest.mark.parametrize("model", [Bearings(legs=STRAIGHT), ALONG_SIGHT], ids=["no manoeuvre", "along the sight"])
+@pytest.mark.parametrize(
+    "model", [Bearings(legs=STRAIGHT), ALONG_SIGHT], ids=["no manoeuvre", "along the sight"]
+)
 def test_a_problem_that_is_not_observable_is_refused(model):
     assert np.linalg.matrix_rank(model.linearization(), tol=1e-9) < 4
     with pytest.raises(np.linalg.LinAlgError, match=r"H has not full column rank"):

@@ -19,7 +19,13 @@ from ipe_bench.trials.scenario import Scenario
 from ipe_bench.workshop.conformance import check_component
 
 FEED, BEGIN = (2.0, 0.0, 5.0), (1.0, 9.0, 4.0)
-MODEL = Ode({"y": "feed - k*y"}, {"k": 0.5, "gain": 1.0}, {"y": "begin"}, {"shown": "gain*y"}, tolerance=1e-11)
+MODEL = Ode(
+    {"y": "feed - k*y"},
+    {"k": 0.5, "gain": 1.0},
+    {"y": "begin"},
+    {"shown": "gain*y"},
+    tolerance=1e-11,
+)
 LM = {"lm": LevenbergMarquardt(tolerance=1e-10, max_iterations=300)}
 
 
@@ -37,7 +43,11 @@ def file(tmp_path):
     t = np.round(rng.uniform(0.1, 6.0, 15), 3)
     z = solution(case, t, 0.37, 1.4) + 0.05 * rng.standard_normal(15)
     order = rng.permutation(15)
-    rows = [f"{FEED[c]},{float(z[i])!r},{t[i]},{c + 1},{BEGIN[c]},0.05" for i in order for c in [case[i]]]
+    rows = [
+        f"{FEED[c]},{float(z[i])!r},{t[i]},{c + 1},{BEGIN[c]},0.05"
+        for i in order
+        for c in [case[i]]
+    ]
     (tmp_path / "a.csv").write_text("\n".join(["feed,reading,time,case,begin [g],sigma", *rows]))
     return tmp_path / "a.csv", case[order], t[order], z[order]
 
@@ -63,7 +73,9 @@ def test_an_estimate_from_several_cases_is_scipys(file):
     )  # fmt: skip
     assert_agrees(result.x, x, rtol=1e-8)
     assert_agrees(result.standard_errors, np.sqrt(np.diag(P)), rtol=1e-6)
-    bounded = fit_of(open_together([path], ConstrainedModel(MODEL, (ParameterInfo("k", positive=True),))))
+    bounded = fit_of(
+        open_together([path], ConstrainedModel(MODEL, (ParameterInfo("k", positive=True),)))
+    )
     assert bounded.x == pytest.approx(x, rel=1e-8)
 
 
@@ -81,7 +93,9 @@ def test_files_of_one_case_each_are_estimated_together(file, tmp_path):
     for case in "123":
         own = [row.split(",") for row in rows if row.split(",")[3] == case]
         paths.append(tmp_path / f"case{case}.csv")
-        paths[-1].write_text("\n".join(["feed,reading,time,begin", *(",".join((*r[:3], r[4])) for r in own)]))
+        paths[-1].write_text(
+            "\n".join(["feed,reading,time,begin", *(",".join((*r[:3], r[4])) for r in own)])
+        )
     together = fit_of(open_together(paths, MODEL))
     assert together.x == pytest.approx(whole.x, rel=1e-7)
 
@@ -104,7 +118,13 @@ def test_a_model_in_the_config_has_its_cases_there(tmp_path):
 
 def test_a_constant_of_the_config_stands_for_a_column(tmp_path):
     (tmp_path / "a.csv").write_text("time,reading,begin\n1,2,1\n2,3,1\n3,3,1\n")
-    model = Ode({"y": "feed - k*y"}, {"k": 0.5, "gain": 1.0}, {"y": "begin"}, {"s": "gain*y"}, constants={"feed": 2.0})
+    model = Ode(
+        {"y": "feed - k*y"},
+        {"k": 0.5, "gain": 1.0},
+        {"y": "begin"},
+        {"s": "gain*y"},
+        constants={"feed": 2.0},
+    )
     h = open_together([tmp_path / "a.csv"], model).model.simulate(np.array([[1.0, 1.0]]))[0]
     assert h == pytest.approx([4 - 3 * np.exp(-0.5 * t) for t in (1, 2, 3)], abs=1e-6)
 
@@ -142,7 +162,9 @@ def test_a_file_that_does_not_say_which_state_was_read_is_refused(tmp_path):
 
 def test_a_misspelt_parameter_is_told_of_with_both_remedies():
     model = Ode({"y": "-kk*y"}, {"y0": 1.0}, {"y": "y0"}, times=(1.0, 2.0))
-    with pytest.raises(UserError, match=r"kk is not known; give it a start, measurement.start.kk=1, .*constants.kk"):
+    with pytest.raises(
+        UserError, match=r"kk is not known; give it a start, measurement.start.kk=1, .*constants.kk"
+    ):
         model.simulate(np.ones((1, 1)))
 
 
@@ -178,7 +200,9 @@ def test_the_column_of_the_readings_has_the_name_that_is_stated(tmp_path):
         Ode({"y": "-k*y*conc"}, {"k": 0.1}, {"y": 1.0}, reading="conc")
 
 
-@pytest.mark.parametrize(("shown", "named"), [("y if t < q else 0", "q"), ("floor(4*y)+q", "k"), ("max(y,0.4)+q", "")])
+@pytest.mark.parametrize(
+    ("shown", "named"), [("y if t < q else 0", "q"), ("floor(4*y)+q", "k"), ("max(y,0.4)+q", "")]
+)
 def test_parameters_of_which_outputs_are_constant_in_pieces_are_named(shown, named):
     model = Ode({"y": "-k*y"}, {"k": 0.5, "q": 3.3}, {"y": "1"}, {"z": shown}, (1.0, 2.0, 3.0, 4.0))
     said = [text.partition(", but")[0] for text in model.remarks(model.nominal)]

@@ -17,7 +17,9 @@ def check(number, expected):
     """Readings at a truth are those of the solution, or the model is refused, or there is a word."""
     one = drawn(number)
     model, x = one.model, one.x[None]
-    if not len(expected) or model.hindrance(model.nominal):  # SciPy has none, or the shortest steps are too long
+    if not len(expected) or model.hindrance(
+        model.nominal
+    ):  # SciPy has none, or the shortest steps are too long
         return
     z = model.simulate(x)
     off = np.abs(z[0] - expected).max() / model.engine.tolerance

@@ -54,7 +54,9 @@ def test_a_battery_follows_its_current(method):
     z = model.simulate(x)
     for row, p in zip(z, x * model.sizes, strict=True):
         assert_agrees(row, circuit(*p), atol=1e-10)
-    np.testing.assert_allclose(model.jacobian(x), differentiate(model.simulate, x, analytic=False), atol=1e-9)
+    np.testing.assert_allclose(
+        model.jacobian(x), differentiate(model.simulate, x, analytic=False), atol=1e-9
+    )
     assert np.array_equal(model.simulate(x[1:])[0], z[1])
     assert np.array_equal(model.simulate_until(x, 30), z[:, :30])
     with patch.object(compiled, "available", lambda: False):
@@ -66,7 +68,9 @@ def test_a_battery_follows_its_current(method):
 def test_a_rate_that_depends_on_time_has_its_exact_solution(method, there):
     """y' = cos t - k y from 0, with its slope by k; without a compiler, too."""
     times = np.array([0.3, 2.0, 5.5])
-    model = Ode({"y": "cos(t) - k*y"}, {"k": 0.7}, times=tuple(times), method=method, tolerance=1e-11)
+    model = Ode(
+        {"y": "cos(t) - k*y"}, {"k": 0.7}, times=tuple(times), method=method, tolerance=1e-11
+    )
     x = np.array([[1.0], [1.5]])
 
     def exact(k):
@@ -91,7 +95,9 @@ def test_a_reading_at_a_jump_shows_the_input_from_then_on(method):
         y = u / k + (y - u / k) * np.exp(-k * step)
         exact.append(y)
     shown = np.array([3.0, 3.0, -1.0, -1.0, 0.5, 0.5])
-    np.testing.assert_allclose(model.simulate(model.nominal[None])[0], exact + 10 * shown, atol=1e-9)
+    np.testing.assert_allclose(
+        model.simulate(model.nominal[None])[0], exact + 10 * shown, atol=1e-9
+    )
 
 
 @pytest.mark.oracle("closed form: a state that follows a straight input", "readings", 1e-10)
@@ -109,7 +115,9 @@ def test_a_stiff_follower_of_a_straight_input_has_its_exact_solution(method):
                 tolerance=1e-11)  # fmt: skip
     x = model.nominal[None]
     assert_agrees(model.simulate(x)[0], exact, atol=1e-10)
-    np.testing.assert_allclose(model.jacobian(x), differentiate(model.simulate, x, analytic=False), atol=1e-8)
+    np.testing.assert_allclose(
+        model.jacobian(x), differentiate(model.simulate, x, analytic=False), atol=1e-8
+    )
     early = replace(
         model, columns={"time": [2.0, 3.0], "u": [1.0, 1.0]}
     )  # level before the first row and after the last
@@ -122,7 +130,9 @@ def test_few_readings_of_many_changes_are_those_of_all():
     np.testing.assert_allclose(few.simulate(x), BATTERY.simulate(x)[:, 5::7], atol=1e-12)
     assert (few.m, len(few.epochs or ())) == (8, 8)
     assert not [f for f in check_component("ode", BATTERY) if f.complaint]
-    with pytest.raises(UserError, match=r"current changes at 0 without a reading; add it to measurement.times"):
+    with pytest.raises(
+        UserError, match=r"current changes at 0 without a reading; add it to measurement.times"
+    ):
         _ = few.input_columns
 
 
@@ -138,7 +148,11 @@ def test_readings_are_written_with_their_inputs_and_read_again(tmp_path):
 @pytest.mark.oracle("closed form: doses and a ramp into one compartment", "readings", 1e-10)
 @pytest.mark.parametrize("method", ["explicit", "implicit"])
 @pytest.mark.parametrize(
-    "dose", ["(dose if 1 <= t and not begin + 1.3 <= t else 0)", "dose*(sign(t - 1) - sign(t - begin - 1.3))/2"]
+    "dose",
+    [
+        "(dose if 1 <= t and not begin + 1.3 <= t else 0)",
+        "dose*(sign(t - 1) - sign(t - begin - 1.3))/2",
+    ],
 )
 def test_rates_in_pieces_of_time_have_their_exact_solution(method, dose):
     """y' = dose - k y within [1, 2.3) and -k y outside, then with a ramp q (t - 3)."""
@@ -149,30 +163,45 @@ def test_rates_in_pieces_of_time_have_their_exact_solution(method, dose):
     k, q = 0.7, 0.2
 
     def exact(t, dose):
-        y = dose / k * (1 - np.exp(-k * (min(t, 2.3) - 1))) * np.exp(-k * max(t - 2.3, 0)) if t > 1 else 0.0
+        y = (
+            dose / k * (1 - np.exp(-k * (min(t, 2.3) - 1))) * np.exp(-k * max(t - 2.3, 0))
+            if t > 1
+            else 0.0
+        )
         return y + (q / k * (t - 3) - q / k**2 * (1 - np.exp(-k * (t - 3))) if t > 3 else 0.0)
 
     x = model.nominal[None]
     expected = [exact(t, dose) for dose in (2.0, 3.0) for t in model.times]
     assert_agrees(model.simulate(x)[0], expected, atol=1e-10)
-    np.testing.assert_allclose(model.jacobian(x), differentiate(model.simulate, x, analytic=False), atol=1e-8)
+    np.testing.assert_allclose(
+        model.jacobian(x), differentiate(model.simulate, x, analytic=False), atol=1e-8
+    )
 
 
 @pytest.mark.parametrize(
     ("rate", "message"),
     [
-        ("(1 if y < 0.5 else 0) - k*y", "a rate jumps at a moment that a state or a parameter decides"),
+        (
+            "(1 if y < 0.5 else 0) - k*y",
+            "a rate jumps at a moment that a state or a parameter decides",
+        ),
         ("-k*y if t < 10*k else 0", "a rate jumps at a moment"),
         ("-k*y if t < 2 and y > 0.5 else -k", "a rate jumps at a moment"),
         ("-k*y if sin(t) > 0 else 0", "sin.t. > 0: compare t itself with a constant"),
         ("-k*y if sin(2*pi*t) > 0.5 else 0", "compare t itself with a constant"),
         ("-k*y if (1 if t < 3 else 2) > 1.5 else 0", "compare t itself with a constant"),
         ("-k*y*sign(y - 0.5)", "a rate jumps at a moment"),
-        ("-k*y*floor(t)", "a rate jumps at a moment.*write comparisons of t where floor or mod is taken"),
+        (
+            "-k*y*floor(t)",
+            "a rate jumps at a moment.*write comparisons of t where floor or mod is taken",
+        ),
         ("-k*mod(y, 0.1)", "a rate jumps at a moment"),
         ("-k*y if mod(t, 2) < 1 else 0", "compare t itself with a constant"),
         ("-k*y*sign(sin(t))", "the sign of t: compare t itself with a constant"),
-        ("-k*y*" + "abs(" * 40 + "t - 1" + ")" * 40, "the abs of t: compare t itself with a constant"),
+        (
+            "-k*y*" + "abs(" * 40 + "t - 1" + ")" * 40,
+            "the abs of t: compare t itself with a constant",
+        ),
     ],
 )
 @pytest.mark.parametrize("method", ["auto", "implicit"])
@@ -193,7 +222,9 @@ def test_angles_lengths_and_steps_are_read_of_a_solution_with_their_slopes(metho
         "turns": "r*floor(a/(2*pi))",
     }
     times = tuple(np.arange(0.25, 9.0, 0.5))
-    model = Ode({"a": "w"}, {"w": 1.7, "r": 2.0}, {"a": 0.3}, shown, times, tolerance=1e-11, method=method)
+    model = Ode(
+        {"a": "w"}, {"w": 1.7, "r": 2.0}, {"a": 0.3}, shown, times, tolerance=1e-11, method=method
+    )
     x = np.array([[1.0, 1.0], [0.83, 1.2], [-1.3, 0.7]])
     w, r = (x * model.sizes).T[:, :, None]
     a = 0.3 + w * np.array(times)
@@ -204,10 +235,16 @@ def test_angles_lengths_and_steps_are_read_of_a_solution_with_their_slopes(metho
     turning = (r**2 - r * np.cos(a) / 2) / (east**2 + north**2) * np.array(times)
     slopes = model.jacobian(x).reshape(3, -1, 5, 2) / model.sizes
     assert slopes[:, :, 0, 0] == pytest.approx(turning, abs=1e-7)
-    assert slopes[:, :, 1, 0] == pytest.approx(0.5 * north / np.hypot(north, east) * np.array(times), abs=1e-7)
-    assert slopes[:, :, 2] == pytest.approx(np.stack([level + np.array(times), level], axis=2), abs=1e-7)
+    assert slopes[:, :, 1, 0] == pytest.approx(
+        0.5 * north / np.hypot(north, east) * np.array(times), abs=1e-7
+    )
+    assert slopes[:, :, 2] == pytest.approx(
+        np.stack([level + np.array(times), level], axis=2), abs=1e-7
+    )
     assert slopes[:, :, 3] == pytest.approx(np.stack([level, np.sign(np.sin(a))], axis=2), abs=1e-7)
-    assert slopes[:, :, 4] == pytest.approx(np.stack([level, np.floor(a / (2 * np.pi))], axis=2), abs=1e-7)
+    assert slopes[:, :, 4] == pytest.approx(
+        np.stack([level, np.floor(a / (2 * np.pi))], axis=2), abs=1e-7
+    )
 
 
 @pytest.mark.parametrize(
@@ -234,7 +271,10 @@ def test_readings_that_a_kink_leaves_off_are_told_of():
     (said,) = [text for text in kinked.remarks(kinked.nominal) if "kinks" in text]
     assert float(said.partition("about ")[2].split()[0]) == pytest.approx(off, rel=0.2)
     assert "measurement.method=implicit" in said
-    for other in (replace(kinked, method="implicit"), replace(kinked, rates={"y": "-a*y*y"}, times=(40.0,))):
+    for other in (
+        replace(kinked, method="implicit"),
+        replace(kinked, rates={"y": "-a*y*y"}, times=(40.0,)),
+    ):
         assert not [text for text in other.remarks(other.nominal) if "kinks" in text]
 
 
@@ -254,9 +294,14 @@ def test_a_row_without_a_reading_only_changes_the_input(tmp_path):
     rng = np.random.default_rng(1)
     z = circuit(0.022, 0.013, 2100.0) + 1e-4 * rng.standard_normal(len(T))
     z = np.where(np.arange(len(T)) % 3 == 0, np.nan, z)
-    path = file(tmp_path / "a.csv", [(t, c, "" if np.isnan(v) else v) for t, c, v in zip(T, CURRENT, z, strict=True)])
+    path = file(
+        tmp_path / "a.csv",
+        [(t, c, "" if np.isnan(v) else v) for t, c, v in zip(T, CURRENT, z, strict=True)],
+    )
     model = replace(BATTERY, times=(), columns={}, tolerance=None)
-    question = Question(model=model, readings=(path,), estimators=LM, noise=Gaussian(1e-4)).checked()
+    question = Question(
+        model=model, readings=(path,), estimators=LM, noise=Gaussian(1e-4)
+    ).checked()
     (found,) = fit(question.problem, question.found.z, LM, Gaussian(1e-4))
     assert np.abs((found.x - [0.022, 0.013, 2100.0]) / found.standard_errors).max() < 3.5
     assert list(found.values) == ["r0", "r1", "c1"]
@@ -265,14 +310,24 @@ def test_a_row_without_a_reading_only_changes_the_input(tmp_path):
 @pytest.mark.parametrize(
     ("rows", "header", "message"),
     [
-        ([(0, 1)], "time,reading", "column current is missing; measurement.driven_by.current takes it from the file"),
+        (
+            [(0, 1)],
+            "time,reading",
+            "column current is missing; measurement.driven_by.current takes it from the file",
+        ),
         ([(0, 1, 3), (10, "", 3)], "time,current,reading", "row 3, column current: is empty"),
-        ([(0, 1, 3), (0, 2, 3)], "time,current,reading", "case=1, time=0: current is 1 in one row and 2 in another"),
+        (
+            [(0, 1, 3), (0, 2, 3)],
+            "time,current,reading",
+            "case=1, time=0: current is 1 in one row and 2 in another",
+        ),
     ],
 )
 def test_an_input_that_is_missing_or_has_gaps_is_refused(tmp_path, rows, header, message):
     with pytest.raises(UserError, match=message):
-        open_together([file(tmp_path / "a.csv", rows, header)], replace(BATTERY, times=(), columns={}))
+        open_together(
+            [file(tmp_path / "a.csv", rows, header)], replace(BATTERY, times=(), columns={})
+        )
 
 
 def test_two_readings_of_one_thing_at_one_time_both_count(tmp_path):
@@ -280,7 +335,9 @@ def test_two_readings_of_one_thing_at_one_time_both_count(tmp_path):
     rows = [(1, 0.62), (1, 0.6), (2, 0.37), (3, 0.23), (2, 0.36)]
     found = open_together([file(tmp_path / "a.csv", rows, "time,reading")], model)
     x = found.model.nominal[None]
-    np.testing.assert_allclose(found.model.simulate(x)[0], np.exp(-0.5 * np.array([1, 1, 2, 3, 2])), atol=1e-7)
+    np.testing.assert_allclose(
+        found.model.simulate(x)[0], np.exp(-0.5 * np.array([1, 1, 2, 3, 2])), atol=1e-7
+    )
     assert [rows.tolist() for rows in found.model.epochs or ()] == [[0, 1], [2, 4], [3]]
 
 

@@ -38,7 +38,10 @@ def every_estimator(experiment: str, scenario: Scenario) -> dict[str, Estimator]
         if option.source == own:
             config = OmegaConf.to_container(OmegaConf.load(option.path), resolve=True)
             estimator = construct(config, f"estimators.{option.name}")
-            if not estimator.hindrance(scenario.problem) and (experiment, option.name) not in SLOW_TO_CONVERGE:
+            if (
+                not estimator.hindrance(scenario.problem)
+                and (experiment, option.name) not in SLOW_TO_CONVERGE
+            ):
                 found[option.name] = estimator
     return found
 
@@ -62,6 +65,8 @@ def test_efficient_estimators_reach_the_bound(experiment):
         high = row["rmse"] * (1 + wider * (row["rmse"] / row["rmse_low"] - 1))
         efficient = estimator.equation in EFFICIENT
         if efficient and not (row["converged"] == 1 and low <= bound <= high):
-            failed[label] = f"converged {row['converged']}, rmse {low:.4g} to {high:.4g}, bound {bound:.4g}"
+            failed[label] = (
+                f"converged {row['converged']}, rmse {low:.4g} to {high:.4g}, bound {bound:.4g}"
+            )
     assert not failed, failed
     assert sum(e.equation in EFFICIENT for e in estimators.values()) >= 6

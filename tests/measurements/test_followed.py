@@ -59,7 +59,9 @@ def test_a_truth_that_explicit_steps_do_not_follow_has_no_readings_though_the_no
     assert np.isnan(z[2:]).all()
     assert [bool(model.hindrance(row)) for row in x] == [False, False, True, True]
     assert "measurement.method=implicit follows them" in model.hindrance(x[3])
-    np.testing.assert_allclose(replace(model, method="implicit").simulate(x)[:, -1], settled(1.0), rtol=1e-7)
+    np.testing.assert_allclose(
+        replace(model, method="implicit").simulate(x)[:, -1], settled(1.0), rtol=1e-7
+    )
 
 
 def test_a_truth_whose_well_is_narrower_than_any_step_has_no_readings():
@@ -77,7 +79,9 @@ def test_numpy_notes_the_same_steps_in_doubt_as_machine_code(rate, doubt):
     for available in (True, False):
         z, states = np.empty((1, engine.m)), np.empty((1, 1, 3, 3))
         with patch.object(compiled, "available", lambda available=available: available):
-            engine._simulate(np.ones((1, 1)), np.arange(1), np.array([4, 4]), np.zeros(engine.m), z, states)
+            engine._simulate(
+                np.ones((1, 1)), np.arange(1), np.array([4, 4]), np.zeros(engine.m), z, states
+            )
         assert states[0, 0, -1, -1] == doubt
 
 
@@ -96,7 +100,9 @@ def test_a_solution_that_ends_at_a_pole_has_no_readings_behind_it():
 @pytest.mark.parametrize("method", ["auto", "explicit", "implicit"])
 def test_a_divisor_that_passes_zero_without_a_pole_is_passed(method):
     """(1 - e^-y) / y is 1 at y = 0, and y settles where it is 2."""
-    model = Ode({"y": "k*(1-exp(-y))/y-2"}, {"k": 1.0}, {"y": 2.0}, times=(1.0, 2.0, 40.0), method=method)
+    model = Ode(
+        {"y": "k*(1-exp(-y))/y-2"}, {"k": 1.0}, {"y": 2.0}, times=(1.0, 2.0, 40.0), method=method
+    )
     z = model.simulate(model.nominal[None])[0]
     assert z[1] < 0 < z[0]
     assert (1 - np.exp(-z[2])) / z[2] == pytest.approx(2.0, rel=1e-7)
@@ -110,7 +116,9 @@ def test_a_pulse_is_met_by_both_methods(width, method):
     x = np.array([[1.0, 1.0], [1.3, 0.5]])
     k0, k1 = x[:, :1], 0.1 * x[:, 1:]
     left = np.exp(-k1 * (np.array(model.times) - 0.77) + (k1 * width / 2) ** 2)
-    np.testing.assert_allclose(model.simulate(x), k0 * np.sqrt(np.pi) * left, rtol=1e-7, atol=1e-4 * width)
+    np.testing.assert_allclose(
+        model.simulate(x), k0 * np.sqrt(np.pi) * left, rtol=1e-7, atol=1e-4 * width
+    )
     assert not model.hindrance(model.nominal)
 
 

@@ -58,8 +58,14 @@ def test_nist_answers_come_from_the_formula_with_an_unknown_noise(dataset, tmp_p
     start = {f"b{i + 1}": float(b) for i, b in enumerate(nist.start_values)}
     found = open_together([path], Formula(NIST[dataset], start))
     order = [[p.name for p in found.model.parameters].index(name) for name in start]
-    estimators = {"lm": LeastSquares(method="lm", start="nominal", ftol=1e-15, xtol=1e-15, gtol=1e-15, max_nfev=5000)}
-    result = fit(Problem(found.model, Unknown().covariance(len(found.z))), found.z, estimators, Unknown())[0]
+    estimators = {
+        "lm": LeastSquares(
+            method="lm", start="nominal", ftol=1e-15, xtol=1e-15, gtol=1e-15, max_nfev=5000
+        )
+    }
+    result = fit(
+        Problem(found.model, Unknown().covariance(len(found.z))), found.z, estimators, Unknown()
+    )[0]
     agreed(10.0 ** -digits(result.x[order], nist.certified.parameters), 1e-6)
     if dataset == "Lanczos1":
         # Generated without noise to 14 digits: the certified sum of squares, 1.4e-25, is of their rounding.
@@ -133,7 +139,9 @@ def test_derivatives_are_exact_and_those_of_a_power_of_zero_are_zero():
     assert model.jacobian_cost == 2.0  # a simulation for each direction
     power = Formula("a*t**b", {"a": 2.0, "b": 1.5}, {"t": (0.0, 4.0)})
     assert power.jacobian(np.ones((1, 2)))[0, 0].tolist() == [0.0, 0.0]
-    assert power.jacobian(np.ones((1, 2)))[0, 1, 1] == pytest.approx(2.0 * 8.0 * math.log(4.0) * 1.5)
+    assert power.jacobian(np.ones((1, 2)))[0, 1, 1] == pytest.approx(
+        2.0 * 8.0 * math.log(4.0) * 1.5
+    )
 
 
 _PLANE = "hypot(b1*t - 1, b2, t) + arctan2(b1 - t, b2 - t) + b1*floor(3*b2*t) + b2*sign(b1 - t) + mod(b1*t, b2 - 0.4)"
@@ -143,17 +151,30 @@ def test_slopes_of_angles_lengths_and_steps_are_exact_on_the_whole_plane():
     """By a complex step, which NumPy's own arctan2, hypot and floor refuse, and by differences."""
     model = Formula(_PLANE, {"b1": 0.7, "b2": 1.3}, {"t": (0.31, 1.13, 2.4, -0.83)})
     x = np.array([[1.0, 1.0], [1.2, 0.7], [-1.1, -0.53]])
-    z = [_PLANE.replace("mod", "np.mod").replace("hypot", "math.hypot").replace("arctan2", "math.atan2")]
+    z = [
+        _PLANE.replace("mod", "np.mod")
+        .replace("hypot", "math.hypot")
+        .replace("arctan2", "math.atan2")
+    ]
     names = {"math": math, "np": np, "floor": math.floor, "sign": np.sign}
-    expected = [[eval(z[0], names, {"b1": 0.7 * a, "b2": 1.3 * b, "t": t}) for t in model.columns["t"]] for a, b in x]
+    expected = [
+        [eval(z[0], names, {"b1": 0.7 * a, "b2": 1.3 * b, "t": t}) for t in model.columns["t"]]
+        for a, b in x
+    ]
     assert model.simulate(x) == pytest.approx(np.array(expected), rel=1e-14)
     formula = parse(_PLANE, "expression")
 
     def h(x):
-        return formula({"b1": 0.7 * x[:, :1], "b2": 1.3 * x[:, 1:], "t": np.array(model.columns["t"])})
+        return formula(
+            {"b1": 0.7 * x[:, :1], "b2": 1.3 * x[:, 1:], "t": np.array(model.columns["t"])}
+        )
 
-    assert model.jacobian(x) == pytest.approx(differentiate(h, x, analytic=True), rel=1e-13, abs=1e-14)
-    assert model.jacobian(x) == pytest.approx(differentiate(h, x, analytic=False), rel=1e-7, abs=1e-8)
+    assert model.jacobian(x) == pytest.approx(
+        differentiate(h, x, analytic=True), rel=1e-13, abs=1e-14
+    )
+    assert model.jacobian(x) == pytest.approx(
+        differentiate(h, x, analytic=False), rel=1e-7, abs=1e-8
+    )
 
 
 def test_a_formula_is_evaluated_or_refused_however_long():
@@ -183,9 +204,13 @@ def test_comparisons_within_comparisons_are_evaluated_or_refused_however_deep():
         text, value = f"0.5<1-({text})<2", float(0.5 < 1 - value < 2)
         if level < 6:
             assert parse(text, "expression")({"t": 0.5, "b1": 0.5}) == value
-    with pytest.raises(UserError, match=r"^expression: has more than 10000 numbers, names and operations; write"):
+    with pytest.raises(
+        UserError, match=r"^expression: has more than 10000 numbers, names and operations; write"
+    ):
         parse(text, "expression")
-    with pytest.raises(UserError, match=r"^expression: has more than 400 operations one after another"):
+    with pytest.raises(
+        UserError, match=r"^expression: has more than 400 operations one after another"
+    ):
         parse("<".join(["b1"] * 5000), "expression")
 
 
@@ -193,9 +218,20 @@ numbers = st.sampled_from(["t", "p", "q", "0.5", "-1.5", "2"])
 drawn = st.recursive(
     numbers,
     lambda inner: st.one_of(
-        st.tuples(st.sampled_from(["({} + {})", "({} - {})", "({}*{})", "min({}, {})", "max({}, {})"]), inner, inner),
-        st.tuples(st.sampled_from(["abs({})", "erf({})", "erfc({})", "sin({})", "sqrt({} + t)", "log({} + t)"]), inner),
-        st.tuples(st.sampled_from(["({} if {} < {} else {})", "({} if {} >= {} else {})"]), *[inner] * 4),
+        st.tuples(
+            st.sampled_from(["({} + {})", "({} - {})", "({}*{})", "min({}, {})", "max({}, {})"]),
+            inner,
+            inner,
+        ),
+        st.tuples(
+            st.sampled_from(
+                ["abs({})", "erf({})", "erfc({})", "sin({})", "sqrt({} + t)", "log({} + t)"]
+            ),
+            inner,
+        ),
+        st.tuples(
+            st.sampled_from(["({} if {} < {} else {})", "({} if {} >= {} else {})"]), *[inner] * 4
+        ),
         st.tuples(st.sampled_from(["({} if {} < {} and {} <= {} else {})"]), *[inner] * 6),
     ).map(lambda parts: parts[0].format(*parts[1:])),
     max_leaves=8,
@@ -213,7 +249,13 @@ def test_a_drawn_formula_is_what_python_makes_of_it_and_its_slopes_are_differenc
 
     def python(x, k):
         p, q = x * model.sizes
-        names = PYTHON | {"log": math.log, "sqrt": math.sqrt, "t": float(t[k]), "p": float(p), "q": float(q)}
+        names = PYTHON | {
+            "log": math.log,
+            "sqrt": math.sqrt,
+            "t": float(t[k]),
+            "p": float(p),
+            "q": float(q),
+        }
         return eval(text, {}, names)
 
     z, J = model.simulate(x), model.jacobian(x)
@@ -227,12 +269,16 @@ def test_a_drawn_formula_is_what_python_makes_of_it_and_its_slopes_are_differenc
             for j, step in enumerate(1e-6 * np.eye(2)):
                 with contextlib.suppress(ValueError):
                     sides = [(python(row + s * step, k) - expected) / (s * 1e-6) for s in (1, -1)]
-                    if abs(sides[0] - sides[1]) < 1e-3 * (1 + abs(sides[0])):  # neither a kink nor a jump
+                    if abs(sides[0] - sides[1]) < 1e-3 * (
+                        1 + abs(sides[0])
+                    ):  # neither a kink nor a jump
                         assert J[i, k, j] == pytest.approx(sum(sides) / 2, rel=1e-5, abs=1e-6)
 
 
 def test_a_conditional_that_never_switches_is_named():
-    model = Formula("a + (b*(t-c) if t > c else 0)", {"a": 1.0, "b": 1.0, "c": 2.5}, {"t": (1.0, 2.0, 3.0, 4.0)})
+    model = Formula(
+        "a + (b*(t-c) if t > c else 0)", {"a": 1.0, "b": 1.0, "c": 2.5}, {"t": (1.0, 2.0, 3.0, 4.0)}
+    )
     assert model.remarks(np.array([1.0, 1.0, 1.0])) == ()
     (said,) = model.remarks(np.array([1.0, 1.0, 2.0]))
     assert said.startswith("measurement.expression: t > c holds at no reading")
@@ -241,7 +287,9 @@ def test_a_conditional_that_never_switches_is_named():
 def test_parameters_stand_as_they_are_written():
     model = Formula("exp(-k*t)*y0", {"y0": 2.0, "k": 1.0}, {"t": (0.0, 1.0)})
     assert [p.name for p in model.parameters] == ["y0", "k"]
-    np.testing.assert_allclose(model.jacobian(np.ones((1, 2)))[0], [[2.0, 0.0], [2 * math.exp(-1), -2 * math.exp(-1)]])
+    np.testing.assert_allclose(
+        model.jacobian(np.ones((1, 2)))[0], [[2.0, 0.0], [2 * math.exp(-1), -2 * math.exp(-1)]]
+    )
 
 
 def test_python_takes_what_is_known_of_parameters_and_has_estimates_by_name():

@@ -108,9 +108,16 @@ def formula():
 def test_a_function_is_the_model_that_its_formula_is(laws):
     ours, beside = model("swing"), formula()
     x = ours.nominal + 0.2 * np.random.default_rng(0).standard_normal((9, 2))
-    np.testing.assert_allclose(ours.simulate(x), beside.simulate(x[:, ::-1]), rtol=1e-14, atol=1e-14)
-    np.testing.assert_allclose(ours.jacobian(x), beside.jacobian(x[:, ::-1])[:, :, ::-1], rtol=1e-12, atol=1e-12)
-    assert [(p.name, p.unit, p.size) for p in ours.parameters] == [("length", "m", 1.2), ("damping", "", 0.1)]
+    np.testing.assert_allclose(
+        ours.simulate(x), beside.simulate(x[:, ::-1]), rtol=1e-14, atol=1e-14
+    )
+    np.testing.assert_allclose(
+        ours.jacobian(x), beside.jacobian(x[:, ::-1])[:, :, ::-1], rtol=1e-12, atol=1e-12
+    )
+    assert [(p.name, p.unit, p.size) for p in ours.parameters] == [
+        ("length", "m", 1.2),
+        ("damping", "", 0.1),
+    ]
     assert ours.jacobian_cost == 2.0 + 2.0
     assert len(ours.epochs) == len(T)
 
@@ -126,15 +133,25 @@ def test_slopes_are_differences_where_the_complex_step_is_wrong(laws, name, cost
 
 @pytest.mark.parametrize("name", ["high_by_abs", "high_by_array"])
 def test_an_estimate_is_right_in_a_branch_that_the_start_is_not_in(laws, name):
-    z = 3.0 * np.exp(-0.5 * ((T - 1.5) / 0.5) ** 2) + 0.3 + np.random.default_rng(2).normal(0, 0.03, len(T))
-    (laws / "bell.csv").write_text("t,reading\n" + "".join(f"{t},{value}\n" for t, value in zip(T, z, strict=True)))
+    z = (
+        3.0 * np.exp(-0.5 * ((T - 1.5) / 0.5) ** 2)
+        + 0.3
+        + np.random.default_rng(2).normal(0, 0.03, len(T))
+    )
+    (laws / "bell.csv").write_text(
+        "t,reading\n" + "".join(f"{t},{value}\n" for t, value in zip(T, z, strict=True))
+    )
     import some_laws
 
     law = getattr(some_laws, name)
     fit = {fit.label: fit for fit in ib.estimate(function(law), "bell.csv")}["auto"]
-    expected, covariance = curve_fit(some_laws.bell, T, z, p0=[3.0, 1.5, 0.5, 0.3], xtol=1e-12, ftol=1e-12)
+    expected, covariance = curve_fit(
+        some_laws.bell, T, z, p0=[3.0, 1.5, 0.5, 0.3], xtol=1e-12, ftol=1e-12
+    )
     np.testing.assert_allclose(fit.x, expected, rtol=1e-6)
-    np.testing.assert_allclose(np.sqrt(np.diag(fit.covariance)), np.sqrt(np.diag(covariance)), rtol=1e-4)
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(fit.covariance)), np.sqrt(np.diag(covariance)), rtol=1e-4
+    )
 
 
 @pytest.mark.parametrize("name", ["high_by_abs", "high_by_array"])
@@ -142,7 +159,9 @@ def test_slopes_of_a_trial_in_a_branch_that_is_not_analytic_do_not_depend_on_oth
     ours = model(name)
     x = ours.nominal + np.array([[0.0], [0.5]]) * np.array([1.0, 0.0, 0.0, 0.0])
     J = ours.jacobian(x)
-    exact = ib.measurements.Function(of="some_laws:bell", columns={"t": T}, start=ours.starts).jacobian(x)
+    exact = ib.measurements.Function(
+        of="some_laws:bell", columns={"t": T}, start=ours.starts
+    ).jacobian(x)
     np.testing.assert_allclose(J[0], exact[0], rtol=1e-14, atol=1e-14)
     np.testing.assert_allclose(J[1], exact[1], atol=1e-8)
     assert all(np.array_equal(J[i : i + 1], ours.jacobian(x[i : i + 1])) for i in range(2))
@@ -150,7 +169,9 @@ def test_slopes_of_a_trial_in_a_branch_that_is_not_analytic_do_not_depend_on_oth
 
 def test_a_wrong_slope_shows_beside_one_that_is_much_larger(laws):
     expected = np.stack([2e-6 * np.exp(-T), np.ones_like(T)], axis=-1)
-    np.testing.assert_allclose(model("faint").jacobian(np.array([[1.5, 0.0]]))[0], expected, rtol=1e-9, atol=1e-13)
+    np.testing.assert_allclose(
+        model("faint").jacobian(np.array([[1.5, 0.0]]))[0], expected, rtol=1e-9, atol=1e-13
+    )
 
 
 def test_a_function_in_jax_has_the_slopes_of_the_one_in_numpy_in_every_batch(laws):
@@ -162,10 +183,18 @@ def test_a_function_in_jax_has_the_slopes_of_the_one_in_numpy_in_every_batch(law
 
 
 def test_options_set_starts_sizes_units_constants_and_order(laws):
-    ours = model("swing", start={"damping": 0.5}, size={"length": 0.1}, units={"damping": "1/s"}, constants={"g": 1.6})
+    ours = model(
+        "swing",
+        start={"damping": 0.5},
+        size={"length": 0.1},
+        units={"damping": "1/s"},
+        constants={"g": 1.6},
+    )
     np.testing.assert_allclose(ours.nominal, [12.0, 1.0])
     assert [p.unit for p in ours.parameters] == ["m", "1/s"]
-    np.testing.assert_allclose(ours.simulate(ours.nominal[None])[0], np.exp(-T / 4) * np.cos(np.sqrt(1.6 / 1.2) * T))
+    np.testing.assert_allclose(
+        ours.simulate(ours.nominal[None])[0], np.exp(-T / 4) * np.cos(np.sqrt(1.6 / 1.2) * T)
+    )
     assert model("swing", time="").epochs is None
 
 
@@ -176,7 +205,9 @@ def test_results_of_another_function_are_stale(laws):
 
 
 def test_readings_of_a_file_give_the_parameters_back(laws):
-    z = np.exp(-0.15 * T / 2) * np.cos(np.sqrt(9.80665 / 1.1) * T) + np.random.default_rng(1).normal(0, 0.01, len(T))
+    z = np.exp(-0.15 * T / 2) * np.cos(np.sqrt(9.80665 / 1.1) * T) + np.random.default_rng(
+        1
+    ).normal(0, 0.01, len(T))
     rows = "\n".join(f"{t},{value}" for t, value in zip(T, z, strict=True))
     (laws / "swing.csv").write_text(f"t,reading\n{rows}\n")
     import some_laws
@@ -198,8 +229,16 @@ def test_readings_of_a_file_give_the_parameters_back(laws):
         ("some_laws:text", {}, "the default of k is no number"),
         ("some_laws:starred", {}, "takes *rest; give every argument a name"),
         ("some_laws:needs", {}, "constants.g: some_laws:needs needs it"),
-        ("some_laws:swing", {"start": {"lenght": 1.0}}, "start.lenght: there is no such argument; did you mean len"),
-        ("some_laws:swing", {"size": {"lenght": 1.0}}, "size: lenght is not a parameter; did you mean length?"),
+        (
+            "some_laws:swing",
+            {"start": {"lenght": 1.0}},
+            "start.lenght: there is no such argument; did you mean len",
+        ),
+        (
+            "some_laws:swing",
+            {"size": {"lenght": 1.0}},
+            "size: lenght is not a parameter; did you mean length?",
+        ),
         ("some_laws:swing", {"constants": {"h": 1.0}}, "constants.h: "),
         ("some_laws:swing", {"time": "s"}, "time=s: "),
     ],
@@ -213,14 +252,23 @@ def test_a_mistake_is_one_line(laws, of, options, said):
 
 @pytest.mark.parametrize("name", ["two_columns", "shrinking"])
 def test_another_shape_is_refused_by_the_function_s_name(laws, name):
-    with pytest.raises(ib.UserError, match=f"measurement.of=some_laws:{name}: returns an array of shape"):
+    with pytest.raises(
+        ib.UserError, match=f"measurement.of=some_laws:{name}: returns an array of shape"
+    ):
         model(name).simulate(np.array([[1.0], [1.1]]))
 
 
 def test_what_the_function_raises_is_one_line_with_its_place(laws, capsys):
     line = LAW.splitlines().index("    return np.expp(-k * t)") + 1
-    words = ["measurement=function", "measurement.of=some_laws:boom", "measurement.columns.t=[0,1,2]"]
-    assert main(["run", *words, "noise=gaussian", "noise.deviation=0.01", "trials=2", "figures=none"]) == 2
+    words = [
+        "measurement=function",
+        "measurement.of=some_laws:boom",
+        "measurement.columns.t=[0,1,2]",
+    ]
+    assert (
+        main(["run", *words, "noise=gaussian", "noise.deviation=0.01", "trials=2", "figures=none"])
+        == 2
+    )
     said = f"measurement.of=some_laws:boom: some_laws.py, line {line}: AttributeError: module 'numpy' has no attribute"
     assert capsys.readouterr().err.startswith(f"ipe-bench: {said} 'expp'")
     assert main(["check", *words[:2]]) == 2
@@ -230,7 +278,11 @@ def test_what_the_function_raises_is_one_line_with_its_place(laws, capsys):
 @pytest.mark.parametrize(
     ("name", "line", "said"),
     [
-        ("scribbling", "t *= k.real", "ValueError: output array is read-only (it writes into what it is given"),
+        (
+            "scribbling",
+            "t *= k.real",
+            "ValueError: output array is read-only (it writes into what it is given",
+        ),
         ("leaving", "raise SystemExit(3)", "SystemExit: 3"),
     ],
 )
@@ -238,7 +290,12 @@ def test_a_function_that_writes_into_a_column_or_ends_the_process_is_refused_wit
     laws, capsys, tmp_path, name, line, said
 ):
     (tmp_path / "some.csv").write_text("t,reading\n0,1.0\n1,0.4\n2,0.1\n", encoding="utf-8")
-    words = ["measurement=function", f"measurement.of=some_laws:{name}", "readings=some.csv", "noise.deviation=0.1"]
+    words = [
+        "measurement=function",
+        f"measurement.of=some_laws:{name}",
+        "readings=some.csv",
+        "noise.deviation=0.1",
+    ]
     assert main(["estimate", *words]) == 2
     (number,) = (i for i, text in enumerate(LAW.splitlines(), 1) if text.strip() == line)
     expected = f"ipe-bench: measurement.of=some_laws:{name}: some_laws.py, line {number}: {said}"
@@ -268,7 +325,20 @@ def test_a_new_model_of_one_file_runs_as_it_stands(laws, capsys, kind, file, cho
     assert main(["new", kind, "decay"]) == 2
     assert f"{file}: is there already" in capsys.readouterr().err
     noise = ["noise=gaussian", "noise.deviation=0.01"]
-    assert main(["run", *choice, *noise, "error_scale=0.1", "trials=5", "figures=none", "execution=serial"]) == 0
+    assert (
+        main(
+            [
+                "run",
+                *choice,
+                *noise,
+                "error_scale=0.1",
+                "trials=5",
+                "figures=none",
+                "execution=serial",
+            ]
+        )
+        == 0
+    )
     sys.modules.pop("decay", None)
 
 

@@ -58,7 +58,9 @@ def errors_beside_scipy(scale, trials):
 
 
 QUICK = [(scale, 4, 1e-6) for scale in (1.0, 33.0, 300.0, 3000.0)]
-SLOW = [(scale, 60, 2e-6 if scale == 10000.0 else 1e-6) for scale in (300.0, 1000.0, 3000.0, 10000.0)]
+SLOW = [
+    (scale, 60, 2e-6 if scale == 10000.0 else 1e-6) for scale in (300.0, 1000.0, 3000.0, 10000.0)
+]
 
 
 @pytest.mark.oracle(
@@ -67,7 +69,8 @@ SLOW = [(scale, 60, 2e-6 if scale == 10000.0 else 1e-6) for scale in (300.0, 100
     2e-6,
 )
 @pytest.mark.parametrize(
-    ("scale", "trials", "limit"), [*QUICK, *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW)]
+    ("scale", "trials", "limit"),
+    [*QUICK, *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW)],
 )
 def test_every_step_keeps_its_promise_whatever_the_scale(scale, trials, limit):
     agreed(errors_beside_scipy(scale, trials), limit)
@@ -122,7 +125,9 @@ def test_the_jacobian_is_that_of_the_same_formula_in_complex_arithmetic(gins):
         for i in range(30):
             slopes = []
             for s in range(12):
-                at = y + 180.0 * sum((DOP853.A[s, j] * slopes[j] for j in range(s)), np.zeros_like(y))
+                at = y + 180.0 * sum(
+                    (DOP853.A[s, j] * slopes[j] for j in range(s)), np.zeros_like(y)
+                )
                 slopes.append(np.array(gins.rhs(0.0, list(at), p, gins.cases[k])))
             y = y + 180.0 * sum(DOP853.B[s] * slopes[s] for s in range(12))
             exact = y[:2].imag / 1e-100
@@ -166,7 +171,13 @@ def test_bits_of_a_coarse_jacobian_depend_on_the_trial_alone():
 
 @pytest.mark.parametrize(
     ("scale", "stops"),
-    [(33.0, (30,)), (300.0, (4, 16, 30)), (1000.0, (30,)), (3000.0, (4, 16, 30)), (10000.0, (4, 16))],
+    [
+        (33.0, (30,)),
+        (300.0, (4, 16, 30)),
+        (1000.0, (30,)),
+        (3000.0, (4, 16, 30)),
+        (10000.0, (4, 16)),
+    ],
 )
 def test_steps_with_a_coarse_jacobian_contract(scale, stops):
     model = Gins()
@@ -174,7 +185,10 @@ def test_steps_with_a_coarse_jacobian_contract(scale, stops):
         x = draw(scale, 40 if stop == 30 else 20, seed=13)
         J, coarse = model.jacobian_until(x, stop), model.coarse_jacobian_until(x, stop)
         size = np.linalg.norm(J, axis=1, keepdims=True)
-        left = [np.eye(11) - np.linalg.lstsq(c, j)[0] for c, j in zip(coarse / size, J / size, strict=True)]
+        left = [
+            np.eye(11) - np.linalg.lstsq(c, j)[0]
+            for c, j in zip(coarse / size, J / size, strict=True)
+        ]
         assert np.linalg.norm(left, 2, axis=(1, 2)).max() < (0.01 if scale < 10000 else 0.1)
 
 
@@ -219,7 +233,9 @@ def test_an_estimate_that_fits_is_right_at_large_errors(tmp_path, monkeypatch):
     assert main(["estimate", "readings=t.csv", "solver=[progressive]", "baseline=[]"]) == 0
     rows = csv.DictReader((tmp_path / "t.truth.csv").read_text().splitlines())
     truth = {row["parameter"]: float(row["value"]) for row in rows}
-    found = json.loads(next(tmp_path.glob("outputs/*/estimate.json")).read_text())["estimators"]["progressive"]
+    found = json.loads(next(tmp_path.glob("outputs/*/estimate.json")).read_text())["estimators"][
+        "progressive"
+    ]
     assert found["status"] == "converged"
     assert found["fits"]
     for name, value in truth.items():
@@ -284,10 +300,17 @@ def test_a_random_walk_keeps_the_tolerance_of_gins(scale):
 
 def test_a_level_accelerometer_senses_the_other_axis_and_a_square():
     p, gravity = np.zeros(15), RicherGins().gravity
-    p[11:] = 1e-3, 2e-3, 3e-4, 5e-4  # quadratic x and y in 1 / (m/s^2), misalignment of x to y and of y to x in rad
+    p[11:] = (
+        1e-3,
+        2e-3,
+        3e-4,
+        5e-4,
+    )  # quadratic x and y in 1 / (m/s^2), misalignment of x to y and of y to x in rad
     fx, fy = 0.02, -0.05
     shown = RicherGins().acceleration((fx / gravity, fy / gravity), p)
-    np.testing.assert_allclose(shown, (fx + 1e-3 * fx**2 + 3e-4 * fy, fy + 2e-3 * fy**2 + 5e-4 * fx), rtol=1e-14)
+    np.testing.assert_allclose(
+        shown, (fx + 1e-3 * fx**2 + 3e-4 * fy, fy + 2e-3 * fy**2 + 5e-4 * fx), rtol=1e-14
+    )
 
 
 def test_the_parameters_of_a_trial_are_those_of_the_plain_scenario():
@@ -300,7 +323,9 @@ def test_the_parameters_of_a_trial_are_those_of_the_plain_scenario():
 def test_nuisances_do_not_scale_with_the_errors():
     """Twice the error scale doubles the parameters' readings, not those of the random walk."""
     noiseless = [
-        Scenario(Gins(), NoNoise(0.0066), error_scale=s, truth=RicherGins(gyro_random_walk=0.01)).draw(0, 20).z
+        Scenario(Gins(), NoNoise(0.0066), error_scale=s, truth=RicherGins(gyro_random_walk=0.01))
+        .draw(0, 20)
+        .z
         for s in (1e-6, 1e-3)
     ]
     assert abs(noiseless[0].std() / noiseless[1].std() - 1) < 0.01

@@ -130,10 +130,15 @@ def lost(model):
 
 def model(rates, initial, outputs, constants):
     formulas = [*rates.values(), *initial.values(), *outputs.values()]
-    names = sorted({name for text in formulas for name in parse(text, "formula").names} - {*rates, *constants, "t"})
+    names = sorted(
+        {name for text in formulas for name in parse(text, "formula").names}
+        - {*rates, *constants, "t"}
+    )
     start = dict.fromkeys(names, 1.0)
     times = tuple(0.5 * k for k in range(1, 17))
-    return Ode(rates=rates, start=start, initial=initial, outputs=outputs, times=times, constants=constants)
+    return Ode(
+        rates=rates, start=start, initial=initial, outputs=outputs, times=times, constants=constants
+    )
 
 
 @pytest.mark.oracle(
@@ -164,7 +169,10 @@ def test_a_cold_saturable_cascade_is_told(inflow, output):
     for half, interval in itertools.product((0.01, 0.05, 0.3), (0.5, 1.0, 4.0)):
         times = tuple(interval * k for k in range(1, 11))
         constants = {"L": inflow, "Km": half}
-        assert lost(Ode(rates, {"k1": 1.0}, outputs={"r": output}, constants=constants, times=times)) == ()
+        assert (
+            lost(Ode(rates, {"k1": 1.0}, outputs={"r": output}, constants=constants, times=times))
+            == ()
+        )
 
 
 def test_nothing_is_said_against_the_readings():
@@ -250,8 +258,12 @@ def lost_by_transfer(n, flows, filled, read):
     slopes = []
     for pair in unknown:
         moved = transfer(n, values | {pair: values[pair] + 1}, filled, read)
-        dN, dD = ([b - a for a, b in zip(*each, strict=True)] for each in zip((N, D), moved, strict=True))
-        slopes.append([a - b for a, b in zip(times_polynomial(dN, D), times_polynomial(N, dD), strict=True)])
+        dN, dD = (
+            [b - a for a, b in zip(*each, strict=True)] for each in zip((N, D), moved, strict=True)
+        )
+        slopes.append(
+            [a - b for a, b in zip(times_polynomial(dN, D), times_polynomial(N, dD), strict=True)]
+        )
     whole = rank(slopes)
     others = [[slope for slope in slopes if slope is not one] for one in slopes]
     return {pair for pair, rest in zip(unknown, others, strict=True) if rank(rest) == whole}
@@ -299,7 +311,9 @@ def test_many_compartments_by_their_transfer_function():
 
 @pytest.mark.parametrize("expression", FORMULAS)
 def test_formulas(expression):
-    start = {name: 1.0 for name in "abcn" if name in expression.replace("exp", "").replace("sqrt", "")}
+    start = {
+        name: 1.0 for name in "abcn" if name in expression.replace("exp", "").replace("sqrt", "")
+    }
     assert set(lost(Formula(expression, start))) == {*FORMULAS[expression]}
 
 
@@ -307,6 +321,10 @@ def test_what_cannot_be_examined_has_no_answer():
     assert structure(Gins()) is None
     assert structure(Formula("a*sin(b*t)", {"a": 1.0, "b": 1.0})) is None
     assert structure(Formula("a*max(b, t) + erf(t)", {"a": 1.0, "b": 1.0})) is None
-    driven = {"driven_by": {"u": "hold"}, "columns": {"time": [0.0], "u": [1.0]}, "times": (1.0, 2.0)}
+    driven = {
+        "driven_by": {"u": "hold"},
+        "columns": {"time": [0.0], "u": [1.0]},
+        "times": (1.0, 2.0),
+    }
     assert structure(Ode({"y": "u - k*y"}, {"k": 1.0}, **driven)) is None
     assert structure(Ode({"y": "(1 if t < 1 else 0) - k*y"}, {"k": 1.0}, times=(1.0, 2.0))) is None

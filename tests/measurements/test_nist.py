@@ -49,7 +49,11 @@ def test_certified_parameters_reproduce_the_certified_residuals_and_deviations(d
     agreed(10.0**-reached.deviations, 6.3e-10)
 
 
-@pytest.mark.oracle("certified: NIST Statistical Reference Datasets, 27 problems", "residual standard deviation", 2e-10)
+@pytest.mark.oracle(
+    "certified: NIST Statistical Reference Datasets, 27 problems",
+    "residual standard deviation",
+    2e-10,
+)
 @pytest.mark.parametrize("dataset", FORMULAS)
 def test_the_certified_residual_deviation_follows_from_m_minus_n_degrees_of_freedom(dataset):
     certified = Nist(dataset).certified
@@ -65,7 +69,9 @@ def test_known_errors_of_well_known_copies_are_corrected():
 @pytest.mark.parametrize("start", [1, 2])
 def test_the_nominal_point_is_the_certified_start(start):
     model = Nist("Bennett5", start)
-    assert (model.nominal * model.sizes).tolist() == {1: [-2000, 50, 0.8], 2: [-1500, 45, 0.85]}[start]
+    assert (model.nominal * model.sizes).tolist() == {1: [-2000, 50, 0.8], 2: [-1500, 45, 0.85]}[
+        start
+    ]
 
 
 def test_digits_are_the_fewest_over_the_parameters_capped_and_zero_where_wrong():

@@ -146,20 +146,29 @@ class Written(OdeMeasurement):
         found = dict.fromkeys([0.0], np.array(start, dtype=float))
         if len(later):
             span, exactly = (0.0, later[-1]), {"rtol": 1e-12, "atol": 1e-13}
-            y = solve_ivp(lambda t, y: self._law.rhs(t, y, p, (c,)), span, start, "DOP853", later, **exactly).y
+            y = solve_ivp(
+                lambda t, y: self._law.rhs(t, y, p, (c,)), span, start, "DOP853", later, **exactly
+            ).y
             found |= dict(zip(later.tolist(), y.T, strict=True))
         return np.concatenate([found[t] for t in self.at])
 
     def exact_slope(self, p):
         """dh/dp (m, n) by complex steps of a closed form, else by differences of fourth order."""
         if self._law.solution is not None:
-            return np.stack([self.exact(p + 1e-100j * e).imag / 1e-100 for e in np.eye(self.n)], axis=1)
+            return np.stack(
+                [self.exact(p + 1e-100j * e).imag / 1e-100 for e in np.eye(self.n)], axis=1
+            )
         weights, h = {1: 8.0, -1: -8.0, 2: -1.0, -2: 1.0}, 2e-3
-        slopes = [sum(w * self.exact(p + k * h * e) for k, w in weights.items()) / (12 * h) for e in np.eye(self.n)]
+        slopes = [
+            sum(w * self.exact(p + k * h * e) for k, w in weights.items()) / (12 * h)
+            for e in np.eye(self.n)
+        ]
         return np.stack(slopes, axis=1)
 
 
-gaps = st.sampled_from([0.0, 0.0, 1e-12, 1e-6, 1e-3, 0.1, 0.25, 0.5, 1.0, 4.0]) | st.floats(0.01, 2.0)
+gaps = st.sampled_from([0.0, 0.0, 1e-12, 1e-6, 1e-3, 0.1, 0.25, 0.5, 1.0, 4.0]) | st.floats(
+    0.01, 2.0
+)
 draws = st.fixed_dictionaries(
     {
         "law": st.sampled_from(sorted(LAWS)),
@@ -198,12 +207,20 @@ def check(law, gaps, given, batch, seed):
     # A window has the readings of the whole, and so have some of its readings, and several files together.
     for stop in {1, (len(gaps) + 1) // 2, len(gaps)}:
         rows = model.rows(stop)
-        same(model.simulate_until(x, stop), z[:, rows]), same(model.jacobian_until(x, stop), J[:, rows])
+        (
+            same(model.simulate_until(x, stop), z[:, rows]),
+            same(model.jacobian_until(x, stop), J[:, rows]),
+        )
         same(SubsetModel.until(model, stop).simulate(x), z[:, rows])
         near = SubsetModel.until(model, stop, coarse=True)
-        assert np.abs(near.simulate(x) - z[:, rows]).max() < 10 * TOLERANCE * max(1.0, np.abs(z).max())
+        assert np.abs(near.simulate(x) - z[:, rows]).max() < 10 * TOLERANCE * max(
+            1.0, np.abs(z).max()
+        )
     kept = tuple(range(seed % 2, model.m, 2)) or (0,)
-    same(SubsetModel(model, kept).simulate(x), z[:, kept]), same(SubsetModel(model, kept).jacobian(x), J[:, kept])
+    (
+        same(SubsetModel(model, kept).simulate(x), z[:, kept]),
+        same(SubsetModel(model, kept).jacobian(x), J[:, kept]),
+    )
     other = Written(law, (0.0, 0.5), model.given)
     both = Joint((model, other))
     same(both.simulate(x), np.concatenate([z, other.simulate(x)], axis=1))
@@ -217,10 +234,14 @@ def check(law, gaps, given, batch, seed):
     # A fixed step, the same equations as formulas, other coordinates: the same readings.
     longest = max([*gaps, 1e-3])
     fixed = Written(law, model.at, model.given, step=longest / 64)
-    assert np.abs(fixed.simulate(x)[-1] - exact).max() < 10 * TOLERANCE * max(1.0, np.abs(exact).max())
+    assert np.abs(fixed.simulate(x)[-1] - exact).max() < 10 * TOLERANCE * max(
+        1.0, np.abs(exact).max()
+    )
     positive = ConstrainedModel(model, (ParameterInfo("p0", positive=True),))
     inner = positive.inner(x)
-    np.testing.assert_allclose(positive.simulate(inner), z, rtol=0, atol=TOLERANCE * max(1.0, np.abs(z).max()))
+    np.testing.assert_allclose(
+        positive.simulate(inner), z, rtol=0, atol=TOLERANCE * max(1.0, np.abs(z).max())
+    )
     ascending = all(gap > 0.0 for gap in gaps[1:])
     if ascending:
         states = ("a", "b")[: model.states]
@@ -266,7 +287,9 @@ PIECES = {
     "least": lambda a, b: np.minimum(a, b),
     "most": lambda a, b: np.maximum(a, b),
     "size": lambda a, b: np.where(np.less(a, 0.0), -a, a) - b,
-    "root of what is positive": lambda a, b: np.where(np.less_equal(a, 0.0), 0.0 * b, a * np.sqrt(a)) + b,
+    "root of what is positive": lambda a, b: (
+        np.where(np.less_equal(a, 0.0), 0.0 * b, a * np.sqrt(a)) + b
+    ),
     "sign": lambda a, b: FUNCTIONS["sign"](a) * (a - b) * a,
     "erf": lambda a, b: erf(a) * b,
     "erfc": lambda a, b: erfc(b) - a,
@@ -277,7 +300,8 @@ PIECES = {
 def built(operations):
     """Expressions of these operations on the arguments of a right-hand side."""
     return st.recursive(
-        st.sampled_from(["t", "y0", "y1", "p0", "p1", "p2", "c0"]) | st.sampled_from([0.0, 1.0, -1.0, 0.5, 3.0]),
+        st.sampled_from(["t", "y0", "y1", "p0", "p1", "p2", "c0"])
+        | st.sampled_from([0.0, 1.0, -1.0, 0.5, 3.0]),
         lambda inner: st.tuples(st.sampled_from(operations), inner, inner),
         max_leaves=8,
     )
@@ -329,7 +353,9 @@ class Drawn(OdeMeasurement):
                 for s in range(count if to > t else 0):
                     k = []
                     for row, time in zip((*DOP853.A, DOP853.B), (*DOP853.C, 1.0), strict=True):
-                        at = y + h * sum((a * kj for a, kj in zip(row, k, strict=False)), np.zeros(2))
+                        at = y + h * sum(
+                            (a * kj for a, kj in zip(row, k, strict=False)), np.zeros(2)
+                        )
                         k.append(np.array(self.rhs(t + s * h + time * h, at, p, c)))
                     y = at
                 t = to
@@ -361,8 +387,14 @@ def check_drawn(rates, shown, gaps, batch, seed):
         np.testing.assert_allclose(model.simulate(x), z, rtol=1e-11, atol=1e-11)
         np.testing.assert_allclose(model.jacobian(x), J, rtol=1e-9, atol=1e-10 * size)
     free = Drawn(rates, shown, model.at, step=None)
-    assert np.abs(free.simulate(x) - Drawn(rates, shown, model.at, step=1 / 64).simulate(x)).max() < 2 * TOLERANCE
-    same(free.jacobian(x[:1])[0], free.jacobian(x)[0]), same(Drawn(rates, shown, model.at).simulate(x[::-1]), z[::-1])
+    assert (
+        np.abs(free.simulate(x) - Drawn(rates, shown, model.at, step=1 / 64).simulate(x)).max()
+        < 2 * TOLERANCE
+    )
+    (
+        same(free.jacobian(x[:1])[0], free.jacobian(x)[0]),
+        same(Drawn(rates, shown, model.at).simulate(x[::-1]), z[::-1]),
+    )
 
 
 @pytest.mark.slow

@@ -12,7 +12,9 @@ FEW = ((1.0, 0.0, 0.0),) * 9
 
 
 def _fed(**options):
-    return Ode(**({"rates": {"y": "feed - k*y"}, "start": {"k": 0.5}, "initial": {"y": "begin"}} | options))
+    return Ode(
+        **({"rates": {"y": "feed - k*y"}, "start": {"k": 0.5}, "initial": {"y": "begin"}} | options)
+    )
 
 
 MISTAKES = [
@@ -22,21 +24,36 @@ MISTAKES = [
     (lambda: Polynomial(4, 4), "count=4"),
     (lambda: Gins(injected=()), r"injected=\[\]: give a list of at least 1"),
     (lambda: ParameterInfo("k", fixed=1.0, lower=0.0), "fixed=1.0: a fixed parameter has no lower"),
-    (lambda: ParameterInfo("k", positive=True, lower=-1.0), "lower=-1.0: is given with positive=true"),
+    (
+        lambda: ParameterInfo("k", positive=True, lower=-1.0),
+        "lower=-1.0: is given with positive=true",
+    ),
     (lambda: ParameterInfo("k", lower=2.0, upper=1.0), "upper=1.0: give a number above lower=2"),
     (lambda: ParameterInfo("k", deviation=0.0), "deviation=0.0: give a number above 0 or null"),
     (lambda: Sir(size={"beta": 1.0}), "size: beta is not a parameter"),
-    (lambda: Sir(constants={"population": 763.0}).simulate(np.ones((1, 3))), "measurement: infection is not known"),
+    (
+        lambda: Sir(constants={"population": 763.0}).simulate(np.ones((1, 3))),
+        "measurement: infection is not known",
+    ),
     (lambda: _fed(tolerance="1e-13*cosh(nu*t)"), "tolerance: nu is neither a constant nor t"),
     (lambda: _fed(answer={"q": 3.0}), "answer: q is not a parameter"),
     (lambda: _fed(constants={"fed": 1.0}), "constants.fed: appears in no formula"),
     (lambda: _fed(constants={"y": 1.0}), "constants.y: is a state, a parameter or the time"),
-    (lambda: _fed(constants={"feed": (1.0, 2.0), "begin": (1.0, 2.0, 3.0)}), "constants: have different lengths"),
+    (
+        lambda: _fed(constants={"feed": (1.0, 2.0), "begin": (1.0, 2.0, 3.0)}),
+        "constants: have different lengths",
+    ),
     (lambda: _fed(constants={"feed": "much"}), "constants.feed=much: give a finite number"),
     (lambda: _fed(outputs={"s": "k*time*y"}), "time: is a column .* the time is t"),
     (lambda: _fed(initial={"y": "y"}), "initial.y: y changes with time"),
-    (lambda: _fed(start={"k": 1.0, "y": 1.0}), "start.y: the state, parameter, column or time has this name"),
-    (lambda: _fed(driven_by={"feed": "hold"}, columns={"fed": [1.0]}), "columns.fed: there is no such input"),
+    (
+        lambda: _fed(start={"k": 1.0, "y": 1.0}),
+        "start.y: the state, parameter, column or time has this name",
+    ),
+    (
+        lambda: _fed(driven_by={"feed": "hold"}, columns={"fed": [1.0]}),
+        "columns.fed: there is no such input",
+    ),
     (lambda: _fed(start={"k": np.inf}), "start.k=inf: give a finite number"),
     (lambda: _fed(size={"k": 0.0}), "size.k=0.0: give a number above 0"),
     (lambda: _fed(driven_by={"u": "steps"}), "driven_by.u=steps: choose one of hold, linear"),

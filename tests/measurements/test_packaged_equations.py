@@ -24,7 +24,12 @@ COUNTED = {"susceptible": "S", "infected": "I", "removed": "population - S - I"}
 PAPER = np.array([0.0, 0.0, 1.0])
 """The true falling body of both papers, in units of error from the presumed one."""
 MODELS = {
-    "sir": (Sir(), Sir(population=763.0, outputs={"removed": "population-S-I", "infected": "I"}), 1 / 32, 1e-6),
+    "sir": (
+        Sir(),
+        Sir(population=763.0, outputs={"removed": "population-S-I", "infected": "I"}),
+        1 / 32,
+        1e-6,
+    ),
     "falling_body": (FallingBody(), FallingBody(density_decay=1.7e-4, altitude=9e4), 1 / 16, 1e-5),
     "lotka_volterra": (LotkaVolterra(), LotkaVolterra(birth=0.6), 1 / 64, 1e-6),
 }
@@ -43,7 +48,9 @@ def test_a_model_is_that_of_its_config_and_keeps_the_promises_of_models(name):
     assert spec.scenario.measurement == model
     assert isinstance(other, Ode)
     assert other != model
-    assert not [f.complaint for one in (model, other) for f in check_component(name, one) if f.complaint]
+    assert not [
+        f.complaint for one in (model, other) for f in check_component(name, one) if f.complaint
+    ]
     x = draw(model, scale=3.0 if name == "sir" else 1.0)
     assert np.abs(model.simulate(x) - replace(model, step=step).simulate(x)).max() < tolerance
 
@@ -51,7 +58,10 @@ def test_a_model_is_that_of_its_config_and_keeps_the_promises_of_models(name):
 def epidemic(t, beta, gamma, infected, population=763.0):
     """(S, I) by an adaptive integrator."""
     return solve_ivp(
-        lambda t, y: [-beta * y[0] * y[1] / population, beta * y[0] * y[1] / population - gamma * y[1]],
+        lambda t, y: [
+            -beta * y[0] * y[1] / population,
+            beta * y[0] * y[1] / population - gamma * y[1],
+        ],
         (0.0, t[-1]),
         [population - infected, infected],
         "DOP853",
@@ -74,7 +84,9 @@ def test_an_epidemic_conserves_what_its_equations_conserve_whatever_is_drawn():
     beta, gamma, infected = (value[:, None] for value in epidemics(model, x))
     S, I, R = np.moveaxis(model.simulate(x).reshape(len(x), -1, 3), 2, 0)  # noqa: E741
     start = 763.0 - 763.0 * gamma / beta * np.log(763.0 - infected)
-    assert_agrees(S + I - 763.0 * gamma / beta * np.log(S), np.broadcast_to(start, S.shape), rtol=1e-8)
+    assert_agrees(
+        S + I - 763.0 * gamma / beta * np.log(S), np.broadcast_to(start, S.shape), rtol=1e-8
+    )
     np.testing.assert_allclose(S + I + R, 763.0, rtol=1e-14)
     far = np.vstack([draw(model, 200, scale=10.0), [[0.0, 0.0, 40.0], [0.0, 0.0, -40.0]]])
     z = model.simulate(far)
@@ -93,13 +105,17 @@ def test_an_epidemic_that_is_over_has_its_final_size_and_another_is_that_of_scip
         assert_agrees(z, epidemic(model.whole.times, *values)[1], atol=1e-6)
 
 
-@pytest.mark.oracle("library: SciPy's curve_fit", "estimates from the boys in bed of a boarding school (1978)", 1e-4)
+@pytest.mark.oracle(
+    "library: SciPy's curve_fit", "estimates from the boys in bed of a boarding school (1978)", 1e-4
+)
 def test_the_boarding_school_is_estimated_as_scipy_estimates_it():
     model = Sir()
     estimates = MultiscaleLM().estimate(Problem(model, Covariance(np.full(14, 20.0))), IN_BED[None])
     assert estimates.status[0] == 0
     days = np.arange(1.0, 15.0)
-    theirs, _ = curve_fit(lambda t, *p: epidemic(t, *np.exp(p))[1], days, IN_BED, np.log([1.66, 0.44, 1.0]))
+    theirs, _ = curve_fit(
+        lambda t, *p: epidemic(t, *np.exp(p))[1], days, IN_BED, np.log([1.66, 0.44, 1.0])
+    )
     assert_agrees(np.ravel(epidemics(model, estimates.x)), np.exp(theirs), rtol=1e-4)
     residuals = IN_BED - model.simulate(estimates.x)[0]
     assert 15.0 < np.sqrt(residuals @ residuals / 11) < 25.0
@@ -124,7 +140,9 @@ def test_ranges_of_a_falling_body_are_those_of_the_closed_form():
 
 
 @pytest.mark.oracle("library: SciPy's Radau", "ranges, m", 1e-3)
-@pytest.mark.parametrize("ln_ballistic", [*(pytest.param(far, marks=pytest.mark.slow) for far in (10.0, 17.0)), 18.0])
+@pytest.mark.parametrize(
+    "ln_ballistic", [*(pytest.param(far, marks=pytest.mark.slow) for far in (10.0, 17.0)), 18.0]
+)
 def test_a_body_that_is_stopped_at_once_is_followed_as_well(ln_ballistic):
     """With steps of half a second the ranges are off by 13.5 m at 17, by 297 m at 17.4, and no numbers at 18."""
     model = FallingBody()
@@ -153,11 +171,16 @@ def test_predators_and_prey_conserve_what_their_equations_conserve_and_agree_wit
     def conserved(u, v):
         return growth * u - death * np.log(u) + hunting * v - birth * np.log(v)
 
-    np.testing.assert_allclose(conserved(u, v), np.broadcast_to(conserved(prey, predators), u.shape), rtol=1e-8)
+    np.testing.assert_allclose(
+        conserved(u, v), np.broadcast_to(conserved(prey, predators), u.shape), rtol=1e-8
+    )
     for row, z in zip(x[:3], model.simulate(x[:3]), strict=True):
         b, m, d, g, u0, v0 = row * model.sizes
         solution = solve_ivp(
-            lambda t, y, b=b, m=m, d=d, g=g: [b * y[0] - m * y[0] * y[1], g * y[0] * y[1] - d * y[1]],
+            lambda t, y, b=b, m=m, d=d, g=g: [
+                b * y[0] - m * y[0] * y[1],
+                g * y[0] * y[1] - d * y[1],
+            ],
             (0.0, 20.0),
             [u0, v0],
             "DOP853",

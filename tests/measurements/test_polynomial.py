@@ -11,14 +11,21 @@ from ipe_bench.measurements import Polynomial
 from ipe_bench.measurements.problem import Problem
 
 
-@given(n=st.integers(1, 6), extra=st.integers(1, 20), strength=st.floats(-0.5, 0.5), seed=st.integers(0, 10_000))
+@given(
+    n=st.integers(1, 6),
+    extra=st.integers(1, 20),
+    strength=st.floats(-0.5, 0.5),
+    seed=st.integers(0, 10_000),
+)
 def test_the_nonlinear_part_is_as_documented(n, extra, strength, seed):
     model = Polynomial(n, n + extra, strength)
     x = np.random.default_rng(seed).normal(size=(3, n))
     u = x @ model.linearization().T
     np.testing.assert_allclose(model.linearization(), model.matrix, atol=1e-15)
     np.testing.assert_allclose(
-        model.simulate(x) - u, strength * u**2 / 2 + strength**2 * u**3 / 6, atol=1e-12 * (1 + np.abs(u).max() ** 3)
+        model.simulate(x) - u,
+        strength * u**2 / 2 + strength**2 * u**3 / 6,
+        atol=1e-12 * (1 + np.abs(u).max() ** 3),
     )
 
 

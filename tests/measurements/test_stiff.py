@@ -23,16 +23,25 @@ HIRES = {
 
 def robertson(*times):
     rates = {"a": "-k1*a + k3*b*c", "b": "k1*a - k3*b*c - k2*b*b", "c": "k2*b*b"}
-    return Ode(rates=rates, start={"k1": 0.04, "k2": 3e7, "k3": 1e4}, initial={"a": 1.0}, times=times)
+    return Ode(
+        rates=rates, start={"k1": 0.04, "k2": 3e7, "k3": 1e4}, initial={"a": 1.0}, times=times
+    )
 
 
 def van_der_pol(mu, end):
     rates = {"u": "v", "v": "mu*(1-u*u)*v - u"}
-    return Ode(rates=rates, start={"mu": mu}, initial={"u": 2.0}, times=tuple(np.linspace(end / 20, end, 20)))
+    return Ode(
+        rates=rates,
+        start={"mu": mu},
+        initial={"u": 2.0},
+        times=tuple(np.linspace(end / 20, end, 20)),
+    )
 
 
 def hires():
-    return Ode(rates=HIRES, start={"k": 280.0}, initial={"y1": 1.0, "y8": 0.0057}, times=(321.8122,))
+    return Ode(
+        rates=HIRES, start={"k": 280.0}, initial={"y1": 1.0, "y8": 0.0057}, times=(321.8122,)
+    )
 
 
 def follower(**options):
@@ -52,15 +61,29 @@ def follower(**options):
     ("model", "expected", "left"),
     [
         pytest.param(
-            *(robertson(1e11), (0.2083340149701255e-7, 0.8333360770334713e-13, 0.9999999791665050), 5e-9),
+            *(
+                robertson(1e11),
+                (0.2083340149701255e-7, 0.8333360770334713e-13, 0.9999999791665050),
+                5e-9,
+            ),
             marks=pytest.mark.slow,
         ),
         (van_der_pol(1000.0, 2000.0), (1.706167732170469, -0.8928097010248125e-3), 2e-8),
         (
             hires(),
             (
-                *(0.7371312573325668e-3, 0.1442485726316185e-3, 0.5888729740967575e-4, 0.1175651343283149e-2),
-                *(0.2386356198831331e-2, 0.6238968252742796e-2, 0.2849998395185769e-2, 0.2850001604814231e-2),
+                *(
+                    0.7371312573325668e-3,
+                    0.1442485726316185e-3,
+                    0.5888729740967575e-4,
+                    0.1175651343283149e-2,
+                ),
+                *(
+                    0.2386356198831331e-2,
+                    0.6238968252742796e-2,
+                    0.2849998395185769e-2,
+                    0.2850001604814231e-2,
+                ),
             ),
             5e-9,
         ),
@@ -83,7 +106,9 @@ def test_a_stiff_model_is_found_and_is_within_its_tolerance():
     assert "measurement.method=" in said
     assert replace(model, method="implicit").remarks(model.nominal) == ()
     assert_agrees(model.simulate(np.array([[1.0]]))[0], exact, atol=1e-8)
-    slope = -0.01 / (k - 0.01) ** 2 * (np.exp(-0.01 * t) - np.exp(-k * t)) + k / (k - 0.01) * t * np.exp(-k * t)
+    slope = -0.01 / (k - 0.01) ** 2 * (np.exp(-0.01 * t) - np.exp(-k * t)) + k / (
+        k - 0.01
+    ) * t * np.exp(-k * t)
     assert_agrees(model.jacobian(np.array([[1.0]]))[0, :, 0], k * slope, atol=1e-8)
 
 
@@ -98,7 +123,9 @@ def test_readings_beside_radau_and_slopes_beside_differences():
         def rhs(t, y, p=p):
             return model.engine.rhs(t, y, p, ())
 
-        solved = solve_ivp(rhs, (0, 1e3), [1.0, 0.0, 0.0], "Radau", model.times, rtol=1e-10, atol=1e-16)
+        solved = solve_ivp(
+            rhs, (0, 1e3), [1.0, 0.0, 0.0], "Radau", model.times, rtol=1e-10, atol=1e-16
+        )
         assert_agrees(row.reshape(-1, 3), solved.y.T, rtol=1e-7)
     by_differences = differentiate(model.simulate, x, analytic=False)
     np.testing.assert_allclose(J, by_differences, atol=1e-7 * np.abs(by_differences).max())
@@ -140,13 +167,22 @@ SHOWN = {
     "sin(y)": np.sin,
 }
 GRIDS = (tuple(np.arange(0.5, 6.5, 0.5)), (2.0,), (0.0, 0.1, 0.7, 3.0, 10.0))
-FAST = [(shown, rate, times) for shown in SHOWN for rate in (60.0, 300.0, 3e3, 1e5) for times in GRIDS]
+FAST = [
+    (shown, rate, times) for shown in SHOWN for rate in (60.0, 300.0, 3e3, 1e5) for times in GRIDS
+]
 
 
 def check_fast(shown, rate, times):
     """y follows k (1.2 + sin t) with a time constant of 1 / rate, which an explicit step leaves for 1e30; where a
     reading saturates, one such state reads as another."""
-    model = Ode({"y": "-L*(y-(1.2+sin(t))*k)"}, {"k": 0.5}, {"y": 0.2}, {"z": shown}, times, constants={"L": rate})
+    model = Ode(
+        {"y": "-L*(y-(1.2+sin(t))*k)"},
+        {"k": 0.5},
+        {"y": 0.2},
+        {"z": shown},
+        times,
+        constants={"L": rate},
+    )
     assert not model.hindrance(model.nominal)
     x = model.nominal + np.array([[0.0], [0.3], [-0.3], [1.0], [3.0]])
     k, t = 0.5 * x, np.array(times)
@@ -158,7 +194,11 @@ def check_fast(shown, rate, times):
     assert_agrees(model.jacobian(x)[:, :, 0], turned * slope, atol=1e-6)
 
 
-@pytest.mark.oracle("closed form: a fast state that follows a sine", "readings and slopes of saturating outputs", 1e-6)
+@pytest.mark.oracle(
+    "closed form: a fast state that follows a sine",
+    "readings and slopes of saturating outputs",
+    1e-6,
+)
 @pytest.mark.parametrize(("shown", "rate", "times"), FAST[::40])
 def test_a_reading_that_saturates_is_that_of_the_solution(shown, rate, times):
     check_fast(shown, rate, times)
@@ -246,4 +286,6 @@ def test_equations_that_the_shortest_explicit_steps_do_not_follow_are_integrated
     assert not model.hindrance(model.nominal)
     assert_agrees(model.simulate(model.nominal[None])[0, 0], np.tanh(lag), atol=1e-8)
     (said,) = model.remarks(model.nominal)
-    assert said.startswith("the shortest steps of the explicit method are too long for these equations; they are")
+    assert said.startswith(
+        "the shortest steps of the explicit method are too long for these equations; they are"
+    )

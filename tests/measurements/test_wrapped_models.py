@@ -25,10 +25,16 @@ def test_a_subset_has_its_rows_of_everything(kept, stop):
     np.testing.assert_array_equal(model.linearization(), whole.linearization()[rows])
     np.testing.assert_array_equal(model.index["number"], np.array(whole.index["number"])[rows])
     numbers = [np.array(model.index["number"])[epoch].tolist() for epoch in model.epochs]
-    assert numbers == [own for epoch in whole.epochs if (own := [r + 1 for r in epoch if r in rows])]
+    assert numbers == [
+        own for epoch in whole.epochs if (own := [r + 1 for r in epoch if r in rows])
+    ]
     for k in range(1, len(model.epochs) + 1):
-        np.testing.assert_array_equal(model.simulate_until(x, k), model.simulate(x)[:, model.rows(k)])
-        np.testing.assert_array_equal(model.jacobian_until(x, k), model.jacobian(x)[:, model.rows(k)])
+        np.testing.assert_array_equal(
+            model.simulate_until(x, k), model.simulate(x)[:, model.rows(k)]
+        )
+        np.testing.assert_array_equal(
+            model.jacobian_until(x, k), model.jacobian(x)[:, model.rows(k)]
+        )
 
 
 @pytest.mark.parametrize("kept", [(0, 5, 6, 9), (4, 13, 14, 15), (2, 3)])
@@ -39,7 +45,9 @@ def test_a_subset_of_a_window_takes_its_columns_of_what_has_arrived(kept):
     model, x = SubsetModel(GINS, tuple(rows.tolist()), 3), draw(GINS)
     np.testing.assert_array_equal(model.simulate(x), GINS.simulate(x)[:, rows])
     np.testing.assert_array_equal(model.jacobian(x), GINS.jacobian(x)[:, rows])
-    np.testing.assert_array_equal(model.coarse_jacobian(x), GINS.coarse_jacobian_until(x, 3)[:, list(kept)])
+    np.testing.assert_array_equal(
+        model.coarse_jacobian(x), GINS.coarse_jacobian_until(x, 3)[:, list(kept)]
+    )
 
 
 def test_readings_of_some_cases_are_computed_without_the_others():

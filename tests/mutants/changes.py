@@ -39,7 +39,9 @@ class Change:
 @cache
 def sources() -> dict[Path, str]:
     """The text of every module, folded."""
-    return {path: folded(path.read_text(encoding="utf-8")) for path in sorted(PACKAGE.rglob("*.py"))}
+    return {
+        path: folded(path.read_text(encoding="utf-8")) for path in sorted(PACKAGE.rglob("*.py"))
+    }
 
 
 def folded(text: str) -> str:

@@ -40,11 +40,26 @@ def failing(files: Iterable[Path], change: Change | None) -> str:
             text = changed(path.read_text(encoding="utf-8"), change)
             (copy / path.relative_to(PACKAGE)).write_text(text, encoding="utf-8")
         # `-P`: what runs must not find the package in the working folder.
-        command = [sys.executable, "-P", "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *map(str, files)]
+        command = [
+            sys.executable,
+            "-P",
+            "-m",
+            "pytest",
+            "-x",
+            "-q",
+            "-p",
+            "no:cacheprovider",
+            *map(str, files),
+        ]
         environment = {**os.environ, "PYTHONPATH": folder}
         try:
             ended = subprocess.run(
-                command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=change and TIMEOUT_S
+                command,
+                cwd=ROOT,
+                env=environment,
+                capture_output=True,
+                text=True,
+                timeout=change and TIMEOUT_S,
             )
         except subprocess.TimeoutExpired:
             return f"the tests took more than {TIMEOUT_S:g} s"
@@ -71,13 +86,20 @@ def main() -> int:
     if given.rooms:
         chosen = {name: change for name, change in chosen.items() if change.room in given.rooms}
     # A test that fails anyhow notices nothing.
-    if said := failing(dict.fromkeys(path for change in chosen.values() for path in change.files), None):
+    if said := failing(
+        dict.fromkeys(path for change in chosen.values() for path in change.files), None
+    ):
         print(said)
         return 2
-    table = ["| change | room | what becomes wrong | noticed | s |", "| --- | --- | --- | --- | --: |"]
+    table = [
+        "| change | room | what becomes wrong | noticed | s |",
+        "| --- | --- | --- | --- | --: |",
+    ]
     count, unexpected = 0, []
     with ThreadPoolExecutor(given.workers) as pool:
-        for (name, change), (was, seconds) in zip(chosen.items(), pool.map(timed, chosen.values()), strict=True):
+        for (name, change), (was, seconds) in zip(
+            chosen.items(), pool.map(timed, chosen.values()), strict=True
+        ):
             said = "yes" if was else f"no: {change.survives or 'and nobody knows why'}"
             table.append(f"| {name} | {change.room} | {change.does} | {said} | {seconds:.0f} |")
             print(table[-1], flush=True)

@@ -24,7 +24,15 @@ from cosmic_ray.work_item import MutationSpec, TestOutcome
 
 ROOT = Path(__file__).resolve().parents[2]
 TIMEOUT_S = 600.0
-LEFT_OUT = ("RemoveDecorator", "ExceptionReplacer", "Variable", "_Eq_Is", "_Is_Eq", "_NotEq_IsNot", "_IsNot_NotEq")
+LEFT_OUT = (
+    "RemoveDecorator",
+    "ExceptionReplacer",
+    "Variable",
+    "_Eq_Is",
+    "_Is_Eq",
+    "_NotEq_IsNot",
+    "_IsNot_NotEq",
+)
 """Parts of the names of operators that make no change, none that a run survives, or none without arguments."""
 
 ROOMS = {
@@ -35,7 +43,12 @@ ROOMS = {
     "statistics": (("statistics/*.py",), ("tests/statistics", "tests/report/test_report.py")),
     "noise": (
         ("noise/*.py",),
-        ("tests/noise", "tests/plugins/test_options.py", "tests/real/test_fit.py", "tests/trials/test_fit_test.py"),
+        (
+            "tests/noise",
+            "tests/plugins/test_options.py",
+            "tests/real/test_fit.py",
+            "tests/trials/test_fit_test.py",
+        ),
     ),
     "filters": (
         tuple(f"baselines/{name}.py" for name in ("kalman", "epochs", "sequential", "information")),
@@ -47,8 +60,17 @@ ROOMS = {
 
 def places(patterns: tuple[str, ...]) -> Iterator[MutationSpec]:
     """Every change of the modules' code that a run could notice."""
-    files = sorted({path.relative_to(ROOT) for pattern in patterns for path in (ROOT / "ipe_bench").glob(pattern)})
-    with tempfile.TemporaryDirectory() as folder, use_db(str(Path(folder) / "session"), WorkDB.Mode.create) as work:
+    files = sorted(
+        {
+            path.relative_to(ROOT)
+            for pattern in patterns
+            for path in (ROOT / "ipe_bench").glob(pattern)
+        }
+    )
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        use_db(str(Path(folder) / "session"), WorkDB.Mode.create) as work,
+    ):
         init(files, work, {})
         specs = [spec for item in work.work_items for spec in item.mutations]
     silent = {path: list(annotations(path)) for path in files}
@@ -61,7 +83,9 @@ def places(patterns: tuple[str, ...]) -> Iterator[MutationSpec]:
 def annotations(path: Path) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
     """Where the annotations of a module begin and end."""
     for node in ast.walk(ast.parse((ROOT / path).read_text(encoding="utf-8"))):
-        inner = node.returns if isinstance(node, ast.FunctionDef) else getattr(node, "annotation", None)
+        inner = (
+            node.returns if isinstance(node, ast.FunctionDef) else getattr(node, "annotation", None)
+        )
         if inner is not None:
             yield (inner.lineno, inner.col_offset), (inner.end_lineno, inner.end_col_offset)
 
@@ -71,21 +95,29 @@ def sample(specs: list[MutationSpec], number: int | None, seed: int) -> list[Mut
     rng = random.Random(seed)
     at: dict[tuple[Path, tuple[int, int], str], list[MutationSpec]] = {}
     for spec in specs:
-        at.setdefault((spec.module_path, spec.start_pos, spec.operator_name.partition("_")[0]), []).append(spec)
+        at.setdefault(
+            (spec.module_path, spec.start_pos, spec.operator_name.partition("_")[0]), []
+        ).append(spec)
     single = [rng.choice(of_one_place) for of_one_place in at.values()]
     return single if number is None else rng.sample(single, min(number, len(single)))
 
 
 def tried(tests: tuple[str, ...], specs: list[MutationSpec]) -> list[tuple[bool, str]]:
     """Whether each change was noticed, and the change, in a copy of the project."""
-    ignored = shutil.ignore_patterns(".venv", ".git", "outputs", ".pytest_cache", ".hypothesis", ".ruff_cache")
-    command = f"{sys.executable} -m pytest -x -q -p no:cacheprovider -p no:randomly {' '.join(tests)}"
+    ignored = shutil.ignore_patterns(
+        ".venv", ".git", "outputs", ".pytest_cache", ".hypothesis", ".ruff_cache"
+    )
+    command = (
+        f"{sys.executable} -m pytest -x -q -p no:cacheprovider -p no:randomly {' '.join(tests)}"
+    )
     found = []
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(shutil.copytree(ROOT, Path(folder) / "copy", ignore=ignored))
         for spec in specs:
             result = mutate_and_test([spec], command, TIMEOUT_S)
-            found.append((result.test_outcome != TestOutcome.SURVIVED, f"{spec.module_path}\n{result.diff}"))
+            found.append(
+                (result.test_outcome != TestOutcome.SURVIVED, f"{spec.module_path}\n{result.diff}")
+            )
         os.chdir(ROOT)
     return found
 
@@ -93,19 +125,29 @@ def tried(tests: tuple[str, ...], specs: list[MutationSpec]) -> list[tuple[bool,
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("rooms", nargs="*", choices=[*ROOMS, []], help="all where none is named")
-    parser.add_argument("--sample", type=int, help="changes per room, drawn at random; all where it is not given")
+    parser.add_argument(
+        "--sample", type=int, help="changes per room, drawn at random; all where it is not given"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--at-least", type=float, default=0.9, help="share to be noticed in each room")
+    parser.add_argument(
+        "--at-least", type=float, default=0.9, help="share to be noticed in each room"
+    )
     parser.add_argument("--output", type=Path, default=ROOT / "outputs" / "mutants")
     given = parser.parse_args()
-    table, survived, least = ["| room | changes | noticed | share |", "| --- | --- | --- | --- |"], [], 1.0
+    table, survived, least = (
+        ["| room | changes | noticed | share |", "| --- | --- | --- | --- |"],
+        [],
+        1.0,
+    )
     for name in given.rooms or ROOMS:
         patterns, tests = ROOMS[name]
         chosen = sample(list(places(patterns)), given.sample, given.seed)
         parts = [chosen[i :: given.workers] for i in range(given.workers)]
         with ProcessPoolExecutor(given.workers) as pool:
-            outcomes = [one for part in pool.map(tried, [tests] * len(parts), parts) for one in part]
+            outcomes = [
+                one for part in pool.map(tried, [tests] * len(parts), parts) for one in part
+            ]
         noticed = sum(was for was, _ in outcomes)
         share = noticed / len(outcomes) if outcomes else 1.0
         least = min(least, share)

@@ -7,7 +7,16 @@ from shared.oracles import assert_agrees
 import ipe_bench as ib
 from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements.base import UsualNoise
-from ipe_bench.noise import Colored, Correlated, Gaussian, NoNoise, Outliers, Quantization, StudentT, Unknown
+from ipe_bench.noise import (
+    Colored,
+    Correlated,
+    Gaussian,
+    NoNoise,
+    Outliers,
+    Quantization,
+    StudentT,
+    Unknown,
+)
 
 TRIALS = 4000
 
@@ -20,13 +29,21 @@ def errors(noise, m=40, h=None, offset=None):
     return np.stack([noise.corrupt(h, offset, rng) for _ in range(TRIALS)]) - h
 
 
-INDEPENDENT = [Gaussian(0.3), StudentT(0.3, 5.0), Outliers(0.3, share=0.1, factor=5.0, assumed="total")]
+INDEPENDENT = [
+    Gaussian(0.3),
+    StudentT(0.3, 5.0),
+    Outliers(0.3, share=0.1, factor=5.0, assumed="total"),
+]
 COLORED = Colored(0.3, 0.8, channels=2, length=10, assumed="full")
 
 
 @pytest.mark.parametrize(
     "noise",
-    [COLORED, Correlated(0.3, 0.6, block=8), Correlated(matrix=((2.0, -0.5, 0.1), (-0.5, 1.0, 0.3), (0.1, 0.3, 0.5)))],
+    [
+        COLORED,
+        Correlated(0.3, 0.6, block=8),
+        Correlated(matrix=((2.0, -0.5, 0.1), (-0.5, 1.0, 0.3), (0.1, 0.3, 0.5))),
+    ],
     ids=["colored", "blocks", "matrix"],
 )
 def test_the_sample_covariance_is_the_full_r(noise):
@@ -56,7 +73,9 @@ def test_what_is_told_is_an_option():
     assert (Colored(0.3, 0.9).covariance(4).factor == 0.3).all()
     np.testing.assert_allclose(Correlated(0.3, 0.9, assumed="white").covariance(4).factor, 0.3)
     assert (Outliers(0.3, 0.5, 10.0).covariance(4).factor == 0.3).all()
-    assert Outliers(0.3, 0.5, 3.0, "total").covariance(1).factor == pytest.approx(0.3 * np.sqrt(5.0))
+    assert Outliers(0.3, 0.5, 3.0, "total").covariance(1).factor == pytest.approx(
+        0.3 * np.sqrt(5.0)
+    )
 
 
 def test_students_tails_are_heavy_and_outliers_are_as_many_as_stated():
@@ -77,11 +96,18 @@ def test_quantisation_rounds_the_whole_read_out():
 
 def test_equal_readings_beside_different_read_outs_are_rounded_apart():
     # Rounding h alone would give all of them one error, and would correlate the cases of a model.
-    v = Quantization(1.0).corrupt(np.full(40, 0.3), np.linspace(0.0, 1.0, 40), np.random.default_rng(0)) - 0.3
+    v = (
+        Quantization(1.0).corrupt(
+            np.full(40, 0.3), np.linspace(0.0, 1.0, 40), np.random.default_rng(0)
+        )
+        - 0.3
+    )
     assert np.ptp(v) > 0.9
 
 
-@pytest.mark.oracle("closed form: variance of a uniform error", "variance of 20,000 rounding errors", 0.03)
+@pytest.mark.oracle(
+    "closed form: variance of a uniform error", "variance of 20,000 rounding errors", 0.03
+)
 def test_quantisation_errors_are_uniform_with_variance_step_squared_over_twelve():
     rng = np.random.default_rng(0)
     h = rng.uniform(-100, 100, 20000)
@@ -105,7 +131,9 @@ def test_no_noise_adds_nothing_while_r_stays_nominal():
 
 
 @pytest.mark.parametrize(
-    "noise", [*INDEPENDENT, Quantization(0.3, dither=True), COLORED], ids=lambda noise: type(noise).__name__
+    "noise",
+    [*INDEPENDENT, Quantization(0.3, dither=True), COLORED],
+    ids=lambda noise: type(noise).__name__,
 )
 def test_the_stated_law_is_that_of_whitened_errors(noise):
     """Mean, variance and kurtosis, the last from many draws of what it should be."""
@@ -124,13 +152,24 @@ def test_outliers_that_estimators_are_not_told_of_leave_the_law_normal():
 
 # What is left out ----------------------------------------------------------------------------------------------------
 
-SCALED = [ib.noise.Gaussian(), ib.noise.NoNoise(), ib.noise.StudentT(), ib.noise.Outliers(), ib.noise.Colored()]
+SCALED = [
+    ib.noise.Gaussian(),
+    ib.noise.NoNoise(),
+    ib.noise.StudentT(),
+    ib.noise.Outliers(),
+    ib.noise.Colored(),
+]
 
 
-@pytest.mark.parametrize("noise", [*SCALED, ib.noise.Correlated(assumed="white")], ids=lambda noise: noise.name)
+@pytest.mark.parametrize(
+    "noise", [*SCALED, ib.noise.Correlated(assumed="white")], ids=lambda noise: noise.name
+)
 def test_a_deviation_that_is_left_out_is_that_of_the_model_and_of_no_other(noise):
     """That of GINS is its read-outs' step over the root of 12."""
-    for model, deviation in ((ib.measurements.Ranging(), 0.1), (ib.measurements.Gins(), 0.02286 / 12**0.5)):
+    for model, deviation in (
+        (ib.measurements.Ranging(), 0.1),
+        (ib.measurements.Gins(), 0.02286 / 12**0.5),
+    ):
         assert ib.Scenario(model, noise).problem.R.deviations == pytest.approx(deviation, rel=1e-12)
     own = ib.measurements.Formula("a*t", {"a": 1.0}, {"t": (1.0, 2.0)})
     with pytest.raises(UserError, match=rf"noise.deviation: is not given for noise={noise.name}"):
@@ -140,7 +179,9 @@ def test_a_deviation_that_is_left_out_is_that_of_the_model_and_of_no_other(noise
 
 
 def test_a_step_that_is_left_out_is_that_of_the_model():
-    assert ib.Scenario(ib.measurements.Gins(), ib.noise.Quantization()).noise == ib.noise.Quantization(0.02286)
+    assert ib.Scenario(
+        ib.measurements.Gins(), ib.noise.Quantization()
+    ).noise == ib.noise.Quantization(0.02286)
     with pytest.raises(UserError, match=r"noise.step: is not given for noise=quantization"):
         _ = ib.Scenario(ib.measurements.Ranging(), ib.noise.Quantization()).problem
 

@@ -17,13 +17,17 @@ pytestmark = pytest.mark.slow
 
 def python(*words: str, cwd: Path, **variables: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, *words]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, env=os.environ | variables, check=False)
+    return subprocess.run(
+        command, cwd=cwd, capture_output=True, text=True, env=os.environ | variables, check=False
+    )
 
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("wheel")
-    done = python("-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", ".", str(ROOT), cwd=folder)
+    done = python(
+        "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", ".", str(ROOT), cwd=folder
+    )
     if done.returncode:
         pytest.skip(f"no wheel can be built here: {done.stderr.splitlines()[-1]}")
     (built,) = folder.glob("*.whl")
@@ -40,12 +44,16 @@ def installed(wheel, tmp_path_factory) -> Path:
 
 def test_all_kinds_of_plugins_are_made_checked_run_and_seen(installed, tmp_path):
     def run(*words: str) -> str:
-        done = python("-m", "ipe_bench", *words, cwd=tmp_path, PYTHONPATH=str(installed), COLUMNS="200")
+        done = python(
+            "-m", "ipe_bench", *words, cwd=tmp_path, PYTHONPATH=str(installed), COLUMNS="200"
+        )
         assert done.returncode == 0, f"{words}\n{done.stdout}\n{done.stderr}"
         assert done.stderr == "" or words[0] == "run"
         return done.stdout
 
-    where = python("-c", "import ipe_bench; print(ipe_bench.__file__)", cwd=tmp_path, PYTHONPATH=str(installed))
+    where = python(
+        "-c", "import ipe_bench; print(ipe_bench.__file__)", cwd=tmp_path, PYTHONPATH=str(installed)
+    )
     assert Path(where.stdout.strip()).is_relative_to(installed)
     for kind in KINDS:
         run("new", kind, f"own_{kind}")

@@ -14,7 +14,9 @@ from ipe_bench.runs.results import Results
 PLACE = "in the plugin zoo now; work in a clone of ipe-bench, or `pip install CLONE/plugins/zoo`"
 
 
-@pytest.mark.parametrize("name", ["measurements.Gnss", "measurements.mgh.Mgh", "baselines.es_mda.EsMda"])
+@pytest.mark.parametrize(
+    "name", ["measurements.Gnss", "measurements.mgh.Mgh", "baselines.es_mda.EsMda"]
+)
 def test_a_config_that_names_an_old_class(name):
     cls = name.rpartition(".")[2]
     with pytest.raises(UserError) as error:
@@ -58,7 +60,10 @@ def test_results_that_are_of_an_old_class(ipe_bench, synthetic):
     found = Results.read([synthetic.directory])
     said = f"stale: ipe_bench.baselines.es_mda.EsMda is ipe_bench_zoo.EsMda {PLACE}; left out: its results (1)"
     assert (found.problems, found.stale) == ([], [said])
-    assert [(cell.names["estimator"], cell.done) for cell in found.cells] == [("truth", 5), ("other", 5)]
+    assert [(cell.names["estimator"], cell.done) for cell in found.cells] == [
+        ("truth", 5),
+        ("other", 5),
+    ]
     assert set(ib.load(synthetic.directory)["estimator"]) == {"other"}
     code, out, err = ipe_bench("report", str(synthetic.directory))
     assert (code, said in err) == (0, True)
@@ -70,7 +75,10 @@ def test_where_nothing_else_is_stored_it_is_a_problem(synthetic):
     for path in synthetic.store.trials.iterdir():  # the truth, which has no old class here
         if not path.name.startswith(key):
             path.unlink()
-    with pytest.warns(UserWarning, match="was written by an older version of ipe-bench; run the same command again"):
+    with pytest.warns(
+        UserWarning,
+        match="was written by an older version of ipe-bench; run the same command again",
+    ):
         assert ib.load(synthetic.directory).empty
 
 

@@ -27,7 +27,9 @@ from ipe_bench.solvers import Newton, Relinearized, SteepestDescent
 inf, nan = np.inf, np.nan
 
 
-@pytest.mark.parametrize(("text", "wrong"), [("a: 1\nb: 2\na: 3", "a is there twice"), ("a: &x 1\nb: *x", "an alias")])
+@pytest.mark.parametrize(
+    ("text", "wrong"), [("a: 1\nb: 2\na: 3", "a is there twice"), ("a: &x 1\nb: *x", "an alias")]
+)
 def test_yaml_that_would_lose_or_hide_a_value_is_refused(text, wrong):
     assert discovery.read_yaml("a: 1e-6\nb: [2, x]") == {"a": 1e-6, "b": [2, "x"]}
     with pytest.raises(yaml.YAMLError, match=wrong):
@@ -37,7 +39,12 @@ def test_yaml_that_would_lose_or_hide_a_value_is_refused(text, wrong):
 @pytest.mark.parametrize(
     ("hint", "good", "bad", "remedy"),
     [
-        (Positive, [1e-300, 2, np.float32(0.5)], [0, -1, inf, nan, True, "1", None], "a number above 0"),
+        (
+            Positive,
+            [1e-300, 2, np.float32(0.5)],
+            [0, -1, inf, nan, True, "1", None],
+            "a number above 0",
+        ),
         (NonNegative, [0, 1e300], [-1e-9, inf, nan, False], "a number from 0 up"),
         (Finite, [-1e300], [inf, -inf, nan], "a finite number"),
         (Annotated[float, Gt(2)], [inf, 3], [2, nan], "a number above 2"),
@@ -50,7 +57,12 @@ def test_yaml_that_would_lose_or_hide_a_value_is_refused(text, wrong):
         (Positive | None, [None, 3], [0, "null"], "a number above 0 or null"),
         (bool, [True], [1, "true"], "true or false"),
         (str, ["a"], [1, None], "a text"),
-        (Annotated[tuple[int, ...], MinLen(2)], [[1, 2], (1, 2, 3)], [(), (1,)], "a list of at least 2"),
+        (
+            Annotated[tuple[int, ...], MinLen(2)],
+            [[1, 2], (1, 2, 3)],
+            [(), (1,)],
+            "a list of at least 2",
+        ),
         (tuple[float, float], [(1, 2), np.ones(2)], [(1,), 3, "ab"], "a list of 2 numbers"),
         (Mapping[str, Any], [{}], [[], 1], "keys and values"),
         (Any, [object], [], ""),
@@ -84,7 +96,9 @@ def test_values_are_kept_as_their_type_has_them():
     assert {type(v) for v in model.position} == {float}
     assert type(model.rounds) is int
     assert type(Newton(tolerance=1).tolerance) is float
-    assert hash(model) == hash(Ranging(position=(1.0, 2.0, 3.0), beacons=((1.0, 1.0, 1.0),) * 5, rounds=2))
+    assert hash(model) == hash(
+        Ranging(position=(1.0, 2.0, 3.0), beacons=((1.0, 1.0, 1.0),) * 5, rounds=2)
+    )
 
 
 # fmt: off
@@ -97,7 +111,9 @@ WRONG = [
 # fmt: on
 
 
-@pytest.mark.parametrize(("cls", "key", "value"), WRONG, ids=lambda v: getattr(v, "__name__", str(v)))
+@pytest.mark.parametrize(
+    ("cls", "key", "value"), WRONG, ids=lambda v: getattr(v, "__name__", str(v))
+)
 def test_python_and_config_say_the_same_of_a_mistake(cls, key, value):
     with pytest.raises(UserError) as from_python:
         cls(**{key: value})
@@ -140,11 +156,17 @@ def test_what_a_plugins_class_does_not_check_is_checked_where_it_is_constructed(
     assert type(made.size) is float
     for options, said in (
         ({"_target_": "Own", "size": 0.0}, r"^part\.size=0\.0: give a number above 0$"),
-        ({"_target_": "Own", "sise": 1.0}, r"^part\.sise: there is no such option; did you mean size\?"),
+        (
+            {"_target_": "Own", "sise": 1.0},
+            r"^part\.sise: there is no such option; did you mean size\?",
+        ),
         ({"_target_": "Own", "count": 10}, r"^part: count=10: at most 9$"),
         ({"_target_": "Deaf", "gain": 2.0}, r"^part\.gain=2\.0: give a number from 0 to 1$"),
         ({"_target_": "Deaf", "tolerance": 0.0}, r"^part\.tolerance=0\.0: give a number above 0$"),
-        ({"_target_": "Unreadable"}, r"Unreadable: the type of an option cannot be read \(NameError"),
+        (
+            {"_target_": "Unreadable"},
+            r"Unreadable: the type of an option cannot be read \(NameError",
+        ),
         ({"_target_": "np"}, "is not a component"),
         ({"_target_": "Deef"}, r"Deef: test_options has no Deef; did you mean Deaf\?$"),
     ):
@@ -187,7 +209,11 @@ def test_an_import_that_fails_is_named_by_its_line(tmp_path, monkeypatch):
         construct({"_target_": "my_library.Model"}, "part")
 
 
-DESCRIBED = "_target_: ipe_bench.measurements.Ode", "_target_: ipe_bench.states.Formulas", "states.RecordedFormulas"
+DESCRIBED = (
+    "_target_: ipe_bench.measurements.Ode",
+    "_target_: ipe_bench.states.Formulas",
+    "states.RecordedFormulas",
+)
 """Of models that are nothing but their config."""
 
 
@@ -211,8 +237,12 @@ def test_conf_says_what_the_class_says(option):
         raise
     fields = {f.name: f for f in dataclasses.fields(component) if f.init}
     assert set(config) - {"_target_"} <= set(fields)
-    assert option.group in ("measurement", "execution") or set(fields) <= set(config), "an option that nobody sees"
+    assert option.group in ("measurement", "execution") or set(fields) <= set(config), (
+        "an option that nobody sees"
+    )
     if any(f.default is f.default_factory for f in fields.values()):
         return  # a model that a file describes: the class alone is none
-    differs = {name for name in fields if getattr(component, name) != getattr(type(component)(), name)}
+    differs = {
+        name for name in fields if getattr(component, name) != getattr(type(component)(), name)
+    }
     assert differs == PRESETS.get((option.group, option.name), set())

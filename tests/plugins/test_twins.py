@@ -11,7 +11,13 @@ import pytest
 from ipe_bench.cli.main import main
 from ipe_bench.plugins import discovery
 
-CHOSEN = ("measurement=polynomial", "noise=gaussian", "solver=[twin]", "baseline=[linear_lse]", "block_size=2")
+CHOSEN = (
+    "measurement=polynomial",
+    "noise=gaussian",
+    "solver=[twin]",
+    "baseline=[linear_lse]",
+    "block_size=2",
+)
 
 
 def run(*words: str, site: Path) -> subprocess.CompletedProcess[str]:
@@ -32,7 +38,9 @@ def site(tmp_path, monkeypatch):
         source.write("\nraise RuntimeError('this is the installed copy')\n")
     described = site / "ipe_bench_twin-0.1.0.dist-info"
     described.mkdir()
-    (described / "METADATA").write_text("Metadata-Version: 2.1\nName: IPE_bench.twin\nVersion: 0.1.0\n")
+    (described / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: IPE_bench.twin\nVersion: 0.1.0\n"
+    )
     (described / "entry_points.txt").write_text("[ipe_bench.plugins]\ntwin = ipe_bench_twin\n")
     return site
 
@@ -67,18 +75,27 @@ def test_what_is_installed_runs_where_the_folder_holds_none(site, tmp_path):
 @pytest.mark.slow
 def test_another_distribution_of_that_package_is_named_and_left_out(site, tmp_path):
     project = tmp_path / "plugins/twin/pyproject.toml"
-    project.write_text(project.read_text().replace('name = "ipe-bench-twin"', 'name = "somebody-elses"'))
+    project.write_text(
+        project.read_text().replace('name = "ipe-bench-twin"', 'name = "somebody-elses"')
+    )
     done = run("run", *CHOSEN, "trials=4", "output=out", site=site)
     installed, left_out = site / "ipe_bench_twin", tmp_path / "plugins/twin/ipe_bench_twin"
-    assert f"plugin {left_out}: {installed} is called ipe_bench_twin too; it is left out" in done.stderr
+    assert (
+        f"plugin {left_out}: {installed} is called ipe_bench_twin too; it is left out"
+        in done.stderr
+    )
     assert done.returncode == 2
     assert "this is the installed copy" in done.stderr
 
 
 def test_a_copy_that_was_imported_already_goes_on(site, monkeypatch):
-    (site / "ipe_bench_twin/twin.py").write_bytes(Path("plugins/twin/ipe_bench_twin/twin.py").read_bytes())
+    (site / "ipe_bench_twin/twin.py").write_bytes(
+        Path("plugins/twin/ipe_bench_twin/twin.py").read_bytes()
+    )
     code = "import ipe_bench_twin; from ipe_bench.cli.main import main; main(['list', 'solver'])"
     environment = os.environ | {"PYTHONPATH": str(site), "COLUMNS": "200"}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True
+    )
     assert "is called ipe_bench_twin too; it is left out" in done.stderr
     assert "\nsolver, from IPE_bench.twin 0.1.0\n" in done.stdout

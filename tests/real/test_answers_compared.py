@@ -28,11 +28,15 @@ def test_of_two_minima_far_apart_the_worse_does_not_fit(noise):
     """A wave in so much noise that a wrong frequency passes the test of the fit by itself."""
     z = np.sin(2.0 * T) + 0.9 * np.random.default_rng(1).standard_normal(41)
     near, far = (Formula("a*sin(w*t)", {"w": w, "a": 0.5}, {"t": T.tolist()}) for w in (2.0, 5.0))
-    wrong, right = (ib.estimate(m, z, {"lm": LevenbergMarquardt()}, noise=noise)["lm"] for m in (far, near))
+    wrong, right = (
+        ib.estimate(m, z, {"lm": LevenbergMarquardt()}, noise=noise)["lm"] for m in (far, near)
+    )
     w = [p.name for p in right.model.parameters].index("w")
     assert abs(wrong.x[w] - right.x[w]) > 20 * right.standard_errors[w]
     assert wrong.fits is not False
-    answer = ib.estimate(far, z, {"lm": LevenbergMarquardt(), "auto": ib.solvers.Auto()}, noise=noise)
+    answer = ib.estimate(
+        far, z, {"lm": LevenbergMarquardt(), "auto": ib.solvers.Auto()}, noise=noise
+    )
     assert answer["auto"].x == pytest.approx(right.x, rel=1e-4)
     assert (answer["auto"].passes, answer["lm"].passes) == (True, False)
     assert answer["lm"].beaten_by == "auto"
@@ -42,9 +46,13 @@ def test_of_two_minima_far_apart_the_worse_does_not_fit(noise):
 
 def test_parameters_that_the_readings_do_not_tell_apart_are_named():
     """Two lengths on parallel axes count by their sum alone, and an offset of nothing does not count at all."""
-    model = Formula("(d2+d3)*cos(t)+a*sin(t)+0*k", {"d2": 0.4, "d3": 0.1, "a": 1.0, "k": 2.0}, {"t": T.tolist()})
+    model = Formula(
+        "(d2+d3)*cos(t)+a*sin(t)+0*k", {"d2": 0.4, "d3": 0.1, "a": 1.0, "k": 2.0}, {"t": T.tolist()}
+    )
     z = 0.52 * np.cos(T) + 0.9 * np.sin(T) + 0.01 * np.random.default_rng(1).standard_normal(41)
-    answer = ib.estimate(model, z, {"lm": LevenbergMarquardt(), "gn": GaussNewton()}, noise=Gaussian(0.01))
+    answer = ib.estimate(
+        model, z, {"lm": LevenbergMarquardt(), "gn": GaussNewton()}, noise=Gaussian(0.01)
+    )
     for one in answer:
         assert set(one.undetermined) == {"d2 - d3", "k"}
     for text in (str(answer), answer._repr_html_()):
@@ -64,7 +72,11 @@ class Stating(Estimator):
 
     def estimate(self, problem, z, *, history=False):
         x = np.repeat(np.array(self.answer)[None], len(z), axis=0)
-        return Estimates(x, np.full(len(z), Status.CONVERGED, np.int8), np.repeat(np.eye(x.shape[1])[None], len(z), 0))
+        return Estimates(
+            x,
+            np.full(len(z), Status.CONVERGED, np.int8),
+            np.repeat(np.eye(x.shape[1])[None], len(z), 0),
+        )
 
 
 LINE = Formula("a+b*t+c*t**2", {"a": 1.0, "b": 1.0, "c": 1.0}, {"t": T[:12].tolist()})
@@ -79,7 +91,9 @@ def test_with_an_unknown_level_the_joint_region_of_the_best_is_that_of_snedecors
     along = np.array([1.0, -2.0, 0.5])
     reach = np.sqrt(3 * f_law.isf(1e-3, 3, 9) * variance / np.sum((A @ along) ** 2))
     away = Stating(tuple((best + np.sqrt(share) * reach * along).tolist()))
-    answer = ib.estimate(LINE, z, {"lm": LevenbergMarquardt(tolerance=1e-10), "away": away}, noise=Unknown())
+    answer = ib.estimate(
+        LINE, z, {"lm": LevenbergMarquardt(tolerance=1e-10), "away": away}, noise=Unknown()
+    )
     assert answer["away"].beaten_by == beaten
 
 
@@ -97,7 +111,11 @@ def test_a_later_column_that_fits_better_is_named_and_quoted(noise, excess, lowe
     best = np.linalg.lstsq(A, z, rcond=None)[0]
     along = np.array([1.0, -2.0, 0.5])
     away = tuple((best + 0.3 * np.sqrt(excess) / np.linalg.norm(A @ along) * along).tolist())
-    estimators = {"first": Seeking(away), "stated": Stating(away), "lm": LevenbergMarquardt(tolerance=1e-10)}
+    estimators = {
+        "first": Seeking(away),
+        "stated": Stating(away),
+        "lm": LevenbergMarquardt(tolerance=1e-10),
+    }
     answer = ib.estimate(LINE, z, estimators, noise=noise)
     assert all(one.passes for one in answer)
     assert [one.lower_at for one in answer] == [lower, "", ""]
@@ -108,7 +126,9 @@ def test_a_later_column_that_fits_better_is_named_and_quoted(noise, excess, lowe
 
 def far_overstated(deviation):
     z = A @ [1.0, 1.2, 0.8] + 0.01 * np.random.default_rng(2).standard_normal(12)
-    return ib.estimate(LINE, z, {"lm": LevenbergMarquardt()}, noise=deviation and Gaussian(deviation))
+    return ib.estimate(
+        LINE, z, {"lm": LevenbergMarquardt()}, noise=deviation and Gaussian(deviation)
+    )
 
 
 def test_noise_that_is_far_overstated_ends_an_estimate_before_its_intervals(monkeypatch):
@@ -152,7 +172,10 @@ def test_with_an_unknown_level_another_minimum_is_as_good_within_snedecors_regio
     """Of y = c^2 t + b, c has two minima, which a small odd term tells apart; n F of the 95 % region is 6.9 here."""
     rng, t = np.random.default_rng(4), np.linspace(-1, 1, 23)
     s = rng.standard_normal(23)
-    s -= np.column_stack([np.ones(23), t]) @ np.linalg.lstsq(np.column_stack([np.ones(23), t]), s, rcond=None)[0]
+    s -= (
+        np.column_stack([np.ones(23), t])
+        @ np.linalg.lstsq(np.column_stack([np.ones(23), t]), s, rcond=None)[0]
+    )
     s /= np.linalg.norm(s)
     noise = rng.standard_normal(23)
     for column in (np.ones(23), t, s):
@@ -162,7 +185,9 @@ def test_with_an_unknown_level_another_minimum_is_as_good_within_snedecors_regio
     z = 100 * t + odd * s + noise
     columns = {"t": t.tolist(), "s": s.tolist()}
     model = Formula(f"c**2*t+b+{odd:.12f}*(c/10)*s", {"c": 9.0, "b": 1.0}, columns)
-    found = ib.estimate(model, z, {"lm": LevenbergMarquardt(tolerance=1e-10)}, noise=Unknown()).examination
+    found = ib.estimate(
+        model, z, {"lm": LevenbergMarquardt(tolerance=1e-10)}, noise=Unknown()
+    ).examination
     other = next(one for one in found.minima if one.x[0] < 0)
     assert other.chi_square - found.minima[0].chi_square == pytest.approx(excess, rel=0.02)
     assert 2 * f_law.isf(0.05, 2, 21) == pytest.approx(6.93, abs=0.01)
@@ -173,7 +198,9 @@ def test_an_estimate_at_which_the_model_has_no_readings_is_in_brackets():
     model = Formula("sqrt(a - t)", {"a": 20.0}, {"t": T.tolist()})
     z = np.sqrt(10.5 - T) + 0.01 * np.random.default_rng(1).standard_normal(41)
     for noise in (Unknown(), Gaussian(0.01)):
-        answer = ib.estimate(model, z, {"bad": Stating(answer=(0.1,)), "lm": LevenbergMarquardt()}, noise=noise)
+        answer = ib.estimate(
+            model, z, {"bad": Stating(answer=(0.1,)), "lm": LevenbergMarquardt()}, noise=noise
+        )
         assert not answer["bad"].passes
         assert answer["bad"].fits is False
         assert "bad: the model has no finite readings at this estimate" in str(answer)
@@ -182,9 +209,15 @@ def test_an_estimate_at_which_the_model_has_no_readings_is_in_brackets():
 
 def test_intervals_are_those_of_the_first_column_that_passes():
     z = A @ [1.0, 2.0, 3.0] + 0.1 * np.random.default_rng(1).standard_normal(12)
-    columns = {"stated": Stating(answer=(9.0, 9.0, 9.0)), "gn": GaussNewton(), "lm": LevenbergMarquardt()}
+    columns = {
+        "stated": Stating(answer=(9.0, 9.0, 9.0)),
+        "gn": GaussNewton(),
+        "lm": LevenbergMarquardt(),
+    }
     for order in (["stated", "gn", "lm"], ["lm", "stated", "gn"]):
-        found = ib.estimate(LINE, z, {label: columns[label] for label in order}, noise=Gaussian(0.1)).examination
+        found = ib.estimate(
+            LINE, z, {label: columns[label] for label in order}, noise=Gaussian(0.1)
+        ).examination
         assert found.label == next(label for label in order if label != "stated")
 
 
@@ -215,6 +248,8 @@ def test_answers_of_different_curves_are_ambiguous():
     t[3] += 0.02
     model = Formula("sin(w*t)", {"w": 1.0}, {"t": t.tolist()})
     z = model.simulate(model.nominal[None])[0] + 0.1 * np.random.default_rng(2).standard_normal(12)
-    answer = ib.estimate(model, z, {"lm": LevenbergMarquardt()}, noise=Gaussian(0.1), error_scale=6.0)
+    answer = ib.estimate(
+        model, z, {"lm": LevenbergMarquardt()}, noise=Gaussian(0.1), error_scale=6.0
+    )
     assert "AMBIGUOUS: the readings fit as well" in str(answer)
     assert "exactly the same" not in str(answer)

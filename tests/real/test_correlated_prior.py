@@ -23,7 +23,9 @@ SIGMA = 3.0
 @pytest.fixture(scope="module")
 def bench() -> Scenario:
     """A linear model whose readings say little, so that the prior counts."""
-    return Scenario(Bent(), Gaussian(SIGMA), GaussianPrior(DEVIATIONS, CORRELATIONS), error_scale=1.5, seed=4)
+    return Scenario(
+        Bent(), Gaussian(SIGMA), GaussianPrior(DEVIATIONS, CORRELATIONS), error_scale=1.5, seed=4
+    )
 
 
 def conditional(bench: Scenario, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -35,7 +37,9 @@ def conditional(bench: Scenario, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return P0 @ A.T @ np.linalg.solve(S, z), P0 - P0 @ A.T @ np.linalg.solve(S, A @ P0)
 
 
-@pytest.mark.oracle("closed form: conditional normal distribution", "estimates by seven estimators", 1e-6)
+@pytest.mark.oracle(
+    "closed form: conditional normal distribution", "estimates by seven estimators", 1e-6
+)
 @pytest.mark.parametrize(
     "estimator",
     [MapLM(tolerance=1e-10), EKF(), EKF(engine="filterpy"), UKF(), CKF(), IteratedEKF(), IPLF()],
@@ -86,7 +90,10 @@ def test_residuals_of_the_maximum_a_posteriori_scatter_as_is_said(bench):
 
 
 REFUSED = {
-    "not symmetric": (((1, 0.5), (0.4, 1)), r"is not symmetric; row 1, column 2 is 0.5, and row 2, column 1 is 0.4"),
+    "not symmetric": (
+        ((1, 0.5), (0.4, 1)),
+        r"is not symmetric; row 1, column 2 is 0.5, and row 2, column 1 is 0.4",
+    ),
     "not definite": (((1, 1.1), (1.1, 1)), r"is not positive definite; the least eigenvalue"),
     "singular": (((1, 1), (1, 1)), r"is not positive definite"),
     "not square": (((1, 0, 0), (0, 1, 0)), r"row 1 has 3 numbers; give a square matrix"),
@@ -102,5 +109,9 @@ def test_what_is_no_correlation_is_refused_in_a_line(case):
 
 
 def test_correlations_of_another_number_of_parameters_are_refused():
-    with pytest.raises(UserError, match=r"prior.correlations: has 2 rows; give one for each of 3 parameters"):
-        _ = Scenario(Bent(), Gaussian(1.0), GaussianPrior(correlations=((1.0, 0.0), (0.0, 1.0)))).problem
+    with pytest.raises(
+        UserError, match=r"prior.correlations: has 2 rows; give one for each of 3 parameters"
+    ):
+        _ = Scenario(
+            Bent(), Gaussian(1.0), GaussianPrior(correlations=((1.0, 0.0), (0.0, 1.0)))
+        ).problem

@@ -33,7 +33,9 @@ def test_profiles_of_a_linear_model_are_the_intervals_of_its_standard_errors():
     assert np.array(found.profiles) == pytest.approx(np.array(found.wald), abs=1e-9)
     assert not found.bent.any()
     low, high = found.bootstrap.low, found.bootstrap.high
-    assert (low + high) / 2 == pytest.approx(found.x, abs=4 * found.standard_errors.max() / np.sqrt(500))
+    assert (low + high) / 2 == pytest.approx(
+        found.x, abs=4 * found.standard_errors.max() / np.sqrt(500)
+    )
     assert high - low == pytest.approx(2 * 1.96 * found.standard_errors, rel=0.15)
     assert found.least
     assert not found.ambiguous
@@ -76,7 +78,9 @@ def test_ends_of_a_profile_are_where_chi_square_has_risen_by_the_quantile():
 @pytest.mark.parametrize(("decades", "low"), [(8.6, 10**-8.6), (12.9, 0.0)])
 def test_an_end_is_on_a_bound_if_it_is_as_near_as_round_off(decades, low):
     """And no other: of a positive parameter that starts at 1, 10^-8.6 is a value, and 10^-12.9 is 0."""
-    model = informed(Formula("b*t", {"b": 1.0}, {"t": (1.0,)}), (ParameterInfo("b", positive=True),))
+    model = informed(
+        Formula("b*t", {"b": 1.0}, {"t": (1.0,)}), (ParameterInfo("b", positive=True),)
+    )
     # Chi-square rises by q^2 at a distance of `decades` below the estimate.
     q, value = norm.isf(0.025), 10.0**-decades
     problem = Problem(model, Gaussian((1 - value) / q).covariance(1))
@@ -105,7 +109,9 @@ def test_profile_intervals_cover_the_truth_as_often_as_they_say(unknown):
     residuals = problem.R.whiten(z - SATURATION.simulate(estimates.x))
     levels = np.sqrt(np.sum(residuals**2, axis=1) / 4) if unknown else np.ones(1000)
     for row, x, P, level in zip(z, estimates.x, estimates.covariance, levels, strict=True):
-        wald = wald_interval(SATURATION, x, level * np.sqrt(np.diag(P)), half_width(CONFIDENCE, freedom))
+        wald = wald_interval(
+            SATURATION, x, level * np.sqrt(np.diag(P)), half_width(CONFIDENCE, freedom)
+        )
         found = profiles(scaled(problem, level), row, x, P * level**2, freedom=freedom)
         held.append([(low <= truth) & (truth <= high) for low, high in (found, wald)])
     covered, short = np.mean(held, axis=0)
@@ -124,7 +130,11 @@ def test_the_reading_that_carries_the_answer_is_named(noise):
     t = np.array([0.0, 1.0, 2.0, 3.0, 20.0])
     model = Formula("a+b*t", {"a": 1.0, "b": 1.0}, {"t": tuple(t)})
     z = 1 + t + np.array([0.3, -0.2, 0.1, -0.3, 2.0])
-    found, X, R = examined(model, z, noise), np.column_stack([np.ones(5), t]), noise.covariance(5).matrix()
+    found, X, R = (
+        examined(model, z, noise),
+        np.column_stack([np.ones(5), t]),
+        noise.covariance(5).matrix(),
+    )
     assert np.argmax(found.shift) == 4
     for i in range(5):
         rest = np.delete(np.arange(5), i)
@@ -157,8 +167,12 @@ def test_rows_without_a_reading_are_predicted_with_their_band(unknown):
 
 def test_another_minimum_that_fits_as_well_is_told():
     """a and b of exp(-a t) + exp(-b t) can be exchanged; a phase has a lower minimum than the one near its start."""
-    model = Formula("exp(-a*t)+exp(-b*t)", {"a": 1.0, "b": 2.0}, {"t": tuple(np.linspace(0.1, 3, 20))})
-    z = model.simulate(np.array([[1.0, 1.0]]))[0] + 0.005 * np.random.default_rng(1).standard_normal(20)
+    model = Formula(
+        "exp(-a*t)+exp(-b*t)", {"a": 1.0, "b": 2.0}, {"t": tuple(np.linspace(0.1, 3, 20))}
+    )
+    z = model.simulate(np.array([[1.0, 1.0]]))[0] + 0.005 * np.random.default_rng(
+        1
+    ).standard_normal(20)
     found = examined(model, z, Gaussian(0.005))
     assert found.least
     assert any(one.x == pytest.approx(found.x[::-1], rel=1e-3) for one in found.ambiguous)
@@ -189,10 +203,16 @@ def test_a_profile_that_comes_upon_a_better_fit_is_no_interval():
 
 
 def test_a_prior_that_counts_in_no_estimate_is_told():
-    known, z, said = {"a": {"deviation": 0.1}}, SATURATION.simulate(np.ones((1, 2)))[0], "prior of a counts in no"
+    known, z, said = (
+        {"a": {"deviation": 0.1}},
+        SATURATION.simulate(np.ones((1, 2)))[0],
+        "prior of a counts in no",
+    )
     assert said in str(ib.estimate(SATURATION, z, LM, noise=Gaussian(0.4), parameters=known))
     assert said not in str(ib.estimate(SATURATION, z, LM, noise=Gaussian(0.4), error_scale=1.0))
-    assert said not in str(ib.estimate(SATURATION, z, {"map": MapLM()}, noise=Gaussian(0.4), parameters=known))
+    assert said not in str(
+        ib.estimate(SATURATION, z, {"map": MapLM()}, noise=Gaussian(0.4), parameters=known)
+    )
 
 
 def test_an_answer_is_a_frame_too():

@@ -26,7 +26,9 @@ LM = {"lm": LevenbergMarquardt(tolerance=1e-10, max_iterations=300)}
 @pytest.fixture
 def files(tmp_path) -> tuple[list[Path], list[np.ndarray]]:
     """Two files of one rate and two amplitudes, 240 and 180, and their columns t, y, sigma."""
-    found = [simulated(tmp_path / f"{b1}.csv", float(b1), k, 12 + k) for k, b1 in enumerate((240, 180))]
+    found = [
+        simulated(tmp_path / f"{b1}.csv", float(b1), k, 12 + k) for k, b1 in enumerate((240, 180))
+    ]
     return [path for path, _ in found], [columns for _, columns in found]
 
 
@@ -49,10 +51,14 @@ def of(result, values) -> dict[str, float]:
 
 def test_a_parameter_of_one_file_may_be_known_there(files):
     paths, data = files
-    result = estimate(together(paths, ParameterInfo("b1", lower=0.0), ParameterInfo("b1_2", fixed=181.0)))
+    result = estimate(
+        together(paths, ParameterInfo("b1", lower=0.0), ParameterInfo("b1_2", fixed=181.0))
+    )
     x, deviations = solution(lambda p: residuals(data, p[0], 181.0, p[1]), [250, 5e-4])
     assert of(result, result.x) == pytest.approx({"b1_1": x[0], "b2": x[1]}, rel=1e-8)
-    assert of(result, result.standard_errors) == pytest.approx({"b1_1": deviations[0], "b2": deviations[1]}, rel=1e-8)
+    assert of(result, result.standard_errors) == pytest.approx(
+        {"b1_1": deviations[0], "b2": deviations[1]}, rel=1e-8
+    )
     assert result.model.fixed == {"b1_2": 181.0}
     assert result.degrees_of_freedom == sum(map(len, data)) - 2
 
@@ -63,11 +69,16 @@ def test_the_epochs_of_files_are_those_of_one_after_those_of_another():
     assert rows == [[0, 1, 2], [3, 4, 5], [6, 7, 8], [9, 10, 11], [12, 13, 14]]
 
 
-@pytest.mark.oracle("library: SciPy's least_squares within bounds", "standard errors of two files together", 1e-6)
+@pytest.mark.oracle(
+    "library: SciPy's least_squares within bounds", "standard errors of two files together", 1e-6
+)
 def test_a_bound_acts_in_the_file_that_it_is_of(files):
     """On the bound in one file and free in the other, where SciPy's bounded minimum is."""
     paths, data = files
-    known = (ParameterInfo("b1", lower=100.0, upper=300.0), ParameterInfo("b1_2", nominal=160.0, upper=176.0))
+    known = (
+        ParameterInfo("b1", lower=100.0, upper=300.0),
+        ParameterInfo("b1_2", nominal=160.0, upper=176.0),
+    )
     result = estimate(together(paths, *known))
     bounded = least_squares(
         lambda p: residuals(data, 100 * p[0], 100 * p[1], 1e-4 * p[2]),
@@ -116,13 +127,20 @@ def test_columns_are_left_out_with_their_units_or_without(tmp_path):
     found = open_together([tmp_path / "a.csv"], line, without=("remark", "T", "sigma"))
     assert found.z.tolist() == [1.0, 2.0, 4.0]
     assert found.deviations is None
-    assert open_together([tmp_path / "a.csv"], line, without=("remark", "T [C]")).deviations is not None
+    assert (
+        open_together([tmp_path / "a.csv"], line, without=("remark", "T [C]")).deviations
+        is not None
+    )
 
 
 @pytest.mark.parametrize(
     ("known", "without", "expected"),
     [
-        (ParameterInfo("b1_3", fixed=1.0), (), r"parameters.b1_3: there is no such parameter; did you mean b1_2"),
+        (
+            ParameterInfo("b1_3", fixed=1.0),
+            (),
+            r"parameters.b1_3: there is no such parameter; did you mean b1_2",
+        ),
         (ParameterInfo("b1_2", upper=200.0), (), r"parameters.b1_2: its start, 250, is not inside"),
         (None, ("u",), r"ignore_columns=u: there is no such column \(there are: sigma, t, y\)"),
         (None, ("t",), r"column t is missing"),
@@ -136,7 +154,9 @@ def test_what_is_not_there_is_neither_known_nor_left_out(files, known, without, 
 
 def test_fewer_readings_than_parameters_are_refused(tmp_path):
     (tmp_path / "a.csv").write_text("t,y\n1,2\n2,\n3,\n")
-    with pytest.raises(UserError, match=r"readings=.*a.csv: 1 readings are too few for 2 parameters"):
+    with pytest.raises(
+        UserError, match=r"readings=.*a.csv: 1 readings are too few for 2 parameters"
+    ):
         open_together([tmp_path / "a.csv"], OWN)
 
 

@@ -30,7 +30,9 @@ def test_missing_readings_are_no_obstacle_to_any_estimator():
     trial = scenario.draw(0, 1)
     z = trial.z[0].copy()
     z[np.random.default_rng(0).choice(len(z), 10, replace=False)] = np.nan
-    estimators = {type(e).__name__: e for e in (Newton(), GaussNewton(), Progressive(), EKF(), UKF())}
+    estimators = {
+        type(e).__name__: e for e in (Newton(), GaussNewton(), Progressive(), EKF(), UKF())
+    }
     for one in fit(scenario.problem, z, estimators):
         assert one.status is Status.CONVERGED, one.label
         assert one.degrees_of_freedom == 230 - 11
@@ -67,9 +69,15 @@ def test_the_oxygen_demand_of_bates_and_watts_is_estimated_as_r_estimates_it():
     """R prints A = 19.1426 (2.4959), lrc = log b2 = -0.6328 (0.3824), and 2.549."""
     t, y = np.loadtxt(SAMPLES / "oxygen.csv", delimiter=",", skiprows=1).T
     model = ib.measurements.Formula("b1*(1-exp(-b2*t))", {"b1": 20.0, "b2": 0.5}, {"t": t.tolist()})
-    (found,) = fit(Scenario(model, Unknown()).problem, y, {"lm": LevenbergMarquardt(tolerance=1e-9)}, Unknown())
+    (found,) = fit(
+        Scenario(model, Unknown()).problem, y, {"lm": LevenbergMarquardt(tolerance=1e-9)}, Unknown()
+    )
     (b1, b2), (e1, e2) = found.x, found.standard_errors
-    assert_agrees([b1, np.log(b2), e1, e2 / b2, found.level], [19.1426, -0.6328, 2.4959, 0.3824, 2.549], rtol=5e-4)
+    assert_agrees(
+        [b1, np.log(b2), e1, e2 / b2, found.level],
+        [19.1426, -0.6328, 2.4959, 0.3824, 2.549],
+        rtol=5e-4,
+    )
 
 
 def test_the_chi_square_test_rejects_a_true_model_as_often_as_it_says_and_a_wrong_deviation_always():
@@ -91,7 +99,10 @@ def test_rounded_readings_are_held_to_the_law_of_rounding():
     found = [fit(scenario.problem, row, estimator, noise)[0] for row in z]
     p = np.array([f.p_value for f in found])
     assert kstest(p, "uniform").pvalue > 0.01
-    assert kstest([chi2.sf(f.chi_square, f.degrees_of_freedom) for f in found], "uniform").pvalue < 0.01
+    assert (
+        kstest([chi2.sf(f.chi_square, f.degrees_of_freedom) for f in found], "uniform").pvalue
+        < 0.01
+    )
 
 
 @pytest.mark.parametrize(
@@ -121,7 +132,9 @@ def test_of_two_fits_with_noise_of_their_own_size_the_worse_is_beaten():
     ).fits
     assert near.chi_square == pytest.approx(far.chi_square)
     for one in (near, far):
-        assert one.deviance == pytest.approx(np.sum((z - model.simulate(one.x[None] / model.sizes)[0]) ** 2))
+        assert one.deviance == pytest.approx(
+            np.sum((z - model.simulate(one.x[None] / model.sizes)[0]) ** 2)
+        )
     assert (near.beaten_by, far.beaten_by) == ("", "near")
 
 

@@ -22,7 +22,10 @@ from ipe_bench.trials.scenario import Scenario
     [
         (ParameterInfo("b1", lower=100.0, upper=300.0), ParameterInfo("b2", positive=True)),
         (ParameterInfo("b1", upper=260.0), ParameterInfo("b2", lower=1e-5)),
-        (ParameterInfo("b1", nominal=200.0), ParameterInfo("b2", nominal=8e-4, lower=0.0, upper=1e-3)),
+        (
+            ParameterInfo("b1", nominal=200.0),
+            ParameterInfo("b2", nominal=8e-4, lower=0.0, upper=1e-3),
+        ),
     ],
 )
 def test_bounds_move_neither_a_minimum_inside_of_them_nor_its_standard_errors(tmp_path, known):
@@ -44,7 +47,10 @@ def test_an_estimate_on_its_bound_is_the_minimum_within_the_bounds(tmp_path, upp
     """Against SciPy's bounded solution; what is on the bound has no error, and the others' are with it held there."""
     path, columns = simulated(tmp_path / "a.csv", 240.0, 3)
     t, y, sigma = columns.T
-    known = (ParameterInfo("b1", nominal=200.0, lower=100.0, upper=upper), ParameterInfo("b2", positive=True))
+    known = (
+        ParameterInfo("b1", nominal=200.0, lower=100.0, upper=upper),
+        ParameterInfo("b2", positive=True),
+    )
     result = estimate(
         open_together([path], ConstrainedModel(Formula(SATURATION, START), known)),
         noise=Unknown() if unknown else Gaussian(1.0),
@@ -61,7 +67,11 @@ def test_an_estimate_on_its_bound_is_the_minimum_within_the_bounds(tmp_path, upp
     x, deviations = solution(lambda p: (upper * (1 - np.exp(-p[0] * t)) - y) / sigma, [5e-4])
     assert result.x[1] == pytest.approx(x[0], rel=1e-8)
     assert result.degrees_of_freedom == len(t) - 1
-    level = np.sqrt(np.sum(((upper * (1 - np.exp(-x[0] * t)) - y) / sigma) ** 2) / (len(t) - 1)) if unknown else 1.0
+    level = (
+        np.sqrt(np.sum(((upper * (1 - np.exp(-x[0] * t)) - y) / sigma) ** 2) / (len(t) - 1))
+        if unknown
+        else 1.0
+    )
     assert np.isnan(result.standard_errors[0])
     assert result.standard_errors[1] == pytest.approx(level * deviations[0], rel=1e-6)
 
@@ -80,11 +90,19 @@ def test_a_minimum_near_a_bound_but_inside_is_not_on_it(tmp_path):
 def test_draws_of_a_positive_parameter_are_log_normal_and_of_a_bounded_one_inside():
     model = ConstrainedModel(
         LotkaVolterra(),
-        (ParameterInfo("birth", positive=True, deviation=0.3), ParameterInfo("death", lower=0.5, upper=1.0)),
+        (
+            ParameterInfo("birth", positive=True, deviation=0.3),
+            ParameterInfo("death", lower=0.5, upper=1.0),
+        ),
     )
     scenario = Scenario(model, Gaussian(0.5), GaussianPrior(model.prior_deviations), 1.0)
     values = model.physical(
-        np.stack([scenario.prior.draw(model.nominal, 1.0, rng) for rng in map(np.random.default_rng, range(2000))])
+        np.stack(
+            [
+                scenario.prior.draw(model.nominal, 1.0, rng)
+                for rng in map(np.random.default_rng, range(2000))
+            ]
+        )
     )
     birth, death = values[:, 0], values[:, 2]
     assert (birth > 0).all()
@@ -108,5 +126,7 @@ def test_every_coordinate_of_a_known_parameter_leads_back_to_its_value():
 def test_every_model_with_a_noise_of_its_own_is_simulated_with_it():
     assert Scenario(Gins()).noise == Quantization(step=0.02286)
     assert Scenario(Sir()).noise == Gaussian(20.0)
-    with pytest.raises(UserError, match=r"measurement=formula names no noise of its own; set noise.deviation"):
+    with pytest.raises(
+        UserError, match=r"measurement=formula names no noise of its own; set noise.deviation"
+    ):
         Scenario(Formula("a*t", {"a": 1.0}, {"t": (1.0, 2.0)}))

@@ -31,7 +31,9 @@ def examined(model, z, deviation: float, *known: ParameterInfo):
     return found
 
 
-@pytest.mark.oracle("closed form: chi-square of a linear parameter", "end of the interval, in standard errors", 1e-3)
+@pytest.mark.oracle(
+    "closed form: chi-square of a linear parameter", "end of the interval, in standard errors", 1e-3
+)
 @pytest.mark.parametrize("beyond", [0.0, 0.5, 3.0])
 @pytest.mark.parametrize("side", [-1, 1])
 def test_the_interval_of_a_linear_parameter_on_its_bound_is_known(beyond, side):
@@ -73,14 +75,18 @@ def test_profiles_of_the_others_let_a_parameter_leave_its_bound_inwards(side):
 
     least = 2 + c / sb**2 * (bound - 5)
     assert found.x[0] == pytest.approx(least, abs=1e-9)
-    ends = [brentq(lambda a: rise(a) - Q**2, least + s * 1e-9, least + s * 20 * sa) for s in (-1, 1)]
+    ends = [
+        brentq(lambda a: rise(a) - Q**2, least + s * 1e-9, least + s * 20 * sa) for s in (-1, 1)
+    ]
     assert np.ravel(found.profiles) == pytest.approx(ends, abs=2e-3 * sa)
     # Held on its bound, the slope would leave far shorter an interval to one side.
     longer, shorter = sorted((least - ends[0], ends[1] - least), reverse=True)
     assert longer > 1.2 * shorter
 
 
-@pytest.mark.oracle("library: SciPy's least_squares and brentq", "end of the interval, in its width", 1e-3)
+@pytest.mark.oracle(
+    "library: SciPy's least_squares and brentq", "end of the interval, in its width", 1e-3
+)
 def test_the_interval_on_a_bound_is_where_scipys_profile_rises():
     rng = np.random.default_rng(8)
     t = np.linspace(50, 700, 14)
@@ -96,7 +102,9 @@ def test_the_interval_on_a_bound_is_where_scipys_profile_rises():
 
     least = chi_square(235.0)
     expected = float(brentq(lambda b1: chi_square(b1) - least - Q**2, 150.0, 235.0))  # type: ignore[arg-type]
-    assert_agrees(found.on_bounds[0].other / (235.0 - expected), expected / (235.0 - expected), atol=1e-3)
+    assert_agrees(
+        found.on_bounds[0].other / (235.0 - expected), expected / (235.0 - expected), atol=1e-3
+    )
 
 
 def test_an_interval_ends_at_the_other_bound_where_the_readings_say_nothing():
@@ -110,13 +118,17 @@ TIMES = np.linspace(0, 6, 25)
 def decay_above_zero(c: float, seed: int, bootstraps: int = 500):
     """A decay to c, which cannot be negative, read 25 times with errors of .05."""
     model = Formula("a*exp(-b*t)+c", {"a": 1.0, "b": 0.5, "c": 0.1}, {"t": tuple(TIMES)})
-    problem = Scenario(ConstrainedModel(model, (ParameterInfo("c", lower=0.0),)), Gaussian(0.05)).problem
+    problem = Scenario(
+        ConstrainedModel(model, (ParameterInfo("c", lower=0.0),)), Gaussian(0.05)
+    ).problem
     z = 2 * np.exp(-0.7 * TIMES) + c + 0.05 * np.random.default_rng(seed).standard_normal(25)
     fits = fit(problem, z, LM)
     return fits[0], examine(problem, z, fits, bootstraps=bootstraps)
 
 
-@pytest.mark.parametrize(("seed", "drawn"), [(0, 500), (2, 60)], ids=["estimate inside", "estimate on the bound"])
+@pytest.mark.parametrize(
+    ("seed", "drawn"), [(0, 500), (2, 60)], ids=["estimate inside", "estimate on the bound"]
+)
 def test_simulated_sets_are_minimised_within_the_bounds_as_the_readings_were(seed, drawn):
     """Each once more by SciPy; about half are on the bound, and without those 0 would not be in the interval."""
     one, found = decay_above_zero(0.0, seed, bootstraps=drawn)
@@ -130,7 +142,9 @@ def test_simulated_sets_are_minimised_within_the_bounds_as_the_readings_were(see
         return p[0] * np.exp(-p[1] * TIMES) + p[2] - z
 
     bounds = ([-np.inf, -np.inf, 0.0], np.inf)
-    x = np.array([least_squares(residuals, one.x, bounds=bounds, xtol=1e-10, args=(z,)).x for z in sets])
+    x = np.array(
+        [least_squares(residuals, one.x, bounds=bounds, xtol=1e-10, args=(z,)).x for z in sets]
+    )
     assert drawn / 6 < (x[:, 2] < 1e-6).sum() < 5 * drawn / 6
     low, high = np.quantile(x, [0.025, 0.975], axis=0)
     free = len(found.bootstrap.low)  # of one on its bound no interval is drawn
@@ -153,15 +167,22 @@ def test_intervals_end_on_the_bound_that_they_reach():
     assert high == pytest.approx(reach, rel=0.1)
 
 
-@pytest.mark.parametrize(("error", "symmetric"), [(0.6, True), (0.9, True), (1.1, True), (0.3, False)])
-def test_an_interval_is_symmetric_in_the_parameter_if_three_half_widths_reach_its_bound(error, symmetric):
+@pytest.mark.parametrize(
+    ("error", "symmetric"), [(0.6, True), (0.9, True), (1.1, True), (0.3, False)]
+)
+def test_an_interval_is_symmetric_in_the_parameter_if_three_half_widths_reach_its_bound(
+    error, symmetric
+):
     """The estimate is 2 above 0, and 1.96 standard errors are the half-width."""
     model = ConstrainedModel(LINE, (ParameterInfo("a", lower=0.0),))
     x = model.nominal + np.array([np.log(2.0), 0.0])
     assert model.physical(x[None])[0, 0] == pytest.approx(2.0)
     low, high = (end[0] for end in wald_interval(model, x, np.array([error / 2.0, 1.0]), Q))
     if symmetric:
-        assert (low, high) == (pytest.approx(max(0.0, 2.0 - Q * error)), pytest.approx(2.0 + Q * error))
+        assert (low, high) == (
+            pytest.approx(max(0.0, 2.0 - Q * error)),
+            pytest.approx(2.0 + Q * error),
+        )
     else:
         assert np.log([low / 2.0, high / 2.0]) == pytest.approx([-Q * error / 2.0, Q * error / 2.0])
 
@@ -186,12 +207,17 @@ def test_1000_truths_on_and_near_a_bound_are_in_every_interval(c):
             ends = [(found.on_bounds[0].bound, found.on_bounds[0].other)] * 3
         else:
             bootstrap = found.bootstrap
-            ends = [[end[2] for end in both] for both in (found.profiles, found.wald, (bootstrap.low, bootstrap.high))]
+            ends = [
+                [end[2] for end in both]
+                for both in (found.profiles, found.wald, (bootstrap.low, bootstrap.high))
+            ]
         held = [low <= c <= high for low, high in ends]
         inside += held if seed < drawn else [*held[:2], False]
         widths.append([high - low for low, high in ends])
     covered = inside / [studies, studies, drawn]
-    print(f"c = {c}: covered {covered} (profile, standard error, bootstrap), widths {np.median(widths, axis=0)}")
+    print(
+        f"c = {c}: covered {covered} (profile, standard error, bootstrap), widths {np.median(widths, axis=0)}"
+    )
     assert (covered >= 0.93 - 2 * np.sqrt(0.07 * 0.93 / np.array([studies, studies, drawn]))).all()
 
 

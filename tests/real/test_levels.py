@@ -60,7 +60,9 @@ def gradient(function, u):
     return np.array([function(u + 1e-30j * e).imag for e in np.eye(len(u))]) / 1e-30
 
 
-@pytest.mark.oracle("library: SciPy's root of the likelihood's slopes", "parameters and logarithms of levels", 1e-8)
+@pytest.mark.oracle(
+    "library: SciPy's root of the likelihood's slopes", "parameters and logarithms of levels", 1e-8
+)
 @pytest.mark.parametrize("case", NOISES)
 def test_the_maximum_of_the_likelihood_is_that_of_a_direct_search(case):
     z, noise = readings(case, 3), NOISES[case][0]
@@ -72,27 +74,41 @@ def test_the_maximum_of_the_likelihood_is_that_of_a_direct_search(case):
         return np.sum(((z - h) / s) ** 2 + 2 * np.log(s))
 
     start = np.concatenate([[1.1, 0.9, 1.05], np.log([0.3, 0.3])])
-    near = nelder_mead(deviance, start, method="Nelder-Mead", options={"maxiter": 5000, "maxfev": 5000})
+    near = nelder_mead(
+        deviance, start, method="Nelder-Mead", options={"maxiter": 5000, "maxfev": 5000}
+    )
     direct = root(lambda u: gradient(deviance, u), near.x, tol=1e-13).x
     assert deviance(direct) <= near.fun
     found = start
-    for _ in range(2):  # the second from the first, since the logarithm of a level is held a little at its start
+    for _ in range(
+        2
+    ):  # the second from the first, since the logarithm of a level is held a little at its start
         model = Levelled(DECAY, levels, found[3:], np.ones(60))
-        minima = maximise_likelihood(Problem(model, Covariance(np.full(60, 0.2))), z[None], found[None])
+        minima = maximise_likelihood(
+            Problem(model, Covariance(np.full(60, 0.2))), z[None], found[None]
+        )
         found = minima.x[0]
     assert_agrees(found, direct, atol=1e-8)
     # Its value is -2 times the log likelihood over that of the deviations that R holds.
     assert minima.chi_square[0] == pytest.approx(deviance(direct) - 60 * 2 * np.log(0.2), rel=1e-9)
 
 
-@pytest.mark.oracle("published: restricted likelihood of Patterson and Thompson (1971)", "logarithms of levels", 1e-8)
+@pytest.mark.oracle(
+    "published: restricted likelihood of Patterson and Thompson (1971)",
+    "logarithms of levels",
+    1e-8,
+)
 def test_levels_of_a_linear_model_maximise_the_restricted_likelihood():
     """Of Patterson and Thompson: that of all contrasts of the readings whose mean is zero."""
     t, group = np.linspace(0.0, 1.0, 15), np.repeat([0, 1, 2], 5)
-    line = Formula("a + b*t + 0*group", {"a": 1.0, "b": 1.0}, {"t": tuple(t), "group": tuple(group)})
+    line = Formula(
+        "a + b*t + 0*group", {"a": 1.0, "b": 1.0}, {"t": tuple(t), "group": tuple(group)}
+    )
     z = 1 + 2 * t + np.array([0.1, 0.3, 1.0])[group] * np.random.default_rng(4).standard_normal(15)
     X = np.column_stack([np.ones(15), t])
-    contrasts = np.linalg.qr(np.column_stack([X, np.random.default_rng(0).standard_normal((15, 13))]))[0][:, 2:]
+    contrasts = np.linalg.qr(
+        np.column_stack([X, np.random.default_rng(0).standard_normal((15, 13))])
+    )[0][:, 2:]
     y = contrasts.T @ z
 
     def deviance(u):
@@ -117,7 +133,9 @@ def test_levels_of_a_linear_model_maximise_the_restricted_likelihood():
 def test_a_single_level_is_certified(dataset):
     model = Nist(dataset)
     problem = Problem(model, Covariance(np.ones(model.m)))
-    single, old = (fit(problem, model.recorded.z, LM, noise)[0] for noise in (Unknown(sigma="s"), Unknown()))
+    single, old = (
+        fit(problem, model.recorded.z, LM, noise)[0] for noise in (Unknown(sigma="s"), Unknown())
+    )
     n = model.n
     assert_agrees(single.x[n], model.certified.residual_deviation, rtol=1e-6)
     assert_agrees(single.x[:n], model.certified.parameters, rtol=1e-6)
@@ -164,8 +182,13 @@ def test_profile_ends_are_where_the_likelihood_has_risen_by_the_quantile(case, d
             options = {"xatol": 1e-8, "fatol": 1e-10, "maxiter": 5000, "maxfev": 5000}
             # A level of zero is far, in its logarithm, from where it is in the profile of another parameter.
             starts = (best[others], np.maximum(best[others], np.log(0.01)))
-            tried = [nelder_mead(held, start, method="Nelder-Mead", options=options).fun for start in starts]
-            assert min(tried) - deviance(best) == pytest.approx(expected, rel=1e-2 if case != data else 1e-3)
+            tried = [
+                nelder_mead(held, start, method="Nelder-Mead", options=options).fun
+                for start in starts
+            ]
+            assert min(tried) - deviance(best) == pytest.approx(
+                expected, rel=1e-2 if case != data else 1e-3
+            )
 
 
 @pytest.mark.slow
@@ -192,7 +215,9 @@ def test_intervals_hold_the_truth_and_levels_have_no_bias(case):
 
 @pytest.mark.slow
 def test_levels_stand_beside_the_parameters_of_every_estimator():
-    answer = ib.estimate(DECAY, readings("by output", 1), {**LM, "linear": LinearLSE()}, noise=NOISES["by output"][0])
+    answer = ib.estimate(
+        DECAY, readings("by output", 1), {**LM, "linear": LinearLSE()}, noise=NOISES["by output"][0]
+    )
     assert answer.table()["parameter"].tolist() == ["a", "k", "l", "sigma_0", "sigma_1"] * 2
     shown = str(answer)
     assert "linear: takes the levels for known" in shown
@@ -205,7 +230,11 @@ def test_only_the_profile_stands_beside_a_level():
     z = readings("by output", 1)
     answer = ib.estimate(DECAY, z, LM, noise=NOISES["by output"][0])
     found = answer.examination
-    for low, high in (found.wald, (found.bootstrap.low, found.bootstrap.high), answer["lm"].interval()):
+    for low, high in (
+        found.wald,
+        (found.bootstrap.low, found.bootstrap.high),
+        answer["lm"].interval(),
+    ):
         assert (low[:3] < high[:3]).all()
         assert np.isnan([low[3:], high[3:]]).all()
     low, high = found.profiles
@@ -218,7 +247,9 @@ def test_only_the_profile_stands_beside_a_level():
 def test_estimates_with_a_prior_have_the_levels_of_their_residuals():
     """A wide prior says next to nothing, so that its estimate is that without one."""
     estimators = {**LM, "map": MapLM(tolerance=1e-10, prior_inflation=1e6)}
-    answer = ib.estimate(DECAY, readings("by output", 1), estimators, noise=Unknown(by="second"), error_scale=1.0)
+    answer = ib.estimate(
+        DECAY, readings("by output", 1), estimators, noise=Unknown(by="second"), error_scale=1.0
+    )
     assert answer["map"].x == pytest.approx(answer["lm"].x, rel=1e-3)
     assert answer.examination.label == "lm"
     assert "map: takes the levels for known" in str(answer)
@@ -227,10 +258,15 @@ def test_estimates_with_a_prior_have_the_levels_of_their_residuals():
 def test_a_column_of_standard_deviations_weighs_the_levels(tmp_path):
     z, weight = readings("by output", 1), np.where(SECOND == 0, 4.0, 1.0)
     rows = zip(TIMES.tolist(), SECOND.tolist(), z.tolist(), weight.tolist(), strict=True)
-    (tmp_path / "my.csv").write_text("\n".join(["t,second,y,sigma", *(",".join(map(str, row)) for row in rows)]))
+    (tmp_path / "my.csv").write_text(
+        "\n".join(["t,second,y,sigma", *(",".join(map(str, row)) for row in rows)])
+    )
     model = Formula(DECAY.expression, dict(DECAY.start))
     noise = Unknown(by="second", sigma="s")
-    weighted, plain = ib.estimate(model, tmp_path / "my.csv", LM, noise=noise)["lm"], fitted("by output", z)
+    weighted, plain = (
+        ib.estimate(model, tmp_path / "my.csv", LM, noise=noise)["lm"],
+        fitted("by output", z),
+    )
     assert weighted.x * [1, 1, 1, 4, 1] == pytest.approx(plain.x, rel=1e-6)
 
 
@@ -270,10 +306,16 @@ def test_a_parameter_on_its_bound_is_held_there_beside_the_levels():
         ({"sigma": "a0 - b0*h"}, r"noise.sigma=a0 - b0\*h: can be negative .* such as a \+ b\*h"),
         ({"sigma": "0.1*h"}, "has no level to estimate"),
         ({"sigma": "a + b*h"}, "a is a parameter of the model; give the level another name"),
-        ({"sigma": "a0 + b0*y"}, r"no readings tell its levels a0, b0, y apart; leave some out \(h is the reading"),
+        (
+            {"sigma": "a0 + b0*y"},
+            r"no readings tell its levels a0, b0, y apart; leave some out \(h is the reading",
+        ),
         ({"sigma": "a*1e400"}, "no readings tell its levels a apart"),
         ({"sigma": "floor + "}, r"noise.sigma: 'floor \+ ' is not a formula"),
-        ({"by": "output"}, "noise.by=output: there is no such column of the readings .*row, second, t"),
+        (
+            {"by": "output"},
+            "noise.by=output: there is no such column of the readings .*row, second, t",
+        ),
     ],
 )
 def test_a_noise_that_cannot_be_is_refused_in_one_line(options, words):
@@ -289,9 +331,21 @@ FLAT = replace(DECAY, expression="second*(a + k*t) + 0*l")
 @pytest.mark.parametrize(
     ("model", "noise", "rows", "value", "words"),
     [
-        (DECAY, BY, np.s_[32:], np.nan, "the 2 readings of 1 are too few to tell sigma beside 2 parameters"),
+        (
+            DECAY,
+            BY,
+            np.s_[32:],
+            np.nan,
+            "the 2 readings of 1 are too few to tell sigma beside 2 parameters",
+        ),
         (FLAT, BY, np.s_[:30], 0.0, "the level of 0 cannot be estimated from residuals of zero"),
-        (DECAY, Unknown(sigma="share*h"), np.s_[:1], 0.0, r"noise.sigma=share\*h: is 0 at 1 of 60 readings"),
+        (
+            DECAY,
+            Unknown(sigma="share*h"),
+            np.s_[:1],
+            0.0,
+            r"noise.sigma=share\*h: is 0 at 1 of 60 readings",
+        ),
     ],
 )
 def test_what_would_make_the_likelihood_infinite_is_refused(model, noise, rows, value, words):
@@ -302,11 +356,15 @@ def test_what_would_make_the_likelihood_infinite_is_refused(model, noise, rows, 
 
 
 def test_a_formula_of_the_standard_deviation_has_exact_slopes():
-    levels = Unknown(tuple(np.linspace(1, 2, 60).tolist()), "second", "floor + sqrt(share*h)").levels_of(DECAY)
+    levels = Unknown(
+        tuple(np.linspace(1, 2, 60).tolist()), "second", "floor + sqrt(share*h)"
+    ).levels_of(DECAY)
     h, theta = np.random.default_rng(0).normal(0, 3, (2, 60)), np.log([[0.5, 0.1, 0.4, 2.0]] * 2)
     _, by_h, by_theta = levels.at(h, theta)
     step = 1e-6
-    assert by_h == pytest.approx((levels.at(h + step, theta)[0] - levels.at(h - step, theta)[0]) / (2 * step), rel=1e-4)
+    assert by_h == pytest.approx(
+        (levels.at(h + step, theta)[0] - levels.at(h - step, theta)[0]) / (2 * step), rel=1e-4
+    )
     for k, e in enumerate(np.eye(4)):
         change = levels.at(h, theta + step * e)[0] - levels.at(h, theta - step * e)[0]
         assert by_theta[:, :, k] == pytest.approx(change / (2 * step), abs=1e-7)

@@ -52,7 +52,9 @@ def ways_of_writing() -> Iterator[Case]:
         itertools.permutations(COLUMNS), separators.items(), ends.items(), (False, True)
     ):
         text = lines(
-            {k: COLUMNS[k] for k in order}, separator=separator, cell=lambda v, p=point: repr(v).replace(".", p)
+            {k: COLUMNS[k] for k in order},
+            separator=separator,
+            cell=lambda v, p=point: repr(v).replace(".", p),
         )
         content = newline.join(text).encode("utf-8-sig" if marked else "utf-8")
         yield Case(f"{'-'.join(order)} {how} {end}{' marked' * marked}", content)
@@ -77,7 +79,11 @@ NO_NUMBERS = {
 
 def wrong_cells() -> Iterator[Case]:
     for column, (name, text) in itertools.product(COLUMNS, NO_NUMBERS.items()):
-        yield Case(f"{name} in {column}", with_cell(column, text), rf"row 4, column {column}: .*; (correct it|leave)")
+        yield Case(
+            f"{name} in {column}",
+            with_cell(column, text),
+            rf"row 4, column {column}: .*; (correct it|leave)",
+        )
 
 
 def text(*rows: str) -> bytes:
@@ -105,8 +111,14 @@ WITHOUT_THE_THIRD = {
 }
 NO_HEADER = "row 2: looks like the header, which must be the first row"
 REFUSED = {
-    "weight missing": (with_cell("sigma", ""), r"row 4, column sigma: '' is not a standard deviation"),
-    "weight zero": (with_cell("sigma", "0"), r"row 4, column sigma: '0' is not a standard deviation"),
+    "weight missing": (
+        with_cell("sigma", ""),
+        r"row 4, column sigma: '' is not a standard deviation",
+    ),
+    "weight zero": (
+        with_cell("sigma", "0"),
+        r"row 4, column sigma: '0' is not a standard deviation",
+    ),
     "time missing": (with_cell("t", ""), r"row 4, column t: is empty"),
     "rows numbered otherwise": (
         text("row,t,y,sigma", *(f"{i},{line}" for i, line in enumerate(GOOD[1:]))),
@@ -123,7 +135,10 @@ REFUSED = {
     "blanks between": (WHOLE.replace(",", "  ").encode(), "column t is missing"),
     "a separator declared": (text("sep=,", *GOOD), NO_HEADER),
     "a remark first": (text("# voltmeter 3", *GOOD), NO_HEADER),
-    "a remark within": (text(*GOOD[:3], "# pause", *GOOD[3:]), "row 4: has 1 cells and the header 3"),
+    "a remark within": (
+        text(*GOOD[:3], "# pause", *GOOD[3:]),
+        "row 4: has 1 cells and the header 3",
+    ),
     "two headers": (text(*GOOD[:4], *GOOD), r"row 5, column .: '.' is not a number"),
     "units in a row": (text(GOOD[0], "s,V,V", *GOOD[1:]), r"row 2, column .: '.' is not a number"),
     "a sum below": (text(*GOOD, ",999,"), r"row 8, column t: is empty"),
@@ -131,29 +146,65 @@ REFUSED = {
         text(GOOD[0], *(line.replace(".", ",") for line in GOOD[1:])),
         "row 2: has 6 cells and the header 3; with decimal commas, separate the cells by semicolons",
     ),
-    "thousands": (text(GOOD[0], '1,"1,017.5",1', *GOOD[1:]), r"row 2, column y: '1,017.5' is not a number"),
+    "thousands": (
+        text(GOOD[0], '1,"1,017.5",1', *GOOD[1:]),
+        r"row 2, column y: '1,017.5' is not a number",
+    ),
     # Of which nobody knows whether it is 1.234 or 1234.
-    "a point between decimal commas": (text("t;y;sigma", "0,5;1,2;1", "1.234;2,4;1"), r"row 3, column t: '1\.234'"),
-    "thousands of Germany": (text("t;y;sigma", "1,5;1.017,5;1", "2;3;1", "3;4;1"), r"row 2, column y: '1.017,5'"),
-    "a cell too few": (text(*GOOD[:2], "1.25,2.5", *GOOD[3:]), "row 3: has 2 cells and the header 3"),
-    "a cell too many": (text(*GOOD[:2], GOOD[2] + ",7", *GOOD[3:]), "row 3: has 4 cells and the header 3"),
-    "a comma behind each row": (text(*(line + "," for line in GOOD)), "column 4, which has no name, is not"),
+    "a point between decimal commas": (
+        text("t;y;sigma", "0,5;1,2;1", "1.234;2,4;1"),
+        r"row 3, column t: '1\.234'",
+    ),
+    "thousands of Germany": (
+        text("t;y;sigma", "1,5;1.017,5;1", "2;3;1", "3;4;1"),
+        r"row 2, column y: '1.017,5'",
+    ),
+    "a cell too few": (
+        text(*GOOD[:2], "1.25,2.5", *GOOD[3:]),
+        "row 3: has 2 cells and the header 3",
+    ),
+    "a cell too many": (
+        text(*GOOD[:2], GOOD[2] + ",7", *GOOD[3:]),
+        "row 3: has 4 cells and the header 3",
+    ),
+    "a comma behind each row": (
+        text(*(line + "," for line in GOOD)),
+        "column 4, which has no name, is not",
+    ),
     "two columns of one name": (text("t,y,y", *GOOD[1:]), "column y stands there twice"),
-    "two columns without a name": (text("t,y,sigma,,", *(f"{line},," for line in GOOD[1:])), "without a name stand"),
+    "two columns without a name": (
+        text("t,y,sigma,,", *(f"{line},," for line in GOOD[1:])),
+        "without a name stand",
+    ),
     "weight": (text("t,y,weight", *GOOD[1:]), "column weight is not understood; remove it"),
     "a note": (text("t,y,note", *(f"{t},{y},fine" for t, y, _ in ROWS)), "column note is not"),
     "sigm": (text("t,y,sigm", *GOOD[1:]), "column sigm is not understood; did you mean sigma"),
     "Sigma": (text("t,y,Sigma", *GOOD[1:]), "column Sigma is not understood; did you mean sigma"),
-    "T": (text("T,y,sigma", *GOOD[1:]), "column t is missing; there are T, y, sigma; did you mean T"),
-    "Y": (text("t,Y,sigma", *GOOD[1:]), "column y is missing, .* there are t, Y, sigma; set measurement.read"),
+    "T": (
+        text("T,y,sigma", *GOOD[1:]),
+        "column t is missing; there are T, y, sigma; did you mean T",
+    ),
+    "Y": (
+        text("t,Y,sigma", *GOOD[1:]),
+        "column y is missing, .* there are t, Y, sigma; set measurement.read",
+    ),
     "x": (text("x,y,sigma", *GOOD[1:]), "column t is missing.*If t is a parameter"),
     "another unit of sigma": (
         text("t,y [V],sigma [mV]", *GOOD[1:]),
         r"column sigma \[mV\]: the unit must be that of y",
     ),
-    "a quote left open": (text(*GOOD[:4], '3.5,"0.001,2.0', *GOOD[5:]), r"row \d: is not a readable CSV file"),
-    "a quote within": (text(*GOOD[:4], '3.5,"0."001,2.0', *GOOD[5:]), r"row 5: is not a readable CSV file"),
-    "latin-1": (text("t,y [µV],sigma", *GOOD[1:]).decode().encode("latin-1"), "row 1: is not a readable CSV"),
+    "a quote left open": (
+        text(*GOOD[:4], '3.5,"0.001,2.0', *GOOD[5:]),
+        r"row \d: is not a readable CSV file",
+    ),
+    "a quote within": (
+        text(*GOOD[:4], '3.5,"0."001,2.0', *GOOD[5:]),
+        r"row 5: is not a readable CSV file",
+    ),
+    "latin-1": (
+        text("t,y [µV],sigma", *GOOD[1:]).decode().encode("latin-1"),
+        "row 1: is not a readable CSV",
+    ),
     "UTF-16": (WHOLE.encode("utf-16"), "row 1: is not a readable CSV file"),
     "compressed": (gzip.compress(WHOLE.encode(), mtime=0), "is not a readable CSV file"),
     "a page": (b"<html><body>404 not found</body></html>", "column t is missing"),
@@ -179,12 +230,21 @@ def tables_of_programs() -> Iterator[Case]:
     yield Case("text called Parquet", WHOLE.encode(), "is not a readable Parquet file", ".parquet")
     yield Case("Parquet called text", parquet(COLUMNS), "is not a readable CSV file")
     yield Case("Parquet", parquet(COLUMNS), suffix=".parquet")
-    yield Case("Parquet of texts", parquet({k: [repr(v) for v in c] for k, c in COLUMNS.items()}), suffix=".parquet")
-    yield Case("Parquet in another order", parquet(dict(reversed(COLUMNS.items()))), suffix=".parquet")
+    yield Case(
+        "Parquet of texts",
+        parquet({k: [repr(v) for v in c] for k, c in COLUMNS.items()}),
+        suffix=".parquet",
+    )
+    yield Case(
+        "Parquet in another order", parquet(dict(reversed(COLUMNS.items()))), suffix=".parquet"
+    )
     holes = {"t": T, "y": [*Y[:2], None, *Y[3:]], "sigma": SIGMA}
     yield Case("Parquet with a hole", parquet(holes), suffix=".parquet", missing=(2,))
     yield Case(
-        "Parquet with words", parquet({**COLUMNS, "y": list("abcdef")}), "row 1, column y: 'a' is not", ".parquet"
+        "Parquet with words",
+        parquet({**COLUMNS, "y": list("abcdef")}),
+        "row 1, column y: 'a' is not",
+        ".parquet",
     )
     yield Case(
         "Parquet with dates",
@@ -192,7 +252,12 @@ def tables_of_programs() -> Iterator[Case]:
         "row 1, column t: '1970.*' is not",
         ".parquet",
     )
-    yield Case("Parquet without rows", parquet({k: [] for k in COLUMNS}), "has a header and no rows", ".parquet")
+    yield Case(
+        "Parquet without rows",
+        parquet({k: [] for k in COLUMNS}),
+        "has a header and no rows",
+        ".parquet",
+    )
 
 
 def written(model: Measurement, change=lambda rows: rows) -> bytes:
@@ -218,9 +283,19 @@ MEANT = (
     ("a beacon with weights", Ranging(), lambda rows: with_weights(rows)),
 )
 MISTAKEN = (
-    ("a beacon twice", Ranging(), lambda r: [*r, r[1]], r"row \d+: round=1, beacon=1 stands in row 2 already"),
+    (
+        "a beacon twice",
+        Ranging(),
+        lambda r: [*r, r[1]],
+        r"row \d+: round=1, beacon=1 stands in row 2 already",
+    ),
     ("a beacon too few", Ranging(), lambda rows: rows[:-1], r"rows; the first absent one is"),
-    ("an unknown beacon", Ranging(), replaced(2, "1,1,", "1,99,"), "row 2: ranging has no reading round=1, beacon=99"),
+    (
+        "an unknown beacon",
+        Ranging(),
+        replaced(2, "1,1,", "1,99,"),
+        "row 2: ranging has no reading round=1, beacon=99",
+    ),
     ("a day before the start", Sir(), replaced(2, "1,1.0,", "1,-1.0,"), "comes before the start"),
     ("an unknown output", Sir(), replaced(3, "infected", "healed"), "output=healed"),
     ("no first epidemic", Sir(), replaced(3, "1,", "3,"), "case=3: cases are numbered"),
@@ -229,12 +304,27 @@ MISTAKEN = (
 
 def files_of_models() -> Iterator[Case]:
     for model in (Ranging(), Sir()):
-        other_unit = replaced(1, "[day]", "[week]") if model.name == "sir" else replaced(1, "[m", "[km")
+        other_unit = (
+            replaced(1, "[day]", "[week]") if model.name == "sir" else replaced(1, "[m", "[km")
+        )
         yield Case(f"{model.name} as written", written(model), model=model)
-        yield Case(f"{model.name} in another unit", written(model, other_unit), r"unit must be|is missing", model=model)
-        yield Case(f"{model.name} with its first reading gone", written(model, emptied), model=model, missing=(0,))
+        yield Case(
+            f"{model.name} in another unit",
+            written(model, other_unit),
+            r"unit must be|is missing",
+            model=model,
+        )
+        yield Case(
+            f"{model.name} with its first reading gone",
+            written(model, emptied),
+            model=model,
+            missing=(0,),
+        )
     yield from (Case(name, written(model, change), model=model) for name, model, change in MEANT)
-    yield from (Case(name, written(model, change), refusal, model=model) for name, model, change, refusal in MISTAKEN)
+    yield from (
+        Case(name, written(model, change), refusal, model=model)
+        for name, model, change, refusal in MISTAKEN
+    )
 
 
 def emptied(rows: list[str]) -> list[str]:
@@ -273,7 +363,9 @@ def test_a_file_is_read_as_meant_or_refused_with_its_row(case, tmp_path):
     if case.model is LINE:
         z, known = np.array(Y), found.model.columns["t"]
         assert list(known) == T
-        expected = np.where(np.isin(np.arange(6), case.missing) & np.isnan(found.deviations), np.nan, SIGMA)
+        expected = np.where(
+            np.isin(np.arange(6), case.missing) & np.isnan(found.deviations), np.nan, SIGMA
+        )
         np.testing.assert_array_equal(found.deviations, expected)
     else:
         # In whatever order the rows stand, each reading is that of the model which the file describes.
@@ -286,7 +378,9 @@ def test_a_file_is_read_as_meant_or_refused_with_its_row(case, tmp_path):
 def test_files_in_different_units_are_not_estimated_together(tmp_path):
     (tmp_path / "a.csv").write_text("t [s],y\n1,2\n2,3\n3,4\n")
     (tmp_path / "b.csv").write_text("t [min],y\n1,2\n2,3\n3,4\n")
-    with pytest.raises(UserError, match=r"b.csv: column t \[min\]: .*a.csv has it in s; convert the values"):
+    with pytest.raises(
+        UserError, match=r"b.csv: column t \[min\]: .*a.csv has it in s; convert the values"
+    ):
         open_together([tmp_path / "a.csv", tmp_path / "b.csv"], LINE)
 
 

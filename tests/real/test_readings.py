@@ -58,7 +58,9 @@ def test_every_number_survives_both_ways_of_writing_it(tmp_path, value):
 @pytest.mark.slow
 @settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @example(text="0\x1f")
-@given(text=st.text(st.characters(codec="utf-8", exclude_characters='"\n\r'), min_size=1, max_size=8))
+@given(
+    text=st.text(st.characters(codec="utf-8", exclude_characters='"\n\r'), min_size=1, max_size=8)
+)
 def test_no_text_is_read_as_a_number_that_it_does_not_say(tmp_path, text):
     """What is accepted consists of the signs that numbers are written with, and is what Python reads."""
     path = with_reading(tmp_path, text)
@@ -72,7 +74,9 @@ def test_no_text_is_read_as_a_number_that_it_does_not_say(tmp_path, text):
         assert len(lines) == 1
         return
     text = text.strip()
-    assert (np.isnan(value) and not text) or (set(text) <= set("0123456789.+-eE") and value == float(text))
+    assert (np.isnan(value) and not text) or (
+        set(text) <= set("0123456789.+-eE") and value == float(text)
+    )
 
 
 def test_labels_are_compared_as_what_they_say(tmp_path):

@@ -160,5 +160,8 @@ def test_a_lag_without_two_readings_is_no_degree_of_freedom():
     apart = np.full((20, 1, 60), np.nan)
     apart[:, :, ::2] = e
     assert ljung_box(apart)[1].tolist() == [5.0] * 20
-    Q = [30 * 32 * sum((s[k:] @ s[:-k] / (s @ s)) ** 2 / (30 - k) for k in range(1, 6)) for s in e[:, 0]]
+    Q = [
+        30 * 32 * sum((s[k:] @ s[:-k] / (s @ s)) ** 2 / (30 - k) for k in range(1, 6))
+        for s in e[:, 0]
+    ]
     assert white_p(apart) == pytest.approx(chi2.sf(Q, 5), rel=1e-10)

@@ -37,7 +37,12 @@ def test_a_page_states_command_version_and_file_and_no_path_of_this_machine(tmp_
     pd.DataFrame({"x_error": error, "x_std": 0.1}).to_csv(file, index=False)
     assert main(["audit", str(file), f"output={tmp_path / 'out'}"]) == 1
     page = (tmp_path / "out" / "audit.html").read_text(encoding="utf-8")
-    for words in ("ipe-bench audit …/runs.csv output=…/out", f"ipe-bench {ib.__version__}", "How to cite", "<figure"):
+    for words in (
+        "ipe-bench audit …/runs.csv output=…/out",
+        f"ipe-bench {ib.__version__}",
+        "How to cite",
+        "<figure",
+    ):
         assert words in page
     assert hashlib.sha256(file.read_bytes()).hexdigest()[:16] in page
     assert str(tmp_path) not in page
@@ -55,7 +60,9 @@ def test_the_band_of_a_straight_line_is_the_textbooks_and_equal_residuals_are_dr
     """Draper and Smith, Applied Regression Analysis, 3rd ed., 1998, eq. (1.4.7)."""
     x = np.array([1.0, 2.0, 3.0, 5.0, 8.0])
     z = 1 + 2 * x + np.array([0.1, -0.2, 0.15, 0.05, -0.1])
-    found = ib.estimate(ib.measurements.Formula("a + b*x", {"a": 0.0, "b": 1.0}, {"x": x.tolist()}), z)
+    found = ib.estimate(
+        ib.measurements.Formula("a + b*x", {"a": 0.0, "b": 1.0}, {"x": x.tolist()}), z
+    )
     with house_style():
         (fit,) = draw_fit(found.examination, z, FACES["auto"])
         (residuals,) = draw_residuals(found.model, found.fits)
@@ -63,7 +70,11 @@ def test_the_band_of_a_straight_line_is_the_textbooks_and_equal_residuals_are_dr
     band = fit.figure.axes[0].collections[0].get_paths()[0].vertices
     s = np.sqrt(np.sum((z - np.polyval(np.polyfit(x, z, 1), x)) ** 2) / 3)
     for at in (1.0, 8.0):
-        half = student.ppf(0.975, 3) * s * np.sqrt(1 / 5 + (at - x.mean()) ** 2 / np.sum((x - x.mean()) ** 2))
+        half = (
+            student.ppf(0.975, 3)
+            * s
+            * np.sqrt(1 / 5 + (at - x.mean()) ** 2 / np.sum((x - x.mean()) ** 2))
+        )
         ends = band[np.isclose(band[:, 0], at)][:, 1]
         assert_agrees(np.ptp(ends), 2 * half, rtol=1e-4)
 
@@ -77,7 +88,12 @@ def test_certified_readings_have_a_curve_over_their_input():
 
 @pytest.mark.parametrize(
     ("low", "high", "ends"),
-    [(0.9963, 1, ("99.6", "100")), (0, 0.0037, ("0", "0.4")), (0.93, 1, ("93", "100")), (1, 1, ("100", "100"))],
+    [
+        (0.9963, 1, ("99.6", "100")),
+        (0, 0.0037, ("0", "0.4")),
+        (0.93, 1, ("93", "100")),
+        (1, 1, ("100", "100")),
+    ],
 )
 def test_ends_of_a_narrow_interval_have_decimals(low, high, ends):
     assert ends_in_percent(low, high) == ends
@@ -133,7 +149,11 @@ def test_a_tick_says_its_whole_value(start, width):
 def test_the_axes_of_posteriors_set_no_part_aside_and_its_lines_are_those_of_a_run(synthetic):
     """Marginals a millionth as wide as they are far from zero."""
     scenario = synthetic.scenario()
-    estimators = {"gauss_newton": ib.baselines.GaussNewton(), "enkf": ib.baselines.EnKF(), "mine": Pink()}
+    estimators = {
+        "gauss_newton": ib.baselines.GaussNewton(),
+        "enkf": ib.baselines.EnKF(),
+        "mine": Pink(),
+    }
     for label, estimator in estimators.items():
         synthetic.add(scenario, label, np.full((30, 3), 0.1), estimator=estimator)
     assert looks_of(estimators) == views(analyse([synthetic.directory]))[1].look
@@ -141,10 +161,16 @@ def test_the_axes_of_posteriors_set_no_part_aside_and_its_lines_are_those_of_a_r
     x = far * (1 + 1e-6 * np.random.default_rng(0).standard_normal((200, 3)))
     posterior = Posterior(x, x[:1], np.ones(1), 0.0, 0.0, np.zeros(2))
     status = np.array([Status.CONVERGED])
-    estimates = {label: Estimates(x[:1], status, covariance=np.cov(x.T)[None]) for label in estimators}
+    estimates = {
+        label: Estimates(x[:1], status, covariance=np.cov(x.T)[None]) for label in estimators
+    }
     with house_style():
-        (drawing,) = draw_marginals(model, [Reference(0, far, posterior, estimators, estimates, {})])
-    for ax, middle in zip(drawing.figure.axes, far * [p.size for p in model.parameters], strict=True):
+        (drawing,) = draw_marginals(
+            model, [Reference(0, far, posterior, estimators, estimates, {})]
+        )
+    for ax, middle in zip(
+        drawing.figure.axes, far * [p.size for p in model.parameters], strict=True
+    ):
         places, said = ticks_of(ax)
         assert len(set(said)) == len(said) >= 2
         assert said == pytest.approx(places, rel=1e-9)
@@ -162,13 +188,20 @@ def test_a_design_has_the_units_of_its_table_and_says_where_candidates_are_what_
     table = next(part for part in found.parts() if getattr(part, "name", "") == "parameters")
     bounds = next(column for column in table.columns if column.title == "bound")
     assert drawn == pytest.approx([float(cell.text) for cell in bounds.cells], rel=1e-2)
-    assert [label.get_text() for label in ax.get_yticklabels()] == ["east [m]", "north [m]", "up [m]", "clock [m]"]
+    assert [label.get_text() for label in ax.get_yticklabels()] == [
+        "east [m]",
+        "north [m]",
+        "up [m]",
+        "clock [m]",
+    ]
     assert not crowded(ax)
     assert "best choice" not in " ".join(ax.get_legend_handles_labels()[1])
     said = "The candidates are today's 21 readings, so there is no other choice."
     assert said in list(_design_sentences(found))
     assert [part.startswith(said) for part in _ways(found)] == [True]
-    fewer = ib.design(ib.measurements.Ranging(), noise=ib.noise.Gaussian(0.1), error_scale=10.0, readings=15)
+    fewer = ib.design(
+        ib.measurements.Ranging(), noise=ib.noise.Gaussian(0.1), error_scale=10.0, readings=15
+    )
     assert said not in list(_design_sentences(fewer))
     assert "optimal" not in " ".join(_design_sentences(fewer))
 
@@ -188,17 +221,27 @@ def test_a_change_that_is_found_but_may_be_below_the_margin_is_not_drawn_as_no_d
         (drawing,) = draw_pairs(frame)
     marks = {ax.get_title().partition(",")[0]: ax.lines[1] for ax in drawing.figure.axes}
     (legend,) = drawing.figure.legends
-    keys = dict(zip([text.get_text() for text in legend.get_texts()], legend.legend_handles, strict=True))
+    keys = dict(
+        zip([text.get_text() for text in legend.get_texts()], legend.legend_handles, strict=True)
+    )
     for kind, words in (
         ("error", "different, perhaps by less than the margin"),
         ("cost", "worse"),
         ("success", "no difference found"),
     ):
         same = marks[kind], keys[words]
-        assert len({line.get_marker() for line in same}) == len({line.get_markerfacecolor() for line in same}) == 1
-    for ax, (low, high) in zip(drawing.figure.axes, ((-1.0, 1.0), (1 / 1.02, 1.02), (1 / 1.05, 1.05)), strict=True):
+        assert (
+            len({line.get_marker() for line in same})
+            == len({line.get_markerfacecolor() for line in same})
+            == 1
+        )
+    for ax, (low, high) in zip(
+        drawing.figure.axes, ((-1.0, 1.0), (1 / 1.02, 1.02), (1 / 1.05, 1.05)), strict=True
+    ):
         (band,) = ax.patches
         assert (band.get_x(), band.get_x() + band.get_width()) == pytest.approx((low, high))
         assert ax.get_xlim()[0] <= low < high <= ax.get_xlim()[1]
-    assert "different is a change that may be smaller than the margin" in " ".join(str(frame).split())
+    assert "different is a change that may be smaller than the margin" in " ".join(
+        str(frame).split()
+    )
     assert re.search(r"mean error .* different", str(frame))

@@ -43,7 +43,9 @@ WRITTEN = sorted(PAGES.rglob("*.md"))
 
 
 def ids(path: Path) -> str:
-    return str(path.relative_to(PAGES)) if path.is_relative_to(PAGES) else path.name.partition(".")[0]
+    return (
+        str(path.relative_to(PAGES)) if path.is_relative_to(PAGES) else path.name.partition(".")[0]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +76,12 @@ LONG = ("nist",)
 """Experiments of so many jobs that to compose them takes longer than a second."""
 every_experiment = pytest.mark.parametrize(
     "path",
-    [pytest.param(p, marks=[pytest.mark.slow] * p.name.startswith(LONG), id=p.name.partition(".")[0]) for p in STORED],
+    [
+        pytest.param(
+            p, marks=[pytest.mark.slow] * p.name.startswith(LONG), id=p.name.partition(".")[0]
+        )
+        for p in STORED
+    ],
 )
 
 
@@ -82,7 +89,12 @@ def asked(experiment: str) -> tuple[Counter[str], int]:
     """The names of the results that an experiment asks for today, and its trials in each."""
     with session():
         jobs = jobs_of(words.read("run", [f"+experiment={experiment}"]), multirun=False)
-    keys = [key for one in jobs.specs for key in result_keys(one.scenario, one.estimators) if key.label != TRUTH]
+    keys = [
+        key
+        for one in jobs.specs
+        for key in result_keys(one.scenario, one.estimators)
+        if key.label != TRUTH
+    ]
     (trials,) = {one.count for one in jobs.specs}
     return Counter(canonical_json(key.names) for key in keys), trials
 
@@ -91,7 +103,9 @@ def asked(experiment: str) -> tuple[Counter[str], int]:
 def test_a_page_has_the_results_that_its_experiment_asks_for_today_or_says_how_many_it_lacks(path):
     name = path.name.removesuffix(SUFFIX)
     found, (wanted, trials) = read(path), asked(name)
-    there = Counter(canonical_json(group.footer["names"]) for group in found.analysis.collection.groups)
+    there = Counter(
+        canonical_json(group.footer["names"]) for group in found.analysis.collection.groups
+    )
     assert there <= wanted, "rows of another experiment"
     assert (found.asked_results, found.asked_trials) == (wanted.total(), trials)
     assert found.complete == (there == wanted and set(totals(found)["trials"]) == {trials})
@@ -139,21 +153,33 @@ def test_a_page_drawn_from_what_is_kept_is_the_page_of_the_results(synthetic, tm
     computed = two_scales(synthetic)
     computed.write(tmp_path / f"two{SUFFIX}", parameters=False)
     again = read(tmp_path / f"two{SUFFIX}")
-    assert (again.command, again.version, again.extent) == (computed.command, "1.2.3", computed.extent)
+    assert (again.command, again.version, again.extent) == (
+        computed.command,
+        "1.2.3",
+        computed.extent,
+    )
     with house_style():
         first, second = (pages.Page.of("two", one.analysis) for one in (computed, again))
     assert second.words == first.words
     assert first.html.index("<p>") < first.html.index("<table")  # the answer, then the numbers
     assert first.html.count("<tr") >= 1 + 4
     curves = [
-        [(line.get_color(), line.get_xydata().tolist()) for ax in one.figures[0].figure.axes for line in ax.lines]
+        [
+            (line.get_color(), line.get_xydata().tolist())
+            for ax in one.figures[0].figure.axes
+            for line in ax.lines
+        ]
         for one in (first, second)
     ]
     assert str(curves[0]) == str(curves[1])  # as NaN is no number
 
 
-@pytest.mark.parametrize(("results", "trials", "complete"), [(4, 30, True), (5, 30, False), (4, 31, False)])
-def test_a_page_and_its_thumbnail_say_what_is_incomplete(synthetic, tmp_path, results, trials, complete):
+@pytest.mark.parametrize(
+    ("results", "trials", "complete"), [(4, 30, True), (5, 30, False), (4, 31, False)]
+)
+def test_a_page_and_its_thumbnail_say_what_is_incomplete(
+    synthetic, tmp_path, results, trials, complete
+):
     computed = replace(two_scales(synthetic), asked_results=results, asked_trials=trials)
     extent = f"30 of {trials} trials; 4 of {results} results"
     option = SimpleNamespace(name="two", summary="", text="")
@@ -170,8 +196,14 @@ def test_a_page_and_its_thumbnail_say_what_is_incomplete(synthetic, tmp_path, re
 def test_the_table_of_the_best_names_who_was_not_run_at_a_scale(synthetic):
     summary = two_scales(synthetic).analysis.summary
     lacking = summary[(summary["estimator"] != "mine") | (summary["error_scale"] < 10)]
-    assert [row[2] for row in pages._best("two", summary)] == ["linear_lse, mine", "linear_lse, mine"]
-    assert [row[2] for row in pages._best("two", lacking)] == ["linear_lse, mine", "linear_lse (not run: mine)"]
+    assert [row[2] for row in pages._best("two", summary)] == [
+        "linear_lse, mine",
+        "linear_lse, mine",
+    ]
+    assert [row[2] for row in pages._best("two", lacking)] == [
+        "linear_lse, mine",
+        "linear_lse (not run: mine)",
+    ]
 
 
 @pytest.mark.slow
@@ -185,7 +217,9 @@ def test_what_is_stored_is_what_the_program_computes_today(name, tmp_path):
     for frame in KEPT:
         one, other = (getattr(each.analysis, frame) for each in (now, stored))
         timed = [column for column in one if "time" in column]
-        pd.testing.assert_frame_equal(one.drop(columns=timed), other.drop(columns=timed), rtol=1e-5, atol=1e-9)
+        pd.testing.assert_frame_equal(
+            one.drop(columns=timed), other.drop(columns=timed), rtol=1e-5, atol=1e-9
+        )
 
 
 @pytest.mark.parametrize("page", WRITTEN, ids=ids)
@@ -202,9 +236,18 @@ def test_options_are_described_from_class_and_config_and_say_what_they_mean():
     assert rows["tolerance"].kind == "a number above 0"
     assert rows["budget"].value == "null"
     assert rows["depth"].meaning == "past steps that each new one draws on"
-    every = [option for group in ("solver", "baseline", "noise", "measurement") for option in discovery.options(group)]
+    every = [
+        option
+        for group in ("solver", "baseline", "noise", "measurement")
+        for option in discovery.options(group)
+    ]
     ours = [option for option in every if option.source.name == "ipe-bench"]
-    assert [f"{option.name}.{row.name}" for option in ours for row in described(option) if not row.meaning] == []
+    assert [
+        f"{option.name}.{row.name}"
+        for option in ours
+        for row in described(option)
+        if not row.meaning
+    ] == []
 
 
 def test_every_command_has_a_section(generated):
@@ -241,29 +284,57 @@ def test_the_filters_of_the_page_are_the_kalman_filter_on_a_linear_model(code, n
 
 
 def test_attributes_of_public_classes_have_types_that_are_types():
-    lines = ["no limit.", "", ":type: Simulations that a trial may cost; None"]  # as napoleon leaves them
+    lines = [
+        "no limit.",
+        "",
+        ":type: Simulations that a trial may cost; None",
+    ]  # as napoleon leaves them
     show_type(None, "attribute", "ipe_bench.IPE.budget", None, None, lines)
-    assert lines == ["Simulations that a trial may cost; None: no limit.", "", "", ":type: float | None"]
-    classes = [thing for name in ipe_bench.__all__ if isinstance(thing := getattr(ipe_bench, name), type)]
-    assert {ipe_bench.IPE, ipe_bench.State, ipe_bench.Sequential, ipe_bench.OdeMeasurement} <= set(classes)
+    assert lines == [
+        "Simulations that a trial may cost; None: no limit.",
+        "",
+        "",
+        ":type: float | None",
+    ]
+    classes = [
+        thing for name in ipe_bench.__all__ if isinstance(thing := getattr(ipe_bench, name), type)
+    ]
+    assert {ipe_bench.IPE, ipe_bench.State, ipe_bench.Sequential, ipe_bench.OdeMeasurement} <= set(
+        classes
+    )
     names = [(cls, name) for cls in classes for name in vars(cls).get("__annotations__", {})]
     assert len(names) > 50
-    assert [one for one in names if not re.fullmatch(r"[\w.]+(\[.*\])?( \| .*)?", type_of(*one))] == []
+    assert [
+        one for one in names if not re.fullmatch(r"[\w.]+(\[.*\])?( \| .*)?", type_of(*one))
+    ] == []
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", [p for p in WRITTEN if blocks(p, "console") or blocks(p, "python")], ids=ids)
+@pytest.mark.parametrize(
+    "page", [p for p in WRITTEN if blocks(p, "console") or blocks(p, "python")], ids=ids
+)
 def test_what_a_page_says_to_type_works(page, tmp_path):
     environment = os.environ | {"NO_COLOR": "1"}
-    for name, content in re.findall(r"Write a file `(\S+)`:\n\n```text\n(.*?)```", page.read_text("utf-8"), re.DOTALL):
+    for name, content in re.findall(
+        r"Write a file `(\S+)`:\n\n```text\n(.*?)```", page.read_text("utf-8"), re.DOTALL
+    ):
         (tmp_path / name).write_text(content, encoding="utf-8")
     for line in "".join(blocks(page, "console")).splitlines():
-        program = [sys.executable, "-m", "ipe_bench", *shlex.split(line.removeprefix("$ ipe-bench "))]
-        done = subprocess.run(program, cwd=tmp_path, capture_output=True, text=True, env=environment, check=False)
+        program = [
+            sys.executable,
+            "-m",
+            "ipe_bench",
+            *shlex.split(line.removeprefix("$ ipe-bench ")),
+        ]
+        done = subprocess.run(
+            program, cwd=tmp_path, capture_output=True, text=True, env=environment, check=False
+        )
         assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
     for code in blocks(page, "python"):
         program = [sys.executable, "-c", code]
-        done = subprocess.run(program, cwd=tmp_path, capture_output=True, text=True, env=environment, check=False)
+        done = subprocess.run(
+            program, cwd=tmp_path, capture_output=True, text=True, env=environment, check=False
+        )
         assert done.returncode == 0, done.stderr
 
 
@@ -276,7 +347,11 @@ def test_the_whole_site_builds_without_a_warning_and_fetches_nothing(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     html = tmp_path / "html"
-    ours = [option.name for option in discovery.options("experiment") if option.source.name == "ipe-bench"]
+    ours = [
+        option.name
+        for option in discovery.options("experiment")
+        if option.source.name == "ipe-bench"
+    ]
     assert {"nist", "polynomial"} <= set(ours)
     assert 'href="gallery/ranging.html"' in (html / "choosing.html").read_text(encoding="utf-8")
     assert "100 trials per row" in (html / "howto" / "notebook.html").read_text(encoding="utf-8")
@@ -287,5 +362,11 @@ def test_the_whole_site_builds_without_a_warning_and_fetches_nothing(tmp_path):
         assert f"experiment={name}" in re.sub("<[^>]*>", "", page)  # without the marks of colours
         assert "<table" in page
         assert str(tmp_path) not in page
-    fetched = r"""<(?:script|img|iframe|link(?=[^>]*stylesheet))[^>]*(?:src|href)=["']?(?:https?:)?//"""
-    assert [page for page in html.rglob("*.html") if re.search(fetched, page.read_text(encoding="utf-8"))] == []
+    fetched = (
+        r"""<(?:script|img|iframe|link(?=[^>]*stylesheet))[^>]*(?:src|href)=["']?(?:https?:)?//"""
+    )
+    assert [
+        page
+        for page in html.rglob("*.html")
+        if re.search(fetched, page.read_text(encoding="utf-8"))
+    ] == []

@@ -90,7 +90,9 @@ def test_a_bar_is_drawn_and_what_is_printed_above_it_is_shown(monkeypatch):
     written = glass.getvalue()
     assert "\x1b[?25l" in written  # the bar hides the cursor
     assert "\u2501" in written
-    assert [bit for bit in ("\\x1b[0m", "\x9b", "\u202e", "\x1b]", "\x1b[2J") if bit in written] == []
+    assert [
+        bit for bit in ("\\x1b[0m", "\x9b", "\u202e", "\x1b]", "\x1b[2J") if bit in written
+    ] == []
     assert "\\x1b[31mr" in written
     assert "printed above" in written
 
@@ -108,4 +110,7 @@ def test_the_header_of_a_foreign_table_is_shown(ipe_bench):
         assert code == 0
         assert "\x1b" not in out + err
         with open("o/audit.html", encoding="utf-8") as page:
-            assert all("body{display" not in style for style in re.findall("<style>(.*?)</style>", page.read()))
+            assert all(
+                "body{display" not in style
+                for style in re.findall("<style>(.*?)</style>", page.read())
+            )

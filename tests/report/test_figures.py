@@ -47,7 +47,15 @@ SCALES = (1.0, 10.0, 100.0)
 MODULES = (errors, costs, parameters)
 
 
-def fill(store: Synthetic, *, labels=(REFERENCE, "fixed_point", "two"), scales=SCALES, trials=60, solved=None, **given):
+def fill(
+    store: Synthetic,
+    *,
+    labels=(REFERENCE, "fixed_point", "two"),
+    scales=SCALES,
+    trials=60,
+    solved=None,
+    **given,
+):
     rng = np.random.default_rng(0)
     for scale in scales:
         scenario = store.scenario(error_scale=scale, **given)
@@ -56,7 +64,13 @@ def fill(store: Synthetic, *, labels=(REFERENCE, "fixed_point", "two"), scales=S
             count = (solved or {}).get((label, scale), trials)
             estimator = Pretender() if label == REFERENCE else Seeker()
             factor = scale if label == REFERENCE else 1.0
-            store.add(scenario, label, factor * error, solved=np.arange(trials) < count, estimator=estimator)
+            store.add(
+                scenario,
+                label,
+                factor * error,
+                solved=np.arange(trials) < count,
+                estimator=estimator,
+            )
 
 
 def drawn(module, view: View) -> dict[str, Drawing]:
@@ -84,7 +98,12 @@ def points(ax, color: str) -> dict[float, tuple[float, bool]]:
 
 
 def bars(ax) -> list[np.ndarray]:
-    segments = [s for lines in ax.collections if isinstance(lines, LineCollection) for s in lines.get_segments()]
+    segments = [
+        s
+        for lines in ax.collections
+        if isinstance(lines, LineCollection)
+        for s in lines.get_segments()
+    ]
     return [segment for segment in segments if len(segment) == 2 and np.isfinite(segment).all()]
 
 
@@ -99,14 +118,24 @@ def test_costs_and_errors_stand_at_quantiles_of_all_trials(synthetic):
     distance = np.sort(np.sqrt(((error / 0.1) ** 2).mean(axis=1)))
     for scale in SCALES:
         scenario = synthetic.scenario(error_scale=scale)
-        synthetic.add(scenario, "one", error, solved=np.arange(200) < 150, estimator=Seeker(), simulations=7.0)
+        synthetic.add(
+            scenario, "one", error, solved=np.arange(200) < 150, estimator=Seeker(), simulations=7.0
+        )
     view = only_view(synthetic)
     (panel, *_) = drawn(costs, view)["cost_against_accuracy"].figure.axes
     ((cost, at),) = [point for marks in panel.collections for point in marks.get_offsets()]
     simulated = np.sqrt((np.random.default_rng(0).normal(size=(200_000, 3)) ** 2).mean(axis=1))
-    assert (cost, at) == pytest.approx((7.0, distance[189] / np.quantile(simulated, 0.95)), rel=0.05)
+    assert (cost, at) == pytest.approx(
+        (7.0, distance[189] / np.quantile(simulated, 0.95)), rel=0.05
+    )
     assert panel.lines[0].get_ydata()[0] == 1.0
-    synthetic.add(synthetic.scenario(error_scale=SCALES[0]), "same", error, estimator=Seeker(), simulations=7.0)
+    synthetic.add(
+        synthetic.scenario(error_scale=SCALES[0]),
+        "same",
+        error,
+        estimator=Seeker(),
+        simulations=7.0,
+    )
     (panel, *_) = drawn(costs, only_view(synthetic))["cost_against_accuracy"].figure.axes
     beside = sorted(float(cost) for marks in panel.collections for cost, _ in marks.get_offsets())
     assert beside == pytest.approx([7.0, 7.0 * 10**0.04])
@@ -130,7 +159,12 @@ def test_points_are_in_view_however_heavy_the_tails(synthetic):
     synthetic.add(synthetic.scenario(error_scale=100.0), "lost", np.full((60, 3), 1e12))
     for ax in drawn(costs, only_view(synthetic))["cost_against_accuracy"].figure.axes:
         low, high = ax.get_ylim()
-        places = [y for marks in ax.collections if isinstance(marks, PathCollection) for _, y in marks.get_offsets()]
+        places = [
+            y
+            for marks in ax.collections
+            if isinstance(marks, PathCollection)
+            for _, y in marks.get_offsets()
+        ]
         assert low < 1.0 < high
         assert all(low <= y <= high for y in places)
 
@@ -138,25 +172,44 @@ def test_points_are_in_view_however_heavy_the_tails(synthetic):
 # Curves over the error scale -----------------------------------------------------------------------------------------
 
 
-def test_points_of_few_trials_are_hollow_without_an_interval_and_missing_ones_break_the_line(synthetic):
-    fill(synthetic, labels=("fixed_point",), solved={("fixed_point", 100.0): 19, ("fixed_point", 10.0): 20})
+def test_points_of_few_trials_are_hollow_without_an_interval_and_missing_ones_break_the_line(
+    synthetic,
+):
+    fill(
+        synthetic,
+        labels=("fixed_point",),
+        solved={("fixed_point", 100.0): 19, ("fixed_point", 10.0): 20},
+    )
     drawing = drawn(parameters, only_view(synthetic))["parameter_errors_fixed_point"]
     panel = drawing.figure.axes[-1]
-    assert {x: hollow for x, (_, hollow) in points(panel, "#000000").items()} == {1.0: False, 10.0: True, 100.0: True}
+    assert {x: hollow for x, (_, hollow) in points(panel, "#000000").items()} == {
+        1.0: False,
+        10.0: True,
+        100.0: True,
+    }
     assert len(bars(panel)) == 2
     assert "(19 of 60 at scale 100)" in drawing.caption
     assert "solved trials" in drawing.title
     again = Synthetic(synthetic.directory.parent / "again")
     fill(again, solved={("fixed_point", 10.0): 0})
     drawing = drawn(parameters, only_view(again))["parameter_errors_fixed_point"]
-    curves = [line.get_ydata() for line in drawing.figure.axes[-1].lines if line.get_color() == "#000000"]
-    assert [np.isnan(np.array(y, dtype=float)).tolist() for y in curves if len(y) == 3] == [[False, True, False]]
+    curves = [
+        line.get_ydata() for line in drawing.figure.axes[-1].lines if line.get_color() == "#000000"
+    ]
+    assert [np.isnan(np.array(y, dtype=float)).tolist() for y in curves if len(y) == 3] == [
+        [False, True, False]
+    ]
 
 
 def test_estimators_that_coincide_are_seen_side_by_side(synthetic):
     fill(synthetic, labels=("fixed_point", "two", "three"))
     panel = drawn(errors, only_view(synthetic))["headline"].figure.axes[1]
-    at_ten = [x for line in panel.lines for x in line.get_xdata() if 5 < x < 20 and len(line.get_xdata()) == 3]
+    at_ten = [
+        x
+        for line in panel.lines
+        for x in line.get_xdata()
+        if 5 < x < 20 and len(line.get_xdata()) == 3
+    ]
     assert len(set(at_ten)) == 3
     assert max(at_ten) / min(at_ten) < 2
     # In the order of the legend, about the scale itself.
@@ -167,7 +220,9 @@ def test_estimators_that_coincide_are_seen_side_by_side(synthetic):
     ax = drawn(errors, view)["headline"].figure.axes[0]
     assert [t.get_text() for t in ax.get_yticklabels()] == list(view.look)
     assert {t.get_rotation() for t in ax.get_yticklabels()} == {0.0}
-    assert sorted(y for line in ax.lines for y in line.get_ydata() if len(line.get_ydata()) == 1) == [0, 1, 2]
+    assert sorted(
+        y for line in ax.lines for y in line.get_ydata() if len(line.get_ydata()) == 1
+    ) == [0, 1, 2]
 
 
 def test_scales_are_labelled_as_far_as_there_is_room_with_both_ends():
@@ -175,10 +230,21 @@ def test_scales_are_labelled_as_far_as_there_is_room_with_both_ends():
     for letter in (0.2, 0.1, 0.05, 0.02, 0.001):
         kept = common.labelled(scales, letter)
         assert (kept[0], kept[-1]) == (300.0, 10000.0)
-        assert all(np.log10(b / a) > letter * (len(f"{a:g}") + len(f"{b:g}")) / 2 for a, b in pairwise(kept))
+        assert all(
+            np.log10(b / a) > letter * (len(f"{a:g}") + len(f"{b:g}")) / 2
+            for a, b in pairwise(kept)
+        )
     assert kept == scales
     assert common.labelled([33.0], 1.0) == [33.0]
-    shown = {0.0: "0", 1e-3: "0.001", -0.05: "−0.05", 200.0: "200", 1e3: "1000", 1e4: "10⁴", 5e-7: "5·10⁻⁷"}
+    shown = {
+        0.0: "0",
+        1e-3: "0.001",
+        -0.05: "−0.05",
+        200.0: "200",
+        1e3: "1000",
+        1e4: "10⁴",
+        5e-7: "5·10⁻⁷",
+    }
     shown[1e-12] = "10⁻¹²"
     assert [common.number(v) for v in shown] == list(shown.values())
 
@@ -190,14 +256,26 @@ def test_scales_are_labelled_as_far_as_there_is_room_with_both_ends():
 SIGHT = {
     "normal": np.eye(3),
     "deuteranopia": np.array(
-        [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]]
+        [
+            [0.367322, 0.860646, -0.227968],
+            [0.280085, 0.672501, 0.047413],
+            [-0.011820, 0.042940, 0.968881],
+        ]
     ),
     "protanopia": np.array(
-        [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]]
+        [
+            [0.152286, 1.052583, -0.204868],
+            [0.114503, 0.786281, 0.099216],
+            [-0.003882, -0.048116, 1.051998],
+        ]
     ),
 }
 XYZ = np.array(
-    [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]
+    [
+        [0.4124564, 0.3575761, 0.1804375],
+        [0.2126729, 0.7151522, 0.0721750],
+        [0.0193339, 0.1191920, 0.9503041],
+    ]
 )
 
 
@@ -218,21 +296,35 @@ def test_the_faces_differ_in_hue_marker_and_lightness_for_the_colour_blind_and_i
         assert shown[a].marker != shown[b].marker
         assert abs(lab(color[a])[0] - lab(color[b])[0]) > (8 if paper == "white" else 4), (a, b)
         for sight in SIGHT:
-            assert np.linalg.norm(lab(color[a], sight) - lab(color[b], sight)) > (14 if paper == "white" else 10)
-        hues = [rgb_to_hls(*to_rgb(color[e]))[0] for e in (a, b) if e != REFERENCE]  # black has none
-        assert len(hues) < 2 or min(abs(hues[0] - hues[1]), 1 - abs(hues[0] - hues[1])) > 18 / 360, (a, b)
-    assert all(abs(lab(c)[0] - lab(DARK if paper == "dark" else WHITE)[0]) > 25 for c in color.values())
+            assert np.linalg.norm(lab(color[a], sight) - lab(color[b], sight)) > (
+                14 if paper == "white" else 10
+            )
+        hues = [
+            rgb_to_hls(*to_rgb(color[e]))[0] for e in (a, b) if e != REFERENCE
+        ]  # black has none
+        assert (
+            len(hues) < 2 or min(abs(hues[0] - hues[1]), 1 - abs(hues[0] - hues[1])) > 18 / 360
+        ), (a, b)
+    assert all(
+        abs(lab(c)[0] - lab(DARK if paper == "dark" else WHITE)[0]) > 25 for c in color.values()
+    )
 
 
 def test_a_name_has_one_look_whichever_others_are_there_and_its_family_the_hue():
-    kinds = {"ekf": "filters", "mine": "IPE", "newton": "IPE", "other (gain=2)": "filters", "newton (gain=2)": "IPE"}
+    kinds = {
+        "ekf": "filters",
+        "mine": "IPE",
+        "newton": "IPE",
+        "other (gain=2)": "filters",
+        "newton (gain=2)": "IPE",
+    }
     kinds |= dict.fromkeys(POOL, "filters")
     alone = {label: looks([label], kinds)[label] for label in kinds}
     together = looks(list(kinds), kinds)
     assert together == alone == looks(list(kinds)[::-1], kinds)
-    assert len({(together[e].marker, str(together[e].dash)) for e in (*POOL, *FACES, "ekf") if e in kinds}) == len(
-        {*POOL, "ekf", "newton"}
-    )
+    assert len(
+        {(together[e].marker, str(together[e].dash)) for e in (*POOL, *FACES, "ekf") if e in kinds}
+    ) == len({*POOL, "ekf", "newton"})
     assert together["mine"].color in FAMILIES["IPE"]
     assert together["newton (gain=2)"].color == FACES["newton"].color
     assert together["newton (gain=2)"] != FACES["newton"]
@@ -266,36 +358,56 @@ def test_an_estimator_is_in_the_colours_of_its_family_and_of_many_the_best_are_i
     for label, (estimator, _) in kinds.items():
         synthetic.add(scenario, label, np.full((30, 3), 0.1), estimator=estimator)
     look = only_view(synthetic).look
-    assert all(look[label].color in FAMILIES[family] for label, (_, family) in kinds.items() if label != "c")
+    assert all(
+        look[label].color in FAMILIES[family]
+        for label, (_, family) in kinds.items()
+        if label != "c"
+    )
     many = Synthetic(synthetic.directory.parent / "many")
     error = 0.1 * np.random.default_rng(0).normal(size=(60, 3))
     for i in range(6):
         for label, estimator in ((f"filter{i}", Filter()), (f"iterated{i}", Seeker())):
             for scale in (1.0, 10.0):
-                many.add(many.scenario(error_scale=scale), label, (1 + 2 * i) * error, estimator=estimator)
+                many.add(
+                    many.scenario(error_scale=scale),
+                    label,
+                    (1 + 2 * i) * error,
+                    estimator=estimator,
+                )
     view = only_view(many)
     colored = {label for label, one in view.look.items() if one.color != GREY}
     assert colored == {"filter0", "filter1", "iterated0", "iterated1"}
     (legend,) = drawn(errors, view)["headline"].figure.legends
-    assert [t.get_text() for t in legend.get_texts()][:5] == [*(e for e in view.look if e in colored), "8 others"]
+    assert [t.get_text() for t in legend.get_texts()][:5] == [
+        *(e for e in view.look if e in colored),
+        "8 others",
+    ]
 
 
 @pytest.mark.slow
-def test_more_than_seven_in_colour_have_a_row_of_panels_for_each_family_with_the_others_in_grey(synthetic):
+def test_more_than_seven_in_colour_have_a_row_of_panels_for_each_family_with_the_others_in_grey(
+    synthetic,
+):
     fill(synthetic, labels=(REFERENCE, *(f"iterated{i}" for i in range(4))))
     error = 0.1 * np.random.default_rng(0).normal(size=(60, 3))
     for i in range(4):
-        (drawing,) = [d for name, d in drawn(errors, only_view(synthetic)).items() if name == "headline"]
+        (drawing,) = [
+            d for name, d in drawn(errors, only_view(synthetic)).items() if name == "headline"
+        ]
         assert len(drawing.figure.axes) == 3
         for scale in SCALES:
-            synthetic.add(synthetic.scenario(error_scale=scale), f"filter{i}", error, estimator=Filter())
+            synthetic.add(
+                synthetic.scenario(error_scale=scale), f"filter{i}", error, estimator=Filter()
+            )
     view = only_view(synthetic)
     drawing = drawn(errors, view)["headline"]
     axes = drawing.figure.axes
     assert [ax.get_title() for ax in axes[::3]] == [f"success: {f}" for f in ("filters", "IPE")]
     for ax in axes:
         family = ax.get_title().partition(": ")[2]
-        seen = {line.get_color() for line in ax.lines if len(line.get_xdata()) == len(SCALES)} - {GREY}
+        seen = {line.get_color() for line in ax.lines if len(line.get_xdata()) == len(SCALES)} - {
+            GREY
+        }
         own = {label for label in view.look if view.families[label] == family}
         assert seen == {view.look[label].color for label in {REFERENCE, *own}}
     assert "Grey" in drawing.caption
@@ -315,11 +427,15 @@ def test_distributions_of_all_trials_leave_the_panel_where_trials_diverge(synthe
     rows = analysis.distributions.set_index("probability")["distance"]
     assert rows[0.5] == pytest.approx(np.median(known), rel=1e-9)
     assert rows[1.0] == np.inf
-    (drawing,) = (d for name, d in drawn(errors, only_view(synthetic)).items() if name == "distributions")
+    (drawing,) = (
+        d for name, d in drawn(errors, only_view(synthetic)).items() if name == "distributions"
+    )
     (panel,) = drawing.figure.axes
     efficient, curve = (line.get_xydata() for line in panel.lines[:2])
     inside = curve[curve[:, 0] < panel.get_xlim()[1]]
-    assert np.interp(0.5, inside[:, 1], inside[:, 0]) == pytest.approx(np.median(known) / np.sqrt(3), rel=1e-9)
+    assert np.interp(0.5, inside[:, 1], inside[:, 0]) == pytest.approx(
+        np.median(known) / np.sqrt(3), rel=1e-9
+    )
     assert inside[:, 1].max() == pytest.approx(0.8, abs=0.011)
     simulated = np.sqrt((np.random.default_rng(0).normal(size=(200_000, 3)) ** 2).mean(axis=1))
     assert np.interp(1.0, *efficient.T) == pytest.approx((simulated <= 1).mean(), abs=0.01)
@@ -335,8 +451,12 @@ def test_neither_the_last_iterate_nor_the_epochs_of_filters_are_drawn_as_converg
     iterates = {f"x_{name}": np.array([0.8, 0.4, 0.001, 0.0]) for name in "abc"}
     history = {"trial": np.zeros(4, dtype=int), "iteration": np.arange(4)} | iterates
     for label, estimator in (("ekf", Filter()), ("direct", Pretender()), ("newton", Seeker())):
-        synthetic.add(synthetic.scenario(), label, np.full((30, 3), 0.1), estimator=estimator, history=history)
-    (drawing,) = (d for name, d in drawn(costs, only_view(synthetic)).items() if name == "convergence")
+        synthetic.add(
+            synthetic.scenario(), label, np.full((30, 3), 0.1), estimator=estimator, history=history
+        )
+    (drawing,) = (
+        d for name, d in drawn(costs, only_view(synthetic)).items() if name == "convergence"
+    )
     (panel,) = (ax for ax in drawing.figure.axes if ax.axison)
     assert panel.get_title() == "newton"
     assert panel.lines[0].get_xydata() == pytest.approx(np.array([[0, 8.0], [1, 4.0], [2, 0.01]]))
@@ -355,9 +475,15 @@ def test_only_the_papers_setting_has_the_papers_figures(synthetic):
     assert not any("paper" in f"{d.title} {d.caption}" for d in named.values())
     assert {"figure_2", "figure_3"} == set(drawn(parameters, replace(view, paper=True)))
     # Errors stand in the unit of the parameter.
-    labels = [ax.get_ylabel() for ax in named["parameter_errors_linear_lse"].figure.axes if ax.axison]
+    labels = [
+        ax.get_ylabel() for ax in named["parameter_errors_linear_lse"].figure.axes if ax.axison
+    ]
     assert "rms error [m]" in labels
-    shown = [y for line in named["parameter_errors_linear_lse"].figure.axes[0].lines for y in line.get_ydata()]
+    shown = [
+        y
+        for line in named["parameter_errors_linear_lse"].figure.axes[0].lines
+        for y in line.get_ydata()
+    ]
     rows = view["summary"].query("estimator == 'linear_lse' and parameter in ['a', 'b']")
     assert set(rows["rmse"]) <= set(shown)
 
@@ -376,20 +502,32 @@ def test_long_settings_have_file_names_of_their_own(synthetic):
 
 
 @pytest.mark.slow
-def test_stale_figures_go_foreign_files_stay_and_the_same_figure_is_the_same_file(synthetic, monkeypatch, tmp_path):
+def test_stale_figures_go_foreign_files_stay_and_the_same_figure_is_the_same_file(
+    synthetic, monkeypatch, tmp_path
+):
     monkeypatch.setattr(figures, "FIGURES", ("costs",))
-    folder, small = tmp_path / "figures", {"labels": (REFERENCE, "two"), "scales": (1.0, 10.0), "names": ("a",)}
+    folder, small = (
+        tmp_path / "figures",
+        {"labels": (REFERENCE, "two"), "scales": (1.0, 10.0), "names": ("a",)},
+    )
     fill(synthetic, **small)
     analysis = analyse([synthetic.directory])
     (found,) = draw_all(analysis, folder, formats=("png", "pdf"))
     same = {path: path.read_bytes() for path in found.files}
     (folder / "mine.png").write_bytes(b"of the user")
     draw_all(analysis, folder, formats=("png", "pdf"))
-    assert [path.name for path in same] == ["cost_against_accuracy.png", "cost_against_accuracy.pdf"]
+    assert [path.name for path in same] == [
+        "cost_against_accuracy.png",
+        "cost_against_accuracy.pdf",
+    ]
     assert all(path.read_bytes() == content for path, content in same.items())
     fill(synthetic, sigma=0.4, **small)
     names = {one.name for one in draw_all(analyse([synthetic.directory]), folder)}
-    assert {path.name for path in folder.iterdir()} == {"index.json", "mine.png", *(f"{name}.png" for name in names)}
+    assert {path.name for path in folder.iterdir()} == {
+        "index.json",
+        "mine.png",
+        *(f"{name}.png" for name in names),
+    }
     assert len([name for name in names if name.startswith("cost_against_accuracy_")]) == 2
 
 
@@ -410,7 +548,9 @@ def overlaps(fig) -> list[str]:
     return found
 
 
-@pytest.mark.parametrize("content", [None, "", "3", "[3]", '[{"name": "../mine"}]', '[{"name": 5}]'])
+@pytest.mark.parametrize(
+    "content", [None, "", "3", "[3]", '[{"name": "../mine"}]', '[{"name": 5}]']
+)
 def test_a_list_of_figures_of_a_foreign_hand_removes_nothing(synthetic, tmp_path, content):
     """Nor is one waited for that is a pipe."""
     (tmp_path / "mine.png").touch()
@@ -418,7 +558,9 @@ def test_a_list_of_figures_of_a_foreign_hand_removes_nothing(synthetic, tmp_path
     index = tmp_path / "drawn" / "index.json"
     os.mkfifo(index) if content is None else index.write_text(content)
     fill(synthetic, scales=(1.0,))
-    with pytest.raises(UserError, match=r"index\.json: is no list of the figures beside it; remove it"):
+    with pytest.raises(
+        UserError, match=r"index\.json: is no list of the figures beside it; remove it"
+    ):
         draw_all(analyse([synthetic.directory]), tmp_path / "drawn", which="none")
     assert (tmp_path / "mine.png").exists()
 
@@ -435,7 +577,10 @@ def test_the_setting_with_most_failures_is_drawn_first_and_those_alike_keep_thei
 @pytest.mark.parametrize("width", [3.5, None, 7.16])
 def test_nothing_is_clipped_on_the_page_or_in_print(synthetic, width):
     """Long names of groups and many estimators included, in a column of print too."""
-    labels, names = (REFERENCE, *(f"an_estimator_{i}" for i in range(11))), ("a" * 30, "b", "c", "d", "e")
+    labels, names = (
+        (REFERENCE, *(f"an_estimator_{i}" for i in range(11))),
+        ("a" * 30, "b", "c", "d", "e"),
+    )
     fill(synthetic, names=names, labels=labels, scales=(0.1, 1.0, 10.0, 33.0, 1000.0), trials=20)
     (view,), whole = views(analyse([synthetic.directory]))
     with print_style(width) if width else house_style():
@@ -461,9 +606,17 @@ def test_captions_are_short_and_titles_and_labels_stand_at_their_own_panels(synt
     rng, names = np.random.default_rng(7), [f"an_estimator_{i}" for i in range(3)]
     for scale in (0.1, 1.0, 3.0, 10.0, 33.0, 100.0, 300.0, 1000.0, 3000.0):
         for label in (REFERENCE, "fixed_point", *names):
-            error = 0.1 * rng.normal(size=(40, 3)) * 10 ** rng.uniform(-1, 9 * rng.random(), (40, 1))
+            error = (
+                0.1 * rng.normal(size=(40, 3)) * 10 ** rng.uniform(-1, 9 * rng.random(), (40, 1))
+            )
             solved = rng.random(40) < rng.random()
-            synthetic.add(synthetic.scenario(error_scale=scale), label, error, solved=solved, estimator=Seeker())
+            synthetic.add(
+                synthetic.scenario(error_scale=scale),
+                label,
+                error,
+                solved=solved,
+                estimator=Seeker(),
+            )
     with house_style():
         for drawing in figures.drawings(analyse([synthetic.directory])):
             assert len(drawing.caption.split()) <= 30, drawing.caption
@@ -471,7 +624,9 @@ def test_captions_are_short_and_titles_and_labels_stand_at_their_own_panels(synt
             assert len(page) < 300_000, drawing.name
             assert page.count("<svg") >= page.count("</span>") + sum(ax.axison for ax in fig.axes)
             assert "id=" not in re.sub(r'id="[mpCi]\w*"', "", page)
-            boxes = [(ax, ax.get_window_extent(), ax.get_tightbbox()) for ax in fig.axes if ax.axison]
+            boxes = [
+                (ax, ax.get_window_extent(), ax.get_tightbbox()) for ax in fig.axes if ax.axison
+            ]
             for (_, _, left), (ax, own, _) in pairwise(boxes):
                 assert "\n" not in ax.get_title()
                 label = ax.yaxis.label.get_window_extent()
@@ -484,14 +639,22 @@ def test_captions_are_short_and_titles_and_labels_stand_at_their_own_panels(synt
 def test_a_point_at_a_cap_is_hollow_with_an_arrow_and_what_is_dense_is_a_bitmap(synthetic):
     error = np.full((60, 3), 0.1)
     for scale, factor in zip(SCALES, (1.0, 2.0, 1e9), strict=True):
-        synthetic.add(synthetic.scenario(error_scale=scale), "one", factor * error, estimator=Seeker())
+        synthetic.add(
+            synthetic.scenario(error_scale=scale), "one", factor * error, estimator=Seeker()
+        )
     view = only_view(synthetic)
     drawing = drawn(errors, view)["headline"]
     found = points(drawing.figure.axes[1], view.look["one"].color)
-    assert {scale: hollow for scale, (_, hollow) in found.items()} == {1.0: False, 10.0: False, 100.0: True}
+    assert {scale: hollow for scale, (_, hollow) in found.items()} == {
+        1.0: False,
+        10.0: False,
+        100.0: True,
+    }
     assert found[100.0][0] == errors.CEILING["error_median"]
     arrows = [
-        line for line in drawing.figure.axes[1].lines if "arrow" in str(line.get_marker()) and len(line.get_xdata())
+        line
+        for line in drawing.figure.axes[1].lines
+        if "arrow" in str(line.get_marker()) and len(line.get_xdata())
     ]
     assert len(arrows) == 1
     assert "<image" not in drawing.html()
@@ -505,11 +668,17 @@ def test_a_point_at_a_cap_is_hollow_with_an_arrow_and_what_is_dense_is_a_bitmap(
 def cut_ends(ax) -> list[tuple[float, float]]:
     """Where the arrows of intervals stand that go on."""
     arrows = [line for line in ax.lines if "arrow" in str(line.get_marker())]
-    return [(float(x), float(y)) for line in arrows for x, y in np.column_stack([line.get_xdata(), line.get_ydata()])]
+    return [
+        (float(x), float(y))
+        for line in arrows
+        for x, y in np.column_stack([line.get_xdata(), line.get_ydata()])
+    ]
 
 
 @pytest.mark.parametrize("scales", [(10.0,), SCALES])
-def test_an_interval_that_ends_beyond_the_axis_has_an_arrow_there_and_one_within_has_none(synthetic, scales):
+def test_an_interval_that_ends_beyond_the_axis_has_an_arrow_there_and_one_within_has_none(
+    synthetic, scales
+):
     """A tenth of the trials are lost, by 90 or by 132 bounds; the median is that of the others."""
     most = errors.CEILING["error_q95"]
     for label, lost in (("near", 90.0), ("far", 132.0), ("away", np.inf)):
@@ -527,7 +696,9 @@ def test_an_interval_that_ends_beyond_the_axis_has_an_arrow_there_and_one_within
     assert sorted({round(float(end)) for end in reached}) == [90, 100]
 
 
-@pytest.mark.parametrize(("ends", "arrows"), [((0.5, 2.0), []), ((0.0, 2.0), [0.1]), ((1e-3, np.inf), [0.1, 10.0])])
+@pytest.mark.parametrize(
+    ("ends", "arrows"), [((0.5, 2.0), []), ((0.0, 2.0), [0.1]), ((1e-3, np.inf), [0.1, 10.0])]
+)
 def test_an_interval_that_leaves_the_panel_has_an_arrow_at_its_edge(ends, arrows):
     rows = pd.DataFrame({"estimator": "one", "error_scale": SCALES, "trials": 60, "y": 1.0})
     rows["low"], rows["high"] = ends

@@ -36,7 +36,11 @@ from ipe_bench.trials.scenario import Scenario
 from ipe_bench.trials.thresholds import GATE
 
 IPE, FILTERS, OTHER = ("newton", "chord"), ("ekf",), ("direct",)
-KINDS = {**dict.fromkeys(IPE, Seeker()), **dict.fromkeys(FILTERS, Filter()), **dict.fromkeys(OTHER, Pretender())}
+KINDS = {
+    **dict.fromkeys(IPE, Seeker()),
+    **dict.fromkeys(FILTERS, Filter()),
+    **dict.fromkeys(OTHER, Pretender()),
+}
 
 
 def said(directory: Path) -> list[str]:
@@ -64,13 +68,22 @@ def test_the_headline_says_who_agrees_who_is_honest_who_breaks_and_what_it_costs
     analysis = analyse([synthetic.directory])
     *sentences, table = headline(analysis)
     agree, lead, silent = sentences
-    assert "IPE (solver) and filters (filter) agree up to error scale 10: all of 100 trials succeed at each" in agree
+    assert (
+        "IPE (solver) and filters (filter) agree up to error scale 10: all of 100 trials succeed at each"
+        in agree
+    )
     assert lead == (
         "At error scale 100, solver succeeds in all of 100 trials, significantly more often than filter (0 %) (exact"
         " McNemar tests, 5 % over all pairs)."
     )
-    assert silent == "Failures that no test of fit notices: up to 25.0 % of the trials (filter at scale 100)."
-    assert cells(table) == [["solver", "1000", "1000", "4 (1.0 ms)"], ["filter", "1", "10", "187 (1.0 ms)"]]
+    assert (
+        silent
+        == "Failures that no test of fit notices: up to 25.0 % of the trials (filter at scale 100)."
+    )
+    assert cells(table) == [
+        ["solver", "1000", "1000", "4 (1.0 ms)"],
+        ["filter", "1", "10", "187 (1.0 ms)"],
+    ]
     (model,) = about(analysis)
     assert model.startswith("repeated: Each parameter read `repeats` times directly")
     assert "12 readings determine 3 parameters" in model
@@ -110,7 +123,10 @@ def test_who_surely_holds_stands_above_who_is_undecided(synthetic):
 
 def test_few_trials_leave_open_who_is_honest_and_who_holds(synthetic):
     for scale in (1.0, 10.0):
-        e, scenario = 0.1 * np.random.default_rng(1).normal(size=(10, 3)), synthetic.scenario(error_scale=scale)
+        e, scenario = (
+            0.1 * np.random.default_rng(1).normal(size=(10, 3)),
+            synthetic.scenario(error_scale=scale),
+        )
         wrong = np.where(np.arange(10)[:, None] < 3, 9.0, e)
         for label, error in (("liar", 100 * e), ("solver", e), ("loser", wrong)):
             synthetic.add(scenario, label, error, deviation=np.full(3, 0.1))
@@ -127,10 +143,16 @@ def test_one_scale_or_several_settings_are_ranked(synthetic):
     e = 0.1 * np.random.default_rng(2).normal(size=(50, 3))
     for sigma in (0.2, 0.4):
         synthetic.add(synthetic.scenario(sigma=sigma), "good", e)
-        synthetic.add(synthetic.scenario(sigma=sigma), "bad", np.where(np.arange(50)[:, None] < 20, 50.0, e))
+        synthetic.add(
+            synthetic.scenario(sigma=sigma), "bad", np.where(np.arange(50)[:, None] < 20, 50.0, e)
+        )
     (sentence,) = said(synthetic.directory)
-    assert sentence.startswith("At error scale 1, good succeeds in 100 % of 100 trials in 2 scenarios, bad in 60.0 %.")
-    assert sentence.endswith("notices: up to 40.0 % of the trials of a scenario (bad, noise.deviation=0.2, scale 1).")
+    assert sentence.startswith(
+        "At error scale 1, good succeeds in 100 % of 100 trials in 2 scenarios, bad in 60.0 %."
+    )
+    assert sentence.endswith(
+        "notices: up to 40.0 % of the trials of a scenario (bad, noise.deviation=0.2, scale 1)."
+    )
 
 
 # Random results -------------------------------------------------------------------------------------------------------
@@ -140,8 +162,12 @@ def test_one_scale_or_several_settings_are_ranked(synthetic):
 class Results:
     """What was stored, by scenario (sigma, scale), estimator and trial."""
 
-    success: dict[tuple[float, float], dict[str, dict[int, bool]]] = field(default_factory=lambda: defaultdict(dict))
-    silent: dict[tuple[float, float], dict[str, dict[int, bool]]] = field(default_factory=lambda: defaultdict(dict))
+    success: dict[tuple[float, float], dict[str, dict[int, bool]]] = field(
+        default_factory=lambda: defaultdict(dict)
+    )
+    silent: dict[tuple[float, float], dict[str, dict[int, bool]]] = field(
+        default_factory=lambda: defaultdict(dict)
+    )
     cost: dict[tuple[float, str], float] = field(default_factory=dict)
 
     @property
@@ -163,7 +189,11 @@ class Results:
         return sum(values) / len(values)
 
     def of_scales(self, label: str) -> dict[float, list[bool]]:
-        return {where[1]: list(each[label].values()) for where, each in sorted(self.success.items()) if label in each}
+        return {
+            where[1]: list(each[label].values())
+            for where, each in sorted(self.success.items())
+            if label in each
+        }
 
 
 def filled(store: Synthetic, seed: int) -> Results:
@@ -172,22 +202,45 @@ def filled(store: Synthetic, seed: int) -> Results:
     labels = rng.permutation(list(KINDS))[: rng.integers(2, 5)].tolist()
     sigmas, scales = (0.2, 0.4)[: rng.integers(1, 3)], (1.0, 10.0, 100.0)[: rng.integers(1, 4)]
     everywhere = rng.random() < 0.3
-    for scenario in (store.scenario(error_scale=scale, sigma=sigma) for sigma in sigmas for scale in scales):
+    for scenario in (
+        store.scenario(error_scale=scale, sigma=sigma) for sigma in sigmas for scale in scales
+    ):
         sigma, scale = scenario.noise.deviation, scenario.error_scale
         for label in labels:
             if not everywhere and rng.random() < 0.25:
                 continue
-            start, trials = (0, 60) if everywhere else (20 * rng.integers(3), 20 * rng.integers(1, 4))
-            lost = rng.random(trials) < rng.choice([0.0, 0.03, 0.15, 0.5, 1.0], p=[0.5, 0.2, 0.1, 0.1, 0.1])
+            start, trials = (
+                (0, 60) if everywhere else (20 * rng.integers(3), 20 * rng.integers(1, 4))
+            )
+            lost = rng.random(trials) < rng.choice(
+                [0.0, 0.03, 0.15, 0.5, 1.0], p=[0.5, 0.2, 0.1, 0.1, 0.1]
+            )
             e = np.where(lost[:, None], 9.0, sigma / 2 * rng.normal(size=(trials, 3)))
             fits = rng.random(trials) < rng.choice([0.0, 0.5])
-            claimed, spent = np.full(3, sigma / 2 * rng.choice([0.3, 1.0, 3.0])), float(rng.integers(1, 200))
-            columns: dict[str, Any] = {"deviation": claimed, "fit_p": np.where(lost & ~fits, 0.0, 0.5)}
-            store.add(scenario, label, e, start=start, block=20, estimator=KINDS[label], simulations=spent, **columns)
+            claimed, spent = (
+                np.full(3, sigma / 2 * rng.choice([0.3, 1.0, 3.0])),
+                float(rng.integers(1, 200)),
+            )
+            columns: dict[str, Any] = {
+                "deviation": claimed,
+                "fit_p": np.where(lost & ~fits, 0.0, 0.5),
+            }
+            store.add(
+                scenario,
+                label,
+                e,
+                start=start,
+                block=20,
+                estimator=KINDS[label],
+                simulations=spent,
+                **columns,
+            )
             good = ((e / (sigma / 2)) ** 2).sum(axis=1) <= chi2.isf(GATE, 3)
             numbers = range(int(start), int(start) + int(trials))
             found.success[sigma, scale][label] = dict(zip(numbers, good.tolist(), strict=True))
-            found.silent[sigma, scale][label] = dict(zip(numbers, (~good & (fits | ~lost)).tolist(), strict=True))
+            found.silent[sigma, scale][label] = dict(
+                zip(numbers, (~good & (fits | ~lost)).tolist(), strict=True)
+            )
             found.cost[scale, label] = spent
     return found
 
@@ -201,7 +254,8 @@ def ranking_is_so(sentence: str, results: Results) -> None:
     assert (out > 0) == (f"{out} other scenario" in sentence)
     scales = sorted({scale for _, scale in common})
     assert re.match(
-        rf"At error scales? {' to '.join(f'{s:g}' for s in dict.fromkeys((scales[0], scales[-1])))}, ", sentence
+        rf"At error scales? {' to '.join(f'{s:g}' for s in dict.fromkeys((scales[0], scales[-1])))}, ",
+        sentence,
     )
     shares = {label: results.share("success", label) for label in labels}
     told = sentence.partition("Failures")[0]
@@ -220,7 +274,10 @@ def ranking_is_so(sentence: str, results: Results) -> None:
         assert set(shares.values()) == {1.0}
         assert all(label in sentence for label in labels)
     silent = {
-        label: max(np.mean([results.silent[where][label][t] for t in trials]) for where, trials in common.items())
+        label: max(
+            np.mean([results.silent[where][label][t] for t in trials])
+            for where, trials in common.items()
+        )
         for label in labels
     }
     if worst := re.search(r"notices: up to <?([\d.]+) % of the trials[^(]*\((\w+)", sentence):
@@ -233,18 +290,27 @@ def ranking_is_so(sentence: str, results: Results) -> None:
 def lead_is_so(sentence: str, results: Results) -> None:
     """The scale is one that all share, the shares are those of its common trials, and who is beaten loses pairs."""
     scale = float(re.search(r"At error scale ([\d.]+),", sentence)[1])  # type: ignore[index]
-    ((where, trials),) = ((where, trials) for where, trials in results.common().items() if where[1] == scale)
+    ((where, trials),) = (
+        (where, trials) for where, trials in results.common().items() if where[1] == scale
+    )
     assert f" of {len(trials)} trials" in sentence
-    success = {label: np.array([results.success[where][label][t] for t in trials]) for label in results.labels}
+    success = {
+        label: np.array([results.success[where][label][t] for t in trials])
+        for label in results.labels
+    }
     firsts = re.search(r", ([\w, ]+?) succeeds? in (all|[\d.]+ %) of", sentence)
     assert firsts
-    assert {percent(success[label].mean()) for label in firsts[1].split(", ")} == {firsts[2].replace("all", "100 %")}
+    assert {percent(success[label].mean()) for label in firsts[1].split(", ")} == {
+        firsts[2].replace("all", "100 %")
+    }
     won, _, rest = sentence.partition("not")
     for text, beaten in ((won, True), (rest, False)):
         for label, share in re.findall(r"(\w+) \(([\d.]+ %)\)", text):
             assert share == percent(success[label].mean())
             for first in firsts[1].split(", "):
-                ahead, behind = ((success[a] & ~success[b]).sum() for a, b in ((first, label), (label, first)))
+                ahead, behind = (
+                    (success[a] & ~success[b]).sum() for a, b in ((first, label), (label, first))
+                )
                 assert ahead > behind
                 assert binomtest(ahead, ahead + behind).pvalue < 0.05 or not beaten
 
@@ -264,7 +330,8 @@ def limits_are_so(table: Table, results: Results, summary: pd.DataFrame) -> None
             for scale, v in own.items()
         }
         kept, lost = (
-            {scale: test(*ends[scale]) for scale in own} for test in (lambda a, b: a >= 0.9, lambda a, b: b < 0.9)
+            {scale: test(*ends[scale]) for scale in own}
+            for test in (lambda a, b: a >= 0.9, lambda a, b: b < 0.9)
         )
         wrong = {scale: verdicts[scale] == "overconfident" for scale in own}
         good = {scale: verdicts[scale] in ("consistent", "too cautious") for scale in own}
@@ -309,7 +376,9 @@ def agreement_is_so(sentence: str, results: Results, summary: pd.DataFrame) -> N
         assert (": all of" in sentence) == bool((here["success"] == 1).all())
 
 
-@pytest.mark.parametrize("seed", [*range(6), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(6, 24))])
+@pytest.mark.parametrize(
+    "seed", [*range(6), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(6, 24))]
+)
 def test_sentences_are_true_of_random_results(synthetic, seed):
     results = filled(synthetic, seed)
     analysis = analyse([synthetic.directory])
@@ -328,7 +397,9 @@ def test_sentences_are_true_of_random_results(synthetic, seed):
             agreement_is_so(sentence, results, analysis.summary)
         else:
             assert sentence.startswith("Failures that no test of fit notices")
-            most = max(np.mean([*v.values()]) for each in results.silent.values() for v in each.values())
+            most = max(
+                np.mean([*v.values()]) for each in results.silent.values() for v in each.values()
+            )
             assert percent(most) in sentence
 
 
@@ -339,7 +410,12 @@ def test_what_only_some_have_ranks_nobody_elsewhere(synthetic):
         scenario = synthetic.scenario(error_scale=scale)
         for label, number in (("newton", good), ("chord", poor)):
             e = 0.1 * rng.normal(size=(50, 3)).clip(-1, 1)
-            synthetic.add(scenario, label, np.where(np.arange(50)[:, None] < number, e, 9.0), estimator=Seeker())
+            synthetic.add(
+                scenario,
+                label,
+                np.where(np.arange(50)[:, None] < number, e, 9.0),
+                estimator=Seeker(),
+            )
     alone = synthetic.scenario(sigma=0.4)
     synthetic.add(alone, "chord", np.zeros((1000, 3)), estimator=Seeker())
     (sentence,) = said(synthetic.directory)
@@ -354,21 +430,43 @@ def test_trials_in_common_alone_are_ranked(synthetic):
     wrong = np.where(np.arange(40)[:, None] < 20, np.zeros(3), 9.0)
     synthetic.add(scenario, "newton", wrong[:20], estimator=Seeker())
     synthetic.add(scenario, "chord", wrong, block=20, estimator=Seeker())
-    assert said(synthetic.directory) == ["At error scale 1, chord, newton succeed in all of 20 trials."]
+    assert said(synthetic.directory) == [
+        "At error scale 1, chord, newton succeed in all of 20 trials."
+    ]
     other = synthetic.scenario(seed=1)
     synthetic.add(other, "ekf", wrong, estimator=Filter())
-    assert said(synthetic.directory) == ["No trial is common to chord, ekf, newton, so they are not ranked."]
+    assert said(synthetic.directory) == [
+        "No trial is common to chord, ekf, newton, so they are not ranked."
+    ]
 
 
 @pytest.mark.parametrize(
-    "verdict", ["undecided", "-", "consistent", "too cautious", "overconfident", "optimistic", "diverged but confident"]
+    "verdict",
+    [
+        "undecided",
+        "-",
+        "consistent",
+        "too cautious",
+        "overconfident",
+        "optimistic",
+        "diverged but confident",
+    ],
 )
 def test_only_a_sure_verdict_calls_an_estimator_overconfident(verdict):
-    rows = pd.DataFrame({"estimator": "one", "error_scale": [1.0, 10.0], "nees_median": [1.0, 2.5], "success": 1.0})
-    rows = rows.assign(trials=100, success_low=0.95, simulations_median=1.0, simulations_mean=1.0, time_mean_s=1.0)
+    rows = pd.DataFrame(
+        {"estimator": "one", "error_scale": [1.0, 10.0], "nees_median": [1.0, 2.5], "success": 1.0}
+    )
+    rows = rows.assign(
+        trials=100, success_low=0.95, simulations_median=1.0, simulations_mean=1.0, time_mean_s=1.0
+    )
     rows = rows.assign(verdict=["consistent", verdict])
     ((_, honest, *_),) = cells(limits(rows, "limits"))
-    expected = {"undecided": "1 or more", "-": "1 or more", "consistent": "10", "too cautious": "10"}
+    expected = {
+        "undecided": "1 or more",
+        "-": "1 or more",
+        "consistent": "10",
+        "too cautious": "10",
+    }
     assert honest == expected.get(verdict, "1")
 
 
@@ -384,15 +482,24 @@ def test_problems_in_common_alone_are_counted():
 SWEEP = (r"At error scale 1, .* succeed in all of 20 trials\.", "limits")
 RIVALS = (r"IPE \(.*\) and filters \(.*\) agree at every error scale", "limits")
 PAGES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    "nist": (("measurement.dataset=Misra1a,BoxBOD", "measurement.start=2"), (r"Of 2 certified problems, .* solve",)),
+    "nist": (
+        ("measurement.dataset=Misra1a,BoxBOD", "measurement.start=2"),
+        (r"Of 2 certified problems, .* solve",),
+    ),
     "pendulum_book": ((), (r"All 2 published errors are met, to \d\.\de-1\d at worst\.",)),
     "mismatch": ((), (r"At error scale 33, .* succeed in all of 100 trials in 5 scenarios\.",)),
     **dict.fromkeys(("headline", "filters", "beyond"), (("error_scale=1,300",), RIVALS)),
-    **dict.fromkeys(("paper", "bearings", "ranging", "polynomial"), (("error_scale=0.1,1",), SWEEP)),
+    **dict.fromkeys(
+        ("paper", "bearings", "ranging", "polynomial"), (("error_scale=0.1,1",), SWEEP)
+    ),
     "lotka_volterra": (("error_scale=0.1,1",), SWEEP),
     "states": (
         ("state_model=bearings_only", "error_scale=1,10"),
-        (r"At error scale 10, .* track .* trials", r"Failures that no test of fit notices", "limits_of_states"),
+        (
+            r"At error scale 10, .* track .* trials",
+            r"Failures that no test of fit notices",
+            "limits_of_states",
+        ),
     ),
 }
 """For each experiment the part of it that is stored here, with errors as large as their bound, and what its page says
@@ -401,7 +508,10 @@ first."""
 
 OURS = [o for o in discovery.options("experiment") if o.source.name == "ipe-bench"]
 EACH = [
-    pytest.param(o, marks=() if o.name in ("nist", "mismatch", "headline", "polynomial") else pytest.mark.slow)
+    pytest.param(
+        o,
+        marks=() if o.name in ("nist", "mismatch", "headline", "polynomial") else pytest.mark.slow,
+    )
     for o in OURS
 ]
 
@@ -428,7 +538,11 @@ def fill(store: Synthetic, specs: list[Any]) -> None:
     for spec in specs:
         scenario = spec.scenario
         trials = 1 if scenario.noise.name == "certified" else 20
-        e = 0.0 if trials == 1 else np.random.default_rng(0).normal(size=(trials, scenario.measurement.n))
+        e = (
+            0.0
+            if trials == 1
+            else np.random.default_rng(0).normal(size=(trials, scenario.measurement.n))
+        )
         error = e * scenario.linear_bound if trials > 1 else np.zeros((1, scenario.measurement.n))
         store.bound = lambda scenario: scenario.linear_bound  # type: ignore[method-assign]
         for label, estimator in spec.estimators.items():
@@ -444,7 +558,9 @@ class Measured(Repeated):
         return Recorded(np.zeros(self.m), Covariance(np.ones(self.m)), np.zeros(self.n))
 
 
-def test_certified_readings_of_no_collection_are_found_too_and_an_empty_folder_is_said_to_be(tmp_path, synthetic):
+def test_certified_readings_of_no_collection_are_found_too_and_an_empty_folder_is_said_to_be(
+    tmp_path, synthetic
+):
     make_folder(tmp_path / "empty" / "runs")
     assert said(tmp_path / "empty") == ["No trial is stored yet, so there is no finding."]
     scenario = Scenario(Measured(), Certified())
@@ -452,9 +568,14 @@ def test_certified_readings_of_no_collection_are_found_too_and_an_empty_folder_i
     synthetic.add(scenario, "newton", np.zeros((1, 3)))
     synthetic.add(scenario, "chord", np.full((1, 3), 9.0))
     (sentence,) = said(synthetic.directory)
-    assert sentence.startswith("With certified readings, newton succeeds in 100 % of 1 trial, chord in 0 %.")
+    assert sentence.startswith(
+        "With certified readings, newton succeeds in 100 % of 1 trial, chord in 0 %."
+    )
     synthetic.add(synthetic.scenario(sigma=0.1), "newton", np.zeros((20, 3)))
-    assert said(synthetic.directory) == [sentence, "At error scale 1, newton succeeds in 100 % of 20 trials."]
+    assert said(synthetic.directory) == [
+        sentence,
+        "At error scale 1, newton succeeds in 100 % of 20 trials.",
+    ]
     tables = {table.name: table for table in all_tables(analyse([synthetic.directory]).simulated)}
     assert tables["all_trials"].data["capped_error"].tolist() == [0.0]
 
@@ -468,7 +589,9 @@ def test_states_that_move_have_words_of_their_own(tmp_path):
     median = table[table["parameter"] == "all"].set_index("estimator")["error_median"]
     assert errors.endswith(f": kf ({median['kf']:.2f}), rts ({median['rts']:.2f}).")
     assert median["rts"] == pytest.approx(median["kf"], rel=1e-12)
-    path = table[table["parameter"] != "all"].pivot_table(index="estimator", columns="parameter", values="path_rmse")
+    path = table[table["parameter"] != "all"].pivot_table(
+        index="estimator", columns="parameter", values="path_rmse"
+    )
     ratio = np.sqrt(((path.loc["kf"] / path.loc["rts"]) ** 2).mean())
     assert paths.endswith(f": rts (1), kf ({ratio:.2f}).")
     assert ratio > 1.25

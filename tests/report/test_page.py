@@ -48,7 +48,9 @@ def column(page, table: str, index: int) -> list[str]:
 
 
 def heading(page, table: str, title: str) -> int:
-    titles = page.run(f"Array.from(document.querySelectorAll('#table-{table} th'), h => h.textContent)")
+    titles = page.run(
+        f"Array.from(document.querySelectorAll('#table-{table} th'), h => h.textContent)"
+    )
     return titles.index(title)
 
 
@@ -61,7 +63,9 @@ def test_there_are_no_errors_no_dialogs_no_requests_and_all_figures(desktop, pag
     outside = [url for url in desktop.requests if not url.startswith(("file:", "data:"))]
     assert outside == []
     assert HOSTILE in desktop.run("document.body.innerText")
-    widths = desktop.run("Array.from(document.querySelectorAll('figure'), f => f.getBoundingClientRect().width)")
+    widths = desktop.run(
+        "Array.from(document.querySelectorAll('figure'), f => f.getBoundingClientRect().width)"
+    )
     drawn = {path.stem for path in (page_file.parent / "figures").glob("*.png")}
     assert "headline" in drawn
     assert len(widths) == len(drawn)
@@ -71,7 +75,9 @@ def test_there_are_no_errors_no_dialogs_no_requests_and_all_figures(desktop, pag
 def test_the_page_is_dark_where_the_reader_has_it_so(desktop, page_file):
     color = "getComputedStyle(document.body).backgroundColor"
     assert desktop.run(color) == "rgb(255, 255, 255)"
-    desktop.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "dark"}])
+    desktop.call(
+        "Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "dark"}]
+    )
     try:
         assert max(map(int, re.findall(r"\d+", desktop.run(color)))) < 50
         # Figures are dark by their own colours: the axes' ground is the page's, and their letters are light.
@@ -79,7 +85,10 @@ def test_the_page_is_dark_where_the_reader_has_it_so(desktop, page_file):
         assert desktop.run(f"{fill}('.panels svg path')") == desktop.run(color)
         assert min(map(int, re.findall(r"\d+", desktop.run(f"{fill}('.panels text')")))) > 150
     finally:
-        desktop.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "light"}])
+        desktop.call(
+            "Emulation.setEmulatedMedia",
+            features=[{"name": "prefers-color-scheme", "value": "light"}],
+        )
 
 
 def test_the_page_opens_with_the_answer_and_a_link_unfolds_the_rest(browser, page_file):
@@ -89,7 +98,9 @@ def test_the_page_opens_with_the_answer_and_a_link_unfolds_the_rest(browser, pag
         " e => e.getBoundingClientRect().y)"
     )
     assert order == sorted(order)
-    assert browser.run("Array.from(document.querySelectorAll('details.part'), d => d.open).every(o => !o)")
+    assert browser.run(
+        "Array.from(document.querySelectorAll('details.part'), d => d.open).every(o => !o)"
+    )
     browser.run("document.querySelector('nav a[href=\"#tables\"]').click()")
     browser.run("unfold()")
     assert browser.run("document.querySelector('#tables').closest('details').open")
@@ -141,7 +152,13 @@ def test_it_prints_and_the_answer_on_a_few_pages(browser, page_file, desktop):
     # Nothing runs off the paper: 297 mm less two margins of 12 mm, at 96 pixels an inch.
     width = round((297 - 24) / 25.4 * 96)
     desktop.call("Emulation.setEmulatedMedia", media="print")
-    desktop.call("Emulation.setDeviceMetricsOverride", width=width, height=700, deviceScaleFactor=1, mobile=False)
+    desktop.call(
+        "Emulation.setDeviceMetricsOverride",
+        width=width,
+        height=700,
+        deviceScaleFactor=1,
+        mobile=False,
+    )
     try:
         assert desktop.run("document.documentElement.scrollWidth") <= width
     finally:

@@ -16,9 +16,39 @@ from ipe_bench.report.words import percent, short
 from ipe_bench.statistics import analyse
 
 COMMANDS = {
-    *("begin", "end", "centering", "caption", "label", "footnotesize", "setlength", "tabcolsep", "toprule", "midrule"),
-    *("bottomrule", "endhead", "textbf", "num", "shortstack", "ensuremath", "mu", "sigma", "surd", "times"),
-    *("textasciitilde", "textasciicircum", "textbackslash", "textless", "textgreater", "textbar", "textquotedbl"),
+    *(
+        "begin",
+        "end",
+        "centering",
+        "caption",
+        "label",
+        "footnotesize",
+        "setlength",
+        "tabcolsep",
+        "toprule",
+        "midrule",
+    ),
+    *(
+        "bottomrule",
+        "endhead",
+        "textbf",
+        "num",
+        "shortstack",
+        "ensuremath",
+        "mu",
+        "sigma",
+        "surd",
+        "times",
+    ),
+    *(
+        "textasciitilde",
+        "textasciicircum",
+        "textbackslash",
+        "textless",
+        "textgreater",
+        "textbar",
+        "textquotedbl",
+    ),
     *("texttt", "textsuperscript"),
 }
 TOKENS = re.compile(r"\\([a-zA-Z]+)|\\([^a-zA-Z])|%[^\n]*\n|([{}])|([^\\{}%]+)")
@@ -52,7 +82,9 @@ def read(text: str) -> list[list[str]]:
         assert re.fullmatch(r"-?\d+(\.\d+)?(e[+-]?\d+)?", number), number
     rules = re.split(r"\\(?:toprule|midrule|bottomrule)\n", text)
     shape = re.search(r"\{@\{\}([lr]+)@\{\}\}", text)[1]
-    rows = [row for part in rules[1:3] for row in part.replace("\\endhead\n", "").strip().split("\n")]
+    rows = [
+        row for part in rules[1:3] for row in part.replace("\\endhead\n", "").strip().split("\n")
+    ]
     cells = [re.split(r"(?<!\\)&", row.removesuffix(r"\\")) for row in rows]
     assert all(row.endswith(r"\\") for row in rows)
     assert {len(row) for row in cells} == {len(shape)}
@@ -69,13 +101,20 @@ def typeset(cell: str) -> str:
 def test_the_reader_refuses_what_latex_would():
     good = latex(Table("t", "T", "C", [words("a", ["b"])], pd.DataFrame()), COLUMN)
     assert read(good) == [["a"], ["b"]]
-    for bad in (good + "}", good.replace("b \\\\", "b & c \\\\"), good.replace("b \\\\", "b_1 \\\\"), good + "\\foo"):
+    for bad in (
+        good + "}",
+        good.replace("b \\\\", "b & c \\\\"),
+        good.replace("b \\\\", "b_1 \\\\"),
+        good + "\\foo",
+    ):
         with pytest.raises(AssertionError):
             read(bad)
 
 
 def test_intervals_and_signs_read_as_they_are_meant():
-    shares = interval("95 % of it", [0.996, 1.0, float("nan")], [1.0, float("nan"), float("nan")], percent)
+    shares = interval(
+        "95 % of it", [0.996, 1.0, float("nan")], [1.0, float("nan"), float("nan")], percent
+    )
     numbers = interval("twice", [1.5e-7, -1.25, 0.0], [14520.0, 2.0, 0.00004], short)
     names = words("a & b_c", ["a_b & 50 %", "$x$ {y} #1 ~ ^ \\", "< > µ 中"])
     text = latex(Table("t", "T", "C", [shares, numbers, numbers, names], pd.DataFrame()), COLUMN)
@@ -106,7 +145,9 @@ def test_tables_say_what_the_report_says_whatever_the_names(synthetic, tmp_path)
 
 
 @pytest.mark.slow
-def test_a_figure_is_as_wide_as_the_column_and_the_report_stays_as_it_is(synthetic, tmp_path, monkeypatch):
+def test_a_figure_is_as_wide_as_the_column_and_the_report_stays_as_it_is(
+    synthetic, tmp_path, monkeypatch
+):
     fill(synthetic)
     analysis = analyse([synthetic.directory])
     monkeypatch.setattr(figures, "FIGURES", ("costs",))

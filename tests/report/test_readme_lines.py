@@ -20,13 +20,17 @@ import ipe_bench as ib
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 DRAWN = "outputs/headline/figures/headline.png"
-LINES = [line.removeprefix("    ") for line in README.splitlines() if line.startswith("    ") or not line]
+LINES = [
+    line.removeprefix("    ") for line in README.splitlines() if line.startswith("    ") or not line
+]
 
 
 def test_it_leads_somewhere():
     led_to = re.findall(r"\]\((?!https?:)([^)#]+)\)", README)
     assert len(led_to) >= 8
-    kept = [path for path in led_to if (ROOT / "plugins").is_dir() or not path.startswith("plugins/")]
+    kept = [
+        path for path in led_to if (ROOT / "plugins").is_dir() or not path.startswith("plugins/")
+    ]
     assert [path for path in kept if not (ROOT / path).exists()] == []
 
 
@@ -34,7 +38,9 @@ def test_the_solver_that_it_writes_costs_what_newton_costs():
     (code,) = re.findall(r"my_newton\.py <<'END'\n(.*?)\n    END", README, re.DOTALL)
     names: dict = {"__name__": "__main__"}
     exec(compile(textwrap.dedent(code), "my_newton", "exec", dont_inherit=True), names)
-    bench = ib.Scenario(ib.measurements.Gins(), ib.noise.Quantization(step=0.02286), error_scale=100.0)
+    bench = ib.Scenario(
+        ib.measurements.Gins(), ib.noise.Quantization(step=0.02286), error_scale=100.0
+    )
     estimators = {"newton": ib.solvers.Newton(), "my_newton": names["MyNewton"]()}
     costs = ib.run(bench, estimators, 20).trials.groupby("estimator")["simulations"].apply(list)
     assert costs["my_newton"] == costs["newton"]
@@ -61,7 +67,9 @@ def recomputed(folder: Path) -> pd.DataFrame:
     groups = rows.groupby(["error_scale", "estimator"])
     found = groups[["success", "silent", "known"]].mean()
     found["error"] = groups["error"].median()
-    found["error_95"] = groups["error"].apply(lambda error: np.quantile(error[np.isfinite(error)], 0.95))
+    found["error_95"] = groups["error"].apply(
+        lambda error: np.quantile(error[np.isfinite(error)], 0.95)
+    )
     found["whole"] = groups["error"].apply(lambda error: np.isfinite(error).all())
     found["efficiency"] = groups["square"].mean() ** -0.5
     found["nees"] = groups["nees"].median()
@@ -71,7 +79,9 @@ def recomputed(folder: Path) -> pd.DataFrame:
 def check(folder: Path) -> pd.DataFrame:
     """Holds the summary of a folder against what pandas makes of its trials, and returns the latter."""
     summary = pd.read_csv(folder / "summary.csv")
-    summary = summary[summary["parameter"] == "all"].set_index(["error_scale", "estimator"]).sort_index()
+    summary = (
+        summary[summary["parameter"] == "all"].set_index(["error_scale", "estimator"]).sort_index()
+    )
     found = recomputed(folder).sort_index()
     for column, mine in (
         ("success", "success"),
@@ -93,32 +103,53 @@ def test_every_line_runs_in_order_and_the_table_comes_out(tmp_path):
     (command,) = re.findall(
         r"^run:.*\n\t\$\(BIN\)/(.*)$", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE
     )
-    script = "\n".join(LINES).replace("make run\n", f"{command}\n").replace(". .venv/bin/activate\n", "")
+    script = (
+        "\n".join(LINES).replace("make run\n", f"{command}\n").replace(". .venv/bin/activate\n", "")
+    )
     assert script.count("ipe-bench ") >= 9
     assert DRAWN in README
     environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
     done = subprocess.run(
-        ["bash", "-euo", "pipefail", "-c", script], cwd=tmp_path, env=environment, capture_output=True, text=True
+        ["bash", "-euo", "pipefail", "-c", script],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
     )
     assert done.returncode == 0, done.stderr[-2000:]
     found = check(tmp_path / "outputs/headline")
     scales = [0.1, 1, 10, 33, 100, 300, 1000]
-    table = [line.replace("*", "").strip("| ").split(" | ") for line in README.splitlines() if line.startswith("| `")]
+    table = [
+        line.replace("*", "").strip("| ").split(" | ")
+        for line in README.splitlines()
+        if line.startswith("| `")
+    ]
     assert len(table) == 8
     trials = ib.load(tmp_path / "outputs/headline")
     for name, *cells in table:
         own = found.xs(name.strip("`"), level="estimator")
-        assert [float(cell) for cell in cells[:7]] == pytest.approx([100 * own["success"][s] for s in scales])
+        assert [float(cell) for cell in cells[:7]] == pytest.approx(
+            [100 * own["success"][s] for s in scales]
+        )
         assert float(cells[7].replace("M", "e6")) == pytest.approx(own["nees"][100.0], rel=0.005)
         cost = trials.query("error_scale == 100 and estimator == @name.strip('`')")
         paid = np.median(cost["simulations"] + cost["jacobians"] * 11.08695652173913)
         assert float(cells[8]) == pytest.approx(paid, abs=0.5)
-    answered = trials.query("estimator == 'auto' and extra_stage == 2").groupby("error_scale").size() / 200
-    said = re.search(r"At 300 `progressive` answers ([\d.]+) % of\s+the trials, at 1000 ([\d.]+) %", README)
+    answered = (
+        trials.query("estimator == 'auto' and extra_stage == 2").groupby("error_scale").size() / 200
+    )
+    said = re.search(
+        r"At 300 `progressive` answers ([\d.]+) % of\s+the trials, at 1000 ([\d.]+) %", README
+    )
     assert said
-    assert [100 * answered[300.0], 100 * answered[1000.0]] == [float(share) for share in said.groups()]
+    assert [100 * answered[300.0], 100 * answered[1000.0]] == [
+        float(share) for share in said.groups()
+    ]
     with Image.open(ROOT / ".assets/headline.png") as shown, Image.open(tmp_path / DRAWN) as drawn:
         assert shown.size == drawn.size, f"{DRAWN} is not .assets/headline.png: copy it"
-        off = np.abs(np.asarray(shown.convert("L"), float) - np.asarray(drawn.convert("L"), float)) > 64
+        off = (
+            np.abs(np.asarray(shown.convert("L"), float) - np.asarray(drawn.convert("L"), float))
+            > 64
+        )
     # Another label of one tick changes twice as much.
     assert off.mean() < 2e-5, f"{DRAWN} is not .assets/headline.png: copy it"

@@ -62,11 +62,23 @@ def test_what_is_written_is_whole_and_the_page_stands_alone(result):
     pd.testing.assert_frame_equal(stored, result.summary, check_exact=False, rtol=1e-12)
     main = pd.read_csv(result.summary_path)
     pd.testing.assert_frame_equal(main, stored[list(main)])
-    assert {"success_low", "rmse_low", "nees_median", "simulations_mean", "verdict", "may_be_best"} < set(main)
+    assert {
+        "success_low",
+        "rmse_low",
+        "nees_median",
+        "simulations_mean",
+        "verdict",
+        "may_be_best",
+    } < set(main)
     assert "rmse_high" in set(stored) - set(main)
     assert len(list(main)) < 35
     assert {p.name for p in result.figures} >= {f"headline.{kind}" for kind in ("png", "pdf")}
-    assert {p.name for p in result.tables} >= {"parameters.csv", "overview.md", "overview.tex", "comparisons.tex"}
+    assert {p.name for p in result.tables} >= {
+        "parameters.csv",
+        "overview.md",
+        "overview.tex",
+        "comparisons.tex",
+    }
     for path in (*result.figures, *result.tables, result.report):
         assert path.stat().st_size > 100
     assert not list(result.report.parent.rglob("*.tmp"))
@@ -76,7 +88,10 @@ def test_what_is_written_is_whole_and_the_page_stands_alone(result):
     led_to = set(re.findall(r"""href\s*=\s*["'](?!data:|#)([^"']*)""", page))
     assert led_to == {f"figures/{path.name}" for path in result.figures}
     assert "http" not in re.sub(r"base64,[^\"]*|http-equiv", "", page)
-    analysis, shown = analyse([result.report.parent]), page.replace("&#39;", "'").replace("\u00a0", " ")
+    analysis, shown = (
+        analyse([result.report.parent]),
+        page.replace("&#39;", "'").replace("\u00a0", " "),
+    )
     *sentences, limits = headline(analysis)
     assert all(sentence in shown for sentence in (*sentences, *about(analysis)))
     assert f'id="table-{limits.name}"' in shown
@@ -89,15 +104,22 @@ def test_survivors_are_shown_as_survivors(synthetic):
     e = 0.1 * rng.normal(size=(200, 3))
     solved = np.arange(200) == 7
     scenario = synthetic.scenario(error_scale=1000.0)
-    synthetic.add(scenario, "lucky", np.where(solved[:, None], e, 1e6), solved=solved, estimator=Seeker())
+    synthetic.add(
+        scenario, "lucky", np.where(solved[:, None], e, 1e6), solved=solved, estimator=Seeker()
+    )
     synthetic.add(scenario, "steady", 3 * e, estimator=Seeker(option=1))
     synthetic.add(scenario, "filter", 3 * e)
     analysis = analyse([synthetic.directory])
     total = analysis.summary[analysis.summary["parameter"] == "all"].set_index("estimator")
-    assert np.isnan(total.loc["lucky", ["rmse_low", "rmse_high", "efficiency_low"]].astype(float)).all()
+    assert np.isnan(
+        total.loc["lucky", ["rmse_low", "rmse_high", "efficiency_low"]].astype(float)
+    ).all()
     assert total.loc["lucky", "efficiency_capped"] == pytest.approx(0.2, rel=0.01)
     assert total["efficiency_capped"]["steady"] == total["efficiency_capped"]["filter"]
-    tables = {t.name: {c.title: [cell.text for cell in c.cells] for c in t.columns} for t in all_tables(analysis)}
+    tables = {
+        t.name: {c.title: [cell.text for cell in c.cells] for c in t.columns}
+        for t in all_tables(analysis)
+    }
     solved, overview = tables["solved_trials"], tables["overview"]
     at = solved["estimator"].index
     assert solved["efficiency"][at("lucky")].endswith(" (1)")
@@ -109,7 +131,9 @@ def test_survivors_are_shown_as_survivors(synthetic):
     assert overview["efficiency"][at("filter")] == overview["efficiency"][at("steady")]
     # One over the cap, where nearly all are capped: a limit.
     assert overview["efficiency"][at("lucky")] == "<0.20"
-    assert not any("-" in text for title in ("efficiency", "NEES", "error") for text in overview[title])
+    assert not any(
+        "-" in text for title in ("efficiency", "NEES", "error") for text in overview[title]
+    )
 
 
 def test_nothing_stored_gives_a_page_that_says_so(tmp_path):
@@ -134,7 +158,16 @@ def test_hostile_names_are_shown_and_not_run(synthetic, figures):
     for path in (path for path in result.tables if path.suffix == ".md"):
         text = path.read_text(encoding="utf-8")
         assert "<script>" not in text
-        assert len({len(re.findall(r"(?<!\\)\|", line)) for line in text.splitlines() if line.startswith("|")}) == 1
+        assert (
+            len(
+                {
+                    len(re.findall(r"(?<!\\)\|", line))
+                    for line in text.splitlines()
+                    if line.startswith("|")
+                }
+            )
+            == 1
+        )
 
 
 def test_a_record_is_all_that_a_statistic_needs(result):
@@ -158,12 +191,33 @@ def test_a_record_is_all_that_a_statistic_needs(result):
 def test_numbers_are_written_for_readers():
     shares = [percent(v) for v in (1.0, 0.9999, 0.974, 0.0, 0.0001, float("nan"))]
     assert shares == ["100 %", ">99.9 %", "97.4 %", "0 %", "<0.1 %", "-"]
-    assert [short(v) for v in (1.00234, 14520.3, 3.0, float("inf"))] == ["1.002", "14,520", "3", "inf"]
+    assert [short(v) for v in (1.00234, 14520.3, 3.0, float("inf"))] == [
+        "1.002",
+        "14,520",
+        "3",
+        "inf",
+    ]
     assert [duration(v) for v in (2.0, 0.0123, 9.4e-6)] == ["2.00 s", "12.3 ms", "9.40 µs"]
-    assert [duration(v, 2) for v in (0.00096, 0.123, 0.9996, 0.0)] == ["960 µs", "120 ms", "1.0 s", "0 s"]
+    assert [duration(v, 2) for v in (0.00096, 0.123, 0.9996, 0.0)] == [
+        "960 µs",
+        "120 ms",
+        "1.0 s",
+        "0 s",
+    ]
     # The mean stands behind a median from which it differs by more than a twentieth, to either side.
-    assert [cost(100.0, v) for v in (60.0, 96.0, 104.0, 250.0)] == ["100/60", "100", "100", "100/250"]
-    assert [compact(v) for v in (0.945, 12195, 999.7, 1.6e6, 3e-5)] == ["0.945", "12.2k", "1.00k", "1.60M", "3.0e-5"]
+    assert [cost(100.0, v) for v in (60.0, 96.0, 104.0, 250.0)] == [
+        "100/60",
+        "100",
+        "100",
+        "100/250",
+    ]
+    assert [compact(v) for v in (0.945, 12195, 999.7, 1.6e6, 3e-5)] == [
+        "0.945",
+        "12.2k",
+        "1.00k",
+        "1.60M",
+        "3.0e-5",
+    ]
 
 
 @pytest.mark.slow
@@ -176,7 +230,9 @@ def test_settings_that_differ_have_figures_of_their_own(synthetic, tmp_path, mon
     monkeypatch.setattr(figures, "FIGURES", ("costs",))
     result = write_report([synthetic.directory], tmp_path / "out", figures="all")
     kind = "cost_against_accuracy_"
-    settings = {path.stem.removeprefix(kind) for path in result.figures if path.stem.startswith(kind)}
+    settings = {
+        path.stem.removeprefix(kind) for path in result.figures if path.stem.startswith(kind)
+    }
     assert settings == {"gaussian-0.2", "gaussian-0.4", "quantization"}
     page = re.sub(r'base64,[^"]*', "", result.report.read_text(encoding="utf-8"))
     assert not re.search(r"\bnan\b", page)
@@ -191,27 +247,41 @@ def test_rows_of_equal_settings_each_have_a_dash():
 
 def test_every_renderer_has_every_cell():
     """Cells that the CSV file has stand in the same order in every other form of a table."""
-    columns = [words("name", ["a_b", "c & d", HOSTILE]), column("value", [1.5, 2.0, 3.25], short, [False, True, False])]
+    columns = [
+        words("name", ["a_b", "c & d", HOSTILE]),
+        column("value", [1.5, 2.0, 3.25], short, [False, True, False]),
+    ]
     table = Table("t", "Title", "Caption.", columns, notes=["Note."])
     rows = [["a_b", "1.500"], ["c & d", "2"], [HOSTILE, "3.250"]]
     assert list(csv.reader(io.StringIO(comma_separated(table)))) == [["name", "value"], *rows]
     lines = shown_at(80, table)
-    places = [next(i for i, line in enumerate(lines) if line.split() == " ".join(row).split()) for row in rows]
+    places = [
+        next(i for i, line in enumerate(lines) if line.split() == " ".join(row).split())
+        for row in rows
+    ]
     assert places == sorted(places)
     page = html([table, Strong("Stands out"), "does not"])
     cells = re.findall(r"<td[^>]*>(?:<b>)?(.*?)(?:</b>)?</td>", page)
-    assert [unescape(text.replace("<wbr>", "")) for text in cells] == [cell for row in rows for cell in row]
+    assert [unescape(text.replace("<wbr>", "")) for text in cells] == [
+        cell for row in rows for cell in row
+    ]
     assert HOSTILE not in page
     assert "<b>2</b>" in page
     assert "<b>Stands out</b>" in page
-    assert re.findall(r"^\| (\S.*?) \| (\S*?) \|$", markdown(table), re.MULTILINE)[2] == ("c & d", "**2**")
+    assert re.findall(r"^\| (\S.*?) \| (\S*?) \|$", markdown(table), re.MULTILINE)[2] == (
+        "c & d",
+        "**2**",
+    )
     assert r"c \& d & \textbf{\num{2}} \\" in latex(table)
     for text in (page, markdown(table), "\n".join(lines)):
         assert "Note." in text
 
 
 def test_what_a_terminal_has_no_room_for_is_named_with_its_file_or_goes_below():
-    columns = [words("estimator", ["one", "one", "two"]), *(texts(f"value {i}", ["1234567890"] * 3) for i in range(9))]
+    columns = [
+        words("estimator", ["one", "one", "two"]),
+        *(texts(f"value {i}", ["1234567890"] * 3) for i in range(9)),
+    ]
     left = shown_at(60, replace(Table("t", "T", "", columns), grouped=1, whole="all.csv"))
     named = re.search(r"Too narrow for: (.*); all.csv has them.", " ".join(left))[1].split(", ")
     head = next(line for line in left if "estimator" in line)
@@ -236,14 +306,18 @@ def test_words_show_on_the_dark_ground(synthetic):
     analysis = analyse([synthetic.directory])
     style = render_page(analysis, all_tables(analysis), []).partition("</style>")[0]
     dark = style[style.index("prefers-color-scheme: dark") :]
-    ground, *words = (_luminance(re.search(rf"--{name}: (#\w+)", dark)[1]) for name in ("ground", "ink", "soft"))
+    ground, *words = (
+        _luminance(re.search(rf"--{name}: (#\w+)", dark)[1]) for name in ("ground", "ink", "soft")
+    )
     assert (min(words) + 0.05) / (ground + 0.05) > 4.5
 
 
 def test_the_page_says_which_commands_computed_what_it_shows(synthetic):
     """One entry for the jobs of a sweep; none for a run that found everything stored."""
     fill(synthetic)
-    record = json.loads(next((synthetic.directory / "runs").glob("*.json")).read_text(encoding="utf-8"))
+    record = json.loads(
+        next((synthetic.directory / "runs").glob("*.json")).read_text(encoding="utf-8")
+    )
     record = {k: v for k, v in record.items() if k not in ("schema", "file", "run", "digest")}
     for name, command, blocks in (
         ("b", "ipe-bench run -m error_scale=1,10", 2),

@@ -29,7 +29,14 @@ from ipe_bench.report.page.headline import headline
 from ipe_bench.report.tables.table import Table
 from ipe_bench.report.words import brief, percent
 from ipe_bench.statistics import analyse
-from ipe_bench.statistics.verdicts import CONSISTENT, NO_VERDICT, OVERCONFIDENT, TOO_CAUTIOUS, UNDECIDED, WRONG
+from ipe_bench.statistics.verdicts import (
+    CONSISTENT,
+    NO_VERDICT,
+    OVERCONFIDENT,
+    TOO_CAUTIOUS,
+    UNDECIDED,
+    WRONG,
+)
 from ipe_bench.trials.thresholds import FEW, FIT_LEVEL
 
 COUNTS, INFERS, READ = "counts", "infers", "read"
@@ -79,7 +86,11 @@ def claims_of(report: Report) -> Iterator[Claim]:
         if isinstance(part, Table):
             continue
         one_scale = len(report.board.scales) == 1
-        kinds = [(re.fullmatch(pattern, part), judge) for pattern, judge, of_one in SENTENCES if of_one == one_scale]
+        kinds = [
+            (re.fullmatch(pattern, part), judge)
+            for pattern, judge, of_one in SENTENCES
+            if of_one == one_scale
+        ]
         found = [(match, judge) for match, judge in kinds if match]
         assert len(found) == 1, f"{len(found)} kinds of sentence match: {part}"
         ((match, judge),) = found
@@ -102,7 +113,9 @@ def shares_named(text: str) -> dict[str, str]:
 
 
 def are_shares(report: Report, at: int, named: dict[str, str]) -> bool:
-    return all(text == percent(successes(report, at, label).mean()) for label, text in named.items())
+    return all(
+        text == percent(successes(report, at, label).mean()) for label, text in named.items()
+    )
 
 
 def significant(report: Report) -> set[tuple[int, str, str]]:
@@ -140,7 +153,10 @@ def who_leads(report: Report, match: Any) -> Iterator[tuple[str, str, bool]]:
     """Counts who succeeds most at a scale and how often each does; who is not beaten significantly is not; infers that
     the leaders succeed more often, in the population, than those that they are said to beat."""
     at = report.board.scales.index(float(match["scale"]))
-    beaten, others = shares_named(match["beaten"] or ""), shares_named(match["others"] or match["only"] or "")
+    beaten, others = (
+        shares_named(match["beaten"] or ""),
+        shares_named(match["others"] or match["only"] or ""),
+    )
     compared = compared_by(report) if has_rivals(report) else list(report.board.populations)
     share = {label: successes(report, at, label).mean() for label in compared}
     leaders = most_successful(report, at, compared)
@@ -150,10 +166,18 @@ def who_leads(report: Report, match: Any) -> Iterator[tuple[str, str, bool]]:
     wrong = wrong or not named <= set(leaders) or not are_shares(report, at, beaten | others)
     won = significant(report)
     # Of rivals that agree at first, the sentence is on the first scale at which they part.
-    earlier = [(k, most_successful(report, k, compared)) for k in range(at)] if has_rivals(report) else []
-    parted = [k for k, best in earlier if any(all((k, a, b) in won for a in best) for b in compared)]
+    earlier = (
+        [(k, most_successful(report, k, compared)) for k in range(at)] if has_rivals(report) else []
+    )
+    parted = [
+        k for k, best in earlier if any(all((k, a, b) in won for a in best) for b in compared)
+    ]
     yield "who leads", COUNTS, bool(wrong or parted)
-    yield "not significantly more often", COUNTS, any(all((at, a, b) in won for a in leaders) for b in others)
+    yield (
+        "not significantly more often",
+        COUNTS,
+        any(all((at, a, b) in won for a in leaders) for b in others),
+    )
     if beaten:
         truth = {label: report.board.success(label)[at] for label in share}
         false = any(truth[a] <= truth[b] + 1e-12 for a in leaders for b in beaten)
@@ -178,7 +202,8 @@ def has_rivals(report: Report) -> bool:
 
 
 @sentence(
-    WHO + r" agree (?:at every error scale|up to error scale (?P<last>[\d.]+)): (?P<share>all|at least \S+ %) of"
+    WHO
+    + r" agree (?:at every error scale|up to error scale (?P<last>[\d.]+)): (?P<share>all|at least \S+ %) of"
     r" (?P<trials>\d+) trials succeed at each, with an efficiency of (?P<low>[\d.]+\d)(?: to (?P<high>[\d.]+\d))?\."
 )
 def who_agree(report: Report, match: Any) -> Iterator[tuple[str, str, bool]]:
@@ -189,12 +214,20 @@ def who_agree(report: Report, match: Any) -> Iterator[tuple[str, str, bool]]:
     last = drawn.scales.index(float(match["last"])) if match["last"] else len(drawn.scales) - 1
     cells = [(at, label) for at in range(last + 1) for label in labels]
     least = min(successes(report, *cell).mean() for cell in cells)
-    squares = [np.minimum((report.samples[cell].error ** 2).mean(axis=1), 25.0).mean() for cell in cells]
+    squares = [
+        np.minimum((report.samples[cell].error ** 2).mean(axis=1), 25.0).mean() for cell in cells
+    ]
     each = np.reshape(squares, (last + 1, len(labels)))
     ends = float(match["low"]), float(match["high"] or match["low"])
     wrong = match["share"] != ("all" if least == 1 else f"at least {percent(least)}")
-    wrong = wrong or int(match["trials"]) != drawn.trials or bool((each.max(axis=1) > 1.1026 * each.min(axis=1)).any())
-    wrong = wrong or not np.allclose(ends, (max(squares) ** -0.5, min(squares) ** -0.5), rtol=0, atol=0.00501)
+    wrong = (
+        wrong
+        or int(match["trials"]) != drawn.trials
+        or bool((each.max(axis=1) > 1.1026 * each.min(axis=1)).any())
+    )
+    wrong = wrong or not np.allclose(
+        ends, (max(squares) ** -0.5, min(squares) ** -0.5), rtol=0, atol=0.00501
+    )
     yield "agree, in numbers", COUNTS, bool(wrong)
     false = False
     for at in range(last + 1):
@@ -229,13 +262,21 @@ def who_succeeds(report: Report, match: Any) -> Iterator[tuple[str, str, bool]]:
     assert len(report.board.scales) == 1
     head = match["head"]
     share = {label: float(successes(report, 0, label).mean()) for label in report.board.populations}
-    alike = re.search(r"(?:succeed|keep)(?: the track to the last epoch)? in (?:(all)|(\S+ %)) of", head)
+    alike = re.search(
+        r"(?:succeed|keep)(?: the track to the last epoch)? in (?:(all)|(\S+ %)) of", head
+    )
     if alike:
         wrong = {percent(v) for v in share.values()} != {alike[2] or "100 %"}
     else:
-        told = re.findall(r"(e\d+)(?: succeeds| keeps the track to the last epoch)? in (\S+ %)", head)
+        told = re.findall(
+            r"(e\d+)(?: succeeds| keeps the track to the last epoch)? in (\S+ %)", head
+        )
         wrong = any(percent(share[label]) != text for label, text in told)
-        wrong = wrong or [share[label] for label, _ in told] != sorted(share.values(), reverse=True)[: len(told)]
+        wrong = (
+            wrong
+            or [share[label] for label, _ in told]
+            != sorted(share.values(), reverse=True)[: len(told)]
+        )
     wrong = wrong or f"of {report.board.trials} trials" not in head
     silent = {
         label: float((~s.scalars["success"] & (s.scalars["status"] == "converged")).mean())
@@ -258,11 +299,16 @@ def are_told(match: Any, values: dict[str, float]) -> bool:
 @sentence(r"Median error at the last epoch, in multiples of .*: (?P<each>.*)\.", of_one=True)
 def median_errors(report: Report, match: Any) -> Iterator[tuple[str, str, bool]]:
     """Counts the median error of each."""
-    values = {label: float(np.median(np.sqrt((s.error**2).mean(axis=1)))) for (_, label), s in report.samples.items()}
+    values = {
+        label: float(np.median(np.sqrt((s.error**2).mean(axis=1))))
+        for (_, label), s in report.samples.items()
+    }
     yield "median errors", COUNTS, not are_told(match, values)
 
 
-@sentence(r"Root mean square error over all epochs, relative to the smallest: (?P<each>.*)\.", of_one=True)
+@sentence(
+    r"Root mean square error over all epochs, relative to the smallest: (?P<each>.*)\.", of_one=True
+)
 def path_errors(report: Report, match: Any) -> Iterator[tuple[str, str, bool]]:
     """Counts the errors of each, of which the smallest is 1 and none is 0."""
     errors = {label: np.sqrt((s.error**2).mean(axis=0)) for (_, label), s in report.samples.items()}
@@ -313,10 +359,14 @@ def box(report: Report) -> Iterator[Claim]:
             here = report.analysis.summary.query("parameter == 'all' and estimator == @label")
             verdicts = dict(zip(here["error_scale"], here["verdict"], strict=True))
             good = [verdicts[s] not in (OVERCONFIDENT, UNDECIDED, NO_VERDICT) for s in drawn.scales]
-            yield Claim("honest up to, by the verdicts", COUNTS, honest, limit_of(good, drawn.scales) != low)
+            yield Claim(
+                "honest up to, by the verdicts", COUNTS, honest, limit_of(good, drawn.scales) != low
+            )
             if low > -np.inf:
                 nearly = [p.mean_nees <= RIGHT for p in drawn.populations[label]]
-                yield Claim("honest up to, as proven", READ, honest, limit_of(nearly, drawn.scales) < low)
+                yield Claim(
+                    "honest up to, as proven", READ, honest, limit_of(nearly, drawn.scales) < low
+                )
             if high < drawn.scales[-1]:
                 right = [p.mean_nees <= 1 + 1e-9 for p in drawn.populations[label]]
                 yield Claim("honest up to", INFERS, honest, limit_of(right, drawn.scales) > high)
@@ -329,7 +379,8 @@ def box(report: Report) -> Iterator[Claim]:
         spent = {label: cost for label, *_, cost in rows}
         nobody = all(is_lost(report, at, label) for at, label in report.samples)
         wrong = [
-            (cost == "-") != (is_lost(report, drawn.scales.index(scale), e) and not nobody) for e, cost in spent.items()
+            (cost == "-") != (is_lost(report, drawn.scales.index(scale), e) and not nobody)
+            for e, cost in spent.items()
         ]
         yield Claim("cost of who may hold", COUNTS, str(spent), any(wrong))
         yield Claim("order of the box", COUNTS, "", lows != sorted(lows, reverse=True))
@@ -341,7 +392,9 @@ def opening(report: Report) -> Iterator[Claim]:
     scales = report.board.scales
     if len(scales) > 1 and not has_rivals(report):
         first = str(report.parts[0])
-        yield Claim("opening", COUNTS, first, not first.startswith(f"At error scale {scales[-1]:g}, "))
+        yield Claim(
+            "opening", COUNTS, first, not first.startswith(f"At error scale {scales[-1]:g}, ")
+        )
 
 
 @entries
@@ -354,7 +407,11 @@ def verdicts(report: Report) -> Iterator[Claim]:
         there = report.population(row["error_scale"], row["estimator"])
         sample = report.trials_of(row["error_scale"], row["estimator"])
         enough = int(sample.converged.sum()) >= FEW
-        means = {"verdict": there.mean_nees, "path_verdict": there.mean_nees, "nis_verdict": there.innovations}
+        means = {
+            "verdict": there.mean_nees,
+            "path_verdict": there.mean_nees,
+            "nis_verdict": there.innovations,
+        }
         for column in list(means)[: 3 if report.board.moving else 1]:
             word, kind = row[column], f"{column}: {row[column]}"
             if word == OVERCONFIDENT:
@@ -362,11 +419,18 @@ def verdicts(report: Report) -> Iterator[Claim]:
             elif word == TOO_CAUTIOUS:
                 yield Claim(kind, INFERS, word, means[column] >= 1 - 1e-9)
             elif word == WRONG:
-                yield Claim(kind, INFERS, word, there.correlated + FIT_LEVEL * (1 - there.correlated) <= 0.01)
+                yield Claim(
+                    kind,
+                    INFERS,
+                    word,
+                    there.correlated + FIT_LEVEL * (1 - there.correlated) <= 0.01,
+                )
             else:
                 yield Claim(kind, COUNTS, word, enough != (word != NO_VERDICT))
             if word == CONSISTENT:
-                yield Claim(f"{kind}, as right", READ, word, not 1 / RIGHT <= means[column] <= RIGHT)
+                yield Claim(
+                    f"{kind}, as right", READ, word, not 1 / RIGHT <= means[column] <= RIGHT
+                )
 
 
 @entries
@@ -378,7 +442,12 @@ def bold(report: Report) -> Iterator[Claim]:
         if not marks.all():
             truth = {label: report.board.success(label)[at] for label in marks.index}
             best = [label for label, value in truth.items() if value >= max(truth.values()) - 1e-12]
-            yield Claim("may be the best (bold)", INFERS, str(scale), not all(marks[label] for label in best))
+            yield Claim(
+                "may be the best (bold)",
+                INFERS,
+                str(scale),
+                not all(marks[label] for label in best),
+            )
 
 
 # The reports ----------------------------------------------------------------------------------------------------------
@@ -398,7 +467,9 @@ class Tally:
     @property
     def upper(self) -> float:
         """The upper limit (95 %, Clopper and Pearson) of the share of reports in which it is false."""
-        return float(beta.ppf(0.95, self.false_reports + 1, self.reports - self.false_reports) or 1.0)
+        return float(
+            beta.ppf(0.95, self.false_reports + 1, self.reports - self.false_reports) or 1.0
+        )
 
 
 def judged(seed: int, largest: bool = True) -> list[Claim]:
@@ -418,7 +489,12 @@ def tallies(reports: list[list[Claim]]) -> list[Tally]:
         for claim in claims:
             each[claim.does, claim.kind].append(claim.false)
         for key, false in each.items():
-            found = {"reports": 1, "false_reports": any(false), "times": len(false), "false_times": sum(false)}
+            found = {
+                "reports": 1,
+                "false_reports": any(false),
+                "times": len(false),
+                "false_times": sum(false),
+            }
             printed[key].update(found)
     return [Tally(kind, does, **printed[does, kind]) for does, kind in sorted(printed)]
 
@@ -447,10 +523,16 @@ def test_a_simulated_report_says_what_the_stored_trials_say(synthetic):
     names = tuple(f"x{i}" for i in range(report.board.n))
     for (at, label), sample in report.samples.items():
         kept = {name: sample.scalars[name] for name in ("status", "fit_p", "simulations", "time_s")}
-        scenario = synthetic.scenario(report.board.scales[at], sigma=2.0, names=names, sizes_given=(1.0,))
+        scenario = synthetic.scenario(
+            report.board.scales[at], sigma=2.0, names=names, sizes_given=(1.0,)
+        )
         estimator = kinds[report.board.family[label]]
-        synthetic.add(scenario, label, sample.error, estimator=estimator, deviation=sample.deviation, **kept)
-    assert list(map(shown_part, headline(analyse([synthetic.directory])))) == list(map(shown_part, report.parts))
+        synthetic.add(
+            scenario, label, sample.error, estimator=estimator, deviation=sample.deviation, **kept
+        )
+    assert list(map(shown_part, headline(analyse([synthetic.directory])))) == list(
+        map(shown_part, report.parts)
+    )
 
 
 def test_all_verdicts_of_a_page_share_one_level():
@@ -458,7 +540,9 @@ def test_all_verdicts_of_a_page_share_one_level():
         drawn = board(seed)
         report = simulated(drawn)
         each = 3 if drawn.moving else 1
-        assert {sample.verdicts for sample in report.samples.values()} == {each * len(report.samples)}
+        assert {sample.verdicts for sample in report.samples.values()} == {
+            each * len(report.samples)
+        }
 
 
 def of_constants(seed: int) -> Report | None:

@@ -17,12 +17,22 @@ def run(folder: Path, *more: str) -> int:
 
 
 def written(folder: Path) -> dict[str, int]:
-    files = [folder / "report.html", folder / "summary.csv", *folder.glob("tables/*"), *folder.glob("figures/*.*")]
-    return {str(path.relative_to(folder)): path.stat().st_mtime_ns for path in (*files, *folder.glob("runs/*"))}
+    files = [
+        folder / "report.html",
+        folder / "summary.csv",
+        *folder.glob("tables/*"),
+        *folder.glob("figures/*.*"),
+    ]
+    return {
+        str(path.relative_to(folder)): path.stat().st_mtime_ns
+        for path in (*files, *folder.glob("runs/*"))
+    }
 
 
 @pytest.mark.slow
-def test_a_report_is_made_again_where_anything_has_changed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_report_is_made_again_where_anything_has_changed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run(tmp_path) == 0
     before = written(tmp_path)
     capsys.readouterr()

@@ -80,11 +80,16 @@ CHANGES = {
 
 
 @pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
-def test_a_bundle_that_was_changed_is_refused_in_one_line_and_leaves_nothing(bundle, tmp_path, change, capsys):
+def test_a_bundle_that_was_changed_is_refused_in_one_line_and_leaves_nothing(
+    bundle, tmp_path, change, capsys
+):
     bad = rewritten(bundle.path, tmp_path / "bad.zip", change)
     mine = fill(tmp_path / "mine")
     out = tmp_path / "out"
-    for words in (["compare", str(mine), str(bad)], ["report", str(mine), str(bad), f"output={out}"]):
+    for words in (
+        ["compare", str(mine), str(bad)],
+        ["report", str(mine), str(bad), f"output={out}"],
+    ):
         assert main(words) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert str(bad) in line
@@ -106,9 +111,16 @@ def test_any_byte_that_is_changed_is_noticed(bundle, tmp_path):
     assert noticed > 45
 
 
-ODD = ["../evil.json", "/runs/evil.json", "theirs/../../runs/x.json", "theirs/log/x.json", "theirs/runs/x.py"]
+ODD = [
+    "../evil.json",
+    "/runs/evil.json",
+    "theirs/../../runs/x.json",
+    "theirs/log/x.json",
+    "theirs/runs/x.py",
+]
 ODD += [
-    f"{folder}/runs/x.json" for folder in ("C:", "CON", "nul.x", "-rf", " ", "~", ".git", "a:b", "a\u202eb", "base.")
+    f"{folder}/runs/x.json"
+    for folder in ("C:", "CON", "nul.x", "-rf", " ", "~", ".git", "a:b", "a\u202eb", "base.")
 ]
 ODD += [f"theirs/runs/{300 * 'x'}.json", f"{300 * 'x'}/runs/x.json"]
 
@@ -116,13 +128,20 @@ ODD += [f"theirs/runs/{300 * 'x'}.json", f"{300 * 'x'}/runs/x.json"]
 @pytest.mark.parametrize("name", ODD)
 def test_a_manifest_cannot_write_elsewhere(bundle, tmp_path, name):
     def change(entry, content):
-        yield entry, content + f"{hashlib.sha256(b'{}').hexdigest()}  {name}\n".encode() * (entry == MANIFEST)
+        yield (
+            entry,
+            content
+            + f"{hashlib.sha256(b'{}').hexdigest()}  {name}\n".encode() * (entry == MANIFEST),
+        )
         if entry == MANIFEST:
             yield name, b"{}"
 
     bad = rewritten(bundle.path, tmp_path / "bad.zip", change)
     before = set(tmp_path.rglob("*"))
-    with pytest.raises(UserError, match="is no name of a result"), opened([bad], tmp_path / "a" / "b"):
+    with (
+        pytest.raises(UserError, match="is no name of a result"),
+        opened([bad], tmp_path / "a" / "b"),
+    ):
         pass
     assert set(tmp_path.rglob("*")) == before
 

@@ -45,7 +45,13 @@ class Fails(Estimator):
 
 
 def run(folder: Path) -> None:
-    compute(SCENARIOS, {"newton": Newton(), "linear_lse": LinearLSE(), "fails": Fails()}, 20, folder, block_size=10)
+    compute(
+        SCENARIOS,
+        {"newton": Newton(), "linear_lse": LinearLSE(), "fails": Fails()},
+        20,
+        folder,
+        block_size=10,
+    )
 
 
 def summary(folder: Path) -> pd.DataFrame:
@@ -115,8 +121,14 @@ def without_a_key(path: Path, rng: random.Random) -> None:
     if path.suffix != ".json":
         return truncate(path, rng)
     record = json.loads(path.read_text())
-    del record[rng.choice(sorted({"key", "start", "message", "cells", "started", "trials"} & record.keys()))]
-    parts.write_record(path, {name: value for name, value in record.items() if name not in ("digest", "schema")})
+    del record[
+        rng.choice(
+            sorted({"key", "start", "message", "cells", "started", "trials"} & record.keys())
+        )
+    ]
+    parts.write_record(
+        path, {name: value for name, value in record.items() if name not in ("digest", "schema")}
+    )
 
 
 Harm = Callable[[Path, random.Random], None]
@@ -142,7 +154,9 @@ def test_whatever_is_done_to_a_file_is_named_and_healed(folder, expected, kind, 
     pd.testing.assert_frame_equal(summary(folder), table)
 
 
-@pytest.mark.parametrize("name", ["trials/0123456789abcdef-0-8.parquet", "trials/x.parquet", "failed/x.json"])
+@pytest.mark.parametrize(
+    "name", ["trials/0123456789abcdef-0-8.parquet", "trials/x.parquet", "failed/x.json"]
+)
 def test_a_pipe_among_the_results_stops_no_command(folder, expected, capsys, name):
     """Whoever opens one waits until something is written into it."""
     os.mkfifo(folder / name)
@@ -164,9 +178,13 @@ def between_columns(path: Path) -> set[int]:
     """The bytes that belong to no column: pyarrow 17 repeats there what the footer says, for no reader."""
     group = pq.read_metadata(path).row_group(0)
     columns = [group.column(i) for i in range(group.num_columns)]
-    starts = [c.dictionary_page_offset if c.has_dictionary_page else c.data_page_offset for c in columns]
+    starts = [
+        c.dictionary_page_offset if c.has_dictionary_page else c.data_page_offset for c in columns
+    ]
     ends = [start + c.total_compressed_size for start, c in zip(starts, columns, strict=True)]
-    return {byte for end, start in zip(ends, starts[1:], strict=False) for byte in range(end, start)}
+    return {
+        byte for end, start in zip(ends, starts[1:], strict=False) for byte in range(end, start)
+    }
 
 
 def test_one_bit_in_127_of_a_part_and_in_11_of_a_record_is_told_or_without_effect(tmp_path):
@@ -202,13 +220,20 @@ PLACES = ["trials", "runs", "failed", "figures", "tables"]
 
 @pytest.mark.parametrize(
     ("command", "name"),
-    [*(("report", name) for name in PLACES), ("run", "trials"), ("run", "tables"), ("status", "runs")],
+    [
+        *(("report", name) for name in PLACES),
+        ("run", "trials"),
+        ("run", "tables"),
+        ("status", "runs"),
+    ],
 )
 def test_a_file_where_a_folder_should_be_is_a_line(folder, capfd, name, command):
     path = folder / name
     shutil.rmtree(path, ignore_errors=True)
     path.write_text("a file")
-    words = {"run": ["run", "measurement=polynomial", "trials=5", f"output={folder}", "execution=serial"]}
+    words = {
+        "run": ["run", "measurement=polynomial", "trials=5", f"output={folder}", "execution=serial"]
+    }
     drawn = [] if name == "figures" or command == "status" else ["figures=none"]
     code = main([*words.get(command, [command, str(folder)]), *drawn])
     out, err = capfd.readouterr()
@@ -270,12 +295,17 @@ def test_of_an_older_folder_everybody_says_in_a_sentence_what_to_do(folder, caps
     with pytest.warns(UserWarning, match=sentence):
         assert len(ib.load(folder)) == 0
     assert any(sentence in line for line in ib.status(folder).attrs["problems"])
-    for command, said_in in ((["status", str(folder)], "out"), (["report", str(folder), "figures=none"], "err")):
+    for command, said_in in (
+        (["status", str(folder)], "out"),
+        (["report", str(folder), "figures=none"], "err"),
+    ):
         assert main(command) == 1
         assert sentence in getattr(capsys.readouterr(), said_in)
 
 
-def test_a_run_in_an_older_folder_computes_everything_anew_and_leaves_the_old_files(folder, expected):
+def test_a_run_in_an_older_folder_computes_everything_anew_and_leaves_the_old_files(
+    folder, expected
+):
     as_of_an_older_version(folder)
     older = {path: path.read_bytes() for path in (folder / "trials").iterdir()}
     for path in list(older):

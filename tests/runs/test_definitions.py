@@ -22,29 +22,50 @@ from ipe_bench.trials.fit_test import Spread, fit_probability
 # Ways to say how far estimates are shifted: the part of a cell that is edited, and the part that uses it.
 WAYS = {
     "constant": ("class By:\n    def by(self):\n        return {v}", ""),
-    "inner function": ("class By:\n    def by(self):\n        return (lambda: [{v} for _ in 'a'][0])()", ""),
+    "inner function": (
+        "class By:\n    def by(self):\n        return (lambda: [{v} for _ in 'a'][0])()",
+        "",
+    ),
     "default": ("class By:\n    def by(self, v={v}):\n        return v", ""),
     "keyword": ("class By:\n    def by(self, *, v={v}):\n        return v", ""),
     "attribute": ("class By:\n    v = {v}\n    def by(self):\n        return self.v", ""),
     "static": ("class By:\n    @staticmethod\n    def by():\n        return {v}", ""),
-    "property": ("class By:\n    value = property(lambda self: {v})\n    def by(self):\n        return self.value", ""),
+    "property": (
+        "class By:\n    value = property(lambda self: {v})\n    def by(self):\n        return self.value",
+        "",
+    ),
     "closure": ("def method(v):\n    return lambda self: v\nclass By:\n    by = method({v})", ""),
-    "array": ("def method(v):\n    return lambda self: v[0]\nclass By:\n    by = method(np.array([{v}]))", ""),
+    "array": (
+        "def method(v):\n    return lambda self: v[0]\nclass By:\n    by = method(np.array([{v}]))",
+        "",
+    ),
     "factory": (
         "def kind(v):\n    class By:\n        def by(self):\n            return v\n    return By\nBy = kind({v})",
         "",
     ),
     "variable": ("V = {v}", "class By:\n    def by(self):\n        return V"),
     "list": ("V = [{v}]", "class By:\n    def by(self):\n        return V[0]"),
-    "helper": ("def helper():\n    return {v}", "class By:\n    def by(self):\n        return helper()"),
-    "kept helper": ("@functools.cache\ndef f():\n    return {v}", "class By:\n    def by(self):\n        return f()"),
+    "helper": (
+        "def helper():\n    return {v}",
+        "class By:\n    def by(self):\n        return helper()",
+    ),
+    "kept helper": (
+        "@functools.cache\ndef f():\n    return {v}",
+        "class By:\n    def by(self):\n        return f()",
+    ),
     "decorator": (
         "class Times:\n    def __init__(self, f):\n        self.f, self.k = functools.update_wrapper(self, f), {v}\n"
         "    def __call__(self):\n        return self.k * self.__wrapped__()\n@Times\ndef f():\n    return 1.0",
         "class By:\n    def by(self):\n        return f()",
     ),
-    "partial": ("f = functools.partial(max, {v})", "class By:\n    def by(self):\n        return f(-1.0)"),
-    "other class": ("class Other:\n    v = {v}", "class By:\n    def by(self):\n        return Other.v"),
+    "partial": (
+        "f = functools.partial(max, {v})",
+        "class By:\n    def by(self):\n        return f(-1.0)",
+    ),
+    "other class": (
+        "class Other:\n    v = {v}",
+        "class By:\n    def by(self):\n        return Other.v",
+    ),
     "object": (
         "class Box:\n    def __init__(self, v):\n        self.v = v\nbox = Box({v})",
         "class By:\n    def by(self):\n        return box.v",
@@ -53,7 +74,10 @@ WAYS = {
         "def inner():\n    return {v}",
         "def outer():\n    return inner()\nclass By:\n    def by(self):\n        return outer()",
     ),
-    "evaluated": ("def helper():\n    return {v}", "class By:\n    def by(self):\n        return eval('helper()')"),
+    "evaluated": (
+        "def helper():\n    return {v}",
+        "class By:\n    def by(self):\n        return eval('helper()')",
+    ),
 }
 KINDS = {
     "estimator": """
@@ -93,7 +117,9 @@ class Mine(By, ib.states.Tracker):
 }
 COLUMN = {"prior": "x_c0", "tracker": "error_p"}
 WALK = {"next": {"p": "p + w"}, "readings": {"z": "p"}, "noise": {"w": 1.0}}
-TRACK = ib.StateScenario(ib.states.Formulas(**WALK, deviation={"z": 0.5}, spread={"p": 3.0}, count=5))
+TRACK = ib.StateScenario(
+    ib.states.Formulas(**WALK, deviation={"z": 0.5}, spread={"p": 3.0}, count=5)
+)
 SETUP = "import functools\nfrom dataclasses import dataclass\nimport numpy as np\nimport ipe_bench as ib"
 
 
@@ -121,8 +147,13 @@ class Session:
         if self.kind == "tracker":
             return TRACK, {"mine": mine}
         if self.kind == "estimator":
-            return ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01)), {"mine": mine}
-        plain: dict = {"measurement": ib.measurements.Polynomial(), "noise": ib.noise.Gaussian(0.01)}
+            return ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01)), {
+                "mine": mine
+            }
+        plain: dict = {
+            "measurement": ib.measurements.Polynomial(),
+            "noise": ib.noise.Gaussian(0.01),
+        }
         plain |= {"truth" if self.kind == "model" else self.kind: mine}
         return ib.Scenario(**plain), {"linear": ib.baselines.LinearLSE()}
 
@@ -176,7 +207,9 @@ def test_the_key_of_each_kind_follows_what_the_cell_above_it_says(way, kind):
 def test_remarks_docstrings_and_lines_change_no_key(way):
     session = Session("estimator", way, 1.0)
     key = session.key()
-    told = session.edited.replace(":\n", ":\n\n    # a remark\n" if way == "variable" else ":\n\n", 1)
+    told = session.edited.replace(
+        ":\n", ":\n\n    # a remark\n" if way == "variable" else ":\n\n", 1
+    )
     exec("'''What it does.'''\n\n" + told.format(v=1.0), session.names)
     exec(session.used, session.names)
     exec(KINDS["estimator"].replace("=False):\n", "=False):\n        'Shifts.'\n"), session.names)
@@ -185,7 +218,11 @@ def test_remarks_docstrings_and_lines_change_no_key(way):
 
 def test_what_cannot_be_digested_is_another_with_each_definition():
     session = Session("estimator", "variable", 1.0)
-    lines = ["import threading", "lock = threading.Lock()", "class By:\n    def by(self):\n        return id(lock)"]
+    lines = [
+        "import threading",
+        "lock = threading.Lock()",
+        "class By:\n    def by(self):\n        return id(lock)",
+    ]
     keys = []
     for _ in range(2):
         for line in (*lines, KINDS["estimator"]):
@@ -197,7 +234,10 @@ def test_what_cannot_be_digested_is_another_with_each_definition():
 
 def test_a_rerun_computes_nothing_though_the_code_fills_its_variables(tmp_path):
     session = Session("estimator", "constant", 1.0)
-    exec("seen = []\nclass By:\n    def by(self):\n        seen.append(1)\n        return 1.0", session.names)
+    exec(
+        "seen = []\nclass By:\n    def by(self):\n        seen.append(1)\n        return 1.0",
+        session.names,
+    )
     exec(KINDS["estimator"], session.names)
     scenario, estimators = session.asked()
     table = ib.run(scenario, estimators, trials=40, precision=1e-9, block_size=20, output=tmp_path)
@@ -252,7 +292,9 @@ SCENARIO = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01))
 def write(folder: Path, name: str, v: float, *, apart: bool = False) -> None:
     """Writes a module with an estimator, and its helper in it or apart."""
     helper = f"def shift():\n    return {v}\n"
-    (folder / f"{name}.py").write_text(MODULE.format(helper="from helper import shift" if apart else helper))
+    (folder / f"{name}.py").write_text(
+        MODULE.format(helper="from helper import shift" if apart else helper)
+    )
     if apart:
         (folder / "helper.py").write_text(helper)
 
@@ -267,7 +309,9 @@ def importing(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("apart", [False, True])
-def test_a_module_that_is_edited_and_reloaded_has_new_numbers_and_known_ones_when_it_is_as_before(importing, apart):
+def test_a_module_that_is_edited_and_reloaded_has_new_numbers_and_known_ones_when_it_is_as_before(
+    importing, apart
+):
     shifts, keys = [], []
     for v in (0.0, 1000.0, 0.0):
         write(importing, "mine", v, apart=apart)
@@ -282,7 +326,9 @@ def test_a_module_that_is_edited_and_reloaded_has_new_numbers_and_known_ones_whe
     assert keys[0] == keys[2] != keys[1]
 
 
-def test_a_module_that_is_edited_and_not_imported_again_is_neither_the_old_one_nor_the_new(importing):
+def test_a_module_that_is_edited_and_not_imported_again_is_neither_the_old_one_nor_the_new(
+    importing,
+):
     write(importing, "mine", 0.0)
     mine = importlib.import_module("mine").Reloaded()
     keys = {ResultKey(SCENARIO, "mine", mine).key}
@@ -349,7 +395,13 @@ def test_classes_of_the_main_program_are_computed_by_workers_as_they_are_now(tmp
     (tmp_path / "script.py").write_text(CELLS)
     arguments = {"file": ["script.py"], "input": ["-"], "argument": ["-c", CELLS]}[given]
     environment = {**os.environ, "PYTHONWARNINGS": "error::UserWarning"}
-    options: dict = {"input": CELLS, "cwd": tmp_path, "env": environment, "capture_output": True, "text": True}
+    options: dict = {
+        "input": CELLS,
+        "cwd": tmp_path,
+        "env": environment,
+        "capture_output": True,
+        "text": True,
+    }
     done = subprocess.run([sys.executable, *arguments], **options, check=False)
     assert done.stdout.split("\n")[:3] == ["0 100", "1000 1100", "2000 2200"], done.stderr
 

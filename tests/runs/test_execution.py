@@ -35,7 +35,12 @@ def stored(directory: Path) -> dict[str, np.ndarray]:
     """Every number that a run stored, timings aside, by file and column."""
     parts = (part for cell in Results.read([directory]).stored.values() for part in cell.parts)
     tables = {part.path.name: part.read()[1] for part in parts}
-    names = ((file, name) for file, table in tables.items() for name in table.column_names if name != "time_s")
+    names = (
+        (file, name)
+        for file, table in tables.items()
+        for name in table.column_names
+        if name != "time_s"
+    )
     return {f"{file}:{name}": tables[file][name].to_numpy() for file, name in names}
 
 
@@ -77,7 +82,11 @@ class Dying(Serial):
             labels = [cell.label for cell in task.cells]
             if "newton" in labels:
                 asked.append(labels)
-                yield Event(index, ended=True, failure=Failure("died", "the worker process was ended by SIGKILL"))
+                yield Event(
+                    index,
+                    ended=True,
+                    failure=Failure("died", "the worker process was ended by SIGKILL"),
+                )
             else:
                 yield from (replace(event, index=index) for event in super().run(work, [task]))
 
@@ -97,7 +106,12 @@ def test_what_takes_its_process_with_it_is_tried_twice_alone_and_the_rest_goes_o
 
 def test_a_run_completes_when_a_worker_is_killed(tmp_path, reference):
     rogue = {"killer": Rogue("kill", until=str(tmp_path / "killed"))}
-    assert compute([scenario()], {**rogue, **GOOD}, 40, tmp_path, execution=Processes(2), block_size=10) == ()
+    assert (
+        compute(
+            [scenario()], {**rogue, **GOOD}, 40, tmp_path, execution=Processes(2), block_size=10
+        )
+        == ()
+    )
     assert (tmp_path / "killed").exists()
     there = stored(tmp_path)
     assert_same({name: there[name] for name in reference}, reference)
@@ -116,11 +130,16 @@ def test_a_run_completes_when_a_worker_is_killed(tmp_path, reference):
             (f"simulations {value}", {}, "simulations that are not finite numbers from 0 up")
             for value in (-1, "nan", "inf")
         ),
-        *((f"iterations {value}", {}, "iterations that are not whole numbers") for value in (1.5, 1e300)),
+        *(
+            (f"iterations {value}", {}, "iterations that are not whole numbers")
+            for value in (1.5, 1e300)
+        ),
         *((f"status {value}", {}, "a status that is not one of") for value in (-1, 0.5, 99)),
         ("status None", {}, "status of type object"),
         ("history", {}, "history of 1 trials, where 10 belong"),
-        pytest.param("sleep", {"block_timeout_s": 3.0}, "block_timeout_s=3", marks=pytest.mark.slow),
+        pytest.param(
+            "sleep", {"block_timeout_s": 3.0}, "block_timeout_s=3", marks=pytest.mark.slow
+        ),
         pytest.param(
             *("memory", {"memory_limit_gb": 1.0}, "MemoryError"),
             marks=[
@@ -130,20 +149,30 @@ def test_a_run_completes_when_a_worker_is_killed(tmp_path, reference):
         ),
     ],
 )
-def test_one_estimator_that_fails_loses_nothing_but_itself(tmp_path, reference, does, limits, message):
+def test_one_estimator_that_fails_loses_nothing_but_itself(
+    tmp_path, reference, does, limits, message
+):
     estimators = {"rogue": Rogue(does), **GOOD}
     (failure,) = compute([scenario()], estimators, 10, tmp_path, execution=Processes(1, **limits))
     assert message in failure
     assert "rogue" in failure
-    assert_same(stored(tmp_path), {name.replace("-0-40.", "-0-10."): rows[:10] for name, rows in reference.items()})
-    rogue = next(cell for cell in Results.read([tmp_path]).cells if cell.names["estimator"] == "rogue")
+    assert_same(
+        stored(tmp_path),
+        {name.replace("-0-40.", "-0-10."): rows[:10] for name, rows in reference.items()},
+    )
+    rogue = next(
+        cell for cell in Results.read([tmp_path]).cells if cell.names["estimator"] == "rogue"
+    )
     assert (rogue.done, rogue.failed, rogue.missing) == (0, 10, 0)
 
 
 @pytest.mark.slow
 def test_the_time_limit_does_not_count_what_any_estimator_compiles(tmp_path):
     estimators = {**GOOD, "rogue": Rogue("compile")}
-    assert compute([scenario()], estimators, 10, tmp_path, execution=Processes(1, block_timeout_s=2.5)) == ()
+    assert (
+        compute([scenario()], estimators, 10, tmp_path, execution=Processes(1, block_timeout_s=2.5))
+        == ()
+    )
 
 
 def rows_of(directory: Path, label: str) -> dict[str, np.ndarray]:
@@ -159,10 +188,17 @@ def rows_of(directory: Path, label: str) -> dict[str, np.ndarray]:
         ("boast", ["nonfinite", *["converged"] * 4], ""),
         ("masked", ["nonfinite"] * 5, ""),
         ("masked in one", ["nonfinite", *["converged"] * 4], ""),
-        pytest.param("matrix", ["converged"] * 5, "", marks=pytest.mark.filterwarnings("ignore:the matrix subclass")),
+        pytest.param(
+            "matrix",
+            ["converged"] * 5,
+            "",
+            marks=pytest.mark.filterwarnings("ignore:the matrix subclass"),
+        ),
     ],
 )
-def test_an_exception_or_an_infinite_estimate_is_a_status_and_no_failure(tmp_path, does, statuses, message):
+def test_an_exception_or_an_infinite_estimate_is_a_status_and_no_failure(
+    tmp_path, does, statuses, message
+):
     assert compute([scenario()], {"rogue": Rogue(does)}, 5, tmp_path, execution=Processes(1)) == ()
     rows = rows_of(tmp_path, "rogue")
     assert rows["status"].tolist() == statuses
@@ -170,7 +206,11 @@ def test_an_exception_or_an_infinite_estimate_is_a_status_and_no_failure(tmp_pat
     if does.startswith("masked"):  # what lies under a mask is no answer
         assert not rows["success"][0]
         assert np.isnan(
-            [rows["crlb_distance"][0], rows["nees"][0], *(v[0] for k, v in rows.items() if k.startswith("deviation_"))]
+            [
+                rows["crlb_distance"][0],
+                rows["nees"][0],
+                *(v[0] for k, v in rows.items() if k.startswith("deviation_")),
+            ]
         ).all()
 
 
@@ -198,7 +238,10 @@ try:
 except KeyboardInterrupt:
     sys.exit(130)
 """
-    assert subprocess.run([sys.executable, "-c", code], env=environment(), check=False).returncode == 130
+    assert (
+        subprocess.run([sys.executable, "-c", code], env=environment(), check=False).returncode
+        == 130
+    )
 
 
 @pytest.mark.parametrize("execution", [Serial(), Processes(1)], ids=repr)
@@ -236,15 +279,22 @@ def test_steps_come_in_order_and_an_exception_fails_its_task_alone(execution):
         assert [event.step for event in mine[:-1]] == [0, task, 2 * task]
         assert mine[-1].ended
         failure = mine[-1].failure
-        assert (None if failure is None else failure.message) == ("ValueError: two" if task == 2 else None)
+        assert (None if failure is None else failure.message) == (
+            "ValueError: two" if task == 2 else None
+        )
         assert failure is None or "in square" in failure.detail  # the traceback
 
 
 @pytest.mark.parametrize(
-    ("tasks", "options", "here"), [([0], {}, True), ([0, 0], {}, False), ([0], {"block_timeout_s": 60.0}, False)]
+    ("tasks", "options", "here"),
+    [([0], {}, True), ([0, 0], {}, False), ([0], {"block_timeout_s": 60.0}, False)],
 )
 def test_auto_starts_workers_only_where_they_are_of_use(tasks, options, here):
-    seen = [event.step for event in Auto(2, **options).run(rogues.surroundings, tasks) if not event.ended]
+    seen = [
+        event.step
+        for event in Auto(2, **options).run(rogues.surroundings, tasks)
+        if not event.ended
+    ]
     assert len(seen) == len(tasks)
     assert ({pid for pid, _, _ in seen} == {os.getpid()}) == here
 
@@ -278,7 +328,9 @@ def test_a_worker_that_dies_between_two_runs_is_replaced():
 
 @pytest.mark.skipif(sys.platform == "win32", reason="stops processes with POSIX means")
 def test_a_task_handed_to_a_worker_that_is_ending_is_handed_to_another():
-    (seen,) = [event.step for event in Processes(1).run(rogues.surroundings, [0]) if not event.ended]
+    (seen,) = [
+        event.step for event in Processes(1).run(rogues.surroundings, [0]) if not event.ended
+    ]
     os.kill(seen[0], signal.SIGSTOP)  # it takes a message, and never reads it
     killer = threading.Timer(1.0, os.kill, (seen[0], signal.SIGKILL))
     killer.start()
@@ -294,14 +346,18 @@ def test_a_script_needs_no_guard_against_being_imported_by_its_workers(tmp_path)
         "from shared import rogues\nfrom ipe_bench.runs.execution import Processes\nprint('begins')\n"
         "print([event.step for event in Processes(2).run(rogues.square, [1]) if not event.ended])\n"
     )
-    ran = subprocess.run([sys.executable, script], env=environment(), capture_output=True, text=True, check=True)
+    ran = subprocess.run(
+        [sys.executable, script], env=environment(), capture_output=True, text=True, check=True
+    )
     assert ran.stdout.splitlines() == ["begins", "[0, 1, 2]"]
 
 
 def test_workers_end_when_their_parent_is_killed(tmp_path):
     code = "from shared import rogues; from ipe_bench.runs.execution import Processes\n"
     code += "for event in Processes(1).run(rogues.doze, [0]): print(event.step, flush=True)"
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, env=environment(), text=True) as parent:
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, env=environment(), text=True
+    ) as parent:
         assert parent.stdout is not None
         pid = int(parent.stdout.readline())
         assert alive(pid)
@@ -320,7 +376,9 @@ def test_a_folder_that_cannot_be_written_to_is_refused_before_any_work(tmp_path)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="limits the size of files with POSIX means")
-@pytest.mark.parametrize("execution", ["Serial()", pytest.param("Processes(1)", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "execution", ["Serial()", pytest.param("Processes(1)", marks=pytest.mark.slow)]
+)
 def test_a_full_disk_ends_the_run_with_one_line_and_no_half_files(tmp_path, execution):
     code = f"""
 import resource, sys
@@ -334,7 +392,10 @@ except StorageError as error:
     assert "cannot be written to any more" in str(error) and "\\n" not in str(error)
     sys.exit(42)
 """
-    assert subprocess.run([sys.executable, "-c", code], env=environment(), check=False).returncode == 42
+    assert (
+        subprocess.run([sys.executable, "-c", code], env=environment(), check=False).returncode
+        == 42
+    )
     assert not Results.read([tmp_path]).damaged
     assert [path for path in tmp_path.rglob("*") if path.suffix == ".tmp"] == []
 

@@ -47,13 +47,23 @@ def rows_and_faults(folder: Path, expected: Rows) -> tuple[Rows, list[str]]:
     """All rows by key; and everything that is not as in a run that nobody disturbed, but for what is not computed."""
     results = Results.read([folder])
     found = {key: results.load(cell, None) for key, cell in results.stored.items()}
-    wrong = [line for line in results.problems if not line.startswith("missing: ") or "went away" in line]
-    wrong = [line for line in wrong if "older version" not in line and "holds no results" not in line]
+    wrong = [
+        line for line in results.problems if not line.startswith("missing: ") or "went away" in line
+    ]
+    wrong = [
+        line for line in wrong if "older version" not in line and "holds no results" not in line
+    ]
     for key, rows in found.items():
-        wrong += [f"{key}: a trial stands there twice"] if (np.diff(rows["trial"]) < 1).any() else []
+        wrong += (
+            [f"{key}: a trial stands there twice"] if (np.diff(rows["trial"]) < 1).any() else []
+        )
         for name in rows.keys() - {"time_s"}:
             right, real = expected[key][name][rows["trial"]], rows[name].dtype.kind == "f"
-            wrong += [] if np.array_equal(rows[name], right, equal_nan=real) else [f"{key}: other numbers in {name}"]
+            wrong += (
+                []
+                if np.array_equal(rows[name], right, equal_nan=real)
+                else [f"{key}: other numbers in {name}"]
+            )
     return found, wrong
 
 
@@ -123,7 +133,10 @@ def test_kills_of_two_writers_on_an_older_folder_change_nothing_and_lose_nothing
         found, wrong = rows_and_faults(folder, expected)
         assert wrong == []
         # Nothing that was there before, or that a writer had said was stored, is gone.
-        counts = [sum(len(rows["trial"]) for rows in of.values() if "status" in rows) for of in (before, found)]
+        counts = [
+            sum(len(rows["trial"]) for rows in of.values() if "status" in rows)
+            for of in (before, found)
+        ]
         assert counts[1] >= counts[0] + max(max(lines, default=0) for lines in said)
         assert all(len(found[key]["trial"]) >= len(rows["trial"]) for key, rows in before.items())
         before = found
@@ -135,7 +148,9 @@ def test_kills_of_two_writers_on_an_older_folder_change_nothing_and_lose_nothing
     found, wrong = rows_and_faults(folder, expected)
     assert (wrong, len(found)) == ([], RESULTS)
     assert all(len(rows["trial"]) == trials for rows in found.values())
-    ours = sorted(path.name for path in (folder / "trials").glob("*.parquet") if path.name[:16] in found)
+    ours = sorted(
+        path.name for path in (folder / "trials").glob("*.parquet") if path.name[:16] in found
+    )
     assert ours == [f"{key}-0-{trials}.parquet" for key in sorted(found)]
     assert in_mid_run > kills / 4
     assert reads > kills

@@ -49,7 +49,9 @@ def said(code: str, copy: Path) -> str:
     """What that code prints in a process that has the copy."""
     environment = {**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
     command = [sys.executable, "-c", code]
-    return subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True, check=True).stdout
+    return subprocess.run(
+        command, cwd=copy, env=environment, capture_output=True, text=True, check=True
+    ).stdout
 
 
 def keys(copy: Path) -> dict[str, str]:
@@ -76,7 +78,10 @@ def test_prose_edited_anywhere_leaves_every_key_as_it_was(copy, before):
     edited = 0
     for path in (copy / "ipe_bench").rglob("*.py"):
         text = path.read_text(encoding="utf-8")
-        new = re.sub(r'^( *)"""', r'\1# A remark.\n\1"""In other words: ', text, flags=re.MULTILINE) + "\n# The end.\n"
+        new = (
+            re.sub(r'^( *)"""', r'\1# A remark.\n\1"""In other words: ', text, flags=re.MULTILINE)
+            + "\n# The end.\n"
+        )
         try:
             ast.parse(new)
         except SyntaxError:  # an end of a docstring was taken for a beginning
@@ -91,7 +96,11 @@ def test_a_changed_constant_makes_stale_what_was_computed_with_it_and_nothing_el
     edit(copy / "ipe_bench/report/style.py", "\n", "\nUNSEEN = 3\n")
     edit(copy / "ipe_bench/basics/errors.py", "there is no such", "nobody knows such a")
     assert keys(copy) == before
-    edit(copy / "ipe_bench/baselines/sequential.py", "import numpy as np\n", "import numpy as np\nFACTOR = 2\n")
+    edit(
+        copy / "ipe_bench/baselines/sequential.py",
+        "import numpy as np\n",
+        "import numpy as np\nFACTOR = 2\n",
+    )
     after = keys(copy)
     assert {name for name in before if before[name] != after[name]} == {"ukf"}
     edit(copy / "ipe_bench/trials/thresholds.py", "SAME_ROOT = 1e-3", "SAME_ROOT = 2e-3")
@@ -100,12 +109,16 @@ def test_a_changed_constant_makes_stale_what_was_computed_with_it_and_nothing_el
 
 
 @pytest.mark.slow
-def test_a_change_to_states_that_move_makes_stale_what_is_computed_with_them_and_no_constants(copy, before):
+def test_a_change_to_states_that_move_makes_stale_what_is_computed_with_them_and_no_constants(
+    copy, before
+):
     # Filters of constants update as trackers do; bounds of states are those of a filter and of a smoother.
     changed = {"states/trackers.py": {"track", "path", "ukf"}, "trials/paths.py": {"track", "path"}}
     changed |= {"states/smoothers.py": {"track", "path"}, "states/particles.py": set()}
     for module, stale in changed.items():
-        edit(copy / "ipe_bench" / module, "import numpy as np\n", "import numpy as np\nFACTOR = 2\n")
+        edit(
+            copy / "ipe_bench" / module, "import numpy as np\n", "import numpy as np\nFACTOR = 2\n"
+        )
         after = keys(copy)
         assert {name for name in before if before[name] != after[name]} == stale
         before = after
@@ -113,9 +126,20 @@ def test_a_change_to_states_that_move_makes_stale_what_is_computed_with_them_and
 
 def test_the_source_of_a_result_is_in_the_rooms_that_draw_estimate_and_score():
     modules = {cls.__module__ for cls in component_classes(Scenario(Polynomial(), Gaussian(0.01)))}
-    covered = set[str]().union(*map(provenance._import_closure, ["ipe_bench.trials.scoring", *modules]))
+    covered = set[str]().union(
+        *map(provenance._import_closure, ["ipe_bench.trials.scoring", *modules])
+    )
     rooms = {module.split(".")[1] for module in covered}
-    assert rooms == {"basics", "engine", "measurements", "noise", "priors", "estimators", "solvers", "trials"}
+    assert rooms == {
+        "basics",
+        "engine",
+        "measurements",
+        "noise",
+        "priors",
+        "estimators",
+        "solvers",
+        "trials",
+    }
     assert {"ipe_bench.trials.scenario", "ipe_bench.measurements.polynomial"} <= covered
 
 
@@ -159,7 +183,9 @@ print(ib.status("out")["stale"].sum())
 
 @pytest.mark.slow
 @pytest.mark.parametrize("given", ["file", "input"])
-def test_an_estimator_can_stand_in_a_script_and_what_it_computed_before_an_edit_is_stale(tmp_path, given):
+def test_an_estimator_can_stand_in_a_script_and_what_it_computed_before_an_edit_is_stale(
+    tmp_path, given
+):
     def stale(text: str) -> int:
         (tmp_path / "script.py").write_text(text, encoding="utf-8")
         command = [sys.executable, *(["script.py"] if given == "file" else ["-"])]
@@ -173,7 +199,11 @@ def test_an_estimator_can_stand_in_a_script_and_what_it_computed_before_an_edit_
 
 @pytest.mark.slow
 def test_a_base_class_in_another_module_is_part_of_the_source(copy):
-    edit(copy / "ipe_bench/baselines/least_squares.py", "import annotations\n", "import annotations\nFACTOR = 2\n")
+    edit(
+        copy / "ipe_bench/baselines/least_squares.py",
+        "import annotations\n",
+        "import annotations\nFACTOR = 2\n",
+    )
     (copy / "mine.py").write_text(
         "from dataclasses import dataclass\nimport ipe_bench as ib\n"
         "@dataclass(frozen=True)\nclass Mine(ib.baselines.LinearLSE):\n    pass\n",

@@ -32,7 +32,10 @@ def scenario(**changes) -> Scenario:
 def rows(store: Store, cell: ResultKey) -> dict:
     """All columns but that of the clock, and the iterates of the first trials."""
     results = Results.read([store.directory])
-    found, paths = (load(results.stored[cell.key]) for load in (lambda c: results.load(c, None), results.load_history))
+    found, paths = (
+        load(results.stored[cell.key])
+        for load in (lambda c: results.load(c, None), results.load_history)
+    )
     found |= {f"path_{name}": values for name, values in (paths or {}).items()}
     return {name: values for name, values in found.items() if name != "time_s"}
 
@@ -64,14 +67,29 @@ def test_trials_are_the_same_bits_for_any_block_size(tmp_path, block_size):
 
 
 def test_blocks_grow_with_the_number_of_trials_while_there_are_a_hundred():
-    sizes = [block_size_for(trials) for trials in (0, 1, 1000, 49_999, 50_000, 75_000, 100_000, 10**7)]
+    sizes = [
+        block_size_for(trials) for trials in (0, 1, 1000, 49_999, 50_000, 75_000, 100_000, 10**7)
+    ]
     assert sizes == [250, 250, 250, 250, 500, 750, 1000, 1000]
 
 
 def test_the_key_follows_every_constant(tmp_path):
-    scenarios = scenario(), scenario(error_scale=2.0), scenario(seed=1), Scenario(Bent(0.03), Gaussian(0.1))
-    assert len({ResultKey(s, "newton", e).key for s in scenarios for e in (Newton(), Newton(budget=9))}) == 8
-    assert ResultKey(scenario(), "newton", Newton()).key == ResultKey(scenario(), "newton", Newton()).key
+    scenarios = (
+        scenario(),
+        scenario(error_scale=2.0),
+        scenario(seed=1),
+        Scenario(Bent(0.03), Gaussian(0.1)),
+    )
+    assert (
+        len(
+            {ResultKey(s, "newton", e).key for s in scenarios for e in (Newton(), Newton(budget=9))}
+        )
+        == 8
+    )
+    assert (
+        ResultKey(scenario(), "newton", Newton()).key
+        == ResultKey(scenario(), "newton", Newton()).key
+    )
 
 
 def test_a_run_and_its_books_need_no_pandas(tmp_path):
@@ -85,13 +103,17 @@ compute([bench], {{"newton": ib.solvers.Newton()}}, 20, {str(tmp_path)!r}, block
 results = Results.read([{str(tmp_path)!r}])
 print(*[len(results.load(cell, None)["trial"]) for cell in results.current], "pandas" in sys.modules)
 """
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
     assert done.stdout.split() == ["20", "20", "False"]
 
 
 # What is done, failed, missing and stale
 
-RANGES = st.lists(st.tuples(st.integers(0, 40), st.integers(1, 20)).map(lambda r: (r[0], r[0] + r[1])))
+RANGES = st.lists(
+    st.tuples(st.integers(0, 40), st.integers(1, 20)).map(lambda r: (r[0], r[0] + r[1]))
+)
 
 
 @given(RANGES, st.integers(0, 30), st.integers(0, 30))
@@ -105,8 +127,13 @@ def test_gaps_are_what_no_range_holds(covered, start, length):
     assert all(first < last for first, last in found)
 
 
-def test_a_refused_job_of_a_sweep_stays_in_the_books_until_it_is_accepted(tmp_path, capsys, monkeypatch):
-    output, sweep = f"output={tmp_path}", ["run", "-m", "measurement=polynomial", "noise=gaussian", "trials=5"]
+def test_a_refused_job_of_a_sweep_stays_in_the_books_until_it_is_accepted(
+    tmp_path, capsys, monkeypatch
+):
+    output, sweep = (
+        f"output={tmp_path}",
+        ["run", "-m", "measurement=polynomial", "noise=gaussian", "trials=5"],
+    )
     sweep += ["solver=[]", "baseline=[linear_lse]", "figures=none", "execution=serial", output]
     job = "measurement=polynomial, noise=gaussian, noise.deviation=1e-102"
     assert main([*sweep, "noise.deviation=0.02,1e-102"]) == 2
@@ -163,7 +190,9 @@ def merge(folder: Path) -> int:
 
 
 def names(folder: Path, key: str = "") -> list[str]:
-    return sorted(path.name.partition("-")[2] for path in (folder / "trials").glob(f"{key}*.parquet"))
+    return sorted(
+        path.name.partition("-")[2] for path in (folder / "trials").glob(f"{key}*.parquet")
+    )
 
 
 @pytest.mark.parametrize("group", [parts.GROUP, 7])
@@ -271,7 +300,9 @@ def test_killed_at_any_moment_every_trial_is_there_and_the_next_time_it_ends(tmp
     """Before and after a large file is on the disk, between its name and the first removal, and amid the removals."""
     filled(tmp_path)
     expected = everything(tmp_path)
-    done = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path), str(moment)], capture_output=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", KILLED, str(tmp_path), str(moment)], capture_output=True, check=False
+    )
     assert done.returncode == -signal.SIGKILL
     assert_same(everything(tmp_path), expected)
     merge(tmp_path)

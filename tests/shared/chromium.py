@@ -16,11 +16,25 @@ from typing import Any
 import pytest
 
 FLAGS = [
-    *("--headless=new", "--no-sandbox", "--remote-debugging-pipe", "--hide-scrollbars", "--no-first-run"),
-    *(f"--disable-{part}" for part in ("gpu", "quic", "sync", "dev-shm-usage", "background-networking")),
+    *(
+        "--headless=new",
+        "--no-sandbox",
+        "--remote-debugging-pipe",
+        "--hide-scrollbars",
+        "--no-first-run",
+    ),
+    *(
+        f"--disable-{part}"
+        for part in ("gpu", "quic", "sync", "dev-shm-usage", "background-networking")
+    ),
     "--disable-component-update",
 ]
-TROUBLE = ("Runtime.exceptionThrown", "Runtime.consoleAPICalled", "Log.entryAdded", "Page.javascriptDialogOpening")
+TROUBLE = (
+    "Runtime.exceptionThrown",
+    "Runtime.consoleAPICalled",
+    "Log.entryAdded",
+    "Page.javascriptDialogOpening",
+)
 
 
 class Page:
@@ -35,7 +49,9 @@ class Page:
         self.requests: list[str] = []
         self.loaded = False
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
-        self.session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        self.session = self.call("Target.attachToTarget", targetId=target, flatten=True)[
+            "sessionId"
+        ]
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.call(f"{domain}.enable")
 
@@ -67,14 +83,22 @@ class Page:
         return event
 
     def go(self, path: Path, width: int = 1280, height: int = 900, *, phone: bool = False) -> None:
-        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=phone)
+        self.call(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=1,
+            mobile=phone,
+        )
         self.loaded = False
         self.call("Page.navigate", url=path.resolve().as_uri())
         while not self.loaded:
             self._next()
 
     def run(self, script: str) -> Any:
-        result = self.call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
+        result = self.call(
+            "Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True
+        )
         assert "exceptionDetails" not in result, result
         return result["result"].get("value")
 
@@ -86,17 +110,26 @@ class Page:
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Page]:
     """A page of a headless Chromium, whose pipe is on descriptors 3 and 4; skips where there is none."""
-    program = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    program = next(
+        filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+    )
     if program is None:
         pytest.skip("there is no Chromium")
     # Chromium reads descriptor 3 and writes 4: ours are kept above, so that the shell's redirections cannot meet them.
     low = [*os.pipe(), *os.pipe()]
-    to_read, to_write, from_read, from_write = (fcntl.fcntl(fd, fcntl.F_DUPFD_CLOEXEC, 10) for fd in low)
-    with tempfile.TemporaryDirectory(prefix="ipe-bench-chromium-", ignore_cleanup_errors=True) as profile:
+    to_read, to_write, from_read, from_write = (
+        fcntl.fcntl(fd, fcntl.F_DUPFD_CLOEXEC, 10) for fd in low
+    )
+    with tempfile.TemporaryDirectory(
+        prefix="ipe-bench-chromium-", ignore_cleanup_errors=True
+    ) as profile:
         script = f'exec "$@" 3<&{to_read} 4>&{from_write} {to_read}<&- {from_write}>&-'
         command = ["bash", "-c", script, "bash", program, *FLAGS, f"--user-data-dir={profile}"]
         process = subprocess.Popen(
-            command, pass_fds=(to_read, from_write), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+            command,
+            pass_fds=(to_read, from_write),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
         )
         for fd in (*low, to_read, from_write):
             os.close(fd)

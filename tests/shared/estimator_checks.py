@@ -22,15 +22,38 @@ from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.solvers import Anderson, Auto, Broyden, DampedNewton, FixedPoint, Newton, Progressive, Relinearized
+from ipe_bench.solvers import (
+    Anderson,
+    Auto,
+    Broyden,
+    DampedNewton,
+    FixedPoint,
+    Newton,
+    Progressive,
+    Relinearized,
+)
 from ipe_bench.trials.scenario import Scenario
 
 SOLVERS: list[Estimator] = [
-    *(FixedPoint(), Newton(), Broyden(), Broyden("identity"), Anderson(2), DampedNewton(), solvers.SteepestDescent()),
+    *(
+        FixedPoint(),
+        Newton(),
+        Broyden(),
+        Broyden("identity"),
+        Anderson(2),
+        DampedNewton(),
+        solvers.SteepestDescent(),
+    ),
     *(Relinearized(), Relinearized(Newton()), Progressive(), Progressive(use_prior=False), Auto()),
 ]
 LEAST_SQUARES: list[Estimator] = [
-    *(GaussNewton(), GaussNewton(damping=1e-3), LevenbergMarquardt(), LevenbergMarquardt(geodesic=True), MapLM()),
+    *(
+        GaussNewton(),
+        GaussNewton(damping=1e-3),
+        LevenbergMarquardt(),
+        LevenbergMarquardt(geodesic=True),
+        MapLM(),
+    ),
     *(LeastSquares(method=method) for method in ("trf", "lm", "dogbox")),
     *(Multistart(starts=4), MultiscaleLM()),
 ]
@@ -48,7 +71,9 @@ def check_bits(estimator: Estimator, scenario: Scenario, trials: int) -> None:
         together = estimator.estimate(problem, z[::-1], history=True)
         alone = [estimator.estimate(problem, row[None], history=True) for row in z[::-1]]
     for name in ("x", "status", "covariance", "iterations", "simulations", "jacobians"):
-        np.testing.assert_array_equal(getattr(together, name), np.concatenate([getattr(a, name) for a in alone]), name)
+        np.testing.assert_array_equal(
+            getattr(together, name), np.concatenate([getattr(a, name) for a in alone]), name
+        )
     for name, values in together.extras.items():
         np.testing.assert_array_equal(values, np.concatenate([a.extras[name] for a in alone]), name)
     assert together.messages == {i: a.messages[0] for i, a in enumerate(alone) if a.messages}

@@ -39,7 +39,9 @@ class Filterpy(Filter):
             (h, H), R = slope(lambda at, k=k: model.observe(at, k), x.mean), model.R(k)
             for f, *read in zip(filters, z[:, k], h, H, strict=True):
                 _take_in(f, model, k, R, *read)
-            mean, P, y, S = (np.array([getattr(f, name) for f in filters]) for name in ("x", "P", "y", "S"))
+            mean, P, y, S = (
+                np.array([getattr(f, name) for f in filters]) for name in ("x", "P", "y", "S")
+            )
             x = out.note(k, Update.of(Normal(mean, P), y, factor(S), np.isfinite(z[:, k])))
         return out
 
@@ -54,7 +56,10 @@ def _of_filterpy(rule, n: int, m: int) -> Any:
 def _take_in(f: Any, model, k: int, R, z, h, H) -> None:
     """Updates a filter by readings z (m,) near h (m,); a missing one reads 0, with no slope and unit variance."""
     seen = np.isfinite(z)
-    z, R = np.where(seen, model.nearest(z, h), 0.0), np.where(seen[:, None] & seen, R, np.eye(len(z)))
+    z, R = (
+        np.where(seen, model.nearest(z, h), 0.0),
+        np.where(seen[:, None] & seen, R, np.eye(len(z))),
+    )
     if hasattr(f, "points_fn"):
         f.sigmas_f = f.points_fn.sigma_points(f.x, f.P)
         f.update(z, R, hx=lambda x: np.where(seen, model.nearest(model.observe(x, k), h), 0.0))

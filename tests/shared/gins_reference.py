@@ -16,11 +16,18 @@ def velocities(x, walk=None, rtol=1e-13):
     p = np.repeat(x * SI, 4, axis=0)
     axis = np.array([0.0, np.cos(LATITUDE), np.sin(LATITUDE)])
     y = np.concatenate(
-        [np.tile(CASES, (len(x), 1)), np.tile([0.0, 0.0, 1.0], (lanes, 1)), np.tile(axis, (lanes, 2))], 1
+        [
+            np.tile(CASES, (len(x), 1)),
+            np.tile([0.0, 0.0, 1.0], (lanes, 1)),
+            np.tile(axis, (lanes, 2)),
+        ],
+        1,
     )
     drifts = np.zeros((lanes, 30, 3)) if walk is None else walk.reshape(lanes, 30, 3)
     shown = []
-    for k, piece in enumerate([(0.0, 5400.0)] if walk is None else [(180.0 * i, 180.0 * (i + 1)) for i in range(30)]):
+    for k, piece in enumerate(
+        [(0.0, 5400.0)] if walk is None else [(180.0 * i, 180.0 * (i + 1)) for i in range(30)]
+    ):
         times = 180.0 * np.arange(1, 31) if walk is None else [piece[1]]
         solution = solve_ivp(
             _slope, piece, y.ravel(), "DOP853", times, args=(p, drifts[:, k]), rtol=rtol, atol=1e-13
@@ -39,7 +46,15 @@ def _slope(t, y, p, walk):
     drift[:, :2] += np.einsum("lij,lj->li", p[:, 7:].reshape(-1, 2, 2), u[:, :2])
     platform = command + drift
     coriolis = 2 * RATE * c[:, 2:]
-    acceleration = GRAVITY * (1 + p[:, 2:4]) * u[:, :2] + p[:, :2] + coriolis * v[:, ::-1] * [1.0, -1.0]
+    acceleration = (
+        GRAVITY * (1 + p[:, 2:4]) * u[:, :2] + p[:, :2] + coriolis * v[:, ::-1] * [1.0, -1.0]
+    )
     return np.concatenate(
-        [acceleration, np.cross(RATE * e - platform, u), -np.cross(platform, e), -np.cross(command, c)], axis=1
+        [
+            acceleration,
+            np.cross(RATE * e - platform, u),
+            -np.cross(platform, e),
+            -np.cross(command, c),
+        ],
+        axis=1,
     ).ravel()

@@ -28,7 +28,9 @@ def simulated(path: Path, b1: float, seed: int, readings: int = 16) -> tuple[Pat
     rng = np.random.default_rng(seed)
     t, sigma = np.linspace(50, 700, readings), 0.1 * (1 + 4 * rng.random(readings))
     y = b1 * -np.expm1(-5.6e-4 * t) + sigma * rng.standard_normal(readings)
-    return write(path, t=t.tolist(), y=y.tolist(), sigma=sigma.tolist()), np.column_stack([t, y, sigma])
+    return write(path, t=t.tolist(), y=y.tolist(), sigma=sigma.tolist()), np.column_stack(
+        [t, y, sigma]
+    )
 
 
 def solution(residuals, start) -> tuple[np.ndarray, np.ndarray]:

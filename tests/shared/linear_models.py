@@ -71,15 +71,21 @@ class LinearGins(Gins):
 
 
 def block_of_gins(scale: float, trials: int, seed: int = 0) -> Block:
-    return Block.draw(Scenario(Gins(), Quantization(0.02286), GaussianPrior(), scale, seed), 0, trials)
+    return Block.draw(
+        Scenario(Gins(), Quantization(0.02286), GaussianPrior(), scale, seed), 0, trials
+    )
 
 
-def linear_map(problem: Problem, matrix: Array, z: Array, inflation: float = 1.0) -> tuple[Array, Array]:
+def linear_map(
+    problem: Problem, matrix: Array, z: Array, inflation: float = 1.0
+) -> tuple[Array, Array]:
     """The maximum a posteriori (trials, n) of a linear model and its covariance (n, n), by one orthogonal solution."""
     assert problem.prior_deviation is not None
     d, x0 = problem.prior_deviation, problem.x0
     A = np.vstack([problem.R.whiten_jacobian(matrix) * d, np.eye(len(d)) / inflation])
     r = problem.R.whiten(z - matrix @ x0)
-    s = np.array([np.linalg.lstsq(A, np.concatenate([row, np.zeros(len(d))]), rcond=None)[0] for row in r])
+    s = np.array(
+        [np.linalg.lstsq(A, np.concatenate([row, np.zeros(len(d))]), rcond=None)[0] for row in r]
+    )
     P = np.linalg.inv(A.T @ A)
     return x0 + s * d, P * d * d[:, None]

@@ -53,7 +53,9 @@ class Oracle:
     def __post_init__(self) -> None:
         kind = self.source.partition(":")[0]
         if kind not in KINDS:
-            raise ValueError(f"source={self.source!r} begins with none of {', '.join(KINDS)} and a colon")
+            raise ValueError(
+                f"source={self.source!r} begins with none of {', '.join(KINDS)} and a colon"
+            )
 
 
 @dataclass(frozen=True)
@@ -114,7 +116,9 @@ def pytest_runtest_call(item: Any) -> Iterator[None]:
     if mark and _held:  # a case of which the oracle has no answer holds nothing against it
         oracle = Oracle(*mark.args)
         asked = max(one.tolerance for one in _held)
-        assert asked <= oracle.tolerance, f"{asked:g} is looser than {oracle.tolerance:g}, which is marked"
+        assert asked <= oracle.tolerance, (
+            f"{asked:g} is looser than {oracle.tolerance:g}, which is marked"
+        )
         seen = (max(one.difference for one in _held), asked, all(one.relative for one in _held))
         item.user_properties.append(("oracle", seen))
 
@@ -140,15 +144,22 @@ def record() -> None:
     for test in marks.keys() & _seen.keys():
         seen, asked = _seen[test], max(one.tolerance for one in _seen[test])
         if asked != marks[test].tolerance:
-            print(f"\n{test}: not recorded, as its loosest tolerance was {asked:g}, not {marks[test].tolerance:g}")
+            print(
+                f"\n{test}: not recorded, as its loosest tolerance was {asked:g}, not {marks[test].tolerance:g}"
+            )
             continue
         largest = one_digit(max(one.difference for one in seen))
         relative = all(one.relative for one in seen)
-        known[anchor(test)] = Row(**asdict(marks[test]), test=test, relative=relative, agreed=largest)
+        known[anchor(test)] = Row(
+            **asdict(marks[test]), test=test, relative=relative, agreed=largest
+        )
     kept = [
         replace(known[anchor(test)], test=test) for test in marks if anchor(test) in known
     ]  # its file may have moved
-    RECORD.write_text(json.dumps([asdict(row) for row in kept], indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    RECORD.write_text(
+        json.dumps([asdict(row) for row in kept], indent=1, ensure_ascii=False) + "\n",
+        encoding="utf-8",
+    )
     before, _, after = in_page()
     PAGE.write_text(before + BEGIN + tables(kept) + END + after, encoding="utf-8")
 
@@ -161,11 +172,17 @@ def rows() -> list[Row]:
 def marked() -> dict[str, Oracle]:
     """Returns the mark of each marked test by its name, as it is written in the files of tests."""
     found = {}
-    for path in sorted([*ROOT.glob("tests/**/test_*.py"), *ROOT.glob("plugins/**/tests/test_*.py")]):
+    for path in sorted(
+        [*ROOT.glob("tests/**/test_*.py"), *ROOT.glob("plugins/**/tests/test_*.py")]
+    ):
         text = path.read_text(encoding="utf-8")
         functions = ast.parse(text).body if "mark.oracle(" in text else []
         for function in (one for one in functions if isinstance(one, ast.FunctionDef)):
-            calls = [one for one in function.decorator_list if ast.unparse(one).startswith("pytest.mark.oracle(")]
+            calls = [
+                one
+                for one in function.decorator_list
+                if ast.unparse(one).startswith("pytest.mark.oracle(")
+            ]
             for call in (one for one in calls if isinstance(one, ast.Call)):
                 test = f"{path.relative_to(ROOT).as_posix()}::{function.name}"
                 found[test] = Oracle(*map(ast.literal_eval, call.args))
@@ -183,8 +200,25 @@ def one_digit(number: float) -> str:
 def sentence(test: str) -> str:
     """Returns what the name of a test says."""
     words = test.partition("::test_")[2].replace("_", " ")
-    for name in ("SciPy", "NIST", "GINS", "EKF", "UKF", "Radau", "Stone Soup", "MINPACK", "Box", "Kalman", "NEES"):
-        words = re.sub(rf"\b{name}(s?)\b", lambda m, n=name: n + ("'s" if m[1] else ""), words, flags=re.IGNORECASE)
+    for name in (
+        "SciPy",
+        "NIST",
+        "GINS",
+        "EKF",
+        "UKF",
+        "Radau",
+        "Stone Soup",
+        "MINPACK",
+        "Box",
+        "Kalman",
+        "NEES",
+    ):
+        words = re.sub(
+            rf"\b{name}(s?)\b",
+            lambda m, n=name: n + ("'s" if m[1] else ""),
+            words,
+            flags=re.IGNORECASE,
+        )
     return words[0].upper() + words[1:]
 
 
@@ -196,14 +230,22 @@ def tables(recorded: Iterable[Row]) -> str:
     """Returns the tables of the page, one for each subject, in Markdown."""
     by_subject: dict[str, list[str]] = {subject: [] for subject in SUBJECTS.values()}
     for row in recorded:
-        subject = next(subject for start, subject in SUBJECTS.items() if row.test.startswith(f"{start}"))
+        subject = next(
+            subject for start, subject in SUBJECTS.items() if row.test.startswith(f"{start}")
+        )
         claim = f'<a id="{anchor(row.test)}"></a>{sentence(row.test)}'
         measure = " relative" if row.relative else ""
         where = f"`{row.test.partition('::')[0]}`"
         cells = (claim, row.source, row.what, short(row.tolerance) + measure, row.agreed, where)
-        by_subject[subject].append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n")
-    head = "| claim | source | compared | tolerance | agreed to | test |\n|---|---|---|--:|--:|---|\n"
-    return "".join(f"\n## {name}\n\n{head}{''.join(lines)}\n" for name, lines in by_subject.items() if lines)
+        by_subject[subject].append(
+            "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n"
+        )
+    head = (
+        "| claim | source | compared | tolerance | agreed to | test |\n|---|---|---|--:|--:|---|\n"
+    )
+    return "".join(
+        f"\n## {name}\n\n{head}{''.join(lines)}\n" for name, lines in by_subject.items() if lines
+    )
 
 
 def in_page() -> tuple[str, str, str]:

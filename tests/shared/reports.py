@@ -9,7 +9,12 @@ HOSTILE = "<script>alert(1)</script>"
 
 
 def fill(
-    store: Synthetic, labels=("linear_lse", "one", "two"), scales=(1.0, 10.0, 100.0), trials=80, seeds=1, **model
+    store: Synthetic,
+    labels=("linear_lse", "one", "two"),
+    scales=(1.0, 10.0, 100.0),
+    trials=80,
+    seeds=1,
+    **model,
 ) -> None:
     """A linear estimate that is worse the larger the scale, and others that reach the bound."""
     rng = np.random.default_rng(0)

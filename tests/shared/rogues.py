@@ -43,7 +43,9 @@ class Rogue(Estimator):
             mask[0, :1] = mask[:, -1] = self.does == "masked"
             mask[0, 1] = True
             estimates.x = np.ma.masked_array(estimates.x, mask)
-            estimates.covariance = np.ma.masked_array(np.broadcast_to(np.eye(n), (len(z), n, n)), mask=True)
+            estimates.covariance = np.ma.masked_array(
+                np.broadcast_to(np.eye(n), (len(z), n, n)), mask=True
+            )
         if self.does == "matrix":
             estimates.x = np.matrix(estimates.x)
         if self.does == "history":
@@ -78,7 +80,9 @@ class Rogue(Estimator):
                 os.kill(os.getpid(), signal.SIGINT)
                 time.sleep(0.01)
             case "z" | "H" | "R" | "x0":
-                {"z": z, "H": problem.H, "R": problem.R.factor, "x0": problem.x0}[self.does][...] += 1.0
+                {"z": z, "H": problem.H, "R": problem.R.factor, "x0": problem.x0}[self.does][
+                    ...
+                ] += 1.0
 
 
 def surroundings(task):

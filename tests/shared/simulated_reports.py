@@ -32,11 +32,21 @@ HOLDING = 0.9 - 1e-5
 """Success that an estimator holds: 0.9, less what a gate takes of efficient estimates."""
 READINGS = 30
 _READ = {
-    *("trials", "success", "failed_silent", "error_median", "efficiency_capped", "nees_median", "verdict"),
+    *(
+        "trials",
+        "success",
+        "failed_silent",
+        "error_median",
+        "efficiency_capped",
+        "nees_median",
+        "verdict",
+    ),
     *("simulations_median", "simulations_mean", "time_mean_s", "path_verdict", "nis_verdict"),
 }
 """Statistics that sentences, boxes and verdicts are made of; their other intervals take long and are left out."""
-_KEPT = [s if s.name == "success" else replace(s, limits=None) for s in STATISTICS if s.name in _READ]
+_KEPT = [
+    s if s.name == "success" else replace(s, limits=None) for s in STATISTICS if s.name in _READ
+]
 
 
 @dataclass(frozen=True)
@@ -76,7 +86,9 @@ class Population:
         kept = 1 - self.lost
         wrong = self.lost * self.silent
         square = self.mean_square
-        return self.claim / square * (kept * (square + self.bias**2) + wrong * FAR**2) / (kept + wrong)
+        return (
+            self.claim / square * (kept * (square + self.bias**2) + wrong * FAR**2) / (kept + wrong)
+        )
 
     def efficiency(self, n: int) -> float:
         """Computes the efficiency of errors that count at most `CAP` (by 100,000 draws)."""
@@ -89,7 +101,10 @@ def _inside(law: str, spread: float, bias: float, n: int) -> float:
     limit, off = chi2.isf(GATE, n), n * bias**2
     if law == "t3":
         return float(fisher.cdf(limit * 3 / (n * spread**2), n, 3))
-    each = [float(ncx2.cdf(limit / (spread * k) ** 2, n, off / (spread * k) ** 2 + 1e-12)) for k in (1.0, WILD)]
+    each = [
+        float(ncx2.cdf(limit / (spread * k) ** 2, n, off / (spread * k) ** 2 + 1e-12))
+        for k in (1.0, WILD)
+    ]
     return (1 - OFTEN) * each[0] + OFTEN * each[1] if law == "contaminated" else each[0]
 
 
@@ -146,16 +161,26 @@ def board(seed: int, *, largest: bool = True) -> Board:
 def _estimator(rng: np.random.Generator, count: int, *, honest: bool) -> Iterator[Population]:
     """Draws the populations of one estimator: it is right at small scales and begins to be wrong at one of them."""
     kinds = (
-        ["honest"] if honest else ["honest", "sure", "cautious", "heavy", "biased", "losing", "silent", "inefficient"]
+        ["honest"]
+        if honest
+        else ["honest", "sure", "cautious", "heavy", "biased", "losing", "silent", "inefficient"]
     )
-    kind = str(rng.choice(kinds, p=None if honest else [0.3, 0.15, 0.05, 0.1, 0.1, 0.15, 0.1, 0.05]))
+    kind = str(
+        rng.choice(kinds, p=None if honest else [0.3, 0.15, 0.05, 0.1, 0.1, 0.15, 0.1, 0.05])
+    )
     law = str(rng.choice(["t3", "contaminated"])) if kind == "heavy" else "normal"
     # An estimator that reports the variance of the bulk is too sure where 1 % of its errors are wild.
     of_bulk = 1 - OFTEN + OFTEN * WILD**2 if law == "contaminated" else 1.5
     heavy_claim = float(rng.choice([1.0, of_bulk]))
-    claim = {"sure": rng.choice([1.2, 1.5, 2.0, 4.0]), "cautious": rng.choice([0.25, 0.5, 0.8]), "heavy": heavy_claim}
+    claim = {
+        "sure": rng.choice([1.2, 1.5, 2.0, 4.0]),
+        "cautious": rng.choice([0.25, 0.5, 0.8]),
+        "heavy": heavy_claim,
+    }
     bias = float(rng.choice([0.3, 0.5, 1.0])) if kind == "biased" else 0.0
-    losses = np.sort(rng.choice([0.0, 0.02, 0.05, 0.08, 0.1, 0.12, 0.15, 0.3, 0.6, 0.95], size=count))
+    losses = np.sort(
+        rng.choice([0.0, 0.02, 0.05, 0.08, 0.1, 0.12, 0.15, 0.3, 0.6, 0.95], size=count)
+    )
     silent = {"silent": float(rng.choice([0.2, 1.0])), "losing": 0.0}
     begins = int(rng.integers(0, count + 1))
     correlated = 0.0 if honest else float(rng.choice([0.0, 0.005, 0.05, 0.5]))
@@ -210,10 +235,20 @@ class Report:
 def simulated(drawn: Board) -> Report:
     """Draws the trials of a report and writes its headline."""
     rng = np.random.default_rng([drawn.seed, 11])
-    groups = {(at, label): _group(drawn, at, label) for at in range(len(drawn.scales)) for label in drawn.populations}
+    groups = {
+        (at, label): _group(drawn, at, label)
+        for at in range(len(drawn.scales))
+        for label in drawn.populations
+    }
     collection: Any = _Collection(tuple(groups.values()))
-    common = rng.normal(size=(drawn.trials, drawn.n)), rng.normal(size=drawn.trials), rng.random(drawn.trials)
-    samples = {key: _drawn(drawn, key, collection, group, common, rng) for key, group in groups.items()}
+    common = (
+        rng.normal(size=(drawn.trials, drawn.n)),
+        rng.normal(size=drawn.trials),
+        rng.random(drawn.trials),
+    )
+    samples = {
+        key: _drawn(drawn, key, collection, group, common, rng) for key, group in groups.items()
+    }
     analysis = _analysis(drawn, collection, samples)
     return Report(drawn, samples, analysis, headline(analysis))
 
@@ -231,7 +266,9 @@ def _group(drawn: Board, at: int, label: str) -> _Group:
     return _Group({**columns, "error_scale": drawn.scales[at]}, label, footer)
 
 
-def _drawn(drawn: Board, key: tuple[int, str], collection: Any, group: Any, common: Any, rng: Any) -> Sample:
+def _drawn(
+    drawn: Board, key: tuple[int, str], collection: Any, group: Any, common: Any, rng: Any
+) -> Sample:
     at, label = key
     there, trials, n = drawn.populations[label][at], drawn.trials, drawn.n
     noise, luck, tails = common
@@ -261,11 +298,23 @@ def _drawn(drawn: Board, key: tuple[int, str], collection: Any, group: Any, comm
     if drawn.moving:
         # The mean over ten epochs, dependent on the last.
         scalars["extra_nis"] = there.innovations * rng.chisquare(READINGS, trials) / READINGS
-        scalars["white_p"] = np.where(rng.random(trials) < there.correlated, 1e-9, rng.random(trials))
-        scalars["path_nees"] = 0.5 * (scalars["nees"] + there.mean_nees * rng.chisquare(10 * n, trials) / 10)
+        scalars["white_p"] = np.where(
+            rng.random(trials) < there.correlated, 1e-9, rng.random(trials)
+        )
+        scalars["path_nees"] = 0.5 * (
+            scalars["nees"] + there.mean_nees * rng.chisquare(10 * n, trials) / 10
+        )
     everywhere = np.ones(trials, dtype=bool)
     return Sample(
-        collection, group, np.arange(trials), scalars, error, deviation, everywhere, everywhere, np.empty(0, dtype=int)
+        collection,
+        group,
+        np.arange(trials),
+        scalars,
+        error,
+        deviation,
+        everywhere,
+        everywhere,
+        np.empty(0, dtype=int),
     )
 
 
@@ -282,8 +331,14 @@ def _analysis(drawn: Board, collection: Any, samples: Mapping[tuple[int, str], S
             scores.append({**where, "estimator": label, **_shared(here[label])})
         pairs += [where | pair for pair in compare_pairs(outcomes)]
     none = pd.DataFrame()
-    held = dict.fromkeys(("endings", "distributions", "convergence", "calibration", "contraction", "tracks"), none)
-    frames = {"summary": pd.DataFrame(summary), "scores": pd.DataFrame(scores), "pairs": pd.DataFrame(corrected(pairs))}
+    held = dict.fromkeys(
+        ("endings", "distributions", "convergence", "calibration", "contraction", "tracks"), none
+    )
+    frames = {
+        "summary": pd.DataFrame(summary),
+        "scores": pd.DataFrame(scores),
+        "pairs": pd.DataFrame(corrected(pairs)),
+    }
     return Analysis(collection=collection, **frames, **held)
 
 
@@ -292,7 +347,13 @@ def _rows(s: Sample, may_be_the_best: bool) -> list[dict[str, Any]]:
     head = dict(s.group.columns) | {"estimator": s.group.estimator, BEST: may_be_the_best}
     whole = head | {"parameter": "all"} | rows_of(_KEPT, s)[-1]
     errors = np.sqrt((s.error**2).mean(axis=0))
-    return [*({**whole, "parameter": name, "path_rmse": e} for name, e in zip(s.names, errors, strict=True)), whole]
+    return [
+        *(
+            {**whole, "parameter": name, "path_rmse": e}
+            for name, e in zip(s.names, errors, strict=True)
+        ),
+        whole,
+    ]
 
 
 def _shared(s: Sample) -> dict[str, Any]:

@@ -81,7 +81,13 @@ class CoordinatedTurn(Steady):
         rate = np.where(np.abs(rate) < 1e-9, 1e-9, rate)
         s, c = np.sin(rate * self.step), np.cos(rate * self.step)
         a, b = s / rate, (1 - c) / rate
-        moved = [px + a * vx - b * vy, c * vx - s * vy, py + b * vx + a * vy, s * vx + c * vy, x[..., 4]]
+        moved = [
+            px + a * vx - b * vy,
+            c * vx - s * vy,
+            py + b * vx + a * vy,
+            s * vx + c * vy,
+            x[..., 4],
+        ]
         return np.stack(moved, axis=-1)
 
     def observe(self, x: Array, k: int) -> Array:
@@ -92,7 +98,11 @@ class CoordinatedTurn(Steady):
         G = np.zeros((5, 5))
         block = root(white_acceleration(self.step, self.density))
         columns = block.shape[1]
-        G[:2, :columns], G[2:4, 2 : 2 + columns], G[4, 4] = block, block, np.sqrt(self.walk * self.step)
+        G[:2, :columns], G[2:4, 2 : 2 + columns], G[4, 4] = (
+            block,
+            block,
+            np.sqrt(self.walk * self.step),
+        )
         return G
 
     def R(self, k: int) -> Array:
@@ -135,7 +145,9 @@ class Pendulum(Steady):
 
     def transition(self, x: Array, k: int) -> Array:
         angle, rate = x[..., 0], x[..., 1]
-        return np.stack([angle + self.step * rate, rate - self.step * self.gravity * np.sin(angle)], axis=-1)
+        return np.stack(
+            [angle + self.step * rate, rate - self.step * self.gravity * np.sin(angle)], axis=-1
+        )
 
     def observe(self, x: Array, k: int) -> Array:
         return np.sin(x[..., :1])

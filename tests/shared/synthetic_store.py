@@ -38,7 +38,8 @@ class Repeated(Measurement):
     def parameters(self) -> tuple[Parameter, ...]:
         sizes = [self.sizes_given[i % len(self.sizes_given)] for i in range(len(self.names))]
         return tuple(
-            Parameter(n, "m", s, f"group {i // 2}") for i, (n, s) in enumerate(zip(self.names, sizes, strict=True))
+            Parameter(n, "m", s, f"group {i // 2}")
+            for i, (n, s) in enumerate(zip(self.names, sizes, strict=True))
         )
 
     @property
@@ -93,8 +94,12 @@ class Synthetic:
         self.cells: dict[str, ResultKey] = {}
 
     @staticmethod
-    def scenario(error_scale: float = 1.0, seed: int = 0, sigma: float = 0.2, **model: Any) -> Scenario:
-        return Scenario(Repeated(**model), Gaussian(sigma), prior.GaussianPrior(), error_scale, seed)
+    def scenario(
+        error_scale: float = 1.0, seed: int = 0, sigma: float = 0.2, **model: Any
+    ) -> Scenario:
+        return Scenario(
+            Repeated(**model), Gaussian(sigma), prior.GaussianPrior(), error_scale, seed
+        )
 
     @staticmethod
     def bound(scenario: Scenario) -> np.ndarray:
@@ -145,19 +150,29 @@ class Synthetic:
         for at in range(0, trials, step):
             part = slice(at, min(at + step, trials))
             first, last = start + part.start, start + part.stop
-            self.store.write(cell, first, last, {k: v[part] for k, v in rows.items()}, None if at else history)
+            self.store.write(
+                cell, first, last, {k: v[part] for k, v in rows.items()}, None if at else history
+            )
             if not (self.store.trials / f"{truth.key}-{first}-{last}.parquet").exists():
                 self.store.write(truth, first, last, {k: v[part] for k, v in facts.items()})
         self.cells |= {cell.key: cell, truth.key: truth}
         return cell
 
-    def record(self, trials: int, identifier: str = "run", started: str | None = None, **more: Any) -> Path:
+    def record(
+        self, trials: int, identifier: str = "run", started: str | None = None, **more: Any
+    ) -> Path:
         cells = [
             {"key": c.key, "identity_key": c.footer["identity_key"], "names": c.footer["names"]}
             for c in self.cells.values()
         ]
         now = started or datetime.datetime.now(datetime.UTC).isoformat()
-        record = {"started": now, "trials": trials, "cells": cells, "versions": {"numpy": np.__version__}, **more}
+        record = {
+            "started": now,
+            "trials": trials,
+            "cells": cells,
+            "versions": {"numpy": np.__version__},
+            **more,
+        }
         return self.store.write_run(identifier, record)
 
 

@@ -23,7 +23,10 @@ class Watched(WrappedModel):
 
     @property
     def cost(self) -> float:
-        price = {"jacobian": self.whole.jacobian_cost, "coarse_jacobian": self.whole.coarse_jacobian_cost}
+        price = {
+            "jacobian": self.whole.jacobian_cost,
+            "coarse_jacobian": self.whole.coarse_jacobian_cost,
+        }
         return sum(count * price.get(name, 1.0) for name, count in self.seen.items())
 
 

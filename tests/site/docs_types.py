@@ -12,7 +12,9 @@ from typing import Annotated, Any, get_args, get_origin
 
 from ipe_bench.basics import options
 
-_CONSTRAINED = {n: get_args(t)[0].__name__ for n, t in vars(options).items() if get_origin(t) is Annotated}
+_CONSTRAINED = {
+    n: get_args(t)[0].__name__ for n, t in vars(options).items() if get_origin(t) is Annotated
+}
 """Plain types of the annotations that name a constraint, such as Positive."""
 _STYLE = "margin: 1rem 0; padding: .5rem 0; overflow-x: auto"
 
@@ -53,7 +55,9 @@ def setup(app: Any) -> dict[str, bool]:
         raise SkipNode
 
     def display(translator: Any, node: Any) -> None:
-        translator.body.append(f'<div style="{_STYLE}">{convert(node.astext(), display="block")}</div>')
+        translator.body.append(
+            f'<div style="{_STYLE}">{convert(node.astext(), display="block")}</div>'
+        )
         raise SkipNode
 
     app.add_html_math_renderer("mathml", (inline, None), (display, None))

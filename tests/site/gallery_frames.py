@@ -63,7 +63,9 @@ class Computed:
     @property
     def complete(self) -> bool:
         """Whether all that the experiment asks for is there."""
-        return len(self._totals) >= self.asked_results and bool((self._totals["trials"] >= self.asked_trials).all())
+        return len(self._totals) >= self.asked_results and bool(
+            (self._totals["trials"] >= self.asked_trials).all()
+        )
 
     @property
     def extent(self) -> str:
@@ -86,10 +88,14 @@ class Computed:
             "asked_trials": self.asked_trials,
             "frames": {name: frame.to_dict("list") for name, frame in frames.items()},
             "groups": [_described(group) for group in groups],
-            "rows": {group.cells[0].key: _single(self.analysis.collection, group) for group in groups},
+            "rows": {
+                group.cells[0].key: _single(self.analysis.collection, group) for group in groups
+            },
         }
         text = json.dumps(content, ensure_ascii=False, separators=(",", ":"), default=_plain)
-        write_atomically(path, lambda place: place.write_bytes(lzma.compress(text.encode(), preset=9)))
+        write_atomically(
+            path, lambda place: place.write_bytes(lzma.compress(text.encode(), preset=9))
+        )
 
 
 def read(path: Path) -> Computed:
@@ -111,7 +117,9 @@ def _described(group: Group) -> dict[str, Any]:
 
 def _group(described: Mapping[str, Any]) -> Group:
     cell = StoredCell(described["footer"], ())
-    return Group(described["columns"], described["estimator"], described["options"], (cell,), (None,))
+    return Group(
+        described["columns"], described["estimator"], described["options"], (cell,), (None,)
+    )
 
 
 def _single(collection: Collection, group: Group) -> dict[str, list[Any]]:
@@ -119,7 +127,11 @@ def _single(collection: Collection, group: Group) -> dict[str, list[Any]]:
     cell = group.cells[0]
     if cell.trials > 1:
         return {}
-    return {name: list(v) for name, v in collection.load(cell, None).items() if name.startswith(_COLUMNS)}
+    return {
+        name: list(v)
+        for name, v in collection.load(cell, None).items()
+        if name.startswith(_COLUMNS)
+    }
 
 
 def _plain(value: Any) -> Any:

@@ -50,7 +50,9 @@ SETTINGS = {
     "extensions": ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "docs_types"],
     "myst_enable_extensions": ["attrs_inline", "dollarmath", "deflist", "colon_fence"],
     "myst_heading_anchors": 3,
-    "suppress_warnings": ["myst.xref_missing"],  # of links to rows of checked.md, which tests/test_oracles.py follows
+    "suppress_warnings": [
+        "myst.xref_missing"
+    ],  # of links to rows of checked.md, which tests/test_oracles.py follows
     "nb_execution_mode": "force",
     "nb_execution_in_temp": True,
     "nb_execution_raise_on_error": True,
@@ -121,14 +123,18 @@ def printed_by(command: Sequence[str], columns: int = 80) -> str:
     environment = os.environ | {"COLUMNS": str(columns), "NO_COLOR": "1"}
     done = subprocess.run(program, capture_output=True, text=True, env=environment, check=False)
     if done.returncode != 0:
-        raise UserError(f"{shlex.join(command)}: ended with exit code {done.returncode}: {done.stderr[-2000:]}")
+        raise UserError(
+            f"{shlex.join(command)}: ended with exit code {done.returncode}: {done.stderr[-2000:]}"
+        )
     return "\n".join(line.rstrip() for line in done.stdout.splitlines())
 
 
 def write_page(path: Path, template: str, **content: Any) -> None:
     """Writes a page from its template, in which the filter `cell` makes any text a cell of a Markdown table."""
     made = environment().overlay(autoescape=False)
-    made.filters["cell"] = lambda text: " ".join(str(text).replace("|", "\\|").replace("<", "&lt;").split())
+    made.filters["cell"] = lambda text: " ".join(
+        str(text).replace("|", "\\|").replace("<", "&lt;").split()
+    )
     write_text(path, made.get_template(f"docs/{template}.md.j2").render(content))
 
 
@@ -143,7 +149,9 @@ def write_reference(folder: Path) -> None:
     for group, title in GROUPS.items():
         rows = [(option, described(option)) for option in _ours(group)]
         key = f"{PACKAGES[group]}.NAME" if group in PACKAGES else group
-        write_page(folder / f"{group}.md", "options", group=group, title=title, key=key, options=rows)
+        write_page(
+            folder / f"{group}.md", "options", group=group, title=title, key=key, options=rows
+        )
     statuses = [status for status in Status if status is not Status.RUNNING]
     write_page(folder / "statuses.md", "statuses", statuses=statuses)
     words = {"records": STATISTICS, "verdicts": VERDICTS, "definitions": DEFINITIONS.items()}
@@ -152,11 +160,22 @@ def write_reference(folder: Path) -> None:
     names = re.findall(r"^    (\w+)(?:  |$)", summary, re.MULTILINE)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         said = pool.map(lambda name: printed_by([name, "--help"], columns=100).rstrip(), names)
-        write_page(folder / "commands.md", "commands", commands={"": summary, **dict(zip(names, said, strict=True))})
+        write_page(
+            folder / "commands.md",
+            "commands",
+            commands={"": summary, **dict(zip(names, said, strict=True))},
+        )
     write_page(folder / "contracts.md", "contracts", kinds=CONTRACTS)
-    things = [(name, getattr(ipe_bench, name)) for name in ipe_bench.__all__ if f"ipe_bench.{name}" not in CLASSES]
+    things = [
+        (name, getattr(ipe_bench, name))
+        for name in ipe_bench.__all__
+        if f"ipe_bench.{name}" not in CLASSES
+    ]
     shown = [(name, thing) for name, thing in things if hasattr(thing, "__qualname__")]
-    kinds = [("autoclass" if isinstance(t, type) else "autofunction", f"ipe_bench.{name}") for name, t in shown]
+    kinds = [
+        ("autoclass" if isinstance(t, type) else "autofunction", f"ipe_bench.{name}")
+        for name, t in shown
+    ]
     write_page(folder / "python.md", "python", names=kinds)
 
 
@@ -181,7 +200,10 @@ class Page:
     @property
     def words(self) -> list[str]:
         """All that is read on it, besides what stands in figures."""
-        return [self.html, *(word for one in self.figures for word in (one.name, one.title, one.caption))]
+        return [
+            self.html,
+            *(word for one in self.figures for word in (one.name, one.title, one.caption)),
+        ]
 
 
 def write_gallery(folder: Path, results: Path, trials: int) -> None:
@@ -192,20 +214,38 @@ def write_gallery(folder: Path, results: Path, trials: int) -> None:
     for option in chosen:
         path = STORED / f"{option.name}{SUFFIX}"
         if not path.exists():
-            print(f"{option.name}: no result of it is stored; it runs now, with few trials ...", flush=True)
-            path = store(option, results, results / option.name, trials, _PARTS.get(option.name, ()))
+            print(
+                f"{option.name}: no result of it is stored; it runs now, with few trials ...",
+                flush=True,
+            )
+            path = store(
+                option, results, results / option.name, trials, _PARTS.get(option.name, ())
+            )
         found[option.name] = computed = read(path)
         with house_style():
             page = Page.of(option.name, computed.analysis)
-            for file, figure in (("", page.small), *((f"_{one.name}", one.figure) for one in page.figures)):
+            for file, figure in (
+                ("", page.small),
+                *((f"_{one.name}", one.figure) for one in page.figures),
+            ):
                 figure.savefig(pictures / f"{option.name}{file}.png", dpi=150)
-        write_page(folder / f"{option.name}.md", "experiment", option=option, computed=computed, page=page)
-    write_page(folder / "index.md", "gallery", experiments=[(option, found[option.name]) for option in chosen])
-    best = [row for name, computed in found.items() for row in _best(name, computed.analysis.summary)]
+        write_page(
+            folder / f"{option.name}.md", "experiment", option=option, computed=computed, page=page
+        )
+    write_page(
+        folder / "index.md",
+        "gallery",
+        experiments=[(option, found[option.name]) for option in chosen],
+    )
+    best = [
+        row for name, computed in found.items() for row in _best(name, computed.analysis.summary)
+    ]
     write_page(folder / "best.inc", "best", rows=best)
 
 
-def store(option: Option, folder: Path, results: Path, trials: int, part: Sequence[str] = ()) -> Path:
+def store(
+    option: Option, folder: Path, results: Path, trials: int, part: Sequence[str] = ()
+) -> Path:
     """Runs an experiment, or a part of it, and keeps what its page is drawn from; returns the file."""
     name, command = option.name, ["run", f"+experiment={option.name}", *part]
     own = (option.config or {}).get("trials", ORDINARY)
@@ -214,16 +254,22 @@ def store(option: Option, folder: Path, results: Path, trials: int, part: Sequen
         command.append(f"trials={number}")
     try:
         printed_by([*command, "execution=serial", "figures=none", f"output={results}"])
-    except UserError as error:  # such as a data set of many that one of the estimators cannot begin with
+    except (
+        UserError
+    ) as error:  # such as a data set of many that one of the estimators cannot begin with
         if "(refused: " not in str(error):
             raise
         print(f"{name}: {str(error).strip().splitlines()[-1]}", flush=True)
     analysis = analyse([results])
-    computed = Computed(shlex.join(command), version("ipe-bench"), _asked(name) // own, own, analysis)
+    computed = Computed(
+        shlex.join(command), version("ipe-bench"), _asked(name) // own, own, analysis
+    )
     computed.write(path := folder / f"{name}{SUFFIX}", parameters=name in _OF_PARAMETERS)
     with house_style():
         if Page.of(name, read(path).analysis).words != Page.of(name, analysis).words:
-            raise AssertionError(f"{path}: what is kept is not all that the page of {name} is drawn from")
+            raise AssertionError(
+                f"{path}: what is kept is not all that the page of {name} is drawn from"
+            )
     print(f"{name}: {computed.extent}", flush=True)
     return path
 
@@ -249,11 +295,18 @@ def _small(analysis: Analysis) -> Any:
     rows: Any = analysis.summary[analysis.summary["parameter"] == ALL]
     column = "success"
     for table in certified_tables(analysis.collection)[:1]:
-        rows, column = table.data, "mean_lre_parameters" if table.name == "certified_averages" else "found"
+        rows, column = (
+            table.data,
+            "mean_lre_parameters" if table.name == "certified_averages" else "found",
+        )
     means = rows.groupby("estimator")[column].mean().sort_values()
     fig, (ax,) = common.panels(1, height=0.6 + 0.2 * len(means))
     ax.barh(list(means.index), means)
-    ax.set_xlabel({"success": "success", "found": "root mean square error"}.get(column, "correct digits, mean"))
+    ax.set_xlabel(
+        {"success": "success", "found": "root mean square error"}.get(
+            column, "correct digits, mean"
+        )
+    )
     return fig
 
 
@@ -264,8 +317,12 @@ def _best(experiment: str, summary: pd.DataFrame) -> Iterator[tuple[str, ...]]:
         return
     totals = summary[(summary["parameter"] == ALL) & (summary["noise"] != "certified")]
     every = list(dict.fromkeys(totals["estimator"]))
-    for scale in sorted({totals["error_scale"].min(), totals["error_scale"].max()} if len(totals) else ()):
-        here = totals[totals["error_scale"] == scale].sort_values("simulations_median", kind="stable")
+    for scale in sorted(
+        {totals["error_scale"].min(), totals["error_scale"].max()} if len(totals) else ()
+    ):
+        here = totals[totals["error_scale"] == scale].sort_values(
+            "simulations_median", kind="stable"
+        )
         best = here[here["success"] == here["success"].max()]
         names = dict.fromkeys((str(best["measurement"].iloc[0]), experiment))
         link = f"[{', '.join(names)}](gallery/{experiment}.md)"
@@ -281,7 +338,13 @@ def store_all(output: Path, trials: int, names: Sequence[str]) -> int:
     for option in _ours("experiment"):
         if option.name in names:
             print(f"{option.name} ...", flush=True)
-            store(option, STORED, output / "results" / option.name, trials, _STORED.get(option.name, ()))
+            store(
+                option,
+                STORED,
+                output / "results" / option.name,
+                trials,
+                _STORED.get(option.name, ()),
+            )
     write_gallery(output / "source" / "gallery", output / "results", trials)
     for option in _ours("experiment"):
         computed = read(STORED / f"{option.name}{SUFFIX}")

@@ -65,7 +65,9 @@ def test_what_is_far_is_left_to_progressive(scale):
         chosen, thorough = (e.estimate(scenario.problem, z) for e in (Auto(), Progressive()))
     assert (chosen.extras["stage"] == PROGRESSIVE).all()
     np.testing.assert_array_equal(chosen.x, thorough.x)
-    wasted = (chosen.simulations - thorough.simulations) + 11 * (chosen.jacobians - thorough.jacobians)
+    wasted = (chosen.simulations - thorough.simulations) + 11 * (
+        chosen.jacobians - thorough.jacobians
+    )
     assert (wasted > 0).all()
     assert np.median(wasted) < 11
 
@@ -78,7 +80,9 @@ def test_residuals_that_do_not_fit_are_no_answer_of_the_first_stage():
     assert (Auto().estimate(strict, z).extras["stage"] == PROGRESSIVE).all()
 
 
-@pytest.mark.parametrize(("model", "scale"), [(Bearings(), 1.0), (LotkaVolterra(), 1.0)], ids=["bearings", "lotka"])
+@pytest.mark.parametrize(
+    ("model", "scale"), [(Bearings(), 1.0), (LotkaVolterra(), 1.0)], ids=["bearings", "lotka"]
+)
 def test_a_jacobian_that_changes_on_the_way_is_renewed(model, scale):
     """With that of the frozen root alone, two in five of these answers are a thousandth to a tenth of a deviation off,
     and chord steps cannot see it: they converge."""
@@ -101,15 +105,21 @@ OTHERS = (FixedPoint(), Newton(), GaussNewton(), LevenbergMarquardt(), Progressi
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("model", "scale"), [(m, s) for m, (_, _, scales) in CASES.items() for s in scales])
-def test_it_succeeds_as_often_as_the_best_and_costs_little_more_than_the_cheapest_that_does(model, scale):
+@pytest.mark.parametrize(
+    ("model", "scale"), [(m, s) for m, (_, _, scales) in CASES.items() for s in scales]
+)
+def test_it_succeeds_as_often_as_the_best_and_costs_little_more_than_the_cheapest_that_does(
+    model, scale
+):
     measurement, noise, _ = CASES[model]
     block = Block.draw(Scenario(measurement, noise, error_scale=scale), 5000, 5100)
 
     def figures(estimator):
         with np.errstate(all="ignore"):
             estimates, scored = block.estimate(estimator)
-        return scored["success"].mean(), np.median(estimates.simulations + measurement.n * estimates.jacobians)
+        return scored["success"].mean(), np.median(
+            estimates.simulations + measurement.n * estimates.jacobians
+        )
 
     success, cost = figures(Auto())
     others = [figures(other) for other in OTHERS]
@@ -143,7 +153,9 @@ def fits(model: Formula, z: NDArray[np.float64], noise, estimator) -> Fit:
 
 @pytest.mark.parametrize("starts", [2, pytest.param(16, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
-    "noise", [Gaussian(0.3), pytest.param(Unknown(), marks=pytest.mark.slow)], ids=["known level", "unknown level"]
+    "noise",
+    [Gaussian(0.3), pytest.param(Unknown(), marks=pytest.mark.slow)],
+    ids=["known level", "unknown level"],
 )
 def test_a_noisy_peak_is_found_from_anywhere(noise, starts):
     """From random starts, among flat lines and dips that are minima, too; an unknown level has no test of the fit to
@@ -154,7 +166,9 @@ def test_a_noisy_peak_is_found_from_anywhere(noise, starts):
         uniform = ((-2, 3), (0.5, 6), (0, 10), (0.1, 3))
         start = {name: float(rng.uniform(*ends)) for name, ends in zip(truth, uniform, strict=True)}
         there = Formula(PEAK, truth, {"t": T.tolist()})
-        z = there.simulate(there.nominal[None])[0] + 0.3 * np.random.default_rng(100 + i).standard_normal(60)
+        z = there.simulate(there.nominal[None])[0] + 0.3 * np.random.default_rng(
+            100 + i
+        ).standard_normal(60)
         best = fits(there, z, noise, LevenbergMarquardt(max_iterations=500))
         found = fits(Formula(PEAK, start, {"t": T.tolist()}), z, noise, Auto())
         assert np.sum(found.residuals**2) <= np.sum(best.residuals**2) * (1 + 1e-6), start
@@ -167,7 +181,9 @@ def test_a_saturating_law_is_found_from_a_bad_start(start, noise):
     truth = Formula("V*t/(K+t)", {"V": 2.0, "K": 3.0}, {"t": t})
     z = truth.simulate(truth.nominal[None])[0] + 0.05 * np.random.default_rng(3).standard_normal(9)
     best = fits(truth, z, noise, LevenbergMarquardt())
-    found = fits(Formula("V*t/(K+t)", dict(zip("VK", start, strict=True)), {"t": t}), z, noise, Auto())
+    found = fits(
+        Formula("V*t/(K+t)", dict(zip("VK", start, strict=True)), {"t": t}), z, noise, Auto()
+    )
     assert found.x == pytest.approx(best.x, rel=1e-4)
 
 
@@ -190,7 +206,9 @@ def test_an_image_below_the_ground_is_not_believed(estimator):
     ids=["ranging", "lotka_volterra"],
 )
 @pytest.mark.parametrize("estimator", [Auto(), Progressive()], ids=["auto", "progressive"])
-def test_noise_that_is_understated_is_no_reason_for_a_long_search(model, true, told, scale, estimator):
+def test_noise_that_is_understated_is_no_reason_for_a_long_search(
+    model, true, told, scale, estimator
+):
     """Nothing ever fits, and draws lead to the same minimum: some ten to thirty times the first fit."""
     z = Scenario(model, Gaussian(true), error_scale=scale).draw(0, 4).z
     problem = Problem(model, Scenario(model, Gaussian(told)).problem.R)
@@ -220,10 +238,17 @@ def test_a_search_ends_where_restarts_land_on_one_point(name, noise):
     expression, start, true, deviation = UNDERSTATED[name]
     t = np.linspace(0.2, 10, 25)
     there = Formula(expression, dict(zip("abcd", true, strict=False)), {"t": t.tolist()})
-    z = there.simulate(there.nominal[None])[0] + deviation * np.random.default_rng(3).standard_normal(25)
+    z = there.simulate(there.nominal[None])[0] + deviation * np.random.default_rng(
+        3
+    ).standard_normal(25)
     noise = noise if noise.estimated else Gaussian(deviation / 10)
     best = fits(there, z, noise, LevenbergMarquardt(max_iterations=500))
-    found = fits(Formula(expression, dict(zip("abcd", start, strict=False)), {"t": t.tolist()}), z, noise, Auto())
+    found = fits(
+        Formula(expression, dict(zip("abcd", start, strict=False)), {"t": t.tolist()}),
+        z,
+        noise,
+        Auto(),
+    )
     assert found.x == pytest.approx(best.x, rel=1e-3)
     assert found.simulations < 2000
     assert "this minimum again" in found.message

@@ -25,7 +25,13 @@ from ipe_bench.solvers import Auto, DampedNewton, FixedPoint, Newton, Progressiv
 from ipe_bench.trials.scenario import Scenario
 
 LEAST_SQUARES = [
-    *(GaussNewton(), GaussNewton(damping=1e-3), LevenbergMarquardt(), Relinearized(), Relinearized(Newton())),
+    *(
+        GaussNewton(),
+        GaussNewton(damping=1e-3),
+        LevenbergMarquardt(),
+        Relinearized(),
+        Relinearized(Newton()),
+    ),
     *(Progressive(), Progressive(use_prior=False)),
 ]
 
@@ -47,7 +53,9 @@ def test_the_minimum_is_that_of_scipy(estimator):
         def residual(x, z=z):
             return problem.R.whiten(problem.measurement.simulate(x[None])[0] - z)
 
-        found = least_squares(residual, problem.x0, jac="3-point", xtol=1e-15, ftol=1e-15, gtol=1e-12)
+        found = least_squares(
+            residual, problem.x0, jac="3-point", xtol=1e-15, ftol=1e-15, gtol=1e-12
+        )
         agreed(np.abs(x - found.x), 1e-6)
         np.testing.assert_allclose(P, np.linalg.inv(found.jac.T @ found.jac), rtol=1e-4)
 
@@ -75,7 +83,9 @@ def exact_inverse_of_normal_matrix(J: Array) -> Array:
     return table[:, n:]
 
 
-@pytest.mark.oracle("closed form: normal equations in rational numbers", "steps, in standard deviations", 1e-8)
+@pytest.mark.oracle(
+    "closed form: normal equations in rational numbers", "steps, in standard deviations", 1e-8
+)
 def test_a_step_is_exact_however_badly_conditioned_the_jacobian_is():
     """Beside rational numbers, for conditions of 10 to 1e7 and columns of sizes 1e-100 to 1e100."""
     rng = np.random.default_rng(1)
@@ -94,7 +104,9 @@ def test_a_step_is_exact_however_badly_conditioned_the_jacobian_is():
 
 def test_one_inner_fixed_point_step_is_gauss_newton():
     problem, trials = gins(100.0, 5, Gins(step=60.0))  # with a fixed step all Jacobians are exact
-    rounds = Relinearized(FixedPoint(), inner_iterations=1).estimate(problem, trials.z, history=True)
+    rounds = Relinearized(FixedPoint(), inner_iterations=1).estimate(
+        problem, trials.z, history=True
+    )
     steps = GaussNewton().estimate(problem, trials.z, history=True)
     for a, b, P in zip(rounds.history, steps.history, steps.covariance, strict=True):
         k = min(len(a), len(b))
@@ -104,14 +116,19 @@ def test_one_inner_fixed_point_step_is_gauss_newton():
 
 PRIORS = (Progressive(), Progressive(prior_inflation=10.0), Progressive(use_prior=False))
 FAR = [pytest.param(estimator, 600.0, 40, 1.0) for estimator in PRIORS]
-FAR += [pytest.param(Progressive(), *far, marks=pytest.mark.slow) for far in ((1000.0, 250, 1.0), (3000.0, 250, 0.98))]
+FAR += [
+    pytest.param(Progressive(), *far, marks=pytest.mark.slow)
+    for far in ((1000.0, 250, 1.0), (3000.0, 250, 0.98))
+]
 
 
 @pytest.mark.parametrize(("estimator", "scale", "trials", "share"), FAR, ids=str)
 def test_progressive_ipe_from_far_away(estimator, scale, trials, share):
     problem, drawn = gins(scale, trials)
     found = estimator.estimate(problem, drawn.z)
-    distance = quadratic_form(information(problem.measurement.jacobian(drawn.x), problem.R), found.x - drawn.x)
+    distance = quadratic_form(
+        information(problem.measurement.jacobian(drawn.x), problem.R), found.x - drawn.x
+    )
     success = distance < chi2.isf(1e-6, 11)
     assert success.mean() >= share
     # Its own verdict is right.
@@ -125,7 +142,9 @@ def test_candidates_that_differ_find_what_a_common_prior_hides():
     scenario = Scenario(Gins(), Quantization(0.02286), GaussianPrior(), 5000.0)
     z = np.concatenate([scenario.draw(t, t + 1).z for t in (32, 392, 538, 959, 3042)])
     with np.errstate(all="ignore"):
-        careful, all_attempts = (Progressive(restarts=k).estimate(scenario.problem, z) for k in (1, None))
+        careful, all_attempts = (
+            Progressive(restarts=k).estimate(scenario.problem, z) for k in (1, None)
+        )
     assert (careful.extras["fit_p"] < 1e-6).all()
     assert (all_attempts.extras["fit_p"] > 1e-3).all()
 
@@ -171,7 +190,9 @@ def test_a_coarse_jacobian_counts_as_what_it_costs():
     np.testing.assert_array_equal(J[1], model.jacobian(x[1:2])[0])
 
 
-@pytest.mark.parametrize("solver", [Newton(tolerance=1e-12), DampedNewton(tolerance=1e-12)], ids=repr)
+@pytest.mark.parametrize(
+    "solver", [Newton(tolerance=1e-12), DampedNewton(tolerance=1e-12)], ids=repr
+)
 def test_newtons_method_is_coarse_far_away_and_of_order_two_near_a_root(solver):
     """A Jacobian that is off by one part in a hundred would gain a factor of a hundred in a step."""
     problem = Problem(Crude(0.01), Covariance(np.full(12, 0.03)), None)
@@ -181,14 +202,19 @@ def test_newtons_method_is_coarse_far_away_and_of_order_two_near_a_root(solver):
     system = FrozenSystem.at_nominal(problem, z)
     assert found.history is not None
     sizes = [
-        [np.abs(system.subset(np.arange(20) == i).F(x[None]) / system.deviation).max() for x in iterates]
+        [
+            np.abs(system.subset(np.arange(20) == i).F(x[None]) / system.deviation).max()
+            for x in iterates
+        ]
         for i, iterates in enumerate(found.history)
     ]
     near = [(a, b) for trial in sizes for a, b in itertools.pairwise(trial) if 1e-6 < a <= 0.03]
     assert len(near) >= 5
     assert all(b < 1e-4 * a for a, b in near)
     far = np.array([np.sum(np.array(trial[:-1]) > 0.03) for trial in sizes])
-    np.testing.assert_allclose(found.jacobians, found.iterations - 0.75 * far + 1, rtol=1e-12)  # and the covariance's
+    np.testing.assert_allclose(
+        found.jacobians, found.iterations - 0.75 * far + 1, rtol=1e-12
+    )  # and the covariance's
 
 
 COARSE = [GaussNewton(), LevenbergMarquardt(), Progressive(), Auto()]
@@ -202,7 +228,9 @@ def test_a_minimum_and_its_covariance_are_those_of_exact_jacobians(estimator):
     step, P = gauss_newton_step(problem, trials.z, found.x)
     within = 1e-4 if isinstance(estimator, Auto) else 1e-6
     assert (np.abs(step) <= within * deviations(P)).all()
-    np.testing.assert_allclose(found.covariance, P, rtol=within if within > 1e-6 else 1e-9, atol=1e-4 * within)
+    np.testing.assert_allclose(
+        found.covariance, P, rtol=within if within > 1e-6 else 1e-9, atol=1e-4 * within
+    )
     assert np.median(found.simulations + found.jacobians * problem.measurement.jacobian_cost) < 45
 
 
@@ -226,7 +254,9 @@ def test_residuals_that_stay_large_do_not_move_the_minimum(estimator, error):
     np.testing.assert_allclose(found.covariance, P, rtol=1e-9, atol=1e-15)
 
 
-@pytest.mark.parametrize("estimator", [GaussNewton("nominal", tolerance=1e-5), LevenbergMarquardt(tolerance=1e-5)])
+@pytest.mark.parametrize(
+    "estimator", [GaussNewton("nominal", tolerance=1e-5), LevenbergMarquardt(tolerance=1e-5)]
+)
 def test_a_step_that_lands_where_the_coarse_gradient_is_zero_is_not_the_last(estimator):
     problem = Problem(Crude(0.0, error=1e-5), Covariance(np.full(12, 3e-5)), None)
     A = problem.measurement.A
@@ -248,6 +278,8 @@ def test_levenberg_marquardt_does_not_trust_a_coarse_jacobian_that_leads_nowhere
 def test_without_a_cheaper_jacobian_nothing_changes(estimator):
     z = Bent(0.01).simulate(np.random.default_rng(4).normal(size=(5, 3)))
     R = Covariance(np.full(12, 0.03))
-    plain, same = (estimator.estimate(Problem(m, R), z) for m in (Bent(0.01), Crude(0.01, cheap=1.0)))
+    plain, same = (
+        estimator.estimate(Problem(m, R), z) for m in (Bent(0.01), Crude(0.01, cheap=1.0))
+    )
     for name in ("x", "status", "covariance", "iterations", "simulations", "jacobians"):
         np.testing.assert_array_equal(getattr(plain, name), getattr(same, name), name)

@@ -13,7 +13,15 @@ from ipe_bench.measurements import Gins, Measurement, Polynomial
 from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.noise import Gaussian, Quantization
 from ipe_bench.priors import GaussianPrior
-from ipe_bench.solvers import Anderson, Broyden, DampedNewton, FixedPoint, Newton, Relinearized, SteepestDescent
+from ipe_bench.solvers import (
+    Anderson,
+    Broyden,
+    DampedNewton,
+    FixedPoint,
+    Newton,
+    Relinearized,
+    SteepestDescent,
+)
 from ipe_bench.statistics.sample import orders_of
 from ipe_bench.trials.roots import frozen_root
 from ipe_bench.trials.scenario import Scenario
@@ -30,7 +38,9 @@ BURDEN_FAIRES = Written(
 """Burden and Faires, Numerical Analysis, section 10.2, example 2: root (1/2, 0, -pi/6)."""
 ROSENBROCK = Written(lambda a, b: (10 * (b - a**2), 1 - a), 2)
 """10 (b - a^2), 1 - a: root (1, 1), from the customary start (-1.2, 1)."""
-CUBIC = Written(lambda a, b: (1.2 * a + 0.3 * b + (a + b) ** 3 / 20, -0.2 * a + 0.9 * b + (a - b) ** 3 / 20), 2)
+CUBIC = Written(
+    lambda a, b: (1.2 * a + 0.3 * b + (a + b) ** 3 / 20, -0.2 * a + 0.9 * b + (a - b) ** 3 / 20), 2
+)
 """A x and a cubic: root 0, a contraction of the fixed-point iteration around it."""
 NO_ROOT = Written(lambda a, b: (a**2 + 1, b), 2)
 """a^2 + 1, b: |F| has its minimum 1 at 0, where the Jacobian is singular."""
@@ -41,10 +51,20 @@ def system_of(model: Measurement, trials: int) -> FrozenSystem:
     unit = np.eye(model.n)[None]
     R = Covariance(np.ones(model.m))
     counted = CountingModel(model, EvaluationCount.zeros(trials))
-    return FrozenSystem(counted, unit, np.ones((1, model.n)), R, np.zeros((trials, model.m)), np.arange(trials))
+    return FrozenSystem(
+        counted, unit, np.ones((1, model.n)), R, np.zeros((trials, model.m)), np.arange(trials)
+    )
 
 
-ALL = [FixedPoint(), Newton(), Broyden(), Broyden("identity"), SteepestDescent(), Anderson(2), DampedNewton()]
+ALL = [
+    FixedPoint(),
+    Newton(),
+    Broyden(),
+    Broyden("identity"),
+    SteepestDescent(),
+    Anderson(2),
+    DampedNewton(),
+]
 WITH_SLOPE = [Newton(), Broyden(), DampedNewton(), SteepestDescent()]
 
 
@@ -85,7 +105,9 @@ def test_a_line_search_takes_no_step_that_decreases_nothing():
 
     model = Written(signed_root, 1, 1)
     start = np.array([[0.5], [-3.0]])
-    assert (roots_of(model, Newton(), start, max_iterations=50)[0].status == Status.MAX_ITERATIONS).all()
+    assert (
+        roots_of(model, Newton(), start, max_iterations=50)[0].status == Status.MAX_ITERATIONS
+    ).all()
     damped, _ = roots_of(model, DampedNewton(), start, max_iterations=50)
     np.testing.assert_allclose(damped.x, 0.0, atol=1e-12)
 
@@ -105,7 +127,10 @@ def test_rounds_of_relinearized_count_the_steps_within_them(solver):
 @pytest.mark.parametrize("solver", WITH_SLOPE, ids=repr)
 @pytest.mark.parametrize(
     ("model", "start", "root"),
-    [(BURDEN_FAIRES, (0.1, 0.1, -0.1), (0.5, 0.0, -np.pi / 6)), (ROSENBROCK, (-1.2, 1.0), (1.0, 1.0))],
+    [
+        (BURDEN_FAIRES, (0.1, 0.1, -0.1), (0.5, 0.0, -np.pi / 6)),
+        (ROSENBROCK, (-1.2, 1.0), (1.0, 1.0)),
+    ],
     ids=["burden_faires", "rosenbrock"],
 )
 def test_textbook_systems_have_their_roots(solver, model, start, root):

@@ -86,7 +86,9 @@ def test_constants_and_errors_are_those_of_the_dense_likelihood():
         E = 0.01 * np.diag(scale)
         slopes = [(cost(e) - cost(-e)) / 0.02 for e in E]
         np.testing.assert_allclose(slopes, 0.0, atol=2e-3)  # by so many standard errors off
-        H = [[(cost(e + f) - cost(e - f) - cost(f - e) + cost(-e - f)) / 4e-4 for e in E] for f in E]
+        H = [
+            [(cost(e + f) - cost(e - f) - cost(f - e) + cost(-e - f)) / 4e-4 for e in E] for f in E
+        ]
         np.testing.assert_allclose(np.sqrt(np.diag(np.linalg.inv(H))), 1.0, rtol=2e-3)
         low, high = one.constants[1].low, one.constants[1].high
         assert low * high == pytest.approx(w**2, rel=1e-9)
@@ -96,12 +98,20 @@ def test_constants_and_errors_are_those_of_the_dense_likelihood():
 @pytest.mark.slow
 def test_intervals_hold_the_constants_as_often_as_they_say(monkeypatch):
     monkeypatch.setattr(tracks, "SEARCHES", 1)  # all end at one maximum here
-    model = replace(DAMPED, readings={"z": "x + b"}, constants={"a": 0.5, "b": 1.0}, deviation={"z": 0.5}, count=40)
+    model = replace(
+        DAMPED,
+        readings={"z": "x + b"},
+        constants={"a": 0.5, "b": 1.0},
+        deviation={"z": 0.5},
+        count=40,
+    )
     z, held = model.draw(0, 100, 1).z, np.zeros((100, 2), dtype=bool)
     for trial in range(100):
         (one,) = ib.estimate(model, z[trial], {"kf": ekf()}, find=["b", "w"])
         held[trial] = [c.low < 1.0 < c.high for c in one.constants]
-    assert (np.abs(held.mean(axis=0) - 0.95) < 3 * np.sqrt(0.95 * 0.05 / 100)).all(), held.mean(axis=0)
+    assert (np.abs(held.mean(axis=0) - 0.95) < 3 * np.sqrt(0.95 * 0.05 / 100)).all(), held.mean(
+        axis=0
+    )
 
 
 @pytest.mark.parametrize(
@@ -114,7 +124,11 @@ def test_a_search_ends_after_five_hundred_evaluations(cost):
     for one in tracks._minima(cost, np.zeros(5, dtype=bool), told.append):
         assert one.evaluations <= 500
     counted = Counter(line.partition(", ")[0] for line in told)
-    assert set(told) == {f"{name}, evaluation {k + 1} of at most 500" for name in counted for k in range(counted[name])}
+    assert set(told) == {
+        f"{name}, evaluation {k + 1} of at most 500"
+        for name in counted
+        for k in range(counted[name])
+    }
     assert list(counted) == [f"search {k} of 4" for k in (1, 2, 3, 4)]
     assert max(counted.values()) <= 500
 
@@ -124,7 +138,12 @@ def log(tmp_path):
     """The words of a command on a log, in which two noises have but one variance."""
     (tmp_path / "log.csv").write_text("z\n1\n-2\n0.5\n3\n")
     words = "readings.z=x next.x=0.5*x+v+w noise.v=1 noise.w=1 deviation.z=1 spread.x=1"
-    return [*(f"state_model.{word}" for word in words.split()), "tracker=[ekf]", "readings=log.csv", "output=out"]
+    return [
+        *(f"state_model.{word}" for word in words.split()),
+        "tracker=[ekf]",
+        "readings=log.csv",
+        "output=out",
+    ]
 
 
 def test_a_search_tells_how_far_it_is_and_where_it_ended(ipe_bench, log, monkeypatch):
@@ -141,7 +160,9 @@ def test_a_search_tells_how_far_it_is_and_where_it_ended(ipe_bench, log, monkeyp
     assert f"the search ended after {last} evaluations at v=" in " ".join(out.split())
 
 
-def test_a_search_that_is_interrupted_is_one_line_and_no_file(ipe_bench, log, monkeypatch, tmp_path):
+def test_a_search_that_is_interrupted_is_one_line_and_no_file(
+    ipe_bench, log, monkeypatch, tmp_path
+):
     def interrupted(*_):
         raise KeyboardInterrupt
 
@@ -159,7 +180,8 @@ def test_a_log_without_noise_determines_no_noise():
     assert one.constants == ()
     assert one.verdict == "no maximum"
     assert re.match(
-        r"no maximum of the likelihood was found in w: .* ended after \d+ evaluations at w=[\d.]+e-", one.message
+        r"no maximum of the likelihood was found in w: .* ended after \d+ evaluations at w=[\d.]+e-",
+        one.message,
     )
 
 
@@ -223,8 +245,16 @@ def test_an_option_of_a_model_in_python_is_found_as_that_of_its_formulas():
         ({"kf": ekf()}, "b", "find=b: there is no such constant"),
         ({"kf": ekf()}, ["w", "noise.w"], "find=w: is named twice"),
         ({"kf": ekf()}, "noise.z", r"find=noise\.z: there is no such constant"),
-        ({"rts": Smoother(ekf())}, "a", "find: trackers.rts has no likelihood that can be maximised"),
-        ({"particles": Bootstrap(20)}, "a", "find: trackers.particles has no likelihood that can be maximised"),
+        (
+            {"rts": Smoother(ekf())},
+            "a",
+            "find: trackers.rts has no likelihood that can be maximised",
+        ),
+        (
+            {"particles": Bootstrap(20)},
+            "a",
+            "find: trackers.particles has no likelihood that can be maximised",
+        ),
     ],
 )
 def test_what_cannot_be_found_is_refused(trackers, find, complaint):

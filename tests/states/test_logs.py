@@ -38,7 +38,9 @@ def estimate(ipe_bench):
 
 
 def written(path, model, z, **columns):
-    pd.DataFrame({**columns, **dict(zip(model.reading_names, z.T, strict=True))}).to_csv(path, index=False)
+    pd.DataFrame({**columns, **dict(zip(model.reading_names, z.T, strict=True))}).to_csv(
+        path, index=False
+    )
 
 
 class Feet(ConstantVelocity):
@@ -53,7 +55,9 @@ class Feet(ConstantVelocity):
 def test_a_track_is_continued_from_its_covariance():
     long, short = Feet(count=6, step=2.0), Feet(count=5, step=2.0)
     z = np.arange(6.0)[:, None]
-    (before,), (after,) = (ib.estimate(model, z[: model.epochs], {"kf": ekf()}) for model in (short, long))
+    (before,), (after,) = (
+        ib.estimate(model, z[: model.epochs], {"kf": ekf()}) for model in (short, long)
+    )
     D = np.diag([1.0, 1 / 0.3048])
     F = D @ [[1.0, 2.0], [0.0, 1.0]] @ np.linalg.inv(D)
     P = F @ before.covariance[-1] @ F.T + D @ [[8 / 3, 2.0], [2.0, 2.0]] @ D
@@ -61,7 +65,9 @@ def test_a_track_is_continued_from_its_covariance():
     predicted = F @ before.mean[-1]
     assert_agrees(after.mean[-1], predicted + gain * (z[5, 0] - predicted[0]), rtol=1e-12)
     assert_agrees(after.covariance[-1], P - np.outer(gain, P[0]), rtol=1e-9)
-    np.testing.assert_allclose(after.deviation**2, np.einsum("kii->ki", after.covariance), rtol=1e-12)
+    np.testing.assert_allclose(
+        after.deviation**2, np.einsum("kii->ki", after.covariance), rtol=1e-12
+    )
 
 
 def test_a_log_is_tracked_with_the_bits_of_a_run(tmp_path):
@@ -76,10 +82,15 @@ def test_a_log_is_tracked_with_the_bits_of_a_run(tmp_path):
     for label, tracker in trackers.items():
         whole, one = tracker.track(model, z), answer[label]
         np.testing.assert_array_equal(one.mean, whole.mean[4])
-        np.testing.assert_array_equal(one.deviation, np.sqrt(np.einsum("kii->ki", whole.covariance[4])))
+        np.testing.assert_array_equal(
+            one.deviation, np.sqrt(np.einsum("kii->ki", whole.covariance[4]))
+        )
         assert one.log_likelihood == stored.loc[(label, 4), "log_likelihood"] or label == "rts"
         assert one.white_p == stored.loc[(label, 4), "white_p"] or label == "rts"
-        assert one.mean_nis == pytest.approx(stored.loc[(label, 4), "extra_nis"], rel=1e-12) or label == "rts"
+        assert (
+            one.mean_nis == pytest.approx(stored.loc[(label, 4), "extra_nis"], rel=1e-12)
+            or label == "rts"
+        )
         assert one.fit_p == stored.loc[(label, 4), "fit_p"]
     one = answer["ekf"]
     assert one.limits == pytest.approx(chi2.ppf([0.025, 0.975], 50) / 50, rel=1e-9)
@@ -103,7 +114,9 @@ def test_smoothers_are_judged_by_the_cost_of_their_path():
         for one in ib.estimate(model, factor * z, trackers):
             assert_agrees(one.mean_nis, cost / 20, rtol=1e-6)
             assert one.fit_p == pytest.approx(chi2.sf(cost, 20), rel=1e-5)
-            assert (one.verdict, one.passes) == (("consistent", True) if right else ("overconfident", False))
+            assert (one.verdict, one.passes) == (
+                ("consistent", True) if right else ("overconfident", False)
+            )
 
 
 @pytest.mark.oracle("closed form: posterior of one normal state", "mean and deviation", 1e-9)
@@ -129,8 +142,12 @@ def test_particles_that_lose_a_log_are_named():
     answer = ib.estimate(sharp, sharp.draw(0, 1).z[0], {"kf": ekf(), "few": Bootstrap(200)})
     assert [one.passes for one in answer] == [True, False]
     assert answer["few"].verdict == "collapsed"
-    assert "few: kf predicts each next reading far better, by 8.291e+04 in log likelihood" in str(answer)
-    steered = replace(DRIVEN, noise={"w": 1e-3}, count=50)  # whose particles do not spread far enough to follow
+    assert "few: kf predicts each next reading far better, by 8.291e+04 in log likelihood" in str(
+        answer
+    )
+    steered = replace(
+        DRIVEN, noise={"w": 1e-3}, count=50
+    )  # whose particles do not spread far enough to follow
     z = np.r_[np.zeros(30), np.linspace(1.0, 30.0, 20)][:, None]
     one = ib.estimate(steered, z, {"few": Bootstrap(200)})["few"]
     assert (one.verdict, one.passes, one.lost_from) == ("lost from epoch 31", False, 31)
@@ -143,7 +160,9 @@ def test_known_inputs_and_unequal_steps_of_a_log_give_the_closed_form(tmp_path):
     x = rng.normal() + np.cumsum(h * u + 0.5 * np.sqrt(h) * rng.normal(size=40))
     z = x + 0.2 * rng.normal(size=40)
     z[[7, 8]] = np.nan
-    written(tmp_path / "log.csv", DRIVEN, z[:, None], h=h, u=u, epoch=np.arange(1, 41), note=np.ones(40))
+    written(
+        tmp_path / "log.csv", DRIVEN, z[:, None], h=h, u=u, epoch=np.arange(1, 41), note=np.ones(40)
+    )
     (one,) = ib.estimate(DRIVEN, tmp_path / "log.csv", {"ekf": ekf()}, ignore_columns=["note"])
     m, P, log_likelihood = 0.0, 1.0, 0.0
     for k in range(40):
@@ -169,40 +188,63 @@ def test_the_times_of_a_log_are_those_of_its_epochs(tmp_path):
     assert answer["ekf"].mean[:2, 0] == pytest.approx([0.5, 2.5], rel=1e-12)
     assert answer["ekf"].mean[2, 0] == pytest.approx(4.75 + (4.0 - 4.75) / 1.04, rel=1e-12)
     pd.DataFrame({"time [s]": t[[0, 2, 1]], "z": z}).to_csv(tmp_path / "back.csv", index=False)
-    with pytest.raises(ib.UserError, match=r"row 4, column time \[s\]: is not after that of the row before"):
+    with pytest.raises(
+        ib.UserError, match=r"row 4, column time \[s\]: is not after that of the row before"
+    ):
         ib.estimate(model, tmp_path / "back.csv", {"ekf": ekf()})
     pd.DataFrame({"time [ms]": t, "z": z}).to_csv(tmp_path / "ms.csv", index=False)
-    with pytest.raises(ib.UserError, match=r"column time \[ms\]: the unit must be that of time \[s\]"):
+    with pytest.raises(
+        ib.UserError, match=r"column time \[ms\]: the unit must be that of time \[s\]"
+    ):
         ib.estimate(model, tmp_path / "ms.csv", {"ekf": ekf()})
 
 
-@pytest.mark.parametrize(("z", "said"), [(np.inf, "inf is not a reading"), (np.nan, "there is no reading")])
+@pytest.mark.parametrize(
+    ("z", "said"), [(np.inf, "inf is not a reading"), (np.nan, "there is no reading")]
+)
 def test_an_array_without_readings_is_refused(z, said):
     with pytest.raises(ib.UserError, match=f"readings: {said}"):
-        ib.estimate(replace(DRIVEN, inputs={}, next={"x": "x + w"}, count=3), np.full((3, 1), z), {"ekf": ekf()})
+        ib.estimate(
+            replace(DRIVEN, inputs={}, next={"x": "x + w"}, count=3),
+            np.full((3, 1), z),
+            {"ekf": ekf()},
+        )
 
 
 def test_a_first_reading_at_the_time_of_the_prior_gives_the_closed_form(tmp_path):
     """x grows by t and w at each step: the mean and covariance of all readings at once."""
-    model = replace(DRIVEN, next={"x": "x + t + k*w"}, inputs={}, count=6, step=0.5, moved_first=False)
+    model = replace(
+        DRIVEN, next={"x": "x + t + k*w"}, inputs={}, count=6, step=0.5, moved_first=False
+    )
     z = np.array([0.3, -0.2, 1.4, 2.0, 5.0, 6.0])
     written(tmp_path / "log.csv", model, z[:, None], time=0.5 * np.arange(6))
     (one,) = ib.estimate(model, tmp_path / "log.csv", {"ekf": ekf()})
     moved = np.array([0, 0.5, 1, 1.5, 2, 2.5]).cumsum()
-    C = np.tril(np.ones((6, 6))) @ np.diag([1.0, *(0.25 * np.arange(2, 7) ** 2)]) @ np.triu(np.ones((6, 6)))
+    C = (
+        np.tril(np.ones((6, 6)))
+        @ np.diag([1.0, *(0.25 * np.arange(2, 7) ** 2)])
+        @ np.triu(np.ones((6, 6)))
+    )
     S = C + 0.04 * np.eye(6)
     assert one.log_likelihood == pytest.approx(multivariate_normal(moved, S).logpdf(z), rel=1e-12)
-    assert one.mean[-1, 0] == pytest.approx(moved[-1] + C[-1] @ np.linalg.solve(S, z - moved), rel=1e-12)
+    assert one.mean[-1, 0] == pytest.approx(
+        moved[-1] + C[-1] @ np.linalg.solve(S, z - moved), rel=1e-12
+    )
     with pytest.raises(ib.UserError, match=r"column time: 0\.5 belongs here"):
         ib.estimate(replace(model, moved_first=True), tmp_path / "log.csv", {"ekf": ekf()})
 
 
 def test_the_command_leaves_the_track_and_says_whether_the_filter_is_right(tmp_path, estimate):
-    model = construct(next(o for o in options("state_model") if o.name == "constant_velocity").config, "state_model")
+    model = construct(
+        next(o for o in options("state_model") if o.name == "constant_velocity").config,
+        "state_model",
+    )
     z = model.draw(3, 4).z[0]
     z[11] = np.nan
     written(tmp_path / "log.csv", model, z, epoch=range(1, 101))
-    code, out, err = estimate("state_model=constant_velocity", "readings=log.csv", "tracker=[ekf,ekf_rts]")
+    code, out, err = estimate(
+        "state_model=constant_velocity", "readings=log.csv", "tracker=[ekf,ekf_rts]"
+    )
     assert (code, err) == (0, "")
     assert all(words in out for words in ("consistent", "NIS or cost / m", "white p", "position"))
     folder = tmp_path / "outputs" / "estimate-constant_velocity"
@@ -211,9 +253,15 @@ def test_the_command_leaves_the_track_and_says_whether_the_filter_is_right(tmp_p
     track = ekf().track(model, z[None])
     np.testing.assert_array_equal(table["velocity [m/s]"].astype(float), track.mean[0, :, 1])
     np.testing.assert_array_equal(table["nis"].dropna().astype(float), np.delete(track.nis[0], 11))
-    assert json.loads((folder / "track.json").read_text())["trackers"]["ekf"]["verdict"] == "consistent"
+    assert (
+        json.loads((folder / "track.json").read_text())["trackers"]["ekf"]["verdict"]
+        == "consistent"
+    )
     code, out, _ = estimate(
-        "state_model=constant_velocity", "readings=log.csv", "state_model.deviation.seen=0.3", "output=two"
+        "state_model=constant_velocity",
+        "readings=log.csv",
+        "state_model.deviation.seen=0.3",
+        "output=two",
     )
     assert code == 1
     assert "wrong (not white)" in out
@@ -229,15 +277,22 @@ def test_a_model_of_formulas_may_stand_in_a_file(tmp_path, estimate):
     mine = ("state_model=formulas", "state_model.file=mine.yaml")
     code, _, err = estimate(*mine, "readings=log.csv", "tracker=[ekf]", "output=one")
     assert (code, err) == (0, "")
-    model = replace(DRIVEN, count=3, inputs={name: tuple(values) for name, values in columns.items()})
+    model = replace(
+        DRIVEN, count=3, inputs={name: tuple(values) for name, values in columns.items()}
+    )
     np.testing.assert_array_equal(
         pd.read_csv(tmp_path / "one" / "track.csv", dtype=str)["x [m]"].astype(float),
         ekf().track(model, z[None]).mean[0, :, 0],
     )
     (tmp_path / "copied.yaml").write_text("_target_: ipe_bench.states.Formulas")
-    code, _, err = estimate("state_model=formulas", "state_model.file=copied.yaml", "readings=log.csv")
+    code, _, err = estimate(
+        "state_model=formulas", "state_model.file=copied.yaml", "readings=log.csv"
+    )
     assert code == 2
-    assert "state_model.file=copied.yaml: has a _target_; the model is chosen by state_model=, so leave it out" in err
+    assert (
+        "state_model.file=copied.yaml: has a _target_; the model is chosen by state_model=, so leave it out"
+        in err
+    )
 
 
 @pytest.mark.parametrize(
@@ -245,33 +300,87 @@ def test_a_model_of_formulas_may_stand_in_a_file(tmp_path, estimate):
     [
         (["readings=absent.csv"], "readings=absent.csv: there is no such file"),
         ([], "readings: is not given; write readings=FILE, with the columns u,h,z"),
-        (["readings=short.csv"], "readings=short.csv: column h is missing (the header must be u,h,z)"),
-        (["readings=more.csv"], "readings=more.csv: column note is not understood; remove it, or set ignore_columns"),
-        (["readings=order.csv"], "readings=order.csv: row 4, column epoch: 3 belongs here; give a row for each epoch"),
-        (["readings=time.csv"], "readings=time.csv: row 3, column time [s]: 2 belongs here; give a row for"),
-        (["readings=hole.csv"], "readings=hole.csv: row 3, column u: is empty; a known input has a value at each"),
+        (
+            ["readings=short.csv"],
+            "readings=short.csv: column h is missing (the header must be u,h,z)",
+        ),
+        (
+            ["readings=more.csv"],
+            "readings=more.csv: column note is not understood; remove it, or set ignore_columns",
+        ),
+        (
+            ["readings=order.csv"],
+            "readings=order.csv: row 4, column epoch: 3 belongs here; give a row for each epoch",
+        ),
+        (
+            ["readings=time.csv"],
+            "readings=time.csv: row 3, column time [s]: 2 belongs here; give a row for",
+        ),
+        (
+            ["readings=hole.csv"],
+            "readings=hole.csv: row 3, column u: is empty; a known input has a value at each",
+        ),
         (["readings=blank.csv"], "readings=blank.csv: has no reading"),
-        (["readings=gap.csv"], "readings=gap.csv: row 3: is empty; if a reading is missing there, number the rows in"),
-        (["readings=[good.csv,more.csv]"], "readings=[good.csv,more.csv]: a track has one log; name one file"),
+        (
+            ["readings=gap.csv"],
+            "readings=gap.csv: row 3: is empty; if a reading is missing there, number the rows in",
+        ),
+        (
+            ["readings=[good.csv,more.csv]"],
+            "readings=[good.csv,more.csv]: a track has one log; name one file",
+        ),
         (["readings=good.csv", "tracker=[nothing]"], "tracker=nothing: there is no such option"),
-        (["readings=good.csv", "tracker=[newton]"], "tracker=newton: newton is no tracker but a solver"),
-        (["readings=good.csv", "baseline=[ekf]"], "baseline: is of a measurement, and state_model= chooses"),
-        (["readings=good.csv", "measurement=gins"], "measurement: is of a measurement, and state_model= chooses"),
-        (["readings=good.csv", "ignore_rows=[2]"], "ignore_rows=[2]: is no key any more; empty the cells"),
+        (
+            ["readings=good.csv", "tracker=[newton]"],
+            "tracker=newton: newton is no tracker but a solver",
+        ),
+        (
+            ["readings=good.csv", "baseline=[ekf]"],
+            "baseline: is of a measurement, and state_model= chooses",
+        ),
+        (
+            ["readings=good.csv", "measurement=gins"],
+            "measurement: is of a measurement, and state_model= chooses",
+        ),
+        (
+            ["readings=good.csv", "ignore_rows=[2]"],
+            "ignore_rows=[2]: is no key any more; empty the cells",
+        ),
         (["readings=good.csv", "ignore_columns=[v]"], "ignore_columns=v: there is no such column"),
-        (["readings=good.csv", "state_model.inputs.u=[1,2]"], "state_model.inputs.u: has 2 numbers; give one"),
+        (
+            ["readings=good.csv", "state_model.inputs.u=[1,2]"],
+            "state_model.inputs.u: has 2 numbers; give one",
+        ),
     ],
 )
 def test_what_is_no_log_of_the_model_is_refused(words, complaint, tmp_path, estimate):
     good = {"u": [1.0, 2.0, 3.0], "h": [1.0] * 3, "z": [0.1, 0.2, 0.3]}
-    changes = {"short": {"h": None}, "more": {"note": [1, 2, 3]}, "order": {"epoch": [1, 2, 4]}, "good": {}}
-    changes |= {"time": {"time [s]": [1, 1.5, 3]}, "hole": {"u": [1.0, None, 3.0]}, "blank": {"z": [None] * 3}}
+    changes = {
+        "short": {"h": None},
+        "more": {"note": [1, 2, 3]},
+        "order": {"epoch": [1, 2, 4]},
+        "good": {},
+    }
+    changes |= {
+        "time": {"time [s]": [1, 1.5, 3]},
+        "hole": {"u": [1.0, None, 3.0]},
+        "blank": {"z": [None] * 3},
+    }
     changes["gap"] = {name: [values[0], None, values[2]] for name, values in good.items()}
     for name, change in changes.items():
         columns = {key: value for key, value in {**good, **change}.items() if value is not None}
         pd.DataFrame(columns).to_csv(tmp_path / f"{name}.csv", index=False)
-    options = ("next.x=x+h*u+w", "noise.w=1", "readings.z=x", "deviation.z=1", "spread.x=1", "inputs={u:0,h:1}")
-    code, _, err = estimate("state_model=formulas", *(f"state_model.{one}" for one in options), *words)
+    options = (
+        "next.x=x+h*u+w",
+        "noise.w=1",
+        "readings.z=x",
+        "deviation.z=1",
+        "spread.x=1",
+        "inputs={u:0,h:1}",
+    )
+    code, _, err = estimate(
+        "state_model=formulas", *(f"state_model.{one}" for one in options), *words
+    )
     assert code == 2
     assert err.splitlines()[-1].startswith(f"ipe-bench: {complaint}")
     assert not list(tmp_path.rglob("track.csv"))
@@ -282,13 +391,17 @@ def test_a_model_in_python_has_the_epochs_that_it_says(tmp_path):
     written(tmp_path / "log.csv", model, model.draw(0, 1).z[0, :11])
     with pytest.raises(ib.UserError, match="has 11 rows, and constant_velocity 12 epochs"):
         ib.estimate(model, tmp_path / "log.csv")
-    with pytest.raises(ib.UserError, match=r"readings: has shape \(3, 1\), where \(12, 1\) belongs"):
+    with pytest.raises(
+        ib.UserError, match=r"readings: has shape \(3, 1\), where \(12, 1\) belongs"
+    ):
         ib.estimate(model, np.zeros((3, 1)))
 
 
 def test_estimates_of_constants_and_of_states_are_told_apart():
     model, z = ConstantVelocity(count=12), np.zeros((12, 1))
-    with pytest.raises(ib.UserError, match=r"estimators\.ekf: estimates constants; a state model takes trackers"):
+    with pytest.raises(
+        ib.UserError, match=r"estimators\.ekf: estimates constants; a state model takes trackers"
+    ):
         ib.estimate(model, z, {"ekf": ib.baselines.EKF()})  # pyright: ignore
     with pytest.raises(ib.UserError, match="noise=: is of a measurement"):
         ib.estimate(model, z, noise=ib.noise.Gaussian(1.0))  # pyright: ignore

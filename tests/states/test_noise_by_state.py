@@ -74,7 +74,9 @@ class Rover(StateModel):
         return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
 
     def R_at(self, x, k):
-        deviations = np.stack([0.05 + 0.05 * np.hypot(x[..., 0], x[..., 1]), np.full(x.shape[:-1], 0.02)], axis=-1)
+        deviations = np.stack(
+            [0.05 + 0.05 * np.hypot(x[..., 0], x[..., 1]), np.full(x.shape[:-1], 0.02)], axis=-1
+        )
         return deviations[..., None] ** 2 * np.eye(2)
 
 
@@ -127,8 +129,12 @@ def loop(rule, model, z):
     m, P = model.prior
     means, covariances = [], []
     for k, reading in enumerate(z):
-        m, P, _ = augmented(rule, lambda x, k=k: model.transition(x, k), lambda x, k=k: model.gain_at(x, k), m, P)
-        y, S, C = augmented(rule, lambda x, k=k: model.observe(x, k), lambda x, k=k: np.sqrt(model.R_at(x, k)), m, P)
+        m, P, _ = augmented(
+            rule, lambda x, k=k: model.transition(x, k), lambda x, k=k: model.gain_at(x, k), m, P
+        )
+        y, S, C = augmented(
+            rule, lambda x, k=k: model.observe(x, k), lambda x, k=k: np.sqrt(model.R_at(x, k)), m, P
+        )
         K = C @ np.linalg.inv(S)
         m, P = m + K @ (reading - y), P - K @ S @ K.T
         means.append(m)
@@ -136,7 +142,9 @@ def loop(rule, model, z):
     return np.array(means), np.array(covariances)
 
 
-@pytest.mark.oracle("own second implementation: loops over an augmented state", "means and covariances", 1e-9)
+@pytest.mark.oracle(
+    "own second implementation: loops over an augmented state", "means and covariances", 1e-9
+)
 @pytest.mark.parametrize("rule", [Taylor(), ukf().rule], ids=["ekf", "ukf"])
 def test_extended_and_unscented_filters_are_those_of_an_augmented_state(rule):
     z = ROVER.draw(0, 4).z
@@ -152,7 +160,9 @@ def test_a_step_has_the_mean_and_the_covariance_of_many_draws():
     rng, (m, P), N = np.random.default_rng(3), ROVER.prior, 300_000
     rule, blind = GaussHermite(5), np.full((1, 1, 2), np.nan)
     before = rng.multivariate_normal(m, P, N)
-    moved = ROVER.transition(before, 0) + np.einsum("tij,tj->ti", ROVER.gain_at(before, 0), rng.normal(size=(N, 2)))
+    moved = ROVER.transition(before, 0) + np.einsum(
+        "tij,tj->ti", ROVER.gain_at(before, 0), rng.normal(size=(N, 2))
+    )
     x = filtered(replace(ROVER, count=1), blind, rule).predicted[0]
     near = rng.multivariate_normal(x.mean[0], x.covariance[0], N)
     deviations = np.sqrt(np.einsum("tii->ti", ROVER.R_at(near, 0)))
@@ -166,7 +176,11 @@ def test_a_step_has_the_mean_and_the_covariance_of_many_draws():
         assert (np.abs(d.mean(axis=0)) < 4 * d.std(axis=0) / np.sqrt(N)).all()
         assert (np.abs(products.mean(axis=0) - covariance[0]) < 4 * error).all()
         if draws is moved:
-            at_mean = covariance[0] - rule.mean(lambda x: ROVER.Q_at(x, 0), m[None], P[None])[0] + ROVER.Q_at(m, 0)
+            at_mean = (
+                covariance[0]
+                - rule.mean(lambda x: ROVER.Q_at(x, 0), m[None], P[None])[0]
+                + ROVER.Q_at(m, 0)
+            )
             assert (np.abs(products.mean(axis=0) - at_mean) / error)[0, 1] > 10
 
 
@@ -177,10 +191,14 @@ def test_paths_are_drawn_with_the_noise_of_their_states():
         e = paths.x[:, k] - ROVER.transition(before[:, k], k)
         heading = before[:, k, 2]
         along = e[:, 0] * np.cos(heading) + e[:, 1] * np.sin(heading)
-        np.testing.assert_allclose(e[:, 0] * np.sin(heading) - e[:, 1] * np.cos(heading), 0.0, atol=1e-14)
+        np.testing.assert_allclose(
+            e[:, 0] * np.sin(heading) - e[:, 1] * np.cos(heading), 0.0, atol=1e-14
+        )
         assert along.std() == pytest.approx(ALONG, rel=0.06)
         r = paths.z[:, k, 0] - ROVER.observe(paths.x[:, k], k)[:, 0]
-        assert (r / np.sqrt(ROVER.R_at(paths.x[:, k], k)[:, 0, 0])).std() == pytest.approx(1.0, rel=0.06)
+        assert (r / np.sqrt(ROVER.R_at(paths.x[:, k], k)[:, 0, 0])).std() == pytest.approx(
+            1.0, rel=0.06
+        )
 
 
 def test_a_model_by_formulas_is_the_one_in_python():
@@ -189,7 +207,9 @@ def test_a_model_by_formulas_is_the_one_in_python():
     assert written.R_by_state
     x = ROVER.draw(0, 3).x
     for k in (0, 5):
-        np.testing.assert_allclose(written.gain_at(x, k), ROVER.gain_at(x, k), rtol=1e-14, atol=1e-16)
+        np.testing.assert_allclose(
+            written.gain_at(x, k), ROVER.gain_at(x, k), rtol=1e-14, atol=1e-16
+        )
         np.testing.assert_allclose(written.R_at(x, k), ROVER.R_at(x, k), rtol=1e-14)
     z = ROVER.draw(0, 2).z
     for label in ("iekf", "ckf_rts", "bootstrap"):
@@ -198,7 +218,9 @@ def test_a_model_by_formulas_is_the_one_in_python():
         np.testing.assert_allclose(means[1], means[0], atol=1e-9)
     assert not [one for one in check_component("rover", ROVER) if one.complaint]
     assert not Formulas(**WRITTEN | {"deviation": {"range": "b*k", "bearing": 0.02}}).R_by_state
-    assert Formulas(**WRITTEN | {"deviation": {"range": "b*k", "bearing": 0.02}}).R(3)[0, 0] == pytest.approx(0.04)
+    assert Formulas(**WRITTEN | {"deviation": {"range": "b*k", "bearing": 0.02}}).R(3)[
+        0, 0
+    ] == pytest.approx(0.04)
     assert ("deviation", "range") not in _numbers(written)
 
 
@@ -239,18 +261,28 @@ GROWING = Formulas(
 def quadrature(model, z):
     """Filtered means (K,) and log likelihood of a scalar model, by the trapezoidal rule on one grid of 1,201 points."""
     g = np.linspace(-9.0, 9.0, 1201)
-    Q, R = (np.broadcast_to(at(g[:, None], 0)[..., 0, 0], g.shape) for at in (model.Q_at, model.R_at))
-    kernel = np.exp(-0.5 * (g[:, None] - model.transition(g[:, None], 0)[:, 0]) ** 2 / Q) / np.sqrt(2 * np.pi * Q)
+    Q, R = (
+        np.broadcast_to(at(g[:, None], 0)[..., 0, 0], g.shape) for at in (model.Q_at, model.R_at)
+    )
+    kernel = np.exp(-0.5 * (g[:, None] - model.transition(g[:, None], 0)[:, 0]) ** 2 / Q) / np.sqrt(
+        2 * np.pi * Q
+    )
     p, step, total, means = np.exp(-0.5 * g**2) / np.sqrt(2 * np.pi), g[1] - g[0], 0.0, []
     for reading in z[:, 0]:
         p = kernel @ p * step
-        p *= np.exp(-0.5 * (reading - model.observe(g[:, None], 0)[:, 0]) ** 2 / R) / np.sqrt(2 * np.pi * R)
+        p *= np.exp(-0.5 * (reading - model.observe(g[:, None], 0)[:, 0]) ** 2 / R) / np.sqrt(
+            2 * np.pi * R
+        )
         total, p = total + np.log(p.sum() * step), p / (p.sum() * step)
         means.append(np.sum(g * p) * step)
     return np.array(means), total
 
 
-@pytest.mark.oracle("own second implementation: quadrature on one grid", "means and log likelihood by the grid", 1e-5)
+@pytest.mark.oracle(
+    "own second implementation: quadrature on one grid",
+    "means and log likelihood by the grid",
+    1e-5,
+)
 @pytest.mark.parametrize("model", [VOLATILITY, GROWING], ids=["stochastic volatility", "growing"])
 def test_grid_and_particles_agree_with_quadrature(model):
     z = model.draw(0, 2).z
@@ -263,7 +295,9 @@ def test_grid_and_particles_agree_with_quadrature(model):
         assert particles.log_likelihood[trial] == pytest.approx(total, abs=0.2)
 
 
-@pytest.mark.oracle("own second implementation: loops over an augmented state", "covariances at the truth", 1e-9)
+@pytest.mark.oracle(
+    "own second implementation: loops over an augmented state", "covariances at the truth", 1e-9
+)
 def test_the_bound_at_the_truth_takes_the_noise_of_the_true_states():
     paths = ROVER.draw(0, 1)
     P = PathBlock.draw(StateScenario(ROVER), 0, 1).bound[0]
@@ -271,14 +305,24 @@ def test_the_bound_at_the_truth_takes_the_noise_of_the_true_states():
     x = np.vstack([paths.start, paths.x[0]])
     for k in range(ROVER.count):
         _, moved, _ = augmented(
-            Taylor(), lambda x: ROVER.transition(x, 0), lambda x: ROVER.gain_at(x, 0), x[k], covariance
+            Taylor(),
+            lambda x: ROVER.transition(x, 0),
+            lambda x: ROVER.gain_at(x, 0),
+            x[k],
+            covariance,
         )
         _, S, C = augmented(
-            Taylor(), lambda x: ROVER.observe(x, 0), lambda x: np.sqrt(ROVER.R_at(x, 0)), x[k + 1], moved
+            Taylor(),
+            lambda x: ROVER.observe(x, 0),
+            lambda x: np.sqrt(ROVER.R_at(x, 0)),
+            x[k + 1],
+            moved,
         )
         covariance = moved - C @ np.linalg.inv(S) @ C.T
         assert_agrees(P[k], covariance, atol=1e-9)
-    with pytest.raises(ib.UserError, match="state_model=rover: R depends on the states; what takes R"):
+    with pytest.raises(
+        ib.UserError, match="state_model=rover: R depends on the states; what takes R"
+    ):
         posterior_bounds(ROVER, paths)
 
 
@@ -301,8 +345,14 @@ def test_what_takes_fixed_noise_refuses_before_any_work(tmp_path):
             {"next": WRITTEN["next"] | {"x": "x + sin(along)"}},
             r"next: depends on along by more than a factor; write FACTOR",
         ),
-        ({"deviation": {"range": "0.05 + c*x", "bearing": 0.02}}, r"deviation\.range: there is no such name"),
-        ({"deviation": {"range": -1, "bearing": 0.02}}, r"deviation\.range=-1: give a number from 0 up or a text"),
+        (
+            {"deviation": {"range": "0.05 + c*x", "bearing": 0.02}},
+            r"deviation\.range: there is no such name",
+        ),
+        (
+            {"deviation": {"range": -1, "bearing": 0.02}},
+            r"deviation\.range=-1: give a number from 0 up or a text",
+        ),
         ({"state_period": {"bearing": 6.0}}, r"state_period\.bearing: there is no such state|name"),
     ],
 )
@@ -316,8 +366,13 @@ def test_a_state_known_exactly_may_change_the_noise_all_the_same():
 
 
 def test_noise_without_a_value_at_the_mean_of_the_prior_is_refused():
-    for changes, what in (({"next": {"x": "x + w/x"}}, "Q"), ({"deviation": {"z": "sqrt(x - 1)"}}, "R")):
-        with pytest.raises(ib.UserError, match=f"{what} of epoch 1 is not finite at the mean of the prior"):
+    for changes, what in (
+        ({"next": {"x": "x + w/x"}}, "Q"),
+        ({"deviation": {"z": "sqrt(x - 1)"}}, "R"),
+    ):
+        with pytest.raises(
+            ib.UserError, match=f"{what} of epoch 1 is not finite at the mean of the prior"
+        ):
             StateScenario(Formulas(**SCALAR | changes))
 
 
@@ -332,7 +387,10 @@ def test_a_model_without_noise_is_refused():
     class Noiseless(ConstantVelocity):
         R = StateModel.R
 
-    with pytest.raises(ib.UserError, match=r"it has no R; write R\(k\), or R_at\(x, k\) if it depends on the states"):
+    with pytest.raises(
+        ib.UserError,
+        match=r"it has no R; write R\(k\), or R_at\(x, k\) if it depends on the states",
+    ):
         StateScenario(Noiseless())
 
 
@@ -349,7 +407,9 @@ TURNING = Formulas(
 """A vehicle that turns by 480 degrees."""
 
 
-@pytest.mark.parametrize("label", ["ekf", "iplf", "ukf_rts", "ieks", "ipls", "lm_ieks", "ipe_newton", "bootstrap"])
+@pytest.mark.parametrize(
+    "label", ["ekf", "iplf", "ukf_rts", "ieks", "ipls", "lm_ieks", "ipe_newton", "bootstrap"]
+)
 def test_a_heading_that_is_kept_within_half_a_turn_is_tracked_as_one_that_is_not(label):
     """Only the branch differs, of the heading's true path, its transition and what the compass shows."""
     wrapped = replace(
@@ -385,5 +445,7 @@ def test_a_transition_that_jumps_by_a_turn_is_told_to_state_its_period():
     assert len(found) == 1
     assert found[0].startswith("state 3 jumps by 6.28: it is an angle; state its period")
     assert (
-        Grid().hindrance(replace(VOLATILITY, state_period={"logvar": 1.0})).startswith("has no place for a state that")
+        Grid()
+        .hindrance(replace(VOLATILITY, state_period={"logvar": 1.0}))
+        .startswith("has no place for a state that")
     )

@@ -37,8 +37,13 @@ LINEAR = ConstantVelocity(count=12, spread=2.0)
 def unknowns(model, start, x):
     """Start and process noises of paths (K, n) in their own deviations, for a diagonal prior and square gains."""
     before = np.vstack([start, x[:-1]])
-    noise = [np.linalg.solve(model.gain(k), x[k] - model.transition(before[k], k)) for k in range(model.epochs)]
-    return np.concatenate([(start - model.prior.mean) / np.sqrt(np.diag(model.prior.covariance)), *noise])
+    noise = [
+        np.linalg.solve(model.gain(k), x[k] - model.transition(before[k], k))
+        for k in range(model.epochs)
+    ]
+    return np.concatenate(
+        [(start - model.prior.mean) / np.sqrt(np.diag(model.prior.covariance)), *noise]
+    )
 
 
 def run(model, u):
@@ -46,7 +51,9 @@ def run(model, u):
     x = [model.prior.mean + np.sqrt(np.diag(model.prior.covariance)) * u[: model.n]]
     for k, w in enumerate(u[model.n :].reshape(model.epochs, -1)):
         x.append(model.transition(x[-1], k) + model.gain(k) @ w)
-    read = [model.observe(x[k + 1], k)[..., 0] / np.sqrt(model.R(k)[0, 0]) for k in range(model.epochs)]
+    read = [
+        model.observe(x[k + 1], k)[..., 0] / np.sqrt(model.R(k)[0, 0]) for k in range(model.epochs)
+    ]
     return np.array(x), np.array(read)
 
 
@@ -57,7 +64,9 @@ def test_levenberg_and_marquardt_find_the_minimum_that_halved_steps_find():
     other = IteratedSmoother(ukf(), Taylor(), 50, damped=True, tolerance=1e-10).track(NEAR, z)
     np.testing.assert_allclose(found.mean, other.mean, atol=1e-7)
     np.testing.assert_allclose(found.covariance, other.covariance, rtol=1e-5)
-    np.testing.assert_allclose(found.cost, path_cost(NEAR, z, other.start.mean, other.mean), rtol=1e-9)
+    np.testing.assert_allclose(
+        found.cost, path_cost(NEAR, z, other.start.mean, other.mean), rtol=1e-9
+    )
     assert (found.status == Status.CONVERGED).all()
 
 
@@ -74,9 +83,14 @@ def test_a_damped_step_reads_every_state_once_more():
         H[k, n * (k + 1)] = 1.0
     prior = np.zeros((n * (K + 1),) * 2)
     prior[:n, :n] = np.linalg.inv(LINEAR.prior.covariance)
-    free = prior + D.T @ np.kron(np.eye(K), np.linalg.inv(LINEAR.Q(0))) @ D + H.T @ H / LINEAR.R(0)[0, 0]
+    free = (
+        prior
+        + D.T @ np.kron(np.eye(K), np.linalg.inv(LINEAR.Q(0))) @ D
+        + H.T @ H / LINEAR.R(0)[0, 0]
+    )
     exact = np.linalg.solve(
-        free + np.diag(1 / variances.ravel()), H.T @ z.ravel() / LINEAR.R(0)[0, 0] + (about / variances).ravel()
+        free + np.diag(1 / variances.ravel()),
+        H.T @ z.ravel() / LINEAR.R(0)[0, 0] + (about / variances).ravel(),
     )
     affine = _linearised(LINEAR, z, about)
     mean, _ = whole(smoothed(LINEAR, _passed(LINEAR, z, *affine, about=(about, variances))))
@@ -85,8 +99,12 @@ def test_a_damped_step_reads_every_state_once_more():
 
 def bearings(scale):
     """`bearings_only`, its target unknown by so many multiples."""
-    model = construct(next(o for o in options("state_model") if o.name == "bearings_only").config, "state_model")
-    return replace(model, spread={name: scale * float(value) for name, value in model.spread.items()})
+    model = construct(
+        next(o for o in options("state_model") if o.name == "bearings_only").config, "state_model"
+    )
+    return replace(
+        model, spread={name: scale * float(value) for name, value in model.spread.items()}
+    )
 
 
 def test_a_damped_step_is_the_same_in_any_unit_of_the_states():
@@ -114,7 +132,9 @@ def test_a_damped_step_is_the_same_in_any_unit_of_the_states():
     for model in (NEAR, Scaled(count=25, start=(1.0, 0.0), spread=0.2)):
         z = NEAR.draw(0, 4).z
         paths = _Paths.of(model, z, smoothed(model, filtered(model, z, Taylor())))
-        steps.append(LevenbergMarquardtSmoother()._stepped(model, z, replace(paths, damping=np.ones(4))))
+        steps.append(
+            LevenbergMarquardtSmoother()._stepped(model, z, replace(paths, damping=np.ones(4)))
+        )
     np.testing.assert_allclose(steps[1].x / sizes, steps[0].x, atol=1e-9)
     np.testing.assert_allclose(steps[1].cost, steps[0].cost, rtol=1e-9)
 
@@ -137,7 +157,9 @@ def test_further_starts_are_draws_of_the_prior_with_half_its_deviations():
     model = ConstantVelocity(count=2, spread=2.0, deviation=1e6)
     z = model.draw(0, 400).z
     drawn = LevenbergMarquardtSmoother(starts=1)._drawn(model, z)
-    np.testing.assert_allclose(drawn.P[:, 0], np.broadcast_to(4.0 / 4 * np.eye(2), (400, 2, 2)), atol=1e-6)
+    np.testing.assert_allclose(
+        drawn.P[:, 0], np.broadcast_to(4.0 / 4 * np.eye(2), (400, 2, 2)), atol=1e-6
+    )
     np.testing.assert_allclose(drawn.x[:, 0].std(axis=0), 2.0, rtol=5 / np.sqrt(800))
 
 
@@ -149,7 +171,10 @@ def test_a_state_that_comes_round_is_followed_next_to_its_path():
         def state_periods(self):
             return 2 * np.pi, 0.0
 
-    model, x = Heading(count=3), Normal(np.array([[3.0, 0.5], [3.0, -9.0]]), np.array([np.eye(2)] * 2))
+    model, x = (
+        Heading(count=3),
+        Normal(np.array([[3.0, 0.5], [3.0, -9.0]]), np.array([np.eye(2)] * 2)),
+    )
     turns = np.array([[2 * np.pi, 0.0], [-6 * np.pi, 0.0]])
     to = model.transition(x.mean, 0) + turns + [0.4, 30.0]
     for rule in (Taylor(), Cubature()):
@@ -161,7 +186,9 @@ def test_a_state_that_comes_round_is_followed_next_to_its_path():
 @pytest.mark.slow
 def test_levenberg_and_marquardt_hold_targets_that_filters_lose():
     block = PathBlock.draw(StateScenario(bearings(30.0), seed=1), 0, 12)
-    filtered, kept = (block.estimate(tracker)[1] for tracker in (ekf(), LevenbergMarquardtSmoother()))
+    filtered, kept = (
+        block.estimate(tracker)[1] for tracker in (ekf(), LevenbergMarquardtSmoother())
+    )
     assert not filtered["success"].all()
     assert kept["success"].all()
     assert (kept["fit_p"] > 1e-3).all()
@@ -209,13 +236,18 @@ def test_eq_11_of_a_linear_path_is_its_smoother(method, singular):
     assert (found.iterations == 0).all()  # the linear estimate is the root
 
 
-@pytest.mark.oracle("own second implementation: eq. (11) by dense matrices", "what is left of the equation", 1e-6)
+@pytest.mark.oracle(
+    "own second implementation: eq. (11) by dense matrices", "what is left of the equation", 1e-6
+)
 def test_the_root_of_eq_11_and_its_covariance_are_those_of_a_dense_solution():
     z, n = NEAR.draw(0, 2).z, NEAR.n
     N = n * (NEAR.epochs + 1)
     A = approx_derivative(lambda u: run(NEAR, u)[1], np.zeros(N), method="3-point", rel_step=1e-5)
     H_plus = np.linalg.pinv(np.vstack([np.eye(N), A]))
-    tracks = {method: PathIPE(method, tolerance=1e-9).track(NEAR, z) for method in ("fixed_point", "newton")}
+    tracks = {
+        method: PathIPE(method, tolerance=1e-9).track(NEAR, z)
+        for method in ("fixed_point", "newton")
+    }
     for found in tracks.values():
         assert (found.status == Status.CONVERGED).all()
         np.testing.assert_allclose(found.mean, tracks["newton"].mean, atol=1e-7)

@@ -90,7 +90,13 @@ CASES = {
         G0=((1.0,), (0.5,), (0.25,)), G=((0.0,), (0.0,), (0.5,)), H=((1.0, 0.0, 0.0),), mean=(0.0, 1.0, 2.0),
     ),
 }  # fmt: skip
-FILTERS = {"ekf": ekf(), "ukf": ukf(), "ckf": ckf(), "ghkf": Filter(GaussHermite(2)), "iplf": Filter(Cubature(), 3)}
+FILTERS = {
+    "ekf": ekf(),
+    "ukf": ukf(),
+    "ckf": ckf(),
+    "ghkf": Filter(GaussHermite(2)),
+    "iplf": Filter(Cubature(), 3),
+}
 SMOOTHERS = {name: Smoother(tracker) for name, tracker in FILTERS.items()} | {
     "ieks": IteratedSmoother(ekf(), Taylor(), 4),
     "damped": IteratedSmoother(ukf(), Taylor(), 4, damped=True),
@@ -129,7 +135,8 @@ def exact(model, z):
 
     def each(distributions):
         parts = [
-            (m[i : i + n], P[i : i + n, i : i + n]) for i, (m, P) in zip(range(0, K * n, n), distributions, strict=True)
+            (m[i : i + n], P[i : i + n, i : i + n])
+            for i, (m, P) in zip(range(0, K * n, n), distributions, strict=True)
         ]
         return [np.array(part, dtype=float) for part in zip(*parts, strict=True)]
 
@@ -176,14 +183,18 @@ class Known(CoordinatedTurn):
         return Normal(m, np.diag([*np.diagonal(P)[:4], self.known]))
 
 
-@pytest.mark.parametrize("walk", [pytest.param(1.75e-4, marks=pytest.mark.slow), 0.0], ids=["walks", "constant"])
+@pytest.mark.parametrize(
+    "walk", [pytest.param(1.75e-4, marks=pytest.mark.slow), 0.0], ids=["walks", "constant"]
+)
 @pytest.mark.parametrize("tracker", [ukf(), *SMOOTHERS.values()], ids=["ukf", *SMOOTHERS])
 def test_a_rate_known_exactly_is_the_limit_of_a_rate_known_well(tracker, walk):
     known, nearly = (Known(count=25, walk=walk, known=variance) for variance in (0.0, 1e-20))
     paths = known.draw(0, 6)
     whole, limit = tracker.track(known, paths.z), tracker.track(nearly, paths.z)
     size = np.sqrt(np.diagonal(limit.covariance, axis1=2, axis2=3))
-    far = 1e-3 if tracker is not SMOOTHERS["damped"] else 0.05  # whose steps are halved at discrete points
+    far = (
+        1e-3 if tracker is not SMOOTHERS["damped"] else 0.05
+    )  # whose steps are halved at discrete points
     assert np.abs((whole.mean - limit.mean) / np.where(size > 1e-9, size, 1.0)).max() < far
     assert np.array_equal(tracker.track(known, paths.z[2:3]).mean, whole.mean[2:3])
 
@@ -191,7 +202,10 @@ def test_a_rate_known_exactly_is_the_limit_of_a_rate_known_well(tracker, walk):
 def test_damped_steps_keep_to_paths_that_the_process_noise_reaches():
     model = Known(count=25, walk=0.0, known=1e-2)
     paths = model.draw(0, 8)
-    found = {damped: IteratedSmoother(ekf(), Taylor(), 15, damped).track(model, paths.z) for damped in (False, True)}
+    found = {
+        damped: IteratedSmoother(ekf(), Taylor(), 15, damped).track(model, paths.z)
+        for damped in (False, True)
+    }
     cost = {damped: path_cost(model, paths.z, t.start.mean, t.mean) for damped, t in found.items()}
     assert np.isfinite(cost[True]).all()
     assert (cost[True] <= cost[False] * (1 + 1e-9)).all()
@@ -210,7 +224,9 @@ def test_bounds_exist_where_the_start_is_known():
     paths = model.draw(0, 3)
     filtered, smoothed = posterior_bounds(model, paths)
     np.testing.assert_allclose(filtered, ekf().track(model, paths.z).covariance[0], rtol=1e-10)
-    np.testing.assert_allclose(smoothed, Smoother(ekf()).track(model, paths.z).covariance[0], rtol=1e-10)
+    np.testing.assert_allclose(
+        smoothed, Smoother(ekf()).track(model, paths.z).covariance[0], rtol=1e-10
+    )
 
 
 def test_particles_of_known_states_stand_on_them():
@@ -228,10 +244,15 @@ class ExactLater(Linear):
 
 
 def test_a_product_rule_of_too_many_points_is_refused():
-    with pytest.raises(ib.UserError, match=r"order=3: 3\^22 points for 22 states; choose the rule Cubature"):
+    with pytest.raises(
+        ib.UserError, match=r"order=3: 3\^22 points for 22 states; choose the rule Cubature"
+    ):
         GaussHermite(3).points(22)
 
 
 def test_exact_readings_are_refused():
-    with pytest.raises(ib.UserError, match="R of epoch 3 is singular; give every reading a standard deviation above 0"):
+    with pytest.raises(
+        ib.UserError,
+        match="R of epoch 3 is singular; give every reading a standard deviation above 0",
+    ):
         StateScenario(ExactLater())

@@ -53,7 +53,9 @@ NEAR = Pendulum(count=60, start=(1.0, 0.0), spread=0.1)
 @pytest.fixture(scope="module")
 def stored():
     """The book's path (1, 500, 2) and readings (1, 500, 1)."""
-    rows = np.loadtxt(Path(ipe_bench.states.__file__).with_name("pendulum.csv"), delimiter=",", skiprows=1)
+    rows = np.loadtxt(
+        Path(ipe_bench.states.__file__).with_name("pendulum.csv"), delimiter=",", skiprows=1
+    )
     return rows[None, :, 1:3], rows[None, :, 3:]
 
 
@@ -65,7 +67,9 @@ DEAR = ("IEKF", "IPLF")
     "RMSE of the pendulum's angle by six filters and their smoothers, rad",
     1e-12,
 )
-@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow if n in DEAR else ()) for n in BOOK])
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow if n in DEAR else ()) for n in BOOK]
+)
 def test_the_twelve_figures_of_the_book(name, stored):
     (rule, iterations, filtered, smoothed), (x, z) = BOOK[name], stored
     first = Filter(rule, iterations)
@@ -75,12 +79,16 @@ def test_the_twelve_figures_of_the_book(name, stored):
         assert_agrees(np.sqrt(np.mean(error[..., 0] ** 2)), figure, atol=1e-12)
 
 
-@pytest.mark.oracle("library: filterpy's CubatureKalmanFilter, with its points drawn again", "means", 1e-10)
+@pytest.mark.oracle(
+    "library: filterpy's CubatureKalmanFilter, with its points drawn again", "means", 1e-10
+)
 def test_filterpy_s_cubature_filter_passes_points_on_that_do_not_carry_the_process_noise(stored):
     model, (_, z) = Pendulum(), stored
     means = {}
     for redrawn in (False, True):
-        theirs = CubatureKalmanFilter(2, 1, model.step, lambda x: model.observe(x, 0), _moved(model))
+        theirs = CubatureKalmanFilter(
+            2, 1, model.step, lambda x: model.observe(x, 0), _moved(model)
+        )
         theirs.x, theirs.P, theirs.Q, theirs.R = np.zeros((2, 1)), np.eye(2), model.Q(0), model.R(0)
         path = []
         for reading in z[0]:
@@ -130,9 +138,15 @@ class Walk(ConstantVelocity):
         return np.array([[0.0], [0.3]])
 
 
-@pytest.mark.oracle("closed form: conditional means by one dense solve", "means and covariances of states", 1e-8)
-@pytest.mark.parametrize("model", [ConstantVelocity(count=20, spread=2.0), Walk()], ids=lambda m: m.name)
-@pytest.mark.parametrize("rule", [Taylor(), Cubature(), Unscented(), GaussHermite(2)], ids=lambda r: type(r).__name__)
+@pytest.mark.oracle(
+    "closed form: conditional means by one dense solve", "means and covariances of states", 1e-8
+)
+@pytest.mark.parametrize(
+    "model", [ConstantVelocity(count=20, spread=2.0), Walk()], ids=lambda m: m.name
+)
+@pytest.mark.parametrize(
+    "rule", [Taylor(), Cubature(), Unscented(), GaussHermite(2)], ids=lambda r: type(r).__name__
+)
 def test_linear_models_have_their_closed_form_by_every_rule(model, rule):
     z = model.draw(0, 3).z
     filtered, smoothed = Filter(rule).track(model, z), Smoother(Filter(rule)).track(model, z)
@@ -160,14 +174,21 @@ def test_the_damped_gauss_newton_smoother_finds_the_path_of_a_dense_solver():
     start = np.concatenate([NEAR.prior.mean, Smoother(ukf()).track(NEAR, z).mean.ravel()])
     found = least_squares(residual, start, method="lm", xtol=1e-14, ftol=1e-14, gtol=1e-14)
     assert_agrees(track.mean[0], found.x.reshape(-1, 2)[1:], atol=1e-7)
-    assert path_cost(NEAR, z, track.start.mean, track.mean)[0] == pytest.approx(2 * found.cost, rel=1e-12)
+    assert path_cost(NEAR, z, track.start.mean, track.mean)[0] == pytest.approx(
+        2 * found.cost, rel=1e-12
+    )
 
 
-@pytest.mark.oracle("closed form: mean slope of a sine over a normal law", "slopes of ghkf and ukf at 2 rad", 1e-9)
+@pytest.mark.oracle(
+    "closed form: mean slope of a sine over a normal law", "slopes of ghkf and ukf at 2 rad", 1e-9
+)
 def test_an_unscented_slope_has_the_wrong_sign_where_the_prior_spans_the_sine():
     """exp(-P / 2) is .14 for a deviation of 2 rad; two points at the root of 3 deviations have sin(a) / a, -.09."""
     m, P = np.zeros((1, 2)), np.diag([4.0, 1.0])[None]
-    slopes = [rule.linearise(lambda x: np.sin(x[..., :1]), m, P).A[0, 0, 0] for rule in (GaussHermite(30), ukf().rule)]
+    slopes = [
+        rule.linearise(lambda x: np.sin(x[..., :1]), m, P).A[0, 0, 0]
+        for rule in (GaussHermite(30), ukf().rule)
+    ]
     assert_agrees(slopes, [np.exp(-2.0), np.sin(np.sqrt(12.0)) / np.sqrt(12.0)], atol=1e-9)
 
 
@@ -183,15 +204,20 @@ def test_missing_readings_are_as_if_they_had_never_been_taken(rule):
     assert tracks.nis[0, 10:30].max() == 0.0
     x = Normal(before.mean[0, -1], before.covariance[0, -1])
     for k in range(10, 30):  # the prediction alone
-        move = rule.linearise(lambda at, k=k: ahead.transition(at, k), x.mean[None], x.covariance[None])
+        move = rule.linearise(
+            lambda at, k=k: ahead.transition(at, k), x.mean[None], x.covariance[None]
+        )
         x = Normal(
-            (move.A @ x.mean + move.b)[0], (move.A @ x.covariance @ move.A.swapaxes(1, 2) + move.W)[0] + NEAR.Q(k)
+            (move.A @ x.mean + move.b)[0],
+            (move.A @ x.covariance @ move.A.swapaxes(1, 2) + move.W)[0] + NEAR.Q(k),
         )
     np.testing.assert_allclose(tracks.mean[0, 29], x.mean, atol=1e-12)
     np.testing.assert_allclose(tracks.covariance[0, 29], x.covariance, atol=1e-12)
 
 
-@pytest.mark.parametrize("rule", [Cubature(), Unscented(kappa=0.0), GaussHermite(2)], ids=lambda r: type(r).__name__)
+@pytest.mark.parametrize(
+    "rule", [Cubature(), Unscented(kappa=0.0), GaussHermite(2)], ids=lambda r: type(r).__name__
+)
 @pytest.mark.parametrize("m", [0.0, 1.0, 3.0, -3.1])
 def test_points_of_an_angle_lie_about_that_of_their_centre(rule, m):
     """Two points .6 of half a turn to either side: next to each other they would be .8 of half a turn apart."""
@@ -201,7 +227,9 @@ def test_points_of_an_angle_lie_about_that_of_their_centre(rule, m):
 
     P = np.array([[[(0.6 * np.pi) ** 2]]])
     found = rule.linearise(wrapped, np.array([[m]]), P, lambda y, to: to + wrapped(y - to))
-    np.testing.assert_allclose([found.A[0, 0, 0], found.b[0, 0], found.W[0, 0, 0]], [1.0, 0.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(
+        [found.A[0, 0, 0], found.b[0, 0], found.W[0, 0, 0]], [1.0, 0.0, 0.0], atol=1e-9
+    )
 
 
 def test_bearings_come_round():
@@ -210,7 +238,9 @@ def test_bearings_come_round():
     paths = model.draw(0, 40)
     angle = np.arctan2(paths.x[..., 2], paths.x[..., 0])
     assert (np.abs(np.diff(angle, axis=1)) > np.pi).any()
-    bound = np.sqrt(np.median(np.einsum("tkii->tki", bound_at_truth(model, paths))[..., [0, 2]].sum(axis=-1)))
+    bound = np.sqrt(
+        np.median(np.einsum("tkii->tki", bound_at_truth(model, paths))[..., [0, 2]].sum(axis=-1))
+    )
     for tracker in (ukf(), ckf()):
         error = tracker.track(model, paths.z).mean - paths.x
         assert np.median(np.hypot(error[..., 0], error[..., 2])) < 2 * bound
@@ -260,9 +290,13 @@ class Sharp(Scalar):
     "means and covariances, in standard deviations",
     1e-10,
 )
-@pytest.mark.parametrize("rule", [Taylor(), Unscented(), Unscented(0.0, 0.5, 2.0)], ids=["ekf", "ukf", "scaled"])
 @pytest.mark.parametrize(
-    "model", [NEAR, ConstantVelocity(count=40), CoordinatedTurn(count=50), Scalar(False)], ids=lambda m: m.name
+    "rule", [Taylor(), Unscented(), Unscented(0.0, 0.5, 2.0)], ids=["ekf", "ukf", "scaled"]
+)
+@pytest.mark.parametrize(
+    "model",
+    [NEAR, ConstantVelocity(count=40), CoordinatedTurn(count=50), Scalar(False)],
+    ids=lambda m: m.name,
 )
 def test_filterpy_has_the_same_tracks(model, rule):
     z = model.draw(0, 4).z
@@ -275,7 +309,9 @@ def test_filterpy_has_the_same_tracks(model, rule):
         scaled = (other.covariance - one.covariance) / (size[..., None] * size[..., None, :])
         assert_agrees(scaled, 0.0, atol=1e-10)
         for name in ("nis", "innovations", "degrees", "log_likelihood"):
-            np.testing.assert_allclose(getattr(other, name), getattr(one, name), rtol=1e-10, atol=1e-10)
+            np.testing.assert_allclose(
+                getattr(other, name), getattr(one, name), rtol=1e-10, atol=1e-10
+            )
 
 
 @pytest.mark.parametrize("moved_first", [True, False])
@@ -303,7 +339,10 @@ def test_an_iterated_update_is_the_most_probable_state_after_a_reading():
         root = np.linalg.inv(np.linalg.cholesky(P[trial]))
 
         def misfits(x, trial=trial, root=root):
-            return [*(root @ (x - m[trial])), (z[trial, 0, 0] - np.sin(x[0])) / np.sqrt(model.variance)]
+            return [
+                *(root @ (x - m[trial])),
+                (z[trial, 0, 0] - np.sin(x[0])) / np.sqrt(model.variance),
+            ]
 
         found = least_squares(misfits, m[trial], xtol=1e-14, ftol=1e-14, gtol=1e-14).x
         np.testing.assert_allclose(tracks.mean[trial, 0], found, atol=1e-5)
@@ -335,7 +374,8 @@ def test_a_grid_refuses_what_it_cannot_be_exact_for():
     growth = Growth(count=20)
     assert "is exact for one state, and pendulum has 2" in Grid().hindrance(NEAR)
     with pytest.raises(
-        ib.UserError, match=r"trackers\.grid: its points are farther apart than process noise reaches"
+        ib.UserError,
+        match=r"trackers\.grid: its points are farther apart than process noise reaches",
     ) as refused:
         ib.run(growth, {"grid": Grid(300)}, 3)
     needed = int(str(refused.value).rpartition("=")[2])
@@ -371,12 +411,20 @@ def test_the_bounds_of_a_linear_model_are_its_covariances():
     paths = model.draw(0, 5)
     filtered, smoothed = posterior_bounds(model, paths)
     np.testing.assert_allclose(filtered, ekf().track(model, paths.z).covariance[0], rtol=1e-9)
-    np.testing.assert_allclose(smoothed, Smoother(ekf()).track(model, paths.z).covariance[0], rtol=1e-9)
+    np.testing.assert_allclose(
+        smoothed, Smoother(ekf()).track(model, paths.z).covariance[0], rtol=1e-9
+    )
     np.testing.assert_allclose(bound_at_truth(model, paths)[2], filtered, rtol=1e-9)
 
 
-@pytest.mark.oracle("own second implementation: information matrix of whole paths", "posterior Cramér-Rao bounds", 1e-6)
-@pytest.mark.parametrize("model", [Pendulum(count=12), Growth(count=12)], ids=lambda model: model.name)
+@pytest.mark.oracle(
+    "own second implementation: information matrix of whole paths",
+    "posterior Cramér-Rao bounds",
+    1e-6,
+)
+@pytest.mark.parametrize(
+    "model", [Pendulum(count=12), Growth(count=12)], ids=lambda model: model.name
+)
 def test_the_posterior_bound_is_the_inverse_of_the_information_of_whole_paths(model):
     """The second derivatives of the log density, one matrix for all epochs up to each, by differences of slopes."""
     paths, n = model.draw(0, 40), model.n
@@ -389,8 +437,12 @@ def test_the_posterior_bound_is_the_inverse_of_the_information_of_whole_paths(mo
             here, there = slice(n * k, n * (k + 1)), slice(n * (k + 1), n * (k + 2))
             Q, R = np.linalg.inv(model.Q(k)), np.linalg.inv(model.R(k))
             for before, after in zip(path[:, k], path[:, k + 1], strict=True):
-                F = approx_derivative(lambda x, k=k: model.transition(x, k), before, method="cs").reshape(n, n)
-                H = approx_derivative(lambda x, k=k: model.observe(x, k), after, method="cs").reshape(-1, n)
+                F = approx_derivative(
+                    lambda x, k=k: model.transition(x, k), before, method="cs"
+                ).reshape(n, n)
+                H = approx_derivative(
+                    lambda x, k=k: model.observe(x, k), after, method="cs"
+                ).reshape(-1, n)
                 D = np.hstack([-F, np.eye(n)])
                 rows = np.r_[here, there]
                 total[np.ix_(rows, rows)] += D.T @ Q @ D / len(path)

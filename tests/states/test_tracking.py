@@ -18,7 +18,17 @@ from ipe_bench.cli.words import read
 from ipe_bench.plugins.construct import construct
 from ipe_bench.plugins.discovery import composed, options
 from ipe_bench.report.page.headline import headline
-from ipe_bench.states import Bootstrap, Cubature, Formulas, IteratedSmoother, Smoother, Tracker, ckf, ekf, ukf
+from ipe_bench.states import (
+    Bootstrap,
+    Cubature,
+    Formulas,
+    IteratedSmoother,
+    Smoother,
+    Tracker,
+    ckf,
+    ekf,
+    ukf,
+)
 from ipe_bench.states.algebra import root
 from ipe_bench.statistics import analyse
 from ipe_bench.statistics.certified import published_table
@@ -29,7 +39,9 @@ LINEAR = ConstantVelocity(count=30, spread=3.0)
 
 
 def row(table, estimator, parameter="all"):
-    (found,) = table[(table["estimator"] == estimator) & (table["parameter"] == parameter)].to_dict("records")
+    (found,) = table[(table["estimator"] == estimator) & (table["parameter"] == parameter)].to_dict(
+        "records"
+    )
     return found
 
 
@@ -46,23 +58,42 @@ def test_a_run_says_what_direct_computation_says(tmp_path):
         assert found["path_rmse"] == pytest.approx(np.sqrt(np.mean(e[..., 0] ** 2)), rel=1e-12)
         assert found["rmse"] == pytest.approx(np.sqrt(np.mean(e[:, -1, 0] ** 2)), rel=1e-12)
         assert found["path_nees"] == pytest.approx(nees.mean() / 2, rel=1e-9)
-        assert found["nees"] == pytest.approx(np.mean(e[:, -1, 0] ** 2 / tracks.covariance[:, -1, 0, 0]), rel=1e-9)
+        assert found["nees"] == pytest.approx(
+            np.mean(e[:, -1, 0] ** 2 / tracks.covariance[:, -1, 0, 0]), rel=1e-9
+        )
         curve = analyse([tmp_path]).tracks.query(f"estimator == '{label}' and parameter == 'rate'")
-        np.testing.assert_allclose(curve["rmse"], np.sqrt(np.mean(e[..., 1] ** 2, axis=0)), rtol=1e-12)
+        np.testing.assert_allclose(
+            curve["rmse"], np.sqrt(np.mean(e[..., 1] ** 2, axis=0)), rtol=1e-12
+        )
         np.testing.assert_allclose(curve["nees"], nees.mean(axis=0) / 2, rtol=1e-9)
         np.testing.assert_array_equal(curve["at"], model.times)
     tracks = ekf().track(model, paths.z)
     assert row(table, "ekf")["path_nis"] == pytest.approx(tracks.nis.mean(), rel=1e-12)
-    assert row(table, "ekf")["log_likelihood"] == pytest.approx(tracks.log_likelihood.mean(), rel=1e-12)
+    assert row(table, "ekf")["log_likelihood"] == pytest.approx(
+        tracks.log_likelihood.mean(), rel=1e-12
+    )
     assert np.isnan(row(table, "rts")["path_nis"])
 
 
 def test_a_sweep_of_states_opens_with_a_row_per_tracker(tmp_path):
     for scale in (1.0, 10.0):
-        ib.run(StateScenario(LINEAR, error_scale=scale), {"ekf": ekf(), "ukf": ukf()}, 40, output=tmp_path)
+        ib.run(
+            StateScenario(LINEAR, error_scale=scale),
+            {"ekf": ekf(), "ukf": ukf()},
+            40,
+            output=tmp_path,
+        )
     limits: Any = headline(analyse([tmp_path]))[-1]
-    assert [[cell.text for cell in row][:3] for row in limits.rows] == [["ekf", "10", "10"], ["ukf", "10", "10"]]
-    ib.run(ib.Scenario(ib.measurements.Polynomial()), {"newton": ib.solvers.Newton()}, 5, output=tmp_path)
+    assert [[cell.text for cell in row][:3] for row in limits.rows] == [
+        ["ekf", "10", "10"],
+        ["ukf", "10", "10"],
+    ]
+    ib.run(
+        ib.Scenario(ib.measurements.Polynomial()),
+        {"newton": ib.solvers.Newton()},
+        5,
+        output=tmp_path,
+    )
     ranked, *_, limits = headline(analyse([tmp_path]))
     assert "newton" in str(ranked)
     assert len(limits) == 2
@@ -103,14 +134,18 @@ def test_the_kalman_filter_attains_both_bounds_on_its_own_model():
         for column in ("van_trees", "bayes_bound", "linear_bound", "reported"):
             assert one[column] == pytest.approx(np.sqrt(P[-1, i, i]), rel=1e-8)
         assert one["path_bound"] == pytest.approx(np.sqrt(P[:, i, i].mean()), rel=1e-8)
-        assert row(table, "rts", name)["path_bound"] == pytest.approx(np.sqrt(smoothed[:, i, i].mean()), rel=1e-8)
+        assert row(table, "rts", name)["path_bound"] == pytest.approx(
+            np.sqrt(smoothed[:, i, i].mean()), rel=1e-8
+        )
 
 
 def test_an_error_scale_widens_the_prior_of_truth_and_trackers(tmp_path):
     trackers = {"ckf": ckf(), "rts": Smoother(ekf())}
     for scale, name in ((1.0, "one"), (3.0, "three")):
         ib.run(LINEAR, trackers, 20, error_scale=scale, output=tmp_path / name)
-        ib.run(replace(LINEAR, spread=3.0 * scale), trackers, 20, output=tmp_path / f"{name} written")
+        ib.run(
+            replace(LINEAR, spread=3.0 * scale), trackers, 20, output=tmp_path / f"{name} written"
+        )
         one, other = (ib.load(tmp_path / each) for each in (name, f"{name} written"))
         drop = ["time_s", "error_scale", "spread"]
         frames = [each.drop(columns=drop, errors="ignore") for each in (one, other)]
@@ -118,10 +153,15 @@ def test_an_error_scale_widens_the_prior_of_truth_and_trackers(tmp_path):
     both = [StateScenario(LINEAR, error_scale=scale) for scale in (1.0, 3.0)]
     table = ib.run(both, trackers, 20)
     assert sorted(table["error_scale"].unique()) == [1.0, 3.0]
-    stored = construct(composed(next(o for o in options("state_model") if o.name == "pendulum_book")), "state_model")
+    stored = construct(
+        composed(next(o for o in options("state_model") if o.name == "pendulum_book")),
+        "state_model",
+    )
     with pytest.raises(ib.UserError, match=r"error_scale=10: state_model=.* has stored paths"):
         StateScenario(stored, error_scale=10.0)
-    with pytest.raises(ib.UserError, match="error_scale=: is part of the state model or its scenario"):
+    with pytest.raises(
+        ib.UserError, match="error_scale=: is part of the state model or its scenario"
+    ):
         ib.run(both[0], trackers, 3, error_scale=2.0)
 
 
@@ -148,7 +188,11 @@ def test_only_the_states_that_are_named_are_scored():
 def test_trackers_that_are_named_are_all_that_an_experiment_runs():
     def chosen(*more):
         with session():
-            return jobs_of(read("run", ["+experiment=states", *more]), multirun=True).specs[0].estimators
+            return (
+                jobs_of(read("run", ["+experiment=states", *more]), multirun=True)
+                .specs[0]
+                .estimators
+            )
 
     assert list(chosen("tracker=[ekf,ipls]")) == ["ekf", "ipls"]
     assert len(chosen()) == 10
@@ -169,7 +213,11 @@ class Deceived(Tracker):
 def test_innovations_are_white_where_the_filter_is_right_and_nowhere_else(tmp_path):
     table = ib.run(
         StateScenario(LINEAR),
-        {"kf": ekf(), "told": Deceived(replace(LINEAR, density=0.05 * LINEAR.density)), "rts": Smoother(ekf())},
+        {
+            "kf": ekf(),
+            "told": Deceived(replace(LINEAR, density=0.05 * LINEAR.density)),
+            "rts": Smoother(ekf()),
+        },
         600,
         output=tmp_path,
     )
@@ -194,7 +242,11 @@ def test_blocks_and_further_trials_change_no_trial(tmp_path):
     order = ["estimator", "trial"]
     assert "log_likelihood" in parts.columns
     assert not [name for name in parts.columns if "curves" in name]
-    assert parts.sort_values(order).reset_index(drop=True).equals(whole.sort_values(order).reset_index(drop=True))
+    assert (
+        parts.sort_values(order)
+        .reset_index(drop=True)
+        .equals(whole.sort_values(order).reset_index(drop=True))
+    )
 
 
 @dataclass(frozen=True)
@@ -214,13 +266,20 @@ def test_a_tracker_that_fails_in_one_trial_fails_in_that_alone():
     paths.z[2, 9], paths.z[4, 9] = 1e6, -1e6
     block = PathBlock(StateScenario(LINEAR), 0, paths)
     estimates, columns = block.estimate(Brittle())
-    assert columns["status"].tolist() == ["converged"] * 2 + ["error", "converged", "nonfinite", "converged"]
+    assert columns["status"].tolist() == ["converged"] * 2 + [
+        "error",
+        "converged",
+        "nonfinite",
+        "converged",
+    ]
     assert "a reading is beyond 1e5" in columns["message"][2]
     assert columns["message"][4] == "the track is not finite from epoch 6 on"
     alone = ekf().track(LINEAR, paths.z)
     np.testing.assert_array_equal(estimates.x[[0, 1, 3, 5]], alone.mean[[0, 1, 3, 5], -1])
     assert columns["success"].tolist() == [True, True, False, True, False, True]
-    np.testing.assert_array_equal(columns["first_bad_epoch"], [np.nan, np.nan, 1, np.nan, 6, np.nan])
+    np.testing.assert_array_equal(
+        columns["first_bad_epoch"], [np.nan, np.nan, 1, np.nan, 6, np.nan]
+    )
 
 
 @dataclass(frozen=True)
@@ -240,7 +299,12 @@ class Astray(Tracker):
 
 @pytest.mark.parametrize(
     ("where", "by", "success"),
-    [(slice(4, 5), 25.0, True), (slice(4, 5), 30.0, False), (slice(None), 5.0, True), (slice(None), 5.5, False)],
+    [
+        (slice(4, 5), 25.0, True),
+        (slice(4, 5), 30.0, False),
+        (slice(None), 5.0, True),
+        (slice(None), 5.5, False),
+    ],
 )
 def test_a_path_succeeds_if_its_mean_square_error_is_within_the_gate(where, by, success):
     """The gate of two states is at 27.6: 25^2 / 30 and 5^2 are inside, 30^2 / 30 and 5.5^2 are not."""
@@ -252,7 +316,9 @@ def test_the_posterior_bound_tells_its_own_error():
     """The scatter of the bound over 40 seeds, each with paths of its own, is known to 1 / sqrt(80), 11 %."""
     found = []
     for seed in range(40):
-        columns = PathBlock.draw(StateScenario(Pendulum(count=2, spread=0.5), seed=seed), 0, 1).truth_columns()
+        columns = PathBlock.draw(
+            StateScenario(Pendulum(count=2, spread=0.5), seed=seed), 0, 1
+        ).truth_columns()
         found.append([columns["van_trees_angle"][0], columns["van_trees_error_angle"][0]])
     bounds, errors = np.array(found).T
     assert bounds.std() > 0
@@ -260,7 +326,9 @@ def test_the_posterior_bound_tells_its_own_error():
 
 
 def test_filters_of_constants_and_of_states_are_told_apart():
-    with pytest.raises(ib.UserError, match=r"estimators\.ekf: estimates constants; a state model takes trackers"):
+    with pytest.raises(
+        ib.UserError, match=r"estimators\.ekf: estimates constants; a state model takes trackers"
+    ):
         ib.run(StateScenario(LINEAR), {"ekf": ib.baselines.EKF()}, 3)
     constant = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01))
     with pytest.raises(ib.UserError, match=r"estimators\.ekf: tracks states that move"):
@@ -278,7 +346,11 @@ class Odd(ConstantVelocity):
         return super().times[::-1] if self.part == "times" else super().times
 
     def Q(self, k):
-        wrong = {"size": np.eye(3), "skew": np.array([[1.0, 0.5], [0.0, 1.0]]), "negative": -np.eye(2)}
+        wrong = {
+            "size": np.eye(3),
+            "skew": np.array([[1.0, 0.5], [0.0, 1.0]]),
+            "negative": -np.eye(2),
+        }
         return wrong.get(self.part, super().Q(k))
 
     def observe(self, x, k):
@@ -313,15 +385,24 @@ def test_nees_of_the_kalman_filter_lies_within_its_limits_as_often_as_is_said():
     paths = LINEAR.draw(0, 40_000)
     tracks = ekf().track(LINEAR, paths.z)
     e = (tracks.mean - paths.x)[:, -1]
-    nees = np.einsum("ti,tij,tj->t", e, np.linalg.inv(tracks.covariance[:, -1]), e).reshape(1000, 40).mean(axis=1) / 2
+    nees = (
+        np.einsum("ti,tij,tj->t", e, np.linalg.inv(tracks.covariance[:, -1]), e)
+        .reshape(1000, 40)
+        .mean(axis=1)
+        / 2
+    )
     assert np.mean((low < nees) & (nees < high)) >= 0.93
 
 
 @pytest.mark.parametrize(
-    "ours", [Pendulum(), Growth(), ConstantVelocity(), CoordinatedTurn()], ids=lambda model: model.name
+    "ours",
+    [Pendulum(), Growth(), ConstantVelocity(), CoordinatedTurn()],
+    ids=lambda model: model.name,
 )
 def test_models_by_formulas_are_those_written_in_python(ours):
-    theirs = construct(next(o for o in options("state_model") if o.name == ours.name).config, "state_model")
+    theirs = construct(
+        next(o for o in options("state_model") if o.name == ours.name).config, "state_model"
+    )
     x = ours.draw(0, 6).x[:, 50]
     for k in (0, 7):
         np.testing.assert_allclose(theirs.transition(x, k), ours.transition(x, k), rtol=1e-12)
@@ -351,9 +432,15 @@ WALK = {
         ({"next": {"x": "x + y", "v": "v + w"}}, r"next\.x: there is no such name"),
         ({"next": {"x": "x +", "v": "v"}}, r"next\.x: 'x \+' is not a formula"),
         ({"next": {"x": "x", "v": "v + w*w"}}, "next: depends on w by more than a factor"),
-        ({"next": {"x": "x", "v": "v"}}, r"noise\.w: stands in no formula of next; add it to one, or leave it out"),
+        (
+            {"next": {"x": "x", "v": "v"}},
+            r"noise\.w: stands in no formula of next; add it to one, or leave it out",
+        ),
         ({"readings": {}}, "readings: is empty"),
-        ({"constants": {"h": 1.0, "x": 2.0}}, r"next\.x: two of states, noise, constants, inputs, k and t have"),
+        (
+            {"constants": {"h": 1.0, "x": 2.0}},
+            r"next\.x: two of states, noise, constants, inputs, k and t have",
+        ),
         ({"readings": {"z": "x + w"}}, r"readings\.z: there is no such name"),
         ({"spread": {"x": 1.0}}, r"spread\.v: is not given"),
         ({"deviation": {"z": -1.0}}, r"deviation\.z=-1\.0: give a number from 0 up"),
@@ -373,7 +460,10 @@ def test_formulas_that_make_no_model_are_refused(changes, complaint):
 @pytest.mark.slow
 def test_published_errors_stand_beside_those_found(tmp_path):
     """Four of the twelve; the others take the same path through +experiment=pendulum_book."""
-    model = construct(composed(next(o for o in options("state_model") if o.name == "pendulum_book")), "state_model")
+    model = construct(
+        composed(next(o for o in options("state_model") if o.name == "pendulum_book")),
+        "state_model",
+    )
     trackers = {"ekf": ekf(), "ukf": ukf(), "ckf": ckf(), "ckf_rts": Smoother(ckf())}
     ib.run(StateScenario(model), trackers, 1, output=tmp_path)
     table = published_table(collect([tmp_path]))
@@ -393,7 +483,9 @@ class Masking(Tracker):
     def track(self, model, z):
         tracks, mask = ekf().track(model, z), np.zeros(z.shape[:2], dtype=bool)
         mask[self.where] = True
-        tracks.mean = np.ma.masked_array(tracks.mean, np.broadcast_to(mask[:, :, None], tracks.mean.shape))
+        tracks.mean = np.ma.masked_array(
+            tracks.mean, np.broadcast_to(mask[:, :, None], tracks.mean.shape)
+        )
         tracks.degrees = tracks.degrees[:, : model.epochs // self.degrees]
         return tracks
 
@@ -405,7 +497,10 @@ def test_masked_states_are_unknown_and_a_wrong_shape_is_refused():
     assert np.isnan(estimates.x[0]).all()
     assert np.isfinite(estimates.x[1:]).all()
     assert not block.estimate(Masking((slice(None), -1)))[1]["success"].any()
-    with pytest.raises(ValueError, match=r"Masking.track returns degrees of shape \(3, 15\), where \(3, 30\) belongs"):
+    with pytest.raises(
+        ValueError,
+        match=r"Masking.track returns degrees of shape \(3, 15\), where \(3, 30\) belongs",
+    ):
         block.estimate(Masking((0,), degrees=2))
 
 

@@ -13,7 +13,9 @@ from ipe_bench.statistics.intervals import mean_limits
 from ipe_bench.trials.paths import StateScenario
 
 
-@pytest.mark.oracle("own second implementation: Runge-Kutta steps of NumPy", "velocities, m/s", 5e-4)
+@pytest.mark.oracle(
+    "own second implementation: Runge-Kutta steps of NumPy", "velocities, m/s", 5e-4
+)
 def test_the_inertial_system_with_drifts_that_stand_still_reads_what_gins_does():
     """Four Runge-Kutta steps of 45 s leave 2e-4 m/s of 450 m/s at error scale 10."""
     model = WalkingGins(walk=0.0)
@@ -46,7 +48,9 @@ TRACKERS = {
 @pytest.mark.slow
 def test_trackers_of_singular_covariances_are_calibrated():
     """The motion follows from the parameters after each first reading of a run: ranks of 11 to 22 of 22."""
-    table = ib.run(StateScenario(WalkingGins(gins=Gins(readings_per_case=4)), error_scale=10.0), TRACKERS, 12)
+    table = ib.run(
+        StateScenario(WalkingGins(gins=Gins(readings_per_case=4)), error_scale=10.0), TRACKERS, 12
+    )
     rows = table[table["parameter"] == "all"].set_index("estimator")
     assert (rows["converged"] == 1).all()
     assert rows["nees"].between(*mean_limits(11, 12, 0.9999)).all(), rows["nees"]

@@ -36,7 +36,9 @@ def claims(trials: int, ratio: float = 1.0, shift: float = 0.0, n: int = 1, seed
 
 def curves_of(u: np.ndarray):
     """The curve of each row of u (curves, trials)."""
-    return curves([np.searchsorted(row, POINTS, side="right") for row in np.sort(u, axis=1)], u.shape[1])
+    return curves(
+        [np.searchsorted(row, POINTS, side="right") for row in np.sort(u, axis=1)], u.shape[1]
+    )
 
 
 # The bands -----------------------------------------------------------------------------------------------------------
@@ -50,7 +52,9 @@ def test_one_trial_in_closed_form():
     assert_agrees(covered(1, tails), 1 - 2 * np.floor(100 * tails) / 100, atol=1e-12)
 
 
-@pytest.mark.parametrize("trials", [7, *(pytest.param(trials, marks=pytest.mark.slow) for trials in (150, 2500))])
+@pytest.mark.parametrize(
+    "trials", [7, *(pytest.param(trials, marks=pytest.mark.slow) for trials in (150, 2500))]
+)
 def test_the_coverage_is_that_of_simulated_draws(trials):
     """20,000 simulated sets of counts keep both tails as often as computed, within 4 deviations."""
     rng = np.random.default_rng(trials)
@@ -60,7 +64,9 @@ def test_the_coverage_is_that_of_simulated_draws(trials):
     tails = np.array([0.02, 0.003, 0.0005])
     shares = (least[:, None] > tails).mean(axis=0)
     expected = covered(trials, tails)
-    assert np.all(np.abs(shares - expected) < 4 * np.sqrt(expected * (1 - expected) / 20_000) + 1e-9)
+    assert np.all(
+        np.abs(shares - expected) < 4 * np.sqrt(expected * (1 - expected) / 20_000) + 1e-9
+    )
 
 
 @pytest.mark.parametrize("trials", [5, 200, 100_000])
@@ -114,7 +120,9 @@ def test_a_deviation_ten_per_cent_too_small_is_found_with_2000_trials():
         error, deviation = rng.standard_normal((2000, 11)), np.ones(11)
         deviation[3] = 0.9
         nees = ((error / deviation) ** 2).sum(axis=1)
-        parts = calibrations(error, np.broadcast_to(deviation, error.shape), nees, np.ones(2000, dtype=bool))
+        parts = calibrations(
+            error, np.broadcast_to(deviation, error.shape), nees, np.ones(2000, dtype=bool)
+        )
         found.append(parts[3].words)
     assert sum("times larger" in words for words in found) >= 38
     assert all(words != INSIDE for words in found)
@@ -135,7 +143,9 @@ def test_faults_are_named(ratio, shift, words):
     assert claims(20_000, ratio, shift)[0].words == words
 
 
-@pytest.mark.oracle("library: SciPy's t", "share of 20,000 errors of Student's law far outside", 0.3)
+@pytest.mark.oracle(
+    "library: SciPy's t", "share of 20,000 errors of Student's law far outside", 0.3
+)
 def test_heavy_tails_of_the_stated_variance_are_no_variance_that_is_too_large():
     """Student's law with 5 degrees has a median of squares 1.45 times smaller than the normal one of its variance."""
     rng = np.random.default_rng(0)
@@ -176,7 +186,11 @@ def test_errors_of_1e80_are_summed_up_without_a_warning():
 def test_another_shape_is_neither_shift_nor_scale():
     """Errors of either sign, all about as large as the median of normal ones."""
     rng = np.random.default_rng(0)
-    error = rng.choice([-1.0, 1.0], size=(20_000, 1)) * 0.674489750196 * (1 + 1e-3 * rng.standard_normal((20_000, 1)))
+    error = (
+        rng.choice([-1.0, 1.0], size=(20_000, 1))
+        * 0.674489750196
+        * (1 + 1e-3 * rng.standard_normal((20_000, 1)))
+    )
     parts = calibrations(error, np.ones_like(error), error[:, 0] ** 2, np.ones(20_000, dtype=bool))
     assert parts[0].words == "of another shape"
 
@@ -185,9 +199,16 @@ def test_what_makes_no_claim_and_what_is_no_covariance():
     error = np.random.default_rng(0).standard_normal((300, 2))
     deviation, nees = np.ones_like(error), (error**2).sum(axis=1)
     assert calibrations(error, deviation, nees, np.zeros(300, dtype=bool)) == []
-    assert calibrations(error, np.full_like(error, np.nan), np.full(300, np.nan), np.ones(300, dtype=bool)) == []
+    assert (
+        calibrations(
+            error, np.full_like(error, np.nan), np.full(300, np.nan), np.ones(300, dtype=bool)
+        )
+        == []
+    )
     assert overall_words([], []) == "-"
-    void = calibrations(error, np.full_like(error, np.nan), np.full(300, np.inf), np.ones(300, dtype=bool))
+    void = calibrations(
+        error, np.full_like(error, np.nan), np.full(300, np.inf), np.ones(300, dtype=bool)
+    )
     assert overall_words(void, ["a", "b"]).startswith("most reported covariances are void")
 
 
@@ -195,7 +216,9 @@ def test_the_parameter_that_is_off_is_named_among_honest_ones():
     rng = np.random.default_rng(0)
     error, deviation = rng.standard_normal((1000, 3)), np.array([1.0, 0.25, 1.0])
     nees = ((error / deviation) ** 2).sum(axis=1)
-    parts = calibrations(error, np.broadcast_to(deviation, error.shape), nees, np.ones(1000, dtype=bool))
+    parts = calibrations(
+        error, np.broadcast_to(deviation, error.shape), nees, np.ones(1000, dtype=bool)
+    )
     assert "; b: most errors 3." in overall_words(parts, ["a", "b", "c"])
     assert [part.words for part in (parts[0], parts[2])] == [INSIDE] * 2
 
@@ -210,15 +233,24 @@ def test_summary_table_and_figures_say_so(synthetic):
         error = 0.1 * rng.standard_normal((400, 3))
         synthetic.add(scenario, "honest", error, estimator=Seeker())
         synthetic.add(scenario, "boaster", error, deviation=np.full(3, 0.05), estimator=Seeker())
-        synthetic.add(scenario, "silent", error, deviation=np.full(3, np.nan), nees=np.nan, estimator=Seeker())
+        synthetic.add(
+            scenario, "silent", error, deviation=np.full(3, np.nan), nees=np.nan, estimator=Seeker()
+        )
     analysis = analyse([synthetic.directory])
-    summary = analysis.summary[analysis.summary["error_scale"] == 10].set_index(["estimator", "parameter"])
+    summary = analysis.summary[analysis.summary["error_scale"] == 10].set_index(
+        ["estimator", "parameter"]
+    )
     assert summary.loc[("honest", "all"), "calibration"] == INSIDE
-    assert "most errors 2.0 times larger than claimed" in summary.loc[("boaster", "all"), "calibration"]
+    assert (
+        "most errors 2.0 times larger than claimed"
+        in summary.loc[("boaster", "all"), "calibration"]
+    )
     assert "times larger" in summary.loc[("boaster", "b"), "calibration"]
     # Off the grid of points the distribution functions differ by hardly more.
     farthest = kstest((error[:, 1] / 0.05) ** 2, "chi2", (1,)).statistic
-    assert summary.loc[("boaster", "b"), "calibration_excursion"] == pytest.approx(farthest, abs=0.02)
+    assert summary.loc[("boaster", "b"), "calibration_excursion"] == pytest.approx(
+        farthest, abs=0.02
+    )
     assert (summary.loc["silent", "calibration"] == "-").all()
     assert (summary.loc["silent", "claims"] == 0).all()
     (shown,) = [table for table in all_tables(analysis) if table.name == "calibration"]
@@ -227,7 +259,9 @@ def test_summary_table_and_figures_say_so(synthetic):
     with house_style():
         drawings = {d.name: d for kind in figure.FIGURES for d in kind.draw(view)}
     assert set(drawings) == {"headline", "calibration", "distributions"}
-    said = [cell.text for column in shown.columns for cell in column.cells if "most errors" in cell.text]
+    said = [
+        cell.text for column in shown.columns for cell in column.cells if "most errors" in cell.text
+    ]
     assert len(said) == 2
     assert all("most errors 2.0 times larger than claimed" in text for text in said)
 
@@ -240,7 +274,9 @@ def _verdicts(scenario, estimators, trials):
 @pytest.mark.slow
 def test_an_ekf_at_scale_300_is_outside_and_gauss_newton_on_the_same_trials_is_not():
     bench = ib.Scenario(ib.measurements.Gins(), ib.noise.Quantization(), error_scale=300.0)
-    rows = _verdicts(bench, {"ekf": ib.baselines.EKF(), "gauss_newton": ib.baselines.GaussNewton()}, 100)
+    rows = _verdicts(
+        bench, {"ekf": ib.baselines.EKF(), "gauss_newton": ib.baselines.GaussNewton()}, 100
+    )
     assert rows.loc["ekf", "calibration_p"] < 1e-6
     assert "times larger than claimed" in rows.loc["ekf", "calibration"]
     assert rows.loc["gauss_newton", "calibration"] == INSIDE

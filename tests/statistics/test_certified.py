@@ -15,7 +15,11 @@ from ipe_bench.statistics.certified import certified_averages, certified_table
 from ipe_bench.statistics.collect import collect
 from ipe_bench.trials.scenario import Scenario
 
-ESTIMATORS = {"linear_lse": LinearLSE(), "fixed_point": FixedPoint(), "multiscale_lm": MultiscaleLM()}
+ESTIMATORS = {
+    "linear_lse": LinearLSE(),
+    "fixed_point": FixedPoint(),
+    "multiscale_lm": MultiscaleLM(),
+}
 
 
 def scenario(dataset, start=1):
@@ -25,7 +29,9 @@ def scenario(dataset, start=1):
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("certified")
-    scenarios = [scenario(name, start) for name in ("Misra1a", "Rat42", "BoxBOD") for start in (1, 2)]
+    scenarios = [
+        scenario(name, start) for name in ("Misra1a", "Rat42", "BoxBOD") for start in (1, 2)
+    ]
     assert compute(scenarios, ESTIMATORS, 1, folder) == ()
     return folder
 
@@ -57,7 +63,11 @@ def test_the_report_writes_the_table_and_draws_nothing_over_error_scales(folder)
     shown = {p.stem for p in result.tables}
     assert not shown & {"overview", "calibration", "costs", "comparisons", "parameters"}
     page = result.report.read_text(encoding="utf-8")
-    assert page.index('id="certified_averages"') < page.index('<details class="part"') < page.index('id="certified"')
+    assert (
+        page.index('id="certified_averages"')
+        < page.index('<details class="part"')
+        < page.index('id="certified"')
+    )
     # The linear estimate has no digits, the fixed point not all of them.
     most = "multiscale_lm solves all with four digits or more of every parameter"
     assert f"Of 6 certified problems, each a data set from one start, {most}" in page

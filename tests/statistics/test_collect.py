@@ -65,7 +65,9 @@ def test_foreign_files_under_our_names_are_named_and_skipped(filled):
     trials = filled.store.trials
     pq.write_table(pa.table({"x": [1.0]}), trials / "weather.parquet")
     pq.write_table(pa.table({"x": [1.0]}), trials / "0123456789abcdef-0-1.parquet")
-    parts.write(trials / "0123456789abcdef-1-2.parquet", pa.table({"trial": [1]}), {"key": "another"})
+    parts.write(
+        trials / "0123456789abcdef-1-2.parquet", pa.table({"trial": [1]}), {"key": "another"}
+    )
     shutil.copy(pieces(filled)[0], trials / "fedcba9876543210-0-20.parquet")
     (filled.store.runs / "note.json").write_text("[1, 2]")
     analysis = analyse([filled.directory])
@@ -78,7 +80,9 @@ def test_a_file_with_fewer_rows_than_its_name_says_is_damaged(filled):
     path = pieces(filled)[0]
     footer, table = parts.StoredPart.parse(path).read()
     parts.write(path, table.slice(0, 5), footer)
-    assert any("does not count from 0 to 20" in line for line in collect([filled.directory]).problems)
+    assert any(
+        "does not count from 0 to 20" in line for line in collect([filled.directory]).problems
+    )
 
 
 @pytest.mark.parametrize("file", ["kinds", "base"])
@@ -86,7 +90,9 @@ def test_stale_results_are_named_and_never_mixed_in(filled, file):
     # The same identity under the key of another source, as older code would have stored it, with noise in this file.
     for path in pieces(filled):
         footer, table = parts.StoredPart.parse(path).read()
-        identity = json.loads(json.dumps(footer["identity"]).replace(".noise.kinds.", f".noise.{file}."))
+        identity = json.loads(
+            json.dumps(footer["identity"]).replace(".noise.kinds.", f".noise.{file}.")
+        )
         assert (identity == footer["identity"]) is (file == "kinds")
         older = {"key": digest("of older code"), "source": "old"}
         footer = {**footer, **older, "identity": identity, "identity_key": digest(identity)}

@@ -22,11 +22,15 @@ from ipe_bench.statistics.registry import summary_columns
 ELSEWHERE = {
     **dict.fromkeys(("success_anytime_low", "success_anytime_high"), "test_sequences.py"),
     **dict.fromkeys(("rmse_anytime_low", "rmse_anytime_high"), "test_sequences.py"),
-    **dict.fromkeys(("rmse_low", "rmse_high", "path_rmse_low", "path_rmse_high"), "test_intervals.py"),
+    **dict.fromkeys(
+        ("rmse_low", "rmse_high", "path_rmse_low", "path_rmse_high"), "test_intervals.py"
+    ),
     **dict.fromkeys(("efficiency_capped_low", "efficiency_capped_high"), "test_intervals.py"),
     **dict.fromkeys(("verdict", "path_verdict"), "test_consistency.py"),
     "nis_verdict": "test_verdicts.py",
-    **dict.fromkeys(("calibration_p", "calibration_excursion", "calibration"), "test_calibration.py"),
+    **dict.fromkeys(
+        ("calibration_p", "calibration_excursion", "calibration"), "test_calibration.py"
+    ),
     "may_be_best": "test_comparisons.py",
 }
 """Intervals of resampling, words, and what compares estimators, with the file that tests them."""
@@ -162,7 +166,16 @@ def van_trees(sign: float) -> Callable[[Trials], np.ndarray]:
         bound, error = t.truth["van_trees"], t.truth["van_trees_error"]
         centre = rms(bound)
         return t.units(
-            np.maximum(centre + sign * norm.ppf(0.975) * rms(2 * bound * error) / np.sqrt(len(bound)) / 2 / centre, 0)
+            np.maximum(
+                centre
+                + sign
+                * norm.ppf(0.975)
+                * rms(2 * bound * error)
+                / np.sqrt(len(bound))
+                / 2
+                / centre,
+                0,
+            )
         )
 
     return value
@@ -190,7 +203,11 @@ def held(t: Trials) -> tuple[int, int]:
 
 
 def predicted_rmse(t: Trials) -> np.ndarray:
-    return t.units(np.sqrt((t.truth["crlb"][t.solved] ** 2).mean(axis=0) + (t.truth["box_bias"] ** 2).mean(axis=0)))
+    return t.units(
+        np.sqrt(
+            (t.truth["crlb"][t.solved] ** 2).mean(axis=0) + (t.truth["box_bias"] ** 2).mean(axis=0)
+        )
+    )
 
 
 def only(equation: str, formula: Callable[[Trials], Any]) -> Callable[[Trials], Any]:
@@ -224,7 +241,9 @@ DEFINITIONS: dict[str, Callable[[Trials], Any]] = {
     "rmse": lambda t: t.units(rms(t.error[t.solved])),
     "rmse_anytime": lambda t: t.units(rms(t.error[t.solved])),
     "rmse_unseen": unseen,
-    "effective_trials": lambda t: t.solved_squares().sum(axis=1) ** 2 / (t.solved_squares() ** 2).sum(axis=1),
+    "effective_trials": lambda t: (
+        t.solved_squares().sum(axis=1) ** 2 / (t.solved_squares() ** 2).sum(axis=1)
+    ),
     "rmse_common": lambda t: t.units(rms(t.error[t.solved & t.others])),
     "linear_bound": lambda t: t.units(t.linear),
     "crlb": lambda t: t.units(rms(t.truth["crlb"][t.solved])),
@@ -236,25 +255,37 @@ DEFINITIONS: dict[str, Callable[[Trials], Any]] = {
     "predicted_rmse": only("least_squares", predicted_rmse),
     "curvature_intrinsic": lambda t: np.median(t.truth["curvature_intrinsic"]),
     "curvature_parameter": lambda t: np.median(t.truth["curvature_parameter"]),
-    "reported": lambda t: t.units(rms(t.deviation[t.solved & np.isfinite(t.deviation).all(axis=1)])),
+    "reported": lambda t: t.units(
+        rms(t.deviation[t.solved & np.isfinite(t.deviation).all(axis=1)])
+    ),
     "eq_14": only(
-        "frozen", lambda t: t.units(np.sqrt(t.linear**2 + rms((t.error - t.truth["linear_error"])[t.solved]) ** 2))
+        "frozen",
+        lambda t: t.units(
+            np.sqrt(t.linear**2 + rms((t.error - t.truth["linear_error"])[t.solved]) ** 2)
+        ),
     ),
     "rmse_over_linear_bound": lambda t: t.told["rmse"] / np.append(t.linear * t.sizes, 1.0),
-    "efficiency": lambda t: t.units(rms(t.truth["crlb"][t.solved])) / t.units(rms(t.error[t.solved])),
+    "efficiency": lambda t: (
+        t.units(rms(t.truth["crlb"][t.solved])) / t.units(rms(t.error[t.solved]))
+    ),
     "efficiency_low": lambda t: t.told["crlb"] / t.told["rmse_high"],
     "efficiency_high": lambda t: t.told["crlb"] / t.told["rmse_low"],
     "rmse_all": lambda t: t.units(rms(np.where(np.isfinite(t.error), t.error, np.inf))),
     "efficiency_all": lambda t: t.units(rms(t.truth["crlb"])) / t.told["rmse_all"],
-    "median_abs_error": lambda t: np.append([middle(abs(e)) for e in t.error.T] * t.sizes, middle(t.normalised)),
+    "median_abs_error": lambda t: np.append(
+        [middle(abs(e)) for e in t.error.T] * t.sizes, middle(t.normalised)
+    ),
     "q95_abs_error": lambda t: np.append(
         [middle(abs(e), 0.95) for e in t.error.T] * t.sizes, middle(t.normalised, 0.95)
     ),
-    "nees": lambda t: np.append(((t.error / t.deviation)[t.solved] ** 2).mean(axis=0), t.nees[t.solved].mean() / t.n),
+    "nees": lambda t: np.append(
+        ((t.error / t.deviation)[t.solved] ** 2).mean(axis=0), t.nees[t.solved].mean() / t.n
+    ),
     "nees_low_if_honest": nees_limit(0.025),
     "nees_high_if_honest": nees_limit(0.975),
     "coverage95": lambda t: np.append(
-        (abs(t.error / t.deviation) <= norm.ppf(0.975)).mean(axis=0), np.mean(t.nees <= chi2.ppf(0.95, t.n))
+        (abs(t.error / t.deviation) <= norm.ppf(0.975)).mean(axis=0),
+        np.mean(t.nees <= chi2.ppf(0.95, t.n)),
     ),
     "claims": lambda t: np.sum(t.converged & ~np.isnan(t.nees)),
     "misfit": lambda t: np.mean(~(t.fit_p >= 1e-3)),
@@ -288,12 +319,18 @@ def drawn(folder, seed: int) -> Trials:
     names, store = [f"p{i}" for i in range(n)], Synthetic(folder)
     scenario = store.scenario(names=tuple(names))
     linear, estimator = store.bound(scenario), [Seeker(), LeastSquares()][int(rng.integers(2))]
-    truth = {kind: linear * rng.uniform(0.5, 2.0, (N, n)) for kind in ("crlb", "bayes", "van_trees")}
-    truth |= {kind: 0.1 * linear * rng.standard_normal((N, n)) for kind in ("box_bias", "linear_error")}
+    truth = {
+        kind: linear * rng.uniform(0.5, 2.0, (N, n)) for kind in ("crlb", "bayes", "van_trees")
+    }
+    truth |= {
+        kind: 0.1 * linear * rng.standard_normal((N, n)) for kind in ("box_bias", "linear_error")
+    }
     truth |= {"van_trees_error": 0.1 * truth["van_trees"], "x": rng.standard_normal((N, n))}
     curved = {f"curvature_{kind}": rng.exponential(size=N) for kind in ("intrinsic", "parameter")}
     error = linear * rng.standard_t(3, (N, n)) * rng.lognormal(sigma=0.3, size=(N, 1))
-    status = rng.choice(np.array(["converged", "diverged", "stalled"], dtype=object), N, p=[0.8, 0.1, 0.1])
+    status = rng.choice(
+        np.array(["converged", "diverged", "stalled"], dtype=object), N, p=[0.8, 0.1, 0.1]
+    )
     solved = (status == "converged") & (rng.random(N) < 0.9)
     error[~solved & (rng.random(N) < rng.choice([0.0, 0.1, 0.4]))] = np.nan
     deviation = linear * rng.uniform(0.5, 2.0, (N, n))
@@ -326,16 +363,33 @@ def drawn(folder, seed: int) -> Trials:
     }
     of_path = {f"path_{name}": path[:, i] for i, name in enumerate(names)}
     of_path |= {f"path_bound_{name}": path_bound[:, i] for i, name in enumerate(names)}
-    facts = {f"{kind}_{name}": values[:, i] for kind, values in truth.items() for i, name in enumerate(names)}
+    facts = {
+        f"{kind}_{name}": values[:, i]
+        for kind, values in truth.items()
+        for i, name in enumerate(names)
+    }
     for first in range(0, N, block):
         part = slice(first, min(first + block, N))
-        here = {"trial": np.arange(N)[part]} | {key: values[part] for key, values in (facts | curved).items()}
+        here = {"trial": np.arange(N)[part]} | {
+            key: values[part] for key, values in (facts | curved).items()
+        }
         store.store.write(ResultKey(scenario), part.start, part.stop, here)
-    store.add(scenario, "one", error, block=block, estimator=estimator, deviation=deviation, **rows, **of_path)
+    store.add(
+        scenario,
+        "one",
+        error,
+        block=block,
+        estimator=estimator,
+        deviation=deviation,
+        **rows,
+        **of_path,
+    )
     read: np.ndarray = np.asarray(status != "no_readings")
     others = read & (rng.random(N) < 0.7)
     other = {"status": np.where(read, "converged", "no_readings").astype(object), "solved": others}
-    store.add(scenario, "other", error, block=block, estimator=estimator.__class__(option=1), **other)
+    store.add(
+        scenario, "other", error, block=block, estimator=estimator.__class__(option=1), **other
+    )
     frame = summarize([folder])
     frame = frame[frame["estimator"] == "one"]
     return Trials(
@@ -353,7 +407,9 @@ def drawn(folder, seed: int) -> Trials:
     )
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 30))])
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 30))]
+)
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def test_every_column_is_the_statistic_that_its_name_says(tmp_path, seed):
     assert not set(DEFINITIONS) & set(ELSEWHERE)
@@ -366,7 +422,9 @@ def test_every_column_is_the_statistic_that_its_name_says(tmp_path, seed):
         if told.dtype == object and isinstance(expected.flat[0], str):
             equal = (told == expected).all()
         else:
-            equal = np.allclose(told.astype(float), expected.astype(float), rtol=1e-9, atol=1e-12, equal_nan=True)
+            equal = np.allclose(
+                told.astype(float), expected.astype(float), rtol=1e-9, atol=1e-12, equal_nan=True
+            )
         if not equal:
             wrong[column] = told, expected
     assert not wrong
@@ -374,12 +432,20 @@ def test_every_column_is_the_statistic_that_its_name_says(tmp_path, seed):
 
 def test_columns_of_older_versions_are_read_with_a_line(synthetic):
     """Medians of times were those of blocks; limits of NEES are those of a right covariance."""
-    synthetic.add(synthetic.scenario(), "one", np.ones((30, 3)), block=20, time_s=np.repeat([1.0, 4.0], [20, 10]))
+    synthetic.add(
+        synthetic.scenario(),
+        "one",
+        np.ones((30, 3)),
+        block=20,
+        time_s=np.repeat([1.0, 4.0], [20, 10]),
+    )
     table = Summary.of(summarize([synthetic.directory]), Stored(synthetic.directory))
     with pytest.warns(FutureWarning, match="time_median_s: is called time_mean_s now"):
         old = table["time_median_s"]
     assert old.tolist() == [2.0] * 4
-    with pytest.warns(FutureWarning, match="nees_median_low: is called nees_median_low_if_honest now"):
+    with pytest.warns(
+        FutureWarning, match="nees_median_low: is called nees_median_low_if_honest now"
+    ):
         some = table[["estimator", "nees_median_low"]]
     assert list(some) == ["estimator", "nees_median_low_if_honest"]
     assert set(RENAMED.values()) <= set(summary_columns())
@@ -389,8 +455,12 @@ def test_columns_of_older_versions_are_read_with_a_line(synthetic):
 def test_a_cost_that_few_trials_carry_shows_its_mean(synthetic):
     """19 trials cost 100 and one costs 8000, on average 495."""
     error = np.zeros((20, 3))
-    synthetic.add(synthetic.scenario(), "tailed", error, simulations=np.append(np.full(19, 100.0), 8000.0))
-    synthetic.add(synthetic.scenario(), "even", error, simulations=np.append(np.full(19, 100.0), 104.0))
+    synthetic.add(
+        synthetic.scenario(), "tailed", error, simulations=np.append(np.full(19, 100.0), 8000.0)
+    )
+    synthetic.add(
+        synthetic.scenario(), "even", error, simulations=np.append(np.full(19, 100.0), 104.0)
+    )
     rows: Any = summarize([synthetic.directory]).to_dict("records")
     lines = plain_text(summary_tables(rows, (), 120), 120).splitlines()
     costs = {name: next(line for line in lines if name in line) for name in ("tailed", "even")}

@@ -10,7 +10,15 @@ from shared.synthetic_store import Pretender
 
 from ipe_bench.report.tables.reports import all_tables
 from ipe_bench.statistics import analyse
-from ipe_bench.statistics.comparisons import Outcomes, compare_pairs, corrected, differences, holm, may_be_best, mcnemar
+from ipe_bench.statistics.comparisons import (
+    Outcomes,
+    compare_pairs,
+    corrected,
+    differences,
+    holm,
+    may_be_best,
+    mcnemar,
+)
 from ipe_bench.statistics.sample import distances_to_limit, iterations_to_limit
 
 
@@ -20,14 +28,18 @@ def outcomes(distance, success=True):
 
 
 def test_two_failures_are_a_tie_and_one_is_a_loss():
-    d = differences(np.array([np.inf, np.inf, 1.0, np.nan]), np.array([np.inf, 2.0, np.inf, np.inf]))
+    d = differences(
+        np.array([np.inf, np.inf, 1.0, np.nan]), np.array([np.inf, 2.0, np.inf, np.inf])
+    )
     assert list(np.sign(d)) == [0, 1, -1, 0]
 
 
 def p_of(d):
     """The p of error of a pair whose errors differ by d."""
     d = np.asarray(d, dtype=float)
-    return compare_pairs({"a": outcomes(np.maximum(d, 0)), "b": outcomes(np.maximum(-d, 0))})[0]["p_error"]
+    return compare_pairs({"a": outcomes(np.maximum(d, 0)), "b": outcomes(np.maximum(-d, 0))})[0][
+        "p_error"
+    ]
 
 
 @pytest.mark.oracle("closed form: 2 of 32 assignments of signs", "p of the signed-rank test", 1e-9)
@@ -38,7 +50,9 @@ def test_signed_rank_of_five_positive_differences_is_one_sixteenth():
     assert p_of(np.zeros(10)) == 1.0
 
 
-@pytest.mark.oracle("closed form: all 512 assignments of signs", "p of the signed-rank test with ties", 1e-12)
+@pytest.mark.oracle(
+    "closed form: all 512 assignments of signs", "p of the signed-rank test with ties", 1e-12
+)
 def test_signed_rank_counts_every_choice_of_signs_where_ranks_are_tied():
     d = np.array([1.0, 1.0, -1.0, 2.0, 2.0, 3.0, -0.5, np.inf, np.inf])
     ranks = stats.rankdata(np.abs(d))
@@ -96,8 +110,13 @@ def test_who_may_be_the_best_is_mcnemar_s_exact_test_against_every_rival():
     for i in range(4):
         p = []
         for j in set(range(4)) - {i}:
-            alone, other = (success[:, i] & ~success[:, j]).sum(), (success[:, j] & ~success[:, i]).sum()
-            p.append(stats.binomtest(int(alone), int(alone + other), 0.5, alternative="less").pvalue)
+            alone, other = (
+                (success[:, i] & ~success[:, j]).sum(),
+                (success[:, j] & ~success[:, i]).sum(),
+            )
+            p.append(
+                stats.binomtest(int(alone), int(alone + other), 0.5, alternative="less").pvalue
+            )
         expected.append(min(p) > 0.05 / 3)
     agreed(np.sum(may_be_best(success) != expected), 0)
     assert len(set(expected)) == 2
@@ -134,8 +153,12 @@ def test_known_differences_are_found_in_a_store(synthetic):
             base = 0.1 * rng.normal(size=(300, 3))
             synthetic.add(scenario, "good", base, simulations=3.0)
             synthetic.add(scenario, "same", base * (1 + 1e-9), simulations=9.0)
-            synthetic.add(scenario, "bad", (3.0 if seed else 0.5) * base, simulations=1.0, jacobians=1.0)
-    synthetic.add(synthetic.scenario(error_scale=1.0, seed=5), "good", np.zeros((300, 3)))  # a seed of one alone
+            synthetic.add(
+                scenario, "bad", (3.0 if seed else 0.5) * base, simulations=1.0, jacobians=1.0
+            )
+    synthetic.add(
+        synthetic.scenario(error_scale=1.0, seed=5), "good", np.zeros((300, 3))
+    )  # a seed of one alone
     analysis = analyse([synthetic.directory])
     pairs = analysis.pairs.set_index(["first", "second"])
     assert (pairs.loc[("good", "same"), "ties"] == 1500).all()

@@ -81,10 +81,16 @@ def student(rng, shape):
 
 def contaminated(rng, shape):
     """One error in twenty is ten times larger; of variance 1."""
-    return np.where(rng.random(shape) < 0.05, 10.0, 1.0) * rng.standard_normal(shape) / np.sqrt(0.95 + 5)
+    return (
+        np.where(rng.random(shape) < 0.05, 10.0, 1.0)
+        * rng.standard_normal(shape)
+        / np.sqrt(0.95 + 5)
+    )
 
 
-def verdicts(noise, n: int, m: int, trials: int, studies: int, claimed: float = 1.0) -> dict[str, float]:
+def verdicts(
+    noise, n: int, m: int, trials: int, studies: int, claimed: float = 1.0
+) -> dict[str, float]:
     """How often each verdict is given on n parameters estimated from m readings with errors of that law, when the
     reported standard deviations are `claimed` times the true ones."""
     rng = np.random.default_rng([n, m, trials])
@@ -107,7 +113,9 @@ def test_an_honest_covariance_is_seldom_called_otherwise_whatever_the_law_of_the
     assert false_alarms(found) <= 0.07 + 2 * np.sqrt(0.07 * 0.93 / 150)
 
 
-@pytest.mark.parametrize(("claimed", "word", "trials"), [(0.7, "overconfident", 100), (1 / 0.7, "too cautious", 500)])
+@pytest.mark.parametrize(
+    ("claimed", "word", "trials"), [(0.7, "overconfident", 100), (1 / 0.7, "too cautious", 500)]
+)
 def test_a_deviation_30_per_cent_off_is_found(claimed, word, trials):
     assert verdicts(normal, 3, 6, trials, 40, claimed)[word] >= 0.9
 
@@ -131,17 +139,25 @@ def test_small_errors_of_few_trials_are_no_sure_sign_of_caution(trials, word):
 
 @pytest.mark.parametrize("n", [1, 4, 11])
 @pytest.mark.parametrize(("share", "times"), [(0.01, 10.0), (0.02, 1e4), (0.05, 10.0)])
-def test_a_right_covariance_is_seldom_called_too_cautious_by_trials_without_their_outliers(n, share, times):
+def test_a_right_covariance_is_seldom_called_too_cautious_by_trials_without_their_outliers(
+    n, share, times
+):
     """Of 60 trials .55 show none of the errors that one in a hundred has, and their mean NEES is half of n."""
     rng = np.random.default_rng(n)
     for trials in (60, 200):
-        squares = rng.chisquare(n, (100, trials)) * np.where(rng.random((100, trials)) < share, times**2, 1.0)
+        squares = rng.chisquare(n, (100, trials)) * np.where(
+            rng.random((100, trials)) < share, times**2, 1.0
+        )
         found = [verdict(x / (1 - share + share * times**2), n) for x in squares]
         assert found.count("too cautious") <= 7
 
 
-@pytest.mark.parametrize(("times", "word"), [(21, "undecided"), (39, "undecided"), (41, "overconfident")])
-def test_a_mean_above_1_that_few_trials_carry_is_sure_where_bets_on_it_win_40_times_their_stake(times, word):
+@pytest.mark.parametrize(
+    ("times", "word"), [(21, "undecided"), (39, "undecided"), (41, "overconfident")]
+)
+def test_a_mean_above_1_that_few_trials_carry_is_sure_where_bets_on_it_win_40_times_their_stake(
+    times, word
+):
     """Ville: they win as much in at most 1 / 40, which is the half of 5 % that one side of 1 has. 1 - 2^-k of the stake
     .99 is kept back."""
 
@@ -169,7 +185,10 @@ def test_where_few_trials_carry_the_mean_only_too_large_a_mean_is_sure():
 @pytest.mark.parametrize(("n", "m"), [(1, 6), (3, 20), (11, 40)])
 @pytest.mark.parametrize("noise", [normal, student, contaminated])
 def test_1000_honest_studies_have_few_false_alarms(noise, n, m, trials):
-    found, low = (verdicts(noise, n, m, trials, 1000 if claimed == 1 else 300, claimed) for claimed in (1.0, 0.7))
+    found, low = (
+        verdicts(noise, n, m, trials, 1000 if claimed == 1 else 300, claimed)
+        for claimed in (1.0, 0.7)
+    )
     print(f"{noise.__name__}, n {n}, m {m}, {trials} trials: {found}; 30 % too small: {low}")
     assert false_alarms(found) <= 0.07 + 2 * np.sqrt(0.07 * 0.93 / 1000)
     if trials >= 100 and noise is not contaminated:

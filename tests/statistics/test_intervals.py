@@ -19,7 +19,11 @@ from ipe_bench.statistics.intervals import (
 @pytest.mark.parametrize("p", [0.01, 0.3, 0.5, 0.97])
 def test_clopper_pearson_covers_at_least_its_level(p):
     n = 40
-    covered = sum(binom.pmf(k, n, p) for k in range(n + 1) if clopper_pearson(k, n)[0] <= p <= clopper_pearson(k, n)[1])
+    covered = sum(
+        binom.pmf(k, n, p)
+        for k in range(n + 1)
+        if clopper_pearson(k, n)[0] <= p <= clopper_pearson(k, n)[1]
+    )
     assert covered >= 0.95
 
 
@@ -35,7 +39,9 @@ def test_clopper_pearson_has_closed_ends():
 
 
 @pytest.mark.oracle("library: SciPy's binomtest", "ends of the Clopper-Pearson interval", 1e-9)
-@pytest.mark.parametrize("seen", [(60, 60), (200, 200), (166, 200), (0, 100), (11, 200), (363, 2500)], ids=str)
+@pytest.mark.parametrize(
+    "seen", [(60, 60), (200, 200), (166, 200), (0, 100), (11, 200), (363, 2500)], ids=str
+)
 def test_clopper_pearson_is_scipys_exact_interval(seen):
     assert_agrees(clopper_pearson(*seen), binomtest(*seen).proportion_ci(method="exact"), atol=1e-9)
 
@@ -107,7 +113,9 @@ def test_intervals_of_few_trials_hold_the_truth(law):
 @pytest.mark.slow
 def test_an_interval_of_many_trials_is_at_the_level_of_95_per_cent():
     """90 % would hold the truth in 90 of 100: nine standard deviations below."""
-    assert coverage("normal", 400, 4000) == pytest.approx(0.957, abs=4 * np.sqrt(0.95 * 0.05 / 4000))
+    assert coverage("normal", 400, 4000) == pytest.approx(
+        0.957, abs=4 * np.sqrt(0.95 * 0.05 / 4000)
+    )
 
 
 @pytest.mark.campaign
@@ -150,7 +158,9 @@ def test_one_trial_has_to_make_up_a_twentieth():
 def test_many_trials_that_are_a_little_uneven_carry_a_sum_together():
     """Half of the errors are twice as large: of 20,000 trials none matters, though the errors are surely not normal."""
     rng = np.random.default_rng(0)
-    squares = (np.where(rng.random((20_000, 20)) < 0.5, 2.0, 1.0) * rng.normal(size=(20_000, 20))) ** 2
+    squares = (
+        np.where(rng.random((20_000, 20)) < 0.5, 2.0, 1.0) * rng.normal(size=(20_000, 20))
+    ) ** 2
     assert not carried(squares, 1).any()
 
 
@@ -169,7 +179,11 @@ def missed(law: str, trials: int, studies: int) -> tuple[float, float, float]:
         none += int(few.sum())
         widths += ((high - low) / true)[~few].tolist()
     ends = np.sqrt(trials / chi2.isf([0.025, 0.975], trials))
-    return miss / studies, none / studies, float(np.median(widths or [np.nan])) / (ends[1] - ends[0])
+    return (
+        miss / studies,
+        none / studies,
+        float(np.median(widths or [np.nan])) / (ends[1] - ends[0]),
+    )
 
 
 @pytest.mark.parametrize("law", ["Student's t, 3 degrees", "5 % ten times larger"])
@@ -186,7 +200,9 @@ def test_1000_studies_of_a_root_mean_square(law):
     none of the errors that one trial in twenty has, and nothing in them tells."""
     for trials in (20, 50, 100, 200, 1000):
         miss, none, width = missed(law, trials, 1000)
-        print(f"{law}, {trials} trials: missed {miss:.3f}, not given {none:.3f}, width over the exact {width:.2f}")
+        print(
+            f"{law}, {trials} trials: missed {miss:.3f}, not given {none:.3f}, width over the exact {width:.2f}"
+        )
         if trials >= 200 or law == "normal":
             assert miss <= 0.07 + 3 * np.sqrt(0.07 * 0.93 / 1000)
         if law == "normal":
@@ -197,7 +213,9 @@ def test_1000_studies_of_a_root_mean_square(law):
 # What no trial has shown ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.oracle("closed form: upper limit of a share that no trial shows", "share that may be unseen", 1e-9)
+@pytest.mark.oracle(
+    "closed form: upper limit of a share that no trial shows", "share that may be unseen", 1e-9
+)
 def test_what_may_be_unseen_is_the_upper_limit_of_unusual_errors_less_those_seen():
     """Of none in N, 1 - .05^(1/N); of k the share whose binomial law gives k or fewer with .05, less k / N; of ten or
     more nothing. Unusual is 3.29 normal deviations, and the median absolute deviation is .6745 of them."""
@@ -236,7 +254,9 @@ def missed_capped(law: str, n: int, trials: int, studies: int, size: float = 1.0
 
     true = np.sqrt((1 - share) * mean_square(size) + share * mean_square(size * times))
     factor = np.where(rng.random((studies, trials)) < share, times, 1.0) * size
-    low, high = capped_interval(factor**2 * rng.chisquare(n, (studies, trials)) / n, np.full(studies, n), 5.0)
+    low, high = capped_interval(
+        factor**2 * rng.chisquare(n, (studies, trials)) / n, np.full(studies, n), 5.0
+    )
     return float(np.mean((low > true) | (high < true)))
 
 

@@ -42,7 +42,9 @@ def test_honesty_is_worse_as_far_as_it_goes_from_1_in_logarithms(start, low, hig
 def test_what_may_be_right_counts_as_right():
     """A mean error of .03 deviations in 1,000 trials is 0 within chance, a NEES of .99 is 1."""
     first = DEVIATES[:, 0] - DEVIATES[:, 0].mean() + 0.03
-    assert _loss("bias", Effect(0.03, 0.0, 0.0, -0.2, -0.1), first, 3) == farther(0.0, 0.0, -0.2, -0.1)
+    assert _loss("bias", Effect(0.03, 0.0, 0.0, -0.2, -0.1), first, 3) == farther(
+        0.0, 0.0, -0.2, -0.1
+    )
     first = 0.99 * chi2.ppf((np.arange(1000) + 0.5) / 1000, 3) / 3
     ends = np.log(1.1), np.log(1.3)
     assert _loss("honesty", Effect(0.99, 0.0, 0.0, 1.1, 1.3), first, 3) == farther(0.0, 0.0, *ends)
@@ -51,7 +53,9 @@ def test_what_may_be_right_counts_as_right():
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_success_that_falls_and_an_error_that_grows_are_worse(sign):
     assert _loss("success", Effect(0.9, 0.8, -0.1, -0.2, 0.05), np.ones(9), 3) == (-0.05, 0.2)
-    assert _loss("error", Effect(1.0, 2.0, 2.0, 0.5, 4.0), np.ones(9), 3) == pytest.approx(np.log([0.5, 4.0]))
+    assert _loss("error", Effect(1.0, 2.0, 2.0, 0.5, 4.0), np.ones(9), 3) == pytest.approx(
+        np.log([0.5, 4.0])
+    )
 
 
 def test_bias_is_of_the_trials_in_which_both_succeed(synthetic):

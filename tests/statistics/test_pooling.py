@@ -34,14 +34,19 @@ def errors(trials: int = 25, n: int = 3) -> np.ndarray:
 
 def titles_in(text: str) -> list[str]:
     """The titles of tables, which may be broken into lines."""
-    return re.findall(r"[a-z_.]*(?:repeated|Repeated|Twice|polynomial|ranging),.*?trialsperrow", "".join(text.split()))
+    return re.findall(
+        r"[a-z_.]*(?:repeated|Repeated|Twice|polynomial|ranging),.*?trialsperrow",
+        "".join(text.split()),
+    )
 
 
 def headings(directory) -> tuple[list[str], list[tuple[str, ...]]]:
     """The titles in the terminal, and what tells the rows of the overview apart."""
     analysis = analyse([directory])
     out = io.StringIO()
-    Console(file=out, width=250).print(terminal(summary_tables(analysis.summary.to_dict("records"), [], 250), 250))
+    Console(file=out, width=250).print(
+        terminal(summary_tables(analysis.summary.to_dict("records"), [], 250), 250)
+    )
     titles = titles_in(out.getvalue())
     table = overview(analysis)
     named = [column.title for column in table.columns].index("estimator") + 1
@@ -53,7 +58,10 @@ def test_a_matrix_and_none_are_two_experiments(tmp_path):
     model = ib.measurements.Polynomial(count=6)
     noises = [Correlated(0.01), Correlated(0.01, matrix=tuple(map(tuple, 1e-4 * np.eye(6))))]
     table = ib.run(
-        [ib.Scenario(model, noise) for noise in noises], {"lse": ib.baselines.LinearLSE()}, 20, output=tmp_path
+        [ib.Scenario(model, noise) for noise in noises],
+        {"lse": ib.baselines.LinearLSE()},
+        20,
+        output=tmp_path,
     )
     rows = table[table["parameter"] == "all"]
     assert rows["trials"].tolist() == [20, 20]
@@ -89,7 +97,8 @@ def test_models_that_share_a_name_are_two_experiments(synthetic, kind):
 
 def test_a_setting_of_zero_is_in_every_heading(tmp_path):
     scenarios = [
-        ib.Scenario(ib.measurements.Polynomial(strength=strength), Gaussian(0.01)) for strength in (0.0, 0.005)
+        ib.Scenario(ib.measurements.Polynomial(strength=strength), Gaussian(0.01))
+        for strength in (0.0, 0.005)
     ]
     ib.run(scenarios, {"lse": ib.baselines.LinearLSE()}, 20, output=tmp_path)
     titles, rows = headings(tmp_path)
@@ -99,17 +108,33 @@ def test_a_setting_of_zero_is_in_every_heading(tmp_path):
 
 def test_equal_numbers_of_another_type_are_one_experiment():
     scenario = ib.Scenario(Repeated(), Gaussian(1.0), error_scale=2.0)
-    same = ib.Scenario(Repeated(sizes_given=(1, 10, 0.1)), Gaussian(1), error_scale=2, seed=np.int64(0))
+    same = ib.Scenario(
+        Repeated(sizes_given=(1, 10, 0.1)), Gaussian(1), error_scale=2, seed=np.int64(0)
+    )
     assert ResultKey(scenario, "one", Pretender()).key == ResultKey(same, "one", Pretender()).key
     assert ResultKey(scenario).key != ResultKey(replace(scenario, error_scale=2.5)).key
 
 
-def test_a_sweep_over_lists_names_what_differs_in_tables_status_and_files(tmp_path, monkeypatch, capsys):
+def test_a_sweep_over_lists_names_what_differs_in_tables_status_and_files(
+    tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
-    one, other = ("[" + ",".join(str(list(b)).replace(" ", "") for b in part) + "]" for part in (BEACONS, BEACONS[:4]))
-    arguments = ["noise=gaussian", "noise.deviation=0.1", "trials=20", "solver=[]", "baseline=[linear_lse]"]
+    one, other = (
+        "[" + ",".join(str(list(b)).replace(" ", "") for b in part) + "]"
+        for part in (BEACONS, BEACONS[:4])
+    )
+    arguments = [
+        "noise=gaussian",
+        "noise.deviation=0.1",
+        "trials=20",
+        "solver=[]",
+        "baseline=[linear_lse]",
+    ]
     arguments += ["execution=serial", "output=out", "figures=none"]
-    assert main(["run", "-m", "measurement=ranging", f"measurement.beacons={one},{other}", *arguments]) == 0
+    assert (
+        main(["run", "-m", "measurement=ranging", f"measurement.beacons={one},{other}", *arguments])
+        == 0
+    )
     titles = titles_in(capsys.readouterr().out)
     assert len(titles) == len(set(titles)) == 2
     table = ib.load("out")

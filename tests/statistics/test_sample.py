@@ -36,7 +36,12 @@ def fill(folder: Path, blocks: tuple[int, int, int]) -> Synthetic:
             status = np.where(lost, "nonfinite", "converged").astype(object)
             deviation = bound * rng.uniform(0.8, 1.2, (TRIALS, 3))
             solved = ~lost & (rng.random(TRIALS) < 0.9)
-            more = {"status": status, "solved": solved, "deviation": deviation, "time_s": rng.random(TRIALS)}
+            more = {
+                "status": status,
+                "solved": solved,
+                "deviation": deviation,
+                "time_s": rng.random(TRIALS),
+            }
             more["crlb_distance"] = ((error / bound) ** 2).sum(axis=1)
             more["nees"] = ((error / deviation) ** 2).sum(axis=1)
             more["success"] = np.nan_to_num(more["crlb_distance"], nan=1e9) < 16
@@ -46,7 +51,10 @@ def fill(folder: Path, blocks: tuple[int, int, int]) -> Synthetic:
             path.unlink()
         drawn = rng.uniform(0.5, 1.5, (4, TRIALS, 3))
         names = [p.name for p in scenario.measurement.parameters]
-        facts = {"trial": np.arange(TRIALS), "curvature_intrinsic": np.where(np.arange(TRIALS) < 5, 0.1, np.nan)}
+        facts = {
+            "trial": np.arange(TRIALS),
+            "curvature_intrinsic": np.where(np.arange(TRIALS) < 5, 0.1, np.nan),
+        }
         for kind, values in zip(("x", "crlb", "bayes", "linear_error"), drawn, strict=True):
             facts |= {f"{kind}_{name}": values[:, i] * bound[i] for i, name in enumerate(names)}
         for at in range(0, TRIALS, blocks[2]):
@@ -87,7 +95,9 @@ def test_every_sum_is_that_of_pandas_over_all_rows_at_once(store, analysis):
         together = squares.mean(axis=1, skipna=False) ** 0.5 / linear
         overall = summary.loc[label, "all"]
         limited = together.fillna(1e300).quantile([0.5, 0.95])
-        assert [overall["median_abs_error"], overall["q95_abs_error"]] == pytest.approx(list(limited), rel=1e-12)
+        assert [overall["median_abs_error"], overall["q95_abs_error"]] == pytest.approx(
+            list(limited), rel=1e-12
+        )
         for name, size in sizes.items():
             found, e = summary.loc[label, name], solved[f"error_{name}"]
             ratio = (mine[f"error_{name}"] / mine[f"deviation_{name}"]).abs()
@@ -124,7 +134,9 @@ def test_a_truth_that_is_missing_is_not_a_number_beside_its_estimates(synthetic)
     """Of five blocks of the truth the second and the last are lost, and one estimator has fewer trials."""
     scenario, rng = synthetic.scenario(), RNG(3)
     synthetic.add(scenario, "long", 0.1 * rng.standard_normal((50, 3)), block=10)
-    synthetic.add(scenario, "short", 0.1 * rng.standard_normal((15, 3)), start=8, estimator=Pretender(1))
+    synthetic.add(
+        scenario, "short", 0.1 * rng.standard_normal((15, 3)), start=8, estimator=Pretender(1)
+    )
     for path in synthetic.store.trials.glob(f"{ResultKey(scenario).key}-*"):
         if path.name.split("-")[1] in ("10", "40", "8"):
             path.unlink()
@@ -132,20 +144,26 @@ def test_a_truth_that_is_missing_is_not_a_number_beside_its_estimates(synthetic)
     for sample in samples(collection, collection.groups):
         trial = sample.number % (1 << 40)
         known = ~((trial >= 10) & (trial < 20) | (trial >= 40))
-        np.testing.assert_array_equal(np.isfinite(sample.of_truth("crlb")), np.repeat(known[:, None], 3, axis=1))
+        np.testing.assert_array_equal(
+            np.isfinite(sample.of_truth("crlb")), np.repeat(known[:, None], 3, axis=1)
+        )
         assert np.isnan(sample.of_truth("linear_error")).all()
 
 
 def test_bounds_of_several_seeds_are_pooled_as_squares(tmp_path):
     """Van Trees's of two seeds, and the error of the mean of their squares."""
     scenarios = [
-        ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0, seed=s) for s in (0, 1)
+        ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0, seed=s)
+        for s in (0, 1)
     ]
     rows = ib.run(scenarios, {"linear": ib.baselines.LinearLSE()}, 4, output=tmp_path)
     stored = ib.load(tmp_path)
     stored = stored[stored["trial"] == 0]
     for name, row in rows.set_index("parameter").drop(index="all").iterrows():
-        bound, error = stored[f"van_trees_{name}"].to_numpy(), stored[f"van_trees_error_{name}"].to_numpy()
+        bound, error = (
+            stored[f"van_trees_{name}"].to_numpy(),
+            stored[f"van_trees_error_{name}"].to_numpy(),
+        )
         size = row["linear_bound"] / sample_bound(tmp_path, str(name))
         mean = np.sqrt(np.mean(bound**2))
         assert row["van_trees"] == pytest.approx(size * mean)

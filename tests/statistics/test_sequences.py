@@ -36,24 +36,33 @@ def test_an_interval_after_every_ten_trials_holds_the_share_at_all_times(p):
     assert missed > 0 or p != 0.5
 
 
-@pytest.mark.parametrize(("count", "trials"), [(0, 1), (1, 1), (0, 250), (249, 250), (500, 1000), (7, 9000)])
+@pytest.mark.parametrize(
+    ("count", "trials"), [(0, 1), (1, 1), (0, 250), (249, 250), (500, 1000), (7, 9000)]
+)
 def test_an_interval_of_a_share_holds_what_was_seen_and_that_of_a_fixed_number(count, trials):
     low, high = share_sequence(count, trials)
     fixed = clopper_pearson(count, trials)
     assert 0 <= low <= fixed[0]
     assert fixed[1] <= high <= 1
     mirrored = share_sequence(trials - count, trials)
-    assert (low, high) == (pytest.approx(1 - mirrored[1], abs=1e-9), pytest.approx(1 - mirrored[0], abs=1e-9))
+    assert (low, high) == (
+        pytest.approx(1 - mirrored[1], abs=1e-9),
+        pytest.approx(1 - mirrored[0], abs=1e-9),
+    )
 
 
-@pytest.mark.oracle("closed form: Robbins's normal mixture", "width of the interval that holds at all times", 0.02)
+@pytest.mark.oracle(
+    "closed form: Robbins's normal mixture", "width of the interval that holds at all times", 0.02
+)
 def test_looking_costs_half_as_much_again_at_a_thousand_trials():
     """Robbins's normal mixture, tightest there, is 3.04 deviations wide where a fixed number has 1.96."""
     low, high = share_sequence(500, 1000)
     assert_agrees((high - low) / 2, 3.04 * np.sqrt(0.25 / 1000), rtol=0.02)
 
 
-@pytest.mark.oracle("closed form: the narrowest normal mixture", "width of the sequence of a root mean square", 5e-3)
+@pytest.mark.oracle(
+    "closed form: the narrowest normal mixture", "width of the sequence of a root mean square", 5e-3
+)
 def test_the_sequence_of_a_mean_is_as_narrow_as_a_mixture_can_be_at_a_thousand_trials():
     """Over all variances r of it: sqrt(2 (1000 r + 1) / (1000 r) ln(sqrt(1000 r + 1) / .05)) standard errors."""
 
@@ -94,7 +103,9 @@ def test_the_upper_end_of_rmse_is_known_once_rare_errors_have_been_seen(syntheti
     assert np.isfinite(high).tolist() == [known] * 2
 
 
-@pytest.mark.parametrize("given", [0, 1, -0.1, 2, True, "x", float("nan"), {}, {"nees": 0.1}, {"rmse": 0}, None])
+@pytest.mark.parametrize(
+    "given", [0, 1, -0.1, 2, True, "x", float("nan"), {}, {"nees": 0.1}, {"rmse": 0}, None]
+)
 def test_what_is_no_precision_is_refused(given):
     with pytest.raises(UserError, match="precision"):
         precision_of(given)
@@ -115,7 +126,10 @@ def trials_taken(p: float, wanted: float, rng: np.random.Generator, block: int =
 def test_shares_near_0_and_1_take_fewer_trials_than_a_fixed_thousand_and_one_half_more():
     """To within the 3.1 % that a thousand trials give in the worst case, p = 0.5."""
     rng = np.random.default_rng(0)
-    taken = {p: np.mean([trials_taken(p, 0.0316, rng) for _ in range(20)]) for p in (0.0, 0.01, 0.99, 1.0, 0.5)}
+    taken = {
+        p: np.mean([trials_taken(p, 0.0316, rng) for _ in range(20)])
+        for p in (0.0, 0.01, 0.99, 1.0, 0.5)
+    }
     assert max(taken[0.0], taken[1.0]) <= 250
     assert max(taken[0.01], taken[0.99]) < 500
     assert 2000 < taken[0.5] < 3000

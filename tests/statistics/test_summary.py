@@ -62,7 +62,9 @@ def test_shares_are_of_all_trials_and_moments_of_solved_ones(synthetic):
     e[~solved] = 1e6
     e[390:] = np.nan
     status = np.where(np.arange(400) < 350, "converged", "diverged").astype(object)
-    synthetic.add(scenario, "one", e, solved=solved, status=status, nees=np.where(solved, 3.0, np.nan))
+    synthetic.add(
+        scenario, "one", e, solved=solved, status=status, nees=np.where(solved, 3.0, np.nan)
+    )
     total = row(summarize([synthetic.directory]), "one")
     assert total["trials"] == 400
     assert total["converged"] == 350 / 400
@@ -79,7 +81,11 @@ def test_shares_are_of_all_trials_and_moments_of_solved_ones(synthetic):
     assert a["median_abs_error"] == pytest.approx(np.median(worst))
 
 
-@pytest.mark.oracle("closed form: chi-square of three degrees", "coverage of half the deviation, of 4000 trials", 0.03)
+@pytest.mark.oracle(
+    "closed form: chi-square of three degrees",
+    "coverage of half the deviation, of 4000 trials",
+    0.03,
+)
 def test_coverage_and_nees_of_an_estimator_that_boasts(synthetic):
     e = np.random.default_rng(5).normal(size=(4000, 3)) * 0.1
     synthetic.add(synthetic.scenario(), "honest", e)
@@ -98,7 +104,11 @@ def test_an_estimator_without_covariance_has_no_nees_and_no_coverage(synthetic):
     e = errors(50)
     synthetic.add(synthetic.scenario(), "mute", e, deviation=np.full(3, np.nan), nees=np.nan)
     frame = summarize([synthetic.directory])
-    assert frame[["nees", "nees_low_if_honest", "nees_high_if_honest", "coverage95"]].isna().all(axis=None)
+    assert (
+        frame[["nees", "nees_low_if_honest", "nees_high_if_honest", "coverage95"]]
+        .isna()
+        .all(axis=None)
+    )
 
 
 def test_estimators_with_a_prior_are_held_against_the_bayesian_bound(synthetic):
@@ -136,17 +146,25 @@ def test_halves_in_two_directories_are_one_run(tmp_path):
     for store in (whole, left, right):
         store.record(600)
     once = summarize([whole.directory])
-    pd.testing.assert_frame_equal(once, summarize([left.directory, right.directory]), check_exact=True)
-    pd.testing.assert_frame_equal(once, summarize([right.directory, left.directory]), check_exact=True)
+    pd.testing.assert_frame_equal(
+        once, summarize([left.directory, right.directory]), check_exact=True
+    )
+    pd.testing.assert_frame_equal(
+        once, summarize([right.directory, left.directory]), check_exact=True
+    )
     # Overlapping pieces count each trial once.
-    pd.testing.assert_frame_equal(once, summarize([whole.directory, right.directory]), check_exact=True)
+    pd.testing.assert_frame_equal(
+        once, summarize([whole.directory, right.directory]), check_exact=True
+    )
 
 
 def rewrite_truth(synthetic, kind: str, value: float) -> None:
     """Puts another number in place of a bound in the truth's files."""
 
     def change(rows, footer) -> None:
-        rows |= {name: np.full(len(rows[name]), value) for name in rows if name.startswith(f"{kind}_")}
+        rows |= {
+            name: np.full(len(rows[name]), value) for name in rows if name.startswith(f"{kind}_")
+        }
 
     for path in (synthetic.directory / "trials").glob("*.parquet"):
         forge(path, change)
@@ -204,8 +222,12 @@ def test_one_runaway_does_not_decide(synthetic):
     most = squares.mean() + (beta.ppf(0.95, 2, 199) - 1 / 200) * 24
     assert 0.8 / np.sqrt(most) < low < 1 / np.sqrt(most)
     assert total["efficiency_capped"] < high < 1.1
-    assert total["error_median"] == pytest.approx(np.median(np.sqrt((e**2).sum(axis=1) / 0.1**2 / 3)))
-    assert total["error_q95"] == pytest.approx(np.quantile(np.sqrt((e**2).sum(axis=1) / 0.1**2 / 3), 0.95))
+    assert total["error_median"] == pytest.approx(
+        np.median(np.sqrt((e**2).sum(axis=1) / 0.1**2 / 3))
+    )
+    assert total["error_q95"] == pytest.approx(
+        np.quantile(np.sqrt((e**2).sum(axis=1) / 0.1**2 / 3), 0.95)
+    )
 
 
 def test_everybody_is_judged_by_the_same_trials(synthetic):
@@ -220,9 +242,13 @@ def test_everybody_is_judged_by_the_same_trials(synthetic):
     frame = summarize([synthetic.directory])
     filtered, half, nothing = (row(frame, label) for label in ("filter", "half", "nothing"))
     assert filtered["efficiency_capped"] == pytest.approx(0.5)
-    assert filtered["nees_median"] == pytest.approx(np.median((2 * e / 0.1) ** 2 @ np.ones(3)) / chi2.median(3))
+    assert filtered["nees_median"] == pytest.approx(
+        np.median((2 * e / 0.1) ** 2 @ np.ones(3)) / chi2.median(3)
+    )
     assert half["efficiency_capped"] == pytest.approx(1 / np.sqrt((25 + 1) / 2), rel=0.1)
-    assert half["efficiency_capped_low"] < half["efficiency_capped"] < half["efficiency_capped_high"]
+    assert (
+        half["efficiency_capped_low"] < half["efficiency_capped"] < half["efficiency_capped_high"]
+    )
     assert half["error_q95"] == np.inf
     assert nothing["efficiency_capped"] == pytest.approx(0.2)
     assert nothing["error_median"] == nothing["nees_median"] == np.inf
@@ -232,7 +258,10 @@ def test_the_median_of_honest_nees_lies_within_its_limits_in_95_per_cent_of_runs
     synthetic.add(synthetic.scenario(), "one", errors(40))
     total = row(summarize([synthetic.directory]), "one")
     medians = np.median(chi2.rvs(3, size=(4000, 40), random_state=1), axis=1) / chi2.median(3)
-    inside = np.mean((total["nees_median_low_if_honest"] <= medians) & (medians <= total["nees_median_high_if_honest"]))
+    inside = np.mean(
+        (total["nees_median_low_if_honest"] <= medians)
+        & (medians <= total["nees_median_high_if_honest"])
+    )
     # The median of an even number is the mean of two values, which scatters a little less than one.
     assert 0.94 < inside < 0.975
 
@@ -244,7 +273,15 @@ def test_a_failure_is_known_or_silent(synthetic):
     status = np.array(["max_iterations"] + ["converged"] * 9, dtype=object)
     fit = np.array([0.5, 1e-5] + [0.5] * 8)
     ambiguous = np.array([0.0, 0.0, 1.0] + [0.0] * 7)
-    synthetic.add(synthetic.scenario(), "one", e, status=status, solved=right, fit_p=fit, extra_ambiguous=ambiguous)
+    synthetic.add(
+        synthetic.scenario(),
+        "one",
+        e,
+        status=status,
+        solved=right,
+        fit_p=fit,
+        extra_ambiguous=ambiguous,
+    )
     synthetic.add(synthetic.scenario(), "untested", e, status=status, solved=right)
     frame = summarize([synthetic.directory])
     assert tuple(row(frame, "one")[["success", "failed_known", "failed_silent"]]) == (0.6, 0.3, 0.1)
@@ -268,7 +305,9 @@ def test_a_jacobian_counts_what_the_model_says_it_costs(synthetic):
 def test_epochs_of_a_filter_are_not_iterations(synthetic):
     scenario = synthetic.scenario()
     path = 0.1 * 0.5 ** np.arange(6.0)
-    history = {"trial": np.zeros(6, dtype=int), "iteration": np.arange(6)} | {f"x_{n}": path for n in "abc"}
+    history = {"trial": np.zeros(6, dtype=int), "iteration": np.arange(6)} | {
+        f"x_{n}": path for n in "abc"
+    }
     synthetic.add(scenario, "ekf", errors(40), iterations=30, estimator=Filter(), history=history)
     synthetic.add(scenario, "newton", errors(40), iterations=3, history=history)
     analysis = analyse([synthetic.directory])

@@ -61,7 +61,9 @@ def test_eq_18_holds_with_the_k_that_the_print_lost():
 def test_eq_18_holds_on_gins_at_scale_1():
     scenario = Scenario(Gins(), Quantization(0.02286), GaussianPrior(), 1.0)
     trials = scenario.draw(0, 10)
-    histories = FixedPoint(tolerance=1e-9).estimate(scenario.problem, trials.z, history=True).history
+    histories = (
+        FixedPoint(tolerance=1e-9).estimate(scenario.problem, trials.z, history=True).history
+    )
     root = frozen_root(scenario.problem, trials.z, trials.x)
     for iterates, x in zip(histories, root, strict=True):
         K = 1.05 * contracting(scenario.problem, iterates)[0].max()
@@ -116,7 +118,9 @@ def test_stored_contraction_is_that_of_the_model_at_the_truth():
     # M is stored for the first trials of the scenario, whatever the block.
     assert np.isfinite(columns["curvature_M"]).tolist() == [True] * CURVED + [False] * 3
     later = Block.draw(scenario, CURVED - 1, CURVED + 3).truth_columns()
-    assert np.array_equal(later["curvature_M"], columns["curvature_M"][CURVED - 1 :], equal_nan=True)
+    assert np.array_equal(
+        later["curvature_M"], columns["curvature_M"][CURVED - 1 :], equal_nan=True
+    )
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +137,9 @@ def analysis(tmp_path_factory):
 
 def test_eq_14_and_the_sandwich_stand_beside_what_happened(analysis):
     """Eq. (14) is H+ R H+' + E[c c'] with c = H+ (N(x) - N(x^)); the same from the model's own values."""
-    total = analysis.summary[analysis.summary["parameter"] == "all"].set_index(["estimator", "error_scale"])
+    total = analysis.summary[analysis.summary["parameter"] == "all"].set_index(
+        ["estimator", "error_scale"]
+    )
     scenario = Scenario(Polynomial(strength=0.02), Gaussian(0.1), GaussianPrior(), 5.0)
     block = Block.draw(scenario, 0, 400)
     estimates, columns = block.estimate(Newton())
@@ -177,7 +183,9 @@ def test_how_iterations_converge_is_in_the_report(analysis):
 def test_false_roots_say_how_far_off_they_are(synthetic):
     e = 0.1 * np.random.default_rng(0).normal(size=(60, 3))
     solved = np.arange(60) >= 20
-    synthetic.add(synthetic.scenario(), "one", e, solved=solved, root_distance=np.where(solved, 0.0, 7.0))
+    synthetic.add(
+        synthetic.scenario(), "one", e, solved=solved, root_distance=np.where(solved, 0.0, 7.0)
+    )
     total = analyse([synthetic.directory]).summary.iloc[-1]
     assert total["false_root"] == pytest.approx(1 / 3)
     assert total["false_root_distance"] == 7.0

@@ -17,7 +17,12 @@ from ipe_bench.statistics.sample import NIS
 from ipe_bench.statistics.verdicts import VERDICTS, Verdict, current, shown
 
 WHITE = Formulas(
-    next={"x": "w"}, readings={"z": "x"}, noise={"w": 6.0}, deviation={"z": 1.0}, spread={"x": 6.0}, count=60
+    next={"x": "w"},
+    readings={"z": "x"},
+    noise={"w": 6.0},
+    deviation={"z": 1.0},
+    spread={"x": 6.0},
+    count=60,
 )
 """Successive states of this model are independent, with deviation 6."""
 SINE = 3 * np.sin(np.arange(60.0) / 5)[:, None]
@@ -27,7 +32,14 @@ def test_the_table_has_every_word_once_and_reads_those_of_older_files():
     assert [word.value for word in VERDICTS[:6]] == list(get_args(Verdict))
     names = [name for word in VERDICTS for name in (word.value, *word.replaces)]
     assert len(names) == len(set(names))
-    old = ("optimistic", "diverged but confident", "pessimistic", "does not fit", "consistent", "undecided")
+    old = (
+        "optimistic",
+        "diverged but confident",
+        "pessimistic",
+        "does not fit",
+        "consistent",
+        "undecided",
+    )
     now = ["overconfident", "overconfident", "too cautious", "wrong", "consistent", "undecided"]
     assert [current(word) for word in old] == now
     assert current("lost from epoch 31") == shown("lost from epoch 31") == "lost from epoch 31"
@@ -68,7 +80,9 @@ def test_a_log_whose_innovations_are_not_white_is_wrong_however_small_they_are()
         assert (right.verdict, right.passes) == ("consistent", True)
 
 
-@pytest.mark.parametrize(("worse", "said"), [({}, True), ({"mean_nis": 3.0}, False), ({"white_p": 1e-9}, False)])
+@pytest.mark.parametrize(
+    ("worse", "said"), [({}, True), ({"mean_nis": 3.0}, False), ({"white_p": 1e-9}, False)]
+)
 def test_only_a_track_whose_innovations_fit_is_a_standard_for_others(worse, said):
     """The likelihood of a filter that linearises is that of its own approximation."""
     model = ConstantVelocity(count=50)
@@ -89,7 +103,9 @@ def test_far_less_likely_is_ten_and_a_tenth_of_the_number_of_readings(less, said
     assert bool(far_below([first, other])) == said
 
 
-def test_simulated_trackers_are_wrong_where_surely_more_than_one_trial_in_a_hundred_is_not_white(synthetic):
+def test_simulated_trackers_are_wrong_where_surely_more_than_one_trial_in_a_hundred_is_not_white(
+    synthetic,
+):
     """If the share is 1 %, 5 or more of 200 trials have a probability of .052, and 6 or more one of .016 < .025."""
     rng = np.random.default_rng(0)
     error, nis = 0.1 * rng.standard_normal((200, 1)), rng.chisquare(4, 200) / 4
@@ -97,5 +113,9 @@ def test_simulated_trackers_are_wrong_where_surely_more_than_one_trial_in_a_hund
     for wrong in (0, 5, 6):
         p = np.where(np.arange(200) < wrong, 1e-4, 0.5)
         synthetic.add(synthetic.scenario(names=("a",)), f"of {wrong}", error, white_p=p, **of_path)
-    found = summarize([synthetic.directory]).query("parameter == 'all'").set_index("estimator")["nis_verdict"]
+    found = (
+        summarize([synthetic.directory])
+        .query("parameter == 'all'")
+        .set_index("estimator")["nis_verdict"]
+    )
     assert found.to_dict() == {"of 0": "consistent", "of 5": "consistent", "of 6": "wrong"}

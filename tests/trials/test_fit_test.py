@@ -27,7 +27,9 @@ NOISES = [
 
 
 def p_values(model, noise, error_scale, estimator, trials=2000):
-    _, columns = Block.draw(Scenario(model, noise, error_scale=error_scale), 0, trials).estimate(estimator)
+    _, columns = Block.draw(Scenario(model, noise, error_scale=error_scale), 0, trials).estimate(
+        estimator
+    )
     return columns["fit_p"]
 
 
@@ -41,10 +43,15 @@ QUICK = (Gaussian, Outliers, Quantization)
 )
 def test_p_is_uniform_for_every_noise_that_states_its_law(noise):
     """With chi-square in its place the test fails for Student's t, outliers and quantisation."""
-    assert kstest(p_values(Polynomial(strength=0.01), noise, 1.0, GaussNewton()), "uniform").pvalue > 0.01
+    assert (
+        kstest(p_values(Polynomial(strength=0.01), noise, 1.0, GaussNewton()), "uniform").pvalue
+        > 0.01
+    )
 
 
-@pytest.mark.parametrize("estimator", [MapLM(), MapLM(prior_inflation=3.0), EKF(engine="batched")], ids=repr)
+@pytest.mark.parametrize(
+    "estimator", [MapLM(), MapLM(prior_inflation=3.0), EKF(engine="batched")], ids=repr
+)
 def test_p_is_uniform_for_estimators_with_a_prior(estimator):
     """The prior is as good as the readings here: m - n degrees are 3 too few of 40."""
     p = p_values(Polynomial(strength=0.001), Gaussian(1.0), 0.2, estimator)
@@ -88,7 +95,9 @@ def test_residuals_of_the_frozen_root_scatter_as_their_projection_says(m):
     spread = frozen_spread(J[None], H, Covariance(np.ones(m)))
     plus = np.linalg.pinv(H)
     T = np.eye(m) - J @ np.linalg.inv(plus @ J) @ plus
-    assert np.sort([*[1.0] * spread.ones, *spread.others[0]]) == pytest.approx(spectrum(T, np.eye(m)))
+    assert np.sort([*[1.0] * spread.ones, *spread.others[0]]) == pytest.approx(
+        spectrum(T, np.eye(m))
+    )
 
 
 @pytest.mark.parametrize("inflation", [0.3, 1.0, 3.0])
@@ -99,14 +108,18 @@ def test_residuals_of_an_inflated_prior_scatter_as_its_gain_says(inflation):
     T = np.eye(m) - J @ P @ J.T @ np.linalg.inv(J @ P @ J.T + np.eye(m))
     spread = prior_spread((J.T @ J)[None], m, factor, inflation)
     readings = J @ np.diag(factor**2) @ J.T + np.eye(m)
-    assert np.sort([*[1.0] * spread.ones, *spread.others[0]]) == pytest.approx(spectrum(T, readings))
+    assert np.sort([*[1.0] * spread.ones, *spread.others[0]]) == pytest.approx(
+        spectrum(T, readings)
+    )
 
 
 @pytest.mark.oracle("library: SciPy's chi2", "p of the test of fit", 1e-12)
 def test_least_squares_and_normal_noise_is_chi_square():
     H = np.random.default_rng(0).normal(size=(12, 3))
     squares = np.array([0.0, 3.0, 9.0, 40.0, np.inf, np.nan])
-    p = fit_probability(squares, Spread(9, np.empty((6, 0))), Gaussian(1.0), H, Covariance(np.ones(12)))
+    p = fit_probability(
+        squares, Spread(9, np.empty((6, 0))), Gaussian(1.0), H, Covariance(np.ones(12))
+    )
     assert_agrees(p[:5], chi2.sf(squares[:5], 9), rtol=1e-12)
     assert np.isnan(p[5])
 
@@ -124,7 +137,9 @@ def test_a_simulated_law_has_a_floor_and_ends_at_nothing():
 
 def test_nothing_to_spare_is_nothing_to_test():
     H = np.eye(3)
-    p = fit_probability(np.zeros(2), Spread(0, np.empty((2, 0))), Gaussian(1.0), H, Covariance(np.ones(3)))
+    p = fit_probability(
+        np.zeros(2), Spread(0, np.empty((2, 0))), Gaussian(1.0), H, Covariance(np.ones(3))
+    )
     assert np.isnan(p).all()
 
 
@@ -150,7 +165,9 @@ def test_spreads_are_the_eigenvalues_of_the_residuals_covariance(m):
         plus = np.linalg.pinv(Hw)
         B = Jw @ np.linalg.solve(plus @ Jw, plus)
         A = (np.eye(m) - B).T @ (np.eye(m) - B)
-        assert_agrees([frozen.mean[i], frozen.squares[i]], [np.trace(A), np.trace(A @ A)], rtol=1e-8)
+        assert_agrees(
+            [frozen.mean[i], frozen.squares[i]], [np.trace(A), np.trace(A @ A)], rtol=1e-8
+        )
         S = np.linalg.inv(Jw.T @ Jw + np.diag((1.7 * d) ** -2))
         left = np.eye(m) - Jw @ S @ Jw.T
         C = left @ (Jw @ np.diag(d**2) @ Jw.T + np.eye(m)) @ left.T

@@ -16,10 +16,22 @@ from ipe_bench.states.trackers import Tracks
 from ipe_bench.trials.paths import block_of, track_safely
 
 TRIALS = 12
-OPTIONAL = ("covariance", "history", "alternatives", "nis", "stage", "cost", "status", "iterations", "effective")
+OPTIONAL = (
+    "covariance",
+    "history",
+    "alternatives",
+    "nis",
+    "stage",
+    "cost",
+    "status",
+    "iterations",
+    "effective",
+)
 CONSTANTS = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01))
 WALK = {"next": {"p": "p + w"}, "readings": {"z": "p"}, "noise": {"w": 1.0}}
-STATES = ib.StateScenario(ib.states.Formulas(**WALK, deviation={"z": 0.5}, spread={"p": 3.0}, count=4))
+STATES = ib.StateScenario(
+    ib.states.Formulas(**WALK, deviation={"z": 0.5}, spread={"p": 3.0}, count=4)
+)
 ENDS = [ib.Status.CONVERGED, ib.Status.STALLED, ib.Status.MAX_ITERATIONS, ib.Status.DIVERGED]
 
 
@@ -49,13 +61,20 @@ class Drawn:
 class DrawnEstimator(Drawn, ib.Estimator):
     def estimate(self, problem, z, *, history=False):
         known = {"status": np.zeros(len(z), np.int8), **self.look_at(z)}
-        n, rows = problem.measurement.n, [drawn_for(row[None], 1 + int(abs(row[0]) * 100) % 3, 4)[0] for row in z]
-        known |= {"covariance": np.eye(n) * drawn_for(z, 1, 1)} if "covariance" in self.given else {}
+        n, rows = (
+            problem.measurement.n,
+            [drawn_for(row[None], 1 + int(abs(row[0]) * 100) % 3, 4)[0] for row in z],
+        )
+        known |= (
+            {"covariance": np.eye(n) * drawn_for(z, 1, 1)} if "covariance" in self.given else {}
+        )
         known |= {name: rows for name in ("history", "alternatives") if name in self.given}
         known["extras"] = {name: drawn_for(z) for name in ("nis", "stage") if name in self.given}
         wanted = {field.name for field in fields(ib.Estimates)}
         known = {name: values for name, values in known.items() if name in wanted}
-        return ib.Estimates(drawn_for(z, n), simulations=drawn_for(z), jacobians=drawn_for(z), **known)
+        return ib.Estimates(
+            drawn_for(z, n), simulations=drawn_for(z), jacobians=drawn_for(z), **known
+        )
 
 
 @dataclass(frozen=True)
@@ -89,7 +108,9 @@ def of(kind: str, estimator, z) -> dict:
         found, messages = track_safely(estimator, STATES.assumed, z)
     own = {field.name: getattr(found, field.name) for field in fields(found)}
     left_out = ("seconds", "start", "moves", "predicted", "reads")
-    return {"messages": messages} | {name: values for name, values in own.items() if name not in left_out}
+    return {"messages": messages} | {
+        name: values for name, values in own.items() if name not in left_out
+    }
 
 
 def flat(values) -> dict:
@@ -99,8 +120,13 @@ def flat(values) -> dict:
 
 @pytest.mark.parametrize("kind", KINDS)
 @settings(max_examples=10, deadline=None)
-@given(refused=st.sets(st.integers(0, TRIALS - 1), max_size=TRIALS - 1), given=st.sets(st.sampled_from(OPTIONAL)))
-def test_every_field_of_the_others_is_what_it_is_without_the_trials_that_raise(kind, refused, given):
+@given(
+    refused=st.sets(st.integers(0, TRIALS - 1), max_size=TRIALS - 1),
+    given=st.sets(st.sampled_from(OPTIONAL)),
+)
+def test_every_field_of_the_others_is_what_it_is_without_the_trials_that_raise(
+    kind, refused, given
+):
     z = readings(kind)
     at = tuple(sorted(refused))
     others = np.setdiff1d(np.arange(TRIALS), at)
@@ -117,7 +143,9 @@ def test_every_field_of_the_others_is_what_it_is_without_the_trials_that_raise(k
             assert all(np.array_equal(joined[name][i], values[i]) for i in others)
             assert all(not len(joined[name][i]) for i in at)
         else:
-            np.testing.assert_array_equal(take(joined[name], others), take(values, others), err_msg=name)
+            np.testing.assert_array_equal(
+                take(joined[name], others), take(values, others), err_msg=name
+            )
             assert joined[name].dtype == values.dtype
 
 
@@ -133,7 +161,8 @@ def test_rows_are_the_same_at_every_block_size(kind, given):
         names = [name for name in max(parts, key=len) if name not in ("curves", "time_s")]
         # A block whose only trial raised has no extras, which is NaN when it is read.
         assert all(
-            [name for name in names if name in part] == [name for name in part if name in names] for part in parts
+            [name for name in names if name in part] == [name for name in part if name in names]
+            for part in parts
         )
         blocks = [{"extra_nis": [np.nan], "extra_stage": [np.nan]} | part for part in parts]
         stored[size] = {name: np.concatenate([part[name] for part in blocks]) for name in names}
@@ -145,6 +174,8 @@ def test_rows_are_the_same_at_every_block_size(kind, given):
 
 def test_blocks_with_and_without_a_trial_that_raises_are_stored_as_one(tmp_path):
     first = readings("states").reshape(TRIALS, -1)[:, 0]
-    assert not compute([STATES], {"drawn": DrawnTracker(tuple(first[[0]]))}, TRIALS, tmp_path, block_size=5)
+    assert not compute(
+        [STATES], {"drawn": DrawnTracker(tuple(first[[0]]))}, TRIALS, tmp_path, block_size=5
+    )
     ends = [ib.Status(end).label for end in DrawnTracker().look_at(readings("states"))["status"]]
     assert ib.load(tmp_path)["status"].tolist() == ["error", *ends[1:]]

@@ -16,7 +16,15 @@ from ipe_bench.trials.scenario import Scenario
 @pytest.mark.parametrize(
     ("model", "noise"),
     [
-        *((Ranging(), n) for n in (Gaussian(0.1), StudentT(0.1), Colored(0.1, 0.5), Quantization(0.1, dither=True))),
+        *(
+            (Ranging(), n)
+            for n in (
+                Gaussian(0.1),
+                StudentT(0.1),
+                Colored(0.1, 0.5),
+                Quantization(0.1, dither=True),
+            )
+        ),
         (Gins(), Quantization(0.02286)),
     ],
     ids=str,
@@ -32,8 +40,13 @@ def test_a_trial_is_the_same_in_every_block(model, noise):
 
 
 def test_seeds_and_trials_are_independent():
-    draws = [Scenario(Polynomial(), Gaussian(1.0), GaussianPrior(), 1.0, seed).draw(0, 500) for seed in (1, 2)]
-    joined = np.column_stack([*(d.x for d in draws), *((d.z - Polynomial().simulate(d.x))[:, :4] for d in draws)])
+    draws = [
+        Scenario(Polynomial(), Gaussian(1.0), GaussianPrior(), 1.0, seed).draw(0, 500)
+        for seed in (1, 2)
+    ]
+    joined = np.column_stack(
+        [*(d.x for d in draws), *((d.z - Polynomial().simulate(d.x))[:, :4] for d in draws)]
+    )
     assert np.abs(np.corrcoef(joined.T) - np.eye(16)).max() < 5 / np.sqrt(500)
 
 
@@ -45,7 +58,10 @@ def test_truths_are_normal_about_the_nominal_point_with_the_error_scale():
 
 
 def test_one_seed_gives_the_same_draws_at_every_scale_in_units_of_it():
-    small, large = (Scenario(Polynomial(), Gaussian(1.0), GaussianPrior(), s).draw(0, 5).x / s for s in (0.5, 64.0))
+    small, large = (
+        Scenario(Polynomial(), Gaussian(1.0), GaussianPrior(), s).draw(0, 5).x / s
+        for s in (0.5, 64.0)
+    )
     np.testing.assert_allclose(small, large, rtol=1e-15)
 
 
@@ -62,8 +78,13 @@ class Short(Polynomial):
 
 
 def test_a_nominal_point_of_another_length_is_refused():
-    for make in (lambda: Scenario(Short(), Gaussian(1.0)), lambda: Problem(Short(), Gaussian(1.0).covariance(21))):
-        with pytest.raises(UserError, match=r"^measurement=short: nominal has shape \(1,\); let it return \(4,\)"):
+    for make in (
+        lambda: Scenario(Short(), Gaussian(1.0)),
+        lambda: Problem(Short(), Gaussian(1.0).covariance(21)),
+    ):
+        with pytest.raises(
+            UserError, match=r"^measurement=short: nominal has shape \(1,\); let it return \(4,\)"
+        ):
             make()
 
 

@@ -46,19 +46,28 @@ def test_bounds_of_ill_conditioned_models_are_those_of_their_singular_values(mu)
     for bound, A in (("crlb", J), ("bayes", below)):
         _, s, right = np.linalg.svd(A, full_matrices=False)
         deviation = np.sqrt(np.sum((right / s[:, :, None]) ** 2, axis=1))
-        found = np.stack([columns[f"{bound}_{p.name}"] for p in block.problem.measurement.parameters], axis=1)
+        found = np.stack(
+            [columns[f"{bound}_{p.name}"] for p in block.problem.measurement.parameters], axis=1
+        )
         np.testing.assert_allclose(found, deviation, rtol=1e-9)
     found = [columns[f"van_trees_{p.name}"][0] for p in block.problem.measurement.parameters]
     truths = block.scenario.truths(0, EXPECTED)
-    rows = block.problem.R.whiten_jacobian(block.problem.measurement.jacobian(truths)).reshape(-1, 3)
-    _, s, right = np.linalg.svd(np.concatenate([rows / np.sqrt(EXPECTED), prior]), full_matrices=False)
+    rows = block.problem.R.whiten_jacobian(block.problem.measurement.jacobian(truths)).reshape(
+        -1, 3
+    )
+    _, s, right = np.linalg.svd(
+        np.concatenate([rows / np.sqrt(EXPECTED), prior]), full_matrices=False
+    )
     np.testing.assert_allclose(found, np.sqrt(np.sum((right / s[:, None]) ** 2, axis=0)), rtol=1e-8)
 
 
 def test_residuals_of_angles_are_within_half_a_turn():
     """By a bearing of about pi, whose readings are on both sides of it; more turns of the model change nothing."""
     bearing = ib.measurements.Formula(
-        "arctan2(b, a - s)", {"a": -1.0, "b": 0.001}, {"s": tuple(np.linspace(0, 5, 40))}, circular=("y",)
+        "arctan2(b, a - s)",
+        {"a": -1.0, "b": 0.001},
+        {"s": tuple(np.linspace(0, 5, 40))},
+        circular=("y",),
     )
     block = Block.draw(Scenario(bearing, Gaussian(0.1), error_scale=1e-3), 0, 5)
     h = block.readings_at(block.trials.x)
@@ -95,20 +104,26 @@ class Beside(Estimator):
         return found
 
 
-@pytest.mark.parametrize(("by", "solved"), [(0.0, True), (0.5e-3, True), (2e-3, False), (1.0, False)])
+@pytest.mark.parametrize(
+    ("by", "solved"), [(0.0, True), (0.5e-3, True), (2e-3, False), (1.0, False)]
+)
 def test_another_root_is_one_that_lies_a_thousandth_of_a_deviation_away(by, solved):
     _, columns = Block.draw(SCENARIO, 0, 40).estimate(Beside(by))
     assert (columns["solved"] == solved).all()
     np.testing.assert_allclose(columns["root_distance"], by, rtol=0.05, atol=1e-5)
 
 
-@pytest.mark.oracle("closed form: one normal reading of a normal parameter", "Cramér-Rao and Bayesian bounds", 1e-9)
+@pytest.mark.oracle(
+    "closed form: one normal reading of a normal parameter", "Cramér-Rao and Bayesian bounds", 1e-9
+)
 def test_the_bayesian_bound_has_the_prior_in_it_and_so_has_its_gate():
     """Linear, one reading of each parameter: the variance is 1 / (1 / sigma^2 + 1 / d^2), sigma = d = 1."""
     scenario = Scenario(Repeated(names=("a", "b"), repeats=1), Gaussian(1.0), GaussianPrior(), 1.0)
     block = Block.draw(scenario, 0, 4)
     columns = block.truth_columns()
-    assert_agrees([columns["crlb_a"], columns["bayes_a"]], [[1.0] * 4, [np.sqrt(0.5)] * 4], rtol=1e-9)
+    assert_agrees(
+        [columns["crlb_a"], columns["bayes_a"]], [[1.0] * 4, [np.sqrt(0.5)] * 4], rtol=1e-9
+    )
 
     @dataclass(frozen=True)
     class Off(Estimator):
@@ -122,7 +137,9 @@ def test_the_bayesian_bound_has_the_prior_in_it_and_so_has_its_gate():
     assert block.estimate(Off())[1]["success"].tolist() == [True, True, False, False]
 
 
-@pytest.mark.oracle("closed form: one normal reading of a normal parameter", "Van Trees's bound", 1e-9)
+@pytest.mark.oracle(
+    "closed form: one normal reading of a normal parameter", "Van Trees's bound", 1e-9
+)
 def test_van_trees_bound_is_that_of_the_mean_information():
     """In closed form where h is linear, the same at every truth; and below the mean of the local bounds where it is
     not, as Jensen's inequality has it."""
@@ -145,7 +162,9 @@ def test_van_trees_bound_tells_its_own_error():
     """The scatter of the bound over 60 seeds, each with truths of its own, is known to 1 / sqrt(120), 9 %."""
     found = []
     for seed in range(60):
-        columns = Block.draw(Scenario(Bent(0.3), Gaussian(0.1), GaussianPrior(), 1.0, seed), 0, 1).truth_columns()
+        columns = Block.draw(
+            Scenario(Bent(0.3), Gaussian(0.1), GaussianPrior(), 1.0, seed), 0, 1
+        ).truth_columns()
         found.append([columns["van_trees_a"][0], columns["van_trees_error_a"][0]])
     bounds, errors = np.array(found).T
     assert 0.01 < bounds.std() / bounds.mean() < 0.2
@@ -155,7 +174,9 @@ def test_van_trees_bound_tells_its_own_error():
 
 def test_van_trees_bound_tells_no_error_where_few_truths_carry_it():
     """Rates of decay that scatter as widely as they are large: intervals would hold the bound in .6 of cases."""
-    decay = ib.measurements.Formula("a*exp(-b*t)", {"a": 2.0, "b": 0.7}, {"t": tuple(np.linspace(0.5, 5, 10))})
+    decay = ib.measurements.Formula(
+        "a*exp(-b*t)", {"a": 2.0, "b": 0.7}, {"t": tuple(np.linspace(0.5, 5, 10))}
+    )
     columns = Block.draw(Scenario(decay, Gaussian(0.1), GaussianPrior(), 1.0), 0, 1).truth_columns()
     assert np.isfinite(columns["van_trees_a"][0])
     assert np.isnan(columns["van_trees_error_a"][0])
@@ -175,14 +196,21 @@ def test_trials_whose_truth_has_no_readings_are_told_apart_from_failures_of_esti
     block = Block.draw(Scenario(Gap(), Gaussian(0.1)), 0, 20)
     _, columns = block.estimate(LinearLSE())
     assert ((columns["status"] == "no_readings") == (block.trials.x[:, 0] <= 0.0)).all()
-    table = run(Scenario(Gap(), Gaussian(0.1)), {"lse": LinearLSE(), "map": MapLM()}, trials=20, output=tmp_path)
+    table = run(
+        Scenario(Gap(), Gaussian(0.1)),
+        {"lse": LinearLSE(), "map": MapLM()},
+        trials=20,
+        output=tmp_path,
+    )
     lost = int((columns["status"] == "no_readings").sum())
     assert 0 < lost < 20
     assert (ib.load(tmp_path)["status"] == "no_readings").sum() == 2 * lost
     overall = table[table["parameter"] == "all"]
     assert overall["trials"].tolist() == [20 - lost] * 2
     assert overall["no_readings"].tolist() == [lost] * 2
-    assert overall["success"].iloc[0] == columns["success"][columns["status"] != "no_readings"].mean()
+    assert (
+        overall["success"].iloc[0] == columns["success"][columns["status"] != "no_readings"].mean()
+    )
     endings = analyse([tmp_path]).endings
     endings = endings[endings["status"] == "no_readings"]
     assert endings["trials"].tolist() == [lost] * 2

@@ -27,7 +27,9 @@ def curvatures(model: Measurement, x: Array, sigma: float = 1.0) -> tuple[Array,
     return relative_curvatures(model.jacobian(x), second_derivatives(model, x), R)
 
 
-@pytest.mark.oracle("closed form: curvature of a circle (Bates and Watts 1980)", "intrinsic curvature", 1e-5)
+@pytest.mark.oracle(
+    "closed form: curvature of a circle (Bates and Watts 1980)", "intrinsic curvature", 1e-5
+)
 def test_a_circle_bends_by_its_radius_and_runs_evenly():
     model = Written(lambda t: (5 * np.cos(t), 5 * np.sin(t)))
     intrinsic, parametric = curvatures(model, np.array([[0.3], [2.0]]), sigma=0.5)
@@ -46,7 +48,9 @@ def test_a_bent_scale_on_a_straight_line_is_all_parameter_effects():
 
 @pytest.mark.oracle("closed form: curvature of a sphere", "intrinsic curvature", 1e-4)
 def test_a_sphere_bends_alike_in_all_directions():
-    model = Written(lambda a, b: (7 * np.cos(a) * np.cos(b), 7 * np.sin(a) * np.cos(b), 7 * np.sin(b)), 2, 3)
+    model = Written(
+        lambda a, b: (7 * np.cos(a) * np.cos(b), 7 * np.sin(a) * np.cos(b), 7 * np.sin(b)), 2, 3
+    )
     intrinsic, _ = curvatures(model, np.array([[0.4, 0.3]]))
     assert_agrees(intrinsic, np.sqrt(5.991465) / 7, rtol=1e-4)
 
@@ -74,12 +78,17 @@ def test_the_mean_error_of_least_squares_is_the_bias_of_box():
     np.testing.assert_allclose(error.mean(axis=0), expected, atol=4 * spread.max(), rtol=0.15)
 
 
-@pytest.mark.oracle("closed form: least squares of a linear model", "bias under a wrong model", 1e-9)
+@pytest.mark.oracle(
+    "closed form: least squares of a linear model", "bias under a wrong model", 1e-9
+)
 def test_under_a_wrong_linear_model_the_bias_is_h_plus_times_what_is_left_out():
     model, R = Bent(), Covariance(np.full(12, 0.3))
     x, left_out = np.zeros((2, 3)), np.random.default_rng(1).normal(size=(2, 12))
     bias, deviation = misspecified(
-        Problem(model, R), left_out, x, least_squares_root(Problem(model, R), left_out, x, prior=None)
+        Problem(model, R),
+        left_out,
+        x,
+        least_squares_root(Problem(model, R), left_out, x, prior=None),
     )
     assert_agrees(bias, left_out @ np.linalg.pinv(model.A).T, atol=1e-9)
     crlb = np.sqrt(np.diag(np.linalg.inv(information(model.A, R))))
@@ -121,7 +130,10 @@ def test_the_mismatch_experiment_comes_out_as_theory_says(errors):
     assert scores["solved"].all()
     columns = block.truth_columns()
     names = [p.name for p in bench.measurement.parameters]
-    bias, deviation = (np.stack([columns[f"{k}_{n}"] for n in names], axis=1) for k in ("pseudo_bias", "misspecified"))
+    bias, deviation = (
+        np.stack([columns[f"{k}_{n}"] for n in names], axis=1)
+        for k in ("pseudo_bias", "misspecified")
+    )
     left = (estimates.x - block.trials.x - bias) / deviation
     # 80 trials: a root mean square of 1 with a deviation of 0.08.
     assert np.abs(np.sqrt(np.mean(left**2, axis=0)) - 1).max() < 0.32
@@ -137,7 +149,13 @@ def scenario(model: Measurement, scale: float) -> ib.Scenario:
 def test_columns_do_not_depend_on_the_block():
     bench = replace(scenario(Gins(), 33.0), truth=RicherGins(platform_misalignment=5.0))
     whole, part = Block.draw(bench, 0, 6).truth_columns(), Block.draw(bench, 4, 6).truth_columns()
-    for name in ("pseudo_bias_bx", "misspecified_bx", "box_bias_bx", "curvature_intrinsic", "curvature_parameter"):
+    for name in (
+        "pseudo_bias_bx",
+        "misspecified_bx",
+        "box_bias_bx",
+        "curvature_intrinsic",
+        "curvature_parameter",
+    ):
         assert np.array_equal(whole[name][4:], part[name])
     late = Block.draw(scenario(Gins(), 33.0), CURVED, CURVED + 2).truth_columns()
     assert np.isnan(late["box_bias_bx"]).all()

@@ -31,7 +31,9 @@ def test_the_bound_is_that_of_parameters_and_levels_together():
         u = np.concatenate([x, np.log(NOISE.levels)])
         steps = [(u + 1e-30j * e) for e in np.eye(4)]
         h = [10 * v[0] * np.exp(-0.9 * v[1] * t) for v in (u, *steps)]
-        variance = [(np.exp(v[2]) + np.exp(v[3]) * m) ** 2 for v, m in zip((u, *steps), h, strict=True)]
+        variance = [
+            (np.exp(v[2]) + np.exp(v[3]) * m) ** 2 for v, m in zip((u, *steps), h, strict=True)
+        ]
         dh, dR = (np.array([value.imag for value in a[1:]]) / 1e-30 for a in (h, variance))
         fisher = (dh / variance[0]) @ dh.T + 0.5 * (dR / variance[0] ** 2) @ dR.T
         assert_agrees(bound, np.sqrt(np.diag(np.linalg.inv(fisher)))[:2], rtol=1e-10)
@@ -61,7 +63,9 @@ def test_without_levels_a_run_is_refused():
 
 
 def test_levels_that_do_not_suit_are_refused():
-    with pytest.raises(ib.UserError, match=r"noise.levels: has 1 numbers; give one for each of a0, b0"):
+    with pytest.raises(
+        ib.UserError, match=r"noise.levels: has 1 numbers; give one for each of a0, b0"
+    ):
         Unknown(sigma="a0 + b0*h", levels=(1.0,))
     with pytest.raises(ib.UserError, match=r"noise.by: does not go with noise.levels"):
         Unknown(by="t", levels=(1.0,))

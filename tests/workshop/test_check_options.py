@@ -51,7 +51,11 @@ def checked(tmp_path):
 
 @pytest.mark.parametrize("place", GOOD)
 def test_an_option_that_can_be_used_passes(checked, place):
-    own = {"noise/NOISE_made_of_another": GOOD["noise/made_of_another"]} if place == "noise/made_of_ours" else {}
+    own = (
+        {"noise/NOISE_made_of_another": GOOD["noise/made_of_another"]}
+        if place == "noise/made_of_ours"
+        else {}
+    )
     findings = checked({place: GOOD[place], **own}, place)
     assert not [f for f in findings if f.complaint]
     if place != "measurement/to_be_given":
@@ -81,7 +85,9 @@ def test_a_fault_is_still_found(checked, case):
 
 
 @pytest.mark.slow
-def test_the_generated_test_of_a_model_with_an_option_that_it_cannot_do_without(tmp_path, monkeypatch):
+def test_the_generated_test_of_a_model_with_an_option_that_it_cannot_do_without(
+    tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     assert main(["new", "measurement", "tank"]) == 0
     home = Path("plugins/tank")
@@ -91,7 +97,10 @@ def test_the_generated_test_of_a_model_with_an_option_that_it_cannot_do_without(
     name, docs = rest.split('"""', 2)[0], rest.split('"""', 2)
     code.write_text(f'{head}{mark}{name}"""{docs[1]}"""\n\n    level: float\n{docs[2]}')
     run = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(home)]
-    assert subprocess.run(run, capture_output=True, text=True, timeout=300, check=False).returncode == 1
+    assert (
+        subprocess.run(run, capture_output=True, text=True, timeout=300, check=False).returncode
+        == 1
+    )
     (config,) = home.rglob("conf/measurement/*.yaml")
     config.write_text(config.read_text() + "\nlevel: 2.0\n")
     done = subprocess.run(run, capture_output=True, text=True, timeout=300, check=False)
@@ -104,5 +113,7 @@ def test_texts_of_a_skeleton_are_found_in_its_code_and_its_config(ipe_bench):
     found = {finding.component for finding in left_of_skeleton(own)}
     assert found == {"tank.py", "tank.yaml"}
     for path in Path("plugins/tank").rglob("tank.*"):
-        path.write_text(path.read_text().replace("One line that", "What").replace("Replace", "These are"))
+        path.write_text(
+            path.read_text().replace("One line that", "What").replace("Replace", "These are")
+        )
     assert not list(left_of_skeleton(own))

@@ -27,7 +27,9 @@ GROUPS = ("measurement", "noise", "prior", "solver", "baseline", "state_model", 
 OURS = [
     o
     for o in plugins.options()
-    if o.group in GROUPS and o.source.name == "ipe-bench" and "???" not in o.path.read_text(encoding="utf-8")
+    if o.group in GROUPS
+    and o.source.name == "ipe-bench"
+    and "???" not in o.path.read_text(encoding="utf-8")
 ]
 """Those that are something as they stand: a formula or equations of a user's are checked below."""
 
@@ -60,9 +62,14 @@ def test_every_certified_problem_keeps_its_promises(dataset):
 
 FAULTS: dict[str, Callable[[Estimates, np.ndarray], dict[str, Any]]] = {
     "leaning": lambda e, z: {"x": e.x + 1e-9 * len(z)},
-    "rounding": lambda e, z: {"x": e.x * (1 + 1e-15 * len(z))},  # as a matrix product over the whole batch
+    "rounding": lambda e, z: {
+        "x": e.x * (1 + 1e-15 * len(z))
+    },  # as a matrix product over the whole batch
     "averaging": lambda e, z: {"x": e.x + 1e-3 * np.nanmean(z), "history": None},
-    "dicing": lambda e, _: {"x": e.x + 1e-6 * np.random.default_rng().standard_normal(e.x.shape), "history": None},
+    "dicing": lambda e, _: {
+        "x": e.x + 1e-6 * np.random.default_rng().standard_normal(e.x.shape),
+        "history": None,
+    },
     "wrong": lambda e, _: {"x": e.x + 1.0},
     "boasting": lambda e, _: {"status": np.full_like(e.status, Status.CONVERGED)},
     "free": lambda e, _: {"simulations": 0 * e.simulations, "jacobians": 0 * e.jacobians},
@@ -94,8 +101,16 @@ class Thawed(Estimator):
 
 def altered(made, **attributes):
     """A component as that one, of a class with other attributes."""
-    cls = dataclass(frozen=True)(type("Altered", (type(made),), {**attributes, "__module__": __name__}))
-    return cls(**{f.name: getattr(made, f.name) for f in fields(made) if f.init and f.name not in attributes})
+    cls = dataclass(frozen=True)(
+        type("Altered", (type(made),), {**attributes, "__module__": __name__})
+    )
+    return cls(
+        **{
+            f.name: getattr(made, f.name)
+            for f in fields(made)
+            if f.init and f.name not in attributes
+        }
+    )
 
 
 def into_H(self, problem, z, *, history=False):
@@ -216,7 +231,8 @@ def test_a_fault_is_found(faulty, complaint):
 
 
 @pytest.mark.parametrize(
-    ("made", "idle"), [(EKF(), {"Returns from step()"}), (Newton(), {"Reports larger variances"}), (Filter(), set())]
+    ("made", "idle"),
+    [(EKF(), {"Returns from step()"}), (Newton(), {"Reports larger variances"}), (Filter(), set())],
 )
 def test_a_check_that_tests_nothing_says_so(made, idle):
     found = {f.check: f.note for f in check_component("mine", made) if f.note}
@@ -228,7 +244,9 @@ def test_a_check_that_tests_nothing_says_so(made, idle):
 @pytest.mark.parametrize(
     "model",
     [
-        Formula("a*exp(-b*t)+c*t**2", {"a": 2.0, "b": 0.5, "c": -0.1}, {"t": (0.5, 1.0, 2.0, 3.0, 5.0)}),
+        Formula(
+            "a*exp(-b*t)+c*t**2", {"a": 2.0, "b": 0.5, "c": -0.1}, {"t": (0.5, 1.0, 2.0, 3.0, 5.0)}
+        ),
         Ode(
             {"x": "-k*x*y", "y": "k*x*y-0.1*y"},
             {"k": 0.3, "y0": 0.2},
@@ -236,7 +254,10 @@ def test_a_check_that_tests_nothing_says_so(made, idle):
             {"all": "x+y"},
             (0.5, 2.0, 3.0),
         ),
-        ConstrainedModel(Ranging(), (ParameterInfo("clock", fixed=3.0), ParameterInfo("up", lower=-50.0, upper=90.0))),
+        ConstrainedModel(
+            Ranging(),
+            (ParameterInfo("clock", fixed=3.0), ParameterInfo("up", lower=-50.0, upper=90.0)),
+        ),
         Joint((Ranging(), Ranging(rounds=2))),
     ],
     ids=["formula", "ode", "informed", "joint"],

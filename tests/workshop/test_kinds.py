@@ -68,7 +68,10 @@ def edit_figure(name: str, *changes: tuple[str, str]) -> None:
     """Counts a new figure among the main ones, and changes its source in other ways."""
     module = Path("plugins") / name / f"ipe_bench_{name}" / f"{name}.py"
     source = module.read_text()
-    for old, new in (('Figure(draw, ("summary",))', 'Figure(draw, ("summary",), main=True)'), *changes):
+    for old, new in (
+        ('Figure(draw, ("summary",))', 'Figure(draw, ("summary",), main=True)'),
+        *changes,
+    ):
         assert old in source
         source = source.replace(old, new)
     module.write_text(source)
@@ -78,22 +81,34 @@ def edit_figure(name: str, *changes: tuple[str, str]) -> None:
 def files(folder: str) -> dict[str, str]:
     """The digests of the tables and figures of a report."""
     paths = [path for part in ("tables", "figures") for path in Path(folder, part).iterdir()]
-    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in paths if path.name != "index.json"}
+    return {
+        path.name: hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in paths
+        if path.name != "index.json"
+    }
 
 
 DEAR = ("figure", "table", "section")
 """Each draws a report, as `test_a_report_has_what_plugins_add_beside_all_that_is_ours` does of all of them at once."""
 
 
-@pytest.mark.parametrize("kind", [pytest.param(k, marks=pytest.mark.slow if k in DEAR else ()) for k in KINDS])
+@pytest.mark.parametrize(
+    "kind", [pytest.param(k, marks=pytest.mark.slow if k in DEAR else ()) for k in KINDS]
+)
 def test_what_new_makes_passes_its_checks(kind, capsys):
     assert main(["new", kind, "mine"]) == 0
-    assert ("figures=all" in capsys.readouterr().out) == (kind == "figure")  # the main ones do not hold a new figure
+    assert ("figures=all" in capsys.readouterr().out) == (
+        kind == "figure"
+    )  # the main ones do not hold a new figure
     assert main(["check", "plugins/mine"]) == 0
     out = capsys.readouterr().out
     assert f"ok     {GROUPS.get(kind, kind)}=mine: " in out
     assert "all checks passed" in out
-    assert re.search(r'^-      mine.yaml: Describes itself -- line \d still says "One line that', out, re.MULTILINE)
+    assert re.search(
+        r'^-      mine.yaml: Describes itself -- line \d still says "One line that',
+        out,
+        re.MULTILINE,
+    )
 
 
 def test_a_report_has_what_plugins_add_beside_all_that_is_ours(ours, capsys):
@@ -165,13 +180,20 @@ def test_those_that_raise_are_named_and_the_rest_is_whole(ours, capsys):
         capsys.readouterr()
         assert main(["report", "out", MAIN]) == 1
         lines = capsys.readouterr().err.splitlines()
-        assert {line.partition(": ")[2].partition(": ")[0] for line in lines} == {f"{k}=bad_{k}" for k in RECORDS}
+        assert {line.partition(": ")[2].partition(": ")[0] for line in lines} == {
+            f"{k}=bad_{k}" for k in RECORDS
+        }
         assert len(lines) == len(RECORDS)
         assert all(line.startswith("ipe-bench: ") and "broken" in line for line in lines)
     after = files("out")
-    assert {name for name in ours if after.get(name) != ours[name]} <= {"parameters.csv", "costs.csv"}
+    assert {name for name in ours if after.get(name) != ours[name]} <= {
+        "parameters.csv",
+        "costs.csv",
+    }
     assert set(after) == set(ours)
-    complaints = {finding.component for finding in check("plugins/bad") if "broken" in finding.complaint}
+    complaints = {
+        finding.component for finding in check("plugins/bad") if "broken" in finding.complaint
+    }
     assert complaints == {f"{kind}=bad_{kind}" for kind in RECORDS}
 
 
@@ -180,7 +202,10 @@ def test_a_figure_under_the_name_of_ours_is_left_out_and_ours_stays(ours, capsys
     edit_figure("mine", ('fig, "mine"', 'fig, "cost_against_accuracy"'))
     capsys.readouterr()
     assert main(["report", "out", MAIN]) == 1
-    assert "figure=mine: there is a figure cost_against_accuracy already; it is left out" in capsys.readouterr().err
+    assert (
+        "figure=mine: there is a figure cost_against_accuracy already; it is left out"
+        in capsys.readouterr().err
+    )
     assert files("out") == ours
 
 
@@ -193,9 +218,15 @@ STATISTIC = Statistic({!r}, "mine", "all trials", "Mine.", lambda s: {}{})
 FAULTY = {
     "other": (STATISTIC.format("rmse", "1.0", ""), "is called rmse; give file and record one name"),
     "text": (STATISTIC.format("text", "'one'", ""), "a value is a str; return a float"),
-    "short": (STATISTIC.format("short", "s.sizes", ""), "has 4 values; return one, or one for each of 4 parameters"),
+    "short": (
+        STATISTIC.format("short", "s.sizes", ""),
+        "has 4 values; return one, or one for each of 4 parameters",
+    ),
     "colour": (STATISTIC.format("colour", "1.0", ", kind='colour'"), "kind=colour: choose from"),
-    "nowhere": (STATISTIC.format("nowhere", "1.0", ", where=('nowhere',)"), "where=nowhere: choose from"),
+    "nowhere": (
+        STATISTIC.format("nowhere", "1.0", ", where=('nowhere',)"),
+        "where=nowhere: choose from",
+    ),
     "number": ("STATISTIC = 3\n", "is a int and not a Statistic"),
     "library": ("import nothing_like_it\n", "nothing_like_it"),
     "syntax": ("def f(:\n", "SyntaxError"),
@@ -205,7 +236,11 @@ FAULTY = {
 def test_faulty_statistics_are_found():
     for name, (source, _) in FAULTY.items():
         write("statistic", name, source, plugin="bad")
-    complaints = [(finding.component, finding.complaint) for finding in check("plugins/bad") if finding.complaint]
+    complaints = [
+        (finding.component, finding.complaint)
+        for finding in check("plugins/bad")
+        if finding.complaint
+    ]
     assert sorted(name for name, _ in complaints) == sorted(f"statistic={name}" for name in FAULTY)
     for component, complaint in complaints:
         assert FAULTY[component.removeprefix("statistic=")][1] in complaint
@@ -263,7 +298,10 @@ class Hasty(Execution):
         (Faulty("shifted"), "the mean of the draws is off by up to 0.09"),
         (Faulty("common"), "have the correlation 0.99, and 0.00 is stated"),
         (Faulty(power=0.0), "at ten times the error scale"),
-        (Swallowing(), "of task 1 it tells step 0, step 1, end; right is step 0, step 1, a Failure ValueError: wrong"),
+        (
+            Swallowing(),
+            "of task 1 it tells step 0, step 1, end; right is step 0, step 1, a Failure ValueError: wrong",
+        ),
         (Hasty(), "of task 0 it tells end; right is step 0, step 1, step 2, end"),
     ],
     ids=repr,

@@ -20,13 +20,18 @@ def skill(tmp_path_factory) -> Path:
 
 
 def commands(page: Path) -> list[list[str]]:
-    return [shlex.split(line) for line in re.findall(r"^    ipe-bench (.*)$", page.read_text("utf-8"), re.MULTILINE)]
+    return [
+        shlex.split(line)
+        for line in re.findall(r"^    ipe-bench (.*)$", page.read_text("utf-8"), re.MULTILINE)
+    ]
 
 
 def test_the_router_names_every_page_and_the_pages_are_short(skill):
     router = (skill / "SKILL.md").read_text(encoding="utf-8")
     assert router.startswith("---\nname: ipe-bench\n")
-    assert set(re.findall(r"`(new-\w+\.md)`", router)) | {"SKILL.md"} == {path.name for path in skill.iterdir()}
+    assert set(re.findall(r"`(new-\w+\.md)`", router)) | {"SKILL.md"} == {
+        path.name for path in skill.iterdir()
+    }
     assert "\n    ipe-bench run -m error_scale=1,5 " in router
     assert max(path.stat().st_size for path in skill.iterdir()) < 6_500
     assert "Required: `step`." in (skill / "new-solver.md").read_text(encoding="utf-8")

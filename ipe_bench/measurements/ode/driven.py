@@ -15,7 +15,14 @@ import numpy as np
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.engine import trace
-from ipe_bench.measurements.arithmetic import COMPARISONS, CONSTANTS, Arithmetic, Tree, evaluate, parts
+from ipe_bench.measurements.arithmetic import (
+    COMPARISONS,
+    CONSTANTS,
+    Arithmetic,
+    Tree,
+    evaluate,
+    parts,
+)
 
 PIECEWISE = ("min", "max", "abs", "sign", *COMPARISONS)
 _REMEDY = "compare t itself with a constant, so that the moment of the switch is known"
@@ -30,7 +37,11 @@ def separated(
     switches: dict[Tree, str] = {}
 
     def switching(tree: Tree) -> bool:
-        names = {part[1] for part in parts(tree) if part[0] == "name"} if tree[0] in PIECEWISE else set()
+        names = (
+            {part[1] for part in parts(tree) if part[0] == "name"}
+            if tree[0] in PIECEWISE
+            else set()
+        )
         return "t" in names and names <= {"t", *constants, *CONSTANTS}
 
     def rewritten(tree: Tree) -> Tree:
@@ -45,7 +56,9 @@ def separated(
             text, zero = "the sign of t", ("number", 0.0)
             return rewritten(("-", (">", a, zero, text), ("<", a, zero, text)))
         b = other[0] if other else ("negative", a)
-        return rewritten(("if", ("<" if operation == "min" else ">", a, b, f"the {operation} of t"), a, b))
+        return rewritten(
+            ("if", ("<" if operation == "min" else ">", a, b, f"the {operation} of t"), a, b)
+        )
 
     found = dict(formulas)
     for key, formula in formulas.items():
@@ -97,7 +110,9 @@ def numbered_cases(numbers: Sequence[int]) -> int:
     """Counts the cases that a column numbers."""
     known = sorted(set(numbers))
     if known != list(range(1, len(known) + 1)):
-        raise UserError(f"case={known[-1]}: cases are numbered 1, 2 and so on; there are {', '.join(map(str, known))}")
+        raise UserError(
+            f"case={known[-1]}: cases are numbered 1, 2 and so on; there are {', '.join(map(str, known))}"
+        )
     return len(known)
 
 
@@ -108,8 +123,12 @@ def agreed(
     found: dict[tuple[float, ...], float] = {}
     for value, place in zip(column, places, strict=True):
         if found.setdefault(place, value) != value:
-            where = ", ".join(f"{key}={number:g}" for key, number in zip(("case", "time"), place, strict=False))
-            raise UserError(f"{where}: {name} is {found[place]:g} in one row and {value:g} in another{remedy}")
+            where = ", ".join(
+                f"{key}={number:g}" for key, number in zip(("case", "time"), place, strict=False)
+            )
+            raise UserError(
+                f"{where}: {name} is {found[place]:g} in one row and {value:g} in another{remedy}"
+            )
     return dict(sorted(found.items()))
 
 
@@ -123,7 +142,9 @@ def courses(columns: Mapping[str, Sequence[Any]], names: Collection[str]) -> lis
     arrays = {name: np.asarray(columns[name], dtype=float) for name in ("time", *names)}
     case = np.asarray(columns.get("case", np.ones(len(arrays["time"]))), dtype=int)
     numbers = range(1, numbered_cases(case.tolist()) + 1)
-    found = [{name: column[case == number] for name, column in arrays.items()} for number in numbers]
+    found = [
+        {name: column[case == number] for name, column in arrays.items()} for number in numbers
+    ]
     for one in found:
         if one["time"][0] < 0 or (np.diff(one["time"]) <= 0).any():
             raise UserError("columns.time: give ascending numbers from 0 on in each case")

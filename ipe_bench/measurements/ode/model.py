@@ -103,7 +103,9 @@ class OdeMeasurement(Measurement):
         cases = own(self.cases)[None]
         if self.driven is None:
             return cases
-        return own(np.concatenate([np.repeat(cases, len(self.driven), axis=0), self.driven], axis=2))
+        return own(
+            np.concatenate([np.repeat(cases, len(self.driven), axis=0), self.driven], axis=2)
+        )
 
     @property
     def si_sizes(self) -> Array:
@@ -192,7 +194,9 @@ class OdeMeasurement(Measurement):
         z, effort = Rodas5P(self.stepped, SHAPE).measured(x)
         if not np.isfinite(z).all():
             if effort.steps >= MOST_STEPS:
-                return f"the solution takes more than {MOST_STEPS} steps, by the implicit method, too"
+                return (
+                    f"the solution takes more than {MOST_STEPS} steps, by the implicit method, too"
+                )
             return f"the solution itself leaves all numbers near t = {effort.reached:.4g}{unit}"
         if self.step is None and not np.isfinite(self._told(x, len(self.times))).all():
             return (
@@ -203,22 +207,34 @@ class OdeMeasurement(Measurement):
         if needed >= shortest:
             return f"steps of {shortest:.2g}{unit}, the shortest, are too long for these equations"
         looks = f"; they look stiff: {self.stiff_remedy}" if effort.explicit > effort.steps else ""
-        return (
-            f"the equations need steps of {needed:.2g}{unit} at t = {t:.4g}, and the shortest is {shortest:.2g}{looks}"
-        )
+        place = f"at t = {t:.4g}, and the shortest is {shortest:.2g}"
+        return f"the equations need steps of {needed:.2g}{unit} {place}{looks}"
 
     @property
     def stepped(self) -> Stepped:
         """The equations with their numbers, as the implicit method takes them."""
-        return Stepped(self.equations, self.tables, np.asarray(self.times, dtype=float), self.si_sizes)
+        return Stepped(
+            self.equations, self.tables, np.asarray(self.times, dtype=float), self.si_sizes
+        )
 
     def _simulate(
-        self, x: Array, rows: ladder.Indices, steps: NDArray[np.int64], offset: Array, z: Array, y: Array | None = None
+        self,
+        x: Array,
+        rows: ladder.Indices,
+        steps: NDArray[np.int64],
+        offset: Array,
+        z: Array,
+        y: Array | None = None,
     ) -> None:
         """Fills these rows of z (trials, readings), as many times as it has room for, with so many steps to each, and
         of y (trials, cases, states, times + 1), if it has room for any."""
-        times, y = self._times[: z.shape[1] // (self.tables.shape[1] * len(self.outputs))], y if self._kept[1] else None
-        self._readings_kernel.run(x, self._si_sizes, self.tables, rows, times, steps, offset, z.reshape(-1), states=y)
+        times, y = (
+            self._times[: z.shape[1] // (self.tables.shape[1] * len(self.outputs))],
+            y if self._kept[1] else None,
+        )
+        self._readings_kernel.run(
+            x, self._si_sizes, self.tables, rows, times, steps, offset, z.reshape(-1), states=y
+        )
 
     @cached_property
     def _zeros(self) -> Array:
@@ -236,7 +252,11 @@ class OdeMeasurement(Measurement):
     def _kept(self) -> tuple[int, int, int]:
         """Cases, states and times that are held against each other, with a row behind the states that tells whether a
         step was in doubt. A stated rate needs none: no step is unstable."""
-        return self.tables.shape[1], self.states + 1 if self.fastest_rate is None else 0, len(self._times) + 1
+        return (
+            self.tables.shape[1],
+            self.states + 1 if self.fastest_rate is None else 0,
+            len(self._times) + 1,
+        )
 
     @cached_property
     def _remembered(self) -> dict[bytes, tuple[int, bool]]:
@@ -272,11 +292,15 @@ class OdeMeasurement(Measurement):
         def simulate(rows: ladder.Indices, rung: int, z: Array, y: Array) -> None:
             self._simulate(x, rows, rung * self._parts, offset, z, y)
 
-        found = ladder.search(self._rungs, self._tolerances, self._kept, simulate, start, self.near, self._in_doubt)
+        found = ladder.search(
+            self._rungs, self._tolerances, self._kept, simulate, start, self.near, self._in_doubt
+        )
         doubtful = np.flatnonzero(found.doubtful & ~found.lost)
         if len(doubtful):
             z = found.z[np.searchsorted(found.computed, doubtful)] + offset
-            found.lost[doubtful] = ~self._alike(z, self._implicit.simulate(x[doubtful], len(self.times)))
+            found.lost[doubtful] = ~self._alike(
+                z, self._implicit.simulate(x[doubtful], len(self.times))
+            )
         return found
 
     def _alike(self, z: Array, other: Array) -> Mask:
@@ -292,7 +316,10 @@ class OdeMeasurement(Measurement):
 
     @cached_property
     def _implicit(self) -> Rodas5P:
-        return Rodas5P(self.stepped, float(np.clip(_IN_HAND * np.min(self._tolerances) / self._largest, 1e-10, 1e-4)))
+        return Rodas5P(
+            self.stepped,
+            float(np.clip(_IN_HAND * np.min(self._tolerances) / self._largest, 1e-10, 1e-4)),
+        )
 
     @cached_property
     def _largest(self) -> float:
@@ -347,7 +374,10 @@ class OdeMeasurement(Measurement):
     def _is_held(self) -> bool:
         """Whether steps of the implicit method, ten times as accurate or not, lead to the same nominal readings."""
         rougher = replace(self._implicit, rtol=_ROUGHER * self._implicit.rtol)
-        z, rough = self._nominal_reached[0], rougher.simulate(own(self.nominal[None]), len(self.times))
+        z, rough = (
+            self._nominal_reached[0],
+            rougher.simulate(own(self.nominal[None]), len(self.times)),
+        )
         return bool(self._alike(z, rough)[0] or not np.isfinite(z).all())
 
     @cached_property
@@ -356,7 +386,9 @@ class OdeMeasurement(Measurement):
         z, y = np.full((1, self.m), np.nan), np.ones((1, *self._kept))
         if self.fastest_rate is None:
             rung = self._rungs[-1] if compiled.available() else min(self._rungs[-1], _IN_NUMPY)
-            self._simulate(own(self.nominal[None]), np.arange(1), rung * self._parts, self._zeros, z, y)
+            self._simulate(
+                own(self.nominal[None]), np.arange(1), rung * self._parts, self._zeros, z, y
+            )
         lowest, highest = y[0, :, :-1].min(axis=(0, 2)), y[0, :, :-1].max(axis=(0, 2))
         if y[:, :, -1:, -1].any() or ((lowest < 0.0) & (highest > 0.0) & self._divided_by).any():
             z[:] = np.nan
@@ -369,7 +401,9 @@ class OdeMeasurement(Measurement):
         while True:
             found = self._find(own(self.nominal[None]), np.array([place]), self._zeros)
             place = max(place, int(found.places[0])) + 1
-            passed_over = np.isfinite(self._finest).all() and not self._alike(found.z, self._finest)[0]
+            passed_over = (
+                np.isfinite(self._finest).all() and not self._alike(found.z, self._finest)[0]
+            )
             if found.lost[0] or not passed_over or place >= len(self._rungs) - 1:
                 return found
 
@@ -412,13 +446,19 @@ class OdeMeasurement(Measurement):
     def _parts(self) -> NDArray[np.int64]:
         """Steps to each time at rung 1: equal ones, none longer than `step` or the usual interval, none over none."""
         intervals, longest = np.diff(self.times, prepend=0.0), self.step or self._usual_interval
-        return np.where(intervals > 0.0, np.maximum(np.ceil(intervals / longest - 1e-9), 1), 0).astype(np.int64)
+        return np.where(
+            intervals > 0.0, np.maximum(np.ceil(intervals / longest - 1e-9), 1), 0
+        ).astype(np.int64)
 
     @cached_property
     def _usual_interval(self) -> float:
         """The median interval between readings, but for a few that are read one right after another."""
         span = float(self.times[-1])
-        return max(float(np.median(np.diff(self.times, prepend=0.0))), span / (8 * len(self.times))) if span else 1.0
+        return (
+            max(float(np.median(np.diff(self.times, prepend=0.0))), span / (8 * len(self.times)))
+            if span
+            else 1.0
+        )
 
     @cached_property
     def _rungs(self) -> NDArray[np.int64]:
@@ -430,7 +470,9 @@ class OdeMeasurement(Measurement):
         """Tolerance of each reading (m,)."""
         if self.tolerance is None:
             lacking = "states neither a step nor `tolerance`, the error that readings may have"
-            raise UserError(f"measurement.step=null: {self.name} {lacking}; give one, as measurement.step=0.1")
+            raise UserError(
+                f"measurement.step=null: {self.name} {lacking}; give one, as measurement.step=0.1"
+            )
         per_output = np.broadcast_to(np.asarray(self.tolerance, dtype=float), len(self.outputs))
         return np.tile(per_output, self.m // len(self.outputs))
 
@@ -453,7 +495,9 @@ class OdeMeasurement(Measurement):
             return self.jacobian_until(x, stop)
         x = own(x)
         places = self._rungs_of(x, self._zeros, guess=stop < len(self.times)).places
-        groups = ladder.by_rung(np.where(self._trusted(x), 0, self._rungs[places]), np.arange(len(x)))
+        groups = ladder.by_rung(
+            np.where(self._trusted(x), 0, self._rungs[places]), np.arange(len(x))
+        )
         return self._tangents(x, stop, ((*self._coarsened(rung), rows) for rung, rows in groups))
 
     @property
@@ -461,11 +505,21 @@ class OdeMeasurement(Measurement):
         """Whether there are longer steps for tangents."""
         return self.step is None
 
-    def _tangents(self, x: Array, stop: int, groups: Iterable[tuple[Kernel, int, ladder.Indices]]) -> Array:
+    def _tangents(
+        self, x: Array, stop: int, groups: Iterable[tuple[Kernel, int, ladder.Indices]]
+    ) -> Array:
         """Computes J (trials, readings, n) at the first times, each group of trials by its kernel at its rung."""
         J = np.empty((len(x), self.tables.shape[1] * stop * len(self.outputs), self.n))
         for kernel, rung, rows in groups:
-            kernel.run(x, self._si_sizes, self.tables, rows, self._times[:stop], rung * self._parts, J.reshape(-1))
+            kernel.run(
+                x,
+                self._si_sizes,
+                self.tables,
+                rows,
+                self._times[:stop],
+                rung * self._parts,
+                J.reshape(-1),
+            )
         return J
 
     def _coarsened(self, rung: int) -> tuple[Kernel, int]:
@@ -481,7 +535,9 @@ class OdeMeasurement(Measurement):
         def of_fourth(k: int) -> Array:
             return self._tangents(x, stop, [(self._rk4_kernel, k, np.arange(1))])[0]
 
-        fourth = ladder.fewest_of_fourth(of_fourth, J[0]) if rung <= ladder.HIGHEST_OF_FOURTH else None
+        fourth = (
+            ladder.fewest_of_fourth(of_fourth, J[0]) if rung <= ladder.HIGHEST_OF_FOURTH else None
+        )
         # Half the rung; where that is half a step, every second reading.
         if rung == 1 and (stop == 1 or self.driven is not None):
             return ladder.Coarseness(fourth, 1.0)
@@ -513,7 +569,9 @@ class OdeMeasurement(Measurement):
 
     def __getstate__(self) -> dict[str, Any]:
         """Returns the state without what is compiled and remembered, which stays with a process."""
-        return {k: v for k, v in self.__dict__.items() if not k.startswith("_") and k != "equations"}
+        return {
+            k: v for k, v in self.__dict__.items() if not k.startswith("_") and k != "equations"
+        }
 
     @cached_property
     def _readings_kernel(self) -> Kernel:
@@ -536,7 +594,9 @@ class OdeMeasurement(Measurement):
         equations = Equations(self.states, self.n, constants, len(self.outputs), *arithmetic)
         if jumps(equations):
             what = "a rate jumps at a moment that a state or a parameter decides, which no step can end at"
-            remedy = "let both sides agree there, or blend them, as by 1/(1+exp((b-a)/width)) for a > b"
+            remedy = (
+                "let both sides agree there, or blend them, as by 1/(1+exp((b-a)/width)) for a > b"
+            )
             remedy += ", and write comparisons of t where floor or mod is taken of it"
             raise UserError(f"measurement={self.name}: {what}; {remedy}")
         return equations

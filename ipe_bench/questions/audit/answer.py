@@ -33,8 +33,14 @@ class AuditAnswer(Shown, Audit):
             " right; bias is their mean. Intervals hold for all parameters together, and for heavy tails."
         ]
         joint = "The first sentence is of all parameters together, by the whole covariance."
-        notes.append(joint if self.claims.joint else "No covariances are reported, so directions are not judged.")
-        title = f"Audit of {runs} runs" + (f", {left_out} rows without an estimate left out" if left_out else "")
+        notes.append(
+            joint
+            if self.claims.joint
+            else "No covariances are reported, so directions are not judged."
+        )
+        title = f"Audit of {runs} runs" + (
+            f", {left_out} rows without an estimate left out" if left_out else ""
+        )
         return [*self.sentences, Table("audit", title, "", columns, notes=notes)]
 
 

@@ -22,9 +22,13 @@ def answer(files: Sequence[str], output: str | None = None) -> Answered:
     from ipe_bench.questions.audit.answer import audited
 
     if len(files) != 1:
-        raise UserError("audit: name one table of truths, estimates and deviations, such as runs.csv")
+        raise UserError(
+            "audit: name one table of truths, estimates and deviations, such as runs.csv"
+        )
     found = audited(files[0], output)
-    lines = [] if output is None else [f"\nTable   {output}/audit.csv", f"Page    {output}/audit.html"]
+    lines = (
+        [] if output is None else [f"\nTable   {output}/audit.csv", f"Page    {output}/audit.html"]
+    )
     return Answered(found.parts(), 1 if found.scale.wrong else 0, lines=lines)
 
 

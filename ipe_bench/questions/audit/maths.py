@@ -157,7 +157,9 @@ class Audit:
         columns = ["factor", "factor_low", "factor_high", "covariance"]
         frame = pd.DataFrame(factors, columns=columns)
         frame.insert(0, "parameter", self.claims.names)
-        return frame.assign(bias=self.bias[:, 0], bias_low=self.bias[:, 1], bias_high=self.bias[:, 2])
+        return frame.assign(
+            bias=self.bias[:, 0], bias_low=self.bias[:, 1], bias_high=self.bias[:, 2]
+        )
 
 
 def audit(claims: Claims) -> Audit:
@@ -175,8 +177,14 @@ def audit(claims: Claims) -> Audit:
     if lost.any():
         return _with_infinite_errors(claims, lost)
     if claims.runs < FEWEST_RUNS:
-        one = "one log of dependent rows says too little; " if claims.runs == 1 and len(claims.run) > 1 else ""
-        raise UserError(f"audit: there are {claims.runs} independent runs; {one}give at least {FEWEST_RUNS}")
+        one = (
+            "one log of dependent rows says too little; "
+            if claims.runs == 1 and len(claims.run) > 1
+            else ""
+        )
+        raise UserError(
+            f"audit: there are {claims.runs} independent runs; {one}give at least {FEWEST_RUNS}"
+        )
     none = (np.abs(claims.z).max(axis=0) < 1 / _FARTHEST).any()
     if none or any(np.linalg.matrix_rank(part) < part.shape[1] for part in claims.parts):
         raise UserError(
@@ -198,13 +206,18 @@ def audit(claims: Claims) -> Audit:
     value, low, high = bias[worst]
     said = f"{claims.names[worst]} is biased by {value:+.2f} reported deviations ({low:+.2f} to {high:+.2f})."
     # The scale has been tested at its share of the level.
-    asked = [(_SCALE, 0.0 if scale.wrong else 1.0, _of_scale(claims, scale, nees)), (_BIAS, p_bias, said)]
+    asked = [
+        (_SCALE, 0.0 if scale.wrong else 1.0, _of_scale(claims, scale, nees)),
+        (_BIAS, p_bias, said),
+    ]
     if claims.n > 1 and claims.joint:
         asked.insert(1, (_DIRECTION, *_worst_direction(claims)))
     if claims.runs == len(nees):
         asked.append((_TAILS, *_tails(claims)))
     weights, p, sentences = zip(*asked, strict=True)
-    faults = [said for said, q in zip(sentences[1:], holm(p, weights)[1:], strict=True) if q <= ALPHA]
+    faults = [
+        said for said, q in zip(sentences[1:], holm(p, weights)[1:], strict=True) if q <= ALPHA
+    ]
     return Audit(claims, scale, each, bias, (sentences[0], *faults[:2]))
 
 
@@ -225,10 +238,18 @@ def _with_infinite_errors(claims: Claims, lost: NDArray[np.bool_]) -> Audit:
         " covariance is too small."
     )
     if others.runs < FEWEST_RUNS:
-        each, bias, more = (Factor(np.nan, np.nan, np.nan),) * claims.n, np.full((claims.n, 3), np.nan), ()
+        each, bias, more = (
+            (Factor(np.nan, np.nan, np.nan),) * claims.n,
+            np.full((claims.n, 3), np.nan),
+            (),
+        )
     else:
         rest = audit(others)
-        each, bias, more = rest.each, rest.bias, (f"In the others: {rest.sentences[0]}", *rest.sentences[1:2])
+        each, bias, more = (
+            rest.each,
+            rest.bias,
+            (f"In the others: {rest.sentences[0]}", *rest.sentences[1:2]),
+        )
     each = tuple(endless if bad else factor for bad, factor in zip(infinite, each, strict=True))
     return Audit(claims, endless, each, np.where(infinite[:, None], np.nan, bias), (said, *more))
 
@@ -278,12 +299,20 @@ def _worst_direction(claims: Claims) -> tuple[float, str]:
     w = claims.w[np.unique(claims.run, return_index=True)[1]]
     values, vectors = np.linalg.eigh(_scatter(w))
     smallest, largest = _null(_extremes, *w.shape).T
-    p = [(1 + np.sum(smallest <= values[0])) / (1 + _DRAWS), (1 + np.sum(largest >= values[-1])) / (1 + _DRAWS)]
-    found = [(_factors(claims, np.square(claims.w @ v)[:, None], 1 - ALPHA)[0], v) for v in vectors[:, [0, -1]].T]
+    p = [
+        (1 + np.sum(smallest <= values[0])) / (1 + _DRAWS),
+        (1 + np.sum(largest >= values[-1])) / (1 + _DRAWS),
+    ]
+    found = [
+        (_factors(claims, np.square(claims.w @ v)[:, None], 1 - ALPHA)[0], v)
+        for v in vectors[:, [0, -1]].T
+    ]
     factor, v = max(found, key=lambda pair: abs(np.log(pair[0].value)))
     values, vectors = np.linalg.eigh(claims.correlation.mean(axis=0))
     named = in_words(claims.names, (vectors * values**-0.5) @ vectors.T @ v)
-    said = f"In the worst direction, {named} in reported deviations, true errors are {factor.words}."
+    said = (
+        f"In the worst direction, {named} in reported deviations, true errors are {factor.words}."
+    )
     return min(1.0, 2 * float(min(p))), said
 
 
@@ -341,24 +370,38 @@ def read_claims(table: Path | str | pd.DataFrame) -> Claims:
     """
     import pandas as pd
 
-    name, frame = ("the frame", table) if isinstance(table, pd.DataFrame) else (str(table), _read(Path(table)))
+    name, frame = (
+        ("the frame", table)
+        if isinstance(table, pd.DataFrame)
+        else (str(table), _read(Path(table)))
+    )
     _refuse_many(len(frame.columns), name, "columns")
     _refuse_twice(frame, name)
     if "parameter" in frame:
         _refuse_many(frame["parameter"].nunique(), name, "parameters")
         frame = _widened(frame, name)
     ends = ("_true", "_error")
-    names = tuple(dict.fromkeys(c.removesuffix(e) for e in ends for c in map(str, frame.columns) if c.endswith(e)))
-    if not names:
-        raise UserError(f"{name}: has no truth; give columns NAME_true and NAME, or NAME_error, and NAME_std")
-    error, deviation = np.array([_error_and_deviation(frame, parameter, name) for parameter in names]).transpose(
-        1, 2, 0
+    names = tuple(
+        dict.fromkeys(
+            c.removesuffix(e) for e in ends for c in map(str, frame.columns) if c.endswith(e)
+        )
     )
+    if not names:
+        raise UserError(
+            f"{name}: has no truth; give columns NAME_true and NAME, or NAME_error, and NAME_std"
+        )
+    error, deviation = np.array(
+        [_error_and_deviation(frame, parameter, name) for parameter in names]
+    ).transpose(1, 2, 0)
     there = ~np.isnan(error).any(axis=1) & np.isfinite(deviation).all(axis=1)
     if not there.any():
-        raise UserError(f"{name}: no row has an estimate with finite deviations of {', '.join(names)}; give some")
+        raise UserError(
+            f"{name}: no row has an estimate with finite deviations of {', '.join(names)}; give some"
+        )
     if len(bad := np.argwhere(there[:, None] & ~(deviation > 0))):
-        raise UserError(f"{name}: row {bad[0, 0] + 2}: the deviation of {names[bad[0, 1]]} is not above 0")
+        raise UserError(
+            f"{name}: row {bad[0, 0] + 2}: the deviation of {names[bad[0, 1]]} is not above 0"
+        )
     rows, correlation = np.flatnonzero(there), _correlation(frame, names, deviation, name)
     frame, error, deviation = frame.iloc[rows], error[rows], deviation[rows]
     if correlation is not None:
@@ -366,9 +409,13 @@ def read_claims(table: Path | str | pd.DataFrame) -> Claims:
         good = np.array(np.isfinite(correlation).all(axis=(1, 2)))
         good[good] = np.linalg.eigvalsh(correlation[good])[:, 0] > 1e-12
         if not good.all():
-            raise UserError(f"{name}: row {rows[np.argmin(good)] + 2}: the covariance is not positive definite")
+            raise UserError(
+                f"{name}: row {rows[np.argmin(good)] + 2}: the covariance is not positive definite"
+            )
     run = pd.factorize(frame["run"])[0] if "run" in frame else np.arange(len(frame))
-    return Claims(names, error, deviation, correlation, np.asarray(run, dtype=np.intp), int((~there).sum()))
+    return Claims(
+        names, error, deviation, correlation, np.asarray(run, dtype=np.intp), int((~there).sum())
+    )
 
 
 def _read(path: Path) -> pd.DataFrame:
@@ -381,10 +428,16 @@ def _read(path: Path) -> pd.DataFrame:
             return pd.read_parquet(path)
         separator = _separator(path)
         # pandas 2 rounds the last digits of numbers unless it reads texts.
-        frame, texts = (pd.read_csv(path, sep=separator, engine="python", dtype=dtype) for dtype in (None, str))
-        return frame.assign(**{str(name): texts[name].astype(float) for name in frame.select_dtypes("float")})
+        frame, texts = (
+            pd.read_csv(path, sep=separator, engine="python", dtype=dtype) for dtype in (None, str)
+        )
+        return frame.assign(
+            **{str(name): texts[name].astype(float) for name in frame.select_dtypes("float")}
+        )
     except (ValueError, OSError, csv.Error) as error:
-        raise UserError(f"{path}: cannot be read as a table ({str(error).splitlines()[0]})") from None
+        raise UserError(
+            f"{path}: cannot be read as a table ({str(error).splitlines()[0]})"
+        ) from None
 
 
 def _separator(path: Path) -> str:
@@ -410,7 +463,11 @@ def _refuse_twice(frame: pd.DataFrame, name: str) -> None:
     columns = list(map(str, frame.columns))
     for i, column in enumerate(columns):
         base = column.removesuffix(".1")
-        again = base != column and base in columns and not {f"{column}_true", f"{column}_error"} & set(columns)
+        again = (
+            base != column
+            and base in columns
+            and not {f"{column}_true", f"{column}_error"} & set(columns)
+        )
         if column in columns[:i] or again:
             raise UserError(f"{name}: column {base} stands there twice; leave one of them out")
 
@@ -438,7 +495,9 @@ def _widened(frame: pd.DataFrame, name: str) -> pd.DataFrame:
         raise UserError(f"{name}: has no column run, which tells what belongs together")
     if (twice := frame.duplicated([*index, "parameter"]).to_numpy()).any():
         row = int(np.argmax(twice)) + 2
-        raise UserError(f"{name}: row {row}: a parameter stands there a second time in {', '.join(index)}")
+        raise UserError(
+            f"{name}: row {row}: a parameter stands there a second time in {', '.join(index)}"
+        )
     frame = frame.assign(**{c: _numbers(frame, c, name) for c in values})
     wide = frame.pivot_table(index=index, columns="parameter", values=values, sort=False)
     wide.columns = [p if value == "estimate" else f"{p}_{value}" for value, p in wide.columns]
@@ -451,7 +510,9 @@ def _error_and_deviation(frame: pd.DataFrame, parameter: str, name: str) -> tupl
     elif parameter in frame:
         error = _numbers(frame, parameter, name) - _numbers(frame, f"{parameter}_true", name)
     else:
-        raise UserError(f"{name}: has {parameter}_true, but no column {parameter} with the estimates")
+        raise UserError(
+            f"{name}: has {parameter}_true, but no column {parameter} with the estimates"
+        )
     stated = {}
     for column in (f"{parameter}_std", f"{parameter}_var", f"cov_{parameter}_{parameter}"):
         if column in frame:
@@ -466,23 +527,40 @@ def _error_and_deviation(frame: pd.DataFrame, parameter: str, name: str) -> tupl
     for column, other in others:
         # Rounded to three digits they agree.
         if len(bad := np.flatnonzero(np.abs(other - deviation) > 0.01 * np.abs(deviation))):
-            raise UserError(f"{name}: row {bad[0] + 2}: {first} and {column} differ; give one of them")
+            raise UserError(
+                f"{name}: row {bad[0] + 2}: {first} and {column} differ; give one of them"
+            )
     return error, deviation
 
 
-def _correlation(frame: pd.DataFrame, names: Sequence[str], deviation: Array, name: str) -> Array | None:
+def _correlation(
+    frame: pd.DataFrame, names: Sequence[str], deviation: Array, name: str
+) -> Array | None:
     """Returns correlations (rows, n, n), 0 where a pair has no covariance; None if there is no covariance at all."""
     columns = set(frame.columns)
-    stated = [(i, j) for i, a in enumerate(names) for j, b in enumerate(names) if i != j and f"cov_{a}_{b}" in columns]
+    stated = [
+        (i, j)
+        for i, a in enumerate(names)
+        for j, b in enumerate(names)
+        if i != j and f"cov_{a}_{b}" in columns
+    ]
     if not stated:
         return None
     found = np.tile(np.eye(len(names)), (len(frame), 1, 1))
     for i, j in stated:
         with np.errstate(all="ignore"):
-            value = _numbers(frame, f"cov_{names[i]}_{names[j]}", name) / (deviation[:, i] * deviation[:, j])
+            value = _numbers(frame, f"cov_{names[i]}_{names[j]}", name) / (
+                deviation[:, i] * deviation[:, j]
+            )
         # The other half of the matrix may have stated it already.
-        if (i, j)[::-1] in stated and j < i and len(bad := np.flatnonzero(np.abs(found[:, i, j] - value) > 1e-6)):
+        if (
+            (i, j)[::-1] in stated
+            and j < i
+            and len(bad := np.flatnonzero(np.abs(found[:, i, j] - value) > 1e-6))
+        ):
             row, columns = bad[0] + 2, f"cov_{names[j]}_{names[i]} and cov_{names[i]}_{names[j]}"
-            raise UserError(f"{name}: row {row}: {columns} differ; a covariance is symmetric, so give one of them")
+            raise UserError(
+                f"{name}: row {row}: {columns} differ; a covariance is symmetric, so give one of them"
+            )
         found[:, i, j] = found[:, j, i] = value
     return found

@@ -40,10 +40,22 @@ class Comparison(Shown, pd.DataFrame):
 
     def parts(self) -> Iterator[Part]:
         """Yields a table per comparison, within 80 columns, and what the columns mean."""
-        titles = ("", "first", "second", "change", f"{100 * (1 - self.attrs['alpha']):g} %", "p", "e", "second is")
+        titles = (
+            "",
+            "first",
+            "second",
+            "change",
+            f"{100 * (1 - self.attrs['alpha']):g} %",
+            "p",
+            "e",
+            "second is",
+        )
         for title, rows in _comparisons(self):
             cells = zip(titles, zip(*map(_cells, rows), strict=True), strict=True)
-            columns = [(words if title in ("", "second is") else texts)(title, column) for title, column in cells]
+            columns = [
+                (words if title in ("", "second is") else texts)(title, column)
+                for title, column in cells
+            ]
             needed = [_needed(row) for row in rows if row.get("power", math.nan) > 0]
             yield Table("comparison", title, "", columns, notes=needed)
         yield (
@@ -75,8 +87,14 @@ def write_comparison(folder: Path, frame: Comparison, sources: Sequence[tuple[st
 
     parts = list(frame.parts())
     tables = [part for part in parts if isinstance(part, Table)]
-    shown = list(_finding_sentences(frame)), [_joined(tables), *parts[len(tables) :]], draw_pairs(frame)
-    write_files(folder, "comparison", ("comparison.csv", frame), "Comparison", *shown, sources=sources)
+    shown = (
+        list(_finding_sentences(frame)),
+        [_joined(tables), *parts[len(tables) :]],
+        draw_pairs(frame),
+    )
+    write_files(
+        folder, "comparison", ("comparison.csv", frame), "Comparison", *shown, sources=sources
+    )
 
 
 def _joined(tables: Sequence[Table]) -> Table:
@@ -86,19 +104,33 @@ def _joined(tables: Sequence[Table]) -> Table:
     for title in titles:
         found = [next((c for c in table.columns if c.title == title), None) for table in tables]
         cells = [c.cells if c else [Cell("")] * len(t) for c, t in zip(found, tables, strict=True)]
-        columns.append(Column(title or "quantity", list(chain.from_iterable(cells)), title not in ("", "second is")))
+        columns.append(
+            Column(
+                title or "quantity",
+                list(chain.from_iterable(cells)),
+                title not in ("", "second is"),
+            )
+        )
     notes = [note for table in tables for note in table.notes]
     return Table("comparison", "Trial by trial", "", columns, notes=notes, grouped=1)
 
 
 def _finding_sentences(frame: pd.DataFrame) -> Iterator[str]:
     """Says in how many comparisons the second is better, and worse, by quantity."""
-    judged, names = frame[frame["p"].notna()], [frame[which].unique() for which in ("first", "second")]
-    who = [str(each[0]) if len(each) == 1 and len({*names[0], *names[1]}) == 2 else "" for each in names]
+    judged, names = (
+        frame[frame["p"].notna()],
+        [frame[which].unique() for which in ("first", "second")],
+    )
+    who = [
+        str(each[0]) if len(each) == 1 and len({*names[0], *names[1]}) == 2 else ""
+        for each in names
+    ]
     number = judged.groupby("quantity").size().max()
     for word in ("better", "worse"):
         counts = judged[judged["finding"] == word].groupby("quantity", sort=False).size()
-        listed = ", ".join(f"{quantity} ({count} of {number} comparisons)" for quantity, count in counts.items())
+        listed = ", ".join(
+            f"{quantity} ({count} of {number} comparisons)" for quantity, count in counts.items()
+        )
         than = f"{who[1]} is {word} than {who[0]}" if all(who) else f"The second is {word}"
         yield f"{than} in {listed or 'no tested quantity'}."
 
@@ -115,19 +147,31 @@ def _comparisons(frame: pd.DataFrame) -> Iterator[tuple[str, list[dict[str, Any]
     """Yields each comparison with its title, in order."""
     settings = [c for c in frame.columns if c not in NOT_SETTINGS]
     listed: list[Any] = frame.to_dict("records")
-    for _, part in groupby(listed, key=lambda row: tuple(value_text(row[c]) for c in (*settings, "first", "second"))):
+    for _, part in groupby(
+        listed, key=lambda row: tuple(value_text(row[c]) for c in (*settings, "first", "second"))
+    ):
         rows = list(part)
         first = rows[0]
-        who = first["first"] if first["first"] == first["second"] else f"{first['first']}, then {first['second']}"
+        who = (
+            first["first"]
+            if first["first"] == first["second"]
+            else f"{first['first']}, then {first['second']}"
+        )
         how = "" if first["matched_by"] == "trial" else " of other seeds, matched in their order"
-        yield f"{comparison_title(first)}: {who}; {first['trials']} trial{'s' * (first['trials'] != 1)}{how}", rows
+        yield (
+            f"{comparison_title(first)}: {who}; {first['trials']} trial{'s' * (first['trials'] != 1)}{how}",
+            rows,
+        )
 
 
 def _cells(row: dict[str, Any]) -> tuple[str, ...]:
     quantity = row["quantity"]
     show = {"success": percent, "time": lambda v: duration(v, 2)}.get(quantity, compact)
     if quantity == "success":
-        change, ends = f"{100 * row['change']:+.1f} %", f"{100 * row['low']:+.1f} to {100 * row['high']:+.1f}"
+        change, ends = (
+            f"{100 * row['change']:+.1f} %",
+            f"{100 * row['low']:+.1f} to {100 * row['high']:+.1f}",
+        )
     elif quantity.startswith("bias "):
         change, ends = f"{row['change']:+.3f}", f"{row['low']:+.3f} to {row['high']:+.3f}"
     else:
@@ -168,13 +212,23 @@ def compared_folders(
     widened = MARGINS | dict(margins or {})
     _require_known(alpha, tested, widened)
     if plan is not None and "success" not in tested:
-        raise UserError("power: is that of success, which fail_on does not name; add it, or leave out power")
+        raise UserError(
+            "power: is that of success, which fail_on does not name; add it, or leave out power"
+        )
     versions = (first, second)
     with opened(first_folders) as one, opened(second_folders or first_folders) as other:
         _require_two(first_folders, second_folders, versions)
         asked = collect(one), collect(other)
         read = digests(dict.fromkeys([*one, *other]))
-        found = compared(*asked, versions, alpha=alpha, anytime=anytime, plan=plan, tested=tested, margins=widened)
+        found = compared(
+            *asked,
+            versions,
+            alpha=alpha,
+            anytime=anytime,
+            plan=plan,
+            tested=tested,
+            margins=widened,
+        )
         few = [] if anytime else list(too_few(found, alpha))
         lacking = list(gone(*asked, versions)) if complete else []
     frame = Comparison(found)
@@ -182,7 +236,9 @@ def compared_folders(
         whole = ["discordant", "trials_needed"]
         frame[whole] = frame[whole].astype("Int64")
     for name in ("problems", "stale"):
-        frame.attrs[name] = list(dict.fromkeys(line for one in asked for line in getattr(one, name)))
+        frame.attrs[name] = list(
+            dict.fromkeys(line for one in asked for line in getattr(one, name))
+        )
     frame.attrs["problems"] += lacking
     frame.attrs["worse"] = _worse(frame, ("success", "error") if fail_on is None else fail_on)
     frame.attrs["notes"] = [*few, *left_out(*asked), *other_sources(*asked)]
@@ -204,15 +260,21 @@ def _require_known(alpha: float, tested: Sequence[str], margins: Mapping[str, fl
             raise UserError(f"margin.{name}={margin}: give a number from 0 on")
 
 
-def _require_two(first: Sequence[Path], second: Sequence[Path] | None, versions: tuple[str | None, str | None]) -> None:
+def _require_two(
+    first: Sequence[Path], second: Sequence[Path] | None, versions: tuple[str | None, str | None]
+) -> None:
     """Refuses to compare a version with itself."""
     if second is None and None in versions:
-        raise UserError("compare: one folder is given; name another, or first=LABEL and second=LABEL")
+        raise UserError(
+            "compare: one folder is given; name another, or first=LABEL and second=LABEL"
+        )
     same = {path.resolve() for path in first} == {path.resolve() for path in second or first}
     label = versions[0]
     if same and label == versions[1]:
         named = "one folder" if label is None else f"{label} of one folder"
-        raise UserError(f"compare: {named} is compared with itself; name another, or first=LABEL and second=LABEL")
+        raise UserError(
+            f"compare: {named} is compared with itself; name another, or first=LABEL and second=LABEL"
+        )
 
 
 def _worse(frame: Comparison, failing: Sequence[str]) -> list[str]:

@@ -31,8 +31,12 @@ def answer(folders: Sequence[str], **given: Any) -> Answered:
     from ipe_bench.questions.compare.answer import compared_folders
 
     if not 1 <= len(folders) <= 2:
-        raise UserError("compare: name one or two folders of results, such as outputs/before outputs/after")
-    margins = {key.partition(".")[2]: given.pop(key) for key in list(given) if key.startswith("margin.")}
+        raise UserError(
+            "compare: name one or two folders of results, such as outputs/before outputs/after"
+        )
+    margins = {
+        key.partition(".")[2]: given.pop(key) for key in list(given) if key.startswith("margin.")
+    }
     first, *others = ([Path(folder)] for folder in folders)
     frame = compared_folders(first, *others, margins=margins, **given)
     told = frame.attrs
@@ -41,7 +45,9 @@ def answer(folders: Sequence[str], **given: Any) -> Answered:
         output = given["output"]
         lines = [f"\nTable   {output}/comparison.csv", f"Page    {output}/comparison.html", *lines]
     problems = [*told["problems"], *told["stale"], *told["notes"]]
-    return Answered(frame.parts(), 1 if told["worse"] or told["problems"] else 0, problems, lines=lines)
+    return Answered(
+        frame.parts(), 1 if told["worse"] or told["problems"] else 0, problems, lines=lines
+    )
 
 
 def options() -> Mapping[str, Any]:

@@ -62,7 +62,10 @@ def success_effect(first: Array, second: Array, alpha: float = ALPHA) -> Effect:
     """
     only_first, only_second = int((first & ~second).sum()), int((second & ~first).sum())
     trials, p = len(first), mcnemar(only_first, only_second)
-    low, high = _tango(only_first, only_second, trials, alpha), -_tango(only_second, only_first, trials, alpha)
+    low, high = (
+        _tango(only_first, only_second, trials, alpha),
+        -_tango(only_second, only_first, trials, alpha),
+    )
     if p >= alpha:
         low, high = min(low, 0.0), max(high, 0.0)
     change, e = (only_second - only_first) / trials, fair_coin(only_first, only_second)
@@ -84,7 +87,9 @@ def _tango(losses: int, gains: int, trials: int, alpha: float) -> float:
     return first_that(inside, -1.0, (gains - losses) / trials)
 
 
-def ratio_effect(first: Array, second: Array, alpha: float = ALPHA, largest: float | None = None) -> Effect:
+def ratio_effect(
+    first: Array, second: Array, alpha: float = ALPHA, largest: float | None = None
+) -> Effect:
     """Computes the ratio of the means of two columns (trials,) of finite nonnegative numbers, second over first.
 
     Where neither is larger by nature, each trial's difference is as likely to have the other sign: the p is the share
@@ -123,24 +128,42 @@ def mean_effect(first: Array, second: Array, alpha: float, largest: float) -> Ef
     """
     d = differences(second, first)
     ones, mean = np.ones(len(d)), float(d.mean())
-    reach = -float(ndtri(alpha / 2)) * float(d.std()) / np.sqrt(len(d)) + _unseen(ones, d, alpha) * largest
+    reach = (
+        -float(ndtri(alpha / 2)) * float(d.std()) / np.sqrt(len(d))
+        + _unseen(ones, d, alpha) * largest
+    )
     p = _p_of_ratio(*grouped(np.array([ones, d]), MOST_SIGNS).T.copy())(0.0)
     evidence = no_lean(d, float(abs(first[0]) + abs(second[0])) or 1.0)
-    return Effect(float(first.mean()), float(second.mean()), mean, mean - reach, mean + reach, p, evidence)
+    return Effect(
+        float(first.mean()), float(second.mean()), mean, mean - reach, mean + reach, p, evidence
+    )
 
 
 def _p_of_ratio(a: Array, b: Array) -> Callable[[float], float]:
     """Computes the p of b being r times a: the share of sums with random signs at least as far from 0 as the sum of b -
     r a, itself included; if it is alone, Hoeffding's bound of this share (J. Amer. Statist. Assoc. 58, 1963)."""
     signs = _signs(len(a))
-    flipped_a, flipped_b, size_a, size_b = signs @ a, signs @ b, float(a.sum()), float(np.abs(b).sum())
+    flipped_a, flipped_b, size_a, size_b = (
+        signs @ a,
+        signs @ b,
+        float(a.sum()),
+        float(np.abs(b).sum()),
+    )
 
     def p(ratio: float) -> float:
-        d, flipped, roundoff = b - ratio * a, flipped_b - ratio * flipped_a, 1e-12 * (size_b + ratio * size_a)
+        d, flipped, roundoff = (
+            b - ratio * a,
+            flipped_b - ratio * flipped_a,
+            1e-12 * (size_b + ratio * size_a),
+        )
         total = abs(float(d.sum()))
         count = int((np.abs(flipped) >= total - roundoff).sum())
         least = 1 / (FLIPS + 1)
-        return (1 + count) * least if count else min(least, 2 * float(np.exp(-(total**2) / (2 * float(d @ d)))))
+        return (
+            (1 + count) * least
+            if count
+            else min(least, 2 * float(np.exp(-(total**2) / (2 * float(d @ d)))))
+        )
 
     return p
 
@@ -148,7 +171,11 @@ def _p_of_ratio(a: Array, b: Array) -> Callable[[float], float]:
 def _least_ratio(a: Array, b: Array, alpha: float) -> float:
     """Finds the least ratio of b over a that is not rejected."""
     p = _p_of_ratio(a, b)
-    return 0.0 if p(0.0) >= alpha else first_that(lambda ratio: p(ratio) >= alpha, 0.0, float(b.sum() / a.sum()))
+    return (
+        0.0
+        if p(0.0) >= alpha
+        else first_that(lambda ratio: p(ratio) >= alpha, 0.0, float(b.sum() / a.sum()))
+    )
 
 
 def _unseen(first: Array, second: Array, alpha: float) -> float:
@@ -156,7 +183,9 @@ def _unseen(first: Array, second: Array, alpha: float) -> float:
     seen."""
     with np.errstate(all="ignore"):
         # Round-off makes no ratio another one.
-        _, counts = np.unique((second / first).astype(np.float32), return_counts=True, equal_nan=True)
+        _, counts = np.unique(
+            (second / first).astype(np.float32), return_counts=True, equal_nan=True
+        )
     others, trials = len(first) - int(counts.max()), len(first)
     if others >= min(RARE, trials / 2):
         return 0.0
@@ -206,7 +235,9 @@ class PowerPlan:
     difference: float
 
     @classmethod
-    def of(cls, power: float | None, difference: float | None, *, anytime: bool = False) -> PowerPlan | None:
+    def of(
+        cls, power: float | None, difference: float | None, *, anytime: bool = False
+    ) -> PowerPlan | None:
         """Returns the plan that is asked for; None if none is.
 
         Raises:
@@ -216,12 +247,16 @@ class PowerPlan:
             return None
         if power is None or difference is None:
             missing = "power" if power is None else "difference"
-            raise UserError(f"{missing}: is not given; both go together, such as power=0.9 difference=0.05")
+            raise UserError(
+                f"{missing}: is not given; both go together, such as power=0.9 difference=0.05"
+            )
         for name, value, example in (("power", power, 0.9), ("difference", difference, 0.05)):
             if not 0 < value < 1:
                 raise UserError(f"{name}={value}: give a number between 0 and 1, such as {example}")
         if anytime:
-            raise UserError("power: is that of a fixed number of trials; leave out anytime, or see precision= of run")
+            raise UserError(
+                "power: is that of a fixed number of trials; leave out anytime, or see precision= of run"
+            )
         return cls(power, difference)
 
     def row(self, discordant: int, trials: int, alpha: float) -> dict[str, Any]:
@@ -231,11 +266,15 @@ class PowerPlan:
             UserError: there are too few trials to plan from, or the plan has more than `MOST`.
         """
         if trials < FEW:
-            raise UserError(f"power: {trials} common trials are too few to plan from; run at least {FEW}")
+            raise UserError(
+                f"power: {trials} common trials are too few to plan from; run at least {FEW}"
+            )
         # One end of an interval leaves out half of what both do.
         high = clopper_pearson(discordant, trials, 2 * LIMIT - 1)[1]
         needed = trials_needed(max(high, self.difference), self.difference, self.power, alpha)
-        return dict(zip(PLANNED, (self.power, self.difference, discordant, high, needed), strict=True))
+        return dict(
+            zip(PLANNED, (self.power, self.difference, discordant, high, needed), strict=True)
+        )
 
 
 def mcnemar_power(trials: int, share: float, difference: float, alpha: float) -> float:
@@ -269,7 +308,9 @@ def trials_needed(share: float, difference: float, power: float, alpha: float) -
     while not enough(high):
         low, high = high, 2 * high
         if high > MOST:
-            raise UserError(f"difference={difference:g}: needs more than {MOST:,} trials; ask for a larger difference")
+            raise UserError(
+                f"difference={difference:g}: needs more than {MOST:,} trials; ask for a larger difference"
+            )
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (low, middle) if enough(middle) else (middle, high)

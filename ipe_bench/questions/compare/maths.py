@@ -13,9 +13,23 @@ import numpy as np
 
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array
-from ipe_bench.questions.compare.effects import PLANNED, Effect, PowerPlan, mean_effect, ratio_effect, success_effect
+from ipe_bench.questions.compare.effects import (
+    PLANNED,
+    Effect,
+    PowerPlan,
+    mean_effect,
+    ratio_effect,
+    success_effect,
+)
 from ipe_bench.runs.provenance import canonical_json
-from ipe_bench.statistics.collect import Collection, Group, config_leaves, differing, scenario_of, shown_leaf
+from ipe_bench.statistics.collect import (
+    Collection,
+    Group,
+    config_leaves,
+    differing,
+    scenario_of,
+    shown_leaf,
+)
 from ipe_bench.statistics.comparisons import ALPHA, differences, holm
 from ipe_bench.statistics.intervals import verdict
 from ipe_bench.statistics.sample import Sample, samples
@@ -38,7 +52,9 @@ NOT_SETTINGS = (
 
 def comparison_title(row: Mapping[str, Any]) -> str:
     """Titles a comparison in one line."""
-    named = {k: _plain(v) for k, v in row.items() if k not in NOT_SETTINGS and v is not None and v == v}
+    named = {
+        k: _plain(v) for k, v in row.items() if k not in NOT_SETTINGS and v is not None and v == v
+    }
     titles = {"measurement": "", "noise": "", "error_scale": "error scale "}
     return ", ".join(titles.get(key, f"{key} ") + value for key, value in named.items())
 
@@ -67,10 +83,14 @@ def compared(
     Raises:
         UserError: there is nothing to compare.
     """
-    rows = [row for match in _matches(first, second, labels) for row in _rows(*match, alpha, tested)]
+    rows = [
+        row for match in _matches(first, second, labels) for row in _rows(*match, alpha, tested)
+    ]
     hidden = [(row.pop("loss"), row.pop("discordant")) for row in rows]
     judged = [one for one in zip(rows, hidden, strict=True) if np.isfinite(one[0]["p"])]
-    for (row, ((low, high), discordant)), p in zip(judged, holm([row["p"] for row, _ in judged]), strict=True):
+    for (row, ((low, high), discordant)), p in zip(
+        judged, holm([row["p"] for row, _ in judged]), strict=True
+    ):
         if plan is not None and row["quantity"] == "success":
             row |= plan.row(discordant, row["trials"], alpha / len(judged))
         row["p"], kind = float(p), row["quantity"].partition(" ")[0]
@@ -96,14 +116,23 @@ def _rows(a: Sample, b: Sample, alpha: float, tested: Container[str]) -> Iterato
     head = _head(a.group, b.group) | {"first": a.group.estimator, "second": b.group.estimator}
     head |= {"trials": len(one), "matched_by": matched_by}
     for quantity, first, second, largest in _columns(a, b, one, other, tested):
-        kind, effect, loss = quantity.partition(" ")[0], Effect(np.nan, np.nan, np.nan), (np.nan, np.nan)
+        kind, effect, loss = (
+            quantity.partition(" ")[0],
+            Effect(np.nan, np.nan, np.nan),
+            (np.nan, np.nan),
+        )
         if len(first):
             effect = {"success": success_effect, "bias": mean_effect}.get(kind, ratio_effect)(
                 first, second, alpha, *largest
             )
             loss = _loss(kind, effect, first, a.n)
         effect = effect if kind in tested else replace(effect, p=np.nan, e=np.nan)
-        more = {"different": False, "finding": "", "loss": loss, "discordant": int(np.sum(first != second))}
+        more = {
+            "different": False,
+            "finding": "",
+            "loss": loss,
+            "discordant": int(np.sum(first != second)),
+        }
         yield head | {"quantity": quantity} | asdict(effect) | more
     seconds = float(np.mean(a.scalars["time_s"][one])), float(np.mean(b.scalars["time_s"][other]))
     effect = Effect(*seconds, seconds[1] / seconds[0] if seconds[0] > 0 else np.nan)
@@ -120,9 +149,14 @@ def _columns(
     yield "error", error[0], error[0] + differences(error[1], error[0]), (radius,)
     if "honesty" in tested:
         # Trials that do not converge claim nothing. What the second claims no more, in some or in all, is on the gate.
-        nees = [np.where(s.converged[at], s.scalars["nees"][at] / n, np.nan) for s, at in ((a, one), (b, other))]
+        nees = [
+            np.where(s.converged[at], s.scalars["nees"][at] / n, np.nan)
+            for s, at in ((a, one), (b, other))
+        ]
         claimed, common = ~np.isnan(nees[0]), ~np.isnan(nees[0]) & b.converged[other]
-        first, second = (np.fmin(v[common if common.any() else claimed], radius**2 / n) for v in nees)
+        first, second = (
+            np.fmin(v[common if common.any() else claimed], radius**2 / n) for v in nees
+        )
         yield "honesty", first, second, (radius**2 / n,)
     if "bias" in tested:
         bound, both = a.group.footer["bound"], success[0] & success[1]
@@ -151,7 +185,9 @@ def _loss(kind: str, effect: Effect, first: Array, n: int) -> tuple[float, float
     if kind not in ("honesty", "bias"):
         return low, high
     ends = abs(start + low), abs(start + high)
-    return (0.0 if (start + low) * (start + high) < 0 else min(ends)) - abs(start), max(ends) - abs(start)
+    return (0.0 if (start + low) * (start + high) < 0 else min(ends)) - abs(start), max(ends) - abs(
+        start
+    )
 
 
 def _may_be_right(kind: str, first: Array, n: int) -> bool:
@@ -165,7 +201,9 @@ def _head(first: Group, second: Group) -> dict[str, Any]:
     """Returns what identifies a comparison: the scenario, and the differing options of one label, with both values."""
     columns = dict(first.columns)
     if first.label == second.label:
-        configs = [{"estimator": group.footer["identity"]["estimator"]} for group in (first, second)]
+        configs = [
+            {"estimator": group.footer["identity"]["estimator"]} for group in (first, second)
+        ]
         leaves = [config_leaves(config) for config in configs]
         for key in differing(configs):
             shown = [_plain(shown_leaf(own[key][1])) if key in own else "-" for own in leaves]
@@ -200,9 +238,19 @@ def _matches(
     def asked(one: Group, other: Group) -> bool:
         if wanted[0] is None:
             return one.estimator == other.estimator
-        return wanted[0] in (one.estimator, one.label) and wanted[1] in (other.estimator, other.label)
+        return wanted[0] in (one.estimator, one.label) and wanted[1] in (
+            other.estimator,
+            other.label,
+        )
 
-    found = [(one, other) for key in a if key in b for one in a[key] for other in b[key] if asked(one, other)]
+    found = [
+        (one, other)
+        for key in a
+        if key in b
+        for one in a[key]
+        for other in b[key]
+        if asked(one, other)
+    ]
     if not found:
         raise _no_estimator(first, second, wanted)
     for one, other in found:
@@ -212,7 +260,9 @@ def _matches(
         yield mine, theirs
 
 
-def gone(first: Collection, second: Collection, labels: tuple[str | None, str | None]) -> Iterator[str]:
+def gone(
+    first: Collection, second: Collection, labels: tuple[str | None, str | None]
+) -> Iterator[str]:
     """Yields a line where the second lacks an estimator of the first on a scenario, some trials, or its covariance."""
     matched, wanted = list(_matches(first, second, labels)), labels[0] or labels[1]
     for group in (g for g in first.groups if wanted in (None, g.estimator, g.label)):
@@ -231,11 +281,21 @@ def gone(first: Collection, second: Collection, labels: tuple[str | None, str | 
 def other_sources(first: Collection, second: Collection) -> Iterator[str]:
     """Yields a line if other versions of the bench, a plugin or a library drew the trials of a scenario of both."""
     a, b = _by_scenario(first), _by_scenario(second)
-    truths = [(x, y) for key in a if key in b for x in a[key][0].truths for y in b[key][0].truths if x and y]
-    made = [
-        [{**t.footer["versions"], **t.footer["libraries"], "source": t.footer["source"]} for t in p] for p in truths
+    truths = [
+        (x, y)
+        for key in a
+        if key in b
+        for x in a[key][0].truths
+        for y in b[key][0].truths
+        if x and y
     ]
-    differ = dict.fromkeys(f"{k} {x[k]} | {y.get(k)}" for x, y in made for k in x if x[k] != y.get(k))
+    made = [
+        [{**t.footer["versions"], **t.footer["libraries"], "source": t.footer["source"]} for t in p]
+        for p in truths
+    ]
+    differ = dict.fromkeys(
+        f"{k} {x[k]} | {y.get(k)}" for x, y in made for k in x if x[k] != y.get(k)
+    )
     if differ:
         yield f"other sources: {', '.join(differ)}; differences may be theirs: run both sides with the same ones"
 
@@ -252,7 +312,11 @@ def left_out(first: Collection, second: Collection) -> list[str]:
     """Reports scenarios that one side lacks, while both share some."""
     a, b = _by_scenario(first).keys(), _by_scenario(second).keys()
     alone = ((first, len(a - b)), (second, len(b - a))) if a & b else ()
-    return [f"{_where(c)}: {count} scenarios that the other lacks are left out" for c, count in alone if count]
+    return [
+        f"{_where(c)}: {count} scenarios that the other lacks are left out"
+        for c, count in alone
+        if count
+    ]
 
 
 def _by_scenario(collection: Collection) -> dict[str, list[Group]]:
@@ -262,15 +326,21 @@ def _by_scenario(collection: Collection) -> dict[str, list[Group]]:
     return found
 
 
-def _no_estimator(first: Collection, second: Collection, wanted: tuple[str | None, str | None]) -> UserError:
+def _no_estimator(
+    first: Collection, second: Collection, wanted: tuple[str | None, str | None]
+) -> UserError:
     for name, label, collection in zip(("first", "second"), wanted, (first, second), strict=True):
         known = {g.estimator for g in collection.groups} | {g.label for g in collection.groups}
         if label is not None and label not in known:
             return UserError(f"{name}={label}: {unknown(label, known, 'estimator')}")
     if wanted != (None, None):
-        return UserError(f"first={wanted[0]} second={wanted[1]}: no scenario has both; run both on the same one")
+        return UserError(
+            f"first={wanted[0]} second={wanted[1]}: no scenario has both; run both on the same one"
+        )
     names = [", ".join(dict.fromkeys(g.estimator for g in c.groups)) for c in (first, second)]
-    return UserError(f"no estimator is in both ({names[0]}; {names[1]}); choose with first=LABEL second=LABEL")
+    return UserError(
+        f"no estimator is in both ({names[0]}; {names[1]}); choose with first=LABEL second=LABEL"
+    )
 
 
 def _where(collection: Collection) -> str:

@@ -80,7 +80,9 @@ def _draw_design(design: Design) -> Iterator[Drawing]:
     best, scenario, after = None if _no_others(design) else _best(design), design.scenario, None
     if best is not None:
         model = design.measurement(best.sharpest)
-        after = Observability.at(model, scenario.noise.covariance(model.m), scenario.truths(0, TRUTHS))
+        after = Observability.at(
+            model, scenario.noise.covariance(model.m), scenario.truths(0, TRUTHS)
+        )
     yield from draw_bounds(design.observability, after, f"best choice {best.title}" if best else "")
 
 
@@ -103,12 +105,20 @@ def _parameters(name: str, design: Design) -> Table:
     columns = [
         words("parameter", [p.name for p in parameters]),
         words("unit", [p.unit for p in parameters]),
-        texts("bound", [scientific(bound * p.size) for p, bound in zip(parameters, seen.bound, strict=True)]),
+        texts(
+            "bound",
+            [scientific(bound * p.size) for p, bound in zip(parameters, seen.bound, strict=True)],
+        ),
         texts("correlation with all others", [f"{r:.2f}" for r in seen.multiple_correlation]),
     ]
     if len(parameters) > 1:
         most = np.argmax(np.abs(others), axis=1)
-        columns.append(words("strongest", [f"{parameters[j].name} {others[i, j]:+.2f}" for i, j in enumerate(most)]))
+        columns.append(
+            words(
+                "strongest",
+                [f"{parameters[j].name} {others[i, j]:+.2f}" for i, j in enumerate(most)],
+            )
+        )
     notes = [
         "bound is that of the standard deviation, as a root mean square over the prior. The correlation with all others"
         " is the multiple correlation of its error; strongest is that with a single one.",
@@ -151,7 +161,11 @@ def _unseen(design: Design) -> Iterator[str]:
 
 def _ways(design: Design) -> Iterator[Part]:
     if not design.ways:
-        why = "they are too few" if design.observability.observable else "they do not determine all parameters"
+        why = (
+            "they are too few"
+            if design.observability.observable
+            else "they do not determine all parameters"
+        )
         yield f"The candidates offer no choice: {why}."
         return
     same = _no_others(design)
@@ -161,8 +175,14 @@ def _ways(design: Design) -> Iterator[Part]:
     today = design.scenario.measurement.m
     columns = [
         words("chosen", [way.title for way in design.ways]),
-        texts("fewest readings", [f"{way.saving.readings if way.saving else today}" for way in design.ways]),
-        texts("bound", [f"{way.saving.mean_bound:.3f}" if way.saving else "1.000" for way in design.ways]),
+        texts(
+            "fewest readings",
+            [f"{way.saving.readings if way.saving else today}" for way in design.ways],
+        ),
+        texts(
+            "bound",
+            [f"{way.saving.mean_bound:.3f}" if way.saving else "1.000" for way in design.ways],
+        ),
         texts("at most", [f"{way.sharpest.readings}" for way in design.ways]),
         texts("smallest bound", [f"{way.sharpest.mean_bound:.3f}" for way in design.ways]),
     ]
@@ -175,7 +195,9 @@ def _ways(design: Design) -> Iterator[Part]:
     for way in design.ways:
         if way.saving and len(way.units.by) == 1:
             entries = [way.units.entries[u][0] for u in way.saving.taken]
-            levels = ", ".join(entry_in_words(design.candidates, way.units.by[0], entry) for entry in entries)
+            levels = ", ".join(
+                entry_in_words(design.candidates, way.units.by[0], entry) for entry in entries
+            )
             yield f"{way.saving.readings} readings {way.title}: {levels}"
 
 
@@ -191,10 +213,14 @@ def write_design(folder: Path, name: str, design: Design) -> list[Path]:
     columns = ["by", "choice", *index]
     table = pd.concat(chosen)[columns] if chosen else pd.DataFrame(columns=columns)
     answer, parts = list(_design_sentences(design)), design_parts(name, design)
-    return write_files(folder, "design", (READINGS, table), f"{name}: design", answer, parts, _draw_design(design))
+    return write_files(
+        folder, "design", (READINGS, table), f"{name}: design", answer, parts, _draw_design(design)
+    )
 
 
-def designed(scenario: Scenario, errors: Sequence[Measurement] | None = None, **options: Any) -> DesignAnswer:
+def designed(
+    scenario: Scenario, errors: Sequence[Measurement] | None = None, **options: Any
+) -> DesignAnswer:
     """Designs readings of a scenario; `errors` are richer models, by default those that the options offer."""
     known = richer_models(scenario) if errors is None else errors
     return DesignAnswer(**vars(design(replace(scenario, truth=None), errors=known, **options)))

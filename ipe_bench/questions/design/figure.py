@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 def draw_bounds(now: Observability, after: Observability | None, choice: str) -> Iterator[Drawing]:
     """Draws the bound of each parameter in its unit, today and after a `choice` of readings."""
     sizes = np.array([p.size for p in now.parameters])
-    fig, (ax,) = labelled_rows([f"{p.name} [{p.unit}]" if p.unit else p.name for p in now.parameters], 1)
+    fig, (ax,) = labelled_rows(
+        [f"{p.name} [{p.unit}]" if p.unit else p.name for p in now.parameters], 1
+    )
     y = np.arange(len(now.parameters))
     known, today = np.isfinite(now.bound), sizes * now.bound
     chosen = today if after is None else sizes * after.bound

@@ -154,7 +154,9 @@ def design(
     judge = _Judge(criterion, np.matmul(slopes.swapaxes(1, 2), slopes))
     if np.isfinite(value := judge.value(np.matmul(own.swapaxes(1, 2), own))):
         judge = replace(judge, today=value)
-    tried = (_way(judge, _units(model, candidates, chosen, slopes), model.m, most) for chosen in columns)
+    tried = (
+        _way(judge, _units(model, candidates, chosen, slopes), model.m, most) for chosen in columns
+    )
     ways = tuple(way for way in tried if way is not None)
     if readings is not None and not ways:
         titles = " or ".join("by " + " and ".join(chosen) for chosen in columns)
@@ -184,15 +186,22 @@ def _entries(model: Measurement, columns: Sequence[str]) -> list[tuple[Any, ...]
     return list(zip(*(model.index[c] for c in columns), strict=True)) if columns else [()] * model.m
 
 
-def _units(model: Measurement, candidates: Measurement, by: tuple[str, ...], slopes: Array) -> Units:
+def _units(
+    model: Measurement, candidates: Measurement, by: tuple[str, ...], slopes: Array
+) -> Units:
     """Builds the units of the candidates; in all other columns they have what today's readings have."""
     others = [c for c in model.index if c not in by]
     as_today = set(_entries(model, others))
     groups: dict[tuple[Any, ...], list[int]] = {}
-    for row, (entry, other) in enumerate(zip(_entries(candidates, by), _entries(candidates, others), strict=True)):
+    for row, (entry, other) in enumerate(
+        zip(_entries(candidates, by), _entries(candidates, others), strict=True)
+    ):
         if other in as_today:
             groups.setdefault(entry, []).append(row)
-    had, rows = set(_entries(model, by)), tuple(np.array(one, dtype=np.intp) for one in groups.values())
+    had, rows = (
+        set(_entries(model, by)),
+        tuple(np.array(one, dtype=np.intp) for one in groups.values()),
+    )
     # The information of each unit in at most n rows, by QR; shorter units end in zeros.
     truths, _, n = slopes.shape
     r = min(n, max(map(len, rows)))
@@ -230,14 +239,20 @@ class _Judge:
         K = np.eye(r) + np.matmul(B, slopes.swapaxes(-1, -2))
         if self.criterion == "D":
             return np.linalg.slogdet(K)[1].mean(axis=0) / n
-        return np.einsum("turi,turi->u", B, B / K if r == 1 else np.linalg.solve(K, B)) / (truths * n)
+        return np.einsum("turi,turi->u", B, B / K if r == 1 else np.linalg.solve(K, B)) / (
+            truths * n
+        )
 
 
 def _way(judge: _Judge, units: Units, today: int, most: int) -> Way | None:
     """Finds the two choices by adding the unit that gains most per reading; None if there is no choice."""
     if len(units.rows) < _FEW:
         return None
-    sizes, taken, found = np.array([*map(len, units.rows)]), np.zeros(len(units.rows), dtype=bool), []
+    sizes, taken, found = (
+        np.array([*map(len, units.rows)]),
+        np.zeros(len(units.rows), dtype=bool),
+        [],
+    )
     while (free := ~taken & (sizes <= max(today, most) - sizes[taken].sum())).any():
         gains = judge.gains(units.information(taken), units.slopes) / sizes
         taken[int(np.argmax(np.where(free, gains, -np.inf)))] = True
@@ -248,7 +263,9 @@ def _way(judge: _Judge, units: Units, today: int, most: int) -> Way | None:
         return None
     if sizes[units.today].sum() <= most:
         within.append(_choice(judge, units, units.today))
-    saving = next((choice for choice in found if choice.mean_bound <= 1 and choice.readings < today), None)
+    saving = next(
+        (choice for choice in found if choice.mean_bound <= 1 and choice.readings < today), None
+    )
     return Way(units, saving, min(within, key=lambda choice: choice.mean_bound))
 
 

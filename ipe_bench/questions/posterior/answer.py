@@ -10,7 +10,13 @@ import numpy as np
 import pandas as pd
 
 from ipe_bench.basics.statuses import Status
-from ipe_bench.questions.posterior.maths import Divergence, Posterior, Reference, reference, require_particles
+from ipe_bench.questions.posterior.maths import (
+    Divergence,
+    Posterior,
+    Reference,
+    reference,
+    require_particles,
+)
 from ipe_bench.report.page.writer import write_files
 from ipe_bench.report.tables.table import Shown, Table, texts, words
 from ipe_bench.report.words import compact, enumerate_few, percent
@@ -46,11 +52,15 @@ def posterior_parts(name: str, found: Sequence[Reference]) -> list[Table]:
         texts("modes", [str(len(one.posterior.modes)) for one, *_ in rows]),
         texts("noise", [compact(one.posterior.noise) for one, *_ in rows]),
         words("estimator", [label for _, label, _ in rows]),
-        words("status", [Status(int(one.estimates[label].status[0])).label for one, label, _ in rows]),
+        words(
+            "status", [Status(int(one.estimates[label].status[0])).label for one, label, _ in rows]
+        ),
         words("honest", [honest_word(d, one.posterior) for one, _, d in rows]),
     ]
     numbers = {"kl": "divergence", "shift": "shift", "width": "width", "energy": "energy"}
-    columns += [texts(title, [compact(getattr(d, key)) for *_, d in rows]) for key, title in numbers.items()]
+    columns += [
+        texts(title, [compact(getattr(d, key)) for *_, d in rows]) for key, title in numbers.items()
+    ]
     title = f"{name}: estimators beside the posterior"
     return [Table("posterior", title, "", columns, notes=list(_notes(found)), grouped=3)]
 
@@ -83,18 +93,29 @@ def honest_word(d: Divergence, sampled: Posterior) -> str:
     return "yes" if near and len(sampled.modes) == 1 else "NO"
 
 
-def write_posteriors(folder: Path, name: str, title: str, model: Measurement, found: Sequence[Reference]) -> list[Path]:
+def write_posteriors(
+    folder: Path, name: str, title: str, model: Measurement, found: Sequence[Reference]
+) -> list[Path]:
     """Writes a page, and posterior.csv with a row per trial and parameter; returns the files."""
     from ipe_bench.questions.posterior.figure import draw_marginals
 
     frames = []
     for one in found:
-        names = {"parameter": [p.name for p in model.parameters], "unit": [p.unit for p in model.parameters]}
-        values = {"truth": one.truth, "mean": one.posterior.mean, "deviation": one.posterior.deviation}
+        names = {
+            "parameter": [p.name for p in model.parameters],
+            "unit": [p.unit for p in model.parameters],
+        }
+        values = {
+            "truth": one.truth,
+            "mean": one.posterior.mean,
+            "deviation": one.posterior.deviation,
+        }
         sized = {key: model.sizes * value for key, value in values.items()}
         frames.append(pd.DataFrame({"trial": one.trial, **names, **sized}))
     shown = _honest_sentences(found), posterior_parts(title, found), draw_marginals(model, found)
-    return write_files(folder, "posterior", ("posterior.csv", pd.concat(frames)), f"{name}: posteriors", *shown)
+    return write_files(
+        folder, "posterior", ("posterior.csv", pd.concat(frames)), f"{name}: posteriors", *shown
+    )
 
 
 def _honest_sentences(found: Sequence[Reference]) -> list[str]:
@@ -103,10 +124,19 @@ def _honest_sentences(found: Sequence[Reference]) -> list[str]:
     for one in found:
         for label, d in one.divergences.items():
             counts[label] += honest_word(d, one.posterior) == "yes"
-    listed = enumerate_few([f"{label} in {count} of {len(found)}" for label, count in counts.items()], 12)
+    listed = enumerate_few(
+        [f"{label} in {count} of {len(found)}" for label, count in counts.items()], 12
+    )
     unsettled = sum(not one.posterior.settled for one in found)
-    more = [f"In {unsettled} the posterior itself cannot be relied on; take more particles."] if unsettled else []
-    return [f"Trials in which an estimator's Gaussian can stand for the posterior: {listed}.", *more]
+    more = (
+        [f"In {unsettled} the posterior itself cannot be relied on; take more particles."]
+        if unsettled
+        else []
+    )
+    return [
+        f"Trials in which an estimator's Gaussian can stand for the posterior: {listed}.",
+        *more,
+    ]
 
 
 def sampled(

@@ -38,7 +38,9 @@ def answer(asked: Asked, particles: int = 1000) -> Answered:
     if trials > _MOST_TRIALS:
         raise UserError(f"trials={trials}: each takes up to a minute; give at most {_MOST_TRIALS}")
     if scenario.noise.real:
-        raise UserError("noise=certified: has no prior to begin with; choose another noise and an error_scale")
+        raise UserError(
+            "noise=certified: has no prior to begin with; choose another noise and an error_scale"
+        )
     validate([scenario], asked.estimators, trials)
     identity = {
         "scenario": describe(scenario),

@@ -28,14 +28,19 @@ def draw_marginals(model: Measurement, found: Sequence[Reference]) -> Iterator[D
         P = np.full((model.n, model.n), np.nan) if each.covariance is None else each.covariance[0]
         claims[label] = each.x[0], np.sqrt(np.diag(P))
     with np.errstate(all="ignore"):
-        apart = [np.abs(x - mean) / deviation + np.abs(np.log(s / deviation)) for x, s in claims.values()]
+        apart = [
+            np.abs(x - mean) / deviation + np.abs(np.log(s / deviation)) for x, s in claims.values()
+        ]
     worst = np.nan_to_num(np.max(apart, axis=0), nan=np.inf) if apart else np.zeros(model.n)
     chosen = np.sort(np.argsort(-worst, kind="stable")[: common.most_panels()])
     fig, axes = common.panels(len(chosen), look, height=2.4)
     for i, ax in zip(chosen, axes, strict=True):
         p = model.parameters[i]
         low, high = (p.size * (mean[i] + side * FARTHEST * deviation[i]) for side in (-1, 1))
-        at, filled = np.linspace(low, high, 300), {"color": BOUND_COLOR, "alpha": 0.25, "label": "posterior"}
+        at, filled = (
+            np.linspace(low, high, 300),
+            {"color": BOUND_COLOR, "alpha": 0.25, "label": "posterior"},
+        )
         ax.hist(p.size * one.posterior.x[:, i], bins=40, range=(low, high), density=True, **filled)
         for label, (x, s) in claims.items():
             value, width = p.size * x[i], p.size * s[i]
@@ -49,6 +54,8 @@ def draw_marginals(model: Measurement, found: Sequence[Reference]) -> Iterator[D
         common.title(ax, f"{p.name} [{p.unit}]" if p.unit else p.name)
         common.full_ticks(ax)
     common.legend(fig, axes, {label: replace(each, marker="") for label, each in look.items()})
-    more = f", the {len(chosen)} parameters in which they differ most" if len(chosen) < model.n else ""
+    more = (
+        f", the {len(chosen)} parameters in which they differ most" if len(chosen) < model.n else ""
+    )
     caption = f"Trial {one.trial}: draws of the posterior beside the Gaussians that estimators report{more}."
     yield Drawing("posterior", "Marginals", caption, fig)

@@ -118,10 +118,14 @@ def reference(
         UserError: the scenario has no prior or one that is not normal, or there are too few particles.
     """
     if not scenario.prior.normal:
-        raise UserError(f"prior={scenario.prior.name}: is not normal, as the posterior here takes it to be")
+        raise UserError(
+            f"prior={scenario.prior.name}: is not normal, as the posterior here takes it to be"
+        )
     drawn = scenario.draw(trial, trial + 1)
     sampled = sample_posterior(scenario.problem, drawn.z[0], particles=particles, seed=trial)
-    estimates = {label: estimate_safely(e, scenario.problem, drawn.z) for label, e in estimators.items()}
+    estimates = {
+        label: estimate_safely(e, scenario.problem, drawn.z) for label, e in estimators.items()
+    }
     divergences = {label: divergence(sampled, e) for label, e in estimates.items()}
     return Reference(trial, drawn.x[0], sampled, estimators, estimates, divergences)
 
@@ -129,30 +133,46 @@ def reference(
 def require_particles(problem: Problem, particles: int) -> None:
     """Refuses a problem without a prior, and fewer than ten particles per parameter and population."""
     if problem.prior_deviation is None:
-        raise UserError("posterior: needs a prior; choose a noise and an error_scale that parameters are drawn with")
+        raise UserError(
+            "posterior: needs a prior; choose a noise and an error_scale that parameters are drawn with"
+        )
     if particles < (least := 20 * problem.measurement.n):
-        raise UserError(f"particles={particles}: give at least {least}, 10 per parameter and population")
+        raise UserError(
+            f"particles={particles}: give at least {least}, 10 per parameter and population"
+        )
 
 
-def sample_posterior(problem: Problem, z: Array, *, particles: int = PARTICLES, seed: int = 0) -> Posterior:
+def sample_posterior(
+    problem: Problem, z: Array, *, particles: int = PARTICLES, seed: int = 0
+) -> Posterior:
     """Samples the posterior of one trial's readings z (m,), by two populations that are put together by their evidence.
 
     Raises:
         UserError: no prior is known, or there are too few particles.
     """
     require_particles(problem, particles)
-    generators = [np.random.Generator(np.random.Philox(s)) for s in np.random.SeedSequence(seed).spawn(2)]
+    generators = [
+        np.random.Generator(np.random.Philox(s)) for s in np.random.SeedSequence(seed).spawn(2)
+    ]
     runs = [_Population.run(problem, z, particles // 2, rng) for rng in generators]
     parts, evidence = [run.x for run in runs], np.array([run.evidence for run in runs])
     # As many draws of each population as its evidence deserves, the best one's all.
     counts = np.round(np.exp(evidence - evidence.max()) * [len(p) for p in parts]).astype(int)
-    spaced = [p[np.linspace(0, len(p) - 1, count).round().astype(int)] for p, count in zip(parts, counts, strict=True)]
+    spaced = [
+        p[np.linspace(0, len(p) - 1, count).round().astype(int)]
+        for p, count in zip(parts, counts, strict=True)
+    ]
     x = np.concatenate(spaced)
-    means, widths = np.stack([p.mean(axis=0) for p in parts]), np.stack([p.std(axis=0) for p in parts])
+    means, widths = (
+        np.stack([p.mean(axis=0) for p in parts]),
+        np.stack([p.std(axis=0) for p in parts]),
+    )
     moved = np.ptp(means, axis=0) / widths.max(axis=0)
     apart = float(max(moved.max(), 0.5 * np.ptp(np.log(widths), axis=0).max()))
     one, other = (np.atleast_2d(np.cov(p.T)) for p in parts)
-    return Posterior(x, *_modes(problem, z, x), apart, _kl(means[1] - means[0], other, one), evidence)
+    return Posterior(
+        x, *_modes(problem, z, x), apart, _kl(means[1] - means[0], other, one), evidence
+    )
 
 
 def _kl(d: Array, S: Array, P: Array) -> float:
@@ -165,21 +185,27 @@ def _kl(d: Array, S: Array, P: Array) -> float:
 def _modes(problem: Problem, z: Array, x: Array) -> tuple[Array, Array]:
     starts = x[np.linspace(0, len(x) - 1, min(_STARTS, len(x))).round().astype(int)]
     with np.errstate(all="ignore"):
-        ends = least_squares_root(problem, np.broadcast_to(z, (len(starts), len(z))).copy(), starts, prior=1.0)
+        ends = least_squares_root(
+            problem, np.broadcast_to(z, (len(starts), len(z))).copy(), starts, prior=1.0
+        )
     ends = ends[np.isfinite(ends).all(axis=1)]
     if not len(ends):
         return np.empty((0, x.shape[1])), np.empty(0)
     width = deviations(inverse(_tempered(problem, ends, 1.0))[0])
     counts: Counter[int] = Counter()
     for i, end in enumerate(ends):
-        counts[next((k for k in counts if (np.abs(end - ends[k]) / width[k]).max() < _SAME_MODE), i)] += 1
+        counts[
+            next((k for k in counts if (np.abs(end - ends[k]) / width[k]).max() < _SAME_MODE), i)
+        ] += 1
     order, numbers = zip(*counts.most_common(), strict=True)
     return ends[list(order)], np.array(numbers) / len(ends)
 
 
 def _tempered(problem: Problem, x: Array, beta: float) -> Array:
     """Computes beta J' R^-1 J + P0^-1 (points, n, n)."""
-    return beta * information(problem.measurement.jacobian(x), problem.R) + _prior(problem).inverse()
+    return (
+        beta * information(problem.measurement.jacobian(x), problem.R) + _prior(problem).inverse()
+    )
 
 
 def _prior(problem: Problem) -> Covariance:
@@ -207,14 +233,18 @@ class _Population:
 
     @classmethod
     def run(cls, problem: Problem, z: Array, count: int, rng: np.random.Generator) -> _Population:
-        x = problem.x0 + _prior(problem).coloured(rng.standard_normal((count, problem.measurement.n)))
+        x = problem.x0 + _prior(problem).coloured(
+            rng.standard_normal((count, problem.measurement.n))
+        )
         self = cls(problem, z, rng, x)
         for _ in range(_MOST_STAGES):
             self._stage()
             if self.beta == 1:
                 self.x = self._final()
                 return self
-        raise UserError(f"particles={count}: do not reach the posterior in {_MOST_STAGES} stages; give more")
+        raise UserError(
+            f"particles={count}: do not reach the posterior in {_MOST_STAGES} stages; give more"
+        )
 
     def _log_likelihood(self, x: Array) -> Array:
         """Computes the logarithm of the likelihood of each, less its constant."""
@@ -277,11 +307,16 @@ class _Population:
         step = multiply(shapes[chosen], self.rng.standard_normal((count, n)))
         proposed = self.x + self.reach * 2.38 / np.sqrt(n) * step
         log = self._log_likelihood(proposed)
-        before, after = (-0.5 * np.sum(prior.whiten(x - x0) ** 2, axis=1) for x in (self.x, proposed))
+        before, after = (
+            -0.5 * np.sum(prior.whiten(x - x0) ** 2, axis=1) for x in (self.x, proposed)
+        )
         with np.errstate(invalid="ignore"):
             gain = self.beta * (log - self.log) + after - before
         taken = np.log(self.rng.random(count)) < gain
-        self.x, self.log = np.where(taken[:, None], proposed, self.x), np.where(taken, log, self.log)
+        self.x, self.log = (
+            np.where(taken[:, None], proposed, self.x),
+            np.where(taken, log, self.log),
+        )
         share = float(taken.mean())
         self.reach = float(np.clip(self.reach * np.exp(share - _ACCEPTED), 1e-4, 4.0))
         return share
@@ -307,7 +342,11 @@ def divergence(posterior: Posterior, estimates: Estimates) -> Divergence:
     d, S = (estimates.x[0] - posterior.mean) / scale, posterior.covariance / np.outer(scale, scale)
     shift = float(np.sqrt(d @ np.linalg.solve(S, d) / n)) if np.isfinite(d).all() else np.inf
     nothing = Divergence(np.inf, shift, np.nan, np.nan)
-    P = np.full((n, n), np.nan) if estimates.covariance is None else estimates.covariance[0] / np.outer(scale, scale)
+    P = (
+        np.full((n, n), np.nan)
+        if estimates.covariance is None
+        else estimates.covariance[0] / np.outer(scale, scale)
+    )
     if not (np.isfinite(P).all() and np.isfinite(d).all()):
         return nothing
     values, axes = np.linalg.eigh(P)
@@ -318,7 +357,9 @@ def divergence(posterior: Posterior, estimates: Estimates) -> Divergence:
     draws = d + (white * np.sqrt(values)) @ axes.T
     theirs = (posterior.x - posterior.mean) / scale
     theirs = theirs[np.linspace(0, len(theirs) - 1, _COMPARED).round().astype(int)]
-    return Divergence(_kl(d, S, P), shift, float(np.exp(0.5 * log_ratio / n)), _energy(draws, theirs, S))
+    return Divergence(
+        _kl(d, S, P), shift, float(np.exp(0.5 * log_ratio / n)), _energy(draws, theirs, S)
+    )
 
 
 def _energy(a: Array, b: Array, S: Array) -> float:

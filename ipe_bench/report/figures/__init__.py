@@ -78,7 +78,9 @@ def drawings(analysis: Analysis, which: Which = "all") -> Iterator[Drawing]:
         return
     parts, whole = views(analysis, which)
     taken: set[str] = set()
-    for figure in (figure for name in FIGURES for figure in import_module(f"{__name__}.{name}").FIGURES):
+    for figure in (
+        figure for name in FIGURES for figure in import_module(f"{__name__}.{name}").FIGURES
+    ):
         for drawing in _drawn_by(figure, parts, whole, which):
             taken.add(drawing.name)
             yield drawing
@@ -86,7 +88,10 @@ def drawings(analysis: Analysis, which: Which = "all") -> Iterator[Drawing]:
 
 
 def added_drawings(
-    analysis: Analysis, shown: tuple[list[View], View], which: Which = "all", taken: set[str] | None = None
+    analysis: Analysis,
+    shown: tuple[list[View], View],
+    which: Which = "all",
+    taken: set[str] | None = None,
 ) -> Iterator[Drawing]:
     """Yields the figures of plugins; a failed drawing or a duplicate name adds a line to the problems of the
     analysis."""

@@ -41,7 +41,9 @@ def draw_fit(found: Examination, z: Array, look: Look) -> Iterator[Drawing]:
     columns = {**model.index, **model.input_columns}
     varying = {name: column for name, column in columns.items() if len(set(column)) > 1}
     running = list(range(1, model.m + 1))  # beside an input the number of the row is no abscissa
-    varying = {name: column for name, column in varying.items() if list(column) != running} or varying
+    varying = {
+        name: column for name, column in varying.items() if list(column) != running
+    } or varying
     name, column = next(iter(varying.items()), ("", ()))
     x = np.asarray(column)
     if len(varying) != 1 or not np.issubdtype(x.dtype, np.number):
@@ -52,15 +54,28 @@ def draw_fit(found: Examination, z: Array, look: Look) -> Iterator[Drawing]:
     if name in headings and columns.keys() >= {*headings}:
         at = np.linspace(x.min(), x.max(), _GRID)
         inputs = {key: [columns[key][0]] * _GRID for key in headings} | {name: at.tolist()}
-        dense = replace(found, whole=replace(found.whole, measurement=model.with_inputs(inputs, _GRID)))
+        dense = replace(
+            found, whole=replace(found.whole, measurement=model.with_inputs(inputs, _GRID))
+        )
         h, error = dense.fitted, dense.fitted_errors
     q = half_width(CONFIDENCE, None if found.freedom is None else float(np.min(found.freedom)))
     fig, (ax,) = common.panels(1, height=3.2)
     fig.set_figwidth(5.2)
     band = f"{100 * CONFIDENCE:.0f} % band of the curve"
-    ax.fill_between(at, h - q * error, h + q * error, color=look.color, alpha=0.2, linewidth=0, label=band)
+    ax.fill_between(
+        at, h - q * error, h + q * error, color=look.color, alpha=0.2, linewidth=0, label=band
+    )
     ax.plot(at, h, color=look.color, label=common.text(found.label))
-    ax.plot(x, z, "o", color=BOUND_COLOR, markersize=3.5, rasterized=len(x) > _MANY, label="readings", zorder=3)
+    ax.plot(
+        x,
+        z,
+        "o",
+        color=BOUND_COLOR,
+        markersize=3.5,
+        rasterized=len(x) > _MANY,
+        label="readings",
+        zorder=3,
+    )
     unit = f" [{model.reading_unit}]" if model.reading_unit else ""
     ax.set(xlabel=common.text(name), ylabel=common.text(f"{model.reading_name}{unit}"))
     common.legend(fig, [ax])
@@ -93,11 +108,24 @@ def draw_residuals(model: Measurement, fits: Sequence[Fit]) -> Iterator[Drawing]
         ax.axhline(0.0, color=BOUND_COLOR, linewidth=0.6, zorder=1)
         common.bound_line(ax, limit, "limit for outliers")
         common.bound_line(ax, -limit, "")
-        good, style = np.isfinite(r) & ~out, {"color": look[one.label].color, "legend": False, "ax": ax}
+        good, style = (
+            np.isfinite(r) & ~out,
+            {"color": look[one.label].color, "legend": False, "ax": ax},
+        )
         size = 9 if len(x) > 100 else 20
-        sns.scatterplot(x=x[good], y=r[good], s=size, alpha=0.75, linewidth=0, rasterized=len(x) > _MANY, **style)
+        sns.scatterplot(
+            x=x[good],
+            y=r[good],
+            s=size,
+            alpha=0.75,
+            linewidth=0,
+            rasterized=len(x) > _MANY,
+            **style,
+        )
         if out.any():
-            sns.scatterplot(x=x[out], y=r[out], s=25, marker="x", linewidth=1.2, label="outlier", **style)
+            sns.scatterplot(
+                x=x[out], y=r[out], s=25, marker="x", linewidth=1.2, label="outlier", **style
+            )
         edge = 1.15 * max(float(np.nanmax(np.abs(r))), limit)
         ax.set_ylim(-edge, edge)
         if edge > _BENT:

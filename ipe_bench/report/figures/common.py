@@ -82,14 +82,20 @@ def most_panels() -> int:
     return min(MOST_PANELS, 2 * _across())
 
 
-def panels_of_scales(rows: pd.DataFrame, look: Mapping[str, Look]) -> tuple[Figure, list[tuple[Axes, pd.DataFrame]]]:
+def panels_of_scales(
+    rows: pd.DataFrame, look: Mapping[str, Look]
+) -> tuple[Figure, list[tuple[Axes, pd.DataFrame]]]:
     """Makes a figure with a panel per error scale, or for some with both ends; returns it and the panels' rows."""
     every = sorted(set(rows["error_scale"]))
-    scales = [every[round(i)] for i in np.linspace(0, len(every) - 1, min(most_panels(), len(every)))]
+    scales = [
+        every[round(i)] for i in np.linspace(0, len(every) - 1, min(most_panels(), len(every)))
+    ]
     fig, axes = panels(len(scales), look)
     for scale, ax in zip(scales, axes, strict=True):
         title(ax, f"error scale {value_text(scale)}")
-    return fig, [(ax, rows[rows["error_scale"] == scale]) for scale, ax in zip(scales, axes, strict=True)]
+    return fig, [
+        (ax, rows[rows["error_scale"] == scale]) for scale, ax in zip(scales, axes, strict=True)
+    ]
 
 
 def left_out(scales: Sequence[float], panels: Sequence[Any]) -> str:
@@ -115,7 +121,11 @@ def _letters(inches: float, size: Any) -> float:
 def _room(ax: Axes, size: str) -> float:
     """Estimates how many letters fit the width of a panel, before the layout."""
     across = ax.get_subplotspec().get_gridspec().ncols  # type: ignore[union-attr]
-    names = max((len(label.get_text()) for label in ax.get_yticklabels()), default=0) if _value(ax) == "x" else 7
+    names = (
+        max((len(label.get_text()) for label in ax.get_yticklabels()), default=0)
+        if _value(ax) == "x"
+        else 7
+    )
     return _letters(ax.figure.get_figwidth() / across, size) - names  # type: ignore[union-attr]
 
 
@@ -133,7 +143,9 @@ def axis_labels(fig: Figure, x: str, y: str) -> None:
 
 def number(value: float) -> str:
     """Formats a number of an axis: 0.005, 2000, 10⁴ or 5·10⁻⁷, with a typographic minus."""
-    digits, _, exponent = (f"{value:g}" if 0.001 <= abs(value) < 1e4 or value == 0 else f"{value:e}").partition("e")
+    digits, _, exponent = (
+        f"{value:g}" if 0.001 <= abs(value) < 1e4 or value == 0 else f"{value:e}"
+    ).partition("e")
     words = f"{float(digits):g}·10{str(int(exponent)).translate(_RAISED)}" if exponent else digits
     return words.removeprefix("1·").replace("-", "\N{MINUS SIGN}")
 
@@ -155,7 +167,10 @@ def labelled(scales: Sequence[float], letter: float) -> list[float]:
     kept = [scales[0]]
     for scale in scales[1:-1]:
         beside = (kept[-1], scale), (scale, scales[-1])
-        if all(np.log10(b / a) > letter * (len(value_text(a)) + len(value_text(b)) + 1) / 2 for a, b in beside):
+        if all(
+            np.log10(b / a) > letter * (len(value_text(a)) + len(value_text(b)) + 1) / 2
+            for a, b in beside
+        ):
             kept.append(scale)
     return [*kept, *scales[1:][-1:]]
 
@@ -173,7 +188,10 @@ def decades(ax: Axes, values: Any, least: float = 10.0, *, ends: Any = ()) -> No
         return
     low, high = values.min(), values.max()
     room = max(least, (high / low) ** REACH)
-    low, high = max(low / room, ends.min(initial=low)) / 1.6, min(high * room, ends.max(initial=high)) * 1.6
+    low, high = (
+        max(low / room, ends.min(initial=low)) / 1.6,
+        min(high * room, ends.max(initial=high)) * 1.6,
+    )
     wider = max(np.sqrt(least * low / high), 1.0)
     axis, ends = _value(ax), (low / wider, high * wider)
     ax.set(**{f"{axis}scale": "log", f"{axis}lim": ends})
@@ -184,7 +202,9 @@ def log_ticks(axis: Axis, low: float, high: float) -> None:
     """Labels that do not crowd: powers of ten, and 2 and 5 between if those are few."""
     from matplotlib.ticker import LogLocator, NullLocator
 
-    axis.set_major_locator(LogLocator(subs=(1, 2, 5)) if high / low < 200 else LogLocator(numticks=7))
+    axis.set_major_locator(
+        LogLocator(subs=(1, 2, 5)) if high / low < 200 else LogLocator(numticks=7)
+    )
     axis.set_major_formatter(lambda value, _: number(value))
     axis.set_minor_locator(NullLocator())
 
@@ -224,12 +244,18 @@ def band(ax: Axes, low: float, high: float, label: str = "") -> None:
 
 def beyond(ax: Axes, x: Any, y: Any, one: Look) -> None:
     """Draws points that lie beyond the axis at its end: hollow, with an arrow."""
-    edge: dict[str, Any] = {"markeredgecolor": one.color, "markerfacecolor": "white", "markeredgewidth": 1.1}
+    edge: dict[str, Any] = {
+        "markeredgecolor": one.color,
+        "markerfacecolor": "white",
+        "markeredgewidth": 1.1,
+    }
     ax.plot(x, y, marker=one.marker, linestyle="none", clip_on=False, zorder=3, **edge)
     _arrows(ax, x, y, one.color, points=7)
 
 
-def _arrows(ax: Axes, x: Any, y: Any, color: str, *, points: float, downwards: bool = False) -> None:
+def _arrows(
+    ax: Axes, x: Any, y: Any, color: str, *, points: float, downwards: bool = False
+) -> None:
     """Draws arrows towards the end of the axis of values, their middles so many points farther out, and says in the
     legend what they mean."""
     from matplotlib.transforms import ScaledTranslation
@@ -237,10 +263,19 @@ def _arrows(ax: Axes, x: Any, y: Any, color: str, *, points: float, downwards: b
     across = _value(ax) == "x"
     back, forth = ("left", "right") if across else ("down", "up")
     inches = (-points if downwards else points) / 72
-    outwards = ScaledTranslation(*((inches, 0) if across else (0, inches)), ax.figure.dpi_scale_trans)
+    outwards = ScaledTranslation(
+        *((inches, 0) if across else (0, inches)), ax.figure.dpi_scale_trans
+    )
     marker = rf"$\{back if downwards else forth}arrow$"
-    arrow: dict[str, Any] = {"marker": marker, "markersize": 8, "linestyle": "none", "markeredgewidth": 0.0}
-    (drawn,) = ax.plot(x, y, transform=ax.transData + outwards, color=color, clip_on=False, zorder=3, **arrow)
+    arrow: dict[str, Any] = {
+        "marker": marker,
+        "markersize": 8,
+        "linestyle": "none",
+        "markeredgewidth": 0.0,
+    }
+    (drawn,) = ax.plot(
+        x, y, transform=ax.transData + outwards, color=color, clip_on=False, zorder=3, **arrow
+    )
     drawn.set_in_layout(False)
     if BEYOND not in ax.get_legend_handles_labels()[1]:
         ax.plot([], [], label=BEYOND, color=BOUND_COLOR, **arrow)
@@ -258,13 +293,21 @@ def _mark_cut(ax: Axes, place: Any, edge: float, color: str, *, downwards: bool)
 def seaborn_style(look: Mapping[str, Look], by: str = "estimator") -> dict[str, Any]:
     """Arguments of seaborn's functions that give every label its own colour and marker; grey ones lie below."""
     order = sorted(look, key=lambda label: look[label].color != GREY)
-    style: dict[str, Any] = {"hue": by, "hue_order": order, "style": by, "style_order": order, "legend": False}
+    style: dict[str, Any] = {
+        "hue": by,
+        "hue_order": order,
+        "style": by,
+        "style_order": order,
+        "legend": False,
+    }
     style["palette"] = {label: one.color for label, one in look.items()}
     style["markers"] = {label: one.marker for label, one in look.items()}
     return style
 
 
-def lines(ax: Axes, rows: pd.DataFrame, x: str, y: str, look: Mapping[str, Look], **style: Any) -> None:
+def lines(
+    ax: Axes, rows: pd.DataFrame, x: str, y: str, look: Mapping[str, Look], **style: Any
+) -> None:
     """Draws a line per estimator through dense points, with a few markers, staggered so that coinciding lines are
     seen."""
     import seaborn as sns
@@ -309,23 +352,34 @@ def curves(
         ax.set_xticks([])
     gap = float(np.diff(np.log10(scales)).min(initial=1.0))
     all_trials = rows["trials"].max()
-    emptied: dict[str, Any] = {"linestyle": "none", "markerfacecolor": "white", "markeredgewidth": 1.1}
+    emptied: dict[str, Any] = {
+        "linestyle": "none",
+        "markerfacecolor": "white",
+        "markeredgewidth": 1.1,
+    }
     hollow = False
     for i, (name, one) in enumerate(look.items()):
         part: Any = rows[rows[by] == name].sort_values("error_scale", kind="stable")
         beside = 10 ** (0.3 * gap * ((i + 0.5) / len(look) - 0.5))
-        place, values = np.full(len(part), i) if one_scale else part["error_scale"] * beside, part[y].clip(upper=most)
+        place, values = (
+            np.full(len(part), i) if one_scale else part["error_scale"] * beside,
+            part[y].clip(upper=most),
+        )
         few, over = part[trials] < FEW, part[y] > most
         ends = None
         if interval and one.color != GREY:
             low, high = (part[end] for end in interval)
-            sizes = np.array([values - low.clip(lower=least), high.clip(upper=top) - values]).clip(min=0)
+            sizes = np.array([values - low.clip(lower=least), high.clip(upper=top) - values]).clip(
+                min=0
+            )
             known = np.isfinite(sizes) & ~few.to_numpy()
             ends = np.where(known, sizes, np.where(known.any(axis=0), 0.0, np.nan))
             shown = ~over & ~few
             _mark_cut(ax, place[shown & (low < least)], least, one.color, downwards=True)
             _mark_cut(ax, place[shown & (high > top)], top, one.color, downwards=False)
-        line: dict[str, Any] = {**one.line, "zorder": 2} | ({"linestyle": "none"} if one_scale else {})
+        line: dict[str, Any] = {**one.line, "zorder": 2} | (
+            {"linestyle": "none"} if one_scale else {}
+        )
         empty = few | (part[trials] < all_trials)
         if one.color == GREY and not one_scale:  # the background, where estimators are alike
             line, empty = line | {"marker": ",", "zorder": 1}, empty & False
@@ -334,17 +388,37 @@ def curves(
         right, up = (values, place) if across else (place, values)
         ax.errorbar(right, up, elinewidth=0.8, **{"xerr" if across else "yerr": ends}, **line)
         inside = empty & ~over
-        ax.plot(right[inside], up[inside], marker=one.marker, markeredgecolor=one.color, zorder=3, **emptied)
+        ax.plot(
+            right[inside],
+            up[inside],
+            marker=one.marker,
+            markeredgecolor=one.color,
+            zorder=3,
+            **emptied,
+        )
         if one.color != GREY and over.any():
             beyond(ax, right[over], up[over], one)
     if hollow:
-        ax.plot([], [], marker="o", markeredgecolor=BOUND_COLOR, label="hollow: trials missing, or few", **emptied)
+        ax.plot(
+            [],
+            [],
+            marker="o",
+            markeredgecolor=BOUND_COLOR,
+            label="hollow: trials missing, or few",
+            **emptied,
+        )
     ax.set(**{f"{_value(ax)}label": label})
     if heading:
         title(ax, heading)
 
 
-def legend(fig: Figure, axes: Sequence[Axes], look: Mapping[str, Look] | None = None, *, points: bool = False) -> None:
+def legend(
+    fig: Figure,
+    axes: Sequence[Axes],
+    look: Mapping[str, Look] | None = None,
+    *,
+    points: bool = False,
+) -> None:
     """Adds one legend above all panels: the estimators in colour unless their names stand on the axes, then the other
     labels in the panels."""
     from matplotlib.lines import Line2D
@@ -352,7 +426,9 @@ def legend(fig: Figure, axes: Sequence[Axes], look: Mapping[str, Look] | None = 
     named = {} if any(_value(ax) == "x" for ax in axes) else look or {}
     colored = {label: one for label, one in named.items() if one.color != GREY}
     plain: dict[str, Any] = {"linestyle": "none"} if points else {}
-    handles: dict[str, Any] = {text(label): Line2D([], [], **one.line | plain) for label, one in colored.items()}
+    handles: dict[str, Any] = {
+        text(label): Line2D([], [], **one.line | plain) for label, one in colored.items()
+    }
     if len(colored) < len(named):
         handles[f"{len(named) - len(colored)} others"] = Line2D([], [], color=GREY)
     for ax in axes:
@@ -361,7 +437,19 @@ def legend(fig: Figure, axes: Sequence[Axes], look: Mapping[str, Look] | None = 
     if not handles:
         return
     # The most columns that fit side by side, each as wide as its longest label.
-    lengths, room = np.array([7 + len(label) for label in handles]), _letters(fig.get_figwidth(), "legend.fontsize")
-    fitting = [n for n in range(1, len(handles) + 1) if sum(p.max() for p in np.array_split(lengths, n)) <= room]
+    lengths, room = (
+        np.array([7 + len(label) for label in handles]),
+        _letters(fig.get_figwidth(), "legend.fontsize"),
+    )
+    fitting = [
+        n
+        for n in range(1, len(handles) + 1)
+        if sum(p.max() for p in np.array_split(lengths, n)) <= room
+    ]
     rows = -(-len(handles) // max(fitting, default=1))
-    fig.legend(list(handles.values()), list(handles), loc="outside upper center", ncols=-(-len(handles) // rows))
+    fig.legend(
+        list(handles.values()),
+        list(handles),
+        loc="outside upper center",
+        ncols=-(-len(handles) // rows),
+    )

@@ -34,7 +34,10 @@ def draw_costs(view: View) -> Iterator[Drawing]:
     # The 95 % quantile of chi, over its root mean square; the errors of an epoch and of the next are dependent.
     efficient = 1.0 if view.moving else float(np.sqrt(chdtri(view.n, 0.05) / view.n))
     error = rows["error_q95"] / efficient
-    shown = {"cost": rows["simulations_median"].clip(lower=LEAST_COST), "error": error.clip(upper=_HIGHEST)}
+    shown = {
+        "cost": rows["simulations_median"].clip(lower=LEAST_COST),
+        "error": error.clip(upper=_HIGHEST),
+    }
     rows, look = rows.assign(**shown, over=error > _HIGHEST), view.with_look(rows["estimator"])
     # Points of about the same cost stand side by side, so that all are seen.
     step = 0.04 * np.log(max(10.0, rows["cost"].max() / rows["cost"].min()))
@@ -48,7 +51,14 @@ def draw_costs(view: View) -> Iterator[Drawing]:
         for name, inside in here[~here["over"]].groupby("estimator", sort=False):
             one = look[str(name)]
             layer = 2.5 if one.color == GREY else 3
-            ax.scatter(inside["cost"], inside["error"], marker=one.marker, color=one.color, zorder=layer, **style)
+            ax.scatter(
+                inside["cost"],
+                inside["error"],
+                marker=one.marker,
+                color=one.color,
+                zorder=layer,
+                **style,
+            )
         for name, lost in here[here["over"]].groupby("estimator", sort=False):
             common.beyond(ax, lost["cost"], lost["error"], look[str(name)])
         common.bound_line(ax, 1.0, view.reference if view.moving else "efficient estimator")
@@ -59,7 +69,11 @@ def draw_costs(view: View) -> Iterator[Drawing]:
     common.axis_labels(fig, "simulations (median)", f"95 % error / {over}")
     common.legend(fig, fig.axes, look, points=True)
     last = rows[rows["error_scale"] == view.scales[-1]]
-    good = last[last["error"] <= last["error"].min() * 1.05].sort_values("simulations_median", kind="stable").iloc[0]
+    good = (
+        last[last["error"] <= last["error"].min() * 1.05]
+        .sort_values("simulations_median", kind="stable")
+        .iloc[0]
+    )
     yield view.drawing(
         fig,
         "cost_against_accuracy",
@@ -86,9 +100,18 @@ def draw_convergence(view: View) -> Iterator[Drawing]:
     shown = sorted(look, key=lambda label: look[label].color == GREY)[: common.most_panels()]
     names = {scale: f"error scale {value_text(scale)}" for scale in scales}
     colors = sns.color_palette("crest", len(scales)).as_hex()
-    by_scale = {name: Look(colors[i], MARKERS[i % len(MARKERS)]) for i, name in enumerate(names.values())}
-    rows = rows.assign(scale=rows["error_scale"].map(names), distance=rows["distance"].clip(lower=LEAST_DISTANCE))
-    style = {**common.seaborn_style(by_scale, "scale"), "dashes": False, "estimator": None, "linewidth": 1.2}
+    by_scale = {
+        name: Look(colors[i], MARKERS[i % len(MARKERS)]) for i, name in enumerate(names.values())
+    }
+    rows = rows.assign(
+        scale=rows["error_scale"].map(names), distance=rows["distance"].clip(lower=LEAST_DISTANCE)
+    )
+    style = {
+        **common.seaborn_style(by_scale, "scale"),
+        "dashes": False,
+        "estimator": None,
+        "linewidth": 1.2,
+    }
     fig, axes = common.panels(len(shown), by_scale)
     bottom, top = rows["distance"].min() / 3, rows["distance"].max() * 3
     for label, ax in zip(shown, axes, strict=True):
@@ -108,8 +131,12 @@ def draw_convergence(view: View) -> Iterator[Drawing]:
     common.axis_labels(fig, "iteration", "distance to own limit [σ]")
     common.legend(fig, axes, by_scale)
     last = rows[rows["error_scale"] == scales[-1]]
-    arrived = last[last["distance"] > CLOSE].groupby("estimator", sort=False)["iteration"].max().add(1)
-    seen = [f"{label} {arrived.get(label, 0):g}" for label in look if label in set(last["estimator"])]
+    arrived = (
+        last[last["distance"] > CLOSE].groupby("estimator", sort=False)["iteration"].max().add(1)
+    )
+    seen = [
+        f"{label} {arrived.get(label, 0):g}" for label in look if label in set(last["estimator"])
+    ]
     yield view.drawing(
         fig,
         "convergence",

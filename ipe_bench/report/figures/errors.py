@@ -30,11 +30,17 @@ def draw(view: View) -> Iterator[Drawing]:
     claims, rows = totals[totals["nees_median"].notna()], _rows(view)
     row = 3 if len(claims) else 2
     height = 3.3 if len(rows) == 1 else 2.6
-    fig, axes = common.panels(row * len(rows), view.look, height=height, scales=view.scales, row=row)
+    fig, axes = common.panels(
+        row * len(rows), view.look, height=height, scales=view.scales, row=row
+    )
     for i, (family, look) in enumerate(rows.items()):
         _row(view, axes[row * i : row * (i + 1)], look, f": {family}" if family else "", claims)
     common.legend(fig, axes, view.look)
-    over = "over error scales" if len(view.scales) > 1 else f"at error scale {value_text(view.scales[0])}"
+    over = (
+        "over error scales"
+        if len(view.scales) > 1
+        else f"at error scale {value_text(view.scales[0])}"
+    )
     gate = "keep the track" if view.moving else "lie inside the gate"
     yield view.drawing(
         fig,
@@ -53,30 +59,42 @@ def _rows(view: View) -> dict[str, Mapping[str, Look]]:
     families = dict.fromkeys(view.families[label] for label in shown)
     if len(view.scales) == 1 or len(shown) <= MOST_TOGETHER or len(families) == 1:
         return {"": view.look}
-    kept = {family: {REFERENCE, *(e for e in shown if view.families[e] == family)} for family in families}
+    kept = {
+        family: {REFERENCE, *(e for e in shown if view.families[e] == family)}
+        for family in families
+    }
     return {
         family: {e: one if e in own else replace(one, color=GREY) for e, one in view.look.items()}
         for family, own in kept.items()
     }
 
 
-def _row(view: View, axes: Sequence[Any], look: Mapping[str, Look], family: str, claims: pd.DataFrame) -> None:
+def _row(
+    view: View, axes: Sequence[Any], look: Mapping[str, Look], family: str, claims: pd.DataFrame
+) -> None:
     """Draws success, error and, if there is a third panel, NEES."""
     totals, shown = view.totals, (look, view.scales)
     capped = totals[list(CEILING)].clip(upper=pd.Series(CEILING), axis=1)
     words: dict[str, Any] = {"heading": f"success{family}", "label": "share of all trials"}
     common.shares(axes[0])
-    common.curves(axes[0], totals, "success", *shown, interval=("success_low", "success_high"), **words)
+    common.curves(
+        axes[0], totals, "success", *shown, interval=("success_low", "success_high"), **words
+    )
     heading = f"error over {view.reference}{family}"
     words = {"heading": heading, "label": "median, bar to 95 %", "most": CEILING["error_q95"]}
     common.decades(axes[1], capped[["error_median", "error_q95"]].clip(lower=0.5), least=4.0)
     best = f"1: {view.reference}, an honest covariance"
     common.bound_line(axes[1], 1.0, best)
-    common.curves(axes[1], totals, "error_median", *shown, interval=("error_median", "error_q95"), **words)
+    common.curves(
+        axes[1], totals, "error_median", *shown, interval=("error_median", "error_q95"), **words
+    )
     for nees in axes[2:]:
         common.decades(nees, np.append(capped["nees_median"].clip(lower=0.5), 1.0), least=4.0)
         common.bound_line(nees, 1.0, best)
-        limits = claims["nees_median_low_if_honest"].min(), claims["nees_median_high_if_honest"].max()
+        limits = (
+            claims["nees_median_low_if_honest"].min(),
+            claims["nees_median_high_if_honest"].max(),
+        )
         common.band(nees, *limits, "95 % limits of the median if honest")
         words = {"heading": f"NEES{family}", "label": "median", "most": CEILING["nees_median"]}
         common.curves(nees, claims, "nees_median", *shown, **words)
@@ -89,16 +107,25 @@ def draw_distributions(view: View) -> Iterator[Drawing]:
         return
     look, most = view.with_look(rows["estimator"]), CEILING["error_q95"]
     rows = rows.assign(error=rows["distance"] / np.sqrt(view.n))
-    low, high = 0.7 * rows["error"].clip(0.1, 1.0).min(), 1.5 * rows["error"].clip(2.0, most / 1.5).max()
+    low, high = (
+        0.7 * rows["error"].clip(0.1, 1.0).min(),
+        1.5 * rows["error"].clip(2.0, most / 1.5).max(),
+    )
     # Each curve rises from none within the panel, and what lies beyond its edge is not seen.
     rows["error"] = rows["error"].clip(low / 2, 2 * most)
     fig, panels = common.panels_of_scales(rows, look)
     at = np.geomspace(low, high, 200)
     for ax, part in panels:
         common.shares(ax)
-        efficient: dict[str, Any] = {"color": BOUND_COLOR, "linestyle": BOUND_DASH, "label": "efficient estimator"}
+        efficient: dict[str, Any] = {
+            "color": BOUND_COLOR,
+            "linestyle": BOUND_DASH,
+            "label": "efficient estimator",
+        }
         if not view.moving:  # the errors of an epoch and of the next are dependent
-            ax.plot(at, gammainc(view.n / 2, view.n * at**2 / 2), linewidth=1.0, zorder=1, **efficient)
+            ax.plot(
+                at, gammainc(view.n / 2, view.n * at**2 / 2), linewidth=1.0, zorder=1, **efficient
+            )
         common.lines(ax, part, "error", "probability", look)
         ax.set_xscale("log")
         ax.set_xlim(low, high)
@@ -107,7 +134,10 @@ def draw_distributions(view: View) -> Iterator[Drawing]:
     common.legend(fig, fig.axes, look)
     top = view.scales[-1]
     last = rows[(rows["error_scale"] == top) & (rows["probability"] == 0.99)]
-    seen = [f"{e} {brief(v) if v <= most else f'>{most:g}'}" for e, v in last[["estimator", "error"]].to_numpy()]
+    seen = [
+        f"{e} {brief(v) if v <= most else f'>{most:g}'}"
+        for e, v in last[["estimator", "error"]].to_numpy()
+    ]
     yield view.drawing(
         fig,
         "distributions",
@@ -126,7 +156,9 @@ def draw_calibration(view: View) -> Iterator[Drawing]:
     look = view.with_look(rows["estimator"])
     fig, panels = common.panels_of_scales(rows, look)
     reach = 1.15 * max(LINEAR, float(rows[["difference", "low", "high"]].abs().max().max()))
-    ticks: Sequence[float] = [t for t in (-1.0, -0.3, -0.1, -0.05, 0.0, 0.05, 0.1, 0.3, 1.0) if abs(t) <= reach]
+    ticks: Sequence[float] = [
+        t for t in (-1.0, -0.3, -0.1, -0.05, 0.0, 0.05, 0.1, 0.3, 1.0) if abs(t) <= reach
+    ]
     for ax, part in panels:
         ax.set_yscale("asinh", linear_width=LINEAR / 2)
         ax.set(xlim=(0, 1), ylim=(-reach, reach))
@@ -151,7 +183,15 @@ def _bands(ax: Any, rows: pd.DataFrame) -> None:
     width = (rows["high"] - rows["low"]).groupby(rows["estimator"]).mean()
     for label, alpha in ((width.idxmax(), 0.12), (width.idxmin(), 0.15)):
         edge = rows[rows["estimator"] == label].drop_duplicates("at")
-        ax.fill_between(edge["at"], edge["low"], edge["high"], color=BOUND_COLOR, alpha=alpha, linewidth=0, zorder=0)
+        ax.fill_between(
+            edge["at"],
+            edge["low"],
+            edge["high"],
+            color=BOUND_COLOR,
+            alpha=alpha,
+            linewidth=0,
+            zorder=0,
+        )
     ax.axhline(0, color=BOUND_COLOR, linewidth=0.6, zorder=1)
 
 

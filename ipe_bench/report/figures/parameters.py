@@ -11,7 +11,16 @@ import pandas as pd
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.views import Figure, View
-from ipe_bench.report.style import BLACK, BOUND_COLOR, BOUND_DASH, COLORS, GREY, MARKERS, REFERENCE, Look
+from ipe_bench.report.style import (
+    BLACK,
+    BOUND_COLOR,
+    BOUND_DASH,
+    COLORS,
+    GREY,
+    MARKERS,
+    REFERENCE,
+    Look,
+)
 from ipe_bench.report.words import brief, enumerate_few, value_text
 from ipe_bench.statistics.statistic import ALL
 
@@ -38,7 +47,10 @@ def _of_one(view: View, estimator: str) -> Drawing:
     if not several:
         fig.set_figheight(fig.get_figheight() + 0.08 * len(view.parameters))
     for (group, inside), ax in zip(groups.items(), axes, strict=False):
-        look = {p["name"]: Look(COLORS[i % len(COLORS)], MARKERS[i % len(MARKERS)]) for i, p in enumerate(inside)}
+        look = {
+            p["name"]: Look(COLORS[i % len(COLORS)], MARKERS[i % len(MARKERS)])
+            for i, p in enumerate(inside)
+        }
         if not several:
             common.name_axis(ax, list(look))
         part = rows[rows["parameter"].isin(list(look))]
@@ -58,20 +70,37 @@ def _of_one(view: View, estimator: str) -> Drawing:
         if legend:
             lines: list[Any] = [one.line | {"linestyle": "none"} for one in look.values()]
             handles = [ax.plot([], [], **line)[0] for line in lines]
-            tight: Any = {"handlelength": 0.4, "handletextpad": 0.4, "columnspacing": 0.8, "borderaxespad": 0.2}
-            ax.legend(handles, list(map(common.text, look)), ncols=2, fontsize="small", loc="upper left", **tight)
+            tight: Any = {
+                "handlelength": 0.4,
+                "handletextpad": 0.4,
+                "columnspacing": 0.8,
+                "borderaxespad": 0.2,
+            }
+            ax.legend(
+                handles,
+                list(map(common.text, look)),
+                ncols=2,
+                fontsize="small",
+                loc="upper left",
+                **tight,
+            )
     ratio, last = "rmse_over_linear_bound", axes[-1]
     each, together = {p["name"]: Look(GREY, ",") for p in view.parameters}, {ALL: Look(BLACK, "o")}
     if not several:
         common.name_axis(last, [ALL])
-    common.decades(last, np.append(rows[ratio], [1.0, *totals["rmse"]]), ends=totals[["rmse_low", "rmse_high"]])
+    common.decades(
+        last, np.append(rows[ratio], [1.0, *totals["rmse"]]), ends=totals[["rmse_low", "rmse_high"]]
+    )
     if several:
         _curves(last, rows.assign(rmse=rows[ratio]), each, view)
         last.plot([], [], color=GREY, label="each parameter")
     _curves(last, totals, together, view, "all parameters", "bounds")
     common.bound_line(last, 1.0, "linear bound, eq. (5)")
     common.legend(fig, axes[-1:])
-    at = [f"{brief(v)} at scale {value_text(s)}" for s, v in totals[["error_scale", "rmse"]].dropna().to_numpy()[-1:]]
+    at = [
+        f"{brief(v)} at scale {value_text(s)}"
+        for s, v in totals[["error_scale", "rmse"]].dropna().to_numpy()[-1:]
+    ]
     number = 2 if estimator == REFERENCE else 3
     of_paper = f"Figure {number} of the paper: " if view.paper else ""
     return view.drawing(
@@ -104,7 +133,10 @@ def _missing(totals: pd.DataFrame) -> str:
     """Says in how many trials an estimator solved the equation at the largest scale where it did not in all."""
     lacking = totals[totals["solved_trials"] < totals["trials"]].tail(1)
     rows = lacking[["solved_trials", "trials", "error_scale"]].to_numpy()
-    seen = [f"{solved:.0f} of {trials:.0f} at scale {value_text(scale)}" for solved, trials, scale in rows]
+    seen = [
+        f"{solved:.0f} of {trials:.0f} at scale {value_text(scale)}"
+        for solved, trials, scale in rows
+    ]
     return "".join(seen) or f"all of {totals['trials'].min():.0f}"
 
 
@@ -127,13 +159,27 @@ def draw_tracks(view: View) -> Iterator[Drawing]:
             if len(those) and np.isfinite(those["bound"]).any():
                 same = those[those["estimator"] == those["estimator"].iloc[0]]
                 style: Any = {"color": BOUND_COLOR, "linewidth": 1.0, "zorder": 1}
-                ax.plot(same["at"], same["bound"], linestyle=dash, label=f"{kind} linearised at the truth", **style)
+                ax.plot(
+                    same["at"],
+                    same["bound"],
+                    linestyle=dash,
+                    label=f"{kind} linearised at the truth",
+                    **style,
+                )
         for name, dash, label in (
             ("posterior", ":", "posterior bound of filters"),
             ("posterior_smoothed", "-.", "posterior bound of smoothers"),
         ):
             if np.isfinite(one[name]).any():
-                ax.plot(one["at"], one[name], dash, color=BOUND_COLOR, linewidth=1.0, label=label, zorder=1)
+                ax.plot(
+                    one["at"],
+                    one[name],
+                    dash,
+                    color=BOUND_COLOR,
+                    linewidth=1.0,
+                    label=label,
+                    zorder=1,
+                )
         common.decades(ax, part[["rmse", "bound", "posterior", "posterior_smoothed"]])
         unit = f" [{one['unit'].iloc[0]}]" if one["unit"].iloc[0] else ""
         common.title(ax, state)
@@ -146,7 +192,10 @@ def draw_tracks(view: View) -> Iterator[Drawing]:
     common.title(ax, "NEES")
     ax.set(xlabel="time [s]", ylabel="NEES / n")
     common.legend(fig, axes, look)
-    total = {name: np.sqrt(np.mean(part["rmse"] ** 2)) for name, part in first.groupby("estimator", sort=False)}
+    total = {
+        name: np.sqrt(np.mean(part["rmse"] ** 2))
+        for name, part in first.groupby("estimator", sort=False)
+    }
     yield view.drawing(
         fig,
         "tracks",

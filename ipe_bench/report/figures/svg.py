@@ -29,7 +29,12 @@ def page_figure(figure: Figure, svg: str) -> str:
     groups, cells = _GROUP.findall(content), _cells(figure)
     panels = [inside for kind, inside in groups if kind == "axes"]
     shown = ["".join(panels[i] for i in inside) for inside in cells.values()] or [content]
-    keys = [_key(*key) for kind, inside in groups if kind == "legend" and cells for key in _KEY.findall(inside)]
+    keys = [
+        _key(*key)
+        for kind, inside in groups
+        if kind == "legend" and cells
+        for key in _KEY.findall(inside)
+    ]
     columns, rows = _edges(figure, cells)
     boxes = [(*columns[at], *rows[down]) for down, at in cells or [(0, 0)]]
     shown[0] += definitions
@@ -40,14 +45,22 @@ def page_figure(figure: Figure, svg: str) -> str:
     widths = [right - left for left, right in columns.values()]
     grid = " ".join(f"minmax(0,{width:.0f}fr)" for width in widths)
     size = f"grid-template-columns:{grid};max-width:{sum(widths) / 60:.1f}in"
-    return _classed(f'<div class="keys">{"".join(keys)}</div><div class="panels" style="{size}">{"".join(views)}</div>')
+    return _classed(
+        f'<div class="keys">{"".join(keys)}</div><div class="panels" style="{size}">{"".join(views)}</div>'
+    )
 
 
 def _cells(figure: Figure) -> dict[tuple[int, int], list[int]]:
     """Returns which axes stand at each row and column; empty if they are in no plain grid, or are not all there is."""
     cells: dict[tuple[int, int], list[int]] = {}
-    specs = [spec for ax in figure.axes if (spec := ax.get_subplotspec()) and spec.num1 == spec.num2]
-    if figure.texts or len(specs) < len(figure.axes) or len({id(spec.get_gridspec()) for spec in specs}) != 1:
+    specs = [
+        spec for ax in figure.axes if (spec := ax.get_subplotspec()) and spec.num1 == spec.num2
+    ]
+    if (
+        figure.texts
+        or len(specs) < len(figure.axes)
+        or len({id(spec.get_gridspec()) for spec in specs}) != 1
+    ):
         return {}
     for i, (ax, spec) in enumerate(zip(figure.axes, specs, strict=True)):
         if ax.axison:
@@ -55,14 +68,19 @@ def _cells(figure: Figure) -> dict[tuple[int, int], list[int]]:
     return cells
 
 
-def _edges(figure: Figure, cells: dict[tuple[int, int], list[int]]) -> list[dict[int, tuple[float, float]]]:
+def _edges(
+    figure: Figure, cells: dict[tuple[int, int], list[int]]
+) -> list[dict[int, tuple[float, float]]]:
     """Returns the ends of each column from the left and of each row from above, in points."""
     width, height = 72 * figure.get_size_inches()
     columns, rows = dict[int, tuple[float, float]](), dict[int, tuple[float, float]]()
     for (row, column), inside in cells.items():
         for box in filter(None, (figure.axes[i].get_tightbbox() for i in inside)):
             x0, y0, x1, y1 = (72 / figure.dpi * v for v in box.extents)
-            for ends, at, low, high in ((columns, column, x0, x1), (rows, row, height - y1, height - y0)):
+            for ends, at, low, high in (
+                (columns, column, x0, x1),
+                (rows, row, height - y1, height - y0),
+            ):
                 least, most = ends.get(at, (low, high))
                 ends[at] = min(least, low - _MARGIN), max(most, high + _MARGIN)
     return [columns or {0: (0.0, width)}, rows or {0: (0.0, height)}]
@@ -88,7 +106,11 @@ def _classed(html: str) -> str:
         short = re.sub(r'^<g id="[^"]*"', "<g", tag[0])
         short = re.sub(r' style="((?:fill|stroke|font|opacity|clip)[^"]*)"', named, short)
         short = re.sub(r' transform="rotate\(-0 [^"]*"', "", short)
-        return re.sub(r' (?:d|x|y)="[^"]*"', lambda found: re.sub(r"(\.\d\d)\d+|\s*\n", r"\1", found[0]), short)
+        return re.sub(
+            r' (?:d|x|y)="[^"]*"',
+            lambda found: re.sub(r"(\.\d\d)\d+|\s*\n", r"\1", found[0]),
+            short,
+        )
 
     # In tags alone: a name between them may read as an attribute, and matplotlib escapes no quotes there.
     html = re.sub(r"<\w[^<>]*>", rewritten, html)

@@ -123,26 +123,39 @@ def views(analysis: Analysis, which: Which = "all") -> tuple[list[View], View]:
     families = {g.estimator: _smoothers_apart(g.footer) for g in analysis.collection.groups}
     whole: dict[str, Any] = {name: getattr(analysis, name) for name in FRAMES}
     split = {name: _split(frame, columns) for name, frame in whole.items()}
-    footers = {tuple(_word(g.columns.get(c)) for c in columns): g.footer for g in analysis.collection.groups}
+    footers = {
+        tuple(_word(g.columns.get(c)) for c in columns): g.footer
+        for g in analysis.collection.groups
+    }
     settings = [dict(zip(columns, key, strict=True)) for key in split["scores"]]
     varying = [c for c in columns if len({setting[c] for setting in settings}) > 1]
     parts, (most, left_out) = list[View](), drawn_settings(len(settings), which)
-    for setting in sorted(settings[:most], key=lambda setting: _success(split["summary"][tuple(setting.values())])):
+    for setting in sorted(
+        settings[:most], key=lambda setting: _success(split["summary"][tuple(setting.values())])
+    ):
         key = tuple(setting.values())
         frames = {name: split[name].get(key, frame.iloc[:0]) for name, frame in whole.items()}
-        seen = {label: one for label, one in look.items() if label in set(frames["scores"]["estimator"])}
+        seen = {
+            label: one for label, one in look.items() if label in set(frames["scores"]["estimator"])
+        }
         # An option that this setting does not have is not spoken of.
         own = {c: setting[c] for c in varying if setting[c] != "-"}
         head = [setting[c] for c in ("measurement", "noise") if setting.get(c, "-") != "-"]
-        label = ", ".join([*head, *(f"{c}={v}" for c, v in own.items() if c not in ("measurement", "noise"))])
+        label = ", ".join(
+            [*head, *(f"{c}={v}" for c, v in own.items() if c not in ("measurement", "noise"))]
+        )
         if left_out and len(parts) + 1 == most:
             label += f" ({left_out})"
         suffix = re.sub(r"[^A-Za-z0-9.]+", "-", "_".join(own.values())).strip("-.")
-        if varying and (len(suffix) > MOST_LETTERS or f"_{suffix}" in ("_", *(part.suffix for part in parts))):
+        if varying and (
+            len(suffix) > MOST_LETTERS or f"_{suffix}" in ("_", *(part.suffix for part in parts))
+        ):
             suffix = f"{suffix[:MOST_LETTERS]}-{len(parts) + 1}"
         paper = (setting.get("measurement"), setting.get("noise")) == ("gins", "quantization")
         known = footers[key]["parameters"], paper, setting.get("noise") == "model"
-        parts.append(View(f"_{suffix}" * bool(varying), label, frames, seen, equations, families, *known))
+        parts.append(
+            View(f"_{suffix}" * bool(varying), label, frames, seen, equations, families, *known)
+        )
     return parts, View("", "", whole, every, equations, families, collection=collection)
 
 
@@ -164,7 +177,11 @@ def _word(value: Any) -> str:
     if value is None or (pd.api.types.is_scalar(value) and pd.isna(value)):
         return "-"
     # Six figures where they say it all: values that differ later are different settings.
-    return value_text(value) if isinstance(value, float) and float(value_text(value)) == value else str(value)
+    return (
+        value_text(value)
+        if isinstance(value, float) and float(value_text(value)) == value
+        else str(value)
+    )
 
 
 def _looks(analysis: Analysis) -> dict[str, Look]:
@@ -178,7 +195,11 @@ def _looks(analysis: Analysis) -> dict[str, Look]:
     totals = analysis.summary[analysis.summary["parameter"] == ALL]
     success = totals.groupby("estimator")["success"].mean()
     ranked = sorted(labels, key=lambda label: -success.get(label, 0.0))
-    best = [label for label in labels if label in [e for e in ranked if families.get(e) == families.get(label)][:2]]
+    best = [
+        label
+        for label in labels
+        if label in [e for e in ranked if families.get(e) == families.get(label)][:2]
+    ]
     return looks(labels, families, () if FACES.keys() & set(labels) else best, own)
 
 
@@ -191,7 +212,11 @@ def looks_of(estimators: Mapping[str, Any]) -> dict[str, Look]:
 
 def _own_looks(footers: Mapping[str, Mapping[str, Any]]) -> dict[str, tuple[str, str]]:
     """Returns the colours and markers that classes name, by the labels of their estimators."""
-    return {label: _named(label, footer["look"]) for label, footer in footers.items() if footer.get("look")}
+    return {
+        label: _named(label, footer["look"])
+        for label, footer in footers.items()
+        if footer.get("look")
+    }
 
 
 def _named(label: str, look: Any) -> tuple[str, str]:
@@ -204,12 +229,20 @@ def _named(label: str, look: Any) -> tuple[str, str]:
         MarkerStyle(marker)
         return to_hex(color), marker
     except (TypeError, ValueError):
-        raise UserError(f'{label}: look={look} is no colour and marker; write look = ("#c51b7d", "s")') from None
+        raise UserError(
+            f'{label}: look={look} is no colour and marker; write look = ("#c51b7d", "s")'
+        ) from None
 
 
 def family_of(footer: Mapping[str, Any]) -> str:
     """Returns the family of an estimator, one of `FAMILIES`: its declared one, else by its inputs and equation."""
-    known = "filters" if footer.get("sequential") else "IPE" if footer.get("equation") == "frozen" else "least squares"
+    known = (
+        "filters"
+        if footer.get("sequential")
+        else "IPE"
+        if footer.get("equation") == "frozen"
+        else "least squares"
+    )
     return footer.get("family") or known
 
 

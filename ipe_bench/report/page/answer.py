@@ -85,12 +85,16 @@ class Answer(Shown):
         """Returns the answer to a question, under its model's name or another `name`; `watch` is called with the label
         of each estimator before its fit."""
         model, z = question.found.model, question.found.z
-        return cls(name or model.name, model, z, *question.fitted(watch), ", ".join(question.ignored))
+        return cls(
+            name or model.name, model, z, *question.fitted(watch), ", ".join(question.ignored)
+        )
 
     @property
     def passes(self) -> bool:
         """Whether the answer of any estimator passes every test."""
-        return (self.examination is None or self.examination.least) and any(one.passes for one in self.fits)
+        return (self.examination is None or self.examination.least) and any(
+            one.passes for one in self.fits
+        )
 
     def __iter__(self) -> Iterator[Fit]:
         return iter(self.fits)
@@ -108,21 +112,38 @@ class Answer(Shown):
 
         frames = []
         for one in self.fits:
-            names, units = zip(*((p.name, p.unit) for p in one.model.physical_parameters), strict=True)
+            names, units = zip(
+                *((p.name, p.unit) for p in one.model.physical_parameters), strict=True
+            )
             low, high = one.interval()
             own = {"estimator": one.label, "parameter": names, "unit": units, "estimate": one.x}
-            own |= {"standard_error": one.standard_errors, "low95": low, "high95": high, "passes": one.passes}
+            own |= {
+                "standard_error": one.standard_errors,
+                "low95": low,
+                "high95": high,
+                "passes": one.passes,
+            }
             frames.append(pd.DataFrame(own))
         return pd.concat(frames, ignore_index=True)
 
     def parts(self) -> Iterator[Part]:
         found, one = structure(self.model), self.examination
-        yield from (Strong(f"No data can tell: {sentence}.") for sentence in (found.sentences if found else ()))
-        if lacking := next((f"{'; '.join(f.undetermined)} (at {f.label})" for f in self.fits if f.undetermined), ""):
-            yield Strong(f"The readings do not determine {lacking}; fix parameters, or give prior, until they do.")
+        yield from (
+            Strong(f"No data can tell: {sentence}.")
+            for sentence in (found.sentences if found else ())
+        )
+        if lacking := next(
+            (f"{'; '.join(f.undetermined)} (at {f.label})" for f in self.fits if f.undetermined), ""
+        ):
+            yield Strong(
+                f"The readings do not determine {lacking}; fix parameters, or give prior, until they do."
+            )
         # Without the parameters that are held on bounds, and the levels.
         model = one.whole.measurement if one else self.model
-        yield from (f"Note: {sentence}." for sentence in model.remarks(one.inner[: model.n] if one else model.nominal))
+        yield from (
+            f"Note: {sentence}."
+            for sentence in model.remarks(one.inner[: model.n] if one else model.nominal)
+        )
         yield _estimates(self)
         yield _verdicts(self)
         yield from _outliers(self)
@@ -141,7 +162,11 @@ class Answer(Shown):
         if not self.passes:
             return [f"No answer that passes: {others or 'a better minimum was found'}."]
         labels = enumerate_few([one.label for one in passing])
-        tests = "every test" if passing[0].fits else "what tests there are, none of the size of the residuals"
+        tests = (
+            "every test"
+            if passing[0].fits
+            else "what tests there are, none of the size of the residuals"
+        )
         found = [f"Passing {tests}: {labels}{f'; no answer: {others}' if others else ''}."]
         told = self.examination
         one = next((one for one in passing if told and one.label == told.label), passing[0])
@@ -154,12 +179,19 @@ class Answer(Shown):
 def _estimates(answer: Answer) -> Table:
     """Returns estimates with their errors; an invalid one stands in brackets, without its meaningless errors."""
     parameters = answer.fits[0].model.physical_parameters
-    columns = [words("parameter", [p.name for p in parameters]), words("unit", [p.unit for p in parameters])]
+    columns = [
+        words("parameter", [p.name for p in parameters]),
+        words("unit", [p.unit for p in parameters]),
+    ]
     for one in answer.fits:
         if one.passes:
             columns.append(texts(one.label, map(with_error, one.x, one.standard_errors)))
         else:
-            failing = "MISFIT" if one.status is Status.CONVERGED else one.status.label.replace("_", " ").upper()
+            failing = (
+                "MISFIT"
+                if one.status is Status.CONVERGED
+                else one.status.label.replace("_", " ").upper()
+            )
             cells = [f"({value:.4g})" if math.isfinite(value) else "-" for value in one.x]
             columns.append(texts(f"{one.label}: {failing}", cells))
     return Table("estimates", f"{answer.name}: estimate ± standard error", "", columns)
@@ -200,7 +232,10 @@ def _verdicts(answer: Answer) -> Table:
     if any(one.level is None for one in fits):
         # The least p that simulated fits resolve is an upper limit.
         columns += [
-            texts("p", [p_value(one.p_value, LEAST_FIT_P * (one.p_value == LEAST_FIT_P)) for one in fits]),
+            texts(
+                "p",
+                [p_value(one.p_value, LEAST_FIT_P * (one.p_value == LEAST_FIT_P)) for one in fits],
+            ),
             texts("chi2", [_number(one.chi_square) if one.level is None else "-" for one in fits]),
         ]
     columns += [
@@ -287,13 +322,20 @@ def _outliers(answer: Answer) -> Iterator[Table]:
         return
     beyond = np.flatnonzero(np.any([f.outliers for f in told], axis=0))
     worst = {i: max((float(f.normalised[i]) for f in told), key=abs) for i in beyond}
-    listed, labels = sorted(worst, key=lambda i: -abs(worst[i]))[:_MOST_OUTLIERS], _reading_labels(answer.model)
+    listed, labels = (
+        sorted(worst, key=lambda i: -abs(worst[i]))[:_MOST_OUTLIERS],
+        _reading_labels(answer.model),
+    )
     columns = [
         words("reading", [_where(labels[i]) for i in listed]),
         texts("residual", [f"{worst[i]:.1f}" for i in listed]),
         words("of", [", ".join(f.label for f in told if f.outliers[i]) for i in listed]),
     ]
-    more = [f"And {len(worst) - _MOST_OUTLIERS} others: see {RESIDUALS}."] if len(worst) > _MOST_OUTLIERS else []
+    more = (
+        [f"And {len(worst) - _MOST_OUTLIERS} others: see {RESIDUALS}."]
+        if len(worst) > _MOST_OUTLIERS
+        else []
+    )
     title = f"Outliers: normalised residual beyond ±{told[0].outlier_limit:.2f}"
     yield Table("outliers", title, "", columns, notes=more)
 
@@ -304,7 +346,10 @@ def _where(label: Mapping[str, Any]) -> str:
 
 def _reading_labels(model: Measurement) -> list[dict[str, Any]]:
     columns = model.index
-    return [{k: as_json(v) for k, v in zip(columns, row, strict=True)} for row in zip(*columns.values(), strict=True)]
+    return [
+        {k: as_json(v) for k, v in zip(columns, row, strict=True)}
+        for row in zip(*columns.values(), strict=True)
+    ]
 
 
 def _intervals(found: Examination) -> Table:
@@ -317,8 +362,14 @@ def _intervals(found: Examination) -> Table:
         words("parameter", [p.name for p in parameters]),
         words("unit", [p.unit for p in parameters]),
         texts("standard error", [*map(_interval, *found.wald, found.x), *absent]),
-        texts("profile", [_interval(low, high, at) for (low, high), at in zip(ends, middle, strict=True)]),
-        texts("bootstrap", [*map(_interval, found.bootstrap.low, found.bootstrap.high, found.x), *absent]),
+        texts(
+            "profile",
+            [_interval(low, high, at) for (low, high), at in zip(ends, middle, strict=True)],
+        ),
+        texts(
+            "bootstrap",
+            [*map(_interval, found.bootstrap.low, found.bootstrap.high, found.x), *absent],
+        ),
     ]
     title = f"{100 * CONFIDENCE:.0f} % intervals of {found.label}, in three ways"
     return Table("intervals", title, "", columns)
@@ -328,7 +379,9 @@ def _interval(low: float, high: float, middle: float) -> str:
     """Rounds the ends to a hundredth of twice the lesser distance to the estimate `middle`, or of the width if
     outside."""
     if not math.isfinite(high - low) or high <= low:
-        text = f"{low:.6g} … {high:.6g}".replace("-inf", "−∞").replace("inf", "∞").replace("nan", "-")
+        text = (
+            f"{low:.6g} … {high:.6g}".replace("-inf", "−∞").replace("inf", "∞").replace("nan", "-")
+        )
         return "-" if text == "- … -" else text
     reach = 2 * min(middle - low, high - middle) if low < middle < high else high - low
     return _together((low, high), " … ", math.floor(math.log10(reach)) - 2)
@@ -349,7 +402,9 @@ def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator
         )
     equal = [one for one in found.ambiguous if one.same_readings]
     if equal:
-        ways = dict.fromkeys(_changed(names, found.x, one.x, found.standard_errors) or at(one.x) for one in equal)
+        ways = dict.fromkeys(
+            _changed(names, found.x, one.x, found.standard_errors) or at(one.x) for one in equal
+        )
         listed = "; with ".join(list(ways)[:_MOST_MINIMA])
         yield f"The readings are exactly the same with {listed}: choose one of these answers."
     if found.overstated:
@@ -358,7 +413,9 @@ def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator
         yield f"AMBIGUOUS: the readings fit as well at {at(one.x)} (chi-square {one.chi_square:.5g})."
     if found.bent.any():
         rows = zip(names, *found.profiles, found.x, strict=True)
-        ends = [f"{name} {_interval(low, high, x)}" for name, low, high, x in compress(rows, found.bent)]
+        ends = [
+            f"{name} {_interval(low, high, x)}" for name, low, high, x in compress(rows, found.bent)
+        ]
         yield f"The fit is curved: trust the {100 * CONFIDENCE:.0f} % intervals of profiles, {enumerate_few(ends, 3)}."
     if unlimited := list(compress(names, np.any(np.isinf(found.profiles), axis=0))):
         yield f"The readings set no limit to one side of {', '.join(unlimited)}."
@@ -388,7 +445,9 @@ def _changed(names: Sequence[str], x: Array, y: Array, errors: Array) -> str:
         if abs(x[i] + y[i]) <= near[i]:
             words.append(f"{names[i]} of the other sign")
             continue
-        other = next((j for j in left if abs(y[i] - x[j]) <= near[j] and abs(y[j] - x[i]) <= near[i]), None)
+        other = next(
+            (j for j in left if abs(y[i] - x[j]) <= near[j] and abs(y[j] - x[i]) <= near[i]), None
+        )
         if other is None:
             return ""
         left.remove(other)
@@ -397,14 +456,21 @@ def _changed(names: Sequence[str], x: Array, y: Array, errors: Array) -> str:
 
 
 def write_answer(
-    folder: Path, answer: Answer, command: Any, provenance: Mapping[str, Any], *, figures: bool = True
+    folder: Path,
+    answer: Answer,
+    command: Any,
+    provenance: Mapping[str, Any],
+    *,
+    figures: bool = True,
 ) -> list[Path]:
     """Writes estimate.json, the page, residuals.csv and the figure; returns the files."""
     content = {"schema": SCHEMA, "command": command, **estimate_content(answer), **provenance}
     write_text(folder / f"{NAME}.json", json.dumps(content, indent=1) + "\n")
     shown = answer.sentences(), answer.parts(), _drawings(answer) if figures else ()
     told = {"facts": [f"{np.isfinite(answer.z).sum()} readings"], "sources": read_from(provenance)}
-    files = write_files(folder, NAME, (RESIDUALS, _residuals(answer)), f"{answer.name}: estimates", *shown, **told)
+    files = write_files(
+        folder, NAME, (RESIDUALS, _residuals(answer)), f"{answer.name}: estimates", *shown, **told
+    )
     for old in {folder / each for each in FILES} - set(files):
         old.unlink(missing_ok=True)
     return [folder / f"{NAME}.json", *files]
@@ -444,7 +510,16 @@ def estimate_content(answer: Answer) -> dict[str, Any]:
 
 def _fitted(one: Fit, labels: list[dict[str, Any]]) -> dict[str, Any]:
     names = [p.name for p in one.model.physical_parameters]
-    rows = ("message", "chi_square", "degrees_of_freedom", "fits", "passes", "with_prior", "beaten_by", "lower_at")
+    rows = (
+        "message",
+        "chi_square",
+        "degrees_of_freedom",
+        "fits",
+        "passes",
+        "with_prior",
+        "beaten_by",
+        "lower_at",
+    )
     rows += ("iterations", "simulations", "correlation", "residual_deviation")
     return {
         "status": one.status.label,
@@ -456,7 +531,8 @@ def _fitted(one: Fit, labels: list[dict[str, Any]]) -> dict[str, Any]:
         "on_bounds": {names[k]: value for k, value in one.held_at.items()},
         "noise_level_estimated": one.levels or as_json(one.level),
         "outliers": [
-            {**labels[i], "normalised_residual": as_json(one.normalised[i])} for i in np.flatnonzero(one.outliers)
+            {**labels[i], "normalised_residual": as_json(one.normalised[i])}
+            for i in np.flatnonzero(one.outliers)
         ],
         **{name: as_json(getattr(one, name)) for name in rows},
     }
@@ -494,9 +570,20 @@ def _residuals(answer: Answer) -> pd.DataFrame:
     frames = []
     for one in answer.fits:
         examined = found if found is not None and one.label == found.label else None
-        fitted = z - one.residuals if examined is None else np.where(np.isnan(z), examined.fitted, z - one.residuals)
-        own: dict[str, Any] = {f"reading{unit}": z, f"fitted{unit}": fitted, f"residual{unit}": one.residuals}
-        own |= {"normalised_residual": one.normalised, "outlier": np.where(one.outliers, "yes", "no")}
+        fitted = (
+            z - one.residuals
+            if examined is None
+            else np.where(np.isnan(z), examined.fitted, z - one.residuals)
+        )
+        own: dict[str, Any] = {
+            f"reading{unit}": z,
+            f"fitted{unit}": fitted,
+            f"residual{unit}": one.residuals,
+        }
+        own |= {
+            "normalised_residual": one.normalised,
+            "outlier": np.where(one.outliers, "yes", "no"),
+        }
         own["shift"] = np.nan if examined is None else examined.shift
         own[f"fitted_error{unit}"] = np.nan if examined is None else examined.fitted_errors
         own[f"prediction_error{unit}"] = np.nan if examined is None else examined.new_errors

@@ -27,18 +27,29 @@ _PYTHON, _UNKNOWN = "from Python", "a command that was not recorded"
 
 
 def render_page(
-    analysis: Analysis, tables: Sequence[Table], figures: Sequence[Drawn], written: Sequence[Written] = ()
+    analysis: Analysis,
+    tables: Sequence[Table],
+    figures: Sequence[Drawn],
+    written: Sequence[Written] = (),
 ) -> str:
     """Renders the page as text; what plugins have written stands behind our tables."""
     collection = analysis.collection
     runs, older = _runs(collection.runs)
-    commands = dict.fromkeys(run["command"] for run in runs if run["command"] not in (_PYTHON, _UNKNOWN))
+    commands = dict.fromkeys(
+        run["command"] for run in runs if run["command"] not in (_PYTHON, _UNKNOWN)
+    )
     main: list[Part] = [table for table in tables if not table.appendix]
-    asked = [cell for cell in collection.cells if cell.expected and cell.names["estimator"] != TRUTH]
+    asked = [
+        cell for cell in collection.cells if cell.expected and cell.names["estimator"] != TRUTH
+    ]
     converged = analysis.endings.empty and not analysis.summary.empty
     sections = [
         ("figures", "Figures", figures[1:]),
-        ("tables", "Tables", [*main[1:], *(["Every trial of every estimator converged."] if converged else [])]),
+        (
+            "tables",
+            "Tables",
+            [*main[1:], *(["Every trial of every estimator converged."] if converged else [])],
+        ),
         *((f"section-{section.name}", section.title, section.parts) for section in written),
         ("appendix", "Further tables", [table for table in tables if table.appendix]),
         ("provenance", "Configuration and provenance", _provenance(runs, older)),
@@ -82,7 +93,9 @@ def _runs(runs: Sequence[Mapping[str, Any]]) -> tuple[list[dict[str, Any]], int]
     commands: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
     for run in (run for run in runs if run.get("blocks", 1)):
         command = run.get("command", _UNKNOWN)
-        commands.setdefault((_PYTHON, run["file"]) if command is None else (public(str(command)), ""), []).append(run)
+        commands.setdefault(
+            (_PYTHON, run["file"]) if command is None else (public(str(command)), ""), []
+        ).append(run)
     found = []
     for (command, _), records in list(reversed(commands.items()))[:MOST_RUNS]:
         last = records[-1]
@@ -98,7 +111,14 @@ def _runs(runs: Sequence[Mapping[str, Any]]) -> tuple[list[dict[str, Any]], int]
         scenarios = [scenario for record in records for scenario in record.get("scenarios", ())]
         config = {"scenarios": scenarios, "estimators": last.get("estimators", {})}
         text = json.dumps(config, indent=1, ensure_ascii=False)
-        found.append({"command": command, "started": _minute(records[0]["started"]), "facts": facts, "config": text})
+        found.append(
+            {
+                "command": command,
+                "started": _minute(records[0]["started"]),
+                "facts": facts,
+                "config": text,
+            }
+        )
     return found, len(commands) - len(found)
 
 

@@ -52,10 +52,17 @@ class LogAnswer(Shown):
 
         model, frames = self.log.model, []
         for one in self.tracks:
-            columns = {"tracker": one.label, "epoch": range(1, model.epochs + 1), "time [s]": model.times}
+            columns = {
+                "tracker": one.label,
+                "epoch": range(1, model.epochs + 1),
+                "time [s]": model.times,
+            }
             for i, state in enumerate(model.states):
                 unit = f" [{state.unit}]" if state.unit else ""
-                columns |= {f"{state.name}{unit}": one.mean[:, i], f"{state.name}_deviation{unit}": one.deviation[:, i]}
+                columns |= {
+                    f"{state.name}{unit}": one.mean[:, i],
+                    f"{state.name}_deviation{unit}": one.deviation[:, i],
+                }
             frames.append(pd.DataFrame(columns | {"nis": one.nis}))
         return pd.concat(frames, ignore_index=True)
 
@@ -70,7 +77,9 @@ class LogAnswer(Shown):
             words("verdict", [shown(one.verdict) for one in found]),
             texts("fit p", [p_value(one.fit_p) for one in found]),
             texts("white p", [p_value(one.white_p) for one in found]),
-            texts("log likelihood", [f"{one.log_likelihood:.2f}".replace("nan", "-") for one in found]),
+            texts(
+                "log likelihood", [f"{one.log_likelihood:.2f}".replace("nan", "-") for one in found]
+            ),
         ]
         note = (
             "Innovations are readings less their predictions, in predicted standard deviations, and NIS / m is their"
@@ -92,8 +101,13 @@ class LogAnswer(Shown):
                 f" Constants are those of the largest likelihood that {SEARCHES} searches found. Since they were"
                 " found by the innovations, the mean square of these hardly tests the model; whiteness does."
             )
-        ends = [words("state", [state.name for state in states]), words("unit", [state.unit for state in states])]
-        ends += [texts(one.label, map(with_error, one.mean[-1], one.deviation[-1])) for one in found]
+        ends = [
+            words("state", [state.name for state in states]),
+            words("unit", [state.unit for state in states]),
+        ]
+        ends += [
+            texts(one.label, map(with_error, one.mean[-1], one.deviation[-1])) for one in found
+        ]
         constants = [(one.label, each) for one in found for each in one.constants]
         rows = [each for _, each in constants]
         maximum = [
@@ -103,30 +117,61 @@ class LogAnswer(Shown):
             interval("95 %", [each.low for each in rows], [each.high for each in rows], short),
         ]
         return [
-            *(Strong(f"{one.label}: {text}") for one in found for text in (one.message, *one.notes) if text),
+            *(
+                Strong(f"{one.label}: {text}")
+                for one in found
+                for text in (one.message, *one.notes)
+                if text
+            ),
             *map(Strong, far_below(found)),
-            *([Table("constants", "Constants of largest likelihood", "", maximum)] if constants else ()),
-            Table("innovations", f"{self.log.model.name}: is the filter right?", "", columns, notes=[note]),
+            *(
+                [Table("constants", "Constants of largest likelihood", "", maximum)]
+                if constants
+                else ()
+            ),
+            Table(
+                "innovations",
+                f"{self.log.model.name}: is the filter right?",
+                "",
+                columns,
+                notes=[note],
+            ),
             Table("last", "States at the last epoch ± standard deviation", "", ends),
         ]
 
 
-def write_tracks(folder: Path, answer: LogAnswer, command: Any, provenance: Mapping[str, Any]) -> list[Path]:
+def write_tracks(
+    folder: Path, answer: LogAnswer, command: Any, provenance: Mapping[str, Any]
+) -> list[Path]:
     """Writes track.json, track.csv and track.html, and returns them."""
-    log, rows = answer.log, ("lost_from", "effective", "message", "notes", "mean_nis", "limits", "verdict")
+    log, rows = (
+        answer.log,
+        ("lost_from", "effective", "message", "notes", "mean_nis", "limits", "verdict"),
+    )
     rows = (*rows, "fit_p", "white_p", "log_likelihood", "passes")
     trackers = {one.label: {name: as_json(getattr(one, name)) for name in rows} for one in answer}
     for one in answer:
-        trackers[one.label]["constants"] = {each.name: as_json([each.value, each.error]) for each in one.constants}
+        trackers[one.label]["constants"] = {
+            each.name: as_json([each.value, each.error]) for each in one.constants
+        }
     content = {"schema": SCHEMA, "command": command, "trackers": trackers, **provenance}
     write_text(folder / f"{NAME}.json", json.dumps(content, indent=1) + "\n")
     facts = [f"{int(np.isfinite(log.z).sum())} readings at {log.model.epochs} epochs"]
     verdicts = dict.fromkeys(one.verdict for one in answer if one.verdict != NO_VERDICT)
-    found = {word: enumerate_few([one.label for one in answer if one.verdict == word]) for word in verdicts}
+    found = {
+        word: enumerate_few([one.label for one in answer if one.verdict == word])
+        for word in verdicts
+    }
     listed = "; ".join(f"{who} {shown(word)}" for word, who in found.items())
     said = [f"Judged by innovations or the cost of a path: {listed}."] if found else []
     told = {"facts": facts, "sources": read_from(provenance)}
     files = write_files(
-        folder, NAME, (TABLE, answer.table()), f"{log.model.name}: tracks", said, answer.parts(), **told
+        folder,
+        NAME,
+        (TABLE, answer.table()),
+        f"{log.model.name}: tracks",
+        said,
+        answer.parts(),
+        **told,
     )
     return [folder / f"{NAME}.json", *files]

@@ -53,7 +53,9 @@ class ReportResult(Shown):
     def _repr_html_(self) -> str:
         from markupsafe import Markup
 
-        link = Markup('<a href="{}" target="_blank">{}</a>').format(os.path.relpath(self.report), self.report)
+        link = Markup('<a href="{}" target="_blank">{}</a>').format(
+            os.path.relpath(self.report), self.report
+        )
         return f"<p>{link}</p>{super()._repr_html_()}"
 
     @property
@@ -94,7 +96,11 @@ class Pending:
         added = [table for section in sections for table in section.tables]
         write_text(output / "summary.csv", main_columns(analysis.summary).to_csv(index=False))
         write_text(whole := output / "summary_all.csv", analysis.summary.to_csv(index=False))
-        files = [path for table in (*tables, *added) for path in write_table(table, output / "tables", self.formats)]
+        files = [
+            path
+            for table in (*tables, *added)
+            for path in write_table(table, output / "tables", self.formats)
+        ]
         simulated = analysis.simulated
         for name, frame in {n: getattr(simulated, n) for n in CURVES}.items():
             if len(frame):
@@ -113,7 +119,11 @@ class Pending:
             stale=tuple(analysis.collection.stale),
             headline=tuple(headline(analysis)),
         )
-        earlier = {path.name for path in map(Path, _stamped(output).get("files", ())) if path.parent.name == "tables"}
+        earlier = {
+            path.name
+            for path in map(Path, _stamped(output).get("files", ()))
+            if path.parent.name == "tables"
+        }
         for name in earlier - {path.name for path in files}:
             (output / "tables" / name).unlink(missing_ok=True)
         if len(problems) == known:  # what plugins cannot make is said each time
@@ -123,7 +133,11 @@ class Pending:
 
 
 def begin_report(
-    folders: Sequence[Path], output: Path | str | None = None, *, figures: Any = "main", formats: Any = PAGE
+    folders: Sequence[Path],
+    output: Path | str | None = None,
+    *,
+    figures: Any = "main",
+    formats: Any = PAGE,
 ) -> Pending:
     """Collects and summarises what folders hold, with the statistics of plugins.
 
@@ -143,10 +157,16 @@ def begin_report(
 
 def _made_from(directories: Sequence[Path], output: Path, *choices: object) -> str:
     """Computes a digest of the report's sources before they are read: results that come meanwhile change it."""
-    sources = [p for p in Path(__file__).parents[2].rglob("*") if p.suffix in {".py", ".j2", ".css", ".js"}]
+    sources = [
+        p for p in Path(__file__).parents[2].rglob("*") if p.suffix in {".py", ".j2", ".css", ".js"}
+    ]
     stores = [Store(directory) for directory in directories]
-    stored = [p for s in stores for folder in (s.trials, s.runs, s.failed) for p in folder.glob("*")]
-    libraries = [version(name) for name in ("jinja2", "matplotlib", "numpy", "pandas", "scipy", "seaborn")]
+    stored = [
+        p for s in stores for folder in (s.trials, s.runs, s.failed) for p in folder.glob("*")
+    ]
+    libraries = [
+        version(name) for name in ("jinja2", "matplotlib", "numpy", "pandas", "scipy", "seaborn")
+    ]
     names = [str(path.absolute()) for path in (output, *directories)]
     known = [names, choices, libraries, *map(_digests, (files_of_records(), sources, stored))]
     return hashlib.sha256(repr(known).encode()).hexdigest()
@@ -161,7 +181,9 @@ def _is_current(output: Path, made: str) -> bool:
 def _stamped(output: Path) -> dict[str, Any]:
     """Returns the stamp of the report under `output`; empty if there is none."""
     with contextlib.suppress(OSError, ValueError):
-        if isinstance(known := json.loads(regular(output / STAMP).read_text(encoding="utf-8")), dict):
+        if isinstance(
+            known := json.loads(regular(output / STAMP).read_text(encoding="utf-8")), dict
+        ):
             return known
     return {}
 

@@ -31,7 +31,9 @@ COMMAND: ContextVar[str] = ContextVar("command", default="")
 """The command that is being run, for its page; empty in Python."""
 
 
-def reserve_output_folder(folder: Path, name: str, command: Any, *, elsewhere: bool, files: Sequence[str] = ()) -> Path:
+def reserve_output_folder(
+    folder: Path, name: str, command: Any, *, elsewhere: bool, files: Sequence[str] = ()
+) -> Path:
     """Reserves the folder that a command writes to: a new one, or that of the same command, by `name`.json; with
     `elsewhere` folder-2, folder-3 and so on, if it has `files` of another one.
 
@@ -40,7 +42,10 @@ def reserve_output_folder(folder: Path, name: str, command: Any, *, elsewhere: b
         StorageError: it cannot be written to.
     """
     others = (folder.with_name(f"{folder.name}-{k}") for k in count(2)) if elsewhere else ()
-    found = next((one for one in chain([folder], others) if _is_free(one, f"{name}.json", command, files)), None)
+    found = next(
+        (one for one in chain([folder], others) if _is_free(one, f"{name}.json", command, files)),
+        None,
+    )
     if found is None:
         raise UserError(
             f"output={folder}: holds results of another command, which are not overwritten; choose another folder, or"
@@ -55,7 +60,9 @@ def _is_free(folder: Path, result: str, command: Any, files: Sequence[str]) -> b
     if not (folder / result).exists():
         return not any((folder / name).exists() for name in files)
     try:
-        return json.loads(regular(folder / result).read_text(encoding="utf-8"))["command"] == command
+        return (
+            json.loads(regular(folder / result).read_text(encoding="utf-8"))["command"] == command
+        )
     except (OSError, ValueError, KeyError, TypeError):
         return False
 
@@ -84,8 +91,17 @@ class Page:
         from markupsafe import Markup
 
         templates = resources.files("ipe_bench.report.page") / "templates"
-        style, script = (Markup((templates / f"report.{kind}").read_text(encoding="utf-8")) for kind in ("css", "js"))
-        constant = {"style": style, "script": script, "citation": CITATION, "version": __version__, "public": public}
+        style, script = (
+            Markup((templates / f"report.{kind}").read_text(encoding="utf-8"))
+            for kind in ("css", "js")
+        )
+        constant = {
+            "style": style,
+            "script": script,
+            "citation": CITATION,
+            "version": __version__,
+            "public": public,
+        }
         return environment().get_template("page.html.j2").render(**vars(self), **constant)
 
 
@@ -95,7 +111,12 @@ def digests(places: Iterable[Path]) -> list[tuple[str, str]]:
     for place in places:
         files = sorted((place / "trials").glob("*")) if place.is_dir() else [place]
         each = [hashlib.sha256(path.read_bytes()).hexdigest() for path in files if path.is_file()]
-        found.append((str(place), each[0] if files == [place] else hashlib.sha256("".join(each).encode()).hexdigest()))
+        found.append(
+            (
+                str(place),
+                each[0] if files == [place] else hashlib.sha256("".join(each).encode()).hexdigest(),
+            )
+        )
     return found
 
 
@@ -122,6 +143,8 @@ def write_files(
     commands = [public(asked)] if (asked := COMMAND.get()) else []
     facts = [*facts, f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"]
     sections = [("details", "Details", [*figures[1:], *rest])]
-    page = Page(name, title, list(answer)[:3], [*figures[:1], *first], sections, commands, sources, facts)
+    page = Page(
+        name, title, list(answer)[:3], [*figures[:1], *first], sections, commands, sources, facts
+    )
     write_text(files[1], page.html())
     return [*files, *(file for figure in figures for file in figure.files)]

@@ -128,13 +128,22 @@ def differing(rows: pd.DataFrame, columns: Sequence[str]) -> list[str]:
         return ["-"] * len(rows)
     values = rows[varying].map(value_text)
     usual = {c: values[c].mode().iloc[0] for c in values if len(values.columns) > MOST_SETTINGS}
-    told = ([(c, v) for c, v in row.items() if v not in ("-", usual.get(c))] for row in values.to_dict("records"))
-    return [", ".join(v if c in ("measurement", "noise") else f"{c}={v}" for c, v in each) or "-" for each in told]
+    told = (
+        [(c, v) for c, v in row.items() if v not in ("-", usual.get(c))]
+        for row in values.to_dict("records")
+    )
+    return [
+        ", ".join(v if c in ("measurement", "noise") else f"{c}={v}" for c, v in each) or "-"
+        for each in told
+    ]
 
 
 def _recorded(analysis: Analysis, where: Where, totals: pd.DataFrame) -> Table | None:
     """Returns the table of the statistics whose records name it, behind the estimators and other columns of names."""
-    (title, caption, chosen), names = _RECORDED[where], ("parameter", "unit") if where in _OF_PARAMETERS else ()
+    (title, caption, chosen), names = (
+        _RECORDED[where],
+        ("parameter", "unit") if where in _OF_PARAMETERS else (),
+    )
     rows = analysis.summary if names else totals
     rows = rows[chosen(rows)]
     if rows.empty:
@@ -151,11 +160,25 @@ def overview(analysis: Analysis) -> Table:
     rows = analysis.summary[analysis.summary["parameter"] == ALL].reset_index(drop=True)
     first = head(analysis, rows)
     told: Any = rows.to_dict("records")
-    columns = [*first, *overview_columns(told, leading(told, [*analysis.setting_columns, "error_scale"]))]
+    columns = [
+        *first,
+        *overview_columns(told, leading(told, [*analysis.setting_columns, "error_scale"])),
+    ]
     columns += statistics("overview", told)
-    setting = ("setting: what differs from the values that most rows have.",) * (first[0].title == "setting")
+    setting = ("setting: what differs from the values that most rows have.",) * (
+        first[0].title == "setting"
+    )
     notes = (*setting, *overview_notes(rows["noise"].tolist()))
-    return Table("overview", "Overview", "", columns, rows, notes=notes, grouped=len(first), whole="summary.csv")
+    return Table(
+        "overview",
+        "Overview",
+        "",
+        columns,
+        rows,
+        notes=notes,
+        grouped=len(first),
+        whole="summary.csv",
+    )
 
 
 def contraction(analysis: Analysis) -> Table | None:
@@ -192,7 +215,10 @@ def comparisons(analysis: Analysis) -> Table | None:
         column("first alone", rows["only_first"], str),
         column("second alone", rows["only_second"], str),
         column("p of success", rows["p_success"], p_value),
-        words("finding", [f"{label} is closer" if label else "no difference" for label in rows["closer"]]),
+        words(
+            "finding",
+            [f"{label} is closer" if label else "no difference" for label in rows["closer"]],
+        ),
     ]
     caption = (
         "Over the trials that both have. First alone and second alone count trials in which only that one succeeds, by"
@@ -245,7 +271,10 @@ def _digits(digits: pd.DataFrame) -> list[Table]:
     rows = certified_averages(digits).sort_values(["mean_lre_parameters", "start"], ascending=False)
     columns = [
         words("estimator", rows["estimator"]),
-        *(column(name, rows[name.replace(" ", "")], str) for name in ("start", "data sets", "solved")),
+        *(
+            column(name, rows[name.replace(" ", "")], str)
+            for name in ("start", "data sets", "solved")
+        ),
         *_lre(rows, "mean_"),
         column("deviations to 6 digits", rows["deviations_to_6_digits"], str),
     ]
@@ -263,9 +292,23 @@ def _published(rows: pd.DataFrame, collection: Collection) -> Table:
     ]
     sources = " ".join(dict.fromkeys(model["source"] for model in models if "source" in model))
     caption = f"Root mean square errors over all epochs of one stored path, beside those that are published. {sources}"
-    return Table("published", "Published errors of trackers", caption, columns, rows, whole="tables/published.csv")
+    return Table(
+        "published",
+        "Published errors of trackers",
+        caption,
+        columns,
+        rows,
+        whole="tables/published.csv",
+    )
 
 
 def _lre(rows: pd.DataFrame, prefix: str) -> list[Column]:
-    titles = {"parameters": "digits of parameters", "deviations": "of deviations", "rss": "of residuals"}
-    return [column(title, rows[f"{prefix}lre_{name}"], lambda v: f"{v:.2f}") for name, title in titles.items()]
+    titles = {
+        "parameters": "digits of parameters",
+        "deviations": "of deviations",
+        "rss": "of residuals",
+    }
+    return [
+        column(title, rows[f"{prefix}lre_{name}"], lambda v: f"{v:.2f}")
+        for name, title in titles.items()
+    ]

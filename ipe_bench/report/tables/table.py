@@ -126,27 +126,41 @@ Part = Table | str
 """Element of a report: a table or a sentence."""
 
 
-def column(title: str, values: Iterable[Any], show: Callable[[Any], str], best: Iterable[bool] = ()) -> Column:
+def column(
+    title: str, values: Iterable[Any], show: Callable[[Any], str], best: Iterable[bool] = ()
+) -> Column:
     """Makes a column of numbers, written by `show`."""
     values = list(values)
     marks = list(best) or [False] * len(values)
-    return Column(title, [Cell(show(v), sort_key(v), m) for v, m in zip(values, marks, strict=True)])
+    return Column(
+        title, [Cell(show(v), sort_key(v), m) for v, m in zip(values, marks, strict=True)]
+    )
 
 
 def words(title: str, values: Iterable[Any], best: Iterable[bool] = ()) -> Column:
     """Makes a column of texts."""
     values = [str(v) for v in values]
     marks = list(best) or [False] * len(values)
-    return Column(title, [Cell(v, None, m) for v, m in zip(values, marks, strict=True)], numeric=False)
+    return Column(
+        title, [Cell(v, None, m) for v, m in zip(values, marks, strict=True)], numeric=False
+    )
 
 
-def interval(title: str, low: Iterable[float], high: Iterable[float], show: Callable[[float], str]) -> Column:
+def interval(
+    title: str, low: Iterable[float], high: Iterable[float], show: Callable[[float], str]
+) -> Column:
     """Makes a column of intervals, sorted by their lower ends; one end alone has a sign before it."""
 
     def cell(a: float, b: float) -> str:
         if math.isnan(b):
             return f"> {show(a)}" if math.isfinite(a) else "-"
-        return f"{show(a)} to {show(b)}" if math.isfinite(a) else f"< {show(b)}" if math.isnan(a) else "-"
+        return (
+            f"{show(a)} to {show(b)}"
+            if math.isfinite(a)
+            else f"< {show(b)}"
+            if math.isnan(a)
+            else "-"
+        )
 
     return Column(title, [Cell(cell(a, b), sort_key(a)) for a, b in zip(low, high, strict=True)])
 
@@ -187,7 +201,9 @@ def terminal(parts: Iterable[Part], width: int) -> Group:
             shown.append(_rich([*head, *rest[:count]], part, width))
             rest = rest[count:]
             if rest and part.whole:
-                notes.insert(0, f"Too narrow for: {', '.join(c.title for c in rest)}; {part.whole} has them.")
+                notes.insert(
+                    0, f"Too narrow for: {', '.join(c.title for c in rest)}; {part.whole} has them."
+                )
             if not rest or part.whole:
                 break
         shown += [Text(note, style="dim") for note in notes]
@@ -209,7 +225,9 @@ def _needed(column: Column, table: Table) -> tuple[int, int]:
 
     longest = max([1, *(cell_len(cell.text) for cell in column.cells)])
     if not column.numeric:
-        longest = min(longest, _WHOLE_NAME if column is table.columns[table.naming] else _WHOLE_WORD)
+        longest = min(
+            longest, _WHOLE_NAME if column is table.columns[table.naming] else _WHOLE_WORD
+        )
     title = column.title.replace(" %", "\u00a0%")  # a number and its per cent are one word
     word = max(map(cell_len, title.split(" ")))
     return max(longest, cell_len(title)), max(longest, min(word, _WHOLE_NAME))
@@ -232,7 +250,9 @@ def _rich(columns: Sequence[Column], table: Table, width: int) -> Any:
     folded = _taken(columns, table)[0] > width
     for each in columns:
         letters = _needed(each, table)[folded]
-        title = Text(textwrap.fill(each.title.replace(" %", "\u00a0%"), letters).replace("\u00a0", " "))
+        title = Text(
+            textwrap.fill(each.title.replace(" %", "\u00a0%"), letters).replace("\u00a0", " ")
+        )
         if each.numeric:
             shown.add_column(title, justify="right", no_wrap=True)
         else:
@@ -241,7 +261,12 @@ def _rich(columns: Sequence[Column], table: Table, width: int) -> Any:
     for group, members in groupby(rows, key=lambda row: row[: table.grouped]):
         for k, row in enumerate(members):
             first = [Cell("")] * len(group) if k and group else group
-            shown.add_row(*(Text(c.text, style="bold" if c.best else "") for c in (*first, *row[len(group) :])))
+            shown.add_row(
+                *(
+                    Text(c.text, style="bold" if c.best else "")
+                    for c in (*first, *row[len(group) :])
+                )
+            )
         if group:
             shown.add_section()
     return shown
@@ -282,7 +307,11 @@ def write_table(table: Table, folder: Path, formats: Sequence[str]) -> list[Path
     """Writes one table in those of the formats that are of tables; as CSV unless another file has it whole."""
     writers: dict[str, Any] = dict(zip(TABLES, (comma_separated, markdown, latex), strict=True))
     own = table.whole in ("", f"{folder.name}/{table.name}.csv")
-    files = {kind: folder / f"{table.name}.{kind}" for kind in writers if kind in formats and (own or kind != "csv")}
+    files = {
+        kind: folder / f"{table.name}.{kind}"
+        for kind in writers
+        if kind in formats and (own or kind != "csv")
+    }
     for kind, path in files.items():
         write_text(path, writers[kind](table))
     return list(files.values())
@@ -292,7 +321,10 @@ def comma_separated(table: Table) -> str:
     """Renders the numbers behind the table in full precision, or else its cells."""
     import pandas as pd
 
-    cells = pd.DataFrame([[cell.text for cell in row] for row in table.rows], columns=[c.title for c in table.columns])
+    cells = pd.DataFrame(
+        [[cell.text for cell in row] for row in table.rows],
+        columns=[c.title for c in table.columns],
+    )
     return (cells if table.data is None else table.data).to_csv(index=False)
 
 
@@ -303,7 +335,9 @@ def markdown(table: Table) -> str:
         return re.sub(r"([\\|*])", r"\\\1", " ".join(value.split())).replace("<", "&lt;")
 
     rows = [[f"**{cell(c.text)}**" if c.best else cell(c.text) for c in row] for row in table.rows]
-    head, *lines = [f"| {' | '.join(row)} |" for row in ([cell(c.title) for c in table.columns], *rows)]
+    head, *lines = [
+        f"| {' | '.join(row)} |" for row in ([cell(c.title) for c in table.columns], *rows)
+    ]
     rule = "|" + "|".join("---:" if c.numeric else ":---" for c in table.columns) + "|"
     lines = [f"**{table.title}.** {cell(table.caption)}", "", head, rule, *lines]
     return "\n".join([*lines, *(f"\n{cell(note)}" for note in table.notes)]) + "\n"
@@ -334,11 +368,21 @@ def latex(table: Table, width: float | None = None) -> str:
     shape = "@{}" + "".join("r" if c.numeric else "l" for c in table.columns) + "@{}"
     titles, *rows = [
         f"{' & '.join(cells)} \\\\"
-        for cells in (map(_latex_title, table.columns), *(map(_latex_cell, row, table.columns) for row in table.rows))
+        for cells in (
+            map(_latex_title, table.columns),
+            *(map(_latex_cell, row, table.columns) for row in table.rows),
+        )
     ]
     head = [r"\toprule", titles, r"\midrule"]
     kind, repeated = ("longtable", [r"\endhead"]) if len(table) > LONG else ("tabular", [])
-    lines = [rf"\begin{{{kind}}}{{{shape}}}", *head, *repeated, *rows, r"\bottomrule", rf"\end{{{kind}}}"]
+    lines = [
+        rf"\begin{{{kind}}}{{{shape}}}",
+        *head,
+        *repeated,
+        *rows,
+        r"\bottomrule",
+        rf"\end{{{kind}}}",
+    ]
     if width is not None:
         label = f"tab:{table.name.replace('_', '-')}"
         caption = rf"\caption{{{escaped(table.title)}. {escaped(table.caption)}}}\label{{{label}}}"
@@ -347,7 +391,14 @@ def latex(table: Table, width: float | None = None) -> str:
             lines = [f"{{{size}", lines[0], rf"{caption} \\", *lines[1:], "}"]
         else:
             kind = "table" if width <= COLUMN else "table*"
-            lines = [rf"\begin{{{kind}}}[tb]", r"\centering", caption, size, *lines, rf"\end{{{kind}}}"]
+            lines = [
+                rf"\begin{{{kind}}}[tb]",
+                r"\centering",
+                caption,
+                size,
+                *lines,
+                rf"\end{{{kind}}}",
+            ]
     needed = r"\usepackage{booktabs, longtable, siunitx, amsmath} and \usepackage[T1]{fontenc}."
     return "\n".join([f"% {' '.join(table.title.split())}. Needs {needed}", *lines, ""])
 
@@ -357,20 +408,27 @@ def _latex_title(column: Column) -> str:
     letters = max([1, *(len(cell.text) for cell in column.cells), *map(len, column.title.split())])
     lines = [escaped(line) for line in textwrap.wrap(column.title, letters, break_on_hyphens=False)]
     stacked = r"\\".join(lines)
-    return rf"\shortstack[{'r' if column.numeric else 'l'}]{{{stacked}}}" if len(lines) > 1 else stacked
+    return (
+        rf"\shortstack[{'r' if column.numeric else 'l'}]{{{stacked}}}"
+        if len(lines) > 1
+        else stacked
+    )
 
 
 def _latex_cell(cell: Cell, column: Column) -> str:
     """Returns a cell; siunitx sets numbers, whose digits it groups by its own rules."""
     text = escaped(cell.text)
     if column.numeric:
-        text = _NUMBER.sub(lambda m: f"\\num{{{m.group().replace(',', '')}}}", text).replace(r"} \%", r"}\,\%")
+        text = _NUMBER.sub(lambda m: f"\\num{{{m.group().replace(',', '')}}}", text).replace(
+            r"} \%", r"}\,\%"
+        )
     return rf"\textbf{{{text}}}" if cell.best else text
 
 
 def escaped(text: str) -> str:
     """Escapes the special signs of plain text, those that pdflatex may lack by their number."""
     return "".join(
-        _SIGNS.get(char) or (char if char.isascii() and char.isprintable() else f"\\texttt{{U+{ord(char):04X}}}")
+        _SIGNS.get(char)
+        or (char if char.isascii() and char.isprintable() else f"\\texttt{{U+{ord(char):04X}}}")
         for char in " ".join(text.split())
     )

@@ -7,7 +7,16 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from ipe_bench.report.tables.table import Cell, Column, Part, Table, column, interval, sort_key, words
+from ipe_bench.report.tables.table import (
+    Cell,
+    Column,
+    Part,
+    Table,
+    column,
+    interval,
+    sort_key,
+    words,
+)
 from ipe_bench.report.words import (
     brief,
     cost,
@@ -58,27 +67,43 @@ TRACKED = (
 def overview_notes(noises: Collection[str], *, narrow: bool = False) -> tuple[str, ...]:
     """Explains the columns of the overview, and what estimators assume about these noises."""
     reference = "the linearised filter" if set(noises) == {"model"} else "the bound"
-    legend = _LEGEND.format(failed="" if narrow else _FAILED, reference=reference, sign=_SIGNS[narrow])
-    return (legend, *(words for noise, words in (("unknown", _TOLD), ("model", TRACKED)) if noise in noises))
+    legend = _LEGEND.format(
+        failed="" if narrow else _FAILED, reference=reference, sign=_SIGNS[narrow]
+    )
+    return (
+        legend,
+        *(words for noise, words in (("unknown", _TOLD), ("model", TRACKED)) if noise in noises),
+    )
 
 
-def summary_tables(listed: Sequence[Mapping[str, Any]], totals: Sequence[Table], width: int) -> list[Part]:
+def summary_tables(
+    listed: Sequence[Mapping[str, Any]], totals: Sequence[Table], width: int
+) -> list[Part]:
     """Returns a table per setting (measurement, noise, differing options), after the totals of certified runs."""
     # Models whose own readings are certified, without being of a collection, have no totals.
-    rows = [row for row in listed if row["parameter"] == ALL and not (totals and row["noise"] == "certified")]
+    rows = [
+        row
+        for row in listed
+        if row["parameter"] == ALL and not (totals and row["noise"] == "certified")
+    ]
     known = {*summary_columns(), "parameter", "unit", "estimator", "error_scale"}
-    columns = dict.fromkeys(c for row in rows for c in row if c not in known and not c.startswith("estimator."))
+    columns = dict.fromkeys(
+        c for row in rows for c in row if c not in known and not c.startswith("estimator.")
+    )
     settings: dict[str, list[Any]] = {}
     for row in rows:
         # An option that the class lacks is left out.
         named = {k: value_text(row.get(k)) for k in columns if value_text(row.get(k)) != "-"}
-        title = ", ".join(v if k in ("measurement", "noise") else f"{k}={v}" for k, v in named.items())
+        title = ", ".join(
+            v if k in ("measurement", "noise") else f"{k}={v}" for k, v in named.items()
+        )
         settings.setdefault(title, []).append(row)
     kept = {title: part for title, part in _shortened(settings).items() if part}
     tables = [_setting(title, part, width) for title, part in kept.items()]
     if tables:
         tables[-1] = replace(
-            tables[-1], notes=overview_notes({row["noise"] for row in rows}, narrow=width < _WIDE_ENOUGH)
+            tables[-1],
+            notes=overview_notes({row["noise"] for row in rows}, narrow=width < _WIDE_ENOUGH),
         )
     further, hidden = len(rows) - sum(map(len, kept.values())), len(settings) - len(kept)
     whole = f", {hidden} of {len(settings)} settings whole" if hidden else ""
@@ -102,7 +127,10 @@ def _shortened(settings: Mapping[str, Sequence[Any]]) -> dict[str, list[Any]]:
 
 def _setting(title: str, rows: Sequence[Mapping[str, Any]], width: int) -> Table:
     scales = column("scale", [row["error_scale"] for row in rows], lambda v: f"{v:g}")
-    columns = [scales, *overview_columns(rows, leading(rows, ["error_scale"]), narrow=width < _WIDE_ENOUGH)]
+    columns = [
+        scales,
+        *overview_columns(rows, leading(rows, ["error_scale"]), narrow=width < _WIDE_ENOUGH),
+    ]
     # The number of trials stands in the title if it is the same for all.
     counts = sorted({row["trials"] for row in rows})
     if len(counts) > 1:
@@ -120,12 +148,19 @@ def leading(rows: Sequence[Mapping[str, Any]], scenario: Sequence[str]) -> list[
     return [bool(row[BEST]) and key in beaten for key, row in zip(keys, rows, strict=True)]
 
 
-def overview_columns(rows: Sequence[Mapping[str, Any]], best: Sequence[bool], *, narrow: bool = False) -> list[Column]:
+def overview_columns(
+    rows: Sequence[Mapping[str, Any]], best: Sequence[bool], *, narrow: bool = False
+) -> list[Column]:
     """Returns the columns over all trials for every estimator; a narrow screen has no failures and short verdicts."""
 
-    def cells(title: str, key: str, show: Callable[[Mapping[str, Any]], str], best: Sequence[bool] = ()) -> Column:
+    def cells(
+        title: str, key: str, show: Callable[[Mapping[str, Any]], str], best: Sequence[bool] = ()
+    ) -> Column:
         marks = best or [False] * len(rows)
-        return Column(title, [Cell(show(r), sort_key(r[key]), mark) for r, mark in zip(rows, marks, strict=True)])
+        return Column(
+            title,
+            [Cell(show(r), sort_key(r[key]), mark) for r, mark in zip(rows, marks, strict=True)],
+        )
 
     def points(share: float) -> str:
         return percent(share).removesuffix(" %")
@@ -149,11 +184,23 @@ def overview_columns(rows: Sequence[Mapping[str, Any]], best: Sequence[bool], *,
         words("estimator", [row["estimator"] for row in rows], best),
         cells("success", "success", success, best),
         *([] if narrow else [cells("failed", "failed_silent", failed)]),
-        cells("error", "error_median", lambda r: f"{brief(r['error_median'])}{slash}{brief(r['error_q95'])}"),
+        cells(
+            "error",
+            "error_median",
+            lambda r: f"{brief(r['error_median'])}{slash}{brief(r['error_q95'])}",
+        ),
         cells("eff." if narrow else "efficiency", "efficiency_capped", efficiency),
-        cells("NEES", "nees_median", lambda r: f"{brief(r['nees_median'])} {verdict(r) * narrow}".strip()),
+        cells(
+            "NEES",
+            "nees_median",
+            lambda r: f"{brief(r['nees_median'])} {verdict(r) * narrow}".strip(),
+        ),
         *([] if narrow else [words("verdict", map(verdict, rows))]),
-        cells("cost", "simulations_median", lambda r: cost(r["simulations_median"], r["simulations_mean"])),
+        cells(
+            "cost",
+            "simulations_median",
+            lambda r: cost(r["simulations_median"], r["simulations_mean"]),
+        ),
         cells("time", "time_mean_s", lambda r: duration(r["time_mean_s"], 2)),
     ]
 
@@ -168,11 +215,15 @@ def statistics(where: Where, rows: Sequence[Mapping[str, Any]]) -> list[Column]:
         if where not in record.where or not reported(record, rows):
             continue
         numeric, show = record.kind != "word", _shower(record.kind, where)
-        cells = [Cell(_shown(record, where, row), sort_key(row[record.name]) if numeric else None) for row in rows]
+        cells = [
+            Cell(_shown(record, where, row), sort_key(row[record.name]) if numeric else None)
+            for row in rows
+        ]
         columns.append(Column(record.titles.get(where, record.title), cells, numeric))
         if where in record.limits_titles:
             low, high = (
-                [row[name] if _applies(record, where, row) else math.nan for row in rows] for name in record.columns[1:]
+                [row[name] if _applies(record, where, row) else math.nan for row in rows]
+                for name in record.columns[1:]
             )
             columns.append(interval(record.limits_titles[where], low, high, show))
     return columns
@@ -181,7 +232,9 @@ def statistics(where: Where, rows: Sequence[Mapping[str, Any]]) -> list[Column]:
 def reported(record: Statistic, rows: Sequence[Mapping[str, Any]]) -> bool:
     """Returns whether a table has a statistic's column; a rare one needs a finite value, a rare count one above 0."""
     values = [row[record.name] for row in rows]
-    return not record.rare or any(math.isfinite(v) and (v > 0 or record.kind != "count") for v in values)
+    return not record.rare or any(
+        math.isfinite(v) and (v > 0 or record.kind != "count") for v in values
+    )
 
 
 def _shown(record: Statistic, where: Where, row: Mapping[str, Any]) -> str:
@@ -207,7 +260,9 @@ def _shower(kind: Kind, where: Where) -> Callable[[Any], str]:
         "share": percent,
         "number": short,
         # Physical units are of any size.
-        "physical": (lambda v: scientific(v) if math.isfinite(v) else short(v)) if where == "parameters" else short,
+        "physical": (lambda v: scientific(v) if math.isfinite(v) else short(v))
+        if where == "parameters"
+        else short,
         "seconds": (lambda v: duration(v, 2)) if where == "terminal" else duration,
         "probability": p_value,
         "word": shown,

@@ -53,8 +53,12 @@ class Dask(Processes):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.address is not None and (self.jobqueue is not None or self.workers is not None or self.options):
-            raise UserError(f"address={self.address}: goes with no workers, jobqueue or options; leave out either")
+        if self.address is not None and (
+            self.jobqueue is not None or self.workers is not None or self.options
+        ):
+            raise UserError(
+                f"address={self.address}: goes with no workers, jobqueue or options; leave out either"
+            )
 
     def run(self, work: Work, tasks: Sequence[Any]) -> Iterator[Event]:
         if not tasks:
@@ -66,7 +70,10 @@ class Dask(Processes):
         # As bytes: what a Dask worker cannot unpickle, such as a plugin that it lacks, is then ours to name.
         payloads = [cloudpickle.dumps((work, task)) for task in tasks]
         limits = self.block_timeout_s, self.memory_limit_gb
-        futures = {client.submit(_run_one, payload, *limits, pure=False): i for i, payload in enumerate(payloads)}
+        futures = {
+            client.submit(_run_one, payload, *limits, pure=False): i
+            for i, payload in enumerate(payloads)
+        }
         heard = threading.Event()
         threading.Thread(target=_say_when_nobody_works, args=(client, heard), daemon=True).start()
         try:
@@ -79,14 +86,19 @@ class Dask(Processes):
                 if future.cancelled() or isinstance(error, _CANCELLED):
                     raise _lost(client)
                 if error is not None:  # Dask gave up on it: its workers died again and again
-                    failure = Failure("died", f"{type(error).__name__}: {' '.join(str(error).split())}")
+                    failure = Failure(
+                        "died", f"{type(error).__name__}: {' '.join(str(error).split())}"
+                    )
                     yield Event(index, ended=True, failure=failure)
                     continue
                 steps, failure = future.result()
                 for step in steps:
                     yield Event(index, step)
                 yield Event(index, ended=True, failure=failure)
-        except (*_CANCELLED, OSError) as error:  # what as_completed raises where the scheduler is gone
+        except (
+            *_CANCELLED,
+            OSError,
+        ) as error:  # what as_completed raises where the scheduler is gone
             raise _lost(client) from error
         finally:
             heard.set()
@@ -107,7 +119,9 @@ def _say_when_nobody_works(client: Any, heard: threading.Event) -> None:
         with contextlib.suppress(Exception):
             if not client.nthreads():
                 address = client.scheduler.address
-                log.warning(f"execution=dask: the scheduler at {address} has no workers yet; waiting for one")
+                log.warning(
+                    f"execution=dask: the scheduler at {address} has no workers yet; waiting for one"
+                )
 
 
 def _run_one(payload: bytes, timeout_s: float | None, memory_gb: float | None) -> Any:
@@ -115,13 +129,17 @@ def _run_one(payload: bytes, timeout_s: float | None, memory_gb: float | None) -
     try:
         work, task = pickle.loads(payload)
     except Exception as error:
-        return [], Failure("died", f"{describe_exception(error)}, on {platform.node()}: install the same there")
+        return [], Failure(
+            "died", f"{describe_exception(error)}, on {platform.node()}: install the same there"
+        )
     events = list(supervise(work, [task], 1, 1, timeout_s, memory_gb))
     return [event.step for event in events if not event.ended], events[-1].failure
 
 
 @functools.cache
-def _connect(workers: int | None, address: str | None, jobqueue: str | None, options_json: str) -> Any:
+def _connect(
+    workers: int | None, address: str | None, jobqueue: str | None, options_json: str
+) -> Any:
     """A client of the cluster that these options describe; it serves all runs of this process, then is closed."""
     try:
         import distributed
@@ -135,13 +153,20 @@ def _connect(workers: int | None, address: str | None, jobqueue: str | None, opt
         try:
             client = distributed.Client(address, timeout=_CONNECT_S)
         except (OSError, ValueError) as error:
-            raise UserError(f"execution.address={address}: no scheduler answers there ({error})") from None
+            raise UserError(
+                f"execution.address={address}: no scheduler answers there ({error})"
+            ) from None
     else:
         if jobqueue is not None:
             cluster = _jobqueue_cluster(jobqueue, options)
             cluster.scale(workers or 1)
         else:
-            options = {"n_workers": workers or cores(), "threads_per_worker": 1, "dashboard_address": None, **options}
+            options = {
+                "n_workers": workers or cores(),
+                "threads_per_worker": 1,
+                "dashboard_address": None,
+                **options,
+            }
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # it may warn of ports in use
                 cluster = distributed.LocalCluster(**options)
@@ -155,10 +180,14 @@ def _jobqueue_cluster(name: str, options: Mapping[str, Any]) -> Any:
     try:
         import dask_jobqueue
     except ImportError:
-        raise UserError("execution=dask: dask-jobqueue is not installed; pip install dask-jobqueue") from None
+        raise UserError(
+            "execution=dask: dask-jobqueue is not installed; pip install dask-jobqueue"
+        ) from None
     known = [n for n in dir(dask_jobqueue) if n.endswith("Cluster")]
     if name not in known:
-        raise UserError(f"execution.jobqueue={name}: there is no such cluster (there are: {', '.join(known)})")
+        raise UserError(
+            f"execution.jobqueue={name}: there is no such cluster (there are: {', '.join(known)})"
+        )
     try:
         return getattr(dask_jobqueue, name)(**options)
     except (TypeError, ValueError) as error:

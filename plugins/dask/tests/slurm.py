@@ -64,10 +64,16 @@ def started(folder: Path) -> Iterator[dict[str, str]]:
         f"NodeName={name} NodeHostname={host} NodeAddr=127.0.0.1 Port={_free_port()} CPUs=1 RealMemory=4000\n"
         for name in NODES
     )
-    config.write_text(nodes + _CONFIG.format(host=host, port=port, folder=folder, nodes=",".join(NODES)))
+    config.write_text(
+        nodes + _CONFIG.format(host=host, port=port, folder=folder, nodes=",".join(NODES))
+    )
     environment = os.environ | {"SLURM_CONF": str(config), "PATH": _path()}
     daemons = [
-        ["munged", "--force", *(f"--{name}={folder}/munge/{name}" for name in ("socket", "seed-file", "log-file"))],
+        [
+            "munged",
+            "--force",
+            *(f"--{name}={folder}/munge/{name}" for name in ("socket", "seed-file", "log-file")),
+        ],
         ["slurmctld", "-f", str(config)],
         *(["slurmd", "-N", name, "-f", str(config)] for name in NODES),
     ]
@@ -78,7 +84,11 @@ def started(folder: Path) -> Iterator[dict[str, str]]:
         _wait_for_nodes(environment)
         yield environment
     finally:
-        for path in (*folder.glob("slurmd.*.pid"), folder / "slurmctld.pid", folder / "munge" / "pid"):
+        for path in (
+            *folder.glob("slurmd.*.pid"),
+            folder / "slurmctld.pid",
+            folder / "munge" / "pid",
+        ):
             with contextlib.suppress(OSError, ValueError):
                 os.kill(int(path.read_text()), signal.SIGTERM)
 
@@ -86,7 +96,9 @@ def started(folder: Path) -> Iterator[dict[str, str]]:
 def jobs(environment: dict[str, str]) -> dict[str, str]:
     """The node of every job that runs, by the job's number."""
     command = ["squeue", "--noheader", "--states=RUNNING", "--array", "--format=%i %N"]
-    lines = subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout.splitlines()
+    lines = subprocess.run(
+        command, env=environment, check=True, capture_output=True, text=True
+    ).stdout.splitlines()
     return dict(line.split() for line in lines if len(line.split()) == 2)
 
 
@@ -94,7 +106,9 @@ def _wait_for_nodes(environment: dict[str, str]) -> None:
     command = ["sinfo", "--noheader", "--Node", "--format=%N %T"]
     said = ""
     for _ in range(_PATIENCE_S):
-        said = subprocess.run(command, env=environment, capture_output=True, text=True, check=False).stdout
+        said = subprocess.run(
+            command, env=environment, capture_output=True, text=True, check=False
+        ).stdout
         if said.count(" idle") == len(NODES):
             return
         time.sleep(1)

@@ -38,7 +38,11 @@ def rows(folder: Path, execution: Execution, **more: ib.Estimator) -> pd.DataFra
     scenario = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
     estimators = {"linear_lse": ib.baselines.LinearLSE(), "newton": ib.solvers.Newton(), **more}
     ib.run(scenario, estimators, 40, output=folder, execution=execution, block_size=10)
-    found = ib.load(folder).drop(columns="time_s").sort_values(["estimator", "trial"], ignore_index=True)
+    found = (
+        ib.load(folder)
+        .drop(columns="time_s")
+        .sort_values(["estimator", "trial"], ignore_index=True)
+    )
     return found[found["estimator"].isin(["linear_lse", "newton"])].reset_index(drop=True)
 
 

@@ -23,7 +23,11 @@ COMMON = (
 COMMON += ("figures=none", "block_size=10")
 DASK = ("execution=dask", "execution.jobqueue=SLURMCluster", "execution.workers=2")
 OPTIONS = 'execution.options={cores:1,memory:1GB,walltime:"00:10:00"}'
-SUBMITIT = ("hydra/launcher=submitit_slurm", "hydra.launcher.timeout_min=10", "hydra.launcher.mem_gb=1")
+SUBMITIT = (
+    "hydra/launcher=submitit_slurm",
+    "hydra.launcher.timeout_min=10",
+    "hydra.launcher.mem_gb=1",
+)
 SUBMITIT += ("hydra.launcher.cpus_per_task=1",)
 JUDGED = ("trial", "error_c0", "error_c3", "deviation_c1", "status", "simulations", "nees")
 
@@ -45,14 +49,19 @@ def rows(folder: Path) -> pd.DataFrame:
 
 
 @pytest.fixture(scope="module")
-def serial(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int, tuple[float, ...]], pd.DataFrame]:
+def serial(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Callable[[int, tuple[float, ...]], pd.DataFrame]:
     """The rows of so many trials at these error scales, computed in this process."""
 
     def compute(trials: int, scales: tuple[float, ...]) -> pd.DataFrame:
         folder = tmp_path_factory.mktemp("serial")
         model, noise = ib.measurements.Polynomial(), ib.noise.Gaussian(0.01)
         scenarios = [ib.Scenario(model, noise, error_scale=scale) for scale in scales]
-        estimators = {"fixed_point": ib.solvers.FixedPoint(), "linear_lse": ib.baselines.LinearLSE()}
+        estimators = {
+            "fixed_point": ib.solvers.FixedPoint(),
+            "linear_lse": ib.baselines.LinearLSE(),
+        }
         ib.run(scenarios, estimators, trials, output=folder)
         return rows(folder)
 
@@ -62,7 +71,9 @@ def serial(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int, tuple[flo
 def start(folder: Path, environment: dict[str, str], *words: str) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "ipe_bench", "run", *words, *COMMON, "output=out"]
     quiet = subprocess.PIPE
-    return subprocess.Popen(command, cwd=folder, env=environment, stdout=quiet, stderr=quiet, text=True)
+    return subprocess.Popen(
+        command, cwd=folder, env=environment, stdout=quiet, stderr=quiet, text=True
+    )
 
 
 def seen(process: subprocess.Popen[str], environment: dict[str, str]) -> Iterator[dict[str, str]]:
@@ -92,7 +103,9 @@ def test_a_killed_job_of_workers_loses_nothing(tmp_path, environment, serial):
     pd.testing.assert_frame_equal(rows(tmp_path / "out"), serial(1000, (3.0,)), check_exact=True)
 
 
-@pytest.mark.skipif(importlib.util.find_spec("submitit") is None, reason="hydra-submitit-launcher is not installed")
+@pytest.mark.skipif(
+    importlib.util.find_spec("submitit") is None, reason="hydra-submitit-launcher is not installed"
+)
 def test_a_sweep_whose_job_was_killed_goes_on_where_it_was(tmp_path, environment, serial):
     """Without Slurm's accounting, submitit waits for ever for a job that was killed: the user ends the command."""
     words = ("-m", "error_scale=1,3", *SUBMITIT, "trials=1000")
@@ -107,4 +120,6 @@ def test_a_sweep_whose_job_was_killed_goes_on_where_it_was(tmp_path, environment
     again = start(tmp_path, environment, *words)
     _, error = again.communicate()
     assert again.returncode == 0, error
-    pd.testing.assert_frame_equal(rows(tmp_path / "out"), serial(1000, (1.0, 3.0)), check_exact=True)
+    pd.testing.assert_frame_equal(
+        rows(tmp_path / "out"), serial(1000, (1.0, 3.0)), check_exact=True
+    )

@@ -56,7 +56,9 @@ def errors_by_walk(model: WalkingGins) -> np.ndarray:
 
 def ratios(model: WalkingGins, scale: float, walked: np.ndarray, trials: int) -> dict[str, float]:
     """Root mean square over trials and standing parameters of error over bound, for each estimator."""
-    wide, unaware = (ib.StateScenario(m, error_scale=scale).assumed for m in (model, replace(model, walk=0.0)))
+    wide, unaware = (
+        ib.StateScenario(m, error_scale=scale).assumed for m in (model, replace(model, walk=0.0))
+    )
     paths = wide.draw(0, trials)
     z, truth = paths.z.reshape(trials, -1), paths.start[:, KINEMATIC:]
     noise = ib.noise.Gaussian(model.deviation)
@@ -74,11 +76,16 @@ def ratios(model: WalkingGins, scale: float, walked: np.ndarray, trials: int) ->
     }
     P = bound_at_truth(wide, paths)[:, -1, KINEMATIC:, KINEMATIC:]
     bound = np.sqrt(np.einsum("tii->ti", P)[:, STANDING].mean(axis=0))
-    return {name: float(np.sqrt(np.mean(((x - truth)[:, STANDING] / bound) ** 2))) for name, x in found.items()}
+    return {
+        name: float(np.sqrt(np.mean(((x - truth)[:, STANDING] / bound) ** 2)))
+        for name, x in found.items()
+    }
 
 
 def main(trials: int, figure: Path) -> None:
-    fig, axes = plt.subplots(1, len(SCALES), figsize=(9.5, 3.4), sharex=True, sharey=True, layout="constrained")
+    fig, axes = plt.subplots(
+        1, len(SCALES), figsize=(9.5, 3.4), sharex=True, sharey=True, layout="constrained"
+    )
     for ax, scale in zip(axes, SCALES, strict=True):
         model = WalkingGins()
         walked = errors_by_walk(model)
@@ -88,11 +95,23 @@ def main(trials: int, figure: Path) -> None:
             print(f"{walk:8g}  " + "  ".join(f"{row[name]:20.2f}" for name in STYLES), flush=True)
         for name, (color, line, marker) in STYLES.items():
             values = [row[name] for row in rows]
-            ax.loglog(WALKS, values, color=color, linestyle=line, marker=marker, markersize=4, label=name)
+            ax.loglog(
+                WALKS, values, color=color, linestyle=line, marker=marker, markersize=4, label=name
+            )
         ax.axhline(1.0, color="black", linewidth=0.8, zorder=0)
-        ax.set(title=f"error scale {scale:g}", xlabel="walk of a drift in an hour [its size]", ylim=(0.8, 200))
+        ax.set(
+            title=f"error scale {scale:g}",
+            xlabel="walk of a drift in an hour [its size]",
+            ylim=(0.8, 200),
+        )
     axes[0].set_ylabel("error over the bound")
-    fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False, fontsize=8)
+    fig.legend(
+        *axes[0].get_legend_handles_labels(),
+        loc="outside lower center",
+        ncols=6,
+        frameon=False,
+        fontsize=8,
+    )
     figure.parent.mkdir(parents=True, exist_ok=True)
     fig.savefig(figure, dpi=150)
 

@@ -48,7 +48,14 @@ class GinsJax(Measurement):
     @cached_property
     def twin(self) -> Gins:
         """The model of which this is a second implementation."""
-        shared = ("latitude_deg", "earth_radius", "gravity", "earth_rate", "interval_min", "readings_per_case")
+        shared = (
+            "latitude_deg",
+            "earth_radius",
+            "gravity",
+            "earth_rate",
+            "interval_min",
+            "readings_per_case",
+        )
         return Gins(**{name: getattr(self, name) for name in shared})
 
     @property
@@ -106,7 +113,9 @@ def _programs(model: GinsJax) -> tuple[Callable[[Any], Any], Callable[[Any], Any
         v, u, e, c = y[:2], y[2:5], y[5:8], y[8:]
         transport = jnp.stack([-v[1], v[0], jnp.zeros_like(v[0])]) / model.earth_radius
         command = model.earth_rate * c + transport
-        unbalance = jnp.stack([p[7] * u[0] + p[8] * u[1], p[9] * u[0] + p[10] * u[1], jnp.zeros_like(u[0])])
+        unbalance = jnp.stack(
+            [p[7] * u[0] + p[8] * u[1], p[9] * u[0] + p[10] * u[1], jnp.zeros_like(u[0])]
+        )
         platform = command + p[4:7] + unbalance
         coriolis = 2 * model.earth_rate * c[2] * jnp.stack([v[1], -v[0]])
         a = model.gravity * (1 + p[2:4]) * u[:2] + p[:2] + coriolis

@@ -58,7 +58,9 @@ class Optimistix(Estimator):
         _readers[id(residuals)] = residuals
         try:
             with np.errstate(all="ignore"):
-                return one_by_one(range(len(z)), lambda t: self._search(residuals, t, x[t]), problem.measurement.n)
+                return one_by_one(
+                    range(len(z)), lambda t: self._search(residuals, t, x[t]), problem.measurement.n
+                )
         finally:
             del _readers[id(residuals)]
 
@@ -86,7 +88,9 @@ class Optimistix(Estimator):
             jacobians=residuals.tally.jacobians[trial : trial + 1].copy(),
         )
 
-    def _judge(self, residuals: _Residuals, trial: int, x: Array, result: Any) -> tuple[Status, Array]:
+    def _judge(
+        self, residuals: _Residuals, trial: int, x: Array, result: Any
+    ) -> tuple[Status, Array]:
         """The status and (J' J)^-1 (1, n, n) of where Optimistix ended."""
         J = residuals.J(x, trial)
         J_plus, deficient = pseudo_inverse(J[None], Covariance(np.ones(len(J))))
@@ -151,4 +155,6 @@ class _Residuals:
 
     def J(self, x: Array, trial: int) -> Array:
         self.tally.jacobians[trial] += 1
-        return np.ascontiguousarray(self.problem.R.whiten_jacobian(self.problem.measurement.jacobian(x[None]))[0])
+        return np.ascontiguousarray(
+            self.problem.R.whiten_jacobian(self.problem.measurement.jacobian(x[None]))[0]
+        )

@@ -28,7 +28,9 @@ def test_keeps_its_promises(method):
 
 @pytest.mark.oracle("library: Optimistix", "estimates, in standard deviations", 1e-6)
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("model", [ib.measurements.Ranging(), ib.measurements.Sir()], ids=lambda model: model.name)
+@pytest.mark.parametrize(
+    "model", [ib.measurements.Ranging(), ib.measurements.Sir()], ids=lambda model: model.name
+)
 def test_ends_where_ours_end(model, method):
     bench = ib.Scenario(model, error_scale=1.0)
     drawn = bench.draw(0, 5)
@@ -40,7 +42,9 @@ def test_ends_where_ours_end(model, method):
     np.testing.assert_allclose(theirs.covariance, ours.covariance, rtol=1e-5)
 
 
-@pytest.mark.oracle("certified: NIST Statistical Reference Datasets (Misra1a)", "parameters by Optimistix", 1e-8)
+@pytest.mark.oracle(
+    "certified: NIST Statistical Reference Datasets (Misra1a)", "parameters by Optimistix", 1e-8
+)
 def test_finds_what_nist_certifies():
     bench = ib.Scenario(ib.measurements.Nist("Misra1a", start=2), ib.noise.Certified())
     drawn = bench.draw(0, 1)

@@ -71,7 +71,11 @@ class Pendulum(OdeMeasurement):
 
     @cached_property
     def times(self) -> Array:
-        return self.interval * np.arange(1, self.readings + 1) if self.sampled is None else np.array(self.sampled)
+        return (
+            self.interval * np.arange(1, self.readings + 1)
+            if self.sampled is None
+            else np.array(self.sampled)
+        )
 
     def start(self, p, c):
         return p[2], p[3]

@@ -18,7 +18,11 @@ from ipe_bench.workshop.conformance import check_component
 
 
 def test_keeps_its_promises():
-    assert not [finding for finding in check_component("pendulum", Pendulum(readings=12)) if finding.complaint]
+    assert not [
+        finding
+        for finding in check_component("pendulum", Pendulum(readings=12))
+        if finding.complaint
+    ]
 
 
 @pytest.mark.parametrize("angle", [0.1, 1.2, 3.0])
@@ -26,7 +30,9 @@ def test_swings_without_damping_as_jacobis_elliptic_functions(angle):
     model = Pendulum(angle=angle, damping=0.0, gravity=9.81, length=0.7)
     k = np.sin(angle / 2)
     _, cn, dn, _ = ellipj(np.sqrt(9.81 / 0.7) * model.times, k**2)
-    assert np.allclose(model.simulate(model.nominal[None])[0], 2 * np.arcsin(k * cn / dn), rtol=0, atol=2e-8)
+    assert np.allclose(
+        model.simulate(model.nominal[None])[0], 2 * np.arcsin(k * cn / dn), rtol=0, atol=2e-8
+    )
 
 
 def test_swings_little_as_a_damped_oscillator():

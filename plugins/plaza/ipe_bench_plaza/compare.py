@@ -43,7 +43,9 @@ def compared(folder: Path, samples: Path = SAMPLES) -> pd.DataFrame:
         x = track[["x [m]", "y [m]"]].to_numpy()
         true = gps.iloc[:, 1:].to_numpy()
         rms, largest, end = errors(x, true)
-        claimed = float(np.sqrt((track[["x_deviation [m]", "y_deviation [m]"]] ** 2).sum(axis=1).mean()))
+        claimed = float(
+            np.sqrt((track[["x_deviation [m]", "y_deviation [m]"]] ** 2).sum(axis=1).mean())
+        )
         row = {"path rms": rms, "claimed": claimed, "turned": errors(turned(x, true), true)[0]}
         last, row = track.iloc[-1], {**row, "largest": largest, "last": end}
         for number, *place in surveyed.itertuples(index=False):

@@ -22,7 +22,9 @@ def motion(odometry: Array, times: Array) -> Array:
     at, distance, turn = odometry.T
     heading = np.cumsum(turn)
     along = heading - turn / 2
-    path = np.stack([np.cumsum(distance * np.cos(along)), np.cumsum(distance * np.sin(along)), heading])
+    path = np.stack(
+        [np.cumsum(distance * np.cos(along)), np.cumsum(distance * np.sin(along)), heading]
+    )
     x, y, heading = (np.interp(times, at, one, left=0.0) for one in path)
     dx, dy, turned = (np.diff(one, prepend=0.0) for one in (x, y, heading))
     before = heading - turned
@@ -37,7 +39,12 @@ def write(name: str, odometry: Array, ranges: Array, truth: Array, beacons: Arra
     log = np.column_stack([time, beacon, moved, distance])
     gps = np.column_stack([time, *(np.interp(time, truth[:, 0], truth[:, i]) for i in (1, 2))])
     for end, header, form, rows in (
-        ("", "time [s],beacon,forward [m],left [m],turn [rad],range [m]", "%.4f,%d,%.6f,%.6f,%.7f,%.4f", log),
+        (
+            "",
+            "time [s],beacon,forward [m],left [m],turn [rad],range [m]",
+            "%.4f,%d,%.6f,%.6f,%.7f,%.4f",
+            log,
+        ),
         ("_gps", "time [s],x [m],y [m]", "%.4f,%.4f,%.4f", gps),
         ("_beacons", "beacon,x [m],y [m]", "%d,%.4f,%.4f", beacons),
     ):

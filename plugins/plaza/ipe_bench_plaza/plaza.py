@@ -63,15 +63,21 @@ class Plaza(StateModel):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.beacons:
-            raise UserError("beacons: is empty; give each beacon a presumed place, as in {1: [0, 0], 2: [30, 0]}")
+            raise UserError(
+                "beacons: is empty; give each beacon a presumed place, as in {1: [0, 0], 2: [30, 0]}"
+            )
         numbers = {}
         for name in self.beacons:
             if not name.isdecimal() or int(name) in numbers:
-                raise UserError(f"beacons.{name}: give each beacon once, by its whole number in the log")
+                raise UserError(
+                    f"beacons.{name}: give each beacon once, by its whole number in the log"
+                )
             numbers[int(name)] = None
         lengths = {name: len(values) for name, values in self.inputs.items()}
         if self.inputs and (set(lengths) != set(_INPUTS) or len(set(lengths.values())) > 1):
-            raise UserError(f"inputs: give {', '.join(_INPUTS)}, each with a number for every epoch")
+            raise UserError(
+                f"inputs: give {', '.join(_INPUTS)}, each with a number for every epoch"
+            )
 
     @cached_property
     def drive(self) -> dict[str, Array]:
@@ -114,7 +120,9 @@ class Plaza(StateModel):
     @property
     def prior(self) -> Normal:
         places = np.ravel(list(self.beacons.values()))
-        deviations = [self.position_spread] * 2 + [self.heading_spread] + [self.beacon_spread] * len(places)
+        deviations = (
+            [self.position_spread] * 2 + [self.heading_spread] + [self.beacon_spread] * len(places)
+        )
         return Normal(np.concatenate([self.start, places]), np.diag(deviations) ** 2)
 
     def transition(self, x: Array, k: int) -> Array:
@@ -132,14 +140,18 @@ class Plaza(StateModel):
 
     def gain(self, k: int) -> Array:
         G = np.zeros((self.n, 3))
-        G[[0, 1, 2], [0, 1, 2]] = np.sqrt(self._steps[k]) * np.array([self.walk, self.walk, self.turning])
+        G[[0, 1, 2], [0, 1, 2]] = np.sqrt(self._steps[k]) * np.array(
+            [self.walk, self.walk, self.turning]
+        )
         return G
 
     def R(self, k: int) -> Array:
         return np.array([[self.deviation**2]])
 
     def with_log(self, count: int, inputs: Mapping[str, Array]) -> Plaza:
-        return replace(self, inputs={name: tuple(values.tolist()) for name, values in inputs.items()})
+        return replace(
+            self, inputs={name: tuple(values.tolist()) for name, values in inputs.items()}
+        )
 
     def faults(self, columns: Mapping[str, Array]) -> Iterator[Fault]:
         numbers = [int(name) for name in self.beacons]
@@ -148,4 +160,8 @@ class Plaza(StateModel):
             one = f"{columns['beacon'][np.argmax(absent)]:g}"
             remedy = f"give it one by +state_model.beacons.{one}=[X,Y], or remove its rows"
             yield Fault("beacon", absent, f"beacon {one} has no presumed place; {remedy}")
-        yield Fault("range", columns["range"] < 0, "is negative; correct it, or leave the cell empty if it is missing")
+        yield Fault(
+            "range",
+            columns["range"] < 0,
+            "is negative; correct it, or leave the cell empty if it is missing",
+        )

@@ -54,12 +54,24 @@ def test_a_drive_round_a_circle_ends_where_it_began():
             "7",
             "row 4, column beacon: beacon 7 has no presumed place; give it one by +state_model.beacons.7=[X,Y]",
         ),
-        (9, 0, "3151.5", "row 9, column time [s]: is not after that of the row before; give rows in the order of"),
-        (5, 5, "-3.1", "row 5, column range [m]: is negative; correct it, or leave the cell empty if it is missing"),
+        (
+            9,
+            0,
+            "3151.5",
+            "row 9, column time [s]: is not after that of the row before; give rows in the order of",
+        ),
+        (
+            5,
+            5,
+            "-3.1",
+            "row 5, column range [m]: is negative; correct it, or leave the cell empty if it is missing",
+        ),
         (6, 2, "", "row 6, column forward [m]: is empty; a known input has a value at each epoch"),
     ],
 )
-def test_wrong_rows_are_refused_in_a_line(row, column, cell, complaint, tmp_path, monkeypatch, capsys):
+def test_wrong_rows_are_refused_in_a_line(
+    row, column, cell, complaint, tmp_path, monkeypatch, capsys
+):
     lines = [line.split(",") for line in LOG.read_text().splitlines()[:12]]
     lines[row - 1][column] = cell
     (tmp_path / "log.csv").write_text("\n".join(map(",".join, lines)))
@@ -72,7 +84,10 @@ def test_wrong_rows_are_refused_in_a_line(row, column, cell, complaint, tmp_path
 
 @pytest.mark.parametrize(
     ("options", "complaint"),
-    [({"beacons": {}}, "beacons: is empty"), ({"beacons": {"a": (0.0, 0.0)}}, "by its whole number in the log")],
+    [
+        ({"beacons": {}}, "beacons: is empty"),
+        ({"beacons": {"a": (0.0, 0.0)}}, "by its whole number in the log"),
+    ],
 )
 def test_beacons_that_are_none_are_refused(options, complaint):
     with pytest.raises(ib.UserError, match=complaint):

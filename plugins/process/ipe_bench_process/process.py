@@ -60,10 +60,14 @@ class Process(Estimator):
         spec = importlib.util.find_spec(self.package) if self.package else None
         if self.package and (spec is None or not spec.submodule_search_locations):
             raise UserError(f"package={self.package}: there is no such package; install it")
-        folder = Path(spec.submodule_search_locations[0] if spec and spec.submodule_search_locations else "").resolve()
+        folder = Path(
+            spec.submodule_search_locations[0] if spec and spec.submodule_search_locations else ""
+        ).resolve()
         words = [str(folder / word) if (folder / word).is_file() else word for word in self.command]
         if (program := shutil.which(words[0])) is None:
-            raise UserError(f"command={list(self.command)}: {folder} has no such program that can run; build it first")
+            raise UserError(
+                f"command={list(self.command)}: {folder} has no such program that can run; build it first"
+            )
         if lacking := [file for file in self.files if not (folder / file).is_file()]:
             raise UserError(f"files={lacking}: are not in {folder}")
         started = (program, *words[1:])
@@ -93,7 +97,9 @@ class Process(Estimator):
             if not np.isfinite(readings).all():
                 return Estimates(np.full((1, n), np.nan), np.array([Status.NONFINITE], np.int8))
             if len(failed) == _STRIKES:
-                return Estimates.failed(1, n, f"not tried, as {_STRIKES} trials in a row failed: {failed[-1]}")
+                return Estimates.failed(
+                    1, n, f"not tried, as {_STRIKES} trials in a row failed: {failed[-1]}"
+                )
             program = self._program(text)
             try:
                 found = self._answer(program, problem, readings)
@@ -116,7 +122,9 @@ class Process(Estimator):
                 if self._digest() == self.digest:
                     program = Program(self.started, self.folder, text)
             if program is None:
-                raise UserError(f"{' '.join(self.program)}: is not what it was where the run began; run it again")
+                raise UserError(
+                    f"{' '.join(self.program)}: is not what it was where the run began; run it again"
+                )
         _running[key] = program  # the last used is the last to go
         while len(_running) > _KEPT:
             _running.pop(next(iter(_running))).end()
@@ -124,7 +132,11 @@ class Process(Estimator):
 
     def _answer(self, program: Program, problem: Problem, z: Array) -> Estimates:
         """Estimates from the readings z (m,) of one trial; what is asked counts besides what the program counts."""
-        model, n, asked = problem.measurement, problem.measurement.n, dict.fromkeys(map(str, _COUNTS), 0.0)
+        model, n, asked = (
+            problem.measurement,
+            problem.measurement.n,
+            dict.fromkeys(map(str, _COUNTS), 0.0),
+        )
 
         def points(values: Array, count: str, size: int) -> Iterator[Array]:
             """Yields the points asked for, a few at a time; each is answered by so many numbers."""
@@ -132,7 +144,9 @@ class Process(Estimator):
                 raise ProgramError(f"asked with {len(values)} numbers, and not a multiple of {n}")
             number = len(values) // n
             if number * size > MOST:
-                raise ProgramError(f"asked for {number * size} numbers at once; ask for {MOST // size} points at most")
+                raise ProgramError(
+                    f"asked for {number * size} numbers at once; ask for {MOST // size} points at most"
+                )
             asked[count] += number
             yield from np.array_split(values.reshape(-1, n), -(-number // _TOGETHER))
 
@@ -151,7 +165,11 @@ class Process(Estimator):
                 raise ProgramError(f"wrote {name} with {len(values)} numbers, and not {size}")
         if lacking := [name for name in ("x", "status") if name not in found]:
             raise ProgramError(f"answered without {' and '.join(lacking)}")
-        x, status, P = found.pop("x"), found.pop("status")[0], found.pop("P", np.full(n * n, np.nan)).reshape(n, n)
+        x, status, P = (
+            found.pop("x"),
+            found.pop("status")[0],
+            found.pop("P", np.full(n * n, np.nan)).reshape(n, n),
+        )
         if status not in {status.value for status in Status if status != Status.RUNNING}:
             raise ProgramError(f"wrote status {status:g}, and not one of 0 to {max(Status).value}")
         if np.isfinite(P).all() and not np.allclose(P, P.T, rtol=1e-6, atol=1e-9 * np.abs(P).max()):
@@ -164,7 +182,15 @@ class Process(Estimator):
                 raise ProgramError(f"wrote {name} {value[0]:g}, which is no count")
         ended = np.array([status if np.isfinite(x).all() else Status.NONFINITE], np.int8)
         iterations, simulations, jacobians = counts.values()
-        return Estimates(x[None], ended, P[None], iterations.astype(np.int64), simulations, jacobians, extras=found)
+        return Estimates(
+            x[None],
+            ended,
+            P[None],
+            iterations.astype(np.int64),
+            simulations,
+            jacobians,
+            extras=found,
+        )
 
 
 def _definite(P: Array) -> bool:
@@ -189,7 +215,10 @@ def _opening(problem: Problem, needs: tuple[Need, ...]) -> str:
         for k, rows in enumerate(model.epochs):
             blocks["epoch"][rows] = k
     facts = {f"index.{name}": column for name, column in model.index.items()}
-    facts |= {f"option.{name}": getattr(model, name) for name in getattr(model, "__dataclass_fields__", ())}
+    facts |= {
+        f"option.{name}": getattr(model, name)
+        for name in getattr(model, "__dataclass_fields__", ())
+    }
     for name, values in facts.items():
         with suppress(TypeError, ValueError):
             numbers = np.atleast_1d(np.asarray(values, dtype=float))

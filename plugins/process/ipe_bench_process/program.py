@@ -47,7 +47,9 @@ class ProgramError(Exception):
 
 def written(blocks: Mapping[str, Array]) -> str:
     """Writes blocks as text."""
-    return "".join(f"{name} {values.size}\n{_line(values.ravel())}\n" for name, values in blocks.items())
+    return "".join(
+        f"{name} {values.size}\n{_line(values.ravel())}\n" for name, values in blocks.items()
+    )
 
 
 def _line(values: Array) -> str:
@@ -73,7 +75,9 @@ class Program:
         token = secrets.token_hex(16)
         self.mark = f"{_MARK}={token}"
         shell = ("sh", "-c", f"read _; {_END_ALL}; kill -9 0", "sh", self.mark)
-        self.guard = subprocess.Popen(shell, stdin=PIPE, stdout=DEVNULL, stderr=DEVNULL, process_group=0)
+        self.guard = subprocess.Popen(
+            shell, stdin=PIPE, stdout=DEVNULL, stderr=DEVNULL, process_group=0
+        )
         group = self.guard.pid
         try:
             self.process = subprocess.Popen(
@@ -88,14 +92,20 @@ class Program:
             )
         except OSError as error:
             self.guard.communicate()
-            raise UserError(f"command={list(command)}: cannot be started ({error.strerror})") from None
+            raise UserError(
+                f"command={list(command)}: cannot be started ({error.strerror})"
+            ) from None
         streams = (self.process.stdin, self.process.stdout, self.process.stderr)
-        self.into, self.out, self.errors = (stream.fileno() for stream in streams if stream is not None)
+        self.into, self.out, self.errors = (
+            stream.fileno() for stream in streams if stream is not None
+        )
         self.listening = [self.out, self.errors]
         for pipe in (self.into, self.errors):
             os.set_blocking(pipe, False)
 
-    def ask(self, text: str, replies: Mapping[str, Callable[[Array], str]], seconds: float) -> dict[str, Array]:
+    def ask(
+        self, text: str, replies: Mapping[str, Callable[[Array], str]], seconds: float
+    ) -> dict[str, Array]:
         """Sends a text, and returns the blocks up to `end`; those named in `replies` are questions, answered at once.
         The first line of the text is that of the next one too.
 
@@ -156,7 +166,9 @@ class Program:
         if (left := self.deadline - time.monotonic()) <= 0:
             hint = "" if self.said or data else "; does it flush its output after `end`?"
             raise ProgramError(f"gave no whole answer within the time limit{hint}")
-        ready, free, _ = select.select(self.listening, [self.into] if data else [], [], min(left, 0.1))
+        ready, free, _ = select.select(
+            self.listening, [self.into] if data else [], [], min(left, 0.1)
+        )
         for pipe in ready:
             if not (chunk := os.read(pipe, 1 << 16)):
                 self.listening.remove(pipe)
@@ -189,7 +201,9 @@ class Program:
         if not (name.isidentifier() and name.isascii() and count.isdigit()) or any(more):
             raise ProgramError(f"wrote {_shown(text)}, where a line NAME COUNT or `end` belongs")
         if len(count) > len(str(MOST)) or int(count) > MOST:
-            raise ProgramError(f"wrote {name} with {count[:20]} numbers; a block has at most {MOST}")
+            raise ProgramError(
+                f"wrote {name} with {count[:20]} numbers; a block has at most {MOST}"
+            )
         # More words than numbers are not worth their memory.
         words = self.line().split(maxsplit=int(count))
         try:
@@ -219,7 +233,11 @@ class Program:
             os.killpg(self.guard.pid, signal.SIGKILL)
         self.process.kill()
         subprocess.run(
-            ("sh", "-c", _END_ALL, "sh", self.mark), stdin=DEVNULL, stdout=DEVNULL, stderr=DEVNULL, check=False
+            ("sh", "-c", _END_ALL, "sh", self.mark),
+            stdin=DEVNULL,
+            stdout=DEVNULL,
+            stderr=DEVNULL,
+            check=False,
         )
         for process in (self.guard, self.process):
             process.wait()

@@ -65,7 +65,9 @@ def workplace(tmp_path, monkeypatch):
 # Numbers
 
 
-@pytest.mark.oracle("own second implementation: Gauss-Newton and EKF as programs", "estimates", 1e-5)
+@pytest.mark.oracle(
+    "own second implementation: Gauss-Newton and EKF as programs", "estimates", 1e-5
+)
 @pytest.mark.parametrize(("scale", "within"), [(1.0, 1e-9), (30.0, 1e-5)])
 @pytest.mark.parametrize("name", ["gauss_newton", "ekf"])
 def test_a_program_equals_the_same_estimator_in_python(name, scale, within, programs):
@@ -78,7 +80,10 @@ def test_a_program_equals_the_same_estimator_in_python(name, scale, within, prog
     assert (found.status == 0).all()
     assert_agrees(found.x, expected.x, atol=within)
     np.testing.assert_allclose(
-        found.covariance, expected.covariance, rtol=0, atol=within * np.abs(expected.covariance).max()
+        found.covariance,
+        expected.covariance,
+        rtol=0,
+        atol=within * np.abs(expected.covariance).max(),
     )
     assert list(found.extras) == (["nis"] if name == "ekf" else [])
 
@@ -98,7 +103,8 @@ def test_what_new_makes_keeps_its_promises_and_equals_gauss_newton(language, wor
     scenario = ib.Scenario(model, ib.noise.Gaussian(0.01), error_scale=0.1, seed=1)
     z = scenario.draw(0, 20).z
     found, expected = (
-        estimate_safely(one, scenario.problem, z) for one in (theirs, ib.baselines.GaussNewton(start="nominal"))
+        estimate_safely(one, scenario.problem, z)
+        for one in (theirs, ib.baselines.GaussNewton(start="nominal"))
     )
     np.testing.assert_allclose(found.x, expected.x, rtol=0, atol=1e-6)
     assert (found.simulations == found.iterations + 1).all()
@@ -108,7 +114,10 @@ def test_what_new_makes_keeps_its_promises_and_equals_gauss_newton(language, wor
 # Faults
 
 TRIALS, BAD = 6, 3
-STATUS = {"nan": ib.Status.NONFINITE, **dict.fromkeys(("fork", "flee", "blank"), ib.Status.CONVERGED)}
+STATUS = {
+    "nan": ib.Status.NONFINITE,
+    **dict.fromkeys(("fork", "flee", "blank"), ib.Status.CONVERGED),
+}
 # fmt: off
 LINES = {
     "short": "wrote x with 2 numbers, and not 4", "word": "wrote x with what is no number",
@@ -146,7 +155,11 @@ def answers(fault: str):
 
 def left(fault: str) -> list[str]:
     """The programs of a fault that run."""
-    words = (path.read_bytes().split(b"\0") for path in Path("/proc").glob("[0-9]*/cmdline") if path.exists())
+    words = (
+        path.read_bytes().split(b"\0")
+        for path in Path("/proc").glob("[0-9]*/cmdline")
+        if path.exists()
+    )
     return [str(each) for each in words if str(FAULTY).encode() in each and fault.encode() in each]
 
 
@@ -158,11 +171,16 @@ def none_is_left(fault: str) -> bool:
     return not left(fault)
 
 
-@pytest.mark.parametrize("fault", [pytest.param(each, marks=WAITS.get(each, ())) for each in (*LINES, *STATUS)])
+@pytest.mark.parametrize(
+    "fault", [pytest.param(each, marks=WAITS.get(each, ())) for each in (*LINES, *STATUS)]
+)
 def test_a_fault_costs_its_own_trial_and_a_line(fault):
     found, right = answers(fault), answers("none")
     others = np.setdiff1d(np.arange(TRIALS), [BAD])
-    assert all(np.array_equal(a[others], b[others]) for a, b in ((found.x, right.x), (found.status, right.status)))
+    assert all(
+        np.array_equal(a[others], b[others])
+        for a, b in ((found.x, right.x), (found.status, right.status))
+    )
     assert found.status[BAD] == STATUS.get(fault, ib.Status.ERROR)
     if fault in LINES:
         assert LINES[fault] in found.messages[BAD]
@@ -179,8 +197,14 @@ def test_what_a_program_has_started_ends_with_the_bench(tmp_path):
     says = "import os; from ipe_bench_process.program import Program; "
     says += "program = Program({!r}, '.', ''); input(); os.kill(os.getpid(), 9)"
     mark = tmp_path / "orphan"
-    command = ["sh", "-c", f"setsid sh -c 'echo > {mark}; sleep 1000; :' {FAULTY} killed & sleep 1000"]
-    bench = subprocess.Popen([sys.executable, "-c", says.format(command)], stdin=subprocess.PIPE, cwd=HOME)
+    command = [
+        "sh",
+        "-c",
+        f"setsid sh -c 'echo > {mark}; sleep 1000; :' {FAULTY} killed & sleep 1000",
+    ]
+    bench = subprocess.Popen(
+        [sys.executable, "-c", says.format(command)], stdin=subprocess.PIPE, cwd=HOME
+    )
     while not mark.exists():
         time.sleep(0.01)
     assert left("killed")
@@ -239,18 +263,41 @@ def test_contents_are_its_identity_and_places_are_not(tmp_path, monkeypatch):
 
 
 def rows(folder: str) -> pd.DataFrame:
-    return ib.load(folder).sort_values(["estimator", "trial"]).drop(columns="time_s").reset_index(drop=True)
+    return (
+        ib.load(folder)
+        .sort_values(["estimator", "trial"])
+        .drop(columns="time_s")
+        .reset_index(drop=True)
+    )
 
 
 @pytest.mark.slow
 def test_two_processes_and_a_second_command_have_the_same_rows(workplace, programs, capsys):
-    chosen = (*RUN, "solver=[]", "baseline=[process]", f"estimators.process.command=[{programs / 'ekf'}]")
+    chosen = (
+        *RUN,
+        "solver=[]",
+        "baseline=[process]",
+        f"estimators.process.command=[{programs / 'ekf'}]",
+    )
     chosen += ("estimators.process.needs=[epochs,prior]", "trials=40")
     assert main([*chosen, "output=one", "execution=serial"]) == 0
     assert (
-        main([*chosen, "output=two", "execution=processes", "execution.workers=2", "block_size=10", "trials=20"]) == 0
+        main(
+            [
+                *chosen,
+                "output=two",
+                "execution=processes",
+                "execution.workers=2",
+                "block_size=10",
+                "trials=20",
+            ]
+        )
+        == 0
     )
-    assert main([*chosen, "output=two", "execution=processes", "execution.workers=2", "block_size=10"]) == 0
+    assert (
+        main([*chosen, "output=two", "execution=processes", "execution.workers=2", "block_size=10"])
+        == 0
+    )
     pd.testing.assert_frame_equal(rows("one"), rows("two"), check_exact=True)
     stored = {path: path.stat().st_mtime_ns for path in Path("two/trials").iterdir()}
     assert main([*chosen, "output=two"]) == 0

@@ -61,7 +61,9 @@ class _OfTrial(ConstantFilter):
         return np.asarray(self.state.covar, dtype=float)
 
     def predict(self) -> None:
-        self.state = GaussianStatePrediction(self.state.state_vector, self.P + self.Q, timestamp=_NOW)
+        self.state = GaussianStatePrediction(
+            self.state.state_vector, self.P + self.Q, timestamp=_NOW
+        )
 
     def points(self) -> Array:
         return self.x[None]
@@ -101,7 +103,9 @@ class StoneSoupUKF(Sequential):
 
     def track(self, P0: Array, Q: Array, z: Array) -> ConstantFilter:
         spread = {"alpha": self.alpha, "beta": self.beta, "kappa": self.kappa}
-        updater = UnscentedKalmanUpdater(measurement_model=None, force_symmetric_covariance=True, **spread)
+        updater = UnscentedKalmanUpdater(
+            measurement_model=None, force_symmetric_covariance=True, **spread
+        )
         return _Unscented(P0, Q, updater)
 
 

@@ -47,7 +47,9 @@ def test_agrees_with_ours(pair, engine, model, noise, error_scale):
     # Sigma points lose digits where a prior is 1e4 times as wide as what is left of it.
     close = 1e-8 if pair == "EKF" else 3e-6
     agreed(np.abs(a.x - b.x) / deviations, close)
-    np.testing.assert_allclose(np.diagonal(a.covariance, axis1=1, axis2=2), deviations**2, rtol=close)
+    np.testing.assert_allclose(
+        np.diagonal(a.covariance, axis1=1, axis2=2), deviations**2, rtol=close
+    )
     np.testing.assert_allclose(a.extras["nis"], b.extras["nis"], rtol=close)
 
 

@@ -11,11 +11,19 @@ from shared.oracles import assert_agrees
 from stonesoup.models.base import GaussianModel, TimeVariantModel
 from stonesoup.models.measurement.base import MeasurementModel
 from stonesoup.models.transition.base import TransitionModel
-from stonesoup.predictor.kalman import CubatureKalmanPredictor, ExtendedKalmanPredictor, UnscentedKalmanPredictor
+from stonesoup.predictor.kalman import (
+    CubatureKalmanPredictor,
+    ExtendedKalmanPredictor,
+    UnscentedKalmanPredictor,
+)
 from stonesoup.types.detection import Detection
 from stonesoup.types.hypothesis import SingleHypothesis
 from stonesoup.types.state import GaussianState
-from stonesoup.updater.kalman import CubatureKalmanUpdater, ExtendedKalmanUpdater, UnscentedKalmanUpdater
+from stonesoup.updater.kalman import (
+    CubatureKalmanUpdater,
+    ExtendedKalmanUpdater,
+    UnscentedKalmanUpdater,
+)
 
 from ipe_bench.plugins.construct import construct
 from ipe_bench.plugins.discovery import options
@@ -60,8 +68,15 @@ class _Read(_Part, MeasurementModel, GaussianModel):
 
 def their_track(model, z, predictor, updater, spread):
     """Means (K, n) and covariances (K, n, n)."""
-    move, read = _Move(lambda x: model.transition(x, 0), model.Q(0)), _Read(lambda x: model.observe(x, 0), model.R(0))
-    predictor, updater, now = predictor(move, **spread), updater(None, **spread), datetime(2000, 1, 1)
+    move, read = (
+        _Move(lambda x: model.transition(x, 0), model.Q(0)),
+        _Read(lambda x: model.observe(x, 0), model.R(0)),
+    )
+    predictor, updater, now = (
+        predictor(move, **spread),
+        updater(None, **spread),
+        datetime(2000, 1, 1),
+    )
     state = GaussianState(model.prior.mean[:, None], model.prior.covariance, timestamp=now)
     means, covariances = [], []
     for reading in z:
@@ -73,11 +88,15 @@ def their_track(model, z, predictor, updater, spread):
     return np.array(means), np.array(covariances)
 
 
-@pytest.mark.oracle("library: Stone Soup's EKF, UKF and CKF", "means and covariances of states", 1e-10)
+@pytest.mark.oracle(
+    "library: Stone Soup's EKF, UKF and CKF", "means and covariances of states", 1e-10
+)
 @pytest.mark.parametrize("name", FILTERS)
 @pytest.mark.parametrize("model", ["pendulum", "constant_velocity"])
 def test_tracks_are_those_of_stone_soup(name, model):
-    model = construct(next(o for o in options("state_model") if o.name == model).config, "state_model")
+    model = construct(
+        next(o for o in options("state_model") if o.name == model).config, "state_model"
+    )
     ours, *theirs = FILTERS[name]
     z = model.draw(0, 1).z
     means, covariances = their_track(model, z[0], *theirs)

@@ -12,4 +12,14 @@ from ipe_bench_zoo.triad import Accelerometer, Triad
 
 Bock = packaged("bock", Path(__file__).parent / "conf")
 
-__all__ = ["LMIEKF", "Accelerometer", "Bock", "EsMda", "Gnss", "Mgh", "MultipleShooting", "RecursiveUpdate", "Triad"]
+__all__ = [
+    "LMIEKF",
+    "Accelerometer",
+    "Bock",
+    "EsMda",
+    "Gnss",
+    "Mgh",
+    "MultipleShooting",
+    "RecursiveUpdate",
+    "Triad",
+]

@@ -20,7 +20,17 @@ from ipe_bench.statistics.certified import certified_cells, certified_estimate
 from ipe_bench.statistics.collect import Collection
 from ipe_bench_zoo.mgh import Mgh, score
 
-ATTAINED = ("function", "start", "estimator", "solved", "minimum", "sum_of_squares", "status", "cost", "gradients")
+ATTAINED = (
+    "function",
+    "start",
+    "estimator",
+    "solved",
+    "minimum",
+    "sum_of_squares",
+    "status",
+    "cost",
+    "gradients",
+)
 BUDGETS = (10, 100, 1000)
 """Simplex gradients, n + 1 simulations each, within which `attained_totals` counts problems."""
 
@@ -38,9 +48,17 @@ def attained_table(collection: Collection) -> pd.DataFrame:
         model = Mgh(scenario["function"], scenario["start"])
         columns, x = certified_estimate(collection, cell, model)
         reached = score(model, x)
-        spent = float(cost(columns["simulations"], columns["jacobians"], cell.footer.get("jacobian_cost", model.n))[0])
+        spent = float(
+            cost(
+                columns["simulations"],
+                columns["jacobians"],
+                cell.footer.get("jacobian_cost", model.n),
+            )[0]
+        )
         ended = reached.solved, reached.minimum, reached.sum_of_squares, str(columns["status"][0])
-        rows.append((model.function, model.start, group.estimator, *ended, spent, spent / (model.n + 1)))
+        rows.append(
+            (model.function, model.start, group.estimator, *ended, spent, spent / (model.n + 1))
+        )
     return pd.DataFrame(rows, columns=list(ATTAINED))
 
 
@@ -55,8 +73,14 @@ def attained_totals(table: pd.DataFrame) -> pd.DataFrame:
         spent = part["gradients"].where(solved, np.inf)
         rows.append(
             {"estimator": estimator, "problems": len(part), "solved": int(solved.sum())}
-            | {f"solved_{start:g}": int(solved[part["start"] == start].sum()) for start in sorted(set(table["start"]))}
-            | {"converged": int((solved & converged).sum()), "elsewhere": int((~solved & converged).sum())}
+            | {
+                f"solved_{start:g}": int(solved[part["start"] == start].sum())
+                for start in sorted(set(table["start"]))
+            }
+            | {
+                "converged": int((solved & converged).sum()),
+                "elsewhere": int((~solved & converged).sum()),
+            }
             | {"cost_median": float(part["cost"].where(solved, np.inf).median())}
             | {f"within_{budget}": int((spent <= budget).sum()) for budget in BUDGETS}
         )
@@ -66,9 +90,13 @@ def attained_totals(table: pd.DataFrame) -> pd.DataFrame:
 def data_profile(table: pd.DataFrame) -> pd.DataFrame:
     """The share of problems that each estimator solves within `at` simplex gradients, a step at each solution."""
     problems = table.groupby("estimator")["solved"].transform("size")
-    solved = table.assign(problems=problems)[table["solved"].astype(bool)].sort_values(["estimator", "gradients"])
+    solved = table.assign(problems=problems)[table["solved"].astype(bool)].sort_values(
+        ["estimator", "gradients"]
+    )
     share = (solved.groupby("estimator").cumcount() + 1) / solved["problems"]
-    return solved.assign(at=solved["gradients"], share=share)[["estimator", "at", "share"]].reset_index(drop=True)
+    return solved.assign(at=solved["gradients"], share=share)[
+        ["estimator", "at", "share"]
+    ].reset_index(drop=True)
 
 
 def attained_totals_table(totals: pd.DataFrame) -> Table:
@@ -109,7 +137,8 @@ def _problems(minima: pd.DataFrame) -> Table:
         column("cost", rows["cost"], short),
     ]
     caption = (
-        "The number of the minimum whose sum of squares the estimate has, where 1 is the lowest; a dash means none."
+        "The number of the minimum whose sum of squares the estimate has, where 1 is the lowest;"
+        " a dash means none."
     )
     return Table("attained_problems", "Known minima, problem by problem", caption, columns, rows)
 

@@ -63,7 +63,9 @@ class EsMda(Estimator):
             if not self.polish:
                 return smoothed
             limits = Limits(self.tolerance, self.polish, history=True)
-            minima = continued(smoothed, minimize(objective, GaussNewtonMethod(), smoothed.x, limits))
+            minima = continued(
+                smoothed, minimize(objective, GaussNewtonMethod(), smoothed.x, limits)
+            )
             return minima.estimates(objective.model.tally, objective.readings)
 
     def _smooth(self, objective: Objective) -> Estimates:
@@ -114,7 +116,9 @@ def assimilated(s: Array, h: Array, z: Array, inflation: float) -> Array:
     c = (count - 1) * inflation
     innovation = np.where(usable[:, :, None], z - h, 0.0)
     if s.shape[1] > h.shape[2]:
-        weights, _ = solve(np.matmul(D.swapaxes(1, 2), D) + c * np.eye(h.shape[2]), innovation.swapaxes(1, 2))
+        weights, _ = solve(
+            np.matmul(D.swapaxes(1, 2), D) + c * np.eye(h.shape[2]), innovation.swapaxes(1, 2)
+        )
         return s + np.matmul(weights.swapaxes(1, 2), np.matmul(D.swapaxes(1, 2), S))
     G = np.matmul(D, D.swapaxes(1, 2)) + c * np.eye(s.shape[1])
     weights, _ = solve(G, np.matmul(D, innovation.swapaxes(1, 2)))
@@ -131,4 +135,6 @@ def _anomalies(a: Array, usable: Mask) -> Array:
 def _redrawn(s: Array, generator: np.random.Generator, count: int) -> Array:
     """`count` members from the mean and covariance of the members s (members, n) of one trial."""
     mean = s.mean(axis=0)
-    return mean + generator.standard_normal((count, len(s))) @ (s - mean) / np.sqrt(max(len(s) - 1, 1))
+    return mean + generator.standard_normal((count, len(s))) @ (s - mean) / np.sqrt(
+        max(len(s) - 1, 1)
+    )

@@ -14,7 +14,14 @@ import numpy as np
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count
-from ipe_bench.measurements.base import Epochs, Input, Measurement, Parameter, UsualNoise, parameter_table
+from ipe_bench.measurements.base import (
+    Epochs,
+    Input,
+    Measurement,
+    Parameter,
+    UsualNoise,
+    parameter_table,
+)
 
 LIGHT = 299792458.0
 """Speed of light in m/s."""
@@ -39,13 +46,20 @@ def east_north_up(position: Array) -> Array:
     The latitude is found by Bowring's formula, to better than 1e-9 rad at the surface (Survey Review 23, 1976).
     """
     x, y, z = position
-    minor, p, e2 = _SEMI_MAJOR * (1.0 - _FLATTENING), math.hypot(x, y), _FLATTENING * (2.0 - _FLATTENING)
+    minor, p, e2 = (
+        _SEMI_MAJOR * (1.0 - _FLATTENING),
+        math.hypot(x, y),
+        _FLATTENING * (2.0 - _FLATTENING),
+    )
     reduced = math.atan2(z * _SEMI_MAJOR, p * minor)
     latitude = math.atan2(
-        z + e2 / (1.0 - e2) * minor * math.sin(reduced) ** 3, p - e2 * _SEMI_MAJOR * math.cos(reduced) ** 3
+        z + e2 / (1.0 - e2) * minor * math.sin(reduced) ** 3,
+        p - e2 * _SEMI_MAJOR * math.cos(reduced) ** 3,
     )
     longitude = math.atan2(y, x)
-    sin_lat, cos_lat, sin_lon, cos_lon = (f(a) for a in (latitude, longitude) for f in (math.sin, math.cos))
+    sin_lat, cos_lat, sin_lon, cos_lon = (
+        f(a) for a in (latitude, longitude) for f in (math.sin, math.cos)
+    )
     return np.array(
         [
             [-sin_lon, cos_lon, 0.0],
@@ -109,7 +123,9 @@ class Gnss(Measurement):
         here = np.asarray(self.position)
         # From the centre of the Earth, any axes do.
         axes = east_north_up(here) if np.linalg.norm(here) > _LEAST_RADIUS else np.eye(3)
-        towards = axes.T @ np.array([math.sin(a) * math.cos(e), math.cos(a) * math.cos(e), math.sin(e)])
+        towards = axes.T @ np.array(
+            [math.sin(a) * math.cos(e), math.cos(a) * math.cos(e), math.sin(e)]
+        )
         along = float(here @ towards)
         return here + (math.sqrt(along**2 + radius**2 - float(here @ here)) - along) * towards
 
@@ -137,12 +153,19 @@ class Gnss(Measurement):
         times, systems, _ = self._columns
         pairs = list(zip(times, systems, strict=True))
         numbers = {pair: count(1) for pair in pairs}
-        return {"epoch": list(times), "constellation": list(systems), "satellite": [next(numbers[p]) for p in pairs]}
+        return {
+            "epoch": list(times),
+            "constellation": list(systems),
+            "satellite": [next(numbers[p]) for p in pairs],
+        }
 
     @property
     def inputs(self) -> tuple[Input, ...]:
         """Epoch, constellation and the satellite's place at transmission, for each pseudo-range."""
-        names = Input("epoch", int, label=True, default=1), Input("constellation", str, label=True, default="gps")
+        names = (
+            Input("epoch", int, label=True, default=1),
+            Input("constellation", str, label=True, default="gps"),
+        )
         return (*names, *(Input(f"{axis} [m]") for axis in "xyz"))
 
     @property
@@ -152,7 +175,9 @@ class Gnss(Measurement):
         return dict(zip((i.heading for i in self.inputs), columns, strict=True))
 
     def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Measurement:
-        return replace(self, satellites=tuple(zip(*(columns[i.heading] for i in self.inputs), strict=True)))
+        return replace(
+            self, satellites=tuple(zip(*(columns[i.heading] for i in self.inputs), strict=True))
+        )
 
     @property
     def own_parameters(self) -> tuple[str, ...]:
@@ -168,14 +193,19 @@ class Gnss(Measurement):
         """Which of the clocks and offsets each reading carries: (n - 3, m) of zeros and ones."""
         times, systems, _ = self._columns
         clocks = [np.array(times) == k for k in self._times]
-        return np.array([*clocks, *(np.array(systems) == name for name in self._systems[1:])], dtype=float)
+        return np.array(
+            [*clocks, *(np.array(systems) == name for name in self._systems[1:])], dtype=float
+        )
 
     def simulate(self, x: Array) -> Array:
         values = (x * self.sizes)[:, :, None]
         place: list[Any] = [values[:, i] for i in range(3)]
         if self.frame == "enu":
             axes = east_north_up(np.asarray(self.position))
-            place = [self.position[i] + sum(values[:, k] * axes[k, i] for k in range(3)) for i in range(3)]
+            place = [
+                self.position[i] + sum(values[:, k] * axes[k, i] for k in range(3))
+                for i in range(3)
+            ]
         x, y, z = self._columns[2].T
         # The Earth turns while light travels. Each pass takes the error of the distance down by the speed of the
         # satellite's turning over that of light, 1e-5.

@@ -45,7 +45,10 @@ class Interval(OdeMeasurement):
 
     def read(self, t: Any, y: Sequence[Any], p: Sequence[Any], c: Sequence[Any]) -> Sequence[Any]:
         own, _, constants, t0, length = self._split(p)
-        return [*y, *self.whole.read(t0 + length * t, y, own, constants[-self.whole.tables.shape[2] :])]
+        return [
+            *y,
+            *self.whole.read(t0 + length * t, y, own, constants[-self.whole.tables.shape[2] :]),
+        ]
 
     def _split(self, p: Sequence[Any]) -> tuple[list[Any], list[Any], list[Any], Any, Any]:
         """The parameters, the state at the beginning, the constants, the time of the beginning, and the length."""

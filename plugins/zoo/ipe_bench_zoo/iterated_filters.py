@@ -70,7 +70,10 @@ class LMIEKF(InformationFilter):
     name = "lm_iekf"
 
     def update(self, readings: EpochReadings) -> tuple[Belief, Array]:
-        problem, mean = _Standardized.of_epoch(readings, readings.belief.root()), readings.belief.mean
+        problem, mean = (
+            _Standardized.of_epoch(readings, readings.belief.root()),
+            readings.belief.mean,
+        )
         method = LevenbergMarquardtMethod(self.damping, np.ones(mean.shape[1]))
         start = method.begin(problem, np.zeros_like(mean))
         ended = iterate(problem, method, start, Limits(self.tolerance, self.max_iterations))
@@ -92,7 +95,15 @@ class _Standardized(Objective):
 
     @classmethod
     def of_epoch(cls, given: EpochReadings, root: Array) -> _Standardized:
-        return cls(given.model, given.epoch.R, given.z, given.rows, given.belief.mean, given=given, root=root)
+        return cls(
+            given.model,
+            given.epoch.R,
+            given.z,
+            given.rows,
+            given.belief.mean,
+            given=given,
+            root=root,
+        )
 
     def residual(self, x: Array) -> Array:
         """The whitened residuals, followed by x: the maximum a posteriori has the least squares of these."""
@@ -100,7 +111,9 @@ class _Standardized(Objective):
 
     def jacobian(self, x: Array, *, coarse: Mask | bool = False) -> Array:
         J = np.matmul(self.given.slope(self.x0 + multiply(self.root, x)), self.root)
-        return np.concatenate([J, np.broadcast_to(np.eye(self.root.shape[1]), self.root.shape)], axis=1)
+        return np.concatenate(
+            [J, np.broadcast_to(np.eye(self.root.shape[1]), self.root.shape)], axis=1
+        )
 
     def subset(self, kept: Mask) -> _Standardized:
         return _Standardized.of_epoch(self.given.subset(kept), self.root[kept])

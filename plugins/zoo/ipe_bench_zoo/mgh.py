@@ -50,7 +50,9 @@ class Problem:
     minima: tuple[Minimum, ...]
 
 
-def _problem(residuals: Callable[[Unknowns], Any], start: tuple[float, ...], *minima: tuple[Any, ...]) -> Problem:
+def _problem(
+    residuals: Callable[[Unknowns], Any], start: tuple[float, ...], *minima: tuple[Any, ...]
+) -> Problem:
     """A problem by a function that returns the residuals (trials, m) and is analytic."""
     return Problem(residuals, start, tuple(Minimum(*one) for one in minima))
 
@@ -62,11 +64,15 @@ def _side_by_side(*f: Any) -> Any:
 
 def _helical_valley(x: Unknowns) -> Any:
     turns = np.arctan(x[1] / x[0]) / (2.0 * np.pi) + 0.5 * (np.real(x[0]) < 0)
-    return _side_by_side(10.0 * (x[2] - 10.0 * turns), 10.0 * (np.sqrt(x[0] ** 2 + x[1] ** 2) - 1.0), x[2])
+    return _side_by_side(
+        10.0 * (x[2] - 10.0 * turns), 10.0 * (np.sqrt(x[0] ** 2 + x[1] ** 2) - 1.0), x[2]
+    )
 
 
 def _bard(x: Unknowns) -> Any:
-    y = np.array([0.14, 0.18, 0.22, 0.25, 0.29, 0.32, 0.35, 0.39, 0.37, 0.58, 0.73, 0.96, 1.34, 2.10, 4.39])
+    y = np.array(
+        [0.14, 0.18, 0.22, 0.25, 0.29, 0.32, 0.35, 0.39, 0.37, 0.58, 0.73, 0.96, 1.34, 2.10, 4.39]
+    )
     u = np.arange(1.0, 16.0)
     v = 16.0 - u
     return y - (x[0] + u / (v * x[1] + np.minimum(u, v) * x[2]))
@@ -75,11 +81,30 @@ def _bard(x: Unknowns) -> Any:
 def _gaussian(x: Unknowns) -> Any:
     rising = [0.0009, 0.0044, 0.0175, 0.0540, 0.1295, 0.2420, 0.3521]
     t = (8.0 - np.arange(1.0, 16.0)) / 2.0
-    return x[0] * np.exp(-x[1] * (t - x[2]) ** 2 / 2.0) - np.array([*rising, 0.3989, *reversed(rising)])
+    return x[0] * np.exp(-x[1] * (t - x[2]) ** 2 / 2.0) - np.array(
+        [*rising, 0.3989, *reversed(rising)]
+    )
 
 
 def _meyer(x: Unknowns) -> Any:
-    y = [34780, 28610, 23650, 19630, 16370, 13720, 11540, 9744, 8261, 7030, 6005, 5147, 4427, 3820, 3307, 2872]
+    y = [
+        34780,
+        28610,
+        23650,
+        19630,
+        16370,
+        13720,
+        11540,
+        9744,
+        8261,
+        7030,
+        6005,
+        5147,
+        4427,
+        3820,
+        3307,
+        2872,
+    ]
     t = 45.0 + 5.0 * np.arange(1.0, 17.0)
     return x[0] * np.exp(x[1] / (t + x[2])) - np.array(y, dtype=float)
 
@@ -103,7 +128,9 @@ def _wood(x: Unknowns) -> Any:
 
 
 def _kowalik_osborne(x: Unknowns) -> Any:
-    y = np.array([0.1957, 0.1947, 0.1735, 0.1600, 0.0844, 0.0627, 0.0456, 0.0342, 0.0323, 0.0235, 0.0246])
+    y = np.array(
+        [0.1957, 0.1947, 0.1735, 0.1600, 0.0844, 0.0627, 0.0456, 0.0342, 0.0323, 0.0235, 0.0246]
+    )
     u = np.array([4.0, 2.0, 1.0, 0.5, 0.25, 0.167, 0.125, 0.1, 0.0833, 0.0714, 0.0625])
     return y - x[0] * (u**2 + u * x[1]) / (u**2 + u * x[2] + x[3])
 
@@ -158,12 +185,16 @@ def _watson(x: Unknowns) -> Any:
 def _trigonometric(x: Unknowns) -> Any:
     n, cosines = len(x), [np.cos(a) for a in x]
     total = sum(cosines)
-    return _side_by_side(*(n - total + (i + 1.0) * (1.0 - cosines[i]) - np.sin(x[i]) for i in range(n)))
+    return _side_by_side(
+        *(n - total + (i + 1.0) * (1.0 - cosines[i]) - np.sin(x[i]) for i in range(n))
+    )
 
 
 def _brown_almost_linear(x: Unknowns) -> Any:
     total = sum(x)
-    return _side_by_side(*(a + total - (len(x) + 1.0) for a in x[:-1]), math.prod(x[1:], start=x[0]) - 1.0)
+    return _side_by_side(
+        *(a + total - (len(x) + 1.0) for a in x[:-1]), math.prod(x[1:], start=x[0]) - 1.0
+    )
 
 
 def _chebyquad(x: Unknowns) -> Any:
@@ -171,7 +202,9 @@ def _chebyquad(x: Unknowns) -> Any:
     before, value = [1.0] * n, [2.0 * a - 1.0 for a in x]
     for i in range(1, n + 1):
         f.append(sum(value) / n - (0.0 if i % 2 else -1.0 / (i**2 - 1.0)))
-        following = [2.0 * (2.0 * a - 1.0) * v - b for a, v, b in zip(x, value, before, strict=True)]
+        following = [
+            2.0 * (2.0 * a - 1.0) * v - b for a, v, b in zip(x, value, before, strict=True)
+        ]
         before, value = value, following
     return _side_by_side(*f)
 
@@ -289,17 +322,26 @@ class Mgh(Measurement):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.function not in PROBLEMS:
-            raise UserError(f"function={self.function}: {unknown(self.function, PROBLEMS, 'function')}")
+            raise UserError(
+                f"function={self.function}: {unknown(self.function, PROBLEMS, 'function')}"
+            )
 
     @cached_property
     def start_values(self) -> Array:
         """The starting point (n,)."""
         standard = np.array(PROBLEMS[self.function].start)
-        return self.start * standard if standard.any() or self.start == 1.0 else np.full_like(standard, self.start)
+        return (
+            self.start * standard
+            if standard.any() or self.start == 1.0
+            else np.full_like(standard, self.start)
+        )
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
-        return tuple(Parameter(f"x{i + 1}", size=float(abs(a)) or 1.0) for i, a in enumerate(self.start_values))
+        return tuple(
+            Parameter(f"x{i + 1}", size=float(abs(a)) or 1.0)
+            for i, a in enumerate(self.start_values)
+        )
 
     nominal = property(lambda model: np.sign(model.start_values))  # type: ignore[assignment]
     m = cached_property(lambda model: model.simulate(model.nominal[None]).shape[1])  # type: ignore[assignment]
@@ -320,7 +362,9 @@ class Mgh(Measurement):
         assert least.x is not None
         variance = least.sum_of_squares / max(self.m - self.n, 1)
         deviation = math.sqrt(variance) if variance > 0 else _ZERO_RESIDUAL_DEVIATION
-        return Recorded(np.zeros(self.m), Covariance(np.full(self.m, deviation)), np.array(least.x) / self.sizes)
+        return Recorded(
+            np.zeros(self.m), Covariance(np.full(self.m, deviation)), np.array(least.x) / self.sizes
+        )
 
 
 @dataclass(frozen=True)
@@ -347,6 +391,11 @@ def score(model: Mgh, x: Array) -> Attained:
         value = float(f @ f)
     if not np.isfinite(value):
         return Attained(np.inf, None)
-    above = [(value - one.sum_of_squares, _RELATIVE * one.sum_of_squares + _ABSOLUTE) for one in model.minima]
-    attained = (k for k, (d, tolerance) in enumerate(above) if (d if k == 0 else abs(d)) <= tolerance)
+    above = [
+        (value - one.sum_of_squares, _RELATIVE * one.sum_of_squares + _ABSOLUTE)
+        for one in model.minima
+    ]
+    attained = (
+        k for k, (d, tolerance) in enumerate(above) if (d if k == 0 else abs(d)) <= tolerance
+    )
     return Attained(value, next(attained, None))

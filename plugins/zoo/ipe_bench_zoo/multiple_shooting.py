@@ -11,7 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import put, take
-from ipe_bench.basics.linalg import Array, Mask, deviations, finite, inverse, multiply, nearest, solve
+from ipe_bench.basics.linalg import (
+    Array,
+    Mask,
+    deviations,
+    finite,
+    inverse,
+    multiply,
+    nearest,
+    solve,
+)
 from ipe_bench.basics.options import Count, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator, Need
@@ -61,10 +70,17 @@ class MultipleShooting(Estimator):
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         self.require_suited(problem)
         counted = CountingModel(problem.measurement, EvaluationCount.zeros(len(z)))
-        shooting = Shooting(Pieces.of(problem, self.segments, self.step), counted, z, np.arange(len(z)))
+        shooting = Shooting(
+            Pieces.of(problem, self.segments, self.step), counted, z, np.arange(len(z))
+        )
         limits = Limits(self.tolerance, self.max_iterations, self.budget, history)
         with np.errstate(all="ignore"):
-            ended = iterate(shooting, CondensedGaussNewton(), np.repeat(problem.x0[None], len(z), axis=0), limits)
+            ended = iterate(
+                shooting,
+                CondensedGaussNewton(),
+                np.repeat(problem.x0[None], len(z), axis=0),
+                limits,
+            )
             minima = Minima.of(ended, ended.state.linear.covariance, ended.state.r)
             return minima.estimates(counted.tally, z.shape[1])
 
@@ -85,7 +101,11 @@ class Pieces:
     def of(cls, problem: Problem, segments: int, step: float) -> Pieces:
         model, kept = problem.measurement, np.arange(problem.measurement.m)
         while isinstance(model, SubsetModel | Ode):
-            kept = np.array(model.kept, dtype=np.intp)[kept] if isinstance(model, SubsetModel) else kept
+            kept = (
+                np.array(model.kept, dtype=np.intp)[kept]
+                if isinstance(model, SubsetModel)
+                else kept
+            )
             model = model.whole
         assert isinstance(model, OdeMeasurement)
         return cls(problem, model, kept, segments, Interval(model, step))
@@ -99,7 +119,9 @@ class Pieces:
     def cuts(self) -> NDArray[np.intp]:
         """Where in `grid` each segment begins, and the end."""
         intervals = len(self.grid) - 1
-        return np.unique(np.linspace(0, intervals, min(self.wanted, intervals) + 1).round().astype(np.intp))
+        return np.unique(
+            np.linspace(0, intervals, min(self.wanted, intervals) + 1).round().astype(np.intp)
+        )
 
     @cached_property
     def cases(self) -> int:
@@ -110,14 +132,19 @@ class Pieces:
 
         def states(x: Array) -> Array:
             shape = (*x.shape[:2], self.cases)
-            return _entrywise(self.model.start, shape, (x * self.model.si_sizes)[:, :, None], self.model.tables[0])
+            return _entrywise(
+                self.model.start, shape, (x * self.model.si_sizes)[:, :, None], self.model.tables[0]
+            )
 
         return _with_slope(states, x)
 
     def read(self, x: Array, y: Array, k: int) -> tuple[Array, Array]:
         """The outputs (trials, cases, outputs) of the states y (trials, cases, states) at times[k], and their
         derivatives by the states."""
-        p, c = (x * self.model.si_sizes)[:, None, None], self.model.tables[min(k + 1, len(self.model.tables) - 1)]
+        p, c = (
+            (x * self.model.si_sizes)[:, None, None],
+            self.model.tables[min(k + 1, len(self.model.tables) - 1)],
+        )
         read = partial(self.model.read, self.grid[k + 1])
         return _with_slope(lambda y: _entrywise(read, y.shape[:3], y, p, c), y)
 
@@ -136,7 +163,9 @@ class Pieces:
         """The ends of all segments that begin at y, and all readings h (trials, cases, times, outputs)."""
         h, y = np.empty((len(x), self.cases, len(self.grid) - 1, len(self.model.outputs))), y.copy()
         for lanes, k in self._intervals():
-            read = self.interval.simulate(self.inputs(x, y[:, lanes], k)).reshape(len(x), len(k), -1)
+            read = self.interval.simulate(self.inputs(x, y[:, lanes], k)).reshape(
+                len(x), len(k), -1
+            )
             y[:, lanes], h[:, lanes % self.cases, k] = np.split(read, [self.model.states], axis=2)
         return y, h
 
@@ -147,10 +176,18 @@ class Pieces:
         states, size = model.states, np.concatenate([model.si_sizes, np.ones(model.states)])
         M = np.zeros((*y.shape, len(size)))
         M[..., n:] = np.eye(states)
-        Jh, y = np.empty((len(x), self.cases, len(self.grid) - 1, len(model.outputs), len(size))), y.copy()
+        Jh, y = (
+            np.empty((len(x), self.cases, len(self.grid) - 1, len(model.outputs), len(size))),
+            y.copy(),
+        )
         for lanes, k in self._intervals():
             inputs = self.inputs(x, y[:, lanes], k)
-            J = self.interval.jacobian(inputs).reshape(len(x), len(k), -1, self.interval.n)[..., : len(size)] * size
+            J = (
+                self.interval.jacobian(inputs).reshape(len(x), len(k), -1, self.interval.n)[
+                    ..., : len(size)
+                ]
+                * size
+            )
             along = np.matmul(J[..., n:], M[:, lanes])
             along[..., :n] += J[..., :n]
             M[:, lanes], Jh[:, lanes % self.cases, k] = np.split(along, [states], axis=2)
@@ -159,7 +196,10 @@ class Pieces:
 
     def _intervals(self) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp]]]:
         """In turn, which lanes go on and through which intervals."""
-        first, lengths = np.repeat(self.cuts[:-1], self.cases), np.repeat(np.diff(self.cuts), self.cases)
+        first, lengths = (
+            np.repeat(self.cuts[:-1], self.cases),
+            np.repeat(np.diff(self.cuts), self.cases),
+        )
         for j in range(lengths.max()):
             lanes = np.flatnonzero(lengths > j)
             yield lanes, first[lanes] + j
@@ -191,7 +231,9 @@ class Pieces:
         return y
 
 
-def _entrywise(function: Callable[..., Sequence[Any]], shape: tuple[int, ...], *vectors: Array) -> Array:
+def _entrywise(
+    function: Callable[..., Sequence[Any]], shape: tuple[int, ...], *vectors: Array
+) -> Array:
     """A function of the entries of vectors (..., k), each entry of that shape: (*shape, outputs)."""
     entries = (list(np.moveaxis(np.broadcast_to(a, (*shape, a.shape[-1])), -1, 0)) for a in vectors)
     return np.stack([np.broadcast_to(value, shape) for value in function(*entries)], axis=-1)
@@ -226,7 +268,9 @@ class Linear:
     def of(cls, C: Array, J: Array) -> Linear:
         weights, usable = np.linalg.norm(C, axis=2), (finite(C) & finite(J))[:, None, None]
         weights = np.where(weights > 0, weights, 1.0)
-        Q, U = np.linalg.qr(np.where(usable, C / weights[:, :, None], 0.0).swapaxes(1, 2), mode="complete")
+        Q, U = np.linalg.qr(
+            np.where(usable, C / weights[:, :, None], 0.0).swapaxes(1, 2), mode="complete"
+        )
         Y, Z = np.split(Q, [C.shape[1]], axis=2)
         Qz, V = np.linalg.qr(np.matmul(np.where(usable, J, 0.0), Z))
         V, J = (np.where(usable, A, np.nan) for A in (V, J))
@@ -287,14 +331,18 @@ class Shooting:
         ends, h = pieces.follow(x, np.concatenate([pieces.start(x)[0], nodes], axis=1))
         d = (ends[:, : nodes.shape[1]] - nodes) / size[:, None]
         h = h.reshape(len(x), -1)[:, pieces.kept] - pieces.model.offset[pieces.kept]
-        return d.reshape(len(x), -1), pieces.problem.R.whiten(pieces.problem.measurement.near(h, self.z) - self.z)
+        return d.reshape(len(x), -1), pieces.problem.R.whiten(
+            pieces.problem.measurement.near(h, self.z) - self.z
+        )
 
     def linear(self, x: Array, nodes: Array, size: Array) -> Linear:
         """The gaps' and residuals' derivatives along the parameters and the nodes in multiples of `size`."""
         pieces, n, (lanes, states) = self.pieces, x.shape[1], nodes.shape[1:]
         # The states in between are simulated beside the derivatives.
         self.model.tally.simulations[self.rows] += 1.0
-        self.model.tally.jacobians[self.rows] += pieces.interval.jacobian_cost / self.model.measurement.jacobian_cost
+        self.model.tally.jacobians[self.rows] += (
+            pieces.interval.jacobian_cost / self.model.measurement.jacobian_cost
+        )
         start, S = pieces.start(x)
         M, Jh = pieces.slopes(x, np.concatenate([start, nodes], axis=1))
         C = np.zeros((len(x), lanes, states, n + lanes * states))
@@ -302,16 +350,23 @@ class Shooting:
         segment = np.repeat(np.arange(len(pieces.cuts) - 1), np.diff(pieces.cuts))
         J[..., :n], C[..., :n] = Jh[..., :n], M[:, :lanes, :, :n]
         # The first segment begins where the parameters say.
-        J[:, :, segment == 0, :, :n] += np.einsum("tckos,tcsn->tckon", Jh[:, :, segment == 0][..., n:], S)
+        J[:, :, segment == 0, :, :n] += np.einsum(
+            "tckos,tcsn->tckon", Jh[:, :, segment == 0][..., n:], S
+        )
         if lanes:
             C[:, : pieces.cases, :, :n] += np.matmul(M[:, : pieces.cases, :, n:], S)
         for node in range(lanes):
-            columns, following = slice(n + node * states, n + (node + 1) * states), node + pieces.cases
+            columns, following = (
+                slice(n + node * states, n + (node + 1) * states),
+                node + pieces.cases,
+            )
             C[:, node, :, columns] = -np.eye(states) * size[:, None]
             if following < lanes:
                 C[:, following, :, columns] = M[:, following, :, n:] * size[:, None]
             g, c = divmod(following, pieces.cases)
-            J[:, c, segment == g, :, columns] = Jh[:, c, segment == g][..., n:] * size[:, None, None]
+            J[:, c, segment == g, :, columns] = (
+                Jh[:, c, segment == g][..., n:] * size[:, None, None]
+            )
         C = (C / size[:, None, :, None]).reshape(len(x), -1, C.shape[-1])
         J = J.reshape(len(x), -1, J.shape[-1])[:, pieces.kept]
         return Linear.of(C, pieces.problem.R.whiten_jacobian(J))
@@ -330,30 +385,51 @@ class CondensedGaussNewton(Method[Shooting, Trajectory]):
         system.model.tally.simulations[system.rows] += cuts[-2] / cuts[-1]
         d, r = system.gaps(x, nodes, size)
         linear = system.linear(x, nodes, size)
-        return Trajectory(x, nodes, size, d, r, linear, linear.step(d, r), np.ones(len(x)), np.full(len(x), np.inf))
+        return Trajectory(
+            x,
+            nodes,
+            size,
+            d,
+            r,
+            linear,
+            linear.step(d, r),
+            np.ones(len(x)),
+            np.full(len(x), np.inf),
+        )
 
     def step(self, system: Shooting, state: Trajectory) -> Trajectory:
         change = state.share[:, None] * state.step
         of_x, of_nodes = np.split(change, [state.x.shape[1]], axis=1)
-        x, nodes = state.x + of_x, state.nodes + of_nodes.reshape(state.nodes.shape) * state.size[:, None]
+        x, nodes = (
+            state.x + of_x,
+            state.nodes + of_nodes.reshape(state.nodes.shape) * state.size[:, None],
+        )
         d, r = system.gaps(x, nodes, state.size)
         simplified = _length(state, state.linear.step(d, r))
         taken = simplified <= (1 - state.share / 4) * _length(state, state.step)
-        state = replace(state, moved=_reach(state, change), share=np.where(taken, 1.0, state.share / 2))
+        state = replace(
+            state, moved=_reach(state, change), share=np.where(taken, 1.0, state.share / 2)
+        )
         if not taken.any():
             return state
         x, nodes, d, r = (a[taken] for a in (x, nodes, d, r))
         linear = system.subset(taken).linear(x, nodes, state.size[taken])
-        new = replace(take(state, taken), x=x, nodes=nodes, d=d, r=r, linear=linear, step=linear.step(d, r))
+        new = replace(
+            take(state, taken), x=x, nodes=nodes, d=d, r=r, linear=linear, step=linear.step(d, r)
+        )
         return put(state, taken, new)
 
-    def check(self, system: Shooting, before: Trajectory | None, state: Trajectory) -> ConvergenceCheck:
+    def check(
+        self, system: Shooting, before: Trajectory | None, state: Trajectory
+    ) -> ConvergenceCheck:
         """The step still to go, the gaps, and whether a step can still be shortened."""
         unknown, gap = ~finite(state.step), np.abs(state.d).max(axis=1, initial=0.0)
         size = np.where(unknown, np.inf, np.fmax(_reach(state, state.step), gap))
         growth = np.where(finite(state.r) & finite(state.d), 1.0, np.nan)
         ending = np.where(unknown, Status.SINGULAR, Status.STALLED)
-        return ConvergenceCheck(size, growth, state.moved, unknown | (state.share < _SHORTEST), ending)
+        return ConvergenceCheck(
+            size, growth, state.moved, unknown | (state.share < _SHORTEST), ending
+        )
 
 
 def _reach(state: Trajectory, change: Array) -> Array:
@@ -361,10 +437,14 @@ def _reach(state: Trajectory, change: Array) -> Array:
     change = change[:, : state.x.shape[1]]
     # Where solutions grow as fast as the readings are many, deviations lie below the round-off of an integration.
     invisible = np.abs(change) <= _ROUND_OFF * np.fmax(1.0, np.abs(state.x))
-    return np.where(invisible, 0.0, np.abs(change / deviations(state.linear.covariance))).max(axis=1)
+    return np.where(invisible, 0.0, np.abs(change / deviations(state.linear.covariance))).max(
+        axis=1
+    )
 
 
 def _length(state: Trajectory, change: Array) -> Array:
     """The length (trials,) of a change of all unknowns, parameters and states in their sizes."""
     parameters, states = np.split(change, [state.x.shape[1]], axis=1)
-    return np.linalg.norm(np.concatenate([parameters / np.fmax(1.0, np.abs(state.x)), states], axis=1), axis=1)
+    return np.linalg.norm(
+        np.concatenate([parameters / np.fmax(1.0, np.abs(state.x)), states], axis=1), axis=1
+    )

@@ -14,14 +14,23 @@ from annotated_types import MinLen
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Positive
-from ipe_bench.measurements.base import Input, Measurement, Parameter, UsualNoise, parameter_table, single_epochs
+from ipe_bench.measurements.base import (
+    Input,
+    Measurement,
+    Parameter,
+    UsualNoise,
+    parameter_table,
+    single_epochs,
+)
 
 Vector = tuple[float, float, float]
 
 
 def attitudes() -> Array:
     """26 directions (26, 3): towards the faces, edges and corners of a cube."""
-    return np.array([np.array(v) / np.linalg.norm(v) for v in product((-1.0, 0.0, 1.0), repeat=3) if any(v)])
+    return np.array(
+        [np.array(v) / np.linalg.norm(v) for v in product((-1.0, 0.0, 1.0), repeat=3) if any(v)]
+    )
 
 
 class Magnitudes(Measurement):
@@ -118,7 +127,11 @@ class Triad(Magnitudes):
 
     @cached_property
     def measured(self) -> Array:
-        return self.field * attitudes() if self.outputs is None else np.asarray(self.outputs, dtype=float)
+        return (
+            self.field * attitudes()
+            if self.outputs is None
+            else np.asarray(self.outputs, dtype=float)
+        )
 
     def corrected(self, x: Array) -> Sequence[Array]:
         p = (x * self._plain_sizes)[:, :, None]
@@ -167,7 +180,9 @@ class Accelerometer(Magnitudes):
 
     @cached_property
     def nominal(self) -> Array:
-        return np.concatenate([self.bias, np.zeros(3), 1e3 * np.array(self.misalignment)]) / self.sizes
+        return (
+            np.concatenate([self.bias, np.zeros(3), 1e3 * np.array(self.misalignment)]) / self.sizes
+        )
 
     @cached_property
     def measured(self) -> Array:
@@ -179,6 +194,9 @@ class Accelerometer(Magnitudes):
 
     def corrected(self, x: Array) -> Sequence[Array]:
         p = (x * self.sizes)[:, :, None]
-        d = [self.scale[i] * (1.0 + 1e-6 * p[:, 3 + i]) * (self.measured[:, i] - p[:, i]) for i in range(3)]
+        d = [
+            self.scale[i] * (1.0 + 1e-6 * p[:, 3 + i]) * (self.measured[:, i] - p[:, i])
+            for i in range(3)
+        ]
         ayz, azy, azx = (1e-3 * p[:, 6 + i] for i in range(3))
         return d[0] - ayz * d[1] + azy * d[2], d[1] - azx * d[2], d[2]

@@ -23,7 +23,9 @@ def folders(tmp_path_factory):
     scenario = Scenario(Triad(), Gaussian(1e-5), error_scale=300.0)
     plain = {"levenberg_marquardt": LevenbergMarquardt()}
     assert compute([scenario], LOOKING | plain, 8, looking) == ()
-    assert compute([scenario], plain | {"undamped": LevenbergMarquardt(damping=1e-6)}, 8, blind) == ()
+    assert (
+        compute([scenario], plain | {"undamped": LevenbergMarquardt(damping=1e-6)}, 8, blind) == ()
+    )
     return looking, blind
 
 

@@ -2,7 +2,13 @@
 
 import pytest
 from ipe_bench_zoo import Mgh
-from ipe_bench_zoo.attained import SECTION, attained_table, attained_totals, attained_totals_table, data_profile
+from ipe_bench_zoo.attained import (
+    SECTION,
+    attained_table,
+    attained_totals,
+    attained_totals_table,
+    data_profile,
+)
 from ipe_bench_zoo.mgh import PROBLEMS as FUNCTIONS
 from rich.console import Console
 
@@ -54,7 +60,9 @@ def test_totals_count_what_the_table_says(table):
     for label in ESTIMATORS:
         own = table.xs(label, level="estimator")
         assert totals.loc[label, "solved"] == own["solved"].sum()
-        assert totals.loc[label, ["solved_1", "solved_10", "solved_100"]].sum() == own["solved"].sum()
+        assert (
+            totals.loc[label, ["solved_1", "solved_10", "solved_100"]].sum() == own["solved"].sum()
+        )
     assert totals.loc["progressive", ["solved", "converged", "elsewhere"]].tolist() == [4, 4, 0]
     # A minimum that is not the least one is no solution, however well it has converged.
     local = table.reset_index().assign(status="converged")
@@ -94,7 +102,9 @@ def test_the_terminal_and_the_report_show_them(folder):
 @pytest.mark.campaign
 @pytest.mark.parametrize("estimator", [Progressive(), Auto()], ids=lambda e: type(e).__name__)
 def test_the_general_estimators_attain_all_minima_and_say_so(estimator, tmp_path):
-    scenarios = [Scenario(Mgh(f, start), Certified()) for f in FUNCTIONS for start in (1.0, 10.0, 100.0)]
+    scenarios = [
+        Scenario(Mgh(f, start), Certified()) for f in FUNCTIONS for start in (1.0, 10.0, 100.0)
+    ]
     assert compute(scenarios, {"it": estimator}, 1, tmp_path) == ()
     totals = attained_totals(attained_table(collect([tmp_path]))).iloc[0]
     assert totals["solved"] >= 67

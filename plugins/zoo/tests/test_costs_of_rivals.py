@@ -17,7 +17,9 @@ from ipe_bench.trials.scenario import Scenario
 @pytest.mark.parametrize("scale", [1.0, 100.0])
 @pytest.mark.parametrize("estimator", [EsMda(), LMIEKF(), RecursiveUpdate()], ids=str)
 def test_the_cost_of_an_estimator_is_what_it_evaluates(estimator, scale):
-    check_cost(estimator, Scenario(Gins(readings_per_case=6), Quantization(0.02286), error_scale=scale), 2)
+    check_cost(
+        estimator, Scenario(Gins(readings_per_case=6), Quantization(0.02286), error_scale=scale), 2
+    )
     check_cost(estimator, Scenario(Bent(0.05), Gaussian(0.1), error_scale=scale), 4)
 
 

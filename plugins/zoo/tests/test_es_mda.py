@@ -22,7 +22,9 @@ def linear(trials: int):
     return (problem, z, *linear_map(problem, model.matrix, z))
 
 
-@pytest.mark.oracle("published: Emerick and Reynolds (2013), eq. (12)", "members after an assimilation", 1e-12)
+@pytest.mark.oracle(
+    "published: Emerick and Reynolds (2013), eq. (12)", "members after an assimilation", 1e-12
+)
 @pytest.mark.parametrize("members", [20, 5])
 def test_gain_is_that_of_the_paper(members):
     """C_sh (C_hh + alpha R)^-1 (z - h), Emerick and Reynolds (2013), eq. (12), by inverting a matrix of readings."""
@@ -37,7 +39,11 @@ def test_gain_is_that_of_the_paper(members):
 
 def test_a_member_that_overflows_is_left_out():
     rng = np.random.default_rng(1)
-    s, h, z = rng.standard_normal((1, 20, 4)), rng.standard_normal((1, 20, 7)), rng.standard_normal((1, 20, 7))
+    s, h, z = (
+        rng.standard_normal((1, 20, 4)),
+        rng.standard_normal((1, 20, 7)),
+        rng.standard_normal((1, 20, 7)),
+    )
     others = assimilated(s[:, 1:], h[:, 1:], z[:, 1:], 3.0)
     h[0, 0] = np.inf
     np.testing.assert_allclose(assimilated(s, h, z, 3.0)[:, 1:], others, atol=1e-12)
@@ -51,7 +57,9 @@ def test_polish_ends_at_the_maximum_a_posteriori():
     assert_agrees(found.x, x, atol=1e-9)
     assert_agrees(found.covariance[0], P, atol=1e-9)
     # 16 assimilations and one or two Gauss-Newton steps after the first mean.
-    assert all(len(path) - 1 == count for path, count in zip(found.history, found.iterations, strict=True))
+    assert all(
+        len(path) - 1 == count for path, count in zip(found.history, found.iterations, strict=True)
+    )
     assert (found.simulations - 16 * 20 <= 3).all()
 
 
@@ -60,7 +68,9 @@ def test_inflation_widens_the_prior():
     x, P = linear_map(problem, Linear().matrix, z, inflation=3.0)
     found = EsMda(members=40, prior_inflation=3.0).estimate(problem, z)
     np.testing.assert_allclose(found.x, x, atol=1e-8)
-    wide = EsMda(members=6400, steps=2, first=0.1, polish=0, prior_inflation=3.0).estimate(problem, z)
+    wide = EsMda(members=6400, steps=2, first=0.1, polish=0, prior_inflation=3.0).estimate(
+        problem, z
+    )
     assert np.abs(deviations(wide.covariance) / deviations(P) - 1).max() < 0.1
 
 
@@ -82,6 +92,8 @@ def test_gins_at_scale_300_is_solved_from_the_seed_given():
 def test_equal_steps_fail_where_the_noise_is_far_below_the_prior():
     """Why the information grows geometrically."""
     block = block_of_gins(1000.0, 12, 91)
-    even, geometric = (block.estimate(EsMda(polish=0, first=first))[1]["success"].mean() for first in (1.0, 1e-12))
+    even, geometric = (
+        block.estimate(EsMda(polish=0, first=first))[1]["success"].mean() for first in (1.0, 1e-12)
+    )
     assert even < 0.3
     assert geometric > 0.7

@@ -37,7 +37,9 @@ def on_ellipsoid(latitude, longitude, height):
     e2 = f * (2 - f)
     N = a / np.sqrt(1 - e2 * np.sin(latitude) ** 2)
     r = (N + height) * np.cos(latitude)
-    return np.array([r * np.cos(longitude), r * np.sin(longitude), (N * (1 - e2) + height) * np.sin(latitude)])
+    return np.array(
+        [r * np.cos(longitude), r * np.sin(longitude), (N * (1 - e2) + height) * np.sin(latitude)]
+    )
 
 
 def sky(model):
@@ -47,11 +49,15 @@ def sky(model):
 
 def given(model, **others):
     """The same readings with everything in fields."""
-    labels = zip(model.index["epoch"], model.index["constellation"], sky(model).tolist(), strict=True)
+    labels = zip(
+        model.index["epoch"], model.index["constellation"], sky(model).tolist(), strict=True
+    )
     return Gnss(tuple((epoch, name, *place) for epoch, name, place in labels), **others)
 
 
-@pytest.mark.oracle("own second implementation: flight of light in inertial axes", "pseudo-ranges, m", 1e-6)
+@pytest.mark.oracle(
+    "own second implementation: flight of light in inertial axes", "pseudo-ranges, m", 1e-6
+)
 def test_distances_are_those_of_light_in_axes_that_do_not_turn():
     model = Gnss(frame="ecef")
     x = model.nominal + np.random.default_rng(0).normal(size=(3, model.n))
@@ -74,8 +80,12 @@ def test_the_rotation_is_worth_the_sagnac_term():
 def test_local_axes_are_the_tangents_of_the_ellipsoid():
     latitude, longitude, height, h = 0.6344, 2.2230, 120.0, 1e-6
     place = on_ellipsoid(latitude, longitude, height)
-    east = on_ellipsoid(latitude, longitude + h, height) - on_ellipsoid(latitude, longitude - h, height)
-    north = on_ellipsoid(latitude + h, longitude, height) - on_ellipsoid(latitude - h, longitude, height)
+    east = on_ellipsoid(latitude, longitude + h, height) - on_ellipsoid(
+        latitude, longitude - h, height
+    )
+    north = on_ellipsoid(latitude + h, longitude, height) - on_ellipsoid(
+        latitude - h, longitude, height
+    )
     up = on_ellipsoid(latitude, longitude, height + 1.0) - place
     expected = np.array([v / np.linalg.norm(v) for v in (east, north, up)])
     np.testing.assert_allclose(east_north_up(place), expected, atol=1e-8)
@@ -88,7 +98,9 @@ def test_satellites_stand_where_the_default_says():
     azimuth = np.rad2deg(np.arctan2(towards[:, 0], towards[:, 1])) % 360
     np.testing.assert_allclose((azimuth[0], elevation[0]), (20.0, 65.0), atol=1e-9)
     radii = np.linalg.norm(sky(model), axis=1)
-    np.testing.assert_allclose(radii, np.where(np.array(model.index["constellation"]) == "gps", 26560e3, 29600e3))
+    np.testing.assert_allclose(
+        radii, np.where(np.array(model.index["constellation"]) == "gps", 26560e3, 29600e3)
+    )
 
 
 def test_east_north_up_and_ecef_are_one_model():
@@ -96,7 +108,9 @@ def test_east_north_up_and_ecef_are_one_model():
     fixed = given(local, frame="ecef")
     x = local.nominal + np.random.default_rng(1).normal(size=(3, local.n))
     values = x * local.sizes
-    values[:, :3] = np.array(local.position) + values[:, :3] @ east_north_up(np.array(local.position))
+    values[:, :3] = np.array(local.position) + values[:, :3] @ east_north_up(
+        np.array(local.position)
+    )
     np.testing.assert_allclose(fixed.simulate(values / fixed.sizes), local.simulate(x), atol=1e-6)
 
 
@@ -121,13 +135,19 @@ def test_an_epoch_of_two_constellations_from_the_centre_of_the_earth_is_scipys_s
     galileo = np.array(model.index["constellation"]) == "galileo"
 
     def ranges(p):
-        return np.array([flight(s, p[:3]) for s in sky(model)]) + p[3] + np.where(galileo, p[4], 0.0)
+        return (
+            np.array([flight(s, p[:3]) for s in sky(model)]) + p[3] + np.where(galileo, p[4], 0.0)
+        )
 
     z = ranges(truth) + np.random.default_rng(3).normal(size=model.m)
     scale = np.array([1e6, 1e6, 1e6, 1e6, 10.0])
-    theirs = least_squares(lambda p: z - ranges(p), np.array([1e6, 1e6, 1e6, 0, 0]), x_scale=scale, xtol=1e-15).x
+    theirs = least_squares(
+        lambda p: z - ranges(p), np.array([1e6, 1e6, 1e6, 0, 0]), x_scale=scale, xtol=1e-15
+    ).x
     centre = given(model, frame="ecef", position=(0.0, 0.0, 0.0))
-    estimates = GaussNewton(start="nominal").estimate(Problem(centre, Covariance(np.ones(model.m))), z[None])
+    estimates = GaussNewton(start="nominal").estimate(
+        Problem(centre, Covariance(np.ones(model.m))), z[None]
+    )
     assert estimates.status[0] == 0
     assert_agrees((estimates.x * centre.sizes)[0], theirs, atol=1e-3)
     assert np.linalg.norm(theirs[:3] - truth[:3]) < 10.0
@@ -138,8 +158,13 @@ def test_clocks_belong_to_epochs_and_offsets_to_constellations():
     assert [p.name for p in model.parameters[3:]] == ["clock_1", "clock_2", "offset_galileo"]
     moved = model.simulate(model.nominal + np.vstack([np.zeros(6), np.diag(1 / model.sizes)[3:]]))
     difference = np.round(moved[1:] - moved[0], 6)
-    epoch, galileo = np.array(model.index["epoch"]), np.array(model.index["constellation"]) == "galileo"
-    np.testing.assert_array_equal(difference, np.array([epoch == 1, epoch == 2, galileo], dtype=float))
+    epoch, galileo = (
+        np.array(model.index["epoch"]),
+        np.array(model.index["constellation"]) == "galileo",
+    )
+    np.testing.assert_array_equal(
+        difference, np.array([epoch == 1, epoch == 2, galileo], dtype=float)
+    )
     assert [len(rows) for rows in model.epochs] == [10, 10]
 
 
@@ -166,7 +191,9 @@ def test_the_iterated_estimate_is_bancrofts_and_the_truth_where_readings_are_exa
     model = Ranging(rounds=1)
     x = model.nominal + 3.0 * np.random.default_rng(4).normal(size=(20, 4))
     z = model.simulate(x)
-    estimates = Newton(tolerance=1e-9).estimate(Problem(model, Covariance(np.full(model.m, 0.1))), z)
+    estimates = Newton(tolerance=1e-9).estimate(
+        Problem(model, Covariance(np.full(model.m, 0.1))), z
+    )
     assert (estimates.status == 0).all()
     closed = np.stack([bancroft(np.array(model.beacons), ranges) for ranges in z])
     np.testing.assert_allclose(closed, x * model.sizes, atol=1e-6)
@@ -194,7 +221,11 @@ def test_a_satellite_file_brings_its_own_sky(tmp_path):
     write_readings(tmp_path / "g.csv", truth, z)
     found = open_together([tmp_path / "g.csv"], Gnss(earth_rate=0.0))
     assert found.model.m == 6
-    result = fit(Problem(found.model, ModelNoise().of(found.model).covariance(6)), found.z, {"gn": GaussNewton()})[0]
+    result = fit(
+        Problem(found.model, ModelNoise().of(found.model).covariance(6)),
+        found.z,
+        {"gn": GaussNewton()},
+    )[0]
     low, high = result.interval(0.9999)
     assert ((low < p) & (p < high)).all()
     here = np.asarray(truth.position)

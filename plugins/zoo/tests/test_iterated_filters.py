@@ -27,14 +27,19 @@ def test_recursive_steps_are_updates_with_inflated_noise():
     """The textbook loop in covariance form: at each step the gain for R / w_k, linearised at the last estimate."""
     scenario = Scenario(Bent(0.05), Gaussian(0.3), GaussianPrior(), 1.0, seed=2)
     problem, trials = scenario.problem, scenario.draw(0, 4)
-    model, found = problem.measurement, RecursiveUpdate(steps=4, first=2.0).estimate(problem, trials.z)
+    model, found = (
+        problem.measurement,
+        RecursiveUpdate(steps=4, first=2.0).estimate(problem, trials.z),
+    )
     for z, x_found, P_found in zip(trials.z, found.x, found.covariance, strict=True):
         x, P = np.zeros(3), np.eye(3)
         for rows in model.epochs:
             H = model.jacobian(x[None])[0, rows]
             strength = np.linalg.eigvalsh(H @ P @ H.T / 0.09).max()
             ratio = 1 + strength / 2.0
-            for w in np.array([ratio ** (k / 3) for k in range(4)]) / sum(ratio ** (k / 3) for k in range(4)):
+            for w in np.array([ratio ** (k / 3) for k in range(4)]) / sum(
+                ratio ** (k / 3) for k in range(4)
+            ):
                 H = model.jacobian(x[None])[0, rows]
                 K = P @ H.T @ np.linalg.inv(H @ P @ H.T + 0.09 / w * np.eye(len(rows)))
                 x, P = x + K @ (z[rows] - model.simulate(x[None])[0, rows]), P - K @ H @ P
@@ -60,7 +65,9 @@ def test_damped_iterations_end_at_the_maximum_a_posteriori_of_the_epoch():
     problem = Problem(curved, Covariance(np.full(8, 0.2)), d)
     rng = np.random.default_rng(0)
     x = model.nominal + rng.standard_normal((20, 3)) * d
-    z = curved.simulate_until(x, 1)[:, np.argsort(curved.rows(1))] + 0.2 * rng.standard_normal((20, 8))
+    z = curved.simulate_until(x, 1)[:, np.argsort(curved.rows(1))] + 0.2 * rng.standard_normal(
+        (20, 8)
+    )
     found = LMIEKF(tolerance=1e-9, max_iterations=300).estimate(problem, z)
     h = lambda x: curved.simulate_until(x[None], 1)[0]  # noqa: E731
     for x_found, reading in zip(found.x, z, strict=True):
@@ -96,7 +103,11 @@ def test_a_batch_is_its_trials_one_by_one_bit_for_bit(estimator):
     if isinstance(estimator, MultipleShooting):
         check_bits(estimator, Scenario(LotkaVolterra(), Gaussian(0.5)), 3)
     else:
-        check_bits(estimator, Scenario(Gins(readings_per_case=6), Quantization(0.02286), error_scale=100.0), 5)
+        check_bits(
+            estimator,
+            Scenario(Gins(readings_per_case=6), Quantization(0.02286), error_scale=100.0),
+            5,
+        )
 
 
 @pytest.mark.parametrize("estimator", RIVALS[:3], ids=str)

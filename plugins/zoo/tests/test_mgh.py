@@ -84,7 +84,12 @@ def sum_of_squares(model, values):
 
 
 def finite_minima():
-    return [(f, k) for f in PROBLEMS for k, m in enumerate(Mgh(f).minima) if m.x and np.isfinite(m.x).all()]
+    return [
+        (f, k)
+        for f in PROBLEMS
+        for k, m in enumerate(Mgh(f).minima)
+        if m.x and np.isfinite(m.x).all()
+    ]
 
 
 def test_23_functions_have_the_dimensions_of_the_paper():
@@ -122,10 +127,14 @@ def test_minima_are_those_that_the_paper_prints(function):
 def test_a_minimiser_has_its_sum_of_squares_and_no_gradient(function, which):
     model, minimum = Mgh(function), Mgh(function).minima[which]
     x = np.array(minimum.x) / model.sizes
-    assert sum_of_squares(model, minimum.x) == pytest.approx(minimum.sum_of_squares, rel=1e-11, abs=1e-20)
+    assert sum_of_squares(model, minimum.x) == pytest.approx(
+        minimum.sum_of_squares, rel=1e-11, abs=1e-20
+    )
     r, J = model.simulate(x[None])[0], model.jacobian(x[None])[0]
     # Residuals of 1e-12 are round-off, whatever their sign.
-    assert (np.abs(J.T @ r) <= 1e-10 * np.linalg.norm(J, axis=0) * max(np.linalg.norm(r), 1e-2)).all()
+    assert (
+        np.abs(J.T @ r) <= 1e-10 * np.linalg.norm(J, axis=0) * max(np.linalg.norm(r), 1e-2)
+    ).all()
 
 
 @pytest.mark.parametrize("function", PROBLEMS)
@@ -150,7 +159,9 @@ def test_scipy_finds_nothing_lower_beside_the_least_minimum(function):
     "sums of squares where they print zeros",
     1e-28,
 )
-@pytest.mark.parametrize(("function", "zero"), [(f, zero) for f, zeros in ZEROS.items() for zero in zeros])
+@pytest.mark.parametrize(
+    ("function", "zero"), [(f, zero) for f, zeros in ZEROS.items() for zero in zeros]
+)
 def test_every_printed_zero_is_a_solution(function, zero):
     model = Mgh(function)
     agreed(sum_of_squares(model, zero), 1e-28)
@@ -202,7 +213,9 @@ def test_with_as_many_readings_as_parameters_nothing_is_tested_but_a_worse_answe
     model = Mgh("rosenbrock")
     problem = Problem(model, model.recorded.R)
     good, bad = fit(
-        problem, model.recorded.z, {"lm": LevenbergMarquardt(tolerance=1e-9, max_iterations=500), "linear": LinearLSE()}
+        problem,
+        model.recorded.z,
+        {"lm": LevenbergMarquardt(tolerance=1e-9, max_iterations=500), "linear": LinearLSE()},
     )
     assert (good.fits, bad.fits) == (None, False)
     assert np.isnan(good.p_value)

@@ -18,7 +18,11 @@ from ipe_bench.noise import Gaussian
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.trials.scenario import Scenario
 
-MODELS = {"gins": (Gins(), 100.0, 0.0066), "lotka_volterra": (LotkaVolterra(), 1.0, 0.5), "sir": (Sir(), 1.0, 5.0)}
+MODELS = {
+    "gins": (Gins(), 100.0, 0.0066),
+    "lotka_volterra": (LotkaVolterra(), 1.0, 0.5),
+    "sir": (Sir(), 1.0, 5.0),
+}
 
 
 def scenario(name: str) -> Scenario:
@@ -26,7 +30,9 @@ def scenario(name: str) -> Scenario:
     return Scenario(model, Gaussian(deviation), GaussianPrior(), scale, seed=2)
 
 
-@pytest.mark.parametrize("name", [pytest.param("gins", marks=pytest.mark.slow), "lotka_volterra", "sir"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("gins", marks=pytest.mark.slow), "lotka_volterra", "sir"]
+)
 def test_its_minimum_is_that_of_single_shooting(name):
     drawn, problem = scenario(name).draw(0, 4), scenario(name).problem
     found = MultipleShooting(step=0.05).estimate(problem, drawn.z)
@@ -34,7 +40,9 @@ def test_its_minimum_is_that_of_single_shooting(name):
     deviation = np.sqrt(np.diagonal(single.covariance, axis1=1, axis2=2))
     assert (found.status == Status.CONVERGED).all()
     assert np.abs((found.x - single.x) / deviation).max() < 1e-3
-    np.testing.assert_allclose(np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)), deviation, rtol=1e-3)
+    np.testing.assert_allclose(
+        np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)), deviation, rtol=1e-3
+    )
     np.testing.assert_allclose(found.extras["fit_p"], single.extras["fit_p"], rtol=1e-3)
 
 

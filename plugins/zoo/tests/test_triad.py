@@ -53,18 +53,26 @@ def quadric(outputs, field):
 
 
 def estimate(model, z, deviation):
-    estimates = Newton(tolerance=1e-9).estimate(Problem(model, Covariance(np.full(model.m, deviation))), z)
+    estimates = Newton(tolerance=1e-9).estimate(
+        Problem(model, Covariance(np.full(model.m, deviation))), z
+    )
     assert (estimates.status == 0).all()
     p = estimates.x * model.sizes * np.repeat([1.0, 1e-6, 1e-3], 3)
     (xy, xz, yz), (kx, ky, kz) = p[0, 6:], 1.0 + p[0, 3:6]
     return p[0, :3], np.array([[kx, xy, xz], [xy, ky, yz], [xz, yz, kz]])
 
 
-@pytest.mark.oracle("published: calibration in the tests of the PX4 autopilot", "bias, gauss, and scale factors", 0.01)
+@pytest.mark.oracle(
+    "published: calibration in the tests of the PX4 autopilot",
+    "bias, gauss, and scale factors",
+    0.01,
+)
 def test_a_recorded_magnetometer_calibration_gives_the_known_answer():
     # Newton needs a rough centre: the middle of the extremes, as calibrations begin.
     centre = tuple(((RECORDED.max(axis=0) + RECORDED.min(axis=0)) / 2).tolist())
-    model = Triad(outputs=tuple(map(tuple, RECORDED.tolist())), field=0.4, unit="gauss", bias=centre)
+    model = Triad(
+        outputs=tuple(map(tuple, RECORDED.tolist())), field=0.4, unit="gauss", bias=centre
+    )
     b, M = estimate(model, np.full((1, model.m), 0.4), 0.002)
     assert_agrees(b, ANSWER["bias"], atol=0.01)
     # The answer's field is its own estimate, so scale factors are compared by their ratios.
@@ -117,7 +125,13 @@ def model_of(counts, **options):
 
 
 def x_of(model, bias, K, T):
-    values = [*bias, *(1e6 * (np.diag(K) / model.scale - 1.0)), -1e3 * T[0, 1], 1e3 * T[0, 2], -1e3 * T[1, 2]]
+    values = [
+        *bias,
+        *(1e6 * (np.diag(K) / model.scale - 1.0)),
+        -1e3 * T[0, 1],
+        1e3 * T[0, 2],
+        -1e3 * T[1, 2],
+    ]
     return np.array(values) / model.sizes
 
 
@@ -135,7 +149,9 @@ def test_magnitudes_are_those_of_the_matrices_and_of_the_symmetric_form(held):
     S = polar(T @ scale)[1] / 0.0024
     triad = Triad(outputs=tuple(map(tuple, held.tolist())), field=GRAVITY / 0.0024, unit="counts")
     values = np.array([*bias, *(1e6 * (np.diag(S) - 1.0)), *(1e3 * S[[0, 0, 1], [1, 2, 2]])])
-    np.testing.assert_allclose(triad.simulate((values / triad.sizes)[None])[0] * 0.0024, z, rtol=1e-12)
+    np.testing.assert_allclose(
+        triad.simulate((values / triad.sizes)[None])[0] * 0.0024, z, rtol=1e-12
+    )
 
 
 @pytest.mark.oracle("library: SciPy's least_squares", "estimates", 1e-6)
@@ -152,7 +168,12 @@ def test_a_calibration_with_noise_is_scipys(held):
 
     start = np.array([3.2768, 3.2768, 3.2768, 2.4, 2.4, 2.4, 0.0, 0.0, 0.0])
     p = least_squares(residuals, start, xtol=1e-15, ftol=1e-15, gtol=1e-15).x
-    theirs = x_of(model, 1e4 * p[:3], np.diag(1e-3 * p[3:6]), np.array([[1, -p[6], p[7]], [0, 1, -p[8]], [0, 0, 1]]))
+    theirs = x_of(
+        model,
+        1e4 * p[:3],
+        np.diag(1e-3 * p[3:6]),
+        np.array([[1, -p[6], p[7]], [0, 1, -p[8]], [0, 0, 1]]),
+    )
     assert_agrees(estimates.x[0], theirs, atol=1e-6)
     # One count is 2.4e-3 m/s^2, and 35 attitudes average it.
     np.testing.assert_allclose((estimates.x[0] * model.sizes)[:3], BIAS, atol=2.0)

@@ -16,7 +16,10 @@ MISTAKES = [
     (lambda: Accelerometer(counts=FEW), "counts"),
     (lambda: Accelerometer(scale=(0.0, 1.0, 1.0)), "scale"),
     (lambda: Gnss(satellites=HIGH[:3]), "satellites: 3 readings"),
-    (lambda: Gnss(satellites=((2e7, 0.0),) * 9), r"satellites\[0\]=\[2.*, 0\.0\]: give a list of 5"),
+    (
+        lambda: Gnss(satellites=((2e7, 0.0),) * 9),
+        r"satellites\[0\]=\[2.*, 0\.0\]: give a list of 5",
+    ),
     (lambda: Gnss(position=(0.0, 0.0, 0.0)), "position:"),
 ]
 
@@ -28,5 +31,10 @@ def test_mistakes_are_named(make, said):
 
 
 def test_it_goes_with_this_version_of_the_package():
-    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    assert (project["version"], project["dependencies"]) == (__version__, [f"ipe-bench=={__version__}"])
+    project = tomllib.loads(
+        (Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8")
+    )["project"]
+    assert (project["version"], project["dependencies"]) == (
+        __version__,
+        [f"ipe-bench=={__version__}"],
+    )

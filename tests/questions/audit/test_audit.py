@@ -31,7 +31,11 @@ def claims(rng, runs=200, n=4, *, factor=1.0, law="normal", stretched=1.0):
     shape = (runs, n, n)
     names = tuple("abcdefgh"[:n])
     return Claims(
-        names, error, np.broadcast_to(deviation, (runs, n)), np.broadcast_to(correlation, shape), np.arange(runs)
+        names,
+        error,
+        np.broadcast_to(deviation, (runs, n)),
+        np.broadcast_to(correlation, shape),
+        np.arange(runs),
     )
 
 
@@ -72,9 +76,13 @@ def test_a_direction_is_named_as_a_combination_of_reported_deviations():
     rng, C = np.random.default_rng(6), np.array([[1.0, 0.6], [0.6, 1.0]])
     values, vectors = np.linalg.eigh(C)
     error = (rng.standard_normal((2000, 2)) * [3.0, 1.0]) @ ((vectors * values**0.5) @ vectors.T)
-    found = audit(Claims(("a", "b"), error, np.ones_like(error), np.tile(C, (2000, 1, 1)), np.arange(2000)))
+    found = audit(
+        Claims(("a", "b"), error, np.ones_like(error), np.tile(C, (2000, 1, 1)), np.arange(2000))
+    )
     (said,) = [s for s in found.sentences if s.startswith("In the worst direction")]
-    assert float(re.search(r"a - ([\d.]+) b in reported", said)[1]) == pytest.approx(1 / 3, abs=0.05)
+    assert float(re.search(r"a - ([\d.]+) b in reported", said)[1]) == pytest.approx(
+        1 / 3, abs=0.05
+    )
 
 
 def test_heavy_tails_and_bias_are_told_apart_from_scale():
@@ -100,7 +108,12 @@ def frame(runs=50, seed=0):
     rng = np.random.default_rng(seed)
     truth = rng.normal(size=(runs, 2))
     estimate = truth + rng.multivariate_normal([0, 0], [[0.04, 0.03], [0.03, 0.09]], runs)
-    columns = {"x_true": truth[:, 0], "y_true": truth[:, 1], "x": estimate[:, 0], "y": estimate[:, 1]}
+    columns = {
+        "x_true": truth[:, 0],
+        "y_true": truth[:, 1],
+        "x": estimate[:, 0],
+        "y": estimate[:, 1],
+    }
     return pd.DataFrame(columns | {"x_std": 0.2, "y_var": 0.09, "cov_x_y": 0.03})
 
 
@@ -124,7 +137,9 @@ def test_wide_and_long_tables_are_the_same_claims(tmp_path):
 def test_a_file_is_read_to_the_last_digit(tmp_path):
     rng, file = np.random.default_rng(9), tmp_path / "runs.csv"
     error, deviation = rng.standard_normal((2, 1000)) * 10.0 ** rng.integers(-12, 12, (2, 1000))
-    rows = [f"{a!r},{b!r}\n" for a, b in zip(error.tolist(), np.abs(deviation).tolist(), strict=True)]
+    rows = [
+        f"{a!r},{b!r}\n" for a, b in zip(error.tolist(), np.abs(deviation).tolist(), strict=True)
+    ]
     file.write_text("x_error,x_std\n" + "".join(rows))
     found = read_claims(file)
     assert np.array_equal(found.error[:, 0], error)
@@ -151,9 +166,18 @@ def changed(**columns):
         (changed(x_var=0.05), "row 2: x_std and x_var differ"),
         (changed(cov_y_y=[0.09] * 49 + [0.1]), "row 51: y_var and cov_y_y differ"),
         (pd.concat([frame(), frame()[["x_std"]]], axis=1), "column x_std stands there twice"),
-        (changed(x_std=np.inf, y_var=np.inf), "no row has an estimate with finite deviations of x, y"),
-        (pd.DataFrame({"x_error": np.linspace(-1, 1, 50) * 1e-300, "x_std": 0.2}), "errors of x are 0"),
-        (frame(200).drop(columns="cov_x_y").assign(x_std=0.2 * np.pi / 180), "the factor between degrees and radians"),
+        (
+            changed(x_std=np.inf, y_var=np.inf),
+            "no row has an estimate with finite deviations of x, y",
+        ),
+        (
+            pd.DataFrame({"x_error": np.linspace(-1, 1, 50) * 1e-300, "x_std": 0.2}),
+            "errors of x are 0",
+        ),
+        (
+            frame(200).drop(columns="cov_x_y").assign(x_std=0.2 * np.pi / 180),
+            "the factor between degrees and radians",
+        ),
     ],
 )
 def test_wrong_tables_are_refused_in_one_line(table, said):
@@ -168,8 +192,14 @@ def test_wrong_tables_are_refused_in_one_line(table, said):
     [
         ("", "is empty"),
         ("\n \n\n", "is empty"),
-        (";".join(f"p{i}_error;p{i}_std" for i in range(2049)), "has 4,098 columns; give at most 4,096"),
-        ("parameter,run,error,std\n" + "".join(f"p{i},1,1,1\n" for i in range(4097)), "has 4,097 parameters"),
+        (
+            ";".join(f"p{i}_error;p{i}_std" for i in range(2049)),
+            "has 4,098 columns; give at most 4,096",
+        ),
+        (
+            "parameter,run,error,std\n" + "".join(f"p{i},1,1,1\n" for i in range(4097)),
+            "has 4,097 parameters",
+        ),
         ('x_error,x_std\n1,"2\n', "cannot be read as a table"),
     ],
     ids=["nothing", "blank lines", "columns", "parameters", "quotes"],
@@ -193,7 +223,9 @@ def test_a_column_that_a_file_has_twice_is_refused(tmp_path):
     table.to_csv(tmp_path / "runs.csv", index=False)
     with pytest.raises(UserError, match="column x stands there twice"):
         read_claims(tmp_path / "runs.csv")
-    named = pd.DataFrame({"x_error": [0.1, 0.2], "x_std": 1.0, "x.1_error": [0.1, 0.3], "x.1_std": 1.0})
+    named = pd.DataFrame(
+        {"x_error": [0.1, 0.2], "x_std": 1.0, "x.1_error": [0.1, 0.3], "x.1_std": 1.0}
+    )
     named.to_csv(tmp_path / "runs.csv", index=False)
     assert read_claims(tmp_path / "runs.csv").names == ("x", "x.1")
 
@@ -212,7 +244,11 @@ def test_an_infinite_error_is_the_worst_there_is(far, tmp_path):
     assert found.claims.left_out == 0
     table.to_csv(tmp_path / "runs.csv", index=False)
     assert question_command("audit", [str(tmp_path / "runs.csv")]) == 1
-    assert audit(read_claims(table.head(15))).sentences[0].endswith("in 1 of 15 runs: the covariance is too small.")
+    assert (
+        audit(read_claims(table.head(15)))
+        .sentences[0]
+        .endswith("in 1 of 15 runs: the covariance is too small.")
+    )
 
 
 @pytest.mark.parametrize("far", [1e6, 1e11])
@@ -246,7 +282,10 @@ def test_the_farther_of_two_directions_counts_the_other_one():
 def test_tails_of_any_of_eight_parameters_are_found_by_chance_as_often_as_those_of_one():
     """Of eight parameters without covariances one has a p below .1 in .57 of cases."""
     rng, ones = np.random.default_rng(8), np.ones((60, 8))
-    drawn = [Claims(tuple("abcdefgh"), rng.standard_normal((60, 8)), ones, None, np.arange(60)) for _ in range(100)]
+    drawn = [
+        Claims(tuple("abcdefgh"), rng.standard_normal((60, 8)), ones, None, np.arange(60))
+        for _ in range(100)
+    ]
     p = np.array([_tails(one)[0] for one in drawn])
     assert np.mean(p <= 0.1) <= 0.1 + 3 * np.sqrt(0.1 * 0.9 / 100)
 
@@ -264,7 +303,11 @@ def test_sentence_verdict_and_exit_code_say_the_same(tmp_path, capsys):
         wrong = found.verdict in ("too small", "too large")
         assert (f"the covariance is {found.verdict}" in found.sentences[0]) == wrong
         assert wrong == (not found.scale.low <= 1 <= found.scale.high)
-        assert [f.verdict for f in found.each] == [found.verdict] == found.table()["covariance"].tolist()
+        assert (
+            [f.verdict for f in found.each]
+            == [found.verdict]
+            == found.table()["covariance"].tolist()
+        )
         assert question_command("audit", [str(tmp_path / "runs.csv")]) == wrong
         assert found.sentences[0] in " ".join(capsys.readouterr().out.split())
         seen.add(found.verdict)
@@ -275,7 +318,17 @@ def test_sentence_verdict_and_exit_code_say_the_same(tmp_path, capsys):
 
 SIGMA = 0.5
 """Standard deviation of the image points in pixels."""
-POINTS = np.array([[-1, -1, 5], [1, -1, 6], [1, 1, 5], [-1, 1, 7], [0.3, -0.4, 4], [-0.5, 0.2, 6.5], [0.8, 0.1, 5.5]])
+POINTS = np.array(
+    [
+        [-1, -1, 5],
+        [1, -1, 6],
+        [1, 1, 5],
+        [-1, 1, 7],
+        [0.3, -0.4, 4],
+        [-0.5, 0.2, 6.5],
+        [0.8, 0.1, 5.5],
+    ]
+)
 CENTRES = np.array([[-1.0, 0.0, 0.0], [1.0, 0.2, 0.0]])
 KNOWN = 3
 """Control points, which fix where the scene stands, how it is turned, and its size."""
@@ -291,7 +344,10 @@ def bundle_adjustments(runs: int, assumed: float, seed: int) -> pd.DataFrame:
     def images(x: np.ndarray) -> np.ndarray:
         turned = Rotation.from_rotvec(x[:6].reshape(2, 3))
         points = np.vstack([POINTS[:KNOWN], x[12:].reshape(-1, 3)])
-        seen = [one.apply(points - centre) for one, centre in zip(turned, x[6:12].reshape(2, 3), strict=True)]
+        seen = [
+            one.apply(points - centre)
+            for one, centre in zip(turned, x[6:12].reshape(2, 3), strict=True)
+        ]
         return np.concatenate([(500 * p[:, :2] / p[:, 2:]).ravel() for p in seen])
 
     truth = np.concatenate([np.zeros(6), CENTRES.ravel(), POINTS[KNOWN:].ravel()])
@@ -301,7 +357,10 @@ def bundle_adjustments(runs: int, assumed: float, seed: int) -> pd.DataFrame:
         found = least_squares(lambda x, z=z: (images(x) - z) / assumed, truth, method="lm")
         P = np.linalg.inv(found.jac.T @ found.jac)
         row = {f"r{a}_error": found.x[i] for i, a in enumerate("xyz")}
-        rows.append(row | {f"cov_r{a}_r{b}": P[i, j] for i, a in enumerate("xyz") for j, b in enumerate("xyz")})
+        rows.append(
+            row
+            | {f"cov_r{a}_r{b}": P[i, j] for i, a in enumerate("xyz") for j, b in enumerate("xyz")}
+        )
     return pd.DataFrame(rows)
 
 

@@ -19,7 +19,18 @@ ERROR = 0.1
 """The bound's deviation in the synthetic stores."""
 
 
-def store(folder, *, seed=0, factor=1.0, trials=200, label="it", draws=0, estimator=None, fails=0, **scenario):
+def store(
+    folder,
+    *,
+    seed=0,
+    factor=1.0,
+    trials=200,
+    label="it",
+    draws=0,
+    estimator=None,
+    fails=0,
+    **scenario,
+):
     """A folder in which one estimator errs by `factor` times the bound, and fails in the first `fails` trials."""
     filled = Synthetic(folder)
     error = factor * ERROR * np.random.default_rng(draws).standard_normal((trials, 3))
@@ -76,7 +87,9 @@ def test_other_seeds_are_matched_in_their_order_and_it_is_said(tmp_path, capsys)
     assert (frame["matched_by"] == "order").all()
     assert (frame["trials"] == 150).all()
     assert main(["compare", str(a), str(b)]) == 0
-    assert "150 trials of other seeds, matched in their order" in " ".join(capsys.readouterr().out.split())
+    assert "150 trials of other seeds, matched in their order" in " ".join(
+        capsys.readouterr().out.split()
+    )
 
 
 def test_failures_are_found_worse_and_the_exit_code_says_so(tmp_path, capsys):
@@ -151,7 +164,9 @@ def test_judging_by_evidence(tmp_path):
     enough for one question only."""
     a = store(tmp_path / "a")
     rows = [
-        ib.compare(a, store(tmp_path / f"{k}", fails=k), anytime=True).set_index("quantity").loc["success"]
+        ib.compare(a, store(tmp_path / f"{k}", fails=k), anytime=True)
+        .set_index("quantity")
+        .loc["success"]
         for k in (8, 9, 20)
     ]
     assert 20 < rows[0]["e"] < 60 <= rows[1]["e"] < rows[2]["e"]
@@ -162,7 +177,10 @@ def test_costs_are_judged_by_their_means_alone(tmp_path):
     """Cheaper in 90 % of 400 trials and so much dearer in the others that the mean ratio is 1.01: neither the p nor
     evidence finds the second worse, as a test of signs would find it better."""
     folders = []
-    for name, costs in (("a", np.full(400, 100.0)), ("b", np.where(np.arange(400) % 10 > 0, 50.0, 560.0))):
+    for name, costs in (
+        ("a", np.full(400, 100.0)),
+        ("b", np.where(np.arange(400) % 10 > 0, 50.0, 560.0)),
+    ):
         filled = Synthetic(tmp_path / name)
         error = ERROR * np.random.default_rng(0).standard_normal((400, 3))
         filled.add(filled.scenario(), "it", error, simulations=costs)
@@ -194,11 +212,23 @@ def level(nees: float):
         ({}, {}, {}),
         ({}, {"deviation": ERROR * np.sqrt(0.9)}, {"honesty": "worse"}),
         ({}, {"deviation": ERROR * np.sqrt(0.97)}, {}),
-        ({"deviation": ERROR * np.sqrt(2)}, {"deviation": ERROR / np.sqrt(1.02)}, {"honesty": "better"}),
-        ({"deviation": ERROR / np.sqrt(1.02)}, {"deviation": ERROR * np.sqrt(2)}, {"honesty": "worse"}),
+        (
+            {"deviation": ERROR * np.sqrt(2)},
+            {"deviation": ERROR / np.sqrt(1.02)},
+            {"honesty": "better"},
+        ),
+        (
+            {"deviation": ERROR / np.sqrt(1.02)},
+            {"deviation": ERROR * np.sqrt(2)},
+            {"honesty": "worse"},
+        ),
         ({"deviation": ERROR * np.sqrt(2)}, {"deviation": ERROR / np.sqrt(2)}, {}),
         # 0.96 is 1 within chance: 1.08 is farther from 1, though hardly farther than 0.96.
-        ({"error": level(0.96)}, {"error": level(0.96), "deviation": ERROR / np.sqrt(1.12)}, {"honesty": "worse"}),
+        (
+            {"error": level(0.96)},
+            {"error": level(0.96), "deviation": ERROR / np.sqrt(1.12)},
+            {"honesty": "worse"},
+        ),
         ({}, {"deviation": np.nan}, {"honesty": "worse"}),
         ({"deviation": np.nan}, {}, {}),
         ({}, {"status": "max_iterations"}, {"honesty": "worse"}),
@@ -211,7 +241,11 @@ def level(nees: float):
         ({}, {"error": lambda e: 1.05 * e, "deviation": 1.05 * ERROR}, {"error": "worse"}),
         ({}, {"simulations": 6.0}, {"cost": "worse"}),
         ({}, {"simulations": 5.2}, {}),
-        ({}, {"error": shifted(1e3, 20)}, {"success": "worse", "error": "worse", "honesty": "worse"}),
+        (
+            {},
+            {"error": shifted(1e3, 20)},
+            {"success": "worse", "error": "worse", "honesty": "worse"},
+        ),
         ({}, {"error": shifted(1e3, 125)}, {}),
     ],
 )
@@ -229,7 +263,9 @@ def test_what_matters_is_found_and_nothing_else(tmp_path, first, second, expecte
 def test_an_interval_that_holds_what_is_right_is_not_worse(tmp_path):
     """A bias of 0.4 that becomes -0.05 in all of 60 trials: for what may be unseen, the change is -1.1 to 0.2."""
     first, second = (lambda e, by=by: e - e.mean(axis=0) + [0.0, by, 0.0] for by in (0.4, -0.05))
-    row = changed(tmp_path, {"error": first}, {"error": second}, trials=60, fail_on=("bias",)).loc["bias of b"]
+    row = changed(tmp_path, {"error": first}, {"error": second}, trials=60, fail_on=("bias",)).loc[
+        "bias of b"
+    ]
     assert row["p"] < 0.001
     assert row["low"] < -0.9 < 0.1 < row["high"]
     assert row["finding"] == ""
@@ -239,7 +275,9 @@ def test_honesty_and_bias_are_those_of_the_definition(tmp_path):
     """Mean of the squared errors over the claimed variances, by n, of trials that converge in both; mean error."""
     e = np.random.default_rng(0).standard_normal((1000, 3))
     status = np.where(np.arange(1000) < 100, "diverged", "converged").astype(object)
-    rows = changed(tmp_path, {}, {"error": shifted(0.2), "status": status}, fail_on=("honesty", "bias"))
+    rows = changed(
+        tmp_path, {}, {"error": shifted(0.2), "status": status}, fail_on=("honesty", "bias")
+    )
     assert rows.loc["honesty", "first_value"] == pytest.approx((e[100:] ** 2).mean())
     assert rows.loc["bias of b", "first_value"] == pytest.approx(e[:, 1].mean())
     assert rows.loc["bias of b", "change"] == pytest.approx(0.2)
@@ -257,9 +295,17 @@ def test_what_no_common_trial_shows_is_a_dash(tmp_path, capsys):
 def test_only_what_is_asked_for_is_tested_and_changes_a_p(tmp_path):
     """Four failures of one alone: McNemar's p of 1/8, multiplied by the number of questions; three without fail_on."""
     a, b = store(tmp_path / "a"), store(tmp_path / "b", fails=4)
-    asked = (None, ["success"], ["success", "honesty"], ["success", "bias"], ["cost", "success", "error"])
+    asked = (
+        None,
+        ["success"],
+        ["success", "honesty"],
+        ["success", "bias"],
+        ["cost", "success", "error"],
+    )
     frames = [ib.compare(a, b, fail_on=fail_on).set_index("quantity") for fail_on in asked]
-    assert [frame.loc["success", "p"] for frame in frames] == pytest.approx([3 / 8, 1 / 8, 2 / 8, 4 / 8, 3 / 8])
+    assert [frame.loc["success", "p"] for frame in frames] == pytest.approx(
+        [3 / 8, 1 / 8, 2 / 8, 4 / 8, 3 / 8]
+    )
     assert [frame["p"].notna().sum() for frame in frames] == [3, 1, 2, 4, 3]
     assert frames[0].index.tolist() == ["success", "error", "cost", "time"]
 
@@ -267,8 +313,14 @@ def test_only_what_is_asked_for_is_tested_and_changes_a_p(tmp_path):
 def test_margins_are_for_the_user_to_say(tmp_path, capsys):
     a, b = store(tmp_path / "a", trials=1000), store(tmp_path / "b", trials=1000, factor=1.05)
     words = ["compare", str(a), str(b)]
-    assert [main([*words, *more]) for more in ([], ["margin.error=0.05"], ["margin.error=0"])] == [1, 0, 1]
-    assert "by more than a margin: success 0.01, error 0.05" in " ".join(capsys.readouterr().out.split())
+    assert [main([*words, *more]) for more in ([], ["margin.error=0.05"], ["margin.error=0"])] == [
+        1,
+        0,
+        1,
+    ]
+    assert "by more than a margin: success 0.01, error 0.05" in " ".join(
+        capsys.readouterr().out.split()
+    )
 
 
 def test_what_is_gone_is_named_where_completeness_is_asked_for(tmp_path, capsys):
@@ -285,7 +337,11 @@ def test_what_is_gone_is_named_where_completeness_is_asked_for(tmp_path, capsys)
     assert main(words) == 0
     assert "gone:" not in capsys.readouterr().err
     assert main([*words, "complete=true"]) == 1
-    lines = [line.removeprefix("ipe-bench: gone: ") for line in capsys.readouterr().err.splitlines() if "gone:" in line]
+    lines = [
+        line.removeprefix("ipe-bench: gone: ")
+        for line in capsys.readouterr().err.splitlines()
+        if "gone:" in line
+    ]
     at = [(line.split(",")[0], line.split(": ")[1]) for line in lines]
     assert sorted(at) == [
         ("half", "the second has 100 of its 200 trials"),
@@ -350,7 +406,9 @@ def test_the_table_fits_80_columns_and_files_are_written(tmp_path, capsys, monke
     lines = capsys.readouterr().out.splitlines()
     table = lines[next(i for i, line in enumerate(lines) if "second is" in line) :][:6]
     assert max(len(line.rstrip()) for line in table) <= 80
-    assert {p.name for p in (tmp_path / "out").iterdir()} == {f"comparison.{kind}" for kind in ("csv", "html", "png")}
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {
+        f"comparison.{kind}" for kind in ("csv", "html", "png")
+    }
     written = pd.read_csv(tmp_path / "out" / "comparison.csv")
     assert written["quantity"].tolist() == ["success", "error", "cost", "time"]
 
@@ -359,8 +417,17 @@ def test_the_table_fits_80_columns_and_files_are_written(tmp_path, capsys, monke
 def test_newton_is_better_than_fixed_point_at_scale_100_and_costs_less(tmp_path):
     """Its coarse Jacobians cost less than the many iterations of the other's last few trials."""
     bench = ib.Scenario(ib.measurements.Gins(), ib.noise.Quantization(), error_scale=100.0)
-    ib.run(bench, {"fixed_point": ib.solvers.FixedPoint(), "newton": ib.solvers.Newton()}, 600, output=tmp_path)
-    none = {"success": 0.0, "error": 0.0, "cost": 0.0}  # the differences are sure, and some smaller than the margins
+    ib.run(
+        bench,
+        {"fixed_point": ib.solvers.FixedPoint(), "newton": ib.solvers.Newton()},
+        600,
+        output=tmp_path,
+    )
+    none = {
+        "success": 0.0,
+        "error": 0.0,
+        "cost": 0.0,
+    }  # the differences are sure, and some smaller than the margins
     frame = ib.compare(tmp_path, first="fixed_point", second="newton", margins=none)
     assert findings(frame) == {"success": "better", "error": "better", "cost": "better", "time": ""}
     assert not frame.attrs["worse"]
@@ -380,7 +447,12 @@ def test_equal_folders_of_other_seeds_are_found_different_as_rarely_as_stated(tm
             error = ERROR * rng.standard_normal((100, 3))
             failed = rng.uniform(size=100) < 0.1
             error[failed] = 1e3
-            filled.add(filled.scenario(seed=seed), "it", error, simulations=rng.integers(4, 9, 100).astype(float))
+            filled.add(
+                filled.scenario(seed=seed),
+                "it",
+                error,
+                simulations=rng.integers(4, 9, 100).astype(float),
+            )
             folders.append(filled.directory)
         for anytime in alarms:
             alarms[anytime] += any(findings(ib.compare(*folders, anytime=anytime)).values())
@@ -399,10 +471,17 @@ def test_a_pilot_says_how_many_trials_a_difference_takes(tmp_path, capsys):
     assert rows.loc["success", "discordant"] == 15
     assert rows.loc["success", "discordant_high"] == pytest.approx(high)
     assert rows["trials_needed"].isna().tolist() == [False, True, True, True]
-    drawn = np.random.default_rng(0).multinomial(needed, [(high - 0.05) / 2, (high + 0.05) / 2, 1 - high], 5000)
+    drawn = np.random.default_rng(0).multinomial(
+        needed, [(high - 0.05) / 2, (high + 0.05) / 2, 1 - high], 5000
+    )
     p = 2 * binom.cdf(drawn[:, :2].min(axis=1), drawn[:, :2].sum(axis=1), 0.5)
     assert np.mean(3 * p < 0.05) == pytest.approx(0.9, abs=0.02)
-    assert main(["compare", str(a), str(b), "power=0.9", "difference=0.05", f"output={tmp_path / 'c'}"]) == 1
+    assert (
+        main(
+            ["compare", str(a), str(b), "power=0.9", "difference=0.05", f"output={tmp_path / 'c'}"]
+        )
+        == 1
+    )
     said = " ".join(capsys.readouterr().out.split())
     assert f"{needed} trials find a difference of 5 % in success with a probability of 90 %" in said
     assert pd.read_csv(tmp_path / "c" / "comparison.csv")["trials_needed"][0] == needed
@@ -416,7 +495,10 @@ def test_a_pilot_says_how_many_trials_a_difference_takes(tmp_path, capsys):
         (["power=0.9"], "difference: is not given; both go together"),
         (["power=0.9", "difference=0.05", "anytime=true"], "leave out anytime"),
         (["power=0.9", "difference=0.00001"], "needs more than 10,000,000 trials"),
-        (["power=0.9", "difference=0.05"], "19 common trials are too few to plan from; run at least 20"),
+        (
+            ["power=0.9", "difference=0.05"],
+            "19 common trials are too few to plan from; run at least 20",
+        ),
     ],
 )
 def test_what_cannot_be_planned_is_refused_in_a_line(tmp_path, capsys, wrong, said):
@@ -428,7 +510,9 @@ def test_what_cannot_be_planned_is_refused_in_a_line(tmp_path, capsys, wrong, sa
     assert error.count("\n") == 1
 
 
-def test_a_guard_runs_the_estimators_in_plugins_and_fails_where_the_workflow_says(tmp_path, monkeypatch, capsys):
+def test_a_guard_runs_the_estimators_in_plugins_and_fails_where_the_workflow_says(
+    tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     discovery.sources.cache_clear()
     assert main(["new", "ci"]) == 2
@@ -436,7 +520,9 @@ def test_a_guard_runs_the_estimators_in_plugins_and_fails_where_the_workflow_say
     assert main(["new", "baseline", "guarded_fit"]) == 0
     discovery.sources.cache_clear()
     assert main(["new", "ci"]) == 0
-    steps = yaml.safe_load(Path(".github/workflows/estimator.yml").read_text())["jobs"]["compare"]["steps"]
+    steps = yaml.safe_load(Path(".github/workflows/estimator.yml").read_text())["jobs"]["compare"][
+        "steps"
+    ]
     assert f"pip install ipe-bench=={ib.__version__}" in steps[3]["run"]
     assert "estimator-change" in steps[4]["continue-on-error"]
     run = ["run", "--config-dir", "ci", "+experiment=guard", "figures=none", "trials=20"]

@@ -8,7 +8,13 @@ from scipy.optimize import minimize_scalar
 from scipy.stats import beta, chi, norm
 from shared.oracles import assert_agrees
 
-from ipe_bench.questions.compare.effects import fair_coin, mean_effect, no_lean, ratio_effect, success_effect
+from ipe_bench.questions.compare.effects import (
+    fair_coin,
+    mean_effect,
+    no_lean,
+    ratio_effect,
+    success_effect,
+)
 
 
 def successes(both: int, only_first: int, only_second: int, neither: int):
@@ -67,7 +73,9 @@ def test_a_few_trials_that_differ_are_no_finding_however_far():
 
 def test_sure_differences_have_a_p_beyond_the_number_of_signs():
     """Hoeffding's bound: 2 exp(-n / 2) for n equal differences."""
-    assert ratio_effect(np.full(200, 3.0), np.full(200, 4.0)).p == pytest.approx(2 * np.exp(-100.0), abs=0)
+    assert ratio_effect(np.full(200, 3.0), np.full(200, 4.0)).p == pytest.approx(
+        2 * np.exp(-100.0), abs=0
+    )
 
 
 @pytest.mark.parametrize("trials", [1, 2, 3, 5])
@@ -93,7 +101,9 @@ def rarely_worse(q: float, trials: int, studies: int) -> tuple[float, float]:
 
 
 RARE = [(0.02, 20), (0.02, 50), (0.01, 100), (0.01, 200), (0.05, 100), (0.05, 200), (0.1, 200)]
-STUDIES = [(*case, 40) for case in RARE[:4]] + [pytest.param(*case, 1000, marks=pytest.mark.campaign) for case in RARE]
+STUDIES = [(*case, 40) for case in RARE[:4]] + [
+    pytest.param(*case, 1000, marks=pytest.mark.campaign) for case in RARE
+]
 
 
 @pytest.mark.parametrize(("q", "trials", "studies"), STUDIES)
@@ -188,8 +198,12 @@ def test_the_ends_of_an_interval_of_success_have_the_score_of_the_quantile(count
             return -float(np.array([losses, gains, trials - losses - gains]) @ np.log(shares))
 
         bounds = (max(0.0, -difference) + 1e-12, (1 - difference) / 2 - 1e-12)
-        lost = minimize_scalar(unlikely, bounds=bounds, method="bounded", options={"xatol": 1e-12}).x
-        return (gains - losses - trials * difference) / np.sqrt(trials * (2 * lost + difference - difference**2))
+        lost = minimize_scalar(
+            unlikely, bounds=bounds, method="bounded", options={"xatol": 1e-12}
+        ).x
+        return (gains - losses - trials * difference) / np.sqrt(
+            trials * (2 * lost + difference - difference**2)
+        )
 
     for end, side in ((effect.low, 1), (effect.high, -1)):
         if end != 0:

@@ -7,7 +7,14 @@ from shared.oracles import assert_agrees
 
 from ipe_bench.questions.compare.effects import PowerPlan, mcnemar_power, trials_needed
 
-CASES = [(0.9, 0.95, 0.0), (0.9, 0.95, 0.6), (0.5, 0.6, 0.0), (0.5, 0.6, 0.7), (0.97, 1.0, 0.0), (0.73, 0.67, 0.3)]
+CASES = [
+    (0.9, 0.95, 0.0),
+    (0.9, 0.95, 0.6),
+    (0.5, 0.6, 0.0),
+    (0.5, 0.6, 0.7),
+    (0.97, 1.0, 0.0),
+    (0.73, 0.67, 0.3),
+]
 """Success of the first and of the second, and the correlation of both."""
 
 
@@ -36,7 +43,9 @@ def test_the_power_is_that_of_simulated_tests(case, alpha):
 def test_where_only_the_second_wins_six_wins_are_significant():
     """2 / 2^6 < .05 <= 2 / 2^5: the power is that of six discordant trials or more."""
     for trials in (20, 100, 500):
-        assert_agrees(mcnemar_power(trials, 0.05, 0.05, 0.05), binom.sf(5, trials, 0.05), atol=1e-12)
+        assert_agrees(
+            mcnemar_power(trials, 0.05, 0.05, 0.05), binom.sf(5, trials, 0.05), atol=1e-12
+        )
 
 
 @pytest.mark.parametrize(("share", "difference"), [(0.3, 0.1), (1.0, 0.4), (0.06, 0.05)])
@@ -47,7 +56,9 @@ def test_the_plan_is_the_least_from_which_on_the_power_stays(share, difference):
     assert power[0] < 0.9 <= min(power[1:])
 
 
-@pytest.mark.parametrize("case", [(0.9, 0.95, 0.3), pytest.param((0.5, 0.6, 0.7), marks=pytest.mark.slow)], ids=str)
+@pytest.mark.parametrize(
+    "case", [(0.9, 0.95, 0.3), pytest.param((0.5, 0.6, 0.7), marks=pytest.mark.slow)], ids=str
+)
 def test_plans_of_small_pilots_have_the_power_on_average(case):
     """Of 25 trials each: by the upper limit of the discordant share, and not by the share that the pilot shows."""
     p = outcomes(*case)

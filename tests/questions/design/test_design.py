@@ -61,10 +61,15 @@ class Curve(Measurement):
 
     @property
     def index(self):
-        return {"time": [t for t in self.times for _ in range(self.repeats)], "repeat": [*range(self.repeats)] * 21}
+        return {
+            "time": [t for t in self.times for _ in range(self.repeats)],
+            "repeat": [*range(self.repeats)] * 21,
+        }
 
     def simulate(self, x: Array) -> Array:
-        return np.matmul(np.vander(self.index["time"], self.degree + 1, increasing=True), x[..., None])[..., 0]
+        return np.matmul(
+            np.vander(self.index["time"], self.degree + 1, increasing=True), x[..., None]
+        )[..., 0]
 
 
 def scenario(model: Measurement, noise=None, scale: float = 1.0) -> ib.Scenario:
@@ -91,9 +96,13 @@ def test_the_choice_is_near_that_of_brute_force(criterion, seed):
     (way,) = design(scenario(model), criterion=criterion).ways
     assert way.sharpest.mean_bound == pytest.approx(every[way.sharpest.rows])
     assert (1 - 1e-9) * min(every.values()) <= way.sharpest.mean_bound <= 1.25 * min(every.values())
-    assert way.sharpest.mean_bound <= 1 + 1e-12  # that of today's readings, which may be the best, up to round-off
+    assert (
+        way.sharpest.mean_bound <= 1 + 1e-12
+    )  # that of today's readings, which may be the best, up to round-off
     if way.saving:
-        assert way.saving.readings <= min(len(rows) for rows, bound in every.items() if bound <= 1) + 1
+        assert (
+            way.saving.readings <= min(len(rows) for rows, bound in every.items() if bound <= 1) + 1
+        )
 
 
 @pytest.mark.oracle(
@@ -101,18 +110,24 @@ def test_the_choice_is_near_that_of_brute_force(criterion, seed):
     "times of readings, on a grid of 0.1",
     0.06,
 )
-@pytest.mark.parametrize(("degree", "best"), [(2, (-1.0, 0.0, 1.0)), (3, (-1.0, -(5**-0.5), 5**-0.5, 1.0))])
+@pytest.mark.parametrize(
+    ("degree", "best"), [(2, (-1.0, 0.0, 1.0)), (3, (-1.0, -(5**-0.5), 5**-0.5, 1.0))]
+)
 def test_polynomials_are_best_read_where_theory_says(degree, best):
     """The D-optimal points of degree p are the ends and the zeros of P_p', equally often (Smith, Biometrika 12, 1918;
     Guest, Ann. Math. Stat. 29, 1958); the grid has 0.4 and 0.5 about 1/sqrt(5)."""
-    (way,) = design(scenario(Curve(degree)), by=["time", "repeat"], readings=4 * len(best), criterion="D").ways
+    (way,) = design(
+        scenario(Curve(degree)), by=["time", "repeat"], readings=4 * len(best), criterion="D"
+    ).ways
     entries = np.array([way.units.entries[u][0] for u in way.sharpest.taken])
     apart = np.abs(entries[:, None] - np.array(best))
     agreed(apart.min(axis=1), 0.06)
     assert np.bincount(apart.argmin(axis=1)).tolist() == [4] * len(best)
 
 
-@pytest.mark.oracle("own second implementation: inverse of the normal matrix", "bounds and correlations", 1e-7)
+@pytest.mark.oracle(
+    "own second implementation: inverse of the normal matrix", "bounds and correlations", 1e-7
+)
 def test_bounds_and_correlations_are_those_of_the_covariance():
     model = Linear(count=9)
     R = Covariance(np.full(9, 0.1))
@@ -125,7 +140,9 @@ def test_bounds_and_correlations_are_those_of_the_covariance():
     for i in range(3):
         others = np.delete(e, i, axis=1)
         fitted = others @ np.linalg.lstsq(others, e[:, i])[0]
-        assert np.corrcoef(fitted, e[:, i])[0, 1] == pytest.approx(seen.multiple_correlation[i], abs=0.01)
+        assert np.corrcoef(fitted, e[:, i])[0, 1] == pytest.approx(
+            seen.multiple_correlation[i], abs=0.01
+        )
     scatter = e @ seen.least_observable
     assert scatter.std() == pytest.approx(np.sqrt(np.linalg.eigvalsh(P)[-1]), rel=0.01)
 
@@ -188,7 +205,9 @@ def test_what_the_parameters_imitate_is_found_with_what_it_does():
 
 
 def test_the_tilt_that_looks_like_a_bias_is_named_before_anything_is_measured():
-    found = design(scenario(Gins(), NOISE, 33.0), errors=[RicherGins(platform_misalignment=5.0)], truths=5)
+    found = design(
+        scenario(Gins(), NOISE, 33.0), errors=[RicherGins(platform_misalignment=5.0)], truths=5
+    )
     first, second, _ = found.suspects
     assert {first.name, second.name} == {"tilt x", "tilt y"}
     tilts = {s.name: s for s in found.suspects}
@@ -213,7 +232,9 @@ def test_fewer_readings_at_better_times_are_worth_more(gins):
     model = gins.measurement(way.saving)
     assert (model.n, model.m) == (11, way.saving.readings)
     x = 33.0 * np.random.default_rng(0).normal(size=(2, 11))
-    np.testing.assert_allclose(model.simulate(x), gins.candidates.simulate(x)[:, list(way.saving.rows)], atol=1e-9)
+    np.testing.assert_allclose(
+        model.simulate(x), gins.candidates.simulate(x)[:, list(way.saving.rows)], atol=1e-9
+    )
 
 
 @pytest.mark.slow
@@ -223,7 +244,9 @@ def test_gauss_newton_reaches_the_bound_of_the_designed_model(gins):
     for choice in (way.saving, way.sharpest):
         ratio = []
         for model in (gins.measurement(choice), Gins()):
-            table = ib.run(scenario(model, NOISE, 33.0), {"gn": ib.baselines.GaussNewton()}, trials=400)
+            table = ib.run(
+                scenario(model, NOISE, 33.0), {"gn": ib.baselines.GaussNewton()}, trials=400
+            )
             rows = table[table["parameter"] != "all"]
             assert (rows["solved"] == 1).all()
             ratio.append(rows["rmse"].to_numpy())
@@ -247,7 +270,9 @@ def test_mistakes_are_one_line():
 
 def test_fewer_readings_than_the_smallest_choice_has_are_refused():
     """Rounds have seven readings each."""
-    with pytest.raises(ib.UserError, match="readings=5: no choice by round of so few determines all parameters"):
+    with pytest.raises(
+        ib.UserError, match="readings=5: no choice by round of so few determines all parameters"
+    ):
         ib.design(scenario(ib.measurements.Ranging()), by=["round"], readings=5)
     (way,) = ib.design(scenario(ib.measurements.Ranging()), by=["round"], readings=7).ways
     assert way.sharpest.readings == 7

@@ -14,7 +14,13 @@ from ipe_bench.estimators.base import Estimates
 from ipe_bench.measurements import Gins
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.questions.posterior.answer import honest_word
-from ipe_bench.questions.posterior.maths import Divergence, Posterior, divergence, reference, sample_posterior
+from ipe_bench.questions.posterior.maths import (
+    Divergence,
+    Posterior,
+    divergence,
+    reference,
+    sample_posterior,
+)
 
 PRIOR = np.array([1.0, 0.5, 2.0])
 
@@ -24,7 +30,9 @@ def exact(problem: Problem, z: Array) -> tuple[Array, Array, float]:
     A, R, D = problem.measurement.A, problem.R.matrix(), np.diag(problem.prior_deviation**2)
     P = np.linalg.inv(A.T @ np.linalg.inv(R) @ A + np.linalg.inv(D))
     whole = R + A @ D @ A.T
-    evidence = -0.5 * (z @ np.linalg.inv(whole) @ z + np.linalg.slogdet(whole)[1] - np.linalg.slogdet(R)[1])
+    evidence = -0.5 * (
+        z @ np.linalg.inv(whole) @ z + np.linalg.slogdet(whole)[1] - np.linalg.slogdet(R)[1]
+    )
     return P @ A.T @ np.linalg.inv(R) @ z, P, evidence
 
 
@@ -38,11 +46,15 @@ def held(found: Posterior, x: Array, P: Array | None) -> Divergence:
 def linear(request):
     problem = Problem(Bent(), Covariance(np.full(12, request.param)), PRIOR)
     rng = np.random.default_rng(0)
-    z = problem.measurement.simulate(PRIOR * rng.normal(size=(1, 3)))[0] + request.param * rng.normal(size=12)
+    z = problem.measurement.simulate(PRIOR * rng.normal(size=(1, 3)))[
+        0
+    ] + request.param * rng.normal(size=12)
     return problem, z, sample_posterior(problem, z, particles=2000)
 
 
-@pytest.mark.oracle("closed form: posterior of a linear model", "mean of 2000 draws, in standard deviations", 0.08)
+@pytest.mark.oracle(
+    "closed form: posterior of a linear model", "mean of 2000 draws, in standard deviations", 0.08
+)
 def test_on_a_linear_model_it_is_the_closed_form(linear):
     problem, z, found = linear
     mean, P, evidence = exact(problem, z)
@@ -50,7 +62,9 @@ def test_on_a_linear_model_it_is_the_closed_form(linear):
     agreed(np.abs((found.mean - mean) / deviation), 0.08)
     np.testing.assert_allclose(found.deviation, deviation, rtol=0.06)
     np.testing.assert_allclose(
-        found.covariance / np.outer(deviation, deviation), P / np.outer(deviation, deviation), atol=0.1
+        found.covariance / np.outer(deviation, deviation),
+        P / np.outer(deviation, deviation),
+        atol=0.1,
     )
     assert found.settled
     # Two populations of 1000 draws know a mean to 1 / sqrt(1000) or worse, as their draws depend on each other.
@@ -87,7 +101,9 @@ def square(tilt: float = 0.0) -> Written:
     return Written(lambda x: (x**2, tilt * x))
 
 
-@pytest.mark.oracle("own second implementation: integration on a grid", "share of one of two modes", 0.08)
+@pytest.mark.oracle(
+    "own second implementation: integration on a grid", "share of one of two modes", 0.08
+)
 @pytest.mark.parametrize("tilt", [0.0, 0.01])
 def test_two_modes_are_found_with_their_weights(tilt):
     """Beside integration on a grid."""
@@ -96,7 +112,10 @@ def test_two_modes_are_found_with_their_weights(tilt):
     z = model.simulate(np.array([[1.5]]))[0]
     found = sample_posterior(problem, z, particles=4000)
     grid = np.linspace(-4, 4, 40_001)
-    log = -0.5 * np.sum(((z - model.simulate(grid[:, None])) / 0.05) ** 2, axis=1) - 0.5 * (grid / 2) ** 2
+    log = (
+        -0.5 * np.sum(((z - model.simulate(grid[:, None])) / 0.05) ** 2, axis=1)
+        - 0.5 * (grid / 2) ** 2
+    )
     weight = np.exp(log - log.max())
     right = weight[grid > 0].sum() / weight.sum()
     assert_agrees(np.mean(found.x > 0), right, atol=0.08)
@@ -122,7 +141,9 @@ def test_one_gaussian_cannot_stand_for_two_modes():
 
 def test_the_same_trial_gives_the_same_draws(linear):
     problem, z, _ = linear
-    first, second, other = (sample_posterior(problem, z, particles=100, seed=seed) for seed in (1, 1, 2))
+    first, second, other = (
+        sample_posterior(problem, z, particles=100, seed=seed) for seed in (1, 1, 2)
+    )
     assert (first.x == second.x).all()
     assert not np.array_equal(first.x, other.x)
 
@@ -151,4 +172,6 @@ def test_on_gins_gauss_newton_knows_and_the_ekf_does_not():
     np.testing.assert_allclose(found.posterior.deviation, np.sqrt(np.diag(P[0])), rtol=0.15)
     assert found.divergences["gn"].kl < 0.3
     assert found.divergences["ekf"].kl > 50
-    assert found.divergences["ekf"].width == pytest.approx(1.0, abs=0.15)  # as sure as if it were right
+    assert found.divergences["ekf"].width == pytest.approx(
+        1.0, abs=0.15
+    )  # as sure as if it were right

@@ -22,7 +22,9 @@ def draw(view: View) -> Iterator[Drawing]:
     # An end that is not known is not drawn; neither is one of a trial that cost nothing.
     known = np.isfinite(rows["deadline_high"]) & (rows["deadline_low"] > 0)
     low, high = rows["deadline_low"].where(known), rows["deadline_high"].where(known)
-    rows = rows.assign(low=low, high=high, tail=rows["deadline"] / rows["cost_median"].clip(lower=1))
+    rows = rows.assign(
+        low=low, high=high, tail=rows["deadline"] / rows["cost_median"].clip(lower=1)
+    )
     look = view.with_look(rows["estimator"])
     fig, (by, tail) = common.panels(2, look, height=3.0, scales=view.scales)
     common.decades(by, np.concatenate([rows["deadline"], high, low]))
