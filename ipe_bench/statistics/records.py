@@ -218,17 +218,6 @@ STATISTICS: tuple[Statistic, ...] = (
         limits_titles={"parameters": "95 % of rmse", "theory": "95 % of rmse"},
     ),
     _solved(
-        "rmse_anytime",
-        "rmse, any time",
-        "The same root mean square error, with an asymptotic interval of 95 % that stays valid however often one looks"
-        " and whenever one stops (Waudby-Smith et al., Ann. Statist. 52, 2024); none for fewer than"
-        f" {intervals.FIRST} trials, nor where a few trials carry the sum of squares, and no upper end where larger"
-        " errors may be unseen.",
-        f.of_each(f.rmse),
-        limits=f.ends_in_units(f.rmse_ends_anytime),
-        kind="physical",
-    ),
-    _solved(
         "rmse_unseen",
         "unseen",
         "Share of trials that may have larger errors than those seen: the upper limit (95 %, Clopper and Pearson) of"
@@ -591,6 +580,9 @@ RENAMED = {
     "nees_median_high": "nees_median_high_if_honest",
     "nees_low": "nees_low_if_honest",
     "nees_high": "nees_high_if_honest",
+    "rmse_anytime": "rmse",
+    "rmse_anytime_low": "rmse_low",
+    "rmse_anytime_high": "rmse_high",
 }
 """Columns of versions before 0.4.0, and what they are called now."""
 MAIN_OF_STATES = (*MAIN, "path_rmse", "path_bound", "path_nees", "path_verdict", "nis_verdict")

@@ -21,7 +21,6 @@ from ipe_bench.statistics.registry import summary_columns
 
 ELSEWHERE = {
     **dict.fromkeys(("success_anytime_low", "success_anytime_high"), "test_sequences.py"),
-    **dict.fromkeys(("rmse_anytime_low", "rmse_anytime_high"), "test_sequences.py"),
     **dict.fromkeys(
         ("rmse_low", "rmse_high", "path_rmse_low", "path_rmse_high"), "test_intervals.py"
     ),
@@ -239,7 +238,6 @@ DEFINITIONS: dict[str, Callable[[Trials], Any]] = {
     "bias": lambda t: t.units(t.error[t.solved].mean(axis=0)),
     "std": lambda t: t.units(t.error[t.solved].std(axis=0, ddof=1)),
     "rmse": lambda t: t.units(rms(t.error[t.solved])),
-    "rmse_anytime": lambda t: t.units(rms(t.error[t.solved])),
     "rmse_unseen": unseen,
     "effective_trials": lambda t: (
         t.solved_squares().sum(axis=1) ** 2 / (t.solved_squares() ** 2).sum(axis=1)
