@@ -37,6 +37,8 @@ _RESERVED = (
     "unit",
     "scenario",
 )
+DIGITS = 4
+"""Significant digits of the statistics in `summary.csv`."""
 _of_plugins: dict[str, Statistic] = {}
 
 
@@ -118,11 +120,18 @@ def current_name(column: str) -> str:
 
 
 def main_columns(summary: pd.DataFrame) -> pd.DataFrame:
-    """Selects the columns of `summary.csv`: what a row is of, the main statistics, and those of plugins."""
+    """Selects the columns of `summary.csv`: what a row is of, and the main statistics and those of plugins, rounded.
+
+    `summary_all.csv` has all digits: trials that could tell more than four apart are hardly ever run.
+    """
     states = "noise" in summary and (summary["noise"] == "model").any()
     main = [s for s in STATISTICS if s.name in (MAIN_OF_STATES if states else MAIN)]
     chosen = {*frame_columns([*main, *_of_plugins.values()]), BEST} - {*NOT_MAIN}
-    return summary[[c for c in summary.columns if c in chosen or c not in summary_columns()]]
+    heads = [c for c in summary.columns if c not in summary_columns()]
+    main = summary[[c for c in summary.columns if c in chosen or c in heads]].copy()
+    numbers = main.drop(columns=heads).select_dtypes("float")
+    main[numbers.columns] = numbers.map(lambda number: float(f"{number:.{DIGITS}g}"))
+    return main
 
 
 def summary_rows(sample: Sample) -> list[dict[str, Any]]:

@@ -78,7 +78,7 @@ def recomputed(folder: Path) -> pd.DataFrame:
 
 def check(folder: Path) -> pd.DataFrame:
     """Holds the summary of a folder against what pandas makes of its trials, and returns the latter."""
-    summary = pd.read_csv(folder / "summary.csv")
+    summary = pd.read_csv(folder / "summary_all.csv")
     summary = (
         summary[summary["parameter"] == "all"].set_index(["error_scale", "estimator"]).sort_index()
     )

@@ -88,15 +88,20 @@ class Pending:
         from ipe_bench.report.sections import CURVES, report_tables, written
         from ipe_bench.report.tables.table import write_table
         from ipe_bench.statistics.registry import main_columns
+        from ipe_bench.statistics.statistic import ALL
 
         analysis, output = self.begun.finish(), self.output
         problems = analysis.collection.extra_problems
         known, tables = len(problems), report_tables(analysis)
         sections = written("section", analysis, tables)
         added = [table for section in sections for table in section.tables]
-        write_text(output / "summary.csv", main_columns(analysis.summary).to_csv(index=False))
-        write_text(whole := output / "summary_all.csv", analysis.summary.to_csv(index=False))
-        files = [
+        main = main_columns(analysis.summary)
+        is_total = main["parameter"] == ALL
+        write_text(output / "summary.csv", main[is_total].to_csv(index=False))
+        write_text(output / "parameters.csv", main[~is_total].to_csv(index=False))
+        write_text(output / "summary_all.csv", analysis.summary.to_csv(index=False))
+        files = [output / "summary_all.csv", output / "parameters.csv"]
+        files += [
             path
             for table in (*tables, *added)
             for path in write_table(table, output / "tables", self.formats)
@@ -112,7 +117,7 @@ class Pending:
         result = ReportResult(
             summary=analysis.summary,
             summary_path=output / "summary.csv",
-            tables=(whole, *files),
+            tables=tuple(files),
             figures=tuple(path for figure in drawn for path in figure.files),
             report=output / "report.html",
             problems=tuple(analysis.collection.problems),
