@@ -16,6 +16,7 @@ from ipe_bench.basics.options import Component
 from ipe_bench.basics.streams import numbered
 from ipe_bench.measurements.base import Parameter
 from ipe_bench.states.algebra import factor, half, root, transposed
+from ipe_bench.states.along import Along, AtEpoch, unmoved
 
 _START, _PROCESS, _READINGS = range(3)
 """The random streams of a trial: its start, its process noise and the noise of its readings."""
@@ -118,6 +119,36 @@ class StateModel(Component, ABC):
     @abstractmethod
     def observe(self, x: Array, k: int) -> Array:
         """h: (..., n) -> (..., m)."""
+
+    def transition_into(self, k: int) -> AtEpoch:
+        """f of the step into epoch k as a function of states (..., n) that knows its slopes, for trackers."""
+        return AtEpoch(self.transition, k)
+
+    def observation_at(self, k: int) -> AtEpoch:
+        """h at epoch k likewise."""
+        return AtEpoch(self.observe, k)
+
+    def values_along(self, x: Array) -> tuple[Array, Array]:
+        """f (trials, K, n) and h (trials, K, m) as in `Along`, of paths x (trials, 1 + K, n) that begin before the
+        first transition: `evaluations` for each trial."""
+        moved = [
+            self.transition_into(k)(x[:, k]) if self.moves(k) else x[:, k]
+            for k in range(self.epochs)
+        ]
+        read = [self.observation_at(k)(x[:, k + 1]) for k in range(self.epochs)]
+        return np.stack(moved, axis=1), np.stack(read, axis=1)
+
+    def slopes_along(self, x: Array) -> Along:
+        """f and h with their slopes along paths x (trials, 1 + K, n) that begin before the first transition: 1 + n
+        times `evaluations` for each trial."""
+        moved = [
+            self.transition_into(k).slope(x[:, k]) if self.moves(k) else unmoved(x[:, k])
+            for k in range(self.epochs)
+        ]
+        read = [self.observation_at(k).slope(x[:, k + 1]) for k in range(self.epochs)]
+        f, F = (np.stack(parts, axis=1) for parts in zip(*moved, strict=True))
+        h, H = (np.stack(parts, axis=1) for parts in zip(*read, strict=True))
+        return Along(f, h, F, H)
 
     def gain(self, k: int) -> Array:
         """G (n, q) of the step into epoch k; UserError if it depends on the states."""
@@ -237,7 +268,9 @@ class StateModel(Component, ABC):
     def observe_near(self, x: Array, k: int, to: Array) -> Array:
         """h without jumps around readings `to` (trials, m), for x (trials, ..., n)."""
         between = (1,) * (x.ndim - to.ndim)
-        return self.nearest(self.observe(x, k), to.reshape(to.shape[:1] + between + to.shape[1:]))
+        return self.nearest(
+            self.observation_at(k)(x), to.reshape(to.shape[:1] + between + to.shape[1:])
+        )
 
     def draw(self, start: int, stop: int, seed: int = 0) -> Paths:
         """Trials `start` to `stop`. Start, process noise and readings' noise have a stream each per trial: with another

@@ -8,7 +8,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.states.algebra import symmetric, transposed
 from ipe_bench.states.base import Normal, Paths, StateModel
-from ipe_bench.states.linearisation import Taylor, slope
+from ipe_bench.states.linearisation import Taylor
 from ipe_bench.states.smoothers import smoothed
 from ipe_bench.states.trackers import Tracks, filtered
 
@@ -27,7 +27,7 @@ def posterior_bounds(model: StateModel, paths: Paths) -> tuple[Array, Array]:
     eye, forward, steps = np.eye(model.n), [], []
     for k in range(model.epochs):
         x = paths.x[:, k]
-        H = slope(lambda at, k=k: model.observe(at, k), x)[1]
+        H = model.observation_at(k).slope(x)[1]
         gained = _mean(np.matmul(np.matmul(transposed(H), np.linalg.inv(model.R(k))), H))
         if model.moves(k):
             Q = model.Q(k)
@@ -37,7 +37,7 @@ def posterior_bounds(model: StateModel, paths: Paths) -> tuple[Array, Array]:
                     "posterior bound does not exist; use the bound linearised at the truth"
                 )
             inverse = np.linalg.inv(Q)
-            F = slope(lambda at, k=k: model.transition(at, k), before)[1]
+            F = model.transition_into(k).slope(before)[1]
             D11, D12 = _mean(np.matmul(np.matmul(transposed(F), inverse), F)), -_mean(F).T @ inverse
             V = symmetric(P @ np.linalg.inv(eye + D11 @ P))  # (P^-1 + D11)^-1, of singular P too
             steps.append((V, D12))

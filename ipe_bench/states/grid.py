@@ -112,7 +112,7 @@ def _variances(model: StateModel, grids: Array, k: int) -> Array:
 
 def _moved(model: StateModel, grids: Array, k: int) -> Array:
     """Returns the points before epoch k, moved to it without process noise (points,)."""
-    return model.transition(grids[k][:, None], k)[:, 0]
+    return model.transition_into(k)(grids[k][:, None])[:, 0]
 
 
 def _describe(out: Tracks, k: int, p: Array, grids: Array) -> None:

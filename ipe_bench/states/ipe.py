@@ -164,7 +164,8 @@ class _Frozen:
         r = []
         for k in range(self.model.epochs):
             x.append(
-                (self.model.transition(x[-1], k) if self.model.moves(k) else x[-1]) + noise[k + 1]
+                (self.model.transition_into(k)(x[-1]) if self.model.moves(k) else x[-1])
+                + noise[k + 1]
             )
             e = np.where(self.seen[k], self.model.observe_near(x[-1], k, z[:, k]) - z[:, k], 0.0)
             r.append(lower_solve(self.L[k], e[..., None])[..., 0])

@@ -42,7 +42,7 @@ class Bootstrap(Tracker):
             if model.moves(k):
                 G = model.gain_at(x, k)
                 w = normals(G.shape[-1])
-                x = model.transition(x, k) + (
+                x = model.transition_into(k)(x) + (
                     multiply(G, w) if model.gain_by_state else np.matmul(w, G.T)
                 )
             w = weighed(model, x, k, z[:, k], 1.0, out)

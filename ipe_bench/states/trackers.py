@@ -169,9 +169,7 @@ def linearised_move(
 ) -> Affine:
     """Linearises f about the states x; periodic states next to those of `to` (trials, n), if these are given."""
     periodic = bool(model.state_periods)
-    move = rule.linearise(
-        lambda at: model.transition(at, k), *x, model.nearest_state if periodic else None
-    )
+    move = rule.linearise(model.transition_into(k), *x, model.nearest_state if periodic else None)
     if to is None or not periodic:
         return move
     value = multiply(move.A, x.mean) + move.b
@@ -180,9 +178,7 @@ def linearised_move(
 
 def linearised_reading(model: StateModel, rule: Rule, k: int, z: Array, x: Normal) -> Affine:
     """Linearises h about the states x, periodic readings next to the readings z (trials, m)."""
-    A, b, W = rule.linearise(
-        lambda at: model.observe(at, k), *x, model.nearest if model.periods else None
-    )
+    A, b, W = rule.linearise(model.observation_at(k), *x, model.nearest if model.periods else None)
     value = multiply(A, x.mean) + b
     return Affine(A, b + model.nearest(value, np.where(np.isfinite(z), z, value)) - value, W)
 
