@@ -75,7 +75,9 @@ def _track(asked: Single, model: StateModel) -> int:
     )
     folder = asked.folder(NAME, command, [TABLE])
     show(answer.parts())
-    say_files(write_tracks(folder, answer, command, _provenance(asked, files, parts)))
+    provenance = _provenance(asked, files, parts)
+    drawn = asked.spec.figures != "none"
+    say_files(write_tracks(folder, answer, command, provenance, figures=drawn))
     return 0 if answer.passes else 1
 
 

@@ -189,6 +189,11 @@ class LogTracks:
     """Their standard deviations (K, n)."""
     covariance: Array
     """Their covariance (K, n, n)."""
+    predicted: Array
+    """The readings (K, m) that were predicted from those before; NaN where a reading is missing, and if the tracker has
+    no innovations."""
+    predicted_deviation: Array
+    """Their standard deviations (K, m)."""
     nis: Array
     """Squared normalised innovations (K,); NaN at epochs without readings, and if the tracker has none."""
     mean_nis: float
@@ -229,6 +234,7 @@ class LogTracks:
         )
         mean, deviation = tracks.mean[0] * sizes, deviations(tracks.covariance[0]) * sizes
         covariance = tracks.covariance[0] * np.outer(sizes, sizes)
+        predicted, predicted_deviation = tracks.predicted_readings(log.z[None])
         nis = np.where(tracks.degrees[0] > 0, tracks.nis[0], np.nan)
         size = np.nan if tracks.effective is None else float(np.median(tracks.effective))
         m, total = int(np.isfinite(innovations).sum()), float(np.nansum(nis))
@@ -243,6 +249,8 @@ class LogTracks:
             mean,
             deviation,
             covariance,
+            predicted[0],
+            predicted_deviation[0],
             nis,
             mean_nis=total / m if m else np.nan,
             limits=mean_limits(m, 1),

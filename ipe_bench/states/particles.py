@@ -73,12 +73,15 @@ def weighed(
     S = np.matmul(transposed(d * p), d) + np.where(
         seen[:, :, None] & seen[:, None, :], R, np.eye(R.shape[-1])
     )
-    found = Update.of(Normal(y, S), y, factor(S), seen)
+    L = factor(S)
+    found = Update.of(Normal(y, S), y, L, seen)
     out.nis[:, k], out.innovations[:, k], out.degrees[:, k] = (
         found.nis,
         found.innovation,
         found.degrees,
     )
+    # Particles have no slope; that of 0 keeps the place of the innovation's L.
+    out.reads.append((np.zeros((*y.shape, model.n)), L))
     least = square.min(axis=1, keepdims=True)
     w = before * np.exp(-0.5 * (square - least))
     total = w.sum(axis=1, keepdims=True)

@@ -52,8 +52,8 @@ class Tracks:
     effective: Array | None = None
     """Effective sample sizes 1 / sum w^2 (trials, K) of weighted samples."""
     reads: list[tuple[Array, Array]] = field(default_factory=list)
-    """H (trials, m, n) of the readings of each epoch as they were linearised, 0 of missing ones, and L (trials, m, m)
-    with L L' = S of their innovations."""
+    """H (trials, m, n) of the readings of each epoch as they were linearised, 0 of missing ones and of particles, and L
+    (trials, m, m) with L L' = S of their innovations."""
     cost: Array | None = None
     """-2 log p(path | readings) (trials,) of an iterated smoother up to a constant, or the NIS of the filter behind a
     smoother: chi-square with a degree per reading; see `path_p`."""
@@ -88,6 +88,16 @@ class Tracks:
         if found.read is not None:
             self.reads.append(found.read)
         return found.x
+
+    def predicted_readings(self, z: Array) -> tuple[Array, Array]:
+        """The readings (trials, K, m) that a filter predicted of those of z (trials, K, m) that were there, and their
+        standard deviations; NaN in trackers that have no innovations."""
+        mean, deviation = np.full((2, *z.shape), np.nan)
+        for k, (_, L) in zip(range(z.shape[1]), self.reads, strict=False):
+            mean[:, k] = z[:, k] - multiply(L, np.nan_to_num(self.innovations[:, k]))
+            deviation[:, k] = np.linalg.norm(L, axis=-1)
+        there = np.isfinite(self.innovations)
+        return np.where(there, mean, np.nan), np.where(there, deviation, np.nan)
 
     @classmethod
     def lost(cls, model: StateModel, trials: int) -> Tracks:

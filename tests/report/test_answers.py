@@ -11,8 +11,10 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.figure import Figure
+from scipy.stats import chi2
 from scipy.stats import t as student
 from shared.oracles import assert_agrees
+from shared.state_models import ConstantVelocity
 from shared.synthetic_store import Pretender, Synthetic
 
 import ipe_bench as ib
@@ -25,9 +27,12 @@ from ipe_bench.questions.posterior.figure import draw_marginals
 from ipe_bench.questions.posterior.maths import Posterior, Reference
 from ipe_bench.report.figures.answers import draw_fit, draw_residuals
 from ipe_bench.report.figures.common import full_ticks
+from ipe_bench.report.figures.log import draw_log
 from ipe_bench.report.figures.views import looks_of, views
 from ipe_bench.report.style import FACES, house_style
 from ipe_bench.report.words import ends_in_percent, public
+from ipe_bench.states import Smoother, ekf
+from ipe_bench.states.base import widened
 from ipe_bench.statistics import analyse
 
 
@@ -245,3 +250,77 @@ def test_a_change_that_is_found_but_may_be_below_the_margin_is_not_drawn_as_no_d
         str(frame).split()
     )
     assert re.search(r"mean error .* different", str(frame))
+
+
+# Tracks of a log -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def walked():
+    """A log of a position that is read directly, with a missing reading and one that is 200 m off."""
+    model = ConstantVelocity(count=60)
+    z = model.draw(3, 4).z[0]
+    z[11] = np.nan
+    z[40] += 200.0
+    found = ib.estimate(model, z, {"kf": ekf(), "same": ekf(), "rts": Smoother(ekf())})
+    with house_style():
+        (drawing,) = draw_log(found.log, found.tracks)
+    return found, drawing
+
+
+def test_each_state_is_drawn_with_its_band_and_the_readings_where_it_is_read(walked):
+    found, drawing = walked
+    position, velocity, nis = drawing.figure.axes[:3]
+    assert drawing.title == "kf, same, rts: states ± 2 standard deviations"
+    track = found["kf"]
+    drawn = {line.get_color(): line.get_ydata() for line in position.lines if len(line.get_ydata())}
+    means = [line for line in velocity.lines if line.get_linestyle() == "-"]
+    assert any(np.array_equal(line.get_ydata(), track.mean[:, 1]) for line in means)
+    assert any(np.array_equal(ys, found.log.z[:, 0], equal_nan=True) for ys in drawn.values())
+    ends = np.concatenate([band.get_paths()[0].vertices[:, 1] for band in velocity.collections])
+    for sign in (-1, 1):
+        assert np.isin(track.mean[:, 1] + sign * 2 * track.deviation[:, 1], ends).all()
+    assert nis.get_title() == "NIS of kf"
+
+
+def test_nis_above_its_limit_are_in_red_and_their_share_is_said(walked):
+    found, drawing = walked
+    nis, limit = found["kf"].nis, chi2.ppf(0.95, 1)
+    (red,) = [line for line in drawing.figure.axes[2].lines if line.get_color() == "#c2273d"]
+    np.testing.assert_array_equal(red.get_ydata(), nis[nis > limit])
+    share = 100 * (nis > limit).sum() / 59
+    assert f"at {share:.1f} % of 59 epochs" in drawing.caption
+    assert len(drawing.caption.split()) <= 30
+
+
+def test_a_filter_predicts_readings_from_those_before_and_a_smoother_none(walked):
+    found, _ = walked
+    model, table = found.log.model, found.table()
+    kf = table[table["tracker"] == "kf"]
+    moved = model.transition(found["kf"].mean[:-1], 1)
+    there = kf["reading_predicted"].notna().to_numpy()
+    assert not there[11]
+    assert there.sum() == 59
+    predicted = kf["reading_predicted"].to_numpy()[1:]
+    np.testing.assert_allclose(predicted[there[1:]], moved[there[1:], 0], rtol=1e-12)
+    off = (kf["reading_reading"] - kf["reading_predicted"]) / kf["reading_predicted_deviation"]
+    np.testing.assert_allclose(off[there] ** 2, kf["nis"][there], rtol=1e-9)
+    assert table.loc[table["tracker"] == "rts", "reading_predicted"].isna().all()
+
+
+def test_what_is_beyond_the_axis_of_a_track_is_marked_there():
+    """The prior is a thousand times as wide as the path."""
+    model = ConstantVelocity(count=30)
+    wide = widened(model, 1000.0)
+    z = model.draw(3, 4).z[0]
+    z[0] = np.nan
+    found = ib.estimate(wide, z, {"kf": ekf()})
+    with house_style():
+        (drawing,) = draw_log(found.log, found.tracks)
+    position = drawing.figure.axes[0]
+    low, high = position.get_ylim()
+    assert found["kf"].deviation[0, 0] > high - low
+    arrows = {
+        y for line in position.lines if "arrow" in str(line.get_marker()) for y in line.get_ydata()
+    }
+    assert arrows == {low, high}

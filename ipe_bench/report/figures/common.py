@@ -281,7 +281,7 @@ def _arrows(
         ax.plot([], [], label=BEYOND, color=BOUND_COLOR, **arrow)
 
 
-def _mark_cut(ax: Axes, place: Any, edge: float, color: str, *, downwards: bool) -> None:
+def mark_cut(ax: Axes, place: Any, edge: float, color: str, *, downwards: bool) -> None:
     """Draws an arrow at the ends of intervals that are cut at the edge, each at its place."""
     if len(place) == 0:
         return
@@ -375,8 +375,8 @@ def curves(
             known = np.isfinite(sizes) & ~few.to_numpy()
             ends = np.where(known, sizes, np.where(known.any(axis=0), 0.0, np.nan))
             shown = ~over & ~few
-            _mark_cut(ax, place[shown & (low < least)], least, one.color, downwards=True)
-            _mark_cut(ax, place[shown & (high > top)], top, one.color, downwards=False)
+            mark_cut(ax, place[shown & (low < least)], least, one.color, downwards=True)
+            mark_cut(ax, place[shown & (high > top)], top, one.color, downwards=False)
         line: dict[str, Any] = {**one.line, "zorder": 2} | (
             {"linestyle": "none"} if one_scale else {}
         )

@@ -1,4 +1,4 @@
-"""Tracks of real readings: tables and files."""
+"""Tracks of real readings: tables, picture and files."""
 
 from __future__ import annotations
 
@@ -47,7 +47,8 @@ class LogAnswer(Shown):
         return labelled(self.tracks, [one.label for one in self.tracks], which)
 
     def table(self) -> pd.DataFrame:
-        """Returns a row per tracker and epoch: each state with its standard deviation, and NIS."""
+        """Returns a row per tracker and epoch: each state and each predicted reading with its standard deviation, the
+        readings, and NIS."""
         import pandas as pd
 
         model, frames = self.log.model, []
@@ -62,6 +63,12 @@ class LogAnswer(Shown):
                 columns |= {
                     f"{state.name}{unit}": one.mean[:, i],
                     f"{state.name}_deviation{unit}": one.deviation[:, i],
+                }
+            for j, name in enumerate(model.reading_names):
+                columns |= {
+                    f"{name}_reading": self.log.z[:, j],
+                    f"{name}_predicted": one.predicted[:, j],
+                    f"{name}_predicted_deviation": one.predicted_deviation[:, j],
                 }
             frames.append(pd.DataFrame(columns | {"nis": one.nis}))
         return pd.concat(frames, ignore_index=True)
@@ -141,9 +148,16 @@ class LogAnswer(Shown):
 
 
 def write_tracks(
-    folder: Path, answer: LogAnswer, command: Any, provenance: Mapping[str, Any]
+    folder: Path,
+    answer: LogAnswer,
+    command: Any,
+    provenance: Mapping[str, Any],
+    *,
+    figures: bool = True,
 ) -> list[Path]:
-    """Writes track.json, track.csv and track.html, and returns them."""
+    """Writes track.json, track.csv, track.html and the picture; returns the files."""
+    from ipe_bench.report.figures.log import draw_log
+
     log, rows = (
         answer.log,
         ("lost_from", "effective", "message", "notes", "mean_nis", "limits", "verdict"),
@@ -172,6 +186,7 @@ def write_tracks(
         f"{log.model.name}: tracks",
         said,
         answer.parts(),
+        draw_log(log, answer.tracks) if figures else (),
         **told,
     )
     return [folder / f"{NAME}.json", *files]
