@@ -9,11 +9,11 @@ run: .venv/ready
 	$(BIN)/ipe-bench run +experiment=headline
 
 test: .venv/ready
-	$(BIN)/pytest -n auto --dist worksteal
+	$(BIN)/pytest -n auto --dist worksteal --durations=30 --durations-min=1
 
 # What takes minutes: Monte Carlo, end-to-end and browser checks.
 slow: .venv/ready
-	$(BIN)/pytest -n auto --dist worksteal --durations=40 -m "slow or browser"
+	$(BIN)/pytest -n auto --dist worksteal --durations=40 --durations-min=1 -m "slow or browser"
 
 # Slurm: two nodes on this machine. On Debian, `apt-get install slurm-wlm munge` first; as root.
 cluster: .venv/ready
