@@ -39,6 +39,7 @@ def test_rows_are_those_of_a_serial_sweep(launcher, tmp_path, monkeypatch, capsy
     pd.testing.assert_frame_equal(rows("launched"), serial, check_exact=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("launcher", EACH)
 @pytest.mark.filterwarnings("default")
 def test_a_job_that_is_refused_is_told_and_stands_in_the_books(

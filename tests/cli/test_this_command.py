@@ -46,6 +46,7 @@ def test_run_shows_what_it_asked_for_and_counts_the_rest(ipe_bench):
     assert "max_iterations" in out
 
 
+@pytest.mark.slow
 def test_a_folder_with_results_of_other_settings_is_said_to_hold_them(ipe_bench):
     words = (*SMALL, "solver=[newton]", "output=mixed")
     assert "mixed: holds" not in ipe_bench("run", *words, "trials=4")[1]

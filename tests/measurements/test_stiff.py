@@ -68,7 +68,12 @@ def follower(**options):
             ),
             marks=pytest.mark.slow,
         ),
-        (van_der_pol(1000.0, 2000.0), (1.706167732170469, -0.8928097010248125e-3), 2e-8),
+        pytest.param(
+            van_der_pol(1000.0, 2000.0),
+            (1.706167732170469, -0.8928097010248125e-3),
+            2e-8,
+            marks=pytest.mark.slow,
+        ),
         (
             hires(),
             (
@@ -140,7 +145,10 @@ def test_a_trial_and_a_prefix_have_the_same_bits_alone_and_in_a_batch():
     assert np.array_equal(model.simulate_until(x, 3), model.simulate(x)[:, :9])
 
 
-@pytest.mark.parametrize(("mu", "stiff"), [(3.0, False), (30.0, False), (300.0, True)])
+@pytest.mark.parametrize(
+    ("mu", "stiff"),
+    [(3.0, False), (30.0, False), pytest.param(300.0, True, marks=pytest.mark.slow)],
+)
 def test_the_rule_tells_stiff_oscillators_from_others(mu, stiff):
     assert van_der_pol(mu, 2 * mu).engine.stiff == stiff
 

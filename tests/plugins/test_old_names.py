@@ -52,6 +52,7 @@ class EsMda(Pretender):
     __module__ = "ipe_bench.baselines.es_mda"
 
 
+@pytest.mark.slow
 def test_results_that_are_of_an_old_class(ipe_bench, synthetic):
     scenario, error = synthetic.scenario(), np.zeros((5, 3))
     synthetic.add(scenario, "es_mda", error, estimator=EsMda())

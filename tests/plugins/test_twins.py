@@ -88,6 +88,7 @@ def test_another_distribution_of_that_package_is_named_and_left_out(site, tmp_pa
     assert "this is the installed copy" in done.stderr
 
 
+@pytest.mark.slow
 def test_a_copy_that_was_imported_already_goes_on(site, monkeypatch):
     (site / "ipe_bench_twin/twin.py").write_bytes(
         Path("plugins/twin/ipe_bench_twin/twin.py").read_bytes()

@@ -62,6 +62,7 @@ def test_an_ensemble_is_drawn_with_the_correlations(bench):
     assert estimates.covariance[0] == pytest.approx(P, rel=0.15, abs=0.1)
 
 
+@pytest.mark.slow
 def test_the_posterior_has_the_correlations(bench):
     z = bench.draw(0, 1).z[0]
     found = sample_posterior(bench.problem, z, particles=600)

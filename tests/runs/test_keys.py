@@ -64,6 +64,7 @@ def edit(path: Path, old: str, new: str) -> None:
     path.write_text(text.replace(old, new), encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_keys_do_not_depend_on_the_order_of_sets_or_of_files_in_a_folder(copy, monkeypatch):
     (copy / "ipe_bench/measurements/another.json").write_text("{}", encoding="utf-8")
     listed = "from pathlib import Path; glob = Path.glob; Path.glob = lambda *a: iter(sorted(glob(*a), reverse={}))\n"

@@ -175,7 +175,15 @@ def test_a_noisy_peak_is_found_from_anywhere(noise, starts):
 
 
 @pytest.mark.parametrize("noise", [Gaussian(0.05), Unknown()], ids=["known level", "unknown level"])
-@pytest.mark.parametrize("start", [(0.01, 500.0), (-1.0, 1.0), (2.0, -5.0), (0.1, 1e3)])
+@pytest.mark.parametrize(
+    "start",
+    [
+        pytest.param((0.01, 500.0), marks=pytest.mark.slow),
+        (-1.0, 1.0),
+        (2.0, -5.0),
+        pytest.param((0.1, 1e3), marks=pytest.mark.slow),
+    ],
+)
 def test_a_saturating_law_is_found_from_a_bad_start(start, noise):
     t = [0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 12.8, 25.6]
     truth = Formula("V*t/(K+t)", {"V": 2.0, "K": 3.0}, {"t": t})

@@ -145,6 +145,7 @@ def test_iterations_to_the_limit_of_a_halving_sequence():
     assert iterations_to_limit(np.array([0.01, 1.0, 0.0])) == 2
 
 
+@pytest.mark.slow
 def test_known_differences_are_found_in_a_store(synthetic):
     rng = np.random.default_rng(4)
     for scale in (1.0, 2.0):

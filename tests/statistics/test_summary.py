@@ -133,6 +133,7 @@ def test_one_label_for_two_configs_becomes_two_rows_with_the_option_in_the_label
     assert row(frame, "one (option=2)")["estimator.option"] == 2
 
 
+@pytest.mark.slow
 def test_halves_in_two_directories_are_one_run(tmp_path):
     scenarios = [Synthetic.scenario(error_scale=s) for s in (1.0, 10.0)]
     e = {label: errors(600, seed=i) for i, label in enumerate(("one", "two"))}

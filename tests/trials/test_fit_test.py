@@ -50,7 +50,13 @@ def test_p_is_uniform_for_every_noise_that_states_its_law(noise):
 
 
 @pytest.mark.parametrize(
-    "estimator", [MapLM(), MapLM(prior_inflation=3.0), EKF(engine="batched")], ids=repr
+    "estimator",
+    [
+        MapLM(),
+        MapLM(prior_inflation=3.0),
+        pytest.param(EKF(engine="batched"), marks=pytest.mark.slow),
+    ],
+    ids=repr,
 )
 def test_p_is_uniform_for_estimators_with_a_prior(estimator):
     """The prior is as good as the readings here: m - n degrees are 3 too few of 40."""

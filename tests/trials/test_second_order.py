@@ -64,6 +64,7 @@ def test_the_bias_of_a_logarithm_is_half_its_variance():
     assert_agrees(found[:, 0], -(0.1**2) * np.exp(-2 * x[:, 0]) / 2, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_mean_error_of_least_squares_is_the_bias_of_box():
     model = Bent(bend=0.3)
     R = Covariance(np.full(12, 0.12))
@@ -162,6 +163,7 @@ def test_columns_do_not_depend_on_the_block():
     assert "pseudo_bias_bx" not in late
 
 
+@pytest.mark.slow
 def test_summary_and_table_have_theory_for_least_squares_alone(tmp_path):
     bench = ib.Scenario(Bent(bend=0.2), ib.noise.Gaussian(0.05), error_scale=0.3)
     wrong = replace(bench, truth=Bent(bend=0.25))

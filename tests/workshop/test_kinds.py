@@ -88,8 +88,9 @@ def files(folder: str) -> dict[str, str]:
     }
 
 
-DEAR = ("figure", "table", "section")
-"""Each draws a report, as `test_a_report_has_what_plugins_add_beside_all_that_is_ours` does of all of them at once."""
+DEAR = ("figure", "table", "section", "experiment", "filter")
+"""Each draws a report, as `test_a_report_has_what_plugins_add_beside_all_that_is_ours` does of all of them at once, or
+runs many trials."""
 
 
 @pytest.mark.parametrize(
@@ -197,6 +198,7 @@ def test_those_that_raise_are_named_and_the_rest_is_whole(ours, capsys):
     assert complaints == {f"{kind}=bad_{kind}" for kind in RECORDS}
 
 
+@pytest.mark.slow
 def test_a_figure_under_the_name_of_ours_is_left_out_and_ours_stays(ours, capsys):
     main(["new", "figure", "mine"])
     edit_figure("mine", ('fig, "mine"', 'fig, "cost_against_accuracy"'))
@@ -233,6 +235,7 @@ FAULTY = {
 }
 
 
+@pytest.mark.slow
 def test_faulty_statistics_are_found():
     for name, (source, _) in FAULTY.items():
         write("statistic", name, source, plugin="bad")

@@ -292,6 +292,7 @@ def test_what_no_common_trial_shows_is_a_dash(tmp_path, capsys):
     assert "nan" not in said
 
 
+@pytest.mark.slow
 def test_only_what_is_asked_for_is_tested_and_changes_a_p(tmp_path):
     """Four failures of one alone: McNemar's p of 1/8, multiplied by the number of questions; three without fail_on."""
     a, b = store(tmp_path / "a"), store(tmp_path / "b", fails=4)
@@ -323,6 +324,7 @@ def test_margins_are_for_the_user_to_say(tmp_path, capsys):
     )
 
 
+@pytest.mark.slow
 def test_what_is_gone_is_named_where_completeness_is_asked_for(tmp_path, capsys):
     """An estimator, half of the trials, a scenario and a covariance: a line each, and none without the word."""
     first, second = Synthetic(tmp_path / "a"), Synthetic(tmp_path / "b")
@@ -462,6 +464,7 @@ def test_equal_folders_of_other_seeds_are_found_different_as_rarely_as_stated(tm
     assert alarms[True] <= alarms[False]
 
 
+@pytest.mark.slow
 def test_a_pilot_says_how_many_trials_a_difference_takes(tmp_path, capsys):
     """In 15 of 200 trials one alone succeeds, and three questions are asked: McNemar's p is multiplied by 3."""
     a, b = store(tmp_path / "a"), store(tmp_path / "b", fails=15)
@@ -510,6 +513,7 @@ def test_what_cannot_be_planned_is_refused_in_a_line(tmp_path, capsys, wrong, sa
     assert error.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_a_guard_runs_the_estimators_in_plugins_and_fails_where_the_workflow_says(
     tmp_path, monkeypatch, capsys
 ):

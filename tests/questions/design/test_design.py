@@ -255,6 +255,7 @@ def test_gauss_newton_reaches_the_bound_of_the_designed_model(gins):
         assert mean == pytest.approx(choice.mean_bound, abs=0.05)
 
 
+@pytest.mark.slow
 def test_four_cases_of_the_paper_are_as_good_as_what_is_chosen():
     (way,) = design(scenario(Gins(), NOISE, 33.0), by=["case"], truths=10).ways
     assert way.sharpest.readings == 240
