@@ -25,9 +25,10 @@ from ipe_bench.states import (
     ekf,
     ukf,
 )
-from ipe_bench.states.damped import _linearised, _passed, _Paths
-from ipe_bench.states.smoothers import path_p, smoothed, whole
+from ipe_bench.states.damped import Descent
+from ipe_bench.states.smoothers import path_p, smoothed
 from ipe_bench.states.trackers import filtered, linearised_move
+from ipe_bench.states.whole_paths import PathDensity
 from ipe_bench.trials.paths import PathBlock, StateScenario
 
 NEAR = Pendulum(count=25, start=(1.0, 0.0), spread=0.2)
@@ -92,9 +93,9 @@ def test_a_damped_step_reads_every_state_once_more():
         free + np.diag(1 / variances.ravel()),
         H.T @ z.ravel() / LINEAR.R(0)[0, 0] + (about / variances).ravel(),
     )
-    affine = _linearised(LINEAR, z, about)
-    mean, _ = whole(smoothed(LINEAR, _passed(LINEAR, z, *affine, about=(about, variances))))
-    assert_agrees(mean.ravel(), exact, atol=1e-9)
+    density = PathDensity.of(LINEAR, z)
+    step = density.step(density.tangents(density.settled(about)), 1 / variances)
+    assert_agrees((about + step).ravel(), exact, atol=1e-9)
 
 
 def bearings(scale):
@@ -130,11 +131,10 @@ def test_a_damped_step_is_the_same_in_any_unit_of_the_states():
 
     steps = []
     for model in (NEAR, Scaled(count=25, start=(1.0, 0.0), spread=0.2)):
-        z = NEAR.draw(0, 4).z
-        paths = _Paths.of(model, z, smoothed(model, filtered(model, z, Taylor())))
-        steps.append(
-            LevenbergMarquardtSmoother()._stepped(model, z, replace(paths, damping=np.ones(4)))
-        )
+        density = PathDensity.of(model, NEAR.draw(0, 4).z)
+        track = smoothed(model, filtered(model, density.z, Taylor()))
+        begun = replace(Descent.of(density, track), damping=np.ones(4))
+        steps.append(LevenbergMarquardtSmoother(iterations=1).descended(density, begun).at)
     np.testing.assert_allclose(steps[1].x / sizes, steps[0].x, atol=1e-9)
     np.testing.assert_allclose(steps[1].cost, steps[0].cost, rtol=1e-9)
 
@@ -153,14 +153,13 @@ def test_levenberg_and_marquardt_begin_at_the_better_of_two_filters():
 
 
 def test_further_starts_are_draws_of_the_prior_with_half_its_deviations():
-    """Readings that say nothing leave the start where it was drawn, with what it was given of the prior's variance."""
-    model = ConstantVelocity(count=2, spread=2.0, deviation=1e6)
-    z = model.draw(0, 400).z
-    drawn = LevenbergMarquardtSmoother(starts=1)._drawn(model, z)
-    np.testing.assert_allclose(
-        drawn.P[:, 0], np.broadcast_to(4.0 / 4 * np.eye(2), (400, 2, 2)), atol=1e-6
-    )
-    np.testing.assert_allclose(drawn.x[:, 0].std(axis=0), 2.0, rtol=5 / np.sqrt(800))
+    """Readings without a say leave the start where it was drawn; one as good as that start moves it half way."""
+    spread = 2.0
+    for deviation, size in ((1e6, spread), (spread / 2, spread / 2)):
+        model = ConstantVelocity(count=1, step=1e-9, spread=spread, deviation=deviation)
+        density = PathDensity.of(model, 1e-9 * np.arange(400.0)[:, None, None])
+        start = LevenbergMarquardtSmoother(starts=1).drawn(density).at.x[:, 0, 0]
+        np.testing.assert_allclose(start.std(), size, rtol=5 / np.sqrt(800))
 
 
 def test_a_state_that_comes_round_is_followed_next_to_its_path():

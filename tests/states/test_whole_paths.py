@@ -1,0 +1,103 @@
+"""Steps of whole paths: against filters and smoothers of the same affine model, where covariances are singular."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from shared.oracles import assert_agrees
+from shared.state_models import ConstantVelocity, Pendulum
+
+from ipe_bench.measurements import Parameter
+from ipe_bench.states import LevenbergMarquardtSmoother, Normal, Smoother, StateModel, ekf
+from ipe_bench.states.smoothers import whole
+from ipe_bench.states.whole_paths import PathDensity
+
+
+@dataclass(frozen=True)
+class Drawn(StateModel):
+    """A linear model of numbers that are drawn, from epoch to epoch, its prior and its noise of any rank."""
+
+    number: int
+    moved_first: bool = True
+
+    def _drawn(self, k: int, *shape: int):
+        return np.random.default_rng([self.number, k]).normal(size=shape)
+
+    @property
+    def sizes(self):
+        """States, readings and ranks of the prior and of the noise."""
+        rng = np.random.default_rng(self.number)
+        n = rng.integers(1, 5)
+        return n, rng.integers(1, 4), rng.integers(0, n + 1), rng.integers(0, n + 1)
+
+    @property
+    def states(self):
+        return tuple(Parameter(f"x{i}") for i in range(self.sizes[0]))
+
+    @property
+    def times(self):
+        return np.arange(1.0, 9.0)
+
+    @property
+    def prior(self):
+        n, _, rank, _ = self.sizes
+        G = self._drawn(100, n, rank)
+        return Normal(self._drawn(101, n), G @ G.T)
+
+    def transition(self, x, k):
+        n = self.sizes[0]
+        return np.einsum("ij,...j->...i", self._drawn(200 + k, n, n) / np.sqrt(n), x) + 0.1 * k
+
+    def observe(self, x, k):
+        return np.einsum("ij,...j->...i", self._drawn(300 + k, *self.sizes[1::-1]), x)
+
+    def gain(self, k):
+        return self._drawn(400 + k % 3, self.sizes[0], self.sizes[3])
+
+    def R(self, k):
+        L = self._drawn(500 + k, self.sizes[1], self.sizes[1])
+        return L @ L.T + 0.1 * np.eye(self.sizes[1])
+
+
+@pytest.mark.oracle("own second implementation: Kalman filter and smoother", "steps of paths", 1e-9)
+@pytest.mark.parametrize("number", range(8))
+def test_a_step_from_anywhere_ends_at_the_smoothed_path_of_a_linear_model(number):
+    model = Drawn(number, moved_first=number % 2 == 0)
+    z = model.draw(0, 3).z
+    z[1, 2:4] = np.nan
+    z[2, :, :1] = np.nan
+    tracks = Smoother(ekf()).track(model, z)
+    mean, P = whole(tracks)
+    density = PathDensity.of(model, z)
+    at = density.settled(mean + np.random.default_rng(1).normal(size=mean.shape))
+    # A start outside of the range of its prior has no density, but a step from there all the same.
+    tangents = density.tangents(at)
+    found = density.settled(at.x + density.step(tangents))
+    assert_agrees(found.x, mean, rtol=1e-9, atol=1e-9)
+    assert_agrees(found.cost, tracks.cost, rtol=1e-9, atol=1e-12)
+    assert_agrees(density.covariances(tangents), P, rtol=1e-9, atol=1e-12)
+
+
+def test_the_length_of_a_step_is_in_deviations_of_the_path():
+    """By a dense Hessian of the cost, from differences of what is quadratic."""
+    model = ConstantVelocity(count=3, spread=2.0)
+    density = PathDensity.of(model, model.draw(0, 1).z)
+    x, step = np.random.default_rng(2).normal(size=(2, 1, 4, 2))
+    at, up, down = (density.settled(x + sign * step) for sign in (0.0, 1.0, -1.0))
+    curvature = (up.cost + down.cost - 2 * at.cost) / 2
+    np.testing.assert_allclose(density.size(density.tangents(at), step), curvature, rtol=1e-9)
+
+
+def test_readings_beyond_numbers_lose_their_own_trial_alone():
+    model = Pendulum(count=25, start=(1.0, 0.0), spread=0.2)
+    z = model.draw(0, 3).z
+    spoiled = z.copy()
+    spoiled[1, 5:9] = 1e308
+    tracker = LevenbergMarquardtSmoother(starts=2)
+    with np.errstate(all="ignore"):
+        kept, lost = tracker.track(model, z), tracker.track(model, spoiled)
+    assert not np.isfinite(lost.cost[1])
+    np.testing.assert_array_equal(lost.mean[::2], kept.mean[::2])
+    np.testing.assert_array_equal(lost.covariance[::2], kept.covariance[::2])
