@@ -1,4 +1,5 @@
-"""Estimates parameters from real readings: question -> readings -> model -> noise and prior -> problem -> fits."""
+"""Estimates parameters from real readings: question -> readings -> model -> noise and prior ->
+problem -> fits."""
 
 from __future__ import annotations
 
@@ -46,13 +47,16 @@ class Question:
 
     @cached_property
     def found(self) -> Readings:
-        """The readings, of a model with the inputs of the files, and with what is known of parameters."""
-        model, given = self.model, self.readings
+        """The readings, of a model with the inputs of the files, and with what is known of
+        parameters."""
+        model = self.model
+        given = self.readings
         if isinstance(given, tuple):
             names = [str(path) for path in given]
             if len(set(names)) < len(names):
                 raise UserError(
-                    f"readings=[{','.join(names)}]: names a file twice, and would count its readings twice"
+                    f"readings=[{','.join(names)}]: names a file twice, and would count its"
+                    " readings twice"
                 )
             return open_together(given, model, self.known, self.ignored)
         if self.ignored:
@@ -62,12 +66,14 @@ class Question:
         if given is None:
             if model.recorded is None:
                 raise UserError(
-                    "readings: is not given; write readings=FILE (see `ipe-bench list measurement -v`)"
+                    "readings: is not given; write readings=FILE (see `ipe-bench list measurement"
+                    " -v`)"
                 )
             return Readings(informed(model, self.known), model.recorded.z)
         if given.shape != (model.m,):
             raise UserError(
-                f"readings: has shape {given.shape}; give the {model.m} readings of {model.name}, NaN where missing"
+                f"readings: has shape {given.shape}; give the {model.m} readings of {model.name},"
+                " NaN where missing"
             )
         return Readings(informed(model, self.known), unmasked(given).copy())
 
@@ -76,13 +82,13 @@ class Question:
         model = self.found.model
         prior = prior_stated(self.prior or GaussianPrior(), model)
         require_function(model)
-        if hindrance := model.hindrance(model.nominal):
+        hindrance = model.hindrance(model.nominal)
+        if hindrance:
             raise UserError(
                 f"measurement={model.name}: cannot be computed where estimation starts: {hindrance}"
             )
-        return Scenario(
-            model, self._noise(), prior, 1.0 if self.error_scale is None else self.error_scale
-        )
+        error_scale = 1.0 if self.error_scale is None else self.error_scale
+        return Scenario(model, self._noise(), prior, error_scale)
 
     @cached_property
     def problem(self) -> Problem:
@@ -92,31 +98,35 @@ class Question:
     def checked(self) -> Question:
         """Checks that this question can be answered, and returns it.
 
-        Raises:
-            UserError: a file does not hold the model's readings, or an estimator needs what is not stated.
+        Raises: UserError: a file does not hold the model's readings, or an estimator needs what is
+            not stated.
         """
-        scenario, lacking = self.scenario, []
+        scenario = self.scenario
         if not self.estimators:
             raise UserError("there is no estimator; choose with solver= and baseline=")
+        lacking = []
         for label, estimator in self.estimators.items():
-            if why := estimator.hindrance(scenario.problem):
+            why = estimator.hindrance(scenario.problem)
+            if why:
                 lacking.append(f"estimators.{label}: {why}; leave it out")
             elif estimator.hindrance(self.problem):
                 lacking.append(
-                    f"estimators.{label}: needs prior, which is not stated; give error_scale=X, the standard deviation"
-                    " of the parameters in multiples of their sizes"
+                    f"estimators.{label}: needs prior, which is not stated; give error_scale=X,"
+                    " the standard deviation of the parameters in multiples of their sizes"
                 )
         if lacking:
             raise UserError("; ".join(lacking))
         return self
 
     def fitted(self, watch: Callable[[str], object] = str) -> tuple[list[Fit], Examination | None]:
-        """Fits every estimator, whose label `watch` is called with before, and examines the least minimum."""
+        """Fits every estimator, whose label `watch` is called with before, and examines the least
+        minimum."""
         fits = fit(self.problem, self.found.z, self.estimators, self.scenario.noise, watch)
         return fits, examine(self.problem, self.found.z, fits)
 
     def _noise(self) -> Noise:
-        """Returns the stated noise, or that of a file's column, or the model's own; else its level is unknown."""
+        """Returns the stated noise, or that of a file's column, or the model's own; else its level
+        is unknown."""
         found = self.found
         stated = self.noise.of(found.model) if isinstance(self.noise, ModelNoise) else self.noise
         if self.readings is None and stated is None:
@@ -128,8 +138,8 @@ class Question:
             return replace(stated, weights=deviations)
         if stated is not None:
             raise UserError(
-                f"noise: is given, and the readings have a column {SIGMA}, too; leave one of them out, or set"
-                " noise=unknown to take the column for relative weights"
+                f"noise: is given, and the readings have a column {SIGMA}, too; leave one of them"
+                " out, or set noise=unknown to take the column for relative weights"
             )
         return Gaussian(deviations)
 
@@ -144,18 +154,19 @@ def prior_stated(prior: Prior, model: Measurement) -> Prior:
         return prior
     if not isinstance(prior, GaussianPrior):
         raise UserError(
-            f"parameters: goes with prior=gaussian, which is told of each; prior={prior.name} is not"
+            f"parameters: goes with prior=gaussian, which is told of each; prior={prior.name} is"
+            " not"
         )
     if prior.deviations is None:
         return replace(prior, deviations=model.prior_deviations)
     names = [p.name for p in model.whole.parameters]
     if len(prior.deviations) != len(names):
         raise UserError(
-            f"prior.deviations: has {len(prior.deviations)} numbers; give one for each of {len(names)} parameters"
+            f"prior.deviations: has {len(prior.deviations)} numbers; give one for each of"
+            f" {len(names)} parameters"
         )
     general = dict(zip(names, prior.deviations, strict=True))
     own = {one.name for one in model.known if one.deviation is not None}
     known = zip(model.physical_parameters, model.prior_deviations, strict=True)
-    return replace(
-        prior, deviations=tuple(d if p.name in own else general[p.name] for p, d in known)
-    )
+    deviations = (d if p.name in own else general[p.name] for p, d in known)
+    return replace(prior, deviations=tuple(deviations))

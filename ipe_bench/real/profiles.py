@@ -1,8 +1,8 @@
 """Computes intervals of parameters: from standard errors, and from the profile likelihood.
 
-A profile interval holds what it promises where the model bends and intervals from standard errors do not (Venzon and
-Moolgavkar, Applied Statistics 37, 1988; Bates and Watts, Nonlinear Regression Analysis and Its Applications, 1988,
-section 6.1).
+A profile interval holds what it promises where the model bends and intervals from standard errors
+do not (Venzon and Moolgavkar, Applied Statistics 37, 1988; Bates and Watts, Nonlinear Regression
+Analysis and Its Applications, 1988, section 6.1).
 """
 
 from __future__ import annotations
@@ -32,61 +32,71 @@ _FARTHEST = 1e6
 _STRETCHES = 27
 """The most steps outwards."""
 _STRAIGHT = 0.02
-"""The share by which a rise differs at most from that of a linear model where steps may be large."""
+"""The share by which a rise differs at most from that of a linear model where steps may be
+large."""
 _PRECISION = 1e-8
 """The precision of an end, as a share of the half-width."""
 _JUMP = 0.01
-"""A rise at an end that is smaller than it should be by more than this share is that of another valley."""
+"""A rise at an end that is smaller than it should be by more than this share is that of another
+valley."""
 _STEP = 1e-4
-"""The share of the distance to an end within which a rise does not fall that far, unless minima were lost there."""
+"""The share of the distance to an end within which a rise does not fall that far, unless minima
+were lost there."""
 _LIMITS = Limits(1e-7, 100)
 _LOWER = 1e-6
-"""A chi-square that is smaller than at the estimate by more than this is that of a lower minimum."""
+"""A chi-square that is smaller than at the estimate by more than this is that of a lower
+minimum."""
 _ON_BOUND = 1e-9
-"""A value nearer to a bound than this share of the start's distance is on the bound, but for round-off."""
+"""A value nearer to a bound than this share of the start's distance is on the bound, but for
+round-off."""
 
 
 def half_width(confidence: float, freedom: float | Array | None) -> float | Array:
-    """Returns the normal quantile of a two-sided interval; Student's t if the level of the noise is estimated from
-    `freedom` degrees of freedom, or (n,) of them."""
+    """Returns the normal quantile of a two-sided interval; Student's t if the level of the noise is
+    estimated from `freedom` degrees of freedom, or (n,) of them."""
     return stdtrit(np.inf if freedom is None else freedom, (1 + confidence) / 2)
 
 
 def joint_region(parameters: int, confidence: float, freedom: float | None) -> float:
-    """Computes the squared distance, in standard errors, to the edge of the joint confidence region of some parameters:
-    chi-square, or F if the level of the noise is estimated from `freedom` degrees of freedom."""
+    """Computes the squared distance, in standard errors, to the edge of the joint confidence region
+    of some parameters: chi-square, or F if the level of the noise is estimated from `freedom`
+    degrees of freedom."""
     if freedom is None:
         return float(chdtri(parameters, 1 - confidence))
     return float(parameters * fdtri(parameters, freedom, confidence))
 
 
 def natural_limits(model: Measurement) -> tuple[Array, Array]:
-    """Returns the lower and upper bounds (n,) of the parameters in their own units; infinite if there are none."""
-    ends = model.physical(np.stack([np.full(model.n, -np.inf), np.full(model.n, np.inf)]))
+    """Returns the lower and upper bounds (n,) of the parameters in their own units; infinite if
+    there are none."""
+    infinite = np.full(model.n, np.inf)
+    ends = model.physical(np.stack([-infinite, infinite]))
     return ends.min(axis=0), ends.max(axis=0)
 
 
 def wald_interval(
     model: Measurement, x: Array, deviation: Array, q: float | Array
 ) -> tuple[Array, Array]:
-    """Computes the interval (n,), (n,) of q standard deviations (n,) about x (n,), in the parameters' own units.
+    """Computes the interval (n,), (n,) of q standard deviations (n,) about x (n,), in the
+    parameters' own units.
 
-    It is symmetric in x, such as the logarithm of a distance to a bound. If three times q standard errors reach a
-    bound, the logarithm bends too much over the interval, which is then symmetric in the parameter and ends at the
-    bound.
+    It is symmetric in x, such as the logarithm of a distance to a bound. If three times q standard
+    errors reach a bound, the logarithm bends too much over the interval, which is then symmetric in
+    the parameter and ends at the bound.
     """
+    reach = q * deviation
     with np.errstate(all="ignore"):
-        ends = model.physical(np.stack([x - q * deviation, x + q * deviation]))
-        value, error = (
-            model.physical(x[None])[0],
-            deviation * np.abs(model.physical_slope(x[None])[0]),
-        )
+        ends = model.physical(np.stack([x - reach, x + reach]))
+        value = model.physical(x[None])[0]
+        error = deviation * np.abs(model.physical_slope(x[None])[0])
     lower, upper = natural_limits(model)
     with np.errstate(invalid="ignore"):
-        reached = (value - 3 * q * error <= lower) | (value + 3 * q * error >= upper)
+        far = 3 * q * error
+        reached = (value - far <= lower) | (value + far >= upper)
         reached &= np.isfinite(lower) | np.isfinite(upper)
     low = np.where(reached, np.maximum(lower, value - q * error), ends.min(axis=0))
-    return low, np.where(reached, np.minimum(upper, value + q * error), ends.max(axis=0))
+    high = np.where(reached, np.minimum(upper, value + q * error), ends.max(axis=0))
+    return low, high
 
 
 @dataclass(frozen=True)
@@ -105,7 +115,8 @@ class Released:
     """The sign that leads inwards, of each."""
 
     def inside(self, x: Array) -> Mask:
-        """Tells which of the points x (points, n) are within each of these bounds, (points, bounds)."""
+        """Tells which of the points x (points, n) are within each of these bounds, (points,
+        bounds)."""
         return (x - self.x)[:, self.places] * self.inwards >= 0
 
 
@@ -120,42 +131,60 @@ def profiles(
     signs: Sequence[int] = (-1, 1),
     released: Released | None = None,
 ) -> tuple[Array, Array]:
-    """Computes the profile intervals (places,), (places,) of the parameters `places`, or of all, in their own units,
-    about the least-squares estimate x (n,) of covariance P (n, n) from readings z (m,), all present.
+    """Computes the profile intervals (places,), (places,) of the parameters `places`, or of all, in
+    their own units, about the least-squares estimate x (n,) of covariance P (n, n) from readings z
+    (m,), all present.
 
-    An end is infinite if the readings set no limit, and NaN if no minimum is found on the way to it; both are NaN if
-    the search finds a better fit than the estimate.
-    `freedom` (n,) stands for several levels of the noise among the parameters. `signs` are the sides on which an end is
-    searched for; the other end is infinite. Parameters that are `released` may leave their bounds inwards.
+    An end is infinite if the readings set no limit, and NaN if no minimum is found on the way to
+    it; both are NaN if the search finds a better fit than the estimate. `freedom` (n,) stands for
+    several levels of the noise among the parameters. `signs` are the sides on which an end is
+    searched for; the other end is infinite. Parameters that are `released` may leave their bounds
+    inwards.
 
-    If the estimate of a parameter is on a bound, one end is the bound. The rise of chi-square is compared with the
-    same quantile as inside of bounds: if the true value is beyond, the estimate is only nearer to it, so that the
-    interval holds it at least as often as it says.
+    If the estimate of a parameter is on a bound, one end is the bound. The rise of chi-square is
+    compared with the same quantile as inside of bounds: if the true value is beyond, the estimate
+    is only nearer to it, so that the interval holds it at least as often as it says.
     """
-    model, q = problem.measurement, np.broadcast_to(half_width(CONFIDENCE, freedom), len(x))
-    behind = freedom if isinstance(freedom, np.ndarray) else np.full(len(x), np.inf)
+    model = problem.measurement
+    q = np.broadcast_to(half_width(CONFIDENCE, freedom), len(x))
+    behind = np.full(len(x), np.inf)
+    if isinstance(freedom, np.ndarray):
+        behind = freedom
     objective = objective_of(problem, z[None])
     least = float(objective.cost(x[None], objective.residual(x[None]))[0])
-    start, limits, found = model.physical(model.nominal[None])[0], natural_limits(model), []
+    start = model.physical(model.nominal[None])[0]
+    slope = model.physical_slope(x[None])[0]
+    limits = natural_limits(model)
+    found = []
     for k in range(len(x)) if places is None else places:
-        sides = (
-            _Side(problem, z, x, P, k, s, float(q[k]), float(behind[k]), least, objective, released)
-            for s in (-1, 1)
-        )
         ends = np.repeat(x[None], 2, axis=0)
         try:
-            ends[:, k] += [
-                side.sign * (side.end() if side.sign in signs else np.inf) for side in sides
-            ]
+            for row, s in enumerate((-1, 1)):
+                side = _Side(
+                    problem,
+                    z,
+                    x,
+                    P,
+                    k,
+                    s,
+                    float(q[k]),
+                    float(behind[k]),
+                    least,
+                    objective,
+                    released,
+                )
+                distance = side.end() if s in signs else np.inf
+                ends[row, k] += s * distance
         except _BetterFit:
             ends[:, k] = np.nan
         with np.errstate(invalid="ignore"):
             values = model.physical(ends)[:, k]
         # A negative unit turns the order.
-        values = values if model.physical_slope(x[None])[0, k] > 0 else values[::-1]
+        values = values if slope[k] > 0 else values[::-1]
         for bound in (limits[0][k], limits[1][k]):
             if np.isfinite(bound):
-                values[np.abs(values - bound) <= _ON_BOUND * abs(start[k] - bound)] = bound
+                near = _ON_BOUND * abs(start[k] - bound)
+                values[np.abs(values - bound) <= near] = bound
         found.append(values)
     low, high = np.array(found).reshape(-1, 2).T
     return low, high
@@ -178,7 +207,8 @@ class _Side:
     q: float
     """The rise of root chi-square at the end."""
     behind: float
-    """The degrees of freedom of levels of the noise among the parameters; infinite if there are none."""
+    """The degrees of freedom of levels of the noise among the parameters; infinite if there are
+    none."""
     least: float
     objective: Objective
     released: Released | None
@@ -188,49 +218,52 @@ class _Side:
         """The rise up to twice q, and the parameters, by distance from the estimate."""
 
     def end(self) -> float:
-        """Finds the distance to the end; infinite if there is none, NaN if minima cannot be followed to it."""
+        """Finds the distance to the end; infinite if there is none, NaN if minima cannot be
+        followed to it."""
         half = self.q * float(np.sqrt(self.P[self.place, self.place]))
-        near, far = 0.0, half / 8
+        near = 0.0
+        far = half / 8
         for _ in range(_STRETCHES):
-            if (risen := self.rise(far)) >= self.q:
-                far = cast(
-                    float,
-                    brentq(lambda d: self.rise(d) - self.q, near, far, xtol=_PRECISION * half),
-                )
-                if (risen := self.rise(far, around=True)) >= (1 - _JUMP) * self.q:
-                    return far if self.rise((1 - _STEP) * far) >= (1 - _JUMP) * self.q else np.nan
+            risen = self.rise(far)
+            if risen >= self.q:
+                far = self._crossing(near, far, _PRECISION * half)
+                risen = self.rise(far, around=True)
+                if risen >= (1 - _JUMP) * self.q:
+                    before = self.rise((1 - _STEP) * far)
+                    return far if before >= (1 - _JUMP) * self.q else np.nan
+                # Another valley is lower here: the search goes on along that.
                 self.seen = {far: self.seen[far]}
-            # Small steps where the profile bends, since it may rise beyond q and fall again within a large one.
+            # Small steps where the profile bends, since it may rise beyond q and fall again within
+            # a large one.
             straight = abs(risen * half / (far * self.q) - 1) < _STRAIGHT
-            near, far = (
-                far,
-                far
-                * float(np.clip(1.05 * self.q / max(risen, 1e-3), 1.1, 9.0 if straight else 2.0)),
-            )
+            # A straight profile, whose rise is proportional to the distance, meets q there and 5 %
+            # on.
+            stretch = np.clip(1.05 * self.q / max(risen, 1e-3), 1.1, 9.0 if straight else 2.0)
+            near = far
+            far *= float(stretch)
             if far > _FARTHEST * half:
                 break
         return np.inf
 
+    def _crossing(self, near: float, far: float, precision: float) -> float:
+        """Finds the distance between `near` and `far` at which the rise is q."""
+        return cast(float, brentq(lambda d: self.rise(d) - self.q, near, far, xtol=precision))
+
     def rise(self, distance: float, *, around: bool = False) -> float:
-        """Computes the rise of root chi-square at a distance; that of the least minimum found from the profile's
-        nearest points and, if asked, from all around, where another valley may be lower."""
+        """Computes the rise of root chi-square at a distance; that of the least minimum found from
+        the profile's nearest points and, if asked, from all around, where another valley may be
+        lower."""
         if distance in self.seen and not around:
             return self.seen[distance][0]
         at = float(self.x[self.place] + self.sign * distance)
-        usable = sorted(
-            (abs(d - distance), d) for d, (zeta, _) in self.seen.items() if zeta < 2.0 * self.q
-        )
-        nearest = usable[0][1]
-        beyond = [d for _, d in usable if (d - distance) * (nearest - distance) < 0]
-        points = [self.seen[d][1] for d in (nearest, *beyond[:1])]
-        starts = np.vstack([_ahead(self.objective, points[0], self.place, at), *points])
+        starts = self._starts(distance, at)
         if around:
             starts = np.vstack([starts, self._around(at)])
         point, total = _least_at(self.problem, self.z, self.place, at, starts, self.released)
         change = total - self.least
         if np.isfinite(self.behind):
-            # Levels that are among the other parameters, of f degrees of freedom, raise chi-square by
-            # f log(1 + t^2 / f) where a linear model would give Student's t.
+            # Levels that are among the other parameters, of f degrees of freedom, raise chi-square
+            # by f log(1 + t^2 / f) where a linear model would give Student's t.
             with np.errstate(over="ignore"):
                 change = self.behind * np.expm1(change / self.behind)
         if change < -_LOWER * max(1.0, self.least):
@@ -240,13 +273,26 @@ class _Side:
         self.seen[distance] = risen, point
         return risen
 
+    def _starts(self, distance: float, at: float) -> Array:
+        """Returns the nearest points of the profile, of one side or of both, and where the nearest
+        leads to."""
+        usable = [d for d, (risen, _) in self.seen.items() if risen < 2.0 * self.q]
+        nearest, *others = sorted(usable, key=lambda d: (abs(d - distance), d))
+        beyond = [d for d in others if (d - distance) * (nearest - distance) < 0]
+        points = [self.seen[d][1] for d in (nearest, *beyond[:1])]
+        return np.vstack([_ahead(self.objective, points[0], self.place, at), *points])
+
     def _around(self, at: float) -> Array:
-        """Returns starts (starts, n) two deviations of the others to both sides of a linear model's prediction from the
-        estimate, along each axis of their covariance."""
-        gain = self.P[:, self.place] / self.P[self.place, self.place]
-        sizes, axes = np.linalg.eigh(self.P - np.outer(gain, self.P[self.place]))
+        """Returns starts (starts, n) two deviations of the others to both sides of a linear model's
+        prediction from the estimate, along each axis of their covariance."""
+        P = self.P
+        place = self.place
+        gain = P[:, place] / P[place, place]
+        # The covariance of the others if this one is known.
+        left = P - np.outer(gain, P[place])
+        sizes, axes = np.linalg.eigh(left)
         steps = 2.0 * np.sqrt(np.maximum(sizes, 0.0))[:, None] * axes.T
-        return _along(self.x, self.P, self.place, at) + np.vstack([steps, -steps])
+        return _along(self.x, P, place, at) + np.vstack([steps, -steps])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -260,39 +306,45 @@ class _Pinned(CountingModel):
         return super().simulate(self.whole(x), rows)
 
     def jacobian(self, x: Array, rows: NDArray[np.intp], *, coarse: Mask | bool = False) -> Array:
-        return np.delete(super().jacobian(self.whole(x), rows, coarse=coarse), self.place, axis=2)
+        J = super().jacobian(self.whole(x), rows, coarse=coarse)
+        return np.delete(J, self.place, axis=2)
 
     def whole(self, x: Array) -> Array:
         return np.insert(x, self.place, self.value, axis=1)
 
 
 def _along(x: Array, P: Array, place: int, at: float) -> Array:
-    """Follows a linear model of covariance P (n, n) from its minimum x (n,) to a value of the parameter of a place."""
-    return x + P[:, place] / P[place, place] * (at - x[place])
+    """Follows a linear model of covariance P (n, n) from its minimum x (n,) to a value of the
+    parameter of a place."""
+    gain = P[:, place] / P[place, place]
+    return x + gain * (at - x[place])
 
 
 def _ahead(objective: Objective, near: Array, place: int, at: float) -> Array:
-    """Follows the profile from one of its points `near` (n,) to a value of the parameter of a place, if the model is
-    straight on the way."""
+    """Follows the profile from one of its points `near` (n,) to a value of the parameter of a
+    place, if the model is straight on the way."""
     with np.errstate(all="ignore"):
         J = objective.jacobian(near[None])[0]
     if not np.isfinite(J).all():
         return near
+    # The others make up for what the one changes, by least squares.
+    others = np.delete(J, place, axis=1)
+    gain = np.linalg.lstsq(others, J[:, place], rcond=None)[0]
     step = np.full(len(near), at - near[place])
-    step[np.arange(len(near)) != place] *= -np.linalg.lstsq(
-        np.delete(J, place, axis=1), J[:, place], rcond=None
-    )[0]
+    step[np.arange(len(near)) != place] *= -gain
     return near + step
 
 
 def _least_at(
     problem: Problem, z: Array, place: int, at: float, starts: Array, released: Released | None
 ) -> tuple[Array, float]:
-    """Finds the least of the minima (n,) with one parameter at a value from `starts` (starts, n), and the sum of
-    squares there; that is smaller if parameters that are released fit better inside of their bounds, and NaN where the
-    model has no value."""
-    model = _Pinned(problem.measurement, EvaluationCount.zeros(len(starts)), place=place, value=at)
-    objective = objective_of(problem, np.repeat(z[None], len(starts), axis=0), model)
+    """Finds the least of the minima (n,) with one parameter at a value from `starts` (starts, n),
+    and the sum of squares there; that is smaller if parameters that are released fit better inside
+    of their bounds, and NaN where the model has no value."""
+    tally = EvaluationCount.zeros(len(starts))
+    model = _Pinned(problem.measurement, tally, place=place, value=at)
+    readings = np.repeat(z[None], len(starts), axis=0)
+    objective = objective_of(problem, readings, model)
     x = np.delete(starts, place, axis=1)
     with np.errstate(all="ignore"):
         if x.size:
@@ -301,8 +353,11 @@ def _least_at(
     best = int(np.argmin(np.where(np.isnan(totals), np.inf, totals)))
     total = float(totals[best])
     if released is not None:
-        free = int(np.setdiff1d(np.arange(len(released.x)), released.places)[place])
+        kept = np.setdiff1d(np.arange(len(released.x)), released.places)
+        free = int(kept[place])
         start = _along(released.x, released.P, free, at)
         freed, less = _least_at(released.problem, z, free, at, start[None], None)
-        total = float(np.fmin(total, less)) if released.inside(freed[None]).all() else total
+        # Outside of the bounds a smaller sum does not count.
+        if released.inside(freed[None]).all():
+            total = float(np.fmin(total, less))
     return model.whole(x)[best], total

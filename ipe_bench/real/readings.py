@@ -1,8 +1,9 @@
 """Reads files of readings, and completes the model by their columns.
 
-A file has one row per reading, in any order, with columns that say which reading it is, and the reading with its unit:
-`case,time [min],axis,reading [m/s]` for GINS. An empty reading is missing. Cells are separated by commas or tabs; or by
-semicolons, and then a comma is a decimal point. What is not plainly a number is refused with its row.
+A file has one row per reading, in any order, with columns that say which reading it is, and the
+reading with its unit: `case,time [min],axis,reading [m/s]` for GINS. An empty reading is missing.
+Cells are separated by commas or tabs; or by semicolons, and then a comma is a decimal point. What
+is not plainly a number is refused with its row.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo, inform
 SIGMA = "sigma"
 """The column of standard deviations of the readings."""
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+_NOT_FINITE = ("nan", "inf", "infinity")
 _MISSING = "a missing reading is an empty cell"
 _SAMPLES = Path("ipe_bench/real/samples")
 """Folder of the package's own samples in a clone; from elsewhere, they are found in the package."""
@@ -52,7 +54,7 @@ class Readings:
     """Each file with the SHA-256 of the bytes that were read."""
 
 
-# Tables of text -------------------------------------------------------------------------------------------------------
+# Tables of text -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -70,24 +72,28 @@ class TextTable:
         return UserError(f"readings={self.path}: {text}")
 
     def number(self, text: str) -> float | None:
-        """Parses the number in a cell, or None; a point among decimal commas is ambiguous, and none."""
-        return _number(text.replace(".", "?").replace(",", ".") if self.decimal == "," else text)
+        """Parses the number in a cell, or None; a point among decimal commas is ambiguous, and
+        none."""
+        if self.decimal == ",":
+            text = text.replace(".", "?").replace(",", ".")
+        return _number(text)
 
     def value(self, text: str, where: str) -> float:
-        """Parses the finite number in a cell, NaN if it is empty; otherwise a UserError at `where`, its row and
-        column."""
-        if not text.strip():
+        """Parses the finite number in a cell, NaN if it is empty; otherwise a UserError at `where`,
+        its row and column."""
+        bare = text.strip()
+        if not bare:
             return math.nan
         value = self.number(text)
         if value is not None and math.isfinite(value):
             return value
-        if text.strip().lstrip("+-").lower() in ("nan", "inf", "infinity") or value is not None:
+        if value is not None or bare.lstrip("+-").lower() in _NOT_FINITE:
             raise self.error(
-                f"{where}: {text.strip()} is not a reading; leave the cell empty if it is missing"
+                f"{where}: {bare} is not a reading; leave the cell empty if it is missing"
             )
-        said = f"'{' '.join(text.split())}' is not a number" + (
-            ", with decimal commas" if self.decimal == "," else ""
-        )
+        said = f"'{' '.join(text.split())}' is not a number"
+        if self.decimal == ",":
+            said += ", with decimal commas"
         raise self.error(f"{where}: {said}; correct it, or leave the cell empty if it is missing")
 
     def column(self, name: str) -> list[tuple[str, str]]:
@@ -99,42 +105,36 @@ class TextTable:
         """Finds the column of that heading; a heading without a unit is found with one, too."""
         if wanted in self.heading:
             return wanted
-        return next(
-            (name for name in self.heading if " [" not in wanted and _quantity(name) == wanted),
-            None,
-        )
+        if " [" in wanted:
+            return None
+        return next((name for name in self.heading if _quantity(name) == wanted), None)
 
     def require_known(self, known: Collection[str], wanted: Sequence[str]) -> None:
         """Refuses columns that are not known."""
-        for name in self.heading:
-            if name not in known:
-                meant = did_you_mean(name, [one for one in wanted if one not in self.heading])
-                what = (
-                    f"column {name}"
-                    if name
-                    else f"column {self.heading.index(name) + 1}, which has no name,"
-                )
-                remedy = (
-                    f"remove it, or set ignore_columns=[{name.split(' [')[0]}]"
-                    if name
-                    else "remove it"
-                )
-                hint = f"{meant} Otherwise" if meant else ";"
-                raise self.error(
-                    f"{what} is not understood{hint} {remedy} (the header must be {','.join(wanted)})"
-                )
+        for place, name in enumerate(self.heading):
+            if name in known:
+                continue
+            what = f"column {place + 1}, which has no name,"
+            remedy = "remove it"
+            if name:
+                what = f"column {name}"
+                remedy = f"remove it, or set ignore_columns=[{name.split(' [')[0]}]"
+            meant = did_you_mean(name, [one for one in wanted if one not in self.heading])
+            hint = f"{meant} Otherwise" if meant else ";"
+            raise self.error(
+                f"{what} is not understood{hint} {remedy} (the header must be {','.join(wanted)})"
+            )
 
     def refuse_other_unit(self, name: str) -> None:
         """Refuses a column that is there with another unit, or with none."""
         for other in self.heading:
-            if _quantity(other) == _quantity(name):
-                if not _unit(other):
-                    raise self.error(
-                        f"column {other}: has no unit; call it {name} if that is the unit of its values"
-                    )
+            if _quantity(other) != _quantity(name):
+                continue
+            if not _unit(other):
                 raise self.error(
-                    f"column {other}: the unit must be that of {name}; convert the values"
+                    f"column {other}: has no unit; call it {name} if that is the unit of its values"
                 )
+            raise self.error(f"column {other}: the unit must be that of {name}; convert the values")
 
 
 def _number(text: str) -> float | None:
@@ -161,17 +161,21 @@ def read_tables(paths: Sequence[Path], without: Sequence[str] = ()) -> list[Text
         if not any(table.find(name.strip()) for table in tables):
             headings = dict.fromkeys(heading for table in tables for heading in table.heading)
             raise UserError(f"ignore_columns={name}: {unknown(name, list(headings), 'column')}")
-    reduced = []
-    for table in tables:
-        gone = {table.find(name.strip()) for name in without}
-        kept = [k for k, name in enumerate(table.heading) if name not in gone]
-        rows = [(number, [row[k] for k in kept]) for number, row in table.rows]
-        reduced.append(replace(table, heading=[table.heading[k] for k in kept], rows=rows))
-    return reduced
+    return [_reduced(table, without) for table in tables]
+
+
+def _reduced(table: TextTable, without: Sequence[str]) -> TextTable:
+    """Leaves columns out of a table."""
+    gone = {table.find(name.strip()) for name in without}
+    kept = [k for k, name in enumerate(table.heading) if name not in gone]
+    heading = [table.heading[k] for k in kept]
+    rows = [(number, [row[k] for k in kept]) for number, row in table.rows]
+    return replace(table, heading=heading, rows=rows)
 
 
 def _read_table(path: Path) -> TextTable:
-    """Reads the table of a CSV or Parquet file, in which every row has as many cells as the header."""
+    """Reads the table of a CSV or Parquet file, in which every row has as many cells as the
+    header."""
     if path.parent == _SAMPLES and not path.is_file():
         path = Path(__file__).with_name("samples") / path.name
     if not path.is_file():
@@ -179,29 +183,35 @@ def _read_table(path: Path) -> TextTable:
     data = path.read_bytes()
     table = TextTable(path, digest=hashlib.sha256(data).hexdigest())
     table = (_with_parquet if path.suffix == ".parquet" else _with_text)(table, data)
+    _require_header(table)
+    for number, row in table.rows:
+        if len(row) != len(table.heading):
+            raise table.error(f"row {number}: {_wrong_length(table, number, row)}")
+    return table
+
+
+def _require_header(table: TextTable) -> None:
+    """Refuses a first row of numbers, and names that stand twice."""
     if all(table.number(name) is not None for name in table.heading):
         raise table.error(
-            "the first row has only numbers and is no header; write the names of the columns above it"
+            "the first row has only numbers and is no header; write the names of the columns"
+            " above it"
         )
     for name, count in Counter(table.heading).items():
         if count > 1:
             what = f"column {name} stands there" if name else "columns without a name stand there"
             raise table.error(f"{what} twice; keep one")
-    for number, row in table.rows:
-        if len(row) == len(table.heading):
-            continue
-        if number == table.rows[0][0] and all(
-            cell.strip() and table.number(cell) is None for cell in row
-        ):
-            text = "looks like the header, which must be the first row; remove what stands above it"
-        else:
-            decimal = len(row) > len(table.heading) and table.decimal == "."
-            remedy = (
-                "with decimal commas, separate the cells by semicolons" if decimal else _MISSING
-            )
-            text = f"has {len(row)} cells and the header {len(table.heading)}; {remedy}"
-        raise table.error(f"row {number}: {text}")
-    return table
+
+
+def _wrong_length(table: TextTable, number: int, row: Sequence[str]) -> str:
+    """Says why a row has more or fewer cells than the header, and what mends it."""
+    first, _ = table.rows[0]
+    if number == first and all(cell.strip() and table.number(cell) is None for cell in row):
+        return "looks like the header, which must be the first row; remove what stands above it"
+    remedy = _MISSING
+    if len(row) > len(table.heading) and table.decimal == ".":
+        remedy = "with decimal commas, separate the cells by semicolons"
+    return f"has {len(row)} cells and the header {len(table.heading)}; {remedy}"
 
 
 def _with_parquet(table: TextTable, data: bytes) -> TextTable:
@@ -212,17 +222,14 @@ def _with_parquet(table: TextTable, data: bytes) -> TextTable:
         found = pq.read_table(pa.BufferReader(data))
     except (pa.ArrowException, OSError) as error:
         raise table.error("is not a readable Parquet file") from error
-    found = found.select(
-        [n for n in found.column_names if not n.startswith("__index_level_")]
-    )  # pandas' row numbers
+    # pandas writes the numbers of rows as a column of such a name.
+    heading = [name for name in found.column_names if not name.startswith("__index_level_")]
     columns = [
-        ["" if v is None else str(v) for v in column.to_pylist()] for column in found.columns
+        ["" if cell is None else str(cell) for cell in column.to_pylist()]
+        for column in found.select(heading).columns
     ]
-    return replace(
-        table,
-        heading=found.column_names,
-        rows=list(enumerate(map(list, zip(*columns, strict=True)), 1)),
-    )
+    rows = map(list, zip(*columns, strict=True))
+    return replace(table, heading=heading, rows=list(enumerate(rows, 1)))
 
 
 def _with_text(table: TextTable, data: bytes) -> TextTable:
@@ -244,16 +251,16 @@ def _with_text(table: TextTable, data: bytes) -> TextTable:
         ) from error
     if not lines:
         raise table.error("is empty")
-    (_, heading), *rows = lines
-    comma = separator == ";" and any(
-        _WITH_COMMA.fullmatch(cell.strip()) for _, row in rows for cell in row
-    )
-    return replace(
-        table, heading=[name.strip() for name in heading], rows=rows, decimal="," if comma else "."
-    )
+    (_, first_row), *rows = lines
+    heading = [name.strip() for name in first_row]
+    # Only where semicolons part the cells can a comma be a decimal point, and one number with it is
+    # enough.
+    cells = (cell.strip() for _, row in rows for cell in row)
+    comma = separator == ";" and any(map(_WITH_COMMA.fullmatch, cells))
+    return replace(table, heading=heading, rows=rows, decimal="," if comma else ".")
 
 
-# Files of a model -----------------------------------------------------------------------------------------------------
+# Files of a model ---------------------------------------------------------------------------------
 
 
 def labels(model: Measurement) -> Mapping[str, Sequence[Any]]:
@@ -263,7 +270,8 @@ def labels(model: Measurement) -> Mapping[str, Sequence[Any]]:
 
 def header(model: Measurement) -> list[str]:
     """Returns the columns of a readings file of this model."""
-    return [*labels(model), f"reading [{model.reading_unit}]" if model.reading_unit else "reading"]
+    unit = f" [{model.reading_unit}]" if model.reading_unit else ""
+    return [*labels(model), f"reading{unit}"]
 
 
 def write_readings(path: Path, model: Measurement, z: Array) -> None:
@@ -272,22 +280,16 @@ def write_readings(path: Path, model: Measurement, z: Array) -> None:
     Raises:
         UserError: the file is there already.
     """
-    rows = zip(
-        *labels(model).values(),
-        ["" if math.isnan(value) else repr(float(value)) for value in z],
-        strict=True,
-    )
-    _write(path, [header(model), *rows])
+    cells = ["" if math.isnan(value) else repr(float(value)) for value in z]
+    _write(path, [header(model), *zip(*labels(model).values(), cells, strict=True)])
 
 
 def write_truth(path: Path, model: Measurement, x: Array) -> None:
     """Writes parameters x (n,), given in multiples of their sizes, in physical units."""
-    values = model.physical(x[None])[0]
-    rows = [
-        [p.name, p.unit, repr(float(v))]
-        for p, v in zip(model.physical_parameters, values, strict=True)
-    ]
-    _write(path, [["parameter", "unit", "value"], *rows])
+    rows = [["parameter", "unit", "value"]]
+    for p, value in zip(model.physical_parameters, model.physical(x[None])[0], strict=True):
+        rows.append([p.name, p.unit, repr(float(value))])
+    _write(path, rows)
 
 
 def _write(path: Path, rows: Sequence[Sequence[Any]]) -> None:
@@ -308,28 +310,27 @@ def open_together(
 ) -> Readings:
     """Opens one file of readings or several, which share the parameters that are not a file's own.
 
-    `known` is what is known of all their parameters. `without` are columns that are left out, by their headings with
-    their units or without.
+    `known` is what is known of all their parameters. `without` are columns that are left out, by
+    their headings with their units or without.
 
-    Raises:
-        UserError: a file is absent or does not hold readings of this model, files differ in what they know, or there
-            are fewer readings than parameters.
+    Raises: UserError: a file is absent or does not hold readings of this model, files differ in
+        what they know, or there are fewer readings than parameters.
     """
     if isinstance(model, ConstrainedModel):
         return open_together(paths, model.whole, (*model.known, *known), without)
     tables = read_tables(paths, without)
     found = _together(paths, [_readings_in(table, model) for table in tables])
-    model, files = (
-        informed(found.model, known),
-        tuple((str(table.path), table.digest) for table in tables),
-    )
-    if (there := int(np.isfinite(found.z).sum())) < model.n:
+    model = informed(found.model, known)
+    there = int(np.isfinite(found.z).sum())
+    if there < model.n:
         shown = str(paths[0]) if len(paths) == 1 else f"[{','.join(map(str, paths))}]"
         raise UserError(f"readings={shown}: {there} readings are too few for {model.n} parameters")
+    files = tuple((str(table.path), table.digest) for table in tables)
     return replace(found, model=model, files=files)
 
 
 def _together(paths: Sequence[Path], found: Sequence[Readings]) -> Readings:
+    """Joins the readings of files."""
     first = found[0]
     if len(found) == 1:
         return first
@@ -344,32 +345,26 @@ def _together(paths: Sequence[Path], found: Sequence[Readings]) -> Readings:
             other = units.get(_quantity(name))
             if other and _unit(name) and _unit(name) != other:
                 raise UserError(
-                    f"readings={path}: column {name}: {paths[0]} has it in {other}; convert the values"
+                    f"readings={path}: column {name}: {paths[0]} has it in {other}; convert the"
+                    " values"
                 )
-    deviations = [one.deviations for one in found if one.deviations is not None]
     joint = Joint(tuple(one.model for one in found))
-    return Readings(
-        joint,
-        np.concatenate([one.z for one in found]),
-        np.concatenate(deviations) if deviations else None,
-    )
+    z = np.concatenate([one.z for one in found])
+    deviations = [one.deviations for one in found if one.deviations is not None]
+    return Readings(joint, z, np.concatenate(deviations) if deviations else None)
 
 
 def _readings_in(table: TextTable, model: Measurement) -> Readings:
     """Reads a file, which may have too few readings."""
     sigma = table.find(SIGMA)
-    columns = [table.find(wanted.heading) for wanted in model.inputs]
-    there = [c for i, c in zip(model.inputs, columns, strict=True) if c is not None and not i.label]
-    known = bool(model.inputs) and model.input_columns_known and not there
-    # An input that tells readings apart, such as the time, is in every file.
-    if not model.inputs or (
-        known and not any(i.heading in model.index for i in model.inputs if not i.label)
-    ):
-        rows, shown = _rows_of(table, model, [sigma] if sigma else []), header(model)[-1]
+    columns = {wanted: table.find(wanted.heading) for wanted in model.inputs}
+    if not columns or _knows_rows(model, columns):
+        shown = header(model)[-1]
+        rows = _rows_of(table, model, [sigma] if sigma else [])
         cells = table.column(shown)
         z = np.array([table.value(*cells[row]) for row in rows], dtype=float)
         return Readings(model, z, _sigmas(table, sigma, rows, z, shown))
-    for wanted, column in zip(model.inputs, columns, strict=True):
+    for wanted, column in columns.items():
         if column is None and wanted.default is None:
             table.refuse_other_unit(wanted.heading)
             absent = model.absent_input(wanted.heading, list(table.heading))
@@ -377,33 +372,51 @@ def _readings_in(table: TextTable, model: Measurement) -> Readings:
     if not table.rows:
         raise table.error("has a header and no rows")
     shown = _reading_column(table, model)
-    used = (*(c for c in columns if c is not None), shown, *([sigma] if sigma else []))
+    used = (*filter(None, columns.values()), shown, *([sigma] if sigma else []))
     z = np.array([table.value(*cell) for cell in table.column(shown)])
-    known = {
-        wanted.heading: [wanted.default] * len(z)
-        if column is None
-        else [_input(table, wanted, *cell) for cell in table.column(column)]
-        for wanted, column in zip(model.inputs, columns, strict=True)
-    }
+    known = {wanted.heading: _entries(table, wanted, column) for wanted, column in columns.items()}
     try:
         sampled = model.with_inputs(known, len(z))
     except UserError as error:
         raise table.error(str(error)) from None
-    headings = [wanted.heading for wanted in model.inputs]
-    table.require_known(
-        (*used, *sampled.index), tuple(dict.fromkeys((*headings, _shown_as(model)[0], SIGMA)))
-    )
+    wanted = tuple(dict.fromkeys((*known, _shown_as(model)[0], SIGMA)))
+    table.require_known((*used, *sampled.index), wanted)
     for name, values in sampled.index.items():
-        if name not in headings and name in table.heading:
-            for (text, where), label in zip(table.column(name), values, strict=True):
-                if _label(text, table.number) != _label(str(label)):
-                    said = f"'{text}' stands where the order of the rows says {label}; leave the column out"
-                    raise table.error(f"{where}: {said}")
+        if name not in known and name in table.heading:
+            _require_order(table, name, values)
     return Readings(sampled, z, _sigmas(table, sigma, range(len(z)), z, shown), used)
 
 
+def _knows_rows(model: Measurement, columns: Mapping[Input, str | None]) -> bool:
+    """Tells whether the model has its inputs, so that a file without them holds its readings by
+    their labels."""
+    measured = [wanted for wanted in columns if not wanted.label]
+    if not model.input_columns_known or any(columns[wanted] for wanted in measured):
+        return False
+    # An input that tells readings apart, such as the time, is in every file.
+    return not any(wanted.heading in model.index for wanted in measured)
+
+
+def _entries(table: TextTable, wanted: Input, column: str | None) -> list[Any]:
+    """Reads the values of an input, one for each row; its default if there is no such column."""
+    if column is None:
+        return [wanted.default] * len(table.rows)
+    return [_input(table, wanted, *cell) for cell in table.column(column)]
+
+
+def _require_order(table: TextTable, name: str, values: Sequence[Any]) -> None:
+    """Refuses a column that numbers the rows otherwise than their order does."""
+    for (text, where), label in zip(table.column(name), values, strict=True):
+        if _label(text, table.number) != _label(str(label)):
+            raise table.error(
+                f"{where}: '{text}' stands where the order of the rows says {label}; leave the"
+                " column out"
+            )
+
+
 def _rows_of(table: TextTable, model: Measurement, also: Sequence[str]) -> list[int]:
-    """Finds the row of each of the model's readings in the table; `also` names further columns that are understood."""
+    """Finds the row of each of the model's readings in the table; `also` names further columns that
+    are understood."""
     wanted = header(model)
     for name in (*model.index, wanted[-1]):
         if name not in table.heading:
@@ -415,26 +428,32 @@ def _rows_of(table: TextTable, model: Measurement, also: Sequence[str]) -> list[
     columns = [table.heading.index(name) for name in model.index]
     found: dict[int, int] = {}
     for k, (number, row) in enumerate(table.rows):
-        place = places.get(tuple(_label(row[at], table.number) for at in columns))
-        if place is None or place in found:
-            said = ", ".join(f"{table.heading[at]}={row[at].strip()}" for at in columns)
-            if place is None:
-                raise table.error(
-                    f"row {number}: {model.name} has no reading {said}; correct or remove the row"
-                )
-            earlier = table.rows[found[place]][0]
+        cells = [row[at] for at in columns]
+        place = places.get(tuple(_label(cell, table.number) for cell in cells))
+        if place is None:
+            said = _said(model, [cell.strip() for cell in cells])
+            raise table.error(
+                f"row {number}: {model.name} has no reading {said}; correct or remove the row"
+            )
+        if place in found:
+            said = _said(model, [cell.strip() for cell in cells])
+            earlier, _ = table.rows[found[place]]
             raise table.error(
                 f"row {number}: {said} stands in row {earlier} already; keep one of them"
             )
         found[place] = k
     if len(found) < model.m:
         absent = next(label for i, label in enumerate(every) if i not in found)
-        said = ", ".join(f"{name}={value}" for name, value in zip(model.index, absent, strict=True))
         raise table.error(
-            f"has {len(found)} of {model.m} rows; the first absent one is {said} "
+            f"has {len(found)} of {model.m} rows; the first absent one is {_said(model, absent)} "
             "(a missing reading keeps its row, with an empty cell)"
         )
     return [found[i] for i in range(model.m)]
+
+
+def _said(model: Measurement, label: Sequence[Any]) -> str:
+    """Names a reading by its label."""
+    return ", ".join(f"{name}={value}" for name, value in zip(model.index, label, strict=True))
 
 
 def _label(text: str, number: Callable[[str], float | None] = _number) -> Any:
@@ -451,7 +470,8 @@ def _shown_as(model: Measurement) -> list[str]:
 
 def _reading_column(table: TextTable, model: Measurement) -> str:
     names = _shown_as(model)
-    if found := next(filter(None, map(table.find, names)), None):
+    found = next(filter(None, map(table.find, names)), None)
+    if found:
         return found
     for name in names:
         table.refuse_other_unit(name)
@@ -468,7 +488,8 @@ def _reading_column(table: TextTable, model: Measurement) -> str:
 def _input(table: TextTable, wanted: Input, text: str, where: str) -> Any:
     if not text.strip():
         raise table.error(
-            f"{where}: is empty; what is known of a reading keeps its value, even where it is missing"
+            f"{where}: is empty; what is known of a reading keeps its value, even where it is"
+            " missing"
         )
     if wanted.kind is str:
         return text.strip()
@@ -481,18 +502,21 @@ def _input(table: TextTable, wanted: Input, text: str, where: str) -> Any:
 def _sigmas(
     table: TextTable, column: str | None, rows: Sequence[int], z: Array, shown: str
 ) -> Array | None:
-    """Reads the standard deviations (m,) in `rows` of that column, `shown` being the readings' name; None without
-    it."""
+    """Reads the standard deviations (m,) in `rows` of that column, `shown` being the readings'
+    name; None without it."""
     if column is None:
         return None
     if _unit(column) not in ("", _unit(shown)):
         raise table.error(f"column {column}: the unit must be that of {shown}; convert the values")
-    cells, values = table.column(column), []
+    cells = table.column(column)
+    values = []
     for row, reading in zip(rows, z, strict=True):
         text, where = cells[row]
-        values.append(table.value(text, where))
-        if values[-1] <= 0 or (math.isnan(values[-1]) and not math.isnan(reading)):
+        value = table.value(text, where)
+        absent = math.isnan(value) and not math.isnan(reading)
+        if value <= 0 or absent:
             raise table.error(
                 f"{where}: '{text}' is not a standard deviation; give a number above 0"
             )
+        values.append(value)
     return np.array(values)

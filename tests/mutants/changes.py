@@ -681,7 +681,7 @@ CHANGES = {
     "turned-interval": Change(
         "real",
         "a negative unit turns an interval around",
-        "values if model.physical_slope(x[None])[0, k] > 0 else values[::-1]",
+        "values if slope[k] > 0 else values[::-1]",
         "values",
         "test_intervals_within.py test_fit.py test_examination.py",
     ),
