@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -32,6 +32,15 @@ def _solved(
 ) -> Statistic:
     """Defines a statistic over the solved trials."""
     return Statistic(name, title, "solved trials", meaning, values, given="solved", **shown)
+
+
+def family_of(footer: Mapping[str, Any]) -> str:
+    """Returns the family of an estimator: its declared one, else by its inputs and equation."""
+    if footer.get("family"):
+        return str(footer["family"])
+    if footer.get("sequential"):
+        return "filters"
+    return "IPE" if footer.get("equation") == "frozen" else "least squares"
 
 
 STATISTICS: tuple[Statistic, ...] = (
@@ -167,6 +176,14 @@ STATISTICS: tuple[Statistic, ...] = (
         "The equation that the estimator solves: eq. (11) with the frozen H, the least-squares condition or the"
         " maximum a posteriori condition. Filters and the linear LSE have none.",
         lambda s: s.group.footer.get("equation") or "-",
+        kind="word",
+    ),
+    Statistic(
+        "family",
+        "family",
+        "no trials: the same for all",
+        "The kind of the estimator: IPE, filters (smoothers among them), least squares or one that its class names.",
+        lambda s: family_of(s.group.footer),
         kind="word",
     ),
     _all(

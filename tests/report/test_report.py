@@ -100,9 +100,8 @@ def test_what_is_written_is_whole_and_the_page_stands_alone(result):
         analyse([result.report.parent]),
         page.replace("&#39;", "'").replace("\u00a0", " "),
     )
-    *sentences, limits = headline(analysis)
-    assert all(sentence in shown for sentence in (*sentences, *about(analysis)))
-    assert f'id="table-{limits.name}"' in shown
+    shown = shown.replace("<wbr>", "")
+    assert all(sentence in shown for sentence in (*headline(analysis), *about(analysis)))
 
 
 def test_survivors_are_shown_as_survivors(synthetic):

@@ -1,7 +1,7 @@
 """What a page counts is so, and what it infers is false of the population in at most 5 % of the reports that say it.
 
 A thousand reports are simulated from populations that are known (`shared.simulated_reports`). Every sentence of the
-headline, every entry of its box, every verdict and every row in bold has a kind below: a function whose docstring says
+headline, the finding first, every verdict and every row in bold has a kind below: a function whose docstring says
 what the kind claims, and which answers for each claim whether it is false. A sentence without a kind fails the test, so
 that a new sentence needs a new kind: a function under `@sentence(pattern)` or `@entries`.
 
@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.stats import beta, binomtest
+from scipy.stats import beta
 from shared.simulated_reports import HOLDING, Report, board, simulated
 from shared.synthetic_store import Filter, Pretender, Seeker
 
@@ -34,7 +34,6 @@ from ipe_bench.statistics.verdicts import (
     NO_VERDICT,
     OVERCONFIDENT,
     TOO_CAUTIOUS,
-    UNDECIDED,
     WRONG,
 )
 from ipe_bench.trials.thresholds import FEW, FIT_LEVEL
@@ -112,81 +111,175 @@ def shares_named(text: str) -> dict[str, str]:
     return dict(re.findall(r"(e\d+) \(([^)]*)\)", text))
 
 
-def are_shares(report: Report, at: int, named: dict[str, str]) -> bool:
-    return all(
-        text == percent(successes(report, at, label).mean()) for label, text in named.items()
-    )
-
-
-def significant(report: Report) -> set[tuple[int, str, str]]:
-    """Finds by whom whom is beaten at which scale: exact McNemar tests, corrected by Holm over all pairs and scales."""
-    labels, tests = list(report.board.populations), []
-    for at in range(len(report.board.scales)):
-        for i, first in enumerate(labels):
-            for second in labels[i + 1 :]:
-                a, b = successes(report, at, first), successes(report, at, second)
-                alone = int((a & ~b).sum()), int((b & ~a).sum())
-                p = float(binomtest(alone[0], sum(alone)).pvalue) if sum(alone) else 1.0
-                winner = (first, second) if alone[0] > alone[1] else (second, first)
-                tests.append((p, at, *winner))
-    found = set()
-    for rank, (p, at, winner, loser) in enumerate(sorted(tests)):
-        if p * (len(tests) - rank) >= 0.05:
-            break
-        found.add((at, winner, loser))
-    return found
-
-
 # Sentences ------------------------------------------------------------------------------------------------------------
 
-LEAD = (
-    r"At error scale (?P<scale>[\d.]+), (?P<first>[\w, ]+?) (?:succeeds?|keeps? the track to the last epoch) in"
-    r" (?P<share>all|\S+ %) of (?P<trials>[\d,]+) trials"
-    r"(?:, (?:each )?significantly more often than (?P<beaten>.+?))??"
-    r"(?:, but not than (?P<others>.+?)|, not (?:each )?significantly more often than (?P<only>.+?))?"
-    r"(?: \(exact McNemar tests, 5 % over all pairs\))?\."
-)
+NAMED = r"(?:All (?P<all>\d+) estimators|(?P<count>\d+) of \d+ estimators|(?P<names>e\d+[\w, ]*?))"
+NUMBERS = r"(?P<low>[<>\d.]+)(?: %)?(?: to (?P<high>[<>\d.]+))? % of (?P<trials>\d+) trials"
+UP_TO = r"(?:up to|at) error scale (?P<scale>[\d.]+)"
+CLAUSES = {
+    "winners": rf"(?P<only>Only )?{NAMED} holds? {UP_TO} \({NUMBERS}\)",
+    "covariance": rf"(?:(?P<theirs>its|their) covariance|the covariance of {NAMED}) is too small"
+    r"(?: (?P<extent>from|at) (?P<scale>[\d.]+)(?: on)?)?",
+    "next": rf"at (?P<scale>[\d.]+) {NAMED}: undecided|none at (?P<none>[\d.]+)",
+    "undecided": rf"{NAMED}: undecided",
+    "fails": rf"{NAMED} fails?(?: (?P<extent>from|at) (?P<scale>[\d.]+)(?: on)?)?",
+    "nobody": r"(?P<word>No estimator holds|Too few trials to tell who holds)"
+    r"(?:, even at error scale (?P<even>[\d.]+))?",
+    "most": rf"{NAMED} succeeds? in {NUMBERS} {UP_TO}",
+}
+FINDING = r"(?:Only |All |No estimator |Too few |\d+ of \d+ |e\d+).*(?:hold|tell who holds).*"
 
 
-@sentence(LEAD)
-def who_leads(report: Report, match: Any) -> Iterator[tuple[str, str, bool]]:
-    """Counts who succeeds most at a scale and how often each does; who is not beaten significantly is not; infers that
-    the leaders succeed more often, in the population, than those that they are said to beat."""
-    at = report.board.scales.index(float(match["scale"]))
-    beaten, others = (
-        shares_named(match["beaten"] or ""),
-        shares_named(match["others"] or match["only"] or ""),
+@sentence(FINDING)
+@sentence(FINDING, of_one=True)
+def finding(report: Report, match: Any) -> Iterator[tuple[str, str, bool]]:
+    """Holds: infers that 90 % succeed, in the population, up to that scale; only: that they do of no other. Fails,
+    none, no estimator: infers that fewer do at those scales. Its covariance is too small: infers that the mean NEES is
+    above n at those scales. Counts who is undecided or has the most success, and the numbers that were seen."""
+    winners: list[str] = []
+    for clause in match[0].split("; "):
+        kinds = {kind: re.fullmatch(pattern, clause) for kind, pattern in CLAUSES.items()}
+        ((kind, found),) = [(kind, found) for kind, found in kinds.items() if found]
+        if kind == "winners":
+            winners = named_in(found, holding_up_to(report, place(report, found["scale"])))
+            yield from they_hold(report, found, winners)
+        else:
+            yield from JUDGES[kind](report, found, winners)
+
+
+def place(report: Report, scale: str | None) -> int:
+    return report.board.scales.index(float(scale)) if scale else 0
+
+
+def named_in(found: Any, counted: list[str]) -> list[str]:
+    """Returns who is named, or who may be meant by a number of estimators."""
+    if found["names"]:
+        return re.findall(r"e\d+", found["names"])
+    number = int(found.groupdict().get("all") or found["count"])
+    return counted if len(counted) == number else []
+
+
+def ends(report: Report, at: int, label: str) -> tuple[float, float]:
+    """Computes the exact limits of success: the lower one of one scale, the upper one shared by all scales."""
+    success, tail = successes(report, at, label), 0.025 / len(report.board.scales)
+    good, bad = int(success.sum()), int((~success).sum())
+    low = beta.ppf(0.025, good, bad + 1) if good else 0.0
+    return float(low), float(beta.ppf(1 - tail, good + 1, bad)) if bad else 1.0
+
+
+def holding_up_to(report: Report, last: int) -> list[str]:
+    each = report.board.populations
+    return [e for e in each if all(ends(report, at, e)[0] >= 0.9 for at in range(last + 1))]
+
+
+def possible_up_to(report: Report, last: int) -> list[str]:
+    each = report.board.populations
+    return [e for e in each if not any(ends(report, at, e)[1] < 0.9 for at in range(last + 1))]
+
+
+def truly_holds(report: Report, label: str, last: int) -> bool:
+    return all(p >= HOLDING for p in report.board.success(label)[: last + 1])
+
+
+def numbers_are_so(report: Report, found: Any, labels: list[str], at: int) -> bool:
+    shares = [float(successes(report, at, label).mean()) for label in labels]
+    told = [f"{found[end] or found['low']} %" for end in ("low", "high")]
+    return told == [percent(min(shares)), percent(max(shares))] and int(found["trials"]) == (
+        report.board.trials
     )
-    compared = compared_by(report) if has_rivals(report) else list(report.board.populations)
-    share = {label: successes(report, at, label).mean() for label in compared}
-    leaders = most_successful(report, at, compared)
-    told = "all" if max(share.values()) == 1 else percent(max(share.values()))
-    wrong = told != match["share"] or int(match["trials"].replace(",", "")) != report.board.trials
-    named = set(re.findall(r"e\d+", match["first"]))
-    wrong = wrong or not named <= set(leaders) or not are_shares(report, at, beaten | others)
-    won = significant(report)
-    # Of rivals that agree at first, the sentence is on the first scale at which they part.
-    earlier = (
-        [(k, most_successful(report, k, compared)) for k in range(at)] if has_rivals(report) else []
-    )
-    parted = [
-        k for k, best in earlier if any(all((k, a, b) in won for a in best) for b in compared)
-    ]
-    yield "who leads", COUNTS, bool(wrong or parted)
-    yield (
-        "not significantly more often",
-        COUNTS,
-        any(all((at, a, b) in won for a in leaders) for b in others),
-    )
-    if beaten:
-        truth = {label: report.board.success(label)[at] for label in share}
-        false = any(truth[a] <= truth[b] + 1e-12 for a in leaders for b in beaten)
-        yield "significantly more often", INFERS, false
 
 
-def most_successful(report: Report, at: int, labels: list[str]) -> list[str]:
-    share = {label: successes(report, at, label).mean() for label in labels}
-    return [label for label, value in share.items() if value == max(share.values())]
+def they_hold(report: Report, found: Any, winners: list[str]) -> Iterator[tuple[str, str, bool]]:
+    at, drawn = place(report, found["scale"]), report.board
+    so = winners == sorted(holding_up_to(report, at), key=winners.index) if winners else False
+    longer = at + 1 < len(drawn.scales) and holding_up_to(report, at + 1)
+    yield "winners", COUNTS, not so or bool(longer)
+    yield "numbers of winners", COUNTS, not numbers_are_so(report, found, winners, at)
+    yield "holds", INFERS, not all(truly_holds(report, e, at) for e in winners)
+    others = [e for e in drawn.populations if e not in winners]
+    if found["only"]:
+        yield "only", INFERS, any(truly_holds(report, e, at) for e in others)
+
+
+def covariance(report: Report, found: Any, winners: list[str]) -> Iterator[tuple[str, str, bool]]:
+    last = max(at for at in range(len(report.board.scales)) if holding_up_to(report, at))
+    first = place(report, found["scale"])
+    shown = report.analysis.summary.query("parameter == 'all'")
+    verdicts = shown.set_index(["estimator", "error_scale"])["verdict"]
+    scales = report.board.scales
+    which = range(first, last + 1) if found["extent"] == "from" else [first]
+
+    def wrong(label: str) -> list[int]:
+        return [k for k in range(last + 1) if verdicts[label, scales[k]] == OVERCONFIDENT]
+
+    meant = [e for e in winners if wrong(e)[:1] == [first]]
+    labels = winners if found["theirs"] else named_in(found, meant)
+    known = labels or meant
+    yield "covariance too small, by the verdicts", COUNTS, any(e not in meant for e in known)
+    truth = report.board.populations
+    false = any(truth[e][at].mean_nees <= 1 + 1e-9 for e in known for at in which)
+    yield "covariance too small", INFERS, false
+
+
+def at_the_next(report: Report, found: Any, winners: list[str]) -> Iterator[tuple[str, str, bool]]:
+    at = place(report, found["scale"] or found["none"])
+    possible = possible_up_to(report, at)
+    if found["none"]:
+        yield "none at the next", COUNTS, bool(possible)
+        every = report.board.populations
+        yield "none holds", INFERS, any(truly_holds(report, e, at) for e in every)
+    else:
+        yield "undecided at the next", COUNTS, set(named_in(found, possible)) != set(possible)
+
+
+def undecided(report: Report, found: Any, winners: list[str]) -> Iterator[tuple[str, str, bool]]:
+    last = max(at for at in range(len(report.board.scales)) if holding_up_to(report, at))
+    meant = set(possible_up_to(report, last)) - set(holding_up_to(report, last))
+    yield "undecided", COUNTS, set(named_in(found, sorted(meant))) != meant
+
+
+def fails(report: Report, found: Any, winners: list[str]) -> Iterator[tuple[str, str, bool]]:
+    drawn = report.board
+    first = place(report, found["scale"])
+    lost = [e for e in drawn.populations if ends(report, first, e)[1] < 0.9]
+    labels = named_in(found, lost) or lost
+    which = range(first, len(drawn.scales)) if found["extent"] == "from" else [first]
+    families = {drawn.family[e] for e in labels}
+    wrong = any(ends(report, at, e)[1] >= 0.9 for e in labels for at in which)
+    parted = families <= {"IPE", "filters"} <= set(drawn.family.values())
+    if found["names"]:
+        yield "fails, by its limit", COUNTS, wrong or not parted
+        false = any(drawn.success(e)[at] >= HOLDING for e in labels for at in which)
+        yield "fails", INFERS, false
+
+
+def nobody(report: Report, found: Any, winners: list[str]) -> Iterator[tuple[str, str, bool]]:
+    possible = possible_up_to(report, 0)
+    none = found["word"] == "No estimator holds"
+    yield "nobody", COUNTS, bool(holding_up_to(report, 0)) or none == bool(possible)
+    if none:
+        every = report.board.populations
+        yield "no estimator holds", INFERS, any(truly_holds(report, e, 0) for e in every)
+
+
+def most(report: Report, found: Any, winners: list[str]) -> Iterator[tuple[str, str, bool]]:
+    at, each = place(report, found["scale"]), report.board.populations
+    share = {e: [successes(report, k, e).mean() for k in range(at + 1)] for e in each}
+    ahead = [e for e in each if at == 0 or all(v >= 0.9 for v in share[e])]
+    best = [e for e in ahead if share[e][at] == max(share[one][at] for one in ahead)]
+    labels = named_in(found, best)
+    so = set(labels) == set(best) and numbers_are_so(report, found, best, at)
+    yield "who succeeds most", COUNTS, not so
+
+
+JUDGES = {
+    "covariance": covariance,
+    "next": at_the_next,
+    "undecided": undecided,
+    "fails": fails,
+    "nobody": nobody,
+    "most": most,
+}
 
 
 WHO = r"IPE \((?P<ipe>[^)]*)\) and filters \((?P<filters>[^)]*)\)"
@@ -194,11 +287,6 @@ WHO = r"IPE \((?P<ipe>[^)]*)\) and filters \((?P<filters>[^)]*)\)"
 
 def compared_by(report: Report) -> list[str]:
     return [label for label, family in report.board.family.items() if family in ("IPE", "filters")]
-
-
-def has_rivals(report: Report) -> bool:
-    """Whether IPE and filters of constants are compared, rather than all estimators at the largest scale."""
-    return {"IPE", "filters"} <= set(report.board.family.values()) and not report.board.moving
 
 
 @sentence(
@@ -237,10 +325,14 @@ def who_agree(report: Report, match: Any) -> Iterator[tuple[str, str, bool]]:
     yield "agree up to", INFERS, false
 
 
-@sentence(
-    r"Failures that no test of fit notices: up to (?P<most>\S+ %) of the trials \((?P<label>e\d+) at scale"
+SILENT = (
+    r"Undetected failures: at most (?P<most>\S+ %) of the trials \((?P<label>e\d+) at error scale"
     r" (?P<scale>\S+)\)\."
 )
+
+
+@sentence(SILENT)
+@sentence(SILENT, of_one=True)
 def silent_failures(report: Report, match: Any) -> Iterator[tuple[str, str, bool]]:
     """Counts the largest share of trials that fail, converged and fitting, and where it is."""
     silent = {
@@ -252,43 +344,6 @@ def silent_failures(report: Report, match: Any) -> Iterator[tuple[str, str, bool
     yield "silent failures", COUNTS, wrong
 
 
-@sentence(
-    r"(?:At error scale [\d.]+, )?(?P<head>e[^.%]*?(?:succeeds?|keeps?).*?)"
-    r"(?P<silent> Failures that no test of fit notices: up to (?P<most>\S+ %) of the trials \((?P<who>[^)]*)\)\.)?",
-    of_one=True,
-)
-def who_succeeds(report: Report, match: Any) -> Iterator[tuple[str, str, bool]]:
-    """Counts the success of each at one scale, in order, and the largest share of silent failures."""
-    assert len(report.board.scales) == 1
-    head = match["head"]
-    share = {label: float(successes(report, 0, label).mean()) for label in report.board.populations}
-    alike = re.search(
-        r"(?:succeed|keep)(?: the track to the last epoch)? in (?:(all)|(\S+ %)) of", head
-    )
-    if alike:
-        wrong = {percent(v) for v in share.values()} != {alike[2] or "100 %"}
-    else:
-        told = re.findall(
-            r"(e\d+)(?: succeeds| keeps the track to the last epoch)? in (\S+ %)", head
-        )
-        wrong = any(percent(share[label]) != text for label, text in told)
-        wrong = (
-            wrong
-            or [share[label] for label, _ in told]
-            != sorted(share.values(), reverse=True)[: len(told)]
-        )
-    wrong = wrong or f"of {report.board.trials} trials" not in head
-    silent = {
-        label: float((~s.scalars["success"] & (s.scalars["status"] == "converged")).mean())
-        for (_, label), s in report.samples.items()
-    }
-    most = max(silent.values())
-    wrong = wrong or (match["most"] or "0 %") != percent(most)
-    if match["who"]:
-        wrong = wrong or any(silent[label] != most for label in re.findall(r"e\d+", match["who"]))
-    yield "who succeeds how often", COUNTS, bool(wrong)
-
-
 def are_told(match: Any, values: dict[str, float]) -> bool:
     named = shares_named(match["each"])
     ordered = list(dict(sorted(values.items(), key=lambda item: item[1])))[: len(named)]
@@ -296,7 +351,7 @@ def are_told(match: Any, values: dict[str, float]) -> bool:
     return order and all(text == brief(values[label]) for label, text in named.items())
 
 
-@sentence(r"Median error at the last epoch, in multiples of .*: (?P<each>.*)\.", of_one=True)
+@sentence(r"Median error at the last epoch, relative to .*: (?P<each>.*)\.", of_one=True)
 def median_errors(report: Report, match: Any) -> Iterator[tuple[str, str, bool]]:
     """Counts the median error of each."""
     values = {
@@ -318,83 +373,7 @@ def path_errors(report: Report, match: Any) -> Iterator[tuple[str, str, bool]]:
     yield "errors over all epochs", COUNTS, not are_told(match, values) or "(0" in match["each"]
 
 
-# Entries of the box and of tables -------------------------------------------------------------------------------------
-
-
-def reach(text: str, scales: tuple[float, ...]) -> tuple[float, float]:
-    """Reads an entry of the box: the ends between which the largest scale lies, minus infinity for none."""
-    if text in ("none", "undecided"):
-        return -np.inf, -np.inf if text == "none" else scales[-1]
-    if match := re.fullmatch(r"([\d.]+) or (less|more)", text):
-        end = float(match[1])
-        return (-np.inf, end) if match[2] == "less" else (end, scales[-1])
-    ends = [float(end) for end in text.split(" to ")]
-    return ends[0], ends[-1]
-
-
-def is_lost(report: Report, at: int, label: str) -> bool:
-    """Returns whether success is below 90 % at the level of all scales, by Clopper and Pearson's upper limit."""
-    success = successes(report, at, label)
-    tail = 0.025 / len(report.board.scales)
-    return not success.all() and bool(beta.ppf(1 - tail, success.sum() + 1, (~success).sum()) < 0.9)
-
-
-def limit_of(held: list[bool], scales: tuple[float, ...]) -> float:
-    """Returns the largest scale up to which it is so at every scale."""
-    return max(scales[: held.index(False)] if False in held else scales, default=-np.inf)
-
-
-@entries
-def box(report: Report) -> Iterator[Claim]:
-    """Honest up to: counts that up to its lower end no verdict is against the covariance or undecided; infers that
-    beyond its upper end the covariance is too small, at some scale up to the next. Holds: infers that the largest scale
-    up to which 90 % succeed, in the population, lies between both ends. Order: who surely holds longest stands first,
-    and undecided below all who surely hold somewhere."""
-    drawn = report.board
-    for table in (part for part in report.parts if isinstance(part, Table)):
-        rows = [[cell.text for cell in row] for row in table.rows]
-        lows = []
-        for label, honest, holds, _ in rows:
-            low, high = reach(honest, drawn.scales)
-            here = report.analysis.summary.query("parameter == 'all' and estimator == @label")
-            verdicts = dict(zip(here["error_scale"], here["verdict"], strict=True))
-            good = [verdicts[s] not in (OVERCONFIDENT, UNDECIDED, NO_VERDICT) for s in drawn.scales]
-            yield Claim(
-                "honest up to, by the verdicts", COUNTS, honest, limit_of(good, drawn.scales) != low
-            )
-            if low > -np.inf:
-                nearly = [p.mean_nees <= RIGHT for p in drawn.populations[label]]
-                yield Claim(
-                    "honest up to, as proven", READ, honest, limit_of(nearly, drawn.scales) < low
-                )
-            if high < drawn.scales[-1]:
-                right = [p.mean_nees <= 1 + 1e-9 for p in drawn.populations[label]]
-                yield Claim("honest up to", INFERS, honest, limit_of(right, drawn.scales) > high)
-            low, high = reach(holds, drawn.scales)
-            lows.append(low)
-            if (low, high) != (-np.inf, drawn.scales[-1]):
-                truth = limit_of([p >= HOLDING for p in drawn.success(label)], drawn.scales)
-                yield Claim("holds 90 % up to", INFERS, holds, not low <= truth <= high)
-        scale = float(table.columns[-1].title.rpartition(" ")[2])
-        spent = {label: cost for label, *_, cost in rows}
-        nobody = all(is_lost(report, at, label) for at, label in report.samples)
-        wrong = [
-            (cost == "-") != (is_lost(report, drawn.scales.index(scale), e) and not nobody)
-            for e, cost in spent.items()
-        ]
-        yield Claim("cost of who may hold", COUNTS, str(spent), any(wrong))
-        yield Claim("order of the box", COUNTS, "", lows != sorted(lows, reverse=True))
-
-
-@entries
-def opening(report: Report) -> Iterator[Claim]:
-    """Counts that a page of several scales opens with who leads at the largest, unless IPE and filters are compared."""
-    scales = report.board.scales
-    if len(scales) > 1 and not has_rivals(report):
-        first = str(report.parts[0])
-        yield Claim(
-            "opening", COUNTS, first, not first.startswith(f"At error scale {scales[-1]:g}, ")
-        )
+# Entries of tables ---------------------------------------------------------------------------------------------------
 
 
 @entries

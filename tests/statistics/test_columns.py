@@ -233,6 +233,7 @@ DEFINITIONS: dict[str, Callable[[Trials], Any]] = {
     "solved_trials": lambda t: np.sum(t.solved),
     "common_trials": lambda t: np.sum(t.solved & t.others),
     "equation": lambda t: t.equation,
+    "family": lambda t: "IPE" if t.equation == "frozen" else "least squares",
     "false_root": lambda t: np.mean(t.converged & ~t.solved),
     "false_root_distance": lambda t: middle(t.root_distance[t.converged & ~t.solved]),
     "bias": lambda t: t.units(t.error[t.solved].mean(axis=0)),

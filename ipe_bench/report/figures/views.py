@@ -16,6 +16,7 @@ from ipe_bench.report.style import FACES, MOST_FACES, Look, Which, drawn_setting
 from ipe_bench.report.words import value_text
 from ipe_bench.runs.store import traits
 from ipe_bench.statistics.analysis import Analysis
+from ipe_bench.statistics.records import family_of
 from ipe_bench.statistics.statistic import ALL
 
 if TYPE_CHECKING:
@@ -232,18 +233,6 @@ def _named(label: str, look: Any) -> tuple[str, str]:
         raise UserError(
             f'{label}: look={look} is no colour and marker; write look = ("#c51b7d", "s")'
         ) from None
-
-
-def family_of(footer: Mapping[str, Any]) -> str:
-    """Returns the family of an estimator, one of `FAMILIES`: its declared one, else by its inputs and equation."""
-    known = (
-        "filters"
-        if footer.get("sequential")
-        else "IPE"
-        if footer.get("equation") == "frozen"
-        else "least squares"
-    )
-    return footer.get("family") or known
 
 
 def _smoothers_apart(footer: Mapping[str, Any]) -> str:

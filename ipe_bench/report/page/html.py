@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from ipe_bench.report.page.headline import about, headline
 from ipe_bench.report.page.writer import Page, digests
-from ipe_bench.report.tables.table import Part, Table, environment, words
+from ipe_bench.report.tables.table import Part, Strong, Table, environment, words
 from ipe_bench.report.words import public
 from ipe_bench.runs.parts import TRUTH
 from ipe_bench.statistics.comparisons import TIE
@@ -55,14 +55,18 @@ def render_page(
         ("provenance", "Configuration and provenance", _provenance(runs, older)),
         ("definitions", "Definitions", [_definitions()]),
     ]
+    answer = headline(analysis)
+    names = ", ".join(d.resolve().name or str(d) for d in collection.directories)
+    title = str(answer.pop(0)) if isinstance(answer[0], Strong) else names
     page = Page(
         "report",
-        ", ".join(d.resolve().name or str(d) for d in collection.directories),
-        headline(analysis),
+        title,
+        answer,
         [*figures[:1], *main[:1]],
         sections,
         folder="figures/",
         facts=[
+            *([names] if title != names else ()),
             *([_minute(collection.runs[-1]["started"])] if collection.runs else ()),
             f"{sum(cell.complete for cell in asked)} of {len(asked)} results (an estimator in a scenario) complete",
         ],

@@ -1,0 +1,268 @@
+"""States what a comparison found in one sentence, the title wherever its results are shown.
+
+Holding is judged here alone: an estimator holds where at least `HELD` of its trials succeed with 95 % confidence, fails
+where fewer do, and is undecided otherwise. Rows are those of a summary over all parameters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import takewhile
+from typing import Any
+
+from ipe_bench.report.words import percent, value_text
+from ipe_bench.statistics.intervals import LEVEL, clopper_pearson
+from ipe_bench.statistics.verdicts import OVERCONFIDENT, current
+
+HELD = 0.9
+"""Share of all trials that succeed where an estimator holds."""
+MOST_NAMES = 3
+"""Names in a list of a title; more are counted."""
+HOLDS, FAILS, UNDECIDED = "holds", "fails", "undecided"
+_SIDES = ("filters", "IPE")
+"""The families whose best are named if they part."""
+
+Row = Mapping[str, Any]
+Place = tuple[str, float]
+"""A column: the setting, empty if there is one, and the error scale."""
+
+
+@dataclass(frozen=True)
+class Standing:
+    """Holds how an estimator stands in every column; a column that it lacks is None, and undecided."""
+
+    label: str
+    rows: tuple[Row | None, ...]
+    judged: tuple[str, ...]
+    ascending: bool
+    """Whether the columns are ascending error scales, of which it holds up to one, rather than settings."""
+
+    @property
+    def family(self) -> str:
+        return next(str(row.get("family", "")) for row in self.rows if row)
+
+    @cached_property
+    def sure(self) -> int:
+        """The number of columns in which, or up to which, it holds."""
+        return self._number(lambda word: word == HOLDS)
+
+    @cached_property
+    def possible(self) -> int:
+        """The number of columns in which, or up to which, it may hold."""
+        return self._number(lambda word: word != FAILS)
+
+    @property
+    def seen(self) -> int:
+        """The number of columns in which, or up to which, as many trials did succeed."""
+        enough = [row is not None and row["success"] >= HELD for row in self.rows]
+        return len(list(takewhile(bool, enough))) if self.ascending else sum(enough)
+
+    def _number(self, counts: Callable[[str], bool]) -> int:
+        fitting = takewhile if self.ascending else filter
+        return len(list(fitting(counts, self.judged)))
+
+    @property
+    def rank(self) -> tuple[float, ...]:
+        """Sorts who surely holds longest first, then who may, then who succeeds most."""
+        shares = [row["success"] for row in self.rows if row]
+        return (-self.sure, -self.possible, -sum(shares) / len(shares))
+
+    def overconfident(self, number: int) -> list[int]:
+        """Returns at which of the first columns its reported covariance is too small."""
+        shown = enumerate(self.rows[:number])
+        return [at for at, row in shown if row and current(row["verdict"]) == OVERCONFIDENT]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Holds how all estimators stand, the best first."""
+
+    places: tuple[Place, ...]
+    standings: tuple[Standing, ...]
+
+    @classmethod
+    def of(cls, rows: Iterable[Row]) -> Finding:
+        """Judges the rows of a summary over all parameters; a `setting` tells those of several apart."""
+        table: dict[tuple[str, Place], Row] = {}
+        for row in rows:
+            setting, scale = str(row.get("setting", "")), float(row["error_scale"])
+            label, place = str(row["estimator"]), (setting, scale)
+            # Settings whose texts are equal are different all the same.
+            while (label, place) in table:
+                place = (f"{place[0]}'", scale)
+            table[label, place] = row
+        places = tuple(dict.fromkeys(place for _, place in table))
+        ascending = len({setting for setting, _ in places}) == 1
+        places = tuple(sorted(places, key=lambda place: place[1])) if ascending else places
+        standings = []
+        for label in dict.fromkeys(label for label, _ in table):
+            own = tuple(table.get((label, place)) for place in places)
+            words = tuple(judged(row, len(places)) for row in own)
+            standings.append(Standing(label, own, words, ascending))
+        return cls(places, tuple(sorted(standings, key=lambda one: one.rank)))
+
+    @property
+    def ascending(self) -> bool:
+        return self.standings[0].ascending
+
+    def sentence(self) -> str:
+        """States who holds, who is undecided, whose covariance is too small, and where the best filter or IPE fails."""
+        most = max(one.sure for one in self.standings)
+        if not most:
+            return self._nobody()
+        winners = [one for one in self.standings if one.sure == most]
+        undecided = [one for one in self.standings if one.possible >= most > one.sure]
+        clauses = [self._winners(winners, undecided)]
+        clauses += self._covariances(winners)
+        clauses += self._beyond(most) if self.ascending and most < len(self.places) else []
+        clauses += [f"{named(undecided, self.standings)}: undecided"] if undecided else []
+        return "; ".join([*clauses, *self._parted(most)])
+
+    def _winners(self, winners: Sequence[Standing], undecided: Sequence[Standing]) -> str:
+        number = len(self.standings)
+        if len(winners) == number > MOST_NAMES:
+            who = f"All {number} estimators"
+        else:
+            only = "Only " if len(winners) < number and not undecided else ""
+            who = only + named(winners, self.standings)
+        verb = "holds" if len(winners) == 1 else "hold"
+        return f"{who} {verb} {self._where(winners)} ({self._numbers(winners)})"
+
+    def _where(self, winners: Sequence[Standing]) -> str:
+        """States up to which scale, or in how many settings, the winners hold."""
+        number = winners[0].sure
+        if self.ascending:
+            return f"{'up to' if number > 1 else 'at'} error scale {self._scale(number - 1)}"
+        total, more = len(self.places), any(one.possible > number for one in winners)
+        if number == total:
+            return f"in {'both' if total == 2 else f'all {total}'} {self._columns}"
+        return f"in {'at least ' if more else ''}{number} of {total} {self._columns}"
+
+    @property
+    def _columns(self) -> str:
+        return "scenarios" if len({scale for _, scale in self.places}) > 1 else "settings"
+
+    def _scale(self, at: int) -> str:
+        return value_text(self.places[at][1])
+
+    def _numbers(self, winners: Sequence[Standing]) -> str:
+        """States what share of how many trials succeeds: at the last scale, or over the settings where they hold."""
+        last = [one.rows[one.sure - 1] for one in winners]
+        held = [
+            row
+            for one in winners
+            for row, word in zip(one.rows, one.judged, strict=True)
+            if word == HOLDS
+        ]
+        return seen([row for row in (last if self.ascending else held) if row])
+
+    def _covariances(self, winners: Sequence[Standing]) -> Iterator[str]:
+        phrases: dict[str, list[Standing]] = {}
+        for one in winners:
+            number = one.sure if self.ascending else len(self.places)
+            if wrong := one.overconfident(number):
+                phrases.setdefault(self._extent(wrong, number), []).append(one)
+        for phrase, whose in phrases.items():
+            if len(whose) == len(winners):
+                of = "its covariance" if len(winners) == 1 else "their covariance"
+            else:
+                of = f"the covariance of {named(whose, self.standings)}"
+            yield f"{of} is too small {phrase}".rstrip()
+
+    def _extent(self, columns: Sequence[int], number: int) -> str:
+        """States in which of the first columns something is so, for certain of those that are named."""
+        first = columns[0]
+        if not self.ascending:
+            total = len(self.places)
+            return f"in {len(columns)} of {total} {self._columns}"
+        if number == 1 and len(self.places) == 1:
+            return ""
+        goes_on = list(columns) == list(range(first, number)) and len(columns) > 1
+        return f"{'from' if goes_on else 'at'} {self._scale(first)}{' on' if goes_on else ''}"
+
+    def _beyond(self, most: int) -> Iterator[str]:
+        """States who may hold at the next scale, too."""
+        going_on = [one for one in self.standings if one.possible > most]
+        at = self._scale(most)
+        yield (
+            f"at {at} {named(going_on, self.standings)}: undecided" if going_on else f"none at {at}"
+        )
+
+    def _parted(self, most: int) -> Iterator[str]:
+        """States where the best filters or the best IPE fail, unless both may be among those that hold longest."""
+        phrases: dict[str, list[Standing]] = {}
+        families = {one.family for one in self.standings}
+        for side in _SIDES if families.issuperset(_SIDES) else ():
+            own = [one for one in self.standings if one.family == side]
+            reach = max(one.possible for one in own)
+            if reach >= most:
+                continue
+            for one in (one for one in own if one.possible == reach):
+                lost = [at for at, word in enumerate(one.judged) if word == FAILS]
+                phrase = self._extent(lost, len(self.places))
+                phrases.setdefault(phrase, []).append(one)
+        for phrase, who in phrases.items():
+            verb = "fails" if len(who) == 1 else "fail"
+            yield f"{named(who, self.standings)} {verb} {phrase}".rstrip()
+
+    def _nobody(self) -> str:
+        """States that no estimator surely holds anywhere, and who succeeds most as far as was seen."""
+        most = max(one.seen for one in self.standings)
+        at = max(most - 1, 0)
+        ahead = [one for one in self.standings if one.seen == most]
+        best = max(self._mean(one, at) for one in ahead)
+        first = [one for one in ahead if self._mean(one, at) == best]
+        where = f"in {len(self.places)} {self._columns}"
+        where = f"at error scale {self._scale(at)}" if self.ascending else where
+        verb = "succeeds" if len(first) == 1 else "succeed"
+        share = seen([row for one in first for row in self._counted(one, at)])
+        told = f"{named(first, self.standings)} {verb} in {share} {where}"
+        if any(one.possible for one in self.standings):
+            return f"Too few trials to tell who holds; {told}"
+        return f"No estimator holds{self._anywhere}; {told}"
+
+    @property
+    def _anywhere(self) -> str:
+        if len(self.places) == 1:
+            return ""
+        first = f", even at error scale {self._scale(0)}"
+        return first if self.ascending else f" in any of {len(self.places)} {self._columns}"
+
+    def _counted(self, one: Standing, at: int) -> list[Row]:
+        """Returns its row at that scale, or its rows of all settings."""
+        return [row for row in (one.rows[at : at + 1] if self.ascending else one.rows) if row]
+
+    def _mean(self, one: Standing, at: int) -> float:
+        rows = self._counted(one, at)
+        return sum(row["success"] for row in rows) / len(rows) if rows else -1.0
+
+
+def judged(row: Row | None, columns: int) -> str:
+    """Judges whether an estimator holds by its exact 95 % interval; failing shares that level among the columns."""
+    if row is None:
+        return UNDECIDED
+    if row["success_low"] >= HELD:
+        return HOLDS
+    level = 1 - (1 - LEVEL) / columns
+    count = round(row["success"] * row["trials"])
+    return FAILS if clopper_pearson(count, int(row["trials"]), level)[1] < HELD else UNDECIDED
+
+
+def named(standings: Sequence[Standing], among: Sequence[Standing]) -> str:
+    """Names estimators; more than three are counted."""
+    labels = [one.label for one in standings]
+    if len(labels) > MOST_NAMES:
+        return f"{len(labels)} of {len(among)} estimators"
+    return " and ".join([", ".join(labels[:-1]), labels[-1]] if len(labels) > 1 else labels)
+
+
+def seen(rows: Sequence[Row]) -> str:
+    """States the successes that were seen, and the number of trials."""
+    shares = sorted({row["success"] for row in rows})
+    share = " to ".join(dict.fromkeys(percent(end) for end in (shares[0], shares[-1])))
+    share = share.replace(" % to", " to")
+    numbers = sorted({int(row["trials"]) for row in rows})
+    trials = " to ".join(dict.fromkeys(f"{end:,}" for end in (numbers[0], numbers[-1])))
+    return f"{share} of {trials} {'trial' if trials == '1' else 'trials'}"
