@@ -27,16 +27,20 @@ FAMILIES: dict[str, tuple[str, ...]] = {
 COLORS = tuple(family[i] for i in range(4) for family in FAMILIES.values())
 """Colours of the families by turns, for parameters and settings."""
 BLACK, GREY, WHITE = "#000000", "#b0b0b0", "#ffffff"
+SOFT = "#6f6f6f"
+"""Colour of letters of what is grey."""
 MARKERS = ("v", "P", "p", "<", "d", ">", "*", "^", "s", "o", "D")
 DASHES: tuple[Any, ...] = ((1, 1.5), (5, 2, 1, 2), (8, 2, 1, 2, 1, 2), (3, 1, 1, 1))
 """Dash patterns of the pool as seaborn and matplotlib read them: lengths on and off."""
 REFERENCE = "linear_lse"
 """Label of the reference estimator: black and crossed in every figure."""
 BOUND_COLOR, BOUND_DASH = "#444444", (0, (2, 2))
-MOST_TOGETHER = 7
-"""Coloured curves, the reference estimator's aside, that are told apart in one panel."""
+MOST_TOGETHER = 4
+"""Curves in colour in one panel."""
 MOST_FACES = 10
-"""Estimators up to which each has a colour; of more, those with a face have, and the others are grey."""
+"""Estimators up to which each has a colour where no names stand at the curves."""
+_LEGIBLE = 0.18
+"""Largest relative luminance of letters on white."""
 DARK, LIGHT = "#15181c", "#e4e7ea"
 """What white and black become on a page that is dark."""
 
@@ -83,15 +87,20 @@ class Look:
     color: str
     marker: str
     dash: Any = ""
+    width: float = 1.0
+    """Of a line, in those of others."""
 
     @property
     def line(self) -> dict[str, Any]:
         """Arguments of a line with markers."""
+        from matplotlib import rcParams
+
         dashes = (0, self.dash) if self.dash else "-"
         return {
             "color": self.color,
             "marker": self.marker,
             "linestyle": dashes,
+            "linewidth": self.width * rcParams["lines.linewidth"],
             "markeredgecolor": "white",
         }
 
@@ -140,11 +149,10 @@ _ALIKE = {"iekf": "iterated_ekf", "ipe_fixed_point": "fixed_point", "ipe_newton"
 def looks(
     labels: Sequence[str],
     kinds: Mapping[str, str] | None = None,
-    chosen: Sequence[str] | None = None,
     own: Mapping[str, Sequence[str]] | None = None,
 ) -> dict[str, Look]:
     """Returns a look per label, the same whichever others are there: its `own` colour and marker, its face, or a place
-    of the pool in the colours of its kind. It is grey if it is neither among those `chosen` nor a face.
+    of the pool in the colours of its kind.
 
     Of two labels from elsewhere that chance gives one place, the later takes the next. What follows a name in brackets
     changes marker and dash alone.
@@ -159,8 +167,7 @@ def looks(
         look = FACES.get(name) or _from_pool(at, family)
         while look in found.values():
             look = _from_pool(at := at + 1, family)
-        grey = chosen is not None and label not in chosen and name not in FACES
-        found[label] = Look(GREY if grey else look.color, marker or look.marker, look.dash)
+        found[label] = Look(look.color, marker or look.marker, look.dash)
     return found
 
 
@@ -171,6 +178,19 @@ def _from_pool(at: int, family: Sequence[str]) -> Look:
         DASHES[at // len(MARKERS) % len(DASHES)],
     )
     return Look(color, MARKERS[at % len(MARKERS)], dash)
+
+
+def strong(color: str) -> str:
+    """Returns the colour, darkened until letters of it are read on white: a contrast of 4.5, as WCAG 2 asks for."""
+    rgb = [int(color[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+    while _luminance(rgb) > _LEGIBLE:
+        rgb = [0.97 * c for c in rgb]
+    return "#" + "".join(f"{round(255 * c):02x}" for c in rgb)
+
+
+def _luminance(rgb: Sequence[float]) -> float:
+    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in rgb]
+    return sum(w * c for w, c in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
 
 
 def dark(color: str) -> str:

@@ -18,6 +18,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.offsetbox import AnnotationBbox
 from shared.synthetic_store import Filter, Pretender, Seeker, Synthetic
 
 from ipe_bench.baselines import EnKF
@@ -25,7 +26,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.report import figures
 from ipe_bench.report.figures import common, costs, draw_all, errors, parameters
 from ipe_bench.report.figures.drawing import Drawing
-from ipe_bench.report.figures.views import View, views
+from ipe_bench.report.figures.views import View, focus_of, views
 from ipe_bench.report.style import (
     DARK,
     FACES,
@@ -38,10 +39,12 @@ from ipe_bench.report.style import (
     house_style,
     looks,
     print_style,
+    strong,
 )
 from ipe_bench.solvers import Auto
 from ipe_bench.statistics import analyse
 from ipe_bench.statistics.sample import History, median_distances
+from ipe_bench.statistics.statistic import ALL
 
 SCALES = (1.0, 10.0, 100.0)
 MODULES = (errors, costs, parameters)
@@ -74,8 +77,9 @@ def fill(
 
 
 def drawn(module, view: View) -> dict[str, Drawing]:
+    figures = [one for one in module.FIGURES if set(one.frames) <= view.frames.keys()]
     with house_style():
-        return {drawing.name: drawing for figure in module.FIGURES for drawing in figure.draw(view)}
+        return {drawing.name: drawing for figure in figures for drawing in figure.draw(view)}
 
 
 def only_view(store: Synthetic) -> View:
@@ -329,10 +333,6 @@ def test_a_name_has_one_look_whichever_others_are_there_and_its_family_the_hue()
     assert together["newton (gain=2)"].color == FACES["newton"].color
     assert together["newton (gain=2)"] != FACES["newton"]
     assert looks(["iekf"], {"iekf": "filters"})["iekf"] == together["iterated_ekf"]
-    # Where there are too many, the mission's own keep their looks, and the others are grey.
-    many = looks(list(dict.fromkeys([*kinds, *FACES])), kinds, chosen=())
-    assert {label for label, one in many.items() if one.color != GREY} == set(FACES)
-    assert all(many[label] == FACES[label] for label in FACES)
     assert looks(["mine"], kinds, own={"mine": ("#c51b7d", "s")})["mine"].line["color"] == "#c51b7d"
 
 
@@ -375,42 +375,114 @@ def test_an_estimator_is_in_the_colours_of_its_family_and_of_many_the_best_are_i
                     estimator=estimator,
                 )
     view = only_view(many)
-    colored = {label for label, one in view.look.items() if one.color != GREY}
-    assert colored == {"filter0", "filter1", "iterated0", "iterated1"}
-    (legend,) = drawn(errors, view)["headline"].figure.legends
-    assert [t.get_text() for t in legend.get_texts()][:5] == [
-        *(e for e in view.look if e in colored),
-        "8 others",
-    ]
+    shown = view.with_look(view.look)
+    colored = {label for label, one in shown.items() if one.color != GREY}
+    assert colored == {"filter0", "iterated0", "filter1", "iterated1"}
 
 
-@pytest.mark.slow
-def test_more_than_seven_in_colour_have_a_row_of_panels_for_each_family_with_the_others_in_grey(
-    synthetic,
-):
-    fill(synthetic, labels=(REFERENCE, *(f"iterated{i}" for i in range(4))))
-    error = 0.1 * np.random.default_rng(0).normal(size=(60, 3))
-    for i in range(4):
-        (drawing,) = [
-            d for name, d in drawn(errors, only_view(synthetic)).items() if name == "headline"
-        ]
-        assert len(drawing.figure.axes) == 3
-        for scale in SCALES:
-            synthetic.add(
-                synthetic.scenario(error_scale=scale), f"filter{i}", error, estimator=Filter()
+# Names at the ends ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def parted():
+    """Seven estimators that are alike up to scale 10; then five lose all trials, one none, and one some."""
+    rows = []
+    for scale in (1.0, 10.0, 30.0, 100.0):
+        for label in ("ekf", "newton", "wins", "some", *"abc"):
+            lost = scale > 10 and label != "wins"
+            share = (0.7 if label == "some" else 0.0) if lost else 1.0
+            row = {"estimator": label, "parameter": ALL, "error_scale": scale, "success": share}
+            row |= {"success_low": 0.9 * share, "success_high": 0.1 + 0.9 * share}
+            row |= {"error_median": 1e6 if lost else 1.0, "error_q95": 1e6 if lost else 1.4}
+            row |= {"nees_median": 20.0 if lost else 1.0, "trials": 60, "solved": 1.0}
+            rows.append(
+                {**row, "nees_median_low_if_honest": 0.9, "nees_median_high_if_honest": 1.1}
             )
-    view = only_view(synthetic)
-    drawing = drawn(errors, view)["headline"]
-    axes = drawing.figure.axes
-    assert [ax.get_title() for ax in axes[::3]] == [f"success: {f}" for f in ("filters", "IPE")]
-    for ax in axes:
-        family = ax.get_title().partition(": ")[2]
-        seen = {line.get_color() for line in ax.lines if len(line.get_xdata()) == len(SCALES)} - {
-            GREY
-        }
-        own = {label for label in view.look if view.families[label] == family}
-        assert seen == {view.look[label].color for label in {REFERENCE, *own}}
-    assert "Grey" in drawing.caption
+    summary = pd.DataFrame(rows)
+    look = looks(list(summary["estimator"].unique()))
+    focus, winner = focus_of(summary)
+    view = View("", "", {"summary": summary}, look, {}, {}, focus=focus, winner=winner)
+    return view, drawn(errors, view.only(["summary"]))["headline"]
+
+
+def names_at_ends(drawing):
+    """Each label: its names with their colours, and its box in pixels."""
+    fig = drawing.figure
+    fig.draw_without_rendering()
+    boxes = [box for box in fig.axes[0].artists if isinstance(box, AnnotationBbox)]
+    found = []
+    for box in boxes:
+        words = [area.get_children()[0] for area in box.offsetbox.get_children()]
+        names = {word.get_text().rstrip(","): word for word in words}
+        found.append((names, box.offsetbox.get_window_extent(), box.xy))
+    return found
+
+
+def test_curves_have_names_at_their_ends_and_those_that_end_together_share_a_label(parted):
+    view, drawing = parted
+    labels = names_at_ends(drawing)
+    ends = view.totals[view.totals["error_scale"] == 100].set_index("estimator")["success"]
+    assert {name for names, _, _ in labels for name in names} == set(ends.index)
+    for names, _, (scale, share) in labels:
+        assert scale == 100.0
+        assert all(ends[name] == share for name in names)
+    boxes = [box for _, box, _ in labels]
+    assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))
+    assert all(box.x1 <= drawing.figure.bbox.x1 for box in boxes)
+    assert len(labels) < len(ends)
+
+
+def test_at_most_four_are_in_colour_and_the_winner_in_a_strong_one(parted):
+    view, drawing = parted
+    lines = [line for ax in drawing.figure.axes for line in ax.lines if len(line.get_xdata()) == 3]
+    assert view.winner == "wins"
+    assert view.focus[:3] == ["wins", "newton", "ekf"]
+    assert {line.get_color() for line in lines} - {GREY} == {
+        strong(view.look["wins"].color),
+        *(view.look[name].color for name in view.focus[1:]),
+    }
+    bold = {
+        name: word
+        for names, _, _ in names_at_ends(drawing)
+        for name, word in names.items()
+        if word.get_fontweight() == "bold"
+    }
+    assert bold.keys() == {"wins"}
+    widths = {line.get_color(): line.get_linewidth() for line in lines}
+    assert max(widths, key=lambda color: widths[color]) == bold["wins"].get_color()
+
+
+@pytest.mark.parametrize("color", sorted({*FAMILIES["IPE"], *FAMILIES["filters"], "#ffe0f0"}))
+def test_letters_of_any_colour_are_read_on_white(color):
+    c = np.array(to_rgb(strong(color)))
+    luminance = XYZ[1] @ np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+    assert 1.05 / (luminance + 0.05) >= 4.5
+
+
+def test_the_axis_starts_at_the_last_scale_where_all_are_alike_and_the_caption_says_so(parted):
+    _, drawing = parted
+    for ax in drawing.figure.axes:
+        low, high = ax.get_xlim()
+        assert [t.get_text() for t in ax.get_xticklabels() if t.get_text()] == ["10", "30", "100"]
+        assert 5 < low < 10
+        assert 100 < high < 200
+    assert drawing.caption.startswith("Up to error scale 10 all are alike: the axis starts there.")
+
+
+def test_a_page_names_the_estimator_of_each_curve_and_label(parted):
+    view, drawing = parted
+    page = drawing.html()
+    for name in view.look:
+        assert page.count(f'<g data-name="{name}">') >= len(drawing.figure.axes) + 1
+    assert "name:" not in page
+
+
+def test_places_of_labels_are_the_nearest_that_keep_their_distance():
+    wanted = [0.5, 0.5, 0.5, 0.0, 0.98]
+    found = common.spread(wanted, 0.1, 0.0, 1.0)
+    assert np.diff(np.sort(found)).min() >= 0.1 - 1e-12
+    np.testing.assert_allclose(found, [0.4, 0.5, 0.6, 0.0, 0.98])
+    np.testing.assert_allclose(common.spread([1.0, 1.0], 0.1, 0.0, 1.0), [0.9, 1.0])
 
 
 # Distributions and convergence ---------------------------------------------------------------------------------------

@@ -420,4 +420,4 @@ def test_states_that_move_have_words_of_their_own(tmp_path):
     ):
         assert words not in shown, words
     assert "the filter linearised at the true path" in shown
-    assert "median error over the linearised filter" in shown
+    assert "error over the linearised filter" in shown

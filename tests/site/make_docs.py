@@ -30,7 +30,7 @@ from ipe_bench.plugins.construct import described
 from ipe_bench.plugins.discovery import CONTRACTS, PACKAGES, Option, options
 from ipe_bench.report.figures import common, drawings
 from ipe_bench.report.figures.drawing import Drawing
-from ipe_bench.report.figures.views import views
+from ipe_bench.report.figures.views import in_focus, views
 from ipe_bench.report.page.headline import headline
 from ipe_bench.report.sections import report_tables
 from ipe_bench.report.style import house_style
@@ -287,10 +287,10 @@ def _small(analysis: Analysis) -> Any:
     if parts and len(parts[0].scales) > 1:
         view = parts[0]
         fig, (ax,) = common.panels(1, view.look, height=2.4)
-        common.curves(ax, view.totals, "success", view.look, view.scales, trials="trials")
+        look = in_focus(view.look, view.focus)
         common.shares(ax)
-        ax.set_ylabel("success")
-        common.legend(fig, [ax], view.look)
+        common.curves(ax, view.totals, "success", look, view.scales, label="success")
+        common.end_names(ax, view.totals, "success", look)
         return fig
     rows: Any = analysis.summary[analysis.summary["parameter"] == ALL]
     column = "success"

@@ -8,11 +8,22 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from ipe_bench.report.style import BOUND_COLOR, BOUND_DASH, GREY, Look, print_width
+from ipe_bench.basics.linalg import Array
+from ipe_bench.report.figures.svg import NAMED
+from ipe_bench.report.style import (
+    BOUND_COLOR,
+    BOUND_DASH,
+    GREY,
+    SOFT,
+    Look,
+    print_width,
+    strong,
+)
 from ipe_bench.report.words import value_text
 from ipe_bench.trials.thresholds import FEW
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
@@ -20,6 +31,14 @@ if TYPE_CHECKING:
 MOST_PANELS = 8
 REACH = 0.3
 """Part of the span of the points that intervals may add to an axis at either end."""
+_SAME_END = 0.01
+"""Differences of shares up to which curves end at one place."""
+_MOST_LETTERS = 30
+"""Length of a label that curves share."""
+_TEXT = -1
+"""The number of a name among the artists of its curve."""
+_AROUND = 90.0
+"""Points of a figure's height above and below a panel, about."""
 BEYOND = "beyond the axis"
 """Label of the arrow at points that lie there."""
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -111,11 +130,16 @@ def text(value: Any) -> str:
     return "\u200b" + words if words.startswith("_") else words
 
 
-def _letters(inches: float, size: Any) -> float:
-    """Estimates how many letters of one of matplotlib's sizes fit that length."""
+def _size(name: Any) -> float:
+    """Returns one of matplotlib's sizes of letters in points."""
     from matplotlib import rcParams
 
-    return inches / (0.0085 * float(rcParams[size]))
+    return float(rcParams[name])
+
+
+def _letters(inches: float, size: str) -> float:
+    """Estimates how many letters of one of matplotlib's sizes fit that length."""
+    return inches / (0.0085 * _size(size))
 
 
 def _room(ax: Axes, size: str) -> float:
@@ -338,9 +362,9 @@ def curves(
     """Draws a column over the error scales, a line with markers per label, on an axis with fixed limits, with the
     panel's heading and the label of its axis of values; at one scale a row per label of panels that were made for it.
 
-    Labels stand side by side about their scale, so that points and intervals that coincide are seen. A line is broken
-    where a value is missing; a point that some of the trials or fewer than `FEW` carry is hollow, and without an
-    interval if they are fewer than `FEW`. Of an interval that lacks an end the other is drawn. What exceeds `most`
+    Labels in colour stand side by side about their scale, so that points and intervals that coincide are seen. A line
+    is broken where a value is missing; a point that some of the trials or fewer than `FEW` carry is hollow, and without
+    an interval if they are fewer than `FEW`. Of an interval that lacks an end the other is drawn. What exceeds `most`
     stands there, and an interval that is cut there or at the end of the axis has an arrow.
     """
     across, one_scale = _value(ax) == "x", len(scales) == 1
@@ -358,9 +382,11 @@ def curves(
         "markeredgewidth": 1.1,
     }
     hollow = False
+    colored = [name for name, one in look.items() if one.color != GREY]
+    shifts = {name: (i + 0.5) / len(colored) - 0.5 for i, name in enumerate(colored)}
     for i, (name, one) in enumerate(look.items()):
         part: Any = rows[rows[by] == name].sort_values("error_scale", kind="stable")
-        beside = 10 ** (0.3 * gap * ((i + 0.5) / len(look) - 0.5))
+        beside = 10 ** (0.3 * gap * shifts.get(name, 0.0))
         place, values = (
             np.full(len(part), i) if one_scale else part["error_scale"] * beside,
             part[y].clip(upper=most),
@@ -386,6 +412,7 @@ def curves(
         hollow |= bool(empty.any())
         values = values.where(np.isfinite(values))
         right, up = (values, place) if across else (place, values)
+        before = set(ax.get_children())
         ax.errorbar(right, up, elinewidth=0.8, **{"xerr" if across else "yerr": ends}, **line)
         inside = empty & ~over
         ax.plot(
@@ -396,8 +423,11 @@ def curves(
             zorder=3,
             **emptied,
         )
-        if one.color != GREY and over.any():
+        if over.any():
             beyond(ax, right[over], up[over], one)
+        own = [artist for artist in ax.get_children() if artist not in before]
+        for number, artist in enumerate(own):
+            mark_name(ax, artist, str(name), number)
     if hollow:
         ax.plot(
             [],
@@ -410,6 +440,72 @@ def curves(
     ax.set(**{f"{_value(ax)}label": label})
     if heading:
         title(ax, heading)
+
+
+def mark_name(ax: Axes, artist: Artist, name: str, number: int) -> None:
+    """Marks an artist, with a number among those of its panel and estimator, so that a page finds it by the name."""
+    artist.set_gid(f"{NAMED}{name}#{ax.figure.axes.index(ax)}-{number}")
+
+
+def spread(wanted: Sequence[float], gap: float, low: float, high: float) -> Array:
+    """Returns places at least `gap` apart from `low` to `high`, nearest to where they are wanted: by adjacent violators
+    that are pooled (Ayer and others, Annals of Mathematical Statistics 26, 1955)."""
+    order = np.argsort(wanted, kind="stable")
+    shifts = gap * np.arange(len(order))
+    pools: list[list[float]] = []
+    for value in np.asarray(wanted, dtype=float)[order] - shifts:
+        pools.append([value])
+        while len(pools) > 1 and np.mean(pools[-2]) > np.mean(pools[-1]):
+            last = pools.pop()
+            pools[-1] += last
+    ascending = np.concatenate([np.full(len(pool), np.mean(pool)) for pool in pools])
+    places = np.clip(ascending, low, max(low, high - shifts[-1])) + shifts
+    found = np.empty(len(order))
+    found[order] = places
+    return found
+
+
+def end_names(ax: Axes, rows: pd.DataFrame, y: str, look: Mapping[str, Look]) -> None:
+    """Writes the name of each curve at its end, in its colour; curves that end at one place share a label."""
+    from matplotlib.offsetbox import AnnotationBbox, HPacker, TextArea
+
+    known = rows[rows[y].notna()].sort_values("error_scale", kind="stable")
+    last = known.groupby("estimator", sort=False).tail(1).set_index("estimator")
+    ends = {name: (last["error_scale"][name], last[y][name]) for name in look if name in last.index}
+    labels: list[list[str]] = []
+    for name in sorted(ends, key=lambda name: (ends[name][1], ends[name][0])):
+        near = labels and np.allclose(ends[labels[-1][0]], ends[name], rtol=0, atol=_SAME_END)
+        if near and len(", ".join([*labels[-1], name])) <= _MOST_LETTERS:
+            labels[-1].append(name)
+        else:
+            labels.append([name])
+    low, high = ax.get_ylim()
+    size = _size("legend.fontsize")
+    height = 72 * ax.figure.get_figheight() - _AROUND  # type: ignore[union-attr]
+    wanted = [(ends[names[0]][1] - low) / (high - low) for names in labels]
+    places = spread(wanted, 1.3 * size / height, 0.0, 1.0)
+    for names, place in zip(labels, places, strict=True):
+        words = []
+        for i, name in enumerate(names):
+            one = look[name]
+            color = SOFT if one.color == GREY else strong(one.color)
+            comma = "," if i < len(names) - 1 else ""
+            style: Any = {"color": color, "fontsize": size}
+            style |= {"fontweight": "bold"} if one.width > 1 else {}
+            words.append(TextArea(f"{text(name)}{comma}", textprops=style))
+            mark_name(ax, words[-1].get_children()[0], name, _TEXT)
+        box = AnnotationBbox(
+            HPacker(children=words, pad=0, sep=0.3 * size, align="baseline"),
+            ends[names[0]],
+            (1.06, place),
+            boxcoords="axes fraction",
+            box_alignment=(0.0, 0.5),
+            frameon=False,
+            pad=0,
+            annotation_clip=False,
+            arrowprops={"arrowstyle": "-", "color": SOFT, "linewidth": 0.4, "shrinkB": 2},
+        )
+        ax.add_artist(box)
 
 
 def legend(

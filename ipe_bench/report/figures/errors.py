@@ -12,81 +12,105 @@ from scipy.special import gammainc
 
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
-from ipe_bench.report.figures.views import Figure, View
-from ipe_bench.report.style import BOUND_COLOR, BOUND_DASH, GREY, MOST_TOGETHER, REFERENCE, Look
+from ipe_bench.report.figures.views import Figure, View, in_focus
+from ipe_bench.report.style import BOUND_COLOR, BOUND_DASH, REFERENCE, Look, print_width, strong
 from ipe_bench.report.words import brief, enumerate_few, value_text
 
 CEILING = {"error_median": 100.0, "error_q95": 100.0, "nees_median": 30.0}
 """Errors beyond are drawn here: the size of a diverged error carries no information, and the bound needs the room."""
+_ALL, _APART = 0.995, 0.1
+"""Success that all estimators have where they are alike, and the part by which their errors and NEES differ at most."""
+_WIDE = 5.0
+"""Inches of a column of print from which on there is room for names at curves."""
 LINEAR = 0.1
 """Differences below this are drawn about in proportion, larger ones by their logarithm: honest curves differ by
 hundredths, dishonest ones by up to 1."""
 
 
 def draw(view: View) -> Iterator[Drawing]:
+    """Draws success, error and, where a covariance is reported, NEES: over the error scales with names at the curves'
+    ends, from where estimators part; at one scale a row for each."""
     totals = view.totals
     if totals.empty:
         return
-    claims, rows = totals[totals["nees_median"].notna()], _rows(view)
-    row = 3 if len(claims) else 2
-    height = 3.3 if len(rows) == 1 else 2.6
-    fig, axes = common.panels(
-        row * len(rows), view.look, height=height, scales=view.scales, row=row
-    )
-    for i, (family, look) in enumerate(rows.items()):
-        _row(view, axes[row * i : row * (i + 1)], look, f": {family}" if family else "", claims)
-    common.legend(fig, axes, view.look)
-    over = (
-        "over error scales"
-        if len(view.scales) > 1
-        else f"at error scale {value_text(view.scales[0])}"
-    )
-    gate = "keep the track" if view.moving else "lie inside the gate"
+    several = len(view.scales) > 1
+    start = _parting(view) if several else view.scales[0]
+    scales = [scale for scale in view.scales if scale >= start]
+    rows = totals[totals["error_scale"] >= start]
+    claims = rows[rows["nees_median"].notna()]
+    count = 3 if len(claims) else 2
+    height = max(3.3, 0.17 * len(view.look) + 1.6)
+    look = _looks(view) if several else view.look
+    fig, axes = common.panels(count, look, height=height, scales=scales, row=count)
+    _draw_panels(view, axes, rows, claims, look, scales)
+    named = several and not 0 < print_width() < _WIDE
+    if named:
+        common.end_names(axes[0], rows, "success", look)
+    common.legend(fig, axes, {} if named else look)
+    over = "over error scales" if several else f"at error scale {value_text(start)}"
     yield view.drawing(
         fig,
         "headline",
         f"Success, error and reported covariance {over}",
-        f"Trials that {gate}, with 95 % intervals; median error over {view.reference}, bar to 95 %; NEES, the squared"
-        " error over the claimed variance.",
-        "Grey: the estimators of the other rows." if len(rows) > 1 else "",
+        _start_in_words(view, start) if start > view.scales[0] else "",
+        "Bars: 95 % intervals of success, and errors from the median to the 95 % quantile.",
     )
 
 
-def _rows(view: View) -> dict[str, Mapping[str, Look]]:
-    """Returns the looks in each row of panels: a row for all estimators, or for each family of many, with the others
-    but the reference in grey."""
-    shown = [label for label, one in view.look.items() if one.color != GREY and label != REFERENCE]
-    families = dict.fromkeys(view.families[label] for label in shown)
-    if len(view.scales) == 1 or len(shown) <= MOST_TOGETHER or len(families) == 1:
-        return {"": view.look}
-    kept = {
-        family: {REFERENCE, *(e for e in shown if view.families[e] == family)}
-        for family in families
-    }
-    return {
-        family: {e: one if e in own else replace(one, color=GREY) for e, one in view.look.items()}
-        for family, own in kept.items()
-    }
+def _looks(view: View) -> dict[str, Look]:
+    """Returns the looks with a strong line for the winner, and those out of focus in grey."""
+    look = in_focus(view.look, view.focus)
+    if view.winner:
+        own = look[view.winner]
+        look[view.winner] = replace(own, color=strong(own.color), width=1.6)
+    return look
 
 
-def _row(
-    view: View, axes: Sequence[Any], look: Mapping[str, Look], family: str, claims: pd.DataFrame
+def _parting(view: View) -> float:
+    """Returns the last of the scales up to which all estimators but the reference are alike, so that at least three are
+    left; the first if they never part."""
+    rows = view.totals[view.totals["estimator"] != REFERENCE]
+    whole = rows["estimator"].nunique()
+    alike = []
+    for scale in view.scales:
+        here = rows[rows["error_scale"] == scale]
+        ranges = [here[name].max() / here[name].min() for name in ("error_median", "nees_median")]
+        # Of a statistic that no estimator has, the range is NaN.
+        close = not any(spread > 1 + _APART for spread in ranges)
+        alike.append(len(here) == whole and here["success"].min() >= _ALL and close)
+    if all(alike):
+        return view.scales[0]
+    return view.scales[min(max(alike.index(False) - 1, 0), max(len(alike) - 3, 0))]
+
+
+def _start_in_words(view: View, start: float) -> str:
+    but = f" but {REFERENCE}" if REFERENCE in view.look else ""
+    return f"Up to error scale {value_text(start)} all{but} are alike: the axis starts there."
+
+
+def _draw_panels(
+    view: View,
+    axes: Sequence[Any],
+    rows: pd.DataFrame,
+    claims: pd.DataFrame,
+    look: Mapping[str, Look],
+    scales: Sequence[float],
 ) -> None:
     """Draws success, error and, if there is a third panel, NEES."""
-    totals, shown = view.totals, (look, view.scales)
-    capped = totals[list(CEILING)].clip(upper=pd.Series(CEILING), axis=1)
-    words: dict[str, Any] = {"heading": f"success{family}", "label": "share of all trials"}
+    shown = look, scales
+    capped = rows[list(CEILING)].clip(upper=pd.Series(CEILING), axis=1)
+    words: dict[str, Any] = {"heading": "success", "label": "share of all trials"}
     common.shares(axes[0])
     common.curves(
-        axes[0], totals, "success", *shown, interval=("success_low", "success_high"), **words
+        axes[0], rows, "success", *shown, interval=("success_low", "success_high"), **words
     )
-    heading = f"error over {view.reference}{family}"
+    heading = f"error over {view.reference}"
     words = {"heading": heading, "label": "median, bar to 95 %", "most": CEILING["error_q95"]}
     common.decades(axes[1], capped[["error_median", "error_q95"]].clip(lower=0.5), least=4.0)
     best = f"1: {view.reference}, an honest covariance"
     common.bound_line(axes[1], 1.0, best)
     common.curves(
-        axes[1], totals, "error_median", *shown, interval=("error_median", "error_q95"), **words
+        axes[1], rows, "error_median", *shown, interval=("error_median", "error_q95"), **words
     )
     for nees in axes[2:]:
         common.decades(nees, np.append(capped["nees_median"].clip(lower=0.5), 1.0), least=4.0)
@@ -96,7 +120,7 @@ def _row(
             claims["nees_median_high_if_honest"].max(),
         )
         common.band(nees, *limits, "95 % limits of the median if honest")
-        words = {"heading": f"NEES{family}", "label": "median", "most": CEILING["nees_median"]}
+        words = {"heading": "NEES", "label": "median", "most": CEILING["nees_median"]}
         common.curves(nees, claims, "nees_median", *shown, **words)
 
 

@@ -12,6 +12,8 @@ from ipe_bench.report.style import dark
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+NAMED = "name:"
+"""Begins the id of an artist that is an estimator's; its name ends at `#`. On a page it is `data-name`."""
 _MARGIN = 3.0
 """Points around a panel."""
 _FIGURE = re.compile(r'^ <g id="figure_1">\n(.*?)^ </g>\n(.*)^</svg>', re.MULTILINE | re.DOTALL)
@@ -103,7 +105,8 @@ def _classed(html: str) -> str:
         return f' class="{name}"'
 
     def rewritten(tag: re.Match[str]) -> str:
-        short = re.sub(r'^<g id="[^"]*"', "<g", tag[0])
+        short = re.sub(rf'^<g id="{NAMED}([^"#]*)#[^"]*"', r'<g data-name="\1"', tag[0])
+        short = re.sub(r'^<g id="[^"]*"', "<g", short)
         short = re.sub(r' style="((?:fill|stroke|font|opacity|clip)[^"]*)"', named, short)
         short = re.sub(r' transform="rotate\(-0 [^"]*"', "", short)
         return re.sub(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -12,7 +12,16 @@ import pandas as pd
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.report.figures.drawing import Drawing
-from ipe_bench.report.style import FACES, MOST_FACES, Look, Which, drawn_settings, looks
+from ipe_bench.report.style import (
+    GREY,
+    MOST_FACES,
+    MOST_TOGETHER,
+    REFERENCE,
+    Look,
+    Which,
+    drawn_settings,
+    looks,
+)
 from ipe_bench.report.words import value_text
 from ipe_bench.runs.store import traits
 from ipe_bench.statistics.analysis import Analysis
@@ -26,6 +35,10 @@ if TYPE_CHECKING:
 
 MOST_LETTERS = 70
 """Largest length of a setting in a file name; longer ones are cut and end in a number."""
+FOCUS = ("newton", "ekf", "fixed_point", "ukf")
+"""Those that the bench is about, behind the best of all."""
+BROKEN = 0.9
+"""Share of success that an estimator holds."""
 FRAMES = tuple(field.name for field in fields(Analysis) if field.type == "pd.DataFrame")
 """The tables of an analysis that a figure may ask for."""
 
@@ -46,6 +59,10 @@ class View:
     """Family of each estimator, of which smoothers are one."""
     parameters: Sequence[Mapping[str, Any]] = ()
     """Name, unit, size and group of each; empty for all settings."""
+    focus: Sequence[str] = ()
+    """The estimators in colour where not all can be: the best, then those that the bench is about."""
+    winner: str = ""
+    """The one that holds longest and succeeds most; empty if several do."""
     paper: bool = False
     """Whether this is the setting of the paper: the gimballed INS with quantised readings."""
     moving: bool = False
@@ -79,9 +96,11 @@ class View:
         return sorted({float(s) for frame in frames for s in frame["error_scale"]})
 
     def with_look(self, estimators: Any) -> dict[str, Look]:
-        """Returns the looks of those of the estimators that are present."""
+        """Returns the looks of those of the estimators that are present, of many in grey but for the focus."""
         present = set(estimators)
-        return {label: look for label, look in self.look.items() if label in present}
+        colored = self.focus if len(self.look) > MOST_FACES else self.look
+        look = in_focus(self.look, colored)
+        return {label: one for label, one in look.items() if label in present}
 
     def drawing(self, figure: Canvas, name: str, title: str, *caption: str) -> Drawing:
         """Returns a figure of this setting, whose label stands with the title; empty parts of the caption go."""
@@ -153,11 +172,13 @@ def views(analysis: Analysis, which: Which = "all") -> tuple[list[View], View]:
         ):
             suffix = f"{suffix[:MOST_LETTERS]}-{len(parts) + 1}"
         paper = (setting.get("measurement"), setting.get("noise")) == ("gins", "quantization")
-        known = footers[key]["parameters"], paper, setting.get("noise") == "model"
+        focus = focus_of(frames["summary"])
+        known = footers[key]["parameters"], *focus, paper, setting.get("noise") == "model"
         parts.append(
             View(f"_{suffix}" * bool(varying), label, frames, seen, equations, families, *known)
         )
-    return parts, View("", "", whole, every, equations, families, collection=collection)
+    focus = focus_of(analysis.summary)
+    return parts, View("", "", whole, every, equations, families, (), *focus, collection=collection)
 
 
 def _success(summary: pd.DataFrame) -> float:
@@ -186,22 +207,35 @@ def _word(value: Any) -> str:
 
 
 def _looks(analysis: Analysis) -> dict[str, Look]:
-    """Returns a look for each estimator, in the colours of its family; of more than `MOST_FACES` those with a face are
-    in colour, or if there is none the two best of each family."""
+    """Returns a look for each estimator, in the colours of its family."""
     labels = list(dict.fromkeys(g.estimator for g in analysis.collection.groups))
     families = {g.estimator: family_of(g.footer) for g in analysis.collection.groups}
     own = _own_looks({g.estimator: g.footer for g in analysis.collection.groups})
-    if len(labels) <= MOST_FACES or analysis.summary.empty:
-        return looks(labels, families, own=own)
-    totals = analysis.summary[analysis.summary["parameter"] == ALL]
-    success = totals.groupby("estimator")["success"].mean()
-    ranked = sorted(labels, key=lambda label: -success.get(label, 0.0))
-    best = [
-        label
-        for label in labels
-        if label in [e for e in ranked if families.get(e) == families.get(label)][:2]
-    ]
-    return looks(labels, families, () if FACES.keys() & set(labels) else best, own)
+    return looks(labels, families, own=own)
+
+
+def in_focus(look: Mapping[str, Look], colored: Container[str]) -> dict[str, Look]:
+    """Returns the looks, those in colour that are asked for and the others in grey."""
+    return {
+        e: one if e in colored else replace(one, color=GREY, width=0.7) for e, one in look.items()
+    }
+
+
+def focus_of(summary: pd.DataFrame) -> tuple[list[str], str]:
+    """Returns the estimators that are in colour where not all can be, the best first, and the best if it is one."""
+    if summary.empty:
+        return [], ""
+    rows = summary[(summary["parameter"] == ALL) & (summary["estimator"] != REFERENCE)]
+    rows = rows.sort_values("error_scale", kind="stable")
+    held: dict[Any, tuple[float, float]] = {}
+    for label, own in rows.groupby("estimator", sort=False):
+        longest = float((own["success"] >= BROKEN).cumprod().sum())
+        held[label] = (longest, round(own["success"].mean(), 3))
+    ranked = sorted(held, key=lambda label: held[label], reverse=True)
+    known = [label for label in FOCUS if label in held]
+    shown = list(dict.fromkeys([*ranked[:1], *known, *ranked]))[:MOST_TOGETHER]
+    first = [label for label in ranked if held[label] == held[ranked[0]]]
+    return shown, first[0] if len(first) == 1 else ""
 
 
 def looks_of(estimators: Mapping[str, Any]) -> dict[str, Look]:
