@@ -106,8 +106,8 @@ output=DIR          folder of the files, which are listed at the end: by default
 """,
         {"arguments": _several("KEY=VALUE", "any key of `ipe-bench run`")},
     ),
-    "design": None,
-    "posterior": None,
+    # A question describes itself in its folder, and its line in the table of names.
+    **dict.fromkeys(QUESTIONS),
     "report": (
         "tables, figures and report of what is stored",
         _MISSING,
@@ -127,8 +127,6 @@ formats=pdf,md,tex   {MEANING}
 """,
         {"arguments": _several("DIR", "folders of results, such as outputs/paper")},
     ),
-    "compare": None,
-    "audit": None,
     "bundle": (
         "results in one archive to share, or whether such an archive is whole",
         _MISSING,
