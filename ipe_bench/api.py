@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
 
-from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.base import Measurement
@@ -537,6 +537,33 @@ def posterior(
     estimators = _labelled(estimators)
     validate([scenario], estimators, trials)
     return sampled(scenario, estimators, trials, particles, watch)
+
+
+def component(name: str, **options: Any) -> Any:
+    """Constructs what the command line calls GROUP=NAME: a model, noise, estimator or tracker.
+
+    Parameters:
+        name: GROUP/NAME, one of those that `ipe-bench list` shows, of plugins too.
+        options: values in place of those of its config; a mapping changes the keys that it has.
+
+    Raises:
+        UserError: there is no such option, or a value does not suit.
+
+    >>> import ipe_bench as ib
+    >>> model = ib.component("state_model/pendulum", count=50, start={"angle": 1.0})
+    >>> model.epochs, model.start
+    (50, {'angle': 1.0, 'rate': 0.0})
+    >>> ib.component("tracker/ekf") == ib.states.ekf()
+    True
+    """
+    from ipe_bench.plugins.construct import construct
+    from ipe_bench.plugins.discovery import composed, merged
+    from ipe_bench.plugins.discovery import options as offered
+
+    known = {f"{one.group}/{one.name}": one for one in offered()}
+    if name not in known:
+        raise UserError(f"{name}: {unknown(name, known, 'option')}")
+    return construct(merged(composed(known[name]), options), name.replace("/", "."))
 
 
 def check(component: Any) -> list[Finding]:

@@ -368,16 +368,16 @@ def composed(option: Option) -> dict[str, Any]:
             raise UserError(
                 f"{option.path}: defaults: {unknown(name, known, f'option of {option.group}')}"
             )
-        found = _merged(found, config if entry == "_self_" else composed(known[name]))
+        found = merged(found, config if entry == "_self_" else composed(known[name]))
     return found
 
 
-def _merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
+def merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
     """Merges both, the second in the place of the first but where both are mappings."""
     both = {
         k for k, v in second.items() if isinstance(v, Mapping) and isinstance(first.get(k), Mapping)
     }
-    return {**first, **second, **{key: _merged(first[key], second[key]) for key in both}}
+    return {**first, **second, **{key: merged(first[key], second[key]) for key in both}}
 
 
 def options_in(folder: Path) -> list[Option]:

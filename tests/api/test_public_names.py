@@ -21,6 +21,7 @@ FUNCTIONS = (
     "audit",
     "check",
     "compare",
+    "component",
     "design",
     "estimate",
     "load",

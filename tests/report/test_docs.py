@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import lzma
 import os
 import re
@@ -17,6 +18,7 @@ import make_docs as pages
 import numpy as np
 import pandas as pd
 import pytest
+import word_drawings
 from docs_types import show_type, type_of
 from gallery_frames import KEPT, SUFFIX, Computed, read
 from shared.synthetic_store import Pretender, Seeker, Synthetic
@@ -227,7 +229,9 @@ def test_links_lead_to_pages(page, generated):
     for link in re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8")):
         target = (page.parent / link).resolve()
         made = generated / target.relative_to(PAGES.resolve())
-        assert target.exists() or made.exists() or link.startswith("gallery/pictures/"), link
+        drawn = link in {f"pictures/{name}.png" for name in word_drawings.DRAWINGS}
+        shown = drawn or link.startswith(("gallery/pictures/", "../gallery/pictures/"))
+        assert target.exists() or made.exists() or shown, link
 
 
 def test_options_are_described_from_class_and_config_and_say_what_they_mean():
@@ -309,23 +313,87 @@ def test_attributes_of_public_classes_have_types_that_are_types():
     ] == []
 
 
+def write_files(page: Path, folder: Path) -> None:
+    """Writes the files that a page tells its readers to write."""
+    said = r"Write a file `(\S+)`:\n\n```\w+\n(.*?)```"
+    for name, content in re.findall(said, page.read_text("utf-8"), re.DOTALL):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(content, encoding="utf-8")
+
+
+def commands(page: Path) -> list[list[str]]:
+    """Returns the arguments of each command of a page, one that goes on behind a backslash as a whole."""
+    typed = "".join(blocks(page, "console")).replace("\\\n", "")
+    return [shlex.split(line.removeprefix("$ ipe-bench ")) for line in typed.splitlines()]
+
+
+@pytest.fixture
+def hour(tmp_path, monkeypatch) -> Path:
+    """The folder of a reader of the first hour, with its files."""
+    write_files(PAGES / "first_hour.md", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    return PAGES / "first_hour.md"
+
+
+def oxygen(days: list[float], noise: float) -> ipe_bench.Scenario:
+    model = ipe_bench.measurements.Function(of="oxygen:demand", columns={"t": days})
+    return ipe_bench.Scenario(model, Gaussian(noise))
+
+
+def test_the_bounds_of_the_first_hour_are_those_of_its_commands(hour):
+    """Three late days beat readings of twice the quality, as its table says."""
+    designs = [command for command in commands(hour) if command[0] == "design"]
+    printed = re.findall(
+        r"^\| .* days.* \| ([\d.]+) \| ([\d.]+) \|$", hour.read_text(), re.MULTILINE
+    )
+    assert len(designs) == len(printed) == 3
+    for command, bounds in zip(designs, printed, strict=True):
+        given = dict(word.split("=", 1) for word in command[1:])
+        days = json.loads(given["measurement.columns.t"])
+        found = ipe_bench.design(oxygen(days, float(given["noise.deviation"])))
+        sizes = [one.size for one in found.observability.parameters]
+        seen = found.observability.bound * sizes
+        assert list(seen) == pytest.approx([*map(float, bounds)], rel=5e-3)
+
+
+def test_the_estimates_of_the_first_hour_come_out_with_a_profile_that_allows_no_negative_rate(hour):
+    model = ipe_bench.measurements.Function(of="oxygen:demand")
+    estimators = {"levenberg_marquardt": ipe_bench.baselines.LevenbergMarquardt()}
+    (fit,) = ipe_bench.estimate(model, "oxygen.csv", estimators)
+    printed = re.findall(r"^ b\d .* ([\d.]+) ± ([\d.]+)$", hour.read_text(), re.MULTILINE)
+    values = [float(value) for value, _ in printed]
+    assert list(dict(fit.values).values()) == pytest.approx(values, rel=5e-3)
+    assert fit.fits is None  # as the noise level is estimated from the residuals
+
+
+@pytest.mark.parametrize("command", commands(PAGES / "first_hour.md"), ids=lambda one: one[0])
+def test_the_commands_of_the_first_hour_are_composed(command, hour):
+    """What they ask for is understood; the slow test of all pages runs them."""
+    given = words.read(command[0], [word for word in command[1:] if word != "-m"])
+    with session():
+        jobs = jobs_of(given, multirun="-m" in command)
+    assert len(jobs.specs) == (3 if "-m" in command else 1)
+
+
+def test_the_drawings_of_words_show_what_their_page_says():
+    """Newton's errors are on the bound and its NEES is 1; a linear fit is far outside."""
+    error, square = word_drawings.estimates(ipe_bench.solvers.Newton(), 1.0)
+    linear, _ = word_drawings.estimates(ipe_bench.baselines.LinearLSE(), 1.0)
+    assert error.std(axis=0) == pytest.approx(1.0, abs=0.1)
+    assert square.mean() == pytest.approx(error.shape[1], rel=0.1)
+    assert np.sqrt(np.mean(linear**2)) > 2
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "page", [p for p in WRITTEN if blocks(p, "console") or blocks(p, "python")], ids=ids
 )
 def test_what_a_page_says_to_type_works(page, tmp_path):
     environment = os.environ | {"NO_COLOR": "1"}
-    for name, content in re.findall(
-        r"Write a file `(\S+)`:\n\n```text\n(.*?)```", page.read_text("utf-8"), re.DOTALL
-    ):
-        (tmp_path / name).write_text(content, encoding="utf-8")
-    for line in "".join(blocks(page, "console")).splitlines():
-        program = [
-            sys.executable,
-            "-m",
-            "ipe_bench",
-            *shlex.split(line.removeprefix("$ ipe-bench ")),
-        ]
+    write_files(page, tmp_path)
+    for line in commands(page):
+        program = [sys.executable, "-m", "ipe_bench", *line]
         done = subprocess.run(
             program, cwd=tmp_path, capture_output=True, text=True, env=environment, check=False
         )

@@ -50,7 +50,7 @@ def test_the_columns_that_the_advice_on_choosing_names_are_there(tmp_path):
     bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01))
     table = ib.run(bench, {"auto": ib.solvers.Auto()}, 5, output=tmp_path)
     page = (ROOT / "ipe_bench/report/docs/pages/choosing.md").read_text(encoding="utf-8")
-    assert re.search(r"The column `(\w+)` of its trials", page)[1] in ib.load(tmp_path)  # type: ignore[index]
+    assert re.search(r"The column `(\w+)` of the trials", page)[1] in ib.load(tmp_path)  # type: ignore[index]
     assert re.search(r"`(\w+)` in `summary_all.csv`", page)[1] in table  # type: ignore[index]
 
 

@@ -21,6 +21,7 @@ from typing import Any
 
 import pandas as pd
 from gallery_frames import SUFFIX, Computed, read
+from word_drawings import write_drawings
 
 import ipe_bench
 from ipe_bench.basics.errors import UserError
@@ -80,6 +81,22 @@ GROUPS = {
     "tracker": "Filters and smoothers of states",
     "execution": "Executions",
 }
+IN_USE = (
+    "Scenario",
+    "run",
+    "load",
+    "report",
+    "estimate",
+    "compare",
+    "design",
+    "posterior",
+    "component",
+    "audit",
+    "check",
+    "status",
+    "StateScenario",
+)
+"""Names of the reference of Python in the order in which they are used; the others follow by the alphabet."""
 CLASSES = {place for places in CONTRACTS.values() for place in places}
 ORDINARY, LEAST = 1000, 3
 """Trials of an ordinary experiment, and the least number that a costly one is cut to."""
@@ -110,6 +127,7 @@ def build(output: Path, trials: int) -> int:
     shutil.copytree(SOURCES / "pages", source)
     print("reference pages ...", flush=True)
     write_reference(source / "reference")
+    write_drawings(source / "explanation" / "pictures")
     write_gallery(source / "gallery", output / "results", trials)
     places = (output / "html", output / "doctrees")
     site = Sphinx(source, None, *places, "html", SETTINGS, warningiserror=True, freshenv=True)
@@ -166,9 +184,10 @@ def write_reference(folder: Path) -> None:
             commands={"": summary, **dict(zip(names, said, strict=True))},
         )
     write_page(folder / "contracts.md", "contracts", kinds=CONTRACTS)
+    names = sorted(ipe_bench.__all__, key=lambda name: (IN_USE + (name,)).index(name))
     things = [
         (name, getattr(ipe_bench, name))
-        for name in ipe_bench.__all__
+        for name in names
         if f"ipe_bench.{name}" not in CLASSES
     ]
     shown = [(name, thing) for name, thing in things if hasattr(thing, "__qualname__")]

@@ -1,0 +1,123 @@
+"""Draws error scale, bound and NEES, each by trials of the bench itself, for the page that explains the words."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.stats import chi2
+
+import ipe_bench as ib
+from ipe_bench.basics.linalg import Array
+from ipe_bench.measurements.function import function
+from ipe_bench.report.style import house_style
+
+NOISE = 2.5
+SCALES = (0.1, 0.3, 1.0)
+DAYS = (1, 2, 3, 4, 5, 7)
+TRIALS = 400
+BLUE, ORANGE, GREY = "#0072b2", "#d55e00", "#8a8a8a"
+
+
+def demand(t, b1=20.0, b2=0.5):
+    """Returns the oxygen demand of the tutorial."""
+    return b1 * (1 - np.exp(-b2 * t))
+
+
+def scenario(error_scale: float) -> ib.Scenario:
+    """Returns the tutorial's six readings, their truths drawn at an error scale."""
+    model = function(demand, columns={"t": DAYS})
+    return ib.Scenario(model, ib.noise.Gaussian(NOISE), error_scale=error_scale)
+
+
+def error_scale() -> Figure:
+    """Draws true parameters at three error scales, and the readings that they would give without noise."""
+    fig, axes = _axes(2)
+    days = np.linspace(0, 20, 100)
+    for scale, color in zip(reversed(SCALES), (ORANGE, BLUE, "black"), strict=True):
+        bench = scenario(scale)
+        sizes = [one.size for one in bench.measurement.parameters]
+        b1, b2 = (bench.draw(0, 60).x * sizes).T
+        axes[0].plot(b1, b2, "o", color=color, markersize=3, label=f"error scale {scale:g}")
+        curves = demand(days[:, None], b1[:12], b2[:12])
+        axes[1].plot(days, curves, color=color, linewidth=0.7)
+    axes[0].plot(20, 0.5, "+", color="white", markersize=14, markeredgewidth=3)
+    axes[0].plot(20, 0.5, "+", color="black", markersize=12, markeredgewidth=1.5, label="start")
+    axes[0].set(xlabel="b1", ylabel="b2", title="True parameters")
+    axes[1].set(xlabel="t [days]", ylabel="demand", ylim=(-20, 70), title="Their readings")
+    axes[0].legend()
+    return fig
+
+
+def estimates(estimator: ib.Estimator, scale: float) -> tuple[Array, Array]:
+    """Returns whitened errors (trials, n) and squared errors over the reported variance (trials,)."""
+    bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=scale)
+    trials = bench.draw(0, TRIALS)
+    found = estimator.estimate(bench.problem, trials.z)
+    assert found.covariance is not None
+    error = found.x - trials.x
+    J = bench.measurement.jacobian(trials.x)
+    root = np.linalg.cholesky(np.matmul(J.swapaxes(1, 2), J) / 0.01**2)
+    whitened = np.einsum("tji,tj->ti", root, error)
+    claimed = np.linalg.solve(found.covariance, error[:, :, None])[:, :, 0]
+    return whitened, np.sum(error * claimed, axis=1)
+
+
+def bound() -> Figure:
+    """Draws errors of an efficient and of a linear estimator beside the ellipse of the Cramér-Rao bound."""
+    fig, axes = _axes(2)
+    angle = np.linspace(0, 2 * np.pi, 200)
+    radius = np.sqrt(chi2.ppf(0.95, 2))
+    parts = (
+        (ib.solvers.Newton(), "newton: on the bound"),
+        (ib.baselines.LinearLSE(), "linear_lse: far outside"),
+    )
+    for ax, (estimator, title) in zip(axes, parts, strict=True):
+        error, _ = estimates(estimator, 1.0)
+        ax.plot(error[:, 0], error[:, 1], "o", color=BLUE, markersize=2.5, alpha=0.6)
+        ax.plot(
+            radius * np.cos(angle),
+            radius * np.sin(angle),
+            color=ORANGE,
+            label="95 % of efficient estimates",
+        )
+        ax.set(title=title, xlabel="error of one combination, over its bound", aspect="equal")
+        reach = max(4.0, float(np.quantile(np.abs(error[:, :2]), 0.99)))
+        ax.set(xlim=(-reach, reach), ylim=(-reach, reach))
+    axes[0].set_ylabel("error of another, over its bound")
+    axes[1].legend(loc="upper left")
+    return fig
+
+
+def nees() -> Figure:
+    """Draws squared errors over the claimed variance where the claim is right, and where it is four times too small."""
+    fig, axes = _axes(2)
+    _, square = estimates(ib.solvers.Newton(), 1.0)
+    n = ib.measurements.Polynomial().n
+    line = np.linspace(0, 30, 300)
+    bins = np.linspace(0, 30, 31)
+    for ax, factor, title in zip(axes, (1, 4), ("right: NEES", "overconfident: NEES"), strict=True):
+        median = np.median(factor * square) / chi2.median(n)
+        ax.hist(factor * square, bins=bins, density=True, color=BLUE, alpha=0.6)
+        ax.plot(line, chi2.pdf(line, n), color=ORANGE, label="if the claim is right")
+        ax.set(title=f"{title} {median:.2g}", xlabel="squared error over the claimed variance")
+    axes[0].set_ylabel("density")
+    axes[1].legend()
+    return fig
+
+
+DRAWINGS = {"error_scale": error_scale, "bound": bound, "nees": nees}
+
+
+def write_drawings(folder: Path) -> None:
+    """Writes each drawing as NAME.png into the folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with house_style():
+        for name, draw in DRAWINGS.items():
+            draw().savefig(folder / f"{name}.png", dpi=150)
+
+
+def _axes(number: int) -> tuple[Figure, list]:
+    fig = Figure(figsize=(7.5, 3.2), layout="constrained")
+    return fig, list(fig.subplots(1, number))
