@@ -44,6 +44,14 @@ class Auto(Estimator):
     is the most probable with the prior. Extras: `minima`, how many distinct minima that fit were found, and
     `ambiguous`, 1 where there are several, 0 where the look found none, and NaN if no look was taken; `alternatives`
     lists the others.
+
+    Example:
+
+    >>> import ipe_bench as ib
+    >>> bench = ib.Scenario(ib.measurements.Ranging(), ib.noise.Gaussian(0.1), error_scale=30.0)
+    >>> table = ib.run(bench, {"auto": ib.solvers.Auto()}, trials=20)
+    >>> float(table.iloc[-1]["success"])
+    1.0
     """
 
     tolerance: Positive = 1e-6

@@ -24,6 +24,14 @@ class Broyden(IPE[BroydenState]):
 
     The least change of the Jacobian that satisfies the secant equation is of rank one, so the Sherman-Morrison formula
     updates its inverse: no Jacobian after the first, no linear system, superlinear convergence.
+
+    Example:
+
+    >>> import ipe_bench as ib
+    >>> bench = ib.Scenario(ib.measurements.Ranging(), ib.noise.Gaussian(0.1), error_scale=30.0)
+    >>> table = ib.run(bench, {"broyden": ib.solvers.Broyden(initial="identity")}, trials=20)
+    >>> float(table.iloc[-1]["success"])
+    1.0
     """
 
     initial: Literal["jacobian", "identity"] = "jacobian"

@@ -20,6 +20,14 @@ class DampedNewton(IPE):
     """Iterates x <- x - t J(x)^-1 F(x) with t = 1, 1/2, 1/4, ... until |F| has decreased enough (Armijo's rule).
 
     Newton's method near a root. A trial whose |F| decreases for no t stays where it is, and has stalled.
+
+    Example:
+
+    >>> import ipe_bench as ib
+    >>> bench = ib.Scenario(ib.measurements.Ranging(), ib.noise.Gaussian(0.1), error_scale=30.0)
+    >>> table = ib.run(bench, {"damped": ib.solvers.DampedNewton()}, trials=20)
+    >>> float(table.iloc[-1]["success"])
+    1.0
     """
 
     decrease: Annotated[float, Gt(0), Lt(1)] = 1e-4

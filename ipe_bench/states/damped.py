@@ -72,6 +72,14 @@ class LevenbergMarquardtSmoother(Tracker):
     The first path is the smoothed track of the EKF or of the UKF, whichever costs less. At its minimum J is chi-square
     with as many degrees as there are readings. Where it is too large for that, the trial begins again at draws of the
     prior, each smoothed by a UKF of half the prior's deviations, from the one that costs least.
+
+    Example:
+
+    >>> import ipe_bench as ib
+    >>> model = ib.component("state_model/pendulum", count=20, spread={"angle": 0.3, "rate": 0.3})
+    >>> table = ib.run(model, {"lm_ieks": ib.states.LevenbergMarquardtSmoother()}, trials=20)
+    >>> float(table.iloc[-1]["success"])
+    1.0
     """
 
     family: ClassVar[str] = "least squares"

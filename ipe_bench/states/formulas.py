@@ -25,6 +25,17 @@ class Formulas(StateModel):
     on, and its time t in s; the transition may contain the names of the process noise, each with a factor.
 
     The language is that of `ipe_bench.measurements.arithmetic`: + - * / ** and elementary functions, angles in rad.
+
+    Example:
+
+    >>> import ipe_bench as ib
+    >>> model = ib.states.Formulas(
+    ...     next={"x": "x + v", "v": "v + w"}, readings={"z": "x"},
+    ...     noise={"w": 0.1}, deviation={"z": 1.0}, spread={"x": 5.0, "v": 1.0}, count=20,
+    ... )
+    >>> table = ib.run(model, {"ekf": ib.states.ekf()}, trials=20)
+    >>> float(table.iloc[-1]["success"])
+    1.0
     """
 
     next: Mapping[str, str]
@@ -287,7 +298,16 @@ class Formulas(StateModel):
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedFormulas(Formulas):
-    """A model with one path and its readings that somebody has stored, and what is published of trackers on them."""
+    """A model with one path and its readings that somebody has stored, and what is published of trackers on them.
+
+    Example:
+
+    >>> import ipe_bench as ib
+    >>> model = ib.component("state_model/pendulum_book")
+    >>> track = ib.estimate(model, estimators={"ekf": ib.states.ekf()})[0]
+    >>> track.mean.shape
+    (500, 2)
+    """
 
     recorded: str
     """The CSV file of this package: time, states, readings."""

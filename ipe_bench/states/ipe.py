@@ -36,6 +36,14 @@ class PathIPE(Tracker):
     The fixed-point iteration u <- u - F(u), eq. (17), is the smoother of that frozen model, pass by pass; Newton's,
     eq. (20), solves with J_F. Both begin at the linear estimate, eq. (16). The covariance is the sandwich at the root.
     Neither converges where the prior's mean path is far from the true one.
+
+    Example:
+
+    >>> import ipe_bench as ib
+    >>> model = ib.component("state_model/pendulum", count=20, spread={"angle": 0.3, "rate": 0.3})
+    >>> table = ib.run(model, {"ipe_newton": ib.states.PathIPE(method="newton")}, trials=20)
+    >>> float(table.iloc[-1]["success"])
+    1.0
     """
 
     family: ClassVar[str] = "IPE"

@@ -21,7 +21,16 @@ _HALVINGS = 12
 
 @dataclass(frozen=True)
 class Smoother(Tracker):
-    """The smoother of Rauch, Tung and Striebel (AIAA J. 3, 1965) behind a filter."""
+    """The smoother of Rauch, Tung and Striebel (AIAA J. 3, 1965) behind a filter.
+
+    Example:
+
+    >>> import ipe_bench as ib
+    >>> model = ib.component("state_model/pendulum", count=20, spread={"angle": 0.3, "rate": 0.3})
+    >>> table = ib.run(model, {"ekf_rts": ib.states.Smoother(filter=ib.states.ekf())}, trials=20)
+    >>> float(table.iloc[-1]["success"])
+    1.0
+    """
 
     smooths: ClassVar[bool] = True
     filter: Filter = field(default_factory=Filter)
@@ -44,6 +53,14 @@ class IteratedSmoother(Tracker):
     By Taylor's rule these are Gauss-Newton steps to the path of largest posterior density (Bell, SIAM J. Optim. 4,
     1994), with `damped` halved while they raise its cost; by sigma points it is the iterated posterior linearisation
     smoother (García-Fernández, Svensson, Särkkä, IEEE TSP 65, 2017). The first path is the track of `first`.
+
+    Example:
+
+    >>> import ipe_bench as ib
+    >>> model = ib.component("state_model/pendulum", count=20, spread={"angle": 0.3, "rate": 0.3})
+    >>> table = ib.run(model, {"ieks": ib.states.IteratedSmoother(first=ib.states.ukf())}, trials=20)
+    >>> float(table.iloc[-1]["success"])
+    1.0
     """
 
     family: ClassVar[str] = "least squares"

@@ -25,6 +25,13 @@ class WalkingGins(StateModel):
     The states are the eleven of the motion, which begin anew with each run, and the eleven parameters of `Gins` in
     multiples of their sizes; eight of them stand still. The parameters alone are scored. An epoch is a pair of
     velocities, every three minutes.
+
+    Example:
+
+    >>> import ipe_bench as ib
+    >>> model = ib.states.WalkingGins(walk=1.0)
+    >>> model.epochs, len(model.states)
+    (120, 22)
     """
 
     walk: NonNegative = 0.1

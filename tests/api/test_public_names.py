@@ -63,6 +63,28 @@ def test_a_contract_says_what_is_required_optional_and_promised(place):
 PUBLIC = {f"ipe_bench.{name}" for name in ib.__all__} - {"ipe_bench.__version__"}
 
 
+def parts() -> list[str]:
+    """The classes that users construct by name: estimators, trackers, rules and state models."""
+    kinds = (ib.Estimator, ib.states.Tracker, ib.states.StateModel, ib.states.Taylor.__base__)
+    return [
+        f"ipe_bench.{room.__name__.rpartition('.')[2]}.{name}"
+        for room in (ib.solvers, ib.baselines, ib.states)
+        for name in room.__all__
+        if isinstance(thing := getattr(room, name), type)
+        if issubclass(thing, kinds) and not inspect.isabstract(thing)
+    ]
+
+
+@pytest.mark.parametrize("place", parts())
+def test_the_example_of_a_part_comes_out_as_it_says(place):
+    thing = resolve_name(place)
+    runner = doctest.DocTestRunner()
+    for test in doctest.DocTestFinder(recurse=False).find(thing, place):
+        runner.run(test)
+    assert runner.summarize(verbose=False).failed == 0
+    assert ">>> " in thing.__doc__, f"{place} has no example"
+
+
 @pytest.mark.parametrize("place", sorted(PUBLIC | {*CONTRACTS}))
 def test_the_examples_in_the_docstrings_come_out_as_they_say(place):
     name = place.removeprefix("ipe_bench.")

@@ -4,6 +4,7 @@ program says of itself, and of what is stored of its experiments, which `--store
 from __future__ import annotations
 
 import argparse
+import inspect
 import os
 import re
 import shlex
@@ -27,8 +28,8 @@ import ipe_bench
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.files import make_folder, write_text
 from ipe_bench.basics.statuses import Status
-from ipe_bench.plugins.construct import described
-from ipe_bench.plugins.discovery import CONTRACTS, PACKAGES, Option, options
+from ipe_bench.plugins.construct import described, find_class
+from ipe_bench.plugins.discovery import CONTRACTS, PACKAGES, RECORD_GROUPS, Option, options
 from ipe_bench.report.figures import common, drawings
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.views import in_focus, views
@@ -61,6 +62,8 @@ SETTINGS = {
     "html_theme": "pydata_sphinx_theme",
     "html_title": "ipe-bench",
     "html_show_sourcelink": False,
+    "html_static_path": [str(Path(__file__).parent / "static")],
+    "html_css_files": ["site.css"],
     "html_math_renderer": "mathml",
     "html_theme_options": {
         "show_prev_next": False,
@@ -127,7 +130,7 @@ def build(output: Path, trials: int) -> int:
     shutil.copytree(SOURCES / "pages", source)
     print("reference pages ...", flush=True)
     write_reference(source / "reference")
-    write_drawings(source / "explanation" / "pictures")
+    write_drawings(source)
     write_gallery(source / "gallery", output / "results", trials)
     places = (output / "html", output / "doctrees")
     site = Sphinx(source, None, *places, "html", SETTINGS, warningiserror=True, freshenv=True)
@@ -160,12 +163,21 @@ def _ours(group: str) -> list[Option]:
     return [option for option in options(group) if option.source.name == "ipe-bench"]
 
 
+def example(option: Option) -> str:
+    """Returns the example in the docstring of an option's class; empty if there is none."""
+    if option.group in RECORD_GROUPS or option.target is None:
+        return ""
+    text = inspect.getdoc(find_class(option.target, option.name)) or ""
+    _, begins, code = text.partition(">>> ")
+    return begins + code
+
+
 def write_reference(folder: Path) -> None:
     """Adds pages of options, commands, statuses, statistics and Python names to a folder."""
     from ipe_bench.report.page.html import DEFINITIONS
 
     for group, title in GROUPS.items():
-        rows = [(option, described(option)) for option in _ours(group)]
+        rows = [(option, described(option), example(option)) for option in _ours(group)]
         key = f"{PACKAGES[group]}.NAME" if group in PACKAGES else group
         write_page(
             folder / f"{group}.md", "options", group=group, title=title, key=key, options=rows
@@ -184,11 +196,9 @@ def write_reference(folder: Path) -> None:
             commands={"": summary, **dict(zip(names, said, strict=True))},
         )
     write_page(folder / "contracts.md", "contracts", kinds=CONTRACTS)
-    names = sorted(ipe_bench.__all__, key=lambda name: (IN_USE + (name,)).index(name))
+    names = sorted(ipe_bench.__all__, key=lambda name: ((*IN_USE, name)).index(name))
     things = [
-        (name, getattr(ipe_bench, name))
-        for name in names
-        if f"ipe_bench.{name}" not in CLASSES
+        (name, getattr(ipe_bench, name)) for name in names if f"ipe_bench.{name}" not in CLASSES
     ]
     shown = [(name, thing) for name, thing in things if hasattr(thing, "__qualname__")]
     kinds = [

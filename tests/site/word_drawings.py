@@ -107,15 +107,40 @@ def nees() -> Figure:
     return fig
 
 
-DRAWINGS = {"error_scale": error_scale, "bound": bound, "nees": nees}
+def track() -> Figure:
+    """Draws the true angle of the stored pendulum between the bands of a filter and of its smoother."""
+    model = ib.component("state_model/pendulum_book")
+    trackers = {label: ib.component(f"tracker/{label}") for label in ("ukf", "ukf_rts")}
+    seen = slice(0, 200)
+    times = np.asarray(model.times)[seen]
+    truth = model.draw(0, 1).x[0, seen, 0]
+    fig = Figure(figsize=(7.5, 3), layout="constrained")
+    ax = fig.subplots()
+    for one, color in zip(ib.estimate(model, estimators=trackers), (ORANGE, BLUE), strict=True):
+        mean, deviation = one.mean[seen, 0], one.deviation[seen, 0]
+        low, high = mean - 1.96 * deviation, mean + 1.96 * deviation
+        ax.fill_between(times, low, high, color=color, alpha=0.35, label=one.label, linewidth=0)
+    ax.plot(times, truth, color="black", linewidth=1, label="truth")
+    ax.set(xlabel="t [s]", ylabel="angle [rad]")
+    ax.legend(loc="upper right", ncols=3)
+    return fig
 
 
-def write_drawings(folder: Path) -> None:
-    """Writes each drawing as NAME.png into the folder."""
-    folder.mkdir(parents=True, exist_ok=True)
+DRAWINGS = {
+    "explanation": {"error_scale": error_scale, "bound": bound, "nees": nees},
+    "howto": {"track": track},
+}
+"""Drawings by name, by the folder of the pages that show them."""
+
+
+def write_drawings(source: Path) -> None:
+    """Writes each drawing as pictures/NAME.png beside the page that shows it."""
     with house_style():
-        for name, draw in DRAWINGS.items():
-            draw().savefig(folder / f"{name}.png", dpi=150)
+        for folder, drawings in DRAWINGS.items():
+            pictures = source / folder / "pictures"
+            pictures.mkdir(parents=True, exist_ok=True)
+            for name, draw in drawings.items():
+                draw().savefig(pictures / f"{name}.png", dpi=150)
 
 
 def _axes(number: int) -> tuple[Figure, list]:
