@@ -24,7 +24,7 @@ from ipe_bench.basics.machine import cores
 from ipe_bench.engine import compiled
 from ipe_bench.engine.compiled import INTEGER, POINTER, WHOLE, aligned, at
 from ipe_bench.engine.plan import Equations, Recording, StepPlan, Tableau, planned
-from ipe_bench.engine.trace import Program
+from ipe_bench.engine.trace import Program, RowPrograms
 
 if TYPE_CHECKING:
     # Imported where something is compiled, and here so that results are known to depend on it.
@@ -50,8 +50,8 @@ def _pool(workers: int, process: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(workers, thread_name_prefix="ode")
 
 
-def _compiled(
-    name: str, source: StepPlan | Program, width: int, arguments: tuple[Any, ...]
+def emitted(
+    name: str, source: StepPlan | Program | RowPrograms, width: int, arguments: tuple[Any, ...]
 ) -> Callable[..., None]:
     """Returns the compiled function of `emit` by that name."""
 
@@ -84,7 +84,7 @@ class Kernel:
     def _machine_code(self, width: int) -> tuple[Callable[..., None], int]:
         """Returns the function for groups of so many lanes, and the numbers that it needs room for."""
         weights = -(-sum(map(len, self.plan.tableau.weights)) // width)
-        return _compiled("integrate", self.plan, width, _ARGUMENTS), (
+        return emitted("integrate", self.plan, width, _ARGUMENTS), (
             self.plan.size + weights
         ) * width
 
@@ -241,7 +241,7 @@ def compiled_rates(program: Program) -> Callable[[Array, Array, Array], None]:
     """Compiles a function that fills its third argument (trials,) with the number that a recorded program computes of
     the parameters x (trials, n), times their sizes (n,)."""
     if compiled.available():
-        function = _compiled("rates", program, 1, (POINTER, POINTER, POINTER, INTEGER))
+        function = emitted("rates", program, 1, (POINTER, POINTER, POINTER, INTEGER))
         return lambda x, si, out: function(at(x), at(si), at(out), len(x))
 
     def by_numpy(x: Array, si: Array, out: Array) -> None:

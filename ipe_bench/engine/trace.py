@@ -293,11 +293,18 @@ def border(outputs: Sequence[Expression], varying: Collection[Expression]) -> li
 
 def substitute(e: Expression, values: Mapping[Expression, Expression]) -> Expression:
     """Replaces some inputs of an expression, and simplifies it."""
+    return substituted([e], values)[0]
+
+
+def substituted(
+    outputs: Sequence[Expression], values: Mapping[Expression, Expression]
+) -> list[Expression]:
+    """Replaces some inputs or numbers of expressions likewise."""
     known: dict[Expression, Expression] = {}
-    for a in in_order([e]):
+    for a in in_order(outputs):
         given = [known[o] for o in operands(a)]
         known[a] = values[a] if a in values else a.graph.apply(a.operation, *given) if given else a
-    return known[e]
+    return [known[e] for e in outputs]
 
 
 def slopes(output: Expression, inputs: Iterable[Expression]) -> list[Expression]:
@@ -459,6 +466,68 @@ class Program:
             for i in released:
                 values[i] = None
         return [values[i] for i in self.outputs]
+
+
+@dataclass(frozen=True)
+class RowPrograms:
+    """Holds a function y(x, c) of rows of numbers as programs: its m values, and its tangents by the n numbers x."""
+
+    n: int
+    m: int
+    values: Program
+    """y of x and c; behind y, where there are tangents, what these take."""
+    tangents: Program | None
+    """The tangent of y from a direction (n) of x and what `values` have for it."""
+
+    @classmethod
+    def of(
+        cls,
+        y: Sequence[Expression],
+        x: Sequence[Expression],
+        c: Sequence[Expression],
+        *,
+        sloped: bool,
+    ) -> RowPrograms:
+        if not sloped:
+            return cls(len(x), len(y), Program.of(y, [*x, *c]), None)
+        # No formula has a name with a blank in it.
+        along = x[0].graph.inputs("along ", len(x))
+        moved = tangent(y, dict(zip(x, along, strict=True)))
+        saved = border(moved, dependent(moved, along))
+        tangents = Program.of(moved, [*along, *saved])
+        return cls(len(x), len(y), Program.of([*y, *saved], [*x, *c]), tangents)
+
+
+class Recorded(np.ndarray):
+    """An array of expressions, for models that are written for arrays: each function of NumPy is recorded entry by
+    entry."""
+
+    @classmethod
+    def of(cls, expressions: Sequence[Expression]) -> Recorded:
+        """Makes a stack of one row (1, n)."""
+        return np.array([expressions], dtype=object).view(cls)
+
+    def __array_ufunc__(
+        self, ufunc: np.ufunc, method: str, *inputs: Any, out: Any = None, **kwargs: Any
+    ) -> Any:
+        plain = [np.asarray(one, dtype=object) for one in inputs]
+        if method != "__call__" or ufunc.signature:  # sums and matrix products, of operators
+            return np.asarray(getattr(ufunc, method)(*plain, **kwargs)).view(Recorded)
+        if kwargs:
+            raise TypeError(f"np.{ufunc.__name__} with {', '.join(kwargs)} cannot be recorded")
+        found = np.asarray(np.frompyfunc(ufunc, len(plain), 1)(*plain), dtype=object).view(Recorded)
+        if out is None:
+            return found
+        out[0][...] = found
+        return out[0]
+
+    def __array_function__(
+        self, function: Any, types: Any, args: tuple[Any, ...], kwargs: Any
+    ) -> Any:
+        if function is np.where and len(args) == 3:
+            plain = [np.asarray(one, dtype=object) for one in args]
+            return np.asarray(np.frompyfunc(np.where, 3, 1)(*plain), dtype=object).view(Recorded)
+        return super().__array_function__(function, types, args, kwargs)
 
 
 def _fusion(

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +17,14 @@ from ipe_bench.basics.options import Component
 from ipe_bench.basics.streams import numbered
 from ipe_bench.measurements.base import Parameter
 from ipe_bench.states.algebra import factor, half, root, transposed
-from ipe_bench.states.along import Along, AtEpoch, unmoved
+from ipe_bench.states.along import (
+    Along,
+    AtEpoch,
+    EpochFunctions,
+    Recording,
+    functions_of,
+    recorded_by_epoch,
+)
 
 _START, _PROCESS, _READINGS = range(3)
 """The random streams of a trial: its start, its process noise and the noise of its readings."""
@@ -62,9 +70,12 @@ class StateModel(Component, ABC):
     Required: `states`, `times`, `prior`, `transition` (f), `observe` (h), `gain` (G) and `R`; if noise depends on the
     states, `gain_at(x, k)` in place of `gain(k)`, for the states x[k-1], or `R_at(x, k)` in place of `R(k)`.
     Optional: `moved_first`, `periods`, `state_periods`, `reading_names` and `scored`; `draw`, if paths are stored;
-    `log_inputs`, `with_log` and `faults`, if a log has known inputs.
+    `log_inputs`, `with_log` and `faults`, if a log has known inputs; `alike`, if a transition is long.
     Promised: f and h take stacks of states (..., n), real or complex, and are analytic in them, since slopes are
     complex steps; a trial has the same bits alone and in any batch; `require_sound` finds nothing to refuse.
+
+    Trackers run f and h as compiled code that is recorded from them, if they depend on x and k alone and branch on no
+    state (`np.where` is recorded); `ipe-bench check` says which ones run epoch by epoch, and why.
 
     Process noise enters by its gain, so that a singular Q = G G' needs no special case. Known inputs and unequal steps
     follow from k. A measurement model with epochs is the state model whose states stand still.
@@ -120,35 +131,57 @@ class StateModel(Component, ABC):
     def observe(self, x: Array, k: int) -> Array:
         """h: (..., n) -> (..., m)."""
 
+    def alike(self, k: int) -> int:
+        """An epoch into which the transition is the same function as into epoch k, by which it is recorded: k itself
+        unless a model knows better, which saves recording a long transition again for each epoch."""
+        return k
+
+    def recorded_transition(self, epochs: Sequence[int]) -> list[Recording]:
+        """Records f into these epochs; raises anything if it cannot be recorded."""
+        return recorded_by_epoch(self.transition, self.n, epochs, self.alike)
+
+    def recorded_observation(self, epochs: Sequence[int]) -> list[Recording]:
+        """Records h of these epochs likewise."""
+        return recorded_by_epoch(self.observe, self.n, epochs, lambda k: k)
+
+    @cached_property
+    def _functions(self) -> tuple[StateModel, tuple[EpochFunctions, EpochFunctions]]:
+        return self, functions_of(self)
+
+    @property
+    def epoch_functions(self) -> tuple[EpochFunctions, EpochFunctions]:
+        """f and h for trackers: recorded and compiled if they can be."""
+        # A copy with another prior or log begins with the functions of what it was copied from.
+        if self._functions[0] is not self:
+            del vars(self)["_functions"]
+        return self._functions[1]
+
     def transition_into(self, k: int) -> AtEpoch:
         """f of the step into epoch k as a function of states (..., n) that knows its slopes, for trackers."""
-        return AtEpoch(self.transition, k)
+        return self.epoch_functions[0].at[k]
 
     def observation_at(self, k: int) -> AtEpoch:
         """h at epoch k likewise."""
-        return AtEpoch(self.observe, k)
+        return self.epoch_functions[1].at[k]
 
     def values_along(self, x: Array) -> tuple[Array, Array]:
         """f (trials, K, n) and h (trials, K, m) as in `Along`, of paths x (trials, 1 + K, n) that begin before the
         first transition: `evaluations` for each trial."""
-        moved = [
-            self.transition_into(k)(x[:, k]) if self.moves(k) else x[:, k]
-            for k in range(self.epochs)
-        ]
-        read = [self.observation_at(k)(x[:, k + 1]) for k in range(self.epochs)]
-        return np.stack(moved, axis=1), np.stack(read, axis=1)
+        f, h = self.epoch_functions
+        still = 0 if self.moved_first else 1
+        moved = f.values(x[:, still:-1])
+        return np.concatenate([x[:, :still], moved], axis=1), h.values(x[:, 1:])
 
     def slopes_along(self, x: Array) -> Along:
         """f and h with their slopes along paths x (trials, 1 + K, n) that begin before the first transition: 1 + n
         times `evaluations` for each trial."""
-        moved = [
-            self.transition_into(k).slope(x[:, k]) if self.moves(k) else unmoved(x[:, k])
-            for k in range(self.epochs)
-        ]
-        read = [self.observation_at(k).slope(x[:, k + 1]) for k in range(self.epochs)]
-        f, F = (np.stack(parts, axis=1) for parts in zip(*moved, strict=True))
-        h, H = (np.stack(parts, axis=1) for parts in zip(*read, strict=True))
-        return Along(f, h, F, H)
+        f, h = self.epoch_functions
+        still = 0 if self.moved_first else 1
+        moved, F = f.slopes(x[:, still:-1])
+        read, H = h.slopes(x[:, 1:])
+        one = np.broadcast_to(np.eye(self.n), (len(x), still, self.n, self.n))
+        whole = np.concatenate([x[:, :still], moved], axis=1)
+        return Along(whole, read, np.concatenate([one, F], axis=1), H)
 
     def gain(self, k: int) -> Array:
         """G (n, q) of the step into epoch k; UserError if it depends on the states."""

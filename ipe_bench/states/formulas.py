@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,9 +13,11 @@ import numpy as np
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Finite, NonNegative, Positive
+from ipe_bench.engine.rows import RowFunction
 from ipe_bench.engine.trace import Expression, Graph, Program, dependent, slopes
 from ipe_bench.measurements.arithmetic import Arithmetic, parse
 from ipe_bench.measurements.base import Parameter, differentiate
+from ipe_bench.states.along import Recording
 from ipe_bench.states.base import Normal, Paths, StateModel
 
 
@@ -198,6 +200,25 @@ class Formulas(StateModel):
 
     def observe(self, x: Array, k: int) -> Array:
         return self._values(self._readings, x, k, {})
+
+    def recorded_transition(self, epochs: Sequence[int]) -> list[Recording]:
+        return [self._recorded(self._transitions, epochs)]
+
+    def recorded_observation(self, epochs: Sequence[int]) -> list[Recording]:
+        return [self._recorded(self._readings, epochs)]
+
+    def _recorded(self, formulas: Mapping[str, Arithmetic], epochs: Sequence[int]) -> Recording:
+        """Records formulas once, with k, t and the inputs as numbers of the epoch."""
+        graph = Graph()
+        x = [graph.input(name) for name in self.next]
+        c = [graph.input(name) for name in (*self.inputs, "k", "t")]
+        known = {**self.constants, **dict.fromkeys(self.noise, graph.constant(0.0))}
+        known |= dict(zip((*self.next, *self.inputs, "k", "t"), (*x, *c), strict=True))
+        y = [graph.apply("add", formula(known), 0.0) for formula in formulas.values()]
+        places = np.array(epochs)
+        columns = [*self._inputs.values(), np.arange(1.0, self.count + 1), self._times]
+        numbers = np.array([np.asarray(column, dtype=float)[places] for column in columns])
+        return Recording(RowFunction.of(y, x, c), places, np.ascontiguousarray(numbers.T))
 
     @cached_property
     def _factors(self) -> tuple[dict[str, Expression], list[Expression]]:

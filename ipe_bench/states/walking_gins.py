@@ -70,6 +70,9 @@ class WalkingGins(StateModel):
         variances = np.r_[self._motion**2, np.ones(self.gins.n)]
         return Normal(np.zeros(len(variances)), np.diag(variances))
 
+    def alike(self, k: int) -> int:
+        return k if k % self.gins.readings_per_case == 0 else 1
+
     def transition(self, x: Array, k: int) -> Array:
         g = self.gins
         p = list(np.moveaxis(x[..., KINEMATIC:] * g.si_sizes, -1, 0))

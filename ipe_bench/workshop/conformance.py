@@ -33,6 +33,7 @@ from ipe_bench.priors import Prior
 from ipe_bench.runs.execution import Execution, Serial
 from ipe_bench.runs.provenance import TARGET, describe
 from ipe_bench.states import Formulas
+from ipe_bench.states.along import agree
 from ipe_bench.states.base import StateModel, require_sound
 from ipe_bench.states.trackers import Tracker
 from ipe_bench.trials.scenario import Scenario
@@ -625,6 +626,21 @@ def moves_batches(model: StateModel) -> None:
         )
 
 
+def is_recorded(model: StateModel) -> str | None:
+    """Has the same transition and readings along whole paths, recorded and compiled, as epoch by epoch."""
+    paths, whys = StateModel.draw(model, 0, 4), []
+    before = np.concatenate([paths.start[:, None], paths.x], axis=1)
+    f, h = model.epoch_functions
+    for name, functions, states in (("transition", f, before), ("observe", h, paths.x)):
+        for k in functions.epochs if functions.recordings else ():
+            one, x = functions.at[k], states[:, k]
+            why = f"{name} of epoch {k + 1} is not as recorded; mend `alike`"
+            assert agree(one(x), one.function(x, k)), why
+        if functions.why:
+            whys.append(f"{name} runs epoch by epoch: {functions.why}")
+    return "; ".join(whys) or None
+
+
 def wraps_its_angles(model: StateModel) -> None:
     """States the periods of readings and states that jump by a whole turn."""
     x = StateModel.draw(model, 0, TRIALS).x[:, -1]
@@ -717,7 +733,7 @@ _CHECKS: dict[type, tuple[Callable[[Any], str | None], ...]] = {
     Measurement: (names_its_readings, simulates_batches, differentiates, orders_its_epochs),
     Noise: (corrupts_reproducibly, draws_what_it_states, states_its_law),
     Prior: (states_its_deviations, draws_reproducibly, draws_what_is_told),
-    StateModel: (suits_itself, moves_batches, wraps_its_angles),
+    StateModel: (suits_itself, moves_batches, is_recorded, wraps_its_angles),
     Tracker: (tracks_its_trials,),
     Execution: (does_every_task, ends_with_the_run),
 }

@@ -1,11 +1,56 @@
 """f and h of a state model along whole paths, against its own functions by epoch and quotients of differences."""
 
+from __future__ import annotations
+
+import copy
+import pickle
+from dataclasses import dataclass, replace
+from typing import Any
+from unittest.mock import patch
+
 import numpy as np
 import pytest
-from shared.state_models import CoordinatedTurn, Growth
+from shared.state_models import CoordinatedTurn, Growth, Steady, bearing
 
+from ipe_bench.engine import compiled
+from ipe_bench.measurements import Gins, Parameter
 from ipe_bench.measurements.base import differentiate
-from ipe_bench.states import Formulas, StateModel
+from ipe_bench.states import Formulas, Normal, StateModel, WalkingGins, ekf
+from ipe_bench.states.base import widened
+from ipe_bench.workshop.conformance import check_component
+
+
+@dataclass(frozen=True)
+class Angles(Steady):
+    """A model of Python whose steps differ in form from epoch to epoch, and of which one piece can be replaced."""
+
+    count: int = 6
+    piece: Any = None
+
+    @property
+    def states(self):
+        return Parameter("x"), Parameter("y")
+
+    @property
+    def prior(self):
+        return Normal(np.array([1.0, 2.0]), np.diag([0.2, 0.3]) ** 2)
+
+    def transition(self, x, k):
+        new = x.copy()
+        new[..., k % 2] += 0.1 * np.sin(x[..., 1 - k % 2]) * self.times[k]
+        near = np.where(new[..., 0].real < 1.0, new[..., 0] ** 2, 2 * new[..., 0] - 1.0)
+        new[..., 1] = new[..., 1] + 0.01 * near
+        return new if self.piece is None else self.piece(new, k)
+
+    def observe(self, x, k):
+        return np.stack([bearing(x[..., 0], x[..., 1]), x[..., 0] * 0.0 + 3.0], axis=-1)
+
+    def gain(self, k):
+        return 0.1 * np.eye(2)
+
+    def R(self, k):
+        return np.eye(2)
+
 
 DRIVEN = Formulas(
     next={"p": "p + dt*v + push*sin(v)", "v": "0.9*v + cos(k)*w + 0.01*t"},
@@ -27,6 +72,10 @@ MODELS = {
     ),
     "Python": CoordinatedTurn(count=3),
     "Python by epoch": Growth(count=5),
+    "Python of two forms": Angles(),
+    "one epoch that nothing leads into": replace(
+        DRIVEN, count=1, inputs={"dt": 0.5, "push": 1.0}, moved_first=False
+    ),
 }
 
 
@@ -70,3 +119,160 @@ def test_a_path_has_the_same_bits_alone_and_in_a_batch(name):
         part = (*model.values_along(x[rows]), *model.slopes_along(x[rows]))
         for a, b in zip(whole, part, strict=True):
             np.testing.assert_array_equal(a[rows], b)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_without_machine_code_it_is_the_same_to_round_off(name):
+    model, x = MODELS[name], path(MODELS[name])
+    here = model.slopes_along(x)
+    with patch.object(compiled, "available", lambda: False):
+        there = copy.copy(model).slopes_along(x)
+    for a, b in zip(here, there, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_random_formulas_have_the_slopes_of_complex_steps(seed):
+    rng = np.random.default_rng(seed)
+
+    def formula(noise=""):
+        terms = rng.choice(
+            [
+                "sin(a)*b",
+                "exp(-b*b)",
+                "a/(2 + b*b)",
+                "u*a",
+                "cos(t)*b",
+                "arctan2(a, 3 + b)",
+                "sqrt(4 + a*a)",
+                "k*b",
+                "2",
+            ],
+            3,
+        )
+        signs = rng.choice(["+", "-"], 3)
+        return "".join(f"{sign}{term}" for sign, term in zip(signs, terms, strict=True)) + noise
+
+    model = Formulas(
+        next={"a": formula("+ w"), "b": f"0.1*({formula()})"},
+        readings={"z": formula(), "y": formula()},
+        noise={"w": 0.1},
+        deviation={"z": 1.0, "y": 1.0},
+        spread={"a": 1.0, "b": 1.0},
+        inputs={"u": tuple(rng.standard_normal(3))},
+        count=3,
+    )
+    f, h = model.epoch_functions
+    assert f.recordings
+    assert h.recordings
+    x = rng.standard_normal((4, 2))
+    for functions in model.epoch_functions:
+        for k in range(3):
+            value, slope = functions.at[k].slope(x)
+            own = functions.function
+            np.testing.assert_allclose(value, own(x, k), rtol=1e-13, atol=1e-13)
+            exact = differentiate(lambda s, k=k, own=own: own(s, k), x, analytic=True)
+            np.testing.assert_allclose(slope, exact, rtol=1e-12, atol=1e-12)
+
+
+def _branching(x, k):
+    return x if x[..., 0].sum() > 0 else -x
+
+
+def _random(x, k):
+    return x + np.random.default_rng().standard_normal()
+
+
+def _cast(x, k):
+    return x + np.floor(np.asarray(x, dtype=float)) * 0
+
+
+def _forms(x, k):
+    for _ in range(k % 9):
+        x = np.sin(x)
+    return x
+
+
+def _forgets(x, k):
+    """Its recording takes the other branch than numbers do."""
+    return x + 1.0 if x.dtype == object else x
+
+
+REFUSED = {
+    "a branch on states": (_branching, "no truth value"),
+    "random numbers": (_random, "differs from it by more than 1e-10"),
+    "numbers alone": (_cast, "TypeError"),
+    "many forms": (_forms, "more than 8 forms"),
+    "another recording": (_forgets, "differs from it by more than 1e-10"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_cannot_be_recorded_runs_epoch_by_epoch_and_check_says_so(name):
+    piece, why = REFUSED[name]
+    model = Angles(count=10, piece=piece)
+    f, h = model.epoch_functions
+    assert not f.recordings
+    assert why in f.why
+    assert h.recordings
+    notes = " ".join(finding.note for finding in check_component("model", model))
+    assert "transition runs epoch by epoch" in notes
+    assert why in notes
+    if name != "random numbers":
+        x = path(model)
+        np.testing.assert_array_equal(model.values_along(x)[0][:, 3], model.transition(x[:, 3], 3))
+
+
+def test_check_finds_epochs_that_are_wrongly_called_alike():
+    class Wrong(Angles):
+        def alike(self, k):
+            return k if k != 7 else 9
+
+    complaints = [finding.complaint for finding in check_component("model", Wrong(count=12))]
+    assert any("not as recorded" in complaint for complaint in complaints)
+
+
+def test_a_copy_has_functions_of_its_own():
+    model = Angles()
+    assert model.epoch_functions[0].recordings
+    other = copy.copy(model)
+    object.__setattr__(other, "step", 2.0)
+    x = path(model)[:, 2]
+    np.testing.assert_allclose(other.transition_into(2)(x), other.transition(x, 2), rtol=1e-13)
+    wider = widened(model, 3.0)
+    assert wider.epoch_functions is not model.epoch_functions
+    again = pickle.loads(pickle.dumps(model))
+    np.testing.assert_array_equal(again.transition_into(2)(x), model.transition_into(2)(x))
+
+
+def test_the_inertial_system_is_recorded_with_its_slopes():
+    """Runs begin anew at every fourth epoch here, at other velocities."""
+    model = WalkingGins(gins=Gins(readings_per_case=4))
+    assert [one.why for one in model.epoch_functions] == ["", ""]
+    x = path(model, 2)
+    f, h = model.values_along(x)
+    along = model.slopes_along(x)
+    for k in range(model.epochs):
+        own = model.transition(x[:, k], k)
+        np.testing.assert_allclose(f[:, k], own, rtol=1e-13, atol=1e-11)
+        np.testing.assert_allclose(h[:, k], model.observe(x[:, k + 1], k), rtol=1e-13, atol=1e-11)
+        if k in (0, 3, 4, 15):
+            exact = differentiate(lambda s, k=k: model.transition(s, k), x[:, k], analytic=True)
+            size = np.abs(exact).max(axis=(0, 2))[:, None]
+            assert (np.abs(along.F[:, k] - exact) <= 1e-12 * size).all()
+
+
+def test_trackers_take_the_recorded_functions():
+    called = []
+
+    class Watched(Angles):
+        def transition(self, x, k):
+            called.append(x.dtype.kind)
+            return super().transition(x, k)
+
+    model = Watched()
+    z = model.draw(0, 2).z
+    assert model.epoch_functions[0].recordings
+    called.clear()
+    ekf().track(model, z)
+    assert called == []
