@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import islice
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -12,7 +15,6 @@ from ipe_bench.basics.options import Count, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.states.algebra import factor, lower_solve, root, transposed
 from ipe_bench.states.base import StateModel
-from ipe_bench.states.linearisation import slope
 from ipe_bench.states.trackers import Tracker, Tracks
 
 _FAR = 1e8
@@ -84,7 +86,7 @@ class PathIPE(Tracker):
         assert out.status is not None
         assert out.iterations is not None
         model, n = frozen.model, frozen.model.n
-        u = np.zeros((len(z), frozen.A.shape[1]))
+        u = np.zeros((len(z), len(frozen.gain)))
         u = u - frozen.F(u, frozen.run(u, z)[1])
         x, r = frozen.run(u, z)
         out.calls[rows] += (1 + n + 3) * model.evaluations
@@ -134,74 +136,78 @@ class _Frozen:
     model: StateModel
     gains: list[Array]
     """Root of the prior's covariance, and the gain of the step into each epoch: (n, 0) if none leads there."""
-    L: list[Array]
-    """Roots (m, m) of the covariances of the readings of each epoch."""
     seen: Array
     """(K, m)"""
+    whitening: Array
+    """L^-1 (K, m, m) of the covariances L L' of the readings of each epoch."""
     A: Array
     """dh/du (M, N) at u = 0, whitened; 0 for missing readings."""
     gain: Array
     """A' (I + A A')^-1 (N, M)."""
-    deviation: Array
-    """Standard deviations (N,) of the linear estimate, eq. (5)."""
 
     @classmethod
     def of(cls, model: StateModel, seen: Array) -> _Frozen:
-        K, n, none = model.epochs, model.n, np.empty(0)
-        gains = [
-            root(model.prior.covariance),
-            *(model.gain(k) if model.moves(k) else np.empty((n, 0)) for k in range(K)),
-        ]
-        both = [s[:, None] & s for s in seen]
-        L = [factor(np.where(both[k], model.R(k), np.eye(len(both[k])))) for k in range(K)]
-        start = cls(model, gains, L, seen, none, none, none)
-        u = np.zeros((1, sum(G.shape[1] for G in gains)))
-        A = start.slopes(start.run(u, np.zeros((1, *seen.shape)))[0])[1][0]
+        K, n, m = model.epochs, model.n, model.readings_per_epoch
+        steps = (model.gain(k) if model.moves(k) else np.empty((n, 0)) for k in range(K))
+        both = seen[:, :, None] & seen[:, None, :]
+        R = np.where(both, [model.R(k) for k in range(K)], np.eye(m))
+        whitening = lower_solve(factor(R), np.eye(m))
+        gains, none = [root(model.prior.covariance), *steps], np.empty(0)
+        start = cls(model, gains, seen, whitening, none, none)
+        still = np.zeros((1, sum(G.shape[1] for G in gains)))
+        x, _ = start.run(still, np.zeros((1, *seen.shape)))
+        A = start.slopes(x)[1][0]
         gain = np.linalg.solve(np.eye(len(A)) + A @ A.T, A).T
-        deviation = np.sqrt(1.0 - np.sum(gain * A.T, axis=1))
-        return cls(model, gains, L, seen, A, gain, deviation)
+        return cls(model, gains, seen, whitening, A, gain)
+
+    @cached_property
+    def unknowns(self) -> list[slice]:
+        """The places in u of the start and of the noise of each step."""
+        ends = np.cumsum([G.shape[1] for G in self.gains]).tolist()
+        return [slice(*ends_of) for ends_of in zip([0, *ends], ends, strict=False)]
+
+    @cached_property
+    def inverse(self) -> Array:
+        """H+ (N, N + M) = [(I + A' A)^-1, gain]."""
+        return np.concatenate([np.eye(len(self.gain)) - self.gain @ self.A, self.gain], axis=1)
+
+    @cached_property
+    def deviation(self) -> Array:
+        """Standard deviations (N,) of the linear estimate, eq. (5)."""
+        return np.sqrt(1.0 - np.sum(self.gain * self.A.T, axis=1))
 
     def run(self, u: Array, z: Array) -> tuple[Array, Array]:
         """The states x (trials, 1 + K, n) of u (trials, N), and h(u) - z (trials, M), whitened."""
-        ends = np.cumsum([G.shape[1] for G in self.gains])
-        noise = [
-            multiply(G, part)
-            for G, part in zip(self.gains, np.split(u, ends[:-1], axis=1), strict=True)
-        ]
-        x = [self.model.prior.mean + noise[0]]
-        r = []
-        for k in range(self.model.epochs):
-            x.append(
-                (self.model.transition_into(k)(x[-1]) if self.model.moves(k) else x[-1])
-                + noise[k + 1]
-            )
-            e = np.where(self.seen[k], self.model.observe_near(x[-1], k, z[:, k]) - z[:, k], 0.0)
-            r.append(lower_solve(self.L[k], e[..., None])[..., 0])
-        return np.stack(x, axis=1), np.concatenate(r, axis=1)
+        model = self.model
+        x = np.empty((len(u), model.epochs + 1, model.n))
+        x[:, 0] = model.prior.mean
+        for k, (G, own) in enumerate(zip(self.gains, self.unknowns, strict=True), -1):
+            if k >= 0:
+                x[:, k + 1] = model.transition_into(k)(x[:, k]) if model.moves(k) else x[:, k]
+            x[:, k + 1] += multiply(G, u[:, own])
+        h = model.epoch_functions[1].values(x[:, 1:])
+        e = np.where(self.seen, model.nearest(h, z) - z, 0.0)
+        return x, multiply(self.whitening, e).reshape(len(u), -1)
 
     def slopes(self, x: Array) -> tuple[Array, Array]:
-        """dx/du (trials, 1 + K, n, N) and dh/du (trials, M, N), whitened, along the states x (trials, 1 + K, n)."""
-        model, N, B = self.model, sum(G.shape[1] for G in self.gains), []
-        X, upto = np.zeros((*x.shape, N)), 0
-        for k, G in enumerate(self.gains, -1):
-            if upto:  # the start and noises up to here
-                before = X[:, k, :, :upto]
-                F = (
-                    slope(lambda at, k=k: model.transition(at, k), x[:, k])[1]
-                    if model.moves(k)
-                    else None
-                )
-                X[:, k + 1, :, :upto] = before if F is None else np.matmul(F, before)
-            X[:, k + 1, :, upto : upto + G.shape[1]] = G
-            upto += G.shape[1]
-            if k >= 0:
-                H = slope(lambda at, k=k: model.observe(at, k), x[:, k + 1])[1]
-                B.append(
-                    lower_solve(
-                        self.L[k], np.matmul(np.where(self.seen[k][:, None], H, 0.0), X[:, k + 1])
-                    )
-                )
-        return X, np.concatenate(B, axis=1)
+        """df/dx (trials, K, n, n) along the states x (trials, 1 + K, n), and dh/du (trials, M, N), whitened."""
+        along = self.model.slopes_along(x)
+        N = self.unknowns[-1].stop
+        one = np.broadcast_to(np.eye(N), (len(x), N, N))
+        H = np.matmul(self.whitening, np.where(self.seen[..., None], along.H, 0.0))
+        B = [
+            np.matmul(H[:, k], X) for k, X in enumerate(islice(self._moved(along.F, one), 1, None))
+        ]
+        return along.F, np.concatenate(B, axis=1)
+
+    def _moved(self, F: Array, D: Array) -> Iterator[Array]:
+        """Yields what a change D (trials, N, p) of u changes of the start and of the states at each epoch (trials, n,
+        p), by the slopes F of the transitions."""
+        X = np.matmul(self.gains[0], D[:, self.unknowns[0]])
+        yield X
+        for k, (G, own) in enumerate(zip(self.gains[1:], self.unknowns[1:], strict=True)):
+            X = np.matmul(F[:, k], X) + np.matmul(G, D[:, own])
+            yield X
 
     def F(self, u: Array, r: Array) -> Array:
         """Eq. (11): H+ (h - z) (trials, N), in which (I + A' A)^-1 A' is the gain and (I + A' A)^-1 = I - gain A."""
@@ -214,12 +220,10 @@ class _Frozen:
         w, singular = solve(np.eye(len(self.A)) + np.matmul(C, self.gain), multiply(C, F))
         return F - multiply(self.gain, w), singular & finite(F)
 
-    def sandwich(self, X: Array, B: Array) -> Array:
-        """The covariances (trials, 1 + K, n, n) of the states at the root: T T' with T = X J_F^-1 H+."""
-        trials, K, n, N = X.shape
-        X, C = X.reshape(trials, K * n, N), B - self.A
-        D, _ = solve(np.eye(len(self.A)) + np.matmul(C, self.gain), C)
-        X = X - np.matmul(np.matmul(X, self.gain), D)
-        seen = np.matmul(X, self.gain)
-        T = np.concatenate([X - np.matmul(seen, self.A), seen], axis=2).reshape(trials, K, n, -1)
-        return np.matmul(T, transposed(T))
+    def sandwich(self, F: Array, B: Array) -> Array:
+        """The covariances (trials, 1 + K, n, n) of the states at the root: T T' with T = X J_F^-1 H+ and X = dx/du,
+        which moves from epoch to epoch as states do."""
+        C = B - self.A
+        W, _ = solve(np.eye(len(self.A)) + np.matmul(C, self.gain), np.matmul(C, self.inverse))
+        moved = self._moved(F, self.inverse - np.matmul(self.gain, W))
+        return np.stack([np.matmul(T, transposed(T)) for T in moved], axis=1)

@@ -10,6 +10,7 @@ from shared.small_models import Bent
 from shared.state_models import ConstantVelocity, CoordinatedTurn, Growth
 from shared.watched import check_cost
 
+from ipe_bench.engine.rows import RowFunction
 from ipe_bench.measurements import Gins
 from ipe_bench.noise import Gaussian, Quantization
 from ipe_bench.plugins.construct import construct
@@ -91,22 +92,43 @@ MODELS = {"exact": Exact()} | {
 
 
 def watched(model: StateModel, seen: Counter[str], first: bool) -> StateModel:
-    """The model, counting the states of which it evaluates f and h; `first`: read before they move or after."""
+    """The model, counting the states of which it evaluates f and h; `first`: read before they move or after, and
+    recorded or not."""
 
     class Watching(type(model)):
         moved_first = first
 
         def transition(self, x, k):
-            seen["calls"] += int(np.prod(np.shape(x)[:-1]))
-            return super().transition(x, k)
+            return super().transition(self.watched(x), k)
 
         def observe(self, x, k):
+            return super().observe(self.watched(x), k)
+
+        def watched(self, x):
+            assert first or x.dtype != object, "is not recorded"
             seen["calls"] += int(np.prod(np.shape(x)[:-1]))
-            return super().observe(x, k)
+            return x
 
     copy = object.__new__(Watching)
     vars(copy).update(vars(model))
     return copy
+
+
+@pytest.fixture
+def seen(monkeypatch):
+    """Counts rows of recorded functions, a slope as one for each direction."""
+    counted, values, slopes = Counter(), RowFunction.__call__, RowFunction.slopes
+
+    def count(function, times):
+        def counting(self, x, c):
+            counted["calls"] += len(x) * times(x)
+            return function(self, x, c)
+
+        return counting
+
+    monkeypatch.setattr(RowFunction, "__call__", count(values, lambda x: 1))
+    monkeypatch.setattr(RowFunction, "slopes", count(slopes, lambda x: 1 + x.shape[1]))
+    return counted
 
 
 @pytest.mark.oracle(
@@ -116,8 +138,8 @@ def watched(model: StateModel, seen: Counter[str], first: bool) -> StateModel:
     ("model", "moved_first"), [*((name, True) for name in MODELS), ("growth", False)]
 )
 @pytest.mark.parametrize("name", TRACKERS)
-def test_the_cost_of_a_tracker_is_what_it_evaluates(name, model, moved_first):
-    tracker, seen = TRACKERS[name], Counter()
+def test_the_cost_of_a_tracker_is_what_it_evaluates(name, model, moved_first, seen):
+    tracker = TRACKERS[name]
     model = watched(replace(MODELS[model], count=6), seen, moved_first)
     if tracker.hindrance(model):
         pytest.skip("is for other models")
