@@ -95,12 +95,12 @@ def half(P: Array) -> Half:
         return Half(L, L, L, singular)  # G^- is not asked for
     G, inverse = L.copy(), np.zeros(P.shape)
     L[singular] = np.nan
-    G[singular], inverse[singular] = _by_eigenvalues(P[singular])
+    G[singular], inverse[singular] = principal(P[singular])
     return Half(G, L, inverse, singular)
 
 
-def _by_eigenvalues(P: Array) -> tuple[Array, Array]:
-    """G and G^- (trials, n, n) of positive semidefinite P (trials, n, n)."""
+def principal(P: Array) -> tuple[Array, Array]:
+    """G and G^- (trials, n, n) of positive semidefinite P (trials, n, n), by the axes of its correlations."""
     deviation = np.sqrt(np.maximum(np.diagonal(P, axis1=-2, axis2=-1), 0.0))[..., None]
     d = np.where(deviation > 0, deviation, 1.0)
     C = P / (d * transposed(d))

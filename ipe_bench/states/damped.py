@@ -19,6 +19,7 @@ from ipe_bench.states.linearisation import Taylor, Unscented
 from ipe_bench.states.smoothers import path_p, smoothed, whole
 from ipe_bench.states.trackers import Tracker, Tracks, filtered
 from ipe_bench.states.whole_paths import PathDensity, Settled, Tangents
+from ipe_bench.states.widened import widened
 
 _TRIES, _FACTOR = 15, 10.0
 """Dampings that are tried about one path, and the factor between them."""
@@ -71,7 +72,8 @@ class LevenbergMarquardtSmoother(Tracker):
 
     The first path is the smoothed track of the EKF or of the UKF, whichever costs less. At its minimum J is chi-square
     with as many degrees as there are readings. Where it is too large for that, the trial begins again at draws of the
-    prior, each smoothed by a UKF of half the prior's deviations, from the one that costs least.
+    prior, each smoothed by a UKF of half the prior's deviations, from the one that costs least. The covariance is that
+    of the affine model, widened where the cost rises more slowly or bends; see `widened`.
 
     Example:
 
@@ -167,12 +169,13 @@ class LevenbergMarquardtSmoother(Tracker):
         there = np.zeros(len(calls), dtype=bool)
         for attempt in range(_TRIES):
             some, about = density.subset(todo), take(tangents, todo)
-            step = some.step(about, damping[todo, None, None] * weights[todo])
+            begun = take(paths.at, todo)
+            step = some.step(about, begun, damping[todo, None, None] * weights[todo])
             if not attempt:
-                there = self._converged(some, about, step, damping)
-            found = some.settled(paths.at.x[todo] + step)
+                there = self._converged(some, about, begun, step, damping)
+            found = some.settled(begun.x + step)
             calls[todo] += found.calls
-            lower = found.cost <= paths.at.cost[todo] * (1 + _ROUND_OFF)
+            lower = found.cost <= begun.cost * (1 + _ROUND_OFF)
             at = put(at, todo[lower], take(found, lower))
             todo = todo[~lower & ~there[todo]]
             if not todo.size:
@@ -185,7 +188,7 @@ class LevenbergMarquardtSmoother(Tracker):
         return Descent(damping, at, status, paths.iterations + 1, calls)
 
     def _converged(
-        self, density: PathDensity, tangents: Tangents, step: Array, damping: Array
+        self, density: PathDensity, tangents: Tangents, at: Settled, step: Array, damping: Array
     ) -> Mask:
         """Whether the undamped step is short (trials,). It is longer than a damped one, so that it is asked for only
         where the latter is short."""
@@ -193,17 +196,19 @@ class LevenbergMarquardtSmoother(Tracker):
         rows = np.flatnonzero(short & (damping > 0))
         if rows.size:
             some, about = density.subset(rows), take(tangents, rows)
-            short[rows] = some.size(about, some.step(about)) <= self.tolerance**2
+            undamped = some.step(about, take(at, rows))
+            short[rows] = some.size(about, undamped) <= self.tolerance**2
         return short
 
 
 def reported(density: PathDensity, paths: Descent) -> Tracks:
-    """The tracks of the paths, with the covariances of the affine model about them."""
+    """The tracks of the paths, with covariances that the cost itself widens."""
     model = density.model
     at = density.settled_exactly(paths.at)
     out = Tracks.empty(model, len(at.x))
-    P = density.covariances(density.tangents(at))
+    tangents = density.tangents(at)
+    P, calls = widened(density, at, tangents, density.covariances(tangents))
     out.start, out.mean, out.covariance = Normal(at.x[:, 0], P[:, 0]), at.x[:, 1:], P[:, 1:]
     out.cost, out.status, out.iterations = at.cost, paths.status, paths.iterations
-    out.calls = paths.calls + at.calls + Taylor().calls(model.n) * model.evaluations
+    out.calls = paths.calls + at.calls + calls + Taylor().calls(model.n) * model.evaluations
     return out

@@ -47,8 +47,6 @@ class Tangents:
     """dh/dx (trials, K, m, n)."""
     B: Array
     """R^-1/2 dh/dx (trials, K, m, n); 0 of missing readings."""
-    right: Array
-    """What the equations of a step leave at step 0 (trials, 1 + K, 2, n): of multipliers and of states."""
 
 
 @dataclass(frozen=True)
@@ -172,17 +170,25 @@ class PathDensity:
         """The affine model about settled paths."""
         _, _, A, H = self.model.slopes_along(at.x)
         seen = np.where(np.isfinite(self.z)[..., None], H, 0.0)
-        B = np.matmul(self.whitener, seen)
-        right = np.zeros((*at.x.shape[:2], 2, self.model.n))
-        right[:, 0, 0] = self.model.prior.mean - at.x[:, 0]
-        right[:, 1:, 0] = -at.gap
-        right[:, 1:, 1] = multiply(transposed(B), multiply(self.whitener, at.residual))
-        return Tangents(A, H, B, right)
+        return Tangents(A, H, np.matmul(self.whitener, seen))
 
-    def step(self, tangents: Tangents, damping: Array | None = None) -> Array:
-        """The steps dx (trials, 1 + K, n), NaN of a trial that has none; D = diag(damping (trials, 1 + K, n))."""
-        A, right = tangents.A, tangents.right
-        trials, K, n = right.shape[0], self.model.epochs, self.model.n
+    def left(self, tangents: Tangents, at: Settled) -> Array:
+        """What the equations of a step leave at step 0 (trials, 1 + K, 2, n): of multipliers and of states."""
+        left = np.zeros((*at.x.shape[:2], 2, self.model.n))
+        left[:, 0, 0] = self.model.prior.mean - at.x[:, 0]
+        left[:, 1:, 0] = -at.gap
+        v = multiply(self.whitener, at.residual)
+        left[:, 1:, 1] = multiply(transposed(tangents.B), v)
+        return left
+
+    def step(self, tangents: Tangents, at: Settled, damping: Array | None = None) -> Array:
+        """The steps dx (trials, 1 + K, n) from settled paths, NaN of a trial that has none; with
+        D = diag(damping (trials, 1 + K, n))."""
+        return self.solved(tangents, self.left(tangents, at)[..., None], damping)[..., 0]
+
+    def solved(self, tangents: Tangents, right: Array, damping: Array | None = None) -> Array:
+        """dx (trials, 1 + K, n, r) of the equations of a step, for r right sides (trials, 1 + K, 2, n, r)."""
+        trials, K, n = len(right), self.model.epochs, self.model.n
         noise = np.matmul(self.gains, transposed(self.gains))
         Q = np.concatenate([self.model.prior.covariance[None], noise])
         C = np.zeros((trials, K + 1, n, n))
@@ -191,7 +197,7 @@ class PathDensity:
             np.einsum("tkii->tki", C)[:] += damping
         at_once = max(1, int(_NUMBERS / ((K + 1) * 2 * n * 6 * n)))
         parts = [slice(i, i + at_once) for i in range(0, trials, at_once)]
-        return np.concatenate([_solved(Q, A[one], C[one], right[one]) for one in parts])
+        return np.concatenate([_solved(Q, tangents.A[one], C[one], right[one]) for one in parts])
 
     def size(self, tangents: Tangents, step: Array) -> Array:
         """dx' (Hessian of Gauss and Newton) dx (trials,): a step's squared length in deviations of the path."""
@@ -230,12 +236,12 @@ class PathDensity:
 
 
 def _solved(Q: Array, A: Array, C: Array, right: Array) -> Array:
-    """dx (trials, 1 + K, n) of the equations of `PathDensity`, their unknowns (l, dx) from epoch to epoch, by Q
-    (1 + K, n, n), A (trials, K, n, n), C = H' R^-1 H + D (trials, 1 + K, n, n) and the right side."""
+    """dx (trials, 1 + K, n, r) of the equations of `PathDensity`, their unknowns (l, dx) from epoch to epoch, by Q
+    (1 + K, n, n), A (trials, K, n, n), C = H' R^-1 H + D (trials, 1 + K, n, n) and right sides."""
     # Imported late: SciPy's LAPACK costs a tenth of a second.
     from scipy.linalg.lapack import dgbsv  # pyright: ignore[reportAttributeAccessIssue]
 
-    trials, epochs, _, n = right.shape
+    trials, epochs, _, n, columns = right.shape
     beside = 2 * n - 1
     band = np.zeros((trials, 2 * n * epochs, 3 * beside + 1))
     one = np.eye(n)
@@ -245,11 +251,13 @@ def _solved(Q: Array, A: Array, C: Array, right: Array) -> Array:
     _blocks(band, 1, 1, epochs)[:] = C
     _blocks(band, 2, 1, epochs - 1)[:] = -A
     _blocks(band, 1, 2, epochs - 1)[:] = -transposed(A)
-    found = np.full((trials, epochs, n), np.nan)
+    found = np.full((trials, epochs, n, columns), np.nan)
     for i in np.flatnonzero(finite(band) & finite(right)):
-        _, _, unknowns, failed = dgbsv(beside, beside, band[i].T, right[i].ravel(), overwrite_ab=1)
+        _, _, unknowns, failed = dgbsv(
+            beside, beside, band[i].T, right[i].reshape(-1, columns), overwrite_ab=1
+        )
         if not failed:
-            found[i] = unknowns.reshape(epochs, 2, n)[:, 1]
+            found[i] = unknowns.reshape(epochs, 2, n, columns)[:, 1]
     return found
 
 

@@ -10,7 +10,7 @@ from shared.oracles import assert_agrees
 from shared.state_models import ConstantVelocity, Pendulum
 
 from ipe_bench.measurements import Parameter
-from ipe_bench.states import LevenbergMarquardtSmoother, Normal, Smoother, StateModel, ekf
+from ipe_bench.states import Formulas, LevenbergMarquardtSmoother, Normal, Smoother, StateModel, ekf
 from ipe_bench.states.smoothers import whole
 from ipe_bench.states.whole_paths import PathDensity
 
@@ -74,7 +74,7 @@ def test_a_step_from_anywhere_ends_at_the_smoothed_path_of_a_linear_model(number
     at = density.settled(mean + np.random.default_rng(1).normal(size=mean.shape))
     # A start outside of the range of its prior has no density, but a step from there all the same.
     tangents = density.tangents(at)
-    found = density.settled(at.x + density.step(tangents))
+    found = density.settled(at.x + density.step(tangents, at))
     assert_agrees(found.x, mean, rtol=1e-9, atol=1e-9)
     assert_agrees(found.cost, tracks.cost, rtol=1e-9, atol=1e-12)
     assert_agrees(density.covariances(tangents), P, rtol=1e-9, atol=1e-12)
@@ -101,3 +101,33 @@ def test_readings_beyond_numbers_lose_their_own_trial_alone():
     assert not np.isfinite(lost.cost[1])
     np.testing.assert_array_equal(lost.mean[::2], kept.mean[::2])
     np.testing.assert_array_equal(lost.covariance[::2], kept.covariance[::2])
+
+
+def second_moments(cost, about, *axes):
+    """E (x - about)(x - about)' of the density exp(-cost / 2) over a grid of axes."""
+    grid = np.stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")], axis=-1)
+    w = np.exp(-0.5 * cost(grid))
+    e = grid - about
+    return (e * w[:, None]).T @ e / w.sum()
+
+
+@pytest.mark.parametrize("reading", ["y + x**2/8", "2/(2 + x) + y"])
+def test_a_covariance_holds_where_the_valley_of_the_cost_bends_or_flattens(reading):
+    """Against quadrature; tangents give a fifth of the variance of y about the bend, and half that of x on the flat."""
+    bends = "x**2" in reading
+    spread = {"x": 1.0, "y": 1.0 if bends else 0.01}
+    z = np.full((1, 1, 1), 0.0 if bends else 0.6)
+    still = {"next": {"x": "x", "y": "y"}, "spread": spread, "count": 1}
+    model = Formulas(**still, readings={"z": reading}, deviation={"z": 0.1})
+    found = LevenbergMarquardtSmoother(tolerance=1e-6).track(model, z)
+
+    def cost(x):
+        prior = np.sum((x / np.array(list(spread.values()))) ** 2, axis=-1)
+        return prior + ((z[0, 0] - model.observe(x, 0)[:, 0]) / 0.1) ** 2
+
+    y = np.linspace(-6, 6, 1201) * spread["y"]
+    exact = second_moments(cost, found.mean[0, 0], np.linspace(-1.9, 6, 801), y)
+    density = PathDensity.of(model, z)
+    narrow = density.covariances(density.tangents(density.settled(whole(found)[0])))[0, 0]
+    assert np.abs(np.diag(narrow) / np.diag(exact) - 1).max() > 0.4
+    np.testing.assert_allclose(np.diag(found.covariance[0, 0]), np.diag(exact), rtol=0.2)

@@ -1,0 +1,81 @@
+"""Covariances of paths of largest density that hold where the density is not normal."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ipe_bench.basics.batches import take
+from ipe_bench.basics.linalg import Array
+from ipe_bench.states.algebra import principal, transposed
+from ipe_bench.states.whole_paths import PathDensity, Settled, Tangents
+
+_FAR = 3.0
+"""Standard deviations from the path at which the cost is looked at."""
+_MOST = 100.0
+"""Times its variance that a direction gets at most."""
+_NUMBERS = 2e7
+"""Numbers of the slopes that are held at once."""
+
+
+def widened(density: PathDensity, at: Settled, tangents: Tangents, P: Array) -> tuple[Array, Array]:
+    """Covariances P (trials, 1 + K, n, n) of the affine model about paths, widened by what the cost says, and the
+    evaluations (trials,) that this took.
+
+    Along each axis of the last states' covariance the path is moved by c = 3 deviations to both sides, and a step of
+    the affine model lets the rest of it follow. By this the cost rises by dJ, which is c^2 where the density is normal:
+    the variance along the axis is multiplied by the larger of both c^2 / dJ, but not made smaller. The step itself is
+    b c^2 where the valley of the cost bends: it adds the second moment of that, 3 b b'.
+    """
+    model = density.model
+    at_once = max(1, int(_NUMBERS / (2 * model.n**3 * model.epochs)))
+    P, calls = P.copy(), np.zeros(len(P))
+    for first in range(0, len(P), at_once):
+        rows = np.arange(first, min(first + at_once, len(P)))
+        some = density.subset(rows), take(at, rows), take(tangents, rows)
+        P[rows], calls[rows] = _of_some(*some, P[rows])
+    return P, calls
+
+
+def _of_some(
+    density: PathDensity, at: Settled, tangents: Tangents, P: Array
+) -> tuple[Array, Array]:
+    trials, epochs, n = at.x.shape
+    _, inverse = principal(P[:, -1])
+    unit = np.zeros((trials, epochs, 2, n, n))
+    unit[:, -1, 1] = transposed(inverse)
+    # Column i moves the last states by a deviation along axis i, and the path as the affine model has it.
+    lines = density.solved(tangents, unit)
+    sides = np.concatenate([lines, -lines], axis=-1)
+    rows = np.repeat(np.arange(trials), 2 * n)
+    every, about = density.subset(rows), take(tangents, rows)
+    moved = every.settled(at.x[rows] + _FAR * _as_rows(sides))
+    left = every.left(about, moved).reshape(trials, 2 * n, epochs, 2, n)
+    step = density.solved(tangents, np.moveaxis(left, 1, -1))
+    # What the step would move along the axis itself is taken back.
+    along = np.concatenate([inverse, inverse], axis=1)
+    back = np.sum(transposed(along) * step[:, -1], axis=1)
+    step = step - np.concatenate([lines, lines], axis=-1) * back[:, None, None]
+    followed = every.settled(moved.x + _as_rows(step))
+    costs = np.stack([moved.cost, followed.cost]).reshape(2, trials, 2, n)
+    extra = _rarer(costs.min(axis=0) - at.cost[:, None, None])
+    extra[(lines == 0).all(axis=(1, 2))] = 0.0  # what is known exactly
+    right = (costs[1] <= costs[0]).all(axis=1)
+    bend = (step[..., :n] + step[..., n:]) / (2 * _FAR**2)
+    bend = np.where(right[:, None, None], bend, 0.0)
+    # E t^4 = 3 of a standard normal t.
+    wide = np.concatenate([np.sqrt(extra)[:, None, None] * lines, np.sqrt(3.0) * bend], axis=-1)
+    calls = (moved.calls + followed.calls).reshape(trials, 2 * n).sum(axis=1)
+    return P + np.matmul(wide, transposed(wide)), calls
+
+
+def _rarer(rise: Array) -> Array:
+    """By how much more than once the variance an axis has (trials, n), of rises (trials, 2, n) to both sides."""
+    least = _FAR**2 / _MOST
+    ratio = _FAR**2 / np.fmax(rise, least).min(axis=1)
+    return np.maximum(ratio, 1.0) - 1.0
+
+
+def _as_rows(columns: Array) -> Array:
+    """Paths (trials r, 1 + K, n) of those in columns (trials, 1 + K, n, r)."""
+    rows = np.moveaxis(columns, -1, 1)
+    return rows.reshape(-1, *rows.shape[2:])
