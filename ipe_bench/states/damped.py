@@ -27,6 +27,9 @@ _ROUND_OFF = 1e-12
 """Part of a cost by which it may rise."""
 _SHARE = 0.5
 """Standard deviations of the prior about a further start, in those of the prior."""
+_SLOW, _HARDLY = 3, 0.9
+"""Damped steps in a row after which a search ends that each leave more than this share of an improbable cost: of those
+that crawled so for 30 steps, one in ten arrived."""
 _NUMBERS = 2e7
 """Numbers of the covariances of further starts that are held at once."""
 
@@ -42,6 +45,8 @@ class Descent:
     iterations: NDArray[np.int64]
     calls: Array
     """Evaluations of f and of h (trials,) so far."""
+    slow: NDArray[np.int64]
+    """Damped steps (trials,) in a row that hardly lowered an improbable cost."""
 
     @classmethod
     def of(cls, density: PathDensity, tracks: Tracks) -> Descent:
@@ -49,7 +54,7 @@ class Descent:
         at = density.settled(whole(tracks)[0])
         trials = len(at.x)
         running, none = np.full(trials, Status.RUNNING, np.int8), np.zeros(trials, np.int64)
-        return cls(np.zeros(trials), at, running, none, tracks.calls + at.calls)
+        return cls(np.zeros(trials), at, running, none, tracks.calls + at.calls, none)
 
     def improved(self, other: Descent, rows: NDArray[np.intp]) -> Descent:
         """These paths with those of `other`, of the trials `rows`, that cost less; both have been paid for."""
@@ -184,8 +189,12 @@ class LevenbergMarquardtSmoother(Tracker):
         eased = np.where(damping > self.damping, damping / _FACTOR, 0.0)
         damping = np.where(damping == paths.damping, eased, damping)
         status = np.where(there, Status.CONVERGED, Status.RUNNING).astype(np.int8)
+        improbable = ~(path_p(density.z, at.cost) >= self.level)
+        hardly = improbable & (damping > 0) & (at.cost > _HARDLY * paths.at.cost)
+        slow = np.where(hardly, paths.slow + 1, 0)
+        status[~there & (slow >= _SLOW)] = Status.STALLED
         status[todo] = Status.STALLED
-        return Descent(damping, at, status, paths.iterations + 1, calls)
+        return Descent(damping, at, status, paths.iterations + 1, calls, slow)
 
     def _converged(
         self, density: PathDensity, tangents: Tangents, at: Settled, step: Array, damping: Array

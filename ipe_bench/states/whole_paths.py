@@ -252,7 +252,7 @@ def _solved(Q: Array, A: Array, C: Array, right: Array) -> Array:
     _blocks(band, 2, 1, epochs - 1)[:] = -A
     _blocks(band, 1, 2, epochs - 1)[:] = -transposed(A)
     found = np.full((trials, epochs, n, columns), np.nan)
-    for i in np.flatnonzero(finite(band) & finite(right)):
+    for i in np.flatnonzero(finite(A) & finite(C) & finite(right)):
         _, _, unknowns, failed = dgbsv(
             beside, beside, band[i].T, right[i].reshape(-1, columns), overwrite_ab=1
         )
