@@ -113,6 +113,8 @@ class Measurement(Component, ABC):
     """The rows of z by epoch, in order of arrival; None where readings have no order."""
     entry_words: Mapping[str, Mapping[Any, str]] = {}
     """Words for entries of `index` that do not speak for themselves, by column: the numbers of cases, say."""
+    option_units: ClassVar[Mapping[str, str]] = {}
+    """Units of options that are quantities, by name, as pages word them."""
     own_parameters: Sequence[str] = ()
     """Names of parameters of which every file of readings has its own, where several are estimated together."""
     periods: Array | Sequence[float] = ()

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from annotated_types import MinLen
@@ -275,6 +275,12 @@ class RicherGins(Gins):
     """Initial rotation of the platform about each of its axes, arc seconds."""
 
     name = "gins_richer"
+    option_units: ClassVar[Mapping[str, str]] = {
+        "gyro_random_walk": "deg/h/√h",
+        "accelerometer_quadratic": "µg/g²",
+        "accelerometer_misalignment": "arc seconds",
+        "platform_misalignment": "arc seconds",
+    }
 
     @cached_property
     def nuisance_deviation(self) -> Array:

@@ -9,6 +9,7 @@ import re
 from colorsys import rgb_to_hls
 from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
+from types import SimpleNamespace
 from unittest.mock import patch
 
 import numpy as np
@@ -24,7 +25,7 @@ from shared.synthetic_store import Filter, Pretender, Seeker, Synthetic
 from ipe_bench.baselines import EnKF
 from ipe_bench.basics.errors import UserError
 from ipe_bench.report import figures
-from ipe_bench.report.figures import common, costs, draw_all, errors, parameters
+from ipe_bench.report.figures import common, costs, draw_all, errors, parameters, settings
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.views import View, focus_of, views
 from ipe_bench.report.style import (
@@ -483,6 +484,76 @@ def test_places_of_labels_are_the_nearest_that_keep_their_distance():
     assert np.diff(np.sort(found)).min() >= 0.1 - 1e-12
     np.testing.assert_allclose(found, [0.4, 0.5, 0.6, 0.0, 0.98])
     np.testing.assert_allclose(common.spread([1.0, 1.0], 0.1, 0.0, 1.0), [0.9, 1.0])
+
+
+# Settings ------------------------------------------------------------------------------------------------------------
+
+
+def swept_view(name: str, values, errors_of, **more) -> View:
+    """Three estimators at one scale for each value of a setting, of which two err alike."""
+    rows = []
+    for value in values:
+        for label, factor in (("ekf", 1.0), ("newton", 1.01), ("far", 3.0)):
+            error = factor * errors_of[value]
+            row = {name: value, "error_scale": 10.0, "estimator": label, "parameter": ALL}
+            row |= {"success": 1.0, "success_low": 0.9, "success_high": 1.0, "trials": 60}
+            row |= {"error_median": error, "error_q95": 2 * error, "solved": 1.0}
+            row |= {"nees_median": 1.0, "misfit": float(error > 50)}
+            rows.append(
+                {**row, "nees_median_low_if_honest": 0.9, "nees_median_high_if_honest": 1.1}
+            )
+    summary = pd.DataFrame(rows).assign(**more)
+    look = looks(["ekf", "newton", "far"])
+    return View("", "", {"summary": summary}, look, {}, {}, focus=list(look))
+
+
+def test_a_row_per_setting_has_its_error_and_the_share_of_misfits_detected():
+    errors_of = {np.nan: 1.0, 5.0: 20.0, 20.0: 300.0}
+    view = swept_view("truth.platform_misalignment", errors_of, errors_of)
+    truth = {"_target_": "ipe_bench.measurements.RicherGins"}
+    scenario = {"truth": truth, "measurement": {"_target_": "ipe_bench.measurements.Gins"}}
+    footer = {"identity": {"scenario": scenario}}
+    option = view["summary"]["truth.platform_misalignment"]
+    view["summary"].insert(0, "truth", np.where(option.isna(), "Gins", "RicherGins"))
+    group = SimpleNamespace(footer=footer)
+    view = replace(view, collection=SimpleNamespace(groups=[group]))
+    drawing = drawn(settings, view)["settings"]
+    alike, far, misfit = drawing.figure.axes
+    names = [t.get_text() for t in alike.get_yticklabels()]
+    assert names == [
+        "platform misalignment 20 arc seconds",
+        "platform misalignment 5 arc seconds",
+        "right model",
+    ]
+    assert [ax.get_title() for ax in (alike, far)] == ["ekf, newton", "far"]
+    at = {
+        ax: [float(line.get_xdata()[0]) for line in ax.lines if list(line.get_ydata()) == [0]]
+        for ax in (alike, far, misfit)
+    }
+    assert set(at[alike]) == {300.0}
+    assert set(at[far]) == {900.0}
+    assert set(at[misfit]) == {1.0}
+    assert "Largest undetected: platform misalignment 5 arc seconds" in drawing.caption
+    assert len(drawing.caption.split()) <= 30
+    drawing.figure.draw_without_rendering()
+    boxes = [label.get_window_extent() for label in alike.get_yticklabels()]
+    assert min(box.x0 for box in boxes) >= 0
+    assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))
+
+
+def test_a_number_that_is_swept_has_an_axis_and_kinds_have_rows():
+    values = {0.1: 1.0, 0.2: 2.0, 0.5: 4.0}
+    drawing = drawn(settings, swept_view("noise.deviation", values, values))["settings"]
+    assert [ax.get_xlabel() for ax in drawing.figure.axes] == ["noise.deviation"] * 3
+    curve = drawing.figure.axes[1].lines[1]
+    assert curve.get_ydata() == pytest.approx([1.0, 2.0, 4.0])
+    assert [t.get_text() for t in drawing.figure.axes[0].get_xticklabels()] == ["0.1", "0.2", "0.5"]
+    kinds = {"gaussian": 1.0, "quantization": 2.0}
+    drawing = drawn(settings, swept_view("noise", kinds, kinds))["settings"]
+    labels = [t.get_text() for t in drawing.figure.axes[0].get_yticklabels()]
+    assert labels == ["quantization", "gaussian"]
+    one = swept_view("noise", ["gaussian"], kinds)
+    assert not drawn(settings, one)
 
 
 # Distributions and convergence ---------------------------------------------------------------------------------------

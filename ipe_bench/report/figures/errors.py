@@ -37,12 +37,11 @@ def draw(view: View) -> Iterator[Drawing]:
     start = _parting(view) if several else view.scales[0]
     scales = [scale for scale in view.scales if scale >= start]
     rows = totals[totals["error_scale"] >= start]
-    claims = rows[rows["nees_median"].notna()]
-    count = 3 if len(claims) else 2
+    count = 3 if rows["nees_median"].notna().any() else 2
     height = max(3.3, 0.17 * len(view.look) + 1.6)
     look = _looks(view) if several else view.look
     fig, axes = common.panels(count, look, height=height, scales=scales, row=count)
-    _draw_panels(view, axes, rows, claims, look, scales)
+    draw_panels(view, axes, rows, look, scales)
     named = several and not 0 < print_width() < _WIDE
     if named:
         common.end_names(axes[0], rows, "success", look)
@@ -88,16 +87,16 @@ def _start_in_words(view: View, start: float) -> str:
     return f"Up to error scale {value_text(start)} all{but} are alike: the axis starts there."
 
 
-def _draw_panels(
+def draw_panels(
     view: View,
     axes: Sequence[Any],
     rows: pd.DataFrame,
-    claims: pd.DataFrame,
     look: Mapping[str, Look],
     scales: Sequence[float],
 ) -> None:
     """Draws success, error and, if there is a third panel, NEES."""
     shown = look, scales
+    claims = rows[rows["nees_median"].notna()]
     capped = rows[list(CEILING)].clip(upper=pd.Series(CEILING), axis=1)
     words: dict[str, Any] = {"heading": "success", "label": "share of all trials"}
     common.shares(axes[0])

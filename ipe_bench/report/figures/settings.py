@@ -1,0 +1,248 @@
+"""Draws a sweep of settings: a row for each with its error and how often its misfit is detected, or an axis of the one
+number that is swept."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.plugins.construct import find_object
+from ipe_bench.report.figures import common
+from ipe_bench.report.figures.drawing import Drawing
+from ipe_bench.report.figures.views import Figure, View, in_focus
+from ipe_bench.report.style import BOUND_COLOR, FAMILIES, Look
+from ipe_bench.report.words import brief, enumerate_few, percent, value_text
+from ipe_bench.runs.provenance import TARGET
+from ipe_bench.trials.thresholds import FIT_LEVEL
+
+if TYPE_CHECKING:
+    from ipe_bench.statistics.collect import Collection
+
+MOST_ROWS = 25
+"""Settings that have a row; the tables have all."""
+MOST_GROUPS = 3
+"""Panels of estimators that are not alike."""
+DETECTED = 0.5
+"""Share of trials from which on a misfit counts as detected."""
+RIGHT = "right model"
+_ALIKE = 0.05
+"""Part by which the errors of estimators in one panel differ at most."""
+_MOST_ERROR = 1e4
+"""Errors beyond are drawn here."""
+_LETTERS = 44
+"""Length of a line of a setting's name."""
+_COLORS = {
+    "right": FAMILIES["IPE"][3],
+    "detected": FAMILIES["least squares"][0],
+    "undetected": FAMILIES["filters"][0],
+    "": BOUND_COLOR,
+}
+
+
+def draw(view: View) -> Iterator[Drawing]:
+    """Draws several settings at the largest error scale that all of them have."""
+    columns = list(view["summary"].columns)
+    columns = columns[: columns.index("error_scale")] if "error_scale" in columns else []
+    rows = view.totals if columns else pd.DataFrame()
+    if rows.empty or rows.groupby(columns, dropna=False).ngroups < 2:
+        return
+    varying = [c for c in columns if len(set(rows[c].astype(str))) > 1]
+    rows = rows.assign(setting=_names(rows, varying, view))
+    number = rows["setting"].nunique()
+    at = rows.groupby("error_scale")["setting"].nunique()
+    shared = at.index[at == number]
+    if not len(shared):
+        return
+    scale = max(shared)
+    rows = rows[rows["error_scale"] == scale]
+    rows = rows[rows.groupby(["setting", "estimator"])["setting"].transform("size") == 1]
+    swept = rows[varying[0]] if len(varying) == 1 else pd.Series(dtype=object)
+    drawn = _swept if _is_axis(swept) else _rows
+    yield from drawn(view, rows, varying, scale)
+
+
+def _is_axis(values: pd.Series[Any]) -> bool:
+    """Whether a setting is a positive number with three values or more, so that an axis can have it."""
+    numbers = pd.to_numeric(values, errors="coerce")
+    return numbers.nunique() > 2 and bool((numbers > 0).all())
+
+
+def _scenarios(collection: Collection | None) -> Iterator[Mapping[str, Any]]:
+    for group in collection.groups if collection else ():
+        yield group.footer["identity"]["scenario"]
+
+
+def _units(collection: Collection | None) -> dict[str, str]:
+    """Returns the units of options that their classes state, by the columns of settings."""
+    found: dict[str, str] = {}
+    for scenario in _scenarios(collection):
+        for component, config in scenario.items():
+            if not isinstance(config, Mapping) or TARGET not in config:
+                continue
+            try:
+                stated = getattr(find_object(config[TARGET], component), "option_units", {})
+            except UserError:  # the plugin of a stored result is gone
+                stated = {}
+            found |= {f"{component}.{name}": unit for name, unit in stated.items()}
+    return found
+
+
+def _names(rows: pd.DataFrame, varying: Sequence[str], view: View) -> list[str]:
+    """Words the setting of each row by what is in it: options that are there and not 0, with their units."""
+    units = _units(view.collection)
+    models = {one["measurement"][TARGET].rpartition(".")[2] for one in _scenarios(view.collection)}
+    options = [c for c in varying if "." in c]
+    told = []
+    for row in rows.to_dict("records"):
+        here = [c for c in options if value_text(row[c]) not in ("-", "0")]
+        words = [f"{_worded(c)} {value_text(row[c])} {units.get(c, '')}".strip() for c in here]
+        richer = any(c.startswith("truth.") for c in here)
+        kinds = [value_text(row[c]) for c in varying if c not in (*options, "truth")]
+        if "truth" in varying and not richer:
+            kinds.append(RIGHT if row["truth"] in models else value_text(row["truth"]))
+        told.append(", ".join([*kinds, *words]) or "-")
+    return told
+
+
+def _worded(column: str) -> str:
+    return column.rpartition(".")[2].replace("_", " ")
+
+
+def _swept(
+    view: View, rows: pd.DataFrame, varying: Sequence[str], scale: float
+) -> Iterator[Drawing]:
+    """Draws success, error and NEES over the number that is swept."""
+    from ipe_bench.report.figures.errors import draw_panels
+
+    (column,) = varying
+    rows = rows.assign(error_scale=pd.to_numeric(rows[column]))
+    values = sorted(set(rows["error_scale"]))
+    look = in_focus(view.look, view.focus)
+    fig, axes = common.panels(3, look, height=3.3, row=3)
+    draw_panels(view, axes, rows, look, values)
+    unit = _units(view.collection).get(column, "")
+    for ax in axes:
+        ax.set_xlabel(f"{_worded(column)} [{unit}]" if unit else column)
+    common.end_names(axes[0], rows, "success", look)
+    common.legend(fig, axes)
+    title = f"Success, error and reported covariance over {column} at error scale {scale:g}"
+    caption = "Bars: 95 % intervals of success, and errors from the median to the 95 % quantile."
+    yield view.drawing(fig, "settings", title, caption)
+
+
+def _rows(
+    view: View, rows: pd.DataFrame, varying: Sequence[str], scale: float
+) -> Iterator[Drawing]:
+    """Draws a row for each setting, a panel of errors for estimators that are alike, and beside them how often the
+    misfit is detected if readings come from other models, else NEES."""
+    error = rows.pivot_table("error_median", "setting", "estimator")
+    error = error.loc[error.median(axis=1).sort_values().index[::-1]].iloc[:MOST_ROWS]
+    groups = _groups(error)
+    of_truth = any(c.partition(".")[0] == "truth" for c in varying) and rows["misfit"].notna().any()
+    second = "misfit" if of_truth else "nees_median"
+    detected = rows.groupby("setting")["misfit"].median()
+    kinds = [_kind(name, detected[name]) if of_truth else "" for name in error.index]
+    look = {n: Look(_COLORS[kind], "o") for n, kind in zip(error.index, kinds, strict=True)}
+    shown = groups[:MOST_GROUPS]
+    claims = rows[second].notna().any()
+    fig, axes = common.panels(len(shown) + bool(claims), look, scales=[scale], row=MOST_GROUPS + 1)
+    lines = [_wrapped(name) for name in look]
+    fig.set_figheight(1.2 + sum(0.1 + 0.17 * (1 + line.count("\n")) for line in lines))
+    for group, ax in zip(shown, axes, strict=False):
+        part = rows[rows["estimator"] == group[0]]
+        common.decades(ax, part["error_median"].clip(upper=_MOST_ERROR), ends=part["error_q95"])
+        common.bound_line(ax, 1.0, f"1: {view.reference}")
+        ends: Any = {"interval": ("error_median", "error_q95"), "most": _MOST_ERROR}
+        ends["label"] = f"error over {view.reference}"
+        common.curves(ax, part, "error_median", look, [scale], by="setting", **ends)
+        ax.set_title(_who(group, error).replace("$", r"\$"))
+        _write_values(ax, part, "error_median", look, brief)
+    if claims:
+        part, ax = rows[rows["estimator"] == groups[0][0]], axes[-1]
+        if of_truth:
+            common.shares(ax)
+        else:
+            common.decades(ax, np.append(part[second], 1.0), least=4.0)
+            common.bound_line(ax, 1.0, "1: an honest covariance")
+        heading = "misfit detected" if of_truth else f"NEES of {groups[0][0]}"
+        test = f"share of trials, test of fit at {FIT_LEVEL:g}"
+        words: Any = {"heading": heading, "label": test if of_truth else "median"}
+        common.curves(ax, part, second, look, [scale], by="setting", **words)
+        _write_values(ax, part, second, look, percent if of_truth else brief)
+    for ax in axes[1:]:
+        ax.tick_params(labelleft=False)
+    axes[0].set_yticks(range(len(lines)), lines)
+    common.legend(fig, axes)
+    yield view.drawing(
+        fig,
+        "settings",
+        f"Error by setting at error scale {scale:g}",
+        "Median error, bar to the 95 % quantile.",
+        _worst(error, kinds, detected) if of_truth else "",
+    )
+
+
+def _groups(error: pd.DataFrame) -> list[list[str]]:
+    """Returns estimators whose errors are alike in every setting."""
+    groups: list[list[str]] = []
+    for name in error.columns:
+        ratios = [error[group[0]] / error[name] for group in groups]
+        near = [np.allclose(ratio, 1.0, rtol=0, atol=_ALIKE) for ratio in ratios]
+        if any(near):
+            groups[near.index(True)].append(str(name))
+        else:
+            groups.append([str(name)])
+    return groups
+
+
+def _who(group: Sequence[str], error: pd.DataFrame) -> str:
+    whole = len(group) == len(error.columns)
+    return f"all {len(group)} estimators" if whole and len(group) > 1 else enumerate_few(group, 2)
+
+
+def _kind(name: str, detected: float) -> str:
+    if name.endswith(RIGHT):
+        return "right"
+    return "detected" if detected >= DETECTED else "undetected"
+
+
+def _wrapped(name: str) -> str:
+    """Returns a name in lines, broken behind commas."""
+    lines = [""]
+    for part in name.split(", "):
+        longer = f"{lines[-1]}, {part}".removeprefix(", ")
+        if len(longer) <= _LETTERS:
+            lines[-1] = longer
+        else:
+            lines.append(part)
+    return ",\n".join(filter(None, lines)).replace("$", r"\$")
+
+
+def _write_values(
+    ax: Any, rows: pd.DataFrame, column: str, look: Mapping[str, Look], words: Any
+) -> None:
+    """Writes each value above its mark."""
+    values = rows.set_index("setting")[column]
+    for i, (name, one) in enumerate(look.items()):
+        if np.isfinite(values.get(name, np.nan)):
+            at = (min(values[name], _MOST_ERROR), i)
+            style: Any = {"fontsize": "small", "color": one.color, "ha": "center"}
+            offset: Any = {"xytext": (0, 4), "textcoords": "offset points"}
+            ax.annotate(words(values[name]), at, **offset, **style)
+
+
+def _worst(error: pd.DataFrame, kinds: Sequence[str], detected: pd.Series[Any]) -> str:
+    """Names the largest error whose misfit goes undetected."""
+    hidden = [name for name, kind in zip(error.index, kinds, strict=True) if kind == "undetected"]
+    if not hidden:
+        return ""
+    name = hidden[0]
+    share, most = percent(detected[name]), brief(error.loc[name].median())
+    return f"Largest undetected: {name}, {most} times the bound, detected in {share}."
+
+
+FIGURES = (Figure(draw, ("summary",), together=True, main=True),)
