@@ -486,6 +486,35 @@ def test_places_of_labels_are_the_nearest_that_keep_their_distance():
     np.testing.assert_allclose(common.spread([1.0, 1.0], 0.1, 0.0, 1.0), [0.9, 1.0])
 
 
+def test_errors_of_tracks_are_over_all_epochs_each_state_over_the_bound_of_filters():
+    """At the last epoch the smoother is its filter; over all epochs one of its two states has half the error."""
+    rows = []
+    for label, errors_of in (("ukf", (2.0, 3.0)), ("ukf_rts", (1.0, 3.0))):
+        for scale in (1.0, 10.0):
+            row = {"estimator": label, "error_scale": scale, "trials": 60, "solved": 1.0}
+            row |= {"success": 1.0, "success_low": 0.9, "success_high": 1.0}
+            row |= {"error_median": 7.0, "error_q95": 8.0, "nees_median": 1.0, "path_nees": 1.5}
+            row |= {"nees_median_low_if_honest": 0.9, "nees_median_high_if_honest": 1.1}
+            bound = 1.0 if label == "ukf" else 0.1
+            for state, error in zip(("x", "y"), errors_of, strict=True):
+                rows.append({**row, "parameter": state, "path_rmse": error, "path_bound": bound})
+            rows.append({**row, "parameter": ALL, "path_rmse": 99.0, "path_bound": 1.0})
+    frames = {"summary": pd.DataFrame(rows)}
+    look, families = looks(["ukf", "ukf_rts"]), {"ukf": "filters", "ukf_rts": "smoothers"}
+    view = View("", "", frames, look, {}, families, focus=list(look), moving=True)
+    _, error, nees = drawn(errors, view)["headline"].figure.axes
+    shown = {
+        line.get_color(): line.get_ydata() for line in error.lines if len(line.get_xdata()) == 2
+    }
+    assert shown[look["ukf"].color] == pytest.approx([np.sqrt(6.5)] * 2)
+    assert shown[look["ukf_rts"].color] == pytest.approx([np.sqrt(5.0)] * 2)
+    assert 1.5 in {float(y) for line in nees.lines for y in line.get_ydata()}
+    assert [ax.get_ylabel() for ax in (error, nees)] == [
+        "rms over all epochs",
+        "mean over all epochs",
+    ]
+
+
 # Settings ------------------------------------------------------------------------------------------------------------
 
 

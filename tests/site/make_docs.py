@@ -113,7 +113,7 @@ _STORED = {"states": ["state_model=bearings_only"]}
 """The part of an experiment that is stored where its whole takes hours; the command on its page says so."""
 _FIGURES = {"paper": ("figure_2", "figure_3")}
 """The figures of an experiment's page, where they are not the first."""
-_OF_PARAMETERS = ("paper", "pendulum_book")
+_OF_PARAMETERS = ("paper", "pendulum_book", "states")
 """Experiments whose pages show single parameters."""
 SOURCES = Path(ipe_bench.__file__).parent / "report" / "docs"
 """The folder of what the site is made of."""

@@ -15,9 +15,13 @@ from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.views import Figure, View, in_focus
 from ipe_bench.report.style import BOUND_COLOR, BOUND_DASH, REFERENCE, Look, print_width, strong
 from ipe_bench.report.words import brief, enumerate_few, value_text
+from ipe_bench.statistics.statistic import ALL
 
 CEILING = {"error_median": 100.0, "error_q95": 100.0, "nees_median": 30.0}
 """Errors beyond are drawn here: the size of a diverged error carries no information, and the bound needs the room."""
+BARS = "Bars: 95 % intervals of success, and errors from the median to the 95 % quantile."
+_ALONG = "Success: share of tracks kept to the last epoch, with 95 % intervals. Hollow: some trials have no track."
+_LIMITS = ("nees_median_low_if_honest", "nees_median_high_if_honest")
 _ALL, _APART = 0.995, 0.1
 """Success that all estimators have where they are alike, and the part by which their errors and NEES differ at most."""
 _WIDE = 5.0
@@ -30,11 +34,11 @@ hundredths, dishonest ones by up to 1."""
 def draw(view: View) -> Iterator[Drawing]:
     """Draws success, error and, where a covariance is reported, NEES: over the error scales with names at the curves'
     ends, from where estimators part; at one scale a row for each."""
-    totals = view.totals
+    totals = over_paths(view) if view.moving else view.totals
     if totals.empty:
         return
     several = len(view.scales) > 1
-    start = _parting(view) if several else view.scales[0]
+    start = _parting(view, totals) if several else view.scales[0]
     scales = [scale for scale in view.scales if scale >= start]
     rows = totals[totals["error_scale"] >= start]
     count = 3 if rows["nees_median"].notna().any() else 2
@@ -52,8 +56,26 @@ def draw(view: View) -> Iterator[Drawing]:
         "headline",
         f"Success, error and reported covariance {over}",
         _start_in_words(view, start) if start > view.scales[0] else "",
-        "Bars: 95 % intervals of success, and errors from the median to the 95 % quantile.",
+        _ALONG if view.moving else BARS,
     )
+
+
+def over_paths(view: View) -> pd.DataFrame:
+    """Returns the totals with errors and NEES over all epochs, where a smoother is better than its filter: at the last
+    they are equal by definition. Errors of each state are over those of the filter linearised at the true path."""
+    states = view["summary"][view["summary"]["parameter"] != ALL]
+    filters = [label for label in view.look if view.families.get(label) != "smoothers"]
+    place = ["error_scale", "parameter"]
+    bounds = states[states["estimator"].isin(filters)].groupby(place)["path_bound"].median()
+    error = view.totals["path_rmse"]
+    if len(bounds):
+        whose = pd.MultiIndex.from_frame(states[place])
+        squares = (states["path_rmse"] / bounds.reindex(whose).to_numpy()) ** 2
+        means = squares.groupby([states["error_scale"], states["estimator"]]).agg(np.mean)
+        index = pd.MultiIndex.from_frame(view.totals[["error_scale", "estimator"]])
+        error = np.sqrt(means.reindex(index).to_numpy())
+    nothing: dict[str, Any] = dict.fromkeys(("error_q95", *_LIMITS), np.nan)
+    return view.totals.assign(error_median=error, nees_median=view.totals["path_nees"], **nothing)
 
 
 def _looks(view: View) -> dict[str, Look]:
@@ -65,10 +87,10 @@ def _looks(view: View) -> dict[str, Look]:
     return look
 
 
-def _parting(view: View) -> float:
+def _parting(view: View, totals: pd.DataFrame) -> float:
     """Returns the last of the scales up to which all estimators but the reference are alike, so that at least three are
     left; the first if they never part."""
-    rows = view.totals[view.totals["estimator"] != REFERENCE]
+    rows = totals[totals["estimator"] != REFERENCE]
     whole = rows["estimator"].nunique()
     alike = []
     for scale in view.scales:
@@ -104,8 +126,12 @@ def draw_panels(
         axes[0], rows, "success", *shown, interval=("success_low", "success_high"), **words
     )
     heading = f"error over {view.reference}"
-    words = {"heading": heading, "label": "median, bar to 95 %", "most": CEILING["error_q95"]}
-    common.decades(axes[1], capped[["error_median", "error_q95"]].clip(lower=0.5), least=4.0)
+    error = "rms over all epochs" if view.moving else "median, bar to 95 %"
+    words = {"heading": heading, "label": error, "most": CEILING["error_q95"]}
+    # Errors over all epochs are of the trials that have a track.
+    words |= {"trials": "solved_trials"} if view.moving else {}
+    least = 0.01 if view.moving else 0.5  # smoothers are far below the filter's bound
+    common.decades(axes[1], capped[["error_median", "error_q95"]].clip(lower=least), least=4.0)
     best = f"1: {view.reference}, an honest covariance"
     common.bound_line(axes[1], 1.0, best)
     common.curves(
@@ -114,12 +140,11 @@ def draw_panels(
     for nees in axes[2:]:
         common.decades(nees, np.append(capped["nees_median"].clip(lower=0.5), 1.0), least=4.0)
         common.bound_line(nees, 1.0, best)
-        limits = (
-            claims["nees_median_low_if_honest"].min(),
-            claims["nees_median_high_if_honest"].max(),
-        )
-        common.band(nees, *limits, "95 % limits of the median if honest")
-        words = {"heading": "NEES", "label": "median", "most": CEILING["nees_median"]}
+        low, high = (claims[name] for name in _LIMITS)
+        if low.notna().any():
+            common.band(nees, low.min(), high.max(), "95 % limits of the median if honest")
+        mean = "mean over all epochs" if view.moving else "median"
+        words = {"heading": "NEES", "label": mean, "most": CEILING["nees_median"]}
         common.curves(nees, claims, "nees_median", *shown, **words)
 
 

@@ -13,6 +13,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.plugins.construct import find_object
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
+from ipe_bench.report.figures.errors import BARS, draw_panels
 from ipe_bench.report.figures.views import Figure, View, in_focus
 from ipe_bench.report.style import BOUND_COLOR, FAMILIES, Look
 from ipe_bench.report.words import brief, enumerate_few, percent, value_text
@@ -116,8 +117,6 @@ def _swept(
     view: View, rows: pd.DataFrame, varying: Sequence[str], scale: float
 ) -> Iterator[Drawing]:
     """Draws success, error and NEES over the number that is swept."""
-    from ipe_bench.report.figures.errors import draw_panels
-
     (column,) = varying
     rows = rows.assign(error_scale=pd.to_numeric(rows[column]))
     values = sorted(set(rows["error_scale"]))
@@ -130,8 +129,7 @@ def _swept(
     common.end_names(axes[0], rows, "success", look)
     common.legend(fig, axes)
     title = f"Success, error and reported covariance over {column} at error scale {scale:g}"
-    caption = "Bars: 95 % intervals of success, and errors from the median to the 95 % quantile."
-    yield view.drawing(fig, "settings", title, caption)
+    yield view.drawing(fig, "settings", title, BARS)
 
 
 def _rows(
