@@ -36,32 +36,38 @@ MESSAGES = 20
 
 @dataclass(frozen=True)
 class Analysis:
-    """Tables that figures, tables and the page are drawn from. Each starts with the scenario's columns; those of a
-    scenario under an estimator add `scenario`, its number, and `estimator`."""
+    """Tables that figures, tables and the page are drawn from. Each starts with the scenario's
+    columns; those of a scenario under an estimator add `scenario`, its number, and `estimator`."""
 
     collection: Collection
     summary: pd.DataFrame
     endings: pd.DataFrame
-    """Endings of trials that did not converge: status, message, number, and the first such trial."""
+    """Endings of trials that did not converge: status, message, number, and the first such
+    trial."""
     pairs: pd.DataFrame
     """Every pair of estimators on every scenario; see `comparisons.compare_pairs`."""
     scores: pd.DataFrame
-    """Per scenario and estimator: capped mean error, median costs, and, over the trials that every estimator of the
-    scenario has, their number `shared_trials` and the shares `shared_success` and `shared_silent`."""
+    """Per scenario and estimator: capped mean error, median costs, and, over the trials that every
+    estimator of the scenario has, their number `shared_trials` and the shares `shared_success` and
+    `shared_silent`."""
     distributions: pd.DataFrame
-    """Quantiles of the Mahalanobis error over all trials: `probability` (of `PROBABILITIES`) and `distance`."""
+    """Quantiles of the Mahalanobis error over all trials: `probability` (of `PROBABILITIES`) and
+    `distance`."""
     convergence: pd.DataFrame
-    """Median `distance` of each `iteration` of an iterative estimator from its last iterate, the largest over the
-    parameters in deviations of the bound, over the first converged trials; 0 once half of them have ended."""
+    """Median `distance` of each `iteration` of an iterative estimator from its last iterate, the
+    largest over the parameters in deviations of the bound, over the first converged trials; 0 once
+    half of them have ended."""
     calibration: pd.DataFrame
-    """Calibration of NEES: the probability `at`, the `difference` of the empirical distribution function from the
-    uniform one there, and the ends `low` and `high` of the band; NEES and all parameters of an honest estimator keep
-    within theirs in 95 % of cases."""
+    """Calibration of NEES: the probability `at`, the `difference` of the empirical distribution
+    function from the uniform one there, and the ends `low` and `high` of the band; NEES and all
+    parameters of an honest estimator keep within theirs in 95 % of cases."""
     contraction: pd.DataFrame
-    """Per scenario, how much the fixed-point iteration contracts at the truth; empty if no file says so."""
+    """Per scenario, how much the fixed-point iteration contracts at the truth; empty if no file
+    says so."""
     tracks: pd.DataFrame
-    """Errors of each state of a tracker: time `at` of each epoch, `rmse`, `bound` at the truth, `posterior` and
-    `posterior_smoothed` Cramér-Rao bounds, and `nees` over n with the ends of its limits."""
+    """Errors of each state of a tracker: time `at` of each epoch, `rmse`, `bound` at the truth,
+    `posterior` and `posterior_smoothed` Cramér-Rao bounds, and `nees` over n with the ends of its
+    limits."""
 
     @property
     def setting_columns(self) -> list[str]:
@@ -99,7 +105,8 @@ def summarize(directories: Sequence[Path | str]) -> pd.DataFrame:
 
 
 class Begun:
-    """Holds an analysis with its summary; comparisons, and libraries that take long to load, are still to come."""
+    """Holds an analysis with its summary; comparisons, and libraries that take long to load, are
+    still to come."""
 
     def __init__(self, collection: Collection) -> None:
         self.collection = collection
@@ -188,7 +195,8 @@ def _joined(parts: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
 
 
 def _shared(sample: Sample) -> dict[str, Any]:
-    """Computes success and silent failure in the trials that every estimator of the scenario has."""
+    """Computes success and silent failure in the trials that every estimator of the scenario
+    has."""
     among = sample.present
     silent = failed(sample, known=False, among=among)
     success = share(sample.scalars["success"][among])
@@ -196,7 +204,8 @@ def _shared(sample: Sample) -> dict[str, Any]:
 
 
 def _contraction_rows(collection: Collection, group: Group) -> list[dict[str, Any]]:
-    """Computes median and largest contraction constants of a scenario's trials, and how often they are below 1."""
+    """Computes median and largest contraction constants of a scenario's trials, and how often they
+    are below 1."""
     parts = [collection.load(truth, (), CONTRACTION) for truth in group.truths if truth is not None]
     if not parts or any(name not in part for part in parts for name in CONTRACTION):
         return []
@@ -209,7 +218,8 @@ def _contraction_rows(collection: Collection, group: Group) -> list[dict[str, An
 
 
 def _ending_rows(sample: Sample) -> list[dict[str, Any]]:
-    """Counts the endings of trials that did not converge, the commonest first; trials without readings are last."""
+    """Counts the endings of trials that did not converge, the commonest first; trials without
+    readings are last."""
     lost, reasons = np.flatnonzero(~sample.converged), {s.label: s.reason for s in Status}
     messages = sample.scalars.get("message", np.full(len(sample), ""))[lost]
     ended = [

@@ -1,6 +1,8 @@
-"""From what is stored to what is compared: which cells are one experiment, and what tells them from the others.
+"""From what is stored to what is compared: which cells are one experiment, and what tells them from
+the others.
 
-What is there, and what is wrong with it, `runs.results` says; what the numbers mean, `statistics.records`.
+What is there, and what is wrong with it, `runs.results` says; what the numbers mean,
+`statistics.records`.
 """
 
 from __future__ import annotations
@@ -42,9 +44,11 @@ class Group:
     """Holds the cells of one scenario and one estimator that differ only in the seed."""
 
     columns: Mapping[str, Any]
-    """Identifying columns of the group: measurement, noise, every config leaf that differs, error_scale."""
+    """Identifying columns of the group: measurement, noise, every config leaf that differs,
+    error_scale."""
     estimator: str
-    """The estimator's label, with the options that differ where one label stands for several configs."""
+    """The estimator's label, with the options that differ where one label stands for several
+    configs."""
     options: Mapping[str, Any]
     """Differing options of the estimator, as columns."""
     cells: tuple[StoredCell, ...]
@@ -63,7 +67,8 @@ class Group:
 
 @dataclass
 class Collection(Results):
-    """Holds everything usable under some directories, grouped; `problems` and `stale` name the rest."""
+    """Holds everything usable under some directories, grouped; `problems` and `stale` name the
+    rest."""
 
     groups: tuple[Group, ...] = ()
 
@@ -77,7 +82,8 @@ class Collection(Results):
 
     @property
     def settings(self) -> int:
-        """Number of settings of simulated trials: scenarios that differ in more than the error scale."""
+        """Number of settings of simulated trials: scenarios that differ in more than the error
+        scale."""
         simulated = [
             key
             for key, groups in self.scenarios.items()
@@ -138,12 +144,12 @@ def trials_frame(collection: Collection) -> pd.DataFrame:
     return frame[sorted(frame.columns, key=place)]
 
 
-# Which config leaves tell scenarios, or the estimators of one label, apart -------------------------------------------
+# Which config leaves tell scenarios, or the estimators of one label, apart ------------------------
 
 
 def config_leaves(description: Any, prefix: str = "") -> dict[str, tuple[str, Any]]:
-    """Returns dotted keys with (class that holds the leaf, plain value); a component's own class stands under its own
-    key, that of the whole under `TARGET`."""
+    """Returns dotted keys with (class that holds the leaf, plain value); a component's own class
+    stands under its own key, that of the whole under `TARGET`."""
     if isinstance(description, list) and any(isinstance(v, Mapping) for v in description):
         description = {str(i): v for i, v in enumerate(description)}
     if not isinstance(description, Mapping):
@@ -182,7 +188,8 @@ def differing(descriptions: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _groups(cells: Sequence[StoredCell], runs: Sequence[Mapping[str, Any]]) -> tuple[Group, ...]:
-    """Forms one group per scenario and estimator: identical constructions are one, and names only show it."""
+    """Forms one group per scenario and estimator: identical constructions are one, and names only
+    show it."""
     truths = {cell.scenario_id: cell for cell in cells if cell.label == TRUTH}
     found: dict[tuple[str, str, str], list[StoredCell]] = {}
     configs: dict[str, dict[str, Any]] = {}
@@ -260,7 +267,8 @@ def _stands_in_a_name(key: str, cells: Sequence[StoredCell]) -> bool:
 
 
 def shown_leaf(value: Any) -> Any:
-    """Formats a leaf for a table: a class of ours by its own name, a long text by its beginning and a digest."""
+    """Formats a leaf for a table: a class of ours by its own name, a long text by its beginning and
+    a digest."""
     if isinstance(value, str) and value.startswith("ipe_bench."):
         return value.rpartition(".")[2]
     if isinstance(value, str) and len(value) > _LONGEST:

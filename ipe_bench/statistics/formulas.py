@@ -1,4 +1,5 @@
-"""The formulas of the statistics: each takes a sample, and gives a number or one for each parameter (n,).
+"""The formulas of the statistics: each takes a sample, and gives a number or one for each parameter
+(n,).
 
 Values per parameter are in multiples of the parameters' sizes. A mean over no trials is NaN.
 """
@@ -34,8 +35,8 @@ T = TypeVar("T")
 Ends = tuple[Any, ...]
 """Both ends of an interval."""
 CAP = 5.0
-"""Upper limit of a trial's error over the bound in `efficiency_capped`: an efficient estimate lies beyond it in fewer
-than one trial in a million."""
+"""Upper limit of a trial's error over the bound in `efficiency_capped`: an efficient estimate lies
+beyond it in fewer than one trial in a million."""
 NORMAL_95 = float(-ndtri(0.025))
 """Absolute value that 95 % of normal deviates do not exceed."""
 
@@ -87,7 +88,8 @@ def rms_columns(values: Array, used: Array | None = None) -> Array:
 
 
 def in_units(values: Array, s: Sample) -> Array:
-    """Converts values (n,) to the parameters' own units, followed by their root mean square over the linear bound."""
+    """Converts values (n,) to the parameters' own units, followed by their root mean square over
+    the linear bound."""
     return np.append(values * s.sizes, rms(values / s.linear_bound))
 
 
@@ -96,7 +98,7 @@ def of_each(values: Callable[[Sample], Array]) -> Callable[[Sample], Array]:
     return lambda s: in_units(values(s), s)
 
 
-# Errors --------------------------------------------------------------------------------------------------------------
+# Errors -------------------------------------------------------------------------------------------
 
 
 @once
@@ -111,8 +113,8 @@ def rmse_all(s: Sample) -> Array:
 
 @once
 def products(s: Sample) -> Array:
-    """Computes sums (n, n) over solved trials of products of centred errors, in multiples of the linear bound:
-    parameters may differ by many orders of magnitude."""
+    """Computes sums (n, n) over solved trials of products of centred errors, in multiples of the
+    linear bound: parameters may differ by many orders of magnitude."""
     chosen = _chosen((s.error / _unit(s)).T, s.solved)
     centred = chosen - mean(chosen.T)[:, None]
     return centred @ centred.T
@@ -140,20 +142,22 @@ def together(s: Sample) -> Array:
 
 
 def _all_squares(s: Sample) -> Array:
-    """Computes squared errors (n + 1, trials) of each parameter, and of all together over the linear bound."""
+    """Computes squared errors (n + 1, trials) of each parameter, and of all together over the
+    linear bound."""
     return np.vstack([(s.error**2).T, (s.normalised**2).T.mean(axis=0)])
 
 
 @once
 def squares(s: Sample) -> Squares:
-    """Computes squared errors of solved trials, of each parameter, and of all together over the linear bound."""
+    """Computes squared errors of solved trials, of each parameter, and of all together over the
+    linear bound."""
     return Squares.of(_chosen(_all_squares(s), s.solved))
 
 
 @once
 def degrees(s: Sample) -> Array:
-    """Computes the degrees of freedom (n + 1,) of these squares if errors are normal: 1 of each parameter; of all
-    parameters what matches the variance (Satterthwaite, Biometrics 2, 1946)."""
+    """Computes the degrees of freedom (n + 1,) of these squares if errors are normal: 1 of each
+    parameter; of all parameters what matches the variance (Satterthwaite, Biometrics 2, 1946)."""
     factors = _unit(s) / s.linear_bound
     scaled = products(s) * np.outer(factors, factors)
     matching = np.trace(scaled) ** 2 / np.sum(scaled**2)
@@ -163,14 +167,16 @@ def degrees(s: Sample) -> Array:
 
 @once
 def rmse_unseen(s: Sample) -> Array:
-    """Computes shares (n + 1,) of trials that may have larger errors than those seen; see `intervals.unseen`."""
+    """Computes shares (n + 1,) of trials that may have larger errors than those seen; see
+    `intervals.unseen`."""
     return unseen(_chosen(_all_squares(s), s.solved), degrees(s))
 
 
 @once
 def rmse_ends(s: Sample) -> tuple[Array, Array]:
-    """Computes ends (n + 1,) of the intervals of rmse: per parameter, and of all over the linear bound; the upper one
-    is NaN where larger errors may be unseen, and where few trials carry the sum, see `intervals.few_carry`."""
+    """Computes ends (n + 1,) of the intervals of rmse: per parameter, and of all over the linear
+    bound; the upper one is NaN where larger errors may be unseen, and where few trials carry the
+    sum, see `intervals.few_carry`."""
     low, high = rms_interval(_all_squares(s).T, s.solved)
     return low, np.where(few_carry(squares(s), degrees(s)), np.nan, _unless_unseen(s, high))
 
@@ -181,7 +187,8 @@ def _unless_unseen(s: Sample, high: Array) -> Array:
 
 @once
 def rmse_sequence(s: Sample) -> tuple[Array, Array]:
-    """Computes ends (n + 1,) of such intervals at all numbers of trials at once, from the errors that were seen."""
+    """Computes ends (n + 1,) of such intervals at all numbers of trials at once, from the errors
+    that were seen."""
     return rms_sequence(squares(s), degrees(s))
 
 
@@ -221,7 +228,8 @@ def efficiency_capped_limits(s: Sample) -> Ends:
 
 
 def capped_error(s: Sample) -> float:
-    """Computes the mean Mahalanobis error of the trials that all estimators have, each at most the gate's radius."""
+    """Computes the mean Mahalanobis error of the trials that all estimators have, each at most the
+    gate's radius."""
     error = np.minimum(s.distance[s.present], np.sqrt(gate(s.n)))
     return float(error.mean()) if len(error) else np.nan
 
@@ -243,7 +251,8 @@ def misfit(s: Sample) -> float:
 
 
 def ambiguous(s: Sample) -> float:
-    """Computes the share of ambiguous trials among those in which the estimator has looked for several minima."""
+    """Computes the share of ambiguous trials among those in which the estimator has looked for
+    several minima."""
     flags = s.scalars.get(AMBIGUOUS, np.empty(0))
     flags = flags[np.isfinite(flags)]
     return share(flags > 0) if len(flags) else np.nan
@@ -260,7 +269,7 @@ def false_root_distance(s: Sample) -> float:
     return quantile(s.scalars["root_distance"][wrong], 0.5) if known else np.nan
 
 
-# Bounds and theory ---------------------------------------------------------------------------------------------------
+# Bounds and theory --------------------------------------------------------------------------------
 
 
 @once
@@ -296,8 +305,8 @@ def efficiency_all(s: Sample) -> Array:
 
 @once
 def van_trees(s: Sample) -> tuple[Array, Array]:
-    """Computes the bound (n,) over the first trials of the seeds, and its standard error: of the mean of squared
-    bounds, whose errors are twice the bound times its own."""
+    """Computes the bound (n,) over the first trials of the seeds, and its standard error: of the
+    mean of squared bounds, whose errors are twice the bound times its own."""
     bound, error = s.of_truth("van_trees"), s.of_truth("van_trees_error")
     drawn: Array = np.asarray(~np.isnan(bound[:, 0]))
     middle = np.sqrt(mean(bound**2, drawn))
@@ -307,7 +316,8 @@ def van_trees(s: Sample) -> tuple[Array, Array]:
 
 
 def van_trees_limits(s: Sample) -> Ends:
-    """Computes limits of the bound for infinitely many truths, by the scatter of the information among those used."""
+    """Computes limits of the bound for infinitely many truths, by the scatter of the information
+    among those used."""
     bound, error = van_trees(s)
     return in_units(np.maximum(bound - NORMAL_95 * error, 0.0), s), in_units(
         bound + NORMAL_95 * error, s
@@ -315,8 +325,8 @@ def van_trees_limits(s: Sample) -> Ends:
 
 
 def eq_14(s: Sample) -> Array:
-    r"""Computes standard deviations (n,) by eq. (14), with dN = N(x) - N(x^): at a root of eq. (11), H+ dN is the error
-    less H+ v.
+    r"""Computes standard deviations (n,) by eq. (14), with dN = N(x) - N(x^): at a root of eq.
+    (11), H+ dN is the error less H+ v.
 
     .. math:: P = H^+ R H^{+T} + H^+ \, \mathrm{E}(\delta N \, \delta N^T) \, H^{+T}
     """
@@ -327,10 +337,11 @@ def eq_14(s: Sample) -> Array:
 
 @once
 def predicted(s: Sample) -> tuple[Array, Array]:
-    """Computes the bias (n,) and root mean square error (n,) expected of least squares; NaN for other estimators.
+    """Computes the bias (n,) and root mean square error (n,) expected of least squares; NaN for
+    other estimators.
 
-    Where readings come from another model, from each trial's pseudo-true parameters and the scatter about them; where
-    they do not, from the Cramér-Rao bound and Box's bias.
+    Where readings come from another model, from each trial's pseudo-true parameters and the scatter
+    about them; where they do not, from the Cramér-Rao bound and Box's bias.
     """
     if s.group.footer.get("equation") != "least_squares":
         return np.full(s.n, np.nan), np.full(s.n, np.nan)
@@ -353,7 +364,7 @@ def median_of_truth(s: Sample, name: str) -> float:
     return quantile(values[np.isfinite(values)], 0.5)
 
 
-# What estimators claim -----------------------------------------------------------------------------------------------
+# What estimators claim ----------------------------------------------------------------------------
 
 
 @once
@@ -385,7 +396,8 @@ def nees_median(s: Sample) -> float:
 
 
 def nees_median_limits(s: Sample) -> Ends:
-    """Computes limits of the median of N independent values, whose probability is beta-distributed."""
+    """Computes limits of the median of N independent values, whose probability is
+    beta-distributed."""
     if not reports_covariance(s):
         return np.nan, np.nan
     middle = (len(s) + 1) / 2
@@ -402,13 +414,14 @@ def coverage(s: Sample) -> Any:
 
 
 def verdict_on(nees: Array, degrees: int, s: Sample) -> Verdict:
-    """Words the NEES of the converged trials at a level that all verdicts of a setting share (Bonferroni): where all
-    covariances are right, none is called wrong in 95 % of the reports."""
+    """Words the NEES of the converged trials at a level that all verdicts of a setting share
+    (Bonferroni): where all covariances are right, none is called wrong in 95 % of the reports."""
     return verdict(nees[s.converged], degrees, 1 - (1 - LEVEL) / s.verdicts)
 
 
 def calibration_p(s: Sample) -> Any:
-    """Computes the p of each parameter, and of all by Bonferroni's correction, which needs no independence."""
+    """Computes the p of each parameter, and of all by Bonferroni's correction, which needs no
+    independence."""
     p = [part.p for part in s.calibrations]
     return [*p[:-1], min(1.0, len(p) * min(p))] if p else np.nan
 
@@ -423,7 +436,7 @@ def mean_nis(s: Sample) -> float:
     return float(np.mean(values[np.isfinite(values)])) if np.isfinite(values).any() else np.nan
 
 
-# Iterations ----------------------------------------------------------------------------------------------------------
+# Iterations ---------------------------------------------------------------------------------------
 
 
 def _uses(s: Sample, method: str) -> bool:
@@ -433,11 +446,12 @@ def _uses(s: Sample, method: str) -> bool:
 
 
 def fixed_point_bound(iterates: Array, K: float) -> tuple[bool, float]:
-    """Computes whether the largest error |x_k - x| of each iterate (iterates, n) is at most K^k / (1 - K) |x_1 - x_0|,
-    eq. (18) with the k that the print lost, for K below 1, and the largest such ratio of the iterates between the ends.
+    """Computes whether the largest error |x_k - x| of each iterate (iterates, n) is at most K^k /
+    (1 - K) |x_1 - x_0|, eq. (18) with the k that the print lost, for K below 1, and the largest
+    such ratio of the iterates between the ends.
 
-    The last iterate is taken for x (Burden and Faires, Numerical Analysis). The bound is proven for a K that holds all
-    along the iterates.
+    The last iterate is taken for x (Burden and Faires, Numerical Analysis). The bound is proven for
+    a K that holds all along the iterates.
     """
     error = np.abs(iterates - iterates[-1]).max(axis=1)
     bound = K ** np.arange(len(iterates)) / (1 - K) * np.abs(iterates[1] - iterates[0]).max()
@@ -446,8 +460,9 @@ def fixed_point_bound(iterates: Array, K: float) -> tuple[bool, float]:
 
 
 def observed_constant(iterates: Array) -> float:
-    """Computes the least M with which eq. (23), e_(k+1) <= n^2 M / 2 e_k^2, explains the errors of iterates (iterates,
-    n) that exceed round-off, with the last iterate for the root; NaN where they are over too soon."""
+    """Computes the least M with which eq. (23), e_(k+1) <= n^2 M / 2 e_k^2, explains the errors of
+    iterates (iterates, n) that exceed round-off, with the last iterate for the root; NaN where they
+    are over too soon."""
     e = np.abs(iterates - iterates[-1]).max(axis=1)
     usable = (e[:-1] > FLOOR) & (e[1:] > FLOOR)
     ratios = 2 * e[1:][usable] / (iterates.shape[1] ** 2 * e[:-1][usable] ** 2)
@@ -456,7 +471,8 @@ def observed_constant(iterates: Array) -> float:
 
 @once
 def fixed_point_bounds(s: Sample) -> Array:
-    """Computes `fixed_point_bound` (histories, 2) of each history of fixed-point iteration whose K is below 1."""
+    """Computes `fixed_point_bound` (histories, 2) of each history of fixed-point iteration whose K
+    is below 1."""
     histories = s.histories if _uses(s, "FixedPoint") else ()
     return np.array([fixed_point_bound(h.iterates, h.K) for h in histories if h.K < 1]).reshape(
         -1, 2
@@ -465,7 +481,8 @@ def fixed_point_bounds(s: Sample) -> Array:
 
 @once
 def constants(s: Sample) -> Array:
-    """Computes M as observed and at the truth (histories, 2), of each history of Newton's method that has both."""
+    """Computes M as observed and at the truth (histories, 2), of each history of Newton's method
+    that has both."""
     histories = s.histories if _uses(s, "Newton") else ()
     pairs = np.array([(observed_constant(h.iterates), h.M) for h in histories]).reshape(-1, 2)
     return pairs[np.isfinite(pairs).all(axis=1)]

@@ -63,7 +63,8 @@ def add_statistics(records: Sequence[Statistic]) -> list[str]:
 
 
 def fault_of(record: Any) -> str:
-    """Returns the fault that keeps a record from being added to ours and the others; empty if there is none."""
+    """Returns the fault that keeps a record from being added to ours and the others; empty if there
+    is none."""
     if not isinstance(record, Statistic):
         return f"is a {type(record).__name__} and not a Statistic"
     others = [other for other in _of_plugins.values() if other is not record]
@@ -120,9 +121,11 @@ def current_name(column: str) -> str:
 
 
 def main_columns(summary: pd.DataFrame) -> pd.DataFrame:
-    """Selects the columns of `summary.csv`: what a row is of, and the main statistics and those of plugins, rounded.
+    """Selects the columns of `summary.csv`: what a row is of, and the main statistics and those of
+    plugins, rounded.
 
-    `summary_all.csv` has all digits: trials that could tell more than four apart are hardly ever run.
+    `summary_all.csv` has all digits: trials that could tell more than four apart are hardly ever
+    run.
     """
     states = "noise" in summary and (summary["noise"] == "model").any()
     main = [s for s in STATISTICS if s.name in (MAIN_OF_STATES if states else MAIN)]
@@ -135,10 +138,11 @@ def main_columns(summary: pd.DataFrame) -> pd.DataFrame:
 
 
 def summary_rows(sample: Sample) -> list[dict[str, Any]]:
-    """Computes a row per parameter and one over all, without the comparison of the estimator with its rivals.
+    """Computes a row per parameter and one over all, without the comparison of the estimator with
+    its rivals.
 
-    A statistic that was added and raises, or gives what cannot be shown, is missing in these rows, and named in the
-    collection's problems.
+    A statistic that was added and raises, or gives what cannot be shown, is missing in these rows,
+    and named in the collection's problems.
     """
     rows = rows_of(STATISTICS, sample)
     for record in _of_plugins.values():

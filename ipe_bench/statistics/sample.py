@@ -1,4 +1,5 @@
-"""All stored trials of one scenario under one estimator: the numbers that statistics are computed from."""
+"""All stored trials of one scenario under one estimator: the numbers that statistics are computed
+from."""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ FIT = "fit_p"
 NIS = "extra_nis"
 """The column of the normalised innovations squared that filters report."""
 AMBIGUOUS = "extra_ambiguous"
-"""The column in which estimators that look for several minima report 1 if they found some, else 0."""
+"""The column in which estimators that look for several minima report 1 if they found some, else
+0."""
 SCALARS = (
     "status",
     "solved",
@@ -67,7 +69,8 @@ class History:
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """Holds all trials of one group by seeds; errors and deviations in multiples of the parameters' sizes.
+    """Holds all trials of one group by seeds; errors and deviations in multiples of the parameters'
+    sizes.
 
     Trials without readings are left out of all arrays. Arrays cannot be written into.
     """
@@ -87,14 +90,15 @@ class Sample:
     solved_by_all: Array
     """(trials,)"""
     unread: Array
-    """The numbers of the trials that have no readings, since the model gives none at their true parameters."""
+    """The numbers of the trials that have no readings, since the model gives none at their true
+    parameters."""
     kept: dict[Any, Any] = field(default_factory=dict, repr=False)
     """Cache of derived quantities; see `formulas.once`."""
 
     @classmethod
     def load(cls, collection: Collection, group: Group, present: Array, solved: Array) -> Sample:
-        """Loads the stored trials of a group; `present` and `solved` are the numbers of those that all rivals have, and
-        all solved."""
+        """Loads the stored trials of a group; `present` and `solved` are the numbers of those that
+        all rivals have, and all solved."""
         names = [p["name"] for p in group.footer["parameters"]]
         errors, deviations = (
             [f"{kind}_{name}" for name in names] for kind in ("error", "deviation")
@@ -162,7 +166,8 @@ class Sample:
 
     @property
     def iterates(self) -> bool:
-        """Whether the estimator approaches a limit step by step; the epochs of a filter are not such steps."""
+        """Whether the estimator approaches a limit step by step; the epochs of a filter are not
+        such steps."""
         return not self.group.footer.get("sequential", False)
 
     @property
@@ -172,8 +177,8 @@ class Sample:
 
     @cached_property
     def verdicts(self) -> int:
-        """The number of verdicts in the tables of its setting: of each estimator and error scale one, and of states
-        that move one each on the last epoch, on the path and on innovations."""
+        """The number of verdicts in the tables of its setting: of each estimator and error scale
+        one, and of states that move one each on the last epoch, on the path and on innovations."""
         own = _without_scale(self.group)
         rows = sum(_without_scale(group) == own for group in self.collection.groups)
         return rows * (3 if "path_nees" in self.scalars else 1)
@@ -185,15 +190,16 @@ class Sample:
 
     @cached_property
     def distance(self) -> Array:
-        """Mahalanobis errors (trials,) in deviations of the Cramér-Rao bound, infinite where not finite."""
+        """Mahalanobis errors (trials,) in deviations of the Cramér-Rao bound, infinite where not
+        finite."""
         distance = np.sqrt(self.scalars["crlb_distance"])
         distance[~np.isfinite(distance)] = np.inf
         return distance
 
     @property
     def inside_gate(self) -> Mask:
-        """Success (trials,) by the Cramér-Rao bound, one gate for all; the column `success` is by the bound that
-        the estimator is held against."""
+        """Success (trials,) by the Cramér-Rao bound, one gate for all; the column `success` is by
+        the bound that the estimator is held against."""
         return self.scalars["crlb_distance"] <= gate(self.n)
 
     @property
@@ -202,12 +208,13 @@ class Sample:
         return self.error / self.linear_bound
 
     def of_truth(self, kind: str) -> Array:
-        """Reads what is stored of the truth for each parameter (trials, n), or (trials,) by a name in `TRUTH_COLUMNS`;
-        NaN where it is not stored."""
+        """Reads what is stored of the truth for each parameter (trials, n), or (trials,) by a name
+        in `TRUTH_COLUMNS`; NaN where it is not stored."""
         return self._stored(kind, self.group.truths)
 
     def of_estimate(self, kind: str) -> Array:
-        """Reads what is stored of the estimates for each parameter (trials, n) besides errors and deviations."""
+        """Reads what is stored of the estimates for each parameter (trials, n) besides errors and
+        deviations."""
         return self._stored(kind, self.group.cells)
 
     def _stored(self, kind: str, cells: Sequence[StoredCell | None]) -> Array:
@@ -226,12 +233,14 @@ class Sample:
 
     @cached_property
     def calibrations(self) -> list[Calibration]:
-        """Honesty of the reported covariance for each parameter, and for all last; empty where none is reported."""
+        """Honesty of the reported covariance for each parameter, and for all last; empty where none
+        is reported."""
         return calibrations(self.error, self.deviation, self.scalars["nees"], self.converged)
 
     @cached_property
     def histories(self) -> list[History]:
-        """Histories of the converged trials whose iterates are stored; none for a filter, which has epochs instead."""
+        """Histories of the converged trials whose iterates are stored; none for a filter, which has
+        epochs instead."""
         if not self.iterates:
             return []
         found = []
@@ -293,18 +302,19 @@ def _numbers(cell: StoredCell, trial: Array) -> Array:
     return cell.seed * _SEED + trial.astype(np.int64)
 
 
-# Iterations ----------------------------------------------------------------------------------------------------------
+# Iterations ---------------------------------------------------------------------------------------
 
 
 def distances_to_limit(iterates: Array, deviation: Array) -> Array:
-    """Computes the largest component of each iterate's distance from the last one, in standard deviations (n,)."""
+    """Computes the largest component of each iterate's distance from the last one, in standard
+    deviations (n,)."""
     with np.errstate(invalid="ignore"):
         return np.abs((iterates - iterates[-1]) / deviation).max(axis=1)
 
 
 def median_distances(histories: Sequence[History]) -> Array:
-    """Computes medians (iterates,) over trials of the distances from their limits; an ended trial counts as nearest: 0
-    once half have."""
+    """Computes medians (iterates,) over trials of the distances from their limits; an ended trial
+    counts as nearest: 0 once half have."""
     table = np.zeros((max(len(h.distances) for h in histories), len(histories)))
     for i, h in enumerate(histories):
         table[: len(h.distances), i] = np.where(np.isfinite(h.distances), h.distances, np.inf)
@@ -318,8 +328,8 @@ def iterations_to_limit(distances: Array) -> int:
 
 
 def orders_of(errors: Array, floor: float = FLOOR) -> Array:
-    """Computes log(e_(k+1) / e_k) / log(e_k / e_(k-1)) of successive errors (iterates,), where they decrease above the
-    floor: 1 where convergence is linear, 2 where it is quadratic."""
+    """Computes log(e_(k+1) / e_k) / log(e_k / e_(k-1)) of successive errors (iterates,), where they
+    decrease above the floor: 1 where convergence is linear, 2 where it is quadratic."""
     e = errors[: np.argmax(np.append(errors <= floor, True))]
     with np.errstate(divide="ignore", invalid="ignore"):
         orders = np.log(e[2:] / e[1:-1]) / np.log(e[1:-1] / e[:-2])

@@ -1,4 +1,5 @@
-"""Defines what a statistic is: its name and meaning, its trials, its formula and its format in one record."""
+"""Defines what a statistic is: its name and meaning, its trials, its formula and its format in one
+record."""
 
 from __future__ import annotations
 
@@ -25,8 +26,8 @@ Where = Literal[
     "calibration",
     "tracks",
 ]
-"""A table; its columns are in the order of the records. The overview and the terminal's table show those of plugins
-behind their own."""
+"""A table; its columns are in the order of the records. The overview and the terminal's table show
+those of plugins behind their own."""
 Condition = Literal["", "solved", "common"]
 ALL = "all"
 """The row of the summary over all parameters."""
@@ -37,15 +38,18 @@ Ends = tuple[Any, Any]
 
 @dataclass(frozen=True)
 class Statistic:
-    """Defines a statistic of a scenario under an estimator, which becomes a column of `summary_all.csv` and of tables.
+    """Defines a statistic of a scenario under an estimator, which becomes a column of
+    `summary_all.csv` and of tables.
 
-    Required: `name`, `title`, `over`, `meaning` and `values`.
-    Optional: `limits` (an interval); `given`, `kind`, `where`, `titles`, `limits_titles` and `rare` (how it is shown).
-    Promised: `values` takes a `Sample`, which it does not write into, and returns one number, or one for each parameter
-    in its own unit and last that of all parameters together (n + 1,), NaN where it is undefined. `limits` returns both
-    ends of the interval in the same form. Names of columns are new, in ASCII letters, digits and underscores.
+    Required: `name`, `title`, `over`, `meaning` and `values`. Optional: `limits` (an interval);
+    `given`, `kind`, `where`, `titles`, `limits_titles` and `rare` (how it is shown). Promised:
+    `values` takes a `Sample`, which it does not write into, and returns one number, or one for each
+    parameter in its own unit and last that of all parameters together (n + 1,), NaN where it is
+    undefined. `limits` returns both ends of the interval in the same form. Names of columns are
+    new, in ASCII letters, digits and underscores.
 
-    A plugin offers a record by `conf/statistic/NAME.yaml`; a record that breaks a promise is left out with a line.
+    A plugin offers a record by `conf/statistic/NAME.yaml`; a record that breaks a promise is left
+    out with a line.
 
     >>> import tempfile
     >>> import ipe_bench as ib
@@ -65,7 +69,8 @@ class Statistic:
     """
 
     name: str
-    """Names its column; the ends of its interval are `name_low` and `name_high`, with `limits_given` behind."""
+    """Names its column; the ends of its interval are `name_low` and `name_high`, with
+    `limits_given` behind."""
     title: str
     """Heads its column in tables."""
     over: str
@@ -86,7 +91,8 @@ class Statistic:
     rare: bool = False
     """Leaves it out of tables in which no estimator reports it."""
     limits_given: Literal["", "_if_honest"] = ""
-    """Ends the names of `limits` that are not of the value: values of a right covariance lie within them."""
+    """Ends the names of `limits` that are not of the value: values of a right covariance lie within
+    them."""
 
     @property
     def columns(self) -> tuple[str, ...]:

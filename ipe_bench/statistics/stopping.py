@@ -1,4 +1,5 @@
-"""Runs that end when a precision is reached, and one number of what they stored for those who optimise."""
+"""Runs that end when a precision is reached, and one number of what they stored for those who
+optimise."""
 
 from __future__ import annotations
 
@@ -30,13 +31,14 @@ from ipe_bench.trials.scenario import MOST_TRIALS, TRIALS
 NARROW = "every interval is narrow enough"
 """Reason of a scenario that stops because it has the requested precision."""
 WITH_PRECISION = ("success", "rmse")
-"""Statistics with a precision: success as a difference of shares, of every estimator; rmse as a ratio less 1, of the
-root mean square over parameters of error over bound, of the trials that an estimator solved."""
+"""Statistics with a precision: success as a difference of shares, of every estimator; rmse as a
+ratio less 1, of the root mean square over parameters of error over bound, of the trials that an
+estimator solved."""
 
 
 def precision_of(given: float | Mapping[str, float]) -> Mapping[str, float]:
-    """Returns the requested precision by statistic, valid at any number of trials: from a number, which is that of
-    success, or from numbers by name.
+    """Returns the requested precision by statistic, valid at any number of trials: from a number,
+    which is that of success, or from numbers by name.
 
     Raises:
         UserError: it is neither.
@@ -56,8 +58,8 @@ def precision_of(given: float | Mapping[str, float]) -> Mapping[str, float]:
 
 
 def _distances(sample: Sample, wanted: Mapping[str, float]) -> Iterator[tuple[float, str]]:
-    """Computes the ratio of each statistic's interval to the requested precision, above 1 if too wide, and words for
-    it."""
+    """Computes the ratio of each statistic's interval to the requested precision, above 1 if too
+    wide, and words for it."""
     for statistic, precision in wanted.items():
         if statistic == "success":
             share = float(sample.scalars["success"].mean())
@@ -93,13 +95,14 @@ def compute_until(
     watch: Watcher | None = None,
     command: str | None = None,
 ) -> tuple[tuple[str, ...], list[dict[str, Any]]]:
-    """Adds blocks to what is stored under `output` until every interval is narrow enough, there are `most` trials
-    (`MOST_TRIALS` where None), or `time_limit` seconds are over, which is looked at between rounds of blocks; without a
-    precision until there are `most` trials (`TRIALS` where None).
+    """Adds blocks to what is stored under `output` until every interval is narrow enough, there are
+    `most` trials (`MOST_TRIALS` where None), or `time_limit` seconds are over, which is looked at
+    between rounds of blocks; without a precision until there are `most` trials (`TRIALS` where
+    None).
 
-    Returns the messages of what failed, and a row per scenario that has a precision: its names, how many `trials` it
-    took, the `reason` why it took no more, `NARROW` if the precision is reached, and the `widest` statistic, which is
-    farthest from it.
+    Returns the messages of what failed, and a row per scenario that has a precision: its names, how
+    many `trials` it took, the `reason` why it took no more, `NARROW` if the precision is reached,
+    and the `widest` statistic, which is farthest from it.
 
     Raises:
         UserError: what was asked for cannot be computed; nothing is computed then.
@@ -162,8 +165,8 @@ def compute_until(
 
 
 def next_trials(trials: int, ratio: float, block: int, most: int) -> int:
-    """Computes how many trials to have before looking again: what the widths ask for, at most twice as many as now, in
-    whole blocks. Widths shrink with the root of the number."""
+    """Computes how many trials to have before looking again: what the widths ask for, at most twice
+    as many as now, in whole blocks. Widths shrink with the root of the number."""
     wanted = (
         2.0 * trials if not math.isfinite(ratio) else min(2.0 * trials, 1.02 * trials * ratio**2)
     )
@@ -197,9 +200,11 @@ def objective(
     column: str,
     output: Path | str,
 ) -> float:
-    """Returns one number for an estimator: a column of its row over all parameters, of all stored trials.
+    """Returns one number for an estimator: a column of its row over all parameters, of all stored
+    trials.
 
-    Columns that compare estimators, such as capped_error, are over the trials that all of these estimators have.
+    Columns that compare estimators, such as capped_error, are over the trials that all of these
+    estimators have.
 
     Raises:
         UserError: nothing is stored, or the number is not known.
