@@ -43,44 +43,51 @@ def compare_pairs(outcomes: Mapping[str, Outcomes]) -> list[dict[str, Any]]:
     the trials in which the first alone succeeds; `p_success` is McNemar's exact test of these
     numbers.
     """
+    return [
+        {"first": first, "second": second, **_compared(first, a, second, b)}
+        for (first, a), (second, b) in itertools.combinations(outcomes.items(), 2)
+    ]
+
+
+def _compared(first: str, a: Outcomes, second: str, b: Outcomes) -> dict[str, Any]:
+    """Returns the numbers of `compare_pairs` on one pair."""
     from scipy.stats import rankdata, wilcoxon  # late: takes longer to load than all else here
 
-    rows = []
-    for (first, a), (second, b) in itertools.combinations(outcomes.items(), 2):
-        d = differences(a.distance, b.distance)
-        differing = d[d != 0]
-        side = float(np.sign(differing) @ rankdata(np.abs(differing)))
-        alone = int((a.success & ~b.success).sum()), int((b.success & ~a.success).sum())
-        row = {"first": first, "second": second, "trials": len(d)}
-        row |= {
-            "wins": int((d < 0).sum()),
-            "ties": len(d) - len(differing),
-            "losses": int((d > 0).sum()),
-        }
-        row["median_difference"] = float(np.median(d)) if len(d) else float("nan")
-        row["p_error"] = float(np.asarray(wilcoxon(differing))[1]) if len(differing) else 1.0
-        row["favours"] = first if side < 0 else second if side > 0 else ""
-        rows.append(
-            row | {"only_first": alone[0], "only_second": alone[1], "p_success": mcnemar(*alone)}
-        )
-    return rows
+    d = differences(a.distance, b.distance)
+    differing = d[d != 0]
+    median = float(np.median(d)) if len(d) else float("nan")
+    p_error = float(np.asarray(wilcoxon(differing))[1]) if len(differing) else 1.0
+    # The sum of signed ranks: below 0 where the larger differences are in favour of the first.
+    side = float(np.sign(differing) @ rankdata(np.abs(differing)))
+    favours = ""
+    if side:
+        favours = first if side < 0 else second
+    only_first = int((a.success & ~b.success).sum())
+    only_second = int((b.success & ~a.success).sum())
+    return {
+        "trials": len(d),
+        "wins": int((d < 0).sum()),
+        "ties": len(d) - len(differing),
+        "losses": int((d > 0).sum()),
+        "median_difference": median,
+        "p_error": p_error,
+        "favours": favours,
+        "only_first": only_first,
+        "only_second": only_second,
+        "p_success": mcnemar(only_first, only_second),
+    }
 
 
 def corrected(pairs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Corrects each kind of p by Holm over all rows, and adds `closer`: the estimator that is
     significantly closer to the truth, or empty."""
-    p_error, p_success = (
-        holm([pair[name] for pair in pairs]).tolist() for name in ("p_error", "p_success")
-    )
-    return [
-        {
-            **pair,
-            "p_error": error,
-            "p_success": success,
-            "closer": pair["favours"] if error < ALPHA else "",
-        }
-        for pair, error, success in zip(pairs, p_error, p_success, strict=True)
-    ]
+    p_error = holm([pair["p_error"] for pair in pairs]).tolist()
+    p_success = holm([pair["p_success"] for pair in pairs]).tolist()
+    rows = []
+    for pair, error, success in zip(pairs, p_error, p_success, strict=True):
+        closer = pair["favours"] if error < ALPHA else ""
+        rows.append({**pair, "p_error": error, "p_success": success, "closer": closer})
+    return rows
 
 
 def differences(first: Array, second: Array) -> Array:
@@ -95,18 +102,24 @@ def differences(first: Array, second: Array) -> Array:
 def mcnemar(only_first: int, only_second: int) -> float:
     """Computes the two-sided p of McNemar's exact test (Psychometrika 12, 1947), by tosses of a
     fair coin."""
-    return min(1.0, 2 * float(bdtr(min(only_first, only_second), only_first + only_second, 0.5)))
+    fewer = min(only_first, only_second)
+    one_sided = float(bdtr(fewer, only_first + only_second, 0.5))
+    return min(1.0, 2 * one_sided)
 
 
 def holm(p: Sequence[float], weights: Sequence[float] | None = None) -> Array:
     """Corrects p-values so that any error among them has the stated probability, which is shared by
     the weights, or evenly (Holm, Scand. J. Statist. 6, 1979, section 4)."""
-    shares = np.ones(len(p)) if weights is None else np.asarray(weights, dtype=float)
+    shares = np.ones(len(p))
+    if weights is not None:
+        shares = np.asarray(weights, dtype=float)
     values = np.asarray(p, dtype=float) / shares
     order = np.argsort(values, kind="stable")
-    steps = values[order] * np.cumsum(shares[order][::-1])[::-1]
+    # The k-th smallest is multiplied by the weight of all that are not smaller.
+    remaining = np.cumsum(shares[order][::-1])[::-1]
+    steps = np.maximum.accumulate(values[order] * remaining)
     result = np.empty(len(values))
-    result[order] = np.minimum(np.maximum.accumulate(steps), 1.0)
+    result[order] = np.minimum(steps, 1.0)
     return result
 
 
@@ -119,6 +132,9 @@ def may_be_best(success: Array, level: float = ALPHA) -> Array:
     the best: Hsu, Ann. Statist. 9, 1981).
     """
     k = success.shape[1]
-    won = (success.astype(float).T @ (~success).astype(float)).astype(int)
+    # won[i, j]: trials in which i succeeds and j fails.
+    succeeded = success.astype(float)
+    won = (succeeded.T @ (1 - succeeded)).astype(int)
     p = bdtr(won, won + won.T, 0.5)
-    return p.min(axis=1, initial=1.0) > level / max(k - 1, 1)
+    against_all = p.min(axis=1, initial=1.0)
+    return against_all > level / max(k - 1, 1)

@@ -57,7 +57,10 @@ def once(formula: Callable[[Sample], T]) -> Callable[[Sample], T]:
 def mean(values: Array, used: Array | None = None) -> Array:
     """Computes the mean (k,) of columns (trials, k) over the trials used; NaN if there is none."""
     chosen = _chosen(values.T, used)
-    return chosen.sum(axis=1) / chosen.shape[1] if chosen.shape[1] else np.full(len(chosen), np.nan)
+    count = chosen.shape[1]
+    if not count:
+        return np.full(len(chosen), np.nan)
+    return chosen.sum(axis=1) / count
 
 
 def _chosen(rows: Array, used: Array | None) -> Array:
@@ -71,15 +74,23 @@ def share(mask: Array) -> float:
 
 def ratio(a: Any, b: Any) -> Array:
     """Computes a / b; NaN where b is not above 0."""
-    a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
+    a = np.asarray(a, dtype=float)
+    b = np.asarray(b, dtype=float)
     return np.where(b > 0, a / b, np.nan)
 
 
 def rms(values: Array) -> float:
     size = np.abs(values).max(initial=0.0)
     # The squares of larger numbers are infinite.
-    size = size if 1e150 < size < np.inf else 1.0
-    return float(size * np.sqrt(np.mean((values / size) ** 2)))
+    if not 1e150 < size < np.inf:
+        size = 1.0
+    mean_square = np.mean((values / size) ** 2)
+    return float(size * np.sqrt(mean_square))
+
+
+def chi_square_quantile(degrees: int, probability: Any) -> Any:
+    """Computes quantiles of the chi-square law, whose half follows a gamma law."""
+    return 2 * gammaincinv(degrees / 2, probability)
 
 
 def rms_columns(values: Array, used: Array | None = None) -> Array:
@@ -115,7 +126,8 @@ def rmse_all(s: Sample) -> Array:
 def products(s: Sample) -> Array:
     """Computes sums (n, n) over solved trials of products of centred errors, in multiples of the
     linear bound: parameters may differ by many orders of magnitude."""
-    chosen = _chosen((s.error / _unit(s)).T, s.solved)
+    normalised = s.error / _unit(s)
+    chosen = _chosen(normalised.T, s.solved)
     centred = chosen - mean(chosen.T)[:, None]
     return centred @ centred.T
 
@@ -128,11 +140,9 @@ def _unit(s: Sample) -> Array:
 def std(s: Sample) -> Array:
     """Computes the standard deviation (n - 1)."""
     count = int(s.solved.sum())
-    return (
-        _unit(s) * np.sqrt(np.diag(products(s)) / (count - 1))
-        if count > 1
-        else np.full(s.n, np.nan)
-    )
+    if count < 2:
+        return np.full(s.n, np.nan)
+    return _unit(s) * np.sqrt(np.diag(products(s)) / (count - 1))
 
 
 @once
@@ -144,7 +154,8 @@ def together(s: Sample) -> Array:
 def _all_squares(s: Sample) -> Array:
     """Computes squared errors (n + 1, trials) of each parameter, and of all together over the
     linear bound."""
-    return np.vstack([(s.error**2).T, (s.normalised**2).T.mean(axis=0)])
+    whole = (s.normalised**2).T.mean(axis=0)
+    return np.vstack([(s.error**2).T, whole])
 
 
 @once
@@ -160,8 +171,11 @@ def degrees(s: Sample) -> Array:
     parameter; of all parameters what matches the variance (Satterthwaite, Biometrics 2, 1946)."""
     factors = _unit(s) / s.linear_bound
     scaled = products(s) * np.outer(factors, factors)
+    # The squared sum of the covariance's eigenvalues over the sum of their squares.
     matching = np.trace(scaled) ** 2 / np.sum(scaled**2)
-    whole = np.floor(matching + 1e-9) if 1 <= matching <= s.n + 1e-6 else 1.0
+    whole = 1.0
+    if 1 <= matching <= s.n + 1e-6:
+        whole = np.floor(matching + 1e-9)
     return np.array([*np.ones(s.n), whole])
 
 
@@ -178,7 +192,8 @@ def rmse_ends(s: Sample) -> tuple[Array, Array]:
     bound; the upper one is NaN where larger errors may be unseen, and where few trials carry the
     sum, see `intervals.few_carry`."""
     low, high = rms_interval(_all_squares(s).T, s.solved)
-    return low, np.where(few_carry(squares(s), degrees(s)), np.nan, _unless_unseen(s, high))
+    few = few_carry(squares(s), degrees(s))
+    return low, np.where(few, np.nan, _unless_unseen(s, high))
 
 
 def _unless_unseen(s: Sample, high: Array) -> Array:
@@ -199,14 +214,18 @@ def rmse_ends_anytime(s: Sample) -> tuple[Array, Array]:
 
 
 def ends_in_units(ends: Callable[[Sample], tuple[Array, Array]]) -> Callable[[Sample], Ends]:
-    return lambda s: tuple(end * np.append(s.sizes, 1.0) for end in ends(s))
+    def shown(s: Sample) -> Ends:
+        low, high = ends(s)
+        factors = np.append(s.sizes, 1.0)
+        return low * factors, high * factors
+
+    return shown
 
 
 def error_quantile(s: Sample, q: float) -> Array:
     """Computes a quantile of each parameter's absolute error, and of `together` (n + 1,)."""
-    return np.append(
-        np.array([quantile(np.abs(e), q) for e in s.error.T]) * s.sizes, quantile(together(s), q)
-    )
+    each = np.array([quantile(np.abs(e), q) for e in s.error.T])
+    return np.append(each * s.sizes, quantile(together(s), q))
 
 
 def over_bound(s: Sample) -> Array:
@@ -223,31 +242,40 @@ def efficiency_capped(s: Sample) -> float:
 
 
 def efficiency_capped_limits(s: Sample) -> Ends:
-    (low,), (high,) = capped_interval(over_bound(s)[None] ** 2, np.array([s.n]), CAP)
+    squared = over_bound(s)[None] ** 2
+    (low,), (high,) = capped_interval(squared, np.array([s.n]), CAP)
     return float(ratio(1.0, high)), float(ratio(1.0, low))
 
 
 def capped_error(s: Sample) -> float:
     """Computes the mean Mahalanobis error of the trials that all estimators have, each at most the
     gate's radius."""
-    error = np.minimum(s.distance[s.present], np.sqrt(gate(s.n)))
+    radius = np.sqrt(gate(s.n))
+    error = np.minimum(s.distance[s.present], radius)
     return float(error.mean()) if len(error) else np.nan
+
+
+def _tests_fit(s: Sample) -> bool:
+    """Returns whether the estimator tests the fit of its residuals in any trial."""
+    return FIT in s.scalars and bool(np.isfinite(s.scalars[FIT]).any())
 
 
 def failed(s: Sample, *, known: bool, among: Array | slice = slice(None)) -> float:
     """Computes the share that fails, by whether the estimator itself gives notice of it."""
     noticed = ~s.converged
-    if FIT in s.scalars and np.isfinite(s.scalars[FIT]).any():
+    if _tests_fit(s):
         noticed = noticed | ~(s.scalars[FIT] >= FIT_LEVEL)
     if AMBIGUOUS in s.scalars:
         noticed = noticed | (s.scalars[AMBIGUOUS] > 0)
-    return share((~s.scalars["success"] & (noticed == known))[among])
+    counted = ~s.scalars["success"] & (noticed == known)
+    return share(counted[among])
 
 
 def misfit(s: Sample) -> float:
+    if not _tests_fit(s):
+        return np.nan
     # Residuals that are not finite do not fit.
-    known = FIT in s.scalars and np.isfinite(s.scalars[FIT]).any()
-    return share(~(s.scalars[FIT] >= FIT_LEVEL)) if known else np.nan
+    return share(~(s.scalars[FIT] >= FIT_LEVEL))
 
 
 def ambiguous(s: Sample) -> float:
@@ -259,14 +287,18 @@ def ambiguous(s: Sample) -> float:
 
 
 def failures_flagged(s: Sample) -> float:
-    flags, wrong = s.scalars.get(AMBIGUOUS, np.empty(0)), ~s.scalars["success"]
-    return share(flags[wrong] > 0) if np.isfinite(flags).any() and wrong.any() else np.nan
+    flags = s.scalars.get(AMBIGUOUS, np.empty(0))
+    wrong = ~s.scalars["success"]
+    if not (np.isfinite(flags).any() and wrong.any()):
+        return np.nan
+    return share(flags[wrong] > 0)
 
 
 def false_root_distance(s: Sample) -> float:
     wrong = s.converged & ~s.solved
-    known = "root_distance" in s.scalars and wrong.any()
-    return quantile(s.scalars["root_distance"][wrong], 0.5) if known else np.nan
+    if "root_distance" not in s.scalars or not wrong.any():
+        return np.nan
+    return quantile(s.scalars["root_distance"][wrong], 0.5)
 
 
 # Bounds and theory --------------------------------------------------------------------------------
@@ -292,36 +324,39 @@ def efficiency(s: Sample) -> Array:
 
 
 def efficiency_limits(s: Sample) -> Ends:
-    bound, (low, high) = in_units(applying_bound(s), s), ends_in_units(rmse_ends)(s)
+    bound = in_units(applying_bound(s), s)
+    low, high = ends_in_units(rmse_ends)(s)
     return ratio(bound, high), ratio(bound, low)
 
 
 def efficiency_all(s: Sample) -> Array:
-    bound, error = rms_columns(s.of_truth(s.group.footer["bound"])), rmse_all(s)
-    return np.append(
-        ratio(bound, error), ratio(rms(bound / s.linear_bound), rms(error / s.linear_bound))
-    )
+    bound = rms_columns(s.of_truth(s.group.footer["bound"]))
+    error = rmse_all(s)
+    whole = ratio(rms(bound / s.linear_bound), rms(error / s.linear_bound))
+    return np.append(ratio(bound, error), whole)
 
 
 @once
 def van_trees(s: Sample) -> tuple[Array, Array]:
     """Computes the bound (n,) over the first trials of the seeds, and its standard error: of the
     mean of squared bounds, whose errors are twice the bound times its own."""
-    bound, error = s.of_truth("van_trees"), s.of_truth("van_trees_error")
+    bound = s.of_truth("van_trees")
+    error = s.of_truth("van_trees_error")
     drawn: Array = np.asarray(~np.isnan(bound[:, 0]))
+    number = max(1, int(drawn.sum()))
     middle = np.sqrt(mean(bound**2, drawn))
-    return middle, np.sqrt(mean((2 * bound * error) ** 2, drawn) / max(1, int(drawn.sum()))) / (
-        2 * middle
-    )
+    squared_error = mean((2 * bound * error) ** 2, drawn)
+    error_of_square = np.sqrt(squared_error / number)
+    return middle, error_of_square / (2 * middle)
 
 
 def van_trees_limits(s: Sample) -> Ends:
     """Computes limits of the bound for infinitely many truths, by the scatter of the information
     among those used."""
     bound, error = van_trees(s)
-    return in_units(np.maximum(bound - NORMAL_95 * error, 0.0), s), in_units(
-        bound + NORMAL_95 * error, s
-    )
+    low = np.maximum(bound - NORMAL_95 * error, 0.0)
+    high = bound + NORMAL_95 * error
+    return in_units(low, s), in_units(high, s)
 
 
 def eq_14(s: Sample) -> Array:
@@ -332,7 +367,8 @@ def eq_14(s: Sample) -> Array:
     """
     if s.group.footer.get("equation") != "frozen":
         return np.full(s.n, np.nan)
-    return np.sqrt(s.linear_bound**2 + mean((s.error - s.of_truth("linear_error")) ** 2, s.solved))
+    of_compensation = s.error - s.of_truth("linear_error")
+    return np.sqrt(s.linear_bound**2 + mean(of_compensation**2, s.solved))
 
 
 @once
@@ -344,19 +380,24 @@ def predicted(s: Sample) -> tuple[Array, Array]:
     about them; where they do not, from the Cramér-Rao bound and Box's bias.
     """
     if s.group.footer.get("equation") != "least_squares":
-        return np.full(s.n, np.nan), np.full(s.n, np.nan)
+        unknown = np.full(s.n, np.nan)
+        return unknown, unknown
     if s.group.footer["identity"]["scenario"].get("truth") is not None:
-        wrong, scatter = s.of_truth("pseudo_bias"), s.of_truth("misspecified")
-        used: Array = np.asarray(
-            s.solved & np.isfinite(wrong).all(axis=1) & np.isfinite(scatter).all(axis=1)
-        )
+        wrong = s.of_truth("pseudo_bias")
+        scatter = s.of_truth("misspecified")
+        used = s.solved & _finite(wrong) & _finite(scatter)
         return mean(wrong, used), np.sqrt(mean(wrong**2 + scatter**2, used))
     box = s.of_truth("box_bias")
-    known: Array = np.asarray(np.isfinite(box).all(axis=1))
-    square = mean(box**2, known)
-    return mean(box, known), np.sqrt(
-        mean(s.of_truth("crlb") ** 2, s.solved) + np.where(np.isnan(square), 0.0, square)
-    )
+    known = _finite(box)
+    variance = mean(s.of_truth("crlb") ** 2, s.solved)
+    squared_bias = mean(box**2, known)
+    total = variance + np.where(np.isnan(squared_bias), 0.0, squared_bias)
+    return mean(box, known), np.sqrt(total)
+
+
+def _finite(values: Array) -> Array:
+    """Returns which trials have finite numbers (trials, n) alone."""
+    return np.isfinite(values).all(axis=1)
 
 
 def median_of_truth(s: Sample, name: str) -> float:
@@ -377,22 +418,23 @@ def nees(s: Sample) -> Array:
     if not (reports_covariance(s) and s.solved.any()):
         return np.full(s.n + 1, np.nan)
     each = mean((np.abs(s.error) / s.deviation) ** 2, s.solved)
-    return np.append(each, np.mean(s.scalars["nees"][s.solved]) / s.n)
+    whole = np.mean(s.scalars["nees"][s.solved])
+    return np.append(each, whole / s.n)
 
 
 def nees_limits(s: Sample) -> Ends:
     if not reports_covariance(s):
         return np.nan, np.nan
-    each, whole = (mean_limits(degrees, int(s.solved.sum())) for degrees in (1, s.n))
-    return tuple(np.append(np.full(s.n, one), end) for one, end in zip(each, whole, strict=True))
+    solved = int(s.solved.sum())
+    low, high = mean_limits(1, solved)
+    low_of_all, high_of_all = mean_limits(s.n, solved)
+    return np.append([low] * s.n, low_of_all), np.append([high] * s.n, high_of_all)
 
 
 def nees_median(s: Sample) -> float:
-    return (
-        quantile(s.scalars["nees"], 0.5) / (2 * gammaincinv(s.n / 2, 0.5))
-        if reports_covariance(s)
-        else np.nan
-    )
+    if not reports_covariance(s):
+        return np.nan
+    return quantile(s.scalars["nees"], 0.5) / chi_square_quantile(s.n, 0.5)
 
 
 def nees_median_limits(s: Sample) -> Ends:
@@ -401,8 +443,9 @@ def nees_median_limits(s: Sample) -> Ends:
     if not reports_covariance(s):
         return np.nan, np.nan
     middle = (len(s) + 1) / 2
-    low, high = 2 * gammaincinv(s.n / 2, betaincinv(middle, middle, np.array([0.025, 0.975])))
-    return tuple(np.array([low, high]) / (2 * gammaincinv(s.n / 2, 0.5)))
+    probabilities = betaincinv(middle, middle, np.array([0.025, 0.975]))
+    ends = chi_square_quantile(s.n, probabilities)
+    return tuple(ends / chi_square_quantile(s.n, 0.5))
 
 
 @once
@@ -410,30 +453,37 @@ def coverage(s: Sample) -> Any:
     if not reports_covariance(s):
         return np.nan
     each = mean(np.abs(s.error) / s.deviation <= NORMAL_95)
-    return np.append(each, share(s.scalars["nees"] <= 2 * gammaincinv(s.n / 2, 0.95)))
+    inside = s.scalars["nees"] <= chi_square_quantile(s.n, 0.95)
+    return np.append(each, share(inside))
 
 
 def verdict_on(nees: Array, degrees: int, s: Sample) -> Verdict:
     """Words the NEES of the converged trials at a level that all verdicts of a setting share
     (Bonferroni): where all covariances are right, none is called wrong in 95 % of the reports."""
-    return verdict(nees[s.converged], degrees, 1 - (1 - LEVEL) / s.verdicts)
+    level = 1 - (1 - LEVEL) / s.verdicts
+    return verdict(nees[s.converged], degrees, level)
 
 
 def calibration_p(s: Sample) -> Any:
     """Computes the p of each parameter, and of all by Bonferroni's correction, which needs no
     independence."""
     p = [part.p for part in s.calibrations]
-    return [*p[:-1], min(1.0, len(p) * min(p))] if p else np.nan
+    if not p:
+        return np.nan
+    return [*p[:-1], min(1.0, len(p) * min(p))]
 
 
 def calibration(s: Sample) -> Any:
     words = overall_words(s.calibrations, s.names)
-    return [*(part.words for part in s.calibrations[:-1]), words] if s.calibrations else words
+    if not s.calibrations:
+        return words
+    return [*(part.words for part in s.calibrations[:-1]), words]
 
 
 def mean_nis(s: Sample) -> float:
-    values = s.scalars[NIS] if NIS in s.scalars else np.empty(0)
-    return float(np.mean(values[np.isfinite(values)])) if np.isfinite(values).any() else np.nan
+    values = s.scalars.get(NIS, np.empty(0))
+    values = values[np.isfinite(values)]
+    return float(np.mean(values)) if len(values) else np.nan
 
 
 # Iterations ---------------------------------------------------------------------------------------
@@ -441,8 +491,10 @@ def mean_nis(s: Sample) -> float:
 
 def _uses(s: Sample, method: str) -> bool:
     """Returns whether the estimator iterates by that method on the frozen equation."""
-    target = str((s.group.footer["identity"]["estimator"] or {}).get("_target_", ""))
-    return s.group.footer.get("equation") == "frozen" and target.rpartition(".")[2] == method
+    if s.group.footer.get("equation") != "frozen":
+        return False
+    config = s.group.footer["identity"]["estimator"] or {}
+    return str(config.get("_target_", "")).rpartition(".")[2] == method
 
 
 def fixed_point_bound(iterates: Array, K: float) -> tuple[bool, float]:
@@ -454,19 +506,27 @@ def fixed_point_bound(iterates: Array, K: float) -> tuple[bool, float]:
     a K that holds all along the iterates.
     """
     error = np.abs(iterates - iterates[-1]).max(axis=1)
-    bound = K ** np.arange(len(iterates)) / (1 - K) * np.abs(iterates[1] - iterates[0]).max()
-    ratio = (error / bound)[1:-1][error[1:-1] > FLOOR].max(initial=0.0)
-    return bool(np.all(error <= bound + 1e-12 * (1.0 + error.max()))), float(ratio)
+    first_step = np.abs(iterates[1] - iterates[0]).max()
+    bound = K ** np.arange(len(iterates)) / (1 - K) * first_step
+    round_off = 1e-12 * (1.0 + error.max())
+    holds = bool(np.all(error <= bound + round_off))
+    between = (error / bound)[1:-1]
+    resolved = error[1:-1] > FLOOR
+    return holds, float(between[resolved].max(initial=0.0))
 
 
 def observed_constant(iterates: Array) -> float:
     """Computes the least M with which eq. (23), e_(k+1) <= n^2 M / 2 e_k^2, explains the errors of
     iterates (iterates, n) that exceed round-off, with the last iterate for the root; NaN where they
     are over too soon."""
-    e = np.abs(iterates - iterates[-1]).max(axis=1)
-    usable = (e[:-1] > FLOOR) & (e[1:] > FLOOR)
-    ratios = 2 * e[1:][usable] / (iterates.shape[1] ** 2 * e[:-1][usable] ** 2)
-    return float(ratios.max()) if len(ratios) else np.nan
+    error = np.abs(iterates - iterates[-1]).max(axis=1)
+    before = error[:-1]
+    after = error[1:]
+    usable = (before > FLOOR) & (after > FLOOR)
+    n = iterates.shape[1]
+    # M of each step, by eq. (23).
+    constants = 2 * after[usable] / (n**2 * before[usable] ** 2)
+    return float(constants.max()) if len(constants) else np.nan
 
 
 @once
@@ -474,9 +534,8 @@ def fixed_point_bounds(s: Sample) -> Array:
     """Computes `fixed_point_bound` (histories, 2) of each history of fixed-point iteration whose K
     is below 1."""
     histories = s.histories if _uses(s, "FixedPoint") else ()
-    return np.array([fixed_point_bound(h.iterates, h.K) for h in histories if h.K < 1]).reshape(
-        -1, 2
-    )
+    found = [fixed_point_bound(h.iterates, h.K) for h in histories if h.K < 1]
+    return np.array(found).reshape(-1, 2)
 
 
 @once
@@ -484,5 +543,6 @@ def constants(s: Sample) -> Array:
     """Computes M as observed and at the truth (histories, 2), of each history of Newton's method
     that has both."""
     histories = s.histories if _uses(s, "Newton") else ()
-    pairs = np.array([(observed_constant(h.iterates), h.M) for h in histories]).reshape(-1, 2)
+    found = [(observed_constant(h.iterates), h.M) for h in histories]
+    pairs = np.array(found).reshape(-1, 2)
     return pairs[np.isfinite(pairs).all(axis=1)]
