@@ -81,13 +81,13 @@ class Analysis:
         groups = tuple(g for g in self.collection.groups if g.columns["noise"] != "certified")
         if len(groups) == len(self.collection.groups):
             return self
-        held: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
-        held = {
-            name: v[v["noise"] != "certified"].reset_index(drop=True)
-            for name, v in held.items()
-            if hasattr(v, "columns") and "noise" in v
-        }
-        return replace(self, **held | {"collection": replace(self.collection, groups=groups)})
+        kept: dict[str, Any] = {"collection": replace(self.collection, groups=groups)}
+        for field in fields(self):
+            table = getattr(self, field.name)
+            if hasattr(table, "columns") and "noise" in table:
+                simulated = table["noise"] != "certified"
+                kept[field.name] = table[simulated].reset_index(drop=True)
+        return replace(self, **kept)
 
 
 def analyse(directories: Sequence[Path | str]) -> Analysis:
@@ -121,59 +121,58 @@ class Begun:
 
     def _add(self, number: int, groups: Sequence[Group]) -> None:
         """Adds the results of each estimator of a scenario."""
-        found, summary, outcomes = self._rows, [], {}
-        found["contraction"] += _contraction_rows(self.collection, groups[0])
+        self._rows["contraction"] += _contraction_rows(self.collection, groups[0])
         where = dict(groups[0].columns) | {"scenario": number}
+        summary = []
+        outcomes = {}
         for sample in samples(self.collection, groups):
-            label, present = {"estimator": sample.group.estimator}, sample.present
-            numbered = where | label
+            present = sample.present
+            inside = sample.inside_gate[present]
+            outcomes[sample.group.estimator] = Outcomes(sample.distance[present], inside)
             summary += summary_rows(sample)
-            outcomes[sample.group.estimator] = Outcomes(
-                sample.distance[present], sample.inside_gate[present]
-            )
-            found["endings"] += [
-                dict(sample.group.columns) | label | row for row in _ending_rows(sample)
-            ]
-            found["scores"].append(numbered | rows_of(SCORES, sample)[-1] | _shared(sample))
-            distances = quantiles(sample.distance, PROBABILITIES)
-            found["distributions"].append(
-                numbered | {"probability": PROBABILITIES, "distance": distances}
-            )
-            if sample.histories and sample.group.footer.get("equation") is not None:
-                medians = median_distances(sample.histories)
-                found["convergence"].append(
-                    numbered | {"iteration": np.arange(len(medians)), "distance": medians}
-                )
-            for whole in sample.calibrations[-1:]:
-                low, high = band(len(whole.z), whole.level)
-                curve = {
-                    "at": POINTS,
-                    "difference": whole.size.difference,
-                    "low": low,
-                    "high": high,
-                }
-                found["calibration"].append(numbered | curve)
-            found["tracks"] += [numbered | row for row in epoch_curves(sample)]
+            self._add_sample(where | {"estimator": sample.group.estimator}, sample)
             del sample  # before the next one takes as much memory
         if outcomes:
-            best = may_be_best(np.column_stack([outcome.success for outcome in outcomes.values()]))
+            successes = [outcome.success for outcome in outcomes.values()]
+            best = may_be_best(np.column_stack(successes))
             marks = dict(zip(outcomes, best.tolist(), strict=True))
             self.summary += [row | {BEST: marks[row["estimator"]]} for row in summary]
             self._compared.append((where, outcomes))
+
+    def _add_sample(self, where: Mapping[str, Any], sample: Sample) -> None:
+        """Adds the rows of one estimator on one scenario; `where` says which they are."""
+        found = self._rows
+        of_group = dict(sample.group.columns) | {"estimator": sample.group.estimator}
+        found["endings"] += [of_group | row for row in _ending_rows(sample)]
+        scores = rows_of(SCORES, sample)[-1]
+        found["scores"].append(where | scores | _shared(sample))
+        distances = quantiles(sample.distance, PROBABILITIES)
+        curve = {"probability": PROBABILITIES, "distance": distances}
+        found["distributions"].append(where | curve)
+        if sample.histories and sample.group.footer.get("equation") is not None:
+            medians = median_distances(sample.histories)
+            curve = {"iteration": np.arange(len(medians)), "distance": medians}
+            found["convergence"].append(where | curve)
+        # NEES of all parameters stands last.
+        for whole in sample.calibrations[-1:]:
+            low, high = band(len(whole.z), whole.level)
+            curve = {"at": POINTS, "difference": whole.size.difference, "low": low, "high": high}
+            found["calibration"].append(where | curve)
+        found["tracks"] += [where | row for row in epoch_curves(sample)]
 
     def finish(self) -> Analysis:
         """Completes the analysis."""
         import pandas as pd
 
-        # Corrected over all scenarios: a sweep asks all its questions at once.
-        pairs = [
-            where | pair for where, outcomes in self._compared for pair in compare_pairs(outcomes)
-        ]
+        pairs = []
+        for where, outcomes in self._compared:
+            pairs += [where | pair for pair in compare_pairs(outcomes)]
         rows = self._rows
         return Analysis(
             collection=self.collection,
             summary=to_frame(self.summary),
             endings=pd.DataFrame(rows["endings"]),
+            # Corrected over all scenarios: a sweep asks all its questions at once.
             pairs=pd.DataFrame(corrected(pairs)),
             scores=pd.DataFrame(rows["scores"]),
             distributions=_joined(rows["distributions"]),
@@ -212,7 +211,8 @@ def _contraction_rows(collection: Collection, group: Group) -> list[dict[str, An
     row = dict(group.columns)
     for name in CONTRACTION:
         values = np.concatenate([part[name] for part in parts])
-        row |= {f"{name}_median": quantile(values, 0.5), f"{name}_max": quantile(values, 1.0)}
+        row[f"{name}_median"] = quantile(values, 0.5)
+        row[f"{name}_max"] = quantile(values, 1.0)
         row[f"{name}_below_1"] = float((values < 1).mean())
     return [row]
 
@@ -220,23 +220,27 @@ def _contraction_rows(collection: Collection, group: Group) -> list[dict[str, An
 def _ending_rows(sample: Sample) -> list[dict[str, Any]]:
     """Counts the endings of trials that did not converge, the commonest first; trials without
     readings are last."""
-    lost, reasons = np.flatnonzero(~sample.converged), {s.label: s.reason for s in Status}
+    lost = np.flatnonzero(~sample.converged)
+    reasons = {status.label: status.reason for status in Status}
+    statuses = sample.scalars["status"][lost]
     messages = sample.scalars.get("message", np.full(len(sample), ""))[lost]
     ended = [
-        (str(s), str(m or reasons.get(s, "")))
-        for s, m in zip(sample.scalars["status"][lost], messages, strict=True)
+        (str(status), str(message or reasons.get(status, "")))
+        for status, message in zip(statuses, messages, strict=True)
     ]
+    # Backwards, so that the first trial of each ending is kept.
     first = dict(zip(reversed(ended), reversed(sample.number[lost]), strict=True))
     counts = Counter(ended).most_common()
     rows = [(*ending, count, label_of(first[ending])) for ending, count in counts[:MESSAGES]]
-    if rest := sum(count for _, count in counts[MESSAGES:]):
+    rest = sum(count for _, count in counts[MESSAGES:])
+    if rest:
         rows.append(("others", "further messages, each rarer", rest, ""))
-    if count := len(sample.unread):
-        rows.append(
-            (Status.NO_READINGS.label, Status.NO_READINGS.reason, count, label_of(sample.unread[0]))
-        )
-    columns, trials = (
-        ("status", "message", "trials", "first", "share"),
-        len(sample) + len(sample.unread),
-    )
-    return [dict(zip(columns, (*row, row[2] / trials), strict=True)) for row in rows]
+    unread = len(sample.unread)
+    if unread:
+        ending = (Status.NO_READINGS.label, Status.NO_READINGS.reason)
+        rows.append((*ending, unread, label_of(sample.unread[0])))
+    trials = len(sample) + unread
+    return [
+        {"status": status, "message": message, "trials": n, "first": trial, "share": n / trials}
+        for status, message, n, trial in rows
+    ]

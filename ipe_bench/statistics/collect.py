@@ -21,19 +21,11 @@ if TYPE_CHECKING:
     import pandas as pd
 
 NAMES = ("measurement", "noise", "prior", "error_scale", "seed", "estimator")
-_MAIN = [
-    "trial",
-    "status",
-    "success",
-    "solved",
-    "error_",
-    "crlb_distance",
-    "nees",
-    "fit_p",
-    "iterations",
-    "simulations",
-]
-_MAIN += ["jacobians", "time_s", "message", "x_", "deviation_", "crlb_", "bayes_"]
+_MAIN = (
+    *("trial", "status", "success", "solved", "error_", "crlb_distance", "nees", "fit_p"),
+    *("iterations", "simulations", "jacobians", "time_s", "message"),
+    *("x_", "deviation_", "crlb_", "bayes_"),
+)
 """Columns of a trial that come first, in this order, or what they begin with."""
 _LONGEST = 34
 """Letters of a value in a table or a heading."""
@@ -84,12 +76,13 @@ class Collection(Results):
     def settings(self) -> int:
         """Number of settings of simulated trials: scenarios that differ in more than the error
         scale."""
-        simulated = [
-            key
-            for key, groups in self.scenarios.items()
+        # The error scale is the last column.
+        simulated = {
+            columns[:-1]
+            for columns, groups in self.scenarios.items()
             if groups[0].columns["noise"] != "certified"
-        ]
-        return len({key[:-1] for key in simulated})
+        }
+        return len(simulated)
 
 
 def collect(directories: Sequence[Path | str], keys: Keys[str] | None = None) -> Collection:
@@ -107,22 +100,15 @@ def trials_frame(collection: Collection) -> pd.DataFrame:
     """Returns every usable trial: its scenario, its result, and the truth; see `ipe_bench.load`."""
     import pandas as pd
 
-    parts, first = [], {}
+    parts = []
+    first = {}
     for group in collection.groups:
+        of_group = dict(group.columns) | dict(group.options)
         for cell, truth in zip(group.cells, group.truths, strict=True):
-            rows = pd.DataFrame(collection.load(cell, None))
-            known = {} if truth is None else collection.load(truth, None)
-            rows = rows.merge(pd.DataFrame(known), on="trial", how="left") if known else rows
-            belongs = (
-                {name: cell.names[name] for name in NAMES}
-                | dict(group.columns)
-                | dict(group.options)
-            )
-            rows.insert(0, "trial", rows.pop("trial"))
-            rows = rows.loc[
-                :, ~rows.columns.str.startswith("curves")
-            ]  # sums over trials, and no trial's
-            parts.append(pd.concat([pd.DataFrame(belongs, index=rows.index), rows], axis=1))
+            rows = _rows_with_truth(collection, cell, truth)
+            belongs = {name: cell.names[name] for name in NAMES} | of_group
+            repeated = pd.DataFrame(belongs, index=rows.index)
+            parts.append(pd.concat([repeated, rows], axis=1))
             first |= belongs
     if not parts:
         return pd.DataFrame(columns=[*NAMES, "trial"])
@@ -133,15 +119,29 @@ def trials_frame(collection: Collection) -> pd.DataFrame:
     def place(name: str) -> tuple[int, bool]:
         if name in first:
             return -1, False
-        main = (
-            i
-            for i, begin in enumerate(_MAIN)
-            if name == begin or (begin[-1] == "_" and name.startswith(begin))
-        )
-        at = next(main, len(_MAIN))
-        return at, at == len(_MAIN) and name not in ample
+        for i, begin in enumerate(_MAIN):
+            if name == begin or (begin[-1] == "_" and name.startswith(begin)):
+                return i, False
+        return len(_MAIN), name not in ample
 
     return frame[sorted(frame.columns, key=place)]
+
+
+def _rows_with_truth(
+    collection: Collection, cell: StoredCell, truth: StoredCell | None
+) -> pd.DataFrame:
+    """Returns a row per trial of a cell: its number, its result, and what is stored of its
+    truth."""
+    import pandas as pd
+
+    rows = pd.DataFrame(collection.load(cell, None))
+    known = {} if truth is None else collection.load(truth, None)
+    if known:
+        rows = rows.merge(pd.DataFrame(known), on="trial", how="left")
+    rows.insert(0, "trial", rows.pop("trial"))
+    # These are sums over trials, and no trial's.
+    curves = rows.columns.str.startswith("curves")
+    return rows.loc[:, ~curves]
 
 
 # Which config leaves tell scenarios, or the estimators of one label, apart ------------------------
@@ -150,24 +150,23 @@ def trials_frame(collection: Collection) -> pd.DataFrame:
 def config_leaves(description: Any, prefix: str = "") -> dict[str, tuple[str, Any]]:
     """Returns dotted keys with (class that holds the leaf, plain value); a component's own class
     stands under its own key, that of the whole under `TARGET`."""
-    if isinstance(description, list) and any(isinstance(v, Mapping) for v in description):
-        description = {str(i): v for i, v in enumerate(description)}
+    if isinstance(description, list):
+        if not any(isinstance(value, Mapping) for value in description):
+            # A list is one value, however long: two of different lengths differ.
+            return {prefix: ("", canonical_json(description))}
+        description = {str(i): value for i, value in enumerate(description)}
     if not isinstance(description, Mapping):
-        # A list is one value, however long: two of different lengths differ.
-        return {
-            prefix: (
-                "",
-                canonical_json(description) if isinstance(description, list) else description,
-            )
-        }
+        return {prefix: ("", description)}
     holder = str(description.get(TARGET, ""))
-    result: dict[str, tuple[str, Any]] = (
-        {prefix or TARGET: ("", holder)} if TARGET in description else {}
-    )
+    result: dict[str, tuple[str, Any]] = {}
+    if TARGET in description:
+        result[prefix or TARGET] = ("", holder)
     for key, value in description.items():
-        if key != TARGET:
-            inner = config_leaves(value, f"{prefix}.{key}" if prefix else str(key))
-            result |= {k: (f"{holder}/{h}", v) for k, (h, v) in inner.items()}
+        if key == TARGET:
+            continue
+        inner = config_leaves(value, f"{prefix}.{key}" if prefix else str(key))
+        for leaf, (within, plain) in inner.items():
+            result[leaf] = (f"{holder}/{within}", plain)
     return result
 
 
@@ -179,7 +178,8 @@ def differing(descriptions: Sequence[Mapping[str, Any]]) -> list[str]:
     by_key: dict[str, dict[str, set[str]]] = {}
     for description in descriptions:
         for key, (holder, value) in config_leaves(description).items():
-            by_key.setdefault(key, {}).setdefault(holder, set()).add(canonical_json(value))
+            holders = by_key.setdefault(key, {})
+            holders.setdefault(holder, set()).add(canonical_json(value))
     return [
         key
         for key, holders in by_key.items()
@@ -194,57 +194,72 @@ def _groups(cells: Sequence[StoredCell], runs: Sequence[Mapping[str, Any]]) -> t
     found: dict[tuple[str, str, str], list[StoredCell]] = {}
     configs: dict[str, dict[str, Any]] = {}
     for cell in cells:
-        if cell.label != TRUTH:
-            config = cell.footer["identity"]["estimator"]
-            what = canonical_json(scenario_of(cell)), cell.label, canonical_json(config)
-            found.setdefault(what, []).append(cell)
-            configs.setdefault(cell.label, {})[what[2]] = config
+        if cell.label == TRUTH:
+            continue
+        config = cell.footer["identity"]["estimator"]
+        text = canonical_json(config)
+        constructed = (canonical_json(scenario_of(cell)), cell.label, text)
+        found.setdefault(constructed, []).append(cell)
+        configs.setdefault(cell.label, {})[text] = config
     firsts = [members[0] for members in found.values()]
-    extra = [k for k in differing([scenario_of(cell) for cell in firsts]) if k != "error_scale"]
-    extra = [k for k in extra if not _stands_in_a_name(k, firsts)]
+    leaves = differing([scenario_of(cell) for cell in firsts])
+    leaves = [k for k in leaves if k != "error_scale" and not _stands_in_a_name(k, firsts)]
     options = {label: differing(list(several.values())) for label, several in configs.items()}
-    labels = dict.fromkeys(
-        str(cell["names"].get("estimator")) for run in runs for cell in run["cells"]
-    )
-    order = {label: i for i, label in enumerate(labels)}
-    groups = []
-    for members in found.values():
-        first = members[0]
-        chosen = _shown(first.footer["identity"]["estimator"], options[first.label])
-        columns = {k: first.names[k] for k in ("measurement", "noise")} | _shown(
-            scenario_of(first), extra
-        )
-        columns["error_scale"] = first.names["error_scale"]
-        label = first.label + (
-            f" ({', '.join(f'{k}={v}' for k, v in chosen.items())})" if chosen else ""
-        )
-        members.sort(key=lambda cell: (cell.seed, cell.key))
-        known = tuple(truths.get(cell.scenario_id) for cell in members)
-        groups.append(
-            Group(
-                columns,
-                label,
-                {f"estimator.{k}": v for k, v in chosen.items()},
-                tuple(members),
-                known,
-            )
-        )
+    groups = [
+        _group(members, truths, leaves, options[members[0].label]) for members in found.values()
+    ]
+    order = _order_of_labels(runs)
 
     def place(group: Group) -> tuple[Any, ...]:
-        return (
-            *map(_sortable, group.columns.values()),
-            order.get(group.label, len(order)),
-            group.estimator,
-        )
+        columns = map(_sortable, group.columns.values())
+        return (*columns, order.get(group.label, len(order)), group.estimator)
 
     return tuple(sorted(groups, key=place))
 
 
+def _group(
+    members: Sequence[StoredCell],
+    truths: Mapping[str, StoredCell],
+    leaves: Sequence[str],
+    options: Sequence[str],
+) -> Group:
+    """Forms a group of cells that were constructed alike; `leaves` of the scenario and `options` of
+    the estimator tell it from others."""
+    first = members[0]
+    columns = {
+        "measurement": first.names["measurement"],
+        "noise": first.names["noise"],
+        **_shown(scenario_of(first), leaves),
+        "error_scale": first.names["error_scale"],
+    }
+    chosen = _shown(first.footer["identity"]["estimator"], options)
+    label = first.label
+    if chosen:
+        values = ", ".join(f"{k}={v}" for k, v in chosen.items())
+        label = f"{label} ({values})"
+    cells = sorted(members, key=lambda cell: (cell.seed, cell.key))
+    return Group(
+        columns,
+        label,
+        options={f"estimator.{k}": v for k, v in chosen.items()},
+        cells=tuple(cells),
+        truths=tuple(truths.get(cell.scenario_id) for cell in cells),
+    )
+
+
+def _order_of_labels(runs: Sequence[Mapping[str, Any]]) -> dict[str, int]:
+    """Numbers the estimators as the runs named them first."""
+    order: dict[str, int] = {}
+    for run in runs:
+        for cell in run["cells"]:
+            order.setdefault(str(cell["names"].get("estimator")), len(order))
+    return order
+
+
 def scenario_of(cell: StoredCell) -> dict[str, Any]:
     """Returns the construction of a scenario without its seed: only seeds are pooled."""
-    return {
-        key: value for key, value in cell.footer["identity"]["scenario"].items() if key != "seed"
-    }
+    scenario = cell.footer["identity"]["scenario"]
+    return {key: value for key, value in scenario.items() if key != "seed"}
 
 
 def _shown(description: Any, keys: Iterable[str]) -> dict[str, Any]:
@@ -258,22 +273,25 @@ def _stands_in_a_name(key: str, cells: Sequence[StoredCell]) -> bool:
     component = key.split(".")[0]
     if component not in ("measurement", "noise"):
         return False
-    leaves = [canonical_json(config_leaves(scenario_of(cell)).get(key)) for cell in cells]
-    said = {
-        (cell.footer["names"].get(component), leaf)
-        for cell, leaf in zip(cells, leaves, strict=True)
-    }
-    return len(said) == len({name for name, _ in said})
+    found = set()
+    for cell in cells:
+        leaf = config_leaves(scenario_of(cell)).get(key)
+        found.add((cell.footer["names"].get(component), canonical_json(leaf)))
+    # No name goes with two values.
+    return len(found) == len({name for name, _ in found})
 
 
 def shown_leaf(value: Any) -> Any:
     """Formats a leaf for a table: a class of ours by its own name, a long text by its beginning and
     a digest."""
-    if isinstance(value, str) and value.startswith("ipe_bench."):
+    if not isinstance(value, str):
+        return value
+    if value.startswith("ipe_bench."):
         return value.rpartition(".")[2]
-    if isinstance(value, str) and len(value) > _LONGEST:
-        return f"{value[: _LONGEST - 10]}… #{digest(value)[:6]}"
-    return value
+    if len(value) <= _LONGEST:
+        return value
+    beginning = value[: _LONGEST - 10]
+    return f"{beginning}… #{digest(value)[:6]}"
 
 
 def _sortable(value: Any) -> tuple[int, float, str]:

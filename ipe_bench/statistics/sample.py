@@ -100,38 +100,47 @@ class Sample:
         """Loads the stored trials of a group; `present` and `solved` are the numbers of those that
         all rivals have, and all solved."""
         names = [p["name"] for p in group.footer["parameters"]]
-        errors, deviations = (
-            [f"{kind}_{name}" for name in names] for kind in ("error", "deviation")
-        )
-        parts = [
-            collection.load(cell, [*errors, *deviations, *SCALARS], OPTIONAL_COLUMNS)
-            for cell in group.cells
-        ]
-        every = np.concatenate(
-            [_numbers(cell, part["trial"]) for cell, part in zip(group.cells, parts, strict=True)]
-        )
+        errors = [f"error_{name}" for name in names]
+        deviations = [f"deviation_{name}" for name in names]
+        required = [*errors, *deviations, *SCALARS]
+        parts = [collection.load(cell, required, OPTIONAL_COLUMNS) for cell in group.cells]
+        cells_with_parts = zip(group.cells, parts, strict=True)
+        every = np.concatenate([_numbers(cell, part["trial"]) for cell, part in cells_with_parts])
         status = np.concatenate([part["status"] for part in parts])
         used: Array = np.asarray(status != Status.NO_READINGS.label)
+        number = every[used]
 
         def joined(name: str) -> Array:
-            """Concatenates the column, which is removed from its parts."""
+            """Concatenates the column, which is removed from its parts: it is in memory once."""
             return np.concatenate([part.pop(name) for part in parts])[used]
 
-        there = [
-            name for name in (*SCALARS, *OPTIONAL_COLUMNS) if all(name in part for part in parts)
-        ]
-        number, scalars = every[used], {name: joined(name) for name in there}
-        for name in ("solved", "success"):
-            scalars[name] = scalars[name].astype(bool)
-        error, deviation = np.empty((2, len(names), len(number)))
-        for values, columns in ((error, errors), (deviation, deviations)):
+        def table(columns: Sequence[str]) -> Array:
+            """Joins columns (trials, k), each of them contiguous."""
+            values = np.empty((len(columns), len(number)))
             for row, name in zip(values, columns, strict=True):
                 row[:] = joined(name)
-        error, deviation = error.T, deviation.T
+            return values.T
+
+        known = (*SCALARS, *OPTIONAL_COLUMNS)
+        there = [name for name in known if all(name in part for part in parts)]
+        scalars = {name: joined(name) for name in there}
+        for name in ("solved", "success"):
+            scalars[name] = scalars[name].astype(bool)
+        error = table(errors)
+        deviation = table(deviations)
         for array in (number, error, deviation, *scalars.values()):
             array.flags.writeable = False
-        common = np.isin(number, present), np.isin(number, solved)
-        return cls(collection, group, number, scalars, error, deviation, *common, every[~used])
+        return cls(
+            collection,
+            group,
+            number,
+            scalars,
+            error,
+            deviation,
+            present=np.isin(number, present),
+            solved_by_all=np.isin(number, solved),
+            unread=every[~used],
+        )
 
     def __len__(self) -> int:
         return len(self.number)
@@ -181,7 +190,7 @@ class Sample:
         one, and of states that move one each on the last epoch, on the path and on innovations."""
         own = _without_scale(self.group)
         rows = sum(_without_scale(group) == own for group in self.collection.groups)
-        return rows * (3 if "path_nees" in self.scalars else 1)
+        return rows * 3 if "path_nees" in self.scalars else rows
 
     @cached_property
     def converged(self) -> Array:
@@ -249,14 +258,19 @@ class Sample:
             if history is None:
                 continue
             every = np.stack([history[f"x_{name}"] for name in self.names], axis=1)
-            for trial in np.unique(history["trial"]):
-                iterates = every[history["trial"] == trial]
-                rows = np.flatnonzero(self.converged & (self.number == cell.seed * _SEED + trial))
-                found += [(row, iterates) for row in rows.tolist() if len(iterates) > 1]
+            numbers = _numbers(cell, history["trial"])
+            for number in np.unique(numbers):
+                iterates = every[numbers == number]
+                # A trial that ended at its start has come no way.
+                if len(iterates) > 1:
+                    rows = np.flatnonzero(self.converged & (self.number == number))
+                    found += [(row, iterates) for row in rows.tolist()]
         if not found:
             return []
-        crlb, cost = self.of_truth("crlb"), self.cost.tolist()
-        K, M = (self.of_truth(name).tolist() for name in ("contraction_K", "curvature_M"))
+        crlb = self.of_truth("crlb")
+        cost = self.cost.tolist()
+        K = self.of_truth("contraction_K").tolist()
+        M = self.of_truth("curvature_M").tolist()
         return [
             History(iterates, distances_to_limit(iterates, crlb[row]), cost[row], K[row], M[row])
             for row, iterates in found
@@ -275,27 +289,30 @@ def label_of(number: Any) -> str:
 
 def samples(collection: Collection, groups: Sequence[Group]) -> Iterator[Sample]:
     """Yields the samples of one scenario that have trials."""
-    present, solved = [], []
+    present = []
+    solved = []
     for group in groups:
         parts = [(cell, collection.load(cell, ["solved"])) for cell in group.cells]
         numbers = np.concatenate([_numbers(cell, rows["trial"]) for cell, rows in parts])
         right = np.concatenate([rows["solved"] for _, rows in parts]).astype(bool)
-        present += [numbers] if len(numbers) else []
+        # An estimator without any trials takes none from the others.
+        if len(numbers):
+            present.append(numbers)
         solved.append(numbers[right])
-    common = _in_all(present), _in_all(solved)
+    present_in_all = _in_all(present)
+    solved_by_all = _in_all(solved)
     for group in groups:
-        if len(sample := Sample.load(collection, group, *common)):
+        sample = Sample.load(collection, group, present_in_all, solved_by_all)
+        if len(sample):
             yield sample
         del sample  # before the next one takes as much memory
 
 
 def _in_all(several: Sequence[Array]) -> Array:
     """Returns the numbers that all have, ascending."""
-    return (
-        reduce(np.intersect1d, several[1:], np.unique(several[0]))
-        if several
-        else np.empty(0, dtype=np.int64)
-    )
+    if not several:
+        return np.empty(0, dtype=np.int64)
+    return reduce(np.intersect1d, several[1:], np.unique(several[0]))
 
 
 def _numbers(cell: StoredCell, trial: Array) -> Array:
@@ -315,9 +332,11 @@ def distances_to_limit(iterates: Array, deviation: Array) -> Array:
 def median_distances(histories: Sequence[History]) -> Array:
     """Computes medians (iterates,) over trials of the distances from their limits; an ended trial
     counts as nearest: 0 once half have."""
-    table = np.zeros((max(len(h.distances) for h in histories), len(histories)))
+    longest = max(len(h.distances) for h in histories)
+    table = np.zeros((longest, len(histories)))
     for i, h in enumerate(histories):
-        table[: len(h.distances), i] = np.where(np.isfinite(h.distances), h.distances, np.inf)
+        finite = np.isfinite(h.distances)
+        table[: len(h.distances), i] = np.where(finite, h.distances, np.inf)
     return np.sort(table)[:, (len(histories) - 1) // 2]
 
 
@@ -330,8 +349,12 @@ def iterations_to_limit(distances: Array) -> int:
 def orders_of(errors: Array, floor: float = FLOOR) -> Array:
     """Computes log(e_(k+1) / e_k) / log(e_k / e_(k-1)) of successive errors (iterates,), where they
     decrease above the floor: 1 where convergence is linear, 2 where it is quadratic."""
+    # Up to the first error that is round-off; beyond the last where none is.
     e = errors[: np.argmax(np.append(errors <= floor, True))]
+    before = e[:-2]
+    here = e[1:-1]
+    after = e[2:]
     with np.errstate(divide="ignore", invalid="ignore"):
-        orders = np.log(e[2:] / e[1:-1]) / np.log(e[1:-1] / e[:-2])
-    decreasing = (e[2:] < e[1:-1]) & (e[1:-1] < e[:-2])
+        orders = np.log(after / here) / np.log(here / before)
+    decreasing = (after < here) & (here < before)
     return orders[decreasing]
