@@ -139,7 +139,7 @@ class Begun:
             self.summary += [row | {BEST: marks[row["estimator"]]} for row in summary]
             self._compared.append((where, outcomes))
 
-    def _add_sample(self, where: Mapping[str, Any], sample: Sample) -> None:
+    def _add_sample(self, where: dict[str, Any], sample: Sample) -> None:
         """Adds the rows of one estimator on one scenario; `where` says which they are."""
         found = self._rows
         of_group = dict(sample.group.columns) | {"estimator": sample.group.estimator}

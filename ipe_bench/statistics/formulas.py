@@ -397,7 +397,7 @@ def predicted(s: Sample) -> tuple[Array, Array]:
 
 def _finite(values: Array) -> Array:
     """Returns which trials have finite numbers (trials, n) alone."""
-    return np.isfinite(values).all(axis=1)
+    return np.asarray(np.isfinite(values).all(axis=1))
 
 
 def median_of_truth(s: Sample, name: str) -> float:
