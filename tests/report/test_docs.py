@@ -407,15 +407,37 @@ def test_what_a_page_says_to_type_works(page, tmp_path):
         assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.slow
-def test_the_whole_site_builds_without_a_warning_and_fetches_nothing(tmp_path):
-    """Every experiment, and a line about each that runs without a stored result."""
+@pytest.fixture(scope="module")
+def site(tmp_path_factory) -> tuple[Path, str]:
+    """The folder of the site and what its building printed."""
     pytest.importorskip("pydata_sphinx_theme")
+    folder = tmp_path_factory.mktemp("site")
     # In a process of its own, as a user builds it: what its libraries will do away with is no error of ours.
-    command = [sys.executable, pages.__file__, str(tmp_path), "--trials=1"]
+    command = [sys.executable, pages.__file__, str(folder), "--trials=1"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    html = tmp_path / "html"
+    return folder / "html", done.stdout
+
+
+CUT = """[...document.querySelectorAll(".bd-article :is(table, pre, .pst-scrollable-table-container)")]
+    .filter(part => part.scrollWidth > part.clientWidth + 1)
+    .map(part => part.innerText.slice(0, 60))"""
+"""Tables and code of a page that are wider than their place."""
+
+
+@pytest.mark.slow
+@pytest.mark.browser
+def test_no_table_and_no_code_is_cut_at_1280_pixels(site, browser):
+    folder, _ = site
+    for page in folder.rglob("*.html"):
+        browser.go(page, width=1280)
+        assert browser.run(CUT) == [], page.relative_to(folder)
+
+
+@pytest.mark.slow
+def test_the_whole_site_builds_without_a_warning_and_fetches_nothing(site):
+    """Every experiment, and a line about each that runs without a stored result."""
+    html, printed = site
     ours = [
         option.name
         for option in discovery.options("experiment")
@@ -425,12 +447,12 @@ def test_the_whole_site_builds_without_a_warning_and_fetches_nothing(tmp_path):
     assert 'href="gallery/ranging.html"' in (html / "choosing.html").read_text(encoding="utf-8")
     assert "100 trials per row" in (html / "howto" / "notebook.html").read_text(encoding="utf-8")
     for name in ours:
-        ran = f"{name}: no result of it is stored; it runs now" in done.stdout
+        ran = f"{name}: no result of it is stored; it runs now" in printed
         assert ran == (not (pages.STORED / f"{name}{SUFFIX}").exists())
         page = (html / "gallery" / f"{name}.html").read_text(encoding="utf-8")
         assert f"experiment={name}" in re.sub("<[^>]*>", "", page)  # without the marks of colours
         assert "<table" in page
-        assert str(tmp_path) not in page
+        assert str(html.parent) not in page
     fetched = (
         r"""<(?:script|img|iframe|link(?=[^>]*stylesheet))[^>]*(?:src|href)=["']?(?:https?:)?//"""
     )

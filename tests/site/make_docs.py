@@ -64,6 +64,7 @@ SETTINGS = {
     "html_show_sourcelink": False,
     "html_static_path": [str(Path(__file__).parent / "static")],
     "html_css_files": ["site.css"],
+    "html_sidebars": {page: [] for page in ("first_hour", "choosing", "results", "tutorial")},
     "html_math_renderer": "mathml",
     "html_theme_options": {
         "show_prev_next": False,
