@@ -46,18 +46,22 @@ _ROWS = (
     (
         "",
         "GROUP.KEY=VALUE",
-        "an option of one of these; `ipe-bench list GROUP/NAME` shows its type and default",
+        "option of one of these; `ipe-bench list GROUP/NAME` shows its type and default",
     ),
-    ("estimators", "estimators.NAME.KEY=X", "an option of a solver or a baseline that is chosen"),
+    (
+        "estimators",
+        "estimators.NAME.KEY=X",
+        "option of a chosen solver or baseline, set by its label",
+    ),
     (
         "still",
         "truth_measurement=NAME",
-        "the model that simulates the readings, if estimators assume another one",
+        "model that simulates the readings, if estimators assume another model",
     ),
     (
         "scale",
         "error_scale=X",
-        "standard deviation of the true parameters, in multiples of their sizes, or of states in multiples of that of"
+        "standard deviation of the true parameters in multiples of their sizes, or of states in multiples of"
         " the prior of a state model (1)",
     ),
     ("trials", "seed=N", "number that all random draws follow from (0)"),
@@ -65,13 +69,13 @@ _ROWS = (
     (
         "run",
         "precision=X",
-        "adds trials until the success shares are known to within X, as in 0.01",
+        "add trials until the shares of success are known to within X, as in 0.01",
     ),
-    ("run", "time_limit=SECONDS", "ends this earlier"),
+    ("run", "time_limit=SECONDS", "stop after this many seconds"),
     (
         "run",
         "objective=NAME.COLUMN",
-        "the statistic that a sweeper minimises, as in newton.capped_error",
+        "statistic that a sweeper minimises, as in newton.capped_error",
     ),
     (
         "still",
@@ -82,25 +86,25 @@ _ROWS = (
     (
         "folder",
         "name=NAME",
-        "name of the folder under outputs/, in place of the one made of the other keys (default_name)",
+        "name of the folder under outputs/ (default_name, made of the other keys)",
     ),
     ("folder", "default_name=NAME", ""),
     ("figures", "figures=main", "figures to draw: main, all or none"),
     ("run", "formats=pdf,md,tex", MEANING),
-    ("run", "block_size=N", "trials that are computed at once; it changes no number"),
+    ("run", "block_size=N", "trials that are computed at once; results do not depend on it"),
     (
         "run",
         "write_readings=FILE",
-        "writes the simulated readings of trial write_readings_trial=N, without any estimate",
+        "write the simulated readings of trial write_readings_trial=N to a file, and estimate nothing",
     ),
     ("run", "write_readings_trial=N", ""),
-    ("files", "readings=FILE", "is for `ipe-bench estimate`, as are ignore_columns= and find="),
+    ("files", "readings=FILE", "readings of `ipe-bench estimate`, with ignore_columns= and find="),
     ("files", "ignore_columns=[A]", ""),
     ("files", "find=[A,B]", ""),
     (
         "",
         "+experiment=NAME",
-        "an experiment of `ipe-bench list experiment`, which sets some of these keys",
+        "an experiment, which sets some of these keys; `ipe-bench list experiment` names them",
     ),
 )
 ROWS = tuple(Key(*row) for row in _ROWS)

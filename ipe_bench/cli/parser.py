@@ -1,8 +1,9 @@
-"""What each command may be given, and what `--help` says of it."""
+"""Defines the arguments of each command and the text of its `--help`."""
 
 from __future__ import annotations
 
 import argparse
+import textwrap
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
@@ -16,21 +17,29 @@ _ABOUT = """\
 ipe-bench: which estimator to trust with nonlinear measurements
 
   ipe-bench run +experiment=paper                 the paper's experiment
-  ipe-bench run error_scale=33 "solver=[fixed_point,newton]" "baseline=[linear_lse]"
-  ipe-bench run -m error_scale=1,10,100 seed=1,2  sweeps; any Hydra flag works after run (--cfg job, --info, ...)
+  ipe-bench run error_scale=33 "solver=[fixed_point,newton]" "baseline=[ekf]"
+  ipe-bench run -m error_scale=1,10,100 seed=1,2  a sweep, by Hydra
   ipe-bench estimate readings=FILE.csv            parameters from real readings
-  ipe-bench design measurement=gins               what the readings will say, and which to take instead
-  ipe-bench posterior error_scale=300             what a few trials' readings really say, beside the estimators
+  ipe-bench design measurement=gins               how well readings will do
+  ipe-bench posterior error_scale=300             estimates beside the posterior
 """
 _CODES = """\
-`ipe-bench COMMAND --help` says more of one command.
-Exit codes: 0 done; 1 done, but some pieces failed or are missing; 2 a mistake in what was asked for; 130 Ctrl-C.
+`ipe-bench COMMAND --help` has the arguments of a command.
+Exit codes: 0 done; 1 done, but something failed or is missing; 2 wrong
+arguments; 130 Ctrl-C.
 """
 INFO_TOPICS = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
-_MISSING = "0 done; 1 done, but something that was asked for is missing"
+_MISSING = "0 done; 1 done, but something is missing"
 
 Arguments = dict[str, dict[str, Any]]
 """Options of argparse for each argument, by its names."""
+
+
+def _wrapped(key: str, meaning: str) -> str:
+    """Writes a key and its meaning in 80 columns."""
+    indent = " " * 23
+    lines = textwrap.fill(meaning, 80, initial_indent=indent, subsequent_indent=indent)
+    return f"{key:<22} {lines.lstrip()}\n"
 
 
 def _several(metavar: str, what: str) -> dict[str, Any]:
@@ -42,13 +51,15 @@ COMMANDS: dict[str, tuple[str, str, str, Arguments] | None] = {
         "simulate, estimate, store and report",
         "0 done; 1 done, but something failed",
         """
-  ipe-bench run error_scale=33 "solver=[fixed_point,newton]" "baseline=[linear_lse]"
-  ipe-bench run +experiment=paper                               an experiment, which may be a sweep
-  ipe-bench run -m error_scale=1,10,100 seed=1,2                a job for each combination
-  ipe-bench run +solver@estimators.second=newton estimators.second.tolerance=1e-3
+  ipe-bench run error_scale=33 "solver=[fixed_point,newton]" "baseline=[ekf]"
+  ipe-bench run +experiment=paper                 an experiment
+  ipe-bench run -m error_scale=1,10,100 seed=1,2  a job for each combination
+  ipe-bench run +solver@estimators.big=newton estimators.big.tolerance=1e-3
+
+Quote values with brackets, or the shell takes them for a pattern.
 
 """
-        + "".join(f"{key.written:<22} {key.meaning}\n" for key in ROWS if key.meaning),
+        + "".join(_wrapped(key.written, key.meaning) for key in ROWS if key.meaning),
         {
             "overrides": _several("KEY=VALUE", "see above"),
             "--dry-run": {
@@ -66,7 +77,8 @@ COMMANDS: dict[str, tuple[str, str, str, Arguments] | None] = {
                 "nargs": "?",
                 "const": "all",
                 "choices": INFO_TOPICS,
-                "help": "what Hydra finds where",
+                "metavar": "TOPIC",
+                "help": f"what Hydra finds where: {', '.join(INFO_TOPICS)}",
             },
             "-cd --config-dir": {
                 "metavar": "DIR",
@@ -79,63 +91,78 @@ COMMANDS: dict[str, tuple[str, str, str, Arguments] | None] = {
         },
     ),
     "estimate": (
-        "parameters or states from real readings, and whether the model fits them",
+        "estimate parameters or states from real readings, and test the fit",
         "0 some estimator has an answer; 1 none has, or the model fits none",
         """
-  ipe-bench estimate readings=FILE.csv                          the default model, gins
-  ipe-bench estimate measurement=gins readings=FILE.parquet "solver=[newton]" "baseline=[gauss_newton,ekf]"
-  ipe-bench estimate measurement=nist/misra1a                   readings that come with the model
-  ipe-bench estimate measurement=formula "measurement.expression=a*(1-exp(-b*t))" measurement.start.a=5 \\
-      measurement.start.b=0.3 readings=FILE.csv                 your own formula of parameters and columns
-  ipe-bench estimate state_model=pendulum readings=LOG.csv "tracker=[ekf,ukf_rts]"    states that move, epoch by epoch
+  ipe-bench estimate readings=FILE.csv            the default model, gins
+  ipe-bench estimate measurement=gins readings=FILE.parquet "solver=[newton]"
+  ipe-bench estimate measurement=nist/misra1a     readings that the model has
+  ipe-bench estimate measurement=function measurement.of=MODULE:NAME \\
+      readings=FILE.csv                           your own function
+  ipe-bench estimate measurement=formula \\
+      "measurement.expression=a*(1-exp(-b*t))" measurement.start.a=5 \\
+      measurement.start.b=0.3 readings=FILE.csv   your own formula
+  ipe-bench estimate state_model=pendulum readings=LOG.csv "tracker=[ekf]"
 
-readings=FILE       CSV or Parquet; `ipe-bench list measurement -v` says which rows and columns a model wants.
-                    A missing reading keeps its row, with an empty cell. A column sigma has standard deviations.
-                    With state_model=, a row per epoch and a column per reading.
-readings=[A,B]      several files, which share all parameters but those in measurement.own=[NAME].
-noise.deviation=X   the standard deviation of a reading; standard errors and tests rest on it.
-noise=unknown       estimates the noise level, which leaves no test of its size; noise.by=COLUMN: one for each entry;
-                    "noise.sigma=a + b*h": a formula of the reading's magnitude h and of levels a and b.
+readings=FILE       CSV or Parquet; `ipe-bench list measurement -v` names the
+                    columns of a model. A missing reading is an empty cell.
+                    A column sigma has standard deviations. With state_model=,
+                    a row per epoch and a column per reading.
+readings=[A,B]      several files, which share all parameters except
+                    measurement.own=[NAME].
+noise.deviation=X   standard deviation of a reading, for standard errors and
+                    the test of fit.
+noise=unknown       estimate the noise level; the size of residuals is then
+                    not tested. noise.by=COLUMN: a level for each entry.
+                    "noise.sigma=a + b*h": a formula of levels a, b and of the
+                    reading's magnitude h.
 ignore_columns=[A]  columns to leave out.
-find=[A,B]          constants, noises or readings of state_model=, whose numbers are those of largest likelihood.
-parameters.NAME.fixed=X, .lower=X, .upper=X   what is known of a parameter; parameters=FILE.yaml has that of many.
-error_scale=X       how far the parameters may lie from the nominal point: the prior of filters and map_lm.
-figures=none        omits the figures.
-output=DIR          folder of the files, which are listed at the end: by default outputs/estimate-MODEL, or
-                    outputs/estimate-MODEL-2 and so on. Files of other commands are never overwritten.
+find=[A,B]          find constants, noises or readings of state_model= by
+                    maximum likelihood.
+parameters.NAME.fixed=X, .lower=X, .upper=X
+                    knowledge of a parameter; parameters=FILE.yaml: of many.
+error_scale=X       distance of parameters from the nominal point: the prior
+                    of filters and map_lm.
+figures=none        omit the figures.
+output=DIR          folder of the files (outputs/estimate-MODEL, or
+                    outputs/estimate-MODEL-2 and so on). Files of other
+                    commands are never overwritten.
 """,
         {"arguments": _several("KEY=VALUE", "any key of `ipe-bench run`")},
     ),
     # A question describes itself in its folder, and its line in the table of names.
     **dict.fromkeys(QUESTIONS),
     "report": (
-        "tables, figures and report of what is stored",
+        "build tables, figures and report from stored results",
         _MISSING,
         f"""
 The report is made from stored results alone.
 
   ipe-bench report DIR                            into DIR itself
-  ipe-bench report DIR1 DIR2 output=DIR           several folders together, into another
-  ipe-bench report DIR paper=overview,headline columns=error_scale,estimator,success width=3.5
+  ipe-bench report DIR1 DIR2 output=DIR           several folders in one report
+  ipe-bench report DIR paper=overview columns=estimator,success width=3.5
 
-paper=NAMES          tables and figures for a paper instead, into DIR/paper: LaTeX (booktabs, siunitx), PDF and PNG
-columns=NAMES        columns of the tables, in this order; an unknown name is refused with a list of the known ones
-width=INCHES         width of a figure or table: 3.5 for one column, 7.16 for two
+paper=NAMES         tables and figures for a paper instead, into DIR/paper:
+                    LaTeX (booktabs, siunitx), PDF and PNG
+columns=NAMES       columns of the tables, in this order
+width=INCHES        width of a figure or table: 3.5 for one column, 7.16 for two
 
-figures=all          figures to draw: all, main (the few that answer the question; the default) or none
-formats=pdf,md,tex   {MEANING}
+figures=all         figures to draw: all, main (the default) or none
+formats=pdf,md,tex  {MEANING}
 """,
         {"arguments": _several("DIR", "folders of results, such as outputs/paper")},
     ),
     "bundle": (
-        "results in one archive to share, or whether such an archive is whole",
+        "pack results into one archive to share, or check such an archive",
         _MISSING,
         """
-  ipe-bench bundle outputs/paper                  outputs/paper.zip: all results, and a manifest with their digests
+  ipe-bench bundle outputs/paper                  outputs/paper.zip: results and
+                                                  a manifest of digests
   ipe-bench bundle outputs/a outputs/b output=both.zip
-  ipe-bench bundle both.zip                       is it whole, and what is its digest?
+  ipe-bench bundle both.zip                       check it, and print its digest
 
-The same results give the same file, so that the digest may stand in a paper. Others read it beside their own results:
+Equal results give equal files, so a paper can cite the digest. Others read the
+bundle beside their own results:
 
   ipe-bench report outputs/mine both.zip output=outputs/together
   ipe-bench compare outputs/mine both.zip
@@ -143,7 +170,7 @@ The same results give the same file, so that the digest may stand in a paper. Ot
         {"arguments": _several("DIR", "folders of results, or one bundle to check")},
     ),
     "status": (
-        "what is done, missing, failed and stale in folders of results",
+        "list what is done, missing, failed and stale in folders of results",
         "0 complete; 1 not complete",
         "",
         {
@@ -152,7 +179,7 @@ The same results give the same file, so that the digest may stand in a paper. Ot
         },
     ),
     "list": (
-        "options to choose from, and where each comes from",
+        "list the options of all groups, and where each comes from",
         "",
         "",
         {
@@ -161,12 +188,12 @@ The same results give the same file, so that the digest may stand in a paper. Ot
             ),
             "-v --verbose": {
                 "action": "store_true",
-                "help": "with the options of each, and the files of models",
+                "help": "with the options of each, and the columns of readings files",
             },
         },
     ),
     "check": (
-        "whether a plugin keeps the promises that every component makes",
+        "test whether a plugin keeps the promises of its kind",
         "0 all checks passed; 1 some failed",
         "",
         {
@@ -176,18 +203,20 @@ The same results give the same file, so that the digest may stand in a paper. Ot
         },
     ),
     "new": (
-        "a working model of one file, or a plugin in plugins/NAME, to start from",
+        "create a plugin, or a model of one file, from a template",
         "",
         """
   ipe-bench new solver my_solver                  plugins/my_solver
-  ipe-bench new filter my_filter                  plugins/my_filter, a baseline that takes readings epoch by epoch
-  ipe-bench new state_model my_model              plugins/my_model, states that move
-  ipe-bench new tracker my_tracker                plugins/my_tracker, a filter or smoother of such states
-  ipe-bench new ode my_model                      my_model.yaml, differential equations
-  ipe-bench new function my_model                 my_model.py, a function of parameters and columns
-  ipe-bench new KIND NAME --language LANGUAGE     plugins/NAME, of a kind that an installed plugin adds
-  ipe-bench new skill DIR                         pages by which a coding agent writes plugins, into a new folder DIR
-  ipe-bench new ci                                a GitHub workflow that compares what plugins/ estimates with its base
+  ipe-bench new filter my_filter                  a filter of constants
+  ipe-bench new state_model my_model              states that move
+  ipe-bench new tracker my_tracker                a filter or smoother of them
+  ipe-bench new ode my_model                      my_model.yaml, by equations
+  ipe-bench new function my_model                 my_model.py, by a function
+  ipe-bench new KIND NAME --language LANGUAGE     a kind that a plugin adds
+  ipe-bench new skill DIR                         pages for a coding agent
+  ipe-bench new ci                                a workflow that compares the
+                                                  estimators of plugins/ with
+                                                  their base
 """,
         {
             "kind": {"metavar": "KIND", "help": f"{', '.join((*MODELS, *KINDS))}, skill or ci"},
@@ -200,7 +229,7 @@ The same results give the same file, so that the digest may stand in a paper. Ot
         },
     ),
 }
-"""Each command's line, its exit codes besides 2, what its help says more, and its arguments; None for a question."""
+"""Each command's line, its exit codes besides 2, the rest of its help, and its arguments; None for a question."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -266,9 +295,11 @@ def program() -> Parser:
 def parser_of(name: str) -> Parser:
     """Builds the parser of a command."""
     what, codes, more, arguments = COMMANDS[name] or _of_question(name)
-    epilog = f"Exit codes: {codes}; 2 a mistake in what was asked for." if codes else None
+    epilog = textwrap.fill(f"Exit codes: {codes}; 2 wrong arguments.", 80) if codes else None
     found = Parser(
-        prog=f"ipe-bench {name}", description=f"ipe-bench {name}: {what}\n{more}", epilog=epilog
+        prog=f"ipe-bench {name}",
+        description=f"{textwrap.fill(f'ipe-bench {name}: {what}', 80)}\n{more}",
+        epilog=epilog,
     )
     for names, options in arguments.items():
         found.add_argument(*names.split(), **options)

@@ -25,19 +25,17 @@ class Row(NamedTuple):
 
 QUESTIONS = {
     "design": Row(
-        "what the readings will say of each parameter, and which to take instead",
+        "predict how well each parameter will be determined, and choose readings",
         (*of("run", "figures", "estimators"), "trials"),
-        "the bounds of states are those of `ipe-bench run state_model=NAME`",
+        "use `ipe-bench run state_model=NAME`, which computes the bounds of states",
     ),
     "posterior": Row(
-        "the posterior of a few trials, and how far estimators are from it",
+        "sample the posterior of a few trials, and compare estimators with it",
         of("run", "figures"),
         "use `ipe-bench run state_model=NAME`, with tracker=[grid] for one state, or tracker=[bootstrap]",
     ),
-    "compare": Row(
-        "whether a second version, setting or estimator is better or worse than a first"
-    ),
-    "audit": Row("whether the covariance that another program reports describes its errors"),
+    "compare": Row("compare two versions, settings or estimators on paired trials"),
+    "audit": Row("test whether the covariance of another program describes its errors"),
 }
 """A question is a folder of `ipe_bench.questions` and its row here."""
 

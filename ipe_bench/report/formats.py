@@ -7,5 +7,7 @@ FIGURES = (PAGE, "pdf", "svg")
 TABLES = ("csv", "md", "tex")
 """Formats of tables: the first is always written."""
 FORMATS = (*FIGURES, *TABLES)
-MEANING = f"file formats besides PNG of figures ({', '.join(FIGURES[1:])}) and CSV of tables ({', '.join(TABLES[1:])})"
+MEANING = (
+    f"further formats of figures ({', '.join(FIGURES[1:])}) and tables ({', '.join(TABLES[1:])})"
+)
 """What help says of `formats=`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import subprocess
@@ -54,6 +55,36 @@ def test_the_columns_that_the_advice_on_choosing_names_are_there(tmp_path):
     assert re.search(r"`(\w+)` in `summary_all.csv`", page)[1] in table  # type: ignore[index]
 
 
+def test_it_has_at_most_1100_words():
+    assert len(README.split()) <= 1100
+
+
+def cells(row: str) -> list[str]:
+    return [cell.strip(" `") for cell in row.strip("|").split("|")]
+
+
+def table_under(heading: str, text: str) -> dict[str, dict[str, str]]:
+    """The first Markdown table below a heading: its cells by row and column."""
+    below = text.partition(f"## {heading}\n")[2].splitlines()
+    begins = next(i for i, line in enumerate(below) if line.startswith("|"))
+    lines = list(itertools.takewhile(lambda line: line.startswith("|"), below[begins:]))
+    names = cells(lines[0])[1:]
+    rows = [cells(line) for line in lines[2:]]
+    return {name: dict(zip(names, row, strict=True)) for name, *row in rows}
+
+
+def test_its_rows_of_states_are_those_of_the_page_of_tables():
+    page = ROOT / "ipe_bench/report/docs/pages/explanation/tables_of_states.md"
+    tables = page.read_text(encoding="utf-8")
+    shown = table_under("States that move", README)
+    bearings = table_under("Success and cost", tables)["30"]
+    walking = table_under("Walking drifts", tables)["success, % (95 % interval)"]
+    found = [row for name, row in shown.items() if "error scale" in name]
+    assert len(found) == 2
+    for row, known in zip(found, (bearings, walking), strict=True):
+        assert {name: known[name].partition(" (")[0] for name in row} == row
+
+
 def recomputed(folder: Path) -> pd.DataFrame:
     """What a reader computes from the trials alone, with pandas: a row per error scale and estimator."""
     rows = ib.load(folder)
@@ -99,12 +130,13 @@ def check(folder: Path) -> pd.DataFrame:
 
 @pytest.mark.slow
 def test_every_line_runs_in_order_and_the_table_comes_out(tmp_path):
-    (tmp_path / "ipe_bench").symlink_to(ROOT / "ipe_bench")
     (command,) = re.findall(
         r"^run:.*\n\t\$\(BIN\)/(.*)$", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE
     )
     script = (
-        "\n".join(LINES).replace("make run\n", f"{command}\n").replace(". .venv/bin/activate\n", "")
+        "\n".join(LINES)
+        .replace("make run\nmake test\n", f"{command}\n")
+        .replace(". .venv/bin/activate\n", "")
     )
     assert script.count("ipe-bench ") >= 9
     assert DRAWN in README

@@ -10,10 +10,11 @@ from ipe_bench.questions.question import Answered, Question
 
 _MORE = """
   ipe-bench audit runs.csv
-  ipe-bench audit runs.parquet output=outputs/audit       audit.csv and audit.html, too
+  ipe-bench audit runs.parquet output=outputs/audit   audit.csv and audit.html
 
-A row per run, with columns NAME_true and NAME (or NAME_error), NAME_std (or NAME_var), and cov_A_B as far as there are
-any; or long: run, parameter, true, estimate, std. Rows of one run have its number in the column run.
+A row per run, with columns NAME_true and NAME (or NAME_error), NAME_std (or
+NAME_var), and cov_A_B where there are any; or long: run, parameter, true,
+estimate, std. The column run groups rows of one run.
 """
 
 
@@ -38,7 +39,7 @@ def options() -> Mapping[str, Any]:
 
 
 QUESTION = Question(
-    codes="0 it may; 1 it is surely too small or too large",
+    codes="0 no evidence that the covariance is wrong; 1 it is too small or too large",
     more=_MORE,
     argument=("FILE", "a table of truths, estimates and reported covariances"),
     run=answer,

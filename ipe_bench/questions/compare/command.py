@@ -10,19 +10,25 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.questions.question import NAMES, Answered, Question
 
 _MORE = """
-Stored results are compared, so run both first. Equal trials are paired; those of other seeds, in their order.
+Stored results are compared, so run both first. Trials are paired.
 
-  ipe-bench compare outputs/before outputs/after               two versions, or two settings, of the same estimators
+  ipe-bench compare outputs/before outputs/after     two versions or settings
   ipe-bench compare outputs/a outputs/b first=newton second=my_solver
-  ipe-bench compare outputs/a first=fixed_point second=newton  two estimators of one folder
+  ipe-bench compare outputs/a first=newton second=ekf    in one folder
 
-alpha=0.05           significance level: probability of any finding if there is no difference
-anytime=true         tests by e-values, which remain valid at any number of looks while trials are added
-fail_on=success,error  what is tested and must not be worse: success, error, cost, honesty (NEES farther from 1), bias
-margin.cost=0.1      the change that matters: success 0.01, error 0.02, cost 0.05, honesty 0.05, bias 0.1 deviations
-complete=true        fails on what the second lacks, too: estimators, scenarios, trials, a covariance
-power=0.9            computes the trials that find a difference of success, such as difference=0.05, with this power
-output=DIR           writes comparison.csv and comparison.html there
+alpha=0.05          significance level: probability of any finding if there is
+                    no difference
+anytime=true        test by e-values, which remain valid at every look while
+                    trials are added
+fail_on=success,error  what must not be worse: success, error, cost, honesty
+                    (NEES farther from 1), bias
+margin.cost=0.1     the change that matters: success 0.01, error 0.02, cost
+                    0.05, honesty 0.05, bias 0.1 deviations
+complete=true       fail if the second lacks estimators, scenarios, trials or a
+                    covariance
+power=0.9           compute the number of trials that find a difference of
+                    success, such as difference=0.05, with this power
+output=DIR          write comparison.csv and comparison.html there
 """
 
 
@@ -69,7 +75,7 @@ def options() -> Mapping[str, Any]:
 
 
 QUESTION = Question(
-    codes="0 not worse; 1 the second is worse, or something that was asked for is missing",
+    codes="0 not worse; 1 the second is worse, or something is missing",
     more=_MORE,
     argument=("DIR", "one or two folders of results"),
     run=answer,

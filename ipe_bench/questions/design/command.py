@@ -11,17 +11,18 @@ from ipe_bench.questions.question import NAMES, Answered, Asked, Question
 
 _MORE = """
   ipe-bench design measurement=ranging error_scale=10
-  ipe-bench design measurement=gins by=time                     the same cases and axes, at other times
+  ipe-bench design measurement=gins by=time          other times, equal cases
   ipe-bench design measurement=gins truth_measurement=gins_tilted
 
-The analysis uses the model's Jacobians at true parameters drawn from the prior, without noise or estimates.
-Unmodelled errors are those of truth_measurement=, or of every option of measurement= that is the same model with
-more errors.
+The analysis uses the model's Jacobians at true parameters drawn from the prior,
+without noise or estimates. Unmodelled errors come from truth_measurement=, or
+from every option of measurement= that adds errors to the model.
 
-by=COLUMN            chooses by this column of the readings alone; by=[A,B] by these together
-readings=NUMBER      largest number of readings; by default today's
-criterion=D          what is small: mean squared bound (A, the default) or volume of the ellipsoid (D)
-output=DIR           folder of the files
+by=COLUMN           choose by this column of the readings; by=[A,B] by several
+readings=NUMBER     largest number of readings (today's)
+criterion=D         minimise the mean squared bound (A, the default) or the
+                    volume of the ellipsoid (D)
+output=DIR          folder of the files
 """
 
 

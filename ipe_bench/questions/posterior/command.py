@@ -14,15 +14,17 @@ _TRIALS = 3
 _MOST_TRIALS = 100
 
 _MORE = """
-  ipe-bench posterior error_scale=300 "solver=[newton]" "baseline=[gauss_newton,ekf]"
-  ipe-bench posterior measurement=ranging noise=gaussian noise.deviation=0.1 error_scale=100 trials=1
+  ipe-bench posterior error_scale=300 "solver=[newton]" "baseline=[ekf]"
+  ipe-bench posterior measurement=ranging noise=gaussian noise.deviation=0.1 \\
+      error_scale=100 trials=1
 
-Samples the posterior of the first trials of a scenario (trials=3 by default) by sequential Monte Carlo, without
-linearisation: particles move from the prior to the posterior as the likelihood is tempered. Each estimator's
-estimate and covariance are then compared with it. A trial takes seconds to a minute.
+Sample the posterior of the first trials of a scenario (trials=3 by default) by
+sequential Monte Carlo, without linearisation: particles move from the prior to
+the posterior as the likelihood is tempered. Compare the estimate and covariance
+of each estimator with it. A trial takes seconds to a minute.
 
-particles=NUMBER     particles of each of two populations (1000)
-output=DIR           folder of the files
+particles=NUMBER    particles of each of two populations (1000)
+output=DIR          folder of the files
 """
 
 
@@ -68,7 +70,7 @@ def options() -> Mapping[str, Any]:
 
 
 QUESTION = Question(
-    codes="0 the populations of particles agree; 1 in some trial they do not",
+    codes="0 the populations of particles agree; 1 they differ in some trial",
     more=_MORE,
     argument=("KEY=VALUE", "any key of `ipe-bench run`"),
     run=answer,

@@ -133,11 +133,12 @@ def _setting(title: str, rows: Sequence[Mapping[str, Any]], width: int) -> Table
     ]
     # The number of trials stands in the title if it is the same for all.
     counts = sorted({row["trials"] for row in rows})
+    # A narrow screen leaves out the last columns: cost and time before what a plugin was asked to show.
+    columns[-2:-2] = statistics("terminal", rows)
     if len(counts) > 1:
         columns.append(column("trials", [row["trials"] for row in rows], str))
     else:
         title = f"{title}: {counts[0]} trial{'s' * (counts[0] != 1)} per row"
-    columns += statistics("terminal", rows)
     return Table("summary", title, "", columns, grouped=1, whole="summary.csv")
 
 

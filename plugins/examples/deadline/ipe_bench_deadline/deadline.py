@@ -34,7 +34,7 @@ STATISTIC = Statistic(
     " Interval: distribution-free, from the order of the trials (Conover, Practical Nonparametric Statistics, 1999).",
     lambda s: quantile(s.cost, DONE),
     limits=lambda s: limits(s.cost),
-    where=("costs",),
+    where=("terminal", "costs"),
     titles={"costs": "99 % done by"},
     limits_titles={"costs": "95 % of that"},
 )
