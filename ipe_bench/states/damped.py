@@ -16,7 +16,7 @@ from ipe_bench.basics.streams import normals, own_generators
 from ipe_bench.states.algebra import root
 from ipe_bench.states.base import Normal, StateModel
 from ipe_bench.states.linearisation import Taylor, Unscented
-from ipe_bench.states.smoothers import path_p, smoothed, whole
+from ipe_bench.states.smoothers import covariances, path_p, smoothed, whole
 from ipe_bench.states.trackers import Tracker, Tracks, filtered
 from ipe_bench.states.whole_paths import PathDensity, Settled, Tangents
 from ipe_bench.states.widened import widened
@@ -216,7 +216,7 @@ def reported(density: PathDensity, paths: Descent) -> Tracks:
     at = density.settled_exactly(paths.at)
     out = Tracks.empty(model, len(at.x))
     tangents = density.tangents(at)
-    P, calls = widened(density, at, tangents, density.covariances(tangents))
+    P, calls = widened(density, at, tangents, covariances(density, tangents))
     out.start, out.mean, out.covariance = Normal(at.x[:, 0], P[:, 0]), at.x[:, 1:], P[:, 1:]
     out.cost, out.status, out.iterations = at.cost, paths.status, paths.iterations
     out.calls = paths.calls + at.calls + calls + Taylor().calls(model.n) * model.evaluations

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
 
+from ipe_bench.basics.batches import put
 from ipe_bench.basics.linalg import Array, Mask, multiply
 from ipe_bench.basics.options import Count, NonNegative
-from ipe_bench.states.algebra import half, lower_solve, mahalanobis, symmetric, transposed
+from ipe_bench.states.algebra import half, lower_solve, symmetric, transposed
 from ipe_bench.states.base import Normal, StateModel
-from ipe_bench.states.linearisation import Rule, Taylor
-from ipe_bench.states.trackers import Filter, Tracker, Tracks, filtered, misfit
+from ipe_bench.states.linearisation import Affine, Rule, Taylor
+from ipe_bench.states.trackers import Filter, Tracker, Tracks, filtered, predict, update
+from ipe_bench.states.whole_paths import PathDensity, Settled, Tangents
 
 _HALVINGS = 12
 """Halvings of a damped step."""
@@ -74,7 +75,8 @@ class IteratedSmoother(Tracker):
     damped: bool = False
     """Whether steps that raise the cost of the path are halved; for Taylor's rule."""
     tolerance: NonNegative = 0.0
-    """Ends where no trial's path moves by more than so many of its own standard deviations."""
+    """A trial ends where its path moves by at most so many of its own standard deviations: by tangents over all states
+    and epochs together, by points those of each state."""
 
     def hindrance(self, model: StateModel) -> str | None:
         tangents = self.damped or isinstance(
@@ -84,12 +86,50 @@ class IteratedSmoother(Tracker):
 
     def track(self, model: StateModel, z: Array) -> Tracks:
         path = self.first.track(model, z)
+        if isinstance(self.rule, Taylor):
+            return self._by_tangents(PathDensity.of(model, z), path)
+        return self._by_points(model, z, path)
+
+    def _by_tangents(self, density: PathDensity, path: Tracks) -> Tracks:
+        model, x, calls = density.model, whole(path)[0], path.calls.copy()
+        if not model.moved_first:
+            x[:, 0] = x[:, 1]
+        going, tangents = np.arange(len(x)), None
+        for _ in range(self.iterations):
+            some = density.subset(going)
+            at, about = some.about(x[going])
+            new = at.x + some.step(about, at)
+            calls[going] += at.calls
+            if self.damped:
+                shorter = _shortened(some, at.x, new)
+                new = shorter.x
+                calls[going] += shorter.calls
+            x[going] = new
+            tangents = about if tangents is None else put(tangents, going, about)
+            going = going[some.size(about, new - at.x) > self.tolerance**2]
+            if not going.size:
+                break
+        assert tangents is not None
+        end = density.settled(x)
+        calls += end.calls
+        if self.damped:
+            end = density.settled_exactly(end)
+            x, calls = end.x, calls + end.calls
+        P = covariances(density, tangents)
+        out = Tracks.empty(model, len(x))
+        out.start, out.mean, out.covariance = Normal(x[:, 0], P[:, 0]), x[:, 1:], P[:, 1:]
+        out.cost, out.calls = end.cost, calls
+        return out
+
+    def _by_points(self, model: StateModel, z: Array, path: Tracks) -> Tracks:
         calls, going = path.calls, np.ones(len(z), dtype=bool)
         for _ in range(self.iterations):
             new = smoothed(model, filtered(model, z, self.rule, path=path))
-            if self.damped:
-                new = _shortened(model, z, path, new)
             calls = calls + np.where(going, new.calls, 0.0)
+            if self.damped:
+                shorter = _shortened(PathDensity.of(model, z), whole(path)[0], whole(new)[0])
+                new.start, new.mean = new.start._replace(mean=shorter.x[:, 0]), shorter.x[:, 1:]
+                calls = calls + np.where(going, shorter.calls, 0.0)
             deviation = np.sqrt(np.maximum(np.diagonal(new.covariance, axis1=-2, axis2=-1), 0.0))
             moved = (np.abs(new.mean - path.mean) > self.tolerance * deviation) & (deviation > 0)
             path, on = new, moved.any(axis=(1, 2))
@@ -98,8 +138,8 @@ class IteratedSmoother(Tracker):
                 break
         path.calls = calls
         if not (model.gain_by_state or model.R_by_state):
-            path.cost = settled(model, z, whole(path)[0])[1]
-            path.calls = calls + model.evaluations
+            end = PathDensity.of(model, z).settled(whole(path)[0])
+            path.cost, path.calls = end.cost, calls + end.calls
         return path
 
 
@@ -163,29 +203,22 @@ def _smooth_by_scores(model: StateModel, tracks: Tracks, out: Tracks, rows: Mask
         at.mean[rows], at.covariance[rows] = mean, covariance
 
 
-def settled(model: StateModel, z: Array, x: Array) -> tuple[Array, Array]:
-    """The path x (trials, 1 + K, n) from before the first transition, each step moved into the range of its noise, with
-    its cost -2 log p(path | readings) (trials,) up to a constant:
-
-    x[k] <- f(x[k-1]) + G w,  w = G^+ (x[k] - f(x[k-1]))
-
-    Without a transition before the first epoch, the states before it are those of that epoch. Infinite if the start
-    lies outside the range of the prior, where a path has no density.
-    """
-    x = x.copy()
-    if not model.moved_first:
-        x[:, 0] = x[:, 1]
-    total = mahalanobis(x[:, 0] - model.prior.mean, model.prior.covariance)
+def covariances(density: PathDensity, tangents: Tangents) -> Array:
+    """The covariances (trials, 1 + K, n, n) of the path of an affine model."""
+    model, blank = density.model, np.where(np.isfinite(density.z), 0.0, np.nan)
+    out = Tracks.empty(model, len(blank))
+    x = out.start
     for k in range(model.epochs):
         if model.moves(k):
-            G, moved = model.gain(k), model.nearest_state(model.transition(x[:, k], k), x[:, k + 1])
-            w = multiply(np.linalg.pinv(G), x[:, k + 1] - moved)
-            # Without a column there is no noise, and NumPy 2.0 no rank.
-            if G.shape[1] < model.n or np.linalg.matrix_rank(G) < model.n:
-                x[:, k + 1] = moved + multiply(G, w)
-            total = total + np.sum(w**2, axis=-1)
-        total = total + misfit(model, z[:, k], x[:, k + 1, None], k)[0][:, 0]
-    return x, total
+            A = tangents.A[:, k]
+            move = Affine(A, np.zeros(A.shape[:2]), np.zeros(A.shape))
+            x = predict(x, move, model.Q(k))
+            out.moves.append(move)
+            out.predicted.append(x)
+        H = tangents.H[:, k]
+        read = Affine(H, np.zeros(H.shape[:2]), np.zeros((1, 1)))
+        x = out.note(k, update(x, read, model.R(k), blank[:, k]))
+    return whole(smoothed(model, out))[1]
 
 
 def whole(tracks: Tracks) -> tuple[Array, Array]:
@@ -203,27 +236,17 @@ def path_p(z: Array, cost: Array) -> Array:
     return chdtrc(np.isfinite(z).sum(axis=(1, 2)), cost)
 
 
-def _halved(
-    old: Array, new: Array, settle: Callable[[Array], tuple[Array, Array]]
-) -> tuple[Array, Array]:
-    """The step from `old` to `new` (trials, ...), settled, and halved in each trial until its cost (trials,) is not
-    above that of `old`; and how many costs (trials,) that took."""
-    best, share = settle(old)[1], np.ones((len(old),) + (1,) * (old.ndim - 1))
-    x, worse, taken = new, np.ones(len(old), dtype=bool), np.ones(len(old))
-    for _ in range(_HALVINGS):
-        taken += worse
-        x, cost = settle(old + share * (new - old))
-        worse = ~(cost <= best * (1 + 1e-12))
-        if not worse.any():
+def _shortened(density: PathDensity, old: Array, new: Array) -> Settled:
+    """The steps between paths (trials, 1 + K, n), halved in each trial until they do not raise its cost; the calls are
+    those of all costs."""
+    before, found = density.settled(old), density.settled(new)
+    calls, share = before.calls + found.calls, 1.0
+    for _ in range(_HALVINGS - 1):
+        rows = np.flatnonzero(~(found.cost <= before.cost * (1 + 1e-12)))
+        if not rows.size:
             break
-        share[worse] /= 2
-    return x, taken
-
-
-def _shortened(model: StateModel, z: Array, old: Tracks, new: Tracks) -> Tracks:
-    """The step from one path to the next, halved where it raises the path's cost."""
-    first, last = whole(old)[0], whole(new)[0]
-    path, costs = _halved(first, last, lambda x: settled(model, z, x))
-    new.calls = new.calls + costs * model.evaluations
-    new.mean, new.start = path[:, 1:], Normal(path[:, 0], new.start.covariance)
-    return new
+        share /= 2
+        part = density.subset(rows).settled(old[rows] + share * (new[rows] - old[rows]))
+        found = put(found, rows, part)
+        calls[rows] += part.calls
+    return replace(found, calls=calls)

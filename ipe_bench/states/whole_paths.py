@@ -11,9 +11,6 @@ from numpy.typing import NDArray
 from ipe_bench.basics.linalg import Array, finite, multiply
 from ipe_bench.states.algebra import factor, half, lower_solve, mahalanobis, transposed
 from ipe_bench.states.base import StateModel
-from ipe_bench.states.linearisation import Affine
-from ipe_bench.states.smoothers import smoothed, whole
-from ipe_bench.states.trackers import Tracks, predict, update
 
 _REACHED = 1e-9
 """Part of a state by which a path may miss the range of its noise or of the prior: round-off of a solve."""
@@ -166,11 +163,17 @@ class PathDensity:
             x[:, k + 1] = f + gap[:, k]
         return x, gap
 
+    def about(self, x: Array) -> tuple[Settled, Tangents]:
+        """The paths x (trials, 1 + K, n) as they are, and the affine model about them."""
+        f, h, A, H = self.model.slopes_along(x)
+        gap = x[:, 1:] - self.model.nearest_state(f, x[:, 1:])
+        calls = np.full(len(x), float(self.model.evaluations * (1 + self.model.n)))
+        seen = np.where(np.isfinite(self.z)[..., None], H, 0.0)
+        return self._weighed(x, gap, h, calls), Tangents(A, H, np.matmul(self.whitener, seen))
+
     def tangents(self, at: Settled) -> Tangents:
         """The affine model about settled paths."""
-        _, _, A, H = self.model.slopes_along(at.x)
-        seen = np.where(np.isfinite(self.z)[..., None], H, 0.0)
-        return Tangents(A, H, np.matmul(self.whitener, seen))
+        return self.about(at.x)[1]
 
     def left(self, tangents: Tangents, at: Settled) -> Array:
         """What the equations of a step leave at step 0 (trials, 1 + K, 2, n): of multipliers and of states."""
@@ -205,23 +208,6 @@ class PathDensity:
         v = multiply(tangents.B, step[:, 1:])
         e = half(self.model.prior.covariance).whitened(step[:, :1])
         return np.sum(w**2, axis=(1, 2)) + np.sum(v**2, axis=(1, 2)) + np.sum(e**2, axis=(1, 2))
-
-    def covariances(self, tangents: Tangents) -> Array:
-        """The covariances (trials, 1 + K, n, n) of the affine model's path."""
-        model, blank = self.model, np.where(np.isfinite(self.z), 0.0, np.nan)
-        out = Tracks.empty(model, len(blank))
-        x = out.start
-        for k in range(model.epochs):
-            if model.moves(k):
-                A = tangents.A[:, k]
-                move = Affine(A, np.zeros(A.shape[:2]), np.zeros(A.shape))
-                x = predict(x, move, model.Q(k))
-                out.moves.append(move)
-                out.predicted.append(x)
-            H = tangents.H[:, k]
-            read = Affine(H, np.zeros(H.shape[:2]), np.zeros((1, 1)))
-            x = out.note(k, update(x, read, model.R(k), blank[:, k]))
-        return whole(smoothed(model, out))[1]
 
     def blind_variances(self, tangents: Tangents) -> Array:
         """The variances (trials, 1 + K, n) of states that nothing is read of, along paths."""

@@ -26,7 +26,7 @@ from ipe_bench.states import (
     ukf,
 )
 from ipe_bench.states.damped import Descent
-from ipe_bench.states.smoothers import path_p, smoothed, whole
+from ipe_bench.states.smoothers import covariances, path_p, smoothed, whole
 from ipe_bench.states.trackers import filtered, linearised_move
 from ipe_bench.states.whole_paths import PathDensity
 from ipe_bench.trials.paths import PathBlock, StateScenario
@@ -65,7 +65,7 @@ def test_levenberg_and_marquardt_find_the_minimum_that_halved_steps_find():
     other = IteratedSmoother(ukf(), Taylor(), 50, damped=True, tolerance=1e-10).track(NEAR, z)
     np.testing.assert_allclose(found.mean, other.mean, atol=1e-7)
     density = PathDensity.of(NEAR, z)
-    P = density.covariances(density.tangents(density.settled(whole(found)[0])))[:, 1:]
+    P = covariances(density, density.tangents(density.settled(whole(found)[0])))[:, 1:]
     np.testing.assert_allclose(P, other.covariance, rtol=1e-5)
     np.testing.assert_allclose(
         found.cost, path_cost(NEAR, z, other.start.mean, other.mean), rtol=1e-9
