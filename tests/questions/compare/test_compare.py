@@ -324,7 +324,6 @@ def test_margins_are_for_the_user_to_say(tmp_path, capsys):
     )
 
 
-@pytest.mark.slow
 def test_what_is_gone_is_named_where_completeness_is_asked_for(tmp_path, capsys):
     """An estimator, half of the trials, a scenario and a covariance: a line each, and none without the word."""
     first, second = Synthetic(tmp_path / "a"), Synthetic(tmp_path / "b")
