@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -43,13 +43,15 @@ def precision_of(given: float | Mapping[str, float]) -> Mapping[str, float]:
     Raises:
         UserError: it is neither.
     """
-    named = (
-        {str(k): v for k, v in given.items()} if isinstance(given, Mapping) else {"success": given}
-    )
+    if isinstance(given, Mapping):
+        named = {str(name): value for name, value in given.items()}
+    else:
+        named = {"success": given}
     for name, value in named.items():
         if name not in WITH_PRECISION:
             raise UserError(f"precision.{name}: {unknown(name, WITH_PRECISION, 'statistic')}")
-        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 1:
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not is_number or not 0 < value < 1:
             key = f"precision.{name}" if isinstance(given, Mapping) else "precision"
             raise UserError(f"{key}={value}: give a number between 0 and 1, such as 0.01")
     if not named:
@@ -57,29 +59,53 @@ def precision_of(given: float | Mapping[str, float]) -> Mapping[str, float]:
     return named
 
 
-def _distances(sample: Sample, wanted: Mapping[str, float]) -> Iterator[tuple[float, str]]:
-    """Computes the ratio of each statistic's interval to the requested precision, above 1 if too
-    wide, and words for it."""
+class Distance(NamedTuple):
+    """Tells how far the interval of a statistic is from the requested precision."""
+
+    ratio: float
+    """Half its width over the precision, above 1 if it is too wide."""
+    words: str
+
+
+NO_READINGS = Distance(math.inf, "")
+
+
+def _distances(sample: Sample, wanted: Mapping[str, float]) -> Iterator[Distance]:
+    """Computes the distance of each statistic from its precision."""
     for statistic, precision in wanted.items():
         if statistic == "success":
-            share = float(sample.scalars["success"].mean())
-            low, high = share_sequence(int(sample.scalars["success"].sum()), len(sample))
-            width = max(high - share, share - low)
+            width = _width_of_success(sample)
+            shown = f"{100 * width:.2g} %"
         else:
-            low, high = (float(end[sample.n]) for end in rmse_sequence(sample))
-            width = float(np.sqrt(high / low)) - 1 if low > 0 else np.inf
-        known = math.isfinite(width)
-        shown = (
-            f"{100 * width:.2g} %"
-            if known
-            else "anything, since a few trials carry it or there are too few"
-        )
-        if known and statistic == "rmse" and (rare := float(rmse_unseen(sample)[sample.n])) > 0:
-            shown += f", unless errors are larger in 1 of {1 / rare:.0f} trials or fewer"
-        yield (
-            width / precision if known else np.inf,
-            f"{sample.group.estimator}: {statistic} ± {shown}",
-        )
+            width = _width_of_rmse(sample)
+            shown = _words_of_rmse(sample, width)
+        yield Distance(width / precision, f"{sample.group.estimator}: {statistic} ± {shown}")
+
+
+def _width_of_success(sample: Sample) -> float:
+    success = sample.scalars["success"]
+    share = float(success.mean())
+    low, high = share_sequence(int(success.sum()), len(sample))
+    return max(high - share, share - low)
+
+
+def _width_of_rmse(sample: Sample) -> float:
+    """Computes the larger end of the interval over its centre, less 1; infinite where there is
+    none."""
+    low, high = (float(end[sample.n]) for end in rmse_sequence(sample))
+    if not low > 0 or not math.isfinite(high):
+        return math.inf
+    return float(np.sqrt(high / low)) - 1
+
+
+def _words_of_rmse(sample: Sample, width: float) -> str:
+    if math.isinf(width):
+        return "anything, since a few trials carry it or there are too few"
+    words = f"{100 * width:.2g} %"
+    rare = float(rmse_unseen(sample)[sample.n])
+    if rare > 0:
+        words += f", unless errors are larger in 1 of {1 / rare:.0f} trials or fewer"
+    return words
 
 
 def compute_until(
@@ -109,10 +135,8 @@ def compute_until(
         StorageError: nothing can be stored any more.
     """
     # Code that fills its variables while it computes is still what it was when the run began.
-    scenarios, estimators = (
-        pinned(list(scenarios)),
-        {label: pinned(one) for label, one in estimators.items()},
-    )
+    scenarios = pinned(list(scenarios))
+    estimators = {label: pinned(one) for label, one in estimators.items()}
     options: dict[str, Any] = {"execution": execution, "watch": watch, "command": command}
     if precision is None:
         if time_limit is not None:
@@ -121,56 +145,65 @@ def compute_until(
             )
         trials = TRIALS if most is None else most
         return compute(scenarios, estimators, trials, output, block_size=block_size, **options), []
-    wanted, budget, began = (
-        precision_of(precision),
-        MOST_TRIALS if most is None else most,
-        time.monotonic(),
-    )
+    wanted = precision_of(precision)
+    budget = MOST_TRIALS if most is None else most
     if time_limit is not None and not time_limit > 0:
         raise UserError(f"time_limit={time_limit}: give a number of seconds above 0")
     if any(scenario.noise.real for scenario in scenarios):
         raise UserError(f"precision={precision}: certified readings are one trial; leave it out")
+    end = math.inf if time_limit is None else time.monotonic() + time_limit
     validate(scenarios, estimators, budget, block_size)
     block_size = BLOCK_SIZE if block_size is None else block_size
     options |= {"block_size": block_size, "further": {"precision": wanted}}
     at = [_first_trials(s, estimators, Path(output), block_size, budget) for s in scenarios]
-    names, failures = [new_name() for _ in scenarios], []
+    names = [new_name() for _ in scenarios]
+    failures = []
     stops: dict[int, dict[str, Any]] = {}
+    # Each round adds blocks to every scenario that goes on, so that all share the time.
     while len(stops) < len(scenarios):
-        for i in [i for i in range(len(scenarios)) if i not in stops]:
-            failed = compute(
-                [scenarios[i]], estimators, at[i], output, record_as=names[i], **options
-            )
-            ratios = [
-                one
-                for sample in _stored(scenarios[i], estimators, output)
-                for one in _distances(sample, wanted)
-            ]
-            ratio, widest = max(ratios, key=lambda one: one[0], default=(np.inf, ""))
-            reasons = {
-                "some blocks failed": failed,
-                "no trial has readings": not ratios,
-                NARROW: ratio <= 1,
-                "there are as many trials as there may be": at[i] >= budget,
-                "the time is over": time_limit is not None
-                and time.monotonic() - began >= time_limit,
-            }
-            if reason := next((words for words, applies in reasons.items() if applies), ""):
+        for i, scenario in enumerate(scenarios):
+            if i in stops:
+                continue
+            failed = compute([scenario], estimators, at[i], output, record_as=names[i], **options)
+            widest = _widest(_stored(scenario, estimators, output), wanted)
+            full = at[i] >= budget
+            reason = _reason_to_stop(failed, widest, full, late=time.monotonic() >= end)
+            if reason:
                 failures += failed
-                known = {k: v for k, v in ResultKey(scenarios[i]).names.items() if k != "estimator"}
-                stops[i] = known | {"trials": at[i], "reason": reason, "widest": widest}
+                row = {"trials": at[i], "reason": reason, "widest": widest.words}
+                stops[i] = ResultKey(scenario).names | row
+                del stops[i]["estimator"]
             else:
-                at[i] = next_trials(at[i], ratio, block_size, budget)
+                at[i] = next_trials(at[i], widest.ratio, block_size, budget)
     return tuple(failures), [stops[i] for i in range(len(scenarios))]
+
+
+def _widest(stored: Iterable[Sample], wanted: Mapping[str, float]) -> Distance:
+    distances = [one for sample in stored for one in _distances(sample, wanted)]
+    return max(distances, key=lambda one: one.ratio, default=NO_READINGS)
+
+
+def _reason_to_stop(failed: Sequence[str], widest: Distance, full: bool, late: bool) -> str:
+    """Returns why a scenario gets no more trials; empty if it does."""
+    if failed:
+        return "some blocks failed"
+    if widest is NO_READINGS:
+        return "no trial has readings"
+    if widest.ratio <= 1:
+        return NARROW
+    if full:
+        return "there are as many trials as there may be"
+    return "the time is over" if late else ""
 
 
 def next_trials(trials: int, ratio: float, block: int, most: int) -> int:
     """Computes how many trials to have before looking again: what the widths ask for, at most twice
     as many as now, in whole blocks. Widths shrink with the root of the number."""
-    wanted = (
-        2.0 * trials if not math.isfinite(ratio) else min(2.0 * trials, 1.02 * trials * ratio**2)
-    )
-    return min(most, max(trials // block + 1, math.ceil(wanted / block)) * block)
+    wanted = 2.0 * trials
+    if math.isfinite(ratio):
+        wanted = min(wanted, 1.02 * trials * ratio**2)
+    blocks = max(trials // block + 1, math.ceil(wanted / block))
+    return min(most, blocks * block)
 
 
 def _first_trials(
@@ -178,10 +211,14 @@ def _first_trials(
 ) -> int:
     """Returns the number to begin with: what is stored of every estimator, or one block."""
     cells = result_keys(scenario, estimators)
-    results = Results.read([output] if output.is_dir() else [], keys={cell.key for cell in cells})
-    stored = min(
-        gaps[0][0] if (gaps := results.missing(cell.key, most)) else most for cell in cells
-    )
+    folders = [output] if output.is_dir() else []
+    results = Results.read(folders, keys={cell.key for cell in cells})
+    stored = most
+    for cell in cells:
+        missing = results.missing(cell.key, most)
+        if missing:
+            # Trials are stored without a gap up to the first that is missing.
+            stored = min(stored, missing[0][0])
     return min(most, max(stored, block_size))
 
 
@@ -210,11 +247,12 @@ def objective(
         UserError: nothing is stored, or the number is not known.
     """
     for sample in _stored(scenario, estimators, output):
-        if sample.group.label == label:
-            value = float((summary_rows(sample)[-1] | rows_of(SCORES, sample)[-1])[column])
-            if np.isnan(value):
-                raise UserError(
-                    f"objective={label}.{column}: is not known of {describe_names(sample.group.cells[0].names)}"
-                )
-            return value
+        if sample.group.label != label:
+            continue
+        row = summary_rows(sample)[-1] | rows_of(SCORES, sample)[-1]
+        value = float(row[column])
+        if np.isnan(value):
+            names = describe_names(sample.group.cells[0].names)
+            raise UserError(f"objective={label}.{column}: is not known of {names}")
+        return value
     raise UserError(f"objective={label}.{column}: no trials of {label} are stored")
