@@ -26,16 +26,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _RESERVED = (
-    BEST,
-    "measurement",
-    "noise",
-    "prior",
-    "error_scale",
-    "seed",
-    "estimator",
-    "parameter",
-    "unit",
-    "scenario",
+    *(BEST, "measurement", "noise", "prior", "error_scale", "seed", "estimator"),
+    *("parameter", "unit", "scenario"),
 )
 DIGITS = 4
 """Significant digits of the statistics in `summary.csv`."""
@@ -55,8 +47,10 @@ def add_statistics(records: Sequence[Statistic]) -> list[str]:
     _of_plugins.clear()
     faults = []
     for record in records:
-        if fault := fault_of(record):
-            faults.append(f"statistic={getattr(record, 'name', record)}: {fault}; it is left out")
+        fault = fault_of(record)
+        if fault:
+            name = getattr(record, "name", record)
+            faults.append(f"statistic={name}: {fault}; it is left out")
         else:
             _of_plugins[record.name] = record
     return faults
@@ -74,8 +68,9 @@ def fault_of(record: Any) -> str:
             return f"{column!r} is not a name for a column; use letters, digits and underscores"
         if column in taken:
             return f"there is a column {column} already; choose another name"
-    chosen = [("kind", record.kind, Kind), *(("where", where, Where) for where in record.where)]
-    for name, value, choices in [*chosen, ("given", record.given, Condition)]:
+    places = [("where", where, Where) for where in record.where]
+    chosen = [("kind", record.kind, Kind), *places, ("given", record.given, Condition)]
+    for name, value, choices in chosen:
         if value not in get_args(choices):
             return f"{name}={value}: choose from {', '.join(get_args(choices))}"
     return ""
@@ -91,13 +86,15 @@ def columns_of_added(record: Statistic, sample: Sample) -> dict[str, list[Any]]:
         columns = record.columns_of(sample)
     except Exception as error:
         raise UserError(place_of(error)) from error
+    kind = str if record.kind == "word" else int | float | np.number
     for name, values in columns.items():
         if len(values) != sample.n + 1:
             raise UserError(
-                f"{name}: has {len(values)} values; return one, or one for each of {sample.n} parameters and for all"
+                f"{name}: has {len(values)} values; return one, or one for each of {sample.n}"
+                " parameters and for all"
             )
         for value in values:
-            if not isinstance(value, str if record.kind == "word" else int | float | np.number):
+            if not isinstance(value, kind):
                 raise UserError(
                     f"{name}: a value is a {type(value).__name__}; return a float, or NaN for none"
                 )
@@ -128,10 +125,12 @@ def main_columns(summary: pd.DataFrame) -> pd.DataFrame:
     run.
     """
     states = "noise" in summary and (summary["noise"] == "model").any()
-    main = [s for s in STATISTICS if s.name in (MAIN_OF_STATES if states else MAIN)]
-    chosen = {*frame_columns([*main, *_of_plugins.values()]), BEST} - {*NOT_MAIN}
+    names = MAIN_OF_STATES if states else MAIN
+    statistics = [*(s for s in STATISTICS if s.name in names), *_of_plugins.values()]
+    chosen = {*frame_columns(statistics), BEST} - {*NOT_MAIN}
     heads = [c for c in summary.columns if c not in summary_columns()]
-    main = summary[[c for c in summary.columns if c in chosen or c in heads]].copy()
+    shown = chosen.union(heads)
+    main = summary[[c for c in summary.columns if c in shown]].copy()
     numbers = main.drop(columns=heads).select_dtypes("float")
     main[numbers.columns] = numbers.map(lambda number: float(f"{number:.{DIGITS}g}"))
     return main
@@ -151,18 +150,18 @@ def summary_rows(sample: Sample) -> list[dict[str, Any]]:
         except UserError as error:
             line = f"statistic={record.name}: {error}; it is missing where that is so"
             sample.collection.extra_problems.append(line)
-            columns = {
-                name: ["-" if record.kind == "word" else np.nan] * len(rows)
-                for name in record.columns
-            }
-        for i, row in enumerate(rows):
-            row |= {name: values[i] for name, values in columns.items()}
+            nothing = "-" if record.kind == "word" else np.nan
+            columns = {name: [nothing] * len(rows) for name in record.columns}
+        for name, values in columns.items():
+            for row, value in zip(rows, values, strict=True):
+                row[name] = value
     group = sample.group
-    head = dict(group.columns) | {"estimator": group.estimator} | dict(group.options)
-    labels = [*((p["name"], p["unit"]) for p in sample.parameters), (ALL, "linear bound")]
+    head = {**group.columns, "estimator": group.estimator, **group.options}
+    names = [*sample.names, ALL]
+    units = [*(p["unit"] for p in sample.parameters), "linear bound"]
     return [
-        head | {"parameter": p, "unit": unit} | row
-        for (p, unit), row in zip(labels, rows, strict=True)
+        {**head, "parameter": name, "unit": unit, **row}
+        for name, unit, row in zip(names, units, rows, strict=True)
     ]
 
 
@@ -170,22 +169,15 @@ def to_frame(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     """Converts rows to a table, columns in the order that readers know."""
     import pandas as pd
 
-    frame, known = pd.DataFrame(list(rows)), summary_columns()
+    frame = pd.DataFrame(list(rows))
+    known = summary_columns()
     if frame.empty:
-        return pd.DataFrame(
-            columns=[
-                "measurement",
-                "noise",
-                "error_scale",
-                "estimator",
-                "parameter",
-                "unit",
-                *known,
-            ]
-        )
+        heads = ["measurement", "noise", "error_scale", "estimator", "parameter", "unit"]
+        return pd.DataFrame(columns=[*heads, *known])
     keys = [c for c in frame.columns if c not in (*known, "parameter", "unit")]
     first = [c for c in ("measurement", "noise") if c in keys]
     last = ["error_scale", "estimator"]
-    middle = [c for c in keys if c not in (*first, *last) and not c.startswith("estimator.")]
     options = [c for c in keys if c.startswith("estimator.")]
+    elsewhere = (*first, *last, *options)
+    middle = [c for c in keys if c not in elsewhere]
     return frame[[*first, *middle, *last, *options, "parameter", "unit", *known]]

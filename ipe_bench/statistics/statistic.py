@@ -56,7 +56,9 @@ class Statistic:
     >>> from ipe_bench.statistics.collect import collect
     >>> from ipe_bench.statistics.sample import samples
     >>> meaning = "Share of trials with an error above three times the bound."
-    >>> far = Statistic("far", "far off", "all trials", meaning, lambda s: float((s.distance > 3 * s.n**0.5).mean()))
+    >>> def beyond(s):
+    ...     return float((s.distance > 3 * s.n**0.5).mean())
+    >>> far = Statistic("far", "far off", "all trials", meaning, beyond)
     >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     _ = ib.run(bench, {"newton": ib.solvers.Newton()}, trials=20, output=folder)
@@ -98,7 +100,8 @@ class Statistic:
     def columns(self) -> tuple[str, ...]:
         if self.limits is None:
             return (self.name,)
-        return (self.name, *(f"{self.name}_{end}{self.limits_given}" for end in ("low", "high")))
+        ends = [f"{self.name}_{end}{self.limits_given}" for end in ("low", "high")]
+        return (self.name, *ends)
 
     @property
     def count(self) -> str:
@@ -111,10 +114,12 @@ class Statistic:
     def columns_of(self, sample: Sample) -> dict[str, list[Any]]:
         """Returns its columns, a value for each parameter and one for all together."""
         with np.errstate(all="ignore"):
-            found = [self.values(sample), *(() if self.limits is None else self.limits(sample))]
-        columns = [
-            np.asarray(one).tolist() if np.ndim(one) else [one] * (sample.n + 1) for one in found
-        ]
+            found = [self.values(sample)]
+            if self.limits is not None:
+                found = [*found, *self.limits(sample)]
+        # One number stands for each parameter, and for all.
+        rows = sample.n + 1
+        columns = [np.asarray(one).tolist() if np.ndim(one) else [one] * rows for one in found]
         return dict(zip(self.columns, columns, strict=True))
 
 
@@ -124,5 +129,7 @@ def frame_columns(statistics: Sequence[Statistic]) -> tuple[str, ...]:
 
 def rows_of(statistics: Sequence[Statistic], sample: Sample) -> list[dict[str, Any]]:
     """Returns a row per parameter and one over all: the columns of all the statistics."""
-    columns = {name: values for s in statistics for name, values in s.columns_of(sample).items()}
+    columns: dict[str, list[Any]] = {}
+    for statistic in statistics:
+        columns |= statistic.columns_of(sample)
     return [{name: values[i] for name, values in columns.items()} for i in range(sample.n + 1)]
