@@ -18,10 +18,11 @@ from ipe_bench.basics.options import Finite, NonNegative, Positive, option_types
 from ipe_bench.basics.statuses import Status
 from ipe_bench.real.readings import TextTable, read_tables
 from ipe_bench.states.base import StateModel
+from ipe_bench.states.copies import SURE, copy_p
 from ipe_bench.states.formulas import Formulas, RecordedFormulas
 from ipe_bench.states.particles import Bootstrap
 from ipe_bench.states.smoothers import Smoother
-from ipe_bench.states.trackers import Tracker
+from ipe_bench.states.trackers import Tracker, Tracks
 from ipe_bench.statistics.intervals import mean_limits
 from ipe_bench.statistics.verdicts import (
     COLLAPSED,
@@ -223,7 +224,7 @@ class LogTracks:
     found: str = ""
     """The verdict on the search for them; empty if one maximum was found."""
     notes: Sequence[str] = ()
-    """Other maxima that the searches have found."""
+    """Other maxima that the searches have found, and copies of the path that fit."""
 
     @classmethod
     def of(cls, log: Log, label: str, tracker: Tracker) -> LogTracks:
@@ -268,6 +269,7 @@ class LogTracks:
             ),
             lost_from=lost_from,
             effective=size,
+            notes=_copies(log, tracks),
         )
 
     @property
@@ -288,6 +290,19 @@ class LogTracks:
         if self.mean_nis > high:
             return OVERCONFIDENT
         return TOO_CAUTIOUS if self.mean_nis < low else CONSISTENT
+
+
+def _copies(log: Log, tracks: Tracks) -> list[str]:
+    """Words that copies of the path by whole periods of a state fit as well, if they do."""
+    p = copy_p(log.model, log.z[None], tracks)
+    if p is None or not p[0] < SURE:
+        return []
+    periods = zip(log.model.states, log.model.state_periods, strict=True)
+    names = " or ".join(state.name for state, period in periods if period)
+    return [
+        f"AMBIGUOUS: the path is right with a probability of {p[0]:.2g} among its copies, in which {names} is shifted"
+        " by whole periods"
+    ]
 
 
 def _judged_innovations(log: Log, tracker: Tracker, innovations: Array) -> Array:
@@ -417,7 +432,7 @@ def found_and_tracked(
     return replace(
         track,
         constants=[Constant(name, *map(float, numbers)) for name, *numbers in rows],
-        notes=notes,
+        notes=[*track.notes, *notes],
         found=found,
         message=message,
         passes=track.passes and not found,

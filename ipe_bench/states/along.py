@@ -187,16 +187,16 @@ def _record(function: Function, n: int, k: int) -> tuple[list[Expression], list[
 
 
 def _joined_form(epochs: Sequence[tuple[int, Any, list[float]]]) -> Recording:
-    """Joins recordings of one form: constants that differ become numbers of the epoch."""
+    """Joins recordings of one form. All constants become numbers of the epoch, so that other values of a model's
+    options need no other machine code."""
     _, (y, x), first = epochs[0]
-    constants = np.array([constants for *_, constants in epochs]).reshape(len(epochs), -1)
     graph = x[0].graph
-    differ = np.flatnonzero((constants != constants[0]).any(axis=0))
-    c = list(graph.inputs("c", len(differ)))
-    given = {graph.constant(first[i]): one for i, one in zip(differ.tolist(), c, strict=True)}
+    c = list(graph.inputs("c", len(first)))
+    given = {graph.constant(value): one for value, one in zip(first, c, strict=True)}
     function = RowFunction.of(substituted(y, given), x, c)
     places = np.array([k for k, *_ in epochs])
-    return Recording(function, places, np.ascontiguousarray(constants[:, differ]))
+    numbers = np.array([constants for *_, constants in epochs]).reshape(len(epochs), -1)
+    return Recording(function, places, numbers)
 
 
 def functions_of(model: StateModel) -> tuple[EpochFunctions, EpochFunctions]:

@@ -208,17 +208,19 @@ class Formulas(StateModel):
         return [self._recorded(self._readings, epochs)]
 
     def _recorded(self, formulas: Mapping[str, Arithmetic], epochs: Sequence[int]) -> Recording:
-        """Records formulas once, with k, t and the inputs as numbers of the epoch."""
+        """Records formulas once, with k, t, inputs and constants as numbers of the epoch, so that other values of these
+        need no other machine code."""
+        places = np.array(epochs)
+        columns = {**self._inputs, "k": np.arange(1.0, self.count + 1), "t": self._times}
+        values = [np.asarray(column, dtype=float)[places] for column in columns.values()]
+        values += [np.full(len(places), value, dtype=float) for value in self.constants.values()]
         graph = Graph()
         x = [graph.input(name) for name in self.next]
-        c = [graph.input(name) for name in (*self.inputs, "k", "t")]
-        known = {**self.constants, **dict.fromkeys(self.noise, graph.constant(0.0))}
-        known |= dict(zip((*self.next, *self.inputs, "k", "t"), (*x, *c), strict=True))
+        c = [graph.input(name) for name in (*columns, *self.constants)]
+        known = dict(zip((*self.next, *columns, *self.constants), (*x, *c), strict=True))
+        known |= dict.fromkeys(self.noise, graph.constant(0.0))
         y = [graph.apply("add", formula(known), 0.0) for formula in formulas.values()]
-        places = np.array(epochs)
-        columns = [*self._inputs.values(), np.arange(1.0, self.count + 1), self._times]
-        numbers = np.array([np.asarray(column, dtype=float)[places] for column in columns])
-        return Recording(RowFunction.of(y, x, c), places, np.ascontiguousarray(numbers.T))
+        return Recording(RowFunction.of(y, x, c), places, np.ascontiguousarray(np.array(values).T))
 
     @cached_property
     def _factors(self) -> tuple[dict[str, Expression], list[Expression]]:

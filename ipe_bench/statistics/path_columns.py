@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ipe_bench.basics.linalg import Array
+from ipe_bench.states.copies import SURE
 from ipe_bench.statistics import formulas as f
 from ipe_bench.statistics.intervals import clopper_pearson, mean_limits
 from ipe_bench.statistics.sample import NIS, Sample
@@ -245,6 +246,17 @@ STATISTICS: tuple[Statistic, ...] = (
         f"Mean number of the first epoch whose error lies where a share of {GATE:g} should by the bound at the truth.",
         lambda s: mean_score(s, "first_bad_epoch"),
         where=("tracks",),
+    ),
+    Statistic(
+        "copy_p",
+        "p among copies",
+        "solved trials of trackers of whole paths, if a state has a period",
+        "Mean probability of a path among its copies, in which one state is shifted by whole periods from beginning to"
+        " end, by their costs: the share of paths that are right, if those are that differ by no more than whole"
+        f" periods. Below {SURE:g} a trial counts as ambiguous.",
+        lambda s: mean_score(s, "copy_p"),
+        where=("tracks",),
+        rare=True,
     ),
 )
 """The columns of `summary_all.csv` that are of tracks, in order."""

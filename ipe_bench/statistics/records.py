@@ -102,8 +102,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "failed_known",
         "failed and known",
         "Share of trials without success that the estimator itself reports: it did not converge, its residuals fail"
-        " the test of fit, or several minima fit. The test of a filter of states is that of its innovations, that of an"
-        " iterated smoother the cost of its path, chi-square with as many degrees as there are readings.",
+        " the test of fit, or several minima or copies fit. The test of a filter of states is that of its innovations,"
+        " that of an iterated smoother the cost of its path, chi-square with as many degrees as there are readings.",
         lambda s: f.failed(s, known=True),
         kind="share",
         where=("all_trials",),
@@ -510,7 +510,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "ambiguous",
         "ambiguous",
         "the trials in which the estimator has looked for it",
-        "Share in which several distinct minima fit the readings, so that no residual can tell which is the truth.",
+        "Share in which several distinct minima fit the readings, so that no residual can tell which is the truth, or"
+        " copies of a path by whole periods of a state do.",
         f.ambiguous,
         kind="share",
         where=("all_trials",),

@@ -28,6 +28,7 @@ from ipe_bench.priors import GaussianPrior, Prior
 from ipe_bench.states.algebra import half
 from ipe_bench.states.base import Paths, StateModel, require_sound, widened
 from ipe_bench.states.bounds import bound_at_truth, posterior_bounds
+from ipe_bench.states.copies import SURE, copy_p
 from ipe_bench.states.formulas import RecordedFormulas
 from ipe_bench.states.smoothers import path_p
 from ipe_bench.states.trackers import Tracker, Tracks
@@ -265,7 +266,14 @@ class PathBlock:
             "first_bad_epoch": np.where(lost.any(axis=1), lost.argmax(axis=1) + 1.0, np.nan),
             "curves": packed(trials, [*sums, np.full((K, 1), converged.sum())]),
         }
-        return estimates, columns
+        return estimates, columns | self._copies(tracks)
+
+    def _copies(self, tracks: Tracks) -> Columns:
+        """How probable each path is among its copies by whole periods, and whether that leaves it open."""
+        p = copy_p(self.scenario.assumed, self.paths.z, tracks)
+        if p is None:
+            return {}
+        return {"copy_p": p, "extra_ambiguous": np.where(np.isnan(p), np.nan, p < SURE)}
 
     def _fit_p(self, tracks: Tracks) -> Array:
         """How probable a worse fit is (trials,): of the path of an iterated smoother by its cost, else by the filter's

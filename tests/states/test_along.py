@@ -276,3 +276,27 @@ def test_trackers_take_the_recorded_functions():
     called.clear()
     ekf().track(model, z)
     assert called == []
+
+
+@pytest.mark.parametrize("name", ["formulas", "Python"])
+def test_other_values_of_options_need_no_other_machine_code(name, monkeypatch):
+    """As they are tried by the hundred where constants are looked for in a log."""
+    if name == "formulas":
+        one, other = (
+            replace(
+                DRIVEN, constants={"c": value}, readings={"z": "p*c"}, deviation={"z": 1}, period={}
+            )
+            for value in (2.5, 3.5)
+        )
+    else:
+        one, other = CoordinatedTurn(count=4, step=1.5), CoordinatedTurn(count=4, step=1.6)
+    x = path(one)
+    made, load = [], compiled.load
+    monkeypatch.setattr(compiled, "load", lambda key, *rest: made.append(key) or load(key, *rest))
+    one.slopes_along(x)
+    before = {*made}
+    assert before
+    there = other.slopes_along(x)
+    assert {*made} == before
+    np.testing.assert_allclose(there.f[:, 1], other.transition(x[:, 1], 1), rtol=1e-13)
+    np.testing.assert_allclose(there.h[:, 1], other.observe(x[:, 2], 1), rtol=1e-13)

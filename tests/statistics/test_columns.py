@@ -307,6 +307,7 @@ DEFINITIONS: dict[str, Callable[[Trials], Any]] = {
     "not_white_high": share_limit("high", not_white),
     "log_likelihood": mean_of("log_likelihood"),
     "first_bad_epoch": mean_of("first_bad_epoch"),
+    "copy_p": mean_of("copy_p"),
 }
 """What each column is by its name and docstring."""
 
@@ -359,6 +360,7 @@ def drawn(folder, seed: int) -> Trials:
         "white_p": np.where(rng.random(N) < 0.1, np.nan, rng.random(N) ** 2),
         "log_likelihood": rng.standard_normal(N),
         "first_bad_epoch": np.where(rng.random(N) < 0.5, np.nan, rng.integers(1, 20, N)),
+        "copy_p": rng.random(N),
     }
     of_path = {f"path_{name}": path[:, i] for i, name in enumerate(names)}
     of_path |= {f"path_bound_{name}": path_bound[:, i] for i, name in enumerate(names)}

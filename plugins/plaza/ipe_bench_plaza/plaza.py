@@ -106,6 +106,10 @@ class Plaza(StateModel):
         return Parameter("x", "m"), Parameter("y", "m"), Parameter("heading", "rad"), *places
 
     @property
+    def state_periods(self) -> tuple[float, ...]:
+        return tuple(2 * np.pi if state.name == "heading" else 0.0 for state in self.states)
+
+    @property
     def reading_names(self) -> tuple[str, ...]:
         return ("range",)
 
