@@ -61,6 +61,7 @@ def _no_others(design: Design) -> str:
 
 def _design_sentences(design: Design) -> Iterator[str]:
     yield f"{_direction(design.observability)}."
+    yield from _further_sentence(design)
     same, best = _no_others(design), _best(design)
     if same:
         yield same
@@ -74,9 +75,48 @@ def _design_sentences(design: Design) -> Iterator[str]:
     yield from _unseen(design)
 
 
-def _draw_design(design: Design) -> Iterator[Drawing]:
-    from ipe_bench.questions.design.figure import draw_bounds
+def _further_sentence(design: Design) -> Iterator[str]:
+    """Says what to read next, and the bound that falls most by it."""
+    further = design.further
+    if further is None:
+        return
+    where = [further.words[i] for i in further.taken]
+    most = int(np.argmin(further.bounds[1] / further.bounds[0]))
+    parameter = design.observability.parameters[most]
+    today, one, three = (f"{parameter.size * further.bounds[k, most]:.3g}" for k in (0, 1, 3))
+    unit = f" {parameter.unit}" if parameter.unit else ""
+    yield (
+        f"Read next at {where[0]}: the bound of {parameter.name} falls from {today} to {one}{unit}; with two more, at"
+        f" {where[1]} and {where[2]}, to {three}{unit}."
+    )
 
+
+def _further(design: Design) -> Iterator[Table]:
+    further = design.further
+    if further is None:
+        return
+    shares = further.bounds / further.bounds[0]
+    columns = [
+        texts("further readings", [str(k) for k in range(1, len(shares))]),
+        words("next at", [further.words[i] for i in further.taken]),
+        texts("mean bound", [f"{np.sqrt(np.mean(share**2)):.3f}" for share in shares[1:]]),
+        texts("smallest", [f"{share.min():.3f}" for share in shares[1:]]),
+    ]
+    names = [p.name for p in design.observability.parameters]
+    columns.append(words("of", [names[int(np.argmin(share))] for share in shares[1:]]))
+    note = (
+        "Bounds are shares of today's. Each further reading is the one of the candidates that cuts the mean square of"
+        " these shares most; an input's candidates reach to four times its range."
+    )
+    title = "What to read next, beside today's readings"
+    yield Table("further", title, "", columns, notes=[note])
+
+
+def _draw_design(design: Design) -> Iterator[Drawing]:
+    from ipe_bench.questions.design.figure import draw_bounds, draw_further
+
+    if design.further is not None:
+        yield draw_further(design.scenario.measurement, design.further)
     best, scenario, after = None if _no_others(design) else _best(design), design.scenario, None
     if best is not None:
         model = design.measurement(best.sharpest)
@@ -94,6 +134,7 @@ def design_parts(name: str, design: Design) -> Iterator[Part]:
         if not told.lost:
             yield f"Exact readings would tell all {len(told.unknowns)} parameters from their neighbours."
         yield from (Strong(f"No data can tell: {sentence}.") for sentence in told.sentences)
+    yield from _further(design)
     yield from _suspects(design)
     yield from _ways(design)
 

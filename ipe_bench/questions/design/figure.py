@@ -1,4 +1,4 @@
-"""Draws the bounds of a design."""
+"""Draws the bounds of a design, and what further readings would make of them."""
 
 from __future__ import annotations
 
@@ -10,10 +10,48 @@ import numpy as np
 from ipe_bench.questions.panels import labelled_rows
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
-from ipe_bench.report.style import BOUND_COLOR, FAMILIES
+from ipe_bench.report.style import BOUND_COLOR, BOUND_DASH, COLORS, FAMILIES
+
+MOST_PARAMETERS = 4
+"""Parameters that have curves: those that gain most."""
 
 if TYPE_CHECKING:
+    from ipe_bench.measurements.base import Measurement
+    from ipe_bench.questions.design.maths import Further
     from ipe_bench.trials.observability import Observability
+
+
+def draw_further(model: Measurement, further: Further) -> Drawing:
+    """Draws bounds, as shares of today's, over the number of further readings, and over where one more is taken."""
+    today, number = further.bounds[0], range(len(further.bounds))
+    gain = np.argsort((further.bounds[-1] / today), kind="stable")
+    shown = gain[:MOST_PARAMETERS]
+    fig, axes = common.panels(2 if further.column else 1, height=3.0)
+    for i, k in enumerate(shown):
+        p = model.parameters[k]
+        line: Any = {"color": COLORS[i], "label": common.text(p.name), "zorder": 3 - 0.1 * i}
+        axes[0].plot(number, further.bounds[:, k] / today[k], "o-", **line)
+        for ax in axes[1:]:
+            ax.plot(further.entries, further.alone[:, k] / today[k], **line)
+    axes[0].set_xlabel("further readings, where they tell most")
+    for ax in axes[1:]:
+        ax.set_xlabel(common.text(further.column))
+        at = further.entries[further.taken[0]]
+        ax.axvline(at, color=BOUND_COLOR, linestyle=BOUND_DASH, linewidth=1.0, label="next")
+        columns = {**model.index, **model.input_columns}
+        given = np.asarray(columns[further.column], dtype=float)
+        style: Any = {"linestyle": "none", "color": BOUND_COLOR, "clip_on": False}
+        ax.plot(given, np.ones(len(given)), marker="|", label="today's readings", **style)
+    shares = (further.bounds / today)[:, shown]
+    for ax in axes:
+        common.decades(ax, shares, least=1.25)
+        ax.set_ylabel("bound over today's")
+    common.legend(fig, axes)
+    caption = "Cramér-Rao bounds with further readings."
+    caption += " Right: with one more, by where it is taken." if further.column else ""
+    left = len(today) - len(shown)
+    caption += f" Not drawn: {left} parameters that gain less." if left else ""
+    return Drawing("further", f"Read next at {further.words[further.taken[0]]}", caption, fig)
 
 
 def draw_bounds(now: Observability, after: Observability | None, choice: str) -> Iterator[Drawing]:

@@ -26,6 +26,10 @@ SUSPECTED = 5
 _WEAK = 1e-8
 """Information that every choice is assumed to have beforehand, as a share of that of all candidates: the first readings
 chosen do not determine the parameters by themselves."""
+MOST_MORE = 6
+"""Readings that are suggested one after another."""
+_GRID, _REACH = 61, 4
+"""Entries of an input at which further readings are tried, up to how many times its range."""
 _FEW = 3
 """Least number of units with a choice."""
 
@@ -83,6 +87,24 @@ class Way:
 
 
 @dataclass(frozen=True)
+class Further:
+    """Describes what single readings beside today's would add; bounds in multiples of the parameters' sizes."""
+
+    words: tuple[str, ...]
+    """The candidates (g,): where each is taken."""
+    column: str
+    """The column along which they lie; empty if there is more than one."""
+    entries: Array
+    """Their entries (g,) there."""
+    alone: Array
+    """Bounds (g, n) with one of them."""
+    taken: tuple[int, ...]
+    """The candidates that gain most, one after another."""
+    bounds: Array
+    """Bounds (1 + taken, n): today's, then with each further one."""
+
+
+@dataclass(frozen=True)
 class Design:
     """Describes what a scenario's readings say, and what others would."""
 
@@ -92,6 +114,8 @@ class Design:
     observability: Observability
     suspects: tuple[Suspect, ...]
     ways: tuple[Way, ...]
+    further: Further | None = None
+    """What to read next; None without a candidate, or if today's readings leave a parameter open."""
 
     def measurement(self, choice: Choice) -> Measurement:
         """Returns the model that takes these readings and no others."""
@@ -164,7 +188,64 @@ def design(
             f"readings={readings}: no choice {titles} of so few determines all parameters, or there are fewer than"
             f" {_FEW} to choose among; give more readings, or choose by other columns"
         )
-    return Design(scenario, criterion, candidates, today, tuple(worst.values()), ways)
+    more = _further(scenario, today, x)
+    return Design(scenario, criterion, candidates, today, tuple(worst.values()), ways, more)
+
+
+def _further(scenario: Scenario, today: Observability, x: Array) -> Further | None:
+    """Finds the readings that cut the mean square of the bounds, as shares of today's, most."""
+    found = _candidates(scenario.measurement)
+    if found is None or not today.observable:
+        return None
+    model, column, words = found
+    J = scenario.noise.covariance(model.m).whiten_jacobian(model.jacobian(x))
+    there = np.flatnonzero(np.isfinite(J).all(axis=(0, 2)))
+    if not len(there):
+        return None
+    P, J = today.covariance, J[:, there]
+    before = np.einsum("tii->i", P)
+    alone, taken, bounds = np.empty(0), [], [today.bound]
+    for _ in range(MOST_MORE):
+        # A reading with the whitened slope a takes P a a' P / (1 + a' P a) from P.
+        Pa = np.matmul(J, P)
+        less = Pa**2 / (1 + np.sum(Pa * J, axis=2))[:, :, None]
+        left = np.einsum("tii->i", P) - less.sum(axis=0)
+        best = int(np.argmin((left / before).mean(axis=1)))
+        alone = alone if taken else np.sqrt(left / len(x))
+        taken.append(best)
+        bounds.append(np.sqrt(left[best] / len(x)))
+        a = Pa[:, best]
+        P = P - a[:, :, None] * a[:, None, :] / (1 + np.sum(a * J[:, best], axis=1))[:, None, None]
+    entries = np.asarray(model.index[column], dtype=float)[there] if column else np.empty(0)
+    told = tuple(words[i] for i in there)
+    return Further(told, column, entries, alone, tuple(taken), np.array(bounds))
+
+
+def _candidates(model: Measurement) -> tuple[Measurement, str, list[str]] | None:
+    """Returns a model of readings that may be taken beside today's, the one column that tells them apart, if it is a
+    number, and words for each: inputs over several times their range, else those that the model offers."""
+    columns = {**model.index, **model.input_columns}
+    headings = [one.heading for one in model.inputs]
+    varying = [name for name in headings if len(set(columns.get(name, ()))) > 1]
+    if len(varying) == 1 and columns.keys() >= {*headings}:
+        (name,) = varying
+        given = np.asarray(columns[name], dtype=float)
+        far = given.min() + _REACH * np.ptp(given)
+        grid = [float(f"{at:.2g}") for at in np.linspace(given.min(), far, _GRID)]
+        inputs = {key: [columns[key][0]] * _GRID for key in headings} | {name: grid}
+        return model.with_inputs(inputs, _GRID), name, [f"{name} = {at:.4g}" for at in grid]
+    offered = model.candidates
+    if offered.m == model.m:
+        return None
+    rows = zip(*offered.index.values(), strict=True)
+    words = [
+        ", ".join(
+            f"{name} {entry_in_words(offered, name, entry)}"
+            for name, entry in zip(offered.index, row, strict=True)
+        )
+        for row in rows
+    ]
+    return offered, "", words
 
 
 def _columns(model: Measurement, by: Sequence[str] | None) -> list[tuple[str, ...]]:

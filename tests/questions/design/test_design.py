@@ -11,8 +11,14 @@ from shared.oracles import agreed, assert_agrees
 import ipe_bench as ib
 from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.measurements import Gins, Measurement, Parameter, RicherGins
+from ipe_bench.noise import Gaussian
+from ipe_bench.priors import GaussianPrior
+from ipe_bench.questions.design.answer import _further_sentence
+from ipe_bench.questions.design.figure import draw_further
 from ipe_bench.questions.design.maths import design
+from ipe_bench.report.style import house_style
 from ipe_bench.trials.observability import Observability, suspects
+from ipe_bench.trials.scenario import Scenario
 
 NOISE = ib.noise.Quantization()
 
@@ -278,3 +284,76 @@ def test_fewer_readings_than_the_smallest_choice_has_are_refused():
     (way,) = ib.design(scenario(ib.measurements.Ranging()), by=["round"], readings=7).ways
     assert way.sharpest.readings == 7
     assert way.sharpest.mean_bound == pytest.approx(np.sqrt(3), rel=1e-6)
+
+
+# What to read next ---------------------------------------------------------------------------------------------------
+
+
+DEMAND = {"expression": "b1*(1 - exp(-b2*t))", "start": {"b1": 20.0, "b2": 0.5}}
+
+
+def demand(days):
+    model = ib.measurements.Formula(**DEMAND, columns={"t": list(days)})
+    return Scenario(model, Gaussian(2.5), GaussianPrior(), 0.3, 0)
+
+
+@pytest.fixture(scope="module")
+def six_days():
+    return design(demand([1, 2, 3, 4, 5, 7]))
+
+
+def bound_of(days):
+    return design(demand(days)).observability.bound
+
+
+def test_bounds_with_further_readings_are_those_of_a_model_that_has_them(six_days):
+    further = six_days.further
+    days = [1, 2, 3, 4, 5, 7, *(float(further.entries[i]) for i in further.taken)]
+    for k in (0, 1, 3):
+        np.testing.assert_allclose(further.bounds[k], bound_of(days[: 6 + k]), rtol=1e-8)
+    for g in (0, 20, 60):
+        with_one = bound_of([1, 2, 3, 4, 5, 7, float(further.entries[g])])
+        np.testing.assert_allclose(further.alone[g], with_one, rtol=1e-8)
+
+
+def test_the_next_reading_cuts_bounds_most_and_may_lie_beyond_todays(six_days):
+    further = six_days.further
+    shares = ((further.alone / further.bounds[0]) ** 2).mean(axis=1)
+    assert further.taken[0] == np.argmin(shares)
+    assert further.entries.min() == 1
+    assert further.entries.max() == 25
+    assert further.entries[further.taken[0]] > 7
+    (sentence,) = _further_sentence(six_days)
+    assert sentence.startswith(f"Read next at {further.words[further.taken[0]]}: the bound of b1")
+    today, one = (20.0 * further.bounds[k, 0] for k in (0, 1))
+    assert f"falls from {today:.3g} to {one:.3g};" in sentence
+
+
+def test_shares_of_bounds_are_drawn_over_number_and_place(six_days):
+    further = six_days.further
+    with house_style():
+        drawing = draw_further(six_days.scenario.measurement, further)
+    number, place = drawing.figure.axes
+    shares = further.bounds / further.bounds[0]
+    drawn = {line.get_label(): line.get_ydata() for line in number.lines}
+    np.testing.assert_array_equal(drawn["b1"], shares[:, 0])
+    along = {line.get_label(): line for line in place.lines}
+    np.testing.assert_array_equal(
+        along["b2"].get_ydata(), (further.alone / further.bounds[0])[:, 1]
+    )
+    assert list(along["today's readings"].get_xdata()) == [1, 2, 3, 4, 5, 7]
+    assert along["next"].get_xdata()[0] == further.entries[further.taken[0]]
+
+
+def test_a_model_without_inputs_is_read_next_among_the_readings_that_it_offers():
+    model = Linear()
+    scenario = Scenario(model, Gaussian(1.0), GaussianPrior(), 1.0, 0)
+    further = design(scenario).further
+    offered, today = model.candidates.A, model.A.T @ model.A
+    cost = [
+        (np.diag(np.linalg.inv(today + np.outer(a, a))) / np.diag(np.linalg.inv(today))).mean()
+        for a in offered
+    ]
+    assert further.taken[0] == np.argmin(cost)
+    assert further.words[further.taken[0]] == f"number {np.argmin(cost)}"
+    assert further.column == ""
