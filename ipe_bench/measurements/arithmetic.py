@@ -1,7 +1,8 @@
-"""Reads formulas: numbers, names, + - * / ** ( ), elementary functions, comparisons and `A if C else B`.
+"""Reads formulas: numbers, names, + - * / ** ( ), elementary functions, comparisons and `A if C
+else B`.
 
-Python's grammar reads the text, and nothing of it is executed: it becomes a tree, which is evaluated on numbers, arrays
-or recorded expressions.
+Python's grammar reads the text, and nothing of it is executed: it becomes a tree, which is
+evaluated on numbers, arrays or recorded expressions.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import math
 import operator
 import re
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,7 +25,9 @@ from ipe_bench.engine import trace
 
 def choose(condition: Any, a: Any, b: Any) -> Any:
     """Returns a where the condition is not 0, b elsewhere."""
-    return (a if condition else b) if isinstance(condition, float) else np.where(condition, a, b)
+    if isinstance(condition, float):
+        return a if condition else b
+    return np.where(condition, a, b)
 
 
 def _real(a: Any) -> Any:
@@ -34,33 +37,48 @@ def _real(a: Any) -> Any:
 
 def _angle(y: Any, x: Any) -> Any:
     """Computes arctan2, which NumPy lacks for complex numbers, with its slope by a complex step."""
-    b, a = _real(y), _real(x)
+    b = _real(y)
+    a = _real(x)
     angle = np.arctan2(b, a)
     if isinstance(angle, trace.Expression) or not (np.iscomplexobj(y) or np.iscomplexobj(x)):
         return angle
-    return angle + 1j * (a * np.imag(y) - b * np.imag(x)) / (a * a + b * b)
+    # d angle = (a db - b da) / (a^2 + b^2).
+    turned = a * np.imag(y) - b * np.imag(x)
+    return angle + 1j * turned / (a * a + b * b)
 
 
-FUNCTIONS: dict[str, Callable[[Any], Any]] = trace.FUNCTIONS | {
+FUNCTIONS: dict[str, Callable[[Any], Any]] = {
+    **trace.FUNCTIONS,
     "atan": np.arctan,
     "ln": np.log,
     "log10": lambda a: np.log(a) / math.log(10.0),
     "floor": lambda a: np.floor(_real(a)),
     "sign": lambda a: np.sign(_real(a)),
-    "abs": lambda a: choose(
-        np.less(a, 0.0) * 1.0, -a, a
-    ),  # NumPy's drops the imaginary part of a complex step
+    # NumPy's drops the imaginary part of a complex step.
+    "abs": lambda a: choose(np.less(a, 0.0) * 1.0, -a, a),
 }
 """Functions of one argument."""
-SEVERAL: dict[str, Callable[[Any, Any], Any]] = {"min": np.minimum, "max": np.maximum}
-SEVERAL |= {"hypot": lambda a, b: np.sqrt(a * a + b * b)}
+SEVERAL: dict[str, Callable[[Any, Any], Any]] = {
+    "min": np.minimum,
+    "max": np.maximum,
+    "hypot": lambda a, b: np.sqrt(a * a + b * b),
+}
 """Functions of two arguments or more."""
-PAIRS: dict[str, Callable[[Any, Any], Any]] = {"arctan2": _angle, "atan2": _angle}
-PAIRS |= {"mod": lambda a, b: a - b * np.floor(_real(a / b))}
+PAIRS: dict[str, Callable[[Any, Any], Any]] = {
+    "arctan2": _angle,
+    "atan2": _angle,
+    "mod": lambda a, b: a - b * np.floor(_real(a / b)),
+}
 """Functions of two arguments; the remainder of `mod` has the sign of what divides."""
 _CALLED = (*FUNCTIONS, *SEVERAL, *PAIRS)
-COMPARISONS = {"<": np.less, "<=": np.less_equal, ">": np.greater, ">=": np.greater_equal}
-COMPARISONS |= {"==": np.equal, "!=": np.not_equal}
+COMPARISONS = {
+    "<": np.less,
+    "<=": np.less_equal,
+    ">": np.greater,
+    ">=": np.greater_equal,
+    "==": np.equal,
+    "!=": np.not_equal,
+}
 """They are 1 where they hold and 0 elsewhere."""
 CONSTANTS = {"pi": math.pi}
 _SIGNS = {
@@ -71,8 +89,13 @@ _SIGNS = {
     ast.Pow: "**",
     ast.And: "and",
     ast.Or: "or",
+    ast.Lt: "<",
+    ast.LtE: "<=",
+    ast.Gt: ">",
+    ast.GtE: ">=",
+    ast.Eq: "==",
+    ast.NotEq: "!=",
 }
-_SIGNS |= {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
 _MOST_IN_A_ROW = 400
 """Operations that build on one another, as in a sum of so many terms."""
 _MOST_OPERATIONS = 10_000
@@ -97,19 +120,20 @@ class Arithmetic:
     """Config key of the formula."""
 
     def __call__(self, values: Mapping[str, Any]) -> Any:
-        """Evaluates the formula at the `values` of its names: numbers, arrays, or expressions to be recorded."""
+        """Evaluates the formula at the `values` of its names: numbers, arrays, or expressions to be
+        recorded."""
         return evaluate(self.tree, values)
 
 
 def parse(text: str, where: str) -> Arithmetic:
     """Reads a formula; `where` is the config key, for messages.
 
-    ** (or ^) binds from the right and before a minus in front: -x**2 is -(x**2). Comparisons, `and`, `or`, `not` and
-    `A if C else B` are those of Python, also in a row: 2 <= t < 5. The branch that a conditional does not take
-    need not have a value.
+    ** (or ^) binds from the right and before a minus in front: -x**2 is -(x**2). Comparisons,
+    `and`, `or`, `not` and `A if C else B` are those of Python, also in a row: 2 <= t < 5. The
+    branch that a conditional does not take need not have a value.
 
-    Raises:
-        UserError: the text is not a formula of this language, by the place where it ceases to be one.
+    Raises: UserError: the text is not a formula of this language, by the place where it ceases to
+        be one.
     """
     # Names get a letter in front, so that a parameter may be called lambda.
     source = _NAME.sub("_", " ".join(text.split()).replace("^", "**"))
@@ -128,7 +152,7 @@ def parse(text: str, where: str) -> Arithmetic:
             f"{where}: has more than {_MOST_IN_A_ROW} operations one after another; {remedy}"
         ) from None
     except SyntaxError as error:
-        rest = re.sub(r"\b_", "", source[(error.offset or 1) - 1 :].strip())
+        rest = _as_written(source[(error.offset or 1) - 1 :].strip())
         place = f"at '{rest[:20]}'" if rest else "at its end"
         known = "numbers, names, + - * / ** ( ), comparisons and `A if C else B` are understood"
         reason = error.msg.partition(". ")[0]
@@ -136,15 +160,20 @@ def parse(text: str, where: str) -> Arithmetic:
             f"{where}: {text[:60]!r} is not a formula {place}: {reason}; {known}"
         ) from None
     except NameError as error:
-        raise UserError(
-            f"{where}: {error.name}(...): {unknown(str(error.name), _CALLED, 'function')}"
-        ) from None
+        meant = unknown(str(error.name), _CALLED, "function")
+        raise UserError(f"{where}: {error.name}(...): {meant}") from None
     if size > _MOST_OPERATIONS:
         raise UserError(
             f"{where}: has more than {_MOST_OPERATIONS} numbers, names and operations; {_IN_PYTHON}"
         )
     names = dict.fromkeys(part[1] for part in parts(tree) if part[0] == "name")
-    return Arithmetic(text, tree, tuple(name for name in names if name not in CONSTANTS), where)
+    variables = tuple(name for name in names if name not in CONSTANTS)
+    return Arithmetic(text, tree, variables, where)
+
+
+def _as_written(source: str) -> str:
+    """Takes the letter away that names got in front."""
+    return re.sub(r"\b_", "", source)
 
 
 def _tree(node: ast.expr, source: str) -> Tree:
@@ -156,10 +185,10 @@ def _tree(node: ast.expr, source: str) -> Tree:
     """
     reason = "this is Python, and not of this language"
     match node:
-        case ast.Constant() if _NUMBER.fullmatch(
-            number := source[node.col_offset : node.end_col_offset]
-        ):
-            return ("number", float(number))
+        case ast.Constant():
+            number = source[node.col_offset : node.end_col_offset]
+            if _NUMBER.fullmatch(number):
+                return ("number", float(number))
         case ast.Name(name):
             return ("name", name[1:])
         case ast.UnaryOp(ast.USub(), operand):
@@ -176,26 +205,43 @@ def _tree(node: ast.expr, source: str) -> Tree:
             return _in_a_row(_SIGNS[type(sign)], [_tree(value, source) for value in values])
         case ast.Compare(left, signs, others) if all(type(sign) in _SIGNS for sign in signs):
             operands = [left, *others]
-            texts = [
-                re.sub(r"\b_", "", source[one.col_offset : one.end_col_offset]) for one in operands
-            ]
-            sides = list(zip([_tree(one, source) for one in operands], texts, strict=True))
-            signed = zip(sides, [_SIGNS[type(sign)] for sign in signs], sides[1:], strict=False)
-            return _in_a_row(
-                "and",
-                [(sign, a, b, f"{left} {sign} {right}") for (a, left), sign, (b, right) in signed],
-            )
+            trees = [_tree(one, source) for one in operands]
+            texts = [_as_written(source[o.col_offset : o.end_col_offset]) for o in operands]
+            return _compared([_SIGNS[type(sign)] for sign in signs], trees, texts)
         case ast.Call(ast.Name(name), arguments, []):
-            if name[1:] not in _CALLED:
-                raise NameError(name=name[1:])
-            inner = [_tree(argument, source) for argument in arguments]
-            if (name[1:] in SEVERAL and len(inner) > 1) or (name[1:] in PAIRS and len(inner) == 2):
-                return _in_a_row(name[1:], inner)
-            if name[1:] in FUNCTIONS and len(inner) == 1:
-                return (name[1:], *inner)
-            several = "two arguments or more" if name[1:] in SEVERAL else "two arguments"
-            reason = f"{name[1:]} takes {'one argument' if name[1:] in FUNCTIONS else several}"
+            function = name[1:]
+            if function not in _CALLED:
+                raise NameError(name=function)
+            called = _called(function, [_tree(argument, source) for argument in arguments])
+            if called:
+                return called
+            reason = f"{function} takes {_number_of_arguments(function)}"
     raise SyntaxError(reason, (None, 1, node.col_offset + 1, source))
+
+
+def _compared(signs: Sequence[str], trees: Sequence[Tree], texts: Sequence[str]) -> Tree:
+    """Builds comparisons in a row, each with its text: a < b < c is a < b and b < c."""
+    compared = []
+    for k, sign in enumerate(signs):
+        text = f"{texts[k]} {sign} {texts[k + 1]}"
+        compared.append((sign, trees[k], trees[k + 1], text))
+    return _in_a_row("and", compared)
+
+
+def _called(function: str, arguments: Sequence[Tree]) -> Tree:
+    """Builds the call of a function; empty if it takes another number of arguments."""
+    number = len(arguments)
+    if (function in SEVERAL and number > 1) or (function in PAIRS and number == 2):
+        return _in_a_row(function, arguments)
+    if function in FUNCTIONS and number == 1:
+        return (function, *arguments)
+    return ()
+
+
+def _number_of_arguments(function: str) -> str:
+    if function in FUNCTIONS:
+        return "one argument"
+    return "two arguments or more" if function in SEVERAL else "two arguments"
 
 
 def _in_a_row(operation: str, trees: Iterable[Tree]) -> Tree:
@@ -205,35 +251,45 @@ def _in_a_row(operation: str, trees: Iterable[Tree]) -> Tree:
 
 def parts(tree: Tree) -> list[Tree]:
     """Lists the tree and all trees in it, in order of appearance."""
-    found, waiting = [], [tree]
+    found = []
+    waiting = [tree]
     while waiting:
-        found.append(waiting.pop())
-        waiting.extend(part for part in reversed(found[-1]) if isinstance(part, tuple))
+        part = waiting.pop()
+        found.append(part)
+        waiting.extend(inner for inner in reversed(part) if isinstance(inner, tuple))
     return found
 
 
 def never_switching(formulas: Iterable[Arithmetic], values: Mapping[str, Any]) -> list[str]:
-    """Words each comparison in some formulas that holds for all readings, or for none, at these values."""
-    where = {
-        part: one.where for one in formulas for part in parts(one.tree) if part[0] in COMPARISONS
-    }
-    met = {one: np.asarray(evaluate(one, values), dtype=bool) for one in where}
-    silent = "so these readings say nothing of the other branch"
-    return [
-        f"measurement.{where[one]}: {one[3]} holds at {'every' if held.all() else 'no'} reading, {silent}"
-        for one, held in met.items()
-        if held.all() or not held.any()
-    ]
+    """Words each comparison in some formulas that holds for all readings, or for none, at these
+    values."""
+    where: dict[Tree, str] = {}
+    for formula in formulas:
+        comparisons = [part for part in parts(formula.tree) if part[0] in COMPARISONS]
+        where.update(dict.fromkeys(comparisons, formula.where))
+    words = []
+    for comparison, key in where.items():
+        held = np.asarray(evaluate(comparison, values), dtype=bool)
+        if held.all() or not held.any():
+            often = "every" if held.all() else "no"
+            words.append(
+                f"measurement.{key}: {comparison[3]} holds at {often} reading,"
+                " so these readings say nothing of the other branch"
+            )
+    return words
 
 
 def _extent(tree: Tree, known: dict[int, tuple[int, int]]) -> tuple[int, int]:
-    """Computes the size of a tree, and the most operations that build on one another; a shared operand counts once."""
+    """Computes the size of a tree, and the most operations that build on one another; a shared
+    operand counts once."""
     if id(tree) not in known:
-        size, height = 1, 1
+        size = 1
+        height = 1
         for part in tree:
             if isinstance(part, tuple):
                 inner, below = _extent(part, known)
-                size, height = size + inner, max(height, below + 1)
+                size += inner
+                height = max(height, below + 1)
         known[id(tree)] = size, height
     return known[id(tree)]
 
@@ -266,4 +322,6 @@ def evaluate(tree: Tree, values: Mapping[str, Any]) -> Any:
         return np.where(value, evaluate(others[0], values), evaluate(others[1], values))
     if operation in _BINARY:
         return _BINARY[operation](value, evaluate(others[0], values))
-    return -value if operation == "negative" else FUNCTIONS[operation](value)
+    if operation == "negative":
+        return -value
+    return FUNCTIONS[operation](value)

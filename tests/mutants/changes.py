@@ -309,8 +309,8 @@ CHANGES = {
     "line-before-rows": Change(
         "engine",
         "a straight input goes on before its first row",
-        "np.where(k < 0, 0.0, slopes[place])",
-        "slopes[place]",
+        "np.where(k < 0, 0.0, slopes[row])",
+        "slopes[row]",
         "test_driven.py",
     ),
     "constants-late": Change(
@@ -323,7 +323,7 @@ CHANGES = {
     "switch-inside": Change(
         "engine",
         "steps cross the moments at which known inputs change",
-        "if _SAME * end < time < end]",
+        "if same < time < end]",
         "if False]",
         "test_driven.py",
     ),

@@ -1,4 +1,5 @@
-"""Measurement models whose readings are taken from the solution of ordinary differential equations."""
+"""Measurement models whose readings are taken from the solution of ordinary differential
+equations."""
 
 from __future__ import annotations
 
@@ -23,45 +24,42 @@ from ipe_bench.measurements.base import Measurement
 _IN_HAND = 0.3
 """Error of a step of the implicit method, as a share of the tolerance."""
 _ROUGHER = 10.0
-"""Tolerances of the implicit method whose readings are held against each other, the larger over the smaller."""
+"""Tolerances of the implicit method whose readings are held against each other, the larger over the
+smaller."""
 _MAGNIFIED = 300.0
-"""Tolerances of a reading that a change of the states by the least tolerance, as a share of each, may make."""
+"""Tolerances of a reading that a change of the states by the least tolerance, as a share of each,
+may make."""
 _IN_NUMPY = 64
-"""The finest steps to each reading that are tried at the nominal point where no machine code can be made."""
+"""The finest steps to each reading that are tried at the nominal point where no machine code can be
+made."""
 _ANGLE_AT_START = 0.7
 """Radians over which the first step that is tried lets the solution turn."""
 _REMEMBERED = 100_000
-"""Trials whose rungs are remembered: a simulation and a Jacobian share one search, and what is forgotten is found
-again, the same."""
+"""Trials whose rungs are remembered: a simulation and a Jacobian share one search, and what is
+forgotten is found again, the same."""
 
 
 class OdeMeasurement(Measurement):
-    """Takes readings of y' = rhs(t, y, p, c) at given times, for one or more cases that share the parameters.
+    """Takes readings of y' = rhs(t, y, p, c) at given times, for one or more cases that share the
+    parameters.
 
-    Required: `states`, `outputs`, `tolerance` or `step`, `parameters`, `times`, and the functions `start`, `rhs` and
-    `read`. p are the parameters in SI units (x times `si_sizes`), c the constants of a case.
-    Optional: `cases`, `driven` and `si_sizes`; `fastest_rate`, which saves a search; what a `Measurement` may state.
-    Promised: the functions use arithmetic, NumPy's elementary functions and np.where on the entries of their arguments,
-    and nothing that asks for a value (no if). z has C order over (case, time, output); a time is an epoch.
+    Required: `states`, `outputs`, `tolerance` or `step`, `parameters`, `times`, and the functions
+    `start`, `rhs` and `read`. p are the parameters in SI units (x times `si_sizes`), c the
+    constants of a case. Optional: `cases`, `driven` and `si_sizes`; `fastest_rate`, which saves a
+    search; what a `Measurement` may state. Promised: the functions use arithmetic, NumPy's
+    elementary functions and np.where on the entries of their arguments, and nothing that asks for a
+    value (no if). z has C order over (case, time, output); a time is an epoch.
 
-    >>> from dataclasses import dataclass
-    >>> from ipe_bench.measurements import Parameter
-    >>> @dataclass(frozen=True)
-    ... class Pendulum(OdeMeasurement):  # released from half a radian
-    ...     states, outputs, reading_unit = 2, ("angle",), "rad"
-    ...     tolerance = 1e-9  # of a reading, in the reading's unit
-    ...     parameters = Parameter("length", "m", 0.01), Parameter("damping", "1/s", 0.01)  # x counts in these sizes
-    ...     nominal = np.array([100.0, 0.0])  # about 1 m and no damping
-    ...     times = np.arange(0.5, 10.5, 0.5)
-    ...     def start(self, p, c):
-    ...         return 0.5, 0.0
-    ...     def rhs(self, t, y, p, c):
-    ...         angle, rate = y
-    ...         return rate, -9.80665 / p[0] * np.sin(angle) - p[1] * rate
-    ...     def read(self, t, y, p, c):
-    ...         return (y[0],)
-    >>> print(Pendulum().simulate(np.array([[100.0, 0.0]]))[0, 3].round(3))  # after 2 s; the period is 2.038 s
-    0.497
+    >>> from dataclasses import dataclass >>> from ipe_bench.measurements import Parameter >>>
+    @dataclass(frozen=True) ... class Pendulum(OdeMeasurement):  # released from half a radian ...
+    states, outputs, reading_unit = 2, ("angle",), "rad" ...     tolerance = 1e-9  # of a reading,
+    in the reading's unit ...     parameters = Parameter("length", "m", 0.01), Parameter("damping",
+    "1/s", 0.01)  # x counts in these sizes ...     nominal = np.array([100.0, 0.0])  # about 1 m
+    and no damping ...     times = np.arange(0.5, 10.5, 0.5) ...     def start(self, p, c): ...
+    return 0.5, 0.0 ...     def rhs(self, t, y, p, c): ...         angle, rate = y ...
+    return rate, -9.80665 / p[0] * np.sin(angle) - p[1] * rate ...     def read(self, t, y, p, c):
+    ...         return (y[0],) >>> print(Pendulum().simulate(np.array([[100.0, 0.0]]))[0,
+    3].round(3))  # after 2 s; the period is 2.038 s 0.497
     """
 
     states: int
@@ -71,17 +69,19 @@ class OdeMeasurement(Measurement):
     time_unit: str = "s"
     """The unit of `times`, `step` and t."""
     tolerance: float | Sequence[float] | None = None
-    """The error that the integration may leave in a reading, in `reading_unit`; or one such error for each output.
-    Each trial's step follows from it and from the trial's parameters."""
+    """The error that the integration may leave in a reading, in `reading_unit`; or one such error
+    for each output. Each trial's step follows from it and from the trial's parameters."""
     step: float | None = None
-    """A longest step for all trials, in place of `tolerance`; each interval between readings is divided evenly."""
+    """A longest step for all trials, in place of `tolerance`; each interval between readings is
+    divided evenly."""
     shortest_step: float = 0.0
-    """Shortest step, but for 1/1024 of the usual interval between readings, for any parameters: it limits the cost of
-    an iterate that diverges."""
+    """Shortest step, but for 1/1024 of the usual interval between readings, for any parameters: it
+    limits the cost of an iterate that diverges."""
     stiff_remedy: str = "put what decays fast in balance with the rest"
     """Remedy for equations that are stiff."""
     trusted_angle: float = 0.0
-    """A step that is at most this over `fastest_rate` is known to hold the tolerance; 0: every trial is tested."""
+    """A step that is at most this over `fastest_rate` is known to hold the tolerance; 0: every
+    trial is tested."""
 
     @property
     @abstractmethod
@@ -90,12 +90,13 @@ class OdeMeasurement(Measurement):
 
     @property
     def cases(self) -> Array:
-        """The constants of each case: (cases, constants). One case without constants unless overridden."""
+        """The constants of each case: (cases, constants). One case without constants unless
+        overridden."""
         return np.zeros((1, 0))
 
     driven: Array | None = None
-    """Constants that change with time (times + 1, cases, further constants), behind those of the cases: entry k holds
-    from times[k - 1] on, at that reading too, until times[k]."""
+    """Constants that change with time (times + 1, cases, further constants), behind those of the
+    cases: entry k holds from times[k - 1] on, at that reading too, until times[k]."""
 
     @cached_property
     def tables(self) -> Array:
@@ -103,9 +104,8 @@ class OdeMeasurement(Measurement):
         cases = own(self.cases)[None]
         if self.driven is None:
             return cases
-        return own(
-            np.concatenate([np.repeat(cases, len(self.driven), axis=0), self.driven], axis=2)
-        )
+        fixed = np.repeat(cases, len(self.driven), axis=0)
+        return own(np.concatenate([fixed, self.driven], axis=2))
 
     @property
     def si_sizes(self) -> Array:
@@ -125,10 +125,12 @@ class OdeMeasurement(Measurement):
         """Returns the output of the instruments at the state, one entry per output."""
 
     variation: Variation | None = None
-    """Equations of small deviations in fewer numbers than the state has, where the model knows them."""
+    """Equations of small deviations in fewer numbers than the state has, where the model knows
+    them."""
     fastest_rate: Callable[[Sequence[Any]], Any] | None = None
-    """A method fastest_rate(p), recorded like `rhs`: how fast the solution may turn, grow or decay, per unit of time.
-    It says with which step the search begins; where there is none, it begins with that of the nominal parameters."""
+    """A method fastest_rate(p), recorded like `rhs`: how fast the solution may turn, grow or decay,
+    per unit of time. It says with which step the search begins; where there is none, it begins with
+    that of the nominal parameters."""
 
     by_differential_equations = True
 
@@ -145,8 +147,9 @@ class OdeMeasurement(Measurement):
     @cached_property
     def epochs(self) -> tuple[NDArray[np.intp], ...]:
         """One epoch per time, with the readings of all cases and outputs."""
-        rows = np.arange(self.m).reshape(len(self.cases), len(self.times), len(self.outputs))
-        return tuple(np.ascontiguousarray(rows[:, k]).ravel() for k in range(len(self.times)))
+        times = len(self.times)
+        rows = np.arange(self.m).reshape(len(self.cases), times, len(self.outputs))
+        return tuple(np.ascontiguousarray(rows[:, k]).ravel() for k in range(times))
 
     def simulate(self, x: Array) -> Array:
         return self.simulate_until(x, len(self.times))
@@ -155,8 +158,9 @@ class OdeMeasurement(Measurement):
         return self._shown(x, stop, self._origin)
 
     def coarse_simulate_until(self, x: Array, stop: int) -> Array:
-        """Computes `simulate_until` without the search for the rung, if a rate says it well: GINS at an error scale of
-        2,000 is off by 1e-4 m/s at most in 100 trials, at 30,000 by 4e-7 in the median and 7e-3 in the worst."""
+        """Computes `simulate_until` without the search for the rung, if a rate says it well: GINS
+        at an error scale of 2,000 is off by 1e-4 m/s at most in 100 trials, at 30,000 by 4e-7 in
+        the median and 7e-3 in the worst."""
         return self._shown(x, stop, self._origin, guess=True)
 
     @property
@@ -167,12 +171,15 @@ class OdeMeasurement(Measurement):
     def _shown(self, x: Array, stop: int, offset: Array, *, guess: bool = False) -> Array:
         """Subtracts the offset (m,) from readings."""
         x = own(x)
-        cases, outputs = self.tables.shape[1], len(self.outputs)
+        cases = self.tables.shape[1]
+        outputs = len(self.outputs)
+        rows = np.arange(len(x))
         z = np.empty((len(x), cases * stop * outputs))
         if self._trusted(x).all():
-            self._simulate(x, np.arange(len(x)), self._parts, offset, z)
+            self._simulate(x, rows, self._parts, offset, z)
             return z
-        found, rows = self._rungs_of(x, offset, guess=guess), np.arange(len(x))
+        found = self._rungs_of(x, offset, guess=guess)
+        # Trials whose rung was searched for have their readings from the search.
         if len(found.computed):
             readings = found.z.reshape(-1, cases, len(self.times), outputs)[:, :, :stop]
             z[found.computed] = readings.reshape(len(readings), -1)
@@ -186,7 +193,8 @@ class OdeMeasurement(Measurement):
         x = own(x[None, : self.n])
         if np.isfinite(self.simulate(x)).all():
             return ""
-        return self._diagnosis(x, float(self.step or self._usual_interval / self._rungs[-1]))
+        shortest = self.step or self._usual_interval / self._rungs[-1]
+        return self._diagnosis(x, float(shortest))
 
     def _diagnosis(self, x: Array, shortest: float) -> str:
         """Says what hinders the integrator at x (1, n), whose shortest step is `shortest`."""
@@ -200,22 +208,22 @@ class OdeMeasurement(Measurement):
             return f"the solution itself leaves all numbers near t = {effort.reached:.4g}{unit}"
         if self.step is None and not np.isfinite(self._told(x, len(self.times))).all():
             return (
-                f"neither steps of {shortest:.2g}{unit}, the shortest, nor the implicit method tell these readings: "
-                "outputs magnify what any step leaves of the states, or the solution parts from those next to it"
+                f"neither steps of {shortest:.2g}{unit}, the shortest, nor the implicit method"
+                " tell these readings: outputs magnify what any step leaves of the states, or the"
+                " solution parts from those next to it"
             )
-        needed, t = STABLE / max(effort.fastest, 1e-300), effort.met
+        needed = STABLE / max(effort.fastest, 1e-300)
         if needed >= shortest:
             return f"steps of {shortest:.2g}{unit}, the shortest, are too long for these equations"
         looks = f"; they look stiff: {self.stiff_remedy}" if effort.explicit > effort.steps else ""
-        place = f"at t = {t:.4g}, and the shortest is {shortest:.2g}"
+        place = f"at t = {effort.met:.4g}, and the shortest is {shortest:.2g}"
         return f"the equations need steps of {needed:.2g}{unit} {place}{looks}"
 
     @property
     def stepped(self) -> Stepped:
         """The equations with their numbers, as the implicit method takes them."""
-        return Stepped(
-            self.equations, self.tables, np.asarray(self.times, dtype=float), self.si_sizes
-        )
+        times = np.asarray(self.times, dtype=float)
+        return Stepped(self.equations, self.tables, times, self.si_sizes)
 
     def _simulate(
         self,
@@ -226,12 +234,12 @@ class OdeMeasurement(Measurement):
         z: Array,
         y: Array | None = None,
     ) -> None:
-        """Fills these rows of z (trials, readings), as many times as it has room for, with so many steps to each, and
-        of y (trials, cases, states, times + 1), if it has room for any."""
-        times, y = (
-            self._times[: z.shape[1] // (self.tables.shape[1] * len(self.outputs))],
-            y if self._kept[1] else None,
-        )
+        """Fills these rows of z (trials, readings), as many times as it has room for, with so many
+        steps to each, and of y (trials, cases, states, times + 1), if it has room for any."""
+        at_each_time = self.tables.shape[1] * len(self.outputs)
+        times = self._times[: z.shape[1] // at_each_time]
+        if not self._kept[1]:
+            y = None
         self._readings_kernel.run(
             x, self._si_sizes, self.tables, rows, times, steps, offset, z.reshape(-1), states=y
         )
@@ -250,44 +258,49 @@ class OdeMeasurement(Measurement):
 
     @property
     def _kept(self) -> tuple[int, int, int]:
-        """Cases, states and times that are held against each other, with a row behind the states that tells whether a
-        step was in doubt. A stated rate needs none: no step is unstable."""
-        return (
-            self.tables.shape[1],
-            self.states + 1 if self.fastest_rate is None else 0,
-            len(self._times) + 1,
-        )
+        """Cases, states and times that are held against each other, with a row behind the states
+        that tells whether a step was in doubt. A stated rate needs none: no step is unstable."""
+        states = self.states + 1 if self.fastest_rate is None else 0
+        return self.tables.shape[1], states, len(self._times) + 1
 
     @cached_property
     def _remembered(self) -> dict[bytes, tuple[int, bool]]:
-        """The place of each trial that was searched for, and whether it is lost, by the bits of its x."""
+        """The place of each trial that was searched for, and whether it is lost, by the bits of its
+        x."""
         return {}
 
     def _rungs_of(self, x: Array, offset: Array, *, guess: bool = False) -> ladder.Found:
-        """Finds the rung of each trial, and the readings of those whose rung was searched for; with `guess` the rates
-        say the rung, where the model has them."""
-        trusted, remembered = self._trusted(x), self._remembered
-        places, unknown = trusted.astype(np.intp) - 1, np.flatnonzero(~trusted)
+        """Finds the rung of each trial, and the readings of those whose rung was searched for; with
+        `guess` the rates say the rung, where the model has them."""
+        trusted = self._trusted(x)
+        remembered = self._remembered
+        # The place of a trusted trial is 0; that of others is -1 until it is known.
+        places = trusted.astype(np.intp) - 1
+        unknown = np.flatnonzero(~trusted)
         if guess and len(unknown) and self.trusted_angle > 0 and self._rate_function is not None:
-            places[unknown], unknown = self._first_guess(x[unknown]), unknown[:0]
+            places[unknown] = self._first_guess(x[unknown])
+            unknown = unknown[:0]
         bits = [row.tobytes() for row in x[unknown]]
         lost = np.zeros(len(x), dtype=bool)
+        doubtful = np.zeros_like(lost)
         for row, key in zip(unknown, bits, strict=True):
             places[row], lost[row] = remembered.get(key, (-1, False))
         new = np.flatnonzero(places[unknown] < 0)
         unknown = unknown[new]
         if not len(unknown):
-            return ladder.Found(places, unknown, np.empty((0, self.m)), lost, np.zeros_like(lost))
+            return ladder.Found(places, unknown, np.empty((0, self.m)), lost, doubtful)
         found = self._find(x[unknown], self._first_guess(x[unknown]), offset)
         if len(remembered) + len(unknown) > _REMEMBERED:
             remembered.clear()
         known = zip(found.places.tolist(), found.lost.tolist(), strict=True)
         remembered.update(zip([bits[i] for i in new], known, strict=True))
-        places[unknown], lost[unknown] = found.places, found.lost
-        return ladder.Found(places, unknown[found.computed], found.z, lost, np.zeros_like(lost))
+        places[unknown] = found.places
+        lost[unknown] = found.lost
+        return ladder.Found(places, unknown[found.computed], found.z, lost, doubtful)
 
     def _find(self, x: Array, start: ladder.Indices, offset: Array) -> ladder.Found:
-        """Finds rungs; a trial with a step in doubt is lost unless its readings are those of the implicit method."""
+        """Finds rungs; a trial with a step in doubt is lost unless its readings are those of the
+        implicit method."""
 
         def simulate(rows: ladder.Indices, rung: int, z: Array, y: Array) -> None:
             self._simulate(x, rows, rung * self._parts, offset, z, y)
@@ -298,9 +311,8 @@ class OdeMeasurement(Measurement):
         doubtful = np.flatnonzero(found.doubtful & ~found.lost)
         if len(doubtful):
             z = found.z[np.searchsorted(found.computed, doubtful)] + offset
-            found.lost[doubtful] = ~self._alike(
-                z, self._implicit.simulate(x[doubtful], len(self.times))
-            )
+            implicit = self._implicit.simulate(x[doubtful], len(self.times))
+            found.lost[doubtful] = ~self._alike(z, implicit)
         return found
 
     def _alike(self, z: Array, other: Array) -> Mask:
@@ -311,15 +323,15 @@ class OdeMeasurement(Measurement):
 
     @cached_property
     def shape(self) -> tuple[Array, Effort]:
-        """The nominal readings (1, m) by the implicit method, near enough to show their size, and what they took."""
+        """The nominal readings (1, m) by the implicit method, near enough to show their size, and
+        what they took."""
         return Rodas5P(self.stepped, SHAPE).measured(own(self.nominal[None]))
 
     @cached_property
     def _implicit(self) -> Rodas5P:
-        return Rodas5P(
-            self.stepped,
-            float(np.clip(_IN_HAND * np.min(self._tolerances) / self._largest, 1e-10, 1e-4)),
-        )
+        """The implicit method, more accurate than the tightest tolerance of a reading."""
+        rtol = _IN_HAND * np.min(self._tolerances) / self._largest
+        return Rodas5P(self.stepped, float(np.clip(rtol, 1e-10, 1e-4)))
 
     @cached_property
     def _largest(self) -> float:
@@ -327,39 +339,51 @@ class OdeMeasurement(Measurement):
         return float(np.nanmax(np.abs(self.shape[0]), initial=0.0)) or 1.0
 
     def _in_doubt(self, states: Array) -> Mask:
-        """Selects the trials of states (trials, cases, states + 1, times + 1) in which a step was in doubt, or one that
-        the rates divide by is negative though it never is at the nominal point."""
-        below = (states[:, :, :-1].min(axis=(1, 3), initial=np.inf) < 0.0) & self._positive
-        return (states[:, :, -1:, -1].max(axis=(1, 2), initial=0.0) > 0.0) | below.any(axis=1)
+        """Selects the trials of states (trials, cases, states + 1, times + 1) in which a step was
+        in doubt, or one that the rates divide by is negative though it never is at the nominal
+        point."""
+        lowest = states[:, :, :-1].min(axis=(1, 3), initial=np.inf)
+        below = (lowest < 0.0) & self._positive
+        # The row behind the states counts, at the last time, the steps in doubt.
+        doubts = states[:, :, -1:, -1].max(axis=(1, 2), initial=0.0)
+        return (doubts > 0.0) | below.any(axis=1)
 
     @cached_property
     def _positive(self) -> Mask:
-        """Selects the states that the rates divide by, and that are not negative with the shortest steps."""
+        """Selects the states that the rates divide by, and that are not negative with the shortest
+        steps."""
         return self._divided_by & (self._with_shortest_steps[1] >= 0.0)
 
     @cached_property
     def _divided_by(self) -> Mask:
-        """Selects the states that the rates divide by; none where no state is held against another."""
-        return np.array(Recording(self.equations).divided_by[: self._kept[1]], dtype=bool)
+        """Selects the states that the rates divide by; none where no state is held against
+        another."""
+        states = self._kept[1]
+        return np.array(Recording(self.equations).divided_by[:states], dtype=bool)
 
     @cached_property
     def _finest(self) -> Array:
-        """The nominal readings (1, m) with the shortest steps, which meet what longer ones may pass over; not numbers
-        if a step was in doubt, one that the rates divide by changes its sign, or none is watched."""
+        """The nominal readings (1, m) with the shortest steps, which meet what longer ones may pass
+        over; not numbers if a step was in doubt, one that the rates divide by changes its sign, or
+        none is watched."""
         return self._with_shortest_steps[0]
 
     def _told(self, x: Array, stop: int) -> Array:
-        """Computes readings at the first `stop` times by the implicit method; not numbers from where on outputs magnify
-        what its steps leave of the states, nor anywhere if at the nominal point other steps lead to other readings."""
+        """Computes readings at the first `stop` times by the implicit method; not numbers from
+        where on outputs magnify what its steps leave of the states, nor anywhere if at the nominal
+        point other steps lead to other readings."""
         return self._judged(*self._implicit.with_reach(x, stop), stop)
 
     def _judged(self, z: Array, reach: Array, stop: int) -> Array:
+        """Removes readings (trials, readings) whose states' errors reach too far, and all after
+        them."""
         along = len(z), self.tables.shape[1], stop, len(self.outputs)
         with np.errstate(all="ignore"):
             moved = reach / self._largest * np.min(self._tolerances)
             astray = moved > _MAGNIFIED * self._tolerances[self.rows(stop)]
-        lost = np.logical_or.accumulate(astray.reshape(along).any(axis=3, keepdims=True), axis=2)
-        return np.where(lost | (not self._is_held), np.nan, z.reshape(along)).reshape(z.shape)
+        at_time = astray.reshape(along).any(axis=3, keepdims=True)
+        lost = np.logical_or.accumulate(at_time, axis=2) | (not self._is_held)
+        return np.where(lost, np.nan, z.reshape(along)).reshape(z.shape)
 
     @cached_property
     def _nominal_reached(self) -> tuple[Array, Array]:
@@ -372,38 +396,43 @@ class OdeMeasurement(Measurement):
 
     @cached_property
     def _is_held(self) -> bool:
-        """Whether steps of the implicit method, ten times as accurate or not, lead to the same nominal readings."""
+        """Whether steps of the implicit method, ten times as accurate or not, lead to the same
+        nominal readings."""
+        z = self._nominal_reached[0]
         rougher = replace(self._implicit, rtol=_ROUGHER * self._implicit.rtol)
-        z, rough = (
-            self._nominal_reached[0],
-            rougher.simulate(own(self.nominal[None]), len(self.times)),
-        )
+        rough = rougher.simulate(own(self.nominal[None]), len(self.times))
         return bool(self._alike(z, rough)[0] or not np.isfinite(z).all())
 
     @cached_property
     def _with_shortest_steps(self) -> tuple[Array, Array]:
-        """The nominal readings (1, m) and the lowest value of each state, at the readings, with the shortest steps."""
-        z, y = np.full((1, self.m), np.nan), np.ones((1, *self._kept))
+        """The nominal readings (1, m) and the lowest value of each state, at the readings, with the
+        shortest steps."""
+        z = np.full((1, self.m), np.nan)
+        y = np.ones((1, *self._kept))
         if self.fastest_rate is None:
             rung = self._rungs[-1] if compiled.available() else min(self._rungs[-1], _IN_NUMPY)
-            self._simulate(
-                own(self.nominal[None]), np.arange(1), rung * self._parts, self._zeros, z, y
-            )
-        lowest, highest = y[0, :, :-1].min(axis=(0, 2)), y[0, :, :-1].max(axis=(0, 2))
-        if y[:, :, -1:, -1].any() or ((lowest < 0.0) & (highest > 0.0) & self._divided_by).any():
+            x = own(self.nominal[None])
+            self._simulate(x, np.arange(1), rung * self._parts, self._zeros, z, y)
+        states = y[0, :, :-1]
+        lowest = states.min(axis=(0, 2))
+        highest = states.max(axis=(0, 2))
+        turns_sign = (lowest < 0.0) & (highest > 0.0) & self._divided_by
+        in_doubt = y[:, :, -1:, -1].any()
+        if in_doubt or turns_sign.any():
             z[:] = np.nan
         return z, lowest
 
     @cached_property
     def _nominal(self) -> ladder.Found:
-        """The rung of the nominal point: with steps that are short enough to meet what the shortest meet."""
+        """The rung of the nominal point: with steps that are short enough to meet what the shortest
+        meet."""
+        x = own(self.nominal[None])
+        told = np.isfinite(self._finest).all()
         place = 1
         while True:
-            found = self._find(own(self.nominal[None]), np.array([place]), self._zeros)
+            found = self._find(x, np.array([place]), self._zeros)
             place = max(place, int(found.places[0])) + 1
-            passed_over = (
-                np.isfinite(self._finest).all() and not self._alike(found.z, self._finest)[0]
-            )
+            passed_over = told and not self._alike(found.z, self._finest)[0]
             if found.lost[0] or not passed_over or place >= len(self._rungs) - 1:
                 return found
 
@@ -428,14 +457,18 @@ class OdeMeasurement(Measurement):
     @cached_property
     def _longest(self) -> float:
         """The longest step of the coarsest rung."""
-        return float(np.max(np.diff(self.times, prepend=0.0) / np.maximum(self._parts, 1)))
+        steps = np.diff(self.times, prepend=0.0) / np.maximum(self._parts, 1)
+        return float(np.max(steps))
 
     def _first_guess(self, x: Array) -> ladder.Indices:
-        """Returns the place where the search begins: steps of half a radian, or what the nominal parameters need."""
+        """Returns the place where the search begins: steps of half a radian, or what the nominal
+        parameters need."""
         top = len(self._rungs) - 1
         if self._rate_function is None:
-            return np.where(np.isfinite(x).all(axis=1), min(self._nominal_place, top - 1), top)
-        wanted = np.nan_to_num(self._rates(x) * self._longest / _ANGLE_AT_START, nan=np.inf)
+            usual = min(self._nominal_place, top - 1)
+            return np.where(np.isfinite(x).all(axis=1), usual, top)
+        turned = self._rates(x) * self._longest
+        wanted = np.nan_to_num(turned / _ANGLE_AT_START, nan=np.inf)
         return np.clip(np.searchsorted(self._rungs, wanted), 1, top)
 
     @cached_property
@@ -444,21 +477,23 @@ class OdeMeasurement(Measurement):
 
     @cached_property
     def _parts(self) -> NDArray[np.int64]:
-        """Steps to each time at rung 1: equal ones, none longer than `step` or the usual interval, none over none."""
-        intervals, longest = np.diff(self.times, prepend=0.0), self.step or self._usual_interval
-        return np.where(
-            intervals > 0.0, np.maximum(np.ceil(intervals / longest - 1e-9), 1), 0
-        ).astype(np.int64)
+        """Steps to each time at rung 1: equal ones, none longer than `step` or the usual interval,
+        none over none."""
+        intervals = np.diff(self.times, prepend=0.0)
+        longest = self.step or self._usual_interval
+        # Less a little, so that round-off makes no further step.
+        steps = np.maximum(np.ceil(intervals / longest - 1e-9), 1)
+        return np.where(intervals > 0.0, steps, 0).astype(np.int64)
 
     @cached_property
     def _usual_interval(self) -> float:
-        """The median interval between readings, but for a few that are read one right after another."""
+        """The median interval between readings, but for a few that are read one right after
+        another."""
         span = float(self.times[-1])
-        return (
-            max(float(np.median(np.diff(self.times, prepend=0.0))), span / (8 * len(self.times)))
-            if span
-            else 1.0
-        )
+        if not span:
+            return 1.0
+        median = float(np.median(np.diff(self.times, prepend=0.0)))
+        return max(median, span / (8 * len(self.times)))
 
     @cached_property
     def _rungs(self) -> NDArray[np.int64]:
@@ -483,21 +518,22 @@ class OdeMeasurement(Measurement):
         return self.coarse_jacobian_until(x, len(self.times))
 
     def jacobian_until(self, x: Array, stop: int) -> Array:
-        """Computes dh/dx by the variational equations, with the formula and the steps of the readings at that x."""
+        """Computes dh/dx by the variational equations, with the formula and the steps of the
+        readings at that x."""
         x = own(x)
         groups = ladder.by_rung(self._rungs_of(x, self._zeros).places, np.arange(len(x)))
         given = ((self._jacobian_kernel, int(self._rungs[place]), rows) for place, rows in groups)
         return self._tangents(x, stop, given)
 
     def coarse_jacobian_until(self, x: Array, stop: int) -> Array:
-        """Computes dh/dx with longer steps, or by a cheaper formula, if that was measured to contract; see `coarse`."""
+        """Computes dh/dx with longer steps, or by a cheaper formula, if that was measured to
+        contract; see `coarse`."""
         if not self._coarsens:
             return self.jacobian_until(x, stop)
         x = own(x)
         places = self._rungs_of(x, self._zeros, guess=stop < len(self.times)).places
-        groups = ladder.by_rung(
-            np.where(self._trusted(x), 0, self._rungs[places]), np.arange(len(x))
-        )
+        rungs = np.where(self._trusted(x), 0, self._rungs[places])
+        groups = ladder.by_rung(rungs, np.arange(len(x)))
         return self._tangents(x, stop, ((*self._coarsened(rung), rows) for rung, rows in groups))
 
     @property
@@ -508,49 +544,57 @@ class OdeMeasurement(Measurement):
     def _tangents(
         self, x: Array, stop: int, groups: Iterable[tuple[Kernel, int, ladder.Indices]]
     ) -> Array:
-        """Computes J (trials, readings, n) at the first times, each group of trials by its kernel at its rung."""
+        """Computes J (trials, readings, n) at the first times, each group of trials by its kernel
+        at its rung."""
         J = np.empty((len(x), self.tables.shape[1] * stop * len(self.outputs), self.n))
+        times = self._times[:stop]
         for kernel, rung, rows in groups:
-            kernel.run(
-                x,
-                self._si_sizes,
-                self.tables,
-                rows,
-                self._times[:stop],
-                rung * self._parts,
-                J.reshape(-1),
-            )
+            steps = rung * self._parts
+            kernel.run(x, self._si_sizes, self.tables, rows, times, steps, J.reshape(-1))
         return J
 
     def _coarsened(self, rung: int) -> tuple[Kernel, int]:
-        """Returns the formula and its steps for the tangents of trials at this rung; 0 for those that are trusted."""
+        """Returns the formula and its steps for the tangents of trials at this rung; 0 for those
+        that are trusted."""
         fourth, steps = self._coarseness.steps(rung)
         return self._rk4_kernel if fourth else self._jacobian_kernel, steps
 
     @cached_property
     def _coarseness(self) -> ladder.Coarseness:
-        x, stop = own(self.nominal[None]), len(self.times)
-        rung, J = int(self._rungs[self._rungs_of(x, self._zeros).places[0]]), self.jacobian(x)
+        """How much longer the steps of tangents may be, as measured at the nominal point."""
+        x = own(self.nominal[None])
+        stop = len(self.times)
+        rung = self._nominal_rung
+        J = self.jacobian(x)
 
         def of_fourth(k: int) -> Array:
             return self._tangents(x, stop, [(self._rk4_kernel, k, np.arange(1))])[0]
 
-        fourth = (
-            ladder.fewest_of_fourth(of_fourth, J[0]) if rung <= ladder.HIGHEST_OF_FOURTH else None
-        )
+        fourth = None
+        if rung <= ladder.HIGHEST_OF_FOURTH:
+            fourth = ladder.fewest_of_fourth(of_fourth, J[0])
         # Half the rung; where that is half a step, every second reading.
         if rung == 1 and (stop == 1 or self.driven is not None):
             return ladder.Coarseness(fourth, 1.0)
         every = slice(None) if rung > 1 else slice(1, None, 2)
         rows = np.arange(self.m).reshape(self.tables.shape[1], stop, -1)[:, every].ravel()
-        times, steps = self._times[every], max(1, rung // 2) * self._parts[every]
-        z, coarse = np.empty((1, len(rows))), np.empty((1, len(rows), self.n))
-        given = (x, self._si_sizes, self.tables, np.arange(1), np.ascontiguousarray(times), steps)
+        times = np.ascontiguousarray(self._times[every])
+        steps = max(1, rung // 2) * self._parts[every]
+        z = np.empty((1, len(rows)))
+        coarse = np.empty((1, len(rows), self.n))
+        given = (x, self._si_sizes, self.tables, np.arange(1), times, steps)
         self._readings_kernel.run(*given, np.zeros(len(rows)), z.reshape(-1))
         self._jacobian_kernel.run(*given, coarse.reshape(-1))
+        exact = self._shown(x, stop, self._zeros)[:, rows]
         with np.errstate(all="ignore"):
-            off = np.abs(z - self._shown(x, stop, self._zeros)[:, rows]) / self._tolerances[rows]
+            off = np.abs(z - exact) / self._tolerances[rows]
         return ladder.Coarseness(fourth, ladder.times_longer(off, coarse[0], J[0, rows]))
+
+    @property
+    def _nominal_rung(self) -> int:
+        """The rung of the nominal point, as its readings have it."""
+        places = self._rungs_of(own(self.nominal[None]), self._zeros).places
+        return int(self._rungs[places[0]])
 
     @cached_property
     def jacobian_cost(self) -> float:
@@ -559,19 +603,19 @@ class OdeMeasurement(Measurement):
 
     @cached_property
     def coarse_jacobian_cost(self) -> float:
-        """Cost at the nominal parameters, or where they are at a rung above 2; in simulations at the trial's rung."""
+        """Cost at the nominal parameters, or where they are at a rung above 2; in simulations at
+        the trial's rung."""
         if not self._coarsens:
             return self.jacobian_cost
-        x = own(self.nominal[None])
-        rung = int(self._rungs[self._rungs_of(x, self._zeros).places[0]])
-        kernel, steps = self._coarsened(0 if self._trusted(x)[0] else rung)
+        rung = self._nominal_rung
+        trusted = self._trusted(own(self.nominal[None]))[0]
+        kernel, steps = self._coarsened(0 if trusted else rung)
         return kernel.plan.operations * steps / (self._readings_kernel.plan.operations * rung)
 
     def __getstate__(self) -> dict[str, Any]:
         """Returns the state without what is compiled and remembered, which stays with a process."""
-        return {
-            k: v for k, v in self.__dict__.items() if not k.startswith("_") and k != "equations"
-        }
+        kept = self.__dict__.items()
+        return {k: v for k, v in kept if not k.startswith("_") and k != "equations"}
 
     @cached_property
     def _readings_kernel(self) -> Kernel:
@@ -588,12 +632,16 @@ class OdeMeasurement(Measurement):
     @cached_property
     def equations(self) -> Equations:
         """Equations to integrate; refused where a rate jumps when the solution decides."""
-        constants, driven = self.tables.shape[2], self.tables.shape[2] - self.cases.shape[1]
+        constants = self.tables.shape[2]
+        driven = constants - self.cases.shape[1]
         watched = self.fastest_rate is None
         arithmetic = (self.start, self.rhs, self.read, self.variation, driven, watched)
         equations = Equations(self.states, self.n, constants, len(self.outputs), *arithmetic)
         if jumps(equations):
-            what = "a rate jumps at a moment that a state or a parameter decides, which no step can end at"
+            what = (
+                "a rate jumps at a moment that a state or a parameter decides,"
+                " which no step can end at"
+            )
             remedy = (
                 "let both sides agree there, or blend them, as by 1/(1+exp((b-a)/width)) for a > b"
             )
