@@ -121,13 +121,11 @@ class Finding:
         return "; ".join([*clauses, *self._parted(most)])
 
     def _winners(self, winners: Sequence[Standing], undecided: Sequence[Standing]) -> str:
-        number = len(self.standings)
-        if len(winners) == number > MOST_NAMES:
-            who = f"All {number} estimators"
-        else:
-            only = "Only " if len(winners) < number and not undecided else ""
-            who = only + named(winners, self.standings)
+        who = named(winners, self.standings)
+        if len(winners) < len(self.standings) and not undecided:
+            who = f"Only {who}"
         verb = "holds" if len(winners) == 1 else "hold"
+        who = who.replace("all ", "All ", 1) if who.startswith("all ") else who
         return f"{who} {verb} {self._where(winners)} ({self._numbers(winners)})"
 
     def _where(self, winners: Sequence[Standing]) -> str:
@@ -253,6 +251,8 @@ def judged(row: Row | None, columns: int) -> str:
 def named(standings: Sequence[Standing], among: Sequence[Standing]) -> str:
     """Names estimators; more than three are counted."""
     labels = [one.label for one in standings]
+    if len(labels) == len(among) > MOST_NAMES:
+        return f"all {len(labels)} estimators"
     if len(labels) > MOST_NAMES:
         return f"{len(labels)} of {len(among)} estimators"
     return " and ".join([", ".join(labels[:-1]), labels[-1]] if len(labels) > 1 else labels)

@@ -45,6 +45,33 @@ DARK, LIGHT = "#15181c", "#e4e7ea"
 """What white and black become on a page that is dark."""
 
 
+RAMP = (
+    *("#dcf0fa", "#bfe0f2", "#ffcf9f", "#fdbf85", "#fbab66"),
+    *("#f59145", "#e67a2e", "#ad4a0a", "#983d06", "#842f04"),
+)
+"""Colours of success from all to none: blue where an estimator holds, then orange to brown. Luminance falls with
+success alone, for grey print."""
+DARK_RAMP = (
+    *("#173e55", "#205172", "#70501d", "#7a541c", "#885a1a"),
+    *("#cf7526", "#dd832f", "#ea913c", "#f5a04b", "#ffb062"),
+)
+"""The same on a dark page, where luminance rises as success falls."""
+
+
+def luminance(color: str) -> float:
+    """Computes the relative luminance of a colour (WCAG 2.1)."""
+    parts = [int(color[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in parts]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+
+def ink(ground: str) -> str:
+    """Returns the colour of letters on that ground: the darker or the lighter one, whichever has more contrast."""
+    above = (luminance(ground) + 0.05) / (luminance(DARK) + 0.05)
+    below = (luminance(WHITE) + 0.05) / (luminance(ground) + 0.05)
+    return DARK if above > below else WHITE
+
+
 def which_figures(asked: Any) -> Which:
     """Returns the choice of this name; raises UserError if there is none."""
     if asked not in get_args(Which):

@@ -101,7 +101,9 @@ def test_what_is_written_is_whole_and_the_page_stands_alone(result):
         page.replace("&#39;", "'").replace("\u00a0", " "),
     )
     shown = shown.replace("<wbr>", "")
-    assert all(sentence in shown for sentence in (*headline(analysis), *about(analysis)))
+    finding, matrix, *sentences = headline(analysis)
+    assert all(sentence in shown for sentence in (finding, *sentences, *about(analysis)))
+    assert f'id="table-{matrix.name}"' in shown
 
 
 def test_survivors_are_shown_as_survivors(synthetic):

@@ -34,6 +34,7 @@ from ipe_bench.statistics.verdicts import (
     NO_VERDICT,
     OVERCONFIDENT,
     TOO_CAUTIOUS,
+    UNDECIDED,
     WRONG,
 )
 from ipe_bench.trials.thresholds import FEW, FIT_LEVEL
@@ -113,7 +114,9 @@ def shares_named(text: str) -> dict[str, str]:
 
 # Sentences ------------------------------------------------------------------------------------------------------------
 
-NAMED = r"(?:All (?P<all>\d+) estimators|(?P<count>\d+) of \d+ estimators|(?P<names>e\d+[\w, ]*?))"
+NAMED = (
+    r"(?:[Aa]ll (?P<all>\d+) estimators|(?P<count>\d+) of \d+ estimators|(?P<names>e\d+[\w, ]*?))"
+)
 NUMBERS = r"(?P<low>[<>\d.]+)(?: %)?(?: to (?P<high>[<>\d.]+))? % of (?P<trials>\d+) trials"
 UP_TO = r"(?:up to|at) error scale (?P<scale>[\d.]+)"
 CLAUSES = {
@@ -374,6 +377,27 @@ def path_errors(report: Report, match: Any) -> Iterator[tuple[str, str, bool]]:
 
 
 # Entries of tables ---------------------------------------------------------------------------------------------------
+
+
+@entries
+def tiles(report: Report) -> Iterator[Claim]:
+    """Counts that a cell's number is its success, and that its sign is of the verdict."""
+    shown = report.analysis.summary.query("parameter == 'all'")
+    verdict = shown.set_index(["estimator", "error_scale"])["verdict"]
+    signs = {OVERCONFIDENT: "▲", UNDECIDED: "?", NO_VERDICT: "?"}
+    for matrix in (part for part in report.parts if isinstance(part, Table)):
+        for name, *cells in matrix.rows:
+            for at, cell in enumerate(cells):
+                share = 100 * successes(report, at, name.text).mean()
+                sign = signs.get(verdict[name.text, report.board.scales[at]], "")
+                number = cell.text.strip("▲? ")
+                near = abs(float(number.strip("<>")) - share) <= 0.51
+                yield Claim(
+                    "tile",
+                    COUNTS,
+                    cell.text,
+                    not near or not cell.text.strip().endswith(f"{number}{sign}"),
+                )
 
 
 @entries

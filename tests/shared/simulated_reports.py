@@ -37,6 +37,7 @@ _READ = {
         "success",
         "failed_silent",
         "error_median",
+        "error_q95",
         "efficiency_capped",
         "nees_median",
         "verdict",

@@ -464,7 +464,10 @@ def test_a_cost_that_few_trials_carry_shows_its_mean(synthetic):
     )
     rows: Any = summarize([synthetic.directory]).to_dict("records")
     lines = plain_text(summary_tables(rows, (), 120), 120).splitlines()
-    costs = {name: next(line for line in lines if name in line) for name in ("tailed", "even")}
+    costs = {
+        name: next(line for line in lines if line.startswith(f" {name}"))
+        for name in ("tailed", "even")
+    }
     assert "100/495" in costs["tailed"]
     assert " 100 " in costs["even"]
     assert "/100" not in costs["even"]

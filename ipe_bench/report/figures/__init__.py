@@ -18,11 +18,12 @@ from ipe_bench.report.formats import FORMATS, PAGE
 from ipe_bench.report.style import Which, house_style
 from ipe_bench.statistics.analysis import Analysis
 
-FIGURES = ("settings", "errors", "costs", "parameters")
+FIGURES = ("settings", "errors", "costs", "parameters", "matrix")
 """The modules in the order of the report; each holds its kinds of figures in FIGURES."""
 NAMES = {
     "settings": "error by setting, and how often a misfit is detected; of a number that is swept, an axis of it",
     "headline": "success, error and reported covariance of all trials",
+    "matrix": "success of every estimator at every error scale, best first",
     "distributions": "distribution functions of the error, a panel per error scale",
     "calibration": "distribution of NEES beside that of an honest covariance",
     "cost_against_accuracy": "median cost against the error that 95 % of trials stay below",

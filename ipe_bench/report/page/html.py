@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from ipe_bench.report.page.headline import about, headline
 from ipe_bench.report.page.writer import Page, digests
+from ipe_bench.report.tables.matrix import MATRIX, Matrix
 from ipe_bench.report.tables.table import Part, Strong, Table, environment, words
 from ipe_bench.report.words import public
 from ipe_bench.runs.parts import TRUTH
@@ -38,31 +39,37 @@ def render_page(
     commands = dict.fromkeys(
         run["command"] for run in runs if run["command"] not in (_PYTHON, _UNKNOWN)
     )
+    answer = headline(analysis)
+    # What the matrix shows is not drawn a second time, and the whole table is folded below it.
+    tiled = any(isinstance(part, Matrix) for part in answer)
+    pictures = [figure for figure in figures if not figure.name.startswith(MATRIX)]
     main: list[Part] = [table for table in tables if not table.appendix]
     asked = [
         cell for cell in collection.cells if cell.expected and cell.names["estimator"] != TRUTH
     ]
     converged = analysis.endings.empty and not analysis.summary.empty
     sections = [
-        ("figures", "Figures", figures[1:]),
+        ("figures", "Figures", pictures[1:]),
         (
             "tables",
             "Tables",
-            [*main[1:], *(["Every trial of every estimator converged."] if converged else [])],
+            [
+                *main[0 if tiled else 1 :],
+                *(["Every trial of every estimator converged."] if converged else []),
+            ],
         ),
         *((f"section-{section.name}", section.title, section.parts) for section in written),
         ("appendix", "Further tables", [table for table in tables if table.appendix]),
         ("provenance", "Configuration and provenance", _provenance(runs, older)),
         ("definitions", "Definitions", [_definitions()]),
     ]
-    answer = headline(analysis)
     names = ", ".join(d.resolve().name or str(d) for d in collection.directories)
     title = str(answer.pop(0)) if isinstance(answer[0], Strong) else names
     page = Page(
         "report",
         title,
         answer,
-        [*figures[:1], *main[:1]],
+        [*pictures[:1], *([] if tiled else main[:1])],
         sections,
         folder="figures/",
         facts=[
@@ -73,6 +80,7 @@ def render_page(
         commands=list(commands)[:MOST_COMMANDS],
         sources=digests(collection.directories),
         about=about(analysis),
+        drawn=[path for figure in figures if figure not in pictures for path in figure.files],
         problems=[*collection.problems, *collection.stale],
     )
     return page.html()

@@ -7,7 +7,7 @@ import hashlib
 import json
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +16,7 @@ from ipe_bench.basics.files import regular, write_text
 from ipe_bench.plugins.extensions import files_of_records, use_statistics
 from ipe_bench.report.formats import FIGURES, PAGE
 from ipe_bench.report.style import Which, file_formats, which_figures
-from ipe_bench.report.tables.table import Part, Shown
+from ipe_bench.report.tables.table import Part, Shown, Strong, Table
 from ipe_bench.runs.store import Store
 
 if TYPE_CHECKING:
@@ -95,6 +95,11 @@ class Pending:
         known, tables = len(problems), report_tables(analysis)
         sections = written("section", analysis, tables)
         added = [table for section in sections for table in section.tables]
+        opening = headline(analysis)
+        found = next((str(part) for part in opening if isinstance(part, Strong)), "")
+        matrices = [
+            replace(part, title=part.title or found) for part in opening if isinstance(part, Table)
+        ]
         main = main_columns(analysis.summary)
         is_total = main["parameter"] == ALL
         write_text(output / "summary.csv", main[is_total].to_csv(index=False))
@@ -103,7 +108,7 @@ class Pending:
         files = [output / "summary_all.csv", output / "parameters.csv"]
         files += [
             path
-            for table in (*tables, *added)
+            for table in (*tables, *added, *matrices)
             for path in write_table(table, output / "tables", self.formats)
         ]
         simulated = analysis.simulated
@@ -122,7 +127,7 @@ class Pending:
             report=output / "report.html",
             problems=tuple(analysis.collection.problems),
             stale=tuple(analysis.collection.stale),
-            headline=tuple(headline(analysis)),
+            headline=tuple(opening),
         )
         earlier = {
             path.name

@@ -85,6 +85,8 @@ class Page:
     problems: Sequence[str] = ()
     folder: str = ""
     """Where the figures' files are, seen from the page."""
+    drawn: Sequence[Path] = ()
+    """Files of the matrix, which the page itself shows as a table."""
 
     def html(self) -> str:
         """Renders it, with the style, the script and the citation of every page."""

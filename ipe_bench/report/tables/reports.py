@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import pandas as pd
 
 from ipe_bench.report.tables.table import Column, Table, column, words
-from ipe_bench.report.tables.terminal import leading, overview_columns, overview_notes, statistics
+from ipe_bench.report.tables.terminal import (
+    MOST_SETTINGS,
+    differing,
+    leading,
+    overview_columns,
+    overview_notes,
+    statistics,
+    varying,
+)
 from ipe_bench.report.words import p_value, percent, short, value_text
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.certified import certified_averages, certified_table, published_table
@@ -87,8 +95,6 @@ _RECORDED: dict[Where, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
     ),
 }
 """Title, caption and rows of the tables that are made of recorded statistics alone."""
-MOST_SETTINGS = 2
-"""Differing settings that have a column each."""
 _OF_PARAMETERS = ("tracks", "parameters", "theory")
 """Names of the recorded tables that have a row per parameter."""
 _MAIN = ("overview", "tracks", "costs", "comparisons", "parameters", "calibration", "endings")
@@ -110,32 +116,10 @@ def all_tables(analysis: Analysis, whole: Analysis | None = None) -> list[Table]
 
 def head(analysis: Analysis, rows: pd.DataFrame) -> list[Column]:
     """Returns the columns that tell rows apart: those settings that differ, of many in one column, and the scale."""
-    varying = _varying(analysis.setting_columns, rows)
-    each = [words(c, [value_text(v) for v in rows[c]]) for c in varying]
-    told = each if len(each) <= MOST_SETTINGS else [words("setting", differing(rows, varying))]
+    apart = varying(analysis.setting_columns, rows)
+    each = [words(c, [value_text(v) for v in rows[c]]) for c in apart]
+    told = each if len(each) <= MOST_SETTINGS else [words("setting", differing(rows, apart))]
     return [*told, column("error scale", rows["error_scale"], lambda v: f"{v:g}")]
-
-
-def _varying(columns: Sequence[str], rows: pd.DataFrame) -> list[str]:
-    return [c for c in columns if len(set(rows[c].astype(str))) > 1]
-
-
-def differing(rows: pd.DataFrame, columns: Sequence[str]) -> list[str]:
-    """Returns for each row those of its settings that differ among the rows, of many those other than the most frequent
-    ones; a dash if there are none."""
-    varying = _varying(columns, rows)
-    if not varying:  # a frame without columns loses its rows in pandas 2.2
-        return ["-"] * len(rows)
-    values = rows[varying].map(value_text)
-    usual = {c: values[c].mode().iloc[0] for c in values if len(values.columns) > MOST_SETTINGS}
-    told = (
-        [(c, v) for c, v in row.items() if v not in ("-", usual.get(c))]
-        for row in values.to_dict("records")
-    )
-    return [
-        ", ".join(v if c in ("measurement", "noise") else f"{c}={v}" for c, v in each) or "-"
-        for each in told
-    ]
 
 
 def _recorded(analysis: Analysis, where: Where, totals: pd.DataFrame) -> Table | None:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from ipe_bench.basics.files import write_text
 from ipe_bench.report.formats import TABLES
+from ipe_bench.report.style import DARK_RAMP, RAMP, ink
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -44,6 +45,11 @@ class Cell:
     text: str
     key: Any = None
     best: bool = False
+
+    @property
+    def style(self) -> str:
+        """How a terminal shows it."""
+        return "bold" if self.best else ""
 
 
 @dataclass(frozen=True)
@@ -121,6 +127,10 @@ class Table(Shown):
     def parts(self) -> list[Part]:
         return [self]
 
+    def folded(self) -> Table:
+        """Returns the same as it stands on paper and in a terminal."""
+        return self
+
 
 Part = Table | str
 """Element of a report: a table or a sentence."""
@@ -189,6 +199,7 @@ def terminal(parts: Iterable[Part], width: int) -> Group:
         if not isinstance(part, Table):
             shown.append(Text(part, style="bold" if isinstance(part, Strong) else "dim"))
             continue
+        part = part.folded()
         if part.title:
             shown += [Text()] if shown and isinstance(shown[-1], Text) else []
             shown.append(Text(part.title, style="bold"))
@@ -261,12 +272,7 @@ def _rich(columns: Sequence[Column], table: Table, width: int) -> Any:
     for group, members in groupby(rows, key=lambda row: row[: table.grouped]):
         for k, row in enumerate(members):
             first = [Cell("")] * len(group) if k and group else group
-            shown.add_row(
-                *(
-                    Text(c.text, style="bold" if c.best else "")
-                    for c in (*first, *row[len(group) :])
-                )
-            )
+            shown.add_row(*(Text(c.text, style=c.style) for c in (*first, *row[len(group) :])))
         if group:
             shown.add_section()
     return shown
@@ -292,6 +298,7 @@ def environment() -> Environment:
     made.filters["soft"] = lambda text: escape(text).replace("_", Markup("_<wbr>"))
     made.tests["strong"] = lambda part: isinstance(part, Strong)
     made.globals["MOST_ROWS"] = MOST_ROWS
+    made.globals["ramps"] = [[(color, ink(color)) for color in one] for one in (RAMP, DARK_RAMP)]
     return made
 
 
@@ -334,12 +341,14 @@ def markdown(table: Table) -> str:
     def cell(value: str) -> str:
         return re.sub(r"([\\|*])", r"\\\1", " ".join(value.split())).replace("<", "&lt;")
 
+    table = table.folded()
     rows = [[f"**{cell(c.text)}**" if c.best else cell(c.text) for c in row] for row in table.rows]
     head, *lines = [
         f"| {' | '.join(row)} |" for row in ([cell(c.title) for c in table.columns], *rows)
     ]
     rule = "|" + "|".join("---:" if c.numeric else ":---" for c in table.columns) + "|"
-    lines = [f"**{table.title}.** {cell(table.caption)}", "", head, rule, *lines]
+    title = [f"**{table.title}.** {cell(table.caption)}", ""] if table.title else []
+    lines = [*title, head, rule, *lines]
     return "\n".join([*lines, *(f"\n{cell(note)}" for note in table.notes)]) + "\n"
 
 
@@ -353,6 +362,8 @@ _SIGNS = {sign: f"\\{sign}" for sign in "&%$#_{}"} | {
     "×": r"\ensuremath{\times}",
     "²": r"\textsuperscript{2}",
     "–": "--",
+    "▲": r"\ensuremath{\triangle}",
+    "→": r"\ensuremath{\to}",
     "<": r"\textless{}",
     ">": r"\textgreater{}",
     "|": r"\textbar{}",

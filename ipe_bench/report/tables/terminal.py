@@ -7,6 +7,10 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import pandas as pd
+
+from ipe_bench.report.finding import FAILS, Finding
+from ipe_bench.report.tables.matrix import opening
 from ipe_bench.report.tables.table import (
     Cell,
     Column,
@@ -34,10 +38,12 @@ from ipe_bench.statistics.registry import all_statistics, summary_columns
 from ipe_bench.statistics.statistic import ALL, BEST, Kind, Statistic, Where
 from ipe_bench.statistics.verdicts import VERDICTS, shown, sign_of
 
-_MOST_LINES = 75, 50
-"""Lines that a terminal shows of one setting, and of several: about two screens with what stands below."""
+MOST_SETTINGS = 2
+"""Differing settings that have a column each."""
+_MOST_LINES = 44
+"""Lines that a terminal shows of several settings, half of them of matrices."""
 _HEAD = 4
-"""Lines of a table besides its rows and the blank one after each error scale."""
+"""Lines of a table besides its rows."""
 _WIDE_ENOUGH = 100
 """Letters of a screen with room for failures, and for verdicts spelt out."""
 _LEGEND = (
@@ -108,29 +114,51 @@ def summary_tables(
     further, hidden = len(rows) - sum(map(len, kept.values())), len(settings) - len(kept)
     whole = f", {hidden} of {len(settings)} settings whole" if hidden else ""
     left_out = f"{further} of {len(rows)} rows are left out here{whole}; summary.csv and report.html have all."
-    return [*totals, *tables, *([left_out] if further else [])] or ["no trial is stored yet"]
+    opened = _opening(rows, list(columns))
+    return [*totals, *opened, *tables, *([left_out] if further else [])] or [
+        "no trial is stored yet"
+    ]
+
+
+def _opening(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> list[Part]:
+    """Returns the finding and its matrices, of constants and then of states that move."""
+    simulated = [row for row in rows if row["noise"] != "certified"]
+    frame = pd.DataFrame(simulated)
+    settings = differing(frame, columns) if simulated else []
+    told = [{**row, "setting": text} for row, text in zip(simulated, settings, strict=True)]
+    moving = [row for row in told if row["noise"] == "model"]
+    constant = [row for row in told if row["noise"] != "model"]
+    parts = [one for one in (constant, moving) if one]
+    return [part for one in parts for part in opening(one, _MOST_LINES / 2)]
 
 
 def _shortened(settings: Mapping[str, Sequence[Any]]) -> dict[str, list[Any]]:
-    """Returns the rows of each setting, in order, until the screen is full; of one that does not fit, those of error
-    scales evenly between both ends."""
-    room, kept = _MOST_LINES[len(settings) > 1], {}
+    """Returns the rows of each setting at its telling scale, until the screen is full."""
+    room, kept = _MOST_LINES / 2, dict[str, list[Any]]()
     for title, rows in settings.items():
-        scales = list(dict.fromkeys(row["error_scale"] for row in rows))
-        count = max(not kept, int((room - _HEAD) / (len(rows) / len(scales) + 1)))
-        if count < len(scales):
-            scales = [scales[i * (len(scales) - 1) // max(1, count - 1)] for i in range(count)]
-        kept[title] = [row for row in rows if row["error_scale"] in scales]
-        room -= _HEAD + len(kept[title]) + len(scales)
+        here = _telling(rows)
+        if kept and len(here) + _HEAD > room:
+            break
+        kept[title] = here
+        room -= len(here) + _HEAD
     return kept
 
 
+def _telling(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Returns the rows, the best first, of the largest scale at which most estimators may hold, or else of the last."""
+    finding = Finding.of(rows)
+    best_first = [one.label for one in finding.standings]
+    scale = finding.places[-1][1]
+    for at, (_, place) in enumerate(finding.places):
+        possible = sum(one.judged[at] != FAILS for one in finding.standings)
+        scale = place if 2 * possible > len(best_first) else scale
+    here = [row for row in rows if row["error_scale"] == scale]
+    return sorted(here, key=lambda row: best_first.index(row["estimator"]))
+
+
 def _setting(title: str, rows: Sequence[Mapping[str, Any]], width: int) -> Table:
-    scales = column("scale", [row["error_scale"] for row in rows], lambda v: f"{v:g}")
-    columns = [
-        scales,
-        *overview_columns(rows, leading(rows, ["error_scale"]), narrow=width < _WIDE_ENOUGH),
-    ]
+    best = leading(rows, ["error_scale"])
+    columns = overview_columns(rows, best, narrow=width < _WIDE_ENOUGH)
     # The number of trials stands in the title if it is the same for all.
     counts = sorted({row["trials"] for row in rows})
     # A narrow screen leaves out the last columns: cost and time before what a plugin was asked to show.
@@ -139,7 +167,31 @@ def _setting(title: str, rows: Sequence[Mapping[str, Any]], width: int) -> Table
         columns.append(column("trials", [row["trials"] for row in rows], str))
     else:
         title = f"{title}: {counts[0]} trial{'s' * (counts[0] != 1)} per row"
-    return Table("summary", title, "", columns, grouped=1, whole="summary.csv")
+    title += f" at error scale {value_text(rows[0]['error_scale'])}"
+    return Table("summary", title, "", columns, whole="summary.csv")
+
+
+def varying(columns: Sequence[str], rows: pd.DataFrame) -> list[str]:
+    """Returns the columns in which rows differ."""
+    return [c for c in columns if len(set(rows[c].astype(str))) > 1]
+
+
+def differing(rows: pd.DataFrame, columns: Sequence[str]) -> list[str]:
+    """Returns for each row those of its settings that differ among the rows, of many those other than the most frequent
+    ones; a dash if there are none."""
+    apart = varying(columns, rows)
+    if not apart:  # a frame without columns loses its rows in pandas 2.2
+        return ["-"] * len(rows)
+    values = rows[apart].map(value_text)
+    usual = {c: values[c].mode().iloc[0] for c in values if len(values.columns) > MOST_SETTINGS}
+    told = (
+        [(c, v) for c, v in row.items() if v not in ("-", usual.get(c))]
+        for row in values.to_dict("records")
+    )
+    return [
+        ", ".join(v if c in ("measurement", "noise") else f"{c}={v}" for c, v in each) or "-"
+        for each in told
+    ]
 
 
 def leading(rows: Sequence[Mapping[str, Any]], scenario: Sequence[str]) -> list[bool]:

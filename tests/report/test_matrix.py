@@ -1,0 +1,166 @@
+"""The matrix shows what the table says: success as number and colour, and a sign for the covariance."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from report.test_finding import row
+
+from ipe_bench.report.style import DARK, DARK_RAMP, LIGHT, RAMP, WHITE, ink
+from ipe_bench.report.tables.matrix import Tile, matrices, points, step
+from ipe_bench.report.tables.table import html, markdown, plain_text
+from ipe_bench.statistics.intervals import clopper_pearson
+
+SEEN = {
+    "error_median": 0.98,
+    "error_q95": 1.35,
+    "nees_median": 1.04,
+    "simulations_median": 21.0,
+    "simulations_mean": 30.0,
+    "time_mean_s": 2e-3,
+    "noise": "gaussian",
+}
+
+
+def rows_of(counts: dict[str, tuple[int, ...]], **more: Any) -> list[dict[str, Any]]:
+    return [
+        row(label, scale, good, **{**SEEN, "success_high": clopper_pearson(good, 200)[1], **more})
+        for label, each in counts.items()
+        for scale, good in zip((0.1, 1.0, 10.0, 33.0, 100.0), each, strict=False)
+    ]
+
+
+def brightness(color: str) -> float:
+    """Computes the relative luminance as the definition of WCAG 2.1 has it."""
+    parts = [int(color[at : at + 2], 16) / 255 for at in (1, 3, 5)]
+    r, g, b = (p / 12.92 if p <= 0.03928 else ((p + 0.055) / 1.055) ** 2.4 for p in parts)
+    return 0.2126 * r + 0.7152 * g + 0.0722 * b
+
+
+def contrast(first: str, second: str) -> float:
+    dark, light = sorted((brightness(first), brightness(second)))
+    return (light + 0.05) / (dark + 0.05)
+
+
+@pytest.mark.parametrize(("ramp", "sign"), [(RAMP, -1), (DARK_RAMP, 1)])
+def test_every_number_is_legible_and_luminance_follows_success_alone(ramp, sign):
+    assert all(contrast(color, ink(color)) >= 4.5 for color in ramp)
+    shades = [sign * brightness(color) for color in ramp]
+    assert shades == sorted(set(shades))
+    shares = [k / 1000 for k in range(1001)]
+    places = [step(share) for share in shares]
+    assert places == sorted(places, reverse=True)
+    assert {step(share) for share in shares} == set(range(len(ramp)))
+
+
+def test_no_cell_stands_out_more_than_the_winners_name():
+    assert min(map(brightness, RAMP)) >= brightness("#1c1e21")
+    assert max(map(brightness, DARK_RAMP)) <= brightness(LIGHT)
+    assert {ink(color) for color in (*RAMP, *DARK_RAMP)} == {DARK, WHITE}
+
+
+@pytest.mark.parametrize(
+    ("share", "text"),
+    [
+        *((1.0, "100"), (0.0, "0"), (0.9999, ">99.9"), (0.0001, "<0.1"), (0.995, "99.5")),
+        *((0.98, "98"), (0.9, "90"), (0.8999, "89.9"), (0.896, "89.6"), (0.775, "78")),
+        *((0.035, "3.5"), (0.0996, "10"), (0.899999, "89.9")),
+    ],
+)
+def test_a_number_is_never_rounded_across_a_limit(share, text):
+    assert points(share) == text
+    assert (step(share) <= 1) == (share >= 0.9)
+
+
+def test_the_sign_is_of_the_verdict():
+    signs = {}
+    for verdict in ("overconfident", "undecided", "-", "consistent", "too cautious", "optimistic"):
+        (matrix,) = matrices(rows_of({"a": (200, 200)}, verdict=verdict))
+        (tiles,) = matrix.rows
+        signs[verdict] = {tile.sign for tile in tiles if isinstance(tile, Tile)}
+        assert ("▲" in matrix.notes[-1]) == (signs[verdict] == {"▲"})
+    assert signs == {
+        "overconfident": {"▲"},
+        "optimistic": {"▲"},
+        "undecided": {"?"},
+        "-": {"?"},
+        "consistent": {""},
+        "too cautious": {""},
+    }
+
+
+def test_neighbouring_scales_that_say_the_same_are_one_on_paper():
+    rows = rows_of({"a": (200, 200, 200, 200, 196), "b": (200, 200, 20, 20, 0)})
+    (matrix,) = matrices(rows)
+    assert [column.title for column in matrix.columns[1:]] == ["0.1", "1", "10", "33", "100"]
+    assert [column.title for column in matrix.folded().columns] == [
+        "error scale →",
+        "0.1 to 1",
+        "10 to 33",
+        "100",
+    ]
+    assert markdown(matrix).splitlines()[:4] == [
+        "| error scale → | 0.1 to 1 | 10 to 33 | 100 |",
+        "|:---|---:|---:|---:|",
+        "| a | 100 | 100 | 98 |",
+        "| b | 100 | 10 | 0 |",
+    ]
+
+
+def test_eight_estimators_at_seven_scales_fit_eighty_columns():
+    counts = {f"levenberg_marquardt_{k}": (200 - k, 199, 198, 20, 0) for k in range(8)}
+    rows = rows_of(counts)
+    (matrix,) = matrices([*rows, *({**one, "error_scale": 1000.0} for one in rows[::5])])
+    lines = plain_text([matrix], 80).splitlines()
+    assert max(map(len, lines)) <= 80
+    assert "Too narrow" not in "".join(lines)
+
+
+def test_a_cell_says_all_that_is_known_of_it():
+    (matrix,) = matrices(rows_of({"ekf": (68, 0)}, verdict="overconfident"))
+    ((_, tile, _),) = matrix.rows
+    assert isinstance(tile, Tile)
+    assert tile.says == (
+        "ekf, error scale 0.1: success 34.0 % of 200 trials (95 %: 27 to 41); error 0.98 × the bound, 95 % of"
+        " trials below 1.35; NEES 1.04: covariance too small; cost 21/30, 2.0 ms"
+    )
+    assert f'title="{tile.says}"' in html([matrix])
+
+
+def test_one_scale_has_a_table_and_no_matrix():
+    assert matrices(rows_of({"a": (200,), "b": (100,)})) == []
+
+
+def test_settings_are_columns_with_letters_for_long_names():
+    rows = [
+        one | {"setting": setting, "error_scale": 33.0}
+        for setting in ("-", "truth.platform_misalignment=5")
+        for one in rows_of({"a": (200,), "b": (0,)})
+    ]
+    (matrix,) = matrices(rows)
+    assert [column.title for column in matrix.columns] == ["setting →", "A", "B"]
+    assert matrix.notes[0] == "A: usual; B: truth.platform_misalignment=5."
+    assert [column.title for column in matrix.folded().columns] == ["setting →", "A", "B"]
+
+
+def test_settings_that_are_swept_have_a_matrix_each():
+    rows = [
+        one | {"setting": f"noise={k}"} for k in range(3) for one in rows_of({"a": (200, 20 * k)})
+    ]
+    found = matrices(rows)
+    assert [matrix.title for matrix in found] == ["noise=0", "noise=1", "noise=2"]
+    assert [[cell.text for cell in each][2] for m in found for each in m.rows] == [
+        "0 ",
+        "10 ",
+        "20 ",
+    ]
+
+
+def test_a_missing_result_is_a_dash_without_colour():
+    rows = rows_of({"a": (200, 200), "b": (200,)})
+    (matrix,) = matrices(rows)
+    missing = list(matrix.rows)[1][2]
+    assert (missing.text, missing.style) == ("–", "")
+    assert isinstance(missing, Tile)
+    assert missing.step is None
