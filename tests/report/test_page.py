@@ -68,7 +68,8 @@ def test_there_are_no_errors_no_dialogs_no_requests_and_all_figures(desktop, pag
     )
     drawn = {path.stem for path in (page_file.parent / "figures").glob("*.png")}
     assert "headline" in drawn
-    assert len(widths) == len(drawn)
+    # The matrix is a table here.
+    assert len(widths) == len(drawn - {"matrix"})
     assert min(widths) > 300
 
 
@@ -94,7 +95,7 @@ def test_the_page_is_dark_where_the_reader_has_it_so(desktop, page_file):
 def test_the_page_opens_with_the_answer_and_a_link_unfolds_the_rest(browser, page_file):
     browser.go(page_file)
     order = browser.run(
-        "Array.from(document.querySelectorAll('.about, #headline, #figure-headline, #table-overview, details.part'),"
+        "Array.from(document.querySelectorAll('h1, .matrix, #headline, #figure-headline, .about, details.part'),"
         " e => e.getBoundingClientRect().y)"
     )
     assert order == sorted(order)
@@ -105,6 +106,60 @@ def test_the_page_opens_with_the_answer_and_a_link_unfolds_the_rest(browser, pag
     browser.run("unfold()")
     assert browser.run("document.querySelector('#tables').closest('details').open")
     assert not browser.run("document.querySelector('#definitions').closest('details').open")
+
+
+CELL = "document.querySelector('.matrix').rows[2].cells[1]"
+SHOWN = (
+    f"Array.from({CELL}.querySelectorAll('span')).filter(s => s.offsetWidth).map(s => s.className)"
+)
+
+
+def test_a_choice_shows_another_number_in_every_cell_without_a_script(browser, page_file):
+    browser.call("Emulation.setScriptExecutionDisabled", value=True)
+    try:
+        browser.go(page_file)
+        assert browser.run(SHOWN) == ["success"]
+        assert re.match(r"\S+, error scale .* success .* trials", browser.run(f"{CELL}.title"))
+        for view in ("error", "nees", "cost", "time"):
+            browser.run(f"document.querySelector('.views [value={view}]').click()")
+            assert browser.run(SHOWN) == [view]
+    finally:
+        browser.call("Emulation.setScriptExecutionDisabled", value=False)
+
+
+def test_a_cell_tells_what_it_knows_to_pointer_finger_and_keyboard(desktop):
+    told = "(t => t.hidden ? '' : t.textContent)(document.querySelector('.told'))"
+    assert desktop.run(told) == ""
+    knows = desktop.run(f"{CELL}.dataset.says")
+    for event in (
+        "new PointerEvent('pointerover', {bubbles: true})",
+        "new Event('click', {bubbles: true})",
+    ):
+        desktop.run(f"{CELL}.dispatchEvent({event})")
+        assert desktop.run(told) == knows
+        desktop.run("dispatchEvent(new KeyboardEvent('keydown', {key: 'Escape'}))")
+        assert desktop.run(told) == ""
+    # One stop of the tabulator; arrows go on from there.
+    assert desktop.run("document.querySelectorAll('.matrix td[tabindex=\"0\"]').length") == 1
+    arrow = "document.activeElement.dispatchEvent(new KeyboardEvent('keydown', {key: 'ArrowDown', bubbles: true}))"
+    desktop.run(f"{CELL}.focus(); {arrow}")
+    assert desktop.run(told) == desktop.run(
+        "document.querySelector('.matrix').rows[3].cells[1].dataset.says"
+    )
+
+
+def test_a_click_on_a_name_fades_the_others(desktop):
+    faded = "Array.from(document.querySelectorAll('.matrix tr.faded'), r => r.dataset.name)"
+    names = desktop.run(
+        "Array.from(document.querySelectorAll('.matrix tbody tr'), r => r.dataset.name)"
+    )
+    second = "document.querySelectorAll('.matrix tbody th')[1]"
+    desktop.run(f"{second}.dispatchEvent(new KeyboardEvent('keydown', {{key: 'Enter'}}))")
+    assert desktop.run(faded) == [name for name in names if name != names[1]]
+    desktop.run("document.querySelectorAll('.matrix tbody th')[0].click()")
+    assert desktop.run(faded) == names[2:]
+    desktop.run("dispatchEvent(new KeyboardEvent('keydown', {key: 'Escape'}))")
+    assert desktop.run(faded) == []
 
 
 def test_columns_sort_by_number_and_by_word(desktop):
@@ -165,3 +220,19 @@ def test_it_prints_and_the_answer_on_a_few_pages(browser, page_file, desktop):
         desktop.call("Emulation.setEmulatedMedia", media="")
     browser.go(page_file)
     assert len(re.findall(rb"/Type\s*/Page\b", browser.pdf())) <= 4
+    # The title, the matrix and the first figure stand on the first sheet, upright, if nothing is missing.
+    desktop.run("document.querySelector('.problems').remove()")
+    desktop.call("Emulation.setEmulatedMedia", media="print")
+    desktop.call(
+        "Emulation.setDeviceMetricsOverride",
+        width=round((210 - 24) / 25.4 * 96),
+        height=900,
+        deviceScaleFactor=1,
+        mobile=False,
+    )
+    try:
+        end = "document.querySelector('#figure-headline').getBoundingClientRect().bottom + scrollY"
+        assert desktop.run(end) <= (297 - 24) / 25.4 * 96
+        assert desktop.run("document.documentElement.scrollWidth") <= (210 - 24) / 25.4 * 96 + 1
+    finally:
+        desktop.call("Emulation.setEmulatedMedia", media="")

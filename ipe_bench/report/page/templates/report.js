@@ -54,4 +54,65 @@ document.querySelectorAll(".tools input").forEach(function (input) {
   });
 });
 
+// Matrices: what a cell knows stands at it under the pointer, on a tap and under the keyboard.
+const told = document.createElement("div"), kept = new Set();
+told.className = "told";
+told.setAttribute("role", "status");
+told.hidden = true;
+document.body.append(told);
+document.querySelectorAll(".matrix").forEach(function (matrix) {
+  matrix.querySelectorAll("td[title]").forEach(function (cell) {
+    cell.dataset.says = cell.title;
+    cell.removeAttribute("title");
+    cell.tabIndex = -1;
+  });
+  // One stop of the tabulator a table; arrows go on from there.
+  const first = matrix.querySelector("[data-says]");
+  if (first) first.tabIndex = 0;
+  function show(event) {
+    const cell = event.target.closest("[data-says]");
+    told.hidden = !cell;
+    if (!cell) return;
+    told.textContent = cell.dataset.says;
+    const at = cell.getBoundingClientRect(), below = at.bottom + told.offsetHeight + 8 < innerHeight;
+    told.style.left = Math.max(4, Math.min(at.left, innerWidth - told.offsetWidth - 8)) + "px";
+    told.style.top = (below ? at.bottom + 4 : at.top - told.offsetHeight - 4) + "px";
+  }
+  ["pointerover", "focusin", "click"].forEach((kind) => matrix.addEventListener(kind, show));
+  ["pointerleave", "focusout"].forEach((kind) => matrix.addEventListener(kind, () => { told.hidden = true; }));
+  matrix.addEventListener("keydown", function (event) {
+    const cell = event.target.closest("[data-says]"), row = cell && cell.parentElement;
+    const step = { ArrowLeft: [0, -1], ArrowRight: [0, 1], ArrowUp: [-1, 0], ArrowDown: [1, 0] }[event.key];
+    const to = cell && step && matrix.rows[row.rowIndex + step[0]]?.cells[cell.cellIndex + step[1]];
+    if (to && to.dataset.says) { event.preventDefault(); to.focus(); }
+  });
+});
+addEventListener("scroll", () => { told.hidden = true; }, { passive: true });
+
+// A click on names keeps these and fades the others, in matrices and figures.
+function fade() {
+  document.querySelectorAll("[data-name]").forEach(function (one) {
+    one.classList.toggle("faded", kept.size > 0 && !kept.has(one.dataset.name));
+    const name = one.querySelector(":scope > th");
+    if (name) name.setAttribute("aria-pressed", String(kept.has(one.dataset.name)));
+  });
+}
+document.querySelectorAll("[data-name]").forEach(function (one) {
+  const name = one.querySelector(":scope > th") || one;
+  name.style.cursor = "pointer";
+  name.addEventListener("click", function () {
+    if (!kept.delete(one.dataset.name)) kept.add(one.dataset.name);
+    fade();
+  });
+  if (name === one) return;
+  name.tabIndex = 0;
+  name.setAttribute("role", "button");
+  name.addEventListener("keydown", function (event) {
+    if (event.key === "Enter" || event.key === " ") { event.preventDefault(); name.click(); }
+  });
+});
+addEventListener("keydown", function (event) {
+  if (event.key === "Escape") { told.hidden = true; kept.clear(); fade(); }
+});
+
 unfold();
