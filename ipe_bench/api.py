@@ -432,7 +432,8 @@ def _tracked(
     from ipe_bench.real.logs import Log, LogTracks, found_and_tracked
     from ipe_bench.report.page.log import LogAnswer
     from ipe_bench.report.progress import counting
-    from ipe_bench.states.trackers import ckf, ekf, ukf
+    from ipe_bench.states.auto import AutoTracker
+    from ipe_bench.states.trackers import ekf, ukf
 
     if isinstance(readings, Sequence) and not isinstance(readings, str):
         if len(readings) != 1:
@@ -440,9 +441,10 @@ def _tracked(
                 f"readings=[{','.join(map(str, readings))}]: a track has one log; name one file"
             )
         (readings,) = readings
-    trackers = (
-        {"ekf": ekf(), "ukf": ukf(), "ckf": ckf()} if trackers is None else _labelled(trackers)
-    )
+    if trackers is None:
+        trackers = {"auto": AutoTracker(), "ekf": ekf(), "ukf": ukf()}
+    else:
+        trackers = _labelled(trackers)
     log = Log.of(model, Path(readings) if isinstance(readings, str) else readings, ignored)
     validate([StateScenario(log.model)], trackers, 1)
     names = [find] if isinstance(find, str) else list(find)

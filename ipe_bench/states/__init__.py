@@ -3,6 +3,7 @@
 from typing import Any
 
 from ipe_bench.basics.errors import unknown
+from ipe_bench.states.auto import AutoTracker
 from ipe_bench.states.base import Fault, Normal, Paths, StateModel
 from ipe_bench.states.bounds import bound_at_truth, posterior_bounds
 from ipe_bench.states.damped import LevenbergMarquardtSmoother
@@ -16,6 +17,7 @@ from ipe_bench.states.trackers import Filter, Tracker, Tracks, ckf, ekf, ukf
 from ipe_bench.states.walking_gins import WalkingGins
 
 __all__ = [
+    "AutoTracker",
     "Bootstrap",
     "Cubature",
     "Fault",

@@ -112,22 +112,20 @@ class LevenbergMarquardtSmoother(Tracker):
             for rule in (Taylor(), Unscented())
         )
         paths = self.descended(density, first.improved(other, np.arange(len(z))))
-        rows = self.lost(density, paths)
+        rows = np.flatnonzero(~(path_p(z, paths.at.cost) >= self.level))
         if self.starts and len(rows):
             some = density.subset(rows)
             paths = paths.improved(self.descended(some, self.drawn(some)), rows)
         return reported(density, paths)
 
-    def lost(self, density: PathDensity, paths: Descent) -> NDArray[np.intp]:
-        """The trials whose paths cost more than is probable."""
-        return np.flatnonzero(~(path_p(density.z, paths.at.cost) >= self.level))
-
-    def drawn(self, density: PathDensity) -> Descent:
-        """For each trial, the smoothed UKF of least cost among those that begin at draws of the prior."""
+    def drawn(self, density: PathDensity, number: int = 0) -> Descent:
+        """For each trial, the smoothed UKF of least cost among those that begin at draws of the prior; each number of a
+        round has its own draws."""
         model, trials = density.model, len(density.z)
         m, P = model.prior
         spread, generators = root(P), own_generators(self.seed, density.z.reshape(trials, -1))
-        draws = m + multiply(spread, normals(generators, self.starts, spread.shape[1]))
+        draws = normals(generators, number + 1, self.starts, spread.shape[1])[:, -1]
+        draws = m + multiply(spread, draws)
         at_once = max(1, int(_NUMBERS / (self.starts * model.epochs * model.n**2)))
         parts = np.split(np.arange(trials), range(at_once, trials, at_once))
         return join([self._best(density.subset(rows), draws[rows]) for rows in parts])

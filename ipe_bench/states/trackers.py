@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +61,8 @@ class Tracks:
     """How the iterations of a trial ended (trials,), in trackers that iterate until they have converged."""
     iterations: NDArray[np.int64] | None = None
     """Steps of each trial (trials,), likewise."""
+    stage: NDArray[Any] | None = None
+    """Which stage of a tracker of several answered (trials,)."""
 
     @classmethod
     def empty(cls, model: StateModel, trials: int) -> Tracks:

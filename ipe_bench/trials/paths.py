@@ -266,6 +266,8 @@ class PathBlock:
             "first_bad_epoch": np.where(lost.any(axis=1), lost.argmax(axis=1) + 1.0, np.nan),
             "curves": packed(trials, [*sums, np.full((K, 1), converged.sum())]),
         }
+        if tracks.stage is not None:
+            columns["extra_stage"] = np.asarray(tracks.stage, dtype=float)
         return estimates, columns | self._copies(tracks)
 
     def _copies(self, tracks: Tracks) -> Columns:

@@ -1,0 +1,110 @@
+"""One tracker for those who do not want to choose: it goes further only where the readings say that it has to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.options import Whole
+from ipe_bench.basics.statuses import Status
+from ipe_bench.states.base import StateModel
+from ipe_bench.states.damped import Descent, LevenbergMarquardtSmoother, reported
+from ipe_bench.states.linearisation import Rule, Taylor, Unscented
+from ipe_bench.states.smoothers import path_p, smoothed
+from ipe_bench.states.trackers import Filter, Tracker, Tracks, filtered
+from ipe_bench.states.whole_paths import PathDensity
+
+EXTENDED, UNSCENTED, DAMPED, AGAIN = 1, 2, 3, 4
+"""The stages, as the column `extra_stage` names them; the second round of restarts is 5, and so on."""
+
+
+@dataclass(frozen=True)
+class AutoTracker(Tracker):
+    """Estimates the path of largest posterior density by as much as each trial needs.
+
+    1. The extended filter and its smoother.
+    2. Where its innovations are improbable, the unscented ones, if their path costs less.
+    3. Levenberg-Marquardt steps from there. A path that the first of them would hardly move, such as that of a linear
+       model, is the answer of the stage that it comes from.
+    4. Where the path at the end is improbable, up to three rounds of steps from draws of the prior, other ones in each.
+
+    Noise that depends on the states leaves no density to descend on: the more likely smoother of the two is the answer.
+
+    Example:
+
+    >>> import ipe_bench as ib
+    >>> model = ib.component("state_model/pendulum", count=20, spread={"angle": 0.3, "rate": 0.3})
+    >>> table = ib.run(model, {"auto": ib.states.AutoTracker()}, trials=20)
+    >>> float(table.iloc[-1]["success"])
+    1.0
+    """
+
+    family: ClassVar[str] = "least squares"
+    smooths: ClassVar[bool] = True
+    descent: LevenbergMarquardtSmoother = field(default_factory=LevenbergMarquardtSmoother)
+    """The steps, what counts as improbable, and the draws of a round."""
+    rounds: Whole = 3
+    """Rounds of restarts at most."""
+
+    def hindrance(self, model: StateModel) -> str | None:
+        return Filter().hindrance(model)
+
+    def track(self, model: StateModel, z: Array) -> Tracks:
+        first = filtered(model, z, Taylor())
+        doubtful = self._improbable(z, first.nis.sum(axis=1))
+        if model.gain_by_state or model.R_by_state:
+            return self._likelier(model, z, first, doubtful)
+        density = PathDensity.of(model, z)
+        paths = Descent.of(density, smoothed(model, first))
+        stage = np.full(len(z), EXTENDED)
+        if doubtful.size:
+            some = density.subset(doubtful)
+            other = Descent.of(some, _smoothed(model, some.z, Unscented()))
+            stage[doubtful[other.at.cost < paths.at.cost[doubtful]]] = UNSCENTED
+            paths = paths.improved(other, doubtful)
+        paths = self.descent.descended(density, paths)
+        arrived = (paths.status == Status.CONVERGED) & (paths.iterations == 1)
+        stage[~arrived] = DAMPED
+        for number in range(self.rounds if self.descent.starts else 0):
+            rows = self._improbable(z, paths.at.cost)
+            if not rows.size:
+                break
+            some = density.subset(rows)
+            other = self.descent.descended(some, self.descent.drawn(some, number))
+            stage[rows[other.at.cost < paths.at.cost[rows]]] = AGAIN + number
+            paths = paths.improved(other, rows)
+        return replace(reported(density, paths), stage=stage)
+
+    def _improbable(self, z: Array, cost: Array) -> NDArray[np.intp]:
+        return np.flatnonzero(~(path_p(z, cost) >= self.descent.level))
+
+    def _likelier(
+        self, model: StateModel, z: Array, first: Tracks, doubtful: NDArray[np.intp]
+    ) -> Tracks:
+        tracks = smoothed(model, first)
+        cost = tracks.cost = first.nis.sum(axis=1)
+        stage = tracks.stage = np.full(len(z), EXTENDED)
+        if not doubtful.size:
+            return tracks
+        second = filtered(model, z[doubtful], Unscented())
+        other = smoothed(model, second)
+        tracks.calls[doubtful] += second.calls
+        likelier = ~(second.log_likelihood <= first.log_likelihood[doubtful])
+        rows = doubtful[likelier]
+        stage[rows] = UNSCENTED
+        cost[rows] = second.nis.sum(axis=1)[likelier]
+        tracks.mean[rows], tracks.covariance[rows] = (
+            other.mean[likelier],
+            other.covariance[likelier],
+        )
+        for mine, its in zip(tracks.start, other.start, strict=True):
+            mine[rows] = its[likelier]
+        return tracks
+
+
+def _smoothed(model: StateModel, z: Array, rule: Rule) -> Tracks:
+    return smoothed(model, filtered(model, z, rule))
