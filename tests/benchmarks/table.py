@@ -25,6 +25,7 @@ from scipy.integrate import solve_ivp
 import ipe_bench as ib
 from ipe_bench.basics.machine import library_versions
 from ipe_bench.engine.rodas import Rodas5P
+from ipe_bench.trials.paths import StateScenario
 from ipe_bench.trials.scoring import Block
 
 STEP_S = 180.0
@@ -296,6 +297,31 @@ def trackers() -> Iterator[Row]:
         )
 
 
+def paths() -> Iterator[Row]:
+    """Smoothers of whole paths beside the extended filter, at the batches that their goals name."""
+    S = ib.states
+    cases = (
+        ("bearings_only", 30.0),
+        ("coordinated_turn", 10.0),
+        ("coordinated_turn", 100.0),
+        ("pendulum", 4.0),
+        ("walking_gins", 100.0),
+    )
+    ours = {"lm_ieks": S.LevenbergMarquardtSmoother(), "auto": S.AutoTracker()}
+    for name, scale in cases:
+        model = StateScenario(ib.component(f"state_model/{name}"), error_scale=scale).assumed
+        for trials in (50, 200):
+            z = model.draw(0, trials).z
+            with np.errstate(all="ignore"):
+                calls = [partial(one.track, model, z) for one in (S.ekf(), *ours.values())]
+                extended, *found = least(*calls, rounds=2)
+            for label, seconds in zip(ours, found, strict=True):
+                what = f"{label}, {name} at {scale:g}, {trials} trials"
+                yield Row(
+                    "paths", what, 1e3 * seconds / trials, "ms", "EKF", 1e3 * extended / trials
+                )
+
+
 def loop() -> Iterator[Row]:
     """Whole commands as a user sees them, with bytecode kept."""
     with tempfile.TemporaryDirectory(prefix="ipe-bench-") as folder:
@@ -356,7 +382,10 @@ def scale() -> Iterator[Row]:
     yield Row("scale", f"{what}: on disk", many.files, "files", tenth, few.files)
 
 
-PARTS = {f.__name__: f for f in (simulation, jacobians, stiff, estimation, filters, trackers, loop)}
+PARTS = {
+    f.__name__: f
+    for f in (simulation, jacobians, stiff, estimation, filters, trackers, paths, loop)
+}
 LONG = {"scale": scale}
 """Takes minutes: only where it is asked for."""
 
