@@ -1,4 +1,5 @@
-"""Measurement models: what a parameter vector makes the instruments read. Config group `measurement`."""
+"""Measurement models: what a parameter vector makes the instruments read. Config group
+`measurement`."""
 
 from ipe_bench.basics.errors import without_modules
 from ipe_bench.measurements.base import (

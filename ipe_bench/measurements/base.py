@@ -1,4 +1,5 @@
-"""What a measurement model is: parameters in, readings out, with their names and units and their order of arrival."""
+"""What a measurement model is: parameters in, readings out, with their names and units and their
+order of arrival."""
 
 from __future__ import annotations
 
@@ -17,7 +18,8 @@ from ipe_bench.basics.options import Component
 
 _COMPLEX_STEP = 1e-100
 _SMALL = 16384
-"""Bytes of the Jacobians of one call: an eighth as complex numbers of what NumPy calls a large array."""
+"""Bytes of the Jacobians of one call: an eighth as complex numbers of what NumPy calls a large
+array."""
 _CENTRAL_STEP = float(np.finfo(float).eps ** (1 / 3))
 
 Epochs = tuple[NDArray[np.intp], ...]
@@ -35,7 +37,8 @@ class Parameter:
 
 
 def parameter_table(*groups: tuple[Iterable[str], str, float, str]) -> tuple[Parameter, ...]:
-    """Builds the parameters of several groups, each of which is names, unit, size and the group's name."""
+    """Builds the parameters of several groups, each of which is names, unit, size and the group's
+    name."""
     return tuple(
         Parameter(name, unit, size, group) for names, unit, size, group in groups for name in names
     )
@@ -43,7 +46,8 @@ def parameter_table(*groups: tuple[Iterable[str], str, float, str]) -> tuple[Par
 
 @dataclass(frozen=True)
 class Input:
-    """Describes a column of a readings file that a model takes besides the readings, such as a satellite's place."""
+    """Describes a column of a readings file that a model takes besides the readings, such as a
+    satellite's place."""
 
     heading: str
     """Heading of the column in the file, with the unit: `x [m]`."""
@@ -57,7 +61,8 @@ class Input:
 
 @dataclass(frozen=True)
 class UsualNoise:
-    """Describes the noise that is a model's own: rounding to a step if there is one, else white and Gaussian."""
+    """Describes the noise that is a model's own: rounding to a step if there is one, else white and
+    Gaussian."""
 
     deviation: float | None = None
     """Standard deviation of a reading, in `reading_unit`."""
@@ -66,7 +71,8 @@ class UsualNoise:
 
 @dataclass(frozen=True)
 class Recorded:
-    """Holds real readings that come with a model, which need no file, and what is known of their answer."""
+    """Holds real readings that come with a model, which need no file, and what is known of their
+    answer."""
 
     z: Array
     """The readings (m,)."""
@@ -79,11 +85,13 @@ class Recorded:
 class Measurement(Component, ABC):
     """Simulates the error-free readings h(x) of z = h(x) + v: a frozen dataclass of its options.
 
-    Required: `parameters`, `index` and `simulate`. Optional: `nominal`, 0 unless stated; `analytic`, or a `jacobian` of
-    its own; `usual_noise`; `epochs`, for filters; `periods`, if readings are angles; `recorded`, if real readings come
-    with the model; `inputs` and `with_inputs`, if files bring more than readings; `own_parameters`, if files are joint.
-    Promised: x is (trials, n) in multiples of the parameters' sizes and is not written into, h(x) is (trials, m) in
-    `reading_unit`, m >= n; a trial has the same bits alone and in any batch. If m = n, no fit can be tested.
+    Required: `parameters`, `index` and `simulate`. Optional: `nominal`, 0 unless stated;
+    `analytic`, or a `jacobian` of its own; `usual_noise`; `epochs`, for filters; `periods`, if
+    readings are angles; `recorded`, if real readings come with the model; `inputs` and
+    `with_inputs`, if files bring more than readings; `own_parameters`, if files are joint.
+    Promised: x is (trials, n) in multiples of the parameters' sizes and is not written into, h(x)
+    is (trials, m) in `reading_unit`, m >= n; a trial has the same bits alone and in any batch. If m
+    = n, no fit can be tested.
 
     >>> import ipe_bench as ib
     >>> @dataclass(frozen=True)
@@ -103,7 +111,8 @@ class Measurement(Component, ABC):
     """
 
     analytic: ClassVar[bool] = False
-    """True where `simulate` accepts complex x and is analytic in it: the Jacobian is then a complex step."""
+    """True where `simulate` accepts complex x and is analytic in it: the Jacobian is then a complex
+    step."""
     reading_unit: str = ""
     reading_name: str = "reading"
     """Name of the readings' column in a file; `reading` is understood too."""
@@ -112,13 +121,16 @@ class Measurement(Component, ABC):
     epochs: Epochs | None = None
     """The rows of z by epoch, in order of arrival; None where readings have no order."""
     entry_words: Mapping[str, Mapping[Any, str]] = {}
-    """Words for entries of `index` that do not speak for themselves, by column: the numbers of cases, say."""
+    """Words for entries of `index` that do not speak for themselves, by column: the numbers of
+    cases, say."""
     option_units: ClassVar[Mapping[str, str]] = {}
     """Units of options that are quantities, by name, as pages word them."""
     own_parameters: Sequence[str] = ()
-    """Names of parameters of which every file of readings has its own, where several are estimated together."""
+    """Names of parameters of which every file of readings has its own, where several are estimated
+    together."""
     periods: Array | Sequence[float] = ()
-    """The period (m,) of each reading that is an angle, such as 2 pi, and 0 of others; empty: none is an angle."""
+    """The period (m,) of each reading that is an angle, such as 2 pi, and 0 of others; empty: none
+    is an angle."""
     fixed: Mapping[str, float] = {}
     """Values of parameters that are known and not estimated, by name."""
     inputs: tuple[Input, ...] = ()
@@ -126,11 +138,14 @@ class Measurement(Component, ABC):
     input_columns: Mapping[str, Sequence[Any]] = {}
     """The values of those columns, m each, by heading, of this model as it stands."""
     input_columns_known: bool = True
-    """Whether there are readings without a file, whose inputs stand in the config or are the model's own."""
+    """Whether there are readings without a file, whose inputs stand in the config or are the
+    model's own."""
     by_differential_equations: bool = False
-    """Whether the readings are taken from a trajectory that can be entered anywhere: `OdeMeasurement`."""
+    """Whether the readings are taken from a trajectory that can be entered anywhere:
+    `OdeMeasurement`."""
     recorded: Recorded | None = None
-    """Real readings that come with this model: `estimate` then needs no file, and noise=certified scores by their x."""
+    """Real readings that come with this model: `estimate` then needs no file, and noise=certified
+    scores by their x."""
 
     @property
     @abstractmethod
@@ -140,14 +155,16 @@ class Measurement(Component, ABC):
     @property
     @abstractmethod
     def index(self) -> Mapping[str, Sequence[Any]]:
-        """Description of each of the m readings: columns such as case, time, axis, each with m entries."""
+        """Description of each of the m readings: columns such as case, time, axis, each with m
+        entries."""
 
     @abstractmethod
     def simulate(self, x: Array) -> Array:
         """Computes the error-free readings h(x): (trials, n) -> (trials, m)."""
 
     def near(self, h: Array, z: Array) -> Array:
-        """Shifts each angle of h (..., m) by whole turns next to the reading z: residuals are within half a turn."""
+        """Shifts each angle of h (..., m) by whole turns next to the reading z: residuals are
+        within half a turn."""
         return nearest(h, z, self.periods)
 
     @property
@@ -157,21 +174,22 @@ class Measurement(Component, ABC):
 
     @property
     def nuisance_deviation(self) -> Array:
-        """Standard deviations (k,) of the further errors of a truth that is richer than what estimators assume: drawn
-        in each trial, at any error scale, and handed to `simulate` as columns of x behind the n parameters."""
+        """Standard deviations (k,) of the further errors of a truth that is richer than what
+        estimators assume: drawn in each trial, at any error scale, and handed to `simulate` as
+        columns of x behind the n parameters."""
         return np.zeros(0)
 
     @property
     def nuisances(self) -> tuple[Parameter, ...]:
-        """Names, units and groups of the k numbers of `nuisance_deviation`, each a multiple of its `size`."""
-        return tuple(
-            Parameter(f"nuisance_{i + 1}", group="nuisances")
-            for i in range(len(self.nuisance_deviation))
-        )
+        """Names, units and groups of the k numbers of `nuisance_deviation`, each a multiple of its
+        `size`."""
+        numbers = range(1, len(self.nuisance_deviation) + 1)
+        return tuple(Parameter(f"nuisance_{i}", group="nuisances") for i in numbers)
 
     @property
     def candidates(self) -> Measurement:
-        """The model with every reading that a design may choose among, with the columns and entries of this `index`."""
+        """The model with every reading that a design may choose among, with the columns and entries
+        of this `index`."""
         return self
 
     def taking(self, rows: Sequence[int]) -> Measurement:
@@ -180,7 +198,8 @@ class Measurement(Component, ABC):
 
     @property
     def offset(self) -> Array:
-        """Readings of the instruments (m,) where h(x) is zero; read-outs are quantised with it added."""
+        """Readings of the instruments (m,) where h(x) is zero; read-outs are quantised with it
+        added."""
         return np.zeros(self.m)
 
     def hindrance(self, x: Array) -> str:
@@ -196,8 +215,8 @@ class Measurement(Component, ABC):
         return f"give all of {', '.join(i.heading for i in self.inputs)}, or none"
 
     def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Measurement:
-        """Returns this model with the inputs of a file: `columns` by heading, one entry for each of its readings, in
-        the order of the file, which is that of z from then on."""
+        """Returns this model with the inputs of a file: `columns` by heading, one entry for each of
+        its readings, in the order of the file, which is that of z from then on."""
         raise NotImplementedError(f"{self.name} takes only readings from a file")
 
     @property
@@ -227,21 +246,23 @@ class Measurement(Component, ABC):
         return np.broadcast_to(self.sizes, x.shape)
 
     def near_bounds(self, x: Array) -> Mapping[int, float]:
-        """Finds which of the n parameters are next to a bound at x (n,), and that bound in their own unit."""
+        """Finds which of the n parameters are next to a bound at x (n,), and that bound in their
+        own unit."""
         return {}
 
     def stating(self, key: str, values: Mapping[int, float]) -> Measurement:
-        """Returns this model with some of the n parameters `fixed` at values in their own units; or free of bounds,
-        with these `nominal` values."""
+        """Returns this model with some of the n parameters `fixed` at values in their own units; or
+        free of bounds, with these `nominal` values."""
         raise NotImplementedError(f"{self.name} has no bounds")
 
     def jacobian(self, x: Array) -> Array:
-        """Computes dh/dx: (trials, n) -> (trials, m, n); complex step where analytic, else central differences."""
+        """Computes dh/dx: (trials, n) -> (trials, m, n); complex step where analytic, else central
+        differences."""
         return differentiate(self.simulate, x, analytic=self.analytic, near=self.near)
 
     def coarse_jacobian(self, x: Array) -> Array:
-        """Computes dh/dx near enough for the steps of an iteration, `|I - J~+ J|` below 0.01, where that is cheaper;
-        else exact. Covariances and convergence checks want `jacobian`."""
+        """Computes dh/dx near enough for the steps of an iteration, `|I - J~+ J|` below 0.01, where
+        that is cheaper; else exact. Covariances and convergence checks want `jacobian`."""
         return self.jacobian(x)
 
     @property
@@ -268,8 +289,8 @@ class Measurement(Component, ABC):
         return self.simulate(x)[:, self.rows(stop)]
 
     def coarse_simulate_until(self, x: Array, stop: int) -> Array:
-        """Computes `simulate_until` near enough for fits that only start another, to a small part of a reading's usual
-        noise, where that is cheaper; else the same."""
+        """Computes `simulate_until` near enough for fits that only start another, to a small part
+        of a reading's usual noise, where that is cheaper; else the same."""
         return self.simulate_until(x, stop)
 
     def jacobian_until(self, x: Array, stop: int) -> Array:
@@ -277,7 +298,8 @@ class Measurement(Component, ABC):
         return self.jacobian(x)[:, self.rows(stop)]
 
     def coarse_jacobian_until(self, x: Array, stop: int) -> Array:
-        """Computes dh/dx in `rows(stop)` alone, good enough for fits that start another, `|I - J~+ J|` below 0.1."""
+        """Computes dh/dx in `rows(stop)` alone, good enough for fits that start another, `|I - J~+
+        J|` below 0.1."""
         return self.coarse_jacobian(x)[:, self.rows(stop)]
 
 
@@ -300,7 +322,8 @@ def _forwarded() -> Any:
 class Forwarding(Measurement):
     """Forwards the description of another model, `whole`, but for what a subclass overrides.
 
-    What it computes is left to the subclass, and so are the columns of a file and recorded readings.
+    What it computes is left to the subclass, and so are the columns of a file and recorded
+    readings.
     """
 
     whole: Measurement
@@ -357,7 +380,8 @@ class Forwarding(Measurement):
 class WrappedModel(Forwarding):
     """Wraps another model, `whole`, but for what a subclass overrides.
 
-    Three hooks stand between the two in all that is computed: `whole_x`, `own_readings` and `own_jacobian`.
+    Three hooks stand between the two in all that is computed: `whole_x`, `own_readings` and
+    `own_jacobian`.
     """
 
     inputs = _forwarded()
@@ -405,7 +429,8 @@ class WrappedModel(Forwarding):
 
 @dataclass(frozen=True)
 class SubsetModel(Forwarding):
-    """Restricts a model to some of its readings: those of the first epochs, or those that are not missing."""
+    """Restricts a model to some of its readings: those of the first epochs, or those that are not
+    missing."""
 
     whole: Measurement
     kept: tuple[int, ...]
@@ -416,7 +441,8 @@ class SubsetModel(Forwarding):
     """Whether readings near enough for fits that only start another will do."""
 
     def __post_init__(self) -> None:
-        """Skips the checks of options: every window and epoch makes this object, from checked parts."""
+        """Skips the checks of options: every window and epoch makes this object, from checked
+        parts."""
 
     @classmethod
     def until(cls, whole: Measurement, stop: int, *, coarse: bool = False) -> SubsetModel:
@@ -437,22 +463,24 @@ class SubsetModel(Forwarding):
 
     @property
     def periods(self) -> Array | Sequence[float]:
-        return np.asarray(self.whole.periods)[self._rows] if len(self.whole.periods) else ()
+        periods = self.whole.periods
+        return np.asarray(periods)[self._rows] if len(periods) else ()
 
     @property
     def epochs(self) -> Epochs | None:
         """The whole model's epochs that still have readings, renumbered."""
         if self.whole.epochs is None:
             return None
-        place = np.empty(self.whole.m, dtype=np.intp)
-        for k, epoch in enumerate(self.whole.epochs):
-            place[epoch] = k
-        order = np.argsort(place[self._rows], kind="stable")
-        return (
-            tuple(np.split(order, np.flatnonzero(np.diff(place[self._rows][order])) + 1))
-            if len(order)
-            else ()
-        )
+        epoch_of = np.empty(self.whole.m, dtype=np.intp)
+        for k, rows in enumerate(self.whole.epochs):
+            epoch_of[rows] = k
+        kept = epoch_of[self._rows]
+        order = np.argsort(kept, kind="stable")
+        if not len(order):
+            return ()
+        # An epoch begins wherever the number changes.
+        begins = np.flatnonzero(np.diff(kept[order])) + 1
+        return tuple(np.split(order, begins))
 
     @cached_property
     def _rows(self) -> NDArray[np.intp]:
@@ -460,24 +488,24 @@ class SubsetModel(Forwarding):
 
     @cached_property
     def _among_arrived(self) -> NDArray[np.intp] | slice:
-        """Places of the kept rows in what the whole model returns; a slice if they are all of it."""
+        """Places of the kept rows in what the whole model returns; a slice if they are all of
+        it."""
         arrived = np.arange(self.whole.m) if self.stop is None else self.whole.rows(self.stop)
-        return (
-            slice(None)
-            if np.array_equal(arrived, self._rows)
-            else np.searchsorted(arrived, self._rows)
-        )
+        if np.array_equal(arrived, self._rows):
+            return slice(None)
+        return np.searchsorted(arrived, self._rows)
 
     def _computed(self, name: str, x: Array) -> Array:
         """Computes that method of the whole model, in the kept rows."""
         if self.stop is None:
-            return getattr(self.whole, name)(x)[:, self._among_arrived]
-        return getattr(self.whole, f"{name}_until")(x, self.stop)[:, self._among_arrived]
+            found = getattr(self.whole, name)(x)
+        else:
+            found = getattr(self.whole, f"{name}_until")(x, self.stop)
+        return found[:, self._among_arrived]
 
     def simulate(self, x: Array) -> Array:
-        return self._computed(
-            "coarse_simulate" if self.coarse and self.stop is not None else "simulate", x
-        )
+        coarse = self.coarse and self.stop is not None
+        return self._computed("coarse_simulate" if coarse else "simulate", x)
 
     def jacobian(self, x: Array) -> Array:
         return self._computed("jacobian", x)
@@ -490,57 +518,70 @@ class SubsetModel(Forwarding):
 
 
 def differentiate(h: Any, x: Array, *, analytic: bool, near: Any = lambda h, z: h) -> Array:
-    """Computes dh/dx (trials, m, n) of a batched function h at x (trials, n), all directions in one call of h; `near`
-    shifts angles by whole turns next to others.
+    """Computes dh/dx (trials, m, n) of a batched function h at x (trials, n), all directions in one
+    call of h; `near` shifts angles by whole turns next to others.
 
-    Analytic functions: complex step, exact to round-off (Squire and Trapp, SIAM Review 40, 1998). Others: central
-    differences with a step of eps^(1/3) in units of the parameter, or of its value where that is larger.
+    Analytic functions: complex step, exact to round-off (Squire and Trapp, SIAM Review 40, 1998).
+    Others: central differences with a step of eps^(1/3) in units of the parameter, or of its value
+    where that is larger.
     """
-    trials, n = x.shape
     if analytic:
-        # A few trials in a call: NumPy multiplies complex numbers with other rounding where it reuses a large temporary
-        # array for the product, so in one call of all trials the bits of each would depend on how many there are.
-        parts, begun, few = [], 0, 1
-        while begun < trials or not parts:
-            part = x[begun : begun + few, None, :] + np.eye(n) * _COMPLEX_STEP * 1j
-            parts.append(
-                np.imag(h(read_only(part.reshape(-1, n)))).reshape(len(part), n, -1).swapaxes(1, 2)
-            )
-            begun, few = begun + few, max(1, int(_SMALL / max(parts[0][:1].nbytes, 1)))
-        return np.ascontiguousarray(np.concatenate(parts)) / _COMPLEX_STEP
+        return _by_complex_step(h, x)
+    trials, n = x.shape
     size = _CENTRAL_STEP * np.maximum(1.0, np.abs(x))
-    above, below = x + size, x - size
+    above = x + size
+    below = x - size
+    # Half the distance as it is in floating point, which differs from `size` by round-off.
     steps = np.eye(n)[None] * (above - below)[:, None, :] / 2
     points = np.stack([x[:, None] + steps, x[:, None] - steps])
-    z = h(read_only(points.reshape(-1, n))).reshape(2, trials, n, -1)
-    width = (np.diagonal(points[0], axis1=1, axis2=2) - np.diagonal(points[1], axis1=1, axis2=2))[
-        :, :, None
-    ]
-    return np.ascontiguousarray(((near(z[0], z[1]) - z[1]) / width).swapaxes(1, 2))
+    ahead, behind = h(read_only(points.reshape(-1, n))).reshape(2, trials, n, -1)
+    ends = np.diagonal(points, axis1=2, axis2=3)
+    width = (ends[0] - ends[1])[:, :, None]
+    slopes = (near(ahead, behind) - behind) / width
+    return np.ascontiguousarray(slopes.swapaxes(1, 2))
+
+
+def _by_complex_step(h: Any, x: Array) -> Array:
+    """Computes dh/dx (trials, m, n) as Im h(x + i eps e_k) / eps."""
+    trials, n = x.shape
+    # A few trials in a call: NumPy multiplies complex numbers with other rounding where it reuses a
+    # large temporary array for the product, so in one call of all trials the bits of each would
+    # depend on how many there are.
+    parts: list[Array] = []
+    begun = 0
+    few = 1
+    while begun < trials or not parts:
+        points = x[begun : begun + few, None, :] + np.eye(n) * _COMPLEX_STEP * 1j
+        moved = np.imag(h(read_only(points.reshape(-1, n))))
+        parts.append(moved.reshape(len(points), n, -1).swapaxes(1, 2))
+        begun += few
+        few = max(1, int(_SMALL / max(parts[0][:1].nbytes, 1)))
+    return np.ascontiguousarray(np.concatenate(parts)) / _COMPLEX_STEP
 
 
 def contradicted(h: Any, x: Array, J: Array, near: Any) -> NDArray[np.bool_]:
-    """Finds the trials (trials,) whose central differences of h along a direction contradict J = dh/dx (trials, m, n).
+    """Finds the trials (trials,) whose central differences of h along a direction contradict J =
+    dh/dx (trials, m, n).
 
-    Two calls per trial, whatever n is. Every parameter changes the readings by about as much, none by a multiple of
-    what another does, so that a wrong column shows beside larger ones.
+    Two calls per trial, whatever n is. Every parameter changes the readings by about as much, none
+    by a multiple of what another does, so that a wrong column shows beside larger ones.
     """
     trials, n = x.shape
     unit = np.maximum(1.0, np.abs(x))
-    size = (
-        np.nan_to_num(np.fmax.reduce(np.abs(J), axis=1), posinf=0.0) * unit + np.finfo(float).tiny
-    )
+    largest = np.nan_to_num(np.fmax.reduce(np.abs(J), axis=1), posinf=0.0)
+    size = largest * unit + np.finfo(float).tiny
     weight = 1.0 / np.maximum(size, 1e-4 * size.max(axis=1, keepdims=True))
     weight *= np.random.default_rng(1).uniform(0.5, 1.0, n) / weight.max(axis=1, keepdims=True)
-    above, below = x + _CENTRAL_STEP * unit * weight, x - _CENTRAL_STEP * unit * weight
+    step = _CENTRAL_STEP * unit * weight
+    above = x + step
+    below = x - step
     z = h(read_only(np.concatenate([above, below])))
+    ahead = z[:trials]
+    behind = z[trials:]
     with np.errstate(all="ignore"):
-        change, expected = (
-            near(z[:trials], z[trials:]) - z[trials:],
-            (J * (above - below)[:, None]).sum(axis=2),
-        )
-        rounding = 100 * np.finfo(float).eps * np.fmax.reduce(np.abs(z[:trials]), axis=1)
+        change = near(ahead, behind) - behind
+        expected = (J * (above - below)[:, None]).sum(axis=2)
+        rounding = 100 * np.finfo(float).eps * np.fmax.reduce(np.abs(ahead), axis=1)
         tolerated = 1e-5 * _CENTRAL_STEP * (size * weight).sum(axis=1) + rounding
-        return (np.isfinite(change) & ~(np.abs(change - expected) <= tolerated[:, None])).any(
-            axis=1
-        )
+        alike = np.abs(change - expected) <= tolerated[:, None]
+    return (np.isfinite(change) & ~alike).any(axis=1)

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 
 
 def cost(simulations: Array, jacobians: Array, jacobian_cost: float) -> Array:
-    """Computes the cost of trials (trials,), in simulations: a Jacobian counts as `jacobian_cost` of them."""
+    """Computes the cost of trials (trials,), in simulations: a Jacobian counts as `jacobian_cost`
+    of them."""
     return simulations + jacobian_cost * jacobians
 
 
@@ -39,8 +40,8 @@ class EvaluationCount:
         return cls(simulations, jacobians, reported, np.zeros(trials, dtype=bool))
 
     def of_search(self, n: int) -> Array:
-        """Computes the cost of a search (trials,), for its limits: simulations, a Jacobian counting n, without reported
-        ones."""
+        """Computes the cost of a search (trials,), for its limits: simulations, a Jacobian counting
+        n, without reported ones."""
         return cost(self.simulations, self.jacobians - self.reported, n)
 
     def copied(self, rows: NDArray[np.intp]) -> EvaluationCount:
@@ -70,7 +71,8 @@ class CountingModel:
         return cls(measurement, EvaluationCount.zeros(trials))
 
     def reporting(self) -> CountingModel:
-        """Returns the same model for reports on an answer: counted, but no exception there ends a trial."""
+        """Returns the same model for reports on an answer: counted, but no exception there ends a
+        trial."""
         return replace(self, tally=replace(self.tally, messages={}), for_report=True)
 
     def simulate(self, x: Array, rows: NDArray[np.intp]) -> Array:
@@ -79,12 +81,13 @@ class CountingModel:
         return self._each_if_raising(self.measurement.simulate, x, rows, (self.measurement.m,))
 
     def residual(self, x: Array, rows: NDArray[np.intp], z: Array) -> Array:
-        """Computes h(x) - z (trials, m) for readings z of the trials `rows`, angles within half a turn."""
+        """Computes h(x) - z (trials, m) for readings z of the trials `rows`, angles within half a
+        turn."""
         return self.measurement.near(self.simulate(x, rows), z) - z
 
     def jacobian(self, x: Array, rows: NDArray[np.intp], *, coarse: Mask | bool = False) -> Array:
-        """Computes dh/dx (trials, m, n) for the trials `rows` of the tally; of the trials `coarse` by
-        `coarse_jacobian`, counted as what it costs beside an exact one."""
+        """Computes dh/dx (trials, m, n) for the trials `rows` of the tally; of the trials `coarse`
+        by `coarse_jacobian`, counted as what it costs beside an exact one."""
         exact: Mask = ~np.broadcast_to(coarse, len(x)) | (self.coarse_share == 1.0)
         if exact.all():
             return self._jacobian(self.measurement.jacobian, 1.0, x, rows)
@@ -108,8 +111,10 @@ class CountingModel:
 
     @cached_property
     def coarse_share(self) -> float:
-        """Cost of a coarse Jacobian over that of an exact one; 1 where the model has none that is cheaper."""
-        coarse, exact = self.measurement.coarse_jacobian_cost, self.measurement.jacobian_cost
+        """Cost of a coarse Jacobian over that of an exact one; 1 where the model has none that is
+        cheaper."""
+        coarse = self.measurement.coarse_jacobian_cost
+        exact = self.measurement.jacobian_cost
         return coarse / exact if coarse < exact else 1.0
 
     def _each_if_raising(

@@ -1,4 +1,5 @@
-"""Defines measurement models that users write out: names with a start are parameters, others are columns of a file."""
+"""Defines measurement models that users write out: names with a start are parameters, others are
+columns of a file."""
 
 from __future__ import annotations
 
@@ -18,15 +19,18 @@ from ipe_bench.measurements.arithmetic import Arithmetic, never_switching, parse
 from ipe_bench.measurements.base import Input, Measurement, Parameter
 
 _FARTHER = (0.3, -0.3, 1.0, -1.0)
-"""Changes of a parameter without a slope, in multiples of its magnitude, at which readings are looked at again."""
+"""Changes of a parameter without a slope, in multiples of its magnitude, at which readings are
+looked at again."""
 _FARTHER_BY = 1e-12
 """Change of readings that rounding may cause, as a share of the largest reading."""
 
 
 class WrittenModel(Measurement):
-    """Defines a model whose parameters are names with a start; `start`, `columns` and `unit` are options of each.
+    """Defines a model whose parameters are names with a start; `start`, `columns` and `unit` are
+    options of each.
 
-    The size of a parameter is the magnitude of its start, or 1 where that is 0, unless `size` says otherwise.
+    The size of a parameter is the magnitude of its start, or 1 where that is 0, unless `size` says
+    otherwise.
     """
 
     start: Mapping[str, float]
@@ -65,11 +69,12 @@ class WrittenModel(Measurement):
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
-        sizes = {name: abs(value) or 1.0 for name, value in self.starts.items()} | dict(self.size)
-        return tuple(
-            Parameter(name, self.parameter_units.get(name, ""), float(sizes[name]))
-            for name in self.starts
-        )
+        units = self.parameter_units
+        found = []
+        for name, start in self.starts.items():
+            size = self.size.get(name, abs(start) or 1.0)
+            found.append(Parameter(name, units.get(name, ""), float(size)))
+        return tuple(found)
 
     @cached_property
     def nominal(self) -> Array:
@@ -95,8 +100,9 @@ class WrittenModel(Measurement):
     def column(self, name: str) -> Array:
         if name not in self.columns:
             raise UserError(
-                f"measurement: {name} is neither a column nor a parameter; give a parameter its start, "
-                f"measurement.start.{name}=VALUE, or the column, by readings=FILE or measurement.columns.{name}=[...]"
+                f"measurement: {name} is neither a column nor a parameter; give a parameter its"
+                f" start, measurement.start.{name}=VALUE, or the column, by readings=FILE or"
+                f" measurement.columns.{name}=[...]"
             )
         return np.asarray(self.columns[name], dtype=float)
 
@@ -109,39 +115,39 @@ class WrittenModel(Measurement):
         return f"there are {', '.join(columns)}{did_you_mean(heading, columns) or '.'} {remedy}"
 
     def flat(self, x: Array) -> tuple[str, ...]:
-        """Tells if readings are constant in pieces at x (n,): some parameters have no slope there, yet change
-        readings."""
+        """Tells if readings are constant in pieces at x (n,): some parameters have no slope there,
+        yet change readings."""
         x = x[None, : self.n]
-        z, still = self.simulate(x), np.flatnonzero((self.jacobian(x)[0] == 0.0).all(axis=0))
+        z = self.simulate(x)
+        still = (self.jacobian(x)[0] == 0.0).all(axis=0)
+        least = _FARTHER_BY * np.abs(z).max(initial=0.0)
         names = []
-        for i in still:
+        for i in np.flatnonzero(still):
             steps = np.outer(_FARTHER, np.eye(self.n)[i]) * np.maximum(1.0, np.abs(x))
             with contextlib.suppress(UserError):  # where a function cannot be called
                 moved = np.nan_to_num(np.abs(self.simulate(x + steps) - z))
-                names += (
-                    [self.parameters[i].name]
-                    if (moved > _FARTHER_BY * np.abs(z).max(initial=0.0)).any()
-                    else []
-                )
+                if (moved > least).any():
+                    names.append(self.parameters[i].name)
         if not names:
             return ()
-        found = (
-            f"readings do not change with small changes of {', '.join(names)}, but with larger ones"
-        )
-        why = "they are constant in pieces, as by floor, round, sign or a comparison, where every slope is 0"
         return (
-            f"{found}: {why}, and no estimator that follows slopes moves from there; blend the pieces, as by tanh",
+            f"readings do not change with small changes of {', '.join(names)}, but with larger"
+            " ones: they are constant in pieces, as by floor, round, sign or a comparison, where"
+            " every slope is 0, and no estimator that follows slopes moves from there; blend the"
+            " pieces, as by tanh",
         )
 
     def require_columns_and_parameters(self, *keys: str, readings: Sequence[str] = ()) -> None:
-        """Refuses columns of different lengths, names in the options `keys` that are no parameters, and angles that are
-        none of the `readings` or have another unit."""
+        """Refuses columns of different lengths, names in the options `keys` that are no parameters,
+        and angles that are none of the `readings` or have another unit."""
+        known = [*readings, self.reading]
         for name in self.circular:
-            if name not in (known := [*readings, self.reading]):
+            if name not in known:
                 raise UserError(f"circular={name}: {unknown(name, known, 'reading')}")
             if self.unit not in ("", "rad", "deg", "°"):
                 raise UserError(
-                    f"unit={self.unit}: circular={name} is an angle, in rad or deg; give one of these"
+                    f"unit={self.unit}: circular={name} is an angle, in rad or deg; give one of"
+                    " these"
                 )
         lengths = {name: len(column) for name, column in self.columns.items()}
         if len(set(lengths.values())) > 1:
@@ -149,22 +155,23 @@ class WrittenModel(Measurement):
         for key in keys:
             for name in getattr(self, key):
                 if name not in self.starts:
-                    known = (
-                        f"{did_you_mean(name, self.starts)} (these are {', '.join(self.starts)})"
-                    )
-                    raise UserError(f"{key}: {name} is not a parameter{known}")
+                    meant = did_you_mean(name, self.starts)
+                    these = ", ".join(self.starts)
+                    raise UserError(f"{key}: {name} is not a parameter{meant} (these are {these})")
 
 
 @dataclass(frozen=True)
 class Formula(WrittenModel):
-    """Computes z = expression, in which names with a start are parameters and all others columns of the readings.
+    """Computes z = expression, in which names with a start are parameters and all others columns of
+    the readings.
 
         ipe-bench estimate measurement=formula "measurement.expression=b1*(1-exp(-b2*t))" \\
             measurement.start.b1=500 measurement.start.b2=1e-4 readings=my.csv
 
-    The language is that of `ipe_bench.measurements.arithmetic`: + - * / ** and elementary functions, angles in rad.
-    Parameters stand in the order of their starts, each in multiples of its magnitude; they have no units but those that
-    the formula gives them. Readings have the order of the file, and no epochs.
+    The language is that of `ipe_bench.measurements.arithmetic`: + - * / ** and elementary
+    functions, angles in rad. Parameters stand in the order of their starts, each in multiples of
+    its magnitude; they have no units but those that the formula gives them. Readings have the order
+    of the file, and no epochs.
     """
 
     expression: str
@@ -182,7 +189,8 @@ class Formula(WrittenModel):
     own: tuple[str, ...] = ()
     """Parameters of which every file of readings has its own, where there are several."""
     circular: tuple[str, ...] = ()
-    """The readings' name if they are angles, in rad, or in deg by their unit: residuals are within half a turn."""
+    """The readings' name if they are angles, in rad, or in deg by their unit: residuals are within
+    half a turn."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -195,11 +203,13 @@ class Formula(WrittenModel):
         if not self.start:
             start = f"measurement.start.{next(iter(self.arithmetic.names), 'NAME')}=1"
             raise UserError(
-                f"start: is empty, so no parameter is estimated; give each parameter a start: {start}"
+                "start: is empty, so no parameter is estimated; give each parameter a start:"
+                f" {start}"
             )
         if self.reading in self.arithmetic.names:
             raise UserError(
-                f"reading={self.reading}: stands in the expression too; what is measured cannot explain it"
+                f"reading={self.reading}: stands in the expression too; what is measured cannot"
+                " explain it"
             )
         self.require_columns_and_parameters("own")
 
@@ -236,23 +246,20 @@ class Formula(WrittenModel):
         except (ArithmeticError, ValueError, TypeError) as error:
             numbers = "a part that is made of numbers alone has no real value"
             raise UserError(f"measurement.expression: {numbers} ({error})") from None
-        return Program.of([value], list(known.values())), Program.of(
-            by_parameter, list(known.values())
-        )
+        inputs = list(known.values())
+        return Program.of([value], inputs), Program.of(by_parameter, inputs)
 
     def _values(self, x: Array) -> list[Array]:
+        """Returns the values of the names: of parameters (trials, 1), of columns (1, m)."""
         p = dict(zip(self.start, (x * self.sizes).T[:, :, None], strict=True))
-        return [p[name] if name in p else self.column(name)[None] for name in self.arithmetic.names]
+        names = self.arithmetic.names
+        return [p[name] if name in p else self.column(name)[None] for name in names]
 
     def remarks(self, x: Array) -> tuple[str, ...]:
-        """Says which conditionals never switch at x, or else which parameters have no slope there."""
-        values = dict(
-            zip(
-                self.arithmetic.names,
-                (value[0] for value in self._values(x[None, : self.n])),
-                strict=True,
-            )
-        )
+        """Says which conditionals never switch at x, or else which parameters have no slope
+        there."""
+        at_x = [value[0] for value in self._values(x[None, : self.n])]
+        values = dict(zip(self.arithmetic.names, at_x, strict=True))
         with np.errstate(all="ignore"):
             return tuple(never_switching([self.arithmetic], values)) or self.flat(x)
 
@@ -263,7 +270,8 @@ class Formula(WrittenModel):
 
     @property
     def jacobian_cost(self) -> float:
-        """The derivative along each parameter, by the rules of differentiation, counts as a simulation."""
+        """The derivative along each parameter, by the rules of differentiation, counts as a
+        simulation."""
         return float(self.n)
 
     def jacobian(self, x: Array) -> Array:

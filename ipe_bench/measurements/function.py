@@ -1,4 +1,5 @@
-"""Defines a measurement model by a plain Python function of named parameters, written in NumPy or in JAX."""
+"""Defines a measurement model by a plain Python function of named parameters, written in NumPy or
+in JAX."""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ from ipe_bench.measurements.base import contradicted, differentiate
 from ipe_bench.measurements.formula import WrittenModel
 
 _CHUNK = 8
-"""Trials per call of a compiled JAX program; shorter batches are padded, so that bits do not depend on them."""
+"""Trials per call of a compiled JAX program; shorter batches are padded, so that bits do not depend
+on them."""
 _TIMES = ("t", "time")
 """Columns that are taken for the time of the readings."""
 
@@ -37,19 +39,23 @@ class Function(WrittenModel):
 
         ipe-bench estimate measurement=function measurement.of=swing:angle readings=swing.csv
 
-    Arguments with a number as default are parameters, which start there; arguments without are columns of the readings
-    file, arrays (m,); keyword-only arguments are constants. h returns the readings (m,). The type `Annotated[float,
-    "m"]` gives a parameter its unit. Slopes are exact: by forward differentiation where h returns JAX arrays, by a
-    complex step where differences agree with it, else by central differences. Readings that have a column `t` or
-    `time` arrive in that order, so that filters take part.
+    Arguments with a number as default are parameters, which start there; arguments without are
+    columns of the readings file, arrays (m,); keyword-only arguments are constants. h returns the
+    readings (m,). The type `Annotated[float, "m"]` gives a parameter its unit. Slopes are exact: by
+    forward differentiation where h returns JAX arrays, by a complex step where differences agree
+    with it, else by central differences. Readings that have a column `t` or `time` arrive in that
+    order, so that filters take part.
     """
 
     of: str
-    """The function: MODULE:NAME, where MODULE is importable or MODULE.py lies in the working folder."""
+    """The function: MODULE:NAME, where MODULE is importable or MODULE.py lies in the working
+    folder."""
     start: Mapping[str, Finite] = field(default_factory=dict)
-    """Start of each parameter: the nominal point. An argument without a default becomes a parameter."""
+    """Start of each parameter: the nominal point. An argument without a default becomes a
+    parameter."""
     size: Mapping[str, Positive] = field(default_factory=dict)
-    """The physical size of one unit of a parameter; otherwise the magnitude of its start, or 1 where that is 0."""
+    """The physical size of one unit of a parameter; otherwise the magnitude of its start, or 1
+    where that is 0."""
     units: Mapping[str, str] = field(default_factory=dict)
     """Units of parameters, by name."""
     constants: Mapping[str, Any] = field(default_factory=dict)
@@ -57,13 +63,15 @@ class Function(WrittenModel):
     columns: Mapping[str, Sequence[float]] = field(default_factory=dict)
     """The columns of the readings, for runs that have no file."""
     time: str | None = None
-    """The column in whose order readings arrive; None: `t` or `time` if there is one; empty: no order."""
+    """The column in whose order readings arrive; None: `t` or `time` if there is one; empty: no
+    order."""
     reading: str = "reading"
     """Name of the readings' column in a file."""
     unit: str = ""
     """Unit of the readings."""
     circular: tuple[str, ...] = ()
-    """The readings' name if they are angles, in rad, or in deg by their unit: residuals are within half a turn."""
+    """The readings' name if they are angles, in rad, or in deg by their unit: residuals are within
+    half a turn."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -101,7 +109,8 @@ class Function(WrittenModel):
         function: typing.ClassVar[Callable[..., Any]]
 
     def _found(self) -> Callable[..., Any]:
-        """Finds the function that `of` names; its module is imported from the working folder or the path."""
+        """Finds the function that `of` names; its module is imported from the working folder or the
+        path."""
         module, colon, name = self.of.partition(":")
         module = module.removesuffix(".py")
         if not (module and colon and name.isidentifier()):
@@ -126,16 +135,16 @@ class Function(WrittenModel):
 
     @property
     def functions(self) -> tuple[Callable[..., Any], ...]:
-        """Functions that the model computes with beside its class: a change of their source makes results stale."""
+        """Functions that the model computes with beside its class: a change of their source makes
+        results stale."""
         return (self.function,)
 
     @cached_property
     def _signature(self) -> Mapping[str, inspect.Parameter]:
         arguments = inspect.signature(self.function).parameters
-        if starred := [
-            str(a) for a in arguments.values() if a.kind in (a.VAR_POSITIONAL, a.VAR_KEYWORD)
-        ]:
-            raise UserError(f"of={self.of}: takes {starred[0]}; give every argument a name")
+        for argument in arguments.values():
+            if argument.kind in (argument.VAR_POSITIONAL, argument.VAR_KEYWORD):
+                raise UserError(f"of={self.of}: takes {argument}; give every argument a name")
         return arguments
 
     @cached_property
@@ -159,11 +168,8 @@ class Function(WrittenModel):
 
     @cached_property
     def headings(self) -> tuple[str, ...]:
-        return tuple(
-            name
-            for name in self._signature
-            if name not in self.starts and name not in self._keywords
-        )
+        others = {*self.starts, *self._keywords}
+        return tuple(name for name in self._signature if name not in others)
 
     @cached_property
     def parameter_units(self) -> dict[str, str]:
@@ -171,21 +177,19 @@ class Function(WrittenModel):
             hints = typing.get_type_hints(self.function, include_extras=True)
         except Exception:  # of names that the function's module does not hold
             hints = {}
-        extras = {name: getattr(hint, "__metadata__", ()) for name, hint in hints.items()}
-        texts = {
-            name: next((one for one in found if isinstance(one, str)), "")
-            for name, found in extras.items()
-        }
-        return texts | dict(self.units)
+        units = {}
+        for name, hint in hints.items():
+            texts = (one for one in getattr(hint, "__metadata__", ()) if isinstance(one, str))
+            units[name] = next(texts, "")
+        return units | dict(self.units)
 
     @property
     def input_columns_known(self) -> bool:
         return bool(self.columns) or not self.headings
 
     def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Function:
-        return replace(
-            self, columns={name: tuple(map(float, columns[name])) for name in self.headings}
-        )
+        numbers = {name: tuple(map(float, columns[name])) for name in self.headings}
+        return replace(self, columns=numbers)
 
     @cached_property
     def m(self) -> int:
@@ -195,11 +199,9 @@ class Function(WrittenModel):
 
     @cached_property
     def epochs(self) -> tuple[NDArray[np.intp], ...] | None:
-        chosen = (
-            next((name for name in _TIMES if name in self.headings), "")
-            if self.time is None
-            else self.time
-        )
+        chosen = self.time
+        if chosen is None:
+            chosen = next((name for name in _TIMES if name in self.headings), "")
         if not chosen:
             return None
         times = self.column(chosen)
@@ -208,14 +210,16 @@ class Function(WrittenModel):
     @cached_property
     def _known(self) -> dict[str, Any]:
         """The arguments that are not parameters: columns as arrays (m,), and constants."""
-        return {name: read_only(self.column(name)) for name in self.headings} | {**self.constants}
+        columns = {name: read_only(self.column(name)) for name in self.headings}
+        return {**columns, **self.constants}
 
     def _at(self, values: Any) -> Any:
-        """Computes h at these values (n,) of the parameters, in their own units; at their real parts if h refuses
-        complex ones."""
+        """Computes h at these values (n,) of the parameters, in their own units; at their real
+        parts if h refuses complex ones."""
         known = self._known
+        parameters = dict(zip(self.starts, values, strict=True))
         try:
-            return self.function(**dict(zip(self.starts, values, strict=True)), **known)
+            return self.function(**parameters, **known)
         except (Exception, SystemExit) as error:
             if np.iscomplexobj(values):  # functions of `math` refuse them
                 return self._at(values.real)
@@ -237,10 +241,12 @@ class Function(WrittenModel):
 
     @cached_property
     def _jax(self) -> tuple[Callable[[Array], Array], Callable[[Array], Array]] | None:
-        """Compiled readings and slopes of a function that returns arrays of JAX; None if it does not."""
-        if "jax" not in sys.modules or not type(
-            self._at(self.starts.values())
-        ).__module__.startswith("jax"):
+        """Compiled readings and slopes of a function that returns arrays of JAX; None if it does
+        not."""
+        if "jax" not in sys.modules:
+            return None
+        module = type(self._at(self.starts.values())).__module__
+        if not module.startswith("jax"):
             return None
         import jax  # pyright: ignore[reportMissingImports]
 
@@ -249,14 +255,18 @@ class Function(WrittenModel):
         def one(x: Any) -> Any:
             return self._checked(self._at(x * self.sizes), self.m)
 
-        return _in_chunks(jax.jit(jax.vmap(one))), _in_chunks(jax.jit(jax.vmap(jax.jacfwd(one))))
+        readings = _in_chunks(jax.jit(jax.vmap(one)))
+        slopes = _in_chunks(jax.jit(jax.vmap(jax.jacfwd(one))))
+        return readings, slopes
 
     @cached_property
     def _is_analytic(self) -> bool:
-        """Whether complex steps give the slopes that differences give, near the start and away from it."""
+        """Whether complex steps give the slopes that differences give, near the start and away from
+        it."""
         offsets = np.random.default_rng(1).uniform(-0.3, 0.3, (4, self.n))
         x = self.nominal + np.vstack([np.zeros(self.n), offsets])
-        return not contradicted(self._rows, x, self._by_complex_step(x), self.near).any()
+        J = self._by_complex_step(x)
+        return not contradicted(self._rows, x, J, self.near).any()
 
     def _by_complex_step(self, x: Array) -> Array:
         with warnings.catch_warnings():
@@ -275,9 +285,9 @@ class Function(WrittenModel):
         if not self._is_analytic:
             return differentiate(self._rows, x, analytic=False, near=self.near)
         J = self._by_complex_step(x)
-        if (
-            wrong := contradicted(self._rows, x, J, self.near)
-        ).any():  # in a branch that is not analytic
+        # In a branch that is not analytic.
+        wrong = contradicted(self._rows, x, J, self.near)
+        if wrong.any():
             J[wrong] = differentiate(self._rows, x[wrong], analytic=False, near=self.near)
         return J
 
@@ -291,12 +301,14 @@ class Function(WrittenModel):
 def function(
     h: Callable[..., Any], start: Mapping[str, float] | None = None, **options: Any
 ) -> Function:
-    """Makes the measurement model of a function that a module holds by name, with the options of `Function`; UserError
-    for a lambda or an inner function."""
-    module, name = getattr(h, "__module__", ""), getattr(h, "__qualname__", "")
+    """Makes the measurement model of a function that a module holds by name, with the options of
+    `Function`; UserError for a lambda or an inner function."""
+    module = getattr(h, "__module__", "")
+    name = getattr(h, "__qualname__", "")
     if not name.isidentifier() or getattr(sys.modules.get(module), name, None) is not h:
         raise UserError(
-            f"{name or h!r}: give a function that stands in a module by its own name, not inside another"
+            f"{name or h!r}: give a function that stands in a module by its own name, not inside"
+            " another"
         )
     return Function(of=f"{module}:{name}", start=start or {}, **options)
 
@@ -305,9 +317,10 @@ def _in_chunks(program: Callable[[Array], Any]) -> Callable[[Array], Array]:
     """Computes a batched program in calls of `_CHUNK` trials."""
 
     def run(x: Array) -> Array:
-        padded = np.zeros((-(-max(len(x), 1) // _CHUNK) * _CHUNK, x.shape[1]))
+        chunks = -(-max(len(x), 1) // _CHUNK)
+        padded = np.zeros((chunks * _CHUNK, x.shape[1]))
         padded[: len(x)] = x
-        parts = [np.asarray(program(padded[i : i + _CHUNK])) for i in range(0, len(padded), _CHUNK)]
+        parts = [np.asarray(program(part)) for part in np.split(padded, chunks)]
         return np.ascontiguousarray(np.concatenate(parts)[: len(x)])
 
     return run

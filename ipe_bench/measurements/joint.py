@@ -20,8 +20,8 @@ from ipe_bench.measurements.base import Epochs, Measurement, Parameter, UsualNoi
 class Joint(Measurement):
     """Joins the readings of several models, file by file.
 
-    Parameters of one name are one parameter, but for those that a model calls its own (`own_parameters`): these get the
-    number of their file, as in clock_1 and clock_2.
+    Parameters of one name are one parameter, but for those that a model calls its own
+    (`own_parameters`): these get the number of their file, as in clock_1 and clock_2.
     """
 
     parts: tuple[Measurement, ...]
@@ -48,51 +48,48 @@ class Joint(Measurement):
 
     @property
     def copies(self) -> dict[str, list[str]]:
-        """Names in this model of the parameters of which every file has its own, by their names in the parts."""
+        """Names in this model of the parameters of which every file has its own, by their names in
+        the parts."""
         found: dict[str, list[str]] = {}
-        for name, k in (
-            (name, k) for k, part in enumerate(self.parts, 1) for name in part.own_parameters
-        ):
-            found.setdefault(name, []).append(f"{name}_{k}")
+        for k, part in enumerate(self.parts, 1):
+            for name in part.own_parameters:
+                found.setdefault(name, []).append(f"{name}_{k}")
         return found
 
     @cached_property
     def _places(self) -> list[NDArray[np.intp]]:
         """Places of each part's parameters among all."""
         numbers: dict[str, int] = {}
-        return [
-            np.array(
-                [
-                    numbers.setdefault(self._named(p, p, k).name, len(numbers))
-                    for p in part.physical_parameters
-                ]
-            )
-            for k, part in enumerate(self.parts)
-        ]
+        found = []
+        for k, part in enumerate(self.parts):
+            names = [self._named(p, p, k).name for p in part.physical_parameters]
+            # A name that no part before has is the next of all.
+            places = [numbers.setdefault(name, len(numbers)) for name in names]
+            found.append(np.array(places))
+        return found
 
     def _named(self, p: Parameter, known: Parameter, k: int) -> Parameter:
         """Renames a parameter of part k, which users know as `known`, to its name among all."""
-        own = known.name in self.parts[k].own_parameters
-        return replace(p, name=f"{p.name}_{k + 1}", group=p.group or p.name) if own else p
+        if known.name not in self.parts[k].own_parameters:
+            return p
+        return replace(p, name=f"{p.name}_{k + 1}", group=p.group or p.name)
 
     @cached_property
     def _first(self) -> list[tuple[int, int]]:
         """The part in which each parameter appears first, and its place there."""
-        places = [
-            (place, k, i)
-            for k, own in enumerate(self._places)
-            for i, place in enumerate(own.tolist())
-        ]
-        found = {place: (k, i) for place, k, i in reversed(places)}
+        found: dict[int, tuple[int, int]] = {}
+        for k, places in enumerate(self._places):
+            for i, place in enumerate(places.tolist()):
+                found.setdefault(place, (k, i))
         return [found[place] for place in sorted(found)]
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
-        parts = self.parts
-        return tuple(
-            self._named(parts[k].parameters[i], parts[k].physical_parameters[i], k)
-            for k, i in self._first
-        )
+        found = []
+        for k, i in self._first:
+            part = self.parts[k]
+            found.append(self._named(part.parameters[i], part.physical_parameters[i], k))
+        return tuple(found)
 
     @cached_property
     def physical_parameters(self) -> tuple[Parameter, ...]:
@@ -108,7 +105,8 @@ class Joint(Measurement):
         return {name: value for part in self.parts for name, value in part.fixed.items()}
 
     def _of_parts(self, method: str, x: Array) -> list[Any]:
-        """Computes that method of each part at its own parameters, which are on the last axis of x."""
+        """Computes that method of each part at its own parameters, which are on the last axis of
+        x."""
         pairs = zip(self.parts, self._places, strict=True)
         return [getattr(part, method)(x[..., places]) for part, places in pairs]
 
@@ -133,34 +131,31 @@ class Joint(Measurement):
 
     @property
     def index(self) -> Mapping[str, Sequence[Any]]:
+        files = [[k] * part.m for k, part in enumerate(self.parts, 1)]
+        joined: dict[str, list[Any]] = {"file": list(chain.from_iterable(files))}
         columns = [part.index for part in self.parts]
-        joined: dict[str, list[Any]] = {
-            "file": [k for k, part in enumerate(self.parts, 1) for _ in range(part.m)]
-        }
-        for name in dict.fromkeys(name for column in columns for name in column):
-            each = (
-                column.get(name, [""] * part.m)
-                for column, part in zip(columns, self.parts, strict=True)
-            )
-            joined[name] = list(chain.from_iterable(each))
+        for name in dict.fromkeys(chain.from_iterable(columns)):
+            joined[name] = []
+            for column, part in zip(columns, self.parts, strict=True):
+                joined[name] += column.get(name, [""] * part.m)
         return joined
 
     @property
     def periods(self) -> Array | Sequence[float]:
+        if not any(len(part.periods) for part in self.parts):
+            return ()
         each = [part.periods if len(part.periods) else np.zeros(part.m) for part in self.parts]
-        return np.concatenate(each) if any(len(part.periods) for part in self.parts) else ()
+        return np.concatenate(each)
 
     @cached_property
     def epochs(self) -> Epochs | None:
         """Epochs of the files one after another; None if a file has none."""
-        parts = [part.epochs for part in self.parts]
-        if any(epochs is None for epochs in parts):
-            return None
-        return tuple(
-            rows + start
-            for epochs, start in zip(parts, self._starts, strict=False)
-            for rows in epochs or ()
-        )
+        found: list[NDArray[np.intp]] = []
+        for part, start in zip(self.parts, self._starts, strict=False):
+            if part.epochs is None:
+                return None
+            found += [rows + start for rows in part.epochs]
+        return tuple(found)
 
     @property
     def offset(self) -> Array:
@@ -169,8 +164,8 @@ class Joint(Measurement):
     @property
     def usual_noise(self) -> UsualNoise | None:
         """Usual noise of the parts, if they share one."""
-        known = [part.usual_noise for part in self.parts]
-        return known[0] if all(one == known[0] for one in known) else None
+        first, *others = (part.usual_noise for part in self.parts)
+        return first if all(one == first for one in others) else None
 
     def remarks(self, x: Array) -> tuple[str, ...]:
         return tuple(dict.fromkeys(chain.from_iterable(self._of_parts("remarks", x))))
@@ -188,10 +183,12 @@ class Joint(Measurement):
         return self._placed([part.linearization()[None] for part in self.parts])[0]
 
     def _placed(self, slopes: Sequence[Array]) -> Array:
-        """Assembles the slopes (trials, m, n) of the parts in one matrix, zero where a part has not the parameter."""
+        """Assembles the slopes (trials, m, n) of the parts in one matrix, zero where a part has not
+        the parameter."""
         J = np.zeros((len(slopes[0]), self.m, self.n))
         for slope, places, start in zip(slopes, self._places, self._starts, strict=False):
-            J[:, start : start + slope.shape[1], places] = slope
+            end = start + slope.shape[1]
+            J[:, start:end, places] = slope
         return J
 
     @property

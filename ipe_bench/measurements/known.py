@@ -40,41 +40,48 @@ class ParameterInfo(Component):
         super().__post_init__()
         if self.positive and self.lower is not None:
             raise UserError(
-                f"lower={self.lower}: is given with positive=true, which is lower=0; leave one of them out"
+                f"lower={self.lower}: is given with positive=true, which is lower=0; leave one of"
+                " them out"
             )
         lower, upper = self.bounds
         if not lower < upper:
             raise UserError(f"upper={upper}: give a number above lower={lower:g}")
-        if self.fixed is not None and (others := self.stated.keys() - {"name", "fixed"}):
+        others = self.stated.keys() - {"name", "fixed"}
+        if self.fixed is not None and others:
             raise UserError(
                 f"fixed={self.fixed}: a fixed parameter has no {min(others)}; leave one out"
             )
 
     @property
     def bounds(self) -> tuple[float, float]:
-        lower = 0.0 if self.positive else -np.inf if self.lower is None else self.lower
-        return lower, np.inf if self.upper is None else self.upper
+        lower = -np.inf if self.lower is None else self.lower
+        upper = np.inf if self.upper is None else self.upper
+        return 0.0 if self.positive else lower, upper
 
     @property
     def stated(self) -> dict[str, Any]:
         """Stated options with their values."""
-        return {
-            f.name: value for f in fields(self) if (value := getattr(self, f.name)) != f.default
-        }
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        return {f.name: values[f.name] for f in fields(self) if values[f.name] != f.default}
 
 
 def informed(model: Measurement, known: Sequence[ParameterInfo]) -> Measurement:
     """Returns the model with this knowledge of its parameters.
 
-    Of a parameter of which every file has its own, what is known of NAME is known of NAME_1, NAME_2 and so on, unless
-    that is said of one of them.
+    Of a parameter of which every file has its own, what is known of NAME is known of NAME_1, NAME_2
+    and so on, unless that is said of one of them.
 
     Raises:
         UserError: of a parameter that the model does not have, or a start outside of its bounds.
     """
     copies = model.copies if isinstance(model, Joint) else {}
-    found = {name: replace(one, name=name) for one in known for name in copies.get(one.name, ())}
-    for one in (one for one in known if one.name not in copies):
+    found: dict[str, ParameterInfo] = {}
+    for one in known:
+        for name in copies.get(one.name, ()):
+            found[name] = replace(one, name=name)
+    for one in known:
+        if one.name in copies:
+            continue
         general = found.get(one.name, one)
         free = one.fixed is None and general.fixed is None
         found[one.name] = replace(general, **one.stated) if free else one
@@ -83,11 +90,12 @@ def informed(model: Measurement, known: Sequence[ParameterInfo]) -> Measurement:
 
 @dataclass(frozen=True)
 class ConstrainedModel(WrappedModel):
-    """Transforms a model of which some parameters are fixed, bounded or start elsewhere to other coordinates.
+    """Transforms a model of which some parameters are fixed, bounded or start elsewhere to other
+    coordinates.
 
     x counts the parameters that are left. A bounded one is ln((v - lower) / (v0 - lower)), or
-    ln((upper - v0) / (upper - v)), or the difference of the logits of v and its start v0, and is named accordingly; its
-    size is such that one unit of x moves v by as much at v0 as before.
+    ln((upper - v0) / (upper - v)), or the difference of the logits of v and its start v0, and is
+    named accordingly; its size is such that one unit of x moves v by as much at v0 as before.
     """
 
     whole: Measurement
@@ -102,10 +110,12 @@ class ConstrainedModel(WrappedModel):
             if one.name not in names:
                 raise UserError(f"parameters.{one.name}: {unknown(one.name, names, 'parameter')}")
         for one, v0 in zip(self._known, self._v0, strict=True):
-            if not one.bounds[0] < v0 < one.bounds[1]:
+            lower, upper = one.bounds
+            if not lower < v0 < upper:
                 key = f"parameters.{one.name}"
                 raise UserError(
-                    f"{key}: its start, {v0:g}, is not inside of its bounds; give {key}.nominal=VALUE"
+                    f"{key}: its start, {v0:g}, is not inside of its bounds; give"
+                    f" {key}.nominal=VALUE"
                 )
         if not len(self._free):
             raise UserError("parameters: all are fixed; leave at least one to be estimated")
@@ -123,11 +133,12 @@ class ConstrainedModel(WrappedModel):
     @cached_property
     def _v0(self) -> Array:
         """Starts and fixed values of all parameters, in their units."""
-        starts = self.whole.nominal * self.whole.sizes
-        given = [one.nominal if one.fixed is None else one.fixed for one in self._known]
-        return np.array(
-            [s if g is None else g for s, g in zip(starts, given, strict=True)], dtype=float
-        )
+        values = np.array(self.whole.nominal * self.whole.sizes, dtype=float)
+        for k, one in enumerate(self._known):
+            given = one.nominal if one.fixed is None else one.fixed
+            if given is not None:
+                values[k] = given
+        return values
 
     @cached_property
     def _coordinates(self) -> _Coordinates:
@@ -139,12 +150,14 @@ class ConstrainedModel(WrappedModel):
     def parameters(self) -> tuple[Parameter, ...]:
         c = self._coordinates
         prefixes = c.choose("", "ln_", "ln_", "logit_").tolist()
-        return tuple(
-            Parameter(prefix + p.name, size=size, group=p.group or p.name) if prefix else p
-            for p, prefix, size in zip(
-                self.physical_parameters, prefixes, c.inner_size.tolist(), strict=True
-            )
-        )
+        found = []
+        for p, prefix, size in zip(
+            self.physical_parameters, prefixes, c.inner_size.tolist(), strict=True
+        ):
+            if prefix:
+                p = Parameter(prefix + p.name, size=size, group=p.group or p.name)
+            found.append(p)
+        return tuple(found)
 
     @cached_property
     def physical_parameters(self) -> tuple[Parameter, ...]:
@@ -152,12 +165,13 @@ class ConstrainedModel(WrappedModel):
 
     @cached_property
     def prior_deviations(self) -> tuple[float, ...]:
-        """Standard deviations (n,) of x at error scale 1, as far as is known; 1 where nothing is."""
-        given = [self._known[i].deviation for i in self._free]
-        sizes = self.whole.sizes[self._free]
-        return tuple(
-            1.0 if d is None else float(d / size) for d, size in zip(given, sizes, strict=True)
-        )
+        """Standard deviations (n,) of x at error scale 1, as far as is known; 1 where nothing
+        is."""
+        found = []
+        for i in self._free:
+            deviation = self._known[i].deviation
+            found.append(1.0 if deviation is None else float(deviation / self.whole.sizes[i]))
+        return tuple(found)
 
     @property
     def fixed(self) -> dict[str, float]:
@@ -178,32 +192,37 @@ class ConstrainedModel(WrappedModel):
         return self._coordinates.inner(v)
 
     def near_bounds(self, x: Array) -> dict[int, float]:
-        c, values = self._coordinates, self.physical(x[None])[0]
+        c = self._coordinates
+        values = self.physical(x[None])[0]
         found: dict[int, float] = {}
         for bounds in (c.lower, c.upper):
-            near = np.abs(values - bounds) <= np.where(
-                np.isfinite(bounds), _NEAR * np.abs(c.v0 - bounds), -1.0
-            )
+            reach = np.where(np.isfinite(bounds), _NEAR * np.abs(c.v0 - bounds), -1.0)
+            near = np.abs(values - bounds) <= reach
             found |= {k: float(bounds[k]) for k in np.flatnonzero(near).tolist()}
         return dict(sorted(found.items()))
 
     def stating(self, key: str, values: Mapping[int, float]) -> Measurement:
-        names = {self.physical_parameters[k].name: value for k, value in values.items()}
-        stated = {
-            name: replace(ParameterInfo(name), **{key: value}) for name, value in names.items()
-        }
-        return replace(self, known=tuple(({one.name: one for one in self.known} | stated).values()))
+        known = {one.name: one for one in self.known}
+        for k, value in values.items():
+            name = self.physical_parameters[k].name
+            known[name] = replace(ParameterInfo(name), **{key: value})
+        return replace(self, known=tuple(known.values()))
 
     def whole_x(self, x: Array) -> Array:
-        """Converts x to that of the whole model; a truth's nuisances, behind the parameters, stay there."""
-        c, own = self._coordinates, x[:, : self.n]
-        whole = np.repeat((self._v0 / self.whole.sizes)[None], len(x), axis=0).astype(x.dtype)
+        """Converts x to that of the whole model; a truth's nuisances, behind the parameters, stay
+        there."""
+        c = self._coordinates
+        own = x[:, : self.n]
+        fixed = self._v0 / self.whole.sizes
+        whole = np.repeat(fixed[None], len(x), axis=0).astype(x.dtype)
         whole[:, self._free] = np.where(c.bounded, c.value(own) / c.size, own)
         return np.concatenate([whole, x[:, self.n :]], axis=1)
 
     def own_jacobian(self, x: Array, J: Array) -> Array:
         c = self._coordinates
-        return J[:, :, self._free] * np.where(c.bounded, c.slope(x) / c.size, 1.0)[:, None]
+        # The chain rule: a value moves by its slope with each coordinate.
+        slope = np.where(c.bounded, c.slope(x) / c.size, 1.0)
+        return J[:, :, self._free] * slope[:, None]
 
     def linearization(self) -> Array:
         if np.array_equal(self._v0, self.whole.nominal * self.whole.sizes):
@@ -214,14 +233,16 @@ class ConstrainedModel(WrappedModel):
     def recorded(self) -> Recorded | None:
         """The whole model's readings, and its answer in the parameters that are left."""
         found = self.whole.recorded
-        return found and Recorded(
-            found.z, found.R, self.inner((found.x * self.whole.sizes)[self._free])
-        )
+        if not found:
+            return None
+        values = found.x * self.whole.sizes
+        return Recorded(found.z, found.R, self.inner(values[self._free]))
 
 
 @dataclass(frozen=True)
 class _Coordinates:
-    """Converts multiples x (..., n) of `inner_size` of logarithms or logits to values (..., n) inside of bounds."""
+    """Converts multiples x (..., n) of `inner_size` of logarithms or logits to values (..., n)
+    inside of bounds."""
 
     v0: Array
     lower: Array
@@ -233,10 +254,10 @@ class _Coordinates:
         return np.isfinite(self.lower) | np.isfinite(self.upper)
 
     def choose(self, free: Any, above: Any, below: Any, between: Any) -> Array:
-        """Chooses by parameter what holds: without bounds, above a lower one, below an upper one, or between both."""
-        within = np.where(
-            self.upper == np.inf, above, np.where(self.lower == -np.inf, below, between)
-        )
+        """Chooses by parameter what holds: without bounds, above a lower one, below an upper one,
+        or between both."""
+        within = np.where(self.lower == -np.inf, below, between)
+        within = np.where(self.upper == np.inf, above, within)
         return np.where(self.bounded, within, free)
 
     @cached_property
@@ -251,27 +272,31 @@ class _Coordinates:
     def _slope_at(self, v: Array) -> Array:
         """Computes the derivative of the value by its logarithm or logit."""
         with np.errstate(all="ignore"):
-            above, below = v - self.lower, self.upper - v
-            return self.choose(1.0, above, below, above * below / (self.upper - self.lower))
+            above = v - self.lower
+            below = self.upper - v
+            between = above * below / (self.upper - self.lower)
+            return self.choose(1.0, above, below, between)
 
     def _coordinate(self, v: Array) -> Array:
+        """Computes the logarithm or logit of a value."""
         with np.errstate(all="ignore"):
-            above, below = v - self.lower, self.upper - v
+            above = v - self.lower
+            below = self.upper - v
             return self.choose(v, np.log(above), -np.log(below), np.log(above / below))
 
     def value(self, x: Array) -> Array:
         with np.errstate(all="ignore"):
             u = self._origin + x * self.inner_size
-            within = self.lower + (self.upper - self.lower) / (1.0 + np.exp(-u))
-            return self.choose(
-                x * self.size, self.lower + np.exp(u), self.upper - np.exp(-u), within
-            )
+            above = self.lower + np.exp(u)
+            below = self.upper - np.exp(-u)
+            # The logistic function, between both bounds.
+            between = self.lower + (self.upper - self.lower) / (1.0 + np.exp(-u))
+            return self.choose(x * self.size, above, below, between)
 
     def slope(self, x: Array) -> Array:
         """Computes dv/dx."""
         return self._slope_at(self.value(x)) * self.inner_size
 
     def inner(self, v: Array) -> Array:
-        return np.where(
-            self.bounded, (self._coordinate(v) - self._origin) / self.inner_size, v / self.size
-        )
+        bounded = (self._coordinate(v) - self._origin) / self.inner_size
+        return np.where(self.bounded, bounded, v / self.size)

@@ -1,7 +1,9 @@
-"""Holds the certified regression problems of the NIST Statistical Reference Datasets, and counts digits of an estimate.
+"""Holds the certified regression problems of the NIST Statistical Reference Datasets, and counts
+digits of an estimate.
 
-The readings are real or generated data with certified answers (National Institute of Standards and Technology,
-https://www.itl.nist.gov/div898/strd/nls/nls_main.shtml, public domain), kept in `nist.json`.
+The readings are real or generated data with certified answers (National Institute of Standards and
+Technology, https://www.itl.nist.gov/div898/strd/nls/nls_main.shtml, public domain), kept in
+`nist.json`.
 """
 
 from __future__ import annotations
@@ -21,8 +23,9 @@ from ipe_bench.measurements.base import Measurement, Parameter, Recorded
 
 
 def _gauss(b: Sequence[Any], x: Any) -> Any:
-    peaks = b[2] * np.exp(-(((x - b[3]) / b[4]) ** 2)) + b[5] * np.exp(-(((x - b[6]) / b[7]) ** 2))
-    return b[0] * np.exp(-b[1] * x) + peaks
+    first = b[2] * np.exp(-(((x - b[3]) / b[4]) ** 2))
+    second = b[5] * np.exp(-(((x - b[6]) / b[7]) ** 2))
+    return b[0] * np.exp(-b[1] * x) + (first + second)
 
 
 def _lanczos(b: Sequence[Any], x: Any) -> Any:
@@ -39,12 +42,13 @@ def _cubics(b: Sequence[Any], x: Any) -> Any:
 
 
 def _enso(b: Sequence[Any], x: Any) -> Any:
-    annual, second, third = 2 * np.pi * x / 12, 2 * np.pi * x / b[3], 2 * np.pi * x / b[6]
-    return (
-        (b[0] + b[1] * np.cos(annual) + b[2] * np.sin(annual))
-        + (b[4] * np.cos(second) + b[5] * np.sin(second))
-        + (b[7] * np.cos(third) + b[8] * np.sin(third))
-    )
+    def wave(cos: Any, sin: Any, period: Any) -> Any:
+        angle = 2 * np.pi * x / period
+        return cos * np.cos(angle) + sin * np.sin(angle)
+
+    annual_angle = 2 * np.pi * x / 12
+    annual = b[0] + b[1] * np.cos(annual_angle) + b[2] * np.sin(annual_angle)
+    return annual + wave(b[4], b[5], b[3]) + wave(b[7], b[8], b[6])
 
 
 def _saturation(b: Sequence[Any], x: Any) -> Any:
@@ -81,15 +85,15 @@ FORMULAS: dict[str, Callable[..., Any]] = {
     "Rat43": lambda b, x: b[0] / (1.0 + np.exp(b[1] - b[2] * x)) ** (1.0 / b[3]),
     "Bennett5": lambda b, x: b[0] * (b[1] + x) ** (-1.0 / b[2]),
 }
-"""The 27 regression functions in NIST's order (lower, average, higher difficulty), by data set: from the parameters b,
-arrays (trials, 1), and the predictors x, arrays (m,), to (trials, m). All are analytic."""
+"""The 27 regression functions in NIST's order (lower, average, higher difficulty), by data set:
+from the parameters b, arrays (trials, 1), and the predictors x, arrays (m,), to (trials, m). All
+are analytic."""
 
 
 @cache
 def _tables() -> dict[str, dict[str, Any]]:
-    return json.loads(
-        files("ipe_bench.measurements").joinpath("nist.json").read_text(encoding="utf-8")
-    )
+    file = files("ipe_bench.measurements").joinpath("nist.json")
+    return json.loads(file.read_text(encoding="utf-8"))
 
 
 @dataclass(frozen=True)
@@ -99,20 +103,23 @@ class CertifiedAnswer:
     parameters: Array
     """(n,), in physical units."""
     deviations: Array
-    """(n,): standard deviations of the parameters, with the residual variance estimated from the fit."""
+    """(n,): standard deviations of the parameters, with the residual variance estimated from the
+    fit."""
     residual_sum_of_squares: float
     residual_deviation: float
     degrees_of_freedom: int
-    """m - n. The header of NIST's Rat43 states another number, which its own certified deviations contradict."""
+    """m - n. The header of NIST's Rat43 states another number, which its own certified deviations
+    contradict."""
 
 
 @dataclass(frozen=True)
 class Nist(Measurement):
-    """Holds one regression problem of NIST, to be started at one of its two certified starting points.
+    """Holds one regression problem of NIST, to be started at one of its two certified starting
+    points.
 
-    The nominal point is that start, and each parameter's size is its magnitude there, so x0 consists of ones and minus
-    ones. There is no order of arrival and no prior. A reading is one observation y; for Nelson it is log(y), as NIST
-    fits it.
+    The nominal point is that start, and each parameter's size is its magnitude there, so x0
+    consists of ones and minus ones. There is no order of arrival and no prior. A reading is one
+    observation y; for Nelson it is log(y), as NIST fits it.
     """
 
     dataset: str = "Misra1a"
@@ -139,9 +146,8 @@ class Nist(Measurement):
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
-        return tuple(
-            Parameter(f"b{i + 1}", size=float(abs(b))) for i, b in enumerate(self.start_values)
-        )
+        numbered = enumerate(self.start_values, 1)
+        return tuple(Parameter(f"b{i}", size=float(abs(b))) for i, b in numbered)
 
     @property
     def nominal(self) -> Array:
@@ -155,8 +161,9 @@ class Nist(Measurement):
     @property
     def index(self) -> Mapping[str, Sequence[Any]]:
         names = ("time", "temperature") if self.dataset == "Nelson" else ("x",)
+        observations = list(range(1, self.predictors.shape[1] + 1))
         columns = dict(zip(names, self.predictors.tolist(), strict=True))
-        return {"observation": list(range(1, self.predictors.shape[1] + 1)), **columns}
+        return {"observation": observations, **columns}
 
     @cached_property
     def readings(self) -> Array:
@@ -167,9 +174,12 @@ class Nist(Measurement):
     @cached_property
     def certified(self) -> CertifiedAnswer:
         table = _tables()[self.dataset]
-        residuals = table["residual_sum_of_squares"], table["residual_deviation"]
         return CertifiedAnswer(
-            self._numbers("certified"), self._numbers("deviations"), *residuals, self.m - self.n
+            parameters=self._numbers("certified"),
+            deviations=self._numbers("deviations"),
+            residual_sum_of_squares=table["residual_sum_of_squares"],
+            residual_deviation=table["residual_deviation"],
+            degrees_of_freedom=self.m - self.n,
         )
 
     def simulate(self, x: Array) -> Array:
@@ -179,8 +189,9 @@ class Nist(Measurement):
 
     @property
     def recorded(self) -> Recorded:
-        """The readings with the certified answer, and R for independent readings of the certified residual deviation,
-        which moves no least-squares estimate: it only says what a small gradient is."""
+        """The readings with the certified answer, and R for independent readings of the certified
+        residual deviation, which moves no least-squares estimate: it only says what a small
+        gradient is."""
         certified = self.certified
         R = Covariance(np.full(self.m, certified.residual_deviation))
         return Recorded(self.readings, R, certified.parameters / self.sizes)
@@ -188,7 +199,8 @@ class Nist(Measurement):
 
 @dataclass(frozen=True)
 class Digits:
-    """Holds correct digits, the fewest over the parameters: 11 is all that is certified, 0 is a wrong answer."""
+    """Holds correct digits, the fewest over the parameters: 11 is all that is certified, 0 is a
+    wrong answer."""
 
     parameters: float
     deviations: float
@@ -196,26 +208,32 @@ class Digits:
 
 
 def digits(value: Array | float, certified: Array | float) -> float:
-    """Computes the log relative error -log10(|value - certified| / |certified|), the least of all, at most 11.
+    """Computes the log relative error -log10(|value - certified| / |certified|), the least of all,
+    at most 11.
 
     Less than one digit, or a value that is not finite, counts as none (McCullough, Assessing the
     reliability of statistical software, The American Statistician 52, 1998).
     """
-    value, certified = np.atleast_1d(value), np.atleast_1d(certified)
-    if not np.isfinite(value).all():
+    values = np.atleast_1d(value)
+    known = np.atleast_1d(certified)
+    if not np.isfinite(values).all():
         return 0.0
     with np.errstate(divide="ignore"):
-        lre = float(np.min(-np.log10(np.abs(value - certified) / np.abs(certified))))
-    return min(lre, 11.0) if lre >= 1.0 else 0.0
+        errors = np.abs(values - known) / np.abs(known)
+        least = float(np.min(-np.log10(errors)))
+    return min(least, 11.0) if least >= 1.0 else 0.0
 
 
 def score(model: Nist, x: Array, deviation: Array) -> Digits:
-    """Compares an estimate x (n,) and its standard deviations (n,), both in multiples of sizes, with NIST's.
+    """Compares an estimate x (n,) and its standard deviations (n,), both in multiples of sizes,
+    with NIST's.
 
-    An estimator assumes R = sigma^2 I with NIST's residual deviation as sigma, and states its deviations for that R.
-    NIST's rest on the residual variance of the fit, rss / (m - n), so that is put in the place of sigma^2.
+    An estimator assumes R = sigma^2 I with NIST's residual deviation as sigma, and states its
+    deviations for that R. NIST's rest on the residual variance of the fit, rss / (m - n), so that
+    is put in the place of sigma^2.
     """
-    certified, residuals = model.certified, model.readings - model.simulate(x[None])[0]
+    certified = model.certified
+    residuals = model.readings - model.simulate(x[None])[0]
     with np.errstate(all="ignore"):
         rss = float(residuals @ residuals)
         scale = np.sqrt(rss / certified.degrees_of_freedom) / certified.residual_deviation

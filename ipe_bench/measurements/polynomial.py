@@ -16,11 +16,13 @@ from ipe_bench.measurements.base import Epochs, Measurement, Parameter, UsualNoi
 
 @dataclass(frozen=True)
 class Polynomial(Measurement):
-    """Computes h_k(x) = u_k + s u_k^2 / 2 + s^2 u_k^3 / 6 with u = H x: a linear model that a cubic bends.
+    """Computes h_k(x) = u_k + s u_k^2 / 2 + s^2 u_k^3 / 6 with u = H x: a linear model that a cubic
+    bends.
 
-    H holds Chebyshev polynomials T_0 ... T_(n-1) at m equally spaced times from -1 to 1, so it is well conditioned. At
-    s = 0 the model is linear. The cubic is the Taylor polynomial of (exp(s u) - 1) / s; it grows monotonically, so one
-    reading fixes one u, and N(x) = s u^2 / 2 + s^2 u^3 / 6 in the words of eq. (24). Each reading is an epoch.
+    H holds Chebyshev polynomials T_0 ... T_(n-1) at m equally spaced times from -1 to 1, so it is
+    well conditioned. At s = 0 the model is linear. The cubic is the Taylor polynomial of (exp(s u)
+    - 1) / s; it grows monotonically, so one reading fixes one u, and N(x) = s u^2 / 2 + s^2 u^3 / 6
+    in the words of eq. (24). Each reading is an epoch.
     """
 
     unknowns: Count = 4

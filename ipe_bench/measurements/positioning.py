@@ -23,20 +23,27 @@ from ipe_bench.measurements.base import (
 )
 
 _BEACONS = (
-    (1000.0, 0.0, 300.0), (500.0, 866.0, 20.0), (-500.0, 866.0, 300.0), (-1000.0, 0.0, 20.0), (-500.0, -866.0, 300.0),
-    (500.0, -866.0, 20.0), (0.0, 0.0, 600.0),
-)  # fmt: skip
+    (1000.0, 0.0, 300.0),
+    (500.0, 866.0, 20.0),
+    (-500.0, 866.0, 300.0),
+    (-1000.0, 0.0, 20.0),
+    (-500.0, -866.0, 300.0),
+    (500.0, -866.0, 20.0),
+    (0.0, 0.0, 600.0),
+)
 
 
 @dataclass(frozen=True)
 class Ranging(Measurement):
-    """Measures pseudoranges |s_i - p| + b from a receiver at p with clock bias b to beacons at known places s_i.
+    """Measures pseudoranges |s_i - p| + b from a receiver at p with clock bias b to beacons at
+    known places s_i.
 
-    Parameters: east, north, up in m, and the clock bias as a length in m. Readings: pseudoranges in m, in `rounds` over
-    all beacons; each round is an epoch.
+    Parameters: east, north, up in m, and the clock bias as a length in m. Readings: pseudoranges in
+    m, in `rounds` over all beacons; each round is an epoch.
 
-    Source: Kaplan and Hegarty, Understanding GPS, 2nd ed., section 2.4. The problem has a closed form: Bancroft, An
-    algebraic solution of the GPS equations, IEEE Transactions on Aerospace and Electronic Systems 21, 1985.
+    Source: Kaplan and Hegarty, Understanding GPS, 2nd ed., section 2.4. The problem has a closed
+    form: Bancroft, An algebraic solution of the GPS equations, IEEE Transactions on Aerospace and
+    Electronic Systems 21, 1985.
     """
 
     beacons: tuple[tuple[float, float, float], ...] = _BEACONS
@@ -65,8 +72,9 @@ class Ranging(Measurement):
 
     @property
     def index(self) -> Mapping[str, Sequence[Any]]:
-        rounds, beacons = np.indices((self.rounds, len(self.beacons))).reshape(2, -1) + 1
-        return {"round": rounds.tolist(), "beacon": beacons.tolist()}
+        places = np.indices((self.rounds, len(self.beacons))).reshape(2, -1)
+        rounds, beacons = (places + 1).tolist()
+        return {"round": rounds, "beacon": beacons}
 
     @cached_property
     def epochs(self) -> Epochs:
@@ -75,24 +83,25 @@ class Ranging(Measurement):
     def simulate(self, x: Array) -> Array:
         p = x * self.sizes
         towards = np.asarray(self.beacons, dtype=float) - p[:, None, :3]
-        ranges = (
-            np.sqrt(towards[..., 0] ** 2 + towards[..., 1] ** 2 + towards[..., 2] ** 2) + p[:, 3:]
-        )
-        return np.tile(ranges, (1, self.rounds))
+        # Written out rather than by np.linalg.norm, which is not analytic.
+        distances = np.sqrt(towards[..., 0] ** 2 + towards[..., 1] ** 2 + towards[..., 2] ** 2)
+        return np.tile(distances + p[:, 3:], (1, self.rounds))
 
 
 @dataclass(frozen=True)
 class Bearings(Measurement):
-    """Measures bearings to a target of constant velocity from an observer on straight legs of known courses and speeds.
+    """Measures bearings to a target of constant velocity from an observer on straight legs of known
+    courses and speeds.
 
-    Parameters: the target's position (east, north) at time 0 in m relative to the observer's start, and its velocity in
-    m/s. Readings: bearings in degrees clockwise from north, one per `interval`; each is an epoch. Simulated ones are
-    within half a turn of the nominal target's; whole turns of a reading say nothing.
+    Parameters: the target's position (east, north) at time 0 in m relative to the observer's start,
+    and its velocity in m/s. Readings: bearings in degrees clockwise from north, one per `interval`;
+    each is an epoch. Simulated ones are within half a turn of the nominal target's; whole turns of
+    a reading say nothing.
 
-    On a single leg the range is not observable: every target whose relative motion is scaled by one factor has the same
-    bearings. A turn makes it observable unless the observer's acceleration points along the line of sight (Nardone and
-    Aidala, Observability criteria for bearings-only target motion analysis, IEEE Transactions on Aerospace and
-    Electronic Systems 17, 1981).
+    On a single leg the range is not observable: every target whose relative motion is scaled by one
+    factor has the same bearings. A turn makes it observable unless the observer's acceleration
+    points along the line of sight (Nardone and Aidala, Observability criteria for bearings-only
+    target motion analysis, IEEE Transactions on Aerospace and Electronic Systems 17, 1981).
     """
 
     legs: Annotated[tuple[tuple[float, float, float], ...], MinLen(1)] = (
@@ -133,40 +142,51 @@ class Bearings(Measurement):
     @cached_property
     def times(self) -> Array:
         """Times of the bearings (m,), in s."""
-        return self.interval * np.arange(
-            int(sum(leg[0] for leg in self.legs) / self.interval + 1e-9) + 1
-        )
+        span = sum(leg[0] for leg in self.legs)
+        # More by a little, so that round-off leaves out no bearing.
+        intervals = int(span / self.interval + 1e-9)
+        return self.interval * np.arange(intervals + 1)
 
     @cached_property
     def observer(self) -> Array:
         """Places of the observer at these times (m, 2), east and north in m."""
-        path, began = np.zeros((len(self.times), 2)), 0.0
+        path = np.zeros((len(self.times), 2))
+        began = 0.0
         for duration, course, speed in self.legs:
             sailed = np.clip(self.times - began, 0.0, duration)
             heading = np.deg2rad(course)
-            path += speed * sailed[:, None] * np.array([np.sin(heading), np.cos(heading)])
+            ahead = np.array([np.sin(heading), np.cos(heading)])
+            path += speed * sailed[:, None] * ahead
             began += duration
         return path
 
     def _sight(self, x: Array) -> Array:
         """Returns the vectors (trials, m, 2) from the observer to the target."""
         p = x * self.sizes
-        return p[:, None, :2] + self.times[:, None] * p[:, None, 2:] - self.observer
+        start = p[:, None, :2]
+        velocity = p[:, None, 2:]
+        return start + self.times[:, None] * velocity - self.observer
 
     @cached_property
     def _nominal_bearings(self) -> tuple[Array, Array]:
-        """Unit vectors (m, 2) towards the nominal target, and their bearings (m,) in rad without jumps."""
+        """Unit vectors (m, 2) towards the nominal target, and their bearings (m,) in rad without
+        jumps."""
         sight = self._sight(self.nominal[None])[0]
+        ahead = sight / np.linalg.norm(sight, axis=1)[:, None]
         bearing = np.unwrap(np.arctan2(sight[:, 0], sight[:, 1]))
-        return sight / np.linalg.norm(sight, axis=1)[:, None], bearing - 2 * np.pi * np.floor(
-            bearing[0] / (2 * np.pi)
-        )
+        # The first is between 0 and a whole turn.
+        turns = np.floor(bearing[0] / (2 * np.pi))
+        return ahead, bearing - 2 * np.pi * turns
 
     def simulate(self, x: Array) -> Array:
         sight = self._sight(x)
         ahead, bearing = self._nominal_bearings
-        dot = sight[..., 0] * ahead[:, 0] + sight[..., 1] * ahead[:, 1]
-        cross = sight[..., 0] * ahead[:, 1] - sight[..., 1] * ahead[:, 0]
-        distance = np.sqrt(sight[..., 0] ** 2 + sight[..., 1] ** 2)
-        # The angle from the nominal line of sight by the half-angle formula, which is analytic and within half a turn.
-        return np.rad2deg(1.0) * (bearing + 2.0 * np.arctan(cross / (distance + dot)))
+        east = sight[..., 0]
+        north = sight[..., 1]
+        dot = east * ahead[:, 0] + north * ahead[:, 1]
+        cross = east * ahead[:, 1] - north * ahead[:, 0]
+        distance = np.sqrt(east**2 + north**2)
+        # The angle from the nominal line of sight by the half-angle formula, which is analytic and
+        # within half a turn.
+        angle = 2.0 * np.arctan(cross / (distance + dot))
+        return np.rad2deg(1.0) * (bearing + angle)

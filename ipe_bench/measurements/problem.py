@@ -1,4 +1,5 @@
-"""States what an estimator knows besides the readings: the model, R and the prior, but not the truth."""
+"""States what an estimator knows besides the readings: the model, R and the prior, but not the
+truth."""
 
 from __future__ import annotations
 
@@ -29,12 +30,13 @@ class Problem:
     measurement: Measurement
     R: Covariance
     prior_deviation: Array | None = None
-    """Standard deviation (n,) of the parameters about the nominal point; None where no prior is known."""
+    """Standard deviation (n,) of the parameters about the nominal point; None where no prior is
+    known."""
     prior_correlation: Array | None = None
     """Their correlation (n, n); None: they are independent."""
     doubted: float = 0.0
-    """Residuals less probable than this are reason to look for a better fit; 1 if the level of the noise is not known,
-    so that the size of residuals says nothing."""
+    """Residuals less probable than this are reason to look for a better fit; 1 if the level of the
+    noise is not known, so that the size of residuals says nothing."""
 
     def __post_init__(self) -> None:
         require_nominal(self.measurement)
@@ -63,29 +65,29 @@ class Problem:
         return bool(np.isnan(self.H_plus).all())
 
     def prior_used(self, inflation: float = 1.0) -> Array | None:
-        """Computes the prior's standard deviations (n,) times `inflation`; one that is fixed gets nearly none."""
+        """Computes the prior's standard deviations (n,) times `inflation`; one that is fixed gets
+        nearly none."""
         deviation = self.prior_deviation
-        return (
-            None
-            if deviation is None
-            else inflation * np.maximum(deviation, _FIXED * deviation.max())
-        )
+        if deviation is None:
+            return None
+        return inflation * np.maximum(deviation, _FIXED * deviation.max())
 
     def prior_covariance(self, inflation: float = 1.0) -> Covariance | None:
         """Computes P0 with its deviations times `inflation`, as `prior_used` has them."""
         deviation = self.prior_used(inflation)
-        if deviation is None or self.prior_correlation is None:
-            return None if deviation is None else Covariance(deviation)
+        if deviation is None:
+            return None
+        if self.prior_correlation is None:
+            return Covariance(deviation)
         return Covariance(deviation[:, None] * np.linalg.cholesky(self.prior_correlation))
 
     @property
     def scaled_prior(self) -> Array:
-        """P0 (n, n) in the prior's own deviations: what a filter begins with that counts in them."""
-        return (
-            np.eye(self.measurement.n)
-            if self.prior_correlation is None
-            else np.array(self.prior_correlation)
-        )
+        """P0 (n, n) in the prior's own deviations: what a filter begins with that counts in
+        them."""
+        if self.prior_correlation is None:
+            return np.eye(self.measurement.n)
+        return np.array(self.prior_correlation)
 
     def without_prior(self) -> Problem:
         return replace(self, prior_deviation=None, prior_correlation=None)
@@ -93,37 +95,35 @@ class Problem:
 
 def require_nominal(model: Measurement) -> None:
     """Refuses a model whose nominal point is not (n,)."""
-    if np.shape(model.nominal) != (model.n,):
-        wanted = (
-            f"({model.n},), one number for each of {', '.join(p.name for p in model.parameters)}"
-        )
-        shape = np.shape(model.nominal)
+    shape = np.shape(model.nominal)
+    if shape != (model.n,):
+        names = ", ".join(p.name for p in model.parameters)
+        wanted = f"({model.n},), one number for each of {names}"
         raise UserError(
             f"measurement={model.name}: nominal has shape {shape}; let it return {wanted}"
         )
 
 
 def require_numbers(owner: str, method: Any, values: Any, shape: tuple[int, ...]) -> None:
-    """Refuses what a method of a part from outside returned unless it is an ordinary array of numbers of this shape."""
-    if complaint := _unfit(method, values, shape):
+    """Refuses what a method of a part from outside returned unless it is an ordinary array of
+    numbers of this shape."""
+    complaint = _unfit(method, values, shape)
+    if complaint:
         raise UserError(f"{owner}: {complaint}")
 
 
 def _unfit(method: Any, values: Any, shape: tuple[int, ...]) -> str:
-    """Says what is wrong with what a method returned, and where it is written; empty if it is right."""
+    """Says what is wrong with what a method returned, and where it is written; empty if it is
+    right."""
     array = np.asarray(values)
+    numbers = array.dtype.kind in "fiub"
     if isinstance(values, np.ndarray) and type(values) is not np.ndarray:
-        found, remedy = (
-            f"a {type(values).__name__}",
-            "return an ordinary array, with NaN for what is masked",
-        )
-    elif array.shape != shape or array.dtype.kind not in "fiub":
-        numbers = array.dtype.kind in "fiub"
-        found = (
-            f"an array of shape {array.shape}"
-            if numbers and array.ndim
-            else f"{type(values).__name__}"
-        )
+        found = f"a {type(values).__name__}"
+        remedy = "return an ordinary array, with NaN for what is masked"
+    elif array.shape != shape or not numbers:
+        found = type(values).__name__
+        if numbers and array.ndim:
+            found = f"an array of shape {array.shape}"
         remedy = f"let it return numbers of shape {shape}"
     else:
         return ""
@@ -131,9 +131,9 @@ def _unfit(method: Any, values: Any, shape: tuple[int, ...]) -> str:
 
 
 def require_function(model: Measurement) -> None:
-    """Refuses a model from outside of this package that is no function of x alone: one that gives one x other readings
-    or other slopes after another x, in another batch, or on a fresh object, returns other shapes than (trials, m) and
-    (trials, m, n), writes into x, or ends the process."""
+    """Refuses a model from outside of this package that is no function of x alone: one that gives
+    one x other readings or other slopes after another x, in another batch, or on a fresh object,
+    returns other shapes than (trials, m) and (trials, m, n), writes into x, or ends the process."""
     if all(cls.__module__.startswith("ipe_bench.") for cls in component_classes(model)):
         return
     try:
@@ -146,22 +146,20 @@ def require_function(model: Measurement) -> None:
 
 @lru_cache(maxsize=256)
 def _irregularity(model: Measurement, definition: str) -> str:
-    """Says what is irregular of a model by this definition; empty if the model is regular, and where a call raises,
-    which its trials report."""
+    """Says what is irregular of a model by this definition; empty if the model is regular, and
+    where a call raises, which its trials report."""
     rng = np.random.default_rng(11)
-    x, other = (
-        read_only(model.nominal + 0.1 * rng.standard_normal((trials, model.n))) for trials in (4, 7)
-    )
+    x = read_only(model.nominal + 0.1 * rng.standard_normal((4, model.n)))
+    other = read_only(model.nominal + 0.1 * rng.standard_normal((7, model.n)))
     fresh: Any = replace(cast(Any, model)) if is_dataclass(model) else copy.copy(model)
     if component_classes(fresh) != component_classes(model):
         return "what its options name was defined anew since it was made; make the model anew"
-    for method, shape in (
-        ("simulate", (len(x), model.m)),
-        ("jacobian", (len(x), model.m, model.n)),
-    ):
+    shapes = {"simulate": (len(x), model.m), "jacobian": (len(x), model.m, model.n)}
+    for method, shape in shapes.items():
         call = getattr(model, method)
         try:
-            if wrong := _unfit(call, call(x), shape):  # the first call may compile
+            wrong = _unfit(call, call(x), shape)  # the first call may compile
+            if wrong:
                 return wrong
             began = time.perf_counter()
             first = call(x)
@@ -176,12 +174,13 @@ def _irregularity(model: Measurement, definition: str) -> str:
         except SystemExit as error:
             return f"{place_of(error)}; raise an exception where there are no readings"
         except Exception as error:
-            return (
-                place_of(error)
-                if isinstance(error, ValueError) and "read-only" in str(error)
-                else ""
-            )
+            writes = isinstance(error, ValueError) and "read-only" in str(error)
+            return place_of(error) if writes else ""
         differing = [way for way, z in ways.items() if not np.array_equal(z, first, equal_nan=True)]
         if differing:
-            return f"{method}(x) has other bits {' and '.join(differing)}; let h(x) depend on x and the options alone"
+            ways_said = " and ".join(differing)
+            return (
+                f"{method}(x) has other bits {ways_said};"
+                " let h(x) depend on x and the options alone"
+            )
     return ""

@@ -344,8 +344,8 @@ CHANGES = {
     "files-from-0": Change(
         "measurements",
         "the epochs of a second file are those of the first",
-        "tuple(rows + start for epochs, start in zip",
-        "tuple(rows for epochs, start in zip",
+        "[rows + start for rows in part.epochs]",
+        "list(part.epochs)",
         "test_files_together.py",
     ),
     "course-from-east": Change(
