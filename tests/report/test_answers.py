@@ -211,7 +211,7 @@ def test_a_design_has_the_units_of_its_table_and_says_where_candidates_are_what_
     assert "optimal" not in " ".join(_design_sentences(fewer))
 
 
-def test_a_change_that_is_found_but_may_be_below_the_margin_is_not_drawn_as_no_difference(tmp_path):
+def test_each_change_is_worded_beside_its_margin_and_filled_if_it_is_beyond(tmp_path):
     """All errors 1.5 % larger, where changes from 2 % on matter; costs 30 % larger; success alike."""
     error = 0.03 * np.random.default_rng(0).standard_normal((1000, 3))
     for name, factor, cost in (("a", 1.0, 5.0), ("b", 1.015, 6.5)):
@@ -224,24 +224,22 @@ def test_a_change_that_is_found_but_may_be_below_the_margin_is_not_drawn_as_no_d
     assert told.loc["success"].tolist() == [False, ""]
     with house_style():
         (drawing,) = draw_pairs(frame)
-    marks = {ax.get_title().partition(",")[0]: ax.lines[1] for ax in drawing.figure.axes}
-    (legend,) = drawing.figure.legends
-    keys = dict(
-        zip([text.get_text() for text in legend.get_texts()], legend.legend_handles, strict=True)
+    axes = {ax.get_title().partition(",")[0]: ax for ax in drawing.figure.axes if ax.axison}
+    marks = {kind: ax.lines[1] for kind, ax in axes.items()}
+    assert {kind: line.get_markerfacecolor() == "white" for kind, line in marks.items()} == {
+        "success": True,
+        "error": True,
+        "cost": False,
+    }
+    said = {kind: [t.get_text() for t in ax.texts] for kind, ax in axes.items()}
+    assert said["success"] == ["the same within ± 1 points"]
+    low, high = (
+        100 * (frame.set_index("quantity").loc["error", end] - 1) for end in ("low", "high")
     )
-    for kind, words in (
-        ("error", "different, perhaps by less than the margin"),
-        ("cost", "worse"),
-        ("success", "no difference found"),
-    ):
-        same = marks[kind], keys[words]
-        assert (
-            len({line.get_marker() for line in same})
-            == len({line.get_markerfacecolor() for line in same})
-            == 1
-        )
+    assert said["error"] == [f"perhaps within the margin: {low:+.2g} to {high:+.2g} %"]
+    assert said["cost"][0].startswith("worse: +")
     for ax, (low, high) in zip(
-        drawing.figure.axes, ((-1.0, 1.0), (1 / 1.02, 1.02), (1 / 1.05, 1.05)), strict=True
+        axes.values(), ((-1.0, 1.0), (1 / 1.02, 1.02), (1 / 1.05, 1.05)), strict=True
     ):
         (band,) = ax.patches
         assert (band.get_x(), band.get_x() + band.get_width()) == pytest.approx((low, high))
