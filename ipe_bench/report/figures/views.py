@@ -12,6 +12,7 @@ import pandas as pd
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.report.figures.drawing import Drawing
+from ipe_bench.report.finding import Finding
 from ipe_bench.report.style import (
     GREY,
     MOST_FACES,
@@ -37,8 +38,6 @@ MOST_LETTERS = 70
 """Largest length of a setting in a file name; longer ones are cut and end in a number."""
 FOCUS = ("newton", "ekf", "fixed_point", "ukf")
 """Those that the bench is about, behind the best of all."""
-BROKEN = 0.9
-"""Share of success that an estimator holds."""
 FRAMES = tuple(field.name for field in fields(Analysis) if field.type == "pd.DataFrame")
 """The tables of an analysis that a figure may ask for."""
 
@@ -223,18 +222,14 @@ def in_focus(look: Mapping[str, Look], colored: Container[str]) -> dict[str, Loo
 
 def focus_of(summary: pd.DataFrame) -> tuple[list[str], str]:
     """Returns the estimators that are in colour where not all can be, the best first, and the best if it is one."""
-    if summary.empty:
-        return [], ""
     rows = summary[(summary["parameter"] == ALL) & (summary["estimator"] != REFERENCE)]
-    rows = rows.sort_values("error_scale", kind="stable")
-    held: dict[Any, tuple[float, float]] = {}
-    for label, own in rows.groupby("estimator", sort=False):
-        longest = float((own["success"] >= BROKEN).cumprod().sum())
-        held[label] = (longest, round(own["success"].mean(), 3))
-    ranked = sorted(held, key=lambda label: held[label], reverse=True)
-    known = [label for label in FOCUS if label in held]
+    if rows.empty:
+        return [], ""
+    standings = Finding.of(rows.to_dict("records")).standings
+    ranked = [one.label for one in standings]
+    known = [label for label in FOCUS if label in ranked]
     shown = list(dict.fromkeys([*ranked[:1], *known, *ranked]))[:MOST_TOGETHER]
-    first = [label for label in ranked if held[label] == held[ranked[0]]]
+    first = [one.label for one in standings if one.rank == standings[0].rank]
     return shown, first[0] if len(first) == 1 else ""
 
 
