@@ -20,6 +20,8 @@ HELD = 0.9
 """Share of all trials that succeed where an estimator holds."""
 MOST_NAMES = 3
 """Names in a list of a title; more are counted."""
+MEANING = f"Holds: at least {100 * HELD:.0f} % of all trials succeed, with 95 % confidence."
+"""What a reader of the title needs to know."""
 HOLDS, FAILS, UNDECIDED = "holds", "fails", "undecided"
 _SIDES = ("filters", "IPE")
 """The families whose best are named if they part."""

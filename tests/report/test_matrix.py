@@ -150,6 +150,9 @@ def test_settings_that_are_swept_have_a_matrix_each():
     ]
     found = matrices(rows)
     assert [matrix.title for matrix in found] == ["noise=0", "noise=1", "noise=2"]
+    assert "settings" not in found[-1].notes[-1]
+    (first,) = matrices(rows, 8)
+    assert first.notes[-1].endswith("Of 3 settings 2 are in the table alone.")
     assert [[cell.text for cell in each][2] for m in found for each in m.rows] == [
         "0 ",
         "10 ",

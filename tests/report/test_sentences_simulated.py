@@ -25,6 +25,7 @@ from scipy.stats import beta
 from shared.simulated_reports import HOLDING, Report, board, simulated
 from shared.synthetic_store import Filter, Pretender, Seeker
 
+from ipe_bench.report.finding import MEANING
 from ipe_bench.report.page.headline import headline
 from ipe_bench.report.tables.table import Table
 from ipe_bench.report.words import brief, percent
@@ -148,6 +149,12 @@ def finding(report: Report, match: Any) -> Iterator[tuple[str, str, bool]]:
             yield from they_hold(report, found, winners)
         else:
             yield from JUDGES[kind](report, found, winners)
+
+
+@sentence(re.escape(MEANING), of_one=True)
+def meaning(report: Report, match: Any) -> Iterator[tuple[str, str, bool]]:
+    """Defines a word, and claims nothing."""
+    yield from ()
 
 
 def place(report: Report, scale: str | None) -> int:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from itertools import groupby
 from typing import Any, ClassVar
 
-from ipe_bench.report.finding import HELD, Finding, Row, Standing
+from ipe_bench.report.finding import HELD, MEANING, Finding, Row, Standing
 from ipe_bench.report.style import RAMP, ink
 from ipe_bench.report.tables.table import Cell, Column, Part, Strong, Table
 from ipe_bench.report.words import (
@@ -108,7 +108,7 @@ class Matrix(Table):
 
 def opening(rows: Sequence[Row], lines: float = math.inf) -> list[Part]:
     """Returns the finding and its matrices, of several as many as those lines have room for."""
-    return [Strong(Finding.of(rows).sentence()), *matrices(rows, lines)]
+    return [Strong(Finding.of(rows).sentence()), *(matrices(rows, lines) or [MEANING])]
 
 
 def matrices(rows: Iterable[Row], lines: float = math.inf) -> list[Matrix]:
@@ -130,7 +130,10 @@ def matrices(rows: Iterable[Row], lines: float = math.inf) -> list[Matrix]:
     columns = [column for matrix in found for column in matrix.columns]
     moving = any(row["noise"] == "model" for row in listed)
     bare = [replace(matrix, notes=[]) for matrix in found]
-    return [*bare[:-1], replace(bare[-1], notes=[_legend(columns, moving)])]
+    legend = _legend(columns, moving)
+    if further := len(settings) - len(found):
+        legend += f" Of {len(settings)} settings {further} are in the table alone."
+    return [*bare[:-1], replace(bare[-1], notes=[legend])]
 
 
 def _matrix(finding: Finding, name: str, title: str) -> Matrix:
@@ -171,7 +174,7 @@ def _legend(columns: Sequence[Column], moving: bool) -> str:
         told += f" {TOO_SMALL} The reported covariance is too small."
     if NOT_JUDGED in signs:
         told += f" {NOT_JUDGED} It is not judged: too few trials, or none is reported."
-    return f"{told} Holds: at least {100 * HELD:.0f} % succeed, with 95 % confidence."
+    return f"{told} {MEANING}"
 
 
 def _tile(one: Standing, at: int, finding: Finding, moving: bool) -> Tile:

@@ -41,7 +41,7 @@ from ipe_bench.statistics.verdicts import VERDICTS, shown, sign_of
 MOST_SETTINGS = 2
 """Differing settings that have a column each."""
 _MOST_LINES = 44
-"""Lines that a terminal shows of several settings, half of them of matrices."""
+"""Lines that a terminal shows of several settings, most of them of matrices."""
 _HEAD = 4
 """Lines of a table besides its rows."""
 _WIDE_ENOUGH = 100
@@ -129,12 +129,12 @@ def _opening(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> list[
     moving = [row for row in told if row["noise"] == "model"]
     constant = [row for row in told if row["noise"] != "model"]
     parts = [one for one in (constant, moving) if one]
-    return [part for one in parts for part in opening(one, _MOST_LINES / 2)]
+    return [part for one in parts for part in opening(one, 0.6 * _MOST_LINES)]
 
 
 def _shortened(settings: Mapping[str, Sequence[Any]]) -> dict[str, list[Any]]:
     """Returns the rows of each setting at its telling scale, until the screen is full."""
-    room, kept = _MOST_LINES / 2, dict[str, list[Any]]()
+    room, kept = 0.4 * _MOST_LINES, dict[str, list[Any]]()
     for title, rows in settings.items():
         here = _telling(rows)
         if kept and len(here) + _HEAD > room:
