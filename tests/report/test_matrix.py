@@ -160,6 +160,12 @@ def test_settings_that_are_swept_have_a_matrix_each():
     ]
 
 
+def test_settings_whose_texts_are_equal_have_a_matrix_each():
+    rows = [one | {"setting": "noise=0.1"} for _ in range(2) for one in rows_of({"a": (200, 9)})]
+    first, second = matrices(rows)
+    assert [len(first.columns), len(second.columns)] == [3, 3]
+
+
 def test_a_missing_result_is_a_dash_without_colour():
     rows = rows_of({"a": (200, 200), "b": (200,)})
     (matrix,) = matrices(rows)

@@ -124,7 +124,12 @@ def matrices(rows: Iterable[Row], lines: float = math.inf) -> list[Matrix]:
     found = []
     most = min(MOST_MATRICES, max(1, lines / (len(finding.standings) + _BESIDE)))
     for number, setting in enumerate(settings[: int(most)], 1):
-        own = [row for row in listed if row["setting"] == setting]
+        own = [
+            row
+            for one in finding.standings
+            for row, (named, _) in zip(one.rows, finding.places, strict=True)
+            if row and named == setting
+        ]
         found.append(_matrix(Finding.of(own), f"{MATRIX}_{number}", _setting(setting)))
     # One legend below the last, of the signs of all.
     columns = [column for matrix in found for column in matrix.columns]
