@@ -67,32 +67,33 @@ def rates(program: Program, width: int) -> str:
 
 def rows(source: RowPrograms, width: int) -> str:
     """Writes void rows(double *x, double *c, int64 count, double *unit, double *y, double *J, int64 total): for each
-    row i of x (total, n), with row i % count of the numbers c, the values y (total, m) and, if the source has tangents,
-    their slopes J (total, m, n). A vector holds tangents in `width` directions, of the unit matrix (n, n)."""
+    row i of x (total, n), with row i % count of the numbers c, the values y (total, m) and, unless J is null, their
+    slopes J (total, m, n). A vector holds tangents in `width` directions, of the unit matrix (n, n)."""
     made: Any = ir.Function(
         ir.Module("rows"), ir.FunctionType(VOID, [PTR, PTR, I64, PTR, PTR, PTR, I64]), "rows"
     )
     x, c, count, unit, y, J, total = made.args
     b: Any = ir.IRBuilder(made.append_basic_block())
     v, w = _Vectors(b, 1), _Vectors(b, width)
-    n, numbers, m = source.n, source.values.inputs - source.n, source.m
+    n, m, numbers = source.n, source.m, source.values.inputs - source.n
+    asked, last = b.icmp_signed("!=", b.ptrtoint(J, I64), integer(0)), integer(n - width)
     with loop(b, integer(0), total) as i:
-        row = v.load(v.place(x, b.mul(i, integer(n))), range(n))
         known = v.place(c, b.mul(b.urem(i, count), integer(numbers)))
-        found = v.run(source.values, [*row, *v.load(known, range(numbers))])
+        given = v.load(v.place(x, b.mul(i, integer(n))), range(n))
+        found = v.run(source.values, [*given, *v.load(known, range(numbers))])
         v.store(found[:m], v.place(y, b.mul(i, integer(m))), range(m))
-        if source.tangents is not None:
-            zero = ir.Constant(I32, 0)
-            saved = [w.spread(b.extract_element(value, zero)) for value in found[m:]]
-            with loop(b, integer(0), integer(n), width) as begun:
-                # The last vector begins early enough to end with the last direction.
-                last = integer(n - width)
-                first = b.select(b.icmp_signed("<", begun, last), begun, last)
-                along = [w.load_at(unit, b.add(integer(j * n), first)) for j in range(n)]
-                moved = w.run(source.tangents, [*along, *saved])
-                for j, value in enumerate(moved):
-                    place = b.mul(b.add(b.mul(i, integer(m)), integer(j)), integer(n))
-                    w.store_at(value, J, b.add(place, first))
+        with b.if_then(asked), loop(b, integer(0), integer(n), width) as begun:
+            saved = [w.spread(b.extract_element(a, ir.Constant(I32, 0))) for a in found[m:]]
+            # The last vector begins early enough to end with the last direction.
+            first = b.select(b.icmp_signed("<", begun, last), begun, last)
+            here = b.gep(unit, [first], source_etype=F64)
+            to = b.gep(J, [b.add(b.mul(i, integer(m * n)), first)], source_etype=F64)
+            along = [
+                b.load(b.gep(here, [integer(j * n)], source_etype=F64), typ=w.type, align=8)
+                for j in range(n)
+            ]
+            for j, value in enumerate(w.run(source.tangents, [*along, *saved])):
+                b.store(value, b.gep(to, [integer(j * n)], source_etype=F64), align=8)
     b.ret_void()
     return str(made.module)
 
@@ -392,15 +393,6 @@ class _Vectors:
     def store(self, values: Sequence[Value], frame: Value, places: Iterable[int]) -> None:
         for value, i in zip(values, places, strict=True):
             self.builder.store(value, self.place(frame, i), align=8 * self.width)
-
-    def load_at(self, array: Value, index: Value) -> Value:
-        """Loads a vector that begins at any number of an array."""
-        place = self.builder.gep(array, [index], source_etype=F64)
-        return self.builder.load(place, typ=self.type, align=8)
-
-    def store_at(self, value: Value, array: Value, index: Value) -> None:
-        place = self.builder.gep(array, [index], source_etype=F64)
-        self.builder.store(value, place, align=8)
 
     def constant(self, value: float) -> Value:
         return ir.Constant(self.type, [value] * self.width)

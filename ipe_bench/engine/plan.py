@@ -189,7 +189,7 @@ class Recording:
         """What is noted of the start: magnitudes of the states, the side of the poles, and no doubt."""
         at_start = {self.t: self.graph.constant(0.0)} | dict(zip(self.y, self.start, strict=True))
         sizes = [self.graph.apply("add", np.abs(y), 0.0) for y in self.start]
-        return [*sizes, trace.substitute(self.side, at_start), self.graph.constant(0.0)]
+        return [*sizes, *trace.substitute([self.side], at_start), self.graph.constant(0.0)]
 
     def watch(self, formula: Tableau) -> Program:
         """Notes whether a step crossed a pole or was rough, from its length, the states at its end, the slopes of its
@@ -247,7 +247,7 @@ class Recording:
         units = [
             {other: one if other is along else zero for other in directions} for along in directions
         ]
-        return [[trace.substitute(e, unit) for e in tangents] for unit in units]
+        return [trace.substitute(tangents, unit) for unit in units]
 
     def fixed(self, *outputs: Expression) -> list[Expression]:
         """Returns what is computed once for each lane: it depends on the parameters and the case alone."""
@@ -373,9 +373,9 @@ def jumps(equations: Equations) -> bool:
             continue
         gap = graph.apply("sub", *e.operands)
         sides = [
-            trace.substitute(f, {e: graph.constant(side)})
+            f
             for side in (1.0, 0.0)
-            for f in tape.slope
+            for f in trace.substitute(tape.slope, {e: graph.constant(side)})
         ]
         for place, along in enumerate(inputs[: 1 + equations.states]):
             program = Program.of(

@@ -291,15 +291,10 @@ def border(outputs: Sequence[Expression], varying: Collection[Expression]) -> li
     return [distinct[order] for order in sorted(distinct)]
 
 
-def substitute(e: Expression, values: Mapping[Expression, Expression]) -> Expression:
-    """Replaces some inputs of an expression, and simplifies it."""
-    return substituted([e], values)[0]
-
-
-def substituted(
+def substitute(
     outputs: Sequence[Expression], values: Mapping[Expression, Expression]
 ) -> list[Expression]:
-    """Replaces some inputs or numbers of expressions likewise."""
+    """Replaces some inputs or numbers of expressions, and simplifies these."""
     known: dict[Expression, Expression] = {}
     for a in in_order(outputs):
         given = [known[o] for o in operands(a)]
@@ -475,27 +470,20 @@ class RowPrograms:
     n: int
     m: int
     values: Program
-    """y of x and c; behind y, where there are tangents, what these take."""
-    tangents: Program | None
-    """The tangent of y from a direction (n) of x and what `values` have for it."""
+    """y of x and c, and behind y what the tangents take."""
+    tangents: Program
+    """The tangent of y, from a direction (n) of x and what `values` have for it."""
 
     @classmethod
     def of(
-        cls,
-        y: Sequence[Expression],
-        x: Sequence[Expression],
-        c: Sequence[Expression],
-        *,
-        sloped: bool,
+        cls, y: Sequence[Expression], x: Sequence[Expression], c: Sequence[Expression]
     ) -> RowPrograms:
-        if not sloped:
-            return cls(len(x), len(y), Program.of(y, [*x, *c]), None)
         # No formula has a name with a blank in it.
         along = x[0].graph.inputs("along ", len(x))
         moved = tangent(y, dict(zip(x, along, strict=True)))
         saved = border(moved, dependent(moved, along))
-        tangents = Program.of(moved, [*along, *saved])
-        return cls(len(x), len(y), Program.of([*y, *saved], [*x, *c]), tangents)
+        values = Program.of([*y, *saved], [*x, *c])
+        return cls(len(x), len(y), values, Program.of(moved, [*along, *saved]))
 
 
 class Recorded(np.ndarray):

@@ -17,7 +17,7 @@ import numpy as np
 from ipe_bench.basics.errors import describe_exception
 from ipe_bench.basics.linalg import Array, multiply, own
 from ipe_bench.engine.rows import RowFunction
-from ipe_bench.engine.trace import Expression, Graph, Program, Recorded, substituted
+from ipe_bench.engine.trace import Expression, Graph, Program, Recorded, RowPrograms, substitute
 from ipe_bench.measurements.base import differentiate
 from ipe_bench.states.algebra import root
 
@@ -28,8 +28,8 @@ _MOST_OPERATIONS, _MOST_FORMS = 50_000, 8
 """Operations that are recorded at most of a function over all epochs, and forms that it may have there."""
 _DRAWN = 3
 """Paths on which a recorded function is held against the model's own."""
-_AGREES, _ROUND_OFF = 1e-10, 1e-16
-"""Parts of the largest value of an output, and of all outputs, by which these may differ."""
+_AGREES, _SMALL = 1e-10, 1e-6
+"""Part of the size of an output by which the two may differ; no output counts as smaller than a part of the largest."""
 Function = Callable[[Array, int], Array]
 
 
@@ -46,10 +46,25 @@ class Along(NamedTuple):
     """dh/dx (trials, K, m, n)."""
 
 
-class Recording(NamedTuple):
-    """Holds a recorded function of those epochs at which it is the same but for numbers."""
+@dataclass(frozen=True)
+class Own:
+    """A model's own function at one epoch, called as a recorded one is."""
 
-    function: RowFunction
+    function: Function
+    k: int
+
+    def __call__(self, x: Array, _: Array) -> Array:
+        return self.function(x, self.k)
+
+    def slopes(self, x: Array, _: Array) -> tuple[Array, Array]:
+        slope = differentiate(lambda at: self.function(at, self.k), x, analytic=True)
+        return self.function(x, self.k), slope
+
+
+class Recording(NamedTuple):
+    """Holds a function of those epochs at which it is the same but for numbers."""
+
+    function: RowFunction | Own
     epochs: Array
     """(e,)"""
     numbers: Array
@@ -60,72 +75,46 @@ class Recording(NamedTuple):
 class AtEpoch:
     """A function of states x (..., n) at one epoch, which knows its slopes."""
 
-    function: Function
-    k: int
-    recorded: Recording | None = None
-    """That of this epoch alone."""
+    function: RowFunction | Own
+    numbers: Array
+    """(1, p)"""
 
     def __call__(self, x: Array) -> Array:
-        if self.recorded is None or x.dtype.kind == "c":
-            return self.function(x, self.k)
-        rows = own(x.reshape(-1, x.shape[-1]))
-        values = self.recorded.function(rows, self.recorded.numbers)
+        values = self.function(own(x.reshape(-1, x.shape[-1])), self.numbers)
         return values.reshape(*x.shape[:-1], -1)
 
     def slope(self, x: Array) -> tuple[Array, Array]:
         """Computes value (trials, m) and Jacobian (trials, m, n) at x (trials, n)."""
-        if self.recorded is None:
-            return self(x), differentiate(self, x, analytic=True)
-        return self.recorded.function.slopes(own(x), self.recorded.numbers)
+        return self.function.slopes(own(x), self.numbers)
 
 
 @dataclass(frozen=True)
 class EpochFunctions:
-    """f or h of a model at the epochs that have it."""
+    """f or h of a model at all epochs."""
 
-    function: Function
-    epochs: Sequence[int]
-    recordings: Sequence[Recording] = ()
-    """Those of all epochs, or none."""
+    recordings: Sequence[Recording]
     why: str = ""
-    """Why there are none."""
+    """Why it is called epoch by epoch; empty if it is recorded."""
+
+    @classmethod
+    def by_epoch(cls, function: Function, epochs: Sequence[int], why: str = "") -> EpochFunctions:
+        none = np.empty((1, 0))
+        return cls([Recording(Own(function, k), np.array([k]), none) for k in epochs], why)
 
     @cached_property
     def at(self) -> Mapping[int, AtEpoch]:
-        found = {k: AtEpoch(self.function, k) for k in self.epochs}
-        for recorded, epochs, numbers in self.recordings:
-            for i, k in enumerate(epochs.tolist()):
-                one = Recording(recorded, epochs[i : i + 1], numbers[i : i + 1])
-                found[k] = AtEpoch(self.function, k, one)
-        return found
-
-    def held(self, k: int, x: Array) -> EpochFunctions:
-        """Returns these functions, without recordings if that of epoch k differs from the function at x (trials, n)."""
-        one = self.at[k]
-        if one.recorded is None:
-            return self
-        value, slope = AtEpoch(self.function, k).slope(x)
-        recorded = one.slope(x)
-        if agree(one(x), value) and agree(recorded[0], value) and agree(recorded[1], slope):
-            return self
-        why = f"at epoch {k + 1} its recording differs from it by more than {_AGREES:g} of its size"
-        return EpochFunctions(self.function, self.epochs, why=why)
+        return {
+            k: AtEpoch(function, numbers[i : i + 1])
+            for function, epochs, numbers in self.recordings
+            for i, k in enumerate(epochs.tolist())
+        }
 
     def values(self, x: Array) -> Array:
-        """Computes values (trials, e, m) at states x (trials, e, n) of the epochs."""
-        if not self.recordings:
-            parts = [self.at[k](x[:, i]) for i, k in enumerate(self.epochs)]
-            return np.stack(parts, axis=1) if parts else x
+        """Computes values (trials, K, m) at states x (trials, K, n) of the epochs."""
         return self._joined(x, lambda one, rows: (one.function(rows, one.numbers),))[0]
 
     def slopes(self, x: Array) -> tuple[Array, Array]:
-        """Computes values (trials, e, m) and slopes (trials, e, m, n) likewise."""
-        if not self.epochs:
-            return x, np.empty((*x.shape, x.shape[-1]))
-        if not self.recordings:
-            parts = [self.at[k].slope(x[:, i]) for i, k in enumerate(self.epochs)]
-            value, slope = (np.stack(part, axis=1) for part in zip(*parts, strict=True))
-            return value, slope
+        """Computes values (trials, K, m) and slopes (trials, K, m, n) likewise."""
         value, slope = self._joined(x, lambda one, rows: one.function.slopes(rows, one.numbers))
         return value, slope
 
@@ -133,18 +122,35 @@ class EpochFunctions:
         self, x: Array, run: Callable[[Recording, Array], tuple[Array, ...]]
     ) -> list[Array]:
         """Runs each recording on all its epochs at once."""
-        trials, e, n = x.shape
+        trials, K, n = x.shape
         out: list[Array] = []
         for one in self.recordings:
-            places = one.epochs - self.epochs[0]
-            rows = own(x[:, places].reshape(-1, n))
-            found = [part.reshape(trials, len(places), *part.shape[1:]) for part in run(one, rows)]
-            if len(places) == e:
-                return found
-            out = out or [np.empty((trials, e, *part.shape[2:])) for part in found]
+            found = run(one, own(x[:, one.epochs].reshape(-1, n)))
+            out = out or [np.empty((trials, K, *part.shape[1:])) for part in found]
             for whole, part in zip(out, found, strict=True):
-                whole[:, places] = part
+                whole[:, one.epochs] = part.reshape(trials, -1, *part.shape[1:])
         return out
+
+
+class _Written(NamedTuple):
+    """Holds a function as it is recorded at one epoch."""
+
+    y: Sequence[Expression]
+    x: Sequence[Expression]
+    form: tuple[Any, ...]
+    """Its operations and outputs but for the values of constants, which are the same at epochs that can be joined."""
+    constants: Sequence[float]
+
+    @classmethod
+    def of(cls, function: Function, n: int, k: int) -> _Written:
+        graph = Graph()
+        x = graph.inputs("x", n)
+        found = np.asarray(function(Recorded.of(x), k), dtype=object)[0]
+        y = [graph.apply("add", one, 0.0) for one in found]
+        program = Program.of(y, x)
+        constants = [step[1] for step in program.operations if step[0] == "constant"]
+        steps = (step[:1] if step[0] == "constant" else step for step in program.operations)
+        return cls(y, x, (*steps, program.outputs), constants)
 
 
 def recorded_by_epoch(
@@ -157,96 +163,82 @@ def recorded_by_epoch(
         ValueError: it has too many operations or forms.
         Exception: the function does not take expressions.
     """
-    forms: defaultdict[Any, list[tuple[int, Any, list[float]]]] = defaultdict(list)
-    known: dict[int, tuple[Any, Any, list[float]]] = {}
+    forms: defaultdict[Any, dict[int, _Written]] = defaultdict(dict)
+    known: dict[int, _Written] = {}
     operations = 0
     for k in epochs:
         first = alike(k)
         if first not in known:
-            y, x = _record(function, n, k)
-            program = Program.of(y, x)
-            operations += len(program.operations)
-            if operations > _MOST_OPERATIONS:
-                raise ValueError(f"it has more than {_MOST_OPERATIONS} operations over all epochs")
-            steps = [step for step in program.operations if step[0] == "constant"]
-            form = [step[:1] if step[0] == "constant" else step for step in program.operations]
-            known[first] = (*form, program.outputs), (y, x), [value for _, value in steps]
-        form, written, constants = known[first]
-        forms[form].append((k, written, constants))
+            known[first] = _Written.of(function, n, k)
+            operations += len(known[first].form)
+        forms[known[first].form][k] = known[first]
         if len(forms) > _MOST_FORMS:
             raise ValueError(f"it has more than {_MOST_FORMS} forms over all epochs")
+        if operations > _MOST_OPERATIONS:
+            raise ValueError(f"it has more than {_MOST_OPERATIONS} operations over all epochs")
     return [_joined_form(epochs) for epochs in forms.values()]
 
 
-def _record(function: Function, n: int, k: int) -> tuple[list[Expression], list[Expression]]:
-    """Records the function at one epoch: its outputs and its n inputs."""
-    graph = Graph()
-    x = graph.inputs("x", n)
-    y = np.asarray(function(Recorded.of(x), k), dtype=object)
-    return [graph.apply("add", one, 0.0) for one in y[0]], list(x)
-
-
-def _joined_form(epochs: Sequence[tuple[int, Any, list[float]]]) -> Recording:
+def _joined_form(epochs: Mapping[int, _Written]) -> Recording:
     """Joins recordings of one form. All constants become numbers of the epoch, so that other values of a model's
     options need no other machine code."""
-    _, (y, x), first = epochs[0]
+    y, x, _, first = next(iter(epochs.values()))
     graph = x[0].graph
-    c = list(graph.inputs("c", len(first)))
+    c = graph.inputs("c", len(first))
     given = {graph.constant(value): one for value, one in zip(first, c, strict=True)}
-    function = RowFunction.of(substituted(y, given), x, c)
-    places = np.array([k for k, *_ in epochs])
-    numbers = np.array([constants for *_, constants in epochs]).reshape(len(epochs), -1)
-    return Recording(function, places, numbers)
+    function = RowFunction(RowPrograms.of(substitute(y, given), x, c))
+    numbers = np.array([one.constants for one in epochs.values()], dtype=float)
+    return Recording(function, np.array([*epochs]), numbers)
 
 
 def functions_of(model: StateModel) -> tuple[EpochFunctions, EpochFunctions]:
     """Returns f and h of a model, recorded where they can be and then agree with the model's own on drawn paths."""
-    moving = range(0 if model.moved_first else 1, model.epochs)
-    f = _recorded(model.transition, moving, lambda: model.recorded_transition(moving))
-    reading = range(model.epochs)
-    h = _recorded(model.observe, reading, lambda: model.recorded_observation(reading))
-    return _held(model, f, h)
-
-
-def _recorded(
-    function: Function, epochs: Sequence[int], record: Callable[[], list[Recording]]
-) -> EpochFunctions:
-    if not epochs:
-        return EpochFunctions(function, epochs)
-    try:
-        with np.errstate(all="ignore"):
-            return EpochFunctions(function, epochs, record())
-    except Exception as error:  # a model may raise anything where it meets no numbers
-        return EpochFunctions(function, epochs, why=describe_exception(error))
-
-
-def _held(
-    model: StateModel, f: EpochFunctions, h: EpochFunctions
-) -> tuple[EpochFunctions, EpochFunctions]:
-    """Returns f and h, without recordings that differ from the model's own function at some epochs of drawn paths."""
+    every = range(model.epochs)
+    moving = [k for k in every if model.moves(k)]
+    f = _recorded(model.transition, moving, model.recorded_transition)
+    h = _recorded(model.observe, every, model.recorded_observation)
     m, P = model.prior
     spread = root(P)
     draws = np.random.default_rng(0).standard_normal((_DRAWN, spread.shape[1]))
     x = m + multiply(spread, draws)
-    tried = {k for one in (*f.recordings, *h.recordings) for k in _some(one.epochs)}
+    recorded = [one.epochs for each in (f, h) if not each.why for one in each.recordings]
+    tried = {k for epochs in recorded for k in epochs[[0, len(epochs) // 2, -1]].tolist()}
     with np.errstate(all="ignore"):
         for k in sorted(tried):
-            if k in f.at:
-                f = f.held(k, x)
+            if model.moves(k):
+                f = _held(f, model.transition, k, x)
                 x = model.transition(x, k)
-            h = h.held(k, x)
-    return f, h
+            h = _held(h, model.observe, k, x)
+    still = EpochFunctions.by_epoch(lambda x, k: x, [k for k in every if k not in moving])
+    return EpochFunctions([*still.recordings, *f.recordings], f.why), h
 
 
-def _some(epochs: Array) -> list[int]:
-    """Returns the first, a middle and the last one."""
-    return epochs[[0, len(epochs) // 2, -1]].tolist()
+def _recorded(
+    function: Function,
+    epochs: Sequence[int],
+    record: Callable[[Sequence[int]], Sequence[Recording]],
+) -> EpochFunctions:
+    try:
+        with np.errstate(all="ignore"):
+            return EpochFunctions(record(epochs))
+    except Exception as error:  # a model may raise anything where it meets no numbers
+        return EpochFunctions.by_epoch(function, epochs, describe_exception(error))
 
 
-def agree(values: Array, own: Array) -> bool:
-    """Tells whether values (trials, m, ...) are those of the model's own function but for round-off."""
-    size = np.abs(np.nan_to_num(own)).reshape(len(own), own.shape[1], -1).max(axis=(0, 2))
-    allowed = _AGREES * size + _ROUND_OFF * size.max()
-    allowed = allowed.reshape(-1, *[1] * (own.ndim - 2))
-    same = (values == own) | (np.isnan(values) & np.isnan(own))
-    return bool((same | (np.abs(values - own) <= allowed)).all())
+def _held(functions: EpochFunctions, function: Function, k: int, x: Array) -> EpochFunctions:
+    """Returns the functions; by epoch if that of epoch k differs from the model's own at x (trials, n)."""
+    if functions.why:
+        return functions
+    found = functions.at[k].slope(x)
+    right = Own(function, k).slopes(x, x)
+    if agree(found[0], right[0]) and agree(found[1].swapaxes(1, 2), right[1].swapaxes(1, 2)):
+        return functions
+    why = f"at epoch {k + 1} its recording differs from it by more than {_AGREES:g} of its size"
+    return EpochFunctions.by_epoch(function, [*functions.at], why)
+
+
+def agree(values: Array, right: Array) -> bool:
+    """Tells whether values (..., m) are the right ones but for round-off."""
+    size = np.abs(right).reshape(-1, right.shape[-1]).max(axis=0)
+    size = np.maximum(size, _SMALL * size.max())
+    return np.allclose(values / size, right / size, rtol=0, atol=_AGREES, equal_nan=True)

@@ -168,20 +168,15 @@ class StateModel(Component, ABC):
         """f (trials, K, n) and h (trials, K, m) as in `Along`, of paths x (trials, 1 + K, n) that begin before the
         first transition: `evaluations` for each trial."""
         f, h = self.epoch_functions
-        still = 0 if self.moved_first else 1
-        moved = f.values(x[:, still:-1])
-        return np.concatenate([x[:, :still], moved], axis=1), h.values(x[:, 1:])
+        return f.values(x[:, :-1]), h.values(x[:, 1:])
 
     def slopes_along(self, x: Array) -> Along:
         """f and h with their slopes along paths x (trials, 1 + K, n) that begin before the first transition: 1 + n
         times `evaluations` for each trial."""
         f, h = self.epoch_functions
-        still = 0 if self.moved_first else 1
-        moved, F = f.slopes(x[:, still:-1])
+        moved, F = f.slopes(x[:, :-1])
         read, H = h.slopes(x[:, 1:])
-        one = np.broadcast_to(np.eye(self.n), (len(x), still, self.n, self.n))
-        whole = np.concatenate([x[:, :still], moved], axis=1)
-        return Along(whole, read, np.concatenate([one, F], axis=1), H)
+        return Along(moved, read, F, H)
 
     def gain(self, k: int) -> Array:
         """G (n, q) of the step into epoch k; UserError if it depends on the states."""

@@ -14,7 +14,7 @@ from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Finite, NonNegative, Positive
 from ipe_bench.engine.rows import RowFunction
-from ipe_bench.engine.trace import Expression, Graph, Program, dependent, slopes
+from ipe_bench.engine.trace import Expression, Graph, Program, RowPrograms, dependent, slopes
 from ipe_bench.measurements.arithmetic import Arithmetic, parse
 from ipe_bench.measurements.base import Parameter, differentiate
 from ipe_bench.states.along import Recording
@@ -220,7 +220,9 @@ class Formulas(StateModel):
         known = dict(zip((*self.next, *columns, *self.constants), (*x, *c), strict=True))
         known |= dict.fromkeys(self.noise, graph.constant(0.0))
         y = [graph.apply("add", formula(known), 0.0) for formula in formulas.values()]
-        return Recording(RowFunction.of(y, x, c), places, np.ascontiguousarray(np.array(values).T))
+        return Recording(
+            RowFunction(RowPrograms.of(y, x, c)), places, np.ascontiguousarray(np.array(values).T)
+        )
 
     @cached_property
     def _factors(self) -> tuple[dict[str, Expression], list[Expression]]:
