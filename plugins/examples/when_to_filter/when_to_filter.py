@@ -21,7 +21,6 @@ import numpy as np
 import ipe_bench as ib
 from ipe_bench.basics.linalg import Covariance
 from ipe_bench.states import WalkingGins, bound_at_truth, ekf
-from ipe_bench.states.linearisation import slope
 
 WALKS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
 """Multiples of a drift's size (0.01 deg/h about x and y, 0.1 deg/h about z) in an hour."""
@@ -46,7 +45,7 @@ def errors_by_walk(model: WalkingGins) -> np.ndarray:
     S = np.zeros((model.n, 3 * model.epochs))
     rows = []
     for k in range(model.epochs):
-        value, F = slope(lambda at, k=k: model.transition(at, k), x[None])
+        value, F = model.transition_into(k).slope(x[None])
         x, S = value[0], F[0] @ S
         S[:, 3 * k : 3 * k + 3] += replace(model, walk=1.0).gain(k)
         rows.append(S[:2].copy())
