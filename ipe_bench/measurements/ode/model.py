@@ -50,16 +50,24 @@ class OdeMeasurement(Measurement):
     elementary functions and np.where on the entries of their arguments, and nothing that asks for a
     value (no if). z has C order over (case, time, output); a time is an epoch.
 
-    >>> from dataclasses import dataclass >>> from ipe_bench.measurements import Parameter >>>
-    @dataclass(frozen=True) ... class Pendulum(OdeMeasurement):  # released from half a radian ...
-    states, outputs, reading_unit = 2, ("angle",), "rad" ...     tolerance = 1e-9  # of a reading,
-    in the reading's unit ...     parameters = Parameter("length", "m", 0.01), Parameter("damping",
-    "1/s", 0.01)  # x counts in these sizes ...     nominal = np.array([100.0, 0.0])  # about 1 m
-    and no damping ...     times = np.arange(0.5, 10.5, 0.5) ...     def start(self, p, c): ...
-    return 0.5, 0.0 ...     def rhs(self, t, y, p, c): ...         angle, rate = y ...
-    return rate, -9.80665 / p[0] * np.sin(angle) - p[1] * rate ...     def read(self, t, y, p, c):
-    ...         return (y[0],) >>> print(Pendulum().simulate(np.array([[100.0, 0.0]]))[0,
-    3].round(3))  # after 2 s; the period is 2.038 s 0.497
+    >>> from dataclasses import dataclass
+    >>> from ipe_bench.measurements import Parameter
+    >>> @dataclass(frozen=True)
+    ... class Pendulum(OdeMeasurement):  # released from half a radian
+    ...     states, outputs, reading_unit = 2, ("angle",), "rad"
+    ...     tolerance = 1e-9  # of a reading, in the reading's unit
+    ...     parameters = Parameter("length", "m", 0.01), Parameter("damping", "1/s", 0.01)  # x counts in these sizes
+    ...     nominal = np.array([100.0, 0.0])  # about 1 m and no damping
+    ...     times = np.arange(0.5, 10.5, 0.5)
+    ...     def start(self, p, c):
+    ...         return 0.5, 0.0
+    ...     def rhs(self, t, y, p, c):
+    ...         angle, rate = y
+    ...         return rate, -9.80665 / p[0] * np.sin(angle) - p[1] * rate
+    ...     def read(self, t, y, p, c):
+    ...         return (y[0],)
+    >>> print(Pendulum().simulate(np.array([[100.0, 0.0]]))[0, 3].round(3))  # after 2 s; the period is 2.038 s
+    0.497
     """
 
     states: int
