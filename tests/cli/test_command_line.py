@@ -282,7 +282,7 @@ MISTAKES |= {
         f"ipe-bench: state_model={word.rpartition('=')[2]}: states move, and {why}",
     )
     for command, why in (
-        ("design", "design is of constants; the bounds"),
+        ("design", "design is of constants; use `ipe-bench run"),
         ("posterior", "posterior is of constants; use"),
     )
     for word in ("state_model=growth", "+experiment=pendulum_book")
