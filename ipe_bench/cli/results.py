@@ -97,7 +97,7 @@ def report_command(arguments: Sequence[str]) -> int:
         )
     if output is None and len(named) > 1 and not for_paper:
         raise UserError(
-            "report: several directories need output=DIR, as the report on all is not that of the first"
+            "report: several directories need output=DIR, for the report on all of them"
         )
     with opened(named, None if output is None else output / BUNDLES) as folders:
         if for_paper:

@@ -154,7 +154,7 @@ def _there_already(jobs: Jobs) -> list[str]:
     if name != own and name in [option.name for option in options("experiment")]:
         remedy = f"choose another, or write output=outputs/{name} in its place to mix them"
         raise UserError(
-            f"name={name}: is that of an experiment, whose results these would join; {remedy}"
+            f"name={name}: is the name of an experiment, whose results these would join; {remedy}"
         )
     return lines
 

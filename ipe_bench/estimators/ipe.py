@@ -99,7 +99,7 @@ class FrozenSystem:
         if problem.rankless:
             raise np.linalg.LinAlgError(
                 f"measurement={problem.measurement.name}: H has not full column rank at the nominal point: some "
-                "parameters cannot be told apart there, so there is no linear estimate to start from; give another "
+                "parameters cannot be distinguished there, so there is no linear estimate to start from; give another "
                 "nominal point, start=nominal or best for least squares, or an estimator with a prior"
             )
         model, H_plus = (

@@ -274,7 +274,7 @@ def never_switching(formulas: Iterable[Arithmetic], values: Mapping[str, Any]) -
             often = "every" if held.all() else "no"
             words.append(
                 f"measurement.{key}: {comparison[3]} holds at {often} reading,"
-                " so these readings say nothing of the other branch"
+                " so these readings do not test the other branch"
             )
     return words
 

@@ -287,9 +287,7 @@ class _StandIn(Noise):
     """Stands for a noise that draws no errors itself."""
 
     def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
-        raise UserError(
-            f"noise={self.name}: simulates no readings of its own; choose another noise"
-        )
+        raise UserError(f"noise={self.name}: cannot simulate readings; choose another noise")
 
     def covariance(self, m: int) -> Covariance:
         raise UserError(f"noise={self.name}: knows no R of its own; choose another noise")

@@ -52,7 +52,7 @@ def read_sigma(text: str) -> Arithmetic:
     usable = slopes[np.isfinite(slopes).all(axis=1)]
     if len(usable) == 0 or np.linalg.matrix_rank(usable) < len(names):
         raise UserError(
-            f"noise.sigma={text}: no readings tell its levels {', '.join(names)} apart; leave some out"
+            f"noise.sigma={text}: the readings do not distinguish its levels {', '.join(names)}; leave some out"
             f" ({READING} is the reading's magnitude, all other names are levels)"
         )
     return formula

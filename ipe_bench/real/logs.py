@@ -116,7 +116,7 @@ def _read(table: TextTable, model: StateModel) -> Log:
             raise table.error(f"column {name} is missing (the header must be {','.join(wanted)})")
     if columns.get("time", "time") not in ("time", "time [s]"):
         raise table.error(
-            f"column {columns['time']}: the unit must be that of time [s]; convert the values"
+            f"column {columns['time']}: the unit must be s, as in time [s]; convert the values"
         )
     table.require_known(list(columns.values()), wanted)
     if not table.rows:
@@ -146,7 +146,7 @@ def _read(table: TextTable, model: StateModel) -> Log:
         refuse(
             back,
             "time",
-            "is not after that of the row before; give rows in the order of their times",
+            "is not after the time of the row before; give rows in the order of their times",
         )
     model = model.with_log(len(z), {name: cells[name] for name in model.log_inputs})
     if len(z) != model.epochs:
@@ -401,8 +401,8 @@ def found_and_tracked(
     if not np.isfinite(best.error).all():
         message = (
             f"no maximum of the likelihood was found in {', '.join(find)}: the log may not determine all of them; the"
-            f" search ended after {best.evaluations} evaluations at {_written(find, values(best.u))}, and the track is"
-            " that of the model's own values"
+            f" search ended after {best.evaluations} evaluations at {_written(find, values(best.u))}, and the track"
+            " uses the model's own values"
         )
         return replace(
             LogTracks.of(log, label, tracker), message=message, found=NO_MAXIMUM, passes=False
@@ -428,7 +428,7 @@ def found_and_tracked(
             f" {track.white_p:.2g}): the model does not describe the log, and neither values nor errors can be trusted"
         )
     elif any(one.cost - best.cost < _ALIKE for one in others):
-        found, message = SEVERAL_MAXIMA, "the log hardly tells the maxima of the likelihood apart"
+        found, message = SEVERAL_MAXIMA, "the log hardly distinguishes the maxima of the likelihood"
     return replace(
         track,
         constants=[Constant(name, *map(float, numbers)) for name, *numbers in rows],

@@ -134,7 +134,9 @@ class TextTable:
                 raise self.error(
                     f"column {other}: has no unit; call it {name} if that is the unit of its values"
                 )
-            raise self.error(f"column {other}: the unit must be that of {name}; convert the values")
+            raise self.error(
+                f"column {other}: the unit must be the unit of {name}; convert the values"
+            )
 
 
 def _number(text: str) -> float | None:
@@ -507,7 +509,9 @@ def _sigmas(
     if column is None:
         return None
     if _unit(column) not in ("", _unit(shown)):
-        raise table.error(f"column {column}: the unit must be that of {shown}; convert the values")
+        raise table.error(
+            f"column {column}: the unit must be the unit of {shown}; convert the values"
+        )
     cells = table.column(column)
     values = []
     for row, reading in zip(rows, z, strict=True):

@@ -313,7 +313,7 @@ def read_record(path: Path, shape: Any) -> dict[str, Any]:
     if record.get("schema") in range(1, SCHEMA):
         raise Outdated
     if record.pop("digest", None) != _digest(record) or record.get("file") != path.stem:
-        raise Unusable("damaged: is not a whole record of ipe-bench, or that of another file")
+        raise Unusable("damaged: is not a whole record of ipe-bench, or belongs to another file")
     return _shaped(record, shape)
 
 

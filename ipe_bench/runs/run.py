@@ -193,7 +193,7 @@ def _beyond_numbers(scenario: Scenario) -> Iterator[str]:
             parameter.name for i, parameter in enumerate(model.parameters) if not H[:, i].any()
         ]
         where = (
-            f"no reading changes with {', '.join(still)}"
+            f"readings do not change with {', '.join(still)}"
             if still
             else "its Jacobian has not full column rank"
         )

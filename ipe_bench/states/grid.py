@@ -50,9 +50,7 @@ class Grid(Tracker):
         if model.n > 1:
             return f"is exact for one state, and {model.name} has {model.n}; leave it out"
         if model.state_periods:
-            return (
-                f"has no place for a state that comes round, as that of {model.name}; leave it out"
-            )
+            return f"has no place for a periodic state, as in {model.name}; leave it out"
         grids, epochs = self._grids(model), [k for k in range(model.epochs) if model.moves(k)]
         noise = np.sqrt([_COARSE * _variances(model, grids, k).min() for k in epochs])
         if not (noise > 0).all():

@@ -153,7 +153,7 @@ class Tracker(Component, ABC):
         """Says, in words that follow the tracker's label, why it does not suit the model; None if it does. A tracker
         that takes noise by `Q_at` and `R_at` says so by a method of its own."""
         if model.gain_by_state or model.R_by_state:
-            return f"takes noise that is the same at all states, unlike that of {model.name}; leave it out"
+            return f"takes noise that does not depend on the states; in {model.name} it does; leave it out"
         return None
 
     @abstractmethod

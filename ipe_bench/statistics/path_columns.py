@@ -154,7 +154,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "rmse, all epochs",
         "solved trials of trackers",
         "Root mean square error over all epochs; over all states, root mean square of its ratio to the bound at the"
-        " truth. Interval: as that of rmse, over trials.",
+        " truth. Interval: as for rmse, over trials.",
         rmse,
         limits=rmse_limits,
         given="solved",

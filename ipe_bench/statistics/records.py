@@ -102,15 +102,15 @@ STATISTICS: tuple[Statistic, ...] = (
         "failed_known",
         "failed and known",
         "Share of trials without success that the estimator itself reports: it did not converge, its residuals fail"
-        " the test of fit, or several minima or copies fit. The test of a filter of states is that of its innovations,"
-        " that of an iterated smoother the cost of its path, chi-square with as many degrees as there are readings.",
+        " the test of fit, or several minima or copies fit. A filter of states is tested by its innovations, an iterated"
+        " smoother by the cost of its path, chi-square with a degree of freedom per reading.",
         lambda s: f.failed(s, known=True),
         kind="share",
         where=("all_trials",),
     ),
     _all(
         "failed_silent",
-        "failed silently",
+        "undetected failures",
         "Share of trials without success that converged to residuals that fit. These answers are wrong and look right.",
         lambda s: f.failed(s, known=False),
         kind="share",
@@ -133,9 +133,9 @@ STATISTICS: tuple[Statistic, ...] = (
     _all(
         "efficiency_capped",
         "efficiency",
-        f"One over the root mean square of the same, each trial counting at most {f.CAP:g}, so that no single trial"
-        f" decides; {1 / f.CAP:g} where all count that. Interval: as that of rmse, but its lower end is where it would"
-        f" be if a share of trials (95 %) that may be unusual beyond those seen counted {f.CAP:g} each; 0 from"
+        f"One over the root mean square error over the bound, each trial counting at most {f.CAP:g}, so that no single"
+        f" trial decides; {1 / f.CAP:g} where all count that. Interval: as for rmse, but its lower end is where it"
+        f" would be if a share of trials (95 %) that may be unusual beyond those seen counted {f.CAP:g} each; 0 from"
         f" {intervals.RARE} unusual ones on. Unusual is what {intervals.UNUSUAL:g} of normal errors exceed.",
         f.efficiency_capped,
         limits=f.efficiency_capped_limits,
@@ -147,7 +147,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "NEES",
         "Median of e' P⁻¹ e with the covariance P that the estimator reports, over the median of chi-square with n"
         " degrees: 1 if the covariance is right. A value that is not finite counts as infinite. Limits: 95 % of"
-        " medians over as many trials lie between them if the covariance is right.",
+        " medians over this number of trials lie between them if the covariance is right.",
         f.nees_median,
         limits=f.nees_median_limits,
         where=("calibration",),
@@ -227,7 +227,7 @@ STATISTICS: tuple[Statistic, ...] = (
         f" every estimator; above {intervals.LARGEST_SAMPLE} trials, groups of consecutive trials are resampled. None"
         f" for fewer than {FEW} trials. No upper end where larger errors may be unseen (rmse_unseen above 0), and where"
         " a few trials carry the sum of squares: where its effective number of trials, (Σ e²)² / Σ e⁴ (Kish, Survey"
-        f" Sampling, 1965), is less than that of normal errors in all but {100 * intervals.HEAVY:g} % of cases.",
+        f" Sampling, 1965), is less than for normal errors in all but {100 * intervals.HEAVY:g} % of cases.",
         f.of_each(f.rmse),
         limits=f.ends_in_units(f.rmse_ends),
         kind="physical",
@@ -295,9 +295,9 @@ STATISTICS: tuple[Statistic, ...] = (
         "truths drawn from the prior",
         "(E[J' R⁻¹ J] + P₀⁻¹)⁻¹, which no estimator can beat on average over the prior, biased or not (Van Trees,"
         " Detection, Estimation, and Modulation Theory I, 1968, sec. 2.4): standard deviation. The mean E is over"
-        f" {EXPECTED} truths of each seed; its interval, 95 %, is that of this mean, and none where few of them carry"
-        f" it: where their effective number (Kish, Survey Sampling, 1965) is less than {EVEN:g} of them. Of states that"
-        " move: the posterior Cramér-Rao bound (Tichavský, Muravchik and Nehorai, IEEE TSP 46, 1998).",
+        f" {EXPECTED} truths of each seed; its interval, 95 %, holds for this mean, and there is none where few"
+        f" truths carry it: where their effective number (Kish, Survey Sampling, 1965) is less than {EVEN:g} of them."
+        " Of states that move: the posterior Cramér-Rao bound (Tichavský, Muravchik and Nehorai, IEEE TSP 46, 1998).",
         f.of_each(lambda s: f.van_trees(s)[0]),
         limits=f.van_trees_limits,
         kind="physical",
@@ -374,7 +374,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "efficiency",
         "efficiency, solved",
         "Bound over rmse, as standard deviations: 1 for an efficient estimator. The bound is the one at the truth,"
-        " Cramér and Rao's or, for estimators that use a prior, the Bayesian one. Interval: from that of rmse.",
+        " Cramér and Rao's or, for estimators that use a prior, the Bayesian one. Interval: from the interval of rmse.",
         f.efficiency,
         limits=f.efficiency_limits,
         where=("solved_trials",),
@@ -411,7 +411,7 @@ STATISTICS: tuple[Statistic, ...] = (
     _all(
         "q95_abs_error",
         "95 % abs error",
-        "95 % quantile of the same.",
+        "95 % quantile of the absolute error.",
         lambda s: f.error_quantile(s, 0.95),
         kind="physical",
         where=("parameters",),
@@ -446,7 +446,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "converged trials with a reported covariance: a trial that the estimator itself gives up on makes no claim",
         "Whether the reported covariance is right. Overconfident, too cautious: the mean NEES lies significantly (95 %"
         " for all estimators and error scales of a setting together, for errors of any law) above or below n, and below"
-        f" it also with a NEES of {intervals.UNSEEN_NEES:g} n in as many trials as may be unusual and unseen;"
+        f" it also with a NEES of {intervals.UNSEEN_NEES:g} n in the number of trials that may be unusual and unseen;"
         " consistent: neither; undecided: a few trials carry that mean, or it seems to lie below n and rare large"
         f" errors may be missing. None for fewer than {FEW} trials.",
         lambda s: f.verdict_on(s.scalars["nees"], s.n, s),
@@ -466,9 +466,9 @@ STATISTICS: tuple[Statistic, ...] = (
         "p of calibration",
         "converged trials with a reported covariance",
         "Of a parameter, the probability that the distribution of the truth under the reported Gaussian, or of the"
-        " squared error under chi-square, is so far from uniform by chance: both are held against bands that an honest"
-        " one leaves anywhere with a stated probability (Säilynoja, Bürkner and Vehtari, Stat. Comput. 32, 2022), and"
-        " the smaller p is doubled. Of all, the smallest p of the n parameters and of NEES times n + 1 (Bonferroni).",
+        " squared error under chi-square, is so far from uniform by chance: both are compared with bands that a right"
+        " covariance leaves anywhere with a stated probability (Säilynoja, Bürkner and Vehtari, Stat. Comput. 32,"
+        " 2022), and the smaller p is doubled. Of all, the smallest p times n + 1 (Bonferroni).",
         f.calibration_p,
         kind="probability",
         where=("calibration",),
@@ -477,8 +477,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "calibration_excursion",
         "excursion",
         "the same trials",
-        "The largest difference between these distribution functions and the uniform one; over all parameters, that of"
-        " NEES.",
+        "The largest difference between these distribution functions and the uniform one; over all parameters, the"
+        " one of NEES.",
         lambda s: [part.excursion for part in s.calibrations] or np.nan,
         where=("calibration",),
     ),
@@ -486,11 +486,11 @@ STATISTICS: tuple[Statistic, ...] = (
         "calibration",
         "calibration",
         "the same trials",
-        "How the reported covariance lies, where it surely does, at 5 % for an estimator and all its parameters"
+        "How the reported covariance is wrong, if it significantly is, at 5 % for an estimator and all its parameters"
         " together: shifted is the median of error over reported deviation (estimate less truth); most errors larger"
-        " or smaller, the median of its size over that of an honest one, which ignores rare large errors; far"
-        f" outside, the share beyond the quantile that {GATE:g} should lie beyond, after that factor if it is above 1."
-        " Of all, what is said of NEES and of the parameter that is farthest off.",
+        " or smaller, the median of its size over the median for a right covariance, which ignores rare large errors;"
+        f" far outside, the share beyond the quantile that {GATE:g} should lie beyond, after a factor above 1."
+        " Over all parameters: NEES, and the parameter that is farthest off.",
         f.calibration,
         kind="word",
         where=("calibration", "parameters"),
@@ -544,7 +544,7 @@ STATISTICS: tuple[Statistic, ...] = (
     _all(
         "simulations_median",
         "simulations, median",
-        "Median cost of a trial. A Jacobian counts as many simulations as the model says that it costs.",
+        "Median cost of a trial. A Jacobian counts the simulations that the model states.",
         lambda s: quantile(s.cost, 0.5),
         where=("costs",),
     ),

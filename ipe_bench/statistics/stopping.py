@@ -192,7 +192,7 @@ def _reason_to_stop(failed: Sequence[str], widest: Distance, full: bool, late: b
     if widest.ratio <= 1:
         return NARROW
     if full:
-        return "there are as many trials as there may be"
+        return "the largest number of trials is reached"
     return "the time is over" if late else ""
 
 

@@ -107,7 +107,7 @@ VERDICTS = (
         SEVERAL_MAXIMA,
         "several maxima",
         "!",
-        "The log hardly tells several maxima of the likelihood apart.",
+        "The log hardly distinguishes several maxima of the likelihood.",
     ),
 )
 """The words of verdict, those on covariances first."""

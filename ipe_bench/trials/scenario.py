@@ -98,7 +98,9 @@ class Scenario:
         require_numbers(f"prior={self.prior.name}", self.prior.deviation, deviation, (model.n,))
         R = self.noise.nominal_covariance(model)
         if not isinstance(R, Covariance) or R.m != model.m:
-            found = f"that of {R.m} readings" if isinstance(R, Covariance) else type(R).__name__
+            found = (
+                f"a Covariance of {R.m} readings" if isinstance(R, Covariance) else type(R).__name__
+            )
             complaint = f"{definition(self.noise.covariance)} returns {found}"
             raise UserError(
                 f"noise={self.noise.name}: {complaint}; let it return a Covariance of {model.m} readings"

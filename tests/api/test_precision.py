@@ -104,7 +104,7 @@ def test_scenarios_stop_by_themselves():
 
 def test_it_ends_with_the_number_of_trials_or_the_time_and_says_which():
     table = ib.run(BENCH, ESTIMATORS, 120, precision=0.001, block_size=50)
-    assert stop_of(table)["reason"] == "there are as many trials as there may be"
+    assert stop_of(table)["reason"] == "the largest number of trials is reached"
     assert set(table["trials"]) == {120}
     table = ib.run(BENCH, ESTIMATORS, precision=0.001, block_size=50, time_limit=1e-6)
     assert stop_of(table)["reason"] == "the time is over"
@@ -142,7 +142,7 @@ def test_the_command_says_how_many_trials_it_took_and_why(tmp_path, monkeypatch,
     out = capsys.readouterr().out
     assert " trials; every interval is narrow enough (newton: success ± " in out
     assert main(["run", *words, "precision={success:0.05,rmse:0.001}", "trials=200"]) == 1
-    said = "200 trials; the precision is not reached: there are as many trials as there may be (newton: rmse ± "
+    said = "200 trials; the precision is not reached: the largest number of trials is reached (newton: rmse ± "
     assert said in capsys.readouterr().out
     assert main(["run", *words, "precision=0.01", "--dry-run"]) == 0
     assert "at most" in capsys.readouterr().out

@@ -346,7 +346,7 @@ ELSEWHERE = {
     "of stored results": (
         "no estimator is in both",
         "paper=: name tables",
-        "power: is that of",
+        "power: needs a fixed number",
         "report: the run has",
         "{}: a bundle is read",
         "{}: cannot be used",

@@ -18,13 +18,13 @@ def test_tables_and_files_say_the_same(ipe_bench, tmp_path):
     assert (
         err == "ipe-bench: design: --readings: options have no dashes any more; write readings=20\n"
     )
-    assert "what 40 readings say" in out
+    assert "what 40 readings determine" in out
     folder = tmp_path / "outputs" / "design-polynomial"
     found = ib.design(
         ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01)), readings=20
     )
     best = found.ways[0].sharpest
-    assert f"Least observable direction: {found.observability.words}" in out
+    assert f"Worst-determined combination: {found.observability.words}" in out
     assert f"{best.mean_bound:.3f}" in out
     with (folder / "readings.csv").open(newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["choice"] == "sharpest"]

@@ -61,7 +61,7 @@ def test_a_folder_with_results_of_other_settings_is_said_to_hold_them(ipe_bench)
 def test_the_name_of_an_experiment_is_for_the_experiment(ipe_bench):
     code, _, error = ipe_bench("run", *SMALL, "name=headline", "trials=8")
     assert code == 2
-    assert "name=headline: is that of an experiment" in error
+    assert "name=headline: is the name of an experiment" in error
     assert "write output=outputs/headline" in error
     assert not Path("outputs/headline").exists()
     for words in (

@@ -177,7 +177,7 @@ def test_one_case_needs_times_and_readings_alone(tmp_path):
     for heading, remedy in {
         "time,reading [people]": "column time: has no unit; call it time .day. if that is the unit",
         "time [day],reading": "column reading: has no unit; call it reading .people. if",
-        "time [h],reading [people]": "column time .h.: the unit must be that of time .day.; convert",
+        "time [h],reading [people]": "column time .h.: the unit must be the unit of time .day.; convert",
         "t,reading [people]": "there are t, reading .people.; call the times `time .day.`",
     }.items():
         path.write_text(f"{heading}\n{EPIDEMIC}")

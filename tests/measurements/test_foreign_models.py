@@ -182,7 +182,7 @@ def test_a_model_of_another_shape_is_refused_with_the_place_where_it_is_written(
 
 
 def test_readings_that_do_not_change_are_told_of_the_model_and_not_of_the_noise():
-    expected = "^measurement=wrong: no reading changes with c0, c1, c2, c3 at the nominal point"
+    expected = "^measurement=wrong: readings do not change with c0, c1, c2, c3 at the nominal point"
     with pytest.raises(UserError, match=expected):
         validate([Scenario(Wrong(does="constant"), Gaussian(0.1))], LM, 10)
 
@@ -236,7 +236,7 @@ class WrongPrior(GaussianPrior):
         (WrongNoise(1.0, does="masked"), r"WrongNoise\.corrupt returns a MaskedArray"),
         (
             WrongNoise(1.0, does="small"),
-            r"WrongNoise\.covariance returns that of 39 readings; .* Covariance of 40",
+            r"WrongNoise\.covariance returns a Covariance of 39 readings; .* Covariance of 40",
         ),
         (
             WrongNoise(1.0, does="matrix"),

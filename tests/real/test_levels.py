@@ -220,7 +220,7 @@ def test_levels_stand_beside_the_parameters_of_every_estimator():
     )
     assert answer.table()["parameter"].tolist() == ["a", "k", "l", "sigma_0", "sigma_1"] * 2
     shown = str(answer)
-    assert "linear: takes the levels for known" in shown
+    assert "linear: takes the levels of its own residuals as known" in shown
     assert "the size of the residuals cannot test the model" in shown
     assert answer["lm"].fits is None
 
@@ -252,7 +252,7 @@ def test_estimates_with_a_prior_have_the_levels_of_their_residuals():
     )
     assert answer["map"].x == pytest.approx(answer["lm"].x, rel=1e-3)
     assert answer.examination.label == "lm"
-    assert "map: takes the levels for known" in str(answer)
+    assert "map: takes the levels of its own residuals as known" in str(answer)
 
 
 def test_a_column_of_standard_deviations_weighs_the_levels(tmp_path):
@@ -308,9 +308,9 @@ def test_a_parameter_on_its_bound_is_held_there_beside_the_levels():
         ({"sigma": "a + b*h"}, "a is a parameter of the model; give the level another name"),
         (
             {"sigma": "a0 + b0*y"},
-            r"no readings tell its levels a0, b0, y apart; leave some out \(h is the reading",
+            r"the readings do not distinguish its levels a0, b0, y; leave some out \(h is the reading",
         ),
-        ({"sigma": "a*1e400"}, "no readings tell its levels a apart"),
+        ({"sigma": "a*1e400"}, "the readings do not distinguish its levels a;"),
         ({"sigma": "floor + "}, r"noise.sigma: 'floor \+ ' is not a formula"),
         (
             {"by": "output"},

@@ -191,7 +191,7 @@ REFUSED = {
     "x": (text("x,y,sigma", *GOOD[1:]), "column t is missing.*If t is a parameter"),
     "another unit of sigma": (
         text("t,y [V],sigma [mV]", *GOOD[1:]),
-        r"column sigma \[mV\]: the unit must be that of y",
+        r"column sigma \[mV\]: the unit must be the unit of y",
     ),
     "a quote left open": (
         text(*GOOD[:4], '3.5,"0.001,2.0', *GOOD[5:]),

@@ -201,7 +201,7 @@ def test_a_design_has_the_units_of_its_table_and_says_where_candidates_are_what_
     ]
     assert not crowded(ax)
     assert "best choice" not in " ".join(ax.get_legend_handles_labels()[1])
-    said = "The candidates are today's 21 readings, so there is no other choice."
+    said = "The present 21 readings are the only candidates."
     assert said in list(_design_sentences(found))
     assert [part.startswith(said) for part in _ways(found)] == [True]
     fewer = ib.design(

@@ -28,11 +28,11 @@ def draw_audit(found: Audit) -> Iterator[Drawing]:
         style = {"color": FAMILIES["IPE"][0], "alpha": 0.45, "label": "errors"}
         ax.hist(values, bins=30, range=(-FARTHEST, FARTHEST), density=True, **style)
         claimed = np.exp(-0.5 * at**2) / np.sqrt(2 * np.pi)
-        ax.plot(at, claimed, color=BOUND_COLOR, linestyle="--", linewidth=1.0, label="as claimed")
+        ax.plot(at, claimed, color=BOUND_COLOR, linestyle="--", linewidth=1.0, label="as reported")
         ax.set_yticks([])
         common.title(ax, f"{claims.names[i]}: {found.each[i].value:.2f} times")
     common.axis_labels(fig, "error / reported deviation", "")
     common.legend(fig, axes)
     more = f" The {len(chosen)} of {n} parameters farthest from 1." if len(chosen) < n else ""
     caption = f"Errors beyond ±{FARTHEST:g} reported deviations stand at the edge.{more}"
-    yield Drawing("audit", "Errors beside what is claimed", caption, fig)
+    yield Drawing("audit", "Errors beside the reported covariance", caption, fig)

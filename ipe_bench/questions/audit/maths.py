@@ -127,7 +127,7 @@ class Factor:
     def words(self) -> str:
         """Sentence that compares true errors with reported ones."""
         known = self.high < _LARGEST * self.value
-        span = f"{self.low:.2f} to {self.high:.2f}" if known else f"surely more than {self.low:.2g}"
+        span = f"{self.low:.2f} to {self.high:.2f}" if known else f"more than {self.low:.2g}"
         return f"{self.value:.2f} times as large as reported ({span})"
 
 
@@ -338,7 +338,7 @@ def _tails(claims: Claims) -> tuple[float, str]:
         p = float(ndtr(-(largest / usual - 1) * usual / np.sqrt(8 * usual / rows)))
     else:
         p = float((1 + np.sum(_null(_fourth_moment, rows, n) >= largest)) / (1 + _DRAWS))
-    said = f"their fourth moment is {largest / usual:.1f} times that of a normal law."
+    said = f"their fourth moment is {largest / usual:.1f} times the normal one."
     return min(1.0, len(parts) * p), f"Errors have heavier tails than normal ones: {said}"
 
 

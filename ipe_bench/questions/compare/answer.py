@@ -63,7 +63,7 @@ class Comparison(Shown, pd.DataFrame):
             " the radius of the gate of success; cost counts simulations. Both are means over the common trials,"
             " where the table of a run has medians, and errors over the bound. p comes from McNemar's exact test for"
             " success and from random signs for the others, with Holm's correction over all tests. e is evidence that"
-            " may be looked at repeatedly; e = 20 is as rare as p = 0.05. Each interval is that of its row alone."
+            " may be looked at repeatedly; e = 20 is as rare as p = 0.05. Each interval holds for its row alone."
             " Times are not tested."
         )
         margins = ", ".join(f"{name} {margin:g}" for name, margin in self.attrs["margins"].items())
@@ -73,7 +73,7 @@ class Comparison(Shown, pd.DataFrame):
         )
         if self["quantity"].str.match("honesty|bias").any():
             yield (
-                "NEES (honesty) is the squared error over the claimed variance, by the number of parameters, where"
+                "NEES (honesty) is the squared error over the reported variance, by the number of parameters, where"
                 " both converge: right is 1. bias is the mean error in deviations of the bound, where both succeed:"
                 " right is 0."
             )
@@ -213,7 +213,7 @@ def compared_folders(
     _require_known(alpha, tested, widened)
     if plan is not None and "success" not in tested:
         raise UserError(
-            "power: is that of success, which fail_on does not name; add it, or leave out power"
+            "power: concerns success, which fail_on does not name; add it, or leave out power"
         )
     versions = (first, second)
     with opened(first_folders) as one, opened(second_folders or first_folders) as other:

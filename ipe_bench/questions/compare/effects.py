@@ -255,7 +255,7 @@ class PowerPlan:
                 raise UserError(f"{name}={value}: give a number between 0 and 1, such as {example}")
         if anytime:
             raise UserError(
-                "power: is that of a fixed number of trials; leave out anytime, or see precision= of run"
+                "power: needs a fixed number of trials; leave out anytime, or see precision= of run"
             )
         return cls(power, difference)
 

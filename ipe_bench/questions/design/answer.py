@@ -47,7 +47,7 @@ def _best(design: Design) -> Way | None:
 
 
 def _direction(seen: Observability) -> str:
-    return f"{'Least observable direction' if seen.observable else 'The readings do not determine'}: {seen.words}"
+    return f"{'Worst-determined combination' if seen.observable else 'The readings do not determine'}: {seen.words}"
 
 
 def _no_others(design: Design) -> str:
@@ -56,7 +56,7 @@ def _no_others(design: Design) -> str:
     fewer = any(way.saving or way.sharpest.readings != today for way in design.ways)
     if fewer or not design.ways or design.candidates.m != today:
         return ""
-    return f"The candidates are today's {today} readings, so there is no other choice."
+    return f"The present {today} readings are the only candidates."
 
 
 def _design_sentences(design: Design) -> Iterator[str]:
@@ -132,8 +132,8 @@ def design_parts(name: str, design: Design) -> Iterator[Part]:
     yield Strong(_direction(design.observability))
     if told := structure(design.scenario.measurement):
         if not told.lost:
-            yield f"Exact readings would tell all {len(told.unknowns)} parameters from their neighbours."
-        yield from (Strong(f"No data can tell: {sentence}.") for sentence in told.sentences)
+            yield f"Exact readings would determine all {len(told.unknowns)} parameters locally."
+        yield from (Strong(f"Not identifiable: {sentence}.") for sentence in told.sentences)
     yield from _further(design)
     yield from _suspects(design)
     yield from _ways(design)
@@ -161,12 +161,12 @@ def _parameters(name: str, design: Design) -> Table:
             )
         )
     notes = [
-        "bound is that of the standard deviation, as a root mean square over the prior. The correlation with all others"
-        " is the multiple correlation of its error; strongest is that with a single one.",
+        "bound: smallest standard deviation of an unbiased estimator, root mean square over the prior. Correlations of"
+        " the errors: multiple correlation with all others, and the strongest with one other.",
         f"Singular values of the whitened Jacobian, per parameter's size: {short(s[0])} to {short(s[-1])}.",
     ]
     title = f"{name}, {scenario.noise.name}, error scale {scenario.error_scale:g}: what {scenario.measurement.m}"
-    return Table("parameters", f"{title} readings say", "", columns, notes=notes)
+    return Table("parameters", f"{title} readings determine", "", columns, notes=notes)
 
 
 def _suspects(design: Design) -> Iterator[Part]:
@@ -174,16 +174,16 @@ def _suspects(design: Design) -> Iterator[Part]:
         return
     shown = design.suspects[:_MOST_SUSPECTS]
     note = (
-        f"noticed is the share of trials in which the test of fit at {FIT_LEVEL:g} will report the error. It is hidden"
-        " if it makes a parameter wrong by more than its bound and is noticed in less than half. The readings"
-        " hardly change along the unseen direction."
+        f"detected: share of trials in which the test of fit at {FIT_LEVEL:g} reports the error. An error is hidden"
+        " if it makes a parameter wrong by more than its bound and is detected in less than half of the trials. The"
+        " readings hardly change along the unseen direction."
     )
     columns = [
         words("error", [s.name for s in shown]),
         texts("size", [f"{s.deviation:.3g} {s.unit}" for s in shown]),
         words("moves", [s.parameter for s in shown]),
         texts("bounds", [f"{s.bounds:.3g}" for s in shown]),
-        texts("noticed", [percent(s.noticed) for s in shown]),
+        texts("detected", [percent(s.noticed) for s in shown]),
         words("hidden", ["yes" if s.hidden else "" for s in shown]),
         words("unseen direction", [s.words if s.words != s.name else "" for s in shown]),
     ]

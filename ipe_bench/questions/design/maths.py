@@ -169,11 +169,11 @@ def design(
     own = R.whiten_jacobian(model.jacobian(x)) * bounds
     most = model.m if readings is None else readings
     if most < model.n:
-        raise UserError(f"readings={most}: {model.n} parameters want at least as many readings")
+        raise UserError(f"readings={most}: {model.n} parameters need at least {model.n} readings")
     if readings is not None and readings > candidates.m:
         raise UserError(
-            f"readings={readings}: {model.name} has {candidates.m} readings to choose among; give at most as many, or"
-            " make room for more with its options (`ipe-bench list measurement -v`)"
+            f"readings={readings}: {model.name} has {candidates.m} readings to choose among; give at most"
+            f" {candidates.m}, or make room for more with its options (`ipe-bench list measurement -v`)"
         )
     judge = _Judge(criterion, np.matmul(slopes.swapaxes(1, 2), slopes))
     if np.isfinite(value := judge.value(np.matmul(own.swapaxes(1, 2), own))):
@@ -185,7 +185,7 @@ def design(
     if readings is not None and not ways:
         titles = " or ".join("by " + " and ".join(chosen) for chosen in columns)
         raise UserError(
-            f"readings={readings}: no choice {titles} of so few determines all parameters, or there are fewer than"
+            f"readings={readings}: choices {titles} of so few do not determine all parameters, or there are fewer than"
             f" {_FEW} to choose among; give more readings, or choose by other columns"
         )
     more = _further(scenario, today, x)

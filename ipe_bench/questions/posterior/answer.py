@@ -67,12 +67,11 @@ def posterior_parts(name: str, found: Sequence[Reference]) -> list[Table]:
 
 def _notes(found: Sequence[Reference]) -> Iterator[str]:
     yield (
-        "divergence is that of the estimator's Gaussian from the moments of the posterior, in nats; noise is"
-        " the same between two populations of particles, so a divergence below it is chance. shift is that of the"
-        " mean, in standard deviations of the posterior per root of the number of parameters. width is the geometric"
-        " mean of the standard deviations over those of the posterior. energy is the distance between draws. An"
-        f" estimate is honest if there is a single mode, the divergence is at most {HONEST:g} or twice the noise, and"
-        f" the energy is at most {SAME_LAW:g}."
+        "divergence: KL divergence of the estimator's Gaussian from the moments of the posterior, in nats; noise: its"
+        " value between two populations of particles, so a smaller divergence is chance. shift: difference of the"
+        " means, in standard deviations of the posterior per root of the number of parameters. width: geometric mean"
+        " of the ratios of standard deviations. energy: distance between draws. A Gaussian is adequate if there is a"
+        f" single mode, the divergence is at most {HONEST:g} or twice the noise, and the energy at most {SAME_LAW:g}."
     )
     for one in found:
         if not one.posterior.settled:

@@ -25,7 +25,7 @@ NAMES = {
     "headline": "success, error and reported covariance of all trials",
     "matrix": "success of every estimator at every error scale, best first",
     "distributions": "distribution functions of the error, a panel per error scale",
-    "calibration": "distribution of NEES beside that of an honest covariance",
+    "calibration": "distribution of NEES beside the one for a right covariance",
     "cost_against_accuracy": "median cost against the error that 95 % of trials stay below",
     "convergence": "how iterates approach their limit, a panel per estimator",
     "parameter_errors": "root mean square error of each parameter and its bound; figure_2 and 3 of the paper's setting",

@@ -132,7 +132,7 @@ def draw_panels(
     words |= {"trials": "solved_trials"} if view.moving else {}
     least = 0.01 if view.moving else 0.5  # smoothers are far below the filter's bound
     common.decades(axes[1], capped[["error_median", "error_q95"]].clip(lower=least), least=4.0)
-    best = f"1: {view.reference}, an honest covariance"
+    best = f"1: {view.reference}, a right covariance"
     common.bound_line(axes[1], 1.0, best)
     common.curves(
         axes[1], rows, "error_median", *shown, interval=("error_median", "error_q95"), **words
@@ -142,7 +142,9 @@ def draw_panels(
         common.bound_line(nees, 1.0, best)
         low, high = (claims[name] for name in _LIMITS)
         if low.notna().any():
-            common.band(nees, low.min(), high.max(), "95 % limits of the median if honest")
+            common.band(
+                nees, low.min(), high.max(), "95 % limits of the median if the covariance is right"
+            )
         mean = "mean over all epochs" if view.moving else "median"
         words = {"heading": "NEES", "label": mean, "most": CEILING["nees_median"]}
         common.curves(nees, claims, "nees_median", *shown, **words)

@@ -187,7 +187,7 @@ def draw_tracks(view: View) -> Iterator[Drawing]:
     first, ax = rows[rows["parameter"] == states[0]], axes[-1]
     common.lines(ax, first, "at", "nees", look, legend=False)
     low, high = (first[f"nees_{end}_if_honest"].iloc[0] for end in ("low", "high"))
-    common.band(ax, low, high, "limits of an honest covariance, 95 %")
+    common.band(ax, low, high, "95 % limits for a right covariance")
     common.decades(ax, first["nees"])
     common.title(ax, "NEES")
     ax.set(xlabel="time [s]", ylabel="NEES / n")

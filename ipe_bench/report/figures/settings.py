@@ -165,7 +165,7 @@ def _rows(
             common.shares(ax)
         else:
             common.decades(ax, np.append(part[second], 1.0), least=4.0)
-            common.bound_line(ax, 1.0, "1: an honest covariance")
+            common.bound_line(ax, 1.0, "1: a right covariance")
         heading = "misfit detected" if of_truth else f"NEES of {groups[0][0]}"
         test = f"share of trials, test of fit at {FIT_LEVEL:g}"
         words: Any = {"heading": heading, "label": test if of_truth else "median"}

@@ -129,7 +129,7 @@ class Answer(Shown):
     def parts(self) -> Iterator[Part]:
         found, one = structure(self.model), self.examination
         yield from (
-            Strong(f"No data can tell: {sentence}.")
+            Strong(f"Not identifiable: {sentence}.")
             for sentence in (found.sentences if found else ())
         )
         if lacking := next(
@@ -165,7 +165,7 @@ class Answer(Shown):
         tests = (
             "every test"
             if passing[0].fits
-            else "what tests there are, none of the size of the residuals"
+            else "the available tests; the size of the residuals is not tested, for the noise level is unknown"
         )
         found = [f"Passing {tests}: {labels}{f'; no answer: {others}' if others else ''}."]
         told = self.examination
@@ -250,9 +250,9 @@ def _verdicts(answer: Answer) -> Table:
 def _notes(answer: Answer) -> Iterator[str]:
     fits = answer.fits
     yield (
-        f"An estimate fits if p of chi-square is at least {FIT_LEVEL:g}. white p is that of the Ljung-Box test; it is"
-        " small if successive residuals resemble each other. deviation is the standard deviation of the residuals, in"
-        " the unit of the readings."
+        f"An estimate fits if p of chi-square is at least {FIT_LEVEL:g}. white p: p-value of the Ljung-Box test,"
+        " which is small if successive residuals resemble each other. deviation is the standard deviation of the"
+        " residuals, in the unit of the readings."
     )
     yield from (f"{one.label}: {one.message}" for one in fits if one.message)
     for one in fits:
@@ -263,8 +263,8 @@ def _notes(answer: Answer) -> Iterator[str]:
         if one.held_at:
             at = {one.model.physical_parameters[k].name: value for k, value in one.held_at.items()}
             yield (
-                f"{one.label}: on its bound: {_values(at)}; the readings want it beyond. It has no error, and those of"
-                " the others are with it held there."
+                f"{one.label}: on its bound: {_values(at)}; the readings favour a value beyond. It has no error, and"
+                " the errors of the others hold it there."
             )
     if any(one.levels for one in fits):
         yield (
@@ -274,10 +274,10 @@ def _notes(answer: Answer) -> Iterator[str]:
             " instruments."
         )
         if known := [one.label for one in fits if one.estimated and not one.estimated.maximal]:
-            yield f"{', '.join(known)}: takes the levels for known, which are those of its own residuals."
+            yield f"{', '.join(known)}: takes the levels of its own residuals as known."
     elif any(one.level is not None for one in fits):
         yield (
-            "The noise level is estimated from the residuals. Standard errors are scaled by it, intervals are those of"
+            "The noise level is estimated from the residuals. Standard errors are scaled by it, intervals use"
             " Student's t, and the size of the residuals cannot test the model."
         )
     if suspect := [one.label for one in fits if one.level is not None and one.white_p < FIT_LEVEL]:
@@ -308,7 +308,7 @@ def _notes(answer: Answer) -> Iterator[str]:
     if answer.left_out:
         yield f"Left out on purpose: columns {answer.left_out}."
     if failing := [one.label for one in fits if not one.passes]:
-        yield f"In brackets: {', '.join(failing)}. Not an answer: errors are not given, for they would be wrong."
+        yield f"Values in brackets do not fit, and have no standard errors: {', '.join(failing)}."
 
 
 def _values(values: Mapping[str, float], figures: int = 6) -> str:
@@ -416,7 +416,8 @@ def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator
         ends = [
             f"{name} {_interval(low, high, x)}" for name, low, high, x in compress(rows, found.bent)
         ]
-        yield f"The fit is curved: trust the {100 * CONFIDENCE:.0f} % intervals of profiles, {enumerate_few(ends, 3)}."
+        level = f"{100 * CONFIDENCE:.0f} %"
+        yield f"The model is strongly nonlinear here: use the {level} profile intervals, {enumerate_few(ends, 3)}."
     if unlimited := list(compress(names, np.any(np.isinf(found.profiles), axis=0))):
         yield f"The readings set no limit to one side of {', '.join(unlimited)}."
     if lost := list(compress(names, np.any(np.isnan(found.profiles), axis=0))):
@@ -433,7 +434,7 @@ def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator
         yield f"Without the reading {where} a parameter would move by {shift[i]:.1f} standard errors."
     drawn, converged = found.bootstrap.drawn, found.bootstrap.converged
     if converged < drawn:
-        yield f"Bootstrap: {drawn - converged} of {drawn} simulated sets of readings have no answer."
+        yield f"Bootstrap: {drawn - converged} of {drawn} simulated sets of readings gave no estimate."
 
 
 def _changed(names: Sequence[str], x: Array, y: Array, errors: Array) -> str:

@@ -154,8 +154,8 @@ DEFINITIONS: dict[str, str] = {
     " correction over the pairs of a scenario (Scandinavian Journal of Statistics 6, 1979).",
     "p of success": "McNemar's exact test on the trials in which only one of the two succeeds (Psychometrika 12,"
     " 1947), with Holm's correction.",
-    "may be the best (bold)": "No rival succeeds significantly more often in the same trials, by the gate of the"
-    " Cramér-Rao bound for all: McNemar's exact one-sided test against every rival at 5 % over their number, which"
-    " leaves a true best out in at most 5 % of scenarios (Hsu, Annals of Statistics 9, 1981). No name is bold if no"
-    " estimator is beaten.",
+    "may be the best (bold)": "Other estimators do not succeed significantly more often in the same trials, by the"
+    " gate of the Cramér-Rao bound for all: McNemar's exact one-sided test against every rival at 5 % over their"
+    " number, which leaves a true best out in at most 5 % of scenarios (Hsu, Annals of Statistics 9, 1981). No name"
+    " is bold if no estimator is beaten.",
 }

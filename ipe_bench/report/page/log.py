@@ -93,7 +93,7 @@ class LogAnswer(Shown):
             " mean square. A smoother has none: it is judged by the cost of its path, and one behind a filter by NIS"
             " and whiteness of that filter. If the model is right both are chi-square with a degree per reading, and"
             " fit p is the probability of larger ones. Innovations are white if the filter is right (Ljung and Box)."
-            " The verdict is on innovations alone: an error that no reading shows, such as the turn of a whole map,"
+            " The verdict is on innovations alone: an error that readings do not show, such as the turn of a whole map,"
             " leaves them as they are. A track is lost from the epoch from which most of them are larger than all but"
             " one in a million by chance. A dash: the tracker has none of it."
         )
@@ -105,8 +105,8 @@ class LogAnswer(Shown):
             )
         if any(one.constants for one in found):
             note += (
-                f" Constants are those of the largest likelihood that {SEARCHES} searches found. Since they were"
-                " found by the innovations, the mean square of these hardly tests the model; whiteness does."
+                f" Constants have the largest likelihood that {SEARCHES} searches found. Since innovations determined"
+                " them, the mean square of innovations hardly tests the model; whiteness does."
             )
         ends = [
             words("state", [state.name for state in states]),
@@ -177,7 +177,7 @@ def write_tracks(
         for word in verdicts
     }
     listed = "; ".join(f"{who} {shown(word)}" for word, who in found.items())
-    said = [f"Judged by innovations or the cost of a path: {listed}."] if found else []
+    said = [f"Tested by innovations or the cost of a path: {listed}."] if found else []
     told = {"facts": facts, "sources": read_from(provenance)}
     files = write_files(
         folder,

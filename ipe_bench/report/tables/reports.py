@@ -33,14 +33,14 @@ _OPEN = (
 _RECORDED: dict[Where, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
     "tracks": (
         "States over all epochs",
-        "Over all epochs; all: root mean square over the states, each over that of the filter linearised at the true"
-        " path for filters, and of the smoother behind it for smoothers, which use later readings too; about 1 is good"
+        "Over all epochs; all: root mean square over the states, relative to the filter linearised at the true path,"
+        " or for smoothers, which use later readings too, to the smoother behind it; about 1 is good"
         f" for either.{_OPEN}",
         lambda rows: rows["path_rmse"].notna(),
     ),
     "costs": (
         "Costs",
-        "Over all trials, medians where no mean is named; a Jacobian counts as many simulations as its model states."
+        "Over all trials, medians where no mean is named; a Jacobian counts the simulations that its model states."
         " The cost to 0.05 σ of the limit and the order are over the converged trials with a stored history.",
         lambda rows: rows["trials"] > 0,
     ),
@@ -82,8 +82,8 @@ _RECORDED: dict[Where, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
         "Theory beside experiment",
         "Estimators that minimise the sum of squares, over solved trials, in the parameters' own units; all: over the"
         " linear bound, root mean square over parameters. The theory uses the Jacobians of the models and no draw of"
-        " noise; if readings come from another model than the assumed one, it uses those of both. Linear theory holds"
-        f" if the relative curvatures are below 0.3.{_OPEN}",
+        " noise; if readings come from another model than the assumed one, it uses the Jacobians of both. Linear"
+        f" theory holds if the relative curvatures are below 0.3.{_OPEN}",
         lambda rows: rows["predicted_rmse"].notna(),
     ),
     "iterations": (
@@ -242,7 +242,7 @@ def _digits(digits: pd.DataFrame) -> list[Table]:
     """Returns the mean digits of an estimator from each start, the most first, and its digits per data set."""
     caption = (
         "Log relative error against the certified answer, at most 11. It is the smallest over the parameters of a data"
-        " set, the smallest over their standard deviations, and that of the residual sum of squares."
+        " set, the smallest over their standard deviations, and the error of the residual sum of squares."
     )
     columns = [
         words("data set", digits["dataset"]),

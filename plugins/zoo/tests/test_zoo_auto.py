@@ -77,7 +77,7 @@ def test_a_singular_start_is_not_a_problem_without_an_answer():
     problem = Problem(model, model.recorded.R)
     z = model.recorded.z[None]
     with pytest.raises(
-        np.linalg.LinAlgError, match=r"cannot be told apart there.*start=nominal or best"
+        np.linalg.LinAlgError, match=r"cannot be distinguished there.*start=nominal or best"
     ):
         Newton().estimate(problem, z)
     for estimator in (LeastSquares(), LevenbergMarquardt(start="best")):
