@@ -102,8 +102,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "failed_known",
         "failed and known",
         "Share of trials without success that the estimator itself reports: it did not converge, its residuals fail"
-        " the test of fit, or several minima or copies fit. A filter of states is tested by its innovations, an iterated"
-        " smoother by the cost of its path, chi-square with a degree of freedom per reading.",
+        " the test of fit, or several minima or copies fit. A filter of states is tested by its innovations, an"
+        " iterated smoother by the cost of its path, chi-square with a degree of freedom per reading.",
         lambda s: f.failed(s, known=True),
         kind="share",
         where=("all_trials",),

@@ -420,7 +420,7 @@ def test_states_that_move_have_words_of_their_own(tmp_path):
     assert ratio > 1.25
     page = write_report([tmp_path], tmp_path / "out").report.read_text(encoding="utf-8")
     body = page.partition("</main>")[0].partition('id="definitions"')[0]
-    assert "30 readings at 30 epochs tell 2 states that move: " in body
+    assert "2 moving states are estimated from 30 readings at 30 epochs: " in body
     shown = re.sub(r"base64,[^\"]*", "", body)
     for words in (
         "1 is the best",

@@ -47,25 +47,23 @@ _HEAD = 4
 _WIDE_ENOUGH = 100
 """Letters of a screen with room for failures, and for verdicts spelt out."""
 _LEGEND = (
-    "success: % of all trials (95 % interval; bold: no other succeeds significantly more often; nothing is bold where"
-    " this holds of all){failed}; error: median / 95 % quantile over {reference}; efficiency and NEES (median): 1 is"
-    " right{sign}; cost: simulations of a trial, median/mean where they differ; time: mean of a trial. More: ipe-bench"
-    " list statistic."
+    "success: % of all trials (95 % interval); bold: not significantly worse than the best, unless this holds for all"
+    "{failed}; error: median / 95 % quantile over {reference}; efficiency, NEES (median): 1 is ideal{sign}; cost:"
+    " simulations of a trial, median/mean if they differ; time: mean of a trial. More: ipe-bench list statistic."
 )
-_FAILED = "; failed: known / silent"
+_FAILED = "; failed: known / undetected, %"
 _SIGNS = (
-    "; verdict: is the reported covariance right, by the mean NEES of the converged trials",
+    "; verdict: is the reported covariance right?",
     f", {', '.join(f'{word.sign} {word.shown}' for word in VERDICTS[:4])}",
 )
 _TOLD = (
-    "With noise=unknown every estimator here is given R, that of the true levels at the nominal readings; bounds and"
-    " success are those of parameters that are estimated together with the levels."
+    "With noise=unknown every estimator here assumes R with the true levels at the nominal readings; bounds and success"
+    " hold for parameters that are estimated together with the levels."
 )
 TRACKED = (
-    "For states that move, all of this is of the last epoch, where filters and smoothers have the same readings:"
-    " success is the share of trials whose error there lies within all but one in a million of the covariance of the"
-    " filter linearised at the true path. The whole path is in the table of all epochs, where filters and smoothers"
-    " have bounds of their own. Cost counts evaluations of transition and reading."
+    "States that move: all columns hold at the last epoch, where filters and smoothers have the same readings. Success:"
+    " the error lies in the gate (all but one in a million) of a filter linearised at the true path. The table of all"
+    " epochs has the whole path. Cost: evaluations of transition and reading."
 )
 """References of a track's errors."""
 
