@@ -278,7 +278,7 @@ def test_mistakes_are_one_line():
 def test_fewer_readings_than_the_smallest_choice_has_are_refused():
     """Rounds have seven readings each."""
     with pytest.raises(
-        ib.UserError, match="readings=5: no choice by round of so few determines all parameters"
+        ib.UserError, match="readings=5: choices by round of so few do not determine all parameters"
     ):
         ib.design(scenario(ib.measurements.Ranging()), by=["round"], readings=5)
     (way,) = ib.design(scenario(ib.measurements.Ranging()), by=["round"], readings=7).ways
