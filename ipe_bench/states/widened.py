@@ -11,6 +11,8 @@ from ipe_bench.states.whole_paths import PathDensity, Settled, Tangents
 
 _FAR = 3.0
 """Standard deviations from the path at which the cost is looked at."""
+_NORMAL = 0.05
+"""Part of its rise by which a cost there may differ from that of a normal density before it is followed."""
 _MOST = 100.0
 """Times its variance that a direction gets at most."""
 _NUMBERS = 2e7
@@ -43,29 +45,34 @@ def _of_some(
     _, inverse = principal(P[:, -1])
     unit = np.zeros((trials, epochs, 2, n, n))
     unit[:, -1, 1] = transposed(inverse)
-    # Column i moves the last states by a deviation along axis i, and the path as the affine model has it.
-    lines = density.solved(tangents, unit)
-    sides = np.concatenate([lines, -lines], axis=-1)
-    rows = np.repeat(np.arange(trials), 2 * n)
-    every, about = density.subset(rows), take(tangents, rows)
-    moved = every.settled(at.x[rows] + _FAR * _as_rows(sides))
-    left = every.left(about, moved).reshape(trials, 2 * n, epochs, 2, n)
-    step = density.solved(tangents, np.moveaxis(left, 1, -1))
-    # What the step would move along the axis itself is taken back.
-    along = np.concatenate([inverse, inverse], axis=1)
-    back = np.sum(transposed(along) * step[:, -1], axis=1)
-    step = step - np.concatenate([lines, lines], axis=-1) * back[:, None, None]
-    followed = every.settled(moved.x + _as_rows(step))
-    costs = np.stack([moved.cost, followed.cost]).reshape(2, trials, 2, n)
-    extra = _rarer(costs.min(axis=0) - at.cost[:, None, None])
-    extra[(lines == 0).all(axis=(1, 2))] = 0.0  # what is known exactly
-    right = (costs[1] <= costs[0]).all(axis=1)
-    bend = (step[..., :n] + step[..., n:]) / (2 * _FAR**2)
-    bend = np.where(right[:, None, None], bend, 0.0)
+    # Row i moves the last states by a deviation along axis i, and the path as the affine model has it.
+    lines = np.moveaxis(density.solved(tangents, unit), -1, 1)
+    sides = np.stack([lines, -lines], axis=1).reshape(-1, epochs, n)
+    owner, axis = np.repeat(np.arange(trials), 2 * n), np.tile(np.arange(n), 2 * trials)
+    moved = density.subset(owner).settled(at.x[owner] + _FAR * sides)
+    cost, calls, bends = moved.cost, moved.calls, np.zeros(sides.shape)
+    known = (sides == 0).all(axis=(1, 2))
+    rise = cost / _FAR**2 - at.cost[owner] / _FAR**2
+    rows = np.flatnonzero(~known & ~(np.abs(rise - 1.0) <= _NORMAL))
+    if rows.size:
+        own = owner[rows]
+        some, there = density.subset(own), take(moved, rows)
+        step = some.step(take(tangents, own), there)
+        # What the step would move along the axis itself is taken back.
+        back = np.sum(inverse[own, axis[rows]] * step[:, -1], axis=1)
+        step = step - lines[own, axis[rows]] * back[:, None, None]
+        followed = some.settled(there.x + step)
+        lower = followed.cost <= there.cost
+        bends[rows[lower]] = step[lower]
+        cost[rows[lower]] = followed.cost[lower]
+        calls[rows] += followed.calls
+    extra = _rarer((cost - at.cost[owner]).reshape(trials, 2, n))
+    extra[known.reshape(trials, 2, n)[:, 0]] = 0.0
+    bend = bends.reshape(trials, 2, n, epochs, n).sum(axis=1) / (2 * _FAR**2)
     # E t^4 = 3 of a standard normal t.
-    wide = np.concatenate([np.sqrt(extra)[:, None, None] * lines, np.sqrt(3.0) * bend], axis=-1)
-    calls = (moved.calls + followed.calls).reshape(trials, 2 * n).sum(axis=1)
-    return P + np.matmul(wide, transposed(wide)), calls
+    wide = np.concatenate([np.sqrt(extra)[..., None, None] * lines, np.sqrt(3.0) * bend], axis=1)
+    wide = np.moveaxis(wide, 1, -1)
+    return P + np.matmul(wide, transposed(wide)), calls.reshape(trials, -1).sum(axis=1)
 
 
 def _rarer(rise: Array) -> Array:
@@ -73,9 +80,3 @@ def _rarer(rise: Array) -> Array:
     least = _FAR**2 / _MOST
     ratio = _FAR**2 / np.fmax(rise, least).min(axis=1)
     return np.maximum(ratio, 1.0) - 1.0
-
-
-def _as_rows(columns: Array) -> Array:
-    """Paths (trials r, 1 + K, n) of those in columns (trials, 1 + K, n, r)."""
-    rows = np.moveaxis(columns, -1, 1)
-    return rows.reshape(-1, *rows.shape[2:])
