@@ -202,6 +202,27 @@ def test_a_phone_never_scrolls_the_page_sideways(browser, page_file):
     assert browser.run(f"{box}.getBoundingClientRect().right") <= 390
 
 
+def test_title_matrix_and_figure_stand_on_the_first_printed_page(browser, tmp_path):
+    """An A4 page upright: 210 by 297 mm less two margins of 12 mm, at 96 pixels an inch."""
+    width, height = (round((side - 24) / 25.4 * 96) for side in (210, 297))
+    store = Synthetic(tmp_path)
+    fill(store, labels=("linear_lse", *(f"estimator_{i}" for i in range(9))))
+    browser.go(write_report([store.directory], store.directory).report)
+    browser.call("Emulation.setEmulatedMedia", media="print")
+    shape = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+    browser.call("Emulation.setDeviceMetricsOverride", **shape)
+    try:
+        boxes = "['h1', '.matrix', '#figure-headline'].map(s => document.querySelector(s)"
+        places = browser.run(
+            f"{boxes}.getBoundingClientRect()).map(b => [b.top, b.bottom, b.right])"
+        )
+    finally:
+        browser.call("Emulation.setEmulatedMedia", media="")
+    assert all(low < high <= height for low, high, _ in places)
+    assert all(right <= width for *_, right in places)
+    assert [place[0] for place in places] == sorted(place[0] for place in places)
+
+
 def test_it_prints_and_the_answer_on_a_few_pages(browser, page_file, desktop):
     assert len(re.findall(rb"/Type\s*/Page\b", desktop.pdf())) <= 60
     # Nothing runs off the paper: 297 mm less two margins of 12 mm, at 96 pixels an inch.

@@ -3,6 +3,7 @@ number that is swept."""
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -15,10 +16,9 @@ from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.errors import BARS, draw_panels
 from ipe_bench.report.figures.views import Figure, View, in_focus
-from ipe_bench.report.style import BOUND_COLOR, FAMILIES, Look
+from ipe_bench.report.style import BOUND_COLOR, FAMILIES, SOFT, Look
 from ipe_bench.report.words import brief, enumerate_few, percent, value_text
 from ipe_bench.runs.provenance import TARGET
-from ipe_bench.trials.thresholds import FIT_LEVEL
 
 if TYPE_CHECKING:
     from ipe_bench.statistics.collect import Collection
@@ -34,7 +34,9 @@ _ALIKE = 0.05
 """Part by which the errors of estimators in one panel differ at most."""
 _MOST_ERROR = 1e4
 """Errors beyond are drawn here."""
-_LETTERS = 44
+_WIDTH = 6.0
+"""Inches of the figure at least."""
+_LETTERS = 28
 """Length of a line of a setting's name."""
 _COLORS = {
     "right": FAMILIES["IPE"][3],
@@ -135,22 +137,22 @@ def _swept(
 def _rows(
     view: View, rows: pd.DataFrame, varying: Sequence[str], scale: float
 ) -> Iterator[Drawing]:
-    """Draws a row for each setting, a panel of errors for estimators that are alike, and beside them how often the
-    misfit is detected if readings come from other models, else NEES."""
+    """Draws a row for each setting, a panel of errors for estimators that are alike, with the share of trials in which
+    the misfit is detected if readings come from other models; else a panel of NEES."""
     error = rows.pivot_table("error_median", "setting", "estimator")
     error = error.loc[error.median(axis=1).sort_values().index[::-1]].iloc[:MOST_ROWS]
-    groups = _groups(error)
+    groups = _groups(error)[:MOST_GROUPS]
     of_truth = any(c.partition(".")[0] == "truth" for c in varying) and rows["misfit"].notna().any()
-    second = "misfit" if of_truth else "nees_median"
+    judged = not of_truth and rows["nees_median"].notna().any()
     detected = rows.groupby("setting")["misfit"].median()
     kinds = [_kind(name, detected[name]) if of_truth else "" for name in error.index]
     look = {n: Look(_COLORS[kind], "o") for n, kind in zip(error.index, kinds, strict=True)}
-    shown = groups[:MOST_GROUPS]
-    claims = rows[second].notna().any()
-    fig, axes = common.panels(len(shown) + bool(claims), look, scales=[scale], row=MOST_GROUPS + 1)
-    lines = [_wrapped(name) for name in look]
-    fig.set_figheight(1.2 + sum(0.1 + 0.17 * (1 + line.count("\n")) for line in lines))
-    for group, ax in zip(shown, axes, strict=False):
+    lines = [textwrap.fill(name, _LETTERS).replace("$", r"\$") for name in look]
+    fig, axes = common.panels(len(groups) + bool(judged), look, scales=[scale], row=2)
+    height = 1.2 + sum(0.1 + 0.17 * (1 + line.count("\n")) for line in lines)
+    fig.set_figheight(height * -(-len(axes) // 2))
+    fig.set_figwidth(max(fig.get_figwidth(), _WIDTH))
+    for group, ax in zip(groups, axes, strict=False):
         part = rows[rows["estimator"] == group[0]]
         common.decades(ax, part["error_median"].clip(upper=_MOST_ERROR), ends=part["error_q95"])
         common.bound_line(ax, 1.0, f"1: {view.reference}")
@@ -158,22 +160,18 @@ def _rows(
         ends["label"] = f"error over {view.reference}"
         common.curves(ax, part, "error_median", look, [scale], by="setting", **ends)
         ax.set_title(_who(group, error).replace("$", r"\$"))
-        _write_values(ax, part, "error_median", look, brief)
-    if claims:
-        part, ax = rows[rows["estimator"] == groups[0][0]], axes[-1]
+        _write_values(ax, part, "error_median", look)
         if of_truth:
-            common.shares(ax)
-        else:
-            common.decades(ax, np.append(part[second], 1.0), least=4.0)
-            common.bound_line(ax, 1.0, "1: a right covariance")
-        heading = "misfit detected" if of_truth else f"NEES of {groups[0][0]}"
-        test = f"share of trials, test of fit at {FIT_LEVEL:g}"
-        words: Any = {"heading": heading, "label": test if of_truth else "median"}
-        common.curves(ax, part, second, look, [scale], by="setting", **words)
-        _write_values(ax, part, second, look, percent if of_truth else brief)
-    for ax in axes[1:]:
-        ax.tick_params(labelleft=False)
-    axes[0].set_yticks(range(len(lines)), lines)
+            _write_detected(ax, part, look)
+    for ax in axes[len(groups) :]:
+        part = rows[rows["estimator"] == groups[0][0]]
+        common.decades(ax, np.append(part["nees_median"], 1.0), least=4.0)
+        common.bound_line(ax, 1.0, "1: a right covariance")
+        words: Any = {"heading": f"NEES of {groups[0][0]}", "label": "median"}
+        common.curves(ax, part, "nees_median", look, [scale], by="setting", **words)
+        _write_values(ax, part, "nees_median", look)
+    for ax in axes:
+        ax.set_yticks(range(len(lines)), lines)
     common.legend(fig, axes)
     yield view.drawing(
         fig,
@@ -208,21 +206,7 @@ def _kind(name: str, detected: float) -> str:
     return "detected" if detected >= DETECTED else "undetected"
 
 
-def _wrapped(name: str) -> str:
-    """Returns a name in lines, broken behind commas."""
-    lines = [""]
-    for part in name.split(", "):
-        longer = f"{lines[-1]}, {part}".removeprefix(", ")
-        if len(longer) <= _LETTERS:
-            lines[-1] = longer
-        else:
-            lines.append(part)
-    return ",\n".join(filter(None, lines)).replace("$", r"\$")
-
-
-def _write_values(
-    ax: Any, rows: pd.DataFrame, column: str, look: Mapping[str, Look], words: Any
-) -> None:
+def _write_values(ax: Any, rows: pd.DataFrame, column: str, look: Mapping[str, Look]) -> None:
     """Writes each value above its mark."""
     values = rows.set_index("setting")[column]
     for i, (name, one) in enumerate(look.items()):
@@ -230,7 +214,18 @@ def _write_values(
             at = (min(values[name], _MOST_ERROR), i)
             style: Any = {"fontsize": "small", "color": one.color, "ha": "center"}
             offset: Any = {"xytext": (0, 4), "textcoords": "offset points"}
-            ax.annotate(words(values[name]), at, **offset, **style)
+            ax.annotate(brief(values[name]), at, **offset, **style)
+
+
+def _write_detected(ax: Any, rows: pd.DataFrame, look: Mapping[str, Look]) -> None:
+    """Writes beside each row in how many trials the misfit is detected, under a heading."""
+    shares = rows.set_index("setting")["misfit"]
+    place: Any = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points"}
+    place |= {"xytext": (8, 0), "va": "center", "annotation_clip": False}
+    ax.annotate("misfit detected in", (1, -0.6), **place, fontsize="small", color=SOFT)
+    for i, (name, one) in enumerate(look.items()):
+        share = f"{percent(shares.get(name, np.nan))} of trials"
+        ax.annotate(share, (1, i), **place, color=one.color, fontweight="bold")
 
 
 def _worst(error: pd.DataFrame, kinds: Sequence[str], detected: pd.Series[Any]) -> str:

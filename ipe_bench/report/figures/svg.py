@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
 NAMED = "name:"
 """Begins the id of an artist that is an estimator's; its name ends at `#`. On a page it is `data-name`."""
-_MARGIN = 3.0
-"""Points around a panel."""
+_MARGIN, _WIDER = 3.0, 0.04
+"""Points around a panel, and the part by which texts may be wider in another font."""
 _FIGURE = re.compile(r'^ <g id="figure_1">\n(.*?)^ </g>\n(.*)^</svg>', re.MULTILINE | re.DOTALL)
 _GROUP = re.compile(r'^  <g id="(axes|legend)_\d+">\n(.*?)^  </g>\n', re.MULTILINE | re.DOTALL)
 _KEY = re.compile(
@@ -77,8 +77,13 @@ def _edges(
     width, height = 72 * figure.get_size_inches()
     columns, rows = dict[int, tuple[float, float]](), dict[int, tuple[float, float]]()
     for (row, column), inside in cells.items():
-        for box in filter(None, (figure.axes[i].get_tightbbox() for i in inside)):
-            x0, y0, x1, y1 = (72 / figure.dpi * v for v in box.extents)
+        for ax in (figure.axes[i] for i in inside):
+            box, own = ax.get_tightbbox(), ax.bbox
+            if box is None:
+                continue
+            # Letters of another font than the one measured may need more room beside the axes.
+            left, right = box.x0 - _WIDER * (own.x0 - box.x0), box.x1 + _WIDER * (box.x1 - own.x1)
+            x0, y0, x1, y1 = (72 / figure.dpi * v for v in (left, box.y0, right, box.y1))
             for ends, at, low, high in (
                 (columns, column, x0, x1),
                 (rows, row, height - y1, height - y0),

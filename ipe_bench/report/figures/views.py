@@ -222,7 +222,7 @@ def in_focus(look: Mapping[str, Look], colored: Container[str]) -> dict[str, Loo
 
 def focus_of(summary: pd.DataFrame) -> tuple[list[str], str]:
     """Returns the estimators that are in colour where not all can be, the best first, and the best if it is one."""
-    rows = summary[(summary["parameter"] == ALL) & (summary["estimator"] != REFERENCE)]
+    rows: Any = summary[(summary["parameter"] == ALL) & (summary["estimator"] != REFERENCE)]
     if rows.empty:
         return [], ""
     standings = Finding.of(rows.to_dict("records")).standings
