@@ -1,4 +1,5 @@
-"""Adds errors to readings, and knows the covariance that estimators assume. Config group `noise`."""
+"""Adds errors to readings, and knows the covariance that estimators assume. Config group
+`noise`."""
 
 from ipe_bench.basics.errors import without_modules
 from ipe_bench.noise.base import Noise

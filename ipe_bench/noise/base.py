@@ -1,4 +1,5 @@
-"""Defines a noise: it adds errors to simulated readings, and states the R that estimators assume."""
+"""Defines a noise: it adds errors to simulated readings, and states the R that estimators
+assume."""
 
 from __future__ import annotations
 
@@ -14,11 +15,13 @@ from ipe_bench.noise.levels import Levels
 
 
 class Noise(Component, ABC):
-    """Adds errors to readings, and states the R that estimators assume: a frozen dataclass of its options.
+    """Adds errors to readings, and states the R that estimators assume: a frozen dataclass of its
+    options.
 
-    Required: `corrupt` and `covariance`. Optional: `whitened`, if errors are not normal; `true_covariance`, if R is not
-    theirs; `completed`, if options may be left to the model. The others are for noise whose level is estimated.
-    Promised: errors have mean zero, covariance R unless `true_covariance` is False, and come from `rng` alone.
+    Required: `corrupt` and `covariance`. Optional: `whitened`, if errors are not normal;
+    `true_covariance`, if R is not theirs; `completed`, if options may be left to the model. The
+    others are for noise whose level is estimated. Promised: errors have mean zero, covariance R
+    unless `true_covariance` is False, and come from `rng` alone.
 
     >>> import ipe_bench as ib
     >>> from dataclasses import dataclass
@@ -38,12 +41,14 @@ class Noise(Component, ABC):
     real: ClassVar[bool] = False
     """True if readings are not simulated at all, but are those that come with the model."""
     estimated: ClassVar[bool] = False
-    """True if the level of the errors is estimated from the residuals, R being known up to a factor."""
+    """True if the level of the errors is estimated from the residuals, R being known up to a
+    factor."""
     true_covariance: bool = True
     """Whether R is that of the errors; False if estimators are given another one on purpose."""
 
     def completed(self, usual: UsualNoise | None) -> Noise:
-        """Returns this noise, with what its options leave out taken from the usual noise of the model.
+        """Returns this noise, with what its options leave out taken from the usual noise of the
+        model.
 
         Raises:
             UserError: the model names none.
@@ -53,7 +58,8 @@ class Noise(Component, ABC):
 
     @abstractmethod
     def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
-        """Returns the readings z (m,) of one trial, from the error-free h (m,) and what instruments show besides it."""
+        """Returns the readings z (m,) of one trial, from the error-free h (m,) and what instruments
+        show besides it."""
 
     @abstractmethod
     def covariance(self, m: int) -> Covariance:
@@ -64,14 +70,16 @@ class Noise(Component, ABC):
         return self.covariance(model.m)
 
     def true_levels(self, m: int) -> tuple[Levels, Array] | None:
-        """Returns levels of m readings, and their logarithms (k,), if bounds are to count them as unknown."""
+        """Returns levels of m readings, and their logarithms (k,), if bounds are to count them as
+        unknown."""
         del m
 
     def levels_of(self, model: Measurement) -> Levels | None:
-        """Returns levels of which standard deviations are formulas, if they are to be estimated with the parameters."""
+        """Returns levels of which standard deviations are formulas, if they are to be estimated
+        with the parameters."""
         del model
 
     def whitened(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array | None:
-        """Draws errors of whitened readings, R^-1/2 v, if R is right: independent, of mean 0 and variance 1; None if
-        they are normal. The test of fit takes its law from here."""
+        """Draws errors of whitened readings, R^-1/2 v, if R is right: independent, of mean 0 and
+        variance 1; None if they are normal. The test of fit takes its law from here."""
         del shape, rng

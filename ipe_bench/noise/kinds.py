@@ -21,10 +21,12 @@ UNIFORM_DEVIATION = 1 / np.sqrt(12)
 
 @dataclass(frozen=True)
 class ScaledNoise(Noise):
-    """Describes a noise whose size is one standard deviation; R is white unless a subclass says otherwise."""
+    """Describes a noise whose size is one standard deviation; R is white unless a subclass says
+    otherwise."""
 
     deviation: Positive | None = None
-    """Standard deviation of a reading, in the unit of the readings; None: that of the model's usual noise."""
+    """Standard deviation of a reading, in the unit of the readings; None: that of the model's usual
+    noise."""
 
     def completed(self, usual: UsualNoise | None) -> Self:
         known = usual or UsualNoise()
@@ -44,8 +46,9 @@ class ScaledNoise(Noise):
         """
         if self.deviation is None:
             raise UserError(
-                f"noise.deviation: is not given for noise={self.name}, and the measurement model names no noise of its"
-                " own; give the standard deviation of a reading in its unit, noise.deviation=X"
+                f"noise.deviation: is not given for noise={self.name}, and the measurement model"
+                " names no noise of its own; give the standard deviation of a reading in its"
+                " unit, noise.deviation=X"
             )
         return self.deviation
 
@@ -58,7 +61,8 @@ class Gaussian(ScaledNoise):
     """Draws z = h + v with independent normal v."""
 
     deviation: Positive | tuple[Positive, ...] | None = None
-    """One standard deviation in the unit of the readings, or one for each; None: that of the model's usual noise."""
+    """One standard deviation in the unit of the readings, or one for each; None: that of the
+    model's usual noise."""
 
     def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
         return h + self.covariance(len(h)).factor * rng.standard_normal(h.shape)
@@ -68,7 +72,8 @@ class Gaussian(ScaledNoise):
             return super().covariance(m)
         if len(self.deviation) != m:
             raise UserError(
-                f"noise.deviation: has {len(self.deviation)} numbers; give one for each of {m} readings"
+                f"noise.deviation: has {len(self.deviation)} numbers; give one for each of {m}"
+                " readings"
             )
         return Covariance(np.asarray(self.deviation))
 
@@ -86,7 +91,8 @@ class NoNoise(ScaledNoise):
 
 @dataclass(frozen=True)
 class StudentT(ScaledNoise):
-    """Draws z = h + v with independent v of Student's t distribution, scaled to the given standard deviation.
+    """Draws z = h + v with independent v of Student's t distribution, scaled to the given standard
+    deviation.
 
     Estimators are given the true covariance R = deviation^2 I, and do not know the shape.
     """
@@ -105,10 +111,12 @@ class StudentT(ScaledNoise):
 
 @dataclass(frozen=True)
 class Outliers(ScaledNoise):
-    """Draws from Tukey's contaminated normal: with probability `share` a reading is `factor` times as noisy.
+    """Draws from Tukey's contaminated normal: with probability `share` a reading is `factor` times
+    as noisy.
 
-    `deviation` is that of a good reading. `assumed` is what estimators assume: `nominal`, the variance of the good
-    readings, as if there were no outliers; or `total`, that of the mixture, deviation^2 (1 - share + share factor^2).
+    `deviation` is that of a good reading. `assumed` is what estimators assume: `nominal`, the
+    variance of the good readings, as if there were no outliers; or `total`, that of the mixture,
+    deviation^2 (1 - share + share factor^2).
     """
 
     share: Share = 0.05
@@ -128,17 +136,18 @@ class Outliers(ScaledNoise):
         return np.where(gross, self.factor, 1.0) * rng.standard_normal(shape)
 
     def whitened(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array | None:
-        """Draws from the mixture if estimators know of it; otherwise R is that of good readings, which are normal."""
-        return None if self.assumed == "nominal" else self._mixture(shape, rng) / self._excess
+        """Draws from the mixture if estimators know of it; otherwise R is that of good readings,
+        which are normal."""
+        if self.assumed == "nominal":
+            return None
+        return self._mixture(shape, rng) / self._excess
 
     @property
     def _excess(self) -> float:
         """The standard deviation that R states over that of a good reading."""
-        return (
-            1.0
-            if self.assumed == "nominal"
-            else float(np.sqrt(1 - self.share + self.share * self.factor**2))
-        )
+        if self.assumed == "nominal":
+            return 1.0
+        return float(np.sqrt(1 - self.share + self.share * self.factor**2))
 
     def covariance(self, m: int) -> Covariance:
         return Covariance(np.full(m, self.stated * self._excess))
@@ -146,11 +155,13 @@ class Outliers(ScaledNoise):
 
 @dataclass(frozen=True)
 class Quantization(Noise):
-    """Rounds z = step * round((offset + h) / step) - offset: the instruments' whole read-out, not its error.
+    """Rounds z = step * round((offset + h) / step) - offset: the instruments' whole read-out, not
+    its error.
 
-    Rounding the difference instead would give equal errors in cases that differ in sign alone. The error is taken to be
-    uniform, R = step^2 / 12, unless `deviation` states it. With `dither` a uniform error of one step is added before
-    rounding and taken off again: then the error is uniform and independent of h, which at small h it otherwise is not.
+    Rounding the difference instead would give equal errors in cases that differ in sign alone. The
+    error is taken to be uniform, R = step^2 / 12, unless `deviation` states it. With `dither` a
+    uniform error of one step is added before rounding and taken off again: then the error is
+    uniform and independent of h, which at small h it otherwise is not.
     """
 
     step: Positive | None = None
@@ -165,8 +176,9 @@ class Quantization(Noise):
     def _size(self) -> float:
         if self.step is None:
             raise UserError(
-                "noise.step: is not given for noise=quantization, and the measurement model names no step of its own; "
-                "give the step of the read-out in the unit of the readings, noise.step=X"
+                "noise.step: is not given for noise=quantization, and the measurement model names"
+                " no step of its own; give the step of the read-out in the unit of the readings,"
+                " noise.step=X"
             )
         return self.step
 
@@ -175,7 +187,9 @@ class Quantization(Noise):
         return self.deviation is None
 
     def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
-        shift = self._size * (rng.random(h.shape) - 0.5) if self.dither else 0.0
+        shift = 0.0
+        if self.dither:
+            shift = self._size * (rng.random(h.shape) - 0.5)
         return self._size * np.rint((offset + h + shift) / self._size) - offset - shift
 
     def whitened(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
@@ -187,11 +201,13 @@ class Quantization(Noise):
 
 @dataclass(frozen=True)
 class Colored(ScaledNoise):
-    """Draws stationary autoregressive noise: v_k = correlation v_(k-1) + sqrt(1 - correlation^2) deviation e_k.
+    """Draws stationary autoregressive noise: v_k = correlation v_(k-1) + sqrt(1 - correlation^2)
+    deviation e_k.
 
-    The readings are `channels` instruments in turn, each with a series of its own; after `length` readings of each the
-    series start anew. GINS has 2 channels (the axes) and a length of 30 (the times of a case). `assumed` is what
-    estimators assume: `white`, R = deviation^2 I, which is the mistake that the paper warns of; or `full`, the truth.
+    The readings are `channels` instruments in turn, each with a series of its own; after `length`
+    readings of each the series start anew. GINS has 2 channels (the axes) and a length of 30 (the
+    times of a case). `assumed` is what estimators assume: `white`, R = deviation^2 I, which is the
+    mistake that the paper warns of; or `full`, the truth.
     """
 
     correlation: Annotated[float, Gt(-1), Lt(1)] = 0.5
@@ -206,7 +222,8 @@ class Colored(ScaledNoise):
         length = m // self.channels if self.length is None else self.length
         if length == 0 or m % (length * self.channels):
             raise UserError(
-                f"channels={self.channels}, length={self.length}: {m} readings do not divide into these"
+                f"channels={self.channels}, length={self.length}: {m} readings do not divide into"
+                " these"
             )
         return m // (length * self.channels), length, self.channels
 
@@ -218,6 +235,7 @@ class Colored(ScaledNoise):
         e = rng.standard_normal(self._series(len(h)))
         v = np.empty_like(e)
         v[:, 0] = e[:, 0]
+        # Fresh errors make up for what a share of the last one lacks, so that the variance stays.
         fresh = np.sqrt(1 - self.correlation**2)
         for k in range(1, e.shape[1]):
             v[:, k] = self.correlation * v[:, k - 1] + fresh * e[:, k]
@@ -227,18 +245,21 @@ class Colored(ScaledNoise):
         repeats, length, channels = self._series(m)
         if self.assumed == "white":
             return super().covariance(m)
+        # Readings k apart of one instrument have the correlation to the power of k.
         apart = np.abs(np.subtract.outer(np.arange(length), np.arange(length)))
         series = np.kron(self.correlation**apart, np.eye(channels))
-        return Covariance(np.linalg.cholesky(self.stated**2 * np.kron(np.eye(repeats), series)))
+        R = self.stated**2 * np.kron(np.eye(repeats), series)
+        return Covariance(np.linalg.cholesky(R))
 
 
 @dataclass(frozen=True)
 class Correlated(ScaledNoise):
     """Draws Gaussian errors of any covariance R.
 
-    Either `matrix` is R, in squared units of the readings; or readings of one standard deviation come in blocks of
-    `block` that follow one another and share an error, such that two of a block have the given correlation. `assumed`
-    is what estimators assume: `full`, R itself; or `white`, its diagonal.
+    Either `matrix` is R, in squared units of the readings; or readings of one standard deviation
+    come in blocks of `block` that follow one another and share an error, such that two of a block
+    have the given correlation. `assumed` is what estimators assume: `full`, R itself; or `white`,
+    its diagonal.
     """
 
     correlation: Annotated[float, Ge(0), Lt(1)] = 0.5
@@ -295,7 +316,8 @@ class _StandIn(Noise):
 
 @dataclass(frozen=True)
 class Certified(_StandIn):
-    """Takes the readings that come with the measurement model, with its certified answer for the truth, and no prior.
+    """Takes the readings that come with the measurement model, with its certified answer for the
+    truth, and no prior.
 
     A scenario with it has one trial. R is what the model states of its readings.
     """
@@ -305,7 +327,8 @@ class Certified(_StandIn):
 
 @dataclass(frozen=True)
 class ModelNoise(_StandIn):
-    """Stands for the noise that the measurement model names, with its deviation or step replaced where given.
+    """Stands for the noise that the measurement model names, with its deviation or step replaced
+    where given.
 
     A scenario never holds it: it holds what it stands for.
     """
@@ -318,11 +341,13 @@ class ModelNoise(_StandIn):
     """The step of a read-out that is rounded."""
 
     def of(self, model: Measurement) -> Noise | None:
-        """Returns the noise meant for this model; None where neither the model nor an option says what it is."""
+        """Returns the noise meant for this model; None where neither the model nor an option says
+        what it is."""
         usual = model.usual_noise or UsualNoise()
-        step, deviation = self.step or usual.step, self.deviation or usual.deviation
+        step = self.step or usual.step
         if step is not None and not isinstance(self.deviation, tuple):
             return Quantization(step, self.deviation)
+        deviation = self.deviation or usual.deviation
         return None if deviation is None else Gaussian(deviation)
 
 
@@ -334,9 +359,10 @@ def resolved(noise: Noise, model: Measurement) -> Noise:
     """
     if not isinstance(noise, ModelNoise):
         return noise.completed(model.usual_noise)
-    if (own := noise.of(model)) is None:
+    own = noise.of(model)
+    if own is None:
         raise UserError(
-            f"noise: is not given, and measurement={model.name} names no noise of its own; set noise.deviation=X, the "
-            "standard deviation of a reading, or choose a noise"
+            f"noise: is not given, and measurement={model.name} names no noise of its own; set"
+            " noise.deviation=X, the standard deviation of a reading, or choose a noise"
         )
     return own

@@ -24,9 +24,9 @@ NO_LEVEL = (
 class Unknown(Noise):
     """Draws independent normal errors whose level is estimated from the residuals.
 
-    Estimates do not depend on a single level; standard errors are scaled by it, and tests of the level itself are not
-    possible. Several levels, or a standard deviation that depends on the reading, are estimated with the parameters by
-    restricted maximum likelihood.
+    Estimates do not depend on a single level; standard errors are scaled by it, and tests of the
+    level itself are not possible. Several levels, or a standard deviation that depends on the
+    reading, are estimated with the parameters by restricted maximum likelihood.
     """
 
     weights: tuple[Positive, ...] | None = None
@@ -34,26 +34,32 @@ class Unknown(Noise):
     by: str | None = None
     """Column of the readings whose entries have levels of their own: `output`, say, or `file`."""
     sigma: str = "sigma"
-    """Formula of the standard deviation: h is the magnitude of the error-free reading, all other names are levels."""
+    """Formula of the standard deviation: h is the magnitude of the error-free reading, all other
+    names are levels."""
     levels: tuple[Positive, ...] | None = None
-    """True levels in the order of the formula, for `run`: estimators take R with these, at the nominal readings."""
+    """True levels in the order of the formula, for `run`: estimators take R with these, at the
+    nominal readings."""
 
     estimated = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
         names = level_names(read_sigma(self.sigma))
-        if self.levels is not None and len(self.levels) != len(names):
+        if self.levels is None:
+            return
+        if len(self.levels) != len(names):
             raise UserError(
-                f"noise.levels: has {len(self.levels)} numbers; give one for each of {', '.join(names)}"
+                f"noise.levels: has {len(self.levels)} numbers; give one for each of"
+                f" {', '.join(names)}"
             )
-        if self.levels is not None and self.by is not None:
+        if self.by is not None:
             raise UserError(
                 "noise.by: does not go with noise.levels; state what is known, as in noise=gaussian"
             )
 
     def levels_of(self, model: Measurement) -> Levels | None:
-        """Returns the levels of a model's readings; None if a single one multiplies all standard deviations.
+        """Returns the levels of a model's readings; None if a single one multiplies all standard
+        deviations.
 
         Raises:
             UserError: there is no such column, or a level has the name of a parameter.
@@ -70,7 +76,9 @@ class Unknown(Noise):
         group = np.array([groups.index(entry) for entry in entries], dtype=np.intp)
         weights = self.covariance(model.m).factor
         found = Levels(read_sigma(self.sigma), weights, groups, group, model.reading_unit)
-        if both := {p.name for p in found.parameters} & {p.name for p in model.physical_parameters}:
+        levels = {p.name for p in found.parameters}
+        both = levels & {p.name for p in model.physical_parameters}
+        if both:
             raise UserError(
                 f"noise.sigma: {min(both)} is a parameter of the model; give the level another name"
             )
@@ -79,8 +87,10 @@ class Unknown(Noise):
     def true_levels(self, m: int) -> tuple[Levels, Array] | None:
         if self.levels is None:
             return None
-        formula, weights = read_sigma(self.sigma), self.covariance(m).factor
-        return Levels(formula, weights, ("",), np.zeros(m, dtype=np.intp)), np.log(self.levels)
+        weights = self.covariance(m).factor
+        of_one_group = np.zeros(m, dtype=np.intp)
+        levels = Levels(read_sigma(self.sigma), weights, ("",), of_one_group)
+        return levels, np.log(self.levels)
 
     def nominal_covariance(self, model: Measurement) -> Covariance:
         if self.levels is None:
@@ -103,6 +113,6 @@ class Unknown(Noise):
         return h + self._true_covariance(h).factor * rng.standard_normal(h.shape)
 
     def covariance(self, m: int) -> Covariance:
-        return (
-            Covariance(np.ones(m)) if self.weights is None else Gaussian(self.weights).covariance(m)
-        )
+        if self.weights is None:
+            return Covariance(np.ones(m))
+        return Gaussian(self.weights).covariance(m)
