@@ -1,8 +1,9 @@
-"""Filters by linearising an epoch's readings repeatedly: all trials at once, in square-root information form.
+"""Filters by linearising an epoch's readings repeatedly: all trials at once, in square-root
+information form.
 
-The covariance is kept as a square root U of P^-1 = U'U, which a QR decomposition updates (Bierman, Factorization
-Methods for Discrete Sequential Estimation, 1977, ch. V): no S to invert and no P - K S K' to cancel, however wide the
-prior is beside the noise.
+The covariance is kept as a square root U of P^-1 = U'U, which a QR decomposition updates (Bierman,
+Factorization Methods for Discrete Sequential Estimation, 1977, ch. V): no S to invert and no P - K
+S K' to cancel, however wide the prior is beside the noise.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ from ipe_bench.measurements.counted import CountingModel
 from ipe_bench.measurements.problem import Problem
 
 _SHORTEST = 2.0**-10
-"""A share of a step below which no shorter one is tried: the covariance is brought up to date instead."""
+"""A share of a step below which no shorter one is tried: the covariance is brought up to date
+instead."""
 
 
 @dataclass(frozen=True)
@@ -42,24 +44,29 @@ class Belief:
         return finite(self.mean) & finite(self.U)
 
     def root(self) -> Array:
-        """Computes U^-1 (trials, n, n), so that P is it times its transpose; NaN where U is singular."""
+        """Computes U^-1 (trials, n, n), so that P is it times its transpose; NaN where U is
+        singular."""
         return inverse(self.U)[0]
 
     def given(self, J: Array, r: Array, at: Array) -> tuple[Belief, Array]:
-        """Takes in readings of unit variance, linear in x, with h(at) - z = r (trials, m) and dh/dx = J; returns the
-        belief and the squared innovations y' S^-1 y (trials,) of these readings."""
+        """Takes in readings of unit variance, linear in x, with h(at) - z = r (trials, m) and dh/dx
+        = J; returns the belief and the squared innovations y' S^-1 y (trials,) of these
+        readings."""
         # The step s = x - at that minimises |U (s + at - mean)|^2 + |J s + r|^2.
         rows = np.concatenate([self.U, J], axis=1)
-        wanted = -np.concatenate([multiply(self.U, at - self.mean), r], axis=1)
+        before = multiply(self.U, at - self.mean)
+        wanted = -np.concatenate([before, r], axis=1)
         Q, U = np.linalg.qr(rows)
         fitted = multiply(Q.swapaxes(1, 2), wanted)
         step = multiply(inverse(U)[0], fitted)
+        # What the step does not take away of the sum of squares are the squared innovations.
         return Belief(at + step, U), squared(wanted) - squared(fitted)
 
 
 @dataclass(frozen=True)
 class EpochReadings:
-    """Holds the readings z (trials, m) of an epoch, for the trials `rows`, and the belief before them.
+    """Holds the readings z (trials, m) of an epoch, for the trials `rows`, and the belief before
+    them.
 
     x is in prior deviations from the nominal point.
     """
@@ -75,15 +82,14 @@ class EpochReadings:
 
     def misfit(self, x: Array) -> Array:
         """Computes h(x) - z (trials, m), whitened."""
+        R = self.epoch.R
         h = self.model.simulate(self.physical(x), self.rows)
-        return self.epoch.R.whiten(self.epoch.model.near(h, self.z)) - self.epoch.R.whiten(self.z)
+        return R.whiten(self.epoch.model.near(h, self.z)) - R.whiten(self.z)
 
     def slope(self, x: Array) -> Array:
         """Computes dh/dx (trials, m, n), whitened."""
-        return (
-            self.epoch.R.whiten_jacobian(self.model.jacobian(self.physical(x), self.rows))
-            * self.deviation
-        )
+        J = self.model.jacobian(self.physical(x), self.rows)
+        return self.epoch.R.whiten_jacobian(J) * self.deviation
 
     def misfits(self, points: Array) -> Array:
         """Computes h - z (trials, points, m) at points (trials, points, n), whitened."""
@@ -102,8 +108,8 @@ class EpochReadings:
 class InformationFilter(Estimator):
     """Holds what the filters of this room share: the prior, the epochs, failures and the report.
 
-    Reports its P, and as `extras["nis"]` the trial's squared innovations over their number: 1 on average where the
-    filter is consistent.
+    Reports its P, and as `extras["nis"]` the trial's squared innovations over their number: 1 on
+    average where the filter is consistent.
     """
 
     prior_inflation: Positive = 1.0
@@ -113,7 +119,8 @@ class InformationFilter(Estimator):
 
     @abstractmethod
     def update(self, readings: EpochReadings) -> tuple[Belief, Array]:
-        """Takes in an epoch's readings; returns the belief and the squared innovations (trials,) of the prediction."""
+        """Takes in an epoch's readings; returns the belief and the squared innovations (trials,) of
+        the prediction."""
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         self.require_suited(problem)
@@ -122,35 +129,39 @@ class InformationFilter(Estimator):
 
 
 class _Beliefs(Walk):
-    """Holds the beliefs of a batch of trials; those that fail keep their belief from before the epoch."""
+    """Holds the beliefs of a batch of trials; those that fail keep their belief from before the
+    epoch."""
 
     def __init__(self, filter: InformationFilter, problem: Problem, z: Array) -> None:
         super().__init__(problem, z)
-        self.filter, self.d = filter, np.array(problem.prior_used())
+        self.filter = filter
+        self.d = np.array(problem.prior_used())
         # U0' U0 = P0^-1, in deviations of the prior.
-        U0 = np.linalg.cholesky(np.linalg.inv(problem.scaled_prior)).T / filter.prior_inflation
-        self.belief = Belief(np.zeros((len(z), len(U0))), np.repeat(U0[None], len(z), axis=0))
+        information = np.linalg.inv(problem.scaled_prior)
+        U0 = np.linalg.cholesky(information).T / filter.prior_inflation
+        mean = np.zeros((len(z), len(U0)))
+        self.belief = Belief(mean, np.repeat(U0[None], len(z), axis=0))
 
     def take_in(self, epoch: Epoch, at: Rows) -> None:
-        z, model = self.z[at][:, epoch.rows], epoch.counted(self.tally)
-        readings = EpochReadings(
-            epoch, model, self.problem.x0, self.d, z, at, take(self.belief, at)
-        )
+        z = self.z[at][:, epoch.rows]
+        model = epoch.counted(self.tally)
+        before = take(self.belief, at)
+        readings = EpochReadings(epoch, model, self.problem.x0, self.d, z, at, before)
         after, nis = self.filter.update(readings)
-        raised, singular = self.tally.failed(at), ~finite(after.root()) & after.usable
+        raised = self.tally.failed(at)
+        singular = ~finite(after.root()) & after.usable & ~raised
         good = after.usable & np.isfinite(nis) & ~raised & ~singular
         self.belief = put(self.belief, at[good], take(after, good))
         self.nis[at[good]] += nis[good]
-        lost = f"the model or the filter overflowed at epoch {epoch.number}"
-        self.end(at[~good & ~raised & ~singular], Status.NONFINITE, lost)
-        self.end(
-            at[singular & ~raised],
-            Status.SINGULAR,
-            f"the information became singular at epoch {epoch.number}",
-        )
+        lost = ~good & ~raised & ~singular
+        overflowed = f"the model or the filter overflowed at epoch {epoch.number}"
+        self.end(at[lost], Status.NONFINITE, overflowed)
+        became_singular = f"the information became singular at epoch {epoch.number}"
+        self.end(at[singular], Status.SINGULAR, became_singular)
         self.status[at[raised]] = Status.ERROR
         S = self.belief.root()
-        self.x, self.P = self.belief.mean, np.matmul(S, S.swapaxes(1, 2))
+        self.x = self.belief.mean
+        self.P = np.matmul(S, S.swapaxes(1, 2))
 
     def covariance(self, at: Rows) -> Array:
         S = take(self.belief, at).root() * self.d[:, None]
@@ -158,17 +169,19 @@ class _Beliefs(Walk):
 
 
 def regressed(readings: EpochReadings, x: Array, U: Array) -> tuple[Array, Array, Array]:
-    """Regresses h - z over 2n cubature points of N(x, (U'U)^-1): it is about r + A (. - x) with an error of covariance
-    Omega; returns r (trials, m), A (trials, m, n) and Omega (trials, m, m)."""
+    """Regresses h - z over 2n cubature points of N(x, (U'U)^-1): it is about r + A (. - x) with an
+    error of covariance Omega; returns r (trials, m), A (trials, m, n) and Omega (trials, m, m)."""
     n = x.shape[1]
     S = np.sqrt(n) * inverse(U)[0].swapaxes(1, 2)
-    d = readings.misfits(np.concatenate([x[:, None] + S, x[:, None] - S], axis=1))
+    points = np.concatenate([x[:, None] + S, x[:, None] - S], axis=1)
+    d = readings.misfits(points)
     r = d.mean(axis=1)
     spread = d - r[:, None]
     # A U^-1, since the points are U^-1 times sqrt(n) unit vectors.
     B = (d[:, :n] - d[:, n:]).swapaxes(1, 2) / (2.0 * np.sqrt(n))
-    Omega = np.matmul(spread.swapaxes(1, 2), spread) / (2 * n) - np.matmul(B, B.swapaxes(1, 2))
-    return r, np.matmul(B, U), Omega
+    # Of the covariance of h - z what its slope does not explain.
+    covariance = np.matmul(spread.swapaxes(1, 2), spread) / (2 * n)
+    return r, np.matmul(B, U), covariance - np.matmul(B, B.swapaxes(1, 2))
 
 
 @dataclass(frozen=True)
@@ -200,21 +213,31 @@ class Linearized:
         r, A, Omega = regressed(readings, x, U)
         W = _whitener(Omega)
         proposal, innovations = readings.belief.given(np.matmul(W, A), multiply(W, r), x)
-        cost = _cost(readings, W, r, x)
         return cls(
-            x, U, r, A, W, cost, proposal, innovations, np.ones(len(x)), np.zeros(len(x)), change
+            x=x,
+            U=U,
+            r=r,
+            A=A,
+            W=W,
+            cost=_cost(readings, W, r, x),
+            proposal=proposal,
+            innovations=innovations,
+            share=np.ones(len(x)),
+            inner=np.zeros(len(x)),
+            change=change,
         )
 
 
 @dataclass(frozen=True)
 class IPLF(InformationFilter, Method[EpochReadings, Linearized]):
-    """Linearises readings by regression over the posterior itself, repeatedly (García-Fernández, Svensson, Morelande,
-    Särkkä, IEEE TSP 63(20), 2015), the mean damped as in Raitoharju, Svensson, García-Fernández and Piché (IEEE SPL
-    25(4), 2018; arXiv 1704.01113).
+    """Linearises readings by regression over the posterior itself, repeatedly (García-Fernández,
+    Svensson, Morelande, Särkkä, IEEE TSP 63(20), 2015), the mean damped as in Raitoharju, Svensson,
+    García-Fernández and Piché (IEEE SPL 25(4), 2018; arXiv 1704.01113).
 
-    At 2n cubature points of the posterior so far, h is about A x + b with an error of covariance Omega; that affine
-    model, of noise R + Omega, updates the prior. The inner loop moves the mean at a fixed posterior covariance and
-    Omega, by Gauss-Newton steps halved until the misfit decreases; the outer loop brings both up to date.
+    At 2n cubature points of the posterior so far, h is about A x + b with an error of covariance
+    Omega; that affine model, of noise R + Omega, updates the prior. The inner loop moves the mean
+    at a fixed posterior covariance and Omega, by Gauss-Newton steps halved until the misfit
+    decreases; the outer loop brings both up to date.
 
     Example:
 
@@ -230,7 +253,8 @@ class IPLF(InformationFilter, Method[EpochReadings, Linearized]):
     inner_iterations: Count = 3
     """Regressions between two covariances."""
     tolerance: Positive = 1e-2
-    """Largest change, in deviations of the updated P and in share of them, at which an epoch is done."""
+    """Largest change, in deviations of the updated P and in share of them, at which an epoch is
+    done."""
 
     def update(self, readings: EpochReadings) -> tuple[Belief, Array]:
         start = self.begin(readings, readings.belief.mean)
@@ -243,12 +267,15 @@ class IPLF(InformationFilter, Method[EpochReadings, Linearized]):
         return Linearized.over(system, x, system.belief.U, np.full(len(x), np.inf))
 
     def step(self, system: EpochReadings, state: Linearized) -> Linearized:
-        """Regresses at the point that the last step proposes, and again where the covariance is renewed."""
+        """Regresses at the point that the last step proposes, and again where the covariance is
+        renewed."""
         x = state.x + state.share[:, None] * (state.proposal.mean - state.x)
         r, A, _ = regressed(system, x, state.U)
         cost = _cost(system, state.W, r, x)
+        # A step counts if the misfit decreases; otherwise half of it is tried next.
         taken = cost < state.cost
-        x, r = np.where(taken[:, None], x, state.x), np.where(taken[:, None], r, state.r)
+        x = np.where(taken[:, None], x, state.x)
+        r = np.where(taken[:, None], r, state.r)
         A = np.where(taken[:, None, None], A, state.A)
         proposal, _ = system.belief.given(np.matmul(state.W, A), multiply(state.W, r), x)
         state = replace(
@@ -266,23 +293,33 @@ class IPLF(InformationFilter, Method[EpochReadings, Linearized]):
         settled = (state.inner >= self.inner_iterations) & taken
         settled |= (to_go <= self.tolerance) | (state.share < _SHORTEST)
         if settled.any():
-            part = take(state, settled)
-            narrowed = np.abs(_deviations(part.proposal.U) / _deviations(part.U) - 1.0).max(axis=1)
-            change = np.fmax(to_go[settled], narrowed)
-            renewed = Linearized.over(system.subset(settled), part.x, part.proposal.U, change)
-            state = put(state, settled, replace(renewed, innovations=part.innovations))
+            renewed = self._renewed(system.subset(settled), take(state, settled), to_go[settled])
+            state = put(state, settled, renewed)
         return state
+
+    def _renewed(self, system: EpochReadings, state: Linearized, to_go: Array) -> Linearized:
+        """Brings the covariance up to date: linearises over the posterior that the mean has settled
+        in."""
+        U = state.proposal.U
+        narrowed = np.abs(_deviations(U) / _deviations(state.U) - 1.0).max(axis=1)
+        renewed = Linearized.over(system, state.x, U, np.fmax(to_go, narrowed))
+        # The innovations stay those of the prediction.
+        return replace(renewed, innovations=state.innovations)
 
     def check(
         self, system: EpochReadings, before: Linearized | None, state: Linearized
     ) -> ConvergenceCheck:
-        """Ends a trial if bringing the covariance up to date has changed neither it nor the mean."""
-        growth = np.where(np.isfinite(state.cost) & state.proposal.usable, 1.0, np.nan)
+        """Ends a trial if bringing the covariance up to date has changed neither it nor the
+        mean."""
+        usable = np.isfinite(state.cost) & state.proposal.usable
+        growth = np.where(usable, 1.0, np.nan)
         return ConvergenceCheck(state.change, growth, np.full(len(state.x), np.inf))
 
 
 def _cost(readings: EpochReadings, W: Array, r: Array, x: Array) -> Array:
-    return squared(multiply(W, r)) + squared(multiply(readings.belief.U, x - readings.belief.mean))
+    """Computes |W r|^2 + |U0 (x - x0)|^2 (trials,)."""
+    belief = readings.belief
+    return squared(multiply(W, r)) + squared(multiply(belief.U, x - belief.mean))
 
 
 def _deviations(U: Array) -> Array:
@@ -291,9 +328,11 @@ def _deviations(U: Array) -> Array:
 
 
 def _whitener(Omega: Array) -> Array:
-    """Computes (I + Omega)^-1/2 (trials, m, m); an eigenvalue of Omega that rounding left below zero counts as zero."""
+    """Computes (I + Omega)^-1/2 (trials, m, m); an eigenvalue of Omega that rounding left below
+    zero counts as zero."""
     usable: Mask = finite(Omega)
     Omega = np.where(usable[:, None, None], Omega, 0.0)
     values, vectors = np.linalg.eigh((Omega + Omega.swapaxes(1, 2)) / 2)
-    scale = np.where(usable[:, None], 1.0 / np.sqrt(1.0 + np.maximum(values, 0.0)), np.nan)
+    scale = 1.0 / np.sqrt(1.0 + np.maximum(values, 0.0))
+    scale = np.where(usable[:, None], scale, np.nan)
     return scale[:, :, None] * vectors.swapaxes(1, 2)

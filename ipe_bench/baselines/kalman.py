@@ -1,4 +1,5 @@
-"""Defines the Kalman filters: extended, unscented, cubature and ensemble, each trial's a filter of filterpy's."""
+"""Defines the Kalman filters: extended, unscented, cubature and ensemble, each trial's a filter of
+filterpy's."""
 
 from __future__ import annotations
 
@@ -22,22 +23,18 @@ from ipe_bench.states.linearisation import Cubature, Rule, Taylor, Unscented
 class FilterpyFilter(ConstantFilter):
     """Runs one of filterpy's sigma-point filters on one trial: `UnscentedKalmanFilter` as it is.
 
-    Required: `filter`, filterpy's object, with `x` at 0 (n,), `P` at P0 and `Q` at Q. Optional: `predict`, `points` and
-    `take_in`, for other objects of filterpy's. Promised: `take_in` hands out the readings at all `points`, in order.
+    Required: `filter`, filterpy's object, with `x` at 0 (n,), `P` at P0 and `Q` at Q. Optional:
+    `predict`, `points` and `take_in`, for other objects of filterpy's. Promised: `take_in` hands
+    out the readings at all `points`, in order.
 
-    >>> import numpy as np, ipe_bench as ib
-    >>> from filterpy.kalman import JulierSigmaPoints, UnscentedKalmanFilter
-    >>> class Julier(ib.Sequential):
-    ...     def track(self, P0, Q, z):
-    ...         n = len(P0)
-    ...         points = JulierSigmaPoints(n, kappa=0.0)
-    ...         f = UnscentedKalmanFilter(dim_x=n, dim_z=1, dt=1.0, hx=None, fx=lambda x, dt: x, points=points)
-    ...         f.x, f.P, f.Q = np.zeros(n), P0, Q
-    ...         return FilterpyFilter(f)
-    >>> scenario = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01))
-    >>> z = scenario.draw(0, 3).z
-    >>> print(np.ptp([one.estimate(scenario.problem, z).x for one in (Julier(), ib.baselines.CKF())], 0).max() < 1e-6)
-    True
+    >>> import numpy as np, ipe_bench as ib >>> from filterpy.kalman import JulierSigmaPoints,
+    UnscentedKalmanFilter >>> class Julier(ib.Sequential): ...     def track(self, P0, Q, z): ...
+    n = len(P0) ...         points = JulierSigmaPoints(n, kappa=0.0) ...         f =
+    UnscentedKalmanFilter(dim_x=n, dim_z=1, dt=1.0, hx=None, fx=lambda x, dt: x, points=points) ...
+    f.x, f.P, f.Q = np.zeros(n), P0, Q ...         return FilterpyFilter(f) >>> scenario =
+    ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01)) >>> z = scenario.draw(0, 3).z
+    >>> print(np.ptp([one.estimate(scenario.problem, z).x for one in (Julier(),
+    ib.baselines.CKF())], 0).max() < 1e-6) True
     """
 
     def __init__(self, filter: Any) -> None:
@@ -55,15 +52,16 @@ class FilterpyFilter(ConstantFilter):
         if self.filter.Q.any():
             self.filter.predict()
         else:
-            # Constants without process noise: the moments of their sigma points are x and P themselves.
+            # Constants without process noise: the moments of their sigma points are x and P
+            # themselves.
             self.filter.compute_process_sigmas(dt=1.0)
 
     def points(self) -> Array:
         return self.filter.sigmas_f
 
     def take_in(self, z: Array, hx: Callable[[Any], Array]) -> Array:
-        """Takes in the readings z (m,), whose covariance is I, and returns the innovation. Call `hx` once
-        for each point, in order: each call returns the readings (m,) at the next one."""
+        """Takes in the readings z (m,), whose covariance is I, and returns the innovation. Call
+        `hx` once for each point, in order: each call returns the readings (m,) at the next one."""
         self.filter.update(z, R=np.eye(len(z)), hx=hx)
         return self.filter.y
 
@@ -78,8 +76,9 @@ class FilterpyFilter(ConstantFilter):
 
 @dataclass(frozen=True)
 class EKF(Sequential):
-    """Linearises each epoch's readings at the estimate so far (Bar-Shalom et al., 10.3). filterpy updates P in Joseph's
-    form, (I - K H) P (I - K H)' + K R K', which stays positive definite where the prior is much wider than R.
+    """Linearises each epoch's readings at the estimate so far (Bar-Shalom et al., 10.3). filterpy
+    updates P in Joseph's form, (I - K H) P (I - K H)' + K R K', which stays positive definite where
+    the prior is much wider than R.
 
     Example:
 
@@ -101,8 +100,9 @@ class EKF(Sequential):
 
 @dataclass(frozen=True)
 class IteratedEKF(EKF):
-    """Linearises each epoch's readings again at its updated estimate until that stays: Gauss-Newton on the epoch's
-    readings and the prior that the earlier epochs left (Bell and Cathey, IEEE TAC 38, 1993).
+    """Linearises each epoch's readings again at its updated estimate until that stays: Gauss-Newton
+    on the epoch's readings and the prior that the earlier epochs left (Bell and Cathey, IEEE TAC
+    38, 1993).
 
     Example:
 
@@ -124,17 +124,22 @@ class IteratedEKF(EKF):
 
 
 class _EKFTrack(FilterpyFilter):
-    """Begins each iteration's update again from the epoch's prior, with the readings linearised at the last
-    estimate."""
+    """Begins each iteration's update again from the epoch's prior, with the readings linearised at
+    the last estimate."""
 
     def __init__(self, P0: Array, Q: Array, iterations: int, tolerance: float) -> None:
         from filterpy.kalman import ExtendedKalmanFilter
 
         n = len(P0)
         self.filter = ExtendedKalmanFilter(dim_x=n, dim_z=1)
-        # The default x is a column, with which a vector of readings broadcasts to a matrix and no error.
-        self.filter.x, self.filter.P, self.filter.Q = np.zeros(n), P0, Q
-        self.iterations, self.tolerance, self.iteration = iterations, tolerance, 0
+        # The default x is a column, with which a vector of readings broadcasts to a matrix and no
+        # error.
+        self.filter.x = np.zeros(n)
+        self.filter.P = P0
+        self.filter.Q = Q
+        self.iterations = iterations
+        self.tolerance = tolerance
+        self.iteration = 0
 
     def predict(self) -> None:
         self.filter.predict()
@@ -145,15 +150,19 @@ class _EKFTrack(FilterpyFilter):
 
     def update(self, z: Array, h: Array, H: Array | None) -> bool:
         assert H is not None
-        f, at = self.filter, self.filter.x
-        f.x, f.P = f.x_prior, f.P_prior
+        f = self.filter
+        at = f.x
+        f.x = f.x_prior
+        f.P = f.P_prior
         # What the readings linearised at the last estimate say at the prior mean.
         h = h[0] + H @ (f.x - at)
         # White readings stay white along the principal axes of H P H' (see `_turned`).
         S = H @ f.P @ H.T
         _refuse_overflow(S)
         axes = np.linalg.eigh(S)[1][:, ::-1].T
-        z, h, H = axes @ z, axes @ h, axes @ H
+        z = axes @ z
+        h = axes @ h
+        H = axes @ H
         f.update(z, HJacobian=lambda _: H, Hx=lambda _: h, R=np.eye(len(z)))
         self.iteration += 1
         if self.iteration == 1:
@@ -167,8 +176,8 @@ class _EKFTrack(FilterpyFilter):
 class UKF(Sequential):
     """Replaces slopes by readings at 2n + 1 sigma points (van der Merwe, dissertation, 2004).
 
-    The points lie at alpha sqrt(n + kappa) deviations. An alpha of 1e-3, as often advised, gives the centre a weight
-    of -1e6 and costs as many digits; 0.1 does not.
+    The points lie at alpha sqrt(n + kappa) deviations. An alpha of 1e-3, as often advised, gives
+    the centre a weight of -1e6 and costs as many digits; 0.1 does not.
 
     Example:
 
@@ -193,7 +202,9 @@ class UKF(Sequential):
         filter = UnscentedKalmanFilter(
             dim_x=n, dim_z=1, dt=1.0, hx=None, fx=lambda x, dt: x, points=points
         )
-        filter.x, filter.P, filter.Q = np.zeros(n), P0, Q
+        filter.x = np.zeros(n)
+        filter.P = P0
+        filter.Q = Q
         return FilterpyFilter(filter)
 
     def rule(self) -> Rule:
@@ -202,8 +213,8 @@ class UKF(Sequential):
 
 @dataclass(frozen=True)
 class CKF(Sequential):
-    """Reads 2n cubature points, sqrt(n) deviations out, in place of slopes (Arasaratnam and Haykin, IEEE TAC 54,
-    2009).
+    """Reads 2n cubature points, sqrt(n) deviations out, in place of slopes (Arasaratnam and Haykin,
+    IEEE TAC 54, 2009).
 
     Example:
 
@@ -222,9 +233,10 @@ class CKF(Sequential):
 
 
 class _CKFTrack(FilterpyFilter):
-    """Avoids filterpy's moments mean(X X') - x x', which lose digits if x is much larger than its deviation. So the
-    filter's state is the distance from a reference that moves to the estimate after each epoch, and its readings are
-    distances from the points' mean: the same filter, with nothing to cancel."""
+    """Avoids filterpy's moments mean(X X') - x x', which lose digits if x is much larger than its
+    deviation. So the filter's state is the distance from a reference that moves to the estimate
+    after each epoch, and its readings are distances from the points' mean: the same filter, with
+    nothing to cancel."""
 
     def __init__(self, P0: Array, Q: Array) -> None:
         from filterpy.kalman import CubatureKalmanFilter
@@ -234,7 +246,9 @@ class _CKFTrack(FilterpyFilter):
         self.filter: Any = CubatureKalmanFilter(
             dim_x=n, dim_z=1, dt=1.0, hx=None, fx=lambda x, dt: x
         )
-        self.filter.x, self.filter.P, self.filter.Q = np.zeros((n, 1)), P0, Q
+        self.filter.x = np.zeros((n, 1))
+        self.filter.P = P0
+        self.filter.Q = Q
 
     @property
     def x(self) -> Array:
@@ -245,7 +259,8 @@ class _CKFTrack(FilterpyFilter):
 
         if self.filter.Q.any():
             self.filter.predict()
-        # filterpy leaves the points of before the process noise; the filter's authors draw them anew.
+        # filterpy leaves the points of before the process noise; the filter's authors draw them
+        # anew.
         self.filter.sigmas_f = spherical_radial_sigmas(self.filter.x, self.filter.P)
 
     def points(self) -> Array:
@@ -253,7 +268,8 @@ class _CKFTrack(FilterpyFilter):
 
     def take_in(self, z: Array, hx: Callable[[Any], Array]) -> Array:
         f = self.filter
-        f.hx, f.sigmas_h = hx, np.empty((len(f.sigmas_f), len(z)))
+        f.hx = hx
+        f.sigmas_h = np.empty((len(f.sigmas_f), len(z)))
         # A flat z would make x a matrix: filterpy's x is a column here.
         f.update(z[:, None], R=np.eye(len(z)))
         self.reference = self.reference + f.x[:, 0]
@@ -263,10 +279,12 @@ class _CKFTrack(FilterpyFilter):
 
 @dataclass(frozen=True)
 class EnKF(Sequential):
-    """Samples the state by an ensemble with perturbed readings (Evensen 1994; Crassidis and Junkins, 2nd ed., 4.5).
+    """Samples the state by an ensemble with perturbed readings (Evensen 1994; Crassidis and
+    Junkins, 2nd ed., 4.5).
 
-    Without process noise the ensemble keeps within the span of its first draw, and P carries a sampling error of about
-    sqrt(2 / members): more members than parameters are needed, and many more for a P to be believed.
+    Without process noise the ensemble keeps within the span of its first draw, and P carries a
+    sampling error of about sqrt(2 / members): more members than parameters are needed, and many
+    more for a P to be believed.
 
     Example:
 
@@ -284,7 +302,8 @@ class EnKF(Sequential):
     family = "ensembles"
 
     def track(self, P0: Array, Q: Array, z: Array) -> ConstantFilter:
-        return _EnKFTrack(P0, Q, self.members, own_generators(self.seed, z[None])[0].bit_generator)
+        (generator,) = own_generators(self.seed, z[None])
+        return _EnKFTrack(P0, Q, self.members, generator.bit_generator)
 
 
 class _EnKFTrack(FilterpyFilter):
@@ -308,7 +327,8 @@ class _EnKFTrack(FilterpyFilter):
 
     def take_in(self, z: Array, hx: Callable[[Any], Array]) -> Array:
         # filterpy draws the perturbations about the second; epochs differ in length.
-        self.filter.hx, self.filter._mean_z = hx, np.zeros(len(z))
+        self.filter.hx = hx
+        self.filter._mean_z = np.zeros(len(z))
         with _drawing_from(self.stream):
             self.filter.update(z, R=np.eye(len(z)))
         return z  # the mean of the turned readings at the points is 0
@@ -319,10 +339,12 @@ _GLOBAL_STATE = Lock()
 
 @contextmanager
 def _drawing_from(stream: np.random.BitGenerator) -> Iterator[None]:
-    """Lends NumPy's global generator, which filterpy draws from, another stream, and puts back what was there."""
+    """Lends NumPy's global generator, which filterpy draws from, another stream, and puts back what
+    was there."""
     shared: Any = np.random  # NumPy's stubs do not know the two functions below
     with _GLOBAL_STATE:
-        generator, state = shared.get_bit_generator(), shared.get_state(legacy=False)
+        generator = shared.get_bit_generator()
+        state = shared.get_state(legacy=False)
         shared.set_bit_generator(stream)
         try:
             yield
@@ -338,10 +360,12 @@ def _squared_innovation(y: Array, S_inverse: Array) -> float:
 
 
 def _turned(z: Array, h: Array) -> tuple[Array, Array]:
-    """Turns the readings z (m,) and h (points, m), less the points' mean, to the principal axes of the points' spread.
+    """Turns the readings z (m,) and h (points, m), less the points' mean, to the principal axes of
+    the points' spread.
 
-    White readings stay white when turned, and the filter is the same; but S is then close to diagonal, so its inverse
-    and P - K S K' keep their digits where a wide prior makes S as ill-conditioned as 1e10.
+    White readings stay white when turned, and the filter is the same; but S is then close to
+    diagonal, so its inverse and P - K S K' keep their digits where a wide prior makes S as
+    ill-conditioned as 1e10.
     """
     centre = h.mean(axis=0)
     spread = h - centre

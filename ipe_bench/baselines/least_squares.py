@@ -1,11 +1,12 @@
-"""Fits all readings at once: the linear estimate, Gauss-Newton, Levenberg-Marquardt, and SciPy's own methods."""
+"""Fits all readings at once: the linear estimate, Gauss-Newton, Levenberg-Marquardt, and SciPy's
+own methods."""
 
 from __future__ import annotations
 
 import warnings
 from abc import abstractmethod
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -54,9 +55,10 @@ class LinearLSE(Estimator):
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         x, system = begin(problem, z, "linear_lse")
+        status = np.where(finite(x), Status.CONVERGED, Status.NONFINITE)
         return Estimates(
             x=x,
-            status=np.where(finite(x), Status.CONVERGED, Status.NONFINITE).astype(np.int8),
+            status=status.astype(np.int8),
             covariance=np.repeat(system.covariance(), len(z), axis=0),
             simulations=system.model.tally.simulations,
             history=[np.stack([problem.x0, row]) for row in x] if history else None,
@@ -68,12 +70,13 @@ class Batch(Estimator):
     """Minimises least squares iteratively; a subclass states the objective and the method."""
 
     start: Start = "nominal"
-    """Start of the iteration: the linear LSE, eq. (16), the nominal point, or that of the two where the readings fit
-    better (`best`)."""
+    """Start of the iteration: the linear LSE, eq. (16), the nominal point, or that of the two where
+    the readings fit better (`best`)."""
     max_iterations: Count = 100
     """Steps tried."""
     tolerance: Positive = 1e-6
-    """Largest Gauss-Newton step in standard deviations of the local bound: the gradient in whitened units."""
+    """Largest Gauss-Newton step in standard deviations of the local bound: the gradient in whitened
+    units."""
     budget: Positive | None = None
     """Simulations that a trial may cost, a Jacobian counting n; None: no limit."""
 
@@ -97,16 +100,14 @@ class Batch(Estimator):
 
 @dataclass(frozen=True)
 class GaussNewton(Batch):
-    """Iterates x <- x - (J' R^-1 J)^-1 J' R^-1 (h(x) - z), undamped unless `damping` is given: fast near the minimum,
-    and lost where the model is not nearly linear between start and minimum.
+    """Iterates x <- x - (J' R^-1 J)^-1 J' R^-1 (h(x) - z), undamped unless `damping` is given: fast
+    near the minimum, and lost where the model is not nearly linear between start and minimum.
 
     Example:
 
-    >>> import ipe_bench as ib
-    >>> bench = ib.Scenario(ib.measurements.Ranging(), ib.noise.Gaussian(0.1), error_scale=30.0)
-    >>> table = ib.run(bench, {"gauss_newton": ib.baselines.GaussNewton(start="nominal")}, trials=20)
-    >>> float(table.iloc[-1]["success"])
-    1.0
+    >>> import ipe_bench as ib >>> bench = ib.Scenario(ib.measurements.Ranging(),
+    ib.noise.Gaussian(0.1), error_scale=30.0) >>> table = ib.run(bench, {"gauss_newton":
+    ib.baselines.GaussNewton(start="nominal")}, trials=20) >>> float(table.iloc[-1]["success"]) 1.0
     """
 
     start: Start = "linear_lse"
@@ -114,30 +115,29 @@ class GaussNewton(Batch):
     """The initial lambda of Levenberg-Marquardt with Marquardt's scaling; None: no damping."""
 
     def method(self, objective: Objective) -> Method[Objective, LeastSquaresSystem]:
-        return (
-            GaussNewtonMethod() if self.damping is None else LevenbergMarquardtMethod(self.damping)
-        )
+        if self.damping is None:
+            return GaussNewtonMethod()
+        return LevenbergMarquardtMethod(self.damping)
 
 
 @dataclass(frozen=True)
 class LevenbergMarquardt(Batch):
-    """Shortens Gauss-Newton steps, in Marquardt's scaling, as long as the fit does not improve as predicted (Marquardt,
-    J. SIAM 11, 1963; More, LNM 630, 1978).
+    """Shortens Gauss-Newton steps, in Marquardt's scaling, as long as the fit does not improve as
+    predicted (Marquardt, J. SIAM 11, 1963; More, LNM 630, 1978).
 
     Example:
 
-    >>> import ipe_bench as ib
-    >>> bench = ib.Scenario(ib.measurements.Ranging(), ib.noise.Gaussian(0.1), error_scale=30.0)
-    >>> table = ib.run(bench, {"geodesic_lm": ib.baselines.LevenbergMarquardt(geodesic=True)}, trials=20)
-    >>> float(table.iloc[-1]["success"])
+    >>> import ipe_bench as ib >>> bench = ib.Scenario(ib.measurements.Ranging(),
+    ib.noise.Gaussian(0.1), error_scale=30.0) >>> table = ib.run(bench, {"geodesic_lm":
+    ib.baselines.LevenbergMarquardt(geodesic=True)}, trials=20) >>> float(table.iloc[-1]["success"])
     1.0
     """
 
     damping: Positive = 1e-3
     """lambda at the start."""
     geodesic: bool = False
-    """Bends each step along the curvature of the readings, for one more simulation (Transtrum and Sethna, 2012,
-    arXiv 1201.5885)."""
+    """Bends each step along the curvature of the readings, for one more simulation (Transtrum and
+    Sethna, 2012, arXiv 1201.5885)."""
 
     def method(self, objective: Objective) -> Method[Objective, LeastSquaresSystem]:
         return LevenbergMarquardtMethod(self.damping, geodesic=self.geodesic)
@@ -145,8 +145,9 @@ class LevenbergMarquardt(Batch):
 
 @dataclass(frozen=True)
 class MapLM(Batch):
-    """Maximises the posterior: least squares with the scenario's prior as further readings, by Levenberg-Marquardt
-    damped in the metric of the prior. It is the batch answer that a filter with the same prior should equal.
+    """Maximises the posterior: least squares with the scenario's prior as further readings, by
+    Levenberg-Marquardt damped in the metric of the prior. It is the batch answer that a filter with
+    the same prior should equal.
 
     Reports (J' R^-1 J + P0^-1)^-1.
 
@@ -171,18 +172,18 @@ class MapLM(Batch):
         return Objective.of(problem, z, self.prior_inflation)
 
     def method(self, objective: Objective) -> Method[Objective, LeastSquaresSystem]:
-        return LevenbergMarquardtMethod(
-            self.damping, objective.prior and objective.prior.deviations
-        )
+        metric = objective.prior and objective.prior.deviations
+        return LevenbergMarquardtMethod(self.damping, metric)
 
 
 @dataclass(frozen=True)
 class MultiscaleLM(Estimator):
-    """Minimises least squares for hard starts: twice from the nominal point, keeping the lower minimum.
+    """Minimises least squares for hard starts: twice from the nominal point, keeping the lower
+    minimum.
 
-    Marquardt's scaling (column norms of J, growing) may run along a parameter that the readings hardly see at the
-    start; parameters in multiples of their size do not, but fail where one ends far from its size. Costs about twice as
-    much as one Levenberg-Marquardt.
+    Marquardt's scaling (column norms of J, growing) may run along a parameter that the readings
+    hardly see at the start; parameters in multiples of their size do not, but fail where one ends
+    far from its size. Costs about twice as much as one Levenberg-Marquardt.
 
     Example:
 
@@ -204,28 +205,30 @@ class MultiscaleLM(Estimator):
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         objective = Objective.of(problem, z)
-        size = np.full(len(problem.x0), 1.0 / np.linalg.norm(problem.R.whiten_jacobian(problem.H)))
+        length = np.linalg.norm(problem.R.whiten_jacobian(problem.H))
+        size = np.full(len(problem.x0), 1.0 / length)
         start = np.repeat(problem.x0[None], len(z), axis=0)
         limits = Limits(self.tolerance, self.max_iterations, history=history)
         methods = (LevenbergMarquardtMethod(self.damping, metric) for metric in (size, None))
         by_size, by_columns = (minimize(objective, method, start, limits) for method in methods)
-        costs = [
-            np.where(np.isfinite(m.chi_square), m.chi_square, np.inf) for m in (by_size, by_columns)
-        ]
-        # The first where they fit alike to round-off; without a finite fit anywhere it keeps its status.
+        both = (by_size.chi_square, by_columns.chi_square)
+        costs = [np.where(np.isfinite(cost), cost, np.inf) for cost in both]
+        # The first where they fit alike to round-off; without a finite fit anywhere it keeps its
+        # status.
         best = by_size.replaced(np.arange(len(z)), by_columns, costs[1] < costs[0] * (1 - 1e-12))
         return best.estimates(objective.model.tally, z.shape[1])
 
 
 @dataclass(frozen=True)
 class Multistart(Estimator):
-    """Runs Levenberg-Marquardt from the nominal point, then from draws of the prior, until the residuals pass the
-    chi-square test; of all minima the lowest counts (Boender and Rinnooy Kan, Mathematical Programming 37, 1987).
+    """Runs Levenberg-Marquardt from the nominal point, then from draws of the prior, until the
+    residuals pass the chi-square test; of all minima the lowest counts (Boender and Rinnooy Kan,
+    Mathematical Programming 37, 1987).
 
-    After the first fit `confirmations` further starts look for another minimum that fits. Extras: `minima`, how many
-    distinct minima that fit were found, and `ambiguous`, 1 where there are several; `alternatives` lists the others.
-    Damping is in the metric of the prior. Without a prior it is in Marquardt's, and starts are spread by the size of
-    the nominal point.
+    After the first fit `confirmations` further starts look for another minimum that fits. Extras:
+    `minima`, how many distinct minima that fit were found, and `ambiguous`, 1 where there are
+    several; `alternatives` lists the others. Damping is in the metric of the prior. Without a prior
+    it is in Marquardt's, and starts are spread by the size of the nominal point.
 
     Example:
 
@@ -254,20 +257,24 @@ class Multistart(Estimator):
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         objective = Objective.of(problem, z)
-        tally, x0, trials = objective.model.tally, problem.x0, len(z)
+        tally = objective.model.tally
+        x0 = problem.x0
+        trials = len(z)
         draws = normals(own_generators(self.seed, z), self.starts - 1, len(x0))
         fitting = Fitting.none(trials, z.shape[1])
         method = LevenbergMarquardtMethod(self.damping, problem.prior_used())
         limits = Limits(self.tolerance, self.max_iterations, self.budget, history)
+        budget = np.inf if self.budget is None else self.budget
 
         def believed(found: Minima, rows: NDArray[np.intp]) -> Mask:
             """Tells which minima are believed, and notes those that fit."""
             return fitting.note(found, rows) & passes(found, z.shape[1], problem.doubted)
 
         best = minimize(objective, method, np.repeat(x0[None], trials, axis=0), limits)
+        # Starts since the first fit; -1 before it.
         confirmed = np.where(believed(best, np.arange(trials)), 0, -1)
         for k in range(self.starts - 1):
-            affordable = tally.of_search(len(x0)) < (np.inf if self.budget is None else self.budget)
+            affordable = tally.of_search(len(x0)) < budget
             hopeless = ~finite(z) | tally.failed(np.arange(trials))
             rows = np.flatnonzero((confirmed < self.confirmations) & affordable & ~hopeless)
             if not len(rows):
@@ -281,11 +288,13 @@ class Multistart(Estimator):
 
 @dataclass(frozen=True)
 class LeastSquares(Estimator):
-    """Minimises whitened residuals by `scipy.optimize.least_squares`, with the model's own Jacobian.
+    """Minimises whitened residuals by `scipy.optimize.least_squares`, with the model's own
+    Jacobian.
 
-    Parameters are scaled by the columns of that Jacobian (x_scale="jac"). Reports (J' J)^-1 of the whitened J; with a
-    robust loss, of the J that SciPy has reweighted for it. SciPy's own rules end the search; the trial has converged
-    if a Gauss-Newton step from there would be below `tolerance` deviations, else it has stalled.
+    Parameters are scaled by the columns of that Jacobian (x_scale="jac"). Reports (J' J)^-1 of the
+    whitened J; with a robust loss, of the J that SciPy has reweighted for it. SciPy's own rules end
+    the search; the trial has converged if a Gauss-Newton step from there would be below `tolerance`
+    deviations, else it has stalled.
 
     Example:
 
@@ -299,20 +308,22 @@ class LeastSquares(Estimator):
     method: Literal["trf", "lm", "dogbox"] = "trf"
     """Trust region, MINPACK's Levenberg-Marquardt, or dogleg."""
     start: Start = "best"
-    """The linear LSE, eq. (16), the nominal point, or that of the two where the readings fit better (`best`)."""
+    """The linear LSE, eq. (16), the nominal point, or that of the two where the readings fit better
+    (`best`)."""
     loss: Literal["linear", "soft_l1", "huber", "cauchy", "arctan"] = "linear"
     """Anything but linear bounds what one bad reading can do; `lm` knows linear only."""
     f_scale: Positive = 1.0
     """The residual, in deviations of the reading, from which a robust loss begins to flatten."""
     ftol: Rounding = 1e-14
-    """Relative decrease of the cost. At SciPy's 1e-8 the last step may still be a thousandth of a deviation."""
+    """Relative decrease of the cost. At SciPy's 1e-8 the last step may still be a thousandth of a
+    deviation."""
     xtol: Rounding = 1e-12
     gtol: Rounding = 1e-12
     max_nfev: Count | None = None
     """Evaluations of h after which the trial ends as max_iterations; None: SciPy's limit, 100 n."""
     tolerance: Positive = 1e-4
-    """Largest Gauss-Newton step still to go, in reported deviations, of a converged trial. SciPy cannot promise less
-    than about 1e-5: it watches the cost, which is flat there."""
+    """Largest Gauss-Newton step still to go, in reported deviations, of a converged trial. SciPy
+    cannot promise less than about 1e-5: it watches the cost, which is flat there."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -331,12 +342,10 @@ class LeastSquares(Estimator):
         x = starting_points(problem, z, self.start, tally)
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)
-            trials = [
-                _Residuals(problem, *trial) for trial in zip(z, x, tally.simulations, strict=True)
-            ]
-            return one_by_one(
-                trials, lambda trial: self._search(trial, history=history), problem.measurement.n
-            )
+            given = zip(z, x, tally.simulations, strict=True)
+            trials = [_Residuals(problem, *trial) for trial in given]
+            search = partial(self._search, history=history)
+            return one_by_one(trials, search, problem.measurement.n)
 
     def _search(self, residuals: _Residuals, *, history: bool) -> Estimates:
         """Runs one trial, as a batch of one."""
@@ -344,22 +353,21 @@ class LeastSquares(Estimator):
 
         jacobian: Any = residuals.J  # SciPy's stubs know its finite differences only
         options: Any = {name: getattr(self, name) for name in _SCIPYS}
-        x, covariance = (
-            residuals.start,
-            np.full((1, len(residuals.start), len(residuals.start)), np.nan),
-        )
-        status, message = (
-            Status.NONFINITE,
-            "a reading, or the model at the start, is not a finite number",
-        )
+        x = residuals.start
+        covariance = np.full((1, len(x), len(x)), np.nan)
+        status = Status.NONFINITE
+        message = "a reading, or the model at the start, is not a finite number"
         try:
             if np.isfinite(residuals.r(x)).all():
                 found = least_squares(residuals.r, x, jac=jacobian, x_scale="jac", **options)
-                x, message = found.x, ""
+                x = found.x
+                message = ""
                 status, covariance = self._judge(found)
         except Exception as error:
-            x, message = residuals.iterates[-1], describe_exception(error)
-            status = Status.SINGULAR if isinstance(error, np.linalg.LinAlgError) else Status.ERROR
+            x = residuals.iterates[-1]
+            message = describe_exception(error)
+            singular = isinstance(error, np.linalg.LinAlgError)
+            status = Status.SINGULAR if singular else Status.ERROR
         if not np.array_equal(x, residuals.iterates[-1]):
             residuals.iterates.append(x)
         return Estimates(
@@ -375,7 +383,8 @@ class LeastSquares(Estimator):
 
     def _judge(self, found: Any) -> tuple[Status, Array]:
         """Returns the status and (J' J)^-1 (1, n, n) at SciPy's end."""
-        J_plus, deficient = pseudo_inverse(found.jac[None], Covariance(np.ones(len(found.jac))))
+        white = Covariance(np.ones(len(found.jac)))
+        J_plus, deficient = pseudo_inverse(found.jac[None], white)
         P = np.matmul(J_plus, J_plus.swapaxes(1, 2))
         if not (np.isfinite(found.x).all() and np.isfinite(found.jac).all()):
             return Status.NONFINITE, P
@@ -383,6 +392,7 @@ class LeastSquares(Estimator):
             return Status.SINGULAR, P
         if found.status == _OUT_OF_EVALUATIONS:
             return Status.MAX_ITERATIONS, P
+        # The Gauss-Newton step P J'r, in deviations.
         to_go = np.abs(P[0] @ found.grad) / np.sqrt(np.diag(P[0]))
         return (Status.CONVERGED if to_go.max() <= self.tolerance else Status.STALLED), P
 
@@ -415,4 +425,5 @@ class _Residuals:
         self.jacobians += 1
         if not np.array_equal(x, self.iterates[-1]):
             self.iterates.append(x.copy())
-        return self.problem.R.whiten_jacobian(self.problem.measurement.jacobian(x[None]))[0]
+        J = self.problem.measurement.jacobian(x[None])
+        return self.problem.R.whiten_jacobian(J)[0]

@@ -1,12 +1,13 @@
-"""Filters epoch by epoch, the parameters as a random constant: by a library's own filter for each trial, or by a
-linearisation rule for all trials at once."""
+"""Filters epoch by epoch, the parameters as a random constant: by a library's own filter for each
+trial, or by a linearisation rule for all trials at once."""
 
 from __future__ import annotations
 
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -27,11 +28,12 @@ LARGEST = 1e150
 
 
 class ConstantFilter(ABC):
-    """Filters one trial. The state x is the parameters' distance from the nominal point in prior deviations, and the
-    readings are whitened (R = I).
+    """Filters one trial. The state x is the parameters' distance from the nominal point in prior
+    deviations, and the readings are whitened (R = I).
 
     Required: `x`, `P`, `predict`, `points` and `update`. Optional: `nis`, to which `update` adds.
-    Promised: random numbers come from a stream that is seeded by the readings; an exception ends this trial alone.
+    Promised: random numbers come from a stream that is seeded by the readings; an exception ends
+    this trial alone.
     """
 
     nis: float = 0.0
@@ -49,7 +51,8 @@ class ConstantFilter(ABC):
 
     @abstractmethod
     def predict(self) -> None:
-        """Brings the state from one epoch to the next: the parameters stay, the process noise comes on top."""
+        """Brings the state from one epoch to the next: the parameters stay, the process noise comes
+        on top."""
 
     @abstractmethod
     def points(self) -> Array:
@@ -57,40 +60,41 @@ class ConstantFilter(ABC):
 
     @abstractmethod
     def update(self, z: Array, h: Array, H: Array | None) -> bool:
-        """Takes in the readings z (m,), given h (points, m) and, for filters with slopes, dh/dx (m, n) at the points.
+        """Takes in the readings z (m,), given h (points, m) and, for filters with slopes, dh/dx (m,
+        n) at the points.
 
-        Returns False where the filter wants to be read again at new points before it is done with this epoch.
+        Returns False where the filter wants to be read again at new points before it is done with
+        this epoch.
         """
 
 
 @dataclass(frozen=True)
 class Sequential(Estimator):
-    """Filters readings epoch by epoch, the parameters as a random constant: a frozen dataclass of its options.
+    """Filters readings epoch by epoch, the parameters as a random constant: a frozen dataclass of
+    its options.
 
-    Required: `rule`, with `engine` "batched", or `track`, which returns a `ConstantFilter`. Optional: `slopes`;
-    `relinearisations`. Promised: what an `Estimator` promises. Reported are the filter's P, and as `extras["nis"]` the
-    squared innovations over their number: 1 on average if the filter is consistent (`intervals.mean_limits`).
+    Required: `rule`, with `engine` "batched", or `track`, which returns a `ConstantFilter`.
+    Optional: `slopes`; `relinearisations`. Promised: what an `Estimator` promises. Reported are the
+    filter's P, and as `extras["nis"]` the squared innovations over their number: 1 on average if
+    the filter is consistent (`intervals.mean_limits`).
 
-    >>> import ipe_bench as ib
-    >>> from ipe_bench.states import Taylor
-    >>> @dataclass(frozen=True)
-    ... class Extended(ib.Sequential):
-    ...     engine: Literal["batched"] = "batched"
-    ...     def rule(self):
-    ...         return Taylor()
-    >>> scenario = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01))
-    >>> z = scenario.draw(0, 3).z
-    >>> print(np.ptp([one.estimate(scenario.problem, z).x for one in (Extended(), ib.baselines.EKF())], 0).max() < 1e-9)
-    True
+    >>> import ipe_bench as ib >>> from ipe_bench.states import Taylor >>> @dataclass(frozen=True)
+    ... class Extended(ib.Sequential): ...     engine: Literal["batched"] = "batched" ...     def
+    rule(self): ...         return Taylor() >>> scenario = ib.Scenario(ib.measurements.Polynomial(),
+    ib.noise.Gaussian(0.01)) >>> z = scenario.draw(0, 3).z >>>
+    print(np.ptp([one.estimate(scenario.problem, z).x for one in (Extended(), ib.baselines.EKF())],
+    0).max() < 1e-9) True
     """
 
     prior_inflation: Positive = 1.0
     """The filter's prior deviations over the scenario's: in life a prior is never exact."""
     process_noise: NonNegative = 0.0
-    """Standard deviation of the parameters' random walk from one epoch to the next, in prior deviations (before
-    inflation). The parameters are constants, so anything above 0 makes the filter forget."""
+    """Standard deviation of the parameters' random walk from one epoch to the next, in prior
+    deviations (before inflation). The parameters are constants, so anything above 0 makes the
+    filter forget."""
     engine: Literal["filterpy", "batched"] = "filterpy"
-    """Implementation of the filter's equations: filterpy, trial by trial, or this package, for all trials at once."""
+    """Implementation of the filter's equations: filterpy, trial by trial, or this package, for all
+    trials at once."""
 
     needs: ClassVar[frozenset[Need]] = frozenset({"epochs", "prior"})
     slopes: ClassVar[bool] = False
@@ -98,15 +102,16 @@ class Sequential(Estimator):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for engine, method in (("batched", "rule"), ("filterpy", "track")):
-            if self.engine == engine and getattr(type(self), method) is getattr(Sequential, method):
-                raise UserError(
-                    f"engine={engine}: this filter has no {method}; choose the other engine"
-                )
+        method = "rule" if self.engine == "batched" else "track"
+        if getattr(type(self), method) is getattr(Sequential, method):
+            raise UserError(
+                f"engine={self.engine}: this filter has no {method}; choose the other engine"
+            )
 
     def track(self, P0: Array, Q: Array, z: Array) -> ConstantFilter:
-        """Makes the filter of one trial before its first reading, at x = 0 with covariance P0 (n, n) and process noise
-        Q (n, n) per epoch. z (m,) are all readings of the trial, for the seed of a random stream."""
+        """Makes the filter of one trial before its first reading, at x = 0 with covariance P0 (n,
+        n) and process noise Q (n, n) per epoch. z (m,) are all readings of the trial, for the seed
+        of a random stream."""
         raise NotImplementedError
 
     def rule(self) -> Rule:
@@ -115,8 +120,8 @@ class Sequential(Estimator):
 
     @property
     def relinearisations(self) -> tuple[int, float]:
-        """Returns the most linearisations of an epoch's readings, and the change of a parameter, in deviations of the
-        updated P, that ends them."""
+        """Returns the most linearisations of an epoch's readings, and the change of a parameter, in
+        deviations of the updated P, that ends them."""
         return 1, 0.0
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
@@ -131,7 +136,8 @@ class Sequential(Estimator):
 
 
 class _Filters(Walk):
-    """Holds the filters of a batch, at x = 0 with covariance P0 (n, n) and process noise Q (n, n) per epoch."""
+    """Holds the filters of a batch, at x = 0 with covariance P0 (n, n) and process noise Q (n, n)
+    per epoch."""
 
     def __init__(self, filter: Sequential, problem: Problem, z: Array) -> None:
         super().__init__(problem, z)
@@ -141,15 +147,16 @@ class _Filters(Walk):
 
 
 class _OneByOne(_Filters):
-    """Runs a `ConstantFilter` for each trial; an exception ends the trial that raises it and no other."""
+    """Runs a `ConstantFilter` for each trial; an exception ends the trial that raises it and no
+    other."""
 
     def __init__(self, filter: Sequential, problem: Problem, z: Array) -> None:
         super().__init__(filter, problem, z)
         self.tracks: dict[int, ConstantFilter] = {}
         for t in self.going.tolist():
-            self.tracks[t] = self.attempt(
-                t, lambda t=t: filter.track(self.P[t].copy(), self.Q.copy(), z[t])
-            )
+            P0 = self.P[t].copy()
+            Q = self.Q.copy()
+            self.tracks[t] = self.attempt(t, partial(filter.track, P0, Q, z[t]))
 
     def attempt(self, trial: int, action: Callable[[], Any]) -> Any:
         """Returns `action()`, or None if it raises."""
@@ -164,45 +171,56 @@ class _OneByOne(_Filters):
     def take_in(self, epoch: Epoch, at: Rows) -> None:
         for trial in at.tolist():
             self.attempt(trial, self.tracks[trial].predict)
+        # A filter that linearises again wants to be read at new points.
         waiting = self.going.tolist()
         while waiting:
-            tried = {t: self.attempt(t, self.tracks[t].points) for t in waiting}
-            points, waiting = {t: s for t, s in tried.items() if s is not None}, []
-            if points:
-                s = np.stack(list(points.values()))
-                kept, h, H = self.read(
-                    epoch, s, np.array(list(points), dtype=np.intp), slopes=self.filter.slopes
-                )
-                for i, trial in enumerate(kept.tolist()):
-                    z, slope = epoch.whitened(self.z[trial]), None if H is None else H[i]
-                    update = self.tracks[trial].update
-                    if (
-                        self.attempt(trial, lambda u=update, z=z, h=h[i], H=slope: u(z, h, H))
-                        is False
-                    ):
-                        waiting.append(trial)
+            waiting = self._updated(epoch, waiting)
         for trial in self.going.tolist():
             track = self.tracks[trial]
-            self.x[trial], self.P[trial], self.nis[trial] = track.x, track.P, track.nis
+            self.x[trial] = track.x
+            self.P[trial] = track.P
+            self.nis[trial] = track.nis
+
+    def _updated(self, epoch: Epoch, trials: Sequence[int]) -> list[int]:
+        """Reads trials at the points that their filters want, and returns those that want more."""
+        tried = {t: self.attempt(t, self.tracks[t].points) for t in trials}
+        points = {t: s for t, s in tried.items() if s is not None}
+        if not points:
+            return []
+        s = np.stack(list(points.values()))
+        at = np.array(list(points), dtype=np.intp)
+        kept, h, H = self.read(epoch, s, at, slopes=self.filter.slopes)
+        waiting = []
+        for i, trial in enumerate(kept.tolist()):
+            z = epoch.whitened(self.z[trial])
+            slope = None if H is None else H[i]
+            done = self.attempt(trial, partial(self.tracks[trial].update, z, h[i], slope))
+            if done is False:
+                waiting.append(trial)
+        return waiting
 
 
 class _Stack(_Filters):
     """Filters all trials at once; a trial's bits do not depend on which others there are."""
 
     def take_in(self, epoch: Epoch, at: Rows) -> None:
-        rule, (iterations, tolerance) = self.filter.rule(), self.filter.relinearisations
+        rule = self.filter.rule()
+        iterations, tolerance = self.filter.relinearisations
         self.P[at] += self.Q
-        x, P = self.x.copy(), self.P.copy()
+        x = self.x.copy()
+        P = self.P.copy()
         for iteration in range(iterations):
             before = self.x[at]
+            # Each linearisation updates the prediction anew, about the last estimate.
             readings = _TurnedReadings(self, epoch, at, P[at])
             read = rule.linearise(readings, before, self.P[at])
-            found = update(Normal(x[at], P[at]), read, np.eye(read.b.shape[-1]), readings.z)
-            self.x[at], self.P[at] = found.x
+            R = np.eye(read.b.shape[-1])
+            found = update(Normal(x[at], P[at]), read, R, readings.z)
+            self.x[at] = found.x.mean
+            self.P[at] = found.x.covariance
             if iteration == 0:
-                self.nis[at] += (
-                    found.nis
-                )  # the innovation of the prediction; later ones have seen z
+                # The innovation of the prediction; later ones have seen z.
+                self.nis[at] += found.nis
             lost = ~finite(found.x.mean)
             singular = lost & (self.status[at] == Status.RUNNING)
             self.end(at[singular], Status.SINGULAR, f"S is singular at epoch {epoch.number}")
@@ -213,14 +231,18 @@ class _Stack(_Filters):
 
 
 class _TurnedReadings:
-    """Turns an epoch's whitened readings, functions of the states of the trials `at`, to axes that make S nearly
-    diagonal: white readings stay white, and S keeps its digits where a wide prior makes it as ill-conditioned as 1e10.
+    """Turns an epoch's whitened readings, functions of the states of the trials `at`, to axes that
+    make S nearly diagonal: white readings stay white, and S keeps its digits where a wide prior
+    makes it as ill-conditioned as 1e10.
 
     Trials that the model ends are NaN.
     """
 
     def __init__(self, walk: Walk, epoch: Epoch, at: Rows, P: Array) -> None:
-        self.walk, self.epoch, self.at, self.P = walk, epoch, at, P
+        self.walk = walk
+        self.epoch = epoch
+        self.at = at
+        self.P = P
         self.z = epoch.whitened(walk.z[at])
 
     def __call__(self, x: Array) -> Array:
@@ -235,34 +257,33 @@ class _TurnedReadings:
     def slope(self, x: Array) -> tuple[Array, Array]:
         """Returns h (trials, m) and dh/dx (trials, m, n)."""
         h, H = self._read(x[:, None], slopes=True)
-        axes = _principal_axes(np.matmul(np.matmul(H, self.P), H.swapaxes(1, 2))).swapaxes(1, 2)
+        # S is H P H' + I: axes of the first are those of the sum.
+        spread = np.matmul(np.matmul(H, self.P), H.swapaxes(1, 2))
+        axes = _principal_axes(spread).swapaxes(1, 2)
         self.z = multiply(axes, self.z)
         return multiply(axes, h[:, 0]), np.matmul(axes, H)
 
     def _read(self, x: Array, *, slopes: bool) -> tuple[Array, Array]:
         """Returns h (trials, points, m) as it is and, for one point, dh/dx (trials, m, n)."""
-        known, number = finite(x), self.epoch.number
-        self.walk.end(
-            self.at[~known],
-            Status.SINGULAR,
-            f"the filter's P is not positive definite at epoch {number}",
-        )
+        known = finite(x)
+        indefinite = f"the filter's P is not positive definite at epoch {self.epoch.number}"
+        self.walk.end(self.at[~known], Status.SINGULAR, indefinite)
         kept, h, H = self.walk.read(self.epoch, x[known], self.at[known], slopes=slopes)
         beyond = ~(np.abs(h if H is None else H).max(axis=(1, 2), initial=0) < LARGEST)
-        self.walk.end(
-            kept[beyond],
-            Status.NONFINITE,
-            "what the filter is to take in is beyond the range of numbers",
-        )
-        rows, (trials, points, n), m = np.isin(self.at, kept[~beyond]), x.shape, self.z.shape[1]
-        values, tangents = np.full((trials, points, m), np.nan), np.full((trials, m, n), np.nan)
+        too_large = "what the filter is to take in is beyond the range of numbers"
+        self.walk.end(kept[beyond], Status.NONFINITE, too_large)
+        rows = np.isin(self.at, kept[~beyond])
+        trials, points, n = x.shape
+        m = self.z.shape[1]
+        values = np.full((trials, points, m), np.nan)
         values[rows] = h[~beyond]
+        tangents = np.full((trials, m, n), np.nan)
         if H is not None:
             tangents[rows] = H[~beyond]
         return values, tangents
 
 
 def _principal_axes(G: Array) -> Array:
-    """Computes orthonormal axes (trials, m, m), one per column, in which each symmetric G (trials, m, m) is
-    diagonal."""
+    """Computes orthonormal axes (trials, m, m), one per column, in which each symmetric G (trials,
+    m, m) is diagonal."""
     return np.linalg.eigh(np.nan_to_num(G))[1]
