@@ -13,10 +13,16 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from gallery_frames import SUFFIX, read
+from make_docs import STORED
 from PIL import Image
 from scipy.stats import chi2
 
 import ipe_bench as ib
+from ipe_bench.report.page.headline import headline
+from ipe_bench.report.tables.matrix import Matrix
+from ipe_bench.report.tables.table import markdown
+from ipe_bench.statistics.analysis import Analysis, analyse
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -57,6 +63,46 @@ def test_the_columns_that_the_advice_on_choosing_names_are_there(tmp_path):
 
 def test_it_has_at_most_1100_words():
     assert len(README.split()) <= 1100
+
+
+def opening(analysis: Analysis) -> tuple[str, list[list[str]]]:
+    """What the page of these results opens with: its finding, and the cells of its matrix as they stand on paper."""
+    parts = headline(analysis)
+    (matrix,) = [part for part in parts if isinstance(part, Matrix)]
+    lines = markdown(matrix.folded()).splitlines()
+    rows = [cells(line) for line in lines if line.startswith("| ")]
+    return str(parts[0]), rows
+
+
+def assert_opening(analysis: Analysis) -> None:
+    """README's finding and matrix are those of the page; three columns more stand behind."""
+    finding, rows = opening(analysis)
+    assert f"**{finding}:**" in README
+    begins = README.index("| error scale →")
+    lines = itertools.takewhile(lambda line: line.startswith("|"), README[begins:].splitlines())
+    shown = [cells(line)[:-3] for line in lines if not line.startswith("|:")]
+    assert shown == rows
+
+
+def shown_shares() -> dict[str, tuple[dict[float, float], list[str]]]:
+    """Success in per cent at each error scale, a folded column for both of its ends, and what stands behind."""
+    header, *rows = [
+        line for line in README.splitlines() if line.startswith(("| error scale →", "| `"))
+    ]
+    found = {}
+    for row in rows:
+        name, *values = cells(row)
+        by_scale = {
+            float(scale): float(value.rstrip("▲?"))
+            for title, value in zip(cells(header)[1:-3], values, strict=False)
+            for scale in title.split(" to ")
+        }
+        found[name] = (by_scale, values[-3:])
+    return found
+
+
+def test_it_opens_with_the_finding_and_the_matrix_of_the_stored_experiment():
+    assert_opening(read(STORED / f"headline{SUFFIX}").analysis)
 
 
 def cells(row: str) -> list[str]:
@@ -150,23 +196,18 @@ def test_every_line_runs_in_order_and_the_table_comes_out(tmp_path):
     )
     assert done.returncode == 0, done.stderr[-2000:]
     found = check(tmp_path / "outputs/headline")
-    scales = [0.1, 1, 10, 33, 100, 300, 1000]
-    table = [
-        line.replace("*", "").strip("| ").split(" | ")
-        for line in README.splitlines()
-        if line.startswith("| `")
-    ]
-    assert len(table) == 8
+    assert_opening(analyse([tmp_path / "outputs/headline"]))
+    shares = shown_shares()
+    assert len(shares) == 8
     trials = ib.load(tmp_path / "outputs/headline")
-    for name, *cells in table:
-        own = found.xs(name.strip("`"), level="estimator")
-        assert [float(cell) for cell in cells[:7]] == pytest.approx(
-            [100 * own["success"][s] for s in scales]
-        )
-        assert float(cells[7].replace("M", "e6")) == pytest.approx(own["nees"][100.0], rel=0.005)
-        cost = trials.query("error_scale == 100 and estimator == @name.strip('`')")
+    for name, (by_scale, further) in shares.items():
+        own = found.xs(name, level="estimator")
+        assert [*by_scale] == [*own.index]
+        assert [*by_scale.values()] == pytest.approx([*(100 * own["success"])], abs=0.51)
+        assert float(further[0].replace("M", "e6")) == pytest.approx(own["nees"][100.0], rel=0.005)
+        cost = trials.query("error_scale == 100 and estimator == @name")
         paid = np.median(cost["simulations"] + cost["jacobians"] * 11.08695652173913)
-        assert float(cells[8]) == pytest.approx(paid, abs=0.5)
+        assert float(further[1]) == pytest.approx(paid, abs=0.5)
     answered = (
         trials.query("estimator == 'auto' and extra_stage == 2").groupby("error_scale").size() / 200
     )
