@@ -17,7 +17,7 @@ import pandas as pd
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PathCollection
-from matplotlib.colors import to_rgb
+from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.offsetbox import AnnotationBbox
 from shared.synthetic_store import Filter, Pretender, Seeker, Synthetic
@@ -25,7 +25,15 @@ from shared.synthetic_store import Filter, Pretender, Seeker, Synthetic
 from ipe_bench.baselines import EnKF
 from ipe_bench.basics.errors import UserError
 from ipe_bench.report import figures
-from ipe_bench.report.figures import common, costs, draw_all, errors, parameters, settings
+from ipe_bench.report.figures import (
+    certified,
+    common,
+    costs,
+    draw_all,
+    errors,
+    parameters,
+    settings,
+)
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.views import View, focus_of, views
 from ipe_bench.report.style import (
@@ -34,6 +42,7 @@ from ipe_bench.report.style import (
     FAMILIES,
     GREY,
     POOL,
+    RAMP,
     REFERENCE,
     WHITE,
     dark,
@@ -513,6 +522,52 @@ def test_errors_of_tracks_are_over_all_epochs_each_state_over_the_bound_of_filte
         "rms over all epochs",
         "mean over all epochs",
     ]
+
+
+# Certified and published answers -------------------------------------------------------------------------------------
+
+
+def with_collection() -> View:
+    return View(
+        "", "", {"summary": pd.DataFrame()}, {}, {}, {}, collection=SimpleNamespace(groups=[])
+    )
+
+
+def test_digits_of_each_problem_are_in_its_cell_blue_from_four_on_the_hardest_first():
+    digits = {
+        ("easy", "good"): 10.9,
+        ("easy", "bad"): 4.2,
+        ("hard", "good"): 4.0,
+        ("hard", "bad"): np.nan,
+    }
+    rows = [
+        {"dataset": problem, "estimator": who, "start": 1, "lre_parameters": value}
+        for (problem, who), value in digits.items()
+    ]
+    with patch.object(certified, "certified_table", return_value=pd.DataFrame(rows)):
+        drawing = drawn(certified, with_collection())["digits"]
+    (ax,) = drawing.figure.axes
+    assert [t.get_text() for t in ax.get_yticklabels()] == ["hard", "easy"]
+    assert [t.get_text() for t in ax.get_xticklabels()] == ["good", "bad"]
+    assert [t.get_text() for t in ax.texts] == ["4", "0", "10", "4"]
+    fills = [to_hex(color) for color in ax.collections[0].get_facecolors()]
+    assert [fill in RAMP[:2] for fill in fills] == [True, False, True, True]
+    assert "good solves 100 %" in drawing.caption
+
+
+def test_published_errors_are_rings_about_those_that_are_found():
+    rows = pd.DataFrame({"model": "book", "state": "angle", "estimator": ["ekf", "ukf"]})
+    rows = rows.assign(published=[0.2, 0.1], found=[0.2, 0.125], difference=[0.0, 0.025])
+    with (
+        patch.object(certified, "published_table", return_value=rows),
+        patch.object(certified, "certified_table", return_value=pd.DataFrame()),
+    ):
+        drawing = drawn(certified, with_collection())["published"]
+    (ax,) = drawing.figure.axes
+    assert [t.get_text() for t in ax.get_yticklabels()] == ["ukf", "ekf"]
+    at = {line.get_label(): list(line.get_xdata()) for line in ax.lines}
+    assert at == {"published": [0.1, 0.2], "found": [0.125, 0.2]}
+    assert "2.5e-02" in drawing.caption
 
 
 # Settings ------------------------------------------------------------------------------------------------------------

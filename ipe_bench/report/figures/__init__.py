@@ -18,9 +18,11 @@ from ipe_bench.report.formats import FORMATS, PAGE
 from ipe_bench.report.style import Which, house_style
 from ipe_bench.statistics.analysis import Analysis
 
-FIGURES = ("settings", "errors", "costs", "parameters", "matrix")
+FIGURES = ("certified", "settings", "errors", "costs", "parameters", "matrix")
 """The modules in the order of the report; each holds its kinds of figures in FIGURES."""
 NAMES = {
+    "digits": "digits of certified parameters that agree, by problem and estimator",
+    "published": "errors that were found beside published ones",
     "settings": "error by setting, and how often a misfit is detected; of a number that is swept, an axis of it",
     "headline": "success, error and reported covariance of all trials",
     "matrix": "success of every estimator at every error scale, best first",

@@ -1,0 +1,89 @@
+"""Draws answers beside those that are certified or published: the digits that agree, and the errors that are met."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from ipe_bench.report.figures import common
+from ipe_bench.report.figures.drawing import Drawing
+from ipe_bench.report.figures.views import Figure, View
+from ipe_bench.report.style import BOUND_COLOR, RAMP, ink
+from ipe_bench.report.words import percent
+from ipe_bench.statistics.certified import certified_table, published_table
+
+SOLVED = 4
+"""Digits from which on a problem is solved."""
+_STEPS = {0: RAMP[8], 1: RAMP[6], 2: RAMP[4], 3: RAMP[2], SOLVED: RAMP[1], 8: RAMP[0]}
+"""Colours from so many digits on: blue where a problem is solved."""
+
+
+def draw_digits(view: View) -> Iterator[Drawing]:
+    """Draws the digits of each certified problem by estimator, the hardest problem and the best estimator first."""
+    import seaborn as sns
+    from matplotlib.colors import BoundaryNorm, ListedColormap
+
+    table = pd.DataFrame() if view.collection is None else certified_table(view.collection)
+    if table.empty:
+        return
+    table["digits"] = np.floor(table["lre_parameters"].fillna(0.0))
+    mean = {by: table.groupby(by)["digits"].mean().sort_values() for by in ("dataset", "estimator")}
+    problems, estimators = mean["dataset"].index, mean["estimator"].index[::-1]
+    starts = sorted(set(table["start"]))
+    fig, axes = common.panels(len(starts), row=2)
+    fig.set_size_inches(1.3 + 4.4 * len(axes), 1.8 + 0.2 * len(problems))
+    norm = BoundaryNorm([*_STEPS, 99], len(_STEPS))
+    for start, ax in zip(starts, axes, strict=True):
+        here = table[table["start"] == start].pivot_table("digits", "dataset", "estimator")
+        cells = here.reindex(index=problems, columns=estimators)
+        style: Any = {"cbar": False, "annot": True, "fmt": ".0f", "linewidths": 0.8}
+        sns.heatmap(cells, ax=ax, cmap=ListedColormap(list(_STEPS.values())), norm=norm, **style)
+        for text in ax.texts:
+            step = max(k for k in _STEPS if k <= int(text.get_text()))
+            # Neither is grey, whose place another takes on a dark page.
+            dark = ink(_STEPS[step]) != "#ffffff"
+            text.set(color="#1b2635" if dark else "#fff8ea", fontsize="small")
+        ax.set(xlabel="", ylabel="", title=f"start {start}")
+        ax.set_xticks(ax.get_xticks(), [common.text(e) for e in estimators], rotation=90)
+        ax.set_yticks(np.arange(len(problems)) + 0.5, list(problems), rotation=0)
+    solved = table["digits"] >= SOLVED
+    best = str(estimators[0])
+    share = percent(float(solved[table["estimator"] == best].mean()))
+    yield view.drawing(
+        fig,
+        "digits",
+        "Correct digits of certified parameters, of 11",
+        f"Of the parameter with fewest; blue: {SOLVED} or more, solved. Hardest problems first, best estimators left:"
+        f" {best} solves {share}.",
+    )
+
+
+def draw_published(view: View) -> Iterator[Drawing]:
+    """Draws errors that were found within rings of those that are published, the smallest first."""
+    table = pd.DataFrame() if view.collection is None else published_table(view.collection)
+    if table.empty:
+        return
+    groups = list(table.groupby(["model", "state"], sort=False))[: common.MOST_PANELS]
+    fig, axes = common.panels(len(groups), dict.fromkeys(table["estimator"]), scales=[0.0])  # type: ignore[arg-type]
+    for ((model, state), rows), ax in zip(groups, axes, strict=True):
+        rows = rows.sort_values("published")
+        common.name_axis(ax, list(rows["estimator"]))
+        ring: Any = {"markersize": 9, "markerfacecolor": "white", "color": BOUND_COLOR}
+        y = np.arange(len(rows))
+        ax.plot(rows["published"], y, "o", label="published", **ring)
+        ax.plot(rows["found"], y, "o", markersize=4, color="#0b5a8f", label="found")
+        ax.set(xlabel="root mean square error", xlim=(0, None))
+        common.title(ax, f"{model}, {state}")
+    common.legend(fig, axes)
+    most = table["difference"].abs().max()
+    caption = f"Errors along the published path; the largest difference is {most:.1e}."
+    yield view.drawing(fig, "published", "Published errors and those found", caption)
+
+
+FIGURES = (
+    Figure(draw_digits, ("summary",), together=True, main=True),
+    Figure(draw_published, ("summary",), together=True, main=True),
+)
