@@ -373,7 +373,7 @@ def no_option(group: str, name: str, groups: Groups) -> str:
     """Suggests a replacement of an option that its group lacks: its own group, where another group has it."""
     for other, names in groups.items():
         if name in names and other != group:
-            return f"{name} is no {group} but a {other}; write {_choosing(other, name)}"
+            return f"{name} is a {other}, not a {group}; write {_choosing(other, name)}"
     nist = group == "measurement" and name.lower().startswith("nist/")
     known = [one for one in groups[group] if one.startswith("nist/") == nist]
     meant = next((one for one in known if one.lower() == name.lower()), name)

@@ -311,7 +311,7 @@ class _StandIn(Noise):
         raise UserError(f"noise={self.name}: cannot simulate readings; choose another noise")
 
     def covariance(self, m: int) -> Covariance:
-        raise UserError(f"noise={self.name}: knows no R of its own; choose another noise")
+        raise UserError(f"noise={self.name}: has no R; choose another noise")
 
 
 @dataclass(frozen=True)

@@ -77,7 +77,9 @@ def known_parameters(parameters: Mapping[str, Any]) -> tuple[ParameterInfo, ...]
     for name, options in parameters.items():
         where = f"parameters.{name}"
         if not isinstance(options, Mapping):
-            raise UserError(f"{where}={options}: say what that is, such as {where}.fixed={options}")
+            raise UserError(
+                f"{where}={options}: state what that is, such as {where}.fixed={options}"
+            )
         found.append(instantiate(ParameterInfo, {"name": str(name), **options}, where))
     return tuple(found)
 

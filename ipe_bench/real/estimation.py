@@ -154,8 +154,8 @@ def prior_stated(prior: Prior, model: Measurement) -> Prior:
         return prior
     if not isinstance(prior, GaussianPrior):
         raise UserError(
-            f"parameters: goes with prior=gaussian, which is told of each; prior={prior.name} is"
-            " not"
+            f"parameters: needs prior=gaussian, which takes a deviation of each; prior={prior.name}"
+            " does not"
         )
     if prior.deviations is None:
         return replace(prior, deviations=model.prior_deviations)

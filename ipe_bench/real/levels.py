@@ -373,7 +373,7 @@ def _require_residuals(levels: Levels, z: Array, r: Array, J: Array) -> None:
         rank = np.linalg.matrix_rank(scaled[rows]) if known else 0
         if len(rows) - rank < len(levels.names):
             raise UserError(
-                f"noise=unknown: the {len(rows)} readings {told}are too few to tell"
+                f"noise=unknown: the {len(rows)} readings {told}are too few to determine"
                 f" {', '.join(levels.names)} beside {rank} parameters; state the noise, as in"
                 " noise.deviation=0.1, or let more readings share a level"
             )

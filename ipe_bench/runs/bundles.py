@@ -135,7 +135,7 @@ def read_bundle(path: Path) -> Bundle:
                     )
                 if name not in there or digests.get(name) != _digest_of(archive, name):
                     raise UserError(
-                        f"{path}: was damaged or changed: {name} is not as its manifest says; get it anew"
+                        f"{path}: was damaged or changed: {name} differs from its manifest; get it anew"
                     )
     except UserError:
         raise

@@ -664,7 +664,7 @@ SCORES: tuple[Statistic, ...] = (
         "eq_18_trials",
         "K below 1",
         "converged trials of fixed-point iteration with a stored history",
-        "Number of those in which the K of eq. (15) at the truth is below 1, so that eq. (18) says something.",
+        "Number of those in which the K of eq. (15) at the truth is below 1, so that eq. (18) applies.",
         lambda s: len(f.fixed_point_bounds(s)),
         kind="count",
         where=("iterations",),

@@ -694,7 +694,7 @@ def does_every_task(execution: Execution) -> None:
     told = _told(execution)
     for i, right in _told(Serial()).items():
         assert told[i] == right, (
-            f"of task {i} it tells {', '.join(told[i]) or 'nothing'}; right is {', '.join(right)}"
+            f"of task {i} it reports {', '.join(told[i]) or 'nothing'}; right is {', '.join(right)}"
         )
 
 

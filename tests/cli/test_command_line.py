@@ -97,11 +97,11 @@ MISTAKES = {
     ),
     "a solver among baselines": (
         ["run", "baseline=[newton]"],
-        "newton is no baseline but a solver; write solver",
+        "newton is a solver, not a baseline; write solver",
     ),
     "a baseline among solvers": (
         ["run", "solver=[gauss_newton]"],
-        "is no solver but a baseline; write baseline",
+        "is a baseline, not a solver; write baseline",
     ),
     "a group for a place": (
         ["run", "baseline.ekf.process_noise=1"],
@@ -248,7 +248,7 @@ OF_STATES = [
     (["measurement=polynomial", "tracker=[ekf]"], "tracker: goes with state_model=NAME"),
     (
         ["state_model=pendulum", "tracker=[newton]"],
-        "tracker=newton: newton is no tracker but a solver",
+        "tracker=newton: newton is a solver, not a tracker",
     ),
     (
         ["state_model=pendulum", "trackers.ukf.iterations=0"],

@@ -330,7 +330,7 @@ def test_a_model_of_formulas_may_stand_in_a_file(tmp_path, estimate):
         (["readings=good.csv", "tracker=[nothing]"], "tracker=nothing: there is no such option"),
         (
             ["readings=good.csv", "tracker=[newton]"],
-            "tracker=newton: newton is no tracker but a solver",
+            "tracker=newton: newton is a solver, not a tracker",
         ),
         (
             ["readings=good.csv", "baseline=[ekf]"],

@@ -303,9 +303,9 @@ class Hasty(Execution):
         (Faulty(power=0.0), "at ten times the error scale"),
         (
             Swallowing(),
-            "of task 1 it tells step 0, step 1, end; right is step 0, step 1, a Failure ValueError: wrong",
+            "of task 1 it reports step 0, step 1, end; right is step 0, step 1, a Failure ValueError: wrong",
         ),
-        (Hasty(), "of task 0 it tells end; right is step 0, step 1, step 2, end"),
+        (Hasty(), "of task 0 it reports end; right is step 0, step 1, step 2, end"),
     ],
     ids=repr,
 )

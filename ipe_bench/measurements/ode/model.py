@@ -217,7 +217,7 @@ class OdeMeasurement(Measurement):
         if self.step is None and not np.isfinite(self._told(x, len(self.times))).all():
             return (
                 f"neither steps of {shortest:.2g}{unit}, the shortest, nor the implicit method"
-                " tell these readings: outputs magnify what any step leaves of the states, or the"
+                " determine these readings: outputs magnify what any step leaves of the states, or the"
                 " solution parts from those next to it"
             )
         needed = STABLE / max(effort.fastest, 1e-300)

@@ -178,7 +178,7 @@ def audit(claims: Claims) -> Audit:
         return _with_infinite_errors(claims, lost)
     if claims.runs < FEWEST_RUNS:
         one = (
-            "one log of dependent rows says too little; "
+            "one log of dependent rows is too little evidence; "
             if claims.runs == 1 and len(claims.run) > 1
             else ""
         )
@@ -266,8 +266,8 @@ def _of_scale(claims: Claims, scale: Factor, nees: Array) -> str:
     spread = float(mean.var(ddof=1) / mean.mean() ** 2)
     needed = np.ceil(spread * ((ndtri(1 - ALPHA / 4) + ndtri(0.8)) / (2 * np.log(MATTERS))) ** 2)
     return (
-        f"True errors are {scale.words}: {claims.runs} runs cannot tell if the covariance is right; "
-        f"a standard deviation that is wrong by 10 % would be seen in {needed:.0f} runs."
+        f"True errors are {scale.words}: {claims.runs} runs do not decide if the covariance is right; "
+        f"a standard deviation that is wrong by 10 % would be detected in {needed:.0f} runs."
     )
 
 
@@ -492,7 +492,7 @@ def _widened(frame: pd.DataFrame, name: str) -> pd.DataFrame:
     values = [c for c in ("true", "estimate", "error", "std", "var") if c in frame]
     index = [c for c in frame.columns if c not in (*values, "parameter")]
     if not index:
-        raise UserError(f"{name}: has no column run, which tells what belongs together")
+        raise UserError(f"{name}: has no column run, which groups the rows of a run")
     if (twice := frame.duplicated([*index, "parameter"]).to_numpy()).any():
         row = int(np.argmax(twice)) + 2
         raise UserError(
@@ -520,7 +520,7 @@ def _error_and_deviation(frame: pd.DataFrame, parameter: str, name: str) -> tupl
             stated[column] = values if column.endswith("_std") else np.sqrt(np.maximum(values, 0.0))
     if not stated:
         raise UserError(
-            f"{name}: does not say how sure {parameter} is; give {parameter}_std, {parameter}_var or "
+            f"{name}: has no deviation of {parameter}; give {parameter}_std, {parameter}_var or "
             f"cov_{parameter}_{parameter}"
         )
     (first, deviation), *others = stated.items()

@@ -68,7 +68,7 @@ class Comparison(Shown, pd.DataFrame):
         )
         margins = ", ".join(f"{name} {margin:g}" for name, margin in self.attrs["margins"].items())
         yield (
-            f"better and worse are changes that p tells from none, by more than a margin: {margins}. different is a"
+            f"better and worse are significant changes larger than a margin: {margins}. different is a significant"
             " change that may be smaller than the margin."
         )
         if self["quantity"].str.match("honesty|bias").any():

@@ -225,7 +225,7 @@ def _matches(
     for collection in (first, second):
         if not collection.groups:
             raise UserError(
-                f"{_where(collection)}: holds no trials to compare; `ipe-bench status` says what is missing"
+                f"{_where(collection)}: holds no trials to compare; `ipe-bench status` lists what is missing"
             )
     a, b = _by_scenario(first), _by_scenario(second)
     if not a.keys() & b.keys():

@@ -33,7 +33,7 @@ def draw_further(model: Measurement, further: Further) -> Drawing:
         axes[0].plot(number, further.bounds[:, k] / today[k], "o-", **line)
         for ax in axes[1:]:
             ax.plot(further.entries, further.alone[:, k] / today[k], **line)
-    axes[0].set_xlabel("further readings, where they tell most")
+    axes[0].set_xlabel("further readings, where they help most")
     for ax in axes[1:]:
         ax.set_xlabel(common.text(further.column))
         at = further.entries[further.taken[0]]

@@ -157,7 +157,7 @@ def design(
     if R.factor.ndim != 1:
         raise UserError(
             f"noise={scenario.noise.name}: the errors of readings are correlated, so that readings do not add up; a "
-            "design wants noise=gaussian or noise=quantization"
+            "design needs noise=gaussian or noise=quantization"
         )
     R_all = scenario.noise.covariance(candidates.m)
     whole = Observability.at(candidates, R_all, x)
