@@ -55,7 +55,7 @@ def test_every_richer_version_of_the_model_is_suspected(ipe_bench):
         assert name in rows
     assert "yes" in rows["tilt y"]
     assert "tilt y + 0.97 bx" in rows["tilt y"]
-    assert "No test of residuals will detect tilt y, tilt x, tilt z" in out
+    assert "Tests of residuals will not detect tilt y, tilt x, tilt z" in out
 
 
 def test_a_table_and_files_for_each_trial(ipe_bench, tmp_path):

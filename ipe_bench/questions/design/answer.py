@@ -194,7 +194,7 @@ def _suspects(design: Design) -> Iterator[Part]:
 def _unseen(design: Design) -> Iterator[str]:
     if unseen := [s for s in design.suspects if s.hidden and s.noticed < _UNSEEN]:
         yield (
-            f"No test of residuals will detect {enumerate_few([s.name for s in unseen])}, which parameters imitate."
+            f"Tests of residuals will not detect {enumerate_few([s.name for s in unseen])}, which parameters imitate."
             f" {unseen[0].parameter} will be wrong by {unseen[0].bounds:.3g} bounds where {unseen[0].name} is"
             f" {unseen[0].deviation:.3g} {unseen[0].unit}."
         )
@@ -227,7 +227,7 @@ def _ways(design: Design) -> Iterator[Part]:
         texts("at most", [f"{way.sharpest.readings}" for way in design.ways]),
         texts("smallest bound", [f"{way.sharpest.mean_bound:.3f}" for way in design.ways]),
     ]
-    title = f"What to take instead (bounds as shares of today's, criterion {design.criterion})"
+    title = f"Which readings to take instead (bounds as shares of today's, criterion {design.criterion})"
     note = (
         f"fewest readings is the number whose bound is no larger than today's {today}. Among {design.candidates.m}"
         " candidates those that gain most are taken one after another; another choice may be slightly better."

@@ -142,11 +142,11 @@ def _minute(started: str) -> str:
 
 DEFINITIONS: dict[str, str] = {
     "trial": "One draw of true parameters and of noise. Trial t is the same for every estimator.",
-    "error scale": "Standard deviation of the true parameters about the nominal point, in multiples of the parameters'"
-    " unit inputs.",
+    "error scale": "Standard deviation of the true parameters about the nominal point, in multiples of their sizes"
+    " (the magnitude of the start of a function's or a formula's parameter).",
     **{record.title: record.definition for record in STATISTICS},
-    "parameter 'all'": "Root mean square over parameters of the statistic over the linear bound, unless the statistic"
-    " says otherwise.",
+    "parameter 'all'": "Root mean square over parameters of the statistic over the linear bound, unless its definition"
+    " states another.",
     **{record.title: record.definition for record in SCORES},
     "win, tie, loss": f"Errors are paired by trial. Mahalanobis errors that differ by less than {TIE:g} are a tie,"
     " because estimators that share a root differ by round-off alone.",

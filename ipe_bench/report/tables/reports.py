@@ -149,9 +149,7 @@ def overview(analysis: Analysis) -> Table:
         *overview_columns(told, leading(told, [*analysis.setting_columns, "error_scale"])),
     ]
     columns += statistics("overview", told)
-    setting = ("setting: what differs from the values that most rows have.",) * (
-        first[0].title == "setting"
-    )
+    setting = ("setting: only what was varied.",) * (first[0].title == "setting")
     notes = (*setting, *overview_notes(rows["noise"].tolist()))
     return Table(
         "overview",
