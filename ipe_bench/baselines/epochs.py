@@ -4,9 +4,8 @@ through them."""
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -137,7 +136,7 @@ class Walk(ABC):
         """The squared innovations y' S^-1 y, summed over the epochs so far: chi-square where the
         filter is consistent (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking
         and Navigation, 5.4)."""
-        for trial in np.flatnonzero(~finite(z)):
+        for trial in np.flatnonzero(~finite(z)).tolist():
             first = int(np.argmin(np.isfinite(z[trial])))
             self.end([trial], Status.NONFINITE, f"reading {first + 1} is not a finite number")
 
@@ -155,7 +154,7 @@ class Walk(ABC):
         """The trials that no failure has ended."""
         return np.flatnonzero(self.status == Status.RUNNING)
 
-    def end(self, trials: Any, status: Status, message: str) -> None:
+    def end(self, trials: Iterable[int], status: Status, message: str) -> None:
         """Ends some trials, with what went wrong."""
         for trial in trials:
             self.status[trial] = status

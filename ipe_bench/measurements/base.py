@@ -4,7 +4,7 @@ order of arrival."""
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import attrgetter
@@ -23,6 +23,10 @@ array."""
 _CENTRAL_STEP = float(np.finfo(float).eps ** (1 / 3))
 
 Epochs = tuple[NDArray[np.intp], ...]
+BatchFunction = Callable[[Array], Array]
+"""Readings (trials, m) at x (trials, n)."""
+Shift = Callable[[Array, Array], Array]
+"""Readings (trials, m) shifted by whole turns next to others, as `Measurement.near` does."""
 
 
 @dataclass(frozen=True)
@@ -517,7 +521,9 @@ class SubsetModel(Forwarding):
         return self.whole.linearization()[self._rows]
 
 
-def differentiate(h: Any, x: Array, *, analytic: bool, near: Any = lambda h, z: h) -> Array:
+def differentiate(
+    h: BatchFunction, x: Array, *, analytic: bool, near: Shift = lambda h, z: h
+) -> Array:
     """Computes dh/dx (trials, m, n) of a batched function h at x (trials, n), all directions in one
     call of h; `near` shifts angles by whole turns next to others.
 
@@ -541,7 +547,7 @@ def differentiate(h: Any, x: Array, *, analytic: bool, near: Any = lambda h, z: 
     return np.ascontiguousarray(slopes.swapaxes(1, 2))
 
 
-def _by_complex_step(h: Any, x: Array) -> Array:
+def _by_complex_step(h: BatchFunction, x: Array) -> Array:
     """Computes dh/dx (trials, m, n) as Im h(x + i eps e_k) / eps."""
     trials, n = x.shape
     # A few trials in a call: NumPy multiplies complex numbers with other rounding where it reuses a
@@ -559,7 +565,7 @@ def _by_complex_step(h: Any, x: Array) -> Array:
     return np.ascontiguousarray(np.concatenate(parts)) / _COMPLEX_STEP
 
 
-def contradicted(h: Any, x: Array, J: Array, near: Any) -> NDArray[np.bool_]:
+def contradicted(h: BatchFunction, x: Array, J: Array, near: Shift) -> NDArray[np.bool_]:
     """Finds the trials (trials,) whose central differences of h along a direction contradict J =
     dh/dx (trials, m, n).
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import copy
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, is_dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any, cast
@@ -104,7 +105,9 @@ def require_nominal(model: Measurement) -> None:
         )
 
 
-def require_numbers(owner: str, method: Any, values: Any, shape: tuple[int, ...]) -> None:
+def require_numbers(
+    owner: str, method: Callable[..., Any], values: Any, shape: tuple[int, ...]
+) -> None:
     """Refuses what a method of a part from outside returned unless it is an ordinary array of
     numbers of this shape."""
     complaint = _unfit(method, values, shape)
@@ -112,7 +115,7 @@ def require_numbers(owner: str, method: Any, values: Any, shape: tuple[int, ...]
         raise UserError(f"{owner}: {complaint}")
 
 
-def _unfit(method: Any, values: Any, shape: tuple[int, ...]) -> str:
+def _unfit(method: Callable[..., Any], values: Any, shape: tuple[int, ...]) -> str:
     """Says what is wrong with what a method returned, and where it is written; empty if it is
     right."""
     array = np.asarray(values)
