@@ -113,7 +113,7 @@ def load(
     content = _own_bytes(path)
     code = content[2 * _DIGEST :]
     if content[: 2 * _DIGEST] != made_of + hashlib.sha256(code).digest():
-        _LOG.info("compiling an integrator, once per machine: it is kept in %s", path.parent)
+        _LOG.info("compiling a model, once per machine: it is kept in %s", path.parent)
         code = _object_code(write())
         content = made_of + hashlib.sha256(code).digest() + code
         with contextlib.suppress(StorageError):

@@ -43,7 +43,7 @@ def test_a_first_compilation_says_so_once(folder, caplog):
     with caplog.at_level("INFO"):
         assert times(2.5) == 7.5
         assert times(2.5) == 7.5
-    expected = [f"compiling an integrator, once per machine: it is kept in {folder}"]
+    expected = [f"compiling a model, once per machine: it is kept in {folder}"]
     assert [record.message for record in caplog.records] == expected
 
 
