@@ -46,8 +46,10 @@ FLAT = (*COMPARING, "floor")
 class Graph:
     """Holds all expressions of one recording; equal expressions are the same object, so each is computed once."""
 
-    def __init__(self) -> None:
+    def __init__(self, most: float = math.inf) -> None:
+        """Holds `most` expressions at most; ValueError beyond."""
         self._known: dict[tuple[Any, ...], Expression] = {}
+        self._most = most
 
     def input(self, name: str) -> Expression:
         """Declares the named quantity, to be given when the emitted source runs."""
@@ -63,6 +65,8 @@ class Graph:
     def _node(self, operation: str, *operands: Any) -> Expression:
         key = (operation, *(id(a) if isinstance(a, Expression) else a for a in operands))
         if key not in self._known:
+            if len(self._known) >= self._most:
+                raise ValueError(f"it has more than {self._most} operations")
             self._known[key] = Expression(self, operation, operands, len(self._known))
         return self._known[key]
 

@@ -12,8 +12,10 @@ from ipe_bench.states.whole_paths import PathDensity
 
 SURE = 0.95
 """A path is ambiguous where it is less probable than this among its copies."""
-_REACH, _MOST = 8.0, 30
-"""Deviations of the prior to either side of its mean within which copies begin, and periods to either side at most."""
+_REACH = 8.0
+"""Deviations of the prior to either side of its mean within which copies begin."""
+_MOST = 30
+"""Periods to either side at most."""
 
 
 def copy_p(model: StateModel, z: Array, tracks: Tracks) -> Array | None:

@@ -192,6 +192,14 @@ def _forms(x, k):
     return x
 
 
+def _long(x, k):
+    for _ in range(10**9):
+        x = np.sin(x) if x.dtype == object else x
+        if x.dtype != object:
+            break
+    return x
+
+
 def _forgets(x, k):
     """Its recording takes the other branch than numbers do."""
     return x + 1.0 if x.dtype == object else x
@@ -202,6 +210,7 @@ REFUSED = {
     "random numbers": (_random, "differs from it by more than 1e-10"),
     "numbers alone": (_cast, "TypeError"),
     "many forms": (_forms, "more than 8 forms"),
+    "a loop that is too long": (_long, "more than 20000 operations"),
     "another recording": (_forgets, "differs from it by more than 1e-10"),
 }
 
