@@ -1,7 +1,9 @@
-"""Analyses what readings say about each parameter before any are taken: singular values, the least observable
-direction, bounds and correlations, and which errors that the model leaves out look like its parameters.
+"""Analyses what readings say about each parameter before any are taken: singular values, the least
+observable direction, bounds and correlations, and which errors that the model leaves out look like
+its parameters.
 
-All of it follows from Jacobians at truths drawn from the prior. `design` chooses which readings to take.
+All of it follows from Jacobians at truths drawn from the prior. `design` chooses which readings to
+take.
 """
 
 from __future__ import annotations
@@ -20,7 +22,8 @@ from ipe_bench.trials.thresholds import FIT_LEVEL
 TRUTHS = 30
 """Truths from the prior over which bounds and designs are averaged."""
 _STEP = 0.1
-"""Step of central differences, as a share of a nuisance's deviation: far above round-off, far below where it bends."""
+"""Step of central differences, as a share of a nuisance's deviation: far above round-off, far below
+where it bends."""
 _SINGLE = 4
 """Largest group of nuisances that are reported one by one."""
 _DRAWS = 200
@@ -30,7 +33,8 @@ _WORTH_SAYING = 0.1
 
 @dataclass(frozen=True)
 class Observability:
-    """Describes what a model's readings say about its parameters; lengths in multiples of the parameters' sizes."""
+    """Describes what a model's readings say about its parameters; lengths in multiples of the
+    parameters' sizes."""
 
     parameters: tuple[Parameter, ...]
     singular_values: Array
@@ -41,13 +45,15 @@ class Observability:
     @classmethod
     def at(cls, model: Measurement, R: Covariance, x: Array) -> Observability:
         """Computes the observability at the truths x (truths, n)."""
-        _, s, right = np.linalg.svd(R.whiten_jacobian(model.jacobian(x)), full_matrices=False)
+        white = R.whiten_jacobian(model.jacobian(x))
+        _, s, right = np.linalg.svd(white, full_matrices=False)
         return cls(model.parameters, s, right)
 
     @cached_property
     def observable(self) -> bool:
         """Whether the readings determine every parameter at every truth, to working precision."""
-        return self.singular_values.shape[1] == len(self.parameters) and not self._lost.any()
+        as_many = self.singular_values.shape[1] == len(self.parameters)
+        return as_many and not self._lost.any()
 
     @property
     def _lost(self) -> NDArray[np.bool_]:
@@ -57,36 +63,50 @@ class Observability:
 
     @cached_property
     def covariance(self) -> Array:
-        """The Cramér-Rao bound (truths, n, n); where the readings leave a direction open it is very large there."""
-        s = np.maximum(self.singular_values, np.finfo(float).eps * self.singular_values[:, :1])
+        """The Cramér-Rao bound (truths, n, n); where the readings leave a direction open it is very
+        large there."""
+        least = np.finfo(float).eps * self.singular_values[:, :1]
+        s = np.maximum(self.singular_values, least)
         scaled = self.right / s[:, :, None]
         return np.matmul(scaled.swapaxes(1, 2), scaled)
 
     @cached_property
     def bound(self) -> Array:
-        """Root mean square over the truths (n,) of each parameter's bound; infinite where readings leave it open."""
-        partly_lost = (np.abs(self.right) > 1e-6)[self._lost].any(axis=0)
-        return np.where(partly_lost, np.inf, deviations(self.covariance.mean(axis=0)))
+        """Root mean square over the truths (n,) of each parameter's bound; infinite where readings
+        leave it open."""
+        takes_part = np.abs(self.right) > 1e-6
+        partly_lost = takes_part[self._lost].any(axis=0)
+        mean = self.covariance.mean(axis=0)
+        return np.where(partly_lost, np.inf, deviations(mean))
 
     @cached_property
     def correlation(self) -> Array:
         """Correlation of the errors of efficient estimates (n, n), over the truths."""
         P = self.covariance.mean(axis=0)
-        return P / np.outer(deviations(P), deviations(P))
+        d = deviations(P)
+        return P / np.outer(d, d)
 
     @cached_property
     def multiple_correlation(self) -> Array:
-        """Correlation of each parameter's error with those of all others (n,): sqrt(1 - 1 / (P_ii (P^-1)_ii)), the
-        median over the truths. The bound is 1 / sqrt(1 - square) of what it were if all others were known."""
-        information = np.sum((self.right * self.singular_values[:, :, None]) ** 2, axis=1)
-        inflation = np.diagonal(self.covariance, axis1=1, axis2=2) * information
-        return np.sqrt(np.maximum(1 - 1 / np.maximum(np.median(inflation, axis=0), 1.0), 0.0))
+        """Correlation of each parameter's error with those of all others (n,): sqrt(1 - 1 / (P_ii
+        (P^-1)_ii)), the median over the truths. The bound is 1 / sqrt(1 - square) of what it were
+        if all others were known."""
+        rows = self.right * self.singular_values[:, :, None]
+        information = np.sum(rows**2, axis=1)
+        variances = np.diagonal(self.covariance, axis1=1, axis2=2)
+        inflation = np.median(variances * information, axis=0)
+        # Round-off may leave an inflation below 1.
+        square = 1 - 1 / np.maximum(inflation, 1.0)
+        return np.sqrt(np.maximum(square, 0.0))
 
     @cached_property
     def least_observable(self) -> Array:
-        """The unit vector (n,) along which an efficient estimate scatters most: the first axis of the mean bound."""
-        axis = np.linalg.eigh(self.covariance.mean(axis=0))[1][:, -1]
-        return axis * np.sign(axis[np.argmax(np.abs(axis))])
+        """The unit vector (n,) along which an efficient estimate scatters most: the first axis of
+        the mean bound."""
+        _, axes = np.linalg.eigh(self.covariance.mean(axis=0))
+        axis = axes[:, -1]
+        largest = axis[np.argmax(np.abs(axis))]
+        return axis * np.sign(largest)
 
     @property
     def words(self) -> str:
@@ -95,41 +115,48 @@ class Observability:
 
 
 def in_words(names: Sequence[str], direction: Array) -> str:
-    """Writes a direction (n,) as a sum over its largest coefficient, without what is below a tenth of it."""
+    """Writes a direction (n,) as a sum over its largest coefficient, without what is below a tenth
+    of it."""
     # What is equal but for round-off stays in the order of the names.
-    order = np.argsort(-np.round(np.abs(direction) / np.abs(direction).max(), 6), kind="stable")
+    size = np.abs(direction)
+    order = np.argsort(-np.round(size / size.max(), 6), kind="stable")
     coefficients = direction / direction[order[0]]
     text = str(names[order[0]])
     for i in order[1:]:
         if abs(coefficients[i]) < _WORTH_SAYING:
             break
-        size = f"{abs(coefficients[i]):.2f}"
-        text += f" {'+' if coefficients[i] > 0 else '-'} {'' if size == '1.00' else size + ' '}{names[i]}"
+        sign = "+" if coefficients[i] > 0 else "-"
+        factor = f"{abs(coefficients[i]):.2f} "
+        if factor == "1.00 ":
+            factor = ""
+        text += f" {sign} {factor}{names[i]}"
     return text
 
 
 @dataclass(frozen=True)
 class Suspect:
-    """Describes an error that the model leaves out, of its usual size, and its first-order effect on least squares."""
+    """Describes an error that the model leaves out, of its usual size, and its first-order effect
+    on least squares."""
 
     name: str
     unit: str
     deviation: float
     """Its standard deviation, in `unit`."""
     shift: Array
-    """Shift of each parameter's estimate (n,): root mean square, in multiples of the parameters' sizes; with its sign
-    if the error is a single number."""
+    """Shift of each parameter's estimate (n,): root mean square, in multiples of the parameters'
+    sizes; with its sign if the error is a single number."""
     bounds: float
     """The largest shift of a parameter, in standard deviations of its bound."""
     parameter: str
     """The parameter that it moves most."""
     visible: float
-    """The share of its whitened squares that the residuals keep; the parameters imitate the rest."""
+    """The share of its whitened squares that the residuals keep; the parameters imitate the
+    rest."""
     noticed: float
     """The chance that the test of fit at its level notices it, by the noncentral chi-square law."""
     words: str
-    """Direction, if it is a single number, in multiples of its deviation and of the parameters' sizes, in which
-    parameters undo what it does to the readings."""
+    """Direction, if it is a single number, in multiples of its deviation and of the parameters'
+    sizes, in which parameters undo what it does to the readings."""
 
     @property
     def hidden(self) -> bool:
@@ -140,7 +167,8 @@ class Suspect:
 def suspects(
     model: Measurement, R: Covariance, truth: Measurement, x: Array
 ) -> tuple[Suspect, ...]:
-    """Finds the errors that `truth` has and `model` has not, at the truths x (truths, n), the largest shift first.
+    """Finds the errors that `truth` has and `model` has not, at the truths x (truths, n), the
+    largest shift first.
 
     Each is a nuisance of `truth`; those of a group of many are taken together.
     """
@@ -152,36 +180,55 @@ def suspects(
     # To first order least squares moves by J+ g, and leaves g - J J+ g in the residuals.
     shift = np.matmul(right.swapaxes(1, 2), inside / s[:, :, None])
     left = G - np.matmul(Q, inside)
-    found, names = [], [p.name for p in model.parameters]
+    names = [p.name for p in model.parameters]
+    found = []
     for name, unit, deviation, columns in _told(truth):
-        moved, kept, whole = shift[:, :, columns], left[:, :, columns], G[:, :, columns]
-        rms = np.sqrt(np.mean(np.sum(moved**2, axis=2), axis=0))
-        relative = np.sqrt(np.mean(np.sum((moved / bound[:, :, None]) ** 2, axis=2), axis=0))
-        worst, words = int(np.argmax(relative)), ""
+        moved = shift[:, :, columns]
+        kept = left[:, :, columns]
+        whole = G[:, :, columns]
+        rms = _rms(moved)
+        relative = _rms(moved / bound[:, :, None])
+        worst = int(np.argmax(relative))
+        words = ""
         if len(columns) == 1:
             rms = rms * np.sign(moved[:, :, 0].mean(axis=0))
             words = in_words([name, *names], np.concatenate([[1.0], -rms]))
         visible = float(np.sum(kept**2) / np.sum(whole**2)) if np.any(whole) else 0.0
-        noticed = _noticed(kept, model.m - model.n)
-        bounds = float(relative[worst])
-        found.append(
-            Suspect(name, unit, deviation, rms, bounds, names[worst], visible, noticed, words)
+        one = Suspect(
+            name,
+            unit,
+            deviation,
+            shift=rms,
+            bounds=float(relative[worst]),
+            parameter=names[worst],
+            visible=visible,
+            noticed=_noticed(kept, model.m - model.n),
+            words=words,
         )
+        found.append(one)
     return tuple(sorted(found, key=lambda suspect: -suspect.bounds))
 
 
+def _rms(shifts: Array) -> Array:
+    """Computes the root mean square over truths (n,) of shifts (truths, n, k) that add up by their
+    squares."""
+    squares = np.sum(shifts**2, axis=2)
+    return np.sqrt(np.mean(squares, axis=0))
+
+
 def nuisance_slopes(truth: Measurement, x: Array) -> Array:
-    """Computes the readings' slopes (truths, m, k) along the k nuisances that have a deviation, per deviation, at 0."""
+    """Computes the readings' slopes (truths, m, k) along the k nuisances that have a deviation, per
+    deviation, at 0."""
     deviation = truth.nuisance_deviation
     active = np.flatnonzero(deviation)
     steps = np.zeros((len(active), len(deviation)))
     steps[np.arange(len(active)), active] = _STEP * deviation[active]
     slopes = []
-    for one in x:  # a truth at a time: there may be hundreds of nuisances
+    # A truth at a time: there may be hundreds of nuisances.
+    for one in x:
         fixed = np.broadcast_to(one, (len(active), len(one)))
-        above, below = (
-            truth.simulate(np.concatenate([fixed, sign * steps], axis=1)) for sign in (1.0, -1.0)
-        )
+        above = truth.simulate(np.concatenate([fixed, steps], axis=1))
+        below = truth.simulate(np.concatenate([fixed, -steps], axis=1))
         slopes.append((above - below).T / (2 * _STEP))
     return np.stack(slopes)
 
@@ -191,28 +238,26 @@ def _told(truth: Measurement) -> Iterator[tuple[str, str, float, list[int]]]:
     deviation = truth.nuisance_deviation
     active = [(p, d) for p, d in zip(truth.nuisances, deviation, strict=True) if d != 0]
     groups: dict[str, list[int]] = {}
-    for i, (parameter, _) in enumerate(active):
-        groups.setdefault(parameter.group or parameter.name, []).append(i)
+    for i, (nuisance, _) in enumerate(active):
+        groups.setdefault(nuisance.group or nuisance.name, []).append(i)
     for group, columns in groups.items():
-        if len(columns) <= _SINGLE:
-            for i in columns:
-                yield (
-                    active[i][0].name,
-                    active[i][0].unit,
-                    float(active[i][1] * active[i][0].size),
-                    [i],
-                )
-        else:
-            first, size = active[columns[0]]
-            yield group, first.unit, float(size * first.size), columns
+        if len(columns) > _SINGLE:
+            nuisance, size = active[columns[0]]
+            yield group, nuisance.unit, float(size * nuisance.size), columns
+            continue
+        for i in columns:
+            nuisance, size = active[i]
+            yield nuisance.name, nuisance.unit, float(size * nuisance.size), [i]
 
 
 def _noticed(left: Array, degrees: int) -> float:
-    """Computes the mean chance of a misfit, over truths and nuisances, for residual slopes (truths, m, k)."""
+    """Computes the mean chance of a misfit, over truths and nuisances, for residual slopes (truths,
+    m, k)."""
     from scipy.special import chdtri, chndtr
 
     rng = np.random.Generator(np.random.Philox(0))
     drawn = rng.standard_normal((_DRAWS, left.shape[2]))
     inner = np.matmul(left.swapaxes(1, 2), left)
     squares = np.stack([np.einsum("dk,dk->d", drawn, multiply(one, drawn)) for one in inner])
-    return float(np.mean(1 - chndtr(chdtri(degrees, FIT_LEVEL), degrees, squares)))
+    limit = chdtri(degrees, FIT_LEVEL)
+    return float(np.mean(1 - chndtr(limit, degrees, squares)))

@@ -1,7 +1,8 @@
-"""State models on trial: true paths that move with process noise, trackers on their readings, and the scores of these.
+"""State models on trial: true paths that move with process noise, trackers on their readings, and
+the scores of these.
 
-A trial's parameters are its states at the last epoch, so that whatever is said of estimates of constants is said of
-these; what is said of the whole path stands in columns of its own.
+A trial's parameters are its states at the last epoch, so that whatever is said of estimates of
+constants is said of these; what is said of the whole path stands in columns of its own.
 """
 
 from __future__ import annotations
@@ -45,8 +46,8 @@ _INDEFINITE = 1e-10
 
 @dataclass(frozen=True)
 class StateScenario:
-    """Everything that determines the trials of a state model. Paths and readings are drawn by the model's own prior, Q
-    and R; trial t is the same in whatever block it is drawn."""
+    """Everything that determines the trials of a state model. Paths and readings are drawn by the
+    model's own prior, Q and R; trial t is the same in whatever block it is drawn."""
 
     model: StateModel
     seed: int = 0
@@ -80,8 +81,8 @@ class StateScenario:
 
     @cached_property
     def linear_bound(self) -> Array:
-        """Standard deviations (n,) of the scored states at the last epoch in a filter that is linearised along the path
-        without process noise from the mean of the prior."""
+        """Standard deviations (n,) of the scored states at the last epoch in a filter that is
+        linearised along the path without process noise from the mean of the prior."""
         model = self.assumed
         start = x = model.prior.mean[None]
         path = np.empty((1, model.epochs, model.n))
@@ -128,7 +129,8 @@ class PathBlock:
 
     @cached_property
     def bound(self) -> Array:
-        """Covariances (trials, K, n, n) of the scored states in the filter that is linearised at the truth."""
+        """Covariances (trials, K, n, n) of the scored states in the filter that is linearised at
+        the truth."""
         return self._bound(smooths=False)
 
     def _bound(self, smooths: bool) -> Array:
@@ -148,7 +150,8 @@ class PathBlock:
 
     @cached_property
     def definite(self) -> Mask:
-        """Whether the covariance at the last epoch has an inverse (trials,), so that NEES says something."""
+        """Whether the covariance at the last epoch has an inverse (trials,), so that NEES says
+        something."""
         P, d = self.bound[:, -1], deviations(self.bound[:, -1])
         usable = finite(P) & (d > 0).all(axis=1)
         C = np.where(usable[:, None, None], P / (d[:, :, None] * d[:, None, :]), 0.0)
@@ -163,7 +166,8 @@ class PathBlock:
         _ = self.variances
 
     def truth_columns(self) -> Columns:
-        """The scored states at the last epoch with their bounds, and the posterior bounds along the whole path."""
+        """The scored states at the last epoch with their bounds, and the posterior bounds along the
+        whole path."""
         model, names, at = self.scenario.assumed, self.names, self.scenario.scored
         posterior, error = np.full((2, len(self), len(at)), np.nan)
         curves = np.full((2, model.epochs, len(at)), np.nan)
@@ -189,7 +193,8 @@ class PathBlock:
         }
 
     def estimate(self, tracker: Tracker) -> tuple[Estimates, Columns]:
-        """What a tracker makes of the states at the last epoch, and its scores over the whole path."""
+        """What a tracker makes of the states at the last epoch, and its scores over the whole
+        path."""
         model, z = self.scenario.assumed, self.paths.z
         variances = self.smoothed_variances if tracker.smooths else self.variances
         began = time.perf_counter()
@@ -201,8 +206,8 @@ class PathBlock:
     def _scored(
         self, tracks: Tracks, messages: dict[int, str], seconds: Array, variances: Array
     ) -> tuple[Estimates, Columns]:
-        """The tracks as estimates of the last epoch, with what is stored of each trial; `variances` (trials, K, n) are
-        those of the bound over the path."""
+        """The tracks as estimates of the last epoch, with what is stored of each trial; `variances`
+        (trials, K, n) are those of the bound over the path."""
         at = self.scenario.scored
         x = self.paths.x
         e, P = self.scenario.assumed.nearest_state(tracks.mean, x) - x, tracks.covariance
@@ -278,8 +283,8 @@ class PathBlock:
         return {"copy_p": p, "extra_ambiguous": np.where(np.isnan(p), np.nan, p < SURE)}
 
     def _fit_p(self, tracks: Tracks) -> Array:
-        """How probable a worse fit is (trials,): of the path of an iterated smoother by its cost, else by the filter's
-        innovations; NaN of a tracker that has neither."""
+        """How probable a worse fit is (trials,): of the path of an iterated smoother by its cost,
+        else by the filter's innovations; NaN of a tracker that has neither."""
         from scipy.special import chdtrc
 
         if tracks.cost is not None:
@@ -294,8 +299,9 @@ def block_of(scenario: AnyScenario, start: int, stop: int) -> Any:
 
 
 def track_safely(tracker: Tracker, model: StateModel, z: Array) -> tuple[Tracks, dict[int, str]]:
-    """The tracks of readings z (trials, K, m), and why trials have none: a batch that raises is tracked trial by trial,
-    and one that raises alone is NaN; a UserError or MemoryError is raised."""
+    """The tracks of readings z (trials, K, m), and why trials have none: a batch that raises is
+    tracked trial by trial, and one that raises alone is NaN; a UserError or MemoryError is
+    raised."""
     try:
         with np.errstate(all="ignore"):
             tracks = tracker.track(model, read_only(z))
@@ -314,7 +320,8 @@ def track_safely(tracker: Tracker, model: StateModel, z: Array) -> tuple[Tracks,
 
 
 def _make_plain(tracker: Tracker, tracks: Any, trials: int, model: StateModel) -> None:
-    """Replaces what a tracker returned by ordinary arrays of floats, as of an estimator; ValueError if it cannot be."""
+    """Replaces what a tracker returned by ordinary arrays of floats, as of an estimator; ValueError
+    if it cannot be."""
     name, (K, n) = f"{type(tracker).__name__}.track returns", (model.epochs, model.n)
     if not isinstance(tracks, Tracks):
         raise ValueError(f"{name} {type(tracks).__name__}, where Tracks are asked for")
@@ -344,7 +351,8 @@ def packed(trials: int, sums: Sequence[Array]) -> Array:
 
 
 def unpacked(texts: Array, epochs: int, columns: int) -> Array:
-    """The sums (blocks, K, columns) that `packed` wrote, without those of versions that kept other columns."""
+    """The sums (blocks, K, columns) that `packed` wrote, without those of versions that kept other
+    columns."""
     found = [np.frombuffer(base64.b64decode(text), "<f8") for text in texts if text]
     kept = [numbers for numbers in found if len(numbers) == epochs * columns]
     return np.array(kept).reshape(len(kept), epochs, columns)

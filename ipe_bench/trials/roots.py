@@ -1,4 +1,5 @@
-"""Finds roots of the estimating equations from given points: started at the truth, they expose a false root.
+"""Finds roots of the estimating equations from given points: started at the truth, they expose a
+false root.
 
 Nothing here is an estimator: an estimator does not know where to start.
 """
@@ -46,7 +47,8 @@ class _Chord(IPE[_ChordState]):
 
 @dataclass(frozen=True)
 class _Informed(CountingModel):
-    """Evaluates a model, but for the start of an iteration, where readings and Jacobian are known."""
+    """Evaluates a model, but for the start of an iteration, where readings and Jacobian are
+    known."""
 
     start: Array = field(default_factory=lambda: np.empty(0))
     known: Known = ()
@@ -60,11 +62,12 @@ class _Informed(CountingModel):
 
 
 def frozen_root(problem: Problem, z: Array, x_start: Array, known: Known = ()) -> Array:
-    """Finds the root (trials, n) of the frozen equation (11) next to x_start (trials, n), for readings z (trials, m);
-    NaN where there is none. `known` holds h (trials, m) and dh/dx (trials, m, n) at x_start, if they are known.
+    """Finds the root (trials, n) of the frozen equation (11) next to x_start (trials, n), for
+    readings z (trials, m); NaN where there is none. `known` holds h (trials, m) and dh/dx (trials,
+    m, n) at x_start, if they are known.
 
-    Chord steps with the Jacobian at x_start, which is enough where x_start is the truth; Newton's method for the trials
-    where it is not.
+    Chord steps with the Jacobian at x_start, which is enough where x_start is the truth; Newton's
+    method for the trials where it is not.
     """
 
     def system(kept: NDArray[np.intp], model: CountingModel) -> FrozenSystem:
@@ -76,8 +79,9 @@ def frozen_root(problem: Problem, z: Array, x_start: Array, known: Known = ()) -
 def least_squares_root(
     problem: Problem, z: Array, x_start: Array, *, prior: float | None, known: Known = ()
 ) -> Array:
-    """Finds the minimum (trials, n) of |h(x) - z| in the metric of R next to x_start (trials, n); MAP where `prior`
-    says by how much to widen the prior's deviations. NaN where none is found. `known` is that of `frozen_root`.
+    """Finds the minimum (trials, n) of |h(x) - z| in the metric of R next to x_start (trials, n);
+    MAP where `prior` says by how much to widen the prior's deviations. NaN where none is found.
+    `known` is that of `frozen_root`.
 
     Gauss-Newton; Levenberg-Marquardt for the trials where that fails.
     """
@@ -96,7 +100,8 @@ def _first_root(
     known: Known,
     *attempts: tuple[Method[E, Any], int],
 ) -> Array:
-    """Returns the end of the first method that converges: each has that many iterations from x_start."""
+    """Returns the end of the first method that converges: each has that many iterations from
+    x_start."""
     x, missing = np.full(x_start.shape, np.nan), np.arange(len(x_start))
     for method, limit in attempts:
         if len(missing):

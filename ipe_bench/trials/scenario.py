@@ -1,4 +1,5 @@
-"""Defines a scenario: what is measured, how noisily, and what the truth is drawn from. It draws trials."""
+"""Defines a scenario: what is measured, how noisily, and what the truth is drawn from. It draws
+trials."""
 
 from __future__ import annotations
 
@@ -36,7 +37,8 @@ class Trials:
     x: Array
     z: Array
     h: Array | None = None
-    """The readings (trials, m) before noise, where they are those of the model that estimators assume."""
+    """The readings (trials, m) before noise, where they are those of the model that estimators
+    assume."""
 
     @property
     def stop(self) -> int:
@@ -45,12 +47,12 @@ class Trials:
 
 @dataclass(frozen=True)
 class Scenario:
-    """Determines the trials. `truth` simulates the readings where it differs from what estimators assume (a finer step,
-    a richer model); its parameters and readings are those of `measurement`, and whatever else acts on the readings is
-    drawn by its `nuisance_deviation`.
+    """Determines the trials. `truth` simulates the readings where it differs from what estimators
+    assume (a finer step, a richer model); its parameters and readings are those of `measurement`,
+    and whatever else acts on the readings is drawn by its `nuisance_deviation`.
 
-    With a noise that is `real` nothing is drawn: the one trial is the readings that come with the measurement, and its
-    truth is their certified answer.
+    With a noise that is `real` nothing is drawn: the one trial is the readings that come with the
+    measurement, and its truth is their certified answer.
     """
 
     measurement: Measurement
@@ -122,7 +124,8 @@ class Scenario:
         return self._drawn(start, stop)[:, : self.simulator.n]
 
     def draw(self, start: int, stop: int) -> Trials:
-        """Draws trials start to stop. Trial t has random streams of its own, so it is the same in every block.
+        """Draws trials start to stop. Trial t has random streams of its own, so it is the same in
+        every block.
 
         One seed gives the same draws, in units of the error scale, at every error scale.
         """
@@ -141,8 +144,8 @@ class Scenario:
         return Trials(start, x, z, h if self.truth is None else None)
 
     def error_free(self, start: int, stop: int) -> Array:
-        """Computes the readings (trials, m) of trials start to stop before noise is added; those of a richer truth with
-        what else acts on them."""
+        """Computes the readings (trials, m) of trials start to stop before noise is added; those of
+        a richer truth with what else acts on them."""
         return self._simulated(self._drawn(start, stop))
 
     def _simulated(self, drawn: Array) -> Array:
@@ -157,7 +160,8 @@ class Scenario:
         return read_only(h)
 
     def _drawn(self, start: int, stop: int) -> Array:
-        """Draws x (trials, n), and behind it the nuisances (trials, k), from each trial's stream of parameters."""
+        """Draws x (trials, n), and behind it the nuisances (trials, k), from each trial's stream of
+        parameters."""
         n, deviation = self.simulator.n, self.simulator.nuisance_deviation
         nominal, drawn = (
             read_only(self.simulator.nominal),

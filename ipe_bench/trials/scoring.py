@@ -1,6 +1,8 @@
-"""Runs trials through estimators: draws a block of a scenario, runs estimators on it, and scores what they return.
+"""Runs trials through estimators: draws a block of a scenario, runs estimators on it, and scores
+what they return.
 
-A block is a range of trials; its result depends on nothing but the scenario, the estimator and the range.
+A block is a range of trials; its result depends on nothing but the scenario, the estimator and the
+range.
 """
 
 from __future__ import annotations
@@ -45,14 +47,16 @@ if TYPE_CHECKING:
     from ipe_bench.trials.scenario import Scenario, Trials
 
 CURVED = 20
-"""Trials in which second derivatives are taken, which takes 2 n Jacobians each: the first ones of a scenario."""
+"""Trials in which second derivatives are taken, which takes 2 n Jacobians each: the first ones of a
+scenario."""
 
 Columns = dict[str, Array]
 
 
 @dataclass(frozen=True)
 class Block:
-    """Holds trials of a scenario with what the truth says of them: bounds and reference roots, computed when needed."""
+    """Holds trials of a scenario with what the truth says of them: bounds and reference roots,
+    computed when needed."""
 
     scenario: Scenario
     trials: Trials
@@ -116,8 +120,8 @@ class Block:
             )
 
     def truth_columns(self) -> Columns:
-        """Returns the truth and its bounds, in multiples of the parameters' units, what the noise alone makes of the
-        linear estimate, and what the paper's theorems ask of the model there."""
+        """Returns the truth and its bounds, in multiples of the parameters' units, what the noise
+        alone makes of the linear estimate, and what the paper's theorems ask of the model there."""
         names = [p.name for p in self.problem.measurement.parameters]
         H_plus = self.problem.H_plus[None]
         K, norm, radius = contraction(np.matmul(H_plus, self.jacobian))
@@ -138,10 +142,11 @@ class Block:
         }
 
     def _van_trees(self) -> tuple[Array, Array]:
-        """Deviations (trials, n) of Van Trees's bound (E[J' R^-1 J] + P0^-1)^-1 (Detection, Estimation, and Modulation
-        Theory I, 1968, sec. 2.4), the mean taken over the first `EXPECTED` truths of the scenario, and their standard
-        errors by the scatter of the information among these, to first order: in its first trial, and NaN in the others.
-        No errors are known where few of the truths carry the mean."""
+        """Deviations (trials, n) of Van Trees's bound (E[J' R^-1 J] + P0^-1)^-1 (Detection,
+        Estimation, and Modulation Theory I, 1968, sec. 2.4), the mean taken over the first
+        `EXPECTED` truths of the scenario, and their standard errors by the scatter of the
+        information among these, to first order: in its first trial, and NaN in the others. No
+        errors are known where few of the truths carry the mean."""
         bound, error = np.full((2, *self.trials.x.shape), np.nan)
         prior = self.problem.prior_covariance()
         if (
@@ -178,8 +183,8 @@ class Block:
         return self.trials.z - self.problem.measurement.near(h, self.trials.z)
 
     def _curvature_columns(self, names: list[str]) -> Columns:
-        """Computes what second derivatives at the truth say, for the first trials and NaN for the others: M of eq.
-        (23), the relative curvatures, and the bias of least squares."""
+        """Computes what second derivatives at the truth say, for the first trials and NaN for the
+        others: M of eq. (23), the relative curvatures, and the bias of least squares."""
         kept = max(0, min(CURVED, self.trials.stop) - self.trials.start)
         M, intrinsic, parametric = np.full((3, len(self.trials.x)), np.nan)
         bias = np.full(self.trials.x.shape, np.nan)
@@ -203,8 +208,9 @@ class Block:
         }
 
     def _misspecification_columns(self, names: list[str]) -> Columns:
-        """Computes where least squares goes, and how it scatters there, when readings come from another model; empty
-        where they do not, and where estimators assume another R than that of the noise."""
+        """Computes where least squares goes, and how it scatters there, when readings come from
+        another model; empty where they do not, and where estimators assume another R than that of
+        the noise."""
         if self.scenario.truth is None or not self.scenario.noise.true_covariance:
             return {}
         h = self.scenario.error_free(self.trials.start, self.trials.stop)
@@ -216,7 +222,8 @@ class Block:
         )
 
     def reference_root(self, equation: Equation, inflation: float = 1.0) -> Array:
-        """Finds the root (trials, n) that an estimating equation reaches from the truth; NaN where it reaches none.
+        """Finds the root (trials, n) that an estimating equation reaches from the truth; NaN where
+        it reaches none.
 
         `inflation` widens the prior of the equation `map`.
         """
@@ -334,11 +341,11 @@ def _below(rows: Array, prior: Covariance) -> Array:
 
 
 def nees(error: Array, P: Array) -> Array:
-    """Computes the normalised estimation error squared e' P^-1 e of each trial (trials,): chi-square with n degrees
-    where the reported P is right.
+    """Computes the normalised estimation error squared e' P^-1 e of each trial (trials,):
+    chi-square with n degrees where the reported P is right.
 
-    error (trials, n) and P (trials, n, n). Infinite where P is not a covariance (not positive definite) or the error is
-    not finite; NaN where no P is reported.
+    error (trials, n) and P (trials, n, n). Infinite where P is not a covariance (not positive
+    definite) or the error is not finite; NaN where no P is reported.
     """
     with np.errstate(all="ignore"):
         # Scaled by the deviations first: parameters' units must not decide what is singular.

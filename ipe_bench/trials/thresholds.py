@@ -1,5 +1,5 @@
-"""Where a line is drawn between trials: inside the gate or not, the same root or another, a fit or a misfit; and how
-many trials are enough."""
+"""Where a line is drawn between trials: inside the gate or not, the same root or another, a fit or
+a misfit; and how many trials are enough."""
 
 GATE = 1e-6
 """A success lies inside the ellipsoid that all but this share of efficient estimates lie in."""
@@ -8,9 +8,11 @@ SAME_ROOT = 1e-3
 FIT_LEVEL = 1e-3
 """A model fits where residuals as large as these are no less probable than this."""
 FEW = 20
-"""Below this many trials a figure that is conditional on them has no interval, and no place on a curve unmarked."""
+"""Below this many trials a figure that is conditional on them has no interval, and no place on a
+curve unmarked."""
 HISTORIES = 20
-"""Trials whose iterates are kept: the first ones of a scenario, in whatever blocks they are computed."""
+"""Trials whose iterates are kept: the first ones of a scenario, in whatever blocks they are
+computed."""
 EXPECTED = 50
 """Truths over which Van Trees's bound takes the mean of the information."""
 EVEN = 0.3
