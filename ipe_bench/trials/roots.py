@@ -54,11 +54,14 @@ class _Informed(CountingModel):
     known: Known = ()
 
     def simulate(self, x: Array, rows: NDArray[np.intp]) -> Array:
-        return self.known[0] if self.known and x is self.start else super().simulate(x, rows)
+        if self.known and x is self.start:
+            return self.known[0]
+        return super().simulate(x, rows)
 
     def jacobian(self, x: Array, rows: NDArray[np.intp], *, coarse: Mask | bool = False) -> Array:
-        exact = self.known and x is self.start and not np.any(coarse)
-        return self.known[1] if exact else super().jacobian(x, rows, coarse=coarse)
+        if self.known and x is self.start and not np.any(coarse):
+            return self.known[1]
+        return super().jacobian(x, rows, coarse=coarse)
 
 
 def frozen_root(problem: Problem, z: Array, x_start: Array, known: Known = ()) -> Array:
@@ -102,14 +105,16 @@ def _first_root(
 ) -> Array:
     """Returns the end of the first method that converges: each has that many iterations from
     x_start."""
-    x, missing = np.full(x_start.shape, np.nan), np.arange(len(x_start))
+    x = np.full(x_start.shape, np.nan)
+    missing = np.arange(len(x_start))
     for method, limit in attempts:
-        if len(missing):
-            start, tally = x_start[missing], EvaluationCount.zeros(len(missing))
-            model = _Informed(
-                problem.measurement, tally, start=start, known=tuple(a[missing] for a in known)
-            )
-            ended = iterate(equations(missing, model), method, start, Limits(_TOLERANCE, limit))
-            x = put(x, missing[ended.converged], ended.x[ended.converged])
-            missing = missing[~ended.converged]
+        if not len(missing):
+            break
+        start = x_start[missing]
+        tally = EvaluationCount.zeros(len(missing))
+        known_there = tuple(a[missing] for a in known)
+        model = _Informed(problem.measurement, tally, start=start, known=known_there)
+        ended = iterate(equations(missing, model), method, start, Limits(_TOLERANCE, limit))
+        x = put(x, missing[ended.converged], ended.x[ended.converged])
+        missing = missing[~ended.converged]
     return x

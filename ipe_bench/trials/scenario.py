@@ -23,7 +23,8 @@ TRIALS = 1000
 """Number of trials if neither a number nor a precision is given."""
 MOST_TRIALS = 100_000
 """Largest number of trials with a precision, if no number is given."""
-_PARAMETERS, _NOISE = 0, 1
+_PARAMETERS = 0
+_NOISE = 1
 """The two random streams of a trial."""
 _SEEDS = 1 << 23
 """Seeds there are: seed and trial share one 64-bit number where trials are matched."""
@@ -74,29 +75,21 @@ class Scenario:
         require_nominal(self.measurement)
         if self.noise.real and self.measurement.recorded is None:
             raise UserError(
-                f"noise=certified: measurement={self.measurement.name} comes with no readings of its own; choose "
-                "another noise, or measurement=nist"
+                f"noise=certified: measurement={self.measurement.name} comes with no readings of"
+                " its own; choose another noise, or measurement=nist"
             )
-        if self.truth is not None and (self.truth.n, self.truth.m) != (
-            self.measurement.n,
-            self.measurement.m,
-        ):
-            raise UserError(
-                f"truth_measurement={self.truth.name}: has {self.truth.n} parameters and {self.truth.m} readings, "
-                f"measurement={self.measurement.name} has {self.measurement.n} and {self.measurement.m}; choose a "
-                "truth with the same parameters and readings"
-            )
+        if self.truth is not None:
+            _check_alike(self.truth, self.measurement)
 
     @cached_property
     def problem(self) -> Problem:
         """Problem of the estimators."""
         model = self.measurement
-        if self.noise.real and model.recorded is not None:  # nothing was drawn from a prior
+        # Where readings are real, nothing was drawn from a prior.
+        if self.noise.real and model.recorded is not None:
             return Problem(model, model.recorded.R)
-        deviation, correlation = (
-            self.prior.deviation(model.n, self.error_scale),
-            self.prior.correlation(model.n),
-        )
+        deviation = self.prior.deviation(model.n, self.error_scale)
+        correlation = self.prior.correlation(model.n)
         require_numbers(f"prior={self.prior.name}", self.prior.deviation, deviation, (model.n,))
         R = self.noise.nominal_covariance(model)
         if not isinstance(R, Covariance) or R.m != model.m:
@@ -104,9 +97,8 @@ class Scenario:
                 f"a Covariance of {R.m} readings" if isinstance(R, Covariance) else type(R).__name__
             )
             complaint = f"{definition(self.noise.covariance)} returns {found}"
-            raise UserError(
-                f"noise={self.noise.name}: {complaint}; let it return a Covariance of {model.m} readings"
-            )
+            remedy = f"let it return a Covariance of {model.m} readings"
+            raise UserError(f"noise={self.noise.name}: {complaint}; {remedy}")
         return Problem(model, R, deviation, correlation)
 
     @cached_property
@@ -129,12 +121,15 @@ class Scenario:
 
         One seed gives the same draws, in units of the error scale, at every error scale.
         """
-        if (recorded := self.measurement.recorded) is not None and self.noise.real:
+        recorded = self.measurement.recorded
+        if recorded is not None and self.noise.real:
             if (start, stop) != (0, 1):
                 raise UserError("noise=certified: has one trial; set trials=1")
             return Trials(0, recorded.x[None], recorded.z[None])
-        drawn, offset = self._drawn(start, stop), read_only(self.simulator.offset)
-        h, z = self._simulated(drawn), np.empty((len(drawn), self.simulator.m))
+        drawn = self._drawn(start, stop)
+        offset = read_only(self.simulator.offset)
+        h = self._simulated(drawn)
+        z = np.empty((len(drawn), self.simulator.m))
         for row, given, rng in zip(z, h, numbered(self.seed, start, stop, _NOISE), strict=True):
             noisy = self.noise.corrupt(given, offset, rng)
             if type(noisy) is not np.ndarray or noisy.shape != row.shape or noisy.dtype != float:
@@ -150,31 +145,36 @@ class Scenario:
 
     def _simulated(self, drawn: Array) -> Array:
         """Computes the readings (trials, m) at x and nuisances (trials, n + k)."""
-        h = self.simulator.simulate(read_only(drawn))
-        require_numbers(
-            f"measurement={self.simulator.name}",
-            self.simulator.simulate,
-            h,
-            (len(drawn), self.simulator.m),
-        )
+        model = self.simulator
+        h = model.simulate(read_only(drawn))
+        require_numbers(f"measurement={model.name}", model.simulate, h, (len(drawn), model.m))
         return read_only(h)
 
     def _drawn(self, start: int, stop: int) -> Array:
         """Draws x (trials, n), and behind it the nuisances (trials, k), from each trial's stream of
         parameters."""
-        n, deviation = self.simulator.n, self.simulator.nuisance_deviation
-        nominal, drawn = (
-            read_only(self.simulator.nominal),
-            np.empty((stop - start, n + len(deviation))),
-        )
+        n = self.simulator.n
+        deviation = self.simulator.nuisance_deviation
+        nominal = read_only(self.simulator.nominal)
+        drawn = np.empty((stop - start, n + len(deviation)))
         for row, rng in zip(drawn, numbered(self.seed, start, stop, _PARAMETERS), strict=True):
             x = self.prior.draw(nominal, self.error_scale, rng)
             if type(x) is not np.ndarray or x.shape != (n,):
                 require_numbers(f"prior={self.prior.name}", self.prior.draw, x, (n,))
             row[:n] = x
-            # After the parameters, from the same stream: a richer truth keeps the parameters of the trial.
+            # After the parameters, from the same stream: a richer truth keeps the parameters of the
+            # trial.
             row[n:] = deviation * rng.standard_normal(len(deviation))
         return drawn
+
+
+def _check_alike(truth: Measurement, model: Measurement) -> None:
+    if (truth.n, truth.m) != (model.n, model.m):
+        raise UserError(
+            f"truth_measurement={truth.name}: has {truth.n} parameters and {truth.m} readings,"
+            f" measurement={model.name} has {model.n} and {model.m}; choose a truth with the same"
+            " parameters and readings"
+        )
 
 
 def check_seed(seed: int) -> None:

@@ -83,7 +83,9 @@ class Block:
     @cached_property
     def readings(self) -> Array:
         """h (trials, m) at the truth, of the model that estimators assume; NaN where it fails."""
-        return self.readings_at(self.trials.x) if self.trials.h is None else self.trials.h
+        if self.trials.h is not None:
+            return self.trials.h
+        return self.readings_at(self.trials.x)
 
     @cached_property
     def _white(self) -> Array:
@@ -102,7 +104,9 @@ class Block:
     def bayes_information(self) -> Array:
         """J' R^-1 J + P0^-1 at the truth: the inverse of the Bayesian bound."""
         prior = self.problem.prior_covariance()
-        return self.crlb_information + (0.0 if prior is None else prior.inverse())
+        if prior is None:
+            return self.crlb_information
+        return self.crlb_information + prior.inverse()
 
     @cached_property
     def crlb_deviation(self) -> Array:
@@ -115,9 +119,8 @@ class Block:
         """Standard deviations (trials, n) of the Bayesian bound at the truth."""
         prior = self.problem.prior_covariance()
         with np.errstate(all="ignore"):
-            return bound_deviations(
-                self.bayes_information, _below(self._white, prior) if prior else self._white
-            )
+            rows = _below(self._white, prior) if prior else self._white
+            return bound_deviations(self.bayes_information, rows)
 
     def truth_columns(self) -> Columns:
         """Returns the truth and its bounds, in multiples of the parameters' units, what the noise
@@ -125,6 +128,7 @@ class Block:
         names = [p.name for p in self.problem.measurement.parameters]
         H_plus = self.problem.H_plus[None]
         K, norm, radius = contraction(np.matmul(H_plus, self.jacobian))
+        linear_error = multiply(H_plus, self.errors(self.readings))
         van_trees, van_trees_error = self._van_trees()
         return {
             "trial": np.arange(self.trials.start, self.trials.stop),
@@ -133,7 +137,7 @@ class Block:
             **by_parameter("bayes", names, self.bayes_deviation),
             **by_parameter("van_trees", names, van_trees),
             **by_parameter("van_trees_error", names, van_trees_error),
-            **by_parameter("linear_error", names, multiply(H_plus, self.errors(self.readings))),
+            **by_parameter("linear_error", names, linear_error),
             "contraction_K": K,
             "contraction_norm": norm,
             "contraction_radius": radius,
@@ -149,34 +153,30 @@ class Block:
         errors are known where few of the truths carry the mean."""
         bound, error = np.full((2, *self.trials.x.shape), np.nan)
         prior = self.problem.prior_covariance()
-        if (
-            self.trials.start == 0
-            and len(bound)
-            and prior is not None
-            and not self.scenario.noise.real
-        ):
-            x = self.scenario.truths(0, EXPECTED)
-            with np.errstate(all="ignore"):
-                J = self.problem.measurement.jacobian(x)
-                rows = informative_rows(self.scenario.noise, self.problem.R, J, self.readings_at(x))
-                each = _squared(rows)
-                mean = each.mean(axis=0)
-                expected = (mean + prior.inverse())[None]
-                together = rows.reshape(1, -1, x.shape[1]) / np.sqrt(len(x))
-                bound[0] = bound_deviations(expected, _below(together, prior))[0]
-                P = inverse(expected)[0][0]
-                variances = np.einsum("ij,tjk,ki->ti", P, each, P)
-                if (
-                    variances.sum(axis=0) ** 2 >= EVEN * EXPECTED * (variances**2).sum(axis=0)
-                ).all():
-                    error[0] = variances.std(axis=0, ddof=1) / np.sqrt(EXPECTED) / (2 * bound[0])
+        first = self.trials.start == 0 and len(self) > 0
+        if not first or prior is None or self.scenario.noise.real:
+            return bound, error
+        x = self.scenario.truths(0, EXPECTED)
+        with np.errstate(all="ignore"):
+            J = self.problem.measurement.jacobian(x)
+            rows = informative_rows(self.scenario.noise, self.problem.R, J, self.readings_at(x))
+            of_each = _squared(rows)
+            expected = (of_each.mean(axis=0) + prior.inverse())[None]
+            together = rows.reshape(1, -1, x.shape[1]) / np.sqrt(len(x))
+            bound[0] = bound_deviations(expected, _below(together, prior))[0]
+            P = inverse(expected)[0][0]
+            # To first order P changes by -P dI P where the information changes by dI.
+            variances = np.einsum("ij,tjk,ki->ti", P, of_each, P)
+            least_square = EVEN * EXPECTED * (variances**2).sum(axis=0)
+            if (variances.sum(axis=0) ** 2 >= least_square).all():
+                of_variance = variances.std(axis=0, ddof=1) / np.sqrt(EXPECTED)
+                error[0] = of_variance / (2 * bound[0])
         return bound, error
 
     def readings_at(self, x: Array) -> Array:
         """Computes h(x) (trials, m) for x (trials, n); NaN where the model fails."""
-        return CountingModel.uncounted(self.problem.measurement, len(x)).simulate(
-            read_only(x), np.arange(len(x))
-        )
+        model = CountingModel.uncounted(self.problem.measurement, len(x))
+        return model.simulate(read_only(x), np.arange(len(x)))
 
     def errors(self, h: Array) -> Array:
         """Computes the readings (trials, m) less the error-free h, angles within half a turn."""
@@ -186,17 +186,16 @@ class Block:
         """Computes what second derivatives at the truth say, for the first trials and NaN for the
         others: M of eq. (23), the relative curvatures, and the bias of least squares."""
         kept = max(0, min(CURVED, self.trials.stop) - self.trials.start)
-        M, intrinsic, parametric = np.full((3, len(self.trials.x)), np.nan)
+        M, intrinsic, parametric = np.full((3, len(self)), np.nan)
         bias = np.full(self.trials.x.shape, np.nan)
         if kept:
-            J, R = self.jacobian[:kept], self.problem.R
+            R = self.problem.R
+            J = self.jacobian[:kept]
             with np.errstate(all="ignore"):
                 second = second_derivatives(self.problem.measurement, self.trials.x[:kept])
                 usable = finite(J) & finite(second)
-                J, second = (
-                    np.where(usable.reshape(-1, *[1] * (a.ndim - 1)), a, np.nan)
-                    for a in (J, second)
-                )
+                J = np.where(usable[:, None, None], J, np.nan)
+                second = np.where(usable[:, None, None, None], second, np.nan)
                 bias[:kept] = box_bias(J, second, R)
                 intrinsic[:kept], parametric[:kept] = relative_curvatures(J, second, R)
                 M[:kept] = curvature(J, second, self.problem.H_plus[None])
@@ -217,9 +216,10 @@ class Block:
         with np.errstate(all="ignore"):
             closest = least_squares_root(self.problem, h, self.trials.x, prior=None)
             bias, deviation = misspecified(self.problem, h, self.trials.x, closest)
-        return by_parameter("pseudo_bias", names, bias) | by_parameter(
-            "misspecified", names, deviation
-        )
+        return {
+            **by_parameter("pseudo_bias", names, bias),
+            **by_parameter("misspecified", names, deviation),
+        }
 
     def reference_root(self, equation: Equation, inflation: float = 1.0) -> Array:
         """Finds the root (trials, n) that an estimating equation reaches from the truth; NaN where
@@ -227,25 +227,23 @@ class Block:
 
         `inflation` widens the prior of the equation `map`.
         """
-        if (key := (equation, inflation)) not in self._roots:
-            problem, z, x, known = (
-                self.problem,
-                self.trials.z,
-                self.trials.x,
-                (self.readings, self.jacobian),
-            )
+        key = (equation, inflation)
+        if key not in self._roots:
             with np.errstate(all="ignore"):
-                if equation != "frozen":
-                    prior = inflation if equation == "map" else None
-                    root = least_squares_root(problem, z, x, prior=prior, known=known)
-                elif (
-                    problem.rankless
-                ):  # there is no such equation; the estimators that solve it say so
-                    root = np.full(x.shape, np.nan)
-                else:
-                    root = frozen_root(problem, z, x, known)
-            self._roots[key] = root
+                self._roots[key] = self._root(equation, inflation)
         return self._roots[key]
+
+    def _root(self, equation: Equation, inflation: float) -> Array:
+        z = self.trials.z
+        x = self.trials.x
+        known = (self.readings, self.jacobian)
+        if equation != "frozen":
+            prior = inflation if equation == "map" else None
+            return least_squares_root(self.problem, z, x, prior=prior, known=known)
+        # Without a rank there is no such equation; the estimators that solve it say so.
+        if self.problem.rankless:
+            return np.full(x.shape, np.nan)
+        return frozen_root(self.problem, z, x, known)
 
     def warm_up(self, estimator: Estimator) -> None:
         """Runs the estimator once, so that imports and compilation are not timed."""
@@ -271,59 +269,57 @@ class Block:
 
     def _fit_probability(self, estimator: Estimator, x: Array) -> Array:
         """Computes the test of fit at x (trials, n); see `fit_test`."""
-        problem, key = (
-            self.problem,
-            (estimator.equation, "prior" in estimator.needs, inflation_of(estimator)),
-        )
+        problem = self.problem
+        key = (estimator.equation, "prior" in estimator.needs, inflation_of(estimator))
         if key not in self._spreads:
             self._spreads[key] = spread_of(estimator, problem, self.jacobian)
+        spread = self._spreads[key]
         r = problem.R.whiten(self.errors(self.readings_at(x)))
         with np.errstate(all="ignore"):
             squares = np.sum(r**2, axis=1)
-        return fit_probability(
-            squares, self._spreads[key], self.scenario.noise, problem.H, problem.R
-        )
+        return fit_probability(squares, spread, self.scenario.noise, problem.H, problem.R)
 
     def score(self, estimator: Estimator, estimates: Estimates) -> Columns:
         """Scores each trial's error, cost, status and distances, as columns."""
-        model = self.problem.measurement
-        names = [p.name for p in model.parameters]
-        error, trials = estimates.x - self.trials.x, len(self)
+        n = self.problem.measurement.n
+        names = [p.name for p in self.problem.measurement.parameters]
+        trials = len(self)
+        error = estimates.x - self.trials.x
         # An estimate that is not finite has not converged, even if the estimator says so.
         lost = (estimates.status == Status.CONVERGED) & ~finite(error)
         status = np.where(lost, Status.NONFINITE, estimates.status)
         status = np.where(finite(self.trials.z), status, Status.NO_READINGS)
-        solved, apart = status == Status.CONVERGED, np.full(trials, np.nan)
+        labels = {s: Status(s).label for s in np.unique(status).tolist()}
+        messages = [estimates.messages.get(i, "") for i in range(trials)]
+        solved = status == Status.CONVERGED
+        apart = np.full(trials, np.nan)
         if estimator.equation is not None:
             root = self.reference_root(estimator.equation, inflation_of(estimator))
             apart = (np.abs(estimates.x - root) / self.crlb_deviation).max(axis=1)
             solved = solved & (apart <= SAME_ROOT)
         bound = self.bayes_information if "prior" in estimator.needs else self.crlb_information
-        labels = {s: Status(s).label for s in np.unique(status).tolist()}
-        P = (
-            np.full((trials, model.n, model.n), np.nan)
-            if estimates.covariance is None
-            else estimates.covariance
-        )
+        # Round-off leaves squares below 0 where J lacks rank.
+        success = np.maximum(quadratic_form(bound, error), 0.0) <= gate(n)
+        crlb_distance = np.maximum(quadratic_form(self.crlb_information, error), 0.0)
+        P = estimates.covariance
+        if P is None:
+            P = np.full((trials, n, n), np.nan)
         return {
             "trial": np.arange(self.trials.start, self.trials.stop),
             **by_parameter("error", names, error),
             **by_parameter("deviation", names, deviations(P)),
             "status": np.array([labels[s] for s in status.tolist()], dtype=object),
-            "message": np.array(
-                [estimates.messages.get(i, "") for i in range(trials)], dtype=object
-            ),
+            "message": np.array(messages, dtype=object),
             "iterations": estimates.iterations,
             "simulations": estimates.simulations,
             "jacobians": estimates.jacobians,
             "time_s": estimates.seconds,
-            "crlb_distance": np.maximum(quadratic_form(self.crlb_information, error), 0.0),
+            "crlb_distance": crlb_distance,
             "nees": nees(error, P),
             "fit_p": self._fit_probability(estimator, estimates.x),
             "root_distance": apart,
             "solved": solved,
-            "success": np.maximum(quadratic_form(bound, error), 0.0)
-            <= gate(model.n),  # round-off where J lacks rank
+            "success": success,
             **{f"extra_{name}": values for name, values in estimates.extras.items()},
         }
 
@@ -350,20 +346,22 @@ def nees(error: Array, P: Array) -> Array:
     with np.errstate(all="ignore"):
         # Scaled by the deviations first: parameters' units must not decide what is singular.
         deviation = deviations(P)
-        e, C = error / deviation, P / (deviation[:, :, None] * deviation[:, None, :])
+        e = error / deviation
+        C = P / (deviation[:, :, None] * deviation[:, None, :])
         usable = finite(e) & finite(C)
-        C, e = (
-            np.where(usable[:, None, None], C, np.eye(error.shape[1])),
-            np.where(usable[:, None], e, 0.0),
-        )
+        e = np.where(usable[:, None], e, 0.0)
+        C = np.where(usable[:, None, None], C, np.eye(error.shape[1]))
+        # With U'U = C, e' C^-1 e is the square of U'^-1 e.
         _, inverse_U, definite = definite_factor(C)
         squared = np.sum(multiply(inverse_U.swapaxes(1, 2), e) ** 2, axis=1)
     if not definite.all():
-        ill, e = C[~definite], e[~definite]
+        ill = C[~definite]
+        e = e[~definite]
         x, singular = solve(ill, e)
         covariance = ~singular & (np.linalg.eigvalsh(ill)[:, 0] > 0)
         squared[~definite] = np.where(covariance, np.einsum("ti,ti->t", e, x), np.inf)
-    return np.where(finite(P), np.where(usable, squared, np.inf), np.nan)
+    squared = np.where(usable, squared, np.inf)
+    return np.where(finite(P), squared, np.nan)
 
 
 def by_parameter(prefix: str, names: list[str], values: Array) -> Columns:
