@@ -1,4 +1,5 @@
-"""Defines least squares for a batch of trials: the objective, its normal equations, and the state of an iteration."""
+"""Defines least squares for a batch of trials: the objective, its normal equations, and the state
+of an iteration."""
 
 from __future__ import annotations
 
@@ -38,7 +39,8 @@ _STATIONARY = 1e-3
 
 @dataclass(frozen=True)
 class Objective:
-    """Computes |R^-1/2 (h(x) - z)|^2, plus |P0^-1/2 (x - x0)|^2 where a prior counts, for the trials `rows`."""
+    """Computes |R^-1/2 (h(x) - z)|^2, plus |P0^-1/2 (x - x0)|^2 where a prior counts, for the
+    trials `rows`."""
 
     model: CountingModel
     R: Covariance
@@ -49,13 +51,13 @@ class Objective:
     prior: Covariance | None = None
     """P0, where it counts."""
     exact_within: float = np.inf
-    """Jacobians are exact if the Gauss-Newton step still to go is shorter than so many deviations, else coarse;
-    infinite: always exact; 0: always coarse, and good enough to end with."""
+    """Jacobians are exact if the Gauss-Newton step still to go is shorter than so many deviations,
+    else coarse; infinite: always exact; 0: always coarse, and good enough to end with."""
 
     @classmethod
     def of(cls, problem: Problem, z: Array, inflation: float | None = None) -> Objective:
-        """Makes the objective of all readings z (trials, m), with the prior, if given, its deviations times
-        `inflation`."""
+        """Makes the objective of all readings z (trials, m), with the prior, if given, its
+        deviations times `inflation`."""
         model = CountingModel(problem.measurement, EvaluationCount.zeros(len(z)))
         prior = None if inflation is None else problem.prior_covariance(inflation)
         return cls(model, problem.R, z, np.arange(len(z)), problem.x0, prior)
@@ -65,28 +67,31 @@ class Objective:
         return self.z.shape[1]
 
     def residual(self, x: Array) -> Array:
-        """Computes whitened residuals (trials, m), followed by those of the prior (trials, n) where it counts."""
+        """Computes whitened residuals (trials, m), followed by those of the prior (trials, n) where
+        it counts."""
         r = self.R.whiten(self.model.residual(x, self.rows, self.z))
         if self.prior is None:
             return r
         return np.concatenate([r, self.prior.whiten(x - self.x0)], axis=1)
 
     def cost(self, x: Array, r: Array) -> Array:
-        """Returns the objective (trials,) at x, where the residuals are r: half its gradient is J' r."""
+        """Returns the objective (trials,) at x, where the residuals are r: half its gradient is J'
+        r."""
         return squared(r)
 
     def jacobian(self, x: Array, *, coarse: Mask | bool = False) -> Array:
-        """Computes the derivative of the residuals (trials, m, n) or (trials, m + n, n); where `coarse` (trials,) says
-        so, one that is near enough for steps."""
+        """Computes the derivative of the residuals (trials, m, n) or (trials, m + n, n); where
+        `coarse` (trials,) says so, one that is near enough for steps."""
         J = self.R.whiten_jacobian(self.model.jacobian(x, self.rows, coarse=coarse))
         if self.prior is None:
             return J
         n = x.shape[1]
-        prior = np.broadcast_to(self.prior.whiten_jacobian(np.eye(n)), (len(x), n, n))
-        return np.concatenate([J, prior], axis=1)
+        rows = self.prior.whiten_jacobian(np.eye(n))
+        return np.concatenate([J, np.broadcast_to(rows, (len(x), n, n))], axis=1)
 
     def coarsened(self, exact_within: float) -> Objective:
-        """Returns the objective with coarse Jacobians where steps are longer, if the model has any that are cheaper."""
+        """Returns the objective with coarse Jacobians where steps are longer, if the model has any
+        that are cheaper."""
         cheaper = self.model.coarse_share < 1.0
         return dataclasses.replace(self, exact_within=exact_within if cheaper else np.inf)
 
@@ -111,11 +116,11 @@ class NormalEquations:
     newton: Array
     """The Gauss-Newton step (trials, n); NaN where J has not full rank."""
     size: Array
-    """Its largest entry (trials,) in standard deviations of the local bound (J'J)^-1; infinite where J has not full
-    rank."""
+    """Its largest entry (trials,) in standard deviations of the local bound (J'J)^-1; infinite
+    where J has not full rank."""
     stationary: Array
-    """The largest part (trials,) of the residual along one column of J, in deviations: zero at a stationary point of
-    whatever rank."""
+    """The largest part (trials,) of the residual along one column of J, in deviations: zero at a
+    stationary point of whatever rank."""
     Q: Array | None = None
     """(trials, m, n), where a method asks for it."""
 
@@ -124,28 +129,24 @@ class NormalEquations:
         """Factors J (trials, m, n) for residuals r (trials, m)."""
         A = np.ascontiguousarray(J)
         with np.errstate(all="ignore"):
+            # By the Cholesky factor of J'J where that keeps enough digits, else by QR below.
             U, inverse_U, well = definite_factor(np.matmul(A.swapaxes(1, 2), A))
-            along = np.matmul(np.ascontiguousarray(r)[:, None], A)[:, 0]
+            rows = np.ascontiguousarray(r)[:, None]
+            along = np.matmul(rows, A)[:, 0]
             gradient = multiply(inverse_U.swapaxes(1, 2), along)
         well = well & finite(r)
         Q = np.matmul(A, inverse_U) if keep_Q else None
         if not well.all():
-            QU, U[~well], inverse_U[~well], gradient[~well] = _orthogonal_factors(
-                J[~well], r[~well]
-            )
+            ill = ~well
+            Q_there, U[ill], inverse_U[ill], gradient[ill] = _orthogonal_factors(J[ill], r[ill])
             if Q is not None:
-                Q[~well] = QU
+                Q[ill] = Q_there
         columns = np.sqrt(np.sum(U**2, axis=1))
-        along = np.abs(multiply(U.swapaxes(1, 2), gradient)) / np.where(columns > 0, columns, 1.0)
-        return cls(
-            U,
-            inverse_U,
-            gradient,
-            columns,
-            *_newton_step(inverse_U, gradient),
-            along.max(axis=1),
-            Q,
-        )
+        along = np.abs(multiply(U.swapaxes(1, 2), gradient))
+        along_columns = along / np.where(columns > 0, columns, 1.0)
+        newton, size = _newton_step(inverse_U, gradient)
+        stationary = along_columns.max(axis=1)
+        return cls(U, inverse_U, gradient, columns, newton, size, stationary, Q)
 
     def towards(self, r: Array) -> NormalEquations:
         """Returns the same Jacobian with another residual r (trials, m): a chord. It needs Q."""
@@ -155,15 +156,20 @@ class NormalEquations:
         return dataclasses.replace(self, gradient=gradient, newton=newton, size=size)
 
     def damped(self, weights: Array) -> tuple[Array, Array]:
-        """Computes the step that minimises |r + J s|^2 + |weights s|^2, and its predicted decrease of |r + J s|^2."""
-        with np.errstate(over="ignore"):  # an overflowing damping is treated by the other way
-            squares = weights[:, :, None] ** 2 * np.eye(self.U.shape[1])
-        _, root, well = definite_factor(np.matmul(self.U.swapaxes(1, 2), self.U) + squares)
-        step = -multiply(
-            root, multiply(root.swapaxes(1, 2), multiply(self.U.swapaxes(1, 2), self.gradient))
-        )
+        """Computes the step that minimises |r + J s|^2 + |weights s|^2, and its predicted decrease
+        of |r + J s|^2."""
+        # An overflowing damping is treated by the other way.
+        with np.errstate(over="ignore"):
+            damping = weights[:, :, None] ** 2 * np.eye(self.U.shape[1])
+        U_transposed = self.U.swapaxes(1, 2)
+        _, root, well = definite_factor(np.matmul(U_transposed, self.U) + damping)
+        # (U'U + D^2) s = -U'g, where the inverse of the matrix on the left is root root'.
+        uphill = multiply(U_transposed, self.gradient)
+        step = -multiply(root, multiply(root.swapaxes(1, 2), uphill))
         if not well.all():
-            step[~well] = _damped_step(self.U[~well], weights[~well], self.gradient[~well])
+            ill = ~well
+            step[ill] = _damped_step(self.U[ill], weights[ill], self.gradient[ill])
+        # |g|^2 - |g + U s|^2 = -(U s)' (2 g + U s).
         change = multiply(self.U, step)
         return step, -np.einsum("ti,ti->t", change, 2.0 * self.gradient + change)
 
@@ -171,49 +177,58 @@ class NormalEquations:
 def _newton_step(inverse_U: Array, gradient: Array) -> tuple[Array, Array]:
     """Computes the Gauss-Newton step (trials, n), and its largest entry (trials,) in deviations."""
     newton = -multiply(inverse_U, gradient)
-    size = np.abs(newton / np.sqrt(np.sum(inverse_U**2, axis=2))).max(axis=1)
+    deviation = np.sqrt(np.sum(inverse_U**2, axis=2))
+    size = np.abs(newton / deviation).max(axis=1)
     return newton, np.where(np.isfinite(size), size, np.inf)
 
 
 def _damped_step(U: Array, weights: Array, gradient: Array) -> Array:
     """Computes the step that minimises |gradient + U s|^2 + |weights s|^2 for any U."""
     n = U.shape[1]
-    Q, V = np.linalg.qr(np.concatenate([U, weights[:, :, None] * np.eye(n)], axis=1))
-    return solve(V, -multiply(Q[:, :n].swapaxes(1, 2), gradient))[0]
+    damping = weights[:, :, None] * np.eye(n)
+    Q, V = np.linalg.qr(np.concatenate([U, damping], axis=1))
+    uphill = multiply(Q[:, :n].swapaxes(1, 2), gradient)
+    return solve(V, -uphill)[0]
 
 
 def _orthogonal_factors(J: Array, r: Array) -> tuple[Array, Array, Array, Array]:
     """Computes Q, U, U^-1 and Q' r for any J; U^-1 is NaN where J has not full rank."""
-    m, missing = J.shape[1], max(J.shape[2] - J.shape[1], 0)
+    _, m, n = J.shape
     # Fewer readings than parameters: rows of zeros keep U square, and deficient.
-    J, r = np.pad(J, ((0, 0), (0, missing), (0, 0))), np.pad(r, ((0, 0), (0, missing)))
+    missing = max(n - m, 0)
+    J = np.pad(J, ((0, 0), (0, missing), (0, 0)))
+    r = np.pad(r, ((0, 0), (0, missing)))
     usable = finite(J) & finite(r)
     Q, U = np.linalg.qr(np.where(usable[:, None, None], J, 0.0))
+    # J lacks rank if a pivot is round-off, its columns brought to length 1.
     columns = np.sqrt(np.sum(U**2, axis=1))
     scaled = U / np.where(columns > 0, columns, 1.0)[:, None, :]
-    floor = np.finfo(float).eps * max(J.shape[1:]) * np.sqrt(J.shape[2])
-    deficient = ~usable | (np.abs(np.diagonal(scaled, axis1=1, axis2=2)).min(axis=1) <= floor)
-    gradient = np.where(usable[:, None], multiply(Q.swapaxes(1, 2), r), np.nan)
+    pivots = np.abs(np.diagonal(scaled, axis1=1, axis2=2))
+    round_off = np.finfo(float).eps * max(m, n) * np.sqrt(n)
+    deficient = ~usable | (pivots.min(axis=1) <= round_off)
+    gradient = multiply(Q.swapaxes(1, 2), r)
+    gradient = np.where(usable[:, None], gradient, np.nan)
     inverse_U, _ = inverse(np.where(deficient[:, None, None], np.nan, U))
     return Q[:, :m], U, inverse_U, gradient
 
 
 def inverse_factor(J: Array) -> Array:
-    """Computes U^-1 (trials, n, n) of J = Q U (trials, m, n): (J'J)^-1 = U^-1 U^-T; NaN where J lacks full rank."""
+    """Computes U^-1 (trials, n, n) of J = Q U (trials, m, n): (J'J)^-1 = U^-1 U^-T; NaN where J
+    lacks full rank."""
     return _orthogonal_factors(J, np.zeros(J.shape[:2]))[2]
 
 
 def slope_at(
     objective: Objective, x: Array, r: Array, exact: Mask, *, keep_Q: bool = False
 ) -> tuple[NormalEquations, Mask]:
-    """Computes the slope at x, where the residuals are r, and whether it is exact: where `exact` (trials,) says so, and
-    where a coarse Jacobian has not full rank."""
+    """Computes the slope at x, where the residuals are r, and whether it is exact: where `exact`
+    (trials,) says so, and where a coarse Jacobian has not full rank."""
     slope = NormalEquations.of(objective.jacobian(x, coarse=~exact), r, keep_Q=keep_Q)
     lost = ~exact & ~np.isfinite(slope.size)
     if lost.any():
-        again, _ = slope_at(
-            objective.subset(lost), x[lost], r[lost], np.ones(lost.sum(), dtype=bool), keep_Q=keep_Q
-        )
+        part = objective.subset(lost)
+        all_exact = np.ones(lost.sum(), dtype=bool)
+        again, _ = slope_at(part, x[lost], r[lost], all_exact, keep_Q=keep_Q)
         slope = put(slope, lost, again)
     return slope, exact | lost
 
@@ -235,7 +250,8 @@ class LeastSquaresSystem:
     scale: Array
     """The scale of damped steps: the diagonal of D (trials, n)."""
     regular: Mask
-    """True if J had full rank somewhere on the way: an end without it is then a place, no property of the problem."""
+    """True if J had full rank somewhere on the way: an end without it is then a place, no property
+    of the problem."""
     mark: Array
     """The objective when it last decreased visibly."""
     idle: NDArray[np.int64]
@@ -250,28 +266,41 @@ class LeastSquaresSystem:
         cls, objective: Objective, x: Array, lam: float = 0.0, *, keep_Q: bool = False
     ) -> LeastSquaresSystem:
         """Returns the state at the start."""
-        r = objective.residual(x)
         trials = len(x)
+        r = objective.residual(x)
+        cost = objective.cost(x, r)
         near = np.full(trials, np.isinf(objective.exact_within))
         slope, exact = slope_at(objective, x, r, near, keep_Q=keep_Q)
-        scale = np.where(slope.columns > 0, slope.columns, 1.0)
-        far, regular = np.full(trials, np.inf), np.isfinite(slope.size)
-        cost, idle = objective.cost(x, r), np.zeros(trials, np.int64)
-        damping, growth = np.full(trials, lam), np.full(trials, 2.0)
-        return cls(x, r, cost, slope, far, damping, growth, scale, regular, cost, idle, exact, near)
+        return cls(
+            x=x,
+            r=r,
+            cost=cost,
+            slope=slope,
+            moved=np.full(trials, np.inf),
+            lam=np.full(trials, lam),
+            growth=np.full(trials, 2.0),
+            scale=np.where(slope.columns > 0, slope.columns, 1.0),
+            regular=np.isfinite(slope.size),
+            mark=cost,
+            idle=np.zeros(trials, np.int64),
+            exact=exact,
+            near=near,
+        )
 
     def nearly(self, objective: Objective) -> Mask:
         """Tells whether the next Jacobian (trials,) is to be exact, and all after it."""
         return self.near | (self.slope.size < objective.exact_within)
 
     def reach(self, step: Array) -> Array:
-        """Computes the length (trials,) of a step in standard deviations of the readings that it moves."""
+        """Computes the length (trials,) of a step in standard deviations of the readings that it
+        moves."""
         return np.abs(step * self.slope.columns).max(axis=1)
 
     def watched(self, cost: Array) -> tuple[Array, NDArray[np.int64]]:
         """Updates `mark` and `idle` after a step to an objective of that cost."""
         visible = cost < self.mark * (1 - _VISIBLE)
-        return np.where(visible, cost, self.mark), np.where(visible, 0, self.idle + 1)
+        mark = np.where(visible, cost, self.mark)
+        return mark, np.where(visible, 0, self.idle + 1)
 
     @property
     def rankless(self) -> Mask:
@@ -279,13 +308,14 @@ class LeastSquaresSystem:
         return ~np.isfinite(self.slope.size)
 
     def check(self, objective: Objective, stuck: Mask) -> ConvergenceCheck:
-        """Measures the gradient by the Gauss-Newton step still to go, if J is good enough to end with, and divergence
-        by the cost."""
+        """Measures the gradient by the Gauss-Newton step still to go, if J is good enough to end
+        with, and divergence by the cost."""
         known = np.isfinite(self.cost) & finite(self.slope.gradient)
         growth = np.where(known, np.sqrt(self.cost), np.nan)
         ending = np.where(self.rankless, Status.SINGULAR, Status.STALLED)
         size = np.where(self.rankless & self.regular, self.slope.stationary, self.slope.size)
-        # Where nothing can be gained the answer is there, however badly the Jacobian or round-off behaves.
+        # Where nothing can be gained the answer is there, however badly the Jacobian or round-off
+        # behaves.
         settled = (self.idle >= _FLAT) & (self.slope.stationary <= _STATIONARY) & self.regular
         size = np.where(settled, 0.0, size)
         if objective.exact_within > 0:

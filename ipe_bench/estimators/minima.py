@@ -23,10 +23,11 @@ from ipe_bench.measurements.counted import EvaluationCount
 from ipe_bench.measurements.problem import Problem
 
 _EXACT_WITHIN = 0.03
-"""Steps still to go of fewer deviations are computed from exact Jacobians: a coarse one leaves the gradient about a
-hundredth of a deviation from zero."""
+"""Steps still to go of fewer deviations are computed from exact Jacobians: a coarse one leaves the
+gradient about a hundredth of a deviation from zero."""
 WRONG_MINIMUM = 1e-6
-"""Residuals less probable than this are taken for those of a wrong minimum: far less than those of a misfit."""
+"""Residuals less probable than this are taken for those of a wrong minimum: far less than those of
+a misfit."""
 _APART = 0.1
 """Two minima further apart than this, in standard deviations of the local bound, are two."""
 
@@ -40,29 +41,41 @@ class Minima:
     iterations: NDArray[np.int64]
     history: list[Array] | None
     covariance: Array
-    """(J' R^-1 J)^-1 (trials, n, n), with P0^-1 inside where the prior counts; NaN where it does not exist."""
+    """(J' R^-1 J)^-1 (trials, n, n), with P0^-1 inside where the prior counts; NaN where it does
+    not exist."""
     chi_square: Array
     """|R^-1/2 (h(x) - z)|^2 (trials,), of the readings alone."""
     bulk: Array
-    """The median magnitude (trials,) of the readings' residuals in deviations: .67 where R is right, and little more
-    where it is wrong for some of them only."""
+    """The median magnitude (trials,) of the readings' residuals in deviations: .67 where R is
+    right, and little more where it is wrong for some of them only."""
 
     @classmethod
     def of(cls, ended: SolveResult[Any], covariance: Array, r: Array) -> Minima:
-        """Makes the minima of an iteration that has ended, with whitened residuals r (trials, m) there."""
-        bulk = np.median(np.abs(r), axis=1)
+        """Makes the minima of an iteration that has ended, with whitened residuals r (trials, m)
+        there."""
         return cls(
-            ended.x, ended.status, ended.iterations, ended.history, covariance, squared(r), bulk
+            ended.x,
+            ended.status,
+            ended.iterations,
+            ended.history,
+            covariance,
+            chi_square=squared(r),
+            bulk=np.median(np.abs(r), axis=1),
         )
 
     @classmethod
     def nowhere(cls, x: Array, history: bool) -> Minima:
         """Returns marks every trial as without a minimum, at its start x (trials, n)."""
         trials, n = x.shape
-        status, none = np.full(trials, Status.MAX_ITERATIONS, np.int8), np.zeros(trials, np.int64)
-        unknown, far = np.full((trials, n, n), np.nan), np.full(trials, np.inf)
+        far = np.full(trials, np.inf)
         return cls(
-            x, status, none, [row[None] for row in x] if history else None, unknown, far, far
+            x,
+            status=np.full(trials, Status.MAX_ITERATIONS, np.int8),
+            iterations=np.zeros(trials, np.int64),
+            history=[row[None] for row in x] if history else None,
+            covariance=np.full((trials, n, n), np.nan),
+            chi_square=far,
+            bulk=far,
         )
 
     @property
@@ -70,39 +83,40 @@ class Minima:
         return self.status == Status.CONVERGED
 
     def better_than(self, old: Minima) -> Mask:
-        """Tells which replace the old ones: they converged and are lower, or the old one had no end."""
+        """Tells which replace the old ones: they converged and are lower, or the old one had no
+        end."""
         return self.converged & (~(self.chi_square >= old.chi_square) | ~old.converged)
 
     def replaced(self, rows: NDArray[np.intp], again: Minima, better: Mask) -> Minima:
-        """Replaces the minima of the trials `rows` by further ones `again` where `better`; iterations add up."""
+        """Replaces the minima of the trials `rows` by further ones `again` where `better`;
+        iterations add up."""
         spent = self.iterations.copy()
         spent[rows] += again.iterations
-        return replace(put(self, rows[better], take(again, better)), iterations=spent)
+        found = put(self, rows[better], take(again, better))
+        return replace(found, iterations=spent)
 
     def fit_probability(self, readings: int) -> Array:
-        """Computes the chi-square test of the fit (trials,): how probable residuals at least this large are if the
-        model holds, R is right and the minimum is the global one."""
+        """Computes the chi-square test of the fit (trials,): how probable residuals at least this
+        large are if the model holds, R is right and the minimum is the global one."""
         from scipy.special import chdtrc
 
         return chdtrc(max(readings - self.x.shape[1], 1), self.chi_square)
 
     def estimates(self, tally: EvaluationCount, readings: int) -> Estimates:
         """Makes the estimates of an estimator that ends here."""
-        return Estimates.of(
-            self,
-            tally,
-            covariance=self.covariance,
-            extras={"fit_p": self.fit_probability(readings)},
-        )
+        extras = {"fit_p": self.fit_probability(readings)}
+        return Estimates.of(self, tally, covariance=self.covariance, extras=extras)
 
 
 def minimize(
     objective: Objective, method: Method[Objective, LeastSquaresSystem], x: Array, limits: Limits
 ) -> Minima:
-    """Minimises the objective from x (trials, n), by coarse Jacobians on the way if the model has any that are cheaper.
+    """Minimises the objective from x (trials, n), by coarse Jacobians on the way if the model has
+    any that are cheaper.
 
-    Converged is where the Gauss-Newton step, which is the gradient in whitened units, is at most `limits.tolerance`
-    standard deviations of the local bound in every parameter. An iteration is a step tried, taken or not.
+    Converged is where the Gauss-Newton step, which is the gradient in whitened units, is at most
+    `limits.tolerance` standard deviations of the local bound in every parameter. An iteration is a
+    step tried, taken or not.
     """
     if np.isinf(objective.exact_within):
         objective = objective.coarsened(_EXACT_WITHIN)
@@ -112,26 +126,28 @@ def minimize(
 
 def minima_of(ended: SolveResult[Any], slope: NormalEquations, readings: int) -> Minima:
     """Makes the minima of an iteration that has ended with that slope."""
+    inverse_U = slope.inverse_U
+    lost = ~finite(inverse_U)
+    if lost.any():
+        inverse_there, _ = inverse(slope.U[lost])
+        inverse_U = put(inverse_U, lost, inverse_there)
     # U^-1 U^-T: inverting U'U would lose twice the digits, and with them the sign of a variance.
-    lost = ~finite(slope.inverse_U)
-    inverse_U = (
-        put(slope.inverse_U, lost, inverse(slope.U[lost])[0]) if lost.any() else slope.inverse_U
-    )
-    return Minima.of(
-        ended, np.matmul(inverse_U, inverse_U.swapaxes(1, 2)), ended.state.r[:, :readings]
-    )
+    covariance = np.matmul(inverse_U, inverse_U.swapaxes(1, 2))
+    return Minima.of(ended, covariance, ended.state.r[:, :readings])
 
 
 def _exact_slope(objective: Objective, state: LeastSquaresSystem) -> NormalEquations:
-    """Returns the slope at the end of an iteration; evaluated for the report where that is a coarse one."""
+    """Returns the slope at the end of an iteration; evaluated for the report where that is a coarse
+    one."""
     coarse = ~state.exact & finite(state.x)
     if objective.exact_within == 0 or not coarse.any():
         return state.slope
     report = replace(objective, model=objective.model.reporting()).subset(coarse)
-    x, r, keep_Q = state.x[coarse], state.r[coarse], state.slope.Q is not None
-    return put(
-        state.slope, coarse, slope_at(report, x, r, np.ones(len(x), dtype=bool), keep_Q=keep_Q)[0]
-    )
+    x = state.x[coarse]
+    everywhere = np.ones(len(x), dtype=bool)
+    keep_Q = state.slope.Q is not None
+    exact, _ = slope_at(report, x, state.r[coarse], everywhere, keep_Q=keep_Q)
+    return put(state.slope, coarse, exact)
 
 
 @dataclass(frozen=True)
@@ -147,7 +163,8 @@ class Fitting:
         return cls(readings, [[] for _ in range(trials)])
 
     def note(self, found: Minima, rows: NDArray[np.intp]) -> Mask:
-        """Adds the minima of the trials `rows` that fit and are not known yet, and says which of them fit."""
+        """Adds the minima of the trials `rows` that fit and are not known yet, and says which of
+        them fit."""
         fits: Mask = found.converged & passes(found, self.readings, WRONG_MINIMUM)
         deviation = deviations(found.covariance)
         for i in np.flatnonzero(fits):
@@ -157,27 +174,29 @@ class Fitting:
         return fits
 
     def report(self, estimates: Estimates) -> Estimates:
-        """Reports the estimates with the extras `minima`, the number of distinct ones that fit, and `ambiguous`, 1
-        where there are several; the others are their `alternatives`."""
+        """Reports the estimates with the extras `minima`, the number of distinct ones that fit, and
+        `ambiguous`, 1 where there are several; the others are their `alternatives`."""
         minima = np.array([len(known) for known in self.known], dtype=float)
         estimates.extras |= {"minima": minima, "ambiguous": (minima > 1).astype(float)}
         assert estimates.covariance is not None
         deviation = deviations(estimates.covariance)
-        estimates.alternatives = [
-            np.array([other for other in known if _apart(other, x, d)]).reshape(-1, len(x))
-            for known, x, d in zip(self.known, estimates.x, deviation, strict=True)
-        ]
+        alternatives = []
+        for known, x, d in zip(self.known, estimates.x, deviation, strict=True):
+            others = [other for other in known if _apart(other, x, d)]
+            alternatives.append(np.array(others).reshape(-1, len(x)))
+        estimates.alternatives = alternatives
         return estimates
 
 
 def passes(found: Minima, readings: int, significance: float) -> Mask:
-    """Tells which minima (trials,) pass the test of the fit; none at a significance of 1: residuals say nothing."""
+    """Tells which minima (trials,) pass the test of the fit; none at a significance of 1: residuals
+    say nothing."""
     return (found.fit_probability(readings) >= significance) & (significance < 1)
 
 
 def spread_of_starts(problem: Problem) -> Array:
-    """Computes standard deviations (n,) of random starts about the nominal point: those of the prior where one is
-    known, else the size of the nominal point, or 1 where that is zero."""
+    """Computes standard deviations (n,) of random starts about the nominal point: those of the
+    prior where one is known, else the size of the nominal point, or 1 where that is zero."""
     if problem.prior_deviation is not None:
         return problem.prior_deviation
     return np.where(problem.x0 == 0, 1.0, np.abs(problem.x0))
@@ -185,4 +204,5 @@ def spread_of_starts(problem: Problem) -> Array:
 
 def _apart(a: Array, b: Array, deviation: Array) -> bool:
     """Tells whether two minima (n,) are two."""
-    return bool((np.abs(a - b) / deviation).max() > _APART)
+    distance = (np.abs(a - b) / deviation).max()
+    return bool(distance > _APART)

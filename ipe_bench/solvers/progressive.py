@@ -1,4 +1,5 @@
-"""Implements progressive IPE: the least-squares estimate, reached from far away by windows that grow."""
+"""Implements progressive IPE: the least-squares estimate, reached from far away by windows that
+grow."""
 
 from __future__ import annotations
 
@@ -22,12 +23,13 @@ from ipe_bench.solvers.attempts import Stages, Windows
 _SAME_FIT = 1e-6
 """Two minima whose chi-squares differ by less than this share are one."""
 _BULK = 1.0
-"""The median residual in deviations, .67 where all is right, up to which the minimum is right and R wrong for a few."""
+"""The median residual in deviations, .67 where all is right, up to which the minimum is right and R
+wrong for a few."""
 _READINGS = 4
 """The least number of readings per parameter for which the median says so."""
 _TRUSTED = 1e-3
-"""A significance of the test of fit from which on a large bulk of residuals is asked for no longer: R is known, or
-unknown."""
+"""A significance of the test of fit from which on a large bulk of residuals is asked for no longer:
+R is known, or unknown."""
 _WORTH = 20.0
 """The most that a search for a better fit may cost, in costs of the first fit."""
 
@@ -36,20 +38,24 @@ _WORTH = 20.0
 class Progressive(Estimator):
     """Finds the least-squares estimate from far away.
 
-    A short stretch of data is nearly linear in the parameters, so its fit is easy to find; it starts the fit of a
-    window `growth` times as long, and so on to all data. In the windows the prior counts, as it does for a filter, and
-    damps in its own metric, lambda |dx / prior_deviation|^2. The last pass, on all data, is plain least squares.
+    A short stretch of data is nearly linear in the parameters, so its fit is easy to find; it
+    starts the fit of a window `growth` times as long, and so on to all data. In the windows the
+    prior counts, as it does for a filter, and damps in its own metric, lambda |dx /
+    prior_deviation|^2. The last pass, on all data, is plain least squares.
 
-    The test of the residuals is the estimator's own verdict, extras `fit_p`. A trial that fails it, and whose bulk of
-    residuals is large too, is tried again: carefully from the nominal point (windows that grow slowly, damping by the
-    residual, steps bent along the curvature), by Levenberg-Marquardt on all data, and from 16, 32, ... draws of the
-    prior, which the first windows keep apart and the later ones thin out to those that fit best. The best fit counts.
-    A minimum that other attempts lead to again, some from independent draws, ends the search; so does 20 times the cost
-    of the first fit, once draws were tried. The message of such a trial says how far the search went.
+    The test of the residuals is the estimator's own verdict, extras `fit_p`. A trial that fails it,
+    and whose bulk of residuals is large too, is tried again: carefully from the nominal point
+    (windows that grow slowly, damping by the residual, steps bent along the curvature), by
+    Levenberg-Marquardt on all data, and from 16, 32, ... draws of the prior, which the first
+    windows keep apart and the later ones thin out to those that fit best. The best fit counts. A
+    minimum that other attempts lead to again, some from independent draws, ends the search; so does
+    20 times the cost of the first fit, once draws were tried. The message of such a trial says how
+    far the search went.
 
-    Sources: the incremental single shooting of Michalik, Hannemann and Marquardt (Comput. Chem. Eng. 33, 2009); with a
-    prior, the recursive iterative batch smoother of Stepanov et al. (Sensors 25, 2025); data-tempered Monte Carlo
-    (Chopin, Biometrika 89, 2002), with minimisations for its moves.
+    Sources: the incremental single shooting of Michalik, Hannemann and Marquardt (Comput. Chem.
+    Eng. 33, 2009); with a prior, the recursive iterative batch smoother of Stepanov et al. (Sensors
+    25, 2025); data-tempered Monte Carlo (Chopin, Biometrika 89, 2002), with minimisations for its
+    moves.
 
     Example:
 
@@ -61,7 +67,8 @@ class Progressive(Estimator):
     """
 
     growth: Annotated[float, Gt(1)] = 2.0
-    """Each window has about this many times the epochs of the one before; the first has one epoch."""
+    """Each window has about this many times the epochs of the one before; the first has one
+    epoch."""
     use_prior: bool = True
     prior_inflation: Positive = 1.0
     """Times the prior's standard deviations."""
@@ -72,9 +79,11 @@ class Progressive(Estimator):
     tolerance: Positive = 1e-6
     """The Gauss-Newton step, in standard deviations of the local bound, that ends the last pass."""
     restarts: Whole | None = None
-    """Further attempts at a trial that fails the test; None: eight with windows, fifteen without."""
+    """Further attempts at a trial that fails the test; None: eight with windows, fifteen
+    without."""
     budget: Positive | None = None
-    """Simulations that a trial may cost, a Jacobian counting n and a window its share; None: no limit."""
+    """Simulations that a trial may cost, a Jacobian counting n and a window its share; None: no
+    limit."""
 
     equation = "least_squares"
     family = "IPE"
@@ -86,73 +95,89 @@ class Progressive(Estimator):
     def search(
         self, problem: Problem, z: Array, *, before: Minima | None = None, history: bool = False
     ) -> tuple[Minima, EvaluationCount]:
-        """Finds the best minimum of each trial and the cost of finding it. `before`: minima that are known already and
-        do not fit."""
-        everyone, n, m = np.arange(len(z)), len(problem.x0), z.shape[1]
-        attempts = (Stages if problem.measurement.epochs is None else Windows)(
-            problem,
-            problem.prior_used(self.prior_inflation) if self.use_prior else None,
-            z,
-            EvaluationCount.zeros(len(z)),
-            Limits(self.tolerance, self.max_iterations, self.budget, history),
-            self.growth,
-            self.window_tolerance,
-            self.restarts,
-        )
-        tally, significance = attempts.tally, max(WRONG_MINIMUM, problem.doubted)
+        """Finds the best minimum of each trial and the cost of finding it. `before`: minima that
+        are known already and do not fit."""
+        everyone = np.arange(len(z))
+        n = len(problem.x0)
+        m = z.shape[1]
+        attempts = self._attempts(problem, z, history)
+        tally = attempts.tally
+        significance = max(WRONG_MINIMUM, problem.doubted)
         best = attempts.attempt(0, everyone, None)
         if before is not None:
             worse = before.converged & ~best.better_than(before)
             best = put(best, worse, take(before, worse))
-        # Of each trial: attempts after the first one, independent draws among their starts, attempts that have led to
-        # the best minimum again, those of them from draws, and the cost of the first fit.
+        # Of each trial: attempts after the first, independent draws among their starts, attempts
+        # that led to the best minimum again, those of them from draws, the cost of the first fit.
         tried, drawn, repeats, independent = np.zeros((4, len(z)), np.int64)
         first = np.full(len(z), np.inf)
+        budget = np.inf if self.budget is None else self.budget
         for k in range(1, attempts.last + 1):
-            cost, draws = tally.of_search(n), attempts.draws(k)
+            cost = tally.of_search(n)
             first = np.where(best.converged, np.minimum(first, cost), np.inf)
-            going = ~accepted(best, m, significance) & finite(z) & ~tally.failed(everyone)
-            going &= (cost < np.minimum(_WORTH * first, attempts.most * (1 + n))) | (drawn == 0)
-            going &= (repeats < attempts.repeats) | (independent == 0)
-            going &= self.budget is None or cost < self.budget
-            rows = np.flatnonzero(going)
+            failing = ~accepted(best, m, significance) & finite(z) & ~tally.failed(everyone)
+            # Neither the cost nor repeats end a search before draws were tried.
+            most = np.minimum(_WORTH * first, attempts.most * (1 + n))
+            worth = (cost < most) | (drawn == 0)
+            unsettled = (repeats < attempts.repeats) | (independent == 0)
+            rows = np.flatnonzero(failing & worth & unsettled & (cost < budget))
             if not len(rows):
                 break
             known = take(best, rows)
             again = attempts.attempt(k, rows, known)
-            better, same = again.better_than(known), _same(again, known)
+            better = again.better_than(known)
+            same = _same(again, known)
+            draws = attempts.draws(k)
             tried[rows] += 1
             drawn[rows] += draws
-            for count, led in ((repeats, same), (independent, same & (draws > 0))):
-                count[rows] = np.where(better & ~same, 0, count[rows] + led)
+            # A better minimum that is another one has been found once.
+            other = better & ~same
+            repeats[rows] = np.where(other, 0, repeats[rows] + same)
+            independent[rows] = np.where(other, 0, independent[rows] + (same & (draws > 0)))
             best = put(best, rows[better], take(again, better))
         raised = tally.failed(everyone) & ~best.converged
-        for i in np.flatnonzero(
-            best.converged & ~accepted(best, m, significance) & (tried > 0)
-        ).tolist():
+        doubtful = best.converged & ~accepted(best, m, significance) & (tried > 0)
+        for i in np.flatnonzero(doubtful).tolist():
             tally.messages[i] = _words(tried[i], drawn[i], repeats[i])
-        return replace(
-            best, status=np.where(raised, Status.ERROR, best.status).astype(np.int8)
-        ), tally
+        status = np.where(raised, Status.ERROR, best.status)
+        return replace(best, status=status.astype(np.int8)), tally
+
+    def _attempts(self, problem: Problem, z: Array, history: bool) -> Stages | Windows:
+        kind = Stages if problem.measurement.epochs is None else Windows
+        prior = problem.prior_used(self.prior_inflation) if self.use_prior else None
+        limits = Limits(self.tolerance, self.max_iterations, self.budget, history)
+        return kind(
+            problem,
+            prior,
+            z,
+            EvaluationCount.zeros(len(z)),
+            limits,
+            self.growth,
+            self.window_tolerance,
+            self.restarts,
+        )
 
 
 def _same(one: Minima, other: Minima) -> Mask:
     """Tells where two minima (trials,) are one."""
-    with np.errstate(invalid="ignore"):  # two infinite fits are not one minimum
+    # Two infinite fits are not one minimum.
+    with np.errstate(invalid="ignore"):
         near = _SAME_FIT * np.maximum(one.chi_square, other.chi_square)
-        return one.converged & other.converged & (np.abs(one.chi_square - other.chi_square) <= near)
+        alike = np.abs(one.chi_square - other.chi_square) <= near
+    return one.converged & other.converged & alike
 
 
 def _words(tried: int, drawn: int, repeats: int) -> str:
     """Says how far the search went in a trial."""
-    count = f"{tried} more attempt{'' if tried == 1 else 's'}"
+    count = "1 more attempt" if tried == 1 else f"{tried} more attempts"
     draws = f", from {drawn} independent draws in all" if drawn else ""
     led = f"{repeats} of them led to this minimum again" if repeats else "none found one"
     return f"a better fit was looked for by {count}{draws}: {led}"
 
 
 def accepted(minima: Minima, readings: int, significance: float) -> Mask:
-    """Tells which minima (trials,) are taken for the least: those that fit, and those whose bulk of residuals does."""
+    """Tells which minima (trials,) are taken for the least: those that fit, and those whose bulk of
+    residuals does."""
     gross_errors_only = (minima.bulk <= _BULK) & (readings >= _READINGS * minima.x.shape[1])
     fits = passes(minima, readings, significance)
     return minima.converged & (fits | (gross_errors_only & (significance < _TRUSTED)))
