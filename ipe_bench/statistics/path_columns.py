@@ -50,10 +50,16 @@ def path(s: Sample) -> PathSample:
 
 
 def of_path(formula: Callable[[Sample], Array]) -> Callable[[Sample], Array]:
-    """Turns a formula (n,) of errors over all epochs into its shown form (n + 1,); NaN if no state is tracked."""
-    return lambda s: (
-        f.in_units(formula(path(s)), path(s)) if is_track(s) else np.full(s.n + 1, np.nan)
-    )
+    """Turns a formula (n,) of errors over all epochs into its shown form (n + 1,); NaN if no state
+    is tracked."""
+
+    def shown(s: Sample) -> Array:
+        if not is_track(s):
+            return np.full(s.n + 1, np.nan)
+        along = path(s)
+        return f.in_units(formula(along), along)
+
+    return shown
 
 
 rmse = of_path(f.rmse)
@@ -62,12 +68,17 @@ bound = of_path(lambda s: s.linear_bound)
 
 def rmse_limits(s: Sample) -> f.Ends:
     """Computes ends (n + 1,) of the intervals of these root mean squares."""
-    return f.ends_in_units(f.rmse_ends)(path(s)) if is_track(s) else (np.full(s.n + 1, np.nan),) * 2
+    if not is_track(s):
+        unknown = np.full(s.n + 1, np.nan)
+        return unknown, unknown
+    return f.ends_in_units(f.rmse_ends)(path(s))
 
 
 def mean_score(s: Sample, name: str) -> float:
     """Computes the mean of a score over the trials that have one."""
-    values = s.scalars[name][s.solved] if name in s.scalars else np.empty(0)
+    if name not in s.scalars:
+        return np.nan
+    values = s.scalars[name][s.solved]
     values = values[~np.isnan(values)]
     return float(values.mean()) if len(values) else np.nan
 
@@ -81,15 +92,19 @@ def path_success(s: Sample) -> tuple[float, float, float]:
 
 
 def path_verdict(s: Sample) -> str:
-    return f.verdict_on(s.scalars["path_nees"], s.n, s) if is_track(s) else NO_VERDICT
+    if not is_track(s):
+        return NO_VERDICT
+    return f.verdict_on(s.scalars["path_nees"], s.n, s)
 
 
 def nis_verdict(s: Sample) -> str:
-    """Returns the verdict on innovations: on whiteness, then on NIS, whose degrees are the readings of a trial."""
+    """Returns the verdict on innovations: on whiteness, then on NIS, whose degrees are the readings
+    of a trial."""
     if not (is_track(s) and NIS in s.scalars):
         return NO_VERDICT
     p = _white_p(s)
-    surely_wrong, _ = clopper_pearson(int((p < FIT_LEVEL).sum()), len(p))
+    rejected = int((p < FIT_LEVEL).sum())
+    surely_wrong, _ = clopper_pearson(rejected, len(p))
     if surely_wrong > _TOLERATED:
         return WRONG
     m = int(s.group.footer["readings"])
@@ -98,29 +113,37 @@ def nis_verdict(s: Sample) -> str:
 
 def _white_p(s: Sample) -> Array:
     """Returns the p-values of whiteness of the converged trials that have one."""
-    p = s.scalars["white_p"][s.converged] if "white_p" in s.scalars else np.empty(0)
+    if "white_p" not in s.scalars:
+        return np.empty(0)
+    p = s.scalars["white_p"][s.converged]
     return p[~np.isnan(p)]
 
 
 def not_white(s: Sample) -> tuple[float, float, float]:
-    """Computes the share of trials with autocorrelated innovations, and the ends of its interval."""
+    """Computes the share of trials with autocorrelated innovations, and the ends of its
+    interval."""
     p = _white_p(s)
     rejected = int((p < NOT_WHITE).sum())
-    return rejected / len(p) if len(p) else np.nan, *clopper_pearson(rejected, len(p))
+    share = rejected / len(p) if len(p) else np.nan
+    return share, *clopper_pearson(rejected, len(p))
 
 
 def epoch_curves(s: Sample) -> Iterator[dict[str, Any]]:
-    """Computes time, root mean square error, bounds, and NEES with its limits, per epoch and state of a track."""
+    """Computes time, root mean square error, bounds, and NEES with its limits, per epoch and state
+    of a track."""
     times = np.array(s.group.footer.get("times", ()), dtype=float)
     if not len(times):
         return
-    K, n = len(times), s.n
-    own = sum(_sums(s, s.group.cells, K, 2 * n + 4), np.zeros((K, 2 * n + 4)))
-    truths = _sums(s, [truth for truth in s.group.truths if truth is not None], K, 2 * n)
-    errors, nees, total, count = own[:, :n], own[:, n], own[:, n + 3 : -1], own[:, -1]
-    posterior = next(
-        (block for block in truths if np.isfinite(block).all()), np.full((K, 2 * n), np.nan)
-    )
+    K = len(times)
+    n = s.n
+    # Of each epoch: n squared errors, NEES, NIS, its readings, n variances of the bound, trials.
+    columns = 2 * n + 4
+    own = sum(_sums(s, s.group.cells, K, columns), np.zeros((K, columns)))
+    errors = own[:, :n]
+    nees = own[:, n]
+    total = own[:, n + 3 : -1]
+    count = own[:, -1]
+    posterior = _posterior(s, K)
     with np.errstate(all="ignore"):
         low, high = mean_limits(n, int(count[0]))
         for i, name in enumerate(s.names):
@@ -140,12 +163,24 @@ def epoch_curves(s: Sample) -> Iterator[dict[str, Any]]:
             }
 
 
+def _posterior(s: Sample, epochs: int) -> Array:
+    """Reads the posterior bounds (K, 2 n) of the first seed that has them; NaN if none has."""
+    truths = [truth for truth in s.group.truths if truth is not None]
+    for block in _sums(s, truths, epochs, 2 * s.n):
+        if np.isfinite(block).all():
+            return block
+    return np.full((epochs, 2 * s.n), np.nan)
+
+
 def _sums(s: Sample, cells: Sequence[StoredCell], epochs: int, columns: int) -> list[Array]:
     """Reads the sums (K, columns) of each stored block."""
     from ipe_bench.trials.paths import unpacked
 
-    stored = (s.collection.load(cell, (), ("curves",)).get("curves", np.empty(0)) for cell in cells)
-    return [block for texts in stored for block in unpacked(texts, epochs, columns)]
+    found = []
+    for cell in cells:
+        stored = s.collection.load(cell, (), ("curves",))
+        found.extend(unpacked(stored.get("curves", np.empty(0)), epochs, columns))
+    return found
 
 
 STATISTICS: tuple[Statistic, ...] = (

@@ -84,14 +84,16 @@ class StateScenario:
         """Standard deviations (n,) of the scored states at the last epoch in a filter that is
         linearised along the path without process noise from the mean of the prior."""
         model = self.assumed
-        start = x = model.prior.mean[None]
+        start = model.prior.mean[None]
         path = np.empty((1, model.epochs, model.n))
+        x = start
         for k in range(model.epochs):
-            x = path[:, k] = model.transition(x, k) if model.moves(k) else x
+            if model.moves(k):
+                x = model.transition(x, k)
+            path[:, k] = x
         with np.errstate(all="ignore"):
-            return deviations(bound_at_truth(model, Paths(start, path, np.empty(0)))[0, -1])[
-                self.scored
-            ]
+            P = bound_at_truth(model, Paths(start, path, np.empty(0)))
+            return deviations(P[0, -1])[self.scored]
 
     @cached_property
     def scored(self) -> Array:
@@ -136,7 +138,8 @@ class PathBlock:
     def _bound(self, smooths: bool) -> Array:
         at = self.scenario.scored
         with np.errstate(all="ignore"):
-            return bound_at_truth(self.scenario.assumed, self.paths, smooths)[..., at[:, None], at]
+            P = bound_at_truth(self.scenario.assumed, self.paths, smooths)
+            return P[..., at[:, None], at]
 
     @cached_property
     def variances(self) -> Array:
@@ -146,15 +149,18 @@ class PathBlock:
     @cached_property
     def smoothed_variances(self) -> Array:
         """Those (trials, K, n) of the smoother that is linearised at the truth."""
-        return np.ascontiguousarray(np.diagonal(self._bound(smooths=True), axis1=2, axis2=3))
+        P = self._bound(smooths=True)
+        return np.ascontiguousarray(np.diagonal(P, axis1=2, axis2=3))
 
     @cached_property
     def definite(self) -> Mask:
         """Whether the covariance at the last epoch has an inverse (trials,), so that NEES says
         something."""
-        P, d = self.bound[:, -1], deviations(self.bound[:, -1])
+        P = self.bound[:, -1]
+        d = deviations(P)
         usable = finite(P) & (d > 0).all(axis=1)
-        C = np.where(usable[:, None, None], P / (d[:, :, None] * d[:, None, :]), 0.0)
+        scale = d[:, :, None] * d[:, None, :]
+        C = np.where(usable[:, None, None], P / scale, 0.0)
         return np.linalg.eigvalsh(C)[:, 0] > _INDEFINITE
 
     def warm_up(self, tracker: Tracker) -> None:
@@ -168,7 +174,9 @@ class PathBlock:
     def truth_columns(self) -> Columns:
         """The scored states at the last epoch with their bounds, and the posterior bounds along the
         whole path."""
-        model, names, at = self.scenario.assumed, self.names, self.scenario.scored
+        model = self.scenario.assumed
+        names = self.names
+        at = self.scenario.scored
         posterior, error = np.full((2, len(self), len(at)), np.nan)
         curves = np.full((2, model.epochs, len(at)), np.nan)
         if self.start == 0 and len(self) and not self.scenario.noise.real:
@@ -195,11 +203,11 @@ class PathBlock:
     def estimate(self, tracker: Tracker) -> tuple[Estimates, Columns]:
         """What a tracker makes of the states at the last epoch, and its scores over the whole
         path."""
-        model, z = self.scenario.assumed, self.paths.z
         variances = self.smoothed_variances if tracker.smooths else self.variances
         began = time.perf_counter()
-        tracks, messages = track_safely(tracker, model, z)
-        seconds = np.full(len(self), (time.perf_counter() - began) / max(1, len(self)))
+        tracks, messages = track_safely(tracker, self.scenario.assumed, self.paths.z)
+        elapsed = time.perf_counter() - began
+        seconds = np.full(len(self), elapsed / max(1, len(self)))
         with np.errstate(all="ignore"):
             return self._scored(tracks, messages, seconds, variances)
 
@@ -210,42 +218,23 @@ class PathBlock:
         (trials, K, n) are those of the bound over the path."""
         at = self.scenario.scored
         x = self.paths.x
-        e, P = self.scenario.assumed.nearest_state(tracks.mean, x) - x, tracks.covariance
-        known: Mask = np.asarray(np.isfinite(e).all(axis=2) & np.isfinite(P).all(axis=(2, 3)))
-        e, P = e[..., at], P[..., at[:, None], at]
+        e = self.scenario.assumed.nearest_state(tracks.mean, x) - x
+        reported = np.isfinite(tracks.covariance).all(axis=(2, 3))
+        known: Mask = np.asarray(np.isfinite(e).all(axis=2) & reported)
+        e = e[..., at]
+        P = tracks.covariance[..., at[:, None], at]
         trials, K, n = e.shape
-        ended = np.full(trials, Status.CONVERGED) if tracks.status is None else tracks.status
-        finished = known.all(axis=1)
-        status = np.where(finished | (ended != Status.CONVERGED), ended, Status.NONFINITE).astype(
-            np.int8
-        )
-        status[list(messages)] = Status.ERROR
-        iterations = np.full(trials, K) if tracks.iterations is None else tracks.iterations.copy()
-        iterations[list(messages)] = 0
-        for i in np.flatnonzero(~finished):
-            messages.setdefault(
-                int(i), f"the track is not finite from epoch {int(np.argmin(known[i])) + 1} on"
-            )
-        status[~finite(self.paths.x)] = Status.NO_READINGS
+        estimates = self._estimates(tracks, known, messages, seconds)
+        status = estimates.status
         converged = status == Status.CONVERGED
-        finished &= status != Status.NO_READINGS
-        estimates = Estimates(
-            x=tracks.mean[:, -1, at],
-            status=status,
-            covariance=P[:, -1],
-            iterations=iterations,
-            simulations=tracks.calls,
-            messages=messages,
-            seconds=seconds,
-        )
+        finished = known.all(axis=1) & (status != Status.NO_READINGS)
         each = nees(e.reshape(-1, n), P.reshape(-1, n, n)).reshape(trials, K)
         each[~self.definite] = np.nan
-        distance = np.sum(half(self.bound[:, -1]).whitened(e[:, -1, None])[:, 0] ** 2, axis=1)
+        distance = self._distance(e[:, -1])
+        # Squared errors over the bound's variances, where the model leaves any.
         normalised = np.sum(np.where(variances > 0, e**2 / variances, 0.0), axis=2)
-        lost = ~(normalised <= gate(n))
-        read = tracks.degrees.sum(axis=1)
-        by_epoch = [e**2, *(a[:, :, None] for a in (each, tracks.nis, tracks.degrees)), variances]
-        sums = [a[converged].sum(axis=0) for a in by_epoch]
+        of_filter = [a[:, :, None] for a in (each, tracks.nis, tracks.degrees)]
+        sums = [a[converged].sum(axis=0) for a in (e**2, *of_filter, variances)]
         columns = {
             "trial": np.arange(self.start, self.start + len(self)),
             **by_parameter("error", self.names, e[:, -1]),
@@ -265,18 +254,52 @@ class PathBlock:
             "fit_p": self._fit_p(tracks),
             "path_nees": each.mean(axis=1),
             "path_success": finished & (normalised.mean(axis=1) <= gate(n)),
-            "extra_nis": np.where(read > 0, tracks.nis.sum(axis=1) / np.maximum(read, 1), np.nan),
-            "log_likelihood": np.where(read > 0, tracks.log_likelihood, np.nan),
-            "white_p": white_p(tracks.innovations.swapaxes(1, 2)),
-            "first_bad_epoch": np.where(lost.any(axis=1), lost.argmax(axis=1) + 1.0, np.nan),
+            **_innovation_columns(tracks),
+            "first_bad_epoch": _first_epoch(~(normalised <= gate(n))),
             "curves": packed(trials, [*sums, np.full((K, 1), converged.sum())]),
         }
         if tracks.stage is not None:
             columns["extra_stage"] = np.asarray(tracks.stage, dtype=float)
         return estimates, columns | self._copies(tracks)
 
+    def _distance(self, e: Array) -> Array:
+        """Squared errors (trials,) of the last epoch in the metric of the bound at the truth."""
+        white = half(self.bound[:, -1]).whitened(e[:, None])[:, 0]
+        return np.sum(white**2, axis=1)
+
+    def _estimates(
+        self, tracks: Tracks, known: Mask, messages: dict[int, str], seconds: Array
+    ) -> Estimates:
+        """The tracks at the last epoch; adds to `messages` where a track is not finite, which
+        `known` (trials, K) says."""
+        at = self.scenario.scored
+        trials, K = known.shape
+        raised = list(messages)
+        finished = known.all(axis=1)
+        status = tracks.status
+        if status is None:
+            status = np.full(trials, Status.CONVERGED)
+        status = np.where(finished | (status != Status.CONVERGED), status, Status.NONFINITE)
+        status[raised] = Status.ERROR
+        status[~finite(self.paths.x)] = Status.NO_READINGS
+        iterations = np.full(trials, K) if tracks.iterations is None else tracks.iterations.copy()
+        iterations[raised] = 0
+        for i in np.flatnonzero(~finished).tolist():
+            epoch = int(np.argmin(known[i])) + 1
+            messages.setdefault(i, f"the track is not finite from epoch {epoch} on")
+        return Estimates(
+            x=tracks.mean[:, -1, at],
+            status=status.astype(np.int8),
+            covariance=tracks.covariance[:, -1, at[:, None], at],
+            iterations=iterations,
+            simulations=tracks.calls,
+            messages=messages,
+            seconds=seconds,
+        )
+
     def _copies(self, tracks: Tracks) -> Columns:
-        """How probable each path is among its copies by whole periods, and whether that leaves it open."""
+        """How probable each path is among its copies by whole periods, and whether that leaves it
+        open."""
         p = copy_p(self.scenario.assumed, self.paths.z, tracks)
         if p is None:
             return {}
@@ -289,13 +312,32 @@ class PathBlock:
 
         if tracks.cost is not None:
             return path_p(self.paths.z, tracks.cost)
-        squares, read = tracks.nis.sum(axis=1), tracks.degrees.sum(axis=1)
+        squares = tracks.nis.sum(axis=1)
+        read = tracks.degrees.sum(axis=1)
         return np.where(read > 0, chdtrc(read, squares), np.nan)
+
+
+def _first_epoch(bad: Mask) -> Array:
+    """The number (trials,) of the first epoch that is bad (trials, K); NaN if none is."""
+    return np.where(bad.any(axis=1), bad.argmax(axis=1) + 1.0, np.nan)
+
+
+def _innovation_columns(tracks: Tracks) -> Columns:
+    """What is stored of a filter's innovations; NaN of a tracker that has none."""
+    read = tracks.degrees.sum(axis=1)
+    nis = tracks.nis.sum(axis=1) / np.maximum(read, 1)
+    return {
+        "extra_nis": np.where(read > 0, nis, np.nan),
+        "log_likelihood": np.where(read > 0, tracks.log_likelihood, np.nan),
+        "white_p": white_p(tracks.innovations.swapaxes(1, 2)),
+    }
 
 
 def block_of(scenario: AnyScenario, start: int, stop: int) -> Any:
     """Trials start to stop of a scenario: a `PathBlock` or a `Block`."""
-    return (PathBlock if isinstance(scenario, StateScenario) else Block).draw(scenario, start, stop)  # type: ignore[arg-type]
+    if isinstance(scenario, StateScenario):
+        return PathBlock.draw(scenario, start, stop)
+    return Block.draw(scenario, start, stop)
 
 
 def track_safely(tracker: Tracker, model: StateModel, z: Array) -> tuple[Tracks, dict[int, str]]:
@@ -313,41 +355,49 @@ def track_safely(tracker: Tracker, model: StateModel, z: Array) -> tuple[Tracks,
     else:
         _make_plain(tracker, tracks, len(z), model)
         return tracks, {}
-    parts = [track_safely(tracker, model, row[None]) for row in z]
-    return Tracks.join([part for part, _ in parts]), {
-        i: m[0] for i, (_, m) in enumerate(parts) if m
-    }
+    parts = []
+    messages = {}
+    for i, row in enumerate(z):
+        part, message = track_safely(tracker, model, row[None])
+        parts.append(part)
+        if message:
+            messages[i] = message[0]
+    return Tracks.join(parts), messages
 
 
 def _make_plain(tracker: Tracker, tracks: Any, trials: int, model: StateModel) -> None:
     """Replaces what a tracker returned by ordinary arrays of floats, as of an estimator; ValueError
     if it cannot be."""
-    name, (K, n) = f"{type(tracker).__name__}.track returns", (model.epochs, model.n)
+    name = f"{type(tracker).__name__}.track returns"
     if not isinstance(tracks, Tracks):
         raise ValueError(f"{name} {type(tracks).__name__}, where Tracks are asked for")
+    K = model.epochs
     shapes = {
-        "mean": (K, n),
-        "covariance": (K, n, n),
+        "mean": (K, model.n),
+        "covariance": (K, model.n, model.n),
         "nis": (K,),
         "degrees": (K,),
         "log_likelihood": (),
+        "innovations": (K, model.readings_per_epoch),
     }
-    for part, shape in {**shapes, "innovations": (K, model.readings_per_epoch)}.items():
-        setattr(
-            tracks, part, plain_numbers(f"{name} {part}", getattr(tracks, part), (trials, *shape))
-        )
+    for part, shape in shapes.items():
+        values = getattr(tracks, part)
+        setattr(tracks, part, plain_numbers(f"{name} {part}", values, (trials, *shape)))
     tracks.calls = plain_counts(name, "calls", tracks.calls, trials)
     if tracks.cost is not None:
         tracks.cost = plain_numbers(f"{name} cost", tracks.cost, (trials,))
     for part in ("status", "iterations"):
-        if (values := getattr(tracks, part)) is not None:
+        values = getattr(tracks, part)
+        if values is not None:
             setattr(tracks, part, plain_counts(name, part, values, trials))
 
 
 def packed(trials: int, sums: Sequence[Array]) -> Array:
     """Texts (trials,) of which the first holds sums (K, columns) over the trials of a block."""
-    text = base64.b64encode(np.concatenate(sums, axis=1).astype("<f8").tobytes()).decode()
-    return np.array([text, *[""] * (trials - 1)], dtype=object)[:trials]
+    numbers = np.concatenate(sums, axis=1).astype("<f8")
+    text = base64.b64encode(numbers.tobytes()).decode()
+    texts = [text, *[""] * (trials - 1)]
+    return np.array(texts, dtype=object)[:trials]
 
 
 def unpacked(texts: Array, epochs: int, columns: int) -> Array:
