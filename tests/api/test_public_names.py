@@ -212,3 +212,17 @@ def test_status_and_report_agree_and_the_report_is_still_a_function_afterwards(
     assert result.report == tmp_path / "elsewhere" / "report.html"
     with pytest.warns(UserWarning, match="missing"):
         ib.load([tmp_path])
+
+
+def test_a_component_is_what_the_command_line_constructs():
+    assert ib.component("solver/newton", max_iterations=20) == ib.solvers.Newton(max_iterations=20)
+    assert ib.component("noise/gaussian", deviation=0.1) == ib.noise.Gaussian(0.1)
+    # A mapping changes the keys that it has, and an option stands on the options that its defaults name.
+    pendulum = ib.component("state_model/pendulum", spread={"rate": 0.3})
+    assert pendulum.spread == {"angle": 1.0, "rate": 0.3}
+    book = ib.component("tracker/ekf_rts")
+    assert book == ib.states.Smoother(ib.states.ekf())
+    with pytest.raises(ib.UserError, match="did you mean state_model/pendulum"):
+        ib.component("state_model/pendulom")
+    with pytest.raises(ib.UserError, match=r"solver\.newton.*max_iter"):
+        ib.component("solver/newton", max_iter=20)
