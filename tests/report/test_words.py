@@ -24,7 +24,7 @@ FORBIDDEN = {
     r"\bto be had\b|\bwhat was asked for\b": "say what is missing",
     r"\b(?<!_)honest(ly)?\b": "a right covariance; overconfident",
     r"\breadings? (say|tell)s?\b|\bdata can(not)? tell\b": "readings determine, or distinguish",
-    r"\btells? (\S+ ){1,4}apart\b|\btold apart\b": "distinguish",
+    r"\b(tells?|told)( \S+){0,4} apart\b": "distinguish",
     r"\bnotic(e|es|ed|ing)\b": "detect",
     r"\bwithout a word\b|\bsilent(ly)?\b": "undetected",
     r"(?:^|[.:;] )No (choice|data|rivals?) ": "no negation as subject",
