@@ -1,5 +1,6 @@
 """The deadline is the quantile of what trials cost, its interval holds it as often as it says, and both are shown."""
 
+import re
 import sys
 from pathlib import Path
 
@@ -51,7 +52,8 @@ def test_a_report_has_the_column_and_the_figure(tmp_path, monkeypatch):
     discovery.sources.cache_clear()
     try:
         bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=30.0)
-        ib.run(bench, {"newton": ib.solvers.Newton()}, 40, output="out")
+        monkeypatch.setenv("COLUMNS", "80")
+        screen = str(ib.run(bench, {"newton": ib.solvers.Newton()}, 40, output="out"))
         trials = ib.load("out")
         cost = trials["simulations"] + trials["jacobians"] * bench.measurement.n
         result = ib.report("out", figures="all", formats="md")
@@ -62,5 +64,6 @@ def test_a_report_has_the_column_and_the_figure(tmp_path, monkeypatch):
     assert row["deadline"] == np.quantile(cost, 0.99)
     assert row["deadline_low"] <= row["deadline"] <= row["deadline_high"]
     assert result.problems == ()
+    assert re.search(r"^ estimator .* done by ", screen, re.MULTILINE)
     assert {path.name for path in result.figures} >= {"deadline.png"}
     assert "99 % done by" in (tmp_path / "out" / "tables" / "costs.md").read_text(encoding="utf-8")
