@@ -27,14 +27,22 @@ class FilterpyFilter(ConstantFilter):
     `predict`, `points` and `take_in`, for other objects of filterpy's. Promised: `take_in` hands
     out the readings at all `points`, in order.
 
-    >>> import numpy as np, ipe_bench as ib >>> from filterpy.kalman import JulierSigmaPoints,
-    UnscentedKalmanFilter >>> class Julier(ib.Sequential): ...     def track(self, P0, Q, z): ...
-    n = len(P0) ...         points = JulierSigmaPoints(n, kappa=0.0) ...         f =
-    UnscentedKalmanFilter(dim_x=n, dim_z=1, dt=1.0, hx=None, fx=lambda x, dt: x, points=points) ...
-    f.x, f.P, f.Q = np.zeros(n), P0, Q ...         return FilterpyFilter(f) >>> scenario =
-    ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01)) >>> z = scenario.draw(0, 3).z
-    >>> print(np.ptp([one.estimate(scenario.problem, z).x for one in (Julier(),
-    ib.baselines.CKF())], 0).max() < 1e-6) True
+    >>> import numpy as np, ipe_bench as ib
+    >>> from filterpy.kalman import JulierSigmaPoints, UnscentedKalmanFilter
+    >>> class Julier(ib.Sequential):
+    ...     def track(self, P0, Q, z):
+    ...         n = len(P0)
+    ...         points = JulierSigmaPoints(n, kappa=0.0)
+    ...         functions = {"hx": None, "fx": lambda x, dt: x}
+    ...         f = UnscentedKalmanFilter(dim_x=n, dim_z=1, dt=1.0, points=points, **functions)
+    ...         f.x, f.P, f.Q = np.zeros(n), P0, Q
+    ...         return FilterpyFilter(f)
+    >>> scenario = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01))
+    >>> z = scenario.draw(0, 3).z
+    >>> filters = Julier(), ib.baselines.CKF()
+    >>> x = [one.estimate(scenario.problem, z).x for one in filters]
+    >>> print(np.ptp(x, axis=0).max() < 1e-6)
+    True
     """
 
     def __init__(self, filter: Any) -> None:

@@ -105,9 +105,12 @@ class GaussNewton(Batch):
 
     Example:
 
-    >>> import ipe_bench as ib >>> bench = ib.Scenario(ib.measurements.Ranging(),
-    ib.noise.Gaussian(0.1), error_scale=30.0) >>> table = ib.run(bench, {"gauss_newton":
-    ib.baselines.GaussNewton(start="nominal")}, trials=20) >>> float(table.iloc[-1]["success"]) 1.0
+    >>> import ipe_bench as ib
+    >>> bench = ib.Scenario(ib.measurements.Ranging(), ib.noise.Gaussian(0.1), error_scale=30.0)
+    >>> method = ib.baselines.GaussNewton(start="nominal")
+    >>> table = ib.run(bench, {"gauss_newton": method}, trials=20)
+    >>> float(table.iloc[-1]["success"])
+    1.0
     """
 
     start: Start = "linear_lse"
@@ -127,9 +130,11 @@ class LevenbergMarquardt(Batch):
 
     Example:
 
-    >>> import ipe_bench as ib >>> bench = ib.Scenario(ib.measurements.Ranging(),
-    ib.noise.Gaussian(0.1), error_scale=30.0) >>> table = ib.run(bench, {"geodesic_lm":
-    ib.baselines.LevenbergMarquardt(geodesic=True)}, trials=20) >>> float(table.iloc[-1]["success"])
+    >>> import ipe_bench as ib
+    >>> bench = ib.Scenario(ib.measurements.Ranging(), ib.noise.Gaussian(0.1), error_scale=30.0)
+    >>> method = ib.baselines.LevenbergMarquardt(geodesic=True)
+    >>> table = ib.run(bench, {"geodesic_lm": method}, trials=20)
+    >>> float(table.iloc[-1]["success"])
     1.0
     """
 

@@ -78,12 +78,19 @@ class Sequential(Estimator):
     filter's P, and as `extras["nis"]` the squared innovations over their number: 1 on average if
     the filter is consistent (`intervals.mean_limits`).
 
-    >>> import ipe_bench as ib >>> from ipe_bench.states import Taylor >>> @dataclass(frozen=True)
-    ... class Extended(ib.Sequential): ...     engine: Literal["batched"] = "batched" ...     def
-    rule(self): ...         return Taylor() >>> scenario = ib.Scenario(ib.measurements.Polynomial(),
-    ib.noise.Gaussian(0.01)) >>> z = scenario.draw(0, 3).z >>>
-    print(np.ptp([one.estimate(scenario.problem, z).x for one in (Extended(), ib.baselines.EKF())],
-    0).max() < 1e-9) True
+    >>> import ipe_bench as ib
+    >>> from ipe_bench.states import Taylor
+    >>> @dataclass(frozen=True)
+    ... class Extended(ib.Sequential):
+    ...     engine: Literal["batched"] = "batched"
+    ...     def rule(self):
+    ...         return Taylor()
+    >>> scenario = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01))
+    >>> z = scenario.draw(0, 3).z
+    >>> filters = Extended(), ib.baselines.EKF()
+    >>> x = [one.estimate(scenario.problem, z).x for one in filters]
+    >>> print(np.ptp(x, axis=0).max() < 1e-9)
+    True
     """
 
     prior_inflation: Positive = 1.0

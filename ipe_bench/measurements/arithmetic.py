@@ -132,8 +132,9 @@ def parse(text: str, where: str) -> Arithmetic:
     `and`, `or`, `not` and `A if C else B` are those of Python, also in a row: 2 <= t < 5. The
     branch that a conditional does not take need not have a value.
 
-    Raises: UserError: the text is not a formula of this language, by the place where it ceases to
-        be one.
+    Raises:
+        UserError: the text is not a formula of this language, by the place where it ceases to be
+            one.
     """
     # Names get a letter in front, so that a parameter may be called lambda.
     source = _NAME.sub("_", " ".join(text.split()).replace("^", "**"))

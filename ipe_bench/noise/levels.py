@@ -27,8 +27,9 @@ _PROBES = 1000
 def read_sigma(text: str) -> Arithmetic:
     """Reads the formula of a standard deviation.
 
-    Raises: UserError: it is no formula, has no level, or is negative at some levels and readings,
-        all of them positive.
+    Raises:
+        UserError: it is no formula, has no level, or is negative at some levels and readings, all
+            of them positive.
     """
     formula = parse(text, "noise.sigma")
     names = level_names(formula)
@@ -114,8 +115,9 @@ class Levels:
     def covariance(self, h: Array, theta: Array) -> Covariance:
         """Returns R of readings h (m,) for logarithms theta (k,) of the levels.
 
-        Raises: UserError: the standard deviation of a reading is zero, which makes its likelihood
-            infinite.
+        Raises:
+            UserError: the standard deviation of a reading is zero, which makes its likelihood
+                infinite.
         """
         log_sigma, _, _ = self.at(h[None], theta[None])
         sigma = np.exp(log_sigma[0])

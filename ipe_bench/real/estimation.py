@@ -98,8 +98,9 @@ class Question:
     def checked(self) -> Question:
         """Checks that this question can be answered, and returns it.
 
-        Raises: UserError: a file does not hold the model's readings, or an estimator needs what is
-            not stated.
+        Raises:
+            UserError: a file does not hold the model's readings, or an estimator needs what is not
+                stated.
         """
         scenario = self.scenario
         if not self.estimators:

@@ -315,8 +315,9 @@ def open_together(
     `known` is what is known of all their parameters. `without` are columns that are left out, by
     their headings with their units or without.
 
-    Raises: UserError: a file is absent or does not hold readings of this model, files differ in
-        what they know, or there are fewer readings than parameters.
+    Raises:
+        UserError: a file is absent or does not hold readings of this model, files differ in what
+            they know, or there are fewer readings than parameters.
     """
     if isinstance(model, ConstrainedModel):
         return open_together(paths, model.whole, (*model.known, *known), without)
