@@ -9,7 +9,7 @@ from report.test_finding import row
 
 from ipe_bench.report.style import DARK, DARK_RAMP, LIGHT, RAMP, WHITE, ink
 from ipe_bench.report.tables.matrix import Tile, matrices, points, step
-from ipe_bench.report.tables.table import html, markdown, plain_text
+from ipe_bench.report.tables.table import html, latex, markdown, plain_text
 from ipe_bench.statistics.intervals import clopper_pearson
 
 SEEN = {
@@ -106,6 +106,7 @@ def test_neighbouring_scales_that_say_the_same_are_one_on_paper():
         "| a | 100 | 100 | 98 |",
         "| b | 100 | 10 | 0 |",
     ]
+    assert r"\begin{tabular}{@{}lrrr@{}}" in latex(matrix)
 
 
 def test_eight_estimators_at_seven_scales_fit_eighty_columns():

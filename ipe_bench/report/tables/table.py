@@ -376,6 +376,7 @@ _NUMBER = re.compile(r"-?\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?")
 def latex(table: Table, width: float | None = None) -> str:
     r"""Renders a table for `\input`, by booktabs and siunitx: bare, or floating with its caption in a column of `width`
     inches; a longtable if it has more than `LONG` rows."""
+    table = table.folded()
     shape = "@{}" + "".join("r" if c.numeric else "l" for c in table.columns) + "@{}"
     titles, *rows = [
         f"{' & '.join(cells)} \\\\"
