@@ -208,35 +208,22 @@ class Finding:
             yield f"{named(who, self.standings)} {verb} {phrase}".rstrip()
 
     def _nobody(self) -> str:
-        """States that no estimator surely holds anywhere, and who succeeds most as far as was seen."""
+        """States that nowhere an estimator significantly holds, and who did succeed longest or in most settings."""
         most = max(one.seen for one in self.standings)
         at = max(most - 1, 0)
         ahead = [one for one in self.standings if one.seen == most]
-        best = max(self._mean(one, at) for one in ahead)
-        first = [one for one in ahead if self._mean(one, at) == best]
+        columns = slice(at, at + 1) if self.ascending else slice(None)
+        share = seen([row for one in ahead for row in one.rows[columns] if row])
         where = f"in {len(self.places)} {self._columns}"
         where = f"at error scale {self._scale(at)}" if self.ascending else where
-        verb = "succeeds" if len(first) == 1 else "succeed"
-        share = seen([row for one in first for row in self._counted(one, at)])
-        told = f"{named(first, self.standings)} {verb} in {share} {where}"
+        verb = "succeeds" if len(ahead) == 1 else "succeed"
+        told = f"{named(ahead, self.standings)} {verb} in {share} {where}"
         if any(one.possible for one in self.standings):
             return f"Too few trials to tell who holds; {told}"
-        return f"No estimator holds{self._anywhere}; {told}"
-
-    @property
-    def _anywhere(self) -> str:
         if len(self.places) == 1:
-            return ""
+            return f"No estimator holds; {told}"
         first = f", even at error scale {self._scale(0)}"
-        return first if self.ascending else f" in any of {len(self.places)} {self._columns}"
-
-    def _counted(self, one: Standing, at: int) -> list[Row]:
-        """Returns its row at that scale, or its rows of all settings."""
-        return [row for row in (one.rows[at : at + 1] if self.ascending else one.rows) if row]
-
-    def _mean(self, one: Standing, at: int) -> float:
-        rows = self._counted(one, at)
-        return sum(row["success"] for row in rows) / len(rows) if rows else -1.0
+        return f"No estimator holds{first if self.ascending else ' in any of them'}; {told}"
 
 
 def judged(row: Row | None, columns: int) -> str:

@@ -58,18 +58,12 @@ DARK_RAMP = (
 """The same on a dark page, where luminance rises as success falls."""
 
 
-def luminance(color: str) -> float:
-    """Computes the relative luminance of a colour (WCAG 2.1)."""
-    parts = [int(color[i : i + 2], 16) / 255 for i in (1, 3, 5)]
-    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in parts]
-    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+_LIGHT_LETTERS = {*RAMP[7:], *DARK_RAMP[:5]}
 
 
 def ink(ground: str) -> str:
-    """Returns the colour of letters on that ground: the darker or the lighter one, whichever has more contrast."""
-    above = (luminance(ground) + 0.05) / (luminance(DARK) + 0.05)
-    below = (luminance(WHITE) + 0.05) / (luminance(ground) + 0.05)
-    return DARK if above > below else WHITE
+    """Returns the colour of letters on a colour of success, with a contrast of at least 4.5."""
+    return WHITE if ground in _LIGHT_LETTERS else DARK
 
 
 def which_figures(asked: Any) -> Which:

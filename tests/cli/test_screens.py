@@ -102,8 +102,7 @@ def test_a_report_names_every_estimator_of_every_scenario(screen, folders, tmp_p
     lines = screen("report", folders[0], f"output={tmp_path / 'out'}")
     for name in SHORT:
         assert rows(lines, name) == 4
-    # The finding names it too.
-    assert unfolded(lines).count(LONG) == 5
+    assert unfolded(lines).count(LONG) == 4
     assert any("deviation=0.4" in line for line in lines)
 
 

@@ -274,12 +274,16 @@ def nobody(report: Report, found: Any, winners: list[str]) -> Iterator[tuple[str
 
 def most(report: Report, found: Any, winners: list[str]) -> Iterator[tuple[str, str, bool]]:
     at, each = place(report, found["scale"]), report.board.populations
-    share = {e: [successes(report, k, e).mean() for k in range(at + 1)] for e in each}
-    ahead = [e for e in each if at == 0 or all(v >= 0.9 for v in share[e])]
-    best = [e for e in ahead if share[e][at] == max(share[one][at] for one in ahead)]
+    share = {
+        e: [successes(report, k, e).mean() for k in range(len(report.board.scales))] for e in each
+    }
+    seen = {
+        e: next((k for k, v in enumerate(own) if v < 0.9), len(own)) for e, own in share.items()
+    }
+    best = [e for e in each if seen[e] == max(seen.values())]
     labels = named_in(found, best)
     so = set(labels) == set(best) and numbers_are_so(report, found, best, at)
-    yield "who succeeds most", COUNTS, not so
+    yield "who succeeds most", COUNTS, not so or at != max(max(seen.values()) - 1, 0)
 
 
 JUDGES = {

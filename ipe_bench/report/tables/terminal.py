@@ -40,7 +40,7 @@ from ipe_bench.statistics.verdicts import VERDICTS, shown, sign_of
 
 MOST_SETTINGS = 2
 """Differing settings that have a column each."""
-_MOST_LINES = 44
+_MOST_LINES = 46
 """Lines that a terminal shows of several settings, most of them of matrices."""
 _HEAD = 4
 """Lines of a table besides its rows."""
