@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from scipy.stats import chi2
 from scipy.stats import t as student
 from shared.oracles import assert_agrees
-from shared.state_models import ConstantVelocity
+from shared.state_models import ConstantVelocity, CoordinatedTurn
 from shared.synthetic_store import Pretender, Synthetic
 
 import ipe_bench as ib
@@ -31,7 +31,7 @@ from ipe_bench.report.figures.log import draw_log
 from ipe_bench.report.figures.views import looks_of, views
 from ipe_bench.report.style import FACES, house_style
 from ipe_bench.report.words import ends_in_percent, public
-from ipe_bench.states import Smoother, ekf
+from ipe_bench.states import Smoother, Tracker, ekf
 from ipe_bench.states.base import widened
 from ipe_bench.statistics import analyse
 
@@ -322,3 +322,31 @@ def test_what_is_beyond_the_axis_of_a_track_is_marked_there():
         y for line in position.lines if "arrow" in str(line.get_marker()) for y in line.get_ydata()
     }
     assert arrows == {low, high}
+
+
+@dataclass(frozen=True)
+class Overflowing(Tracker):
+    """A filter of a plugin, which keeps nothing of its readings, and whose states are infinite from epoch 20 on."""
+
+    def track(self, model, z):
+        tracks = ekf().track(model, z)
+        tracks.mean[:, 20:], tracks.covariance[:, 20:] = np.inf, np.inf
+        tracks.reads.clear()
+        return tracks
+
+
+@pytest.mark.parametrize("count", [1, 30])
+def test_a_track_that_overflows_is_drawn_as_far_as_it_goes(count):
+    model = CoordinatedTurn(count=count)
+    z = model.draw(3, 4).z[0]
+    found = ib.estimate(model, z, {"far": Overflowing()})
+    with house_style():
+        (drawing,) = draw_log(found.log, found.tracks)
+    panels = [ax for ax in drawing.figure.axes if ax.axison]
+    assert [ax.get_title() for ax in panels] == [
+        *("x [m]", "vx [m/s]", "y [m]", "vy [m/s]", "rate [rad/s]"),
+        "NIS of far",
+    ]
+    (line,) = [line for line in panels[0].lines if line.get_linestyle() == "-"]
+    assert np.isfinite(line.get_ydata()).sum() == min(count, 20)
+    assert found.table()["reading1_predicted"].isna().all()

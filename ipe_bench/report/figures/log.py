@@ -31,7 +31,7 @@ ABOVE = 0.05
 _ALIKE = 0.25
 """Standard deviations by which tracks that are drawn once differ at most."""
 _JUMP = 0.1
-"""Part of their span by which predictions that jump from epoch to epoch do so, in the median."""
+"""Part of their span by which predictions that jump from epoch to epoch do so, on average."""
 _RED = "#c2273d"
 _MANY = 5000
 """Points from which on they are pixels in the PDF, too."""
@@ -47,7 +47,8 @@ def draw_log(log: Log, tracks: Sequence[LogTracks]) -> Iterator[Drawing]:
     states = model.states[:MOST_STATES]
     read = directly_read(model)
     filters = [group for group in groups if np.isfinite(group[0].nis).any()]
-    there = np.isfinite(log.z).any(axis=0) & bool(filters)
+    foretold = [np.isfinite(group[0].predicted).any(axis=0) for group in filters[:1]]
+    there = np.any(foretold, axis=0) if foretold else np.zeros(0)
     rest = [j for j in np.flatnonzero(there).tolist() if read.get(j, model.n) >= len(states)]
     colors = looks([group[0].label for group in groups])
     look = {_name(group): Look(colors[group[0].label].color, "") for group in groups}
@@ -86,7 +87,8 @@ def directly_read(model: StateModel) -> dict[int, int]:
     """Returns which reading of an epoch is a state itself, as the places of readings and of their states."""
     spread = np.sqrt(np.diagonal(model.prior.covariance))
     x = model.prior.mean + spread * np.array([[0.3], [-1.1], [0.7]]) + np.arange(model.n) / 7
-    z = [model.observe(x, k) for k in {0, model.epochs // 2, model.epochs - 1}]
+    with np.errstate(all="ignore"):  # far from the prior's mean a reading may have no value
+        z = [model.observe(x, k) for k in {0, model.epochs // 2, model.epochs - 1}]
     return {
         j: i
         for j in range(len(model.reading_names))
@@ -101,7 +103,9 @@ def _name(group: Sequence[LogTracks]) -> str:
 
 def _groups(tracks: Sequence[LogTracks]) -> list[list[LogTracks]]:
     """Returns the tracks that are known, those that pass first, and together those that cannot be told apart."""
-    known = [one for one in tracks if np.isfinite(one.mean).any()]
+    known = [
+        one for one in tracks if (np.isfinite(one.mean) & np.isfinite(one.deviation)).all(1).any()
+    ]
     groups: list[list[LogTracks]] = []
     for one in sorted(known, key=lambda one: not one.passes):
         same = next((group for group in groups if _are_alike(group[0], one)), None)
@@ -124,9 +128,12 @@ def _draw_bands(
     look: dict[str, Look],
     readings: Array,
 ) -> None:
-    """Draws means with their bands, and readings (K, kinds); marks at the panel's edge what is far from them."""
+    """Draws means with their bands, and readings (K, kinds); marks at the panel's edge what is far from them. What has
+    overflowed is left out."""
     style: Any = {"linestyle": "none", "marker": ".", "color": BOUND_COLOR, "zorder": 1}
     style |= {"markersize": 3.0, "alpha": 0.5, "rasterized": len(times) > _MANY}
+    bands = {name: _finite(*band) for name, band in bands.items()}
+    bands = {name: band for name, band in bands.items() if np.isfinite(band[0]).any()}
     middle = [mean for mean, _ in bands.values()]
     low, high = np.nanmin(middle), np.nanmax(middle)
     typical = max(float(np.nanmedian(deviation)) for _, deviation in bands.values())
@@ -150,6 +157,12 @@ def _draw_bands(
         _mark_beyond(ax, times, high_end, color)
 
 
+def _finite(mean: Array, deviation: Array) -> tuple[Array, Array]:
+    """Returns both, NaN where either is not finite."""
+    known = np.isfinite(mean) & np.isfinite(deviation)
+    return np.where(known, mean, np.nan), np.where(known, deviation, np.nan)
+
+
 def _draw_predictions(
     ax: Axes, log: Log, j: int, filters: Sequence[Sequence[LogTracks]], look: dict[str, Look]
 ) -> None:
@@ -161,8 +174,8 @@ def _draw_predictions(
         for group in filters
     }
     first = next(iter(found.values()))[0]
-    span = np.nanmax(first) - np.nanmin(first)
-    if np.nanmedian(np.abs(np.diff(first))) < _JUMP * span:
+    first = first[np.isfinite(first)]
+    if np.sum(np.abs(np.diff(first))) <= _JUMP * len(first) * np.ptp(first):
         _draw_bands(ax, log.model.times, found, look, z)
         common.title(ax, f"{name}: reading and prediction")
         return
