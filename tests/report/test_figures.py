@@ -640,6 +640,11 @@ def test_a_number_that_is_swept_has_an_axis_and_kinds_have_rows():
     assert labels == ["quantization", "gaussian"]
     one = swept_view("noise", ["gaussian"], kinds)
     assert not drawn(settings, one)
+    # An option that is 0 and one that is not there have the same words, and are two settings.
+    alike = {0.0: 1.0, np.nan: 2.0}
+    drawing = drawn(settings, swept_view("prior.width", alike, alike))["settings"]
+    labels = [t.get_text() for t in drawing.figure.axes[0].get_yticklabels()]
+    assert labels == ["prior.width=-", "prior.width=0"]
 
 
 # Distributions and convergence ---------------------------------------------------------------------------------------

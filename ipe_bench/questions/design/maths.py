@@ -194,11 +194,16 @@ def design(
 
 def _further(scenario: Scenario, today: Observability, x: Array) -> Further | None:
     """Finds the readings that cut the mean square of the bounds, as shares of today's, most."""
-    found = _candidates(scenario.measurement)
-    if found is None or not today.observable:
+    if not today.observable:
         return None
-    model, column, words = found
-    J = scenario.noise.covariance(model.m).whiten_jacobian(model.jacobian(x))
+    try:
+        model, column, words = _candidates(scenario.measurement)
+        R = scenario.noise.covariance(model.m)
+    except UserError:  # of inputs that the model refuses, or of readings without a deviation
+        return None
+    if model is scenario.measurement:
+        return None
+    J = R.whiten_jacobian(model.jacobian(x))
     there = np.flatnonzero(np.isfinite(J).all(axis=(0, 2)))
     if not len(there):
         return None
@@ -221,22 +226,22 @@ def _further(scenario: Scenario, today: Observability, x: Array) -> Further | No
     return Further(told, column, entries, alone, tuple(taken), np.array(bounds))
 
 
-def _candidates(model: Measurement) -> tuple[Measurement, str, list[str]] | None:
+def _candidates(model: Measurement) -> tuple[Measurement, str, list[str]]:
     """Returns a model of readings that may be taken beside today's, the one column that tells them apart, if it is a
     number, and words for each: inputs over several times their range, else those that the model offers."""
     columns = {**model.index, **model.input_columns}
     headings = [one.heading for one in model.inputs]
     varying = [name for name in headings if len(set(columns.get(name, ()))) > 1]
-    if len(varying) == 1 and columns.keys() >= {*headings}:
+    given = np.asarray(columns[varying[0]]) if len(varying) == 1 else np.empty(0, dtype=str)
+    if np.issubdtype(given.dtype, np.number) and columns.keys() >= {*headings}:
         (name,) = varying
-        given = np.asarray(columns[name], dtype=float)
         far = given.min() + _REACH * np.ptp(given)
         grid = [float(f"{at:.2g}") for at in np.linspace(given.min(), far, _GRID)]
         inputs = {key: [columns[key][0]] * _GRID for key in headings} | {name: grid}
         return model.with_inputs(inputs, _GRID), name, [f"{name} = {at:.4g}" for at in grid]
     offered = model.candidates
     if offered.m == model.m:
-        return None
+        return model, "", []
     rows = zip(*offered.index.values(), strict=True)
     words = [
         ", ".join(

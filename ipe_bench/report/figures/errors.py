@@ -71,7 +71,7 @@ def over_paths(view: View) -> pd.DataFrame:
     if len(bounds):
         whose = pd.MultiIndex.from_frame(states[place])
         squares = (states["path_rmse"] / bounds.reindex(whose).to_numpy()) ** 2
-        means = squares.groupby([states["error_scale"], states["estimator"]]).agg(np.mean)
+        means = squares.groupby([states["error_scale"], states["estimator"]]).mean()
         index = pd.MultiIndex.from_frame(view.totals[["error_scale", "estimator"]])
         error = np.sqrt(means.reindex(index).to_numpy())
     nothing: dict[str, Any] = dict.fromkeys(("error_q95", *_LIMITS), np.nan)
@@ -95,7 +95,10 @@ def _parting(view: View, totals: pd.DataFrame) -> float:
     alike = []
     for scale in view.scales:
         here = rows[rows["error_scale"] == scale]
-        ranges = [here[name].max() / here[name].min() for name in ("error_median", "nees_median")]
+        with np.errstate(all="ignore"):
+            ranges = [
+                here[name].max() / here[name].min() for name in ("error_median", "nees_median")
+            ]
         # Of a statistic that no estimator has, the range is NaN.
         close = not any(spread > 1 + _APART for spread in ranges)
         alike.append(len(here) == whole and here["success"].min() >= _ALL and close)

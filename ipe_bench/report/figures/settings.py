@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -47,25 +48,36 @@ _COLORS = {
 
 
 def draw(view: View) -> Iterator[Drawing]:
-    """Draws several settings at the largest error scale that all of them have."""
+    """Draws several settings at the largest error scale that most of them have."""
     columns = list(view["summary"].columns)
-    columns = columns[: columns.index("error_scale")] if "error_scale" in columns else []
-    rows = view.totals if columns else pd.DataFrame()
-    if rows.empty or rows.groupby(columns, dropna=False).ngroups < 2:
+    if "error_scale" not in columns:
         return
-    varying = [c for c in columns if len(set(rows[c].astype(str))) > 1]
-    rows = rows.assign(setting=_names(rows, varying, view))
-    number = rows["setting"].nunique()
+    rows = view.totals
+    varying = [
+        c for c in columns[: columns.index("error_scale")] if len(set(map(str, rows[c]))) > 1
+    ]
+    if not varying:
+        return
+    names = _names(rows, varying, view)
+    keys = [
+        ", ".join(f"{column}={value_text(value)}" for column, value in row.items())
+        for row in rows[varying].to_dict("records")
+    ]
+    # Settings whose words are alike are different all the same.
+    rows = rows.assign(setting=names if len(set(names)) == len(set(keys)) else keys)
     at = rows.groupby("error_scale")["setting"].nunique()
-    shared = at.index[at == number]
-    if not len(shared):
+    shared = at.index[at == at.max()]
+    if at.max() < 2:
         return
     scale = max(shared)
     rows = rows[rows["error_scale"] == scale]
-    rows = rows[rows.groupby(["setting", "estimator"])["setting"].transform("size") == 1]
-    swept = rows[varying[0]] if len(varying) == 1 else pd.Series(dtype=object)
-    drawn = _swept if _is_axis(swept) else _rows
-    yield from drawn(view, rows, varying, scale)
+    moving = (rows["noise"] == "model").any() if "noise" in rows else False
+    if moving:
+        yield from _rows(replace(view, moving=True), rows, varying, scale)
+    elif len(varying) == 1 and _is_axis(rows[varying[0]]):
+        yield from _swept(view, rows, varying[0], scale)
+    else:
+        yield from _rows(view, rows, varying, scale)
 
 
 def _is_axis(values: pd.Series[Any]) -> bool:
@@ -115,11 +127,8 @@ def _worded(column: str) -> str:
     return column.rpartition(".")[2].replace("_", " ")
 
 
-def _swept(
-    view: View, rows: pd.DataFrame, varying: Sequence[str], scale: float
-) -> Iterator[Drawing]:
+def _swept(view: View, rows: pd.DataFrame, column: str, scale: float) -> Iterator[Drawing]:
     """Draws success, error and NEES over the number that is swept."""
-    (column,) = varying
     rows = rows.assign(error_scale=pd.to_numeric(rows[column]))
     values = sorted(set(rows["error_scale"]))
     look = in_focus(view.look, view.focus)

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from itertools import combinations
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -357,3 +358,13 @@ def test_a_model_without_inputs_is_read_next_among_the_readings_that_it_offers()
     assert further.taken[0] == np.argmin(cost)
     assert further.words[further.taken[0]] == f"number {np.argmin(cost)}"
     assert further.column == ""
+
+
+def test_readings_of_own_deviations_and_inputs_that_are_words_have_no_further_ones():
+    days = [1, 2, 3, 4, 5, 7]
+    model = demand(days).measurement
+    own = Scenario(model, Gaussian((2.0, 2.0, 2.5, 2.5, 3.0, 3.0)), GaussianPrior(), 0.3, 0)
+    assert design(own).further is None
+    refused = replace(model, columns={"t": days})
+    with patch.object(type(refused), "with_inputs", side_effect=ib.UserError("no such input")):
+        assert design(replace(own, measurement=refused, noise=Gaussian(2.5))).further is None
