@@ -244,7 +244,7 @@ def test_each_change_is_worded_beside_its_margin_and_filled_if_it_is_beyond(tmp_
         (band,) = ax.patches
         assert (band.get_x(), band.get_x() + band.get_width()) == pytest.approx((low, high))
         assert ax.get_xlim()[0] <= low < high <= ax.get_xlim()[1]
-    assert "different is a change that may be smaller than the margin" in " ".join(
+    assert "different is a significant change that may be smaller than the margin" in " ".join(
         str(frame).split()
     )
     assert re.search(r"mean error .* different", str(frame))
