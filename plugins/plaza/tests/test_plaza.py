@@ -58,7 +58,7 @@ def test_a_drive_round_a_circle_ends_where_it_began():
             9,
             0,
             "3151.5",
-            "row 9, column time [s]: is not after that of the row before; give rows in the order of",
+            "row 9, column time [s]: is not after the time of the row before; give rows in the order of",
         ),
         (
             5,
