@@ -1,4 +1,5 @@
-"""Combines a portfolio: chord iterations first; the progressive method where the fit test rejects their answer."""
+"""Combines a portfolio: chord iterations first; the progressive method where the fit test rejects
+their answer."""
 
 from __future__ import annotations
 
@@ -21,10 +22,13 @@ from ipe_bench.solvers.chords import by_chords
 from ipe_bench.solvers.progressive import Progressive, accepted
 
 _CONFIRMATIONS = 4
-_DAMPING, _STEPS = 1e-3, 100
-"""lambda at the start of a minimisation that looks for another minimum, and steps tried."""
+_DAMPING = 1e-3
+"""lambda at the start of a minimisation that looks for another minimum."""
+_STEPS = 100
+"""Steps of such a minimisation, tried or taken."""
 
-CHORDS, PROGRESSIVE = 1, 2
+CHORDS = 1
+PROGRESSIVE = 2
 """The stages, as extras `stage` names them."""
 
 
@@ -32,18 +36,20 @@ CHORDS, PROGRESSIVE = 1, 2
 class Auto(Estimator):
     """Finds the least-squares estimate, as cheaply as this problem allows.
 
-    First the paper's fixed-point iteration, with H frozen at the nominal point and Anderson's acceleration, given up
-    where it does not come nearer to a root; then Gauss-Newton steps with one Jacobian, that of the root which it has
-    found, computed anew as long as its change would leave the answer more than some hundred tolerances from the
-    minimum. Where that does not converge, or the residuals fail the test of the fit, `progressive`, which knows what
-    was found. Extras `stage` says which of the two answered, 1 or 2. Such portfolios of algorithms are described by
+    First the paper's fixed-point iteration, with H frozen at the nominal point and Anderson's
+    acceleration, given up where it does not come nearer to a root; then Gauss-Newton steps with one
+    Jacobian, that of the root which it has found, computed anew as long as its change would leave
+    the answer more than some hundred tolerances from the minimum. Where that does not converge, or
+    the residuals fail the test of the fit, `progressive`, which knows what was found. Extras
+    `stage` says which of the two answered, 1 or 2. Such portfolios of algorithms are described by
     Gomes and Selman (Artificial Intelligence 126, 2001).
 
-    Where the first stage did not suffice, or plain fixed-point iteration would hardly contract at its answer, eq. (18),
-    `confirmations` minimisations from draws of the prior look for other minima that fit, of which the one counts that
-    is the most probable with the prior. Extras: `minima`, how many distinct minima that fit were found, and
-    `ambiguous`, 1 where there are several, 0 where the look found none, and NaN if no look was taken; `alternatives`
-    lists the others.
+    Where the first stage did not suffice, or plain fixed-point iteration would hardly contract at
+    its answer, eq. (18), `confirmations` minimisations from draws of the prior look for other
+    minima that fit, of which the one counts that is the most probable with the prior. Extras:
+    `minima`, how many distinct minima that fit were found, and `ambiguous`, 1 where there are
+    several, 0 where the look found none, and NaN if no look was taken; `alternatives` lists the
+    others.
 
     Example:
 
@@ -57,8 +63,9 @@ class Auto(Estimator):
     tolerance: Positive = 1e-6
     """Largest Gauss-Newton step still to go, in standard deviations of the local bound."""
     confirmations: Whole | None = None
-    """Minimisations that look for other minima that fit, where the problem is far from linear; None: four where a prior
-    says where to look and no differential equations make each of them dear, else none."""
+    """Minimisations that look for other minima that fit, where the problem is far from linear;
+    None: four where a prior says where to look and no differential equations make each of them
+    dear, else none."""
     seed: Whole = 0
     """Seed of a trial's random stream, which depends on this and on the trial's readings alone."""
     budget: Positive | None = None
@@ -68,7 +75,8 @@ class Auto(Estimator):
     family = "IPE"
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
-        everyone, m = np.arange(len(z)), z.shape[1]
+        everyone = np.arange(len(z))
+        m = z.shape[1]
         objective = Objective.of(problem, z)
         best, contracts = by_chords(
             objective, problem.H, self.tolerance, self.budget, history=history
@@ -80,22 +88,22 @@ class Auto(Estimator):
         left = np.flatnonzero(~answered)
         if len(left):
             thorough = Progressive(tolerance=self.tolerance, budget=self.budget)
-            found, spent = thorough.search(
-                problem, z[left], before=take(best, left), history=history
-            )
+            known = take(best, left)
+            found, spent = thorough.search(problem, z[left], before=known, history=history)
             best = put(best, left, found)
             tally.simulations[left] += spent.simulations
             tally.jacobians[left] += spent.jacobians
             tally.reported[left] += spent.reported
             tally.messages.update({int(left[i]): message for i, message in spent.messages.items()})
         fits[left] = fitting.note(take(best, left), left)
-        dear = problem.measurement.by_differential_equations or problem.prior_deviation is None
-        count = (
-            (0 if dear else _CONFIRMATIONS) if self.confirmations is None else self.confirmations
-        )
+        count = self.confirmations
+        if count is None:
+            dear = problem.measurement.by_differential_equations or problem.prior_deviation is None
+            count = 0 if dear else _CONFIRMATIONS
         looked = fits & ~(answered & contracts) & (count > 0)
         if looked.any():
-            rows, model = np.flatnonzero(looked), CountingModel(problem.measurement, tally)
+            rows = np.flatnonzero(looked)
+            model = CountingModel(problem.measurement, tally)
             whole = Objective(model, problem.R, z[rows], rows, problem.x0)
             best = self._confirmed(problem, whole, best, fitting, count, history)
         estimates = fitting.report(best.estimates(tally, m))
@@ -113,25 +121,25 @@ class Auto(Estimator):
         history: bool,
     ) -> Minima:
         """Returns the answers, after `count` looks for others in the trials of the objective."""
-        rows, n = objective.rows, len(problem.x0)
-        draws = normals(own_generators(self.seed, objective.z), count, n)
+        rows = objective.rows
+        draws = normals(own_generators(self.seed, objective.z), count, len(problem.x0))
         method = LevenbergMarquardtMethod(_DAMPING, problem.prior_used())
         limits = Limits(self.tolerance, _STEPS, self.budget, history)
         for k in range(count):
-            again = minimize(
-                objective, method, problem.x0 + spread_of_starts(problem) * draws[:, k], limits
-            )
+            start = problem.x0 + spread_of_starts(problem) * draws[:, k]
+            again = minimize(objective, method, start, limits)
             known = take(best, rows)
-            better = fitting.note(again, rows) & (
-                _improbability(problem, again) < _improbability(problem, known)
-            )
+            likelier = _improbability(problem, again) < _improbability(problem, known)
+            better = fitting.note(again, rows) & likelier
             best = best.replaced(rows, again, better)
         return best
 
 
 def _improbability(problem: Problem, minima: Minima) -> Array:
-    """Computes minus twice the logarithm (trials,) of the posterior density, or of the likelihood without a prior, but
-    for a constant."""
+    """Computes minus twice the logarithm (trials,) of the posterior density, or of the likelihood
+    without a prior, but for a constant."""
     prior = problem.prior_covariance()
-    of_prior = 0.0 if prior is None else np.sum(prior.whiten(minima.x - problem.x0) ** 2, axis=1)
+    of_prior = 0.0
+    if prior is not None:
+        of_prior = np.sum(prior.whiten(minima.x - problem.x0) ** 2, axis=1)
     return minima.chi_square + of_prior
