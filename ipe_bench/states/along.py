@@ -77,22 +77,17 @@ class Recording(NamedTuple):
     numbers: Array
     """(e, p)"""
 
-
-@dataclass(frozen=True)
-class AtEpoch:
-    """A function of states x (..., n) at one epoch, which knows its slopes."""
-
-    function: RowFunction | Own
-    numbers: Array
-    """(1, p)"""
-
     def __call__(self, x: Array) -> Array:
+        """Computes values (..., m) at states x (..., n) of one epoch, or (trials, e, m) at those (trials, e, n) of
+        all."""
         values = self.function(own(x.reshape(-1, x.shape[-1])), self.numbers)
         return values.reshape(*x.shape[:-1], -1)
 
     def slope(self, x: Array) -> tuple[Array, Array]:
-        """Computes value (trials, m) and Jacobian (trials, m, n) at x (trials, n)."""
-        return self.function.slopes(own(x), self.numbers)
+        """Computes values (..., m) and Jacobians (..., m, n) likewise."""
+        *stack, n = x.shape
+        values, slopes = self.function.slopes(own(x.reshape(-1, n)), self.numbers)
+        return values.reshape(*stack, -1), slopes.reshape(*stack, -1, n)
 
 
 @dataclass(frozen=True)
@@ -109,33 +104,32 @@ class EpochFunctions:
         return cls([Recording(Own(function, k), np.array([k]), none) for k in epochs], why)
 
     @cached_property
-    def at(self) -> Mapping[int, AtEpoch]:
+    def at(self) -> Mapping[int, Recording]:
         return {
-            k: AtEpoch(function, numbers[i : i + 1])
-            for function, epochs, numbers in self.recordings
-            for i, k in enumerate(epochs.tolist())
+            k: Recording(one.function, one.epochs[[i]], one.numbers[[i]])
+            for one in self.recordings
+            for i, k in enumerate(one.epochs.tolist())
         }
 
     def values(self, x: Array) -> Array:
         """Computes values (trials, K, m) at states x (trials, K, n) of the epochs."""
-        return self._joined(x, lambda one, rows: (one.function(rows, one.numbers),))[0]
+        return self._joined(x, lambda one, states: (one(states),))[0]
 
     def slopes(self, x: Array) -> tuple[Array, Array]:
         """Computes values (trials, K, m) and slopes (trials, K, m, n) likewise."""
-        value, slope = self._joined(x, lambda one, rows: one.function.slopes(rows, one.numbers))
+        value, slope = self._joined(x, Recording.slope)
         return value, slope
 
     def _joined(
         self, x: Array, run: Callable[[Recording, Array], tuple[Array, ...]]
     ) -> list[Array]:
         """Runs each recording on all its epochs at once."""
-        trials, K, n = x.shape
         out: list[Array] = []
         for one in self.recordings:
-            found = run(one, own(x[:, one.epochs].reshape(-1, n)))
-            out = out or [np.empty((trials, K, *part.shape[1:])) for part in found]
+            found = run(one, x[:, one.epochs])
+            out = out or [np.empty((*x.shape[:2], *part.shape[2:])) for part in found]
             for whole, part in zip(out, found, strict=True):
-                whole[:, one.epochs] = part.reshape(trials, -1, *part.shape[1:])
+                whole[:, one.epochs] = part
         return out
 
 
@@ -202,8 +196,8 @@ def functions_of(model: StateModel) -> tuple[EpochFunctions, EpochFunctions]:
     """Returns f and h of a model, recorded where they can be and then agree with the model's own on drawn paths."""
     every = range(model.epochs)
     moving = [k for k in every if model.moves(k)]
-    f = _recorded(model.transition, moving, model.recorded_transition)
-    h = _recorded(model.observe, every, model.recorded_observation)
+    f = _recorded(model, "transition", moving)
+    h = _recorded(model, "observe", every)
     m, P = model.prior
     spread = root(P)
     draws = np.random.default_rng(0).standard_normal((_DRAWN, spread.shape[1]))
@@ -220,16 +214,12 @@ def functions_of(model: StateModel) -> tuple[EpochFunctions, EpochFunctions]:
     return EpochFunctions([*still.recordings, *f.recordings], f.why), h
 
 
-def _recorded(
-    function: Function,
-    epochs: Sequence[int],
-    record: Callable[[Sequence[int]], Sequence[Recording]],
-) -> EpochFunctions:
+def _recorded(model: StateModel, name: str, epochs: Sequence[int]) -> EpochFunctions:
     try:
         with np.errstate(all="ignore"):
-            return EpochFunctions(record(epochs))
+            return EpochFunctions(model.recorded(name, epochs))
     except Exception as error:  # a model may raise anything where it meets no numbers
-        return EpochFunctions.by_epoch(function, epochs, describe_exception(error))
+        return EpochFunctions.by_epoch(getattr(model, name), epochs, describe_exception(error))
 
 
 def _held(functions: EpochFunctions, function: Function, k: int, x: Array) -> EpochFunctions:

@@ -19,7 +19,6 @@ from ipe_bench.measurements.base import Parameter
 from ipe_bench.states.algebra import factor, half, root, transposed
 from ipe_bench.states.along import (
     Along,
-    AtEpoch,
     EpochFunctions,
     Recording,
     functions_of,
@@ -136,13 +135,10 @@ class StateModel(Component, ABC):
         unless a model knows better, which saves recording a long transition again for each epoch."""
         return k
 
-    def recorded_transition(self, epochs: Sequence[int]) -> list[Recording]:
-        """Records f into these epochs; raises anything if it cannot be recorded."""
-        return recorded_by_epoch(self.transition, self.n, epochs, self.alike)
-
-    def recorded_observation(self, epochs: Sequence[int]) -> list[Recording]:
-        """Records h of these epochs likewise."""
-        return recorded_by_epoch(self.observe, self.n, epochs, lambda k: k)
+    def recorded(self, name: str, epochs: Sequence[int]) -> list[Recording]:
+        """Records `transition` into these epochs, or `observe` at them; raises anything if it cannot be recorded."""
+        alike = self.alike if name == "transition" else int
+        return recorded_by_epoch(getattr(self, name), self.n, epochs, alike)
 
     @cached_property
     def _functions(self) -> tuple[StateModel, tuple[EpochFunctions, EpochFunctions]]:
@@ -156,11 +152,11 @@ class StateModel(Component, ABC):
             del vars(self)["_functions"]
         return self._functions[1]
 
-    def transition_into(self, k: int) -> AtEpoch:
+    def transition_into(self, k: int) -> Recording:
         """f of the step into epoch k as a function of states (..., n) that knows its slopes, for trackers."""
         return self.epoch_functions[0].at[k]
 
-    def observation_at(self, k: int) -> AtEpoch:
+    def observation_at(self, k: int) -> Recording:
         """h at epoch k likewise."""
         return self.epoch_functions[1].at[k]
 

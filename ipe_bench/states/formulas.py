@@ -201,28 +201,20 @@ class Formulas(StateModel):
     def observe(self, x: Array, k: int) -> Array:
         return self._values(self._readings, x, k, {})
 
-    def recorded_transition(self, epochs: Sequence[int]) -> list[Recording]:
-        return [self._recorded(self._transitions, epochs)]
-
-    def recorded_observation(self, epochs: Sequence[int]) -> list[Recording]:
-        return [self._recorded(self._readings, epochs)]
-
-    def _recorded(self, formulas: Mapping[str, Arithmetic], epochs: Sequence[int]) -> Recording:
+    def recorded(self, name: str, epochs: Sequence[int]) -> list[Recording]:
         """Records formulas once, with k, t, inputs and constants as numbers of the epoch, so that other values of these
         need no other machine code."""
-        places = np.array(epochs)
+        formulas = {"transition": self._transitions, "observe": self._readings}[name]
         columns = {**self._inputs, "k": np.arange(1.0, self.count + 1), "t": self._times}
-        values = [np.asarray(column, dtype=float)[places] for column in columns.values()]
-        values += [np.full(len(places), value, dtype=float) for value in self.constants.values()]
+        columns |= {name: np.full(self.count, value) for name, value in self.constants.items()}
         graph = Graph()
-        x = [graph.input(name) for name in self.next]
-        c = [graph.input(name) for name in (*columns, *self.constants)]
-        known = dict(zip((*self.next, *columns, *self.constants), (*x, *c), strict=True))
-        known |= dict.fromkeys(self.noise, graph.constant(0.0))
-        y = [graph.apply("add", formula(known), 0.0) for formula in formulas.values()]
-        return Recording(
-            RowFunction(RowPrograms.of(y, x, c)), places, np.ascontiguousarray(np.array(values).T)
-        )
+        known = {name: graph.input(name) for name in (*self.next, *columns)}
+        still = dict.fromkeys(self.noise, graph.constant(0.0))
+        y = [graph.apply("add", formula({**known, **still}), 0.0) for formula in formulas.values()]
+        x, c = ([known[name] for name in names] for names in (self.next, columns))
+        numbers = np.stack([*columns.values()], axis=1, dtype=float)
+        places = np.array(epochs)
+        return [Recording(RowFunction(RowPrograms.of(y, x, c)), places, numbers[places])]
 
     @cached_property
     def _factors(self) -> tuple[dict[str, Expression], list[Expression]]:
