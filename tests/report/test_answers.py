@@ -286,6 +286,9 @@ def test_nis_above_its_limit_are_in_red_and_their_share_is_said(walked):
     nis, limit = found["kf"].nis, chi2.ppf(0.95, 1)
     (red,) = [line for line in drawing.figure.axes[2].lines if line.get_color() == "#c2273d"]
     np.testing.assert_array_equal(red.get_ydata(), nis[nis > limit])
+    (line,) = [one for one in drawing.figure.axes[2].lines if one.get_linestyle() == "--"]
+    assert line.get_ydata() == pytest.approx(limit)
+    assert "(5 % if right)" in drawing.caption
     share = 100 * (nis > limit).sum() / 59
     assert f"at {share:.1f} % of 59 epochs" in drawing.caption
     assert len(drawing.caption.split()) <= 30

@@ -397,7 +397,7 @@ def test_an_estimator_is_in_the_colours_of_its_family_and_of_many_the_best_are_i
 def parted():
     """Seven estimators that are alike up to scale 10; then five lose all trials, one none, and one some."""
     rows = []
-    for scale in (1.0, 10.0, 30.0, 100.0):
+    for scale in (1.0, 10.0, 30.0, 100.0, 300.0):
         for label in ("ekf", "newton", "wins", "some", *"abc"):
             lost = scale > 10 and label != "wins"
             share = (0.7 if label == "some" else 0.0) if lost else 1.0
@@ -431,10 +431,10 @@ def names_at_ends(drawing):
 def test_curves_have_names_at_their_ends_and_those_that_end_together_share_a_label(parted):
     view, drawing = parted
     labels = names_at_ends(drawing)
-    ends = view.totals[view.totals["error_scale"] == 100].set_index("estimator")["success"]
+    ends = view.totals[view.totals["error_scale"] == 300].set_index("estimator")["success"]
     assert {name for names, _, _ in labels for name in names} == set(ends.index)
     for names, _, (scale, share) in labels:
-        assert scale == 100.0
+        assert scale == 300.0
         assert all(ends[name] == share for name in names)
     boxes = [box for _, box, _ in labels]
     assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))
@@ -444,7 +444,7 @@ def test_curves_have_names_at_their_ends_and_those_that_end_together_share_a_lab
 
 def test_at_most_four_are_in_colour_and_the_winner_in_a_strong_one(parted):
     view, drawing = parted
-    lines = [line for ax in drawing.figure.axes for line in ax.lines if len(line.get_xdata()) == 3]
+    lines = [line for ax in drawing.figure.axes for line in ax.lines if len(line.get_xdata()) == 4]
     assert view.winner == "wins"
     assert view.focus[:3] == ["wins", "newton", "ekf"]
     assert {line.get_color() for line in lines} - {GREY} == {
@@ -473,9 +473,10 @@ def test_the_axis_starts_at_the_last_scale_where_all_are_alike_and_the_caption_s
     _, drawing = parted
     for ax in drawing.figure.axes:
         low, high = ax.get_xlim()
-        assert [t.get_text() for t in ax.get_xticklabels() if t.get_text()] == ["10", "30", "100"]
+        ticks = [t.get_text() for t in ax.get_xticklabels() if t.get_text()]
+        assert ticks == ["10", "30", "100", "300"]
         assert 5 < low < 10
-        assert 100 < high < 200
+        assert 300 < high < 600
     assert drawing.caption.startswith("Up to error scale 10 all are alike: the axis starts there.")
 
 
