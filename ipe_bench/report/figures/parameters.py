@@ -200,7 +200,7 @@ def draw_tracks(view: View) -> Iterator[Drawing]:
         fig,
         "tracks",
         f"Tracks at error scale {value_text(scale)}, converged trials",
-        "Root mean square error at each epoch, with the bound at the truth; NEES over states.",
+        "Root mean square error at each epoch, with the bound along the true path; NEES over states.",
         f"{states[0]} over all epochs: {enumerate_few([f'{k} {v:.3g}' for k, v in total.items()], 3)}.",
     )
 
