@@ -91,7 +91,7 @@ def bound() -> Figure:
 
 
 def nees() -> Figure:
-    """Draws squared errors over the claimed variance where the claim is right, and where it is four times too small."""
+    """Draws squared errors over the reported variance, where it is right and where it is four times too small."""
     fig, axes = _axes(2)
     _, square = estimates(ib.solvers.Newton(), 1.0)
     n = ib.measurements.Polynomial().n
@@ -101,7 +101,7 @@ def nees() -> Figure:
         median = np.median(factor * square) / chi2.median(n)
         ax.hist(factor * square, bins=bins, density=True, color=BLUE, alpha=0.6)
         ax.plot(line, chi2.pdf(line, n), color=ORANGE, label="if the claim is right")
-        ax.set(title=f"{title} {median:.2g}", xlabel="squared error over the claimed variance")
+        ax.set(title=f"{title} {median:.2g}", xlabel="squared error over the reported variance")
     axes[0].set_ylabel("density")
     axes[1].legend()
     return fig

@@ -328,7 +328,7 @@ def test_the_bound_at_the_truth_takes_the_noise_of_the_true_states():
 
 def test_what_takes_fixed_noise_refuses_before_any_work(tmp_path):
     for label in ("ieks", "lm_ieks", "ipe_fixed_point", "ipe_newton"):
-        fixed = f"trackers.{label}: takes noise that is the same at all states, unlike that of rover; leave it out"
+        fixed = f"trackers.{label}: takes noise that does not depend on the states; in rover it does; leave it out"
         with pytest.raises(ib.UserError, match=fixed):
             ib.run(StateScenario(ROVER), {label: TRACKERS[label]}, 1, output=tmp_path / "out")
     for label in ("ukf_rts", "ipls"):
@@ -447,5 +447,5 @@ def test_a_transition_that_jumps_by_a_turn_is_told_to_state_its_period():
     assert (
         Grid()
         .hindrance(replace(VOLATILITY, state_period={"logvar": 1.0}))
-        .startswith("has no place for a state that")
+        .startswith("has no place for a periodic state")
     )

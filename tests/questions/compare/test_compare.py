@@ -319,7 +319,7 @@ def test_margins_are_for_the_user_to_say(tmp_path, capsys):
         0,
         1,
     ]
-    assert "by more than a margin: success 0.01, error 0.05" in " ".join(
+    assert "larger than a margin: success 0.01, error 0.05" in " ".join(
         capsys.readouterr().out.split()
     )
 
