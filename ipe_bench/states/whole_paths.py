@@ -14,8 +14,8 @@ from ipe_bench.states.base import StateModel
 
 _REACHED = 1e-9
 """Part of a state by which a path may miss the range of its noise or of the prior: round-off of a solve."""
-_NUMBERS = 1e7
-"""Numbers of the banded matrices that are held at once."""
+_NUMBERS = 3e5
+"""Numbers of the banded matrices that are held at once: they stay in a processor's cache."""
 
 
 @dataclass(frozen=True)

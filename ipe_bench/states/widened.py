@@ -15,8 +15,8 @@ _NORMAL = 0.05
 """Part of its rise by which a cost there may differ from that of a normal density before it is followed."""
 _MOST = 100.0
 """Times its variance that a direction gets at most."""
-_NUMBERS = 2e7
-"""Numbers of the slopes that are held at once."""
+_NUMBERS = 5e5
+"""Numbers of the slopes that are held at once: they stay in a processor's cache."""
 
 
 def widened(density: PathDensity, at: Settled, tangents: Tangents, P: Array) -> tuple[Array, Array]:
