@@ -110,8 +110,6 @@ _PARTS = {
     "states": ["state_model=bearings_only", "error_scale=1,10"],
 }
 """Reduced settings of experiments that take minutes, of which no result is stored."""
-_STORED = {"states": ["state_model=bearings_only"]}
-"""The part of an experiment that is stored where its whole takes hours; the command on its page says so."""
 _FIGURES = {"paper": ("figure_2", "figure_3")}
 """The figures of an experiment's page, where they are not the first."""
 _OF_PARAMETERS = ("paper", "pendulum_book", "states")
@@ -368,13 +366,7 @@ def store_all(output: Path, trials: int, names: Sequence[str]) -> int:
     for option in _ours("experiment"):
         if option.name in names:
             print(f"{option.name} ...", flush=True)
-            store(
-                option,
-                STORED,
-                output / "results" / option.name,
-                trials,
-                _STORED.get(option.name, ()),
-            )
+            store(option, STORED, output / "results" / option.name, trials)
     write_gallery(output / "source" / "gallery", output / "results", trials)
     for option in _ours("experiment"):
         computed = read(STORED / f"{option.name}{SUFFIX}")
