@@ -5,9 +5,12 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ipe_bench import __version__
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 CITATION = (
     f"The ipe-bench developers (2026). ipe-bench, version {__version__} [computer program]. Beside it, state the"
@@ -137,3 +140,12 @@ def p_value(p: float, least: float = 0.0) -> str:
     if p <= least and least > 0:
         return f"≤{p_value(least)}"
     return f"{p:.3f}" if p >= 1e-3 else f"{p:.0e}" if p > 1e-300 else "<1e-300"
+
+
+def varying(columns: Sequence[str], rows: pd.DataFrame) -> list[str]:
+    """Returns the columns that differ among the rows; the model's name alone if that tells every two settings apart."""
+    apart = [c for c in columns if len(set(rows[c].astype(str))) > 1]
+    settings = rows[apart].astype(str).drop_duplicates()
+    if "measurement" in apart and settings["measurement"].is_unique:
+        return ["measurement"]
+    return apart

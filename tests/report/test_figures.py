@@ -628,6 +628,16 @@ def test_a_row_per_setting_has_its_error_and_the_share_of_misfits_detected():
     assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))
 
 
+def test_models_of_states_are_told_apart_by_their_names_alone():
+    view = swept_view("model.step", {1.0: 1.0, 60.0: 4.0}, {1.0: 1.0, 60.0: 4.0})
+    step = view["summary"]["model.step"]
+    view["summary"].insert(0, "measurement", np.where(step == 60, "bearings_only", "pendulum"))
+    footer = {"identity": {"scenario": {"model": {"_target_": "ipe_bench.states.Formulas"}}}}
+    view = replace(view, collection=SimpleNamespace(groups=[SimpleNamespace(footer=footer)]))
+    axes = drawn(settings, view)["settings"].figure.axes
+    assert [t.get_text() for t in axes[0].get_yticklabels()] == ["bearings_only", "pendulum"]
+
+
 def test_a_number_that_is_swept_has_an_axis_and_kinds_have_rows():
     values = {0.1: 1.0, 0.2: 2.0, 0.5: 4.0}
     drawing = drawn(settings, swept_view("noise.deviation", values, values))["settings"]

@@ -310,10 +310,11 @@ def _asked(experiment: str) -> int:
 
 
 def _small(analysis: Analysis) -> Any:
-    """Draws one legible panel: success over the error scale, or a bar for each estimator."""
+    """Draws one legible panel: success over the error scale, of the first of several settings by the alphabet, or a bar
+    for each estimator."""
     parts, _ = views(analysis)
     if parts and len(parts[0].scales) > 1:
-        view = parts[0]
+        view = min(parts, key=lambda part: part.label)
         fig, (ax,) = common.panels(1, view.look, height=2.4)
         look = in_focus(view.look, view.focus)
         common.shares(ax)

@@ -18,7 +18,7 @@ from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.errors import BARS, draw_panels
 from ipe_bench.report.figures.views import Figure, View, in_focus
 from ipe_bench.report.style import BOUND_COLOR, FAMILIES, SOFT, Look
-from ipe_bench.report.words import brief, enumerate_few, percent, value_text
+from ipe_bench.report.words import brief, enumerate_few, percent, value_text, varying
 from ipe_bench.runs.provenance import TARGET
 
 if TYPE_CHECKING:
@@ -53,15 +53,13 @@ def draw(view: View) -> Iterator[Drawing]:
     if "error_scale" not in columns:
         return
     rows = view.totals
-    varying = [
-        c for c in columns[: columns.index("error_scale")] if len(set(map(str, rows[c]))) > 1
-    ]
-    if not varying:
+    apart = varying(columns[: columns.index("error_scale")], rows)
+    if not apart:
         return
-    names = _names(rows, varying, view)
+    names = _names(rows, apart, view)
     keys = [
         ", ".join(f"{column}={value_text(value)}" for column, value in row.items())
-        for row in rows[varying].to_dict("records")
+        for row in rows[apart].to_dict("records")
     ]
     # Settings whose words are alike are different all the same.
     rows = rows.assign(setting=names if len(set(names)) == len(set(keys)) else keys)
@@ -73,11 +71,11 @@ def draw(view: View) -> Iterator[Drawing]:
     rows = rows[rows["error_scale"] == scale]
     moving = (rows["noise"] == "model").any() if "noise" in rows else False
     if moving:
-        yield from _rows(replace(view, moving=True), rows, varying, scale)
-    elif len(varying) == 1 and _is_axis(rows[varying[0]]):
-        yield from _swept(view, rows, varying[0], scale)
+        yield from _rows(replace(view, moving=True), rows, apart, scale)
+    elif len(apart) == 1 and _is_axis(rows[apart[0]]):
+        yield from _swept(view, rows, apart[0], scale)
     else:
-        yield from _rows(view, rows, varying, scale)
+        yield from _rows(view, rows, apart, scale)
 
 
 def _is_axis(values: pd.Series[Any]) -> bool:
@@ -106,18 +104,20 @@ def _units(collection: Collection | None) -> dict[str, str]:
     return found
 
 
-def _names(rows: pd.DataFrame, varying: Sequence[str], view: View) -> list[str]:
+def _names(rows: pd.DataFrame, apart: Sequence[str], view: View) -> list[str]:
     """Words the setting of each row by what is in it: options that are there and not 0, with their units."""
     units = _units(view.collection)
-    models = {one["measurement"][TARGET].rpartition(".")[2] for one in _scenarios(view.collection)}
-    options = [c for c in varying if "." in c]
+    # Scenarios of states that move have a model in place of a measurement.
+    assumed = [one["measurement"] for one in _scenarios(view.collection) if "measurement" in one]
+    models = {config[TARGET].rpartition(".")[2] for config in assumed}
+    options = [c for c in apart if "." in c]
     told = []
     for row in rows.to_dict("records"):
         here = [c for c in options if value_text(row[c]) not in ("-", "0")]
         words = [f"{_worded(c)} {value_text(row[c])} {units.get(c, '')}".strip() for c in here]
         richer = any(c.startswith("truth.") for c in here)
-        kinds = [value_text(row[c]) for c in varying if c not in (*options, "truth")]
-        if "truth" in varying and not richer:
+        kinds = [value_text(row[c]) for c in apart if c not in (*options, "truth")]
+        if "truth" in apart and not richer:
             kinds.append(RIGHT if row["truth"] in models else value_text(row["truth"]))
         told.append(", ".join([*kinds, *words]) or "-")
     return told
@@ -143,15 +143,13 @@ def _swept(view: View, rows: pd.DataFrame, column: str, scale: float) -> Iterato
     yield view.drawing(fig, "settings", title, BARS)
 
 
-def _rows(
-    view: View, rows: pd.DataFrame, varying: Sequence[str], scale: float
-) -> Iterator[Drawing]:
+def _rows(view: View, rows: pd.DataFrame, apart: Sequence[str], scale: float) -> Iterator[Drawing]:
     """Draws a row for each setting, a panel of errors for estimators that are alike, with the share of trials in which
     the misfit is detected if readings come from other models; else a panel of NEES."""
     error = rows.pivot_table("error_median", "setting", "estimator")
     error = error.loc[error.median(axis=1).sort_values().index[::-1]].iloc[:MOST_ROWS]
     groups = _groups(error)[:MOST_GROUPS]
-    of_truth = any(c.partition(".")[0] == "truth" for c in varying) and rows["misfit"].notna().any()
+    of_truth = any(c.partition(".")[0] == "truth" for c in apart) and rows["misfit"].notna().any()
     judged = not of_truth and rows["nees_median"].notna().any()
     detected = rows.groupby("setting")["misfit"].median()
     kinds = [_kind(name, detected[name]) if of_truth else "" for name in error.index]

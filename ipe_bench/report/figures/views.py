@@ -23,7 +23,7 @@ from ipe_bench.report.style import (
     drawn_settings,
     looks,
 )
-from ipe_bench.report.words import value_text
+from ipe_bench.report.words import value_text, varying
 from ipe_bench.runs.store import traits
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.records import family_of
@@ -147,7 +147,7 @@ def views(analysis: Analysis, which: Which = "all") -> tuple[list[View], View]:
         for g in analysis.collection.groups
     }
     settings = [dict(zip(columns, key, strict=True)) for key in split["scores"]]
-    varying = [c for c in columns if len({setting[c] for setting in settings}) > 1]
+    apart = varying(columns, pd.DataFrame(settings, columns=columns))
     parts, (most, left_out) = list[View](), drawn_settings(len(settings), which)
     for setting in sorted(
         settings[:most], key=lambda setting: _success(split["summary"][tuple(setting.values())])
@@ -158,7 +158,7 @@ def views(analysis: Analysis, which: Which = "all") -> tuple[list[View], View]:
             label: one for label, one in look.items() if label in set(frames["scores"]["estimator"])
         }
         # An option that this setting does not have is not spoken of.
-        own = {c: setting[c] for c in varying if setting[c] != "-"}
+        own = {c: setting[c] for c in apart if setting[c] != "-"}
         head = [setting[c] for c in ("measurement", "noise") if setting.get(c, "-") != "-"]
         label = ", ".join(
             [*head, *(f"{c}={v}" for c, v in own.items() if c not in ("measurement", "noise"))]
@@ -166,7 +166,7 @@ def views(analysis: Analysis, which: Which = "all") -> tuple[list[View], View]:
         if left_out and len(parts) + 1 == most:
             label += f" ({left_out})"
         suffix = re.sub(r"[^A-Za-z0-9.]+", "-", "_".join(own.values())).strip("-.")
-        if varying and (
+        if apart and (
             len(suffix) > MOST_LETTERS or f"_{suffix}" in ("_", *(part.suffix for part in parts))
         ):
             suffix = f"{suffix[:MOST_LETTERS]}-{len(parts) + 1}"
@@ -174,7 +174,7 @@ def views(analysis: Analysis, which: Which = "all") -> tuple[list[View], View]:
         focus = focus_of(frames["summary"])
         known = footers[key]["parameters"], *focus, paper, setting.get("noise") == "model"
         parts.append(
-            View(f"_{suffix}" * bool(varying), label, frames, seen, equations, families, *known)
+            View(f"_{suffix}" * bool(apart), label, frames, seen, equations, families, *known)
         )
     focus = focus_of(analysis.summary)
     return parts, View("", "", whole, every, equations, families, (), *focus, collection=collection)

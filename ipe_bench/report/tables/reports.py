@@ -16,9 +16,8 @@ from ipe_bench.report.tables.terminal import (
     overview_columns,
     overview_notes,
     statistics,
-    varying,
 )
-from ipe_bench.report.words import p_value, percent, short, value_text
+from ipe_bench.report.words import p_value, percent, short, value_text, varying
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.certified import certified_averages, certified_table, published_table
 from ipe_bench.statistics.collect import Collection

@@ -31,6 +31,7 @@ from ipe_bench.report.words import (
     scientific,
     short,
     value_text,
+    varying,
 )
 from ipe_bench.statistics.formulas import CAP
 from ipe_bench.statistics.records import SCORES
@@ -167,11 +168,6 @@ def _setting(title: str, rows: Sequence[Mapping[str, Any]], width: int) -> Table
         title = f"{title}: {counts[0]} trial{'s' * (counts[0] != 1)} per row"
     title += f" at error scale {value_text(rows[0]['error_scale'])}"
     return Table("summary", title, "", columns, whole="summary.csv")
-
-
-def varying(columns: Sequence[str], rows: pd.DataFrame) -> list[str]:
-    """Returns the columns in which rows differ."""
-    return [c for c in columns if len(set(rows[c].astype(str))) > 1]
 
 
 def differing(rows: pd.DataFrame, columns: Sequence[str]) -> list[str]:
