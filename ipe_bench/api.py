@@ -442,7 +442,9 @@ def _tracked(
             )
         (readings,) = readings
     if trackers is None:
-        trackers = {"auto": AutoTracker(), "ekf": ekf(), "ukf": ukf()}
+        # A search for constants needs a likelihood, which an estimate of the whole path does not have.
+        best = {} if find else {"auto": AutoTracker()}
+        trackers = {**best, "ekf": ekf(), "ukf": ukf()}
     else:
         trackers = _labelled(trackers)
     log = Log.of(model, Path(readings) if isinstance(readings, str) else readings, ignored)

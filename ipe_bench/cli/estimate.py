@@ -17,6 +17,8 @@ from ipe_bench.states.base import StateModel
 
 STANDARD_ESTIMATORS = ("solver=[auto]", "baseline=[linear_lse,levenberg_marquardt]")
 """Estimators of `estimate`: one that chooses its method itself, and two to compare it with."""
+TRACKERS_THAT_FIND = "tracker=[ekf,ukf]"
+"""Trackers of `find=`: a search needs a likelihood, which an estimate of the whole path does not have."""
 
 
 def _described(estimators: Any) -> dict[str, Any]:
@@ -28,7 +30,10 @@ def estimate_command(arguments: Sequence[str]) -> int:
     from ipe_bench.report.page.answer import FILES, NAME, Answer, write_answer
     from ipe_bench.report.progress import counting
 
-    asked = single("estimate", arguments, STANDARD_ESTIMATORS, run=(*of("run", "trials"), w.TRUTH))
+    standard = STANDARD_ESTIMATORS
+    if any(word.startswith("find=") for word in arguments):
+        standard = (*standard, TRACKERS_THAT_FIND)
+    asked = single("estimate", arguments, standard, run=(*of("run", "trials"), w.TRUTH))
     if asked.spec.state_model is not None:
         return _track(asked, asked.spec.state_model)
     question = asked.spec.question(asked.words.keys).checked()

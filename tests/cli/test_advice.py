@@ -361,6 +361,7 @@ ELSEWHERE = {
         "{}: {} is not a {}",
         "{}={}: is not a part",
     ),
+    "what a key does": ("write the simulated readings",),
     "of Hydra's own keys": ("{}: there is no such key; see",),
 }
 """How texts begin that no mistake above leads to, by what they are about."""

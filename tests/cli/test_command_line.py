@@ -173,7 +173,10 @@ MISTAKES = {
     ),
     "no such column": (["design", *SMALL, "by=colour"], "by=colour: there is no such column"),
     "no such criterion": (["design", *SMALL, "criterion=E"], "criterion=E: choose one of A, D"),
-    "too few readings": (["design", *SMALL, "readings=3"], "readings=3: 4 parameters want"),
+    "too few readings": (
+        ["design", *SMALL, "readings=3"],
+        "readings=3: 4 parameters need at least 4 readings",
+    ),
     "too many readings": (
         ["design", *SMALL, "readings=500"],
         "readings=500: polynomial has 40 readings",

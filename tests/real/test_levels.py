@@ -290,7 +290,7 @@ def test_a_parameter_on_its_bound_is_held_there_beside_the_levels():
     alone = ib.estimate(fixed, z, LM, noise=Unknown(by="second"))["lm"]
     assert answer["lm"].held_at == {1: 1.0}
     for one in (answer, ib.estimate(model, z, LM, noise=Gaussian(0.2))):
-        assert "lm: on its bound: k = 1; the readings want it beyond." in str(one)
+        assert "lm: on its bound: k = 1; the readings favour a value beyond." in str(one)
     assert answer["lm"].x[[0, 2, 3, 4]] == pytest.approx(alone.x, rel=1e-6)
     assert np.isnan(np.array(answer["lm"].interval())[:, 1]).all()
     ends = np.array(alone.interval())

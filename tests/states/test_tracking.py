@@ -191,7 +191,7 @@ def test_trackers_that_are_named_are_all_that_an_experiment_runs():
             )
 
     assert list(chosen("tracker=[ekf,ipls]")) == ["ekf", "ipls"]
-    assert len(chosen()) == 10
+    assert len(chosen()) == 11
     assert chosen()["ipls"] == IteratedSmoother(ukf(), Cubature())
 
 

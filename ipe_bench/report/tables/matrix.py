@@ -53,7 +53,7 @@ _COVARIANCE = {
 }
 _WELL = 0.995
 """Share of success that is well: the lightest colour."""
-_STATES = "Success: the error at the last epoch lies inside the gate of the linearised filter. "
+OF_STATES = "Success: the error at the last epoch lies inside the gate of the linearised filter. "
 
 
 @dataclass(frozen=True)
@@ -174,11 +174,12 @@ def _setting(text: str) -> str:
 
 def _legend(columns: Sequence[Column], moving: bool) -> str:
     signs = {cell.sign for column in columns for cell in column.cells if isinstance(cell, Tile)}
-    told = f"{_STATES if moving else ''}Number and colour: success in % of all trials, blue from {100 * HELD:.0f} % on."
+    begin = OF_STATES if moving else ""
+    told = f"{begin}Number and colour: success in % of all trials, blue from {100 * HELD:.0f} % on."
     if TOO_SMALL in signs:
         told += f" {TOO_SMALL} The reported covariance is too small."
     if NOT_JUDGED in signs:
-        told += f" {NOT_JUDGED} It is not judged: too few trials, or none is reported."
+        told += f" {NOT_JUDGED} Not judged: too few trials, or none reported."
     return f"{told} {MEANING}"
 
 
