@@ -13,8 +13,8 @@ from ipe_bench.basics.options import Whole
 from ipe_bench.basics.statuses import Status
 from ipe_bench.states.base import StateModel
 from ipe_bench.states.damped import Descent, LevenbergMarquardtSmoother, reported
-from ipe_bench.states.linearisation import Rule, Taylor, Unscented
-from ipe_bench.states.smoothers import path_p, smoothed
+from ipe_bench.states.linearisation import Taylor, Unscented
+from ipe_bench.states.smoothers import smoothed
 from ipe_bench.states.trackers import Filter, Tracker, Tracks, filtered
 from ipe_bench.states.whole_paths import PathDensity
 
@@ -55,7 +55,7 @@ class AutoTracker(Tracker):
 
     def track(self, model: StateModel, z: Array) -> Tracks:
         first = filtered(model, z, Taylor())
-        doubtful = self._improbable(z, first.nis.sum(axis=1))
+        doubtful = np.flatnonzero(self.descent.improbable(z, first.nis.sum(axis=1)))
         if model.gain_by_state or model.R_by_state:
             return self._likelier(model, z, first, doubtful)
         density = PathDensity.of(model, z)
@@ -63,14 +63,14 @@ class AutoTracker(Tracker):
         stage = np.full(len(z), EXTENDED)
         if doubtful.size:
             some = density.subset(doubtful)
-            other = Descent.of(some, _smoothed(model, some.z, Unscented()))
+            other = Descent.of(some, smoothed(model, filtered(model, some.z, Unscented())))
             stage[doubtful[other.at.cost < paths.at.cost[doubtful]]] = UNSCENTED
             paths = paths.improved(other, doubtful)
         paths = self.descent.descended(density, paths)
         arrived = (paths.status == Status.CONVERGED) & (paths.iterations == 1)
         stage[~arrived] = DAMPED
         for number in range(self.rounds if self.descent.starts else 0):
-            rows = self._improbable(z, paths.at.cost)
+            rows = np.flatnonzero(self.descent.improbable(z, paths.at.cost))
             if not rows.size:
                 break
             some = density.subset(rows)
@@ -78,9 +78,6 @@ class AutoTracker(Tracker):
             stage[rows[other.at.cost < paths.at.cost[rows]]] = AGAIN + number
             paths = paths.improved(other, rows)
         return replace(reported(density, paths), stage=stage)
-
-    def _improbable(self, z: Array, cost: Array) -> NDArray[np.intp]:
-        return np.flatnonzero(~(path_p(z, cost) >= self.descent.level))
 
     def _likelier(
         self, model: StateModel, z: Array, first: Tracks, doubtful: NDArray[np.intp]
@@ -104,7 +101,3 @@ class AutoTracker(Tracker):
         for mine, its in zip(tracks.start, other.start, strict=True):
             mine[rows] = its[likelier]
         return tracks
-
-
-def _smoothed(model: StateModel, z: Array, rule: Rule) -> Tracks:
-    return smoothed(model, filtered(model, z, rule))

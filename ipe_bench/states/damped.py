@@ -112,11 +112,15 @@ class LevenbergMarquardtSmoother(Tracker):
             for rule in (Taylor(), Unscented())
         )
         paths = self.descended(density, first.improved(other, np.arange(len(z))))
-        rows = np.flatnonzero(~(path_p(z, paths.at.cost) >= self.level))
+        rows = np.flatnonzero(self.improbable(z, paths.at.cost))
         if self.starts and len(rows):
             some = density.subset(rows)
             paths = paths.improved(self.descended(some, self.drawn(some)), rows)
         return reported(density, paths)
+
+    def improbable(self, z: Array, cost: Array) -> Mask:
+        """Whether a path costs too much for its readings (trials,); one without a finite cost does."""
+        return ~(path_p(z, cost) >= self.level)
 
     def drawn(self, density: PathDensity, number: int = 0) -> Descent:
         """For each trial, the smoothed UKF of least cost among those that begin at draws of the prior; each number of a
@@ -187,7 +191,7 @@ class LevenbergMarquardtSmoother(Tracker):
         eased = np.where(damping > self.damping, damping / _FACTOR, 0.0)
         damping = np.where(damping == paths.damping, eased, damping)
         status = np.where(there, Status.CONVERGED, Status.RUNNING).astype(np.int8)
-        improbable = ~(path_p(density.z, at.cost) >= self.level)
+        improbable = self.improbable(density.z, at.cost)
         hardly = improbable & (damping > 0) & (at.cost > _HARDLY * paths.at.cost)
         slow = np.where(hardly, paths.slow + 1, 0)
         status[~there & (slow >= _SLOW)] = Status.STALLED

@@ -8,9 +8,9 @@ from typing import Any
 
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.views import Figure, View
-from ipe_bench.report.finding import MEANING, Finding
+from ipe_bench.report.finding import Finding
 from ipe_bench.report.style import RAMP, ink, print_width
-from ipe_bench.report.tables.matrix import MATRIX, OF_STATES, Tile, matrices
+from ipe_bench.report.tables.matrix import MATRIX, Tile, matrices
 
 WIDTH = 5.0
 """Inches: 750 pixels, the width of a text on GitHub."""
@@ -63,8 +63,7 @@ def draw(view: View) -> Iterator[Drawing]:
     ax.tick_params(length=0, labelsize=7.5 * small, labelrotation=0)
     ax.get_yticklabels()[0].set_fontweight("bold")
     figure.suptitle(finding, x=0.01, ha="left", fontsize=8.5 * small, fontweight="bold")
-    caption = [note.removeprefix(OF_STATES).removesuffix(MEANING) for note in matrix.notes]
-    yield view.drawing(figure, MATRIX, "Success", *map(str.strip, caption))
+    yield view.drawing(figure, MATRIX, "Success", *matrix.captions)
 
 
 def _text(tile: Tile) -> str:

@@ -53,7 +53,7 @@ _COVARIANCE = {
 }
 _WELL = 0.995
 """Share of success that is well: the lightest colour."""
-OF_STATES = "Success: the error at the last epoch lies inside the gate of the linearised filter. "
+_OF_STATES = "Success: the error at the last epoch lies inside the gate of the linearised filter. "
 
 
 @dataclass(frozen=True)
@@ -82,6 +82,8 @@ class Matrix(Table):
 
     over: str = ""
     """What the columns are."""
+    captions: Sequence[str] = ()
+    """What its figure says of letters, numbers and signs."""
 
     views: ClassVar = VIEWS
 
@@ -152,7 +154,10 @@ def _matrix(finding: Finding, name: str, title: str) -> Matrix:
         cells = [_tile(one, at, finding, moving) for one in finding.standings]
         columns.append(Column(head, cells))
     notes = [*keys, _legend(columns, moving)]
-    return Matrix(name, title, "", columns, notes=notes, whole="summary.csv", over=over)
+    captions = (*keys, _signs(columns))
+    return Matrix(
+        name, title, "", columns, notes=notes, whole="summary.csv", over=over, captions=captions
+    )
 
 
 def _heads(finding: Finding) -> tuple[list[str], list[str]]:
@@ -173,14 +178,18 @@ def _setting(text: str) -> str:
 
 
 def _legend(columns: Sequence[Column], moving: bool) -> str:
+    return f"{_OF_STATES if moving else ''}{_signs(columns)} {MEANING}"
+
+
+def _signs(columns: Sequence[Column]) -> str:
+    """Explains numbers, colours and the signs that are there."""
     signs = {cell.sign for column in columns for cell in column.cells if isinstance(cell, Tile)}
-    begin = OF_STATES if moving else ""
-    told = f"{begin}Number and colour: success in % of all trials, blue from {100 * HELD:.0f} % on."
+    told = f"Number and colour: success in % of all trials, blue from {100 * HELD:.0f} % on."
     if TOO_SMALL in signs:
         told += f" {TOO_SMALL} The reported covariance is too small."
     if NOT_JUDGED in signs:
         told += f" {NOT_JUDGED} Not judged: too few trials, or none reported."
-    return f"{told} {MEANING}"
+    return told
 
 
 def _tile(one: Standing, at: int, finding: Finding, moving: bool) -> Tile:
