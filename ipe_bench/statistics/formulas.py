@@ -193,11 +193,8 @@ def rmse_ends(s: Sample) -> tuple[Array, Array]:
     sum, see `intervals.few_carry`."""
     low, high = rms_interval(_all_squares(s).T, s.solved)
     few = few_carry(squares(s), degrees(s))
-    return low, np.where(few, np.nan, _unless_unseen(s, high))
-
-
-def _unless_unseen(s: Sample, high: Array) -> Array:
-    return np.where(rmse_unseen(s) > 0, np.nan, high)
+    unknown = few | (rmse_unseen(s) > 0)
+    return low, np.where(unknown, np.nan, high)
 
 
 @once
@@ -205,12 +202,6 @@ def rmse_sequence(s: Sample) -> tuple[Array, Array]:
     """Computes ends (n + 1,) of such intervals at all numbers of trials at once, from the errors
     that were seen."""
     return rms_sequence(squares(s), degrees(s))
-
-
-def rmse_ends_anytime(s: Sample) -> tuple[Array, Array]:
-    """Computes the same ends, without the upper one where larger errors may be unseen."""
-    low, high = rmse_sequence(s)
-    return low, _unless_unseen(s, high)
 
 
 def ends_in_units(ends: Callable[[Sample], tuple[Array, Array]]) -> Callable[[Sample], Ends]:

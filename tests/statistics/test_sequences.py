@@ -8,7 +8,7 @@ from shared.oracles import assert_agrees
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.statistics.collect import collect
-from ipe_bench.statistics.formulas import rmse_ends_anytime
+from ipe_bench.statistics.formulas import rmse_ends
 from ipe_bench.statistics.intervals import Squares, clopper_pearson, rms_sequence, share_sequence
 from ipe_bench.statistics.sample import samples
 from ipe_bench.statistics.stopping import next_trials, precision_of
@@ -98,7 +98,7 @@ def test_the_upper_end_of_rmse_is_known_once_rare_errors_have_been_seen(syntheti
     error = 0.1 * np.random.default_rng(1).standard_normal((trials, 1))
     synthetic.add(synthetic.scenario(names=("a",)), "one", error)
     collection = collect([synthetic.directory])
-    low, high = rmse_ends_anytime(next(samples(collection, collection.groups)))
+    low, high = rmse_ends(next(samples(collection, collection.groups)))
     assert np.isfinite(low).all()
     assert np.isfinite(high).tolist() == [known] * 2
 
