@@ -1,5 +1,5 @@
-"""Compares two columns of numbers of the same trials: effects with intervals, evidence that allows repeated looks, and
-the number of trials that a difference of success takes."""
+"""Compares two columns of numbers of the same trials: effects with intervals, evidence that allows
+repeated looks, and the number of trials that a difference of success takes."""
 
 from __future__ import annotations
 
@@ -21,12 +21,13 @@ from ipe_bench.trials.thresholds import FEW
 FLIPS = 4999
 """Random assignments of signs."""
 MOST_SIGNS = 1000
-"""Largest number of signs; in more trials, consecutive ones share a sign: as good, since they are independent."""
+"""Largest number of signs; in more trials, consecutive ones share a sign: as good, since they are
+independent."""
 _TILTS = np.concatenate([-(2.0 ** np.arange(-12, 5)), 2.0 ** np.arange(-12, 5)])
 """Multiples of the inverse unit by which differences are tilted, to either side."""
 LIMIT = 0.8
-"""Confidence of the upper limit of the discordant share: a plan by the share that a pilot shows is too small as often
-as not."""
+"""Confidence of the upper limit of the discordant share: a plan by the share that a pilot shows is
+too small as often as not."""
 MOST = 10_000_000
 """Plans end at this many trials."""
 _SAW = 20
@@ -37,7 +38,8 @@ PLANNED = ("power", "difference", "discordant", "discordant_high", "trials_neede
 
 @dataclass(frozen=True)
 class Effect:
-    """Holds the advantage of the second over the first, with interval, the p of no effect, and the evidence."""
+    """Holds the advantage of the second over the first, with interval, the p of no effect, and the
+    evidence."""
 
     first_value: float
     second_value: float
@@ -47,42 +49,53 @@ class Effect:
     high: float = np.nan
     p: float = np.nan
     e: float = np.nan
-    """An e-value: by chance it exceeds 1/alpha, at whatever number of trials one looks, in a share alpha of cases."""
+    """An e-value: by chance it exceeds 1/alpha, at whatever number of trials one looks, in a share
+    alpha of cases."""
 
 
-# Effects -------------------------------------------------------------------------------------------------------------
+# Effects -----------------------------------------------------------------------------------------
 
 
 def success_effect(first: Array, second: Array, alpha: float = ALPHA) -> Effect:
     """Computes the difference of two shares of the same trials (trials,), second less first.
 
-    The p is McNemar's exact one: given their number, the trials in which one alone succeeds are fair coin tosses. The
-    interval is Tango's (Stat. Med. 17, 1998), of the score; it is widened to hold 0 where the exact test does not
-    reject.
+    The p is McNemar's exact one: given their number, the trials in which one alone succeeds are
+    fair coin tosses. The interval is Tango's (Stat. Med. 17, 1998), of the score; it is widened to
+    hold 0 where the exact test does not reject.
     """
-    only_first, only_second = int((first & ~second).sum()), int((second & ~first).sum())
-    trials, p = len(first), mcnemar(only_first, only_second)
-    low, high = (
-        _tango(only_first, only_second, trials, alpha),
-        -_tango(only_second, only_first, trials, alpha),
-    )
+    losses = int((first & ~second).sum())
+    gains = int((second & ~first).sum())
+    trials = len(first)
+    p = mcnemar(losses, gains)
+    low = _tango(losses, gains, trials, alpha)
+    high = -_tango(gains, losses, trials, alpha)
+    # The exact test has the last word on a difference of 0.
     if p >= alpha:
-        low, high = min(low, 0.0), max(high, 0.0)
-    change, e = (only_second - only_first) / trials, fair_coin(only_first, only_second)
-    return Effect(float(first.mean()), float(second.mean()), change, low, high, p, e)
+        low = min(low, 0.0)
+        high = max(high, 0.0)
+    change = (gains - losses) / trials
+    return Effect(*_means(first, second), change, low, high, p, fair_coin(losses, gains))
+
+
+def _means(first: Array, second: Array) -> tuple[float, float]:
+    return float(first.mean()), float(second.mean())
 
 
 def _tango(losses: int, gains: int, trials: int, alpha: float) -> float:
-    """Finds the least difference of shares at which the score, with the likeliest shares of that difference, is not
-    beyond the normal quantile."""
+    """Finds the least difference of shares at which the score, with the likeliest shares of that
+    difference, is not beyond the normal quantile."""
     quantile = -float(ndtri(alpha / 2))
 
     def inside(difference: float) -> bool:
+        # The likeliest share q of losses at the difference d: 2 N q^2 - b q = losses d (1 - d).
         b = losses + gains + difference * (gains - losses - 2 * trials)
-        root = max(b * b + 8 * trials * losses * difference * (1 - difference), 0.0)
-        lost = (b + np.sqrt(root)) / (4 * trials)
-        variance = trials * max(2 * lost + difference * (1 - difference), 0.0)
-        return bool(gains - losses - trials * difference <= quantile * np.sqrt(variance))
+        c = 8 * trials * losses * difference * (1 - difference)
+        root = np.sqrt(max(b * b + c, 0.0))
+        lost = (b + root) / (4 * trials)
+        # The score is (gains - losses - N d) / sqrt(N (2 q + d (1 - d))).
+        variance = 2 * lost + difference * (1 - difference)
+        deviation = np.sqrt(trials * max(variance, 0.0))
+        return bool(gains - losses - trials * difference <= quantile * deviation)
 
     return first_that(inside, -1.0, (gains - losses) / trials)
 
@@ -90,80 +103,98 @@ def _tango(losses: int, gains: int, trials: int, alpha: float) -> float:
 def ratio_effect(
     first: Array, second: Array, alpha: float = ALPHA, largest: float | None = None
 ) -> Effect:
-    """Computes the ratio of the means of two columns (trials,) of finite nonnegative numbers, second over first.
+    """Computes the ratio of the means of two columns (trials,) of finite nonnegative numbers,
+    second over first.
 
-    Where neither is larger by nature, each trial's difference is as likely to have the other sign: the p is the share
-    of random signs whose sum is as far from 0 (Fisher, The Design of Experiments, 1935, sec. 21), the interval holds
-    the ratios r that the same test does not reject for second less r times first. An end that no ratio reaches is 0 or
-    infinite.
+    Where neither is larger by nature, each trial's difference is as likely to have the other sign:
+    the p is the share of random signs whose sum is as far from 0 (Fisher, The Design of
+    Experiments, 1935, sec. 21), the interval holds the ratios r that the same test does not reject
+    for second less r times first. An end that no ratio reaches is 0 or infinite.
 
-    Where nearly all trials have one ratio, signs say nothing of the others, which are rare and perhaps unseen: the
-    interval is widened by the share of trials that may differ beyond those that did (the upper limit of Clopper and
-    Pearson), each by `largest`, the largest difference there can be; None: the largest number seen. It is never widened
-    over a ratio of 1 that the test rejects.
+    Where nearly all trials have one ratio, signs say nothing of the others, which are rare and
+    perhaps unseen: the interval is widened by the share of trials that may differ beyond those that
+    did (the upper limit of Clopper and Pearson), each by `largest`, the largest difference there
+    can be; None: the largest number seen. It is never widened over a ratio of 1 that the test
+    rejects.
     """
-    a, b = grouped(np.array([first, second], dtype=float), MOST_SIGNS).T.copy()
-    means, p_equal = (float(first.mean()), float(second.mean())), _p_of_ratio(a, b)(1.0)
+    a, b = _sharing_signs(first, second)
+    means = _means(first, second)
+    p_equal = _p_of_ratio(a, b)(1.0)
     # The first trial is the unit: whoever looks later divides by the same.
     evidence = no_lean(second - first, float(first[0] + second[0]) or 1.0)
-    total_a, total_b = float(a.sum()), float(b.sum())
-    if not total_a > 0 or not total_b > 0:
-        return Effect(*means, total_b / total_a if total_a > 0 else np.nan, p=p_equal, e=evidence)
+    total_a = float(a.sum())
+    total_b = float(b.sum())
+    if not total_a > 0:
+        return Effect(*means, np.nan, p=p_equal, e=evidence)
     value = total_b / total_a
-    low, least = _least_ratio(a, b, alpha), _least_ratio(b, a, alpha)
-    high = 1 / least if least > 0 else np.inf
-    if unseen := _unseen(first, second, alpha):
-        reach = unseen * (max(first.max(), second.max()) if largest is None else largest) / means[0]
-        sure = p_equal < alpha
-        low = min(low, max(low - reach, 1.0 if sure and value > 1 else 0.0))
-        high = max(high, min(high + reach, 1.0 if sure and value < 1 else np.inf))
+    if not total_b > 0:
+        return Effect(*means, value, p=p_equal, e=evidence)
+
+    # What the test does not reject of a over b is the inverse of what it does not of b over a.
+    low = _least_ratio(a, b, alpha)
+    inverse = _least_ratio(b, a, alpha)
+    high = 1 / inverse if inverse > 0 else np.inf
+    unseen = _unseen(first, second, alpha)
+    if unseen:
+        seen = max(first.max(), second.max())
+        reach = unseen * (seen if largest is None else largest) / means[0]
+        lowest = 1.0 if p_equal < alpha and value > 1 else 0.0
+        highest = 1.0 if p_equal < alpha and value < 1 else np.inf
+        low = min(low, max(low - reach, lowest))
+        high = max(high, min(high + reach, highest))
     return Effect(*means, value, low, high, p_equal, evidence)
 
 
 def mean_effect(first: Array, second: Array, alpha: float, largest: float) -> Effect:
-    """Compares the means of two columns (trials,) of bounded numbers of either sign: second less first.
+    """Compares the means of two columns (trials,) of bounded numbers of either sign: second less
+    first.
 
-    The p is that of random signs, the interval the normal one, widened as that of a ratio by differences of at most
-    `largest` in trials that may be unseen.
+    The p is that of random signs, the interval the normal one, widened as that of a ratio by
+    differences of at most `largest` in trials that may be unseen.
     """
     d = differences(second, first)
-    ones, mean = np.ones(len(d)), float(d.mean())
-    reach = (
-        -float(ndtri(alpha / 2)) * float(d.std()) / np.sqrt(len(d))
-        + _unseen(ones, d, alpha) * largest
-    )
-    p = _p_of_ratio(*grouped(np.array([ones, d]), MOST_SIGNS).T.copy())(0.0)
-    evidence = no_lean(d, float(abs(first[0]) + abs(second[0])) or 1.0)
-    return Effect(
-        float(first.mean()), float(second.mean()), mean, mean - reach, mean + reach, p, evidence
-    )
+    trials = len(d)
+    ones = np.ones(trials)
+    quantile = -float(ndtri(alpha / 2))
+    normal = quantile * float(d.std()) / np.sqrt(trials)
+    reach = normal + _unseen(ones, d, alpha) * largest
+    # A mean of 0 is a ratio of 0 to ones.
+    p = _p_of_ratio(*_sharing_signs(ones, d))(0.0)
+    size = abs(first[0]) + abs(second[0])
+    evidence = no_lean(d, float(size) or 1.0)
+    means = _means(first, second)
+    mean = float(d.mean())
+    return Effect(*means, mean, mean - reach, mean + reach, p, evidence)
+
+
+def _sharing_signs(first: Array, second: Array) -> Array:
+    """Returns both columns (2, signs), with the trials that share a sign put together."""
+    columns = np.array([first, second], dtype=float)
+    return grouped(columns, MOST_SIGNS).T.copy()
 
 
 def _p_of_ratio(a: Array, b: Array) -> Callable[[float], float]:
-    """Computes the p of b being r times a: the share of sums with random signs at least as far from 0 as the sum of b -
-    r a, itself included; if it is alone, Hoeffding's bound of this share (J. Amer. Statist. Assoc. 58, 1963)."""
+    """Computes the p of b being r times a: the share of sums with random signs at least as far from
+    0 as the sum of b - r a, itself included; if it is alone, Hoeffding's bound of this share (J.
+    Amer. Statist. Assoc. 58, 1963)."""
     signs = _signs(len(a))
-    flipped_a, flipped_b, size_a, size_b = (
-        signs @ a,
-        signs @ b,
-        float(a.sum()),
-        float(np.abs(b).sum()),
-    )
+    flipped_a = signs @ a
+    flipped_b = signs @ b
+    size_a = float(a.sum())
+    size_b = float(np.abs(b).sum())
+    least = 1 / (FLIPS + 1)
 
     def p(ratio: float) -> float:
-        d, flipped, roundoff = (
-            b - ratio * a,
-            flipped_b - ratio * flipped_a,
-            1e-12 * (size_b + ratio * size_a),
-        )
+        d = b - ratio * a
         total = abs(float(d.sum()))
-        count = int((np.abs(flipped) >= total - roundoff).sum())
-        least = 1 / (FLIPS + 1)
-        return (
-            (1 + count) * least
-            if count
-            else min(least, 2 * float(np.exp(-(total**2) / (2 * float(d @ d)))))
-        )
+        flipped = np.abs(flipped_b - ratio * flipped_a)
+        roundoff = 1e-12 * (size_b + ratio * size_a)
+        count = int((flipped >= total - roundoff).sum())
+        if count:
+            return (1 + count) * least
+        # Hoeffding: |sum of +-d| is t or more in a share of at most 2 exp(-t^2 / (2 d'd)).
+        exponent = -(total**2) / (2 * float(d @ d))
+        return min(least, 2 * float(np.exp(exponent)))
 
     return p
 
@@ -171,22 +202,20 @@ def _p_of_ratio(a: Array, b: Array) -> Callable[[float], float]:
 def _least_ratio(a: Array, b: Array, alpha: float) -> float:
     """Finds the least ratio of b over a that is not rejected."""
     p = _p_of_ratio(a, b)
-    return (
-        0.0
-        if p(0.0) >= alpha
-        else first_that(lambda ratio: p(ratio) >= alpha, 0.0, float(b.sum() / a.sum()))
-    )
+    if p(0.0) >= alpha:
+        return 0.0
+    return first_that(lambda ratio: p(ratio) >= alpha, 0.0, float(b.sum() / a.sum()))
 
 
 def _unseen(first: Array, second: Array, alpha: float) -> float:
-    """Computes the unseen share of trials that may have another ratio than the commonest one; 0 if enough have been
-    seen."""
+    """Computes the unseen share of trials that may have another ratio than the commonest one; 0 if
+    enough have been seen."""
     with np.errstate(all="ignore"):
         # Round-off makes no ratio another one.
-        _, counts = np.unique(
-            (second / first).astype(np.float32), return_counts=True, equal_nan=True
-        )
-    others, trials = len(first) - int(counts.max()), len(first)
+        ratios = (second / first).astype(np.float32)
+    _, counts = np.unique(ratios, return_counts=True, equal_nan=True)
+    trials = len(first)
+    others = trials - int(counts.max())
     if others >= min(RARE, trials / 2):
         return 0.0
     return clopper_pearson(others, trials, 1 - alpha)[1] - others / trials
@@ -199,24 +228,31 @@ def _signs(size: int) -> Array:
     return rng.integers(0, 2, (FLIPS, size)) * 2.0 - 1
 
 
-# Evidence ------------------------------------------------------------------------------------------------------------
+# Evidence ----------------------------------------------------------------------------------------
 
 
 def fair_coin(heads: int, tails: int) -> float:
-    """Measures evidence against a fair coin: the likelihood under a coin drawn from Beta(1/2, 1/2) over a fair one's.
+    """Measures evidence against a fair coin: the likelihood under a coin drawn from Beta(1/2, 1/2)
+    over a fair one's.
 
-    A martingale in the tosses, so it may be looked at after each of them (Robbins, Ann. Math. Statist. 41, 1970).
+    A martingale in the tosses, so it may be looked at after each of them (Robbins, Ann. Math.
+    Statist. 41, 1970).
     """
-    return _exp(betaln(heads + 0.5, tails + 0.5) - betaln(0.5, 0.5) + (heads + tails) * np.log(2))
+    # B(h + 1/2, t + 1/2) / B(1/2, 1/2) over 2^-(h + t), by logarithms.
+    drawn = betaln(heads + 0.5, tails + 0.5) - betaln(0.5, 0.5)
+    return _exp(drawn + (heads + tails) * np.log(2))
 
 
 def no_lean(differences: Array, unit: float) -> float:
-    """Measures evidence against differences (trials,) that are as likely to have the other sign, of any size: the mean
-    of exp(t d) / cosh(t d) over both signs of t, a martingale under such signs (de la Peña, Ann. Probab. 27, 1999). It
-    exceeds 1 only on the side of their sum. `unit` is about what differences are of, and knows no signs."""
+    """Measures evidence against differences (trials,) that are as likely to have the other sign, of
+    any size: the mean of exp(t d) / cosh(t d) over both signs of t, a martingale under such signs
+    (de la Peña, Ann. Probab. 27, 1999). It exceeds 1 only on the side of their sum. `unit` is about
+    what differences are of, and knows no signs."""
     tilts = _TILTS[:, None] * (differences / unit)[None, :]
+    # log(exp(x) / cosh x) of each trial; their sum over trials is the evidence of one tilt.
     log_gains = tilts - np.logaddexp(tilts, -tilts) + np.log(2)
-    return _exp(float(np.logaddexp.reduce(log_gains.sum(axis=1))) - np.log(len(_TILTS)))
+    together = float(np.logaddexp.reduce(log_gains.sum(axis=1)))
+    return _exp(together - np.log(len(_TILTS)))
 
 
 def _exp(value: float) -> float:
@@ -224,7 +260,7 @@ def _exp(value: float) -> float:
     return float(np.exp(min(value, 690.0)))
 
 
-# How many trials -----------------------------------------------------------------------------------------------------
+# How many trials ---------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -260,7 +296,8 @@ class PowerPlan:
         return cls(power, difference)
 
     def row(self, discordant: int, trials: int, alpha: float) -> dict[str, Any]:
-        """Returns the columns `PLANNED`, from the number of trials, and of those in which one alone succeeds.
+        """Returns the columns `PLANNED`, from the number of trials, and of those in which one alone
+        succeeds.
 
         Raises:
             UserError: there are too few trials to plan from, or the plan has more than `MOST`.
@@ -271,27 +308,39 @@ class PowerPlan:
             )
         # One end of an interval leaves out half of what both do.
         high = clopper_pearson(discordant, trials, 2 * LIMIT - 1)[1]
-        needed = trials_needed(max(high, self.difference), self.difference, self.power, alpha)
-        return dict(
-            zip(PLANNED, (self.power, self.difference, discordant, high, needed), strict=True)
-        )
+        share = max(high, self.difference)
+        return {
+            "power": self.power,
+            "difference": self.difference,
+            "discordant": discordant,
+            "discordant_high": high,
+            "trials_needed": trials_needed(share, self.difference, self.power, alpha),
+        }
 
 
 def mcnemar_power(trials: int, share: float, difference: float, alpha: float) -> float:
-    """Computes the probability that McNemar's exact test at the level `alpha` finds a difference of success, where one
-    estimator alone succeeds in a `share` of the trials.
+    """Computes the probability that McNemar's exact test at the level `alpha` finds a difference of
+    success, where one estimator alone succeeds in a `share` of the trials.
 
-    The number of these trials is binomial, and so is the number of those that the second wins (Duffy, Biometrics 40,
-    1984).
+    The number of these trials is binomial, and so is the number of those that the second wins
+    (Duffy, Biometrics 40, 1984).
     """
-    mean, reach = trials * share, 8 * np.sqrt(trials * share * (1 - share)) + 8
-    m = np.arange(max(1, int(mean - reach)), min(trials, int(mean + reach)) + 1)
+    # The number m of discordant trials, within eight standard deviations of its mean.
+    mean = trials * share
+    reach = 8 * np.sqrt(mean * (1 - share)) + 8
+    least = max(1, int(mean - reach))
+    most = min(trials, int(mean + reach))
+    m = np.arange(least, most + 1)
     probability = bdtr(m, trials, share) - bdtr(m - 1, trials, share)
-    # The most that the loser may win for the test to reject.
-    edge = least_count(m, np.array(0.5), np.array(alpha / 2)) - 1
+    # The most that the loser may win for the test to reject: below 0 where it never does.
+    level = np.array(alpha / 2)
+    edge = least_count(m, np.array(0.5), level) - 1
+    # Of m discordant trials the second wins a share (1 + difference / share) / 2.
     won = (1 + difference / share) / 2
-    rejects = bdtr(np.maximum(edge, 0), m, won) + bdtr(np.maximum(edge, 0), m, 1 - won)
-    return float(np.sum(probability * np.where(edge >= 0, rejects, 0.0)))
+    lost = np.maximum(edge, 0)
+    rejects = bdtr(lost, m, won) + bdtr(lost, m, 1 - won)
+    rejects = np.where(edge >= 0, rejects, 0.0)
+    return float(np.sum(probability * rejects))
 
 
 def trials_needed(share: float, difference: float, power: float, alpha: float) -> int:
@@ -304,16 +353,28 @@ def trials_needed(share: float, difference: float, power: float, alpha: float) -
     def enough(trials: int) -> bool:
         return mcnemar_power(trials, share, difference, alpha) >= power
 
-    low, high = 0, 8
+    # Doubling finds a number that is enough; bisection the least one beyond one that is not.
+    low = 0
+    high = 8
     while not enough(high):
-        low, high = high, 2 * high
+        low = high
+        high = 2 * high
         if high > MOST:
             raise UserError(
-                f"difference={difference:g}: needs more than {MOST:,} trials; ask for a larger difference"
+                f"difference={difference:g}: needs more than {MOST:,} trials; ask for a larger"
+                " difference"
             )
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (low, middle) if enough(middle) else (middle, high)
-    while below := [n for n in range(high, high + _SAW) if not enough(n)]:
-        high = below[-1] + 1
+        if enough(middle):
+            high = middle
+        else:
+            low = middle
+
+    # The power falls again at some larger numbers: go beyond the last of them.
+    checked = high
+    while checked < high + _SAW:
+        if not enough(checked):
+            high = checked + 1
+        checked += 1
     return high
