@@ -20,6 +20,8 @@ HELD = 0.9
 """Share of all trials that succeed where an estimator holds."""
 MOST_NAMES = 3
 """Names in a list of a title; more are counted."""
+MOST_PLACES = 2
+"""Settings, each at an error scale, that a title names; more are counted."""
 MEANING = f"Holds: at least {100 * HELD:.0f} % of all trials succeed, with 95 % confidence."
 """What a reader of the title needs to know."""
 HOLDS, FAILS, UNDECIDED = "holds", "fails", "undecided"
@@ -135,10 +137,28 @@ class Finding:
         number = winners[0].sure
         if self.ascending:
             return f"{'up to' if number > 1 else 'at'} error scale {self._scale(number - 1)}"
-        total, more = len(self.places), any(one.possible > number for one in winners)
+        total = len(self.places)
         if number == total:
             return f"in {'both' if total == 2 else f'all {total}'} {self._columns}"
-        return f"in {'at least ' if more else ''}{number} of {total} {self._columns}"
+        if any(one.possible > number for one in winners):
+            return f"in at least {number} of {total} {self._columns}"
+        return f"in {number} of {total} {self._columns}{self._which(winners)}"
+
+    def _which(self, winners: Sequence[Standing]) -> str:
+        """Names the settings where all winners hold, or all where all fail, if those are few."""
+        judged = winners[0].judged
+        held = [at for at, word in enumerate(judged) if word == HOLDS]
+        lost = [at for at, word in enumerate(judged) if word == FAILS]
+        few = min(held, lost, key=len)
+        if len(few) > MOST_PLACES or any(one.judged != judged for one in winners):
+            return ""
+        names = " and ".join(self._place(at) for at in few)
+        return f", all but {names}" if few is lost else f", {names}"
+
+    def _place(self, at: int) -> str:
+        setting, scale = self.places[at]
+        name = setting_words(setting)
+        return name if self._columns == "settings" else f"{name} at {value_text(scale)}"
 
     @property
     def _columns(self) -> str:
@@ -175,8 +195,7 @@ class Finding:
         """States in which of the first columns something is so, for certain of those that are named."""
         first = columns[0]
         if not self.ascending:
-            total = len(self.places)
-            return f"in {len(columns)} of {total} {self._columns}"
+            return f"in {len(columns)} {self._columns[: -1 if len(columns) == 1 else None]}"
         if number == 1 and len(self.places) == 1:
             return ""
         goes_on = list(columns) == list(range(first, number)) and len(columns) > 1
@@ -197,15 +216,22 @@ class Finding:
         for side in _SIDES if families.issuperset(_SIDES) else ():
             own = [one for one in self.standings if one.family == side]
             reach = max(one.possible for one in own)
-            if reach >= most:
-                continue
-            for one in (one for one in own if one.possible == reach):
-                lost = [at for at, word in enumerate(one.judged) if word == FAILS]
-                phrase = self._extent(lost, len(self.places))
-                phrases.setdefault(phrase, []).append(one)
+            for one in own if reach < most else ():
+                if one.possible == reach:
+                    phrases.setdefault(self._failing(one), []).append(one)
         for phrase, who in phrases.items():
             verb = "fails" if len(who) == 1 else "fail"
             yield f"{named(who, self.standings)} {verb} {phrase}".rstrip()
+
+    def _failing(self, one: Standing) -> str:
+        """States where an estimator fails, and from where on its covariance is too small, if that is before."""
+        number = len(self.places)
+        lost = [at for at, word in enumerate(one.judged) if word == FAILS]
+        wrong = one.overconfident(number)
+        failing = self._extent(lost, number)
+        if not self.ascending or not wrong or wrong[0] >= lost[0]:
+            return failing
+        return f"{failing}, with too small a covariance {self._extent(wrong, number)}"
 
     def _nobody(self) -> str:
         """States that nowhere an estimator significantly holds, and who did succeed longest or in most settings."""
@@ -214,16 +240,16 @@ class Finding:
         ahead = [one for one in self.standings if one.seen == most]
         columns = slice(at, at + 1) if self.ascending else slice(None)
         share = seen([row for one in ahead for row in one.rows[columns] if row])
-        where = f"in {len(self.places)} {self._columns}"
-        where = f"at error scale {self._scale(at)}" if self.ascending else where
         verb = "succeeds" if len(ahead) == 1 else "succeed"
-        told = f"{named(ahead, self.standings)} {verb} in {share} {where}"
+        told = f"{named(ahead, self.standings)} {verb} in {share}"
+        told += f" at error scale {self._scale(at)}" if self.ascending else ""
         if any(one.possible for one in self.standings):
             return f"Too few trials to tell who holds; {told}"
         if len(self.places) == 1:
             return f"No estimator holds; {told}"
-        first = f", even at error scale {self._scale(0)}"
-        return f"No estimator holds{first if self.ascending else ' in any of them'}; {told}"
+        if self.ascending:
+            return f"No estimator holds, even at error scale {self._scale(0)}; {told}"
+        return f"No estimator holds in any of {len(self.places)} {self._columns}; {told}"
 
 
 def judged(row: Row | None, columns: int) -> str:
@@ -235,6 +261,11 @@ def judged(row: Row | None, columns: int) -> str:
     level = 1 - (1 - LEVEL) / columns
     count = round(row["success"] * row["trials"])
     return FAILS if clopper_pearson(count, int(row["trials"]), level)[1] < HELD else UNDECIDED
+
+
+def setting_words(setting: str) -> str:
+    """Words a setting; a dash stands for the values that most rows have."""
+    return "usual" if setting == "-" else setting
 
 
 def named(standings: Sequence[Standing], among: Sequence[Standing]) -> str:

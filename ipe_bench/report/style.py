@@ -133,7 +133,7 @@ FACES = {
     "broyden": Look("#0f7f8f", "p", (5, 2)),
     "steepest_descent": Look("#5b76b8", "<", (5, 2)),
     "auto": Look("#7b2fd0", "D"),
-    "ekf": Look("#d8420c", "^", (5, 2)),
+    "ekf": Look("#6a0010", "^", (5, 2)),
     "ukf": Look("#f29a17", "v", (5, 2)),
 }
 """The looks of those that the bench is about, which no other has and which are never grey. They differ from each other

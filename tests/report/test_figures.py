@@ -322,6 +322,8 @@ def test_the_faces_differ_in_hue_marker_and_lightness_for_the_colour_blind_and_i
     assert all(
         abs(lab(c)[0] - lab(DARK if paper == "dark" else WHITE)[0]) > 25 for c in color.values()
     )
+    # The two filters, each beside the other on every page, are no two tints of orange.
+    assert min(np.linalg.norm(lab(color["ekf"], s) - lab(color["ukf"], s)) for s in SIGHT) > 40
 
 
 def test_a_name_has_one_look_whichever_others_are_there_and_its_family_the_hue():
@@ -604,12 +606,6 @@ def test_a_row_per_setting_has_its_error_and_the_share_of_misfits_detected():
     view = replace(view, collection=SimpleNamespace(groups=[group]))
     drawing = drawn(settings, view)["settings"]
     alike, far = drawing.figure.axes
-    names = [t.get_text().replace("\n", " ") for t in alike.get_yticklabels()]
-    assert names == [
-        "platform misalignment 20 arc seconds",
-        "platform misalignment 5 arc seconds",
-        "right model",
-    ]
     assert [ax.get_title() for ax in (alike, far)] == ["ekf, newton", "far"]
     at = {
         ax: [float(line.get_xdata()[0]) for line in ax.lines if list(line.get_ydata()) == [0]]
@@ -617,28 +613,26 @@ def test_a_row_per_setting_has_its_error_and_the_share_of_misfits_detected():
     }
     assert set(at[alike]) == {300.0}
     assert set(at[far]) == {900.0}
+    names = (
+        "platform misalignment 20 arc seconds",
+        "platform misalignment 5 arc seconds",
+        "right model",
+    )
     for ax, shares in ((alike, (100, 0, 0)), (far, (100, 100, 0))):
-        told = [text.get_text() for text in ax.texts if "of trials" in text.get_text()]
-        assert told == [f"{share} % of trials" for share in shares]
+        texts = [text.get_text().replace("\n", " ") for text in ax.texts]
+        told = [text for text in texts if "detected" in text]
+        assert told == [f"{n}: detected in {s}\u00a0%" for n, s in zip(names, shares, strict=True)]
     assert "Largest undetected: platform misalignment 5 arc seconds" in drawing.caption
     assert len(drawing.caption.split()) <= 30
     drawing.figure.draw_without_rendering()
-    boxes = [label.get_window_extent() for label in alike.get_yticklabels()]
+    boxes = [text.get_window_extent() for text in alike.texts]
     assert min(box.x0 for box in boxes) >= 0
     assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))
+    # Letters of 10 points are still 8 on a phone, which is 366 points wide between its margins.
+    assert drawing.figure.get_figwidth() / 2 * 72 <= 366 / 0.8
 
 
-def test_models_of_states_are_told_apart_by_their_names_alone():
-    view = swept_view("model.step", {1.0: 1.0, 60.0: 4.0}, {1.0: 1.0, 60.0: 4.0})
-    step = view["summary"]["model.step"]
-    view["summary"].insert(0, "measurement", np.where(step == 60, "bearings_only", "pendulum"))
-    footer = {"identity": {"scenario": {"model": {"_target_": "ipe_bench.states.Formulas"}}}}
-    view = replace(view, collection=SimpleNamespace(groups=[SimpleNamespace(footer=footer)]))
-    axes = drawn(settings, view)["settings"].figure.axes
-    assert [t.get_text() for t in axes[0].get_yticklabels()] == ["bearings_only", "pendulum"]
-
-
-def test_a_number_that_is_swept_has_an_axis_and_kinds_have_rows():
+def test_a_number_that_is_swept_has_an_axis_and_kinds_have_the_matrix_alone():
     values = {0.1: 1.0, 0.2: 2.0, 0.5: 4.0}
     drawing = drawn(settings, swept_view("noise.deviation", values, values))["settings"]
     assert [ax.get_xlabel() for ax in drawing.figure.axes] == ["noise.deviation"] * 3
@@ -646,16 +640,14 @@ def test_a_number_that_is_swept_has_an_axis_and_kinds_have_rows():
     assert curve.get_ydata() == pytest.approx([1.0, 2.0, 4.0])
     assert [t.get_text() for t in drawing.figure.axes[0].get_xticklabels()] == ["0.1", "0.2", "0.5"]
     kinds = {"gaussian": 1.0, "quantization": 2.0}
-    drawing = drawn(settings, swept_view("noise", kinds, kinds))["settings"]
-    labels = [t.get_text() for t in drawing.figure.axes[0].get_yticklabels()]
-    assert labels == ["quantization", "gaussian"]
-    one = swept_view("noise", ["gaussian"], kinds)
-    assert not drawn(settings, one)
-    # An option that is 0 and one that is not there have the same words, and are two settings.
+    assert not drawn(settings, swept_view("noise", kinds, kinds))
+
+
+def test_settings_whose_words_are_alike_have_rows_of_their_own():
     alike = {0.0: 1.0, np.nan: 2.0}
-    drawing = drawn(settings, swept_view("prior.width", alike, alike))["settings"]
-    labels = [t.get_text() for t in drawing.figure.axes[0].get_yticklabels()]
-    assert labels == ["prior.width=-", "prior.width=0"]
+    drawing = drawn(settings, swept_view("truth.width", alike, alike))["settings"]
+    told = [text.get_text() for text in drawing.figure.axes[0].texts if ":" in text.get_text()]
+    assert [text.partition(":")[0] for text in told] == ["truth.width=-", "truth.width=0"]
 
 
 # Distributions and convergence ---------------------------------------------------------------------------------------

@@ -133,7 +133,7 @@ def settings(**counts: tuple[int, ...]) -> list[dict[str, Any]]:
 
 def test_settings_are_counted_and_have_no_order():
     assert found(settings(a=(0, 200, 200), b=(200, 0, 0))) == (
-        "Only a holds in 2 of 3 settings (100 % of 200 trials)"
+        "Only a holds in 2 of 3 settings, all but truth=0 (100 % of 200 trials)"
     )
     assert found(settings(a=(200, 200), b=(200, 196))) == (
         "a and b hold in both settings (98.0 to 100 % of 200 trials)"
@@ -142,7 +142,7 @@ def test_settings_are_counted_and_have_no_order():
         "Only a holds in at least 1 of 2 settings (100 % of 200 trials)"
     )
     assert found(settings(a=(0, 0))) == (
-        "No estimator holds in any of them; a succeeds in 0 % of 200 trials in 2 settings"
+        "No estimator holds in any of 2 settings; a succeeds in 0 % of 200 trials"
     )
 
 
@@ -150,4 +150,46 @@ def test_settings_whose_texts_are_equal_are_both_counted():
     rows = settings(a=(200, 0))
     for one in rows:
         one["setting"] = "truth=0.1"
-    assert found(rows) == "a holds in 1 of 2 settings (100 % of 200 trials)"
+    assert found(rows) == "a holds in 1 of 2 settings, truth=0.1 (100 % of 200 trials)"
+
+
+def test_few_scenarios_that_are_lost_are_named_and_their_number_is_told_once():
+    rows = [
+        row(label, scale, good, setting=setting, family=family)
+        for label, family, each in (("auto", "IPE", (200, 100)), ("ekf", "filters", (0, 0)))
+        for setting, last in zip(("-", "pendulum"), (200, each[1]), strict=True)
+        for scale, good in ((1.0, each[0]), (10.0, last if label == "auto" else 0))
+    ]
+    for one in rows[:4]:
+        one["verdict"] = "overconfident"
+    assert found(rows) == (
+        "Only auto holds in 3 of 4 scenarios, all but pendulum at 10 (100 % of 200 trials);"
+        " its covariance is too small in 4 scenarios; ekf fails in 4 scenarios"
+    )
+
+
+def test_settings_where_winners_differ_or_are_undecided_are_not_named():
+    assert found(settings(a=(200, 0), b=(0, 200))) == (
+        "a and b hold in 1 of 2 settings (100 % of 200 trials)"
+    )
+    assert "truth" not in found(settings(a=(200, 178)))
+
+
+@pytest.mark.parametrize(
+    ("verdicts", "clause"),
+    [
+        (("consistent", "overconfident", "overconfident"), " from 10 on"),
+        (("consistent", "overconfident", "-"), " at 10"),
+        (("consistent", "consistent", "overconfident"), None),
+    ],
+)
+def test_a_filter_that_is_overconfident_before_it_fails_is_said_to_be(verdicts, clause):
+    rows = sweep(newton=(200, 200, 200), ekf=(200, 200, 0), ukf=(200, 200, 0))
+    for one, verdict in zip(rows[3:], 2 * verdicts, strict=True):
+        one["verdict"] = verdict
+    told = found(rows).partition("; ")[2]
+    assert told == (
+        f"ekf and ukf fail at 100, with too small a covariance{clause}"
+        if clause
+        else "ekf and ukf fail at 100"
+    )

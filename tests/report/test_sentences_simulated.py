@@ -126,7 +126,8 @@ CLAUSES = {
     r"(?: (?P<extent>from|at) (?P<scale>[\d.]+)(?: on)?)?",
     "next": rf"at (?P<scale>[\d.]+) {NAMED}: undecided|none at (?P<none>[\d.]+)",
     "undecided": rf"{NAMED}: undecided",
-    "fails": rf"{NAMED} fails?(?: (?P<extent>from|at) (?P<scale>[\d.]+)(?: on)?)?",
+    "fails": rf"{NAMED} fails?(?: (?P<extent>from|at) (?P<scale>[\d.]+)(?: on)?)?"
+    r"(?:, with too small a covariance (?P<wrong>from|at) (?P<first>[\d.]+)(?: on)?)?",
     "nobody": r"(?P<word>No estimator holds|Too few trials to tell who holds)"
     r"(?:, even at error scale (?P<even>[\d.]+))?",
     "most": rf"{NAMED} succeeds? in {NUMBERS} {UP_TO}",
@@ -138,7 +139,7 @@ FINDING = r"(?:Only |All |No estimator |Too few |\d+ of \d+ |e\d+).*(?:hold|tell
 @sentence(FINDING, of_one=True)
 def finding(report: Report, match: Any) -> Iterator[tuple[str, str, bool]]:
     """Holds: infers that 90 % succeed, in the population, up to that scale; only: that they do of no other. Fails,
-    none, no estimator: infers that fewer do at those scales. Its covariance is too small: infers that the mean NEES is
+    none, no estimator: infers that fewer do at those scales. Too small a covariance: infers that the mean NEES is
     above n at those scales. Counts who is undecided or has the most success, and the numbers that were seen."""
     winners: list[str] = []
     for clause in match[0].split("; "):
@@ -261,6 +262,23 @@ def fails(report: Report, found: Any, winners: list[str]) -> Iterator[tuple[str,
         yield "fails, by its limit", COUNTS, wrong or not parted
         false = any(drawn.success(e)[at] >= HOLDING for e in labels for at in which)
         yield "fails", INFERS, false
+    if found["names"] and found["first"]:
+        yield from too_small_before(report, found, labels)
+
+
+def too_small_before(
+    report: Report, found: Any, labels: list[str]
+) -> Iterator[tuple[str, str, bool]]:
+    drawn = report.board
+    first = place(report, found["first"])
+    which = range(first, len(drawn.scales)) if found["wrong"] == "from" else [first]
+    shown = report.analysis.summary.query("parameter == 'all'")
+    verdicts = shown.set_index(["estimator", "error_scale"])["verdict"]
+    signs = [verdicts[e, drawn.scales[at]] == OVERCONFIDENT for e in labels for at in which]
+    late = first >= place(report, found["scale"])
+    yield "too small before failing, verdicts", COUNTS, late or not all(signs)
+    false = any(drawn.populations[e][at].mean_nees <= 1 + 1e-9 for e in labels for at in which)
+    yield "too small before failing", INFERS, false
 
 
 def nobody(report: Report, found: Any, winners: list[str]) -> Iterator[tuple[str, str, bool]]:

@@ -1,11 +1,10 @@
-"""Draws a sweep of settings: a row for each with its error and how often its misfit is detected, or an axis of the one
-number that is swept."""
+"""Draws a sweep of settings whose readings come from other models, a row for each with its error and how often its
+misfit is detected, or an axis of the one number that is swept; the matrix shows other settings."""
 
 from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.errors import BARS, draw_panels
 from ipe_bench.report.figures.views import Figure, View, in_focus
-from ipe_bench.report.style import BOUND_COLOR, FAMILIES, SOFT, Look
+from ipe_bench.report.style import FAMILIES, WHITE, Look
 from ipe_bench.report.words import brief, enumerate_few, percent, value_text, varying
 from ipe_bench.runs.provenance import TARGET
 
@@ -35,15 +34,14 @@ _ALIKE = 0.05
 """Part by which the errors of estimators in one panel differ at most."""
 _MOST_ERROR = 1e4
 """Errors beyond are drawn here."""
-_WIDTH = 6.0
-"""Inches of the figure at least."""
-_LETTERS = 28
-"""Length of a line of a setting's name."""
+_WIDTH = 4.4
+"""Inches of a panel: its letters are read on a phone."""
+_LETTERS = 56
+"""Length of a line above a row."""
 _COLORS = {
     "right": FAMILIES["IPE"][3],
     "detected": FAMILIES["least squares"][0],
     "undetected": FAMILIES["filters"][0],
-    "": BOUND_COLOR,
 }
 
 
@@ -69,13 +67,11 @@ def draw(view: View) -> Iterator[Drawing]:
         return
     scale = max(shared)
     rows = rows[rows["error_scale"] == scale]
-    moving = (rows["noise"] == "model").any() if "noise" in rows else False
-    if moving:
-        yield from _rows(replace(view, moving=True), rows, apart, scale)
+    of_truth = any(column.partition(".")[0] == "truth" for column in apart)
+    if of_truth and rows["misfit"].notna().any():
+        yield from _rows(view, rows, scale)
     elif len(apart) == 1 and _is_axis(rows[apart[0]]):
         yield from _swept(view, rows, apart[0], scale)
-    else:
-        yield from _rows(view, rows, apart, scale)
 
 
 def _is_axis(values: pd.Series[Any]) -> bool:
@@ -107,8 +103,9 @@ def _units(collection: Collection | None) -> dict[str, str]:
 def _names(rows: pd.DataFrame, apart: Sequence[str], view: View) -> list[str]:
     """Words the setting of each row by what is in it: options that are there and not 0, with their units."""
     units = _units(view.collection)
+    scenarios = _scenarios(view.collection)
     # Scenarios of states that move have a model in place of a measurement.
-    assumed = [one["measurement"] for one in _scenarios(view.collection) if "measurement" in one]
+    assumed = [one["measurement"] for one in scenarios if "measurement" in one]
     models = {config[TARGET].rpartition(".")[2] for config in assumed}
     options = [c for c in apart if "." in c]
     told = []
@@ -143,49 +140,38 @@ def _swept(view: View, rows: pd.DataFrame, column: str, scale: float) -> Iterato
     yield view.drawing(fig, "settings", title, BARS)
 
 
-def _rows(view: View, rows: pd.DataFrame, apart: Sequence[str], scale: float) -> Iterator[Drawing]:
-    """Draws a row for each setting, a panel of errors for estimators that are alike, with the share of trials in which
-    the misfit is detected if readings come from other models; else a panel of NEES."""
+def _rows(view: View, rows: pd.DataFrame, scale: float) -> Iterator[Drawing]:
+    """Draws a row for each setting, a panel of errors for estimators that are alike, and writes above each row in how
+    many trials the misfit is detected."""
     error = rows.pivot_table("error_median", "setting", "estimator")
     error = error.loc[error.median(axis=1).sort_values().index[::-1]].iloc[:MOST_ROWS]
     groups = _groups(error)[:MOST_GROUPS]
-    of_truth = any(c.partition(".")[0] == "truth" for c in apart) and rows["misfit"].notna().any()
-    judged = not of_truth and rows["nees_median"].notna().any()
     detected = rows.groupby("setting")["misfit"].median()
-    kinds = [_kind(name, detected[name]) if of_truth else "" for name in error.index]
+    kinds = [_kind(name, detected[name]) for name in error.index]
     look = {n: Look(_COLORS[kind], "o") for n, kind in zip(error.index, kinds, strict=True)}
-    lines = [textwrap.fill(name, _LETTERS).replace("$", r"\$") for name in look]
-    fig, axes = common.panels(len(groups) + bool(judged), look, scales=[scale], row=2)
-    height = 1.2 + sum(0.1 + 0.17 * (1 + line.count("\n")) for line in lines)
-    fig.set_figheight(height * -(-len(axes) // 2))
-    fig.set_figwidth(max(fig.get_figwidth(), _WIDTH))
-    for group, ax in zip(groups, axes, strict=False):
+    fig, axes = common.panels(len(groups), look, scales=[scale], row=2)
+    fig.set_figwidth(_WIDTH * min(len(groups), 2))
+    deepest = 1
+    for group, ax in zip(groups, axes, strict=True):
         part = rows[rows["estimator"] == group[0]]
         common.decades(ax, part["error_median"].clip(upper=_MOST_ERROR), ends=part["error_q95"])
-        common.bound_line(ax, 1.0, f"1: {view.reference}")
+        common.bound_line(ax, 1.0, "1: the bound")
         ends: Any = {"interval": ("error_median", "error_q95"), "most": _MOST_ERROR}
-        ends["label"] = f"error over {view.reference}"
-        common.curves(ax, part, "error_median", look, [scale], by="setting", **ends)
+        words: Any = {"by": "setting", "label": "error over the bound"}
+        common.curves(ax, part, "error_median", look, [scale], **words, **ends)
         ax.set_title(_who(group, error).replace("$", r"\$"))
-        _write_values(ax, part, "error_median", look)
-        if of_truth:
-            _write_detected(ax, part, look)
-    for ax in axes[len(groups) :]:
-        part = rows[rows["estimator"] == groups[0][0]]
-        common.decades(ax, np.append(part["nees_median"], 1.0), least=4.0)
-        common.bound_line(ax, 1.0, "1: a right covariance")
-        words: Any = {"heading": f"NEES of {groups[0][0]}", "label": "median"}
-        common.curves(ax, part, "nees_median", look, [scale], by="setting", **words)
-        _write_values(ax, part, "nees_median", look)
-    for ax in axes:
-        ax.set_yticks(range(len(lines)), lines)
+        ax.set_yticks([])
+        ax.set_ylim(len(look) - 0.6, -1.0)
+        deepest = max(deepest, _write(ax, part.set_index("setting"), look))
+    row = 0.4 + 0.16 * deepest
+    fig.set_figheight((1.2 + row * len(look)) * -(-len(axes) // 2))
     common.legend(fig, axes)
     yield view.drawing(
         fig,
         "settings",
         f"Error by setting at error scale {scale:g}",
-        "Median error, bar to the 95 % quantile.",
-        _worst(error, kinds, detected) if of_truth else "",
+        "Median error, bar to the 95 % quantile; misfit detected in % of trials.",
+        _worst(error, kinds, detected),
     )
 
 
@@ -213,26 +199,25 @@ def _kind(name: str, detected: float) -> str:
     return "detected" if detected >= DETECTED else "undetected"
 
 
-def _write_values(ax: Any, rows: pd.DataFrame, column: str, look: Mapping[str, Look]) -> None:
-    """Writes each value above its mark."""
-    values = rows.set_index("setting")[column]
+def _write(ax: Any, rows: pd.DataFrame, look: Mapping[str, Look]) -> int:
+    """Writes each error at its mark, and above each row its setting and in how many trials its misfit is detected;
+    returns the largest number of lines."""
+    most = 1
     for i, (name, one) in enumerate(look.items()):
-        if np.isfinite(values.get(name, np.nan)):
-            at = (min(values[name], _MOST_ERROR), i)
-            style: Any = {"fontsize": "small", "color": one.color, "ha": "center"}
-            offset: Any = {"xytext": (0, 4), "textcoords": "offset points"}
-            ax.annotate(brief(values[name]), at, **offset, **style)
-
-
-def _write_detected(ax: Any, rows: pd.DataFrame, look: Mapping[str, Look]) -> None:
-    """Writes beside each row in how many trials the misfit is detected, under a heading."""
-    shares = rows.set_index("setting")["misfit"]
-    place: Any = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points"}
-    place |= {"xytext": (8, 0), "va": "center", "annotation_clip": False}
-    ax.annotate("misfit detected in", (1, -0.6), **place, fontsize="small", color=SOFT)
-    for i, (name, one) in enumerate(look.items()):
-        share = f"{percent(shares.get(name, np.nan))} of trials"
-        ax.annotate(share, (1, i), **place, color=one.color, fontweight="bold")
+        if name not in rows.index:
+            continue
+        row: Any = rows.loc[name]
+        style: Any = {"color": one.color, "textcoords": "offset points", "annotation_clip": False}
+        at = min(row["error_median"], _MOST_ERROR)
+        if np.isfinite(at):
+            ax.annotate(brief(row["error_median"]), (at, i), xytext=(0, -12), ha="center", **style)
+        told = f"{name}: detected in {percent(row['misfit'])}".replace(" %", "\u00a0%")
+        lines = textwrap.wrap(told, _LETTERS)
+        above: Any = {"xycoords": ("axes fraction", "data"), "xytext": (2, 6), "va": "bottom"}
+        above |= {"bbox": {"facecolor": WHITE, "edgecolor": "none", "pad": 1.0}}
+        ax.annotate("\n".join(lines).replace("$", r"\$"), (0, i), **above, **style)
+        most = max(most, len(lines))
+    return most
 
 
 def _worst(error: pd.DataFrame, kinds: Sequence[str], detected: pd.Series[Any]) -> str:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from itertools import groupby
 from typing import Any, ClassVar
 
-from ipe_bench.report.finding import HELD, MEANING, Finding, Row, Standing
+from ipe_bench.report.finding import HELD, MEANING, Finding, Row, Standing, setting_words
 from ipe_bench.report.style import RAMP, ink
 from ipe_bench.report.tables.table import Cell, Column, Part, Strong, Table
 from ipe_bench.report.words import (
@@ -132,7 +132,7 @@ def matrices(rows: Iterable[Row], lines: float = math.inf) -> list[Matrix]:
             for row, (named, _) in zip(one.rows, finding.places, strict=True)
             if row and named == setting
         ]
-        found.append(_matrix(Finding.of(own), f"{MATRIX}_{number}", _setting(setting)))
+        found.append(_matrix(Finding.of(own), f"{MATRIX}_{number}", setting_words(setting)))
     # One legend below the last, of the signs of all.
     columns = [column for matrix in found for column in matrix.columns]
     moving = any(row["noise"] == "model" for row in listed)
@@ -164,17 +164,12 @@ def _heads(finding: Finding) -> tuple[list[str], list[str]]:
     """Returns the titles of the columns, and a note that explains letters in place of long ones."""
     if finding.ascending:
         return [value_text(scale) for _, scale in finding.places], []
-    texts = [_setting(setting) for setting, _ in finding.places]
+    texts = [setting_words(setting) for setting, _ in finding.places]
     if max(map(len, texts)) <= LONG:
         return texts, []
     letters = [chr(ord("A") + at) if at < 26 else f"#{at + 1}" for at in range(len(texts))]
     told = [f"{letter}: {text}" for letter, text in zip(letters, texts, strict=True)]
     return letters, ["; ".join(told) + "."]
-
-
-def _setting(text: str) -> str:
-    """Words a setting; a dash stands for the values that most rows have."""
-    return "usual" if text == "-" else text
 
 
 def _legend(columns: Sequence[Column], moving: bool) -> str:
