@@ -84,15 +84,15 @@ CHANGES = {
     "margin-crossing": Change(
         "statistics",
         "an interval that holds what is right counts as if it ended there",
-        "(0.0 if (start + low) * (start + high) < 0 else min(ends))",
+        "0.0 if crosses else min(ends)",
         "min(ends)",
         "test_margins.py test_compare.py",
     ),
     "bias-either": Change(
         "statistics",
         "bias is compared over trials in which either succeeds",
-        "success[0] & success[1]",
-        "success[0] | success[1]",
+        "a.inside_gate[one] & b.inside_gate[other]",
+        "a.inside_gate[one] | b.inside_gate[other]",
         "test_margins.py test_compare.py",
     ),
     "widened-by-second": Change(
