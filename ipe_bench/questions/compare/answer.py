@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import chain, groupby
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +31,14 @@ from ipe_bench.statistics.collect import collect
 from ipe_bench.statistics.comparisons import ALPHA
 
 _TITLES = {"error": "mean error", "honesty": "mean NEES", "cost": "mean cost", "time": "mean time"}
-"""Names of a comparison's quantities, where the table of a run has other statistics of error and cost."""
-_LEAST_P, _MOST_EVIDENCE = 1e-6, 1000
+"""Names of a comparison's quantities, where the table of a run has other statistics of error and
+cost."""
+_WORDS = ("", "second is")
+"""Titles of the columns that hold no numbers."""
+_FAILING = ("success", "error")
+"""Quantities in which the second must not be worse, unless others are named."""
+_LEAST_P = 1e-6
+_MOST_EVIDENCE = 1000
 
 
 class Comparison(Shown, pd.DataFrame):
@@ -40,24 +46,13 @@ class Comparison(Shown, pd.DataFrame):
 
     def parts(self) -> Iterator[Part]:
         """Yields a table per comparison, within 80 columns, and what the columns mean."""
-        titles = (
-            "",
-            "first",
-            "second",
-            "change",
-            f"{100 * (1 - self.attrs['alpha']):g} %",
-            "p",
-            "e",
-            "second is",
-        )
+        interval = f"{100 * (1 - self.attrs['alpha']):g} %"
         for title, rows in _comparisons(self):
-            cells = zip(titles, zip(*map(_cells, rows), strict=True), strict=True)
-            columns = [
-                (words if title in ("", "second is") else texts)(title, column)
-                for title, column in cells
-            ]
-            needed = [_needed(row) for row in rows if row.get("power", math.nan) > 0]
-            yield Table("comparison", title, "", columns, notes=needed)
+            cells = [_cells(row, interval) for row in rows]
+            columns = [_column(name, [one[name] for one in cells]) for name in cells[0]]
+            planned = [row for row in rows if row.get("power", math.nan) > 0]
+            notes = [_needed(row) for row in planned]
+            yield Table("comparison", title, "", columns, notes=notes)
         yield (
             "error is its length in standard deviations of the bound (Mahalanobis), where a trial counts as at most"
             " the radius of the gate of success; cost counts simulations. Both are means over the common trials,"
@@ -87,51 +82,57 @@ def write_comparison(folder: Path, frame: Comparison, sources: Sequence[tuple[st
 
     parts = list(frame.parts())
     tables = [part for part in parts if isinstance(part, Table)]
-    shown = (
-        list(_finding_sentences(frame)),
-        [_joined(tables), *parts[len(tables) :]],
-        draw_pairs(frame),
-    )
+    sentences = parts[len(tables) :]
     write_files(
-        folder, "comparison", ("comparison.csv", frame), "Comparison", *shown, sources=sources
+        folder,
+        "comparison",
+        ("comparison.csv", frame),
+        "Comparison",
+        list(_finding_sentences(frame)),
+        [_joined(tables), *sentences],
+        draw_pairs(frame),
+        sources=sources,
     )
+
+
+def _column(title: str, cells: Sequence[str]) -> Column:
+    return words(title, cells) if title in _WORDS else texts(title, cells)
 
 
 def _joined(tables: Sequence[Table]) -> Table:
     """Puts tables of the same columns below each other, their titles in a column."""
     titles = list(dict.fromkeys(column.title for table in tables for column in table.columns))
-    columns = [words("comparison", [table.title for table in tables for _ in table.rows])]
+    names = [table.title for table in tables for _ in table.rows]
+    columns = [words("comparison", names)]
     for title in titles:
-        found = [next((c for c in table.columns if c.title == title), None) for table in tables]
-        cells = [c.cells if c else [Cell("")] * len(t) for c, t in zip(found, tables, strict=True)]
-        columns.append(
-            Column(
-                title or "quantity",
-                list(chain.from_iterable(cells)),
-                title not in ("", "second is"),
-            )
-        )
+        cells = [cell for table in tables for cell in _under(table, title)]
+        columns.append(Column(title or "quantity", cells, title not in _WORDS))
     notes = [note for table in tables for note in table.notes]
     return Table("comparison", "Trial by trial", "", columns, notes=notes, grouped=1)
 
 
+def _under(table: Table, title: str) -> Sequence[Cell]:
+    """Returns the cells of a table under a title, which are empty if it has no such column."""
+    for column in table.columns:
+        if column.title == title:
+            return column.cells
+    return [Cell("")] * len(table)
+
+
 def _finding_sentences(frame: pd.DataFrame) -> Iterator[str]:
     """Says in how many comparisons the second is better, and worse, by quantity."""
-    judged, names = (
-        frame[frame["p"].notna()],
-        [frame[which].unique() for which in ("first", "second")],
-    )
-    who = [
-        str(each[0]) if len(each) == 1 and len({*names[0], *names[1]}) == 2 else ""
-        for each in names
-    ]
+    judged = frame[frame["p"].notna()]
+    firsts = frame["first"].unique()
+    seconds = frame["second"].unique()
+    by_name = len(firsts) == len(seconds) == 1 and firsts[0] != seconds[0]
     number = judged.groupby("quantity").size().max()
     for word in ("better", "worse"):
-        counts = judged[judged["finding"] == word].groupby("quantity", sort=False).size()
+        found = judged[judged["finding"] == word]
+        counts = found.groupby("quantity", sort=False).size()
         listed = ", ".join(
             f"{quantity} ({count} of {number} comparisons)" for quantity, count in counts.items()
         )
-        than = f"{who[1]} is {word} than {who[0]}" if all(who) else f"The second is {word}"
+        than = f"{seconds[0]} is {word} than {firsts[0]}" if by_name else f"The second is {word}"
         yield f"{than} in {listed or 'no tested quantity'}."
 
 
@@ -146,49 +147,75 @@ def _needed(row: dict[str, Any]) -> str:
 def _comparisons(frame: pd.DataFrame) -> Iterator[tuple[str, list[dict[str, Any]]]]:
     """Yields each comparison with its title, in order."""
     settings = [c for c in frame.columns if c not in NOT_SETTINGS]
+    naming = (*settings, "first", "second")
+
+    def named(row: dict[str, Any]) -> tuple[str, ...]:
+        return tuple(value_text(row[column]) for column in naming)
+
     listed: list[Any] = frame.to_dict("records")
-    for _, part in groupby(
-        listed, key=lambda row: tuple(value_text(row[c]) for c in (*settings, "first", "second"))
-    ):
+    for _, part in groupby(listed, key=named):
         rows = list(part)
-        first = rows[0]
-        who = (
-            first["first"]
-            if first["first"] == first["second"]
-            else f"{first['first']}, then {first['second']}"
-        )
-        how = "" if first["matched_by"] == "trial" else " of other seeds, matched in their order"
-        yield (
-            f"{comparison_title(first)}: {who}; {first['trials']} trial{'s' * (first['trials'] != 1)}{how}",
-            rows,
-        )
+        yield _heading(rows[0]), rows
 
 
-def _cells(row: dict[str, Any]) -> tuple[str, ...]:
+def _heading(row: dict[str, Any]) -> str:
+    who = row["first"]
+    if row["second"] != who:
+        who = f"{who}, then {row['second']}"
+    trials = "1 trial" if row["trials"] == 1 else f"{row['trials']} trials"
+    how = "" if row["matched_by"] == "trial" else " of other seeds, matched in their order"
+    return f"{comparison_title(row)}: {who}; {trials}{how}"
+
+
+def _cells(row: dict[str, Any], interval: str) -> dict[str, str]:
+    """Returns what the columns of a table say of one quantity."""
     quantity = row["quantity"]
     show = {"success": percent, "time": lambda v: duration(v, 2)}.get(quantity, compact)
+    unit = " %" if quantity == "success" else ""
+    change = "-"
+    if math.isfinite(row["change"]):
+        change = _change(quantity, row["change"]) + unit
+    ends = "-"
+    if math.isfinite(row["low"]):
+        ends = f"{_change(quantity, row['low'])} to {_change(quantity, row['high'])}"
+    return {
+        "": _TITLES.get(quantity, quantity),
+        "first": show(row["first_value"]),
+        "second": show(row["second_value"]),
+        "change": change,
+        interval: ends,
+        "p": _p(row["p"]),
+        "e": _evidence(row["e"]),
+        "second is": _verdict(row),
+    }
+
+
+def _change(quantity: str, value: float) -> str:
+    """Formats a difference of success in points, one of bias in deviations, or else a ratio."""
     if quantity == "success":
-        change, ends = (
-            f"{100 * row['change']:+.1f} %",
-            f"{100 * row['low']:+.1f} to {100 * row['high']:+.1f}",
-        )
-    elif quantity.startswith("bias "):
-        change, ends = f"{row['change']:+.3f}", f"{row['low']:+.3f} to {row['high']:+.3f}"
-    else:
-        change, ends = _ratio(row["change"]), f"{_ratio(row['low'])} to {_ratio(row['high'])}"
-    p, e = row["p"], row["e"]
-    return (
-        *(_TITLES.get(quantity, quantity), show(row["first_value"]), show(row["second_value"])),
-        change if math.isfinite(row["change"]) else "-",
-        ends if math.isfinite(row["low"]) else "-",
-        (p_value(p) if p >= _LEAST_P else f"<{_LEAST_P:g}") if math.isfinite(p) else "",
-        (compact(e) if e <= _MOST_EVIDENCE else f">{_MOST_EVIDENCE}") if math.isfinite(e) else "",
-        row["finding"] or ("different" if row["different"] else "-" if quantity != "time" else ""),
-    )
-
-
-def _ratio(value: float) -> str:
+        return f"{100 * value:+.1f}"
+    if quantity.startswith("bias "):
+        return f"{value:+.3f}"
     return f"{value:.3f}" if 0.1 <= value < 9.9995 else compact(value)
+
+
+def _p(value: float) -> str:
+    if not math.isfinite(value):
+        return ""
+    return p_value(value) if value >= _LEAST_P else f"<{_LEAST_P:g}"
+
+
+def _evidence(value: float) -> str:
+    if not math.isfinite(value):
+        return ""
+    return compact(value) if value <= _MOST_EVIDENCE else f">{_MOST_EVIDENCE}"
+
+
+def _verdict(row: dict[str, Any]) -> str:
+    if row["different"]:
+        return row["finding"] or "different"
+    # Times are not tested.
+    return "" if row["quantity"] == "time" else "-"
 
 
 def compared_folders(
@@ -206,7 +233,8 @@ def compared_folders(
     difference: float | None = None,
     output: Path | str | None = None,
 ) -> Comparison:
-    """Compares what is stored, as `ipe_bench.compare` says; folders without a second hold both versions."""
+    """Compares what is stored, as `ipe_bench.compare` says; folders without a second hold both
+    versions."""
     plan = PowerPlan.of(power, difference, anytime=anytime)
     tested = tuple(fail_on or JUDGED)
     widened = MARGINS | dict(margins or {})
@@ -218,10 +246,12 @@ def compared_folders(
     versions = (first, second)
     with opened(first_folders) as one, opened(second_folders or first_folders) as other:
         _require_two(first_folders, second_folders, versions)
-        asked = collect(one), collect(other)
+        ours = collect(one)
+        theirs = collect(other)
         read = digests(dict.fromkeys([*one, *other]))
         found = compared(
-            *asked,
+            ours,
+            theirs,
             versions,
             alpha=alpha,
             anytime=anytime,
@@ -230,18 +260,17 @@ def compared_folders(
             margins=widened,
         )
         few = [] if anytime else list(too_few(found, alpha))
-        lacking = list(gone(*asked, versions)) if complete else []
+        lacking = list(gone(ours, theirs, versions)) if complete else []
     frame = Comparison(found)
     if plan is not None:
-        whole = ["discordant", "trials_needed"]
-        frame[whole] = frame[whole].astype("Int64")
-    for name in ("problems", "stale"):
-        frame.attrs[name] = list(
-            dict.fromkeys(line for one in asked for line in getattr(one, name))
-        )
+        # Other rows have no such numbers, which would make floats of them.
+        for column in ("discordant", "trials_needed"):
+            frame[column] = frame[column].astype("Int64")
+    frame.attrs["problems"] = list(dict.fromkeys([*ours.problems, *theirs.problems]))
+    frame.attrs["stale"] = list(dict.fromkeys([*ours.stale, *theirs.stale]))
     frame.attrs["problems"] += lacking
-    frame.attrs["worse"] = _worse(frame, ("success", "error") if fail_on is None else fail_on)
-    frame.attrs["notes"] = [*few, *left_out(*asked), *other_sources(*asked)]
+    frame.attrs["worse"] = _worse(frame, _FAILING if fail_on is None else fail_on)
+    frame.attrs["notes"] = [*few, *left_out(ours, theirs), *other_sources(ours, theirs)]
     frame.attrs["margins"] = widened
     frame.attrs["alpha"] = alpha
     if output is not None:
@@ -268,18 +297,21 @@ def _require_two(
         raise UserError(
             "compare: one folder is given; name another, or first=LABEL and second=LABEL"
         )
-    same = {path.resolve() for path in first} == {path.resolve() for path in second or first}
-    label = versions[0]
-    if same and label == versions[1]:
+    label, other = versions
+    if label == other and _places(first) == _places(second or first):
         named = "one folder" if label is None else f"{label} of one folder"
         raise UserError(
             f"compare: {named} is compared with itself; name another, or first=LABEL and second=LABEL"
         )
 
 
+def _places(folders: Sequence[Path]) -> set[Path]:
+    return {folder.resolve() for folder in folders}
+
+
 def _worse(frame: Comparison, failing: Sequence[str]) -> list[str]:
     """Returns a line for each finding that fails the comparison."""
-    quantity = frame["quantity"].str.split(" ").str[0]
-    worse = frame[(frame["finding"] == "worse") & quantity.isin(list(failing))]
-    rows = [{str(name): value for name, value in row.items()} for row in worse.to_dict("records")]
+    kinds = frame["quantity"].str.split(" ").str[0]
+    worse = frame[(frame["finding"] == "worse") & kinds.isin(list(failing))]
+    rows: list[Any] = worse.to_dict("records")
     return [f"{row['second']} in {row['quantity']}, {comparison_title(row)}" for row in rows]
