@@ -40,9 +40,8 @@ def answer(folders: Sequence[str], **given: Any) -> Answered:
         raise UserError(
             "compare: name one or two folders of results, such as outputs/before outputs/after"
         )
-    margins = {
-        key.partition(".")[2]: given.pop(key) for key in list(given) if key.startswith("margin.")
-    }
+    named = [key for key in given if key.startswith("margin.")]
+    margins = {key.removeprefix("margin."): given.pop(key) for key in named}
     first, *others = ([Path(folder)] for folder in folders)
     frame = compared_folders(first, *others, margins=margins, **given)
     told = frame.attrs

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -25,77 +25,114 @@ _TIMES = 2.0
 _COLORS = {"better": FAMILIES["least squares"][0], "worse": FAMILIES["filters"][0]}
 
 
+class _Measure(NamedTuple):
+    """Describes the axis of a quantity's changes."""
+
+    words: str
+    unit: str
+    margin: str
+    """The largest change that does not matter, in words."""
+    factor: int
+    """What changes are multiplied by."""
+    same: float
+    """No change."""
+    least: float
+    most: float
+    """The ends of the changes that do not matter."""
+
+    @property
+    def ratio(self) -> bool:
+        return self.same == 1.0
+
+
+def _measure(kind: str, margin: float) -> _Measure:
+    if kind.startswith("bias"):
+        return _Measure("difference", "", f"{margin:g}", 1, 0.0, -margin, margin)
+    share = 100 * margin
+    if kind == "success":
+        return _Measure("points", " points", f"{share:g} points", 100, 0.0, -share, share)
+    return _Measure("ratio", " %", f"{share:g} %", 1, 1.0, 1 / (1 + margin), 1 + margin)
+
+
 def draw_pairs(frame: pd.DataFrame) -> Iterator[Drawing]:
-    """Draws the change of each tested quantity with its interval, a row per comparison, and says what it is worth."""
+    """Draws the change of each tested quantity with its interval, a row per comparison, and says
+    what it is worth."""
     listed: list[Any] = frame.to_dict("records")
     rows = [row for row in listed if np.isfinite(row["low"]) and np.isfinite(row["high"])]
     if not rows:
         return
-    parts = [[row["second"], *comparison_title(row).split(", ")] for row in rows]
-    shared = set.intersection(*map(set, parts)) if len(set(map(tuple, parts))) > 1 else set()
-    names = {
-        id(row): ", ".join(w for w in words if w not in shared)
-        for row, words in zip(rows, parts, strict=True)
-    }
-    labels = list(dict.fromkeys(names.values()))
+    names = _names(rows)
+    labels = list(dict.fromkeys(names))
     kinds = list(dict.fromkeys(row["quantity"] for row in rows))[: common.most_panels()]
     look = dict.fromkeys(labels[:MOST_ROWS], Look(BOUND_COLOR, "o"))
     fig, axes = common.panels(len(kinds), look, scales=[0.0], row=2)
     fig.set_figwidth(print_width() or 10.4)
     for kind, ax in zip(kinds, axes, strict=True):
-        shown = [row for row in rows if row["quantity"] == kind and names[id(row)] in look]
-        places = [labels.index(names[id(row)]) for row in shown]
-        _draw_changes(ax, kind, shown, places, frame.attrs["margins"][kind.partition(" ")[0]])
+        measure = _measure(kind, frame.attrs["margins"][kind.partition(" ")[0]])
+        for row, name in zip(rows, names, strict=True):
+            if row["quantity"] == kind and name in look:
+                _draw_change(ax, row, labels.index(name), measure)
+        _set_axis(ax, measure)
+        common.title(ax, f"{kind}, {measure.words}")
     common.legend(fig, axes)
-    caption = "Second against first in the same trials, each with its own interval. Filled: beyond the margin."
+    caption = (
+        "Second against first in the same trials, each with its own interval. Filled: beyond the"
+        " margin."
+    )
     if len(labels) > MOST_ROWS:
         caption += f" {len(labels) - MOST_ROWS} further comparisons are in the table."
     yield Drawing("comparison", "Changes trial by trial", caption, fig)
 
 
-def _draw_changes(
-    ax: Axes, kind: str, rows: Sequence[Any], places: Sequence[int], margin: float
-) -> None:
-    """Draws the changes of one quantity at their places down the axis, beside the band of those below the margin."""
-    ratio = kind != "success" and not kind.startswith("bias")
-    factor = 100 if kind == "success" else 1
-    same, least, most = (
-        (1.0, 1 / (1 + margin), 1 + margin) if ratio else (0.0, -factor * margin, factor * margin)
-    )
-    for row, y in zip(rows, places, strict=True):
-        low, at, high = (factor * row[name] for name in ("low", "change", "high"))
-        color = _COLORS.get(row["finding"], BOUND_COLOR)
-        ax.plot([low, high], [y, y], color=color, linewidth=1.8)
-        face = color if row["finding"] else "white"
-        ax.plot(at, y, "o", color=color, markerfacecolor=face, markeredgecolor=color)
-        unit = "" if kind.startswith("bias") else " %" if ratio else " points"
-        within = f"the same within ± {100 * margin if unit else margin:g}{unit}"
-        words = within if least <= low and high <= most else _outcome(row, low, high, unit)
-        style: Any = {"va": "center", "fontsize": "small", "annotation_clip": False}
-        place: Any = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points"}
-        ax.annotate(words, (1, y), xytext=(6, 0), **place, **style)
+def _names(rows: Sequence[Any]) -> list[str]:
+    """Names each row by what not all of them share, and by everything if all are alike."""
+    parts = [(row["second"], *comparison_title(row).split(", ")) for row in rows]
+    shared: set[str] = set()
+    if len(set(parts)) > 1:
+        shared = set.intersection(*map(set, parts))
+    return [", ".join(word for word in words if word not in shared) for words in parts]
+
+
+def _draw_change(ax: Axes, row: Any, y: int, measure: _Measure) -> None:
+    """Draws a change with its interval at its place down the axis, and words beside it."""
+    low = measure.factor * row["low"]
+    high = measure.factor * row["high"]
+    color = _COLORS.get(row["finding"], BOUND_COLOR)
+    ax.plot([low, high], [y, y], color=color, linewidth=1.8)
+    face = color if row["finding"] else "white"
+    point: Any = {"color": color, "markerfacecolor": face, "markeredgecolor": color}
+    ax.plot(measure.factor * row["change"], y, "o", **point)
+    style: Any = {"va": "center", "fontsize": "small", "annotation_clip": False}
+    place: Any = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points"}
+    ax.annotate(_outcome(row, low, high, measure), (1, y), xytext=(6, 0), **place, **style)
+
+
+def _set_axis(ax: Axes, measure: _Measure) -> None:
+    """Sets an axis that shows no change and the band of those below the margin."""
     low, high = ax.get_xlim()
-    if ratio and high > 3 * max(low, 0.0):
+    if measure.ratio and high > 3 * max(low, 0.0):
         ax.set_xscale("log")
         low, high = ax.get_xlim()
-        low, high = min(low, 0.8), max(high, 1.25)
+        low = min(low, 0.8)
+        high = max(high, 1.25)
         common.log_ticks(ax.xaxis, low, high)
-    elif ratio:
-        low, high = min(low, 0.9), max(high, 1.1)
-    ax.set_xlim(min(low, least), max(high, most))
-    common.band(ax, least, most, "smaller than the margin")
-    ax.axvline(same, color=BOUND_COLOR, linewidth=0.8, linestyle=":")
-    common.title(
-        ax, f"{kind}, {'ratio' if ratio else 'points' if kind == 'success' else 'difference'}"
-    )
+    elif measure.ratio:
+        low = min(low, 0.9)
+        high = max(high, 1.1)
+    ax.set_xlim(min(low, measure.least), max(high, measure.most))
+    common.band(ax, measure.least, measure.most, "smaller than the margin")
+    ax.axvline(measure.same, color=BOUND_COLOR, linewidth=0.8, linestyle=":")
 
 
-def _outcome(row: Any, low: float, high: float, unit: str) -> str:
-    """Words what an interval that reaches beyond the margin says of the second: how much it is better or worse."""
-    extent = f"{low:+.2g} to {high:+.2g}{unit}"
-    if unit == " %" and high > _TIMES:
+def _outcome(row: Any, low: float, high: float, measure: _Measure) -> str:
+    """Words whether an interval lies within the margin, as in a test of equivalence, and else how
+    much better or worse the second is."""
+    if measure.least <= low and high <= measure.most:
+        return f"the same within ± {measure.margin}"
+    extent = f"{low:+.2g} to {high:+.2g}{measure.unit}"
+    if measure.ratio and high > _TIMES:
         extent = f"{compact(low)} to {compact(high)} times"
-    elif unit == " %":
+    elif measure.ratio:
         extent = f"{100 * (low - 1):+.2g} to {100 * (high - 1):+.2g} %"
     if row["finding"]:
         return f"{row['finding']}: {extent}"
