@@ -15,8 +15,10 @@ from ipe_bench.report.formats import FORMATS, PAGE, TABLES
 
 Which = Literal["all", "main", "none"]
 """All figures that the data allow, the few that answer the question, or none."""
-MOST_SETTINGS, FIRST_SETTINGS = 6, 2
-"""Settings with figures of their own: that many, or of more the first few unless all figures are asked for."""
+MOST_SETTINGS = 6
+"""Settings up to which all have figures of their own."""
+FIRST_SETTINGS = 2
+"""Settings that have figures where there are more, unless all figures are asked for."""
 FAMILIES: dict[str, tuple[str, ...]] = {
     "IPE": ("#0f7f8f", "#86a9e0", "#5b76b8", "#3648c9"),
     "filters": ("#8c2d04", "#c08a00", "#c2273d", "#f08a6c"),
@@ -26,7 +28,9 @@ FAMILIES: dict[str, tuple[str, ...]] = {
 """Colours by kind of estimator, neighbours differing in lightness; all of them are told apart on white and in print."""
 COLORS = tuple(family[i] for i in range(4) for family in FAMILIES.values())
 """Colours of the families by turns, for parameters and settings."""
-BLACK, GREY, WHITE = "#000000", "#b0b0b0", "#ffffff"
+BLACK = "#000000"
+GREY = "#b0b0b0"
+WHITE = "#ffffff"
 SOFT = "#6f6f6f"
 """Colour of letters of what is grey."""
 MARKERS = ("v", "P", "p", "<", "d", ">", "*", "^", "s", "o", "D")
@@ -34,16 +38,18 @@ DASHES: tuple[Any, ...] = ((1, 1.5), (5, 2, 1, 2), (8, 2, 1, 2, 1, 2), (3, 1, 1,
 """Dash patterns of the pool as seaborn and matplotlib read them: lengths on and off."""
 REFERENCE = "linear_lse"
 """Label of the reference estimator: black and crossed in every figure."""
-BOUND_COLOR, BOUND_DASH = "#444444", (0, (2, 2))
+BOUND_COLOR = "#444444"
+BOUND_DASH = (0, (2, 2))
 MOST_TOGETHER = 4
 """Curves in colour in one panel."""
 MOST_FACES = 10
 """Estimators up to which each has a colour where no names stand at the curves."""
 _LEGIBLE = 0.18
 """Largest relative luminance of letters on white."""
-DARK, LIGHT = "#15181c", "#e4e7ea"
-"""What white and black become on a page that is dark."""
-
+DARK = "#15181c"
+"""What white becomes on a page that is dark."""
+LIGHT = "#e4e7ea"
+"""What black becomes on a page that is dark."""
 
 RAMP = (
     *("#dcf0fa", "#bfe0f2", "#ffcf9f", "#fdbf85", "#fbab66"),
@@ -75,30 +81,25 @@ def which_figures(asked: Any) -> Which:
 
 def drawn_settings(number: int, which: Which) -> tuple[int, str]:
     """Returns how many of the settings have figures of their own, and a sentence on the others if there are any."""
-    drawn = min(
-        number, MOST_SETTINGS if which == "all" or number <= MOST_SETTINGS else FIRST_SETTINGS
-    )
+    most = MOST_SETTINGS if which == "all" or number <= MOST_SETTINGS else FIRST_SETTINGS
+    if number <= most:
+        return number, ""
     more = f"; figures=all draws {MOST_SETTINGS} of the {number}" if which == "main" else ""
-    return (
-        drawn,
-        f"{number - drawn} further settings are in the tables{more}" if drawn < number else "",
-    )
+    return most, f"{number - most} further settings are in the tables{more}"
 
 
 def file_formats(asked: Any) -> tuple[str, ...]:
     """Returns the formats asked for, in one word or several, with those that are always written; raises UserError if
     one is unknown."""
-    words = (
-        asked
-        if isinstance(asked, Sequence) and not isinstance(asked, str)
-        else str(asked).strip("[]").split(",")
-    )
+    words = asked
+    if isinstance(asked, str) or not isinstance(asked, Sequence):
+        words = str(asked).strip("[]").split(",")
     names = [str(word).strip() for word in words]
     if not names or not set(names) <= set(FORMATS):
-        raise UserError(
-            f"formats={','.join(names)}: choose among {', '.join(FORMATS[:-1])} and {FORMATS[-1]}"
-        )
-    return tuple(kind for kind in FORMATS if kind in {PAGE, TABLES[0], *names})
+        known = f"{', '.join(FORMATS[:-1])} and {FORMATS[-1]}"
+        raise UserError(f"formats={','.join(names)}: choose among {known}")
+    written = {PAGE, TABLES[0], *names}
+    return tuple(kind for kind in FORMATS if kind in written)
 
 
 @dataclass(frozen=True)
@@ -180,49 +181,74 @@ def looks(
     """
     found: dict[str, Look] = {}
     for label in labels:
-        name, (color, marker) = _ALIKE.get(label, label), (own or {}).get(label, (None, None))
-        if variant := FACES.get(name.partition(" (")[0]):
-            color = color or variant.color
-        family = (color,) if color else FAMILIES.get((kinds or {}).get(label, ""), COLORS)
-        at = POOL.index(name) if name in POOL else len(POOL) + crc32(name.encode()) % 1009
-        look = FACES.get(name) or _from_pool(at, family)
+        name = _ALIKE.get(label, label)
+        color, marker = (own or {}).get(label, (None, None))
+        variant = FACES.get(name.partition(" (")[0])
+        if variant and not color:
+            color = variant.color
+        kind = (kinds or {}).get(label, "")
+        family = (color,) if color else FAMILIES.get(kind, COLORS)
+        place = _place(name)
+        look = FACES.get(name) or _from_pool(place, family)
         while look in found.values():
-            look = _from_pool(at := at + 1, family)
+            place += 1
+            look = _from_pool(place, family)
         found[label] = Look(look.color, marker or look.marker, look.dash)
     return found
 
 
+def _place(name: str) -> int:
+    """Returns the place of a name in the pool, or one by chance behind it."""
+    if name in POOL:
+        return POOL.index(name)
+    return len(POOL) + crc32(name.encode()) % 1009
+
+
 def _from_pool(at: int, family: Sequence[str]) -> Look:
-    places = len(MARKERS) * len(DASHES)
-    color, dash = (
-        family[(at + at // places) % len(family)],
-        DASHES[at // len(MARKERS) % len(DASHES)],
-    )
-    return Look(color, MARKERS[at % len(MARKERS)], dash)
+    """Returns the look at a place: markers change first, then dashes, and colours with each place."""
+    markers = len(MARKERS)
+    places = markers * len(DASHES)
+    color = family[(at + at // places) % len(family)]
+    return Look(color, MARKERS[at % markers], DASHES[at // markers % len(DASHES)])
 
 
 def strong(color: str) -> str:
     """Returns the colour, darkened until letters of it are read on white: a contrast of 4.5, as WCAG 2 asks for."""
-    rgb = [int(color[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+    rgb = _rgb(color)
     while _luminance(rgb) > _LEGIBLE:
         rgb = [0.97 * c for c in rgb]
-    return "#" + "".join(f"{round(255 * c):02x}" for c in rgb)
+    return _hex(rgb)
+
+
+def _rgb(color: str) -> list[float]:
+    """Returns red, green and blue from 0 to 1."""
+    return [int(color[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+
+
+def _hex(rgb: Sequence[float]) -> str:
+    levels = [round(255 * c) for c in rgb]
+    return f"#{bytes(levels).hex()}"
 
 
 def _luminance(rgb: Sequence[float]) -> float:
-    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in rgb]
-    return sum(w * c for w, c in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
+    """Returns the relative luminance of sRGB by WCAG 2."""
+    red, green, blue = map(_linear, rgb)
+    return 0.2126 * red + 0.7152 * green + 0.0722 * blue
+
+
+def _linear(c: float) -> float:
+    return c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4
 
 
 def dark(color: str) -> str:
     """Returns what a colour on white becomes on a dark page: greys change places, and the others are lighter."""
-    rgb = [int(color[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+    rgb = _rgb(color)
     if max(rgb) - min(rgb) > 0.05:
-        mixed = [c + 0.25 * (1 - c) for c in rgb]
-    else:
-        ends = ([int(end[i : i + 2], 16) / 255 for i in (1, 3, 5)] for end in (DARK, LIGHT))
-        mixed = [low + (1 - rgb[0]) * (high - low) for low, high in zip(*ends, strict=True)]
-    return "#" + "".join(f"{round(255 * c):02x}" for c in mixed)
+        return _hex([c + 0.25 * (1 - c) for c in rgb])
+    # White becomes the first end, black the second.
+    share = 1 - rgb[0]
+    ends = zip(_rgb(DARK), _rgb(LIGHT), strict=True)
+    return _hex([low + share * (high - low) for low, high in ends])
 
 
 _HOUSE: dict[str, Any] = {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from ipe_bench import __version__
@@ -27,10 +27,16 @@ def value_text(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
+def assigned(column: str, value: str) -> str:
+    """Words a setting by its key and value; models and noises by their names alone."""
+    return value if column in ("measurement", "noise") else f"{column}={value}"
+
+
 def enumerate_few(items: Sequence[str], most: int = 6) -> str:
     """Enumerates 'a, b and 3 others'; a single remaining one is named."""
-    more = f" and {len(items) - most} others" if len(items) > most + 1 else ""
-    return ", ".join(items[:most] if more else items) + more
+    if len(items) <= most + 1:
+        return ", ".join(items)
+    return f"{', '.join(items[:most])} and {len(items) - most} others"
 
 
 def public(text: str) -> str:
@@ -50,11 +56,14 @@ def percent(share: float) -> str:
 
 def ends_in_percent(low: float, high: float) -> tuple[str, str]:
     """Formats the ends of an interval of a share, with a decimal more for each tenth of its width below 2 per cent."""
-    figures = max(0, math.ceil(math.log10(0.02 / (high - low)))) if low < high else 0
-    low_text, high_text = (
-        f"{100 * end:.{0 if end in (0, 1) else figures}f}" for end in (low, high)
-    )
-    return low_text, high_text
+    decimals = 0
+    if low < high:
+        decimals = max(0, math.ceil(math.log10(0.02 / (high - low))))
+
+    def end(share: float) -> str:
+        return f"{100 * share:.{0 if share in (0, 1) else decimals}f}"
+
+    return end(low), end(high)
 
 
 def short(value: float) -> str:
@@ -72,7 +81,8 @@ def short(value: float) -> str:
 
 def scientific(value: float) -> str:
     """Formats three figures, with an exponent below a thousandth."""
-    return _powered(f"{value:.2e}" if 0 < abs(value) < 1e-3 else f"{value:.3g}")
+    is_small = 0 < abs(value) < 1e-3
+    return _powered(f"{value:.2e}" if is_small else f"{value:.3g}")
 
 
 def _powered(text: str) -> str:
@@ -107,12 +117,11 @@ def compact(value: float) -> str:
     if not math.isfinite(value):
         return "inf" if value == math.inf else "-"
     rounded = float(f"{value:.2e}")
-    if rounded == 0 or not 1e-2 <= abs(rounded) < 1e9:
-        return _powered(f"{value:.1e}") if rounded else "0"
-    size, letter = next(
-        ((s, u) for s, u in ((1e6, "M"), (1e3, "k")) if abs(rounded) >= s), (1.0, "")
-    )
-    return f"{rounded / size:.{_decimals(rounded / size, 3)}f}{letter}"
+    if rounded == 0:
+        return "0"
+    if not 1e-2 <= abs(rounded) < 1e9:
+        return _powered(f"{value:.1e}")
+    return _in_unit(rounded, 3, {"M": 1e6, "k": 1e3, "": 1.0})
 
 
 def duration(seconds: float, figures: int = 3) -> str:
@@ -122,15 +131,18 @@ def duration(seconds: float, figures: int = 3) -> str:
     if seconds <= 0:
         return "0 s"
     rounded = float(f"{seconds:.{figures - 1}e}")
-    size, unit = next(
-        ((s, u) for s, u in ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs")) if rounded >= s), (1e-9, "ns")
-    )
-    return f"{rounded / size:.{_decimals(rounded / size, figures)}f} {unit}"
+    return _in_unit(rounded, figures, {" s": 1.0, " ms": 1e-3, " µs": 1e-6, " ns": 1e-9})
 
 
-def _decimals(value: float, figures: int) -> int:
-    """Returns the decimals that leave a number so many figures."""
-    return max(0, figures - 1 - math.floor(math.log10(abs(value)) + 1e-9))
+def _in_unit(value: float, figures: int, units: Mapping[str, float]) -> str:
+    """Formats so many figures of a number in the first of the descending units that it reaches, or in the last."""
+    *_, smallest = units
+    reached = [unit for unit, size in units.items() if abs(value) >= size]
+    unit = reached[0] if reached else smallest
+    scaled = value / units[unit]
+    # Round-off may leave a power of ten just below its order.
+    order = math.floor(math.log10(abs(scaled)) + 1e-9)
+    return f"{scaled:.{max(0, figures - 1 - order)}f}{unit}"
 
 
 def p_value(p: float, least: float = 0.0) -> str:
@@ -139,7 +151,9 @@ def p_value(p: float, least: float = 0.0) -> str:
         return "-"
     if p <= least and least > 0:
         return f"≤{p_value(least)}"
-    return f"{p:.3f}" if p >= 1e-3 else f"{p:.0e}" if p > 1e-300 else "<1e-300"
+    if p >= 1e-3:
+        return f"{p:.3f}"
+    return f"{p:.0e}" if p > 1e-300 else "<1e-300"
 
 
 def varying(columns: Sequence[str], rows: pd.DataFrame) -> list[str]:

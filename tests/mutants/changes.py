@@ -751,8 +751,8 @@ CHANGES = {
     "milli-is-micro": Change(
         "report",
         "milliseconds are called microseconds",
-        '(1e-3, "ms"), (1e-6, "µs")',
-        '(1e-3, "µs"), (1e-6, "ms")',
+        '" ms": 1e-3, " µs": 1e-6',
+        '" µs": 1e-3, " ms": 1e-6',
         "test_report.py test_headline.py",
     ),
     "grey-faces": Change(

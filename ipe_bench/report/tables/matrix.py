@@ -4,14 +4,14 @@ colour, and a sign where the reported covariance is too small or not judged."""
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby
 from typing import Any, ClassVar
 
 from ipe_bench.report.finding import HELD, MEANING, Finding, Row, Standing, setting_words
 from ipe_bench.report.style import RAMP, ink
-from ipe_bench.report.tables.table import Cell, Column, Part, Strong, Table
+from ipe_bench.report.tables.table import Cell, Column, Part, Strong, Table, words
 from ipe_bench.report.words import (
     brief,
     cost,
@@ -39,7 +39,8 @@ VIEWS = {
     "time": "time",
 }
 """What the cells of a page show, one view at a time; the colour is of success in each."""
-TOO_SMALL, NOT_JUDGED = "▲", "?"
+TOO_SMALL = "▲"
+NOT_JUDGED = "?"
 MOST_MATRICES = 6
 """Settings that have a matrix each; the table has the others."""
 _BESIDE = 5
@@ -91,14 +92,19 @@ class Matrix(Table):
     def on_paper(self) -> list[str]:
         """Titles of the columns on paper: neighbouring scales whose cells say the same are one, and the further ones
         have no title."""
+
+        def texts(column: Column) -> list[str]:
+            return [cell.text for cell in column.cells]
+
         titles = [self.columns[0].title]
-        told = groupby(self.columns[1:], lambda column: [cell.text for cell in column.cells])
-        for same in ([column.title for column in group] for _, group in told):
+        for _, alike in groupby(self.columns[1:], texts):
+            same = [column.title for column in alike]
             if self.over != "error scale":
                 titles += same
                 continue
             ends = dict.fromkeys((same[0], same[-1]))
-            titles += [" to ".join(ends), *[""] * (len(same) - 1)]
+            titles.append(" to ".join(ends))
+            titles += [""] * (len(same) - 1)
         return titles
 
     def folded(self) -> Matrix:
@@ -110,7 +116,8 @@ class Matrix(Table):
 
 def opening(rows: Sequence[Row], lines: float = math.inf) -> list[Part]:
     """Returns the finding and its matrices, of several as many as those lines have room for."""
-    return [Strong(Finding.of(rows).sentence()), *(matrices(rows, lines) or [MEANING])]
+    shown = matrices(rows, lines) or [MEANING]
+    return [Strong(Finding.of(rows).sentence()), *shown]
 
 
 def matrices(rows: Iterable[Row], lines: float = math.inf) -> list[Matrix]:
@@ -124,23 +131,28 @@ def matrices(rows: Iterable[Row], lines: float = math.inf) -> list[Matrix]:
     if len(settings) in (1, len(finding.places)):
         return [_matrix(finding, MATRIX, "")]
     found = []
-    most = min(MOST_MATRICES, max(1, lines / (len(finding.standings) + _BESIDE)))
+    fitting = lines / (len(finding.standings) + _BESIDE)
+    most = min(MOST_MATRICES, max(1, fitting))
     for number, setting in enumerate(settings[: int(most)], 1):
-        own = [
-            row
-            for one in finding.standings
-            for row, (named, _) in zip(one.rows, finding.places, strict=True)
-            if row and named == setting
-        ]
-        found.append(_matrix(Finding.of(own), f"{MATRIX}_{number}", setting_words(setting)))
+        own = Finding.of(list(_rows_of(finding, setting)))
+        found.append(_matrix(own, f"{MATRIX}_{number}", setting_words(setting)))
     # One legend below the last, of the signs of all.
     columns = [column for matrix in found for column in matrix.columns]
     moving = any(row["noise"] == "model" for row in listed)
-    bare = [replace(matrix, notes=[]) for matrix in found]
     legend = _legend(columns, moving)
-    if further := len(settings) - len(found):
+    further = len(settings) - len(found)
+    if further:
         legend += f" Of {len(settings)} settings {further} are in the table alone."
-    return [*bare[:-1], replace(bare[-1], notes=[legend])]
+    found = [replace(matrix, notes=[]) for matrix in found]
+    found[-1] = replace(found[-1], notes=[legend])
+    return found
+
+
+def _rows_of(finding: Finding, setting: str) -> Iterator[Row]:
+    for one in finding.standings:
+        for row, (named, _) in zip(one.rows, finding.places, strict=True):
+            if row and named == setting:
+                yield row
 
 
 def _matrix(finding: Finding, name: str, title: str) -> Matrix:
@@ -148,7 +160,7 @@ def _matrix(finding: Finding, name: str, title: str) -> Matrix:
     moving = {row["noise"] for row in rows} == {"model"}
     names = [one.label for one in finding.standings]
     over = "error scale" if finding.ascending else "setting"
-    columns = [Column(f"{over} →", [Cell(label) for label in names], numeric=False)]
+    columns = [words(f"{over} →", names)]
     heads, keys = _heads(finding)
     for at, head in enumerate(heads):
         cells = [_tile(one, at, finding, moving) for one in finding.standings]
@@ -167,9 +179,14 @@ def _heads(finding: Finding) -> tuple[list[str], list[str]]:
     texts = [setting_words(setting) for setting, _ in finding.places]
     if max(map(len, texts)) <= LONG:
         return texts, []
-    letters = [chr(ord("A") + at) if at < 26 else f"#{at + 1}" for at in range(len(texts))]
-    told = [f"{letter}: {text}" for letter, text in zip(letters, texts, strict=True)]
+    letters = [_letter(at) for at in range(len(texts))]
+    told = map(": ".join, zip(letters, texts, strict=True))
     return letters, ["; ".join(told) + "."]
+
+
+def _letter(at: int) -> str:
+    """Returns the letter of a column, or its number behind the alphabet."""
+    return chr(ord("A") + at) if at < 26 else f"#{at + 1}"
 
 
 def _legend(columns: Sequence[Column], moving: bool) -> str:
@@ -213,15 +230,18 @@ def _tile(one: Standing, at: int, finding: Finding, moving: bool) -> Tile:
 
 def _says(row: Row, verdict: str, moving: bool) -> str:
     low, high = ends_in_percent(row["success_low"], row["success_high"])
+    trials = int(row["trials"])
     reference = "the linearised filter" if moving else "the bound"
-    return (
-        f"success {percent(row['success'])} of {int(row['trials']):,} trials (95 %: {low} to {high});"
-        f" error {_brief(row['error_median'])} × {reference},"
-        f" 95 % of trials below {_brief(row['error_q95'])};"
-        f" NEES {_brief(row['nees_median'])}: {_COVARIANCE.get(verdict, 'covariance not judged')};"
-        f" cost {cost(row['simulations_median'], row['simulations_mean'])},"
-        f" {duration(row['time_mean_s'], 2)}"
+    error = f"error {_brief(row['error_median'])} × {reference}"
+    covariance = _COVARIANCE.get(verdict, "covariance not judged")
+    simulations = cost(row["simulations_median"], row["simulations_mean"])
+    told = (
+        f"success {percent(row['success'])} of {trials:,} trials (95 %: {low} to {high})",
+        f"{error}, 95 % of trials below {_brief(row['error_q95'])}",
+        f"NEES {_brief(row['nees_median'])}: {covariance}",
+        f"cost {simulations}, {duration(row['time_mean_s'], 2)}",
     )
+    return "; ".join(told)
 
 
 def points(share: float) -> str:
@@ -233,7 +253,9 @@ def points(share: float) -> str:
         return ">99.9" if value > 50 else "<0.1"
     if 9.95 <= value < 89.5 or 100 * HELD <= value < 99:
         return f"{value:.0f}"
-    return f"{min(value, 100 * HELD - 0.1) if value < 100 * HELD else value:.1f}"
+    if value < 100 * HELD:
+        value = min(value, 100 * HELD - 0.1)
+    return f"{value:.1f}"
 
 
 def step(share: float) -> int:
@@ -242,7 +264,8 @@ def step(share: float) -> int:
         return 0
     if share >= HELD:
         return 1
-    return len(RAMP) - 1 - int(share / HELD * (len(RAMP) - 2))
+    above = int(share / HELD * (len(RAMP) - 2))
+    return len(RAMP) - 1 - above
 
 
 def _brief(value: Any) -> str:

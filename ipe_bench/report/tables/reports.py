@@ -105,60 +105,66 @@ def all_tables(analysis: Analysis, whole: Analysis | None = None) -> list[Table]
     found = {"endings": endings(whole or analysis)}
     if not analysis.summary.empty:
         rows = analysis.summary[analysis.summary["parameter"] == ALL].reset_index(drop=True)
-        totals = pd.concat([rows, analysis.scores[list(frame_columns(SCORES))]], axis=1)
+        scores = analysis.scores[list(frame_columns(SCORES))]
+        totals = pd.concat([rows, scores], axis=1)
         found |= {where: _recorded(analysis, where, totals) for where in _RECORDED}
         found |= {"overview": overview(analysis), "comparisons": comparisons(analysis)}
         found["contraction"] = contraction(analysis)
-    listed = [(found.get(name), name in _APPENDIX) for name in (*_MAIN, *_APPENDIX)]
-    return [replace(table, appendix=late) for table, late in listed if table is not None]
+    main = [found.get(name) for name in _MAIN]
+    appendix = [found.get(name) for name in _APPENDIX]
+    late = [replace(table, appendix=True) for table in appendix if table is not None]
+    return [*(table for table in main if table is not None), *late]
 
 
 def head(analysis: Analysis, rows: pd.DataFrame) -> list[Column]:
     """Returns the columns that tell rows apart: those settings that differ, of many in one column, and the scale."""
     apart = varying(analysis.setting_columns, rows)
-    each = [words(c, [value_text(v) for v in rows[c]]) for c in apart]
-    told = each if len(each) <= MOST_SETTINGS else [words("setting", differing(rows, apart))]
-    return [*told, column("error scale", rows["error_scale"], lambda v: f"{v:g}")]
+    if len(apart) > MOST_SETTINGS:
+        told = [words("setting", differing(rows, apart))]
+    else:
+        told = [words(name, map(value_text, rows[name])) for name in apart]
+    return [*told, column("error scale", rows["error_scale"], "{:g}".format)]
+
+
+def _texts(rows: pd.DataFrame, *names: str) -> list[Column]:
+    return [words(name, rows[name]) for name in names]
+
+
+def _counts(rows: pd.DataFrame, *names: str) -> list[Column]:
+    return [column(name, rows[name], str) for name in names]
 
 
 def _recorded(analysis: Analysis, where: Where, totals: pd.DataFrame) -> Table | None:
     """Returns the table of the statistics whose records name it, behind the estimators and other columns of names."""
-    (title, caption, chosen), names = (
-        _RECORDED[where],
-        ("parameter", "unit") if where in _OF_PARAMETERS else (),
-    )
-    rows = analysis.summary if names else totals
+    title, caption, chosen = _RECORDED[where]
+    of_parameters = where in _OF_PARAMETERS
+    names = ["estimator", "parameter", "unit"] if of_parameters else ["estimator"]
+    rows = analysis.summary if of_parameters else totals
     rows = rows[chosen(rows)]
     if rows.empty:
         return None
-    columns = [*head(analysis, rows), *(words(name, rows[name]) for name in ("estimator", *names))]
-    stored = [name for r in (*all_statistics(), *SCORES) if where in r.where for name in r.columns]
-    data = rows[[*analysis.setting_columns, "error_scale", "estimator", *names, *stored]]
     told: Any = rows.to_dict("records")
-    return Table(where, title, caption, [*columns, *statistics(where, told)], data)
+    columns = [*head(analysis, rows), *_texts(rows, *names), *statistics(where, told)]
+    records = [record for record in (*all_statistics(), *SCORES) if where in record.where]
+    stored = [name for record in records for name in record.columns]
+    data = rows[[*analysis.setting_columns, "error_scale", *names, *stored]]
+    return Table(where, title, caption, columns, data)
 
 
 def overview(analysis: Analysis) -> Table:
     """Returns the overview: each estimator over all trials, a population that every one shares."""
     rows = analysis.summary[analysis.summary["parameter"] == ALL].reset_index(drop=True)
-    first = head(analysis, rows)
     told: Any = rows.to_dict("records")
-    columns = [
-        *first,
-        *overview_columns(told, leading(told, [*analysis.setting_columns, "error_scale"])),
-    ]
-    columns += statistics("overview", told)
-    setting = ("setting: only what was varied.",) * (first[0].title == "setting")
-    notes = (*setting, *overview_notes(rows["noise"].tolist()))
+    first = head(analysis, rows)
+    best = leading(told, [*analysis.setting_columns, "error_scale"])
+    columns = [*first, *overview_columns(told, best), *statistics("overview", told)]
+    notes = overview_notes(rows["noise"].tolist())
+    if first[0].title == "setting":
+        notes = ("setting: only what was varied.", *notes)
+    grouped = len(first)
+    whole = "summary.csv"
     return Table(
-        "overview",
-        "Overview",
-        "",
-        columns,
-        rows,
-        notes=notes,
-        grouped=len(first),
-        whole="summary.csv",
+        "overview", "Overview", "", columns, rows, notes=notes, grouped=grouped, whole=whole
     )
 
 
@@ -169,11 +175,10 @@ def contraction(analysis: Analysis) -> Table | None:
         return None
     columns = head(analysis, rows)
     for name, title in (("K", "K"), ("norm", "infinity norm"), ("radius", "spectral radius")):
-        columns += [
-            column(f"{title}, median", rows[f"contraction_{name}_median"], short),
-            column(f"{title}, largest", rows[f"contraction_{name}_max"], short),
-            column(f"{title} below 1", rows[f"contraction_{name}_below_1"], percent),
-        ]
+        stored = f"contraction_{name}"
+        columns.append(column(f"{title}, median", rows[f"{stored}_median"], short))
+        columns.append(column(f"{title}, largest", rows[f"{stored}_max"], short))
+        columns.append(column(f"{title} below 1", rows[f"{stored}_below_1"], percent))
     caption = (
         "Of g' = I - H⁺J at the truth, over all trials. K of eq. (15), or the infinity norm, below 1 in a whole"
         " neighbourhood is sufficient for fixed-point iteration to converge there; the spectral radius, the rate at"
@@ -187,20 +192,16 @@ def comparisons(analysis: Analysis) -> Table | None:
     rows = analysis.pairs
     if rows.empty:
         return None
-    columns = [
-        *head(analysis, rows),
-        *(words(name, rows[name]) for name in ("first", "second")),
-        *(column(name, rows[name], str) for name in ("trials", "wins", "ties", "losses")),
-        column("median difference", rows["median_difference"], short),
-        column("p of error", rows["p_error"], p_value),
-        column("first alone", rows["only_first"], str),
-        column("second alone", rows["only_second"], str),
-        column("p of success", rows["p_success"], p_value),
-        words(
-            "finding",
-            [f"{label} is closer" if label else "no difference" for label in rows["closer"]],
-        ),
-    ]
+    closer = [f"{label} is closer" if label else "no difference" for label in rows["closer"]]
+    columns = head(analysis, rows)
+    columns += _texts(rows, "first", "second")
+    columns += _counts(rows, "trials", "wins", "ties", "losses")
+    columns.append(column("median difference", rows["median_difference"], short))
+    columns.append(column("p of error", rows["p_error"], p_value))
+    columns.append(column("first alone", rows["only_first"], str))
+    columns.append(column("second alone", rows["only_second"], str))
+    columns.append(column("p of success", rows["p_success"], p_value))
+    columns.append(words("finding", closer))
     caption = (
         "Over the trials that both have. First alone and second alone count trials in which only that one succeeds, by"
         " the gate of the Cramér-Rao bound. p: Wilcoxon's signed-rank and McNemar's exact test, Holm-corrected over all"
@@ -214,13 +215,11 @@ def endings(analysis: Analysis) -> Table | None:
     rows = analysis.endings
     if rows.empty:
         return None
-    columns = [
-        *head(analysis, rows),
-        *(words(name, rows[name]) for name in ("estimator", "status")),
-        column("trials", rows["trials"], str),
-        column("share", rows["share"], percent),
-        *(words(name, rows[name]) for name in ("first", "message")),
-    ]
+    columns = head(analysis, rows)
+    columns += _texts(rows, "estimator", "status")
+    columns += _counts(rows, "trials")
+    columns.append(column("share", rows["share"], percent))
+    columns += _texts(rows, "first", "message")
     caption = "How trials ended that did not converge, and the first of each kind."
     return Table("endings", "Trials that did not converge", caption, columns, rows)
 
@@ -230,8 +229,9 @@ def certified_tables(collection: Collection) -> list[Table]:
     name the file with the `whole`."""
     digits = certified_table(collection)
     found = [] if digits.empty else _digits(digits)
-    if len(rows := published_table(collection)):
-        found.append(_published(rows, collection))
+    published = published_table(collection)
+    if len(published):
+        found.append(_published(published, collection))
     return found
 
 
@@ -241,55 +241,47 @@ def _digits(digits: pd.DataFrame) -> list[Table]:
         "Log relative error against the certified answer, at most 11. It is the smallest over the parameters of a data"
         " set, the smallest over their standard deviations, and the error of the residual sum of squares."
     )
-    columns = [
-        words("data set", digits["dataset"]),
-        column("start", digits["start"], str),
-        words("estimator", digits["estimator"]),
-        *_lre(digits, ""),
-        words("status", digits["status"]),
-    ]
+    columns = [words("data set", digits["dataset"])]
+    columns += _counts(digits, "start")
+    columns += _texts(digits, "estimator")
+    columns += _lre(digits, "")
+    columns += _texts(digits, "status")
     each = Table("certified", "Certified readings", caption, columns, digits.round(2))
     rows = certified_averages(digits).sort_values(["mean_lre_parameters", "start"], ascending=False)
-    columns = [
-        words("estimator", rows["estimator"]),
-        *(
-            column(name, rows[name.replace(" ", "")], str)
-            for name in ("start", "data sets", "solved")
-        ),
-        *_lre(rows, "mean_"),
-        column("deviations to 6 digits", rows["deviations_to_6_digits"], str),
-    ]
+    columns = _texts(rows, "estimator")
+    columns += _counts(rows, "start")
+    columns.append(column("data sets", rows["datasets"], str))
+    columns += _counts(rows, "solved")
+    columns += _lre(rows, "mean_")
+    columns.append(column("deviations to 6 digits", rows["deviations_to_6_digits"], str))
     caption += " Averaged over the data sets; solved: four digits or more of every parameter."
-    title, whole = "Certified readings, averages", "tables/certified_averages.csv"
+    title = "Certified readings, averages"
+    whole = "tables/certified_averages.csv"
     return [Table("certified_averages", title, caption, columns, rows.round(2), whole=whole), each]
 
 
 def _published(rows: pd.DataFrame, collection: Collection) -> Table:
-    models = (group.footer["identity"]["scenario"].get("model", {}) for group in collection.groups)
-    columns = [
-        *(words(name, rows[name]) for name in ("model", "state", "estimator")),
-        *(column(name, rows[name], lambda v: f"{v:.12f}") for name in ("published", "found")),
-        column("difference", rows["difference"], lambda v: f"{v:.1e}"),
-    ]
-    sources = " ".join(dict.fromkeys(model["source"] for model in models if "source" in model))
-    caption = f"Root mean square errors over all epochs of one stored path, beside those that are published. {sources}"
-    return Table(
-        "published",
-        "Published errors of trackers",
-        caption,
-        columns,
-        rows,
-        whole="tables/published.csv",
+    columns = _texts(rows, "model", "state", "estimator")
+    columns += [column(name, rows[name], "{:.12f}".format) for name in ("published", "found")]
+    columns.append(column("difference", rows["difference"], "{:.1e}".format))
+    scenarios = [group.footer["identity"]["scenario"] for group in collection.groups]
+    models = [scenario.get("model", {}) for scenario in scenarios]
+    sources = dict.fromkeys(model["source"] for model in models if "source" in model)
+    caption = (
+        "Root mean square errors over all epochs of one stored path, beside those that are published."
+        f" {' '.join(sources)}"
     )
+    title = "Published errors of trackers"
+    return Table("published", title, caption, columns, rows, whole="tables/published.csv")
+
+
+_LRE = {
+    "parameters": "digits of parameters",
+    "deviations": "of deviations",
+    "rss": "of residuals",
+}
 
 
 def _lre(rows: pd.DataFrame, prefix: str) -> list[Column]:
-    titles = {
-        "parameters": "digits of parameters",
-        "deviations": "of deviations",
-        "rss": "of residuals",
-    }
-    return [
-        column(title, rows[f"{prefix}lre_{name}"], lambda v: f"{v:.2f}")
-        for name, title in titles.items()
-    ]
+    shown = "{:.2f}".format
+    return [column(title, rows[f"{prefix}lre_{name}"], shown) for name, title in _LRE.items()]

@@ -9,7 +9,7 @@ import textwrap
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import groupby
+from itertools import groupby, repeat
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,14 +26,18 @@ LONG = 45
 """Number of rows from which a LaTeX table runs over pages."""
 MOST_ROWS = 2000
 """Largest number of rows of a table on an HTML page."""
-COLUMN, PAGE = 3.5, 7.16
-"""Inches of IEEE's one and two columns."""
+COLUMN = 3.5
+"""Inches of IEEE's column."""
+PAGE = 7.16
+"""Inches of IEEE's two columns with the gap between them."""
 COLUMN_GAP = 3.0
 """Points between the edge of a column of a LaTeX table and its text."""
 _NAMES = ("estimator", "first", "data set", "function", "parameter", "error")
 """Titles of the column that names a row."""
-_WHOLE_NAME, _WHOLE_WORD = 24, 11
-"""Letters of a row's name, and of any other text, up to which a terminal shows it on one line."""
+_WHOLE_NAME = 24
+"""Letters of a row's name up to which a terminal shows it on one line."""
+_WHOLE_WORD = 11
+"""Letters of any other text up to which a terminal shows it on one line."""
 _PADDING = 2
 """Blanks between two columns of a terminal."""
 
@@ -59,6 +63,10 @@ class Column:
     title: str
     cells: Sequence[Cell]
     numeric: bool = True
+
+    @property
+    def has_content(self) -> bool:
+        return any(cell.text for cell in self.cells)
 
 
 class Strong(str):
@@ -109,7 +117,7 @@ class Table(Shown):
 
     def __post_init__(self) -> None:
         """Leaves out columns without content."""
-        kept = [c for c in self.columns if any(cell.text for cell in c.cells)]
+        kept = [column for column in self.columns if column.has_content]
         object.__setattr__(self, "columns", kept or self.columns)
 
     @property
@@ -119,7 +127,10 @@ class Table(Shown):
     @property
     def naming(self) -> int:
         """Index of the column that names a row."""
-        return next((i for i, c in enumerate(self.columns) if c.title in _NAMES), 0)
+        for index, column in enumerate(self.columns):
+            if column.title in _NAMES:
+                return index
+        return 0
 
     def __len__(self) -> int:
         return len(self.columns[0].cells)
@@ -141,19 +152,20 @@ def column(
 ) -> Column:
     """Makes a column of numbers, written by `show`."""
     values = list(values)
-    marks = list(best) or [False] * len(values)
-    return Column(
-        title, [Cell(show(v), sort_key(v), m) for v, m in zip(values, marks, strict=True)]
-    )
+    return Column(title, cells(map(show, values), map(sort_key, values), best))
 
 
 def words(title: str, values: Iterable[Any], best: Iterable[bool] = ()) -> Column:
     """Makes a column of texts."""
-    values = [str(v) for v in values]
-    marks = list(best) or [False] * len(values)
-    return Column(
-        title, [Cell(v, None, m) for v, m in zip(values, marks, strict=True)], numeric=False
-    )
+    return Column(title, cells(map(str, values), repeat(None), best), numeric=False)
+
+
+def cells(texts: Iterable[str], keys: Iterable[Any], best: Iterable[bool] = ()) -> list[Cell]:
+    """Makes a cell of each text, with its key, and in bold if it is among the `best`."""
+    texts = list(texts)
+    marks = list(best) or [False] * len(texts)
+    marked = zip(texts, marks, strict=True)
+    return [Cell(text, key, mark) for (text, mark), key in zip(marked, keys, strict=False)]
 
 
 def interval(
@@ -161,18 +173,15 @@ def interval(
 ) -> Column:
     """Makes a column of intervals, sorted by their lower ends; one end alone has a sign before it."""
 
-    def cell(a: float, b: float) -> str:
-        if math.isnan(b):
-            return f"> {show(a)}" if math.isfinite(a) else "-"
-        return (
-            f"{show(a)} to {show(b)}"
-            if math.isfinite(a)
-            else f"< {show(b)}"
-            if math.isnan(a)
-            else "-"
-        )
+    def shown(low: float, high: float) -> str:
+        if math.isnan(high):
+            return f"> {show(low)}" if math.isfinite(low) else "-"
+        if math.isfinite(low):
+            return f"{show(low)} to {show(high)}"
+        return f"< {show(high)}" if math.isnan(low) else "-"
 
-    return Column(title, [Cell(cell(a, b), sort_key(a)) for a, b in zip(low, high, strict=True)])
+    ends = list(zip(low, high, strict=True))
+    return Column(title, [Cell(shown(*pair), sort_key(pair[0])) for pair in ends])
 
 
 def texts(title: str, values: Iterable[str]) -> Column:
@@ -197,28 +206,48 @@ def terminal(parts: Iterable[Part], width: int) -> Group:
     shown: list[Any] = []
     for part in parts:
         if not isinstance(part, Table):
-            shown.append(Text(part, style="bold" if isinstance(part, Strong) else "dim"))
+            style = "bold" if isinstance(part, Strong) else "dim"
+            shown.append(Text(part, style=style))
             continue
-        part = part.folded()
-        if part.title:
-            shown += [Text()] if shown and isinstance(shown[-1], Text) else []
-            shown.append(Text(part.title, style="bold"))
-        kept, notes = part.naming + 1, [text for text in (part.caption, *part.notes) if text]
-        head, rest = list(part.columns[:kept]), list(part.columns[kept:])
-        while True:
-            count = min(1, len(rest))
-            while count < len(rest) and _taken([*head, *rest[: count + 1]], part)[1] <= width:
-                count += 1
-            shown.append(_rich([*head, *rest[:count]], part, width))
-            rest = rest[count:]
-            if rest and part.whole:
-                notes.insert(
-                    0, f"Too narrow for: {', '.join(c.title for c in rest)}; {part.whole} has them."
-                )
-            if not rest or part.whole:
-                break
-        shown += [Text(note, style="dim") for note in notes]
+        if part.title and shown and isinstance(shown[-1], Text):
+            shown.append(Text())
+        shown += _pieces(part.folded(), width)
     return Group(*shown)
+
+
+def _pieces(table: Table, width: int) -> Iterator[Any]:
+    """Yields the title, tables below each other with the columns that have room in each, and the notes."""
+    from rich.text import Text
+
+    if table.title:
+        yield Text(table.title, style="bold")
+    kept = table.naming + 1
+    head = table.columns[:kept]
+    rest = table.columns[kept:]
+    notes = [table.caption, *table.notes]
+    while True:
+        count = _fitting(head, rest, table, width)
+        yield _rich([*head, *rest[:count]], table, width)
+        rest = rest[count:]
+        if not rest:
+            break
+        if table.whole:
+            hidden = ", ".join(column.title for column in rest)
+            notes.insert(0, f"Too narrow for: {hidden}; {table.whole} has them.")
+            break
+    for note in filter(None, notes):
+        yield Text(note, style="dim")
+
+
+def _fitting(head: Sequence[Column], rest: Sequence[Column], table: Table, width: int) -> int:
+    """Counts the columns that have room beside the head; one of them is shown in any case."""
+    count = min(1, len(rest))
+    while count < len(rest):
+        wider = [*head, *rest[: count + 1]]
+        if _taken(wider, table, folded=True) > width:
+            break
+        count += 1
+    return count
 
 
 def plain_text(parts: Iterable[Part], width: int = 120) -> str:
@@ -230,25 +259,31 @@ def plain_text(parts: Iterable[Part], width: int = 120) -> str:
     return shown.getvalue()
 
 
-def _needed(column: Column, table: Table) -> tuple[int, int]:
-    """Returns a column's letters with its title in one line, and with its title folded; numbers never fold."""
+def _needed(column: Column, table: Table, *, folded: bool) -> int:
+    """Returns a column's letters with its title in one line or folded; numbers never fold."""
     from rich.cells import cell_len
 
-    longest = max([1, *(cell_len(cell.text) for cell in column.cells)])
+    lengths = [cell_len(cell.text) for cell in column.cells]
+    longest = max([1, *lengths])
     if not column.numeric:
-        longest = min(
-            longest, _WHOLE_NAME if column is table.columns[table.naming] else _WHOLE_WORD
-        )
-    title = column.title.replace(" %", "\u00a0%")  # a number and its per cent are one word
+        is_name = column is table.columns[table.naming]
+        longest = min(longest, _WHOLE_NAME if is_name else _WHOLE_WORD)
+    title = _joined(column.title)
+    if not folded:
+        return max(longest, cell_len(title))
     word = max(map(cell_len, title.split(" ")))
-    return max(longest, cell_len(title)), max(longest, min(word, _WHOLE_NAME))
+    return max(longest, min(word, _WHOLE_NAME))
 
 
-def _taken(columns: Iterable[Column], table: Table) -> tuple[int, int]:
-    """Returns the width of a table of such columns with their titles in one line, and with them folded."""
-    whole, folded = zip(*(_needed(column, table) for column in columns), strict=True)
-    space = 2 + _PADDING * len(whole)
-    return sum(whole) + space, sum(folded) + space
+def _joined(title: str) -> str:
+    """Joins a number and its per cent to one word."""
+    return title.replace(" %", "\u00a0%")
+
+
+def _taken(columns: Iterable[Column], table: Table, *, folded: bool) -> int:
+    """Returns the width of a table of such columns with their titles in one line or folded."""
+    letters = [_needed(column, table, folded=folded) for column in columns]
+    return sum(letters) + 2 + _PADDING * len(letters)
 
 
 def _rich(columns: Sequence[Column], table: Table, width: int) -> Any:
@@ -258,21 +293,23 @@ def _rich(columns: Sequence[Column], table: Table, width: int) -> Any:
     from rich.text import Text
 
     shown = RichTable(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False, collapse_padding=True)
-    folded = _taken(columns, table)[0] > width
+    folded = _taken(columns, table, folded=False) > width
     for each in columns:
-        letters = _needed(each, table)[folded]
-        title = Text(
-            textwrap.fill(each.title.replace(" %", "\u00a0%"), letters).replace("\u00a0", " ")
-        )
+        letters = _needed(each, table, folded=folded)
+        lines = textwrap.fill(_joined(each.title), letters)
+        title = Text(lines.replace("\u00a0", " "))
         if each.numeric:
             shown.add_column(title, justify="right", no_wrap=True)
         else:
             shown.add_column(title, overflow="fold", min_width=letters)
     rows = zip(*(c.cells for c in columns), strict=True)
     for group, members in groupby(rows, key=lambda row: row[: table.grouped]):
-        for k, row in enumerate(members):
-            first = [Cell("")] * len(group) if k and group else group
-            shown.add_row(*(Text(c.text, style=c.style) for c in (*first, *row[len(group) :])))
+        first: Sequence[Cell] = group
+        for row in members:
+            line = (*first, *row[len(group) :])
+            shown.add_row(*(Text(c.text, style=c.style) for c in line))
+            # What the rows of a group share stands in the first of them alone.
+            first = [Cell("")] * len(group)
         if group:
             shown.add_section()
     return shown
@@ -294,11 +331,18 @@ def environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    # Names may be broken behind their underscores.
-    made.filters["soft"] = lambda text: escape(text).replace("_", Markup("_<wbr>"))
+
+    def soft(text: Any) -> Markup:
+        """Lets a name be broken behind its underscores."""
+        return escape(text).replace("_", Markup("_<wbr>"))
+
+    def inked(ramp: Iterable[str]) -> list[tuple[str, str]]:
+        return [(color, ink(color)) for color in ramp]
+
+    made.filters["soft"] = soft
     made.tests["strong"] = lambda part: isinstance(part, Strong)
     made.globals["MOST_ROWS"] = MOST_ROWS
-    made.globals["ramps"] = [[(color, ink(color)) for color in one] for one in (RAMP, DARK_RAMP)]
+    made.globals["ramps"] = [inked(RAMP), inked(DARK_RAMP)]
     return made
 
 
@@ -313,46 +357,53 @@ def html(parts: Iterable[Part]) -> str:
 def write_table(table: Table, folder: Path, formats: Sequence[str]) -> list[Path]:
     """Writes one table in those of the formats that are of tables; as CSV unless another file has it whole."""
     writers: dict[str, Any] = dict(zip(TABLES, (comma_separated, markdown, latex), strict=True))
-    own = table.whole in ("", f"{folder.name}/{table.name}.csv")
-    files = {
-        kind: folder / f"{table.name}.{kind}"
-        for kind in writers
-        if kind in formats and (own or kind != "csv")
-    }
-    for kind, path in files.items():
-        write_text(path, writers[kind](table))
-    return list(files.values())
+    elsewhere = table.whole not in ("", f"{folder.name}/{table.name}.csv")
+    files = []
+    for kind, written in writers.items():
+        if kind not in formats or (kind == "csv" and elsewhere):
+            continue
+        files.append(folder / f"{table.name}.{kind}")
+        write_text(files[-1], written(table))
+    return files
 
 
 def comma_separated(table: Table) -> str:
     """Renders the numbers behind the table in full precision, or else its cells."""
     import pandas as pd
 
-    cells = pd.DataFrame(
-        [[cell.text for cell in row] for row in table.rows],
-        columns=[c.title for c in table.columns],
-    )
-    return (cells if table.data is None else table.data).to_csv(index=False)
+    data = table.data
+    if data is None:
+        titles = [column.title for column in table.columns]
+        data = pd.DataFrame([[cell.text for cell in row] for row in table.rows], columns=titles)
+    return data.to_csv(index=False)
 
 
 def markdown(table: Table) -> str:
     """Renders a GitHub table; names cannot break it."""
 
-    def cell(value: str) -> str:
-        return re.sub(r"([\\|*])", r"\\\1", " ".join(value.split())).replace("<", "&lt;")
+    def plain(text: str) -> str:
+        line = " ".join(text.split())
+        return re.sub(r"([\\|*])", r"\\\1", line).replace("<", "&lt;")
+
+    def shown(cell: Cell) -> str:
+        text = plain(cell.text)
+        return f"**{text}**" if cell.best else text
+
+    def line(texts: Iterable[str]) -> str:
+        return f"| {' | '.join(texts)} |"
 
     table = table.folded()
-    rows = [[f"**{cell(c.text)}**" if c.best else cell(c.text) for c in row] for row in table.rows]
-    head, *lines = [
-        f"| {' | '.join(row)} |" for row in ([cell(c.title) for c in table.columns], *rows)
-    ]
-    rule = "|" + "|".join("---:" if c.numeric else ":---" for c in table.columns) + "|"
-    title = [f"**{table.title}.** {cell(table.caption)}", ""] if table.title else []
-    lines = [*title, head, rule, *lines]
-    return "\n".join([*lines, *(f"\n{cell(note)}" for note in table.notes)]) + "\n"
+    rules = ["---:" if column.numeric else ":---" for column in table.columns]
+    lines = [f"**{table.title}.** {plain(table.caption)}", ""] if table.title else []
+    lines.append(line(plain(column.title) for column in table.columns))
+    lines.append(f"|{'|'.join(rules)}|")
+    lines += [line(map(shown, row)) for row in table.rows]
+    lines += [f"\n{plain(note)}" for note in table.notes]
+    return "\n".join(lines) + "\n"
 
 
-_SIGNS = {sign: f"\\{sign}" for sign in "&%$#_{}"} | {
+_SIGNS = {
+    **{sign: f"\\{sign}" for sign in "&%$#_{}"},
     "\\": r"\textbackslash{}",
     "~": r"\textasciitilde{}",
     "^": r"\textasciicircum{}",
@@ -377,70 +428,74 @@ def latex(table: Table, width: float | None = None) -> str:
     r"""Renders a table for `\input`, by booktabs and siunitx: bare, or floating with its caption in a column of `width`
     inches; a longtable if it has more than `LONG` rows."""
     table = table.folded()
-    shape = "@{}" + "".join("r" if c.numeric else "l" for c in table.columns) + "@{}"
-    titles, *rows = [
-        f"{' & '.join(cells)} \\\\"
-        for cells in (
-            map(_latex_title, table.columns),
-            *(map(_latex_cell, row, table.columns) for row in table.rows),
-        )
-    ]
-    head = [r"\toprule", titles, r"\midrule"]
-    kind, repeated = ("longtable", [r"\endhead"]) if len(table) > LONG else ("tabular", [])
+    shape = "".join("r" if c.numeric else "l" for c in table.columns)
+    rows = [map(_latex_title, table.columns)]
+    rows += [map(_latex_cell, row, table.columns) for row in table.rows]
+    titles, *body = [f"{' & '.join(texts)} \\\\" for texts in rows]
+    is_long = len(table) > LONG
+    kind = "longtable" if is_long else "tabular"
+    repeated = [r"\endhead"] if is_long else []
     lines = [
-        rf"\begin{{{kind}}}{{{shape}}}",
-        *head,
+        rf"\begin{{{kind}}}{{@{{}}{shape}@{{}}}}",
+        *(r"\toprule", titles, r"\midrule"),
         *repeated,
-        *rows,
+        *body,
         r"\bottomrule",
         rf"\end{{{kind}}}",
     ]
     if width is not None:
-        label = f"tab:{table.name.replace('_', '-')}"
-        caption = rf"\caption{{{escaped(table.title)}. {escaped(table.caption)}}}\label{{{label}}}"
-        size = rf"\footnotesize\setlength{{\tabcolsep}}{{{COLUMN_GAP:g}pt}}"
-        if repeated:
-            lines = [f"{{{size}", lines[0], rf"{caption} \\", *lines[1:], "}"]
-        else:
-            kind = "table" if width <= COLUMN else "table*"
-            lines = [
-                rf"\begin{{{kind}}}[tb]",
-                r"\centering",
-                caption,
-                size,
-                *lines,
-                rf"\end{{{kind}}}",
-            ]
+        lines = _captioned(lines, table, width)
     needed = r"\usepackage{booktabs, longtable, siunitx, amsmath} and \usepackage[T1]{fontenc}."
-    return "\n".join([f"% {' '.join(table.title.split())}. Needs {needed}", *lines, ""])
+    title = " ".join(table.title.split())
+    return "\n".join([f"% {title}. Needs {needed}", *lines, ""])
+
+
+def _captioned(lines: list[str], table: Table, width: float) -> list[str]:
+    """Returns the lines of a table with its caption: floating, or over pages."""
+    label = f"tab:{table.name.replace('_', '-')}"
+    caption = rf"\caption{{{escaped(table.title)}. {escaped(table.caption)}}}\label{{{label}}}"
+    size = rf"\footnotesize\setlength{{\tabcolsep}}{{{COLUMN_GAP:g}pt}}"
+    if len(table) > LONG:
+        begin, *rest = lines
+        return [f"{{{size}", begin, rf"{caption} \\", *rest, "}"]
+    kind = "table" if width <= COLUMN else "table*"
+    begin = rf"\begin{{{kind}}}[tb]"
+    return [begin, r"\centering", caption, size, *lines, rf"\end{{{kind}}}"]
 
 
 def _latex_title(column: Column) -> str:
     """Returns the title of a column, stacked if it is longer than its cells and its longest word."""
-    letters = max([1, *(len(cell.text) for cell in column.cells), *map(len, column.title.split())])
-    lines = [escaped(line) for line in textwrap.wrap(column.title, letters, break_on_hyphens=False)]
-    stacked = r"\\".join(lines)
-    return (
-        rf"\shortstack[{'r' if column.numeric else 'l'}]{{{stacked}}}"
-        if len(lines) > 1
-        else stacked
-    )
+    texts = [cell.text for cell in column.cells]
+    letters = max(map(len, ["-", *texts, *column.title.split()]))
+    lines = textwrap.wrap(column.title, letters, break_on_hyphens=False)
+    stacked = r"\\".join(map(escaped, lines))
+    if len(lines) <= 1:
+        return stacked
+    side = "r" if column.numeric else "l"
+    return rf"\shortstack[{side}]{{{stacked}}}"
 
 
 def _latex_cell(cell: Cell, column: Column) -> str:
     """Returns a cell; siunitx sets numbers, whose digits it groups by its own rules."""
     text = escaped(cell.text)
     if column.numeric:
-        text = _NUMBER.sub(lambda m: f"\\num{{{m.group().replace(',', '')}}}", text).replace(
-            r"} \%", r"}\,\%"
-        )
+        text = _NUMBER.sub(_latex_number, text).replace(r"} \%", r"}\,\%")
     return rf"\textbf{{{text}}}" if cell.best else text
+
+
+def _latex_number(found: re.Match[str]) -> str:
+    digits = found.group().replace(",", "")
+    return f"\\num{{{digits}}}"
 
 
 def escaped(text: str) -> str:
     """Escapes the special signs of plain text, those that pdflatex may lack by their number."""
-    return "".join(
-        _SIGNS.get(char)
-        or (char if char.isascii() and char.isprintable() else f"\\texttt{{U+{ord(char):04X}}}")
-        for char in " ".join(text.split())
-    )
+    return "".join(map(_escaped_sign, " ".join(text.split())))
+
+
+def _escaped_sign(sign: str) -> str:
+    if sign in _SIGNS:
+        return _SIGNS[sign]
+    if sign.isascii() and sign.isprintable():
+        return sign
+    return f"\\texttt{{U+{ord(sign):04X}}}"

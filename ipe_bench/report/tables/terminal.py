@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
+from itertools import repeat
 from typing import Any
 
 import pandas as pd
@@ -12,16 +13,17 @@ import pandas as pd
 from ipe_bench.report.finding import FAILS, Finding
 from ipe_bench.report.tables.matrix import opening
 from ipe_bench.report.tables.table import (
-    Cell,
     Column,
     Part,
     Table,
+    cells,
     column,
     interval,
     sort_key,
     words,
 )
 from ipe_bench.report.words import (
+    assigned,
     brief,
     cost,
     duration,
@@ -53,10 +55,8 @@ _LEGEND = (
     " simulations of a trial, median/mean if they differ; time: mean of a trial. More: ipe-bench list statistic."
 )
 _FAILED = "; failed: known / undetected, %"
-_SIGNS = (
-    "; verdict: is the reported covariance right?",
-    f", {', '.join(f'{word.sign} {word.shown}' for word in VERDICTS[:4])}",
-)
+_SPELT_OUT = "; verdict: is the reported covariance right?"
+_SIGNS = f", {', '.join(f'{word.sign} {word.shown}' for word in VERDICTS[:4])}"
 _TOLD = (
     "With noise=unknown every estimator here assumes R with the true levels at the nominal readings; bounds and success"
     " hold for parameters that are estimated together with the levels."
@@ -72,68 +72,78 @@ TRACKED = (
 def overview_notes(noises: Collection[str], *, narrow: bool = False) -> tuple[str, ...]:
     """Explains the columns of the overview, and what estimators assume about these noises."""
     reference = "the linearised filter" if set(noises) == {"model"} else "the bound"
-    legend = _LEGEND.format(
-        failed="" if narrow else _FAILED, reference=reference, sign=_SIGNS[narrow]
-    )
-    return (
-        legend,
-        *(words for noise, words in (("unknown", _TOLD), ("model", TRACKED)) if noise in noises),
-    )
+    failed = "" if narrow else _FAILED
+    sign = _SIGNS if narrow else _SPELT_OUT
+    notes = [_LEGEND.format(failed=failed, reference=reference, sign=sign)]
+    if "unknown" in noises:
+        notes.append(_TOLD)
+    if "model" in noises:
+        notes.append(TRACKED)
+    return tuple(notes)
 
 
 def summary_tables(
     listed: Sequence[Mapping[str, Any]], totals: Sequence[Table], width: int
 ) -> list[Part]:
     """Returns a table per setting (measurement, noise, differing options), after the totals of certified runs."""
-    # Models whose own readings are certified, without being of a collection, have no totals.
-    rows = [
-        row
-        for row in listed
-        if row["parameter"] == ALL and not (totals and row["noise"] == "certified")
-    ]
-    known = {*summary_columns(), "parameter", "unit", "estimator", "error_scale"}
-    columns = dict.fromkeys(
-        c for row in rows for c in row if c not in known and not c.startswith("estimator.")
-    )
+    rows = [row for row in listed if row["parameter"] == ALL]
+    if totals:
+        # Models whose own readings are certified, without being of a collection, have no totals.
+        rows = [row for row in rows if row["noise"] != "certified"]
+    columns = _columns_of_settings(rows)
     settings: dict[str, list[Any]] = {}
     for row in rows:
-        # An option that the class lacks is left out.
-        named = {k: value_text(row.get(k)) for k in columns if value_text(row.get(k)) != "-"}
-        title = ", ".join(
-            v if k in ("measurement", "noise") else f"{k}={v}" for k, v in named.items()
-        )
-        settings.setdefault(title, []).append(row)
+        settings.setdefault(_worded(row, columns), []).append(row)
     kept = {title: part for title, part in _shortened(settings).items() if part}
     tables = [_setting(title, part, width) for title, part in kept.items()]
     if tables:
-        tables[-1] = replace(
-            tables[-1],
-            notes=overview_notes({row["noise"] for row in rows}, narrow=width < _WIDE_ENOUGH),
+        noises = {row["noise"] for row in rows}
+        notes = overview_notes(noises, narrow=width < _WIDE_ENOUGH)
+        tables[-1] = replace(tables[-1], notes=notes)
+    parts: list[Part] = [*totals, *_opening(rows, columns), *tables]
+    further = len(rows) - sum(map(len, kept.values()))
+    if further:
+        hidden = len(settings) - len(kept)
+        whole = f", {hidden} of {len(settings)} settings whole" if hidden else ""
+        parts.append(
+            f"{further} of {len(rows)} rows are left out here{whole}; summary.csv and report.html have all."
         )
-    further, hidden = len(rows) - sum(map(len, kept.values())), len(settings) - len(kept)
-    whole = f", {hidden} of {len(settings)} settings whole" if hidden else ""
-    left_out = f"{further} of {len(rows)} rows are left out here{whole}; summary.csv and report.html have all."
-    opened = _opening(rows, list(columns))
-    return [*totals, *opened, *tables, *([left_out] if further else [])] or [
-        "no trial is stored yet"
-    ]
+    return parts or ["no trial is stored yet"]
+
+
+def _columns_of_settings(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Returns the columns of the rows that are of their settings: neither statistics nor the estimator's options."""
+    known = {*summary_columns(), "parameter", "unit", "estimator", "error_scale"}
+    columns = dict.fromkeys(column for row in rows for column in row)
+    return [c for c in columns if c not in known and not c.startswith("estimator.")]
+
+
+def _worded(row: Mapping[str, Any], columns: Sequence[str]) -> str:
+    """Words a row's setting, without the options that its classes lack."""
+    values = {column: value_text(row.get(column)) for column in columns}
+    return ", ".join(assigned(c, value) for c, value in values.items() if value != "-")
 
 
 def _opening(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> list[Part]:
     """Returns the finding and its matrices, of constants and then of states that move."""
     simulated = [row for row in rows if row["noise"] != "certified"]
-    frame = pd.DataFrame(simulated)
-    settings = differing(frame, columns) if simulated else []
-    told = [{**row, "setting": text} for row, text in zip(simulated, settings, strict=True)]
-    moving = [row for row in told if row["noise"] == "model"]
+    if not simulated:
+        return []
+    settings = differing(pd.DataFrame(simulated), columns)
+    pairs = zip(simulated, settings, strict=True)
+    told = [{**row, "setting": setting} for row, setting in pairs]
     constant = [row for row in told if row["noise"] != "model"]
-    parts = [one for one in (constant, moving) if one]
-    return [part for one in parts for part in opening(one, 0.6 * _MOST_LINES)]
+    moving = [row for row in told if row["noise"] == "model"]
+    parts: list[Part] = []
+    for some in filter(None, (constant, moving)):
+        parts += opening(some, 0.6 * _MOST_LINES)
+    return parts
 
 
 def _shortened(settings: Mapping[str, Sequence[Any]]) -> dict[str, list[Any]]:
     """Returns the rows of each setting at its telling scale, until the screen is full."""
-    room, kept = 0.4 * _MOST_LINES, dict[str, list[Any]]()
+    room = 0.4 * _MOST_LINES
+    kept: dict[str, list[Any]] = {}
     for title, rows in settings.items():
         here = _telling(rows)
         if kept and len(here) + _HEAD > room:
@@ -158,14 +168,15 @@ def _telling(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
 def _setting(title: str, rows: Sequence[Mapping[str, Any]], width: int) -> Table:
     best = leading(rows, ["error_scale"])
     columns = overview_columns(rows, best, narrow=width < _WIDE_ENOUGH)
-    # The number of trials stands in the title if it is the same for all.
-    counts = sorted({row["trials"] for row in rows})
     # A narrow screen leaves out the last columns: cost and time before what a plugin was asked to show.
     columns[-2:-2] = statistics("terminal", rows)
+    # The number of trials stands in the title if it is the same for all.
+    counts = sorted({row["trials"] for row in rows})
     if len(counts) > 1:
         columns.append(column("trials", [row["trials"] for row in rows], str))
     else:
-        title = f"{title}: {counts[0]} trial{'s' * (counts[0] != 1)} per row"
+        trials = "1 trial" if counts[0] == 1 else f"{counts[0]} trials"
+        title = f"{title}: {trials} per row"
     title += f" at error scale {value_text(rows[0]['error_scale'])}"
     return Table("summary", title, "", columns, whole="summary.csv")
 
@@ -177,22 +188,24 @@ def differing(rows: pd.DataFrame, columns: Sequence[str]) -> list[str]:
     if not apart:  # a frame without columns loses its rows in pandas 2.2
         return ["-"] * len(rows)
     values = rows[apart].map(value_text)
-    usual = {c: values[c].mode().iloc[0] for c in values if len(values.columns) > MOST_SETTINGS}
-    told = (
-        [(c, v) for c, v in row.items() if v not in ("-", usual.get(c))]
-        for row in values.to_dict("records")
-    )
-    return [
-        ", ".join(v if c in ("measurement", "noise") else f"{c}={v}" for c, v in each) or "-"
-        for each in told
-    ]
+    usual: dict[Any, str] = {}
+    if len(values.columns) > MOST_SETTINGS:
+        usual = {c: values[c].mode().iloc[0] for c in values}
+    settings = []
+    for row in values.to_dict("records"):
+        told = [assigned(str(c), v) for c, v in row.items() if v not in ("-", usual.get(c))]
+        settings.append(", ".join(told) or "-")
+    return settings
 
 
 def leading(rows: Sequence[Mapping[str, Any]], scenario: Sequence[str]) -> list[bool]:
     """Returns whether each row's estimator may be the best of its scenario, if another one is surely beaten."""
-    keys = [tuple(str(row[name]) for name in scenario) for row in rows]
-    beaten = {key for key, row in zip(keys, rows, strict=True) if not row[BEST]}
-    return [bool(row[BEST]) and key in beaten for key, row in zip(keys, rows, strict=True)]
+
+    def scenario_of(row: Mapping[str, Any]) -> tuple[str, ...]:
+        return tuple(str(row[name]) for name in scenario)
+
+    beaten = {scenario_of(row) for row in rows if not row[BEST]}
+    return [bool(row[BEST]) and scenario_of(row) in beaten for row in rows]
 
 
 def overview_columns(
@@ -200,56 +213,60 @@ def overview_columns(
 ) -> list[Column]:
     """Returns the columns over all trials for every estimator; a narrow screen has no failures and short verdicts."""
 
-    def cells(
+    def numbers(
         title: str, key: str, show: Callable[[Mapping[str, Any]], str], best: Sequence[bool] = ()
     ) -> Column:
-        marks = best or [False] * len(rows)
-        return Column(
-            title,
-            [Cell(show(r), sort_key(r[key]), mark) for r, mark in zip(rows, marks, strict=True)],
-        )
+        keys = [sort_key(row[key]) for row in rows]
+        return Column(title, cells(map(show, rows), keys, best))
 
-    def points(share: float) -> str:
-        return percent(share).removesuffix(" %")
+    def error(row: Mapping[str, Any]) -> str:
+        slash = "/" if narrow else " / "
+        return f"{brief(row['error_median'])}{slash}{brief(row['error_q95'])}"
 
-    def success(row: Mapping[str, Any]) -> str:
-        return f"{points(row['success'])} ({'-'.join(ends_in_percent(row['success_low'], row['success_high']))})"
+    def nees(row: Mapping[str, Any]) -> str:
+        sign = sign_of(row["verdict"]) if narrow else ""
+        return f"{brief(row['nees_median'])} {sign}".strip()
 
-    def efficiency(row: Mapping[str, Any]) -> str:
-        # Where half of the trials are capped, it is a limit and no value.
-        return f"{'<' * (row['error_median'] > CAP)}{row['efficiency_capped']:.2f}"
+    columns = [words("estimator", [row["estimator"] for row in rows], best)]
+    columns.append(numbers("success", "success", _success, best))
+    if not narrow:
+        columns.append(numbers("failed", "failed_silent", _failed))
+    columns.append(numbers("error", "error_median", error))
+    efficiency = "eff." if narrow else "efficiency"
+    columns.append(numbers(efficiency, "efficiency_capped", _efficiency))
+    columns.append(numbers("NEES", "nees_median", nees))
+    if not narrow:
+        columns.append(words("verdict", [shown(row["verdict"]) for row in rows]))
+    columns.append(numbers("cost", "simulations_median", _cost))
+    columns.append(numbers("time", "time_mean_s", _time))
+    return columns
 
-    slash = "/" if narrow else " / "
 
-    def verdict(row: Mapping[str, Any]) -> str:
-        return sign_of(row["verdict"]) if narrow else shown(row["verdict"])
+def _success(row: Mapping[str, Any]) -> str:
+    ends = ends_in_percent(row["success_low"], row["success_high"])
+    return f"{_points(row['success'])} ({'-'.join(ends)})"
 
-    def failed(row: Mapping[str, Any]) -> str:
-        return f"{points(row['failed_known'])} / {points(row['failed_silent'])}"
 
-    return [
-        words("estimator", [row["estimator"] for row in rows], best),
-        cells("success", "success", success, best),
-        *([] if narrow else [cells("failed", "failed_silent", failed)]),
-        cells(
-            "error",
-            "error_median",
-            lambda r: f"{brief(r['error_median'])}{slash}{brief(r['error_q95'])}",
-        ),
-        cells("eff." if narrow else "efficiency", "efficiency_capped", efficiency),
-        cells(
-            "NEES",
-            "nees_median",
-            lambda r: f"{brief(r['nees_median'])} {verdict(r) * narrow}".strip(),
-        ),
-        *([] if narrow else [words("verdict", map(verdict, rows))]),
-        cells(
-            "cost",
-            "simulations_median",
-            lambda r: cost(r["simulations_median"], r["simulations_mean"]),
-        ),
-        cells("time", "time_mean_s", lambda r: duration(r["time_mean_s"], 2)),
-    ]
+def _failed(row: Mapping[str, Any]) -> str:
+    return f"{_points(row['failed_known'])} / {_points(row['failed_silent'])}"
+
+
+def _points(share: float) -> str:
+    return percent(share).removesuffix(" %")
+
+
+def _efficiency(row: Mapping[str, Any]) -> str:
+    # Where half of the trials are capped, it is a limit and no value.
+    sign = "<" if row["error_median"] > CAP else ""
+    return f"{sign}{row['efficiency_capped']:.2f}"
+
+
+def _cost(row: Mapping[str, Any]) -> str:
+    return cost(row["simulations_median"], row["simulations_mean"])
+
+
+def _time(row: Mapping[str, Any]) -> str:
+    return duration(row["time_mean_s"], 2)
 
 
 # Statistics ----------------------------------------------------------------------------------------------------------
@@ -261,27 +278,30 @@ def statistics(where: Where, rows: Sequence[Mapping[str, Any]]) -> list[Column]:
     for record in (*all_statistics(), *SCORES):
         if where not in record.where or not reported(record, rows):
             continue
-        numeric, show = record.kind != "word", _shower(record.kind, where)
-        cells = [
-            Cell(_shown(record, where, row), sort_key(row[record.name]) if numeric else None)
-            for row in rows
-        ]
-        columns.append(Column(record.titles.get(where, record.title), cells, numeric))
+        title = record.titles.get(where, record.title)
+        texts = [_shown(record, where, row) for row in rows]
+        if record.kind == "word":
+            columns.append(Column(title, cells(texts, repeat(None)), numeric=False))
+        else:
+            keys = [sort_key(row[record.name]) for row in rows]
+            columns.append(Column(title, cells(texts, keys)))
         if where in record.limits_titles:
-            low, high = (
-                [row[name] if _applies(record, where, row) else math.nan for row in rows]
-                for name in record.columns[1:]
-            )
+            nothing = dict.fromkeys(record.columns, math.nan)
+            judged = [row if _applies(record, where, row) else nothing for row in rows]
+            low, high = ([row[name] for row in judged] for name in record.columns[1:])
+            show = _shower(record.kind, where)
             columns.append(interval(record.limits_titles[where], low, high, show))
     return columns
 
 
 def reported(record: Statistic, rows: Sequence[Mapping[str, Any]]) -> bool:
     """Returns whether a table has a statistic's column; a rare one needs a finite value, a rare count one above 0."""
-    values = [row[record.name] for row in rows]
-    return not record.rare or any(
-        math.isfinite(v) and (v > 0 or record.kind != "count") for v in values
-    )
+    if not record.rare:
+        return True
+    finite = [row[record.name] for row in rows if math.isfinite(row[record.name])]
+    if record.kind == "count":
+        return any(value > 0 for value in finite)
+    return bool(finite)
 
 
 def _shown(record: Statistic, where: Where, row: Mapping[str, Any]) -> str:
@@ -297,20 +317,35 @@ def _shown(record: Statistic, where: Where, row: Mapping[str, Any]) -> str:
 def _applies(record: Statistic, where: Where, row: Mapping[str, Any]) -> bool:
     """Returns whether a row can have the statistic: an estimator that solves no equation has no solved trials. In the
     tables of parameters and of states its finished trials stand in for them."""
-    return record.given != "solved" or where in ("parameters", "tracks") or row["equation"] != "-"
+    if record.given != "solved" or where in ("parameters", "tracks"):
+        return True
+    return row["equation"] != "-"
 
 
 def _shower(kind: Kind, where: Where) -> Callable[[Any], str]:
     """Returns the formatter of values of that kind in that table."""
-    return {
-        "count": lambda v: f"{int(v):d}" if math.isfinite(v) else "-",
-        "share": percent,
-        "number": short,
-        # Physical units are of any size.
-        "physical": (lambda v: scientific(v) if math.isfinite(v) else short(v))
-        if where == "parameters"
-        else short,
-        "seconds": (lambda v: duration(v, 2)) if where == "terminal" else duration,
-        "probability": p_value,
-        "word": shown,
-    }[kind]
+    if kind == "physical" and where == "parameters":
+        return _physical
+    if kind == "seconds" and where == "terminal":
+        return lambda value: duration(value, 2)
+    return _SHOWERS[kind]
+
+
+def _count(value: float) -> str:
+    return f"{int(value):d}" if math.isfinite(value) else "-"
+
+
+def _physical(value: float) -> str:
+    # Physical units are of any size.
+    return scientific(value) if math.isfinite(value) else short(value)
+
+
+_SHOWERS: dict[Kind, Callable[[Any], str]] = {
+    "count": _count,
+    "share": percent,
+    "number": short,
+    "physical": short,
+    "seconds": duration,
+    "probability": p_value,
+    "word": shown,
+}
