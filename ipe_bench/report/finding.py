@@ -112,7 +112,8 @@ class Finding:
         return self.standings[0].ascending
 
     def sentence(self) -> str:
-        """States who holds, who is undecided, whose covariance is too small, and where the best filter or IPE fails."""
+        """States who holds, who is undecided, whose covariance is too small, and at which scales the best filter or IPE
+        fails."""
         most = max(one.sure for one in self.standings)
         if not most:
             return self._nobody()
@@ -122,7 +123,8 @@ class Finding:
         clauses += self._covariances(winners)
         clauses += self._beyond(most) if self.ascending and most < len(self.places) else []
         clauses += [f"{named(undecided, self.standings)}: undecided"] if undecided else []
-        return "; ".join([*clauses, *self._parted(most)])
+        clauses += self._parted(most) if self.ascending else []
+        return "; ".join(clauses)
 
     def _winners(self, winners: Sequence[Standing], undecided: Sequence[Standing]) -> str:
         who = named(winners, self.standings)
@@ -229,7 +231,7 @@ class Finding:
         lost = [at for at, word in enumerate(one.judged) if word == FAILS]
         wrong = one.overconfident(number)
         failing = self._extent(lost, number)
-        if not self.ascending or not wrong or wrong[0] >= lost[0]:
+        if not wrong or wrong[0] >= lost[0]:
             return failing
         return f"{failing}, with too small a covariance {self._extent(wrong, number)}"
 
@@ -241,15 +243,15 @@ class Finding:
         columns = slice(at, at + 1) if self.ascending else slice(None)
         share = seen([row for one in ahead for row in one.rows[columns] if row])
         verb = "succeeds" if len(ahead) == 1 else "succeed"
-        told = f"{named(ahead, self.standings)} {verb} in {share}"
-        told += f" at error scale {self._scale(at)}" if self.ascending else ""
+        where = f"in {len(self.places)} {self._columns}"
+        where = f"at error scale {self._scale(at)}" if self.ascending else where
+        told = f"{named(ahead, self.standings)} {verb} in {share} {where}"
         if any(one.possible for one in self.standings):
             return f"Too few trials to tell who holds; {told}"
         if len(self.places) == 1:
             return f"No estimator holds; {told}"
-        if self.ascending:
-            return f"No estimator holds, even at error scale {self._scale(0)}; {told}"
-        return f"No estimator holds in any of {len(self.places)} {self._columns}; {told}"
+        first = f", even at error scale {self._scale(0)}"
+        return f"No estimator holds{first if self.ascending else ' in any setting'}; {told}"
 
 
 def judged(row: Row | None, columns: int) -> str:

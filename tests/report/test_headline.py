@@ -26,7 +26,7 @@ from ipe_bench.measurements import Recorded
 from ipe_bench.noise import Certified
 from ipe_bench.plugins import discovery
 from ipe_bench.report.finding import MEANING
-from ipe_bench.report.page.headline import about, headline, in_common
+from ipe_bench.report.page.headline import about, headline, in_common, success
 from ipe_bench.report.tables.reports import all_tables
 from ipe_bench.report.tables.table import Table
 from ipe_bench.report.words import percent
@@ -70,7 +70,8 @@ def test_the_headline_says_who_holds_who_agrees_and_who_fails_undetected(synthet
     finding, matrix, agree, silent = headline(analysis)
     assert [row[0].text for row in matrix.rows] == ["solver", "filter"]
     assert finding == (
-        "Only solver holds up to error scale 1000 (100 % of 100 trials); filter fails from 100 on"
+        "Only solver holds up to error scale 1000 (100 % of 100 trials);"
+        " filter fails from 100 on, with too small a covariance from 10 on"
     )
     assert (
         "IPE (solver) and filters (filter) agree up to error scale 10: all of 100 trials succeed at each"
@@ -433,3 +434,16 @@ def test_states_that_move_have_words_of_their_own(tmp_path):
         assert words not in shown, words
     assert "the filter linearised at the true path" in shown
     assert "error over the linearised filter" in shown
+
+
+def test_the_line_below_the_title_says_which_error_makes_a_trial_a_success(synthetic):
+    """Chi-square with three degrees of freedom: all but one in a million errors lie within 3.2 deviations."""
+    limit = np.sqrt(chi2.isf(1e-6, 3) / 3)
+    scenario = synthetic.scenario()
+    synthetic.bound = lambda scenario: np.ones(3)  # type: ignore[method-assign]
+    for label, size in (("inside", 0.99), ("outside", 1.01)):
+        synthetic.add(scenario, label, np.full((20, 3), size * limit))
+    analysis = analyse([synthetic.directory])
+    rows = analysis.summary[analysis.summary["parameter"] == "all"].set_index("estimator")
+    assert rows["success"].to_dict() == {"inside": 1.0, "outside": 0.0}
+    assert f"A trial succeeds if its error is at most {limit:.1f} times the" in success(analysis)

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from ipe_bench.report.page.headline import about, headline
+from ipe_bench.report.page.headline import about, headline, success
 from ipe_bench.report.page.writer import Page, digests
 from ipe_bench.report.tables.matrix import MATRIX, Matrix
 from ipe_bench.report.tables.table import Part, Strong, Table, environment, words
@@ -47,6 +47,7 @@ def render_page(
     asked = [
         cell for cell in collection.cells if cell.expected and cell.names["estimator"] != TRUTH
     ]
+    complete = sum(cell.complete for cell in asked)
     converged = analysis.endings.empty and not analysis.summary.empty
     sections = [
         ("figures", "Figures", pictures[1:]),
@@ -64,7 +65,7 @@ def render_page(
         ("definitions", "Definitions", [_definitions()]),
     ]
     names = ", ".join(d.resolve().name or str(d) for d in collection.directories)
-    title = str(answer.pop(0)) if isinstance(answer[0], Strong) else names
+    title = str(answer.pop(0)).removesuffix(".") if isinstance(answer[0], Strong) else names
     page = Page(
         "report",
         title,
@@ -73,10 +74,15 @@ def render_page(
         sections,
         folder="figures/",
         facts=[
-            *([names] if title != names else ()),
+            *([names] if names and title != names else ()),
             *([_minute(collection.runs[-1]["started"])] if collection.runs else ()),
-            f"{sum(cell.complete for cell in asked)} of {len(asked)} results (an estimator in a scenario) complete",
+            *(
+                [f"{complete} of {len(asked)} results (an estimator in a scenario) complete"]
+                if asked
+                else ()
+            ),
         ],
+        lead=success(analysis),
         commands=list(commands)[:MOST_COMMANDS],
         sources=digests(collection.directories),
         about=about(analysis),

@@ -81,6 +81,8 @@ class Page:
     sources: Sequence[tuple[str, str]]
     """What was read, each with its SHA-256."""
     facts: Sequence[str]
+    lead: str = ""
+    """What a number of the answer is, in a line below the title."""
     about: Sequence[str] = ()
     problems: Sequence[str] = ()
     folder: str = ""

@@ -54,7 +54,6 @@ _COVARIANCE = {
 }
 _WELL = 0.995
 """Share of success that is well: the lightest colour."""
-_OF_STATES = "Success: the error at the last epoch lies inside the gate of the linearised filter. "
 
 
 @dataclass(frozen=True)
@@ -138,8 +137,7 @@ def matrices(rows: Iterable[Row], lines: float = math.inf) -> list[Matrix]:
         found.append(_matrix(own, f"{MATRIX}_{number}", setting_words(setting)))
     # One legend below the last, of the signs of all.
     columns = [column for matrix in found for column in matrix.columns]
-    moving = any(row["noise"] == "model" for row in listed)
-    legend = _legend(columns, moving)
+    legend = _legend(columns)
     further = len(settings) - len(found)
     if further:
         legend += f" Of {len(settings)} settings {further} are in the table alone."
@@ -165,7 +163,7 @@ def _matrix(finding: Finding, name: str, title: str) -> Matrix:
     for at, head in enumerate(heads):
         cells = [_tile(one, at, finding, moving) for one in finding.standings]
         columns.append(Column(head, cells))
-    notes = [*keys, _legend(columns, moving)]
+    notes = [*keys, _legend(columns)]
     captions = (*keys, _signs(columns))
     return Matrix(
         name, title, "", columns, notes=notes, whole="summary.csv", over=over, captions=captions
@@ -189,8 +187,8 @@ def _letter(at: int) -> str:
     return chr(ord("A") + at) if at < 26 else f"#{at + 1}"
 
 
-def _legend(columns: Sequence[Column], moving: bool) -> str:
-    return f"{_OF_STATES if moving else ''}{_signs(columns)} {MEANING}"
+def _legend(columns: Sequence[Column]) -> str:
+    return f"{_signs(columns)} {MEANING}"
 
 
 def _signs(columns: Sequence[Column]) -> str:
