@@ -429,7 +429,7 @@ def _tracked(
     find: str | Sequence[str],
     progress: Shows,
 ) -> LogAnswer:
-    from ipe_bench.real.logs import Log, LogTracks, found_and_tracked
+    from ipe_bench.real.logs import Log, LogTracks, found_and_tracked, require_likelihood
     from ipe_bench.report.page.log import LogAnswer
     from ipe_bench.report.progress import counting
     from ipe_bench.states.auto import AutoTracker
@@ -451,6 +451,8 @@ def _tracked(
     validate([StateScenario(log.model)], trackers, 1)
     names = [find] if isinstance(find, str) else list(find)
     tracks = []
+    for label, tracker in trackers.items() if names else ():
+        require_likelihood(log, label, tracker)
     with counting("estimate", len(trackers), lines=progress == "lines", off=not progress) as begin:
         for label, tracker in trackers.items():
             tell = begin(label)

@@ -121,8 +121,8 @@ def show_report(
     from ipe_bench.statistics.collect import collect
 
     pending = begin_report(folders, output, figures=figures, formats=formats)
-    collection, rows = pending.begun.collection, pending.begun.summary
-    shown = collection
+    begun = pending.begun
+    collection = shown = begun.collection
     others = (
         sum(cell.key not in cells and cell.label != TRUTH for cell in collection.current)
         if cells
@@ -130,8 +130,9 @@ def show_report(
     )
     if cells and others:
         shown = collect(folders, cells.keys())
-        rows = Begun(shown).summary
-    _print_table(rows, shown)
+        begun = Begun(shown)
+    _print_table(begun.summary, shown)
+    say(*begun.raised)
     pending.write_unless_current()
     told = [*collection.problems, *([] if cells else collection.stale)]
     if cells:

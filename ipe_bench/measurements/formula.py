@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ipe_bench.basics.errors import UserError, did_you_mean, unknown
+from ipe_bench.basics.errors import UserError, did_you_mean, shortened, unknown
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Finite
 from ipe_bench.engine.trace import Graph, Program, slopes
@@ -101,10 +101,18 @@ class WrittenModel(Measurement):
         if name not in self.columns:
             raise UserError(
                 f"measurement: {name} is neither a column nor a parameter; give a parameter its"
-                f" start, measurement.start.{name}=VALUE, or the column, by readings=FILE or"
-                f" measurement.columns.{name}=[...]"
+                f" start, measurement.start.{name}=VALUE, or the column,"
+                f" measurement.columns.{name}=[...]; `ipe-bench estimate` takes it from readings=FILE"
             )
-        return np.asarray(self.columns[name], dtype=float)
+        column = self.columns[name]
+        try:
+            numbers = np.asarray(column, dtype=float)
+        except (TypeError, ValueError):
+            numbers = np.empty(0)
+        if numbers.ndim != 1 or not numbers.size:
+            text = shortened(str(column), 60)
+            raise UserError(f"measurement.columns.{name}={text}: give numbers, such as [1,2,3]")
+        return numbers
 
     @property
     def index(self) -> Mapping[str, Sequence[Any]]:

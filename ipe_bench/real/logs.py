@@ -348,6 +348,20 @@ def far_below(tracks: Sequence[LogTracks]) -> list[str]:
 # Constants -----------------------------------------------------------------------------------------------------------
 
 
+def require_likelihood(log: Log, label: str, tracker: Tracker) -> None:
+    """Refuses a tracker whose likelihood no search can maximise.
+
+    Raises:
+        UserError: its likelihood is random, or it has none.
+    """
+    tracks, _ = track_safely(tracker, log.model, log.z[None])
+    known = tracks.degrees.any() and np.isfinite(tracks.log_likelihood[0])
+    if isinstance(tracker, Bootstrap) or not known:
+        raise UserError(
+            f"find: trackers.{label} has no likelihood that can be maximised; choose a filter"
+        )
+
+
 def found_and_tracked(
     log: Log,
     label: str,
@@ -359,7 +373,7 @@ def found_and_tracked(
     told at each evaluation of the likelihood how far the search is.
 
     Raises:
-        UserError: the model has no such constant, or the tracker has no likelihood that can be maximised.
+        UserError: the model has no such constant.
     """
     model = log.model
     numbers = _numbers(model)
@@ -392,10 +406,6 @@ def found_and_tracked(
         value = -float(tracks.log_likelihood[0])
         return value if tracks.degrees.any() and np.isfinite(value) else np.inf
 
-    if isinstance(tracker, Bootstrap) or not np.isfinite(cost(np.zeros(len(find)))):
-        raise UserError(
-            f"find: trackers.{label} has no likelihood that can be maximised; choose a filter"
-        )
     with np.errstate(invalid="ignore"):
         best, *others = _minima(cost, positive, watch)
     if not np.isfinite(best.error).all():

@@ -172,6 +172,12 @@ def _beyond_numbers(scenario: Scenario) -> Iterator[str]:
         yield f"error_scale={scenario.error_scale:g}: its square overflows; give a number up to {LARGEST:g}"
         return
     model, real = scenario.measurement, scenario.noise.real
+    if model.m < model.n:
+        yield (
+            f"measurement={model.name}: {model.m} readings are too few for {model.n} parameters; take more readings, or"
+            " fix a parameter by parameters.NAME.fixed=VALUE"
+        )
+        return
     with np.errstate(all="ignore"):
         bound = scenario.linear_bound
         try:
@@ -192,14 +198,13 @@ def _beyond_numbers(scenario: Scenario) -> Iterator[str]:
         still = [
             parameter.name for i, parameter in enumerate(model.parameters) if not H[:, i].any()
         ]
-        where = (
-            f"readings do not change with {', '.join(still)}"
-            if still
-            else "its Jacobian has not full column rank"
-        )
+        where = f"readings do not change with {', '.join(still)} at the nominal point"
+        if not still:
+            where = "readings at the nominal point do not determine"
+            where += f" {', '.join(_undetermined(scenario)) or 'all parameters'}"
         yield (
-            f"measurement={model.name}: {where} at the nominal point, so that readings do not determine its "
-            "parameters; choose another nominal point, or try `ipe-bench check` if the slopes are wrong"
+            f"measurement={model.name}: {where}; choose another nominal point or further readings, or try `ipe-bench"
+            " check` if the slopes are wrong"
         )
         return
     for i in np.flatnonzero(beyond)[:1]:
@@ -207,6 +212,18 @@ def _beyond_numbers(scenario: Scenario) -> Iterator[str]:
             f"noise={scenario.noise.name}: {model.parameters[i].name} has a linear bound of {bound[i]:g} of its size, "
             "whose square is beyond numbers; choose another scale of the noise"
         )
+
+
+def _undetermined(scenario: Scenario) -> list[str]:
+    """Names the parameters that readings at the nominal point leave open; none if H is not finite."""
+    H = scenario.problem.R.whiten_jacobian(scenario.problem.H)
+    if not np.isfinite(H).all():
+        return []
+    _, values, directions = np.linalg.svd(H, full_matrices=False)
+    open_directions = directions[values <= 1e-8 * values[0]]
+    share = np.linalg.norm(open_directions, axis=0)
+    parameters = scenario.measurement.parameters
+    return [parameters[i].name for i in np.flatnonzero(share > 1e-6)]
 
 
 def result_keys(scenario: AnyScenario, estimators: Mapping[str, Any]) -> list[ResultKey]:

@@ -160,6 +160,21 @@ class Begun:
             found["calibration"].append(where | curve)
         found["tracks"] += [where | row for row in epoch_curves(sample)]
 
+    @property
+    def raised(self) -> list[str]:
+        """A line for each estimator whose trials raised exceptions, with the commonest of them."""
+        raised = defaultdict[str, list[dict[str, Any]]](list)
+        for row in self._rows["endings"]:
+            if row["status"] == Status.ERROR.label:
+                raised[row["estimator"]].append(row)
+        lines = []
+        for label, rows in raised.items():
+            trials = sum(row["trials"] for row in rows)
+            commonest = max(rows, key=lambda row: row["trials"])
+            times = "1 trial" if trials == 1 else f"{trials} trials"
+            lines.append(f"{label}: {times} ended by an exception: {commonest['message']}")
+        return lines
+
     def finish(self) -> Analysis:
         """Completes the analysis."""
         import pandas as pd

@@ -210,6 +210,8 @@ def finds_the_parameters(estimator: Estimator) -> None:
         f"estimate returns {type(estimates).__name__}, and not Estimates"
     )
     _shaped("x", estimates.x, drawn.x.shape)
+    raised = np.flatnonzero(estimates.status == Status.ERROR).tolist()
+    assert not raised, f"it raises {estimates.messages.get(raised[0], 'an exception')}"
     error = estimates.x - drawn.x
     worst = float((np.abs(error) / _bound(scenario.problem)).max())
     assert worst < 8, f"the largest error is {worst:.1f} standard deviations of the bound"

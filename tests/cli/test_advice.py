@@ -16,6 +16,10 @@ from ipe_bench.real.estimation import Question
 FORMULA = "run measurement=formula measurement.expression=b1*t measurement.columns.t=[1,2,3]"
 FITTED = "estimate measurement=formula measurement.expression=b1*t+c"
 STARTED = f"{FITTED} measurement.start.b1=1 measurement.start.c=1"
+FEW = (
+    "run measurement=formula measurement.expression=b1*t+c measurement.columns.t=[1] measurement.start.b1=1"
+    " measurement.start.c=1 noise.deviation=1"
+)
 ODE = "run measurement=ode measurement.start.k=1 measurement.initial.y=1 noise.deviation=1 measurement.times=[1,2]"
 ROBUST = (
     "estimate measurement=nist/misra1a baseline=[least_squares] estimators.least_squares.loss=huber"
@@ -221,10 +225,11 @@ ADVICE = [
     ),
     (
         FORMULA.partition(" measurement.col")[0] + " measurement.start.b1=1 noise.deviation=1",
-        r"or (measurement.columns.t=)",
+        r"column, (measurement.columns.t=)",
         FORMULA.partition(" measurement.col")[0]
         + " measurement.start.b1=1 noise.deviation=1 {}[1,2]",
     ),
+    (FEW, r"parameter by (\S+)", f"{FEW} {{}}", {"NAME": "c"}),
     (SWUNG.format("goode"), MEANT, SWUNG),
     (SWUNG.format("bare"), r"or (\S+)", SWUNG.format("bare") + " {}", {"NAME": "length"}),
     (SWUNG.format("need"), WORD, SWUNG.format("need") + " {}"),
@@ -341,7 +346,7 @@ ELSEWHERE = {
         "noise=unknown: the level",
         "noise=unknown: the {} readings",
         "measurement={}: H has not",
-        "measurement={}: {} at the nominal point",
+        "measurement={}: {}; choose another nominal point",
     ),
     "of stored results": (
         "no estimator is in both",

@@ -2,6 +2,7 @@
 
 import io
 import re
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -104,6 +105,20 @@ def test_a_report_names_every_estimator_of_every_scenario(screen, folders, tmp_p
         assert rows(lines, name) == 4
     assert unfolded(lines).count(LONG) == 4
     assert any("deviation=0.4" in line for line in lines)
+
+
+@dataclass(frozen=True)
+class Unfinished(ib.baselines.EKF):
+    def track(self, P0, Q, z):
+        raise AttributeError("no such thing")
+
+
+def test_a_report_tells_which_exception_ended_the_trials(capsys, tmp_path):
+    bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01))
+    ib.run(bench, {"mine": Unfinished()}, trials=4, output=str(tmp_path))
+    main(["report", str(tmp_path), "figures=none"])
+    lines = capsys.readouterr().out.splitlines()
+    assert "mine: 4 trials ended by an exception: AttributeError: no such thing" in lines
 
 
 def test_status_names_every_estimator_and_each_scenario_once(screen, folders):

@@ -8,7 +8,7 @@ import pytest
 
 from ipe_bench.baselines import LevenbergMarquardt
 from ipe_bench.basics.errors import UserError
-from ipe_bench.measurements import Ode, Polynomial
+from ipe_bench.measurements import Formula, Ode, Polynomial
 from ipe_bench.noise import Gaussian
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.real.estimation import Question
@@ -185,6 +185,20 @@ def test_readings_that_do_not_change_are_told_of_the_model_and_not_of_the_noise(
     expected = "^measurement=wrong: readings do not change with c0, c1, c2, c3 at the nominal point"
     with pytest.raises(UserError, match=expected):
         validate([Scenario(Wrong(does="constant"), Gaussian(0.1))], LM, 10)
+
+
+@pytest.mark.parametrize(
+    ("times", "complaint"),
+    [
+        ((1.0, 2.0), "2 readings are too few for 3 parameters; take more"),
+        ((1.0, 2.0, 3.0), "readings at the nominal point do not determine a, b; choose another"),
+    ],
+)
+def test_readings_that_leave_parameters_open_are_told_of_with_their_names(times, complaint):
+    start = {"a": 2.0, "b": 3.0, "c": 1.0}
+    model = Formula("a*b*t + c*t**2", start, columns={"t": times})
+    with pytest.raises(UserError, match=f"^measurement=formula: {complaint}"):
+        validate([Scenario(model, Gaussian(0.1))], LM, 10)
 
 
 @dataclass(frozen=True)

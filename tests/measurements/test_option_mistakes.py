@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.measurements import Bearings, Gins, Ode, Polynomial, Ranging, Sir
+from ipe_bench.measurements import Bearings, Formula, Gins, Ode, Polynomial, Ranging, Sir
 from ipe_bench.measurements.known import ParameterInfo
 from ipe_bench.noise import Colored, Correlated
 
@@ -15,6 +15,10 @@ def _fed(**options):
     return Ode(
         **({"rates": {"y": "feed - k*y"}, "start": {"k": 0.5}, "initial": {"y": "begin"}} | options)
     )
+
+
+def _line(**columns):
+    return Formula("b*t", {"b": 1.0}, columns=columns)
 
 
 MISTAKES = [
@@ -61,6 +65,8 @@ MISTAKES = [
     (lambda: Correlated(1.0, 0.5, block=7).covariance(10), "block=7"),
     (lambda: Correlated(matrix=((1.0, 2.0), (2.0, 1.0))).covariance(2), "matrix"),
     (lambda: Correlated(matrix=((1.0,),)).covariance(2), "matrix"),
+    (lambda: _line(t="0:8").m, r"measurement\.columns\.t=0:8: give numbers, such as \[1,2,3\]"),
+    (lambda: _line(t=()).m, r"measurement\.columns\.t=\(\): give numbers"),
 ]
 
 

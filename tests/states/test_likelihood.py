@@ -262,6 +262,13 @@ def test_what_cannot_be_found_is_refused(trackers, find, complaint):
         ib.estimate(DAMPED, np.zeros((60, 1)), trackers, find=find)
 
 
+def test_a_tracker_without_a_likelihood_is_refused_before_another_is_searched(monkeypatch):
+    monkeypatch.delattr(tracks, "_minima")
+    trackers = {"kf": ekf(), "rts": Smoother(ekf())}
+    with pytest.raises(ib.UserError, match=r"trackers\.rts has no likelihood"):
+        ib.estimate(DAMPED, np.zeros((60, 1)), trackers, find="a")
+
+
 def test_parameters_of_a_measurement_are_not_named():
     with pytest.raises(ib.UserError, match="find=: is for models of states that move"):
         ib.estimate(ib.measurements.Polynomial(), np.zeros(8), find="c0")  # pyright: ignore

@@ -185,6 +185,7 @@ FOUND = [
     (Faulty("boasting"), "NaN readings counts as converged"),
     (Faulty("wrong"), "standard deviations of the bound"),
     (Faulty("free"), "not counted"),
+    (altered(EKF(), track=lambda self, P0, Q, z: P0.absent), "it raises AttributeError: 'numpy.ndarray'"),
     (Faulty("scribbling"), "it writes into what it is given"),
     (Thawed(), "frozen=True"),
     (altered(Newton(), estimate=into_H), "test_conformance.py, line"),
