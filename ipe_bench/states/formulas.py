@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,10 +23,12 @@ from ipe_bench.states.base import Normal, Paths, StateModel
 
 @dataclass(frozen=True, kw_only=True)
 class Formulas(StateModel):
-    """States whose next values, and readings, are formulas of the states, constants, the number k of the epoch from 1
-    on, and its time t in s; the transition may contain the names of the process noise, each with a factor.
+    """States whose next values, and readings, are formulas of the states, constants, the number k
+    of the epoch from 1 on, and its time t in s; the transition may contain the names of the process
+    noise, each with a factor.
 
-    The language is that of `ipe_bench.measurements.arithmetic`: + - * / ** and elementary functions, angles in rad.
+    The language is that of `ipe_bench.measurements.arithmetic`: + - * / ** and elementary
+    functions, angles in rad.
 
     Example:
 
@@ -45,7 +47,8 @@ class Formulas(StateModel):
     readings: Mapping[str, str]
     """Each reading."""
     noise: Mapping[str, NonNegative] = field(default_factory=dict)
-    """Standard deviation of each independent process noise, by the name that it has in the transition."""
+    """Standard deviation of each independent process noise, by the name that it has in the
+    transition."""
     deviation: Mapping[str, NonNegative | str]
     """Standard deviation of each reading: a number, or a formula as those of the readings are."""
     start: Mapping[str, Finite] = field(default_factory=dict)
@@ -55,12 +58,13 @@ class Formulas(StateModel):
     constants: Mapping[str, Finite] = field(default_factory=dict)
     """Numbers that the formulas name."""
     inputs: Mapping[str, Finite | tuple[Finite, ...]] = field(default_factory=dict)
-    """Known inputs that the formulas name, such as a control: one number, or one for each epoch. `time` is the time of
-    each epoch in s."""
+    """Known inputs that the formulas name, such as a control: one number, or one for each epoch.
+    `time` is the time of each epoch in s."""
     units: Mapping[str, str] = field(default_factory=dict)
     """Units of states."""
     scored: tuple[str, ...] = ()
-    """Names of the states by which trackers are scored, such as constants among states that move; empty: all."""
+    """Names of the states by which trackers are scored, such as constants among states that move;
+    empty: all."""
     period: Mapping[str, NonNegative] = field(default_factory=dict)
     """Periods of readings that come round, such as 6.283185307 of a bearing in rad."""
     state_period: Mapping[str, NonNegative] = field(default_factory=dict)
@@ -70,61 +74,20 @@ class Formulas(StateModel):
     step: Positive = 1.0
     """Seconds between epochs."""
     moved_first: bool = True
-    """Whether the first reading is taken a step after the prior and time 0; if not, it is taken at time 0."""
+    """Whether the first reading is taken a step after the prior and time 0; if not, it is taken at
+    time 0."""
     title: str = "formulas"
     """The name of the model in tables."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "name", self.title)
-        names = [*self.next, *self.noise, *self.constants, *self.inputs, "k", "t"]
-        if twice := next((name for name in names if names.count(name) > 1), None):
-            raise UserError(
-                f"next.{twice}: two of states, noise, constants, inputs, k and t have this name; rename one"
-            )
-        known = {*self.next, *self.constants, *self.inputs, "k", "t"}
-        for key, formulas, names in (
-            ("next", self._transitions, {*known, *self.noise}),
-            ("readings", self._readings, known),
-            ("deviation", self._deviations, known),
-        ):
-            if not formulas and key != "deviation":
-                raise UserError(f"{key}: is empty; write state_model.{key}.NAME=FORMULA")
-            for label, formula in formulas.items():
-                for name in formula.names:
-                    if name not in names:
-                        raise UserError(f"{key}.{label}: {unknown(name, names, 'name')}")
-        moved = {name for formula in self._transitions.values() for name in formula.names}
-        if idle := next((name for name in self.noise if name not in moved), None):
-            raise UserError(
-                f"noise.{idle}: stands in no formula of next; add it to one, or leave it out"
-            )
-        owners = {
-            "deviation": self.readings,
-            "period": self.readings,
-            "spread": self.next,
-            "start": self.next,
-        }
-        owners["state_period"] = self.next
-        for key, labels in owners.items():
-            given = getattr(self, key)
-            for label in given:
-                if label not in labels:
-                    raise UserError(f"{key}.{label}: {unknown(label, labels, 'name')}")
-            if key in ("deviation", "spread") and (absent := set(labels) - set(given)):
-                raise UserError(f"{key}.{min(absent)}: is not given; give it a value")
-        for label, given in self.inputs.items():
-            if (number := np.size(given)) not in (1, self.count):
-                raise UserError(
-                    f"inputs.{label}: has {number} numbers; give one, or one for each of {self.count} epochs"
-                )
-        known, factors = self._factors
-        if found := next(
-            (name for name in self.noise if dependent(factors, [known[name]]) & {*factors}), None
-        ):
-            raise UserError(
-                f"next: depends on {found} by more than a factor; write FACTOR*{found} + ... of process noise"
-            )
+        _check_names(self)
+        _check_formulas(self)
+        _check_noise(self)
+        _check_labels(self)
+        _check_inputs(self)
+        _check_factors(self)
 
     @cached_property
     def _transitions(self) -> dict[str, Arithmetic]:
@@ -139,17 +102,25 @@ class Formulas(StateModel):
         """The formulas of standard deviations, if any is one and no number."""
         if not any(isinstance(value, str) for value in self.deviation.values()):
             return {}
-        return {
-            name: parse(str(self.deviation[name]), f"deviation.{name}") for name in self.readings
-        }
+        formulas = {}
+        for name in self.readings:
+            text = str(self.deviation[name])
+            formulas[name] = parse(text, f"deviation.{name}")
+        return formulas
 
     @cached_property
     def _inputs(self) -> dict[str, Array]:
         """Each input (K,)."""
-        return {
-            name: np.broadcast_to(np.array(given, dtype=float), self.count)
-            for name, given in self.inputs.items()
-        }
+        inputs = {}
+        for name, given in self.inputs.items():
+            numbers = np.array(given, dtype=float)
+            inputs[name] = np.broadcast_to(numbers, self.count)
+        return inputs
+
+    @cached_property
+    def _named_by_next(self) -> set[str]:
+        """What the transitions name."""
+        return {name for formula in self._transitions.values() for name in formula.names}
 
     @property
     def reading_names(self) -> tuple[str, ...]:
@@ -161,18 +132,19 @@ class Formulas(StateModel):
 
     @cached_property
     def _times(self) -> Array:
-        return self._inputs.get("time", self.step * (np.arange(self.count) + self.moved_first))
+        if "time" in self._inputs:
+            return self._inputs["time"]
+        # The first reading is taken at time 0, unless a step comes before it.
+        steps = np.arange(self.count) + self.moved_first
+        return self.step * steps
 
     @property
     def log_inputs(self) -> tuple[str, ...]:
         return tuple(self.inputs)
 
     def with_log(self, count: int, inputs: Mapping[str, Array]) -> Formulas:
-        return replace(
-            self,
-            count=count,
-            inputs={name: tuple(values.tolist()) for name, values in inputs.items()},
-        )
+        given = {name: tuple(values.tolist()) for name, values in inputs.items()}
+        return replace(self, count=count, inputs=given)
 
     @property
     def states(self) -> tuple[Parameter, ...]:
@@ -180,20 +152,21 @@ class Formulas(StateModel):
 
     @property
     def periods(self) -> tuple[float, ...]:
-        return tuple(self.period.get(name, 0.0) for name in self.readings) if self.period else ()
+        if not self.period:
+            return ()
+        return tuple(self.period.get(name, 0.0) for name in self.readings)
 
     @property
     def state_periods(self) -> tuple[float, ...]:
-        return (
-            tuple(self.state_period.get(name, 0.0) for name in self.next)
-            if self.state_period
-            else ()
-        )
+        if not self.state_period:
+            return ()
+        return tuple(self.state_period.get(name, 0.0) for name in self.next)
 
     @property
     def prior(self) -> Normal:
         mean = np.array([self.start.get(name, 0.0) for name in self.next], dtype=float)
-        return Normal(mean, np.diag([float(self.spread[name]) ** 2 for name in self.next]))
+        variances = [float(self.spread[name]) ** 2 for name in self.next]
+        return Normal(mean, np.diag(variances))
 
     def transition(self, x: Array, k: int) -> Array:
         return self._moved(x, np.zeros(len(self.noise)), k)
@@ -202,34 +175,42 @@ class Formulas(StateModel):
         return self._values(self._readings, x, k, {})
 
     def recorded(self, name: str, epochs: Sequence[int]) -> list[Recording]:
-        """Records formulas once, with k, t, inputs and constants as numbers of the epoch, so that other values of these
-        need no other machine code."""
-        formulas = {"transition": self._transitions, "observe": self._readings}[name]
-        columns = {**self._inputs, "k": np.arange(1.0, self.count + 1), "t": self._times}
-        columns |= {name: np.full(self.count, value) for name, value in self.constants.items()}
+        """Records formulas once, with k, t, inputs and constants as numbers of the epoch, so that
+        other values of these need no other machine code."""
+        formulas = self._transitions if name == "transition" else self._readings
+        by_epoch = {
+            **self._inputs,
+            "k": np.arange(1.0, self.count + 1),
+            "t": self._times,
+            **{name: np.full(self.count, value) for name, value in self.constants.items()},
+        }
         graph = Graph()
-        known = {name: graph.input(name) for name in (*self.next, *columns)}
+        known = {name: graph.input(name) for name in (*self.next, *by_epoch)}
+        x = [known[name] for name in self.next]
+        c = [known[name] for name in by_epoch]
+        # f is the transition without its noise.
         still = dict.fromkeys(self.noise, graph.constant(0.0))
-        y = [graph.apply("add", formula({**known, **still}), 0.0) for formula in formulas.values()]
-        x, c = ([known[name] for name in names] for names in (self.next, columns))
-        numbers = np.stack([*columns.values()], axis=1, dtype=float)
+        values = {**known, **still}
+        # A formula may be a bare number, which the sum makes an expression.
+        y = [graph.apply("add", formula(values), 0.0) for formula in formulas.values()]
+        function = RowFunction(RowPrograms.of(y, x, c))
+        numbers = np.stack([*by_epoch.values()], axis=1, dtype=float)
         places = np.array(epochs)
-        return [Recording(RowFunction(RowPrograms.of(y, x, c)), places, numbers[places])]
+        return [Recording(function, places, numbers[places])]
 
     @cached_property
-    def _factors(self) -> tuple[dict[str, Expression], list[Expression]]:
-        """What the transitions name besides constants, and the factor of each noise in each state, as recordings."""
+    def _factors(self) -> _Factors:
         graph = Graph()
-        known = {
-            name: graph.input(name) for name in (*self.next, *self.inputs, "k", "t", *self.noise)
-        }
-        moved = (
-            graph.apply("add", formula({**self.constants, **known}), 0.0)
-            for formula in self._transitions.values()
-        )
-        return known, [
-            factor for one in moved for factor in slopes(one, [known[name] for name in self.noise])
-        ]
+        names = (*self.next, *self.inputs, "k", "t", *self.noise)
+        known = {name: graph.input(name) for name in names}
+        values = {**self.constants, **known}
+        w = [known[name] for name in self.noise]
+        # G = df/dw, of which x = f(x, w) is linear.
+        factors: list[Expression] = []
+        for formula in self._transitions.values():
+            moved = graph.apply("add", formula(values), 0.0)
+            factors += slopes(moved, w)
+        return _Factors(known, factors)
 
     @property
     def gain_by_state(self) -> bool:
@@ -237,30 +218,37 @@ class Formulas(StateModel):
 
     @cached_property
     def _gain_by_state(self) -> bool:
-        known, factors = self._factors
-        return bool(dependent(factors, [known[name] for name in self.next]) & {*factors})
+        return self._factors.depend_on(self.next)
 
     @cached_property
     def _program(self) -> Program:
+        """Computes the factors from the states, the inputs, k and t."""
         known, factors = self._factors
-        return Program.of(factors, list(known.values())[: -len(self.noise)])
+        inputs = [one for name, one in known.items() if name not in self.noise]
+        return Program.of(factors, inputs)
+
+    @property
+    def _noise_deviations(self) -> Array:
+        """Standard deviations (q,) of the process noises."""
+        return np.array([float(value) for value in self.noise.values()])
 
     def gain_at(self, x: Array, k: int) -> Array:
         if not self.gain_by_state:
             return self.gain(k)
-        inputs = (float(values[k]) for values in self._inputs.values())
+        states = np.moveaxis(x, -1, 0)
+        inputs = [float(values[k]) for values in self._inputs.values()]
         with np.errstate(all="ignore"):
-            G = self._program([*np.moveaxis(x, -1, 0), *inputs, k + 1.0, float(self._times[k])])
-        G = np.stack(np.broadcast_arrays(x[..., 0], *G)[1:], axis=-1).reshape(
-            *x.shape, len(self.noise)
-        )
-        return G * np.array([float(value) for value in self.noise.values()])
+            factors = self._program([*states, *inputs, k + 1.0, float(self._times[k])])
+        # A factor that is the same in all states is one number, and becomes one for each.
+        each = np.broadcast_arrays(x[..., 0], *factors)[1:]
+        G = np.stack(each, axis=-1).reshape(*x.shape, len(self.noise))
+        return G * self._noise_deviations
 
     def gain(self, k: int) -> Array:
         if self.gain_by_state:
             return super().gain(k)
-        named = {name for formula in self._transitions.values() for name in formula.names}
-        return self._gain(k) if named & {"k", "t", *self.inputs} else self._steady_gain
+        by_epoch = {"k", "t", *self.inputs}
+        return self._gain(k) if self._named_by_next & by_epoch else self._steady_gain
 
     @cached_property
     def _steady_gain(self) -> Array:
@@ -271,10 +259,9 @@ class Formulas(StateModel):
         if not self.noise:
             return np.zeros((self.n, 0))
         x = self.prior.mean
-        factors = differentiate(
-            lambda w: self._moved(x, w, k), np.zeros((1, len(self.noise))), analytic=True
-        )[0]
-        return factors * np.array([float(value) for value in self.noise.values()])
+        still = np.zeros((1, len(self.noise)))
+        factors = differentiate(lambda w: self._moved(x, w, k), still, analytic=True)[0]
+        return factors * self._noise_deviations
 
     @property
     def R_by_state(self) -> bool:
@@ -285,7 +272,8 @@ class Formulas(StateModel):
     def R_at(self, x: Array, k: int) -> Array:
         if not self.R_by_state:
             return self.R(k)
-        return self._values(self._deviations, x, k, {})[..., None] ** 2 * np.eye(len(self.readings))
+        deviations = self._values(self._deviations, x, k, {})
+        return deviations[..., None] ** 2 * np.eye(len(self.readings))
 
     def R(self, k: int) -> Array:
         if self.R_by_state:
@@ -295,27 +283,121 @@ class Formulas(StateModel):
         return np.diag([float(self.deviation[name]) ** 2 for name in self.readings])
 
     def _moved(self, x: Array, w: Array, k: int) -> Array:
-        return self._values(
-            self._transitions, x, k, dict(zip(self.noise, np.moveaxis(w, -1, 0), strict=True))
-        )
+        noise = dict(zip(self.noise, np.moveaxis(w, -1, 0), strict=True))
+        return self._values(self._transitions, x, k, noise)
 
     def _values(
         self, formulas: Mapping[str, Arithmetic], x: Array, k: int, noise: Mapping[str, Any]
     ) -> Array:
         """Those formulas (..., number) at states x (..., n) at epoch k."""
-        known = dict(zip(self.next, np.moveaxis(x, -1, 0), strict=True)) | dict(noise)
-        known |= {name: float(values[k]) for name, values in self._inputs.items()}
-        known |= {**self.constants, "k": k + 1.0, "t": float(self._times[k])}
+        states = dict(zip(self.next, np.moveaxis(x, -1, 0), strict=True))
+        inputs = {name: float(values[k]) for name, values in self._inputs.items()}
+        epoch = {"k": k + 1.0, "t": float(self._times[k])}
+        known = {**states, **noise, **inputs, **self.constants, **epoch}
         with np.errstate(all="ignore"):
-            values = np.broadcast_arrays(
-                x[..., 0], *(formula(known) for formula in formulas.values())
-            )[1:]
-        return np.stack(np.broadcast_arrays(*values), axis=-1)
+            values = [formula(known) for formula in formulas.values()]
+        # A formula without states is one number, and becomes one for each.
+        return np.stack(np.broadcast_arrays(x[..., 0], *values)[1:], axis=-1)
+
+
+class _Factors(NamedTuple):
+    """Holds the factor of each process noise in each state's transition, as recorded."""
+
+    known: dict[str, Expression]
+    """What the transitions name besides constants."""
+    factors: list[Expression]
+    """Of all noises (n * q) in the first state, in the second, and so on."""
+
+    def depend_on(self, names: Iterable[str]) -> bool:
+        """Tells whether any factor depends on any of these names."""
+        given = [self.known[name] for name in names]
+        return not dependent(self.factors, given).isdisjoint(self.factors)
+
+
+def _check_names(model: Formulas) -> None:
+    names = [*model.next, *model.noise, *model.constants, *model.inputs, "k", "t"]
+    for name in names:
+        if names.count(name) > 1:
+            raise UserError(
+                f"next.{name}: two of states, noise, constants, inputs, k and t have this name; "
+                "rename one"
+            )
+
+
+def _check_formulas(model: Formulas) -> None:
+    """Refuses a formula of a name that stands for nothing there."""
+    # All are read before the names of any are judged.
+    transitions = model._transitions
+    readings = model._readings
+    deviations = model._deviations
+    known = {*model.next, *model.constants, *model.inputs, "k", "t"}
+    _check_group("next", transitions, {*known, *model.noise})
+    _check_group("readings", readings, known)
+    if deviations:
+        _check_group("deviation", deviations, known)
+
+
+def _check_group(key: str, formulas: Mapping[str, Arithmetic], names: set[str]) -> None:
+    if not formulas:
+        raise UserError(f"{key}: is empty; write state_model.{key}.NAME=FORMULA")
+    for label, formula in formulas.items():
+        for name in formula.names:
+            if name not in names:
+                raise UserError(f"{key}.{label}: {unknown(name, names, 'name')}")
+
+
+def _check_noise(model: Formulas) -> None:
+    for name in model.noise:
+        if name not in model._named_by_next:
+            raise UserError(
+                f"noise.{name}: stands in no formula of next; add it to one, or leave it out"
+            )
+
+
+def _check_labels(model: Formulas) -> None:
+    """Refuses values of states and readings that there are not, and values that lack."""
+    _check_values("deviation", model.deviation, model.readings, complete=True)
+    _check_values("period", model.period, model.readings)
+    _check_values("spread", model.spread, model.next, complete=True)
+    _check_values("start", model.start, model.next)
+    _check_values("state_period", model.state_period, model.next)
+
+
+def _check_values(
+    key: str, given: Mapping[str, Any], labels: Mapping[str, Any], complete: bool = False
+) -> None:
+    for label in given:
+        if label not in labels:
+            raise UserError(f"{key}.{label}: {unknown(label, labels, 'name')}")
+    absent = set(labels) - set(given)
+    if complete and absent:
+        raise UserError(f"{key}.{min(absent)}: is not given; give it a value")
+
+
+def _check_inputs(model: Formulas) -> None:
+    for label, given in model.inputs.items():
+        number = np.size(given)
+        if number not in (1, model.count):
+            raise UserError(
+                f"inputs.{label}: has {number} numbers; give one, or one for each of "
+                f"{model.count} epochs"
+            )
+
+
+def _check_factors(model: Formulas) -> None:
+    """Refuses process noise that enters by more than a factor: G may depend on x, but not on w."""
+    for name in model.noise:
+        if model._factors.depend_on([name]):
+            raise UserError(
+                f"next: depends on {name} by more than a factor; write FACTOR*{name} + ... of "
+                "process noise"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedFormulas(Formulas):
-    """A model with one path and its readings that somebody has stored, and what is published of trackers on them.
+    """A model with one path and its readings that somebody has stored, and what is published of
+    trackers on them.
 
     Example:
 
@@ -334,11 +416,14 @@ class RecordedFormulas(Formulas):
     """Where path and figures come from."""
 
     def draw(self, start: int, stop: int, seed: int = 0) -> Paths:
-        """The stored path; its state before the first epoch is not stored, and the first one stands for it."""
+        """The stored path; its state before the first epoch is not stored, and the first one stands
+        for it."""
         if (start, stop) != (0, 1):
             raise UserError(f"state_model={self.name}: has one path; set trials=1")
-        rows = np.loadtxt(
-            Path(__file__).with_name(f"{self.recorded}.csv"), delimiter=",", skiprows=1
-        )[None]
-        x = np.ascontiguousarray(rows[..., 1 : 1 + self.n])
-        return Paths(x[:, 0], x, np.ascontiguousarray(rows[..., 1 + self.n :]))
+        path = Path(__file__).with_name(f"{self.recorded}.csv")
+        rows = np.loadtxt(path, delimiter=",", skiprows=1)[None]
+        # The columns are the time, the states and the readings.
+        first_reading = 1 + self.n
+        x = np.ascontiguousarray(rows[..., 1:first_reading])
+        z = np.ascontiguousarray(rows[..., first_reading:])
+        return Paths(x[:, 0], x, z)
