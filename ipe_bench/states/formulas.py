@@ -104,8 +104,10 @@ class Formulas(StateModel):
             return {}
         formulas = {}
         for name in self.readings:
-            text = str(self.deviation[name])
-            formulas[name] = parse(text, f"deviation.{name}")
+            # A reading without a deviation is refused by its name later.
+            if name in self.deviation:
+                text = str(self.deviation[name])
+                formulas[name] = parse(text, f"deviation.{name}")
         return formulas
 
     @cached_property

@@ -439,6 +439,10 @@ WALK = {
         ),
         ({"readings": {"z": "x + w"}}, r"readings\.z: there is no such name"),
         ({"spread": {"x": 1.0}}, r"spread\.v: is not given"),
+        (
+            {"readings": {"z": "x", "y": "v"}, "deviation": {"z": "1 + x**2"}},
+            r"deviation\.y: is not given; give it a value",
+        ),
         ({"deviation": {"z": -1.0}}, r"deviation\.z=-1\.0: give a number from 0 up"),
     ],
 )
