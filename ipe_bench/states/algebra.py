@@ -1,6 +1,8 @@
-"""Stacked linear algebra of small symmetric matrices in which a trial that breaks down turns NaN and disturbs no other.
+"""Stacked linear algebra of small symmetric matrices in which a trial that breaks down turns NaN
+and disturbs no other.
 
-Sums run in a fixed order along the matrix, so a trial's bits do not depend on the batch that it stands in.
+Sums run in a fixed order along the matrix, so a trial's bits do not depend on the batch that it
+stands in.
 """
 
 from __future__ import annotations
@@ -11,9 +13,10 @@ import numpy as np
 
 from ipe_bench.basics.linalg import Array, Mask, finite
 
-_SMALL, _ROUND_OFF = 1e-12, 1e-15
-"""Pivots, in parts of the variances, below which a covariance counts as singular, and eigenvalues of the correlations,
-over their number, that count as 0."""
+_SMALL = 1e-12
+"""Pivots, in parts of the variances, below which a covariance counts as singular."""
+_ROUND_OFF = 1e-15
+"""Eigenvalues of the correlations, over their number, that count as 0."""
 _INDEFINITE = 1e-6
 """The eigenvalue below -1e-6 of correlations that are no covariance's."""
 _OUTSIDE = 1e-6
@@ -25,42 +28,52 @@ def transposed(A: Array) -> Array:
 
 
 def symmetric(P: Array) -> Array:
-    """The symmetric part of P (..., n, n)."""
+    """Returns the symmetric part of P (..., n, n)."""
     return 0.5 * (P + transposed(P))
 
 
 def factor(P: Array) -> Array:
-    """The lower Cholesky factors L, L L' = P, of P (..., n, n); NaN from the first pivot that is not positive."""
+    """Computes the lower Cholesky factors L, L L' = P, of P (..., n, n); NaN from the first pivot
+    that is not positive (Golub and Van Loan, Matrix Computations, 2013, algorithm 4.2.1)."""
     L = np.zeros(P.shape)
-    for j in range(P.shape[-1]):
-        column = P[..., j:, j]  # the pivot, and what is below
+    n = P.shape[-1]
+    for j in range(n):
+        # L_ij L_jj = P_ij - sum_{k<j} L_ik L_jk, for the pivot i = j and the rows below it.
+        column = P[..., j:, j]
         if j:
-            column = column - np.add.reduce(L[..., j:, :j] * L[..., j, None, :j], axis=-1)
+            explained = L[..., j:, :j] * L[..., j, None, :j]
+            column = column - np.add.reduce(explained, axis=-1)
         pivot = column[..., 0]
         L[..., j, j] = np.sqrt(np.where(pivot > 0, pivot, np.nan))
-        if j + 1 < P.shape[-1]:
+        if j + 1 < n:
             L[..., j + 1 :, j] = column[..., 1:] / L[..., j, j, None]
     return L
 
 
 def lower_solve(L: Array, B: Array) -> Array:
-    """L^-1 B for lower triangular L (..., n, n) and B (..., n, r)."""
-    X = np.empty((*np.broadcast_shapes(L.shape[:-2], B.shape[:-2]), *B.shape[-2:]))
+    """Computes L^-1 B for lower triangular L (..., n, n) and B (..., n, r)."""
+    stack = np.broadcast_shapes(L.shape[:-2], B.shape[:-2])
+    X = np.empty((*stack, *B.shape[-2:]))
     for i in range(L.shape[-1]):
+        # L_ii x_i = b_i - sum_{k<i} L_ik x_k
         rest = B[..., i, :]
         if i:
-            rest = rest - np.add.reduce(L[..., i, :i, None] * X[..., :i, :], axis=-2)
+            solved = L[..., i, :i, None] * X[..., :i, :]
+            rest = rest - np.add.reduce(solved, axis=-2)
         X[..., i, :] = rest / L[..., i, i, None]
     return X
 
 
 def upper_solve(L: Array, B: Array) -> Array:
-    """L^-T B for lower triangular L (..., n, n) and B (..., n, r)."""
-    return lower_solve(transposed(L)[..., ::-1, ::-1], B[..., ::-1, :])[..., ::-1, :]
+    """Computes L^-T B for lower triangular L (..., n, n) and B (..., n, r)."""
+    # L' with rows and columns in reverse order is lower triangular.
+    reversed_L = transposed(L)[..., ::-1, ::-1]
+    return lower_solve(reversed_L, B[..., ::-1, :])[..., ::-1, :]
 
 
 class Half(NamedTuple):
-    """Holds G (..., n, n) with G G' = P for positive semidefinite P (..., n, n), and a generalised inverse G^-."""
+    """Holds G (..., n, n) with G G' = P for positive semidefinite P (..., n, n), and a generalised
+    inverse G^-."""
 
     G: Array
     L: Array
@@ -71,56 +84,75 @@ class Half(NamedTuple):
     """Whether a pivot is as small as round-off (...)."""
 
     def over(self, B: Array) -> Array:
-        """B G^- (..., r, n) for B (..., r, n)."""
+        """Computes B G^- (..., r, n) for B (..., r, n)."""
         X = transposed(upper_solve(self.L, transposed(B)))
-        if self.singular.any():
-            X[self.singular] = np.matmul(B[self.singular], self.inverse[self.singular])
+        rows = self.singular
+        if rows.any():
+            X[rows] = np.matmul(B[rows], self.inverse[rows])
         return X
 
     def whitened(self, B: Array) -> Array:
-        """B G^-' (..., r, n) for B (..., r, n)."""
+        """Computes B G^-' (..., r, n) for B (..., r, n)."""
         X = transposed(lower_solve(self.L, transposed(B)))
-        if self.singular.any():
-            X[self.singular] = np.matmul(B[self.singular], transposed(self.inverse[self.singular]))
+        rows = self.singular
+        if rows.any():
+            X[rows] = np.matmul(B[rows], transposed(self.inverse[rows]))
         return X
 
 
 def half(P: Array) -> Half:
-    """G (..., n, n), G G' = P, of each positive semidefinite P (..., n, n): Cholesky's, or by the eigenvalues of the
-    correlations where a pivot is as small as round-off. Variances of 0 are allowed; P that is indefinite gives NaN."""
+    """Computes G, G G' = P, of each positive semidefinite P (..., n, n): Cholesky's, or by the
+    eigenvalues of the correlations where a pivot is as small as round-off. Variances of 0 are
+    allowed; P that is indefinite gives NaN."""
     L = factor(P)
-    pivots, variances = np.diagonal(L, axis1=-2, axis2=-1) ** 2, np.diagonal(P, axis1=-2, axis2=-1)
+    pivots = np.diagonal(L, axis1=-2, axis2=-1) ** 2
+    variances = np.diagonal(P, axis1=-2, axis2=-1)
     singular = np.asarray(~(pivots > _SMALL * variances).all(axis=-1))
     if not singular.any():
         return Half(L, L, L, singular)  # G^- is not asked for
-    G, inverse = L.copy(), np.zeros(P.shape)
-    L[singular] = np.nan
+    G = L.copy()
+    inverse = np.zeros(P.shape)
     G[singular], inverse[singular] = principal(P[singular])
+    L[singular] = np.nan
     return Half(G, L, inverse, singular)
 
 
 def principal(P: Array) -> tuple[Array, Array]:
-    """G and G^- (trials, n, n) of positive semidefinite P (trials, n, n), by the axes of its correlations."""
-    deviation = np.sqrt(np.maximum(np.diagonal(P, axis1=-2, axis2=-1), 0.0))[..., None]
+    """Computes G and G^- (trials, n, n) of positive semidefinite P (trials, n, n), by the axes of
+    its correlations."""
+    variances = np.diagonal(P, axis1=-2, axis2=-1)
+    deviation = np.sqrt(np.maximum(variances, 0.0))[..., None]
+    # P = D C D. What is known exactly has no correlations: its row of C is 0.
     d = np.where(deviation > 0, deviation, 1.0)
     C = P / (d * transposed(d))
     usable = finite(C)
-    values, vectors = np.linalg.eigh(np.where(usable[:, None, None], C, 0.0))
-    size = np.sqrt(np.where(values > P.shape[-1] * _ROUND_OFF, values, 0.0))[:, None]
-    size[~usable | (values[:, 0] < -_INDEFINITE)] = np.nan
-    return deviation * vectors * size, transposed(vectors / np.where(size == 0, np.inf, size) / d)
+    # C = V diag(size^2) V', of which eigenvalues that are round-off count as 0.
+    values, V = np.linalg.eigh(np.where(usable[:, None, None], C, 0.0))
+    least = P.shape[-1] * _ROUND_OFF
+    size = np.sqrt(np.where(values > least, values, 0.0))[:, None]
+    indefinite = values[:, 0] < -_INDEFINITE
+    size[~usable | indefinite] = np.nan
+    # G = D V diag(size), and G^- = diag(1 / size) V' D^-1 with 0 for 1 / 0.
+    G = deviation * V * size
+    divisor = np.where(size == 0, np.inf, size)
+    return G, transposed(V / divisor / d)
 
 
 def mahalanobis(e: Array, P: Array) -> Array:
-    """e' P^+ e (trials,) for e (trials, n) and positive semidefinite P (n, n); infinite outside the range of P."""
+    """Computes e' P^+ e (trials,) for e (trials, n) and positive semidefinite P (n, n); infinite
+    outside the range of P."""
     parts = half(P)
     w = parts.whitened(e)
-    outside = np.abs(e - np.matmul(w, transposed(parts.G))) > _OUTSIDE * np.sqrt(np.diagonal(P))
+    # What no w gives lies outside the range of G.
+    missed = np.abs(e - np.matmul(w, transposed(parts.G)))
+    outside = missed > _OUTSIDE * np.sqrt(np.diagonal(P))
     return np.where(outside.any(axis=-1), np.inf, np.sum(w**2, axis=-1))
 
 
 def root(P: Array) -> Array:
-    """A matrix G (n, r) with G G' = P for positive semidefinite P (n, n), of as many columns as P has rank."""
-    values, vectors = np.linalg.eigh(symmetric(np.asarray(P, dtype=float)))
-    kept = values > len(values) * np.finfo(float).eps * max(values[-1], 0.0)
-    return vectors[:, kept] * np.sqrt(values[kept])
+    """Computes G (n, r) with G G' = P for positive semidefinite P (n, n), of as many columns as P
+    has rank."""
+    values, V = np.linalg.eigh(symmetric(np.asarray(P, dtype=float)))
+    round_off = len(values) * np.finfo(float).eps * max(values[-1], 0.0)
+    kept = values > round_off
+    return V[:, kept] * np.sqrt(values[kept])
