@@ -1,4 +1,5 @@
-"""Particle filters of state models: the density of a trial's states is a weighted sample of them."""
+"""Particle filters of state models: the density of a trial's states is a weighted sample of
+them."""
 
 from __future__ import annotations
 
@@ -16,8 +17,9 @@ from ipe_bench.states.trackers import Tracker, Tracks, Update, residuals, square
 
 @dataclass(frozen=True)
 class Bootstrap(Tracker):
-    """The bootstrap particle filter (Gordon, Salmond, Smith, IEE Proc. F 140, 1993), with systematic resampling at
-    every epoch. Each trial's random numbers are those of its readings, in whatever batch.
+    """The bootstrap particle filter (Gordon, Salmond, Smith, IEE Proc. F 140, 1993), with
+    systematic resampling at every epoch. Each trial's random numbers are those of its readings, in
+    whatever batch.
 
     Example:
 
@@ -37,7 +39,8 @@ class Bootstrap(Tracker):
         return None
 
     def track(self, model: StateModel, z: Array) -> Tracks:
-        trials, N = len(z), self.particles
+        trials = len(z)
+        N = self.particles
         generators = own_generators(self.seed, z.reshape(trials, -1))
 
         def normals(columns: int) -> Array:
@@ -48,19 +51,25 @@ class Bootstrap(Tracker):
         spread = root(model.prior.covariance)
         x = model.prior.mean + np.matmul(normals(spread.shape[1]), spread.T)
         for k in range(model.epochs):
+            # Importance density p(x_k | x_k-1): each particle moves by the model.
             if model.moves(k):
                 G = model.gain_at(x, k)
                 w = normals(G.shape[-1])
-                x = model.transition_into(k)(x) + (
-                    multiply(G, w) if model.gain_by_state else np.matmul(w, G.T)
-                )
-            w = weighed(model, x, k, z[:, k], 1.0, out)
-            out.effective[:, k] = 1 / np.sum(w**2, axis=1)
-            x = model.nearest_state(x, x[np.arange(trials), w.argmax(axis=1)][:, None])
-            mean = np.sum(w[..., None] * x, axis=1)
+                noise = multiply(G, w) if model.gain_by_state else np.matmul(w, G.T)
+                x = model.transition_into(k)(x) + noise
+            # By it the weights are the likelihoods, w_i ~ p(z_k | x_i).
+            weights = weighed(model, x, k, z[:, k], 1.0, out)
+            out.effective[:, k] = 1 / np.sum(weights**2, axis=1)
+            # Means and covariances of a periodic state are taken about the heaviest particle.
+            heaviest = x[np.arange(trials), weights.argmax(axis=1)]
+            x = model.nearest_state(x, heaviest[:, None])
+            mean = np.sum(weights[..., None] * x, axis=1)
             d = x - mean[:, None]
-            out.mean[:, k], out.covariance[:, k] = mean, np.matmul(transposed(d * w[..., None]), d)
-            x = _resampled(x, w, np.array([g.random() for g in generators]))
+            out.mean[:, k] = mean
+            out.covariance[:, k] = np.matmul(transposed(d * weights[..., None]), d)
+            offset = np.array([g.random() for g in generators])
+            x = _resampled(x, weights, offset)
+        # p(z_k | z_1..k-1) is the mean of the likelihoods, and `weighed` notes their sum.
         out.log_likelihood -= model.epochs * np.log(N)
         out.calls += N * model.evaluations
         return out
@@ -69,47 +78,54 @@ class Bootstrap(Tracker):
 def weighed(
     model: StateModel, x: Array, k: int, z: Array, before: Array | float, out: Tracks
 ) -> Array:
-    """The weights `before` (trials, N) of states x (trials, N, n) times the likelihood of readings z (trials, m), with
-    sum 1. The track notes the logarithm of their sum, and the innovation by the mean and covariance of h(x) before."""
-    r, R, seen = residuals(model, z, x, k), model.R_at(x, k), np.isfinite(z)
+    """The weights `before` (trials, N) of states x (trials, N, n) times the likelihood of readings
+    z (trials, m), with sum 1. The track notes the logarithm of their sum, and the innovation by the
+    mean and covariance of h(x) before."""
+    r = residuals(model, z, x, k)
+    R = model.R_at(x, k)
     square, size = squares(r, z, R)
-    p = np.broadcast_to(before, square.shape)
-    p = (p / p.sum(axis=1, keepdims=True))[..., None]
-    if model.R_by_state:
-        R = np.sum(p[..., None] * R, axis=1)
-    y = np.sum(p * r, axis=1)
-    d = r - y[:, None]
-    S = np.matmul(transposed(d * p), d) + np.where(
-        seen[:, :, None] & seen[:, None, :], R, np.eye(R.shape[-1])
-    )
-    L = factor(S)
-    found = Update.of(Normal(y, S), y, L, seen)
-    out.nis[:, k], out.innovations[:, k], out.degrees[:, k] = (
-        found.nis,
-        found.innovation,
-        found.degrees,
-    )
-    # Particles have no slope; that of 0 keeps the place of the innovation's L.
-    out.reads.append((np.zeros((*y.shape, model.n)), L))
+    out.note_innovation(k, _innovation(model, z, r, R, before))
+    # A likelihood of exp(-800) is 0 in floating point: all are divided by the largest.
     least = square.min(axis=1, keepdims=True)
     w = before * np.exp(-0.5 * (square - least))
     total = w.sum(axis=1, keepdims=True)
     if not (total > 0).all():
         raise ArithmeticError(
-            f"the readings of epoch {k + 1} have no density at some states: f, h or a standard deviation has no value"
-            " there, or is 0 or infinite"
+            f"the readings of epoch {k + 1} have no density at some states: f, h or a standard "
+            "deviation has no value there, or is 0 or infinite"
         )
     out.log_likelihood += np.log(total[:, 0]) - 0.5 * (least[:, 0] + size)
     return w / total
 
 
+def _innovation(model: StateModel, z: Array, r: Array, R: Array, before: Array | float) -> Update:
+    """The innovation y = mean of r and S = covariance of r + R, by the weights before the readings
+    z (trials, m), for residuals r (trials, N, m)."""
+    seen = np.isfinite(z)
+    both = seen[:, :, None] & seen[:, None, :]
+    p = np.broadcast_to(before, r.shape[:2])
+    p = (p / p.sum(axis=1, keepdims=True))[..., None]
+    if model.R_by_state:
+        R = np.sum(p[..., None] * R, axis=1)
+    y = np.sum(p * r, axis=1)
+    d = r - y[:, None]
+    # A missing reading has unit variance.
+    S = np.matmul(transposed(d * p), d) + np.where(both, R, np.eye(R.shape[-1]))
+    L = factor(S)
+    # Particles have no slope; that of 0 keeps the place of the innovation's L.
+    no_slope = np.zeros((*y.shape, model.n))
+    return Update.of(Normal(y, S), y, L, seen, no_slope)
+
+
 def _resampled(x: Array, w: Array, offset: Array) -> Array:
-    """Particles x (trials, N, n) copied in proportion to their weights w (trials, N), systematically from an offset
-    (trials,) in [0, 1)."""
+    """Particles x (trials, N, n) copied in proportion to their weights w (trials, N),
+    systematically from an offset (trials,) in [0, 1)."""
     trials, N, n = x.shape
+    # Of the N points (i + offset) / N, i = 0 ... N-1, as many fall to a particle as lie in its
+    # part of the cumulated weights.
     upto = np.ceil(N * np.cumsum(w, axis=1) - offset[:, None]).clip(0, N)
+    # Round-off may leave the sum of the weights below 1.
     upto[:, -1] = N
     counts = np.diff(upto, axis=1, prepend=0.0).astype(int)
-    return x.reshape(trials * N, n)[np.repeat(np.arange(trials * N), counts.ravel())].reshape(
-        trials, N, n
-    )
+    rows = np.repeat(np.arange(trials * N), counts.ravel())
+    return x.reshape(trials * N, n)[rows].reshape(trials, N, n)
