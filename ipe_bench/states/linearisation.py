@@ -1,8 +1,9 @@
-"""Rules that replace y = g(x), x ~ N(m, P), by y = A x + b + e, e ~ N(0, W): the one thing in which Gaussian filters
-differ.
+"""Rules that replace y = g(x), x ~ N(m, P), by y = A x + b + e, e ~ N(0, W): the one thing in which
+Gaussian filters differ.
 
-Taylor's rule gives the extended Kalman filter; statistical linear regression by sigma points gives the unscented,
-cubature and Gauss-Hermite filters and, about the posterior, those of posterior linearisation.
+Taylor's rule gives the extended Kalman filter; statistical linear regression by sigma points gives
+the unscented, cubature and Gauss-Hermite filters and, about the posterior, those of posterior
+linearisation.
 """
 
 from __future__ import annotations
@@ -44,8 +45,9 @@ class Rule(Component, ABC):
 
     @abstractmethod
     def linearise(self, g: Function, m: Array, P: Array, nearest: Nearest | None = None) -> Affine:
-        """The affine law of g about N(m, P), for m (trials, n) and P (trials, n, n). `nearest` shifts values of g that
-        are periodic next to others: the mean of points on both sides of a bearing's jump would lie opposite."""
+        """The affine law of g about N(m, P), for m (trials, n) and P (trials, n, n). `nearest`
+        shifts values of g that are periodic next to others: the mean of points on both sides of a
+        bearing's jump would lie opposite."""
 
     def mean(self, g: Function, m: Array, P: Array) -> Array:
         """The mean (trials, ...) of g over N(m, P), g (trials, p, ...) at points (trials, p, n)."""
@@ -53,7 +55,8 @@ class Rule(Component, ABC):
 
     @abstractmethod
     def calls(self, n: int, periodic: bool = False) -> int:
-        """Evaluations of g per trial, a slope in one direction counted as one; `periodic` where values are shifted."""
+        """Evaluations of g per trial, a slope in one direction counted as one; `periodic` where
+        values are shifted."""
 
 
 @dataclass(frozen=True)
@@ -79,8 +82,8 @@ class Taylor(Rule):
 
 @dataclass(frozen=True)
 class SigmaPoints(Rule):
-    """Statistical linear regression by points s and weights w of the standard normal distribution, with sum w s s' = I
-    (Arasaratnam, Haykin, Elliott, Proc. IEEE 95, 2007)."""
+    """Statistical linear regression by points s and weights w of the standard normal distribution,
+    with sum w s s' = I (Arasaratnam, Haykin, Elliott, Proc. IEEE 95, 2007)."""
 
     @abstractmethod
     def points(self, n: int) -> tuple[Array, Array]:
@@ -92,21 +95,24 @@ class SigmaPoints(Rule):
 
     def linearise(self, g: Function, m: Array, P: Array, nearest: Nearest | None = None) -> Affine:
         s, w = self.points(m.shape[-1])
-        parts = half(P)
-        y = g(m[..., None, :] + np.matmul(s, transposed(parts.G)))
+        # The points m + G s, of P = G G'.
+        G = half(P)
+        y = g(m[..., None, :] + np.matmul(s, transposed(G.G)))
         if nearest is not None:
             y = nearest(y, g(m)[..., None, :])
         mean = np.sum(w[:, None] * y, axis=-2)
         d = y - mean[..., None, :]
-        w = self.covariance_weights(w)
-        M = np.matmul(s.T, d * w[:, None])  # G' A'
-        W = np.matmul(transposed(d * w[:, None]), d) - np.matmul(transposed(M), M)
-        A = parts.over(transposed(M))
+        weighted = d * self.covariance_weights(w)[:, None]
+        # M = sum w s d' = G' A', and with it A = M' G^-1 and W = sum w d d' - A P A'.
+        M = np.matmul(s.T, weighted)
+        A = G.over(transposed(M))
+        W = np.matmul(transposed(weighted), d) - np.matmul(transposed(M), M)
         return Affine(A, mean - multiply(A, m), symmetric(W))
 
     def mean(self, g: Function, m: Array, P: Array) -> Array:
         s, w = self.points(m.shape[-1])
-        values = g(m[..., None, :] + np.matmul(s, transposed(half(P).G)))
+        points = m[..., None, :] + np.matmul(s, transposed(half(P).G))
+        values = g(points)
         return np.sum(w[:, None, None] * values, axis=-3)
 
     def calls(self, n: int, periodic: bool = False) -> int:
@@ -115,7 +121,8 @@ class SigmaPoints(Rule):
 
 @dataclass(frozen=True)
 class Cubature(SigmaPoints):
-    """The spherical-radial rule of third degree, 2 n points (Arasaratnam and Haykin, IEEE TAC 54, 2009).
+    """The spherical-radial rule of third degree, 2 n points (Arasaratnam and Haykin, IEEE TAC 54,
+    2009).
 
     Example:
 
@@ -127,40 +134,47 @@ class Cubature(SigmaPoints):
     """
 
     def points(self, n: int) -> tuple[Array, Array]:
-        return np.sqrt(n) * np.concatenate([np.eye(n), -np.eye(n)]), np.full(2 * n, 0.5 / n)
+        directions = np.concatenate([np.eye(n), -np.eye(n)])
+        return np.sqrt(n) * directions, np.full(2 * n, 0.5 / n)
 
 
 @dataclass(frozen=True)
 class Unscented(SigmaPoints):
-    """The 2 n + 1 points of Julier and Uhlmann (1997), scaled as by van der Merwe (dissertation, 2004).
+    """The 2 n + 1 points of Julier and Uhlmann (1997), scaled as by van der Merwe (dissertation,
+    2004).
 
     Example:
 
     >>> import ipe_bench as ib
     >>> model = ib.component("state_model/pendulum", count=20, spread={"angle": 0.3, "rate": 0.3})
-    >>> table = ib.run(model, {"ukf": ib.states.Filter(rule=ib.states.Unscented(alpha=0.3))}, trials=20)
+    >>> table = ib.run(model, {"ukf": ib.states.Filter(rule=ib.states.Unscented(alpha=0.3))},
+    trials=20)
     >>> float(table.iloc[-1]["success"])
     1.0
     """
 
     kappa: Finite | None = None
-    """Weight of the central point, in units of the others' doubled; None: 3 - n, and 0 where that is negative, since a
-    negative weight costs the covariance its definiteness."""
+    """Weight of the central point, in units of the others' doubled; None: 3 - n, and 0 where that
+    is negative, since a negative weight costs the covariance its definiteness."""
     alpha: Positive = 1.0
     """Times the distance of the points."""
     beta: Finite = 0.0
-    """Further weight of the central point in covariances: 2 is best for a square of normal numbers."""
+    """Further weight of the central point in covariances: 2 is best for a square of normal
+    numbers."""
 
     def kappa_of(self, n: int) -> float:
         return max(3.0 - n, 0.0) if self.kappa is None else self.kappa
 
     def points(self, n: int) -> tuple[Array, Array]:
+        # c = n + lambda with lambda = alpha^2 (n + kappa) - n
         c = self.alpha**2 * (n + self.kappa_of(n))
-        s = np.sqrt(c) * np.concatenate([np.zeros((1, n)), np.eye(n), -np.eye(n)])
-        return s, np.concatenate([[1 - n / c], np.full(2 * n, 0.5 / c)])
+        directions = np.concatenate([np.zeros((1, n)), np.eye(n), -np.eye(n)])
+        weights = np.concatenate([[1 - n / c], np.full(2 * n, 0.5 / c)])
+        return np.sqrt(c) * directions, weights
 
     def covariance_weights(self, w: Array) -> Array:
-        return np.concatenate([[w[0] + 1 - self.alpha**2 + self.beta], w[1:]])
+        central = w[0] + 1 - self.alpha**2 + self.beta
+        return np.concatenate([[central], w[1:]])
 
 
 @dataclass(frozen=True)
@@ -171,7 +185,8 @@ class GaussHermite(SigmaPoints):
 
     >>> import ipe_bench as ib
     >>> model = ib.component("state_model/pendulum", count=20, spread={"angle": 0.3, "rate": 0.3})
-    >>> table = ib.run(model, {"ghkf": ib.states.Filter(rule=ib.states.GaussHermite(order=3))}, trials=20)
+    >>> table = ib.run(model, {"ghkf": ib.states.Filter(rule=ib.states.GaussHermite(order=3))},
+    trials=20)
     >>> float(table.iloc[-1]["success"])
     1.0
     """
@@ -184,9 +199,10 @@ class GaussHermite(SigmaPoints):
             raise UserError(
                 f"order={self.order}: {self.order}^{n} points for {n} states; choose the rule Cubature"
             )
-        return np.array(list(product(s, repeat=n))), np.array(
-            [np.prod(c) for c in product(w, repeat=n)]
-        )
+        # A point for each choice of n points of the line; its weight is the product of theirs.
+        points = np.array(list(product(s, repeat=n)))
+        weights = np.array([np.prod(c) for c in product(w, repeat=n)])
+        return points, weights
 
     @cached_property
     def _line(self) -> tuple[Array, Array]:
@@ -195,8 +211,9 @@ class GaussHermite(SigmaPoints):
 
 
 def slope(function: Callable[[Array], Array], x: Array) -> tuple[Array, Array]:
-    """Value (trials, m) and Jacobian (trials, m, n) of a function at x (trials, n), by its own `slope` if it has one,
-    else by complex steps."""
-    if (own := getattr(function, "slope", None)) is not None:
+    """Value (trials, m) and Jacobian (trials, m, n) of a function at x (trials, n), by its own
+    `slope` if it has one, else by complex steps."""
+    own = getattr(function, "slope", None)
+    if own is not None:
         return own(x)
     return function(x), differentiate(function, x, analytic=True)

@@ -1,4 +1,5 @@
-"""Smoothers of state models: every epoch is estimated from all readings, by passes back through a filter's tracks."""
+"""Smoothers of state models: every epoch is estimated from all readings, by passes back through a
+filter's tracks."""
 
 from __future__ import annotations
 
@@ -18,6 +19,8 @@ from ipe_bench.states.whole_paths import PathDensity, Settled, Tangents
 
 _HALVINGS = 12
 """Halvings of a damped step."""
+_ROUND_OFF = 1e-12
+"""Part of a cost by which it may rise."""
 
 
 @dataclass(frozen=True)
@@ -49,17 +52,20 @@ class Smoother(Tracker):
 
 @dataclass(frozen=True)
 class IteratedSmoother(Tracker):
-    """Linearises everything about the last smoothed path and solves that affine problem exactly, again and again.
+    """Linearises everything about the last smoothed path and solves that affine problem exactly,
+    again and again.
 
-    By Taylor's rule these are Gauss-Newton steps to the path of largest posterior density (Bell, SIAM J. Optim. 4,
-    1994), with `damped` halved while they raise its cost; by sigma points it is the iterated posterior linearisation
-    smoother (García-Fernández, Svensson, Särkkä, IEEE TSP 65, 2017). The first path is the track of `first`.
+    By Taylor's rule these are Gauss-Newton steps to the path of largest posterior density (Bell,
+    SIAM J. Optim. 4, 1994), with `damped` halved while they raise its cost; by sigma points it is
+    the iterated posterior linearisation smoother (García-Fernández, Svensson, Särkkä, IEEE TSP 65,
+    2017). The first path is the track of `first`.
 
     Example:
 
     >>> import ipe_bench as ib
     >>> model = ib.component("state_model/pendulum", count=20, spread={"angle": 0.3, "rate": 0.3})
-    >>> table = ib.run(model, {"ieks": ib.states.IteratedSmoother(first=ib.states.ukf())}, trials=20)
+    >>> table = ib.run(model, {"ieks": ib.states.IteratedSmoother(first=ib.states.ukf())},
+    trials=20)
     >>> float(table.iloc[-1]["success"])
     1.0
     """
@@ -75,14 +81,14 @@ class IteratedSmoother(Tracker):
     damped: bool = False
     """Whether steps that raise the cost of the path are halved; for Taylor's rule."""
     tolerance: NonNegative = 0.0
-    """A trial ends where its path moves by at most so many of its own standard deviations: by tangents over all states
-    and epochs together, by points those of each state."""
+    """A trial ends where its path moves by at most so many of its own standard deviations: by
+    tangents over all states and epochs together, by points those of each state."""
 
     def hindrance(self, model: StateModel) -> str | None:
-        tangents = self.damped or isinstance(
-            self.rule, Taylor
-        )  # steps on a cost, which knows Q and R alone
-        return (super() if tangents else self.first).hindrance(model)
+        # Steps on a cost know Q and R alone.
+        if self.damped or isinstance(self.rule, Taylor):
+            return super().hindrance(model)
+        return self.first.hindrance(model)
 
     def track(self, model: StateModel, z: Array) -> Tracks:
         path = self.first.track(model, z)
@@ -91,11 +97,15 @@ class IteratedSmoother(Tracker):
         return self._by_points(model, z, path)
 
     def _by_tangents(self, density: PathDensity, path: Tracks) -> Tracks:
-        model, x, calls = density.model, whole(path)[0], path.calls.copy()
+        model = density.model
+        x = whole(path).mean
+        calls = path.calls.copy()
         if not model.moved_first:
             x[:, 0] = x[:, 1]
-        going, tangents = np.arange(len(x)), None
+        going = np.arange(len(x))
+        tangents = None
         for _ in range(self.iterations):
+            # Gauss-Newton: dx solves the affine problem about the path exactly.
             some = density.subset(going)
             at, about = some.about(x[going])
             new = at.x + some.step(about, at)
@@ -106,7 +116,8 @@ class IteratedSmoother(Tracker):
                 calls[going] += shorter.calls
             x[going] = new
             tangents = about if tangents is None else put(tangents, going, about)
-            going = going[some.size(about, new - at.x) > self.tolerance**2]
+            moved = some.size(about, new - at.x)
+            going = going[moved > self.tolerance**2]
             if not going.size:
                 break
         assert tangents is not None
@@ -114,37 +125,49 @@ class IteratedSmoother(Tracker):
         calls += end.calls
         if self.damped:
             end = density.settled_exactly(end)
-            x, calls = end.x, calls + end.calls
+            x = end.x
+            calls = calls + end.calls
         P = covariances(density, tangents)
         out = Tracks.empty(model, len(x))
-        out.start, out.mean, out.covariance = Normal(x[:, 0], P[:, 0]), x[:, 1:], P[:, 1:]
-        out.cost, out.calls = end.cost, calls
+        out.start = Normal(x[:, 0], P[:, 0])
+        out.mean = x[:, 1:]
+        out.covariance = P[:, 1:]
+        out.cost = end.cost
+        out.calls = calls
         return out
 
     def _by_points(self, model: StateModel, z: Array, path: Tracks) -> Tracks:
-        calls, going = path.calls, np.ones(len(z), dtype=bool)
+        calls = path.calls
+        going = np.ones(len(z), dtype=bool)
         for _ in range(self.iterations):
+            # Posterior linearisation: points about the last smoothed path, then its smoother.
             new = smoothed(model, filtered(model, z, self.rule, path=path))
             calls = calls + np.where(going, new.calls, 0.0)
             if self.damped:
-                shorter = _shortened(PathDensity.of(model, z), whole(path)[0], whole(new)[0])
-                new.start, new.mean = new.start._replace(mean=shorter.x[:, 0]), shorter.x[:, 1:]
+                density = PathDensity.of(model, z)
+                shorter = _shortened(density, whole(path).mean, whole(new).mean)
+                new.start = new.start._replace(mean=shorter.x[:, 0])
+                new.mean = shorter.x[:, 1:]
                 calls = calls + np.where(going, shorter.calls, 0.0)
-            deviation = np.sqrt(np.maximum(np.diagonal(new.covariance, axis1=-2, axis2=-1), 0.0))
-            moved = (np.abs(new.mean - path.mean) > self.tolerance * deviation) & (deviation > 0)
-            path, on = new, moved.any(axis=(1, 2))
+            variances = np.diagonal(new.covariance, axis1=-2, axis2=-1)
+            deviation = np.sqrt(np.maximum(variances, 0.0))
+            moved = np.abs(new.mean - path.mean) > self.tolerance * deviation
+            on = (moved & (deviation > 0)).any(axis=(1, 2))
+            path = new
             going &= on
             if not on.any():
                 break
         path.calls = calls
         if not (model.gain_by_state or model.R_by_state):
-            end = PathDensity.of(model, z).settled(whole(path)[0])
-            path.cost, path.calls = end.cost, calls + end.calls
+            end = PathDensity.of(model, z).settled(whole(path).mean)
+            path.cost = end.cost
+            path.calls = calls + end.calls
         return path
 
 
 def smoothed(model: StateModel, tracks: Tracks) -> Tracks:
-    """Passes back through a filter's tracks to before the first transition (Rauch, Tung, Striebel, AIAA J. 3, 1965):
+    """Passes back through a filter's tracks to before the first transition (Rauch, Tung, Striebel,
+    AIAA J. 3, 1965):
 
         G = P[k] A' (A P[k] A' + W + Q)^-1
         m[k] <- m[k] + G (m[k+1] - m-[k+1])
@@ -152,60 +175,82 @@ def smoothed(model: StateModel, tracks: Tracks) -> Tracks:
 
     with m-[k+1] and P-[k+1] predicted from epoch k by the affine law A of its transition.
     """
-    out, singular = Tracks.empty(model, len(tracks.mean)), np.zeros(len(tracks.mean), dtype=bool)
-    out.mean[:, -1], out.covariance[:, -1] = x = tracks.at(model.epochs - 1)
+    trials = len(tracks.mean)
+    out = Tracks.empty(model, trials)
+    singular = np.zeros(trials, dtype=bool)
+    # At the last epoch the filter has all readings.
+    x = tracks.at(model.epochs - 1)
+    out.mean[:, -1] = x.mean
+    out.covariance[:, -1] = x.covariance
     first = 0 if model.moved_first else 1
     for k in range(model.epochs - 1, first - 1, -1):
         before = tracks.at(k - 1)
-        move, predicted = tracks.moves[k - first], tracks.predicted[k - first]
-        parts = half(predicted.covariance)
-        singular |= parts.singular
-        G = parts.over(parts.whitened(np.matmul(before.covariance, transposed(move.A))))
+        move = tracks.moves[k - first]
+        predicted = tracks.predicted[k - first]
+        # G = (P A') (C C')^-1 with P-[k+1] = C C', which may be singular.
+        C = half(predicted.covariance)
+        singular |= C.singular
+        PA = np.matmul(before.covariance, transposed(move.A))
+        G = C.over(C.whitened(PA))
+        m = before.mean + multiply(G, x.mean - predicted.mean)
         P = np.matmul(np.matmul(G, x.covariance - predicted.covariance), transposed(G))
-        x = Normal(
-            before.mean + multiply(G, x.mean - predicted.mean), symmetric(before.covariance + P)
-        )
+        x = Normal(m, symmetric(before.covariance + P))
         if k:
-            out.mean[:, k - 1], out.covariance[:, k - 1] = x
+            out.mean[:, k - 1] = x.mean
+            out.covariance[:, k - 1] = x.covariance
     out.start = x
-    out.moves, out.predicted, out.calls = tracks.moves, tracks.predicted, tracks.calls
+    out.moves = tracks.moves
+    out.predicted = tracks.predicted
+    out.calls = tracks.calls
     if singular.any() and len(tracks.reads) == model.epochs:
         _smooth_by_scores(model, tracks, out, singular)
     return out
 
 
 def _smooth_by_scores(model: StateModel, tracks: Tracks, out: Tracks, rows: Mask) -> None:
-    """Smooths the trials `rows` (trials,) without the inverse of a covariance of states, which then may be singular
-    (Bierman, Automatica 9, 1973): with the score r and the information N that later readings hold of x[k],
+    """Smooths the trials `rows` (trials,) without the inverse of a covariance of states, which then
+    may be singular (Bierman, Automatica 9, 1973): with the score r and the information N that later
+    readings hold of x[k],
 
         m[k] <- m[k] + P[k] r,   P[k] <- P[k] - P[k] N P[k]
 
-    and, on the way from after the reading of an epoch to after that of the epoch before, C = I - P- H' S^-1 H,
+    and, on the way from after the reading of an epoch to after that of the epoch before, C = I - P-
+    H' S^-1 H,
 
         r <- A' (H' S^-1 y + C' r),   N <- A' (H' S^-1 H + C' N C) A.
     """
-    n, first = model.n, 0 if model.moved_first else 1
-    r, N = np.zeros((rows.sum(), n)), np.zeros((rows.sum(), n, n))
+    n = model.n
+    first = 0 if model.moved_first else 1
+    # No readings are later than those of the last epoch.
+    r = np.zeros((rows.sum(), n))
+    N = np.zeros((rows.sum(), n, n))
     for k in range(model.epochs - 1, first - 1, -1):
-        H, L = (a[rows] for a in tracks.reads[k])
-        B = lower_solve(L, H)
-        seen = np.matmul(transposed(B), B)
-        C = np.eye(n) - np.matmul(tracks.predicted[k - first].covariance[rows], seen)
-        e, A = np.nan_to_num(tracks.innovations[rows, k]), tracks.moves[k - first].A[rows]
-        r = multiply(transposed(A), multiply(transposed(B), e) + multiply(transposed(C), r))
-        N = seen + np.matmul(np.matmul(transposed(C), N), C)
-        N = symmetric(np.matmul(np.matmul(transposed(A), N), A))
-        m, P = (a[rows] for a in tracks.at(k - 1))
-        mean, covariance = m + multiply(P, r), symmetric(P - np.matmul(np.matmul(P, N), P))
-        variances = np.einsum("tii->ti", covariance)  # a view
+        # H' S^-1 H = B' B and H' S^-1 y = B' e, with B = L^-1 H and e = L^-1 y.
+        H, L = tracks.reads[k]
+        B = lower_solve(L[rows], H[rows])
+        e = np.nan_to_num(tracks.innovations[rows, k])
+        BB = np.matmul(transposed(B), B)
+        C = np.eye(n) - np.matmul(tracks.predicted[k - first].covariance[rows], BB)
+        A = tracks.moves[k - first].A[rows]
+        score = multiply(transposed(B), e) + multiply(transposed(C), r)
+        r = multiply(transposed(A), score)
+        information = BB + np.matmul(np.matmul(transposed(C), N), C)
+        N = symmetric(np.matmul(np.matmul(transposed(A), information), A))
+        before = tracks.at(k - 1)
+        P = before.covariance[rows]
+        smooth = symmetric(P - np.matmul(np.matmul(P, N), P))
+        variances = np.einsum("tii->ti", smooth)  # a view
         np.maximum(variances, 0.0, out=variances)  # round-off of states that are known exactly
         at = out.at(k - 1)
-        at.mean[rows], at.covariance[rows] = mean, covariance
+        at.mean[rows] = before.mean[rows] + multiply(P, r)
+        at.covariance[rows] = smooth
 
 
 def covariances(density: PathDensity, tangents: Tangents) -> Array:
     """The covariances (trials, 1 + K, n, n) of the path of an affine model."""
-    model, blank = density.model, np.where(np.isfinite(density.z), 0.0, np.nan)
+    model = density.model
+    # No covariance of an affine model depends on the values of its readings.
+    blank = np.where(np.isfinite(density.z), 0.0, np.nan)
     out = Tracks.empty(model, len(blank))
     x = out.start
     for k in range(model.epochs):
@@ -218,35 +263,41 @@ def covariances(density: PathDensity, tangents: Tangents) -> Array:
         H = tangents.H[:, k]
         read = Affine(H, np.zeros(H.shape[:2]), np.zeros((1, 1)))
         x = out.note(k, update(x, read, model.R(k), blank[:, k]))
-    return whole(smoothed(model, out))[1]
+    return whole(smoothed(model, out)).covariance
 
 
-def whole(tracks: Tracks) -> tuple[Array, Array]:
-    """Means (trials, 1 + K, n) and covariances (trials, 1 + K, n, n) from before the first transition."""
-    parts = zip(tracks.start, (tracks.mean, tracks.covariance), strict=True)
-    x, P = (np.concatenate([start[:, None], later], axis=1) for start, later in parts)
-    return x, P
+def whole(tracks: Tracks) -> Normal:
+    """The states (trials, 1 + K, n) and their covariances (trials, 1 + K, n, n) from before the
+    first transition."""
+    mean = np.concatenate([tracks.start.mean[:, None], tracks.mean], axis=1)
+    covariance = np.concatenate([tracks.start.covariance[:, None], tracks.covariance], axis=1)
+    return Normal(mean, covariance)
 
 
 def path_p(z: Array, cost: Array) -> Array:
-    """The probability (trials,) of a cost above that of a path of largest density, if the model holds: it is chi-square
-    with as many degrees as the readings z (trials, K, m) that are there."""
+    """The probability (trials,) of a cost above that of a path of largest density, if the model
+    holds: it is chi-square with as many degrees as the readings z (trials, K, m) that are there."""
     from scipy.special import chdtrc
 
     return chdtrc(np.isfinite(z).sum(axis=(1, 2)), cost)
 
 
 def _shortened(density: PathDensity, old: Array, new: Array) -> Settled:
-    """The steps between paths (trials, 1 + K, n), halved in each trial until they do not raise its cost; the calls are
-    those of all costs."""
-    before, found = density.settled(old), density.settled(new)
-    calls, share = before.calls + found.calls, 1.0
+    """The steps between paths (trials, 1 + K, n), halved in each trial until they do not raise its
+    cost; the calls are those of all costs."""
+    before = density.settled(old)
+    found = density.settled(new)
+    calls = before.calls + found.calls
+    share = 1.0
     for _ in range(_HALVINGS - 1):
-        rows = np.flatnonzero(~(found.cost <= before.cost * (1 + 1e-12)))
+        # A cost that is not finite counts as a rise.
+        lowered = found.cost <= before.cost * (1 + _ROUND_OFF)
+        rows = np.flatnonzero(~lowered)
         if not rows.size:
             break
         share /= 2
-        part = density.subset(rows).settled(old[rows] + share * (new[rows] - old[rows]))
+        shorter = old[rows] + share * (new[rows] - old[rows])
+        part = density.subset(rows).settled(shorter)
         found = put(found, rows, part)
         calls[rows] += part.calls
     return replace(found, calls=calls)
