@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -66,18 +66,22 @@ class StateModel(Component, ABC):
         x[k] = f(x[k-1], k) + G[k] w[k],   w[k] ~ N(0, I)
         z[k] = h(x[k], k) + v[k],          v[k] ~ N(0, R[k])
 
-    Required: `states`, `times`, `prior`, `transition` (f), `observe` (h), `gain` (G) and `R`; if noise depends on the
-    states, `gain_at(x, k)` in place of `gain(k)`, for the states x[k-1], or `R_at(x, k)` in place of `R(k)`.
-    Optional: `moved_first`, `periods`, `state_periods`, `reading_names` and `scored`; `draw`, if paths are stored;
-    `log_inputs`, `with_log` and `faults`, if a log has known inputs; `alike`, if a transition is long.
-    Promised: f and h take stacks of states (..., n), real or complex, and are analytic in them, since slopes are
-    complex steps; a trial has the same bits alone and in any batch; `require_sound` finds nothing to refuse.
+    Required: `states`, `times`, `prior`, `transition` (f), `observe` (h), `gain` (G) and `R`; if
+    noise depends on the states, `gain_at(x, k)` in place of `gain(k)`, for the states x[k-1], or
+    `R_at(x, k)` in place of `R(k)`. Optional: `moved_first`, `periods`, `state_periods`,
+    `reading_names` and `scored`; `draw`, if paths are stored; `log_inputs`, `with_log` and
+    `faults`, if a log has known inputs; `alike`, if a transition is long. Promised: f and h take
+    stacks of states (..., n), real or complex, and are analytic in them, since slopes are complex
+    steps; a trial has the same bits alone and in any batch; `require_sound` finds nothing to
+    refuse.
 
-    Trackers run f and h as compiled code that is recorded from them, if they depend on x and k alone and branch on no
-    state (`np.where` is recorded); `ipe-bench check` says which ones run epoch by epoch, and why.
+    Trackers run f and h as compiled code that is recorded from them, if they depend on x and k
+    alone and branch on no state (`np.where` is recorded); `ipe-bench check` says which ones run
+    epoch by epoch, and why.
 
-    Process noise enters by its gain, so that a singular Q = G G' needs no special case. Known inputs and unequal steps
-    follow from k. A measurement model with epochs is the state model whose states stand still.
+    Process noise enters by its gain, so that a singular Q = G G' needs no special case. Known
+    inputs and unequal steps follow from k. A measurement model with epochs is the state model whose
+    states stand still.
 
     >>> from ipe_bench.states import ekf
     >>> @dataclass(frozen=True)
@@ -119,8 +123,8 @@ class StateModel(Component, ABC):
     @property
     @abstractmethod
     def prior(self) -> Normal:
-        """Mean (n,) and covariance (n, n) before the first transition, or at the first reading if `moved_first` is
-        false."""
+        """Mean (n,) and covariance (n, n) before the first transition, or at the first reading if
+        `moved_first` is false."""
 
     @abstractmethod
     def transition(self, x: Array, k: int) -> Array:
@@ -131,12 +135,14 @@ class StateModel(Component, ABC):
         """h: (..., n) -> (..., m)."""
 
     def alike(self, k: int) -> int:
-        """An epoch into which the transition is the same function as into epoch k, by which it is recorded: k itself
-        unless a model knows better, which saves recording a long transition again for each epoch."""
+        """An epoch into which the transition is the same function as into epoch k, by which it is
+        recorded: k itself unless a model knows better, which saves recording a long transition
+        again for each epoch."""
         return k
 
     def recorded(self, name: str, epochs: Sequence[int]) -> list[Recording]:
-        """Records `transition` into these epochs, or `observe` at them; raises anything if it cannot be recorded."""
+        """Records `transition` into these epochs, or `observe` at them; raises anything if it
+        cannot be recorded."""
         alike = self.alike if name == "transition" else int
         return recorded_by_epoch(getattr(self, name), self.n, epochs, alike)
 
@@ -153,7 +159,8 @@ class StateModel(Component, ABC):
         return self._functions[1]
 
     def transition_into(self, k: int) -> Recording:
-        """f of the step into epoch k as a function of states (..., n) that knows its slopes, for trackers."""
+        """f of the step into epoch k as a function of states (..., n) that knows its slopes, for
+        trackers."""
         return self.epoch_functions[0].at[k]
 
     def observation_at(self, k: int) -> Recording:
@@ -161,14 +168,14 @@ class StateModel(Component, ABC):
         return self.epoch_functions[1].at[k]
 
     def values_along(self, x: Array) -> tuple[Array, Array]:
-        """f (trials, K, n) and h (trials, K, m) as in `Along`, of paths x (trials, 1 + K, n) that begin before the
-        first transition: `evaluations` for each trial."""
+        """f (trials, K, n) and h (trials, K, m) as in `Along`, of paths x (trials, 1 + K, n) that
+        begin before the first transition: `evaluations` for each trial."""
         f, h = self.epoch_functions
         return f.values(x[:, :-1]), h.values(x[:, 1:])
 
     def slopes_along(self, x: Array) -> Along:
-        """f and h with their slopes along paths x (trials, 1 + K, n) that begin before the first transition: 1 + n
-        times `evaluations` for each trial."""
+        """f and h with their slopes along paths x (trials, 1 + K, n) that begin before the first
+        transition: 1 + n times `evaluations` for each trial."""
         f, h = self.epoch_functions
         moved, F = f.slopes(x[:, :-1])
         read, H = h.slopes(x[:, 1:])
@@ -184,15 +191,18 @@ class StateModel(Component, ABC):
 
     def _by_state(self, name: str) -> UserError:
         return UserError(
-            f"state_model={self.name}: {name} depends on the states; what takes {name}(k) does not suit it"
+            f"state_model={self.name}: {name} depends on the states; "
+            f"what takes {name}(k) does not suit it"
         )
 
     def gain_at(self, x: Array, k: int) -> Array:
-        """G (..., n, q) of the step into epoch k from each of the states x (..., n); (n, q) if it is that of all."""
+        """G (..., n, q) of the step into epoch k from each of the states x (..., n); (n, q) if it
+        is that of all."""
         return self.gain(k)
 
     def R_at(self, x: Array, k: int) -> Array:
-        """R (..., m, m) of the readings of epoch k at each of the states x (..., n); (m, m) if it is that of all."""
+        """R (..., m, m) of the readings of epoch k at each of the states x (..., n); (m, m) if it
+        is that of all."""
         return self.R(k)
 
     @property
@@ -207,12 +217,14 @@ class StateModel(Component, ABC):
 
     @property
     def periods(self) -> tuple[float, ...]:
-        """The period of each reading, such as 2 pi of a bearing in rad; 0 for a reading without. Empty: none has."""
+        """The period of each reading, such as 2 pi of a bearing in rad; 0 for a reading without.
+        Empty: none has."""
         return ()
 
     @property
     def state_periods(self) -> tuple[float, ...]:
-        """The period of each state, such as 2 pi of a heading in rad; 0 for a state without. Empty: none has."""
+        """The period of each state, such as 2 pi of a heading in rad; 0 for a state without. Empty:
+        none has."""
         return ()
 
     @property
@@ -227,7 +239,8 @@ class StateModel(Component, ABC):
 
     @property
     def log_inputs(self) -> tuple[str, ...]:
-        """Names of the known inputs that a log has for each epoch, beside the readings; `time` in s is its times."""
+        """Names of the known inputs that a log has for each epoch, beside the readings; `time` in s
+        is its times."""
         return ()
 
     def with_log(self, count: int, inputs: Mapping[str, Array]) -> StateModel:
@@ -235,7 +248,8 @@ class StateModel(Component, ABC):
         return self
 
     def faults(self, columns: Mapping[str, Array]) -> Iterable[Fault]:
-        """Yields what the model refuses of the known inputs and readings (K,) of a log, by the names of its columns."""
+        """Yields what the model refuses of the known inputs and readings (K,) of a log, by the
+        names of its columns."""
         return ()
 
     @property
@@ -244,13 +258,16 @@ class StateModel(Component, ABC):
 
     @property
     def scored(self) -> tuple[str, ...]:
-        """Names of the states by which trackers are scored, such as constants among states that move; empty: all."""
+        """Names of the states by which trackers are scored, such as constants among states that
+        move; empty: all."""
         return ()
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """The states by which trackers are scored."""
-        return tuple(state for state in self.states if not self.scored or state.name in self.scored)
+        if not self.scored:
+            return tuple(self.states)
+        return tuple(state for state in self.states if state.name in self.scored)
 
     @property
     def m(self) -> int:
@@ -277,49 +294,64 @@ class StateModel(Component, ABC):
         return G @ G.T
 
     def Q_at(self, x: Array, k: int) -> Array:
-        """Q (..., n, n) of the step into epoch k from each of the states x (..., n); (n, n) if it is that of all."""
+        """Q (..., n, n) of the step into epoch k from each of the states x (..., n); (n, n) if it
+        is that of all."""
+        if not self.gain_by_state:
+            return self.Q(k)
         G = self.gain_at(x, k)
-        return np.matmul(G, transposed(G)) if self.gain_by_state else self.Q(k)
+        return np.matmul(G, transposed(G))
 
     def nearest(self, z: Array, to: Array) -> Array:
-        """z (..., m), each periodic reading shifted by whole periods next to that of `to` (..., m)."""
+        """z (..., m), each periodic reading shifted by whole periods next to that of `to` (...,
+        m)."""
         return nearest(z, to, self.periods)
 
     def nearest_state(self, x: Array, to: Array) -> Array:
-        """x (..., n), each periodic state shifted by whole periods next to that of `to` (..., n)."""
+        """x (..., n), each periodic state shifted by whole periods next to that of `to` (...,
+        n)."""
         return nearest(x, to, self.state_periods)
 
     def observe_near(self, x: Array, k: int, to: Array) -> Array:
         """h without jumps around readings `to` (trials, m), for x (trials, ..., n)."""
+        h = self.observation_at(k)(x)
         between = (1,) * (x.ndim - to.ndim)
-        return self.nearest(
-            self.observation_at(k)(x), to.reshape(to.shape[:1] + between + to.shape[1:])
-        )
+        to = to.reshape(to.shape[:1] + between + to.shape[1:])
+        return self.nearest(h, to)
 
     def draw(self, start: int, stop: int, seed: int = 0) -> Paths:
-        """Trials `start` to `stop`. Start, process noise and readings' noise have a stream each per trial: with another
-        Q or R, or in another batch, a trial keeps its standard normal numbers."""
-        K, n, trials = self.epochs, self.n, stop - start
-        q, m = self.gain_at(self.prior.mean[None], K - 1).shape[-1], self.readings_per_epoch
+        """Trials `start` to `stop`. Start, process noise and readings' noise have a stream each per
+        trial: with another Q or R, or in another batch, a trial keeps its standard normal
+        numbers."""
+        K = self.epochs
+        n = self.n
+        m = self.readings_per_epoch
+        q = self.gain_at(self.prior.mean[None], K - 1).shape[-1]
+        trials = stop - start
 
         def normals(stream: int, *shape: int) -> Array:
             drawn = [g.standard_normal(shape) for g in numbered(seed, start, stop, stream)]
             return np.array(drawn).reshape(trials, *shape)
 
+        # x0 = m0 + P0^1/2 u, with fewer columns where P0 is singular.
         spread = root(self.prior.covariance)
-        x = self.prior.mean + multiply(spread, normals(_START, n)[:, : spread.shape[1]])
-        w, v = normals(_PROCESS, K, q), normals(_READINGS, K, m)
-        paths = Paths(x, np.empty((trials, K, n)), np.empty((trials, K, m)))
+        u = normals(_START, n)[:, : spread.shape[1]]
+        w = normals(_PROCESS, K, q)
+        v = normals(_READINGS, K, m)
+        x = self.prior.mean + multiply(spread, u)
+        paths = Paths(start=x, x=np.empty((trials, K, n)), z=np.empty((trials, K, m)))
         for k in range(K):
+            # x[k] = f(x[k-1]) + G w,  z[k] = h(x[k]) + R^1/2 v
             if self.moves(k):
                 x = self.transition(x, k) + multiply(self.gain_at(x, k), w[:, k])
             paths.x[:, k] = x
-            paths.z[:, k] = self.observe(x, k) + multiply(factor(self.R_at(x, k)), v[:, k])
+            noise = multiply(factor(self.R_at(x, k)), v[:, k])
+            paths.z[:, k] = self.observe(x, k) + noise
         return paths
 
 
 def widened(model: StateModel, scale: float) -> StateModel:
-    """The model with the deviations of its prior multiplied by a scale: for the truth, and for every tracker.
+    """The model with the deviations of its prior multiplied by a scale: for the truth, and for
+    every tracker.
 
     Raises:
         UserError: the model's paths are stored, and no prior is drawn from.
@@ -343,54 +375,85 @@ def widened(model: StateModel, scale: float) -> StateModel:
 
 
 def require_sound(model: StateModel) -> None:
-    """Raises UserError unless the parts of a model suit one another: times, prior, Q, R, f and h."""
-    n, name = model.n, f"state_model={model.name}"
-    if absent := [one for one in model.scored if one not in [state.name for state in model.states]]:
-        raise UserError(
-            f"{name}: scored: {unknown(absent[0], [state.name for state in model.states], 'state')}"
-        )
+    """Raises UserError unless the parts of a model suit one another: times, prior, Q, R, f and
+    h."""
+    for faults in (_name_faults, _time_faults, _noise_faults, _shape_faults, _covariance_faults):
+        for fault in faults(model):
+            raise UserError(f"state_model={model.name}: {fault}")
+
+
+def _name_faults(model: StateModel) -> Iterator[str]:
+    names = [state.name for state in model.states]
+    for name in model.scored:
+        if name not in names:
+            yield f"scored: {unknown(name, names, 'state')}"
+
+
+def _time_faults(model: StateModel) -> Iterator[str]:
     if not model.epochs or not (np.diff(model.times) > 0).all():
-        raise UserError(
-            f"{name}: its times do not increase from epoch to epoch; give epochs in order"
-        )
-    for one in ("gain", "R"):
-        if all(getattr(type(model), own) is getattr(StateModel, own) for own in (one, f"{one}_at")):
-            raise UserError(
-                f"{name}: it has no {one}; write {one}(k), or {one}_at(x, k) if it depends on the states"
+        yield "its times do not increase from epoch to epoch; give epochs in order"
+
+
+def _noise_faults(model: StateModel) -> Iterator[str]:
+    for name in ("gain", "R"):
+        methods = (name, f"{name}_at")
+        if all(getattr(type(model), own) is getattr(StateModel, own) for own in methods):
+            yield (
+                f"it has no {name}; write {name}(k), or {name}_at(x, k) if it depends on the states"
             )
-    m, x = model.readings_per_epoch, model.prior.mean
-    shapes = {
-        "the mean of the prior": (x, (n,)),
-        "f": (model.transition(x[None], model.epochs - 1), (1, n)),
-        "h": (model.observe(x[None], 0), (1, m)),
-        "periods": (model.periods, (m,) if model.periods else (0,)),
-        "state_periods": (model.state_periods, (n,) if model.state_periods else (0,)),
-    }
-    for k in {0, model.epochs - 1}:
+
+
+def _shape_faults(model: StateModel) -> Iterator[str]:
+    n = model.n
+    m = model.readings_per_epoch
+    x = model.prior.mean
+    last = model.epochs - 1
+    periods = model.periods
+    state_periods = model.state_periods
+    parts = [
+        ("the mean of the prior", x, (n,)),
+        ("f", model.transition(x[None], last), (1, n)),
+        ("h", model.observe(x[None], 0), (1, m)),
+        ("periods", periods, (m,) if periods else (0,)),
+        ("state_periods", state_periods, (n,) if state_periods else (0,)),
+    ]
+    for k in sorted({0, last}):
+        # Its columns are as many as there are process noises, with a G for each state or for all.
         G = model.gain_at(x[None], k)
-        shapes |= {
-            f"the gain of epoch {k + 1}": (G, (1,) * model.gain_by_state + (n, np.shape(G)[-1]))
-        }
-    for what, (value, shape) in shapes.items():
+        stack = (1,) if model.gain_by_state else ()
+        parts.append((f"the gain of epoch {k + 1}", G, (*stack, n, np.shape(G)[-1])))
+    for what, value, shape in parts:
         if np.shape(value) != shape:
-            raise UserError(f"{name}: {what} has shape {np.shape(value)}, where {shape} belongs")
-    matrices = {"the covariance of the prior": (model.prior.covariance, n)}
+            yield f"{what} has shape {np.shape(value)}, where {shape} belongs"
+
+
+def _covariance_faults(model: StateModel) -> Iterator[str]:
+    n = model.n
+    m = model.readings_per_epoch
+    x = model.prior.mean[None]
+    covariances = [("the covariance of the prior", model.prior.covariance, n)]
     for k in range(model.epochs):
-        Q, R = model.Q_at(x[None], k), model.R_at(x[None], k)
-        Q, R = Q[0] if model.gain_by_state else Q, R[0] if model.R_by_state else R
-        matrices |= {f"Q of epoch {k + 1}": (Q, n), f"R of epoch {k + 1}": (R, m)}
-    for what, (P, size) in matrices.items():
-        if not np.isfinite(P).all():
-            raise UserError(
-                f"{name}: {what} is not finite at the mean of the prior; give another mean or noise"
-            )
-        if what[0] == "R" and np.shape(P) == (m, m) and half(P).singular:
-            raise UserError(
-                f"{name}: {what} is singular; give every reading a standard deviation above 0"
-            )
-        if np.shape(P) != (size, size):
-            raise UserError(f"{name}: {what} has shape {np.shape(P)}, where {(size, size)} belongs")
-        if not np.allclose(P, P.T, rtol=1e-9, atol=0):
-            raise UserError(f"{name}: {what} is not symmetric; give a covariance")
-        if not np.linalg.eigvalsh(P)[0] >= -1e-12 * np.abs(P).max() * size:
-            raise UserError(f"{name}: {what} has a negative eigenvalue; give a covariance")
+        Q = model.Q_at(x, k)
+        R = model.R_at(x, k)
+        covariances.append((f"Q of epoch {k + 1}", Q[0] if model.gain_by_state else Q, n))
+        covariances.append((f"R of epoch {k + 1}", R[0] if model.R_by_state else R, m))
+    for what, P, size in covariances:
+        fault = _fault(P, size, regular=what.startswith("R"))
+        if fault:
+            yield f"{what} {fault}"
+
+
+def _fault(P: Array, size: int, regular: bool) -> str | None:
+    """Returns why P is no covariance (size, size), which has to be regular or may be singular."""
+    if not np.isfinite(P).all():
+        return "is not finite at the mean of the prior; give another mean or noise"
+    if np.shape(P) != (size, size):
+        return f"has shape {np.shape(P)}, where {(size, size)} belongs"
+    if regular and half(P).singular:
+        return "is singular; give every reading a standard deviation above 0"
+    if not np.allclose(P, P.T, rtol=1e-9, atol=0):
+        return "is not symmetric; give a covariance"
+    round_off = 1e-12 * np.abs(P).max() * size
+    if not np.linalg.eigvalsh(P)[0] >= -round_off:
+        return "has a negative eigenvalue; give a covariance"
+    return None

@@ -20,11 +20,12 @@ _DRIFTS = slice(KINEMATIC + 4, KINEMATIC + 7)
 
 @dataclass(frozen=True)
 class WalkingGins(StateModel):
-    """The paper's four runs of 90 minutes one after another on one platform, whose three gyro drifts walk meanwhile.
+    """The paper's four runs of 90 minutes one after another on one platform, whose three gyro
+    drifts walk meanwhile.
 
-    The states are the eleven of the motion, which begin anew with each run, and the eleven parameters of `Gins` in
-    multiples of their sizes; eight of them stand still. The parameters alone are scored. An epoch is a pair of
-    velocities, every three minutes.
+    The states are the eleven of the motion, which begin anew with each run, and the eleven
+    parameters of `Gins` in multiples of their sizes; eight of them stand still. The parameters
+    alone are scored. An epoch is a pair of velocities, every three minutes.
 
     Example:
 
@@ -35,11 +36,12 @@ class WalkingGins(StateModel):
     """
 
     walk: NonNegative = 0.1
-    """By how much a drift walks in an hour: standard deviation, in multiples of the drift's size (0.01 deg/h about x
-    and y, 0.1 deg/h about z)."""
+    """By how much a drift walks in an hour: standard deviation, in multiples of the drift's size
+    (0.01 deg/h about x and y, 0.1 deg/h about z)."""
     motion: NonNegative = 0.0
-    """Standard deviation of further noise on each state of the motion at each reading and at the start, in multiples of
-    457.2 m/s for velocities and of 1 for unit vectors; with 0 covariances are singular."""
+    """Standard deviation of further noise on each state of the motion at each reading and at the
+    start, in multiples of 457.2 m/s for velocities and of 1 for unit vectors; with 0 covariances
+    are singular."""
     deviation: Positive = 0.0066
     """Standard deviation of a reading, m/s: that of rounding to 0.02286 m/s."""
     steps: Count = 4
@@ -57,13 +59,14 @@ class WalkingGins(StateModel):
 
     @property
     def times(self) -> Array:
-        runs, interval = len(self.gins.cases), 60.0 * self.gins.interval_min
-        return interval * np.arange(1, runs * self.gins.readings_per_case + 1)
+        epochs = len(self.gins.cases) * self.gins.readings_per_case
+        return 60.0 * self.gins.interval_min * np.arange(1, epochs + 1)
 
     @property
     def _motion(self) -> Array:
         """Standard deviations (11,) of the noise on the motion."""
-        return self.motion * np.repeat([_SPEED, 1.0], [2, KINEMATIC - 2])
+        sizes = np.repeat([_SPEED, 1.0], [2, KINEMATIC - 2])
+        return self.motion * sizes
 
     @property
     def prior(self) -> Normal:
@@ -71,33 +74,42 @@ class WalkingGins(StateModel):
         return Normal(np.zeros(len(variances)), np.diag(variances))
 
     def alike(self, k: int) -> int:
-        return k if k % self.gins.readings_per_case == 0 else 1
+        begins = k % self.gins.readings_per_case == 0
+        return k if begins else 1
 
     def transition(self, x: Array, k: int) -> Array:
         g = self.gins
-        p = list(np.moveaxis(x[..., KINEMATIC:] * g.si_sizes, -1, 0))
         y = x[..., :KINEMATIC]
+        p = list(np.moveaxis(x[..., KINEMATIC:] * g.si_sizes, -1, 0))
+        # The motion begins anew with each run, for every state that was before.
         run, within = divmod(k, g.readings_per_case)
         if within == 0:
             y = y * 0.0 + np.array(g.start(p, g.cases[run]))
         h = 60.0 * g.interval_min / self.steps
 
         def rate(y: Array) -> Array:
-            return np.stack(g.rhs(0.0, list(np.moveaxis(y, -1, 0)), p, ()), axis=-1)
+            rates = g.rhs(0.0, list(np.moveaxis(y, -1, 0)), p, ())
+            return np.stack(rates, axis=-1)
 
+        # The classical Runge-Kutta method of fourth order: y <- y + h (k1 + 2 k2 + 2 k3 + k4) / 6.
         for _ in range(self.steps):
             k1 = rate(y)
             k2 = rate(y + h / 2 * k1)
             k3 = rate(y + h / 2 * k2)
-            y = y + h / 6 * (k1 + 2 * k2 + 2 * k3 + rate(y + h * k3))
+            k4 = rate(y + h * k3)
+            y = y + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        # The parameters stand still, but for the drifts' noise.
         return np.concatenate([y, x[..., KINEMATIC:]], axis=-1)
 
     def observe(self, x: Array, k: int) -> Array:
         return x[..., :2] - self.gins.offset.reshape(-1, 2)[k]
 
     def gain(self, k: int) -> Array:
-        G = np.zeros((self.n, 3 + KINEMATIC * (self.motion > 0)))
-        G[_DRIFTS, :3] = self.walk * np.sqrt(self.gins.interval_min / 60.0) * np.eye(3)
+        # A drift walks by `walk` times the root of the hours between two readings.
+        hours = self.gins.interval_min / 60.0
+        motions = KINEMATIC if self.motion else 0
+        G = np.zeros((self.n, 3 + motions))
+        G[_DRIFTS, :3] = self.walk * np.sqrt(hours) * np.eye(3)
         if self.motion:
             G[:KINEMATIC, 3:] = np.diag(self._motion)
         return G
