@@ -27,20 +27,18 @@ class AuditAnswer(Shown, Audit):
             texts("bias", [f"{value:+.2f}" for value in self.bias[:, 0]]),
             texts("95 % of bias", [f"{low:+.2f} to {high:+.2f}" for low, high in self.bias[:, 1:]]),
         ]
-        runs, left_out = self.claims.runs, self.claims.left_out
+        joint = "No covariances are reported, so directions are not judged."
+        if self.claims.joint:
+            joint = "The first sentence is of all parameters together, by the whole covariance."
         notes = [
-            "true over reported is the root mean square of errors in reported standard deviations, 1 if the report is"
-            " right; bias is their mean. Intervals hold for all parameters together, and for heavy tails."
+            "true over reported is the root mean square of errors in reported standard deviations,"
+            " 1 if the report is right; bias is their mean. Intervals hold for all parameters"
+            " together, and for heavy tails.",
+            joint,
         ]
-        joint = "The first sentence is of all parameters together, by the whole covariance."
-        notes.append(
-            joint
-            if self.claims.joint
-            else "No covariances are reported, so directions are not judged."
-        )
-        title = f"Audit of {runs} runs" + (
-            f", {left_out} rows without an estimate left out" if left_out else ""
-        )
+        title = f"Audit of {self.claims.runs} runs"
+        if self.claims.left_out:
+            title += f", {self.claims.left_out} rows without an estimate left out"
         return [*self.sentences, Table("audit", title, "", columns, notes=notes)]
 
 
@@ -49,12 +47,21 @@ def write_audit(folder: Path, found: AuditAnswer, sources: Sequence[tuple[str, s
     from ipe_bench.questions.audit.figure import draw_audit
 
     parts = [part for part in found.parts() if isinstance(part, Table)]
-    shown = found.sentences, parts, draw_audit(found)
-    write_files(folder, "audit", ("audit.csv", found.table()), "Audit", *shown, sources=sources)
+    write_files(
+        folder,
+        "audit",
+        ("audit.csv", found.table()),
+        "Audit",
+        found.sentences,
+        parts,
+        draw_audit(found),
+        sources=sources,
+    )
 
 
 def audited(table: Any, output: Path | str | None = None) -> AuditAnswer:
-    """Audits a file or a frame, and writes audit.csv and its page into a folder if one is named."""
+    """Audits a file or a frame, and writes audit.csv and its page into a folder if one is
+    named."""
     found = AuditAnswer(**vars(audit(read_claims(table))))
     if output is not None:
         sources = [] if isinstance(table, pd.DataFrame) else digests([Path(table)])

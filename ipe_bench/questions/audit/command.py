@@ -19,7 +19,8 @@ estimate, std. The column run groups rows of one run.
 
 
 def answer(files: Sequence[str], output: str | None = None) -> Answered:
-    """Returns whether reported covariances describe the errors; exit code 1 if there is evidence that they do not."""
+    """Returns whether reported covariances describe the errors; exit code 1 if there is evidence
+    that they do not."""
     from ipe_bench.questions.audit.answer import audited
 
     if len(files) != 1:
@@ -27,9 +28,9 @@ def answer(files: Sequence[str], output: str | None = None) -> Answered:
             "audit: name one table of truths, estimates and deviations, such as runs.csv"
         )
     found = audited(files[0], output)
-    lines = (
-        [] if output is None else [f"\nTable   {output}/audit.csv", f"Page    {output}/audit.html"]
-    )
+    lines = []
+    if output is not None:
+        lines = [f"\nTable   {output}/audit.csv", f"Page    {output}/audit.html"]
     return Answered(found.parts(), 1 if found.scale.wrong else 0, lines=lines)
 
 
