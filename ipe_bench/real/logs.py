@@ -221,6 +221,8 @@ class LogTracks:
     """The median effective sample size of an epoch, of a weighted sample; NaN if there is none."""
     constants: Sequence[Constant] = ()
     """The constants that were asked for."""
+    smooths: bool = False
+    """Whether later readings count."""
     found: str = ""
     """The verdict on the search for them; empty if one maximum was found."""
     notes: Sequence[str] = ()
@@ -269,6 +271,7 @@ class LogTracks:
             ),
             lost_from=lost_from,
             effective=size,
+            smooths=tracker.smooths,
             notes=_copies(log, tracks),
         )
 

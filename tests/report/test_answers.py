@@ -269,7 +269,7 @@ def walked():
 def test_each_state_is_drawn_with_its_band_and_the_readings_where_it_is_read(walked):
     found, drawing = walked
     position, velocity, nis = drawing.figure.axes[:3]
-    assert drawing.title == "kf, same, rts: states ± 2 standard deviations"
+    assert drawing.title == "kf, same, rts (smoother): states ± 2 standard deviations"
     track = found["kf"]
     drawn = {line.get_color(): line.get_ydata() for line in position.lines if len(line.get_ydata())}
     means = [line for line in velocity.lines if line.get_linestyle() == "-"]

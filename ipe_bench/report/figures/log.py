@@ -70,9 +70,10 @@ def draw_log(log: Log, tracks: Sequence[LogTracks]) -> Iterator[Drawing]:
         ax.margins(x=0.01)
     common.legend(fig, axes, look)
     shown = enumerate_few([_name(group) for group in groups])
-    left = len(tracks) - sum(map(len, groups))
+    drawn = {one.label for group in groups for one in group}
+    left = [one.label for one in tracks if one.label not in drawn]
     if left:
-        words.append(f"Not drawn: {left} of {len(tracks)} tracks.")
+        words.append(f"Not drawn: {enumerate_few(left)}.")
     if model.n > len(states):
         words.append(f"{model.n - len(states)} further states are in track.csv.")
     yield Drawing(
@@ -98,7 +99,9 @@ def directly_read(model: StateModel) -> dict[int, int]:
 
 
 def _name(group: Sequence[LogTracks]) -> str:
-    return enumerate_few([one.label for one in group], 2)
+    """Names the tracks of a group, and says which are of smoothers."""
+    labels = [f"{one.label} (smoother)" if one.smooths else one.label for one in group]
+    return enumerate_few(labels, 2)
 
 
 def _groups(tracks: Sequence[LogTracks]) -> list[list[LogTracks]]:

@@ -178,6 +178,9 @@ def write_tracks(
     }
     listed = "; ".join(f"{who} {shown(word)}" for word, who in found.items())
     said = [f"Tested by innovations or the cost of a path: {listed}."] if found else []
+    smoothers = [one.label for one in answer if one.smooths]
+    if smoothers:
+        said.append(f"Smoothers, which use later readings: {enumerate_few(smoothers)}.")
     told = {"facts": facts, "sources": read_from(provenance)}
     files = write_files(
         folder,
