@@ -70,6 +70,7 @@ def _target() -> Any:
 
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
+    # Machine code is for this very processor: files keep its name and features in their keys.
     cpu, features = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
     target = llvm.Target.from_default_triple()
     return target.create_target_machine(cpu=cpu, features=features, opt=1, reloc="pic", jit=True)
@@ -108,6 +109,7 @@ def load(
     """
     import llvmlite.binding as llvm
 
+    # The file begins with the digests of what it was made of and of its code; others are made anew.
     made_of = hashlib.sha256(repr((name, key, _machine())).encode()).digest()
     path = cache_folder() / f"{made_of.hex()[:32]}.o"
     content = _own_bytes(path)
@@ -120,12 +122,14 @@ def load(
             write_atomically(
                 path, lambda temporary: (temporary.write_bytes(content), temporary.chmod(0o600))
             )
+    # The object is linked against the functions of the C library that it may call.
     library = llvm.JITLibraryBuilder().add_object_img(code).export_symbol(name)
     for called, address in _addresses().items():
         library.import_symbol(called, address)
     engine = llvm.create_lljit_compiler(_target())
     tracker = library.link(engine, made_of.hex())
     function = ctypes.CFUNCTYPE(None, *arguments)(tracker[name])
+    # The code lives as long as the function that calls it.
     function.keeps = engine, tracker  # type: ignore[attr-defined]
     return function
 
@@ -147,6 +151,7 @@ def _object_code(text: str) -> bytes:
 
     module = llvm.parse_assembly(text)
     module.triple, module.data_layout = _target().triple, str(_target().target_data)
+    # LLVM's passes must not reorder sums: no fast-math flag is set in what is written.
     options = llvm.create_pipeline_tuning_options(speed_level=2)
     options.loop_vectorization = options.slp_vectorization = options.loop_unrolling = (
         False  # vectors are explicit

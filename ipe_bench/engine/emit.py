@@ -54,6 +54,7 @@ def rates(program: Program, width: int) -> str:
     x, si, out, trials = made.args
     b: Any = ir.IRBuilder(made.append_basic_block())
     n = program.inputs
+    # for i in range(trials): out[i] = rate(x[i] * si)
     with loop(b, integer(0), trials) as i:
         v = _Vectors(b, width)
         row, size = v.load(v.place(x, b.mul(i, integer(n))), range(n)), v.load(si, range(n))
@@ -79,9 +80,11 @@ def rows(source: RowPrograms, width: int) -> str:
     asked, last = b.icmp_signed("!=", b.ptrtoint(J, I64), integer(0)), integer(n - width)
     with loop(b, integer(0), total) as i:
         known = v.place(c, b.mul(b.urem(i, count), integer(numbers)))
+        # y[i] = y(x[i], c[i % count]), and what its tangents need of it.
         given = v.load(v.place(x, b.mul(i, integer(n))), range(n))
         found = v.run(source.values, [*given, *v.load(known, range(numbers))])
         v.store(found[:m], v.place(y, b.mul(i, integer(m))), range(m))
+        # J[i] = dy/dx, `width` columns at a time: a vector holds a tangent in that many directions.
         with b.if_then(asked), loop(b, integer(0), integer(n), width) as begun:
             saved = [w.spread(b.extract_element(a, ir.Constant(I32, 0))) for a in found[m:]]
             # The last vector begins early enough to end with the last direction.
@@ -113,6 +116,7 @@ class _Writer:
         self.read = self._function("read", [PTR, F64], self._read)
         if plan.tangents:
             kinds, n = [PTR, PTR, PTR], len(plan.tangents)
+            # Short tangents advance in pairs, and one alone where their number is odd.
             paired = n - n % 2 if len(plan.tangents[0]) < _FILLED else 0
             self.groups = [
                 group for group in ((0, paired, 2), (paired, n, 1)) if group[0] < group[1]
@@ -176,6 +180,7 @@ class _Writer:
         sides: list[Value] = []
         times: list[Value] = []
         for s, row in enumerate(plan.tableau.weights[:-1]):
+            # Stage s: k_s = f(t + C_s h, y + h sum_j A_sj k_j).
             at = v.combine(y, weights[s], [slopes[j] for j, _ in row])
             time = v.call("fma", v.spread(h), v.constant(plan.tableau.C[s]), v.spread(t))
             times.append(time)
@@ -185,9 +190,12 @@ class _Writer:
                 sides.append(result[-1])
             else:
                 v.store(result[len(plan.y) :], frame, plan.kept[s])
+        # The end of the step, y + h sum_s B_s k_s.
         ended = v.combine(y, weights[-1], [slopes[j] for j, _ in plan.tableau.weights[-1]])
         v.store(ended, frame, plan.y)
         if plan.doubt:
+            # The rates of the stages' moments with the state held, where they depend on the time
+            # itself.
             held = [v.run(plan.rates, [time, *y, *fixed]) for time in times] if plan.timed else []
             places = [*plan.reach, *plan.side, *plan.doubt]
             given = [
@@ -216,6 +224,7 @@ class _Writer:
         ]
         slopes: list[list[list[Value]]] = [[] for _ in one]
         for s, row in enumerate(plan.tableau.weights[:-1]):
+            # The stages of the variational equations, by what the state's own stages have kept.
             at = [v.combine(y[k], weights[s], [slopes[k][j] for j, _ in row]) for k in one]
             stage = v.place(frame, s * plan.stage_size)
             saved = v.load(stage, move.saved)
@@ -285,8 +294,11 @@ class _Writer:
                     put(b, number_at(b, frame, at(place, lane)), states, row)
                     row = b.add(row, b.add(n_times, integer(1)))
 
+        # A group of lanes: their numbers are gathered into the frame, a vector for each.
         with loop(b, first, last, width) as group:
             with loop(b, integer(0), integer(width)) as lane:
+                # Lane l is trial rows[l / n_cases] in case l % n_cases; beyond the last, the last
+                # again.
                 here, end = b.add(group, lane), b.sub(last, integer(1))
                 problem = b.select(b.icmp_signed("<", here, end), here, end)
                 trial, case = (
@@ -303,6 +315,8 @@ class _Writer:
                     put(
                         b, number_at(b, cases, b.add(constants, integer(j))), frame, at(place, lane)
                     )
+                # Where the lane's readings go, what is subtracted of them, its constants, and its
+                # states.
                 place = b.add(b.mul(trial, n_cases), case)
                 put(b, b.mul(b.mul(place, n_times), integer(no * columns)), target, lane)
                 put(b, b.mul(case, stride), shift, lane)
@@ -313,6 +327,7 @@ class _Writer:
                     kept,
                     lane,
                 )
+            # The state at time 0, and what is computed once for the lane.
             b.call(self.begin, [frame])
             keep(integer(0))
             b.store(ir.Constant(F64, 0.0), t)
@@ -320,15 +335,18 @@ class _Writer:
                 ir.Constant(F64, float("nan")), taken
             )  # unlike any step, so that the weights are always written
             with loop(b, integer(0), n_times) as k:
+                # From reading to reading: h = (times[k] - t) / steps[k].
                 to, since = number_at(b, times, k), b.load(t, typ=F64)
                 # No step to a time that is reached already: at the start, or where two readings share a time.
                 count = b.select(
                     b.fcmp_ordered("==", to, since), integer(0), number_at(b, steps, k, I64)
                 )
                 h = b.fdiv(b.fsub(to, since), b.sitofp(count, F64))
+                # The weights times h are written again where the step has changed.
                 with b.if_then(b.fcmp_unordered("!=", h, b.load(taken, typ=F64))):
                     b.call(self.weigh, [frame, h])
                 b.store(h, taken)
+                # One step of the state, then of the tangents beside it.
                 with loop(b, integer(0), count) as s:
                     b.call(self.step, [frame, b.fadd(since, b.fmul(b.sitofp(s, F64), h)), h])
                     for begin, end, by in self.groups if plan.tangents else ():
@@ -339,6 +357,7 @@ class _Writer:
                             )
                 b.store(to, t)
                 keep(b.add(k, integer(1)))
+                # The constants of the next interval hold from this reading on.
                 if plan.driven:
                     later = b.mul(b.add(k, integer(1)), b.mul(n_cases, integer(nc)))
                     with loop(b, integer(0), integer(width)) as lane:
@@ -351,6 +370,8 @@ class _Writer:
                                 at(place, lane),
                             )
                 b.call(self.read, [frame, to])
+                # Readings less their offset, or Jacobians in the parameters' sizes, to their rows
+                # of `out`.
                 done = b.mul(k, integer(no))
                 with loop(b, integer(0), integer(columns)) as j:
                     if plan.tangents:
@@ -408,6 +429,7 @@ class _Vectors:
     def run(self, program: Program, inputs: Sequence[Value]) -> list[Value]:
         values = list(inputs)
         assert len(values) == program.inputs
+        # Values are numbered as in the program: inputs, then the result of each operation.
         for name, *numbers in program.operations:
             constant = name == "constant"
             values.append(
@@ -433,6 +455,7 @@ class _Vectors:
         match name, args:
             case "neg", [a]:
                 return builder.fneg(a)
+            # a b - c and c - a b round once, as a b + c does.
             case "fms", [a, b, c]:
                 return self.call("fma", a, b, builder.fneg(c))
             case "fnma", [a, b, c]:
@@ -479,6 +502,7 @@ def loop(b: ir.IRBuilder, first: Value, last: Value, by: int = 1) -> Iterator[Va
     before = b.block
     b.branch(test)
     b.position_at_end(test)
+    # i is `first` on the way in, and i + by on the way round.
     i = b.phi(I64)
     i.add_incoming(first, before)
     b.cbranch(b.icmp_signed("<", i, last), body, after)

@@ -83,6 +83,7 @@ class Kernel:
 
     def _machine_code(self, width: int) -> tuple[Callable[..., None], int]:
         """Returns the function for groups of so many lanes, and the numbers that it needs room for."""
+        # Behind the plan's vectors lie h times the weights of the formula, in whole vectors.
         weights = -(-sum(map(len, self.plan.tableau.weights)) // width)
         return emitted("integrate", self.plan, width, _ARGUMENTS), (
             self.plan.size + weights
@@ -113,6 +114,7 @@ class Kernel:
         if not compiled.available():
             self._interpret(x, si, cases, rows, times, steps, *more, states=states)
             return
+        # The frame is as wide as the lanes need.
         function, size = self._narrow if lanes <= _NARROW else self._wide
         given = (at(x), at(si), at(cases), count, at(rows, WHOLE))
         stride = len(offset[0]) // count if offset else 0
@@ -132,6 +134,7 @@ class Kernel:
                 function(*given, first, last, *taken, kept, frame)
             del memory
 
+        # Work in steps times lanes times states; a Jacobian costs a tangent for each parameter.
         width = compiled.width()
         work = (
             lanes
@@ -159,6 +162,7 @@ class Kernel:
         """Evaluates from the time, the state with its tangents, and constants: their starts, their slopes, and
         readings."""
         tape = Recording(self.equations)
+        # For Jacobians, each number is a tangent in all directions at once, an array (n, lanes).
         d, dp, slopes, shown, starts = (
             tape.tangents if self.sensitive else ([], [], [], tape.shown, [])
         )
@@ -189,6 +193,7 @@ class Kernel:
         directions = list(np.eye(n)[:, :, None]) if self.sensitive else []
         p = list((x[trial] * si).T)
 
+        # What stays over a step: parameters, the constants of interval k, and directions.
         def stays(k: int) -> list[Any]:
             return [*p, *intervals[min(k, len(intervals) - 1), case].T, *directions]
 
@@ -201,10 +206,13 @@ class Kernel:
             y, noted = begun[:size], begun[size:]
             kept = [y]
             for k, to in enumerate(times):
+                # Equal steps to the next reading; none to a time that is reached already.
                 h = (to - t) / max(int(steps[k]), 1)
                 for s in range(int(steps[k]) if to != t else 0):
                     slopes, held, sides = list[list[Any]](), list[Any](), list[Any]()
                     at = y
+                    # Stage s: k_s = f(t + C_s h, y + h sum_j A_sj k_j); the last row, B, is the end
+                    # of the step.
                     for node, row in zip((*self.tableau.C, 1.0), self.tableau.weights, strict=True):
                         at = y
                         for j, weight in row:
@@ -215,12 +223,15 @@ class Kernel:
                             slopes.append(found[:size])
                             sides += found[size:]
                             if noted and self.plan.timed:
+                                # What the rates do with the states held is the time's doing, and no
+                                # doubt.
                                 held += slope([moment, *y, *stays(k)])[:size]
                     y = at
                     if noted:
                         noted = self.plan.watch(
                             [h, *y, *itertools.chain(*slopes), *held, *sides, *noted]
                         )
+                # The readings are taken with the constants that hold from this time on.
                 t = to
                 kept.append(y)
                 for i, value in enumerate(read([t, *y, *stays(k + 1)])):

@@ -76,6 +76,7 @@ class Found(NamedTuple):
 def apart(fine: Array, coarse: Array) -> Array:
     """Computes the distance of states (trials, cases, states, times) from others over the largest of each (trials,)."""
     with np.errstate(all="ignore"):
+        # The largest gap of a state over all times and cases, over the largest value of that state.
         largest, gap = (np.abs(y).max(axis=3).max(axis=1) for y in (fine, fine - coarse))
         scale = np.maximum(largest, _ROUNDING * largest.max(axis=1, keepdims=True, initial=0.0))
         return np.nan_to_num(np.where(gap == 0.0, 0.0, gap / scale), nan=np.inf).max(
@@ -107,10 +108,12 @@ def search(
     y, near = (np.empty((len(start), *states)) for _ in range(2))
     held = np.full(len(start), -1)  # the place whose readings are in `fine`
     pending = computed = np.flatnonzero(start < top)
+    # Each round integrates the pending trials at their rung n, and at n/2 where it is not known.
     while len(pending):
         still = []
         for place, rows in by_rung(places[pending], pending):
             below, known = coarser(place), held[rows] == coarser(place)
+            # What an earlier round computed at n/2 serves again.
             coarse[rows[known]], near[rows[known]] = fine[rows[known]], y[rows[known]]
             if not known.all():
                 simulate(rows[~known], int(rungs[below]), coarse, near)
@@ -120,11 +123,16 @@ def search(
                 moved = (np.abs(fine[rows] - unturned(coarse[rows], fine[rows])) / tolerance).max(
                     axis=1
                 )
+                # Step doubling: d bounds the error of n/2 and, by the order p = 8, d / (2^p - 1)
+                # that of n (Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I,
+                # section II.4).
                 moved = SAFETY * np.maximum(moved, astray / STATES)
                 left = moved / ((rungs[place] / rungs[below]) ** ORDER - 1.0)
                 # Not a number where an iterate overflows: such a trial climbs to the top, in bounded time.
                 moved, left = np.nan_to_num(moved, nan=np.inf), np.nan_to_num(left, nan=np.inf)
+                # The error falls with the p-th power of the step: n <- n left^(1/p).
                 wanted = rungs[place] * np.minimum(left ** (1.0 / ORDER), _LARGEST_CLIMB)
+            # n/2 is good enough; or n is; else the trial climbs.
             enough, good = moved <= 1.0, (left <= 1.0) | (place == top)
             fine[rows[enough]] = coarse[rows[enough]]
             final[rows] = np.where(enough, below, place)
@@ -144,6 +152,7 @@ def tangent_contraction(coarse: Array, J: Array) -> float:
     """Computes |I - J~+ J| in the spectral norm: the share of an error after a step with J~ (m, n) in place of J."""
     if not (np.isfinite(coarse).all() and np.isfinite(J).all()):
         return np.inf
+    # Columns are scaled, so that the contraction does not depend on the parameters' units.
     size = np.linalg.norm(J, axis=0)
     size[size == 0] = 1.0
     return float(
@@ -164,6 +173,7 @@ class Coarseness(NamedTuple):
     def steps(self, rung: int) -> tuple[bool, int]:
         """Returns whether the formula is that of fourth order, and the steps between two readings, for trials at this
         rung; 0 stands for trials whose rung is known without a search."""
+        # Eighth order: the steps of the readings, as many times longer as was measured to contract.
         if rung > HIGHEST_OF_FOURTH or self.fourth is None:
             return False, max(1, int(np.ceil(max(rung, 1) / self.longer)))
         # The formula of fourth order loses more by what a trial turns faster than the nominal one: at rung 1 there is
@@ -189,5 +199,6 @@ def times_longer(off: Array, coarse: Array, J: Array) -> float:
         sensitivity = tangent_contraction(coarse, J) / off.max()
     if not np.isfinite(sensitivity):
         return 1.0
+    # contraction = sensitivity * error, error ~ h^8: the ratio of steps that reaches the aim.
     longer = (SAFETY * AIM / sensitivity) ** (1 / ORDER) if sensitivity > 0 else np.inf
     return float(np.clip(longer, 1.0, LONGEST))

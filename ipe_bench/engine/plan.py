@@ -162,6 +162,7 @@ class Recording:
     @cached_property
     def divisors(self) -> list[Expression]:
         """What the rates divide by, where it changes along a solution."""
+        # a / b divides by b, and a^b by a where b is a negative number.
         varying, divisors = trace.dependent(self.slope, self.moving), list[Expression]()
         for e in trace.in_order(self.slope):
             base, *others = trace.operands(e) or [e]
@@ -181,6 +182,7 @@ class Recording:
         """A number that tells the signs of all that the rates divide by: where it changes, a pole has been crossed."""
         side = self.graph.constant(0.0)
         for i, divisor in enumerate(self.divisors):
+            # Each divisor has a binary digit: 1 where it is negative.
             side = side + 2.0**i * self.graph.apply("less", divisor, 0.0)
         return side
 
@@ -201,14 +203,18 @@ class Recording:
         began, doubt = g.inputs("noted", 2)
         given = [h, *ended, *slopes, *held, *sides, *reach, began, doubt]
         size: Any = np.abs
+        # The largest magnitude of each state so far, this step's end included.
         larger = [
             g.apply("where", a < size(b), size(b), a) for a, b in zip(reach, ended, strict=True)
         ]
+        # What the time alone does to the rates is no doubt.
         moved = [k - alone for k, alone in zip(slopes, held, strict=True)] if held else slopes
+        # A divisor that changed its sign in any stage: a pole was crossed.
         for side in sides:
             doubt = g.apply("where", (side < began) + (began < side), 1.0, doubt)
         for i, largest in enumerate(larger):
             own = moved[i::n]
+            # h sum_s E_s k_s is the difference from the embedded formula.
             error = sum(weight * k for weight, k in zip(formula.E, own, strict=True) if weight)
             rough = ROUGH * (largest + size(h * own[-1])) < size(h * error)
             doubt = g.apply("where", rough, 1.0, doubt)
@@ -220,6 +226,8 @@ class Recording:
         graph, variation = self.graph, self.equations.variation
         dp = graph.inputs("dp", self.equations.parameters)
         starts = trace.tangent(self.start, dict(zip(self.p, dp, strict=True)))
+        # The variational equations (d/dt) dy = df/dy dy + df/dp dp, with dy = dy0/dp dp at the
+        # start.
         if variation is None:
             dy = d = graph.inputs("d", self.equations.states)
             slopes = trace.tangent(self.slope, dict(zip(self.y + self.p, (*dy, *dp), strict=True)))
@@ -243,6 +251,7 @@ class Recording:
         self, directions: Sequence[Expression], tangents: Sequence[Expression]
     ) -> list[list[Expression]]:
         """Returns the tangents along each direction alone."""
+        # A unit vector in place of the direction leaves one column of the derivative.
         one, zero = self.graph.constant(1.0), self.graph.constant(0.0)
         units = [
             {other: one if other is along else zero for other in directions} for along in directions
@@ -264,12 +273,15 @@ class _Linear:
         dp: Sequence[Expression],
         tangents: Sequence[Expression],
     ) -> None:
+        # Tangents are linear, dy' = J dy + source: a source depends on the direction alone.
         outputs, sources = trace.separate(tangents, d, dp)
         names = [tape.graph.input(f"source{i}") for i in range(len(sources))]
         self.sources = tape.along_each(dp, sources)
         """The value (n, sources) of each source along each parameter."""
         needed = trace.border(outputs, trace.dependent(outputs, (*d, *names)))
         values = [e for row in self.sources for e in row]
+        # What changes along a solution is kept at each stage; what does not is computed once a
+        # lane.
         varying = trace.dependent([*needed, *values], tape.moving)
         self.fixed = [e for e in needed if e not in varying]
         self.saved = [e for e in needed if e in varying]
@@ -371,6 +383,7 @@ def jumps(equations: Equations) -> bool:
     ):
         if e.operands[0] is e.operands[1]:  # asks whether it is a number
             continue
+        # A comparison changes where its operands are equal: gap = 0.
         gap = graph.apply("sub", *e.operands)
         sides = [
             f
@@ -383,10 +396,12 @@ def jumps(equations: Equations) -> bool:
             )
             point = list(np.random.default_rng(1).uniform(-2.0, 2.0, (len(inputs), _POINTS)))
             with np.errstate(all="ignore"):
+                # Newton's method, in one coordinate: x <- x - gap / (dgap/dx).
                 for _ in range(_NEWTON):
                     value, slope, *_ = program(point)
                     point[place] = point[place] - value / slope
                 value, _, *shown = program(point)
+                # The rates as if the comparison held there, and as if it did not.
                 half = equations.states
                 a, b = (
                     np.stack(np.broadcast_arrays(value, *side))
@@ -411,6 +426,7 @@ def planned(equations: Equations, tableau: Tableau, *, sensitive: bool) -> StepP
     d, dp, slopes, shown, starts = tape.tangents if sensitive else ([], [], [], [], [])
     watched = equations.watched and not sensitive
     motion, reading = _Linear(tape, d, dp, slopes), _Linear(tape, d, dp, shown)
+    # What tangents need of a stage: what is kept of the state, and what drives a direction.
     saved = [*motion.saved, *motion.driving]
     noted = [*reading.saved, *reading.driving] if sensitive else tape.shown
     sides = [tape.side] if watched else []
@@ -418,11 +434,14 @@ def planned(equations: Equations, tableau: Tableau, *, sensitive: bool) -> StepP
         [*tape.fixed(*tape.slope, *saved, *noted, *sides), *motion.fixed, *reading.fixed]
     )
     given = [*tape.moving, *fixed]
+    # `step` computes the slopes and, in one program, what else a stage has to leave.
     rates, step, read = (
         Program.of(found, given)
         for found in ([*tape.slope, *saved], [*tape.slope, *saved, *sides], noted)
     )
     k, r = len(saved), len(noted)
+    # The frame, one vector after another: parameters, constants, state, what is fixed, tangents,
+    # what each stage keeps, readings, and what is noted of steps.
     x, constants, y, fixed_at = map(
         room, (equations.parameters, equations.constants, equations.states, len(fixed))
     )
@@ -431,6 +450,7 @@ def planned(equations: Equations, tableau: Tableau, *, sensitive: bool) -> StepP
     noted_at = room(r + len(reading.constant))
     shown_at = room(equations.outputs) if sensitive else noted_at
     reach, side, doubt = map(room, (equations.states, 1, 1) if watched else (0, 0, 0))
+    # Where the results of `begin` go, in the order in which they are started below.
     begun = [
         i
         for place in (y, fixed_at, *lie, *(stage[k:] for stage in stages), noted_at[r:])

@@ -31,6 +31,7 @@ _SIXTH = (
     0.030198172008377946,
 )
 # fmt: off
+# a_ij: stage i is evaluated at y + sum_j a_ij u_j.
 A: tuple[tuple[float, ...], ...] = (
     (),
     (3.0,),
@@ -41,6 +42,7 @@ A: tuple[tuple[float, ...], ...] = (
     (*_SIXTH, 1.0),
     (*_SIXTH, 1.0, 1.0),
 )
+# c_ij: the right side of stage i has sum_j c_ij u_j / h.
 C: tuple[tuple[float, ...], ...] = (
     (),
     (-14.155112264123755,),
@@ -58,6 +60,7 @@ C: tuple[tuple[float, ...], ...] = (
     ),
 )
 # fmt: on
+# alpha_i: stage i is evaluated at t + alpha_i h.
 NODES = (
     0.0,
     0.6358126895828704,
@@ -68,6 +71,7 @@ NODES = (
     1.0,
     1.0,
 )
+# gamma_i: the right side of stage i has gamma_i h df/dt.
 TIME_WEIGHTS = (
     GAMMA,
     -0.42387512638858027,
@@ -139,8 +143,10 @@ class Rodas5P:
         g, t, y, p, c, f = tape.graph, tape.t, tape.y, tape.p, tape.c, tape.slope
         k, s, d = g.inputs("k", n), g.inputs("s", n), g.inputs("d", equations.parameters)
         one, point, ways = g.constant(1.0), [t, *y, *p, *c], [*s, *d]
+        # d is the derivative along s of the states and d of the parameters; turned is J k.
         along = dict(zip([*y, *p], ways, strict=True))
         in_time, turned = tangent(f, {t: one}), tangent(f, dict(zip(y, k, strict=True)))
+        # Column j of J = df/dy is the tangent of f along y_j.
         columns = [tangent(f, {a: one}) for a in y]
         recorded = {
             "f": (f, point),
@@ -216,6 +222,7 @@ class _Run:
             stretched,
         )
         self.timed, self.divided = method.timed, method.divided
+        # The usual interval between readings: the unit of steps at poles and of looks at pulses.
         intervals = np.diff(np.asarray(of.times, dtype=float), prepend=0.0)
         self.interval = float(np.median(intervals[intervals > 0.0])) if intervals.any() else 1.0
         cases, self.q = of.tables.shape[1], equations.parameters if sensitive else 0
@@ -249,6 +256,7 @@ class _Run:
         return out
 
     def _integrate(self) -> None:
+        # Each lane has its own step; those that are done drop out of `live`.
         h = self._first_step()
         live = np.arange(len(self.t))
         while True:
@@ -268,12 +276,16 @@ class _Run:
             )
             y, S, error = self._step(live, now)
             self.steps[live] += 1
+            # h <- h 0.9 error^(-1/5), within 0.2 to 6 times h: the embedded solution has order 4
+            # (Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, eq. II.4.13).
             good = error <= 1
             change = np.clip(_SAFETY * np.maximum(error, 1e-10) ** -0.2, _SHRINK, _GROW)
             wanted = now * np.where(np.isfinite(error), change, _SHRINK)
             # What a reading cut short says nothing against the step that was wanted.
             h[live] = np.where(good & (now < h[live]), np.maximum(wanted, h[live]), wanted)
+            # A step that round-off swallows ends the lane.
             h[live] = np.where(self.t[live] + 8 * h[live] == self.t[live], np.nan, h[live])
+            # Lanes whose error is too large stay where they are, and try the shorter step.
             done = live[good]
             self.t[done] = np.where(
                 now[good] == left[good], self.times[self.place[done]], self.t[done] + now[good]
@@ -290,6 +302,7 @@ class _Run:
                 return
             at = (self.t[here], *self.y[:, here], *self.p[:, here], *self._constants(here, 1))
             self.z[:, self.place[here], here] = self._values("read", at, len(here))
+            # Readings move by sum_i |dh/dy_i| of the largest y_i.
             if self.reaching:
                 n = len(self.y)
                 sizes = self.largest[:, here] * np.eye(n)[:, :, None]
@@ -298,6 +311,7 @@ class _Run:
                 )
                 self.reach[:, self.place[here], here] = np.abs(moved).sum(axis=1)
             if self.q:
+                # dh/dx = dh/dy dy/dx + dh/dp, y' = dy/dx being S.
                 slopes = self._values(
                     "dread", [*at, *self.S[:, :, here], *self.directions], self.q, len(here)
                 )
@@ -322,6 +336,8 @@ class _Run:
         )
         n, at = len(y), (t, *y, *p, *c)
         J = self._values("J", at, lanes).reshape(n, n, lanes)
+        # An explicit method is stable while h |lambda| stays below the reach of its stability
+        # region.
         if self.stretched:
             finite = np.nan_to_num(np.moveaxis(J, 2, 0), posinf=0.0, neginf=0.0)
             radius = np.abs(np.linalg.eigvals(finite)).max(axis=1)
@@ -329,6 +345,7 @@ class _Run:
             faster = live[radius > self.fastest[live]]
             self.met[faster] = self.t[faster]
             self.fastest[live] = np.maximum(self.fastest[live], radius)
+        # W = I / (h gamma) - J is factored once for all stages.
         W = -J
         W[range(n), range(n)] += 1 / (h * GAMMA)
         exchanged = _factor(W)
@@ -336,6 +353,8 @@ class _Run:
         ways = (*S, *self.directions)
         dft = self._values("dft", [*at, *ways], q, lanes) if q else 0.0
         K, D, u, V = list[Array](), list[Array](), y, S
+        # Stage i, by u_j = sum_k gamma_jk k_k in place of the slopes k (Hairer and Wanner):
+        # W u_i = f(t + alpha_i h, y + sum_j a_ij u_j) + gamma_i h df/dt + sum_j c_ij u_j / h
         for a, b, node, weight in zip(A, C, NODES, TIME_WEIGHTS, strict=True):
             u = y + sum(w * k for w, k in zip(a, K, strict=True))
             inside = (t + node * h, *u, *p, *c)
@@ -343,6 +362,7 @@ class _Run:
             rest = rest + sum(w * k for w, k in zip(b, K, strict=True)) / h
             K.append(_solve(W, exchanged, rest[:, None])[:, 0])
             if q:
+                # The same stage differentiated; dW = -dJ adds (dJ) u_i to the right side.
                 V = S + sum(w * k for w, k in zip(a, D, strict=True))
                 rest = (
                     self._values("df", [*inside, *V, *self.directions], q, lanes) + h * weight * dft
@@ -352,11 +372,14 @@ class _Run:
                 D.append(_solve(W, exchanged, rest))
         y1 = u + K[-1]  # stiffly accurate: the last stage is the error of the embedded solution
         largest = np.maximum(np.abs(y), np.abs(y1))
+        # The norm is the largest error of a state in units of its tolerance.
         error = (np.abs(K[-1]) / (self.atol + self.rtol * largest)).max(axis=0)
+        # A pulse between the stages shows in the mean rate over the step.
         if self.timed:
             unseen = _solve(W, exchanged, self._unseen(live, h)[:, None])[:, 0]
             missed = (np.abs(unseen) / (self.atol + _UNSEEN * largest)).max(axis=0)
             error = np.where(missed > 1.0, np.fmax(missed, error), error)
+        # Beyond a pole the solution is another one: the step is refused until it is very short.
         if self.divided:
             before, after = (
                 self._values("side", one, lanes)[0] for one in (at, (t + h, *y1, *p, *c))
@@ -368,6 +391,7 @@ class _Run:
         """Computes the mean of the rates over a step with the states held, less what its ends and its middle say, each
         (states, lanes)."""
         found = np.zeros((len(self.y), len(live)))
+        # As many looks as fall into the step, in powers of two so that few sizes occur.
         wanted = np.maximum(_LOOKS * h / self.interval, 1.0)
         looks = np.minimum(np.ceil(np.log2(wanted)), np.log2(_LOOKS)).astype(int)
         for power in sorted(set(looks[looks > 0].tolist())):
@@ -376,6 +400,7 @@ class _Run:
             shares = np.append([0.0, 0.5, 1.0], (np.arange(count) + 0.5) / count)[:, None]
             at = (self.t[lanes] + shares * h[here], *y, *self.p[:, lanes], *self._constants(lanes))
             f = self._values("f", at, len(shares), len(lanes))
+            # The midpoint rule of all looks, less Simpson's rule of the ends and the middle.
             found[:, here] = f[:, 3:].mean(axis=1) - (f[:, 0] + 4.0 * f[:, 1] + f[:, 2]) / 6.0
         return found
 
@@ -383,6 +408,8 @@ class _Run:
         lanes = len(self.t)
         scale = self.atol + self.rtol * np.abs(self.y)
         f = self._values("f", [self.t, *self.y, *self.p, *self._constants(np.arange(lanes))], lanes)
+        # h = 1e-3 |y| / |y'| in units of the tolerance, after Hairer, Norsett, Wanner I, section
+        # II.4.
         speed, size = (np.abs(f) / scale).max(axis=0), (np.abs(self.y) / scale).max(axis=0)
         return np.where(
             (speed > 1e-5) & (size > 1e-5),
@@ -395,10 +422,12 @@ def _factor(W: Array) -> list[Array]:
     """Factors each lane of W (n, n, lanes) into LU, in place; returns the pivot rows (lanes,) that were exchanged."""
     lanes, exchanged = np.arange(W.shape[2]), []
     for k in range(len(W)):
+        # The pivot is the largest entry on or below the diagonal; its row comes up.
         row = k + np.argmax(np.abs(W[k:, k]), axis=0)
         top = W[k].T.copy()
         W[k] = W[row, :, lanes].T
         W[row, :, lanes] = top
+        # Column k of L, and what remains to be factored: W <- W - l_k u_k'.
         W[k + 1 :, k] /= W[k, k]
         W[k + 1 :, k + 1 :] -= W[k + 1 :, k, None] * W[k, k + 1 :]
         exchanged.append(row)
@@ -408,6 +437,7 @@ def _factor(W: Array) -> list[Array]:
 def _solve(W: Array, exchanged: Sequence[Array], b: Array) -> Array:
     """Computes W^-1 b of every lane for b (n, columns, lanes), in place."""
     lanes = np.arange(b.shape[2])
+    # P b, then L z = P b forward, then U x = z backward.
     for k, row in enumerate(exchanged):
         top = b[k].T.copy()
         b[k] = b[row, :, lanes].T

@@ -63,6 +63,7 @@ class Graph:
         return self._node("constant", float(value).hex())
 
     def _node(self, operation: str, *operands: Any) -> Expression:
+        # Equal operations on the same operands are one node (hash consing).
         key = (operation, *(id(a) if isinstance(a, Expression) else a for a in operands))
         if key not in self._known:
             if len(self._known) >= self._most:
@@ -74,8 +75,10 @@ class Graph:
         """Applies an operation to operands, with constants folded and trivial operations dropped."""
         args = [a if isinstance(a, Expression) else self.constant(a) for a in operands]
         values = [a.value for a in args]
+        # An operation on constants is a constant.
         if all(v is not None for v in values):
             return self.constant(float(_NUMBERS[operation](*values)))
+        # x + 0, 1 x, x / 1, x^1, 0 x and the like need no operation; x - (-y) is x + y.
         match operation, values:
             case ("add", [0.0, _]) | ("mul", [1.0, _]):
                 return args[1]
@@ -267,6 +270,7 @@ def in_order(
     needs: Callable[[Expression], Iterable[Expression]] = operands,
 ) -> list[Expression]:
     """Lists what the outputs need, operands before their users; what `stop` is computed from is left out."""
+    # Depth first from the outputs; the order of recording puts operands before their users.
     ends = {e.order for e in stop}
     needed: dict[int, Expression] = {}
     stack = list(outputs)
@@ -282,6 +286,7 @@ def in_order(
 def dependent(outputs: Iterable[Expression], inputs: Iterable[Expression]) -> set[Expression]:
     """Selects those among the outputs and what they need that depend on any of the inputs."""
     found = set(inputs)
+    # Operands come first, so that one pass finds all.
     for e in in_order(outputs):
         if any(a in found for a in operands(e)):
             found.add(e)
@@ -290,6 +295,7 @@ def dependent(outputs: Iterable[Expression], inputs: Iterable[Expression]) -> se
 
 def border(outputs: Sequence[Expression], varying: Collection[Expression]) -> list[Expression]:
     """Selects what the varying expressions need, or the outputs are, without being varying or a number."""
+    # The operands of varying operations, and outputs, that do not vary themselves.
     used = [a for e in in_order(outputs) if e in varying for a in operands(e)]
     distinct = {e.order: e for e in [*used, *outputs] if e not in varying and e.value is None}
     return [distinct[order] for order in sorted(distinct)]
@@ -325,6 +331,8 @@ def tangent(
     what depends on these, operands before their users, where it is known."""
     if not outputs:
         return []
+    # Forward mode: along[e] is the tangent of e (Griewank and Walther, Evaluating Derivatives,
+    # 2008, section 3.1).
     zero = outputs[0].graph.constant(0.0)
     along: defaultdict[int, Expression] = defaultdict(lambda: zero)
     for e in in_order(outputs) if varying is None else varying:
@@ -341,6 +349,7 @@ def tangent(
             condition, *branches = operands(e)
             along[e.order] = e.graph.apply("where", condition, *(along[a.order] for a in branches))
             continue
+        # The chain rule: de = sum_i (de / da_i) da_i over the operands that move.
         partials = _PARTIALS[e.operation](e, e.graph.constant(1.0), e.operands[0], e.operands[-1])
         for da, i in moving:
             along[e.order] = along[e.order] + partials[i] * da
@@ -368,6 +377,7 @@ def separate(
         assert moved is not None
         return moved
 
+    # From the inputs up, each linear operation splits into its two parts.
     for e in in_order(tangents):
         own = [parts.get(a.order, _NOTHING) for a in operands(e)]
         if e.order not in parts and any(part != _NOTHING for part in own):
@@ -391,6 +401,7 @@ def _linear(e: Expression, own: Sequence[_Parts], joined: Callable[[_Parts], Exp
 
         moved, source = (applied(*values) for values in zip(*terms, strict=True))
         return moved, source
+    # A product or quotient is linear if one operand alone has parts, and divides by none.
     (place, part), *others = [(i, part) for i, part in enumerate(own) if part != _NOTHING]
     if e.operation not in ("mul", "div") or (e.operation == "div" and place == 1) or others:
         raise TypeError(f"a tangent is not linear: {e.operation}")
@@ -424,9 +435,11 @@ class Program:
         """Computes the outputs from the inputs, which may be expressions that are computed elsewhere."""
         given = set(inputs)
         needed = [e for e in in_order(outputs, inputs) if e not in given]
+        # A product that is used once, in a sum, is computed in the sum (fused multiply-add).
         uses = Counter(used.order for used in [*(a for e in needed for a in operands(e)), *outputs])
         fused = {e.order: found for e in needed if (found := _fusion(e, uses, given))}
         inside = {product.order for _, product, _ in fused.values()}
+        # The values are numbered: the inputs first, then the results of the operations.
         number = {e.order: i for i, e in enumerate(inputs)}
         operations: list[tuple[Any, ...]] = []
         for e in needed:
@@ -446,6 +459,7 @@ class Program:
     @cached_property
     def _released(self) -> tuple[tuple[int, ...], ...]:
         """The values that nothing needs after each operation."""
+        # From the last operation back: what none after it needs is released there.
         needed, released = set(self.outputs), []
         for name, *numbers in reversed(self.operations):
             released.append(() if name == "constant" else tuple(set(numbers) - needed))
@@ -484,6 +498,7 @@ class RowPrograms:
     ) -> RowPrograms:
         # No formula has a name with a blank in it.
         along = x[0].graph.inputs("along ", len(x))
+        # The tangent J along, and what it needs of the values: all that does not depend on `along`.
         moved = tangent(y, dict(zip(x, along, strict=True)))
         saved = border(moved, dependent(moved, along))
         values = Program.of([*y, *saved], [*x, *c])
@@ -502,6 +517,7 @@ class Recorded(np.ndarray):
     def __array_ufunc__(
         self, ufunc: np.ufunc, method: str, *inputs: Any, out: Any = None, **kwargs: Any
     ) -> Any:
+        # NumPy's own loop over an array of objects applies the operators of each entry.
         plain = [np.asarray(one, dtype=object) for one in inputs]
         if method != "__call__" or ufunc.signature:  # sums and matrix products, of operators
             return np.asarray(getattr(ufunc, method)(*plain, **kwargs)).view(Recorded)
@@ -527,6 +543,7 @@ def _fusion(
 ) -> tuple[str, Expression, Expression] | None:
     """Returns the name of the fused operation that an expression can be, the product in it, and the other operand."""
     if e.operation in ("add", "sub"):
+        # a b + c, a b - c, or c - a b.
         a, b = operands(e)
         for product, other, subtracted in ((a, b, "fms"), (b, a, "fnma")):
             if product.operation == "mul" and uses[product.order] == 1 and product not in inputs:
