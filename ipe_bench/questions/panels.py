@@ -11,9 +11,16 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from ipe_bench.measurements.base import Parameter
+
 
 FARTHEST = 4.5
 """Standard deviations about the middle that a distribution is drawn to."""
+
+
+def with_unit(parameter: Parameter) -> str:
+    """Names a parameter and its unit, if it has one."""
+    return f"{parameter.name} [{parameter.unit}]" if parameter.unit else parameter.name
 
 
 def labelled_rows(labels: Sequence[str], panels: int) -> tuple[Figure, list[Axes]]:
@@ -22,7 +29,8 @@ def labelled_rows(labels: Sequence[str], panels: int) -> tuple[Figure, list[Axes
 
     words = [common.text(label) for label in labels]
     width = 0.07 * max(map(len, words)) + max(2.2 * panels, 4.5)
-    fig = Figure(figsize=(min(width, 11.0), 1.1 + 0.26 * len(words)), layout="constrained")
+    height = 1.1 + 0.26 * len(words)
+    fig = Figure(figsize=(min(width, 11.0), height), layout="constrained")
     axes = list(fig.subplots(1, panels, sharey=True, squeeze=False).flat)
     axes[0].set_yticks(range(len(words)), words)
     axes[0].set_ylim(len(words) - 0.5, -0.5)

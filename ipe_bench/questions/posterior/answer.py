@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -28,9 +28,26 @@ if TYPE_CHECKING:
 
 
 HONEST = 0.1
-"""Nats up to which a Gaussian may stand for another: a deviation is 40 % too large, or a mean half a deviation off."""
+"""Nats up to which a Gaussian may stand for another: a deviation is 40 % too large, or a mean half
+a deviation off."""
 SAME_LAW = 0.05
-"""Energy distance up to which draws may come from one law: of Gaussians in few dimensions, some tenths of a nat."""
+"""Energy distance up to which draws may come from one law: of Gaussians in few dimensions, some
+tenths of a nat."""
+
+
+class _Row(NamedTuple):
+    reference: Reference
+    label: str
+    divergence: Divergence
+
+    @property
+    def status(self) -> str:
+        """How the estimator ended."""
+        return Status(int(self.reference.estimates[self.label].status[0])).label
+
+    @property
+    def honest(self) -> str:
+        return honest_word(self.divergence, self.reference.posterior)
 
 
 class PosteriorAnswer(Shown, list[Reference]):
@@ -46,20 +63,18 @@ class PosteriorAnswer(Shown, list[Reference]):
 
 def posterior_parts(name: str, found: Sequence[Reference]) -> list[Table]:
     """Returns a row per trial and estimator, under the `name` of the scenario."""
-    rows = [(one, label, d) for one in found for label, d in one.divergences.items()]
+    rows = [_Row(one, label, d) for one in found for label, d in one.divergences.items()]
     columns = [
-        texts("trial", [str(one.trial) for one, *_ in rows]),
-        texts("modes", [str(len(one.posterior.modes)) for one, *_ in rows]),
-        texts("noise", [compact(one.posterior.noise) for one, *_ in rows]),
-        words("estimator", [label for _, label, _ in rows]),
-        words(
-            "status", [Status(int(one.estimates[label].status[0])).label for one, label, _ in rows]
-        ),
-        words("honest", [honest_word(d, one.posterior) for one, _, d in rows]),
-    ]
-    numbers = {"kl": "divergence", "shift": "shift", "width": "width", "energy": "energy"}
-    columns += [
-        texts(title, [compact(getattr(d, key)) for *_, d in rows]) for key, title in numbers.items()
+        texts("trial", [str(row.reference.trial) for row in rows]),
+        texts("modes", [str(len(row.reference.posterior.modes)) for row in rows]),
+        texts("noise", [compact(row.reference.posterior.noise) for row in rows]),
+        words("estimator", [row.label for row in rows]),
+        words("status", [row.status for row in rows]),
+        words("honest", [row.honest for row in rows]),
+        texts("divergence", [compact(row.divergence.kl) for row in rows]),
+        texts("shift", [compact(row.divergence.shift) for row in rows]),
+        texts("width", [compact(row.divergence.width) for row in rows]),
+        texts("energy", [compact(row.divergence.energy) for row in rows]),
     ]
     title = f"{name}: estimators beside the posterior"
     return [Table("posterior", title, "", columns, notes=list(_notes(found)), grouped=3)]
@@ -85,11 +100,14 @@ def _notes(found: Sequence[Reference]) -> Iterator[str]:
 
 
 def honest_word(d: Divergence, sampled: Posterior) -> str:
-    """Words whether a Gaussian can stand for the posterior; a wide one over two modes, with its moments, cannot."""
+    """Words whether a Gaussian can stand for the posterior; a wide one over two modes, with its
+    moments, cannot."""
     if not np.isfinite(d.kl):
         return "-"
+    if len(sampled.modes) != 1:
+        return "NO"
     near = d.kl <= max(HONEST, 2 * sampled.noise) and d.energy <= SAME_LAW
-    return "yes" if near and len(sampled.modes) == 1 else "NO"
+    return "yes" if near else "NO"
 
 
 def write_posteriors(
@@ -100,42 +118,44 @@ def write_posteriors(
 
     frames = []
     for one in found:
-        names = {
+        columns = {
+            "trial": one.trial,
             "parameter": [p.name for p in model.parameters],
             "unit": [p.unit for p in model.parameters],
+            "truth": model.sizes * one.truth,
+            "mean": model.sizes * one.posterior.mean,
+            "deviation": model.sizes * one.posterior.deviation,
         }
-        values = {
-            "truth": one.truth,
-            "mean": one.posterior.mean,
-            "deviation": one.posterior.deviation,
-        }
-        sized = {key: model.sizes * value for key, value in values.items()}
-        frames.append(pd.DataFrame({"trial": one.trial, **names, **sized}))
-    shown = _honest_sentences(found), posterior_parts(title, found), draw_marginals(model, found)
+        frames.append(pd.DataFrame(columns))
     return write_files(
-        folder, "posterior", ("posterior.csv", pd.concat(frames)), f"{name}: posteriors", *shown
+        folder,
+        "posterior",
+        ("posterior.csv", pd.concat(frames)),
+        f"{name}: posteriors",
+        _honest_sentences(found),
+        posterior_parts(title, found),
+        draw_marginals(model, found),
     )
 
 
 def _honest_sentences(found: Sequence[Reference]) -> list[str]:
-    """Says in how many trials each estimator's Gaussian can stand for the posterior, and if that is settled."""
+    """Says in how many trials each estimator's Gaussian can stand for the posterior, and if that is
+    settled."""
     counts = dict.fromkeys(found[0].divergences, 0)
     for one in found:
         for label, d in one.divergences.items():
             counts[label] += honest_word(d, one.posterior) == "yes"
-    listed = enumerate_few(
-        [f"{label} in {count} of {len(found)}" for label, count in counts.items()], 12
-    )
-    unsettled = sum(not one.posterior.settled for one in found)
-    more = (
-        [f"In {unsettled} the posterior itself cannot be relied on; take more particles."]
-        if unsettled
-        else []
-    )
-    return [
-        f"Trials in which an estimator's Gaussian can stand for the posterior: {listed}.",
-        *more,
+    listed = [f"{label} in {count} of {len(found)}" for label, count in counts.items()]
+    sentences = [
+        "Trials in which an estimator's Gaussian can stand for the posterior:"
+        f" {enumerate_few(listed, 12)}."
     ]
+    unsettled = sum(not one.posterior.settled for one in found)
+    if unsettled:
+        sentences.append(
+            f"In {unsettled} the posterior itself cannot be relied on; take more particles."
+        )
+    return sentences
 
 
 def sampled(
@@ -145,7 +165,8 @@ def sampled(
     particles: int,
     watch: Callable[[int], None] | None = None,
 ) -> PosteriorAnswer:
-    """Samples the posteriors of the first trials; `watch` is called with the number of each before that."""
+    """Samples the posteriors of the first trials; `watch` is called with the number of each before
+    that."""
     require_particles(scenario.problem, particles)
     found = []
     for trial in range(trials):

@@ -29,7 +29,8 @@ output=DIR          folder of the files
 
 
 def answer(asked: Asked, particles: int = 1000) -> Answered:
-    """Returns the table of the posteriors, whose files are written; exit code 1 where populations do not agree."""
+    """Returns the table of the posteriors, whose files are written; exit code 1 where populations
+    do not agree."""
     from ipe_bench.questions.posterior.answer import posterior_parts, sampled, write_posteriors
     from ipe_bench.runs.provenance import describe
     from ipe_bench.runs.run import validate

@@ -2,60 +2,96 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ipe_bench.questions.panels import FARTHEST
+from ipe_bench.questions.panels import FARTHEST, with_unit
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.views import looks_of
 from ipe_bench.report.style import BOUND_COLOR
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from ipe_bench.basics.linalg import Array
+    from ipe_bench.estimators.base import Estimates
     from ipe_bench.measurements.base import Measurement
-    from ipe_bench.questions.posterior.maths import Reference
+    from ipe_bench.questions.posterior.maths import Posterior, Reference
+    from ipe_bench.report.style import Look
+
+
+class _Gaussian(NamedTuple):
+    x: Array
+    """(n,)"""
+    deviation: Array
+    """(n,), NaN where none is reported."""
 
 
 def draw_marginals(model: Measurement, found: Sequence[Reference]) -> Iterator[Drawing]:
-    """Draws marginals of the first trial's posterior beside the Gaussians of estimators, the worst parameters."""
+    """Draws marginals of the first trial's posterior beside the Gaussians of estimators, the worst
+    parameters."""
     one = found[0]
-    mean, deviation, look = one.posterior.mean, one.posterior.deviation, looks_of(one.estimators)
-    claims = {}
-    for label, each in one.estimates.items():
-        P = np.full((model.n, model.n), np.nan) if each.covariance is None else each.covariance[0]
-        claims[label] = each.x[0], np.sqrt(np.diag(P))
-    with np.errstate(all="ignore"):
-        apart = [
-            np.abs(x - mean) / deviation + np.abs(np.log(s / deviation)) for x, s in claims.values()
-        ]
-    worst = np.nan_to_num(np.max(apart, axis=0), nan=np.inf) if apart else np.zeros(model.n)
-    chosen = np.sort(np.argsort(-worst, kind="stable")[: common.most_panels()])
+    look = looks_of(one.estimators)
+    claims = {label: _claimed(each) for label, each in one.estimates.items()}
+    chosen = _worst(one.posterior, claims.values())
     fig, axes = common.panels(len(chosen), look, height=2.4)
     for i, ax in zip(chosen, axes, strict=True):
         p = model.parameters[i]
-        low, high = (p.size * (mean[i] + side * FARTHEST * deviation[i]) for side in (-1, 1))
-        at, filled = (
-            np.linspace(low, high, 300),
-            {"color": BOUND_COLOR, "alpha": 0.25, "label": "posterior"},
-        )
-        ax.hist(p.size * one.posterior.x[:, i], bins=40, range=(low, high), density=True, **filled)
-        for label, (x, s) in claims.items():
-            value, width = p.size * x[i], p.size * s[i]
-            line = {"color": look[label].color, "linestyle": look[label].line["linestyle"]}
-            if width > 0 and np.isfinite(value):
-                density = np.exp(-0.5 * ((at - value) / width) ** 2) / (width * np.sqrt(2 * np.pi))
-                ax.plot(at, density, **line)
+        low, high = _ends(one.posterior, i, p.size)
+        draws = p.size * one.posterior.x[:, i]
+        style = {"color": BOUND_COLOR, "alpha": 0.25, "label": "posterior"}
+        ax.hist(draws, bins=40, range=(low, high), density=True, **style)
+        at = np.linspace(low, high, 300)
+        for label, claim in claims.items():
+            _draw_density(ax, at, p.size * claim.x[i], p.size * claim.deviation[i], look[label])
         ax.axvline(p.size * one.truth[i], color=BOUND_COLOR, linestyle=":", label="truth")
         ax.set_xlim(low, high)
         ax.set_yticks([])
-        common.title(ax, f"{p.name} [{p.unit}]" if p.unit else p.name)
+        common.title(ax, with_unit(p))
         common.full_ticks(ax)
     common.legend(fig, axes, {label: replace(each, marker="") for label, each in look.items()})
-    more = (
-        f", the {len(chosen)} parameters in which they differ most" if len(chosen) < model.n else ""
+    caption = (
+        f"Trial {one.trial}: draws of the posterior beside the Gaussians that estimators report"
     )
-    caption = f"Trial {one.trial}: draws of the posterior beside the Gaussians that estimators report{more}."
-    yield Drawing("posterior", "Marginals", caption, fig)
+    if len(chosen) < model.n:
+        caption += f", the {len(chosen)} parameters in which they differ most"
+    yield Drawing("posterior", "Marginals", f"{caption}.", fig)
+
+
+def _claimed(estimates: Estimates) -> _Gaussian:
+    x = estimates.x[0]
+    if estimates.covariance is None:
+        return _Gaussian(x, np.full(len(x), np.nan))
+    return _Gaussian(x, np.sqrt(np.diag(estimates.covariance[0])))
+
+
+def _worst(posterior: Posterior, claims: Iterable[_Gaussian]) -> Array:
+    """Finds the parameters in which an estimator's Gaussian is farthest from the posterior, as many
+    as there are panels: by the difference of means, and of logarithms of the deviations."""
+    apart = [np.zeros(len(posterior.mean))]
+    with np.errstate(all="ignore"):
+        for claim in claims:
+            shift = np.abs(claim.x - posterior.mean) / posterior.deviation
+            width = np.abs(np.log(claim.deviation / posterior.deviation))
+            apart.append(shift + width)
+    farthest = np.nan_to_num(np.max(apart, axis=0), nan=np.inf)
+    order = np.argsort(-farthest, kind="stable")
+    return np.sort(order[: common.most_panels()])
+
+
+def _ends(posterior: Posterior, i: int, size: float) -> tuple[float, float]:
+    """Returns the ends of the axis of a parameter, in its unit."""
+    reach = FARTHEST * posterior.deviation[i]
+    return size * (posterior.mean[i] - reach), size * (posterior.mean[i] + reach)
+
+
+def _draw_density(ax: Axes, at: Array, x: float, deviation: float, look: Look) -> None:
+    """Draws the density of a Gaussian, if it has one."""
+    if deviation > 0 and np.isfinite(x):
+        area = deviation * np.sqrt(2 * np.pi)
+        density = np.exp(-0.5 * ((at - x) / deviation) ** 2)
+        ax.plot(at, density / area, color=look.color, linestyle=look.line["linestyle"])
