@@ -145,6 +145,23 @@ def test_settings_are_columns_with_letters_for_long_names():
     assert [column.title for column in matrix.folded().columns] == ["setting →", "A", "B"]
 
 
+def test_values_of_one_option_stand_as_they_are_below_its_name():
+    values = ("0.05", "0.1", "0.2")
+    for option, over in (
+        ("noise.deviation", "noise.deviation"),
+        ("a=1, noise.deviation", "setting"),
+    ):
+        rows = [
+            one | {"setting": f"{option}={value}", "error_scale": 33.0}
+            for value in values
+            for one in rows_of({"a": (200,), "b": (0,)})
+        ]
+        (matrix,) = matrices(rows)
+        assert matrix.over == over
+        assert bool(matrix.notes[1:]) == (over == "setting")
+    assert [column.title for column in matrix.columns[1:]] == ["A", "B", "C"]
+
+
 def test_settings_that_are_swept_have_a_matrix_each():
     rows = [
         one | {"setting": f"noise={k}"} for k in range(3) for one in rows_of({"a": (200, 20 * k)})

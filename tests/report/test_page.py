@@ -196,6 +196,12 @@ def test_a_phone_never_scrolls_the_page_sideways(browser, page_file):
         "Array.from(document.querySelectorAll('#figure-headline .panels svg'), s => s.getBoundingClientRect().y)"
     )
     assert len(tops) == len(set(tops)) >= 2
+    # The names of the curves in colour stand above each but the first, where they are at the curves.
+    names = browser.run(
+        "Array.from(document.querySelectorAll('#figure-headline .names'), l => l.offsetHeight ? l.innerText : '')"
+    )
+    assert len(names) == len(tops) - 1
+    assert all("one" in line and "two" in line for line in names)
     # Tables scroll in a box of their own.
     box = "document.querySelector('#table-overview').parentElement"
     assert browser.run(f"{box}.scrollWidth > {box}.clientWidth")

@@ -157,9 +157,9 @@ def _matrix(finding: Finding, name: str, title: str) -> Matrix:
     rows = [row for one in finding.standings for row in one.rows if row]
     moving = {row["noise"] for row in rows} == {"model"}
     names = [one.label for one in finding.standings]
-    over = "error scale" if finding.ascending else "setting"
+    over = _over(finding)
     columns = [words(f"{over} →", names)]
-    heads, keys = _heads(finding)
+    heads, keys = _heads(finding, over)
     for at, head in enumerate(heads):
         cells = [_tile(one, at, finding, moving) for one in finding.standings]
         columns.append(Column(head, cells))
@@ -170,11 +170,21 @@ def _matrix(finding: Finding, name: str, title: str) -> Matrix:
     )
 
 
-def _heads(finding: Finding) -> tuple[list[str], list[str]]:
+def _over(finding: Finding) -> str:
+    """Names what the columns are: error scales, values of the one option that is swept, or settings."""
+    if finding.ascending:
+        return "error scale"
+    options = {setting.rpartition("=")[0] for setting, _ in finding.places}
+    (option, *others) = options
+    return "setting" if others or "=" in option else option or "setting"
+
+
+def _heads(finding: Finding, over: str) -> tuple[list[str], list[str]]:
     """Returns the titles of the columns, and a note that explains letters in place of long ones."""
     if finding.ascending:
         return [value_text(scale) for _, scale in finding.places], []
-    texts = [setting_words(setting) for setting, _ in finding.places]
+    settings = [setting.removeprefix(f"{over}=") for setting, _ in finding.places]
+    texts = [setting_words(setting) for setting in settings]
     if max(map(len, texts)) <= LONG:
         return texts, []
     letters = [_letter(at) for at in range(len(texts))]

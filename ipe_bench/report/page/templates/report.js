@@ -89,6 +89,24 @@ document.querySelectorAll(".matrix").forEach(function (matrix) {
 });
 addEventListener("scroll", () => { told.hidden = true; }, { passive: true });
 
+// Names stand at the curves of the first panel; on a phone, where panels are below each other, those in colour stand
+// above the others too.
+document.querySelectorAll(".panels").forEach(function (panels) {
+  const names = panels.querySelectorAll("svg:first-child [data-name] text");
+  if (names.length) Array.from(panels.children).slice(1).forEach(function (panel) {
+    const line = panels.insertBefore(document.createElement("div"), panel);
+    line.className = "names";
+    names.forEach(function (name) {
+      const color = getComputedStyle(name).fill;
+      if (new Set(color.match(/\d+/g)).size === 1) return;  // grey
+      const word = line.appendChild(document.createElement("span"));
+      word.textContent = name.textContent.replace(/,$/, "");
+      word.dataset.name = name.closest("[data-name]").dataset.name;
+      word.style.color = color;
+    });
+  });
+});
+
 // A click on names keeps these and fades the others, in matrices and figures.
 function fade() {
   document.querySelectorAll("[data-name]").forEach(function (one) {
