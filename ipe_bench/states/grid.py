@@ -28,6 +28,8 @@ _CUT = 1e-6
 """Largest density at an end of the grid, in parts of the peak."""
 _TINY = 1e-300
 """What a density is divided by at least."""
+_MOST_POINTS = 10_000
+"""Points of an epoch beyond which none are asked for: their kernel takes 0.8 GB."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,13 @@ class Grid(Tracker):
         excess = np.max(steps / allowed)
         if not excess > 1:
             return None
-        needed = math.ceil(1.1 * self.points * excess)
+        least = 1.1 * self.points * excess
+        if least > _MOST_POINTS:
+            return (
+                f"would need {least:.2g} points for the process noise of {model.name}, above"
+                f" {_MOST_POINTS}; leave it out"
+            )
+        needed = math.ceil(least)
         # The moves of so coarse a grid hardly tell how fine it has to be: the finer one is asked.
         finer = replace(self, points=needed).hindrance(model)
         if finer:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from ipe_bench.states import (
     Bootstrap,
     Cubature,
     Filter,
+    Formulas,
     GaussHermite,
     Grid,
     IteratedSmoother,
@@ -388,6 +390,22 @@ def test_a_grid_refuses_what_it_cannot_be_exact_for():
         Grid(needed).track(growth, z)
     with pytest.raises(ArithmeticError, match="falls between the points of the grid"):
         Grid(400).track(Sharp(), Sharp().draw(0, 3).z)
+
+
+def test_a_grid_is_refused_where_no_number_of_points_would_do():
+    # Asked for by the moves of a coarse grid, the points of the finer one took all memory there was.
+    of_pole = Formulas(
+        next={"x": "1/x + w"},
+        readings={"z": "x"},
+        noise={"w": 1.0},
+        deviation={"z": 1.0},
+        spread={"x": 1.0},
+        count=6,
+    )
+    assert re.fullmatch(
+        r"would need \S+ points for the process noise of \S+, above 10000; leave it out",
+        Grid(50).hindrance(of_pole),
+    )
 
 
 @pytest.mark.slow
