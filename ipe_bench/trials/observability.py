@@ -15,6 +15,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance, deviations, multiply
 from ipe_bench.measurements.base import Measurement, Parameter
 from ipe_bench.trials.thresholds import FIT_LEVEL
@@ -171,7 +172,15 @@ def suspects(
     largest shift first.
 
     Each is a nuisance of `truth`; those of a group of many are taken together.
+
+    Raises:
+        UserError: `truth` has no errors besides the parameters.
     """
+    if not truth.nuisance_deviation.any():
+        raise UserError(
+            f"errors: {truth.name} has no errors besides the parameters; leave it out, or choose a"
+            " richer one"
+        )
     J = R.whiten_jacobian(model.jacobian(x))
     Q, s, right = np.linalg.svd(J, full_matrices=False)
     bound = np.sqrt(np.sum((right / s[:, :, None]) ** 2, axis=1))

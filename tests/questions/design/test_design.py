@@ -225,6 +225,13 @@ def test_the_tilt_that_looks_like_a_bias_is_named_before_anything_is_measured():
     assert all(s.hidden and s.noticed < 2e-3 for s in tilts.values())
 
 
+def test_a_richer_model_without_errors_is_refused():
+    with pytest.raises(
+        ib.UserError, match="errors: gins_richer has no errors besides the parameters"
+    ):
+        design(scenario(Gins(), NOISE, 33.0), errors=[RicherGins()], truths=1)
+
+
 @pytest.fixture(scope="module")
 def gins():
     return design(scenario(Gins(), NOISE, 33.0), by=["time"], truths=10)
