@@ -6,7 +6,7 @@ import dataclasses
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
@@ -36,12 +36,12 @@ if TYPE_CHECKING:
     from ipe_bench.report.page.answer import Answer
     from ipe_bench.report.page.log import LogAnswer
     from ipe_bench.report.page.run import ReportResult
+    from ipe_bench.report.progress import Shows
     from ipe_bench.report.style import Which
     from ipe_bench.report.summary import Summary
     from ipe_bench.workshop.conformance import Finding
 
 Directories = Path | str | Sequence[Path | str]
-Shows = bool | Literal["lines"]
 Simulated = AnyScenario | Measurement | StateModel
 RealReadings = Path | str | Sequence[Path | str] | Array | None
 
@@ -376,7 +376,6 @@ def estimate(
     from ipe_bench.plugins.construct import known_parameters
     from ipe_bench.real.estimation import Question
     from ipe_bench.report.page.answer import Answer
-    from ipe_bench.report.progress import counting
     from ipe_bench.solvers import Auto
 
     if isinstance(model, StateModel):
@@ -415,10 +414,7 @@ def estimate(
     stated: dict[str, Any] = {"noise": noise, "prior": prior, "error_scale": error_scale}
     stated |= {"known": known_parameters(parameters or {}), "ignored": tuple(ignore_columns)}
     question = Question(model=model, readings=given, estimators=estimators, **stated).checked()
-    with counting(
-        "estimate", len(estimators), lines=progress == "lines", off=not progress
-    ) as begin:
-        return Answer.to(question, watch=begin)
+    return Answer.to(question, progress=progress)
 
 
 def _tracked(
@@ -453,7 +449,7 @@ def _tracked(
     tracks = []
     for label, tracker in trackers.items() if names else ():
         require_likelihood(log, label, tracker)
-    with counting("estimate", len(trackers), lines=progress == "lines", off=not progress) as begin:
+    with counting("estimate", len(trackers), progress) as begin:
         for label, tracker in trackers.items():
             tell = begin(label)
             one = log, label, tracker

@@ -1,19 +1,34 @@
 """What tests of several rooms begin with: commands in this process, an empty store, a browser."""
 
+from __future__ import annotations
+
+import gc
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from shared import oracles
 from shared.chromium import browser  # noqa: F401
-from shared.synthetic_store import Synthetic
 
 from ipe_bench.cli.main import main
 from ipe_bench.plugins import discovery
 
+if TYPE_CHECKING:
+    from shared.synthetic_store import Synthetic
+
 
 def pytest_configure(config):
     oracles.join(config)
+
+
+def pytest_collection_finish():
+    """Collects garbage seldom: the modules and tests that are there stay until the end.
+
+    To look through them again took 7 % of `pytest tests/cli/test_hydra_keys.py tests/cli/test_mistakes.py`.
+    """
+    gc.freeze()
+    gc.set_threshold(100_000, 20, 100)
 
 
 @pytest.fixture
@@ -39,4 +54,6 @@ def ipe_bench(monkeypatch, capsys, tmp_path):
 @pytest.fixture
 def synthetic(tmp_path: Path) -> Synthetic:
     """An empty store to fill."""
+    from shared.synthetic_store import Synthetic  # loads SciPy's statistics, which few tests need
+
     return Synthetic(tmp_path / "store")

@@ -28,7 +28,6 @@ def _described(estimators: Any) -> dict[str, Any]:
 def estimate_command(arguments: Sequence[str]) -> int:
     """Estimates with every chosen estimator, prints tables and writes files; returns 1 if no fit passes."""
     from ipe_bench.report.page.answer import FILES, NAME, Answer, write_answer
-    from ipe_bench.report.progress import counting
 
     standard = STANDARD_ESTIMATORS
     if any(word.startswith("find=") for word in arguments):
@@ -46,8 +45,7 @@ def estimate_command(arguments: Sequence[str]) -> int:
         **({"left_out": list(question.ignored)} if question.ignored else {}),
     }
     folder = asked.folder(NAME, command, FILES)
-    with counting("estimate", len(question.estimators), lines=True) as begin:
-        answer = Answer.to(question, asked.measurement, begin)
+    answer = Answer.to(question, asked.measurement, "lines")
     parts = [question.scenario, *question.estimators.values()]
     provenance = _provenance(asked, question.found.files, parts)
     files = write_answer(folder, answer, command, provenance, figures=asked.spec.figures != "none")

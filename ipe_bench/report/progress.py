@@ -10,11 +10,13 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from datetime import timedelta
-from typing import Any
+from typing import Any, Literal
 
 from ipe_bench.basics.errors import shortened
 from ipe_bench.runs.schedule import Progress, Watcher
 
+Shows = bool | Literal["lines"]
+"""Whether a terminal or a notebook shows progress; "lines" prints a line now and then elsewhere."""
 Tell = Callable[[float, float, str], None]
 """Takes how much is done, of how much, and a few words on it."""
 _LINE_EVERY_S = 10.0
@@ -33,12 +35,12 @@ def watching(title: str, *, lines: bool = False, off: bool = False) -> Iterator[
 
 @contextlib.contextmanager
 def counting(
-    title: str, total: int, *, lines: bool = False, off: bool = False
+    title: str, total: int, progress: Shows = True
 ) -> Iterator[Callable[[str], Callable[[str], None]]]:
     """Yields a callback that is given the name of each of `total` pieces of work before it begins, and returns one that
     is told how far that is."""
     begun = itertools.count(0)
-    with _telling(title, lines=lines, off=off) as tell:
+    with _telling(title, lines=progress == "lines", off=not progress) as tell:
 
         def begin(name: str) -> Callable[[str], None]:
             done = next(begun)

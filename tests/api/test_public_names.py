@@ -169,14 +169,38 @@ def test_a_file_and_an_array_are_estimated_alike(tmp_path, polynomial):
         np.testing.assert_array_equal(of_file.x, of_array.x)
 
 
-def test_without_estimators_they_are_those_of_the_command(polynomial):
-    from ipe_bench.cli.estimate import STANDARD_ESTIMATORS
+def chosen(words, standard=()):
     from ipe_bench.cli.single import single
 
-    asked = ["measurement=polynomial", "readings=z.csv"]
-    command = single("estimate", asked, STANDARD_ESTIMATORS).spec.estimators
+    return single("estimate", [*words, "readings=z.csv"], standard).spec.estimators
+
+
+def test_without_estimators_they_are_those_of_the_command(polynomial):
+    from ipe_bench.cli.estimate import STANDARD_ESTIMATORS
+
+    command = chosen(["measurement=polynomial"], STANDARD_ESTIMATORS)
     fits = ib.estimate(polynomial.measurement, polynomial.draw(0, 1).z[0], noise=polynomial.noise)
+    assert {fit.label: fit.estimator for fit in fits} == command
     assert [fit.label for fit in fits] == [*command]
+
+
+@pytest.mark.parametrize("find", [[], ["noise.w"]])
+def test_without_trackers_they_are_those_of_the_command(monkeypatch, find):
+    from ipe_bench.cli.estimate import TRACKERS_THAT_FIND
+    from ipe_bench.real import logs
+
+    command = chosen(["state_model=growth"], [TRACKERS_THAT_FIND] if find else [])
+    used = {}
+
+    def note(log, label, tracker, *_):
+        used[label] = tracker
+
+    monkeypatch.setattr(logs.LogTracks, "of", note)
+    monkeypatch.setattr(logs, "found_and_tracked", note)
+    model = ib.component("state_model/growth", count=3)
+    ib.estimate(model, np.ones((3, 1)), find=find)
+    assert used == command
+    assert [*used] == [*command]
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import filterpy.stats
 import numpy as np
 import pytest
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
+from shared.families import slow_if
 from shared.linear_models import Linear, LinearGins, block_of_gins, linear_map
 from shared.oracles import agreed, assert_agrees
 from shared.small_models import Bent
@@ -51,6 +52,13 @@ def maximum_a_posteriori(problem: Problem, z, x):
 
 # Against closed forms
 
+MAPS = [
+    (one, 1e-8 if one in (EKF(), IteratedEKF()) else 1e-6, scale)
+    for one in (*KALMAN, *BATCHED)
+    for scale in (1.0, 10.0)
+]
+MAPS += [(one, 1e-6, scale) for one in INFORMATION for scale in (1.0, 100.0)]
+
 
 @pytest.mark.oracle(
     "closed form: posterior of a linear model",
@@ -58,16 +66,13 @@ def maximum_a_posteriori(problem: Problem, z, x):
     1e-6,
 )
 @pytest.mark.parametrize(
-    ("estimator", "apart", "scale"),
-    [
-        (one, 1e-8 if one in (EKF(), IteratedEKF()) else 1e-6, s)
-        for one in (*KALMAN, *BATCHED)
-        for s in (1.0, 10.0)
-    ]
-    + [(one, 1e-6, scale) for one in INFORMATION for scale in (1.0, 100.0)],
-    ids=str,
+    ("model", "estimator", "apart", "scale"),
+    slow_if(
+        lambda model, one, *_: isinstance(model, LinearGins) and one == CKF(),
+        ((model, *case) for model in (Linear(), LinearGins()) for case in MAPS),
+    ),
+    ids=lambda given: label(given) if isinstance(given, (Linear, Gins)) else str(given),
 )
-@pytest.mark.parametrize("model", [Linear(), LinearGins()], ids=label)
 def test_on_a_linear_model_a_filter_is_the_batch_map(model, estimator, apart, scale):
     scenario = Scenario(model, Gaussian(0.0066), GaussianPrior(), scale)
     problem, trials = scenario.problem, scenario.draw(0, 5)
@@ -173,9 +178,13 @@ ALIKE += [
     1e-9,
 )
 @pytest.mark.parametrize(
-    ("scenario", "changes"), ALIKE, ids=lambda given: getattr(given, "error_scale", given)
+    ("estimator", "scenario", "changes"),
+    slow_if(
+        lambda one, scenario, changes: isinstance(one, CKF) and scenario is not LINEAR,
+        ((one, *case) for one in KALMAN for case in ALIKE),
+    ),
+    ids=lambda given: getattr(given, "error_scale", getattr(given, "name", given)),
 )
-@pytest.mark.parametrize("estimator", KALMAN, ids=label)
 def test_the_batched_engine_is_filterpy_within_a_billionth_of_the_prior(
     estimator, scenario, changes
 ):

@@ -331,7 +331,7 @@ ADVICE = [
 ]
 
 SOME = [
-    pytest.param(one, id=one[0], marks=[] if i % 4 == 0 else pytest.mark.slow)
+    pytest.param(one, id=one[0], marks=[] if i % 8 == 0 else pytest.mark.slow)
     for i, one in enumerate(ADVICE)
 ]
 _TYPED = re.compile(

@@ -7,9 +7,10 @@ import numpy as np
 import pandas as pd
 import pytest
 from shared.estimator_checks import ALL
+from shared.families import slow_if
 
 import ipe_bench as ib
-from ipe_bench.baselines import EnKF, LevenbergMarquardt, LinearLSE
+from ipe_bench.baselines import IPLF, EnKF, IteratedEKF, LevenbergMarquardt, LinearLSE
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli.main import main
 from ipe_bench.measurements import Formula, Function, Ode
@@ -18,6 +19,7 @@ from ipe_bench.measurements.joint import Joint
 from ipe_bench.measurements.known import ParameterInfo, informed
 from ipe_bench.noise import Gaussian, Quantization
 from ipe_bench.questions.posterior.maths import sample_posterior
+from ipe_bench.solvers import SteepestDescent
 from ipe_bench.trials.scenario import Scenario
 
 TURN = 2 * np.pi
@@ -57,7 +59,15 @@ def turned(z, model=PASSING):
     return within, z + periods * np.random.default_rng(0).integers(-3, 4, z.shape)
 
 
-@pytest.mark.parametrize("estimator", [*ALL, LinearLSE()], ids=str)
+DEAR = SteepestDescent, IPLF, EnKF, IteratedEKF
+"""Kinds of which a quicker one of the same family is quick."""
+
+
+@pytest.mark.parametrize(
+    "estimator",
+    slow_if(lambda one: isinstance(one, DEAR), [*ALL, LinearLSE()]),
+    ids=str,
+)
 def test_an_estimate_is_that_of_a_model_without_the_jump_however_readings_are_turned(
     passing, estimator
 ):

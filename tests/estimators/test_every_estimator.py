@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from shared.estimator_checks import ALL, FILTERS, check_bits, check_failures
+from shared.families import slow_if
 from shared.small_models import Bent
 
 from ipe_bench import baselines, run, solvers
@@ -34,8 +35,16 @@ def test_these_are_all_estimators():
     assert ours == {*map(type, ALL), baselines.LinearLSE}
 
 
+QUICK = baselines.EKF, baselines.LevenbergMarquardt, solvers.Newton, solvers.Relinearized
+"""One of each family; the conformance checks hold the same of every option, on mild problems."""
+
+
 @pytest.mark.parametrize("name", [pytest.param("gins", marks=pytest.mark.slow), "polynomial"])
-@pytest.mark.parametrize("estimator", [*ALL, baselines.LinearLSE()], ids=str)
+@pytest.mark.parametrize(
+    "estimator",
+    slow_if(lambda one: not isinstance(one, QUICK), [*ALL, baselines.LinearLSE()]),
+    ids=str,
+)
 def test_a_batch_is_its_trials_one_by_one_bit_for_bit(estimator, name):
     check_bits(estimator, SCENARIOS[name], 5)
 

@@ -74,6 +74,8 @@ FILTERS = blocks(PAGES / "howto" / "write_filter.md", "python")
 
 
 STORED = sorted(pages.STORED.glob(f"*{SUFFIX}"))
+SOON = ("headline", "pendulum_book")
+"""Experiments, of constants and of states, whose page is held to what they ask for in the quick tests."""
 LONG = ("nist",)
 """Experiments of so many jobs that to compose them takes longer than a second."""
 every_experiment = pytest.mark.parametrize(
@@ -101,7 +103,11 @@ def asked(experiment: str) -> tuple[Counter[str], int]:
     return Counter(canonical_json(key.names) for key in keys), trials
 
 
-@every_experiment
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(p, marks=[pytest.mark.slow] * (ids(p) not in SOON)) for p in STORED],
+    ids=ids,
+)
 def test_a_page_has_the_results_that_its_experiment_asks_for_today_or_says_how_many_it_lacks(path):
     name = path.name.removesuffix(SUFFIX)
     found, (wanted, trials) = read(path), asked(name)

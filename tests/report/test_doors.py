@@ -66,7 +66,7 @@ def test_a_command_prints_names_and_obeys_none(stream, monkeypatch, capsys):
 
 def test_a_mistake_and_progress_name_what_they_are_about(capsys):
     assert main(["audit", ESCAPES.replace("/", "")]) == 2
-    with counting("Title", 0, lines=True) as begin:
+    with counting("Title", 0, "lines") as begin:
         begin(ESCAPES)("done")
     written = capsys.readouterr().err
     assert written.count(SHOWN) == 3

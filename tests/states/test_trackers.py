@@ -61,7 +61,7 @@ def stored():
     return rows[None, :, 1:3], rows[None, :, 3:]
 
 
-DEAR = ("IEKF", "IPLF")
+DEAR = ("IEKF", "IPLF", "CKF", "GHKF")
 
 
 @pytest.mark.oracle(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from itertools import compress
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from ipe_bench.report.figures.drawing import Drawing
+    from ipe_bench.report.progress import Shows
 
 NAME, RESIDUALS, SCHEMA = "estimate", "residuals.csv", 3
 FILES = (RESIDUALS, "fit.png", "residuals.png", "residuals.pdf")
@@ -81,13 +82,15 @@ class Answer(Shown):
     """The columns of the files that were left out on purpose."""
 
     @classmethod
-    def to(cls, question: Question, name: str = "", watch: Callable[[str], object] = str) -> Answer:
-        """Returns the answer to a question, under its model's name or another `name`; `watch` is called with the label
-        of each estimator before its fit."""
+    def to(cls, question: Question, name: str = "", progress: Shows = True) -> Answer:
+        """Returns the answer to a question, under its model's name or another `name`; `progress` is that of
+        `ipe_bench.estimate`."""
+        from ipe_bench.report.progress import counting
+
         model, z = question.found.model, question.found.z
-        return cls(
-            name or model.name, model, z, *question.fitted(watch), ", ".join(question.ignored)
-        )
+        with counting("estimate", len(question.estimators), progress) as begin:
+            fitted = question.fitted(begin)
+        return cls(name or model.name, model, z, *fitted, ", ".join(question.ignored))
 
     @property
     def passes(self) -> bool:

@@ -16,23 +16,20 @@ from ipe_bench.trials.scenario import Scenario
 LOOKING = {"auto": Auto(), "multistart": Multistart()}
 
 
-@pytest.fixture(scope="module")
-def folders(tmp_path_factory):
-    """One with estimators that look for several minima, one without."""
-    looking, blind = (tmp_path_factory.mktemp(name) for name in ("looking", "blind"))
+PLAIN = {"levenberg_marquardt": LevenbergMarquardt()}
+
+
+def stored(folder, estimators, trials):
     scenario = Scenario(Triad(), Gaussian(1e-5), error_scale=300.0)
-    plain = {"levenberg_marquardt": LevenbergMarquardt()}
-    assert compute([scenario], LOOKING | plain, 8, looking) == ()
-    assert (
-        compute([scenario], plain | {"undamped": LevenbergMarquardt(damping=1e-6)}, 8, blind) == ()
-    )
-    return looking, blind
+    assert compute([scenario], estimators, trials, folder) == ()
+    return folder
 
 
 @pytest.mark.slow
-def test_the_summary_counts_the_flags_that_are_stored(folders):
-    trials = ib.load(folders[0]).set_index("estimator")
-    summary = analyse([folders[0]]).summary
+def test_the_summary_counts_the_flags_that_are_stored(tmp_path):
+    stored(tmp_path, LOOKING | PLAIN, 8)
+    trials = ib.load(tmp_path).set_index("estimator")
+    summary = analyse([tmp_path]).summary
     summary = summary[summary["parameter"] == "all"].set_index("estimator")
     for label in LOOKING:
         own = trials.loc[label]
@@ -46,8 +43,11 @@ def test_the_summary_counts_the_flags_that_are_stored(folders):
     assert np.isnan(summary.loc["levenberg_marquardt", "ambiguous"])
 
 
-def test_tables_have_the_columns_only_where_somebody_looks(folders):
-    for folder, there in zip(folders, (True, False), strict=True):
+def test_tables_have_the_columns_only_where_somebody_looks(tmp_path):
+    looking = {"multistart": LOOKING["multistart"]} | PLAIN
+    blind = {"undamped": LevenbergMarquardt(damping=1e-6)} | PLAIN
+    for name, estimators, there in (("looking", looking, True), ("blind", blind, False)):
+        folder = stored(tmp_path / name, estimators, 2)
         table = next(t for t in all_tables(analyse([folder])) if t.name == "all_trials")
         titles = {c.title for c in table.columns}
         assert ({"ambiguous", "failures flagged"} <= titles) == there
