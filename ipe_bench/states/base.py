@@ -128,16 +128,16 @@ class StateModel(Component, ABC):
 
     @abstractmethod
     def transition(self, x: Array, k: int) -> Array:
-        """f: (..., n) -> (..., n), from epoch k-1 to epoch k."""
+        """Computes f: (..., n) -> (..., n), from epoch k-1 to epoch k."""
 
     @abstractmethod
     def observe(self, x: Array, k: int) -> Array:
-        """h: (..., n) -> (..., m)."""
+        """Computes h: (..., n) -> (..., m)."""
 
     def alike(self, k: int) -> int:
-        """An epoch into which the transition is the same function as into epoch k, by which it is
-        recorded: k itself unless a model knows better, which saves recording a long transition
-        again for each epoch."""
+        """Returns an epoch into which the transition is the same function as into epoch k, by which
+        it is recorded: k itself unless a model knows better, which saves recording a long
+        transition again for each epoch."""
         return k
 
     def recorded(self, name: str, epochs: Sequence[int]) -> list[Recording]:
@@ -159,34 +159,35 @@ class StateModel(Component, ABC):
         return self._functions[1]
 
     def transition_into(self, k: int) -> Recording:
-        """f of the step into epoch k as a function of states (..., n) that knows its slopes, for
-        trackers."""
+        """Returns f of the step into epoch k as a function of states (..., n) that knows its
+        slopes, for trackers."""
         return self.epoch_functions[0].at[k]
 
     def observation_at(self, k: int) -> Recording:
-        """h at epoch k likewise."""
+        """Returns h at epoch k likewise."""
         return self.epoch_functions[1].at[k]
 
     def values_along(self, x: Array) -> tuple[Array, Array]:
-        """f (trials, K, n) and h (trials, K, m) as in `Along`, of paths x (trials, 1 + K, n) that
-        begin before the first transition: `evaluations` for each trial."""
+        """Computes f (trials, K, n) and h (trials, K, m) as in `Along`, of paths x (trials, 1 + K,
+        n) that begin before the first transition: `evaluations` for each trial."""
         f, h = self.epoch_functions
         return f.values(x[:, :-1]), h.values(x[:, 1:])
 
     def slopes_along(self, x: Array) -> Along:
-        """f and h with their slopes along paths x (trials, 1 + K, n) that begin before the first
-        transition: 1 + n times `evaluations` for each trial."""
+        """Computes f and h with their slopes along paths x (trials, 1 + K, n) that begin before the
+        first transition: 1 + n times `evaluations` for each trial."""
         f, h = self.epoch_functions
         moved, F = f.slopes(x[:, :-1])
         read, H = h.slopes(x[:, 1:])
         return Along(moved, read, F, H)
 
     def gain(self, k: int) -> Array:
-        """G (n, q) of the step into epoch k; UserError if it depends on the states."""
+        """Returns G (n, q) of the step into epoch k; UserError if it depends on the states."""
         raise self._by_state("gain")
 
     def R(self, k: int) -> Array:
-        """Covariance (m, m) of the readings of epoch k; UserError if it depends on the states."""
+        """Returns the covariance (m, m) of the readings of epoch k; UserError if it depends on the
+        states."""
         raise self._by_state("R")
 
     def _by_state(self, name: str) -> UserError:
@@ -196,13 +197,13 @@ class StateModel(Component, ABC):
         )
 
     def gain_at(self, x: Array, k: int) -> Array:
-        """G (..., n, q) of the step into epoch k from each of the states x (..., n); (n, q) if it
-        is that of all."""
+        """Returns G (..., n, q) of the step into epoch k from each of the states x (..., n); (n, q)
+        if it is that of all."""
         return self.gain(k)
 
     def R_at(self, x: Array, k: int) -> Array:
-        """R (..., m, m) of the readings of epoch k at each of the states x (..., n); (m, m) if it
-        is that of all."""
+        """Returns R (..., m, m) of the readings of epoch k at each of the states x (..., n); (m, m)
+        if it is that of all."""
         return self.R(k)
 
     @property
@@ -280,7 +281,7 @@ class StateModel(Component, ABC):
         return len(self.times)
 
     def moves(self, k: int) -> bool:
-        """Whether a transition leads into epoch k."""
+        """Tells whether a transition leads into epoch k."""
         return k > 0 or self.moved_first
 
     @property
@@ -289,30 +290,30 @@ class StateModel(Component, ABC):
         return 2 * self.epochs - (not self.moved_first)
 
     def Q(self, k: int) -> Array:
-        """Covariance (n, n) of the process noise of the step into epoch k."""
+        """Returns the covariance (n, n) of the process noise of the step into epoch k."""
         G = self.gain(k)
         return G @ G.T
 
     def Q_at(self, x: Array, k: int) -> Array:
-        """Q (..., n, n) of the step into epoch k from each of the states x (..., n); (n, n) if it
-        is that of all."""
+        """Returns Q (..., n, n) of the step into epoch k from each of the states x (..., n); (n, n)
+        if it is that of all."""
         if not self.gain_by_state:
             return self.Q(k)
         G = self.gain_at(x, k)
         return np.matmul(G, transposed(G))
 
     def nearest(self, z: Array, to: Array) -> Array:
-        """z (..., m), each periodic reading shifted by whole periods next to that of `to` (...,
-        m)."""
+        """Returns z (..., m), each periodic reading shifted by whole periods next to that of `to`
+        (..., m)."""
         return nearest(z, to, self.periods)
 
     def nearest_state(self, x: Array, to: Array) -> Array:
-        """x (..., n), each periodic state shifted by whole periods next to that of `to` (...,
-        n)."""
+        """Returns x (..., n), each periodic state shifted by whole periods next to that of `to`
+        (..., n)."""
         return nearest(x, to, self.state_periods)
 
     def observe_near(self, x: Array, k: int, to: Array) -> Array:
-        """h without jumps around readings `to` (trials, m), for x (trials, ..., n)."""
+        """Computes h without jumps around readings `to` (trials, m), for x (trials, ..., n)."""
         h = self.observation_at(k)(x)
         between = (1,) * (x.ndim - to.ndim)
         to = to.reshape(to.shape[:1] + between + to.shape[1:])
@@ -350,8 +351,8 @@ class StateModel(Component, ABC):
 
 
 def widened(model: StateModel, scale: float) -> StateModel:
-    """The model with the deviations of its prior multiplied by a scale: for the truth, and for
-    every tracker.
+    """Returns the model with the deviations of its prior multiplied by a scale: for the truth, and
+    for every tracker.
 
     Raises:
         UserError: the model's paths are stored, and no prior is drawn from.
@@ -360,7 +361,8 @@ def widened(model: StateModel, scale: float) -> StateModel:
         return model
     if type(model).draw is not StateModel.draw:
         raise UserError(
-            f"error_scale={scale:g}: state_model={model.name} has stored paths; leave error_scale out"
+            f"error_scale={scale:g}: state_model={model.name} has stored paths; "
+            "leave error_scale out"
         )
     m, P = model.prior
     wider = Normal(m, scale**2 * P)

@@ -16,7 +16,7 @@ from ipe_bench.states.trackers import Tracks, filtered
 
 
 def posterior_bounds(model: StateModel, paths: Paths) -> tuple[Array, Array]:
-    """The posterior Cramér-Rao bounds (K, n, n) on the error covariances of filters and of
+    """Computes the posterior Cramér-Rao bounds (K, n, n) on the error covariances of filters and of
     smoothers.
 
     Filtering: eq. (21) of Tichavský, Muravchik and Nehorai, IEEE TSP 46, 1998, its expectations
@@ -88,16 +88,16 @@ def _mean(a: Array) -> Array:
 
 
 def _mean_information(J: Array, inverse: Array) -> Array:
-    """E J' C^-1 J (n, n) over the paths, for slopes J (trials, m, n)."""
+    """Computes E J' C^-1 J (n, n) over the paths, for slopes J (trials, m, n)."""
     return _mean(np.matmul(np.matmul(transposed(J), inverse), J))
 
 
 def bound_at_truth(model: StateModel, paths: Paths, smooths: bool = False) -> Array:
-    """The error covariances (trials, K, n, n) of an extended Kalman filter that is linearised at
-    the true path (Taylor, IEEE TAC 24, 1979), or of the smoother behind it, which at the last epoch
-    are the same. They exist for every Q, zero included; their mean is what a good filter attains,
-    but no bound of errors averaged over paths. Noise that depends on the states has its Q and R
-    there, and tells no more of them by its size."""
+    """Computes the error covariances (trials, K, n, n) of an extended Kalman filter that is
+    linearised at the true path (Taylor, IEEE TAC 24, 1979), or of the smoother behind it, which at
+    the last epoch are the same. They exist for every Q, zero included; their mean is what a good
+    filter attains, but no bound of errors averaged over paths. Noise that depends on the states has
+    its Q and R there, and tells no more of them by its size."""
     path = Tracks.empty(model, len(paths.x))
     path.start = path.start._replace(mean=paths.start)
     path.mean = paths.x

@@ -257,7 +257,7 @@ class Formulas(StateModel):
         return self._gain(0)
 
     def _gain(self, k: int) -> Array:
-        """G (n, q) of the step into epoch k, which is that of all states."""
+        """Returns G (n, q) of the step into epoch k, which is that of all states."""
         if not self.noise:
             return np.zeros((self.n, 0))
         x = self.prior.mean
@@ -291,7 +291,7 @@ class Formulas(StateModel):
     def _values(
         self, formulas: Mapping[str, Arithmetic], x: Array, k: int, noise: Mapping[str, Any]
     ) -> Array:
-        """Those formulas (..., number) at states x (..., n) at epoch k."""
+        """Evaluates formulas (..., number) at states x (..., n) at epoch k."""
         states = dict(zip(self.next, np.moveaxis(x, -1, 0), strict=True))
         inputs = {name: float(values[k]) for name, values in self._inputs.items()}
         epoch = {"k": k + 1.0, "t": float(self._times[k])}
@@ -418,8 +418,8 @@ class RecordedFormulas(Formulas):
     """Where path and figures come from."""
 
     def draw(self, start: int, stop: int, seed: int = 0) -> Paths:
-        """The stored path; its state before the first epoch is not stored, and the first one stands
-        for it."""
+        """Returns the stored path; its state before the first epoch is not stored, and the first
+        one stands for it."""
         if (start, stop) != (0, 1):
             raise UserError(f"state_model={self.name}: has one path; set trials=1")
         path = Path(__file__).with_name(f"{self.recorded}.csv")

@@ -120,7 +120,7 @@ class Grid(Tracker):
         return kept
 
     def _grids(self, model: StateModel) -> Array:
-        """The points (K + 1, points) before the first transition, and at each epoch."""
+        """Returns the points (K + 1, points) before the first transition, and at each epoch."""
         paths = StateModel.draw(model, 0, _PATHS)
         x = np.concatenate([paths.start, paths.x[..., 0]], axis=1)
         margin = _BEYOND * x.std(axis=0)
@@ -155,8 +155,8 @@ def _normalised(p: Array) -> Array:
 
 
 def _kernel(model: StateModel, grids: Array, k: int) -> Array:
-    """The probability (points, points) of each point of epoch k, up to a factor, from each of the
-    epoch before."""
+    """Computes the probability (points, points) of each point of epoch k, up to a factor, from each
+    of the epoch before."""
     Q = _variances(model, grids, k)
     # N(x_k; f(x), Q(x)); what all columns share drops out of the sums.
     d = grids[k + 1][:, None] - _moved(model, grids, k)
@@ -165,8 +165,8 @@ def _kernel(model: StateModel, grids: Array, k: int) -> Array:
 
 
 def _variances(model: StateModel, grids: Array, k: int) -> Array:
-    """The variance of the process noise into epoch k: of all points (), or from each of those
-    before it (points,)."""
+    """Returns the variance of the process noise into epoch k: of all points (), or from each of
+    those before it (points,)."""
     return model.Q_at(grids[k][:, None], k)[..., 0, 0]
 
 
@@ -205,5 +205,6 @@ def _require_resolved(p: Array, k: int) -> None:
     ends = np.maximum(p[:, 0], p[:, -1]) / peak
     if not (ends < _CUT).all():
         raise ArithmeticError(
-            f"the density of epoch {k + 1} runs over an end of the grid: the model draws no such path"
+            f"the density of epoch {k + 1} runs over an end of the grid: "
+            "the model draws no such path"
         )

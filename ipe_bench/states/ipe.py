@@ -158,7 +158,7 @@ class _Iterates:
 
 
 def _widths(model: StateModel) -> list[int]:
-    """The numbers of unknowns of the start and of each step."""
+    """Counts the unknowns of the start and of each step."""
     steps = [model.gain(k).shape[1] for k in range(model.epochs) if model.moves(k)]
     return [root(model.prior.covariance).shape[1], *steps]
 
@@ -219,7 +219,8 @@ class _Frozen:
         return np.sqrt(1.0 - np.sum(self.gain * self.A.T, axis=1))
 
     def run(self, u: Array, z: Array) -> tuple[Array, Array]:
-        """The states x (trials, 1 + K, n) of u (trials, N), and h(u) - z (trials, M), whitened."""
+        """Computes the states x (trials, 1 + K, n) of u (trials, N), and h(u) - z (trials, M),
+        whitened."""
         model = self.model
         x = np.empty((len(u), model.epochs + 1, model.n))
         # x_0 = m_0 + P_0^1/2 u_0
@@ -234,7 +235,7 @@ class _Frozen:
         return x, multiply(self.whitening, e).reshape(len(u), -1)
 
     def linear_estimate(self, z: Array) -> _Iterates:
-        """Eq. (16): the first step, from u = 0, for readings z (trials, K, m)."""
+        """Takes the first step, eq. (16), from u = 0, for readings z (trials, K, m)."""
         trials = len(z)
         u = np.zeros((trials, len(self.gain)))
         u = u - self.F(u, self.run(u, z)[1])
@@ -246,8 +247,8 @@ class _Frozen:
         return _Iterates(u, x, r, calls, singular, status, np.zeros(trials, np.int64))
 
     def slopes(self, x: Array) -> tuple[Array, Array]:
-        """df/dx (trials, K, n, n) along the states x (trials, 1 + K, n), and dh/du (trials, M, N),
-        whitened."""
+        """Computes df/dx (trials, K, n, n) along the states x (trials, 1 + K, n), and dh/du
+        (trials, M, N), whitened."""
         along = self.model.slopes_along(x)
         H = np.matmul(self.whitening, np.where(self.seen[..., None], along.H, 0.0))
         N = self.unknowns[-1].stop
@@ -269,26 +270,26 @@ class _Frozen:
             yield X
 
     def F(self, u: Array, r: Array) -> Array:
-        """Eq. (11): H+ (h - z) (trials, N), in which (I + A' A)^-1 A' is the gain and (I + A' A)^-1
-        = I - gain A."""
+        """Computes eq. (11), H+ (h - z) (trials, N), in which (I + A' A)^-1 A' is the gain and (I +
+        A' A)^-1 = I - gain A."""
         return u - multiply(self.gain, multiply(self.A, u) - r)
 
     def divided(self, F: Array, B: Array) -> tuple[Array, Array]:
-        """J_F^-1 F (trials, N), J_F = I + (I + A' A)^-1 A' (B - A), by M equations in place of N
-        (Woodbury), and whether there is none."""
+        """Computes J_F^-1 F (trials, N), J_F = I + (I + A' A)^-1 A' (B - A), by M equations in
+        place of N (Woodbury), and whether there is none."""
         C, core = self._changed(B)
         w, singular = solve(core, multiply(C, F))
         return F - multiply(self.gain, w), singular & finite(F)
 
     def _changed(self, B: Array) -> tuple[Array, Array]:
-        """C = B - A (trials, M, N) and I + C gain (trials, M, M): J_F = I + gain C, and by Woodbury's
-        formula J_F^-1 = I - gain (I + C gain)^-1 C."""
+        """Computes C = B - A (trials, M, N) and I + C gain (trials, M, M): J_F = I + gain C, and by
+        Woodbury's formula J_F^-1 = I - gain (I + C gain)^-1 C."""
         C = B - self.A
         return C, np.eye(len(self.A)) + np.matmul(C, self.gain)
 
     def covariances(self, at: _Iterates) -> Array:
-        """The covariances (trials, 1 + K, n, n) of the states of iterates; NaN of those that are not
-        finite."""
+        """Computes the covariances (trials, 1 + K, n, n) of the states of iterates; NaN of those
+        that are not finite."""
         n = self.model.n
         P = np.full((*at.x.shape, n), np.nan)
         usable = finite(at.x) & finite(at.u)
@@ -298,8 +299,8 @@ class _Frozen:
         return P
 
     def sandwich(self, F: Array, B: Array) -> Array:
-        """The covariances (trials, 1 + K, n, n) of the states at the root: T T' with T = X J_F^-1
-        H+ and X = dx/du, which moves from epoch to epoch as states do."""
+        """Computes the covariances (trials, 1 + K, n, n) of the states at the root: T T' with T = X
+        J_F^-1 H+ and X = dx/du, which moves from epoch to epoch as states do."""
         C, core = self._changed(B)
         W, _ = solve(core, np.matmul(C, self.inverse))
         moved = self._moved(F, self.inverse - np.matmul(self.gain, W))

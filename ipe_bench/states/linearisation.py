@@ -45,12 +45,13 @@ class Rule(Component, ABC):
 
     @abstractmethod
     def linearise(self, g: Function, m: Array, P: Array, nearest: Nearest | None = None) -> Affine:
-        """The affine law of g about N(m, P), for m (trials, n) and P (trials, n, n). `nearest`
-        shifts values of g that are periodic next to others: the mean of points on both sides of a
-        bearing's jump would lie opposite."""
+        """Computes the affine law of g about N(m, P), for m (trials, n) and P (trials, n, n).
+        `nearest` shifts values of g that are periodic next to others: the mean of points on both
+        sides of a bearing's jump would lie opposite."""
 
     def mean(self, g: Function, m: Array, P: Array) -> Array:
-        """The mean (trials, ...) of g over N(m, P), g (trials, p, ...) at points (trials, p, n)."""
+        """Computes the mean (trials, ...) of g over N(m, P), g (trials, p, ...) at points (trials,
+        p, n)."""
         return g(m)
 
     @abstractmethod
@@ -87,10 +88,10 @@ class SigmaPoints(Rule):
 
     @abstractmethod
     def points(self, n: int) -> tuple[Array, Array]:
-        """Points (p, n) and their weights (p,) in means."""
+        """Returns points (p, n) and their weights (p,) in means."""
 
     def covariance_weights(self, w: Array) -> Array:
-        """The points' weights (p,) in covariances."""
+        """Returns the points' weights (p,) in covariances."""
         return w
 
     def linearise(self, g: Function, m: Array, P: Array, nearest: Nearest | None = None) -> Affine:
@@ -197,7 +198,8 @@ class GaussHermite(SigmaPoints):
         s, w = self._line
         if self.order**n > _MOST_POINTS:
             raise UserError(
-                f"order={self.order}: {self.order}^{n} points for {n} states; choose the rule Cubature"
+                f"order={self.order}: {self.order}^{n} points for {n} states; "
+                "choose the rule Cubature"
             )
         # A point for each choice of n points of the line; its weight is the product of theirs.
         points = np.array(list(product(s, repeat=n)))
@@ -211,8 +213,8 @@ class GaussHermite(SigmaPoints):
 
 
 def slope(function: Callable[[Array], Array], x: Array) -> tuple[Array, Array]:
-    """Value (trials, m) and Jacobian (trials, m, n) of a function at x (trials, n), by its own
-    `slope` if it has one, else by complex steps."""
+    """Computes the value (trials, m) and the Jacobian (trials, m, n) of a function at x (trials,
+    n), by its own `slope` if it has one, else by complex steps."""
     own = getattr(function, "slope", None)
     if own is not None:
         return own(x)

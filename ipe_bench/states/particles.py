@@ -78,9 +78,9 @@ class Bootstrap(Tracker):
 def weighed(
     model: StateModel, x: Array, k: int, z: Array, before: Array | float, out: Tracks
 ) -> Array:
-    """The weights `before` (trials, N) of states x (trials, N, n) times the likelihood of readings
-    z (trials, m), with sum 1. The track notes the logarithm of their sum, and the innovation by the
-    mean and covariance of h(x) before."""
+    """Multiplies the weights `before` (trials, N) of states x (trials, N, n) by the likelihood of
+    readings z (trials, m), and divides them by their sum. The track notes the logarithm of their
+    sum, and the innovation by the mean and covariance of h(x) before."""
     r = residuals(model, z, x, k)
     R = model.R_at(x, k)
     square, size = squares(r, z, R)
@@ -99,8 +99,8 @@ def weighed(
 
 
 def _innovation(model: StateModel, z: Array, r: Array, R: Array, before: Array | float) -> Update:
-    """The innovation y = mean of r and S = covariance of r + R, by the weights before the readings
-    z (trials, m), for residuals r (trials, N, m)."""
+    """Computes the innovation y = mean of r and S = covariance of r + R, by the weights before the
+    readings z (trials, m), for residuals r (trials, N, m)."""
     seen = np.isfinite(z)
     both = seen[:, :, None] & seen[:, None, :]
     p = np.broadcast_to(before, r.shape[:2])

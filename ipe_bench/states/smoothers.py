@@ -247,7 +247,7 @@ def _smooth_by_scores(model: StateModel, tracks: Tracks, out: Tracks, rows: Mask
 
 
 def covariances(density: PathDensity, tangents: Tangents) -> Array:
-    """The covariances (trials, 1 + K, n, n) of the path of an affine model."""
+    """Computes the covariances (trials, 1 + K, n, n) of the path of an affine model."""
     model = density.model
     # No covariance of an affine model depends on the values of its readings.
     blank = np.where(np.isfinite(density.z), 0.0, np.nan)
@@ -267,23 +267,24 @@ def covariances(density: PathDensity, tangents: Tangents) -> Array:
 
 
 def whole(tracks: Tracks) -> Normal:
-    """The states (trials, 1 + K, n) and their covariances (trials, 1 + K, n, n) from before the
-    first transition."""
+    """Returns the states (trials, 1 + K, n) and their covariances (trials, 1 + K, n, n) from before
+    the first transition."""
     mean = np.concatenate([tracks.start.mean[:, None], tracks.mean], axis=1)
     covariance = np.concatenate([tracks.start.covariance[:, None], tracks.covariance], axis=1)
     return Normal(mean, covariance)
 
 
 def path_p(z: Array, cost: Array) -> Array:
-    """The probability (trials,) of a cost above that of a path of largest density, if the model
-    holds: it is chi-square with as many degrees as the readings z (trials, K, m) that are there."""
+    """Computes the probability (trials,) of a cost above that of a path of largest density, if the
+    model holds: it is chi-square with as many degrees as the readings z (trials, K, m) that are
+    there."""
     from scipy.special import chdtrc
 
     return chdtrc(np.isfinite(z).sum(axis=(1, 2)), cost)
 
 
 def _shortened(density: PathDensity, old: Array, new: Array) -> Settled:
-    """The steps between paths (trials, 1 + K, n), halved in each trial until they do not raise its
+    """Halves the steps between paths (trials, 1 + K, n) in each trial until they do not raise its
     cost; the calls are those of all costs."""
     before = density.settled(old)
     found = density.settled(new)

@@ -82,12 +82,12 @@ class Tracks:
         )
 
     def at(self, k: int) -> Normal:
-        """The states at epoch k; before the first transition if that is -1."""
+        """Returns the states at epoch k; before the first transition if that is -1."""
         return self.start if k < 0 else Normal(self.mean[:, k], self.covariance[:, k])
 
     def note(self, k: int, found: Update) -> Normal:
-        """The states after the readings of epoch k, which the tracks keep with what the innovation
-        says."""
+        """Returns the states after the readings of epoch k, which the tracks keep with what the
+        innovation says."""
         self.mean[:, k] = found.x.mean
         self.covariance[:, k] = found.x.covariance
         self.log_likelihood += found.log_likelihood
@@ -103,8 +103,8 @@ class Tracks:
             self.reads.append(found.read)
 
     def predicted_readings(self, z: Array) -> tuple[Array, Array]:
-        """The readings (trials, K, m) that a filter predicted of those of z (trials, K, m) that
-        were there, and their standard deviations; NaN in trackers that have no innovations."""
+        """Returns the readings (trials, K, m) that a filter predicted of those of z (trials, K, m)
+        that were there, and their standard deviations; NaN in trackers that have no innovations."""
         mean = np.full(z.shape, np.nan)
         deviation = np.full(z.shape, np.nan)
         for k, (_, L) in enumerate(self.reads):
@@ -125,8 +125,8 @@ class Tracks:
 
     @classmethod
     def join(cls, parts: Sequence[Tracks]) -> Tracks:
-        """The trials of several batches one after another, without what smoothers need; what trials
-        lack that others have is NaN, or the status and the iterations of none."""
+        """Joins the trials of several batches one after another, without what smoothers need; what
+        trials lack that others have is NaN, or the status and the iterations of none."""
         alone = [replace(part, moves=[], predicted=[], reads=[]) for part in parts]
         joined = join(alone)
         if joined.status is not None:
@@ -183,7 +183,7 @@ class Tracker(Component, ABC):
 
 
 def spread_prior(model: StateModel, trials: int) -> Normal:
-    """The prior of each trial."""
+    """Returns the prior of each trial."""
     m, P = model.prior
     return Normal(np.repeat(m[None], trials, axis=0), np.repeat(P[None], trials, axis=0))
 
@@ -238,8 +238,8 @@ class Update(NamedTuple):
 
     @classmethod
     def of(cls, x: Normal, y: Array, L: Array, seen: Mask, H: Array | None = None) -> Update:
-        """The states x after an innovation y (trials, m) of covariance L L', by a reading of slope
-        H (trials, m, n); only readings that are `seen` count."""
+        """Holds the states x after an innovation y (trials, m) of covariance L L', by a reading of
+        slope H (trials, m, n); only readings that are `seen` count."""
         # The normalised innovation e = L^-1 y has the NIS y' S^-1 y = e' e.
         e = lower_solve(L, y[..., None])[..., 0]
         nis = np.sum(e**2, axis=-1)
@@ -334,8 +334,8 @@ def filtered(
     path: Tracks | None = None,
     start: Normal | None = None,
 ) -> Tracks:
-    """The filter of the model that a rule linearises about the filter's own states, or about those
-    of a path; `start` replaces the prior."""
+    """Runs the filter of the model that a rule linearises about the filter's own states, or about
+    those of a path; `start` replaces the prior."""
     out = Tracks.empty(model, len(z))
     out.start = start or out.start
     x = out.start
@@ -367,22 +367,23 @@ def filtered(
 
 
 def misfit(model: StateModel, z: Array, x: Array, k: int) -> tuple[Array, Array]:
-    """(z - h)' R^-1 (z - h) (trials, N) of states x (trials, N, n) over the readings z (trials, m)
-    of epoch k that are there, and log det 2 pi R (trials,) of these."""
+    """Computes (z - h)' R^-1 (z - h) (trials, N) of states x (trials, N, n) over the readings z
+    (trials, m) of epoch k that are there, and log det 2 pi R (trials,) of these."""
     return squares(residuals(model, z, x, k), z, model.R(k))
 
 
 def residuals(model: StateModel, z: Array, x: Array, k: int) -> Array:
-    """z - h (trials, N, m) of states x (trials, N, n) at epoch k; 0 of missing readings."""
+    """Computes z - h (trials, N, m) of states x (trials, N, n) at epoch k; 0 of missing
+    readings."""
     seen = np.isfinite(z)
     h = model.observe_near(x, k, np.where(seen, z, 0.0))
     return np.where(seen[:, None], z[:, None] - h, 0.0)
 
 
 def squares(r: Array, z: Array, R: Array) -> tuple[Array, Array]:
-    """r' R^-1 r (trials, N) of residuals r (trials, N, m), and log det 2 pi R (trials,), over
-    readings z (trials, m) that are there; of an R (trials, N, m, m) for each residual the sum of
-    both, and 0."""
+    """Computes r' R^-1 r (trials, N) of residuals r (trials, N, m), and log det 2 pi R (trials,),
+    over readings z (trials, m) that are there; of an R (trials, N, m, m) for each residual the sum
+    of both, and 0."""
     seen = np.isfinite(z)
     if R.ndim > 3:
         # Each residual with its own R is a trial of its own.
@@ -402,15 +403,15 @@ def squares(r: Array, z: Array, R: Array) -> tuple[Array, Array]:
 
 
 def ekf(iterations: int = 1) -> Filter:
-    """The extended Kalman filter; iterated (IEKF) with more than one iteration."""
+    """Returns the extended Kalman filter; iterated (IEKF) with more than one iteration."""
     return Filter(Taylor(), iterations)
 
 
 def ukf(kappa: float | None = None) -> Filter:
-    """The unscented Kalman filter."""
+    """Returns the unscented Kalman filter."""
     return Filter(Unscented(kappa))
 
 
 def ckf() -> Filter:
-    """The cubature Kalman filter, which draws its points again after the prediction."""
+    """Returns the cubature Kalman filter, which draws its points again after the prediction."""
     return Filter(Cubature())
