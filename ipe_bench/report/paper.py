@@ -37,9 +37,8 @@ def export(
         raise UserError(
             f"columns={','.join(columns)}: goes with a table; paper={','.join(names)} names none"
         )
-    files = _figures(
-        analysis, folder, [name for name in names if name not in tables], width, tables
-    )
+    others = [name for name in names if name not in tables]
+    files = _figures(analysis, folder, others, width, tables)
     for table in chosen:
         files.append(folder / f"{table.name}.tex")
         write_text(files[-1], latex(table, width))
@@ -51,9 +50,10 @@ def _with_columns(table: Table, names: Sequence[str]) -> Table:
     underscores."""
     known: dict[str, Column] = {}
     for column in table.columns:
-        name = re.sub(r"[^a-z0-9]+", "_", column.title.lower()).strip("_") or "column"
-        alike = sum(re.fullmatch(rf"{name}(_\d+)?", other) is not None for other in known)
-        known[f"{name}_{alike + 1}" if alike else name] = column
+        words = re.sub(r"[^a-z0-9]+", "_", column.title.lower())
+        name = words.strip("_") or "column"
+        alike = [other for other in known if re.fullmatch(rf"{name}(_\d+)?", other)]
+        known[f"{name}_{len(alike) + 1}" if alike else name] = column
     for name in names:
         if name not in known:
             raise UserError(f"columns={name}: {unknown(name, known, f'column of {table.name}')}")
@@ -77,10 +77,10 @@ def _figures(
                 break
     for name in names:
         if name not in captions:
-            raise UserError(
-                f"paper={name}: {unknown(name, [*tables, *captions], 'table or figure')}"
-            )
+            known = [*tables, *captions]
+            raise UserError(f"paper={name}: {unknown(name, known, 'table or figure')}")
     if names:
         files.append(folder / "captions.md")
-        write_text(files[-1], "\n\n".join(captions[name] for name in names) + "\n")
+        asked = [captions[name] for name in names]
+        write_text(files[-1], "\n\n".join(asked) + "\n")
     return files

@@ -29,8 +29,15 @@ _NOTEBOOK_EVERY_S = 0.5
 def watching(title: str, *, lines: bool = False, off: bool = False) -> Iterator[Watcher]:
     """Yields a callback of `compute`; `lines` prints a line now and then on a stderr that is no terminal."""
     with _telling(title, lines=lines, kept=lines, off=off) as tell:
-        # A job without estimators to run still has its truth to store: then blocks stand in for trials.
-        yield lambda p: tell(*((p.trials, p.total) if p.total else (p.done, p.tasks)), _state(p))
+
+        def watch(progress: Progress) -> None:
+            if progress.total:
+                tell(progress.trials, progress.total, _state(progress))
+            else:
+                # A job without estimators to run still has its truth to store.
+                tell(progress.done, progress.tasks, _state(progress))
+
+        yield watch
 
 
 @contextlib.contextmanager
@@ -71,13 +78,15 @@ def _line_of_notebook(title: str) -> Iterator[Tell]:
     """Shows a line that is empty again in the end, and that a computation of less than a moment never shows."""
     from IPython.display import display  # pyright: ignore[reportMissingImports]
 
-    last, shown = time.monotonic(), None
+    last = time.monotonic()
+    shown = None
 
     def tell(done: float, total: float, state: str) -> None:
         nonlocal last, shown
         if time.monotonic() - last < _NOTEBOOK_EVERY_S:
             return
-        last, text = time.monotonic(), {"text/plain": f"{title}: {state}"}
+        last = time.monotonic()
+        text = {"text/plain": f"{title}: {state}"}
         if shown is None:
             shown = display(text, raw=True, display_id=True)
         else:
@@ -100,31 +109,28 @@ def _bar(title: str, *, lines: bool, kept: bool) -> Iterator[Tell]:
     from ipe_bench.report.screen import Screen
 
     console = Screen(stderr=True)
-    name, state_of = (
-        TextColumn(field, markup=False) for field in ("{task.description}", "{task.fields[state]}")
-    )
-    columns = name, BarColumn(10), state_of
+    name = TextColumn("{task.description}", markup=False)
+    state_of = TextColumn("{task.fields[state]}", markup=False)
     options: dict[str, Any] = {
         "console": console,
         "disable": not console.is_terminal,
         "transient": not kept,
     }
-    bar = Bar(*columns, TimeElapsedColumn(), **options)
-    line = bar.add_task(shortened(title, max(30, console.width - 80)), total=None, state="")
+    bar = Bar(name, BarColumn(10), state_of, TimeElapsedColumn(), **options)
+    letters = max(30, console.width - 80)
+    line = bar.add_task(shortened(title, letters), total=None, state="")
     spoken = time.monotonic()
 
     def tell(done: float, total: float, state: str) -> None:
         nonlocal spoken
         bar.update(line, total=total or 1, completed=done if total else 1, state=state)
-        if (
-            lines
-            and not console.is_terminal
-            and (done >= total or time.monotonic() - spoken >= _LINE_EVERY_S)
-        ):
+        due = done >= total or time.monotonic() - spoken >= _LINE_EVERY_S
+        if lines and due and not console.is_terminal:
             spoken = time.monotonic()
             console.print(f"{title}: {state}", soft_wrap=True)
 
-    logger, handler = logging.getLogger("ipe_bench"), logging.Handler(logging.WARNING)
+    logger = logging.getLogger("ipe_bench")
+    handler = logging.Handler(logging.WARNING)
     # Through the console that draws the bar, so that neither spoils the other.
     handler.emit = lambda record: console.print(f"ipe-bench: {record.getMessage()}", soft_wrap=True)
     logger.addHandler(handler)
@@ -146,10 +152,10 @@ def _state(progress: Progress) -> str:
     if progress.began is None:
         return f"{state}, compiling, once"
     seconds = time.monotonic() - progress.began
-    if rate := progress.trials / max(seconds, 1e-9):
+    rate = progress.trials / max(seconds, 1e-9)
+    if rate:
         state += f", {rate:.0f} estimates/s" if rate >= 10 else f", {rate:.2g} estimates/s"
     if 0 < progress.done < progress.tasks:
-        state += (
-            f", {timedelta(seconds=round(seconds * (progress.tasks / progress.done - 1)))} left"
-        )
+        left = seconds * (progress.tasks / progress.done - 1)
+        state += f", {timedelta(seconds=round(left))} left"
     return state

@@ -49,7 +49,8 @@ class Written:
 def report_tables(analysis: Analysis) -> list[Table]:
     """Returns all tables of the report: on certified readings, ours on simulated trials, and those of plugins."""
     shown = certified_tables(analysis.collection) + all_tables(analysis.simulated, analysis)
-    return [*shown, *(table for one in written("table", analysis, shown) for table in one.tables)]
+    added = written("table", analysis, shown)
+    return [*shown, *(table for one in added for table in one.tables)]
 
 
 def written(group: str, analysis: Analysis, tables: Iterable[Table]) -> list[Written]:
@@ -59,10 +60,15 @@ def written(group: str, analysis: Analysis, tables: Iterable[Table]) -> list[Wri
     def make(record: Any) -> tuple[str, list[Part]]:
         if group == "section":
             require_type(record, Section, "is")
-            title, parts = str(record.title), list(record.write(analysis))
+            title = str(record.title)
+            parts = list(record.write(analysis))
         else:
-            title, parts = "", [table for table in [record(analysis)] if table is not None]
-        for part in (part for part in parts if not isinstance(part, str)):
+            title = ""
+            table = record(analysis)
+            parts = [] if table is None else [table]
+        for part in parts:
+            if isinstance(part, str):
+                continue
             require_type(part, Table)
             if part.name in names:
                 raise UserError(f"there is a table {part.name} already; choose another name")

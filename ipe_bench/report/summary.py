@@ -51,7 +51,8 @@ class Summary(pd.DataFrame):
     def of(cls, frame: pd.DataFrame, stored: Stored) -> Summary:
         """Reads the summary of the results stored in a folder."""
         made = cls(frame)
-        made.attrs, made._stored = frame.attrs, stored
+        made.attrs = frame.attrs
+        made._stored = stored
         return made
 
     def __getitem__(self, key: Any) -> Any:
@@ -96,9 +97,8 @@ class Summary(pd.DataFrame):
 
     @property
     def _is_whole(self) -> bool:
-        return {"parameter", "noise", *summary_columns()} <= set(self.columns) and ALL in set(
-            self["parameter"]
-        )
+        needed = {"parameter", "noise", *summary_columns()}
+        return needed <= set(self.columns) and ALL in set(self["parameter"])
 
     def _tables(self, width: int) -> list[Any]:
         rows: Any = self.to_dict("records")
@@ -107,7 +107,9 @@ class Summary(pd.DataFrame):
         return summary_tables(rows, [table for table in totals if table.whole], width)
 
     def __repr__(self) -> str:
-        return plain_text(self._tables(120), 120).rstrip() if self._is_whole else super().__repr__()
+        if not self._is_whole:
+            return super().__repr__()
+        return plain_text(self._tables(120), 120).rstrip()
 
     def _repr_html_(self) -> str | None:
         return html(self._tables(1000)) if self._is_whole else super()._repr_html_()  # type: ignore[operator]

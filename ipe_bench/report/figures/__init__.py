@@ -51,11 +51,13 @@ def draw_all(
             make_folder(folder)
             drawn.append(drawing.drawn(folder, formats))
     written = {path.name for one in drawn for path in one.files}
-    for name in {f"{name}.{kind}" for name in old for kind in FORMATS} - written:
+    earlier = {f"{name}.{kind}" for name in old for kind in FORMATS}
+    for name in earlier - written:
         (folder / name).unlink(missing_ok=True)
     index = [{"name": one.name, "title": one.title, "caption": one.caption} for one in drawn]
     if index or old:
-        write_text(folder / INDEX, json.dumps(index, indent=1, ensure_ascii=False) + "\n")
+        text = json.dumps(index, indent=1, ensure_ascii=False)
+        write_text(folder / INDEX, f"{text}\n")
     return drawn
 
 
@@ -66,7 +68,8 @@ def _names_in(index: Path) -> list[str]:
         UserError: the file is none of ours, such as a pipe or one that names files elsewhere.
     """
     try:
-        names = [entry["name"] for entry in json.loads(regular(index).read_text(encoding="utf-8"))]
+        entries = json.loads(regular(index).read_text(encoding="utf-8"))
+        names = [entry["name"] for entry in entries]
         if all(name == Path(name).name for name in names):
             return names
     except FileNotFoundError:
@@ -82,12 +85,11 @@ def drawings(analysis: Analysis, which: Which = "all") -> Iterator[Drawing]:
         return
     parts, whole = views(analysis, which)
     taken: set[str] = set()
-    for figure in (
-        figure for name in FIGURES for figure in import_module(f"{__name__}.{name}").FIGURES
-    ):
-        for drawing in _drawn_by(figure, parts, whole, which):
-            taken.add(drawing.name)
-            yield drawing
+    for name in FIGURES:
+        for figure in import_module(f"{__name__}.{name}").FIGURES:
+            for drawing in _drawn_by(figure, parts, whole, which):
+                taken.add(drawing.name)
+                yield drawing
     yield from added_drawings(analysis, (parts, whole), which, taken)
 
 
@@ -116,5 +118,7 @@ def added_drawings(
 
 
 def _drawn_by(figure: Figure, parts: list[View], whole: View, which: Which) -> Iterator[Drawing]:
-    for view in ([whole] if figure.together else parts) if figure.main or which == "all" else ():
+    if which != "all" and not figure.main:
+        return
+    for view in [whole] if figure.together else parts:
         yield from figure.draw(view.only(figure.frames))

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from scipy.special import chdtri
 
 from ipe_bench.report.figures import common
@@ -26,125 +27,147 @@ MANY_ITERATIONS = 60
 
 
 def draw_costs(view: View) -> Iterator[Drawing]:
-    from matplotlib import rcParams
-
     rows = view.totals[np.isfinite(view.totals["simulations_median"])]
     if rows.empty:
         return
-    # The 95 % quantile of chi, over its root mean square; the errors of an epoch and of the next are dependent.
-    efficient = 1.0 if view.moving else float(np.sqrt(chdtri(view.n, 0.05) / view.n))
-    error = rows["error_q95"] / efficient
-    shown = {
-        "cost": rows["simulations_median"].clip(lower=LEAST_COST),
-        "error": error.clip(upper=_HIGHEST),
-    }
-    rows, look = rows.assign(**shown, over=error > _HIGHEST), view.with_look(rows["estimator"])
-    # Points of about the same cost stand side by side, so that all are seen.
-    step = 0.04 * np.log(max(10.0, rows["cost"].max() / rows["cost"].min()))
-    place = (np.log(rows["cost"]) / step).round()
-    rows["cost"] *= np.exp(step * rows.groupby(["error_scale", place]).cumcount())
+    rows = _placed(rows, view)
+    look = view.with_look(rows["estimator"])
     fig, panels = common.panels_of_scales(rows, look)
-    size = (1.4 * rcParams["lines.markersize"]) ** 2
-    style: Any = {"s": size, "edgecolor": "white", "linewidth": 0.6, "clip_on": False}
+    efficient = view.reference if view.moving else "efficient estimator"
     for ax, here in panels:
         common.decades(ax, [*rows["error"], 1.0])
-        for name, inside in here[~here["over"]].groupby("estimator", sort=False):
-            one = look[str(name)]
-            layer = 2.5 if one.color == GREY else 3
-            ax.scatter(
-                inside["cost"],
-                inside["error"],
-                marker=one.marker,
-                color=one.color,
-                zorder=layer,
-                **style,
-            )
-        for name, lost in here[here["over"]].groupby("estimator", sort=False):
-            common.beyond(ax, lost["cost"], lost["error"], look[str(name)])
-        common.bound_line(ax, 1.0, view.reference if view.moving else "efficient estimator")
+        _mark(ax, here, look)
+        common.bound_line(ax, 1.0, efficient)
         ax.set_xscale("log")
-        ax.set_xlim(rows["cost"].min() / 1.5, rows["cost"].max() * 1.5)
+        ax.set_xlim(rows["cost"].min() / 1.5, 1.5 * rows["cost"].max())
         common.log_ticks(ax.xaxis, *ax.get_xlim())
     over = view.reference.removeprefix("the ") if view.moving else "efficient one"
     common.axis_labels(fig, "simulations (median)", f"95 % error / {over}")
     common.legend(fig, fig.axes, look, points=True)
-    last = rows[rows["error_scale"] == view.scales[-1]]
-    good = (
-        last[last["error"] <= last["error"].min() * 1.05]
-        .sort_values("simulations_median", kind="stable")
-        .iloc[0]
-    )
     yield view.drawing(
         fig,
         "cost_against_accuracy",
         "Cost against accuracy, all trials",
         "Down and left is better; equal costs stand side by side.",
         common.left_out(view.scales, panels),
-        f"Cheapest within 5 % of the least error at scale {value_text(view.scales[-1])}: {good['estimator']},"
-        f" {short(good['simulations_median'])} simulations.",
+        _cheapest(rows, view.scales[-1]),
     )
+
+
+def _placed(rows: pd.DataFrame, view: View) -> pd.DataFrame:
+    """Adds the place of each point: `cost`, `error`, and whether that is `over` the upper edge."""
+    error = rows["error_q95"]
+    if not view.moving:
+        # The 95 % quantile of chi, over its root mean square; the errors of an epoch and of the next are dependent.
+        quantile = chdtri(view.n, 0.05)
+        error = error / float(np.sqrt(quantile / view.n))
+    cost = rows["simulations_median"].clip(lower=LEAST_COST)
+    rows = rows.assign(cost=cost, error=error.clip(upper=_HIGHEST), over=error > _HIGHEST)
+    # Points of about the same cost stand side by side, so that all are seen.
+    span = cost.max() / cost.min()
+    step = 0.04 * np.log(max(10.0, span))
+    place = (np.log(cost) / step).round()
+    beside = rows.groupby(["error_scale", place]).cumcount()
+    rows["cost"] *= np.exp(step * beside)
+    return rows
+
+
+def _mark(ax: Any, rows: pd.DataFrame, look: Mapping[str, Look]) -> None:
+    """Draws the points of a panel, and at its upper edge those beyond."""
+    from matplotlib import rcParams
+
+    size = (1.4 * rcParams["lines.markersize"]) ** 2
+    style: Any = {"s": size, "edgecolor": "white", "linewidth": 0.6, "clip_on": False}
+    for name, inside in rows[~rows["over"]].groupby("estimator", sort=False):
+        one = look[str(name)]
+        style |= {"marker": one.marker, "color": one.color}
+        style["zorder"] = 2.5 if one.color == GREY else 3
+        ax.scatter(inside["cost"], inside["error"], **style)
+    for name, lost in rows[rows["over"]].groupby("estimator", sort=False):
+        one = look[str(name)]
+        common.beyond(ax, lost["cost"], lost["error"], one)
+
+
+def _cheapest(rows: pd.DataFrame, scale: float) -> str:
+    """Names the estimator that reaches about the least error at a scale for the fewest simulations."""
+    here = rows[rows["error_scale"] == scale]
+    good = here[here["error"] <= here["error"].min() * 1.05]
+    best = good.sort_values("simulations_median", kind="stable").iloc[0]
+    who = f"{best['estimator']}, {short(best['simulations_median'])} simulations"
+    return f"Cheapest within 5 % of the least error at scale {value_text(scale)}: {who}."
 
 
 def draw_convergence(view: View) -> Iterator[Drawing]:
     """Draws how iterates approach their limit, a panel per estimator."""
     import seaborn as sns
-    from matplotlib.ticker import MaxNLocator
 
     rows = view["convergence"]
-    rows = rows[(rows["distance"] > 0) & np.isfinite(rows["distance"])] if len(rows) else rows
+    if rows.empty:
+        return
+    rows = rows[(rows["distance"] > 0) & np.isfinite(rows["distance"])]
     if rows.empty or not rows["iteration"].any():
         return
     # An estimate in one step has a start and an end alone.
     rows = rows[rows.groupby("estimator")["iteration"].transform("max") > 0]
-    look, scales = view.with_look(rows["estimator"]), sorted(set(rows["error_scale"]))
-    shown = sorted(look, key=lambda label: look[label].color == GREY)[: common.most_panels()]
+    scales = sorted(set(rows["error_scale"]))
     names = {scale: f"error scale {value_text(scale)}" for scale in scales}
+    distance = rows["distance"].clip(lower=LEAST_DISTANCE)
+    rows = rows.assign(scale=rows["error_scale"].map(names), distance=distance)
     colors = sns.color_palette("crest", len(scales)).as_hex()
-    by_scale = {
-        name: Look(colors[i], MARKERS[i % len(MARKERS)]) for i, name in enumerate(names.values())
-    }
-    rows = rows.assign(
-        scale=rows["error_scale"].map(names), distance=rows["distance"].clip(lower=LEAST_DISTANCE)
-    )
-    style = {
-        **common.seaborn_style(by_scale, "scale"),
-        "dashes": False,
-        "estimator": None,
-        "linewidth": 1.2,
-    }
+    by_scale: dict[str, Look] = {}
+    for i, name in enumerate(names.values()):
+        by_scale[name] = Look(colors[i], MARKERS[i % len(MARKERS)])
+    look = view.with_look(rows["estimator"])
+    # Those in colour come first.
+    colored_first = sorted(look, key=lambda label: look[label].color == GREY)
+    shown = colored_first[: common.most_panels()]
     fig, axes = common.panels(len(shown), by_scale)
-    bottom, top = rows["distance"].min() / 3, rows["distance"].max() * 3
+    ends = (distance.min() / 3, distance.max() * 3)
     for label, ax in zip(shown, axes, strict=True):
-        part = rows[rows["estimator"] == label]
-        end = int(part["iteration"].max())
-        sns.lineplot(part, x="iteration", y="distance", ax=ax, markevery=1 + end // 12, **style)
-        ax.set_yscale("log")
-        ax.set_ylim(bottom, top)
-        common.log_ticks(ax.yaxis, bottom, top)
-        common.bound_line(ax, CLOSE, f"{CLOSE:g} standard deviations")
-        ax.set_xlim(-0.03 * end - 0.2, 1.03 * end + 0.2)
-        if end > MANY_ITERATIONS:
-            ax.set_xscale("symlog", linthresh=10)
-        else:
-            ax.xaxis.set_major_locator(MaxNLocator(6, integer=True))
-        common.title(ax, f"{label}, logarithmic from 10" if end > MANY_ITERATIONS else label)
+        _approach(ax, rows[rows["estimator"] == label], by_scale, label)
+        ax.set_ylim(*ends)
+        common.log_ticks(ax.yaxis, *ends)
     common.axis_labels(fig, "iteration", "distance to own limit [σ]")
     common.legend(fig, axes, by_scale)
-    last = rows[rows["error_scale"] == scales[-1]]
-    arrived = (
-        last[last["distance"] > CLOSE].groupby("estimator", sort=False)["iteration"].max().add(1)
-    )
-    seen = [
-        f"{label} {arrived.get(label, 0):g}" for label in look if label in set(last["estimator"])
-    ]
+    hidden = len(look) - len(shown)
     yield view.drawing(
         fig,
         "convergence",
         "Convergence, converged trials",
         "Median of the largest component of the distance to the last iterate.",
-        f"Iterations to {CLOSE:g} σ at scale {value_text(scales[-1])}: {enumerate_few(seen, 2)}.",
-        f"{len(look) - len(shown)} more are not shown." * (len(look) > len(shown)),
+        _arrivals(rows, look, scales[-1]),
+        f"{hidden} more are not shown." if hidden else "",
     )
+
+
+def _approach(ax: Any, rows: pd.DataFrame, by_scale: Mapping[str, Look], label: str) -> None:
+    """Draws one estimator's distances by iterations, a line per scale."""
+    import seaborn as sns
+    from matplotlib.ticker import MaxNLocator
+
+    end = int(rows["iteration"].max())
+    style = common.seaborn_style(by_scale, "scale")
+    style |= {"dashes": False, "estimator": None, "linewidth": 1.2, "markevery": 1 + end // 12}
+    sns.lineplot(rows, x="iteration", y="distance", ax=ax, **style)
+    ax.set_yscale("log")
+    common.bound_line(ax, CLOSE, f"{CLOSE:g} standard deviations")
+    ax.set_xlim(-0.03 * end - 0.2, 1.03 * end + 0.2)
+    if end > MANY_ITERATIONS:
+        ax.set_xscale("symlog", linthresh=10)
+        common.title(ax, f"{label}, logarithmic from 10")
+    else:
+        ax.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+        common.title(ax, label)
+
+
+def _arrivals(rows: pd.DataFrame, look: Iterable[str], scale: float) -> str:
+    """Says after how many iterations estimators are close to their limit at a scale."""
+    here = rows[rows["error_scale"] == scale]
+    far = here[here["distance"] > CLOSE]
+    last = far.groupby("estimator", sort=False)["iteration"].max()
+    present = set(here["estimator"])
+    seen = [f"{label} {last.get(label, -1) + 1:g}" for label in look if label in present]
+    return f"Iterations to {CLOSE:g} σ at scale {value_text(scale)}: {enumerate_few(seen, 2)}."
 
 
 FIGURES = (

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 from scipy.special import gammainc
 
+from ipe_bench.basics.linalg import Array
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.views import Figure, View, in_focus
@@ -22,13 +23,17 @@ CEILING = {"error_median": 100.0, "error_q95": 100.0, "nees_median": 30.0}
 BARS = "Bars: 95 % intervals of success, and errors from the median to the 95 % quantile."
 _ALONG = "Success: share of tracks kept to the last epoch, with 95 % intervals. Hollow: some trials have no track."
 _LIMITS = ("nees_median_low_if_honest", "nees_median_high_if_honest")
-_ALL, _APART = 0.995, 0.1
-"""Success that all estimators have where they are alike, and the part by which their errors and NEES differ at most."""
+_ALL = 0.995
+"""Success that all estimators have where they are alike."""
+_APART = 0.1
+"""Part by which errors and NEES of estimators that are alike differ at most."""
 _WIDE = 5.0
 """Inches of a column of print from which on there is room for names at curves."""
 LINEAR = 0.1
 """Differences below this are drawn about in proportion, larger ones by their logarithm: honest curves differ by
 hundredths, dishonest ones by up to 1."""
+_TICKS = (-1.0, -0.3, -0.1, -0.05, 0.0, 0.05, 0.1, 0.3, 1.0)
+"""Differences that may have a tick."""
 
 
 def draw(view: View) -> Iterator[Drawing]:
@@ -51,13 +56,9 @@ def draw(view: View) -> Iterator[Drawing]:
         common.end_names(axes[0], rows, "success", look)
     common.legend(fig, axes, {} if named else look)
     over = "over error scales" if several else f"at error scale {value_text(start)}"
-    yield view.drawing(
-        fig,
-        "headline",
-        f"Success, error and reported covariance {over}",
-        _start_in_words(view, start) if start > view.scales[0] else "",
-        _ALONG if view.moving else BARS,
-    )
+    title = f"Success, error and reported covariance {over}"
+    said = _start_in_words(view, start) if start > view.scales[0] else ""
+    yield view.drawing(fig, "headline", title, said, _ALONG if view.moving else BARS)
 
 
 def over_paths(view: View) -> pd.DataFrame:
@@ -66,7 +67,8 @@ def over_paths(view: View) -> pd.DataFrame:
     states = view["summary"][view["summary"]["parameter"] != ALL]
     filters = [label for label in view.look if view.families.get(label) != "smoothers"]
     place = ["error_scale", "parameter"]
-    bounds = states[states["estimator"].isin(filters)].groupby(place)["path_bound"].median()
+    filtered = states[states["estimator"].isin(filters)]
+    bounds = filtered.groupby(place)["path_bound"].median()
     error = view.totals["path_rmse"]
     if len(bounds):
         whose = pd.MultiIndex.from_frame(states[place])
@@ -96,15 +98,20 @@ def _parting(view: View, totals: pd.DataFrame) -> float:
     for scale in view.scales:
         here = rows[rows["error_scale"] == scale]
         with np.errstate(all="ignore"):
-            ranges = [
-                here[name].max() / here[name].min() for name in ("error_median", "nees_median")
-            ]
-        # Of a statistic that no estimator has, the range is NaN.
-        close = not any(spread > 1 + _APART for spread in ranges)
-        alike.append(len(here) == whole and here["success"].min() >= _ALL and close)
+            spreads = [_spread(here[name]) for name in ("error_median", "nees_median")]
+        # Of a statistic that no estimator has, the spread is NaN.
+        close = not any(spread > 1 + _APART for spread in spreads)
+        complete = len(here) == whole
+        alike.append(complete and here["success"].min() >= _ALL and close)
     if all(alike):
         return view.scales[0]
-    return view.scales[min(max(alike.index(False) - 1, 0), max(len(alike) - 3, 0))]
+    last_alike = max(alike.index(False) - 1, 0)
+    third_last = max(len(alike) - 3, 0)
+    return view.scales[min(last_alike, third_last)]
+
+
+def _spread(values: pd.Series[Any]) -> float:
+    return values.max() / values.min()
 
 
 def _start_in_words(view: View, start: float) -> str:
@@ -120,34 +127,34 @@ def draw_panels(
     scales: Sequence[float],
 ) -> None:
     """Draws success, error and, if there is a third panel, NEES."""
-    shown = look, scales
-    claims = rows[rows["nees_median"].notna()]
-    capped = rows[list(CEILING)].clip(upper=pd.Series(CEILING), axis=1)
+    success, error, *third = axes
+    shown = (look, scales)
     words: dict[str, Any] = {"heading": "success", "label": "share of all trials"}
-    common.shares(axes[0])
-    common.curves(
-        axes[0], rows, "success", *shown, interval=("success_low", "success_high"), **words
-    )
-    heading = f"error over {view.reference}"
-    error = "rms over all epochs" if view.moving else "median, bar to 95 %"
-    words = {"heading": heading, "label": error, "most": CEILING["error_q95"]}
-    # Errors over all epochs are of the trials that have a track.
-    words |= {"trials": "solved_trials"} if view.moving else {}
-    least = 0.01 if view.moving else 0.5  # smoothers are far below the filter's bound
-    common.decades(axes[1], capped[["error_median", "error_q95"]].clip(lower=least), least=4.0)
+    words["interval"] = ("success_low", "success_high")
+    common.shares(success)
+    common.curves(success, rows, "success", *shown, **words)
+    capped = rows[list(CEILING)].clip(upper=pd.Series(CEILING), axis=1)
     best = f"1: {view.reference}, a right covariance"
-    common.bound_line(axes[1], 1.0, best)
-    common.curves(
-        axes[1], rows, "error_median", *shown, interval=("error_median", "error_q95"), **words
-    )
-    for nees in axes[2:]:
-        common.decades(nees, np.append(capped["nees_median"].clip(lower=0.5), 1.0), least=4.0)
+    words = {"heading": f"error over {view.reference}", "label": "median, bar to 95 %"}
+    words |= {"most": CEILING["error_q95"], "interval": ("error_median", "error_q95")}
+    least = 0.5
+    if view.moving:
+        # Errors over all epochs are of the trials that have a track.
+        words |= {"label": "rms over all epochs", "trials": "solved_trials"}
+        least = 0.01  # smoothers are far below the filter's bound
+    errors = capped[["error_median", "error_q95"]]
+    common.decades(error, errors.clip(lower=least), least=4.0)
+    common.bound_line(error, 1.0, best)
+    common.curves(error, rows, "error_median", *shown, **words)
+    claims = rows[rows["nees_median"].notna()]
+    for nees in third:
+        values = capped["nees_median"].clip(lower=0.5)
+        common.decades(nees, np.append(values, 1.0), least=4.0)
         common.bound_line(nees, 1.0, best)
         low, high = (claims[name] for name in _LIMITS)
         if low.notna().any():
-            common.band(
-                nees, low.min(), high.max(), "95 % limits of the median if the covariance is right"
-            )
+            limits = "95 % limits of the median if the covariance is right"
+            common.band(nees, low.min(), high.max(), limits)
         mean = "mean over all epochs" if view.moving else "median"
         words = {"heading": "NEES", "label": mean, "most": CEILING["nees_median"]}
         common.curves(nees, claims, "nees_median", *shown, **words)
@@ -158,27 +165,20 @@ def draw_distributions(view: View) -> Iterator[Drawing]:
     rows = view["distributions"]
     if rows.empty:
         return
-    look, most = view.with_look(rows["estimator"]), CEILING["error_q95"]
-    rows = rows.assign(error=rows["distance"] / np.sqrt(view.n))
-    low, high = (
-        0.7 * rows["error"].clip(0.1, 1.0).min(),
-        1.5 * rows["error"].clip(2.0, most / 1.5).max(),
-    )
+    look = view.with_look(rows["estimator"])
+    most = CEILING["error_q95"]
+    error = rows["distance"] / np.sqrt(view.n)
+    low = 0.7 * error.clip(0.1, 1.0).min()
+    high = 1.5 * error.clip(2.0, most / 1.5).max()
     # Each curve rises from none within the panel, and what lies beyond its edge is not seen.
-    rows["error"] = rows["error"].clip(low / 2, 2 * most)
+    rows = rows.assign(error=error.clip(low / 2, 2 * most))
     fig, panels = common.panels_of_scales(rows, look)
-    at = np.geomspace(low, high, 200)
     for ax, part in panels:
         common.shares(ax)
-        efficient: dict[str, Any] = {
-            "color": BOUND_COLOR,
-            "linestyle": BOUND_DASH,
-            "label": "efficient estimator",
-        }
         if not view.moving:  # the errors of an epoch and of the next are dependent
-            ax.plot(
-                at, gammainc(view.n / 2, view.n * at**2 / 2), linewidth=1.0, zorder=1, **efficient
-            )
+            at = np.geomspace(low, high, 200)
+            chi = gammainc(view.n / 2, view.n * at**2 / 2)
+            _efficient(ax, at, chi)
         common.lines(ax, part, "error", "probability", look)
         ax.set_xscale("log")
         ax.set_xlim(low, high)
@@ -187,10 +187,8 @@ def draw_distributions(view: View) -> Iterator[Drawing]:
     common.legend(fig, fig.axes, look)
     top = view.scales[-1]
     last = rows[(rows["error_scale"] == top) & (rows["probability"] == 0.99)]
-    seen = [
-        f"{e} {brief(v) if v <= most else f'>{most:g}'}"
-        for e, v in last[["estimator", "error"]].to_numpy()
-    ]
+    ends = last[["estimator", "error"]].to_numpy()
+    seen = [f"{label} {_up_to(value, most)}" for label, value in ends]
     yield view.drawing(
         fig,
         "distributions",
@@ -201,6 +199,15 @@ def draw_distributions(view: View) -> Iterator[Drawing]:
     )
 
 
+def _efficient(ax: Any, at: Array, probability: Array) -> None:
+    style: Any = {"color": BOUND_COLOR, "linestyle": BOUND_DASH, "linewidth": 1.0, "zorder": 1}
+    ax.plot(at, probability, label="efficient estimator", **style)
+
+
+def _up_to(value: float, most: float) -> str:
+    return brief(value) if value <= most else f">{most:g}"
+
+
 def draw_calibration(view: View) -> Iterator[Drawing]:
     """Draws the calibration of NEES of all estimators, a panel per error scale."""
     rows = view["calibration"]
@@ -208,14 +215,13 @@ def draw_calibration(view: View) -> Iterator[Drawing]:
         return
     look = view.with_look(rows["estimator"])
     fig, panels = common.panels_of_scales(rows, look)
-    reach = 1.15 * max(LINEAR, float(rows[["difference", "low", "high"]].abs().max().max()))
-    ticks: Sequence[float] = [
-        t for t in (-1.0, -0.3, -0.1, -0.05, 0.0, 0.05, 0.1, 0.3, 1.0) if abs(t) <= reach
-    ]
+    largest = rows[["difference", "low", "high"]].abs().max().max()
+    reach = 1.15 * max(LINEAR, float(largest))
+    ticks = [at for at in _TICKS if abs(at) <= reach]
     for ax, part in panels:
         ax.set_yscale("asinh", linear_width=LINEAR / 2)
         ax.set(xlim=(0, 1), ylim=(-reach, reach))
-        ax.set_yticks(ticks, [common.number(t) for t in ticks])
+        ax.set_yticks(ticks, [common.number(at) for at in ticks])
         ax.set_yticks([], minor=True)
         _bands(ax, part)
         common.lines(ax, part, "at", "difference", look)
@@ -233,18 +239,12 @@ def draw_calibration(view: View) -> Iterator[Drawing]:
 
 def _bands(ax: Any, rows: pd.DataFrame) -> None:
     """Draws the widest and the narrowest band of the panel's curves."""
-    width = (rows["high"] - rows["low"]).groupby(rows["estimator"]).mean()
-    for label, alpha in ((width.idxmax(), 0.12), (width.idxmin(), 0.15)):
+    widths = rows["high"] - rows["low"]
+    mean = widths.groupby(rows["estimator"]).mean()
+    for label, alpha in ((mean.idxmax(), 0.12), (mean.idxmin(), 0.15)):
         edge = rows[rows["estimator"] == label].drop_duplicates("at")
-        ax.fill_between(
-            edge["at"],
-            edge["low"],
-            edge["high"],
-            color=BOUND_COLOR,
-            alpha=alpha,
-            linewidth=0,
-            zorder=0,
-        )
+        style: Any = {"color": BOUND_COLOR, "alpha": alpha, "linewidth": 0, "zorder": 0}
+        ax.fill_between(edge["at"], edge["low"], edge["high"], **style)
     ax.axhline(0, color=BOUND_COLOR, linewidth=0.6, zorder=1)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -23,7 +23,7 @@ from ipe_bench.report.style import (
     drawn_settings,
     looks,
 )
-from ipe_bench.report.words import value_text, varying
+from ipe_bench.report.words import assigned, value_text, varying
 from ipe_bench.runs.store import traits
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.records import family_of
@@ -104,7 +104,8 @@ class View:
     def drawing(self, figure: Canvas, name: str, title: str, *caption: str) -> Drawing:
         """Returns a figure of this setting, whose label stands with the title; empty parts of the caption go."""
         titled = f"{title} ({self.label})" if self.label else title
-        return Drawing(f"{name}{self.suffix}", titled, " ".join(filter(None, caption)), figure)
+        words = " ".join(filter(None, caption))
+        return Drawing(f"{name}{self.suffix}", titled, words, figure)
 
     def only(self, names: Sequence[str]) -> View:
         """Returns the same view with those frames alone."""
@@ -136,60 +137,83 @@ class Figure:
 def views(analysis: Analysis, which: Which = "all") -> tuple[list[View], View]:
     """Returns the settings of simulated trials that are drawn, those with most failures first, and all settings
     together with every estimator."""
-    every, collection, analysis = _looks(analysis), analysis.collection, analysis.simulated
-    look, columns = _looks(analysis), analysis.setting_columns
-    equations = {g.estimator: g.footer.get("equation") for g in analysis.collection.groups}
-    families = {g.estimator: _smoothers_apart(g.footer) for g in analysis.collection.groups}
+    every = _looks(analysis)
+    collection = analysis.collection
+    analysis = analysis.simulated
+    groups = analysis.collection.groups
+    columns = analysis.setting_columns
     whole: dict[str, Any] = {name: getattr(analysis, name) for name in FRAMES}
     split = {name: _split(frame, columns) for name, frame in whole.items()}
-    footers = {
-        tuple(_word(g.columns.get(c)) for c in columns): g.footer
-        for g in analysis.collection.groups
-    }
-    settings = [dict(zip(columns, key, strict=True)) for key in split["scores"]]
+    footers = {_setting(group.columns, columns): group.footer for group in groups}
+    look = _looks(analysis)
+    equations = {group.estimator: group.footer.get("equation") for group in groups}
+    families = {group.estimator: _smoothers_apart(group.footer) for group in groups}
+    settings = list(split["scores"])
     apart = varying(columns, pd.DataFrame(settings, columns=columns))
-    parts, (most, left_out) = list[View](), drawn_settings(len(settings), which)
-    for setting in sorted(
-        settings[:most], key=lambda setting: _success(split["summary"][tuple(setting.values())])
-    ):
-        key = tuple(setting.values())
+    most, left_out = drawn_settings(len(settings), which)
+    parts: list[View] = []
+    for key in sorted(settings[:most], key=lambda key: _success(split["summary"][key])):
+        setting = dict(zip(columns, key, strict=True))
         frames = {name: split[name].get(key, frame.iloc[:0]) for name, frame in whole.items()}
-        seen = {
-            label: one for label, one in look.items() if label in set(frames["scores"]["estimator"])
-        }
+        present = set(frames["scores"]["estimator"])
         # An option that this setting does not have is not spoken of.
-        own = {c: setting[c] for c in apart if setting[c] != "-"}
-        head = [setting[c] for c in ("measurement", "noise") if setting.get(c, "-") != "-"]
-        label = ", ".join(
-            [*head, *(f"{c}={v}" for c, v in own.items() if c not in ("measurement", "noise"))]
-        )
+        own = {column: setting[column] for column in apart if setting[column] != "-"}
+        label = _label(setting, own)
         if left_out and len(parts) + 1 == most:
             label += f" ({left_out})"
-        suffix = re.sub(r"[^A-Za-z0-9.]+", "-", "_".join(own.values())).strip("-.")
-        if apart and (
-            len(suffix) > MOST_LETTERS or f"_{suffix}" in ("_", *(part.suffix for part in parts))
-        ):
-            suffix = f"{suffix[:MOST_LETTERS]}-{len(parts) + 1}"
-        paper = (setting.get("measurement"), setting.get("noise")) == ("gins", "quantization")
-        focus = focus_of(frames["summary"])
-        known = footers[key]["parameters"], *focus, paper, setting.get("noise") == "model"
-        parts.append(
-            View(f"_{suffix}" * bool(apart), label, frames, seen, equations, families, *known)
+        focus, winner = focus_of(frames["summary"])
+        part = View(
+            suffix=_suffix(own.values(), [part.suffix for part in parts]) if apart else "",
+            label=label,
+            frames=frames,
+            look={estimator: one for estimator, one in look.items() if estimator in present},
+            equations=equations,
+            families=families,
+            parameters=footers[key]["parameters"],
+            focus=focus,
+            winner=winner,
+            paper=(setting.get("measurement"), setting.get("noise")) == ("gins", "quantization"),
+            moving=setting.get("noise") == "model",
         )
-    focus = focus_of(analysis.summary)
-    return parts, View("", "", whole, every, equations, families, (), *focus, collection=collection)
+        parts.append(part)
+    focus, winner = focus_of(analysis.summary)
+    together = View("", "", whole, every, equations, families, (), focus, winner)
+    return parts, replace(together, collection=collection)
+
+
+def _setting(values: Mapping[str, Any], columns: Sequence[str]) -> tuple[str, ...]:
+    return tuple(_word(values.get(column)) for column in columns)
+
+
+def _label(setting: Mapping[str, str], own: Mapping[str, str]) -> str:
+    """Words a setting: its model and noise, then its own values."""
+    first = {column: setting.get(column, "-") for column in ("measurement", "noise")}
+    told = {**first, **own}
+    return ", ".join(assigned(column, value) for column, value in told.items() if value != "-")
+
+
+def _suffix(words: Iterable[str], taken: Sequence[str]) -> str:
+    """Returns how names of files end, unlike those that are taken."""
+    letters = re.sub(r"[^A-Za-z0-9.]+", "-", "_".join(words)).strip("-.")
+    suffix = f"_{letters}"
+    if len(letters) > MOST_LETTERS or suffix in ("_", *taken):
+        return f"_{letters[:MOST_LETTERS]}-{len(taken) + 1}"
+    return suffix
 
 
 def _success(summary: pd.DataFrame) -> float:
     """Returns the mean rate of success to a tenth, so that settings which are alike keep their order."""
-    return round(summary.loc[summary["parameter"] == ALL, "success"].mean(), 1)
+    success = summary.loc[summary["parameter"] == ALL, "success"]
+    return round(success.mean(), 1)
 
 
 def _split(frame: pd.DataFrame, columns: Sequence[str]) -> dict[tuple[str, ...], Any]:
     """Returns the rows of each setting; none of a frame over all settings."""
     if not set(columns) <= set(frame.columns) or frame.empty:
         return {}
-    grouped = frame.groupby([*columns], sort=False, dropna=False) if columns else [((), frame)]
+    if not columns:
+        return {(): frame}
+    grouped = frame.groupby([*columns], sort=False, dropna=False)
     return {tuple(map(_word, key)): part for key, part in grouped}
 
 
@@ -197,20 +221,23 @@ def _word(value: Any) -> str:
     """Returns a setting's value as it is compared and shown; a dash where a setting does not have that option."""
     if value is None or (pd.api.types.is_scalar(value) and pd.isna(value)):
         return "-"
+    text = value_text(value)
     # Six figures where they say it all: values that differ later are different settings.
-    return (
-        value_text(value)
-        if isinstance(value, float) and float(value_text(value)) == value
-        else str(value)
-    )
+    if isinstance(value, float) and float(text) != value:
+        return str(value)
+    return text
 
 
 def _looks(analysis: Analysis) -> dict[str, Look]:
-    """Returns a look for each estimator, in the colours of its family."""
-    labels = list(dict.fromkeys(g.estimator for g in analysis.collection.groups))
-    families = {g.estimator: family_of(g.footer) for g in analysis.collection.groups}
-    own = _own_looks({g.estimator: g.footer for g in analysis.collection.groups})
-    return looks(labels, families, own=own)
+    return _looks_by({group.estimator: group.footer for group in analysis.collection.groups})
+
+
+def _looks_by(footers: Mapping[str, Mapping[str, Any]]) -> dict[str, Look]:
+    """Returns a look for each label: the colour and marker that its class names, or those of its family."""
+    families = {label: family_of(footer) for label, footer in footers.items()}
+    named = [(label, footer.get("look")) for label, footer in footers.items()]
+    own = {label: _named(label, look) for label, look in named if look}
+    return looks(list(footers), families, own=own)
 
 
 def in_focus(look: Mapping[str, Look], colored: Container[str]) -> dict[str, Look]:
@@ -222,31 +249,22 @@ def in_focus(look: Mapping[str, Look], colored: Container[str]) -> dict[str, Loo
 
 def focus_of(summary: pd.DataFrame) -> tuple[list[str], str]:
     """Returns the estimators that are in colour where not all can be, the best first, and the best if it is one."""
-    rows: Any = summary[(summary["parameter"] == ALL) & (summary["estimator"] != REFERENCE)]
+    totals = summary[summary["parameter"] == ALL]
+    rows: Any = totals[totals["estimator"] != REFERENCE]
     if rows.empty:
         return [], ""
     standings = Finding.of(rows.to_dict("records")).standings
     ranked = [one.label for one in standings]
     known = [label for label in FOCUS if label in ranked]
-    shown = list(dict.fromkeys([*ranked[:1], *known, *ranked]))[:MOST_TOGETHER]
+    order = dict.fromkeys([*ranked[:1], *known, *ranked])
+    shown = list(order)[:MOST_TOGETHER]
     first = [one.label for one in standings if one.rank == standings[0].rank]
     return shown, first[0] if len(first) == 1 else ""
 
 
 def looks_of(estimators: Mapping[str, Any]) -> dict[str, Look]:
     """Returns the looks that a run's figures give these estimators, where there is no run."""
-    traits_of = {label: traits(estimator) for label, estimator in estimators.items()}
-    families = {label: family_of(one) for label, one in traits_of.items()}
-    return looks(list(estimators), families, own=_own_looks(traits_of))
-
-
-def _own_looks(footers: Mapping[str, Mapping[str, Any]]) -> dict[str, tuple[str, str]]:
-    """Returns the colours and markers that classes name, by the labels of their estimators."""
-    return {
-        label: _named(label, footer["look"])
-        for label, footer in footers.items()
-        if footer.get("look")
-    }
+    return _looks_by({label: traits(estimator) for label, estimator in estimators.items()})
 
 
 def _named(label: str, look: Any) -> tuple[str, str]:

@@ -20,11 +20,13 @@ if TYPE_CHECKING:
     from ipe_bench.report.figures import Drawn
     from ipe_bench.report.sections import Written
     from ipe_bench.statistics.analysis import Analysis
+    from ipe_bench.statistics.collect import Collection
 
 MOST_RUNS = 20
 MOST_COMMANDS = 3
 """Largest number of commands at the head of the page; all stand with the provenance."""
-_PYTHON, _UNKNOWN = "from Python", "a command that was not recorded"
+_PYTHON = "from Python"
+_UNKNOWN = "a command that was not recorded"
 
 
 def render_page(
@@ -36,54 +38,39 @@ def render_page(
     """Renders the page as text; what plugins have written stands behind our tables."""
     collection = analysis.collection
     runs, older = _runs(collection.runs)
-    commands = dict.fromkeys(
-        run["command"] for run in runs if run["command"] not in (_PYTHON, _UNKNOWN)
-    )
+    called = dict.fromkeys(run["command"] for run in runs)
+    commands = [command for command in called if command not in (_PYTHON, _UNKNOWN)]
     answer = headline(analysis)
     # What the matrix shows is not drawn a second time, and the whole table is folded below it.
     tiled = any(isinstance(part, Matrix) for part in answer)
     pictures = [figure for figure in figures if not figure.name.startswith(MATRIX)]
     main: list[Part] = [table for table in tables if not table.appendix]
-    asked = [
-        cell for cell in collection.cells if cell.expected and cell.names["estimator"] != TRUTH
-    ]
-    complete = sum(cell.complete for cell in asked)
-    converged = analysis.endings.empty and not analysis.summary.empty
-    sections = [
+    opened = [] if tiled else main[:1]
+    folded = main[len(opened) :]
+    if analysis.endings.empty and not analysis.summary.empty:
+        folded.append("Every trial of every estimator converged.")
+    sections: list[tuple[str, str, Sequence[Any]]] = [
         ("figures", "Figures", pictures[1:]),
-        (
-            "tables",
-            "Tables",
-            [
-                *main[0 if tiled else 1 :],
-                *(["Every trial of every estimator converged."] if converged else []),
-            ],
-        ),
-        *((f"section-{section.name}", section.title, section.parts) for section in written),
-        ("appendix", "Further tables", [table for table in tables if table.appendix]),
-        ("provenance", "Configuration and provenance", _provenance(runs, older)),
-        ("definitions", "Definitions", [_definitions()]),
+        ("tables", "Tables", folded),
     ]
-    names = ", ".join(d.resolve().name or str(d) for d in collection.directories)
+    sections += [(f"section-{one.name}", one.title, one.parts) for one in written]
+    appendix = [table for table in tables if table.appendix]
+    sections.append(("appendix", "Further tables", appendix))
+    sections.append(("provenance", "Configuration and provenance", _provenance(runs, older)))
+    sections.append(("definitions", "Definitions", [_definitions()]))
+    names = ", ".join(folder.resolve().name or str(folder) for folder in collection.directories)
     title = str(answer.pop(0)).removesuffix(".") if isinstance(answer[0], Strong) else names
+    named = [names] if names and title != names else []
     page = Page(
         "report",
         title,
         answer,
-        [*pictures[:1], *([] if tiled else main[:1])],
+        [*pictures[:1], *opened],
         sections,
         folder="figures/",
-        facts=[
-            *([names] if names and title != names else ()),
-            *([_minute(collection.runs[-1]["started"])] if collection.runs else ()),
-            *(
-                [f"{complete} of {len(asked)} results (an estimator in a scenario) complete"]
-                if asked
-                else ()
-            ),
-        ],
+        facts=[*named, *_facts(collection)],
         lead=success(analysis),
-        commands=list(commands)[:MOST_COMMANDS],
+        commands=commands[:MOST_COMMANDS],
         sources=digests(collection.directories),
         about=about(analysis),
         drawn=[path for figure in figures if figure not in pictures for path in figure.files],
@@ -92,52 +79,77 @@ def render_page(
     return page.html()
 
 
+def _facts(collection: Collection) -> list[str]:
+    """Returns the start of the last run, and how much is complete."""
+    facts = []
+    if collection.runs:
+        facts.append(_minute(collection.runs[-1]["started"]))
+    expected = [cell for cell in collection.cells if cell.expected]
+    asked = [cell for cell in expected if cell.names["estimator"] != TRUTH]
+    complete = sum(cell.complete for cell in asked)
+    if asked:
+        facts.append(f"{complete} of {len(asked)} results (an estimator in a scenario) complete")
+    return facts
+
+
 def _definitions() -> Table:
     added = all_statistics()[len(STATISTICS) :]
     defined = DEFINITIONS | {one.title: one.definition for one in added}
-    return Table("words", "", "", [words("word", defined), words("meaning", defined.values())])
+    columns = [words("word", defined), words("meaning", defined.values())]
+    return Table("words", "", "", columns)
 
 
 def _provenance(runs: Sequence[Mapping[str, Any]], older: int) -> list[str]:
     """Returns an entry for each command, as HTML, and how many older ones are left out."""
     entry: Any = environment().get_template("parts.html.j2").module
     shown = [entry.run(run) for run in runs] or ["No record of a run is stored here."]
-    return [*shown, *([f"{older} older commands have their records in runs/."] if older else [])]
+    if older:
+        shown.append(f"{older} older commands have their records in runs/.")
+    return shown
 
 
 def _runs(runs: Sequence[Mapping[str, Any]]) -> tuple[list[dict[str, Any]], int]:
     """Returns what was computed, by command, the last first, and the number of older commands; a run that found
     everything stored computed no trial."""
     commands: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
-    for run in (run for run in runs if run.get("blocks", 1)):
-        command = run.get("command", _UNKNOWN)
-        commands.setdefault(
-            (_PYTHON, run["file"]) if command is None else (public(str(command)), ""), []
-        ).append(run)
-    found = []
-    for (command, _), records in list(reversed(commands.items()))[:MOST_RUNS]:
-        last = records[-1]
-        facts = {
-            "runs": ", ".join(record["file"] for record in records),
-            "trials": ", ".join(dict.fromkeys(str(record.get("trials")) for record in records)),
-            "cells": sum(len(record.get("cells", ())) for record in records),
-            "git commit": last.get("git_commit") or "unknown",
-            "source": last.get("source"),
-            "machine": ", ".join(f"{k} {v}" for k, v in (last.get("machine") or {}).items()),
-            "versions": ", ".join(f"{k} {v}" for k, v in (last.get("libraries") or {}).items()),
-        }
-        scenarios = [scenario for record in records for scenario in record.get("scenarios", ())]
-        config = {"scenarios": scenarios, "estimators": last.get("estimators", {})}
-        text = json.dumps(config, indent=1, ensure_ascii=False)
-        found.append(
-            {
-                "command": command,
-                "started": _minute(records[0]["started"]),
-                "facts": facts,
-                "config": text,
-            }
-        )
+    for run in runs:
+        if run.get("blocks", 1):
+            commands.setdefault(_command(run), []).append(run)
+    last_first = list(reversed(commands.items()))[:MOST_RUNS]
+    found = [_entry(command, records) for (command, _), records in last_first]
     return found, len(commands) - len(found)
+
+
+def _command(run: Mapping[str, Any]) -> tuple[str, str]:
+    """Returns the command of a run; those from Python are told apart by their records."""
+    command = run.get("command", _UNKNOWN)
+    return (_PYTHON, run["file"]) if command is None else (public(str(command)), "")
+
+
+def _entry(command: str, records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Returns what the page shows of a command, from the records of its runs."""
+    last = records[-1]
+    facts = {
+        "runs": ", ".join(record["file"] for record in records),
+        "trials": ", ".join(dict.fromkeys(str(record.get("trials")) for record in records)),
+        "cells": sum(len(record.get("cells", ())) for record in records),
+        "git commit": last.get("git_commit") or "unknown",
+        "source": last.get("source"),
+        "machine": _pairs(last.get("machine")),
+        "versions": _pairs(last.get("libraries")),
+    }
+    scenarios = [scenario for record in records for scenario in record.get("scenarios", ())]
+    config = {"scenarios": scenarios, "estimators": last.get("estimators", {})}
+    return {
+        "command": command,
+        "started": _minute(records[0]["started"]),
+        "facts": facts,
+        "config": json.dumps(config, indent=1, ensure_ascii=False),
+    }
+
+
+def _pairs(named: Mapping[str, Any] | None) -> str:
+    return ", ".join(f"{name} {value}" for name, value in (named or {}).items())
 
 
 def _minute(started: str) -> str:

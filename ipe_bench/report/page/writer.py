@@ -10,7 +10,6 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import resources
-from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,28 +40,28 @@ def reserve_output_folder(
         UserError: the folder is taken.
         StorageError: it cannot be written to.
     """
-    others = (folder.with_name(f"{folder.name}-{k}") for k in count(2)) if elsewhere else ()
-    found = next(
-        (one for one in chain([folder], others) if _is_free(one, f"{name}.json", command, files)),
-        None,
-    )
-    if found is None:
-        raise UserError(
-            f"output={folder}: holds results of another command, which are not overwritten; choose another folder, or"
-            " remove it"
-        )
-    if not (found / f"{name}.json").exists():
-        write_text(found / f"{name}.json", json.dumps({"command": command}, indent=1) + "\n")
-    return found
+    result = f"{name}.json"
+    place = folder
+    number = 1
+    while not _is_free(place, result, command, files):
+        if not elsewhere:
+            raise UserError(
+                f"output={folder}: holds results of another command, which are not overwritten; choose another folder,"
+                " or remove it"
+            )
+        number += 1
+        place = folder.with_name(f"{folder.name}-{number}")
+    if not (place / result).exists():
+        write_text(place / result, json.dumps({"command": command}, indent=1) + "\n")
+    return place
 
 
 def _is_free(folder: Path, result: str, command: Any, files: Sequence[str]) -> bool:
     if not (folder / result).exists():
         return not any((folder / name).exists() for name in files)
     try:
-        return (
-            json.loads(regular(folder / result).read_text(encoding="utf-8"))["command"] == command
-        )
+        stored = json.loads(regular(folder / result).read_text(encoding="utf-8"))
+        return stored["command"] == command
     except (OSError, ValueError, KeyError, TypeError):
         return False
 
@@ -95,13 +94,13 @@ class Page:
         from markupsafe import Markup
 
         templates = resources.files("ipe_bench.report.page") / "templates"
-        style, script = (
-            Markup((templates / f"report.{kind}").read_text(encoding="utf-8"))
-            for kind in ("css", "js")
-        )
+
+        def read(name: str) -> Markup:
+            return Markup((templates / name).read_text(encoding="utf-8"))
+
         constant = {
-            "style": style,
-            "script": script,
+            "style": read("report.css"),
+            "script": read("report.js"),
             "citation": CITATION,
             "version": __version__,
             "public": public,
@@ -113,15 +112,17 @@ def digests(places: Iterable[Path]) -> list[tuple[str, str]]:
     """Returns each file with its SHA-256, and each folder of results with that of the digests of its trials."""
     found = []
     for place in places:
-        files = sorted((place / "trials").glob("*")) if place.is_dir() else [place]
-        each = [hashlib.sha256(path.read_bytes()).hexdigest() for path in files if path.is_file()]
-        found.append(
-            (
-                str(place),
-                each[0] if files == [place] else hashlib.sha256("".join(each).encode()).hexdigest(),
-            )
-        )
+        if place.is_dir():
+            files = [path for path in sorted((place / "trials").glob("*")) if path.is_file()]
+            content = "".join(_digest(path.read_bytes()) for path in files).encode()
+        else:
+            content = place.read_bytes()
+        found.append((str(place), _digest(content)))
     return found
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
 
 
 def write_files(
@@ -143,8 +144,10 @@ def write_files(
     with house_style() if drawings else nullcontext():
         figures = [drawing.drawn(folder, (PAGE,)) for drawing in drawings]
     rest = list(parts)
-    first = [rest.pop(i) for i in [i for i, part in enumerate(rest) if isinstance(part, Table)][:1]]
-    commands = [public(asked)] if (asked := COMMAND.get()) else []
+    tables = [i for i, part in enumerate(rest) if isinstance(part, Table)]
+    first = [rest.pop(i) for i in tables[:1]]
+    command = COMMAND.get()
+    commands = [public(command)] if command else []
     facts = [*facts, f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"]
     sections = [("details", "Details", [*figures[1:], *rest])]
     page = Page(
