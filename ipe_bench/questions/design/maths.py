@@ -1,20 +1,22 @@
-"""Chooses what to measure next: which of the readings that a model could take to add, to drop, or to take instead.
+"""Chooses what to measure next: which of the readings that a model could take to add, to drop, or
+to take instead.
 
-Designs are good on average over truths from the prior (Chaloner and Larntz, J. Stat. Plan. Inference 21, 1989): they
-take, one after another, the readings that gain most. What readings say about each parameter is in `observability`.
+Designs are good on average over truths from the prior (Chaloner and Larntz, J. Stat. Plan.
+Inference 21, 1989): they take, one after another, the readings that gain most. What readings say
+about each parameter is in `observability`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError, unknown
-from ipe_bench.basics.linalg import Array, Mask
+from ipe_bench.basics.linalg import Array, Covariance, Mask
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.trials.observability import TRUTHS, Observability, Suspect, suspects
 from ipe_bench.trials.scenario import Scenario
@@ -24,19 +26,22 @@ Criterion = Literal["A", "D"]
 SUSPECTED = 5
 """Truths at which unmodelled errors are tried: each takes two simulations of each of them."""
 _WEAK = 1e-8
-"""Information that every choice is assumed to have beforehand, as a share of that of all candidates: the first readings
-chosen do not determine the parameters by themselves."""
+"""Information that every choice is assumed to have beforehand, as a share of that of all
+candidates: the first readings chosen do not determine the parameters by themselves."""
 MOST_MORE = 6
 """Readings that are suggested one after another."""
-_GRID, _REACH = 61, 4
-"""Entries of an input at which further readings are tried, up to how many times its range."""
+_GRID = 61
+"""Entries of an input at which further readings are tried."""
+_REACH = 4
+"""Multiple of an input's range up to which they are."""
 _FEW = 3
 """Least number of units with a choice."""
 
 
 @dataclass(frozen=True)
 class Units:
-    """Describes what is taken or left as a whole: the readings with equal entries in the columns `by`."""
+    """Describes what is taken or left as a whole: the readings with equal entries in the columns
+    `by`."""
 
     by: tuple[str, ...]
     entries: tuple[tuple[Any, ...], ...]
@@ -46,7 +51,8 @@ class Units:
     today: Mask
     """Which units today's set-up has (units,)."""
     slopes: Array
-    """(truths, units, r, n): whitened, in units of today's bounds; r rows say what all readings of the unit say."""
+    """(truths, units, r, n): whitened, in units of today's bounds; r rows say what all readings of
+    the unit say."""
 
     def information(self, taken: Mask) -> Array:
         """Computes the information (truths, n, n) of the units that are taken (units,)."""
@@ -63,8 +69,9 @@ class Choice:
     rows: tuple[int, ...]
     """The rows of the candidates' z, ascending."""
     mean_bound: float
-    """The bound as a share of today's, over parameters and truths: the root of the mean square (A), or the geometric
-    mean along the ellipsoid's axes (D). Infinite where the readings leave a direction open."""
+    """The bound as a share of today's, over parameters and truths: the root of the mean square (A),
+    or the geometric mean along the ellipsoid's axes (D). Infinite where the readings leave a
+    direction open."""
 
     @property
     def readings(self) -> int:
@@ -77,7 +84,8 @@ class Way:
 
     units: Units
     saving: Choice | None
-    """The smallest choice whose mean bound is not above today's; None if that takes as many readings as today."""
+    """The smallest choice whose mean bound is not above today's; None if that takes as many
+    readings as today."""
     sharpest: Choice
     """The smallest mean bound with no more readings than today."""
 
@@ -88,7 +96,8 @@ class Way:
 
 @dataclass(frozen=True)
 class Further:
-    """Describes what single readings beside today's would add; bounds in multiples of the parameters' sizes."""
+    """Describes what single readings beside today's would add; bounds in multiples of the
+    parameters' sizes."""
 
     words: tuple[str, ...]
     """The candidates (g,): where each is taken."""
@@ -115,7 +124,8 @@ class Design:
     suspects: tuple[Suspect, ...]
     ways: tuple[Way, ...]
     further: Further | None = None
-    """What to read next; None without a candidate, or if today's readings leave a parameter open."""
+    """What to read next; None without a candidate, or if today's readings leave a parameter
+    open."""
 
     def measurement(self, choice: Choice) -> Measurement:
         """Returns the model that takes these readings and no others."""
@@ -131,65 +141,100 @@ def design(
     errors: Sequence[Measurement] = (),
     truths: int = TRUTHS,
 ) -> Design:
-    """Evaluates what the scenario's readings say about its parameters, and which readings would say more.
+    """Evaluates what the scenario's readings say about its parameters, and which readings would say
+    more.
 
-    `by` names columns of the model's index, whose entries are chosen while all else stays as today; None tries each
-    column and then reading by reading. `readings` is the number to have at most, today's where it is None. `errors` are
-    richer versions of the model, whose nuisances may look like parameters.
+    `by` names columns of the model's index, whose entries are chosen while all else stays as today;
+    None tries each column and then reading by reading. `readings` is the number to have at most,
+    today's where it is None. `errors` are richer versions of the model, whose nuisances may look
+    like parameters.
 
     Raises:
-        UserError: noise of an unknown level, or with correlated errors, which do not add up; an unknown column; too few
-            readings.
+        UserError: noise of an unknown level, or with correlated errors, which do not add up; an
+            unknown column; too few readings.
     """
-    if scenario.noise.estimated:
+    noise = scenario.noise
+    if noise.estimated:
         raise UserError(
-            f"noise={scenario.noise.name}: without the level of the noise there are no bounds; give the deviation that"
-            " you expect, as in noise=gaussian noise.deviation=0.1"
+            f"noise={noise.name}: without the level of the noise there are no bounds; give the"
+            " deviation that you expect, as in noise=gaussian noise.deviation=0.1"
         )
-    model, R, x = scenario.measurement, scenario.problem.R, scenario.truths(0, truths)
+    model = scenario.measurement
+    R = scenario.problem.R
+    x = scenario.truths(0, truths)
     today = Observability.at(model, R, x)
-    found = [one for error in errors for one in suspects(model, R, error, x[:SUSPECTED])]
-    worst: dict[str, Suspect] = {}
-    for one in sorted(found, key=lambda s: -s.bounds):
-        worst.setdefault(one.name, one)
+    worst = _worst_suspects(model, R, errors, x)
     candidates = model.candidates
     columns = _columns(model, by)
     if R.factor.ndim != 1:
         raise UserError(
-            f"noise={scenario.noise.name}: the errors of readings are correlated, so that readings do not add up; a "
-            "design needs noise=gaussian or noise=quantization"
+            f"noise={noise.name}: the errors of readings are correlated, so that readings do not"
+            " add up; a design needs noise=gaussian or noise=quantization"
         )
-    R_all = scenario.noise.covariance(candidates.m)
+    R_all = noise.covariance(candidates.m)
     whole = Observability.at(candidates, R_all, x)
     if not whole.observable:
-        return Design(scenario, criterion, candidates, today, tuple(worst.values()), ())
+        return Design(scenario, criterion, candidates, today, worst, ())
+    most = _most_readings(model, candidates, readings)
+
+    # All is in units of today's bounds, or of those that all candidates have together.
     reference = today if today.observable else whole
-    bounds = np.sqrt(np.diagonal(reference.covariance, axis1=1, axis2=2))[:, None, :]
+    variances = np.diagonal(reference.covariance, axis1=1, axis2=2)
+    bounds = np.sqrt(variances)[:, None, :]
     slopes = R_all.whiten_jacobian(candidates.jacobian(x)) * bounds
     own = R.whiten_jacobian(model.jacobian(x)) * bounds
-    most = model.m if readings is None else readings
-    if most < model.n:
-        raise UserError(f"readings={most}: {model.n} parameters need at least {model.n} readings")
-    if readings is not None and readings > candidates.m:
-        raise UserError(
-            f"readings={readings}: {model.name} has {candidates.m} readings to choose among; give at most"
-            f" {candidates.m}, or make room for more with its options (`ipe-bench list measurement -v`)"
-        )
-    judge = _Judge(criterion, np.matmul(slopes.swapaxes(1, 2), slopes))
-    if np.isfinite(value := judge.value(np.matmul(own.swapaxes(1, 2), own))):
+    judge = _Judge(criterion, _information(slopes))
+    value = judge.value(_information(own))
+    if np.isfinite(value):
         judge = replace(judge, today=value)
-    tried = (
-        _way(judge, _units(model, candidates, chosen, slopes), model.m, most) for chosen in columns
-    )
+    units = [_units(model, candidates, chosen, slopes) for chosen in columns]
+    tried = [_way(judge, one, model.m, most) for one in units]
     ways = tuple(way for way in tried if way is not None)
     if readings is not None and not ways:
-        titles = " or ".join("by " + " and ".join(chosen) for chosen in columns)
+        _refuse_few(readings, columns)
+    further = _further(scenario, today, x)
+    return Design(scenario, criterion, candidates, today, worst, ways, further)
+
+
+def _worst_suspects(
+    model: Measurement, R: Covariance, errors: Sequence[Measurement], x: Array
+) -> tuple[Suspect, ...]:
+    """Returns each unmodelled error where it moves a parameter by most bounds, the worst first."""
+    found = [one for error in errors for one in suspects(model, R, error, x[:SUSPECTED])]
+    worst: dict[str, Suspect] = {}
+    for one in sorted(found, key=lambda suspect: -suspect.bounds):
+        worst.setdefault(one.name, one)
+    return tuple(worst.values())
+
+
+def _most_readings(model: Measurement, candidates: Measurement, readings: int | None) -> int:
+    """Returns the largest number of readings to have, which candidates and parameters allow."""
+    if readings is None:
+        return model.m
+    if readings < model.n:
         raise UserError(
-            f"readings={readings}: choices {titles} of so few do not determine all parameters, or there are fewer than"
-            f" {_FEW} to choose among; give more readings, or choose by other columns"
+            f"readings={readings}: {model.n} parameters need at least {model.n} readings"
         )
-    more = _further(scenario, today, x)
-    return Design(scenario, criterion, candidates, today, tuple(worst.values()), ways, more)
+    if readings > candidates.m:
+        raise UserError(
+            f"readings={readings}: {model.name} has {candidates.m} readings to choose among; give"
+            f" at most {candidates.m}, or make room for more with its options"
+            " (`ipe-bench list measurement -v`)"
+        )
+    return readings
+
+
+def _refuse_few(readings: int, columns: Sequence[tuple[str, ...]]) -> NoReturn:
+    titles = " or ".join("by " + " and ".join(chosen) for chosen in columns)
+    raise UserError(
+        f"readings={readings}: choices {titles} of so few do not determine all parameters, or there"
+        f" are fewer than {_FEW} to choose among; give more readings, or choose by other columns"
+    )
+
+
+def _information(slopes: Array) -> Array:
+    """Computes the information A' A (truths, n, n) of whitened slopes (truths, m, n)."""
+    return np.matmul(slopes.swapaxes(1, 2), slopes)
 
 
 def _further(scenario: Scenario, today: Observability, x: Array) -> Further | None:
@@ -207,49 +252,55 @@ def _further(scenario: Scenario, today: Observability, x: Array) -> Further | No
     there = np.flatnonzero(np.isfinite(J).all(axis=(0, 2)))
     if not len(there):
         return None
-    P, J = today.covariance, J[:, there]
+    J = J[:, there]
+    P = today.covariance
     before = np.einsum("tii->i", P)
-    alone, taken, bounds = np.empty(0), [], [today.bound]
+    alone = np.empty(0)
+    taken: list[int] = []
+    bounds = [today.bound]
     for _ in range(MOST_MORE):
-        # A reading with the whitened slope a takes P a a' P / (1 + a' P a) from P.
+        # A reading with the whitened slope a takes P a a' P / (1 + a' P a) from P (Sherman and
+        # Morrison); what is left of each variance is summed over the truths (g, n).
         Pa = np.matmul(J, P)
-        less = Pa**2 / (1 + np.sum(Pa * J, axis=2))[:, :, None]
+        scale = 1 + np.sum(Pa * J, axis=2)
+        less = Pa**2 / scale[:, :, None]
         left = np.einsum("tii->i", P) - less.sum(axis=0)
+        if not taken:
+            alone = np.sqrt(left / len(x))
         best = int(np.argmin((left / before).mean(axis=1)))
-        alone = alone if taken else np.sqrt(left / len(x))
         taken.append(best)
         bounds.append(np.sqrt(left[best] / len(x)))
         a = Pa[:, best]
-        P = P - a[:, :, None] * a[:, None, :] / (1 + np.sum(a * J[:, best], axis=1))[:, None, None]
+        P = P - a[:, :, None] * a[:, None, :] / scale[:, best, None, None]
     entries = np.asarray(model.index[column], dtype=float)[there] if column else np.empty(0)
     told = tuple(words[i] for i in there)
     return Further(told, column, entries, alone, tuple(taken), np.array(bounds))
 
 
 def _candidates(model: Measurement) -> tuple[Measurement, str, list[str]]:
-    """Returns a model of readings that may be taken beside today's, the one column that tells them apart, if it is a
-    number, and words for each: inputs over several times their range, else those that the model offers."""
+    """Returns a model of readings that may be taken beside today's, the one column that tells them
+    apart, if it is a number, and words for each: inputs over several times their range, else those
+    that the model offers."""
     columns = {**model.index, **model.input_columns}
     headings = [one.heading for one in model.inputs]
     varying = [name for name in headings if len(set(columns.get(name, ()))) > 1]
-    given = np.asarray(columns[varying[0]]) if len(varying) == 1 else np.empty(0, dtype=str)
-    if np.issubdtype(given.dtype, np.number) and columns.keys() >= {*headings}:
+    if len(varying) == 1 and columns.keys() >= {*headings}:
         (name,) = varying
-        far = given.min() + _REACH * np.ptp(given)
-        grid = [float(f"{at:.2g}") for at in np.linspace(given.min(), far, _GRID)]
-        inputs = {key: [columns[key][0]] * _GRID for key in headings} | {name: grid}
-        return model.with_inputs(inputs, _GRID), name, [f"{name} = {at:.4g}" for at in grid]
+        given = np.asarray(columns[name])
+        if np.issubdtype(given.dtype, np.number):
+            far = given.min() + _REACH * np.ptp(given)
+            grid = [float(f"{at:.2g}") for at in np.linspace(given.min(), far, _GRID)]
+            inputs = {key: [columns[key][0]] * _GRID for key in headings}
+            inputs[name] = grid
+            return model.with_inputs(inputs, _GRID), name, [f"{name} = {at:.4g}" for at in grid]
     offered = model.candidates
     if offered.m == model.m:
         return model, "", []
-    rows = zip(*offered.index.values(), strict=True)
-    words = [
-        ", ".join(
-            f"{name} {entry_in_words(offered, name, entry)}"
-            for name, entry in zip(offered.index, row, strict=True)
-        )
-        for row in rows
-    ]
+    words = []
+    for row in zip(*offered.index.values(), strict=True):
+        entries = zip(offered.index, row, strict=True)
+        told = [f"{name} {entry_in_words(offered, name, entry)}" for name, entry in entries]
+        words.append(", ".join(told))
     return offered, "", words
 
 
@@ -275,33 +326,35 @@ def _entries(model: Measurement, columns: Sequence[str]) -> list[tuple[Any, ...]
 def _units(
     model: Measurement, candidates: Measurement, by: tuple[str, ...], slopes: Array
 ) -> Units:
-    """Builds the units of the candidates; in all other columns they have what today's readings have."""
+    """Builds the units of the candidates; in all other columns they have what today's readings
+    have."""
     others = [c for c in model.index if c not in by]
     as_today = set(_entries(model, others))
     groups: dict[tuple[Any, ...], list[int]] = {}
-    for row, (entry, other) in enumerate(
-        zip(_entries(candidates, by), _entries(candidates, others), strict=True)
-    ):
+    entries = zip(_entries(candidates, by), _entries(candidates, others), strict=True)
+    for row, (entry, other) in enumerate(entries):
         if other in as_today:
             groups.setdefault(entry, []).append(row)
-    had, rows = (
-        set(_entries(model, by)),
-        tuple(np.array(one, dtype=np.intp) for one in groups.values()),
-    )
-    # The information of each unit in at most n rows, by QR; shorter units end in zeros.
+    had = set(_entries(model, by))
+    today = np.array([entry in had for entry in groups])
+    rows = tuple(np.array(one, dtype=np.intp) for one in groups.values())
+    # The information of each unit in at most n rows, A' A = R' R by QR; shorter units end in zeros.
     truths, _, n = slopes.shape
     r = min(n, max(map(len, rows)))
     units = np.zeros((truths, len(rows), r, n))
     for u, one in enumerate(rows):
         A = slopes[:, one]
-        units[:, u, : min(len(one), r)] = A if len(one) <= r else np.linalg.qr(A, mode="r")
-    return Units(by, tuple(groups), rows, np.array([entry in had for entry in groups]), units)
+        if len(one) > r:
+            A = np.asarray(np.linalg.qr(A, mode="r"))
+        units[:, u, : A.shape[1]] = A
+    return Units(by, tuple(groups), rows, today, units)
 
 
 @dataclass(frozen=True)
 class _Judge:
-    """Computes a criterion to be small, over information matrices M (truths, n, n) in units of today's bounds: tr M^-1
-    / n, or -log det M / n, averaged over the truths, with the little that is known beforehand."""
+    """Computes a criterion to be small, over information matrices M (truths, n, n) in units of
+    today's bounds: tr M^-1 / n, or -log det M / n, averaged over the truths, with the little that
+    is known beforehand."""
 
     criterion: Criterion
     everything: Array
@@ -310,49 +363,58 @@ class _Judge:
     """The mean bound of today's set-up, which others are shares of; 1 if it is infinite."""
 
     def value(self, M: Array) -> float:
-        """Computes the mean bound in units of today's, without what is known beforehand; infinite if M is singular."""
+        """Computes the mean bound in units of today's, without what is known beforehand; infinite
+        if M is singular."""
         s = np.linalg.eigvalsh(M)
         if (s[:, 0] <= 1e-12 * s[:, -1]).any():
             return float("inf")
-        mean = np.exp(-0.5 * np.log(s).mean()) if self.criterion == "D" else np.sqrt((1 / s).mean())
+        if self.criterion == "D":
+            # det M^(-1/2n), the geometric mean of the ellipsoid's semi-axes.
+            mean = np.exp(-0.5 * np.log(s).mean())
+        else:
+            mean = np.sqrt((1 / s).mean())
         return float(mean) / self.today
 
     def gains(self, M: Array, slopes: Array) -> Array:
-        """Computes the fall of the loss with each further unit (units,), where M is the information without it."""
+        """Computes the fall of the loss with each further unit (units,), where M is the information
+        without it."""
         truths, units, r, n = slopes.shape
         P = np.linalg.inv(M + _WEAK * self.everything)
+        # With a unit's slopes A: B = A P and K = I + A P A'. The determinant of M grows by that of
+        # K, and the trace of P falls by tr(B' K^-1 B) (Woodbury).
         B = np.matmul(slopes.reshape(truths, units * r, n), P).reshape(slopes.shape)
         K = np.eye(r) + np.matmul(B, slopes.swapaxes(-1, -2))
         if self.criterion == "D":
             return np.linalg.slogdet(K)[1].mean(axis=0) / n
-        return np.einsum("turi,turi->u", B, B / K if r == 1 else np.linalg.solve(K, B)) / (
-            truths * n
-        )
+        solved = B / K if r == 1 else np.linalg.solve(K, B)
+        return np.einsum("turi,turi->u", B, solved) / (truths * n)
 
 
 def _way(judge: _Judge, units: Units, today: int, most: int) -> Way | None:
-    """Finds the two choices by adding the unit that gains most per reading; None if there is no choice."""
+    """Finds the two choices by adding the unit that gains most per reading; None if there is no
+    choice."""
     if len(units.rows) < _FEW:
         return None
-    sizes, taken, found = (
-        np.array([*map(len, units.rows)]),
-        np.zeros(len(units.rows), dtype=bool),
-        [],
-    )
-    while (free := ~taken & (sizes <= max(today, most) - sizes[taken].sum())).any():
+    sizes = np.array([*map(len, units.rows)])
+    room = max(today, most)
+    taken = np.zeros(len(sizes), dtype=bool)
+    free = sizes <= room
+    found = []
+    while free.any():
         gains = judge.gains(units.information(taken), units.slopes) / sizes
-        taken[int(np.argmax(np.where(free, gains, -np.inf)))] = True
+        best = int(np.argmax(np.where(free, gains, -np.inf)))
+        taken[best] = True
         found.append(_choice(judge, units, taken))
+        free = ~taken & (sizes <= room - sizes[taken].sum())
     found = [choice for choice in found if np.isfinite(choice.mean_bound)]
     within = [choice for choice in found if choice.readings <= most]
     if not within:
         return None
     if sizes[units.today].sum() <= most:
         within.append(_choice(judge, units, units.today))
-    saving = next(
-        (choice for choice in found if choice.mean_bound <= 1 and choice.readings < today), None
-    )
-    return Way(units, saving, min(within, key=lambda choice: choice.mean_bound))
+    sharpest = min(within, key=lambda choice: choice.mean_bound)
+    saving = (choice for choice in found if choice.mean_bound <= 1 and choice.readings < today)
+    return Way(units, next(saving, None), sharpest)
 
 
 def _choice(judge: _Judge, units: Units, taken: Mask) -> Choice:
