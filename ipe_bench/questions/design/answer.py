@@ -47,7 +47,8 @@ def _best(design: Design) -> Way | None:
 
 
 def _direction(seen: Observability) -> str:
-    return f"{'Worst-determined combination' if seen.observable else 'The readings do not determine'}: {seen.words}"
+    start = "Worst-determined combination" if seen.observable else "The readings do not determine"
+    return f"{start}: {seen.words}"
 
 
 def _no_others(design: Design) -> str:
@@ -62,17 +63,22 @@ def _no_others(design: Design) -> str:
 def _design_sentences(design: Design) -> Iterator[str]:
     yield f"{_direction(design.observability)}."
     yield from _further_sentence(design)
-    same, best = _no_others(design), _best(design)
+    same = _no_others(design)
+    best = _best(design)
     if same:
         yield same
     elif best:
-        choice, today = best.sharpest, design.scenario.measurement.m
-        if choice.readings == today and choice.mean_bound >= 1 - _WORTH:
-            yield "The present readings are already optimal for their number."
-        else:
-            share = percent(choice.mean_bound)
-            yield f"{choice.readings} readings chosen {best.title} have {share} of today's mean bound."
+        yield _best_sentence(best, design.scenario.measurement.m)
     yield from _unseen(design)
+
+
+def _best_sentence(way: Way, today: int) -> str:
+    """Says what a way's sharpest choice is worth beside today's number of readings."""
+    choice = way.sharpest
+    if choice.readings == today and choice.mean_bound >= 1 - _WORTH:
+        return "The present readings are already optimal for their number."
+    share = percent(choice.mean_bound)
+    return f"{choice.readings} readings chosen {way.title} have {share} of today's mean bound."
 
 
 def _further_sentence(design: Design) -> Iterator[str]:
@@ -83,11 +89,11 @@ def _further_sentence(design: Design) -> Iterator[str]:
     where = [further.words[i] for i in further.taken]
     most = int(np.argmin(further.bounds[1] / further.bounds[0]))
     parameter = design.observability.parameters[most]
-    today, one, three = (f"{parameter.size * further.bounds[k, most]:.3g}" for k in (0, 1, 3))
+    bounds = [f"{parameter.size * bound:.3g}" for bound in further.bounds[:, most]]
     unit = f" {parameter.unit}" if parameter.unit else ""
     yield (
-        f"Read next at {where[0]}: the bound of {parameter.name} falls from {today} to {one}{unit}; with two more, at"
-        f" {where[1]} and {where[2]}, to {three}{unit}."
+        f"Read next at {where[0]}: the bound of {parameter.name} falls from {bounds[0]} to"
+        f" {bounds[1]}{unit}; with two more, at {where[1]} and {where[2]}, to {bounds[3]}{unit}."
     )
 
 
@@ -95,15 +101,15 @@ def _further(design: Design) -> Iterator[Table]:
     further = design.further
     if further is None:
         return
-    shares = further.bounds / further.bounds[0]
-    columns = [
-        texts("further readings", [str(k) for k in range(1, len(shares))]),
-        words("next at", [further.words[i] for i in further.taken]),
-        texts("mean bound", [f"{np.sqrt(np.mean(share**2)):.3f}" for share in shares[1:]]),
-        texts("smallest", [f"{share.min():.3f}" for share in shares[1:]]),
-    ]
+    shares = further.bounds[1:] / further.bounds[0]
     names = [p.name for p in design.observability.parameters]
-    columns.append(words("of", [names[int(np.argmin(share))] for share in shares[1:]]))
+    columns = [
+        texts("further readings", [str(1 + k) for k in range(len(shares))]),
+        words("next at", [further.words[i] for i in further.taken]),
+        texts("mean bound", [f"{np.sqrt(np.mean(share**2)):.3f}" for share in shares]),
+        texts("smallest", [f"{share.min():.3f}" for share in shares]),
+        words("of", [names[int(np.argmin(share))] for share in shares]),
+    ]
     note = (
         "Bounds are shares of today's. Each further reading is the one of the candidates that cuts the mean square of"
         " these shares most; an input's candidates reach to four times its range."
@@ -117,20 +123,24 @@ def _draw_design(design: Design) -> Iterator[Drawing]:
 
     if design.further is not None:
         yield draw_further(design.scenario.measurement, design.further)
-    best, scenario, after = None if _no_others(design) else _best(design), design.scenario, None
+    best = None if _no_others(design) else _best(design)
+    after = None
+    title = ""
     if best is not None:
+        scenario = design.scenario
         model = design.measurement(best.sharpest)
-        after = Observability.at(
-            model, scenario.noise.covariance(model.m), scenario.truths(0, TRUTHS)
-        )
-    yield from draw_bounds(design.observability, after, f"best choice {best.title}" if best else "")
+        R = scenario.noise.covariance(model.m)
+        after = Observability.at(model, R, scenario.truths(0, TRUTHS))
+        title = f"best choice {best.title}"
+    yield from draw_bounds(design.observability, after, title)
 
 
 def design_parts(name: str, design: Design) -> Iterator[Part]:
     """Yields the tables and sentences of a design, under the `name` of its model."""
     yield _parameters(name, design)
     yield Strong(_direction(design.observability))
-    if told := structure(design.scenario.measurement):
+    told = structure(design.scenario.measurement)
+    if told:
         if not told.lost:
             yield f"Exact readings would determine all {len(told.unknowns)} parameters locally."
         yield from (Strong(f"Not identifiable: {sentence}.") for sentence in told.sentences)
@@ -140,33 +150,30 @@ def design_parts(name: str, design: Design) -> Iterator[Part]:
 
 
 def _parameters(name: str, design: Design) -> Table:
-    seen, scenario = design.observability, design.scenario
-    parameters, others = seen.parameters, seen.correlation - np.eye(len(seen.parameters))
-    s = np.median(seen.singular_values, axis=0)
+    seen = design.observability
+    scenario = design.scenario
+    parameters = seen.parameters
+    bounds = [p.size * bound for p, bound in zip(parameters, seen.bound, strict=True)]
     columns = [
         words("parameter", [p.name for p in parameters]),
         words("unit", [p.unit for p in parameters]),
-        texts(
-            "bound",
-            [scientific(bound * p.size) for p, bound in zip(parameters, seen.bound, strict=True)],
-        ),
+        texts("bound", [scientific(bound) for bound in bounds]),
         texts("correlation with all others", [f"{r:.2f}" for r in seen.multiple_correlation]),
     ]
     if len(parameters) > 1:
+        others = seen.correlation - np.eye(len(parameters))
         most = np.argmax(np.abs(others), axis=1)
-        columns.append(
-            words(
-                "strongest",
-                [f"{parameters[j].name} {others[i, j]:+.2f}" for i, j in enumerate(most)],
-            )
-        )
+        strongest = [f"{parameters[j].name} {others[i, j]:+.2f}" for i, j in enumerate(most)]
+        columns.append(words("strongest", strongest))
+    s = np.median(seen.singular_values, axis=0)
     notes = [
         "bound: smallest standard deviation of an unbiased estimator, root mean square over the prior. Correlations of"
         " the errors: multiple correlation with all others, and the strongest with one other.",
         f"Singular values of the whitened Jacobian, per parameter's size: {short(s[0])} to {short(s[-1])}.",
     ]
-    title = f"{name}, {scenario.noise.name}, error scale {scenario.error_scale:g}: what {scenario.measurement.m}"
-    return Table("parameters", f"{title} readings determine", "", columns, notes=notes)
+    setting = f"{name}, {scenario.noise.name}, error scale {scenario.error_scale:g}"
+    title = f"{setting}: what {scenario.measurement.m} readings determine"
+    return Table("parameters", title, "", columns, notes=notes)
 
 
 def _suspects(design: Design) -> Iterator[Part]:
@@ -192,21 +199,22 @@ def _suspects(design: Design) -> Iterator[Part]:
 
 
 def _unseen(design: Design) -> Iterator[str]:
-    if unseen := [s for s in design.suspects if s.hidden and s.noticed < _UNSEEN]:
-        yield (
-            f"Tests of residuals will not detect {enumerate_few([s.name for s in unseen])}, which parameters imitate."
-            f" {unseen[0].parameter} will be wrong by {unseen[0].bounds:.3g} bounds where {unseen[0].name} is"
-            f" {unseen[0].deviation:.3g} {unseen[0].unit}."
-        )
+    unseen = [s for s in design.suspects if s.hidden and s.noticed < _UNSEEN]
+    if not unseen:
+        return
+    worst = unseen[0]
+    yield (
+        f"Tests of residuals will not detect {enumerate_few([s.name for s in unseen])}, which"
+        f" parameters imitate. {worst.parameter} will be wrong by {worst.bounds:.3g} bounds where"
+        f" {worst.name} is {worst.deviation:.3g} {worst.unit}."
+    )
 
 
 def _ways(design: Design) -> Iterator[Part]:
     if not design.ways:
-        why = (
-            "they are too few"
-            if design.observability.observable
-            else "they do not determine all parameters"
-        )
+        why = "they do not determine all parameters"
+        if design.observability.observable:
+            why = "they are too few"
         yield f"The candidates offer no choice: {why}."
         return
     same = _no_others(design)
@@ -214,18 +222,18 @@ def _ways(design: Design) -> Iterator[Part]:
         yield f"{same} `readings=NUMBER` chooses fewer of them."
         return
     today = design.scenario.measurement.m
+    # A way without a saving takes what is taken today.
+    savings = [
+        (way.saving.readings, way.saving.mean_bound) if way.saving else (today, 1.0)
+        for way in design.ways
+    ]
+    sharpest = [way.sharpest for way in design.ways]
     columns = [
         words("chosen", [way.title for way in design.ways]),
-        texts(
-            "fewest readings",
-            [f"{way.saving.readings if way.saving else today}" for way in design.ways],
-        ),
-        texts(
-            "bound",
-            [f"{way.saving.mean_bound:.3f}" if way.saving else "1.000" for way in design.ways],
-        ),
-        texts("at most", [f"{way.sharpest.readings}" for way in design.ways]),
-        texts("smallest bound", [f"{way.sharpest.mean_bound:.3f}" for way in design.ways]),
+        texts("fewest readings", [f"{readings}" for readings, _ in savings]),
+        texts("bound", [f"{bound:.3f}" for _, bound in savings]),
+        texts("at most", [f"{choice.readings}" for choice in sharpest]),
+        texts("smallest bound", [f"{choice.mean_bound:.3f}" for choice in sharpest]),
     ]
     title = f"Which readings to take instead (bounds as shares of today's, criterion {design.criterion})"
     note = (
@@ -235,33 +243,41 @@ def _ways(design: Design) -> Iterator[Part]:
     yield Table("ways", title, "", columns, notes=[note])
     for way in design.ways:
         if way.saving and len(way.units.by) == 1:
-            entries = [way.units.entries[u][0] for u in way.saving.taken]
-            levels = ", ".join(
-                entry_in_words(design.candidates, way.units.by[0], entry) for entry in entries
-            )
-            yield f"{way.saving.readings} readings {way.title}: {levels}"
+            (column,) = way.units.by
+            taken = [way.units.entries[u][0] for u in way.saving.taken]
+            levels = [entry_in_words(design.candidates, column, entry) for entry in taken]
+            yield f"{way.saving.readings} readings {way.title}: {', '.join(levels)}"
 
 
 def write_design(folder: Path, name: str, design: Design) -> list[Path]:
-    """Writes the page of a design, and readings.csv with what each choice takes; returns the files."""
+    """Writes the page of a design, and readings.csv with what each choice takes; returns the
+    files."""
     index = pd.DataFrame(dict(design.candidates.index))
-    chosen = [
-        index.iloc[list(choice.rows)].assign(by=" and ".join(way.units.by), choice=name)
-        for way in design.ways
-        for name, choice in (("saving", way.saving), ("sharpest", way.sharpest))
-        if choice
-    ]
+    chosen = []
+    for way in design.ways:
+        by = " and ".join(way.units.by)
+        for word, choice in (("saving", way.saving), ("sharpest", way.sharpest)):
+            if choice:
+                rows = index.iloc[list(choice.rows)]
+                chosen.append(rows.assign(by=by, choice=word))
     columns = ["by", "choice", *index]
     table = pd.concat(chosen)[columns] if chosen else pd.DataFrame(columns=columns)
-    answer, parts = list(_design_sentences(design)), design_parts(name, design)
     return write_files(
-        folder, "design", (READINGS, table), f"{name}: design", answer, parts, _draw_design(design)
+        folder,
+        "design",
+        (READINGS, table),
+        f"{name}: design",
+        list(_design_sentences(design)),
+        design_parts(name, design),
+        _draw_design(design),
     )
 
 
 def designed(
     scenario: Scenario, errors: Sequence[Measurement] | None = None, **options: Any
 ) -> DesignAnswer:
-    """Designs readings of a scenario; `errors` are richer models, by default those that the options offer."""
+    """Designs readings of a scenario; `errors` are richer models, by default those that the options
+    offer."""
     known = richer_models(scenario) if errors is None else errors
-    return DesignAnswer(**vars(design(replace(scenario, truth=None), errors=known, **options)))
+    found = design(replace(scenario, truth=None), errors=known, **options)
+    return DesignAnswer(**vars(found))

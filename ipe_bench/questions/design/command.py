@@ -27,7 +27,8 @@ output=DIR          folder of the files
 
 
 def answer(asked: Asked, **given: Any) -> Answered:
-    """Returns the tables of a design, whose files are written; exit code 1 where a parameter is not determined."""
+    """Returns the tables of a design, whose files are written; exit code 1 where a parameter is not
+    determined."""
     from ipe_bench.plugins.extensions import richer_models
     from ipe_bench.questions.design.answer import READINGS, design_parts, designed, write_design
     from ipe_bench.runs.provenance import describe
@@ -46,7 +47,8 @@ def answer(asked: Asked, **given: Any) -> Answered:
         "readings": given.get("readings"),
         "criterion": given.get("criterion", "A"),
     }
-    files = write_design(asked.folder("design", identity, (READINGS,)), asked.measurement, found)
+    folder = asked.folder("design", identity, (READINGS,))
+    files = write_design(folder, asked.measurement, found)
     code = 0 if found.observability.observable else 1
     return Answered(design_parts(asked.measurement, found), code, files=files)
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ipe_bench.questions.panels import labelled_rows
+from ipe_bench.questions.panels import labelled_rows, with_unit
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.style import BOUND_COLOR, BOUND_DASH, COLORS, FAMILIES
@@ -22,15 +22,16 @@ if TYPE_CHECKING:
 
 
 def draw_further(model: Measurement, further: Further) -> Drawing:
-    """Draws bounds, as shares of today's, over the number of further readings, and over where one more is taken."""
-    today, number = further.bounds[0], range(len(further.bounds))
-    gain = np.argsort((further.bounds[-1] / today), kind="stable")
-    shown = gain[:MOST_PARAMETERS]
+    """Draws bounds, as shares of today's, over the number of further readings, and over where one
+    more is taken."""
+    today = further.bounds[0]
+    shares = further.bounds / today
+    shown = np.argsort(shares[-1], kind="stable")[:MOST_PARAMETERS]
     fig, axes = common.panels(2 if further.column else 1, height=3.0)
     for i, k in enumerate(shown):
         p = model.parameters[k]
         line: Any = {"color": COLORS[i], "label": common.text(p.name), "zorder": 3 - 0.1 * i}
-        axes[0].plot(number, further.bounds[:, k] / today[k], "o-", **line)
+        axes[0].plot(range(len(shares)), shares[:, k], "o-", **line)
         for ax in axes[1:]:
             ax.plot(further.entries, further.alone[:, k] / today[k], **line)
     axes[0].set_xlabel("further readings, where they help most")
@@ -42,26 +43,26 @@ def draw_further(model: Measurement, further: Further) -> Drawing:
         given = np.asarray(columns[further.column], dtype=float)
         style: Any = {"linestyle": "none", "color": BOUND_COLOR, "clip_on": False}
         ax.plot(given, np.ones(len(given)), marker="|", label="today's readings", **style)
-    shares = (further.bounds / today)[:, shown]
     for ax in axes:
-        common.decades(ax, shares, least=1.25)
+        common.decades(ax, shares[:, shown], least=1.25)
         ax.set_ylabel("bound over today's")
     common.legend(fig, axes)
     caption = "Cramér-Rao bounds with further readings."
-    caption += " Right: with one more, by where it is taken." if further.column else ""
+    if further.column:
+        caption += " Right: with one more, by where it is taken."
     left = len(today) - len(shown)
-    caption += f" Not drawn: {left} parameters that gain less." if left else ""
+    if left:
+        caption += f" Not drawn: {left} parameters that gain less."
     return Drawing("further", f"Read next at {further.words[further.taken[0]]}", caption, fig)
 
 
 def draw_bounds(now: Observability, after: Observability | None, choice: str) -> Iterator[Drawing]:
     """Draws the bound of each parameter in its unit, today and after a `choice` of readings."""
     sizes = np.array([p.size for p in now.parameters])
-    fig, (ax,) = labelled_rows(
-        [f"{p.name} [{p.unit}]" if p.unit else p.name for p in now.parameters], 1
-    )
+    fig, (ax,) = labelled_rows([with_unit(p) for p in now.parameters], 1)
     y = np.arange(len(now.parameters))
-    known, today = np.isfinite(now.bound), sizes * now.bound
+    known = np.isfinite(now.bound)
+    today = sizes * now.bound
     chosen = today if after is None else sizes * after.bound
     common.decades(ax, np.append(today, chosen))
     if after is not None:
@@ -72,7 +73,10 @@ def draw_bounds(now: Observability, after: Observability | None, choice: str) ->
         ax.plot(chosen, y, "o", color=FAMILIES["IPE"][0], label=choice)
     ax.set_xlabel("bound, in the unit of each row")
     common.legend(fig, [ax])
-    caption = "Cramér-Rao bound of each parameter's standard deviation, root mean square over truths from the prior."
+    caption = (
+        "Cramér-Rao bound of each parameter's standard deviation, root mean square over truths from"
+        " the prior."
+    )
     if not known.all():
         caption += " Without a hollow mark: today's readings leave the parameter open."
     title = "Bounds today" if after is None else "Bounds today and after the best choice"
