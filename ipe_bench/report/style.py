@@ -46,6 +46,8 @@ MOST_FACES = 10
 """Estimators up to which each has a colour where no names stand at the curves."""
 _LEGIBLE = 0.18
 """Largest relative luminance of letters on white."""
+_BRIGHT = 0.22
+"""Least relative luminance of letters on a dark page."""
 DARK = "#15181c"
 """What white becomes on a page that is dark."""
 LIGHT = "#e4e7ea"
@@ -240,11 +242,17 @@ def _linear(c: float) -> float:
     return c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4
 
 
-def dark(color: str) -> str:
-    """Returns what a colour on white becomes on a dark page: greys change places, and the others are lighter."""
+def dark(color: str, *, letters: bool = False) -> str:
+    """Returns what a colour on white becomes on a dark page: that of success is of the dark colours of success, greys
+    change places, and the others are lighter, those of `letters` until they have a contrast of 4.5."""
+    if color in RAMP:
+        return DARK_RAMP[RAMP.index(color)]
     rgb = _rgb(color)
     if max(rgb) - min(rgb) > 0.05:
-        return _hex([c + 0.25 * (1 - c) for c in rgb])
+        rgb = [c + 0.25 * (1 - c) for c in rgb]
+        while letters and _luminance(rgb) < _BRIGHT:
+            rgb = [c + 0.03 * (1 - c) for c in rgb]
+        return _hex(rgb)
     # White becomes the first end, black the second.
     share = 1 - rgb[0]
     ends = zip(_rgb(DARK), _rgb(LIGHT), strict=True)

@@ -37,6 +37,7 @@ from ipe_bench.report.figures import (
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.views import View, focus_of, views
 from ipe_bench.report.style import (
+    COLORS,
     DARK,
     FACES,
     FAMILIES,
@@ -47,6 +48,7 @@ from ipe_bench.report.style import (
     WHITE,
     dark,
     house_style,
+    ink,
     looks,
     print_style,
     strong,
@@ -469,6 +471,23 @@ def test_letters_of_any_colour_are_read_on_white(color):
     c = np.array(to_rgb(strong(color)))
     luminance = XYZ[1] @ np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
     assert 1.05 / (luminance + 0.05) >= 4.5
+
+
+def contrast(first: str, second: str) -> float:
+    """By WCAG 2, from the luminance of CIE."""
+    each = sorted(((lab(color)[0] + 16) / 116) ** 3 for color in (first, second))
+    return (each[1] + 0.05) / (each[0] + 0.05)
+
+
+@pytest.mark.parametrize("color", [one.color for one in FACES.values()] + [*COLORS])
+def test_letters_of_any_colour_are_read_on_a_dark_page(color):
+    assert contrast(dark(strong(color), letters=True), DARK) >= 4.5
+
+
+@pytest.mark.parametrize("ground", certified._STEPS.values())
+def test_digits_are_read_in_their_cells_on_white_and_on_a_dark_page(ground):
+    assert contrast(ground, ink(ground)) >= 4.5
+    assert contrast(dark(ground), dark(ink(ground), letters=True)) >= 4.5
 
 
 def test_the_axis_starts_at_the_last_scale_where_all_are_alike_and_the_caption_says_so(parted):

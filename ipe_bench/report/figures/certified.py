@@ -17,7 +17,7 @@ from ipe_bench.statistics.certified import certified_table, published_table
 
 SOLVED = 4
 """Digits from which on a problem is solved."""
-_STEPS = {0: RAMP[8], 1: RAMP[6], 2: RAMP[4], 3: RAMP[2], SOLVED: RAMP[1], 8: RAMP[0]}
+_STEPS = {0: RAMP[9], 1: RAMP[7], 2: RAMP[3], 3: RAMP[2], SOLVED: RAMP[1], 8: RAMP[0]}
 """Colours from so many digits on: blue where a problem is solved."""
 
 
@@ -43,9 +43,7 @@ def draw_digits(view: View) -> Iterator[Drawing]:
         sns.heatmap(cells, ax=ax, cmap=ListedColormap(list(_STEPS.values())), norm=norm, **style)
         for text in ax.texts:
             step = max(k for k in _STEPS if k <= int(text.get_text()))
-            # Neither is grey, whose place another takes on a dark page.
-            dark = ink(_STEPS[step]) != "#ffffff"
-            text.set(color="#1b2635" if dark else "#fff8ea", fontsize="small")
+            text.set(color=ink(_STEPS[step]), fontsize="small")
         ax.set(xlabel="", ylabel="", title=f"start {start}")
         ax.set_xticks(ax.get_xticks(), [common.text(e) for e in estimators], rotation=90)
         ax.set_yticks(np.arange(len(problems)) + 0.5, list(problems), rotation=0)

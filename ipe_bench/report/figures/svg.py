@@ -115,6 +115,12 @@ def _key(handle: str, size: str, x: str, y: str, label: str) -> str:
     return f'<span><svg viewBox="{box}">{handle}</svg>{label}</span>'
 
 
+def _at_night(style: str) -> str:
+    """Returns the style with the colours of a dark page."""
+    letters = "font" in style
+    return re.sub("#[0-9a-f]{6}", lambda color: dark(color[0], letters=letters), style)
+
+
 def _classed(html: str) -> str:
     """Returns the same with a class for each style, and exact to 1/100 point."""
     styles: dict[str, str] = {}
@@ -138,6 +144,7 @@ def _classed(html: str) -> str:
     html = re.sub(r"<\w[^<>]*>", rewritten, html)
     html = re.sub(r">\s*\n\s*<", "><", html)
     rules = [f".{name}{{{style}}}" for name, style in styles.items()]
+    dimmed = [f".{name}{{{_at_night(style)}}}" for name, style in styles.items()]
     light = "".join(rules)
-    night = re.sub("#[0-9a-f]{6}", lambda color: dark(color[0]), light)
+    night = "".join(dimmed)
     return f"<style>{light}@media screen and (prefers-color-scheme:dark){{{night}}}</style>{html}"
