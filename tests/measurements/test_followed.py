@@ -88,6 +88,42 @@ def test_numpy_notes_the_same_steps_in_doubt_as_machine_code(rate, doubt):
         assert states[0, 0, -1, -1] == doubt
 
 
+def well(width="K", **options):
+    """A body that moves at 4.5 a unit of time and is held near 0, where the rate is zero on the far side of a well."""
+    rates = {"y": f"5*exp(-((y-c)/({width}))**2)-4.5"}
+    return Ode(rates, {"K": 1.0, "c": 1.0}, {"y": 9.0}, **options)
+
+
+def held(width, c):
+    return c + width * np.sqrt(np.log(5 / 4.5))
+
+
+@pytest.mark.parametrize("width", [0.3, 0.003])
+def test_a_nominal_well_that_long_implicit_steps_agree_to_pass_over_is_met_or_told(width):
+    times = tuple(np.arange(0.5, 4.1, 0.5))
+    for method, met in (("auto", True), ("implicit", width > 0.1)):
+        model = well(f"K*{width}", times=times, method=method)
+        z = model.simulate(model.nominal[None])[0, -1]
+        assert z == pytest.approx(held(width, 1.0), abs=1e-7) if met else np.isnan(z)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["auto", "implicit"])
+def test_drawn_wells_are_met_that_are_a_twentieth_of_the_way_between_readings_or_wider(method):
+    """What a trial alone has is met by chance where it is narrower, unless its steps are told to be short."""
+    rng = np.random.default_rng(1)
+    width = np.exp(rng.uniform(np.log(1e-3), 0.0, 300))
+    x = np.stack([width, rng.uniform(0.2, 8.8, 300)], axis=1)
+    model = well(times=tuple(np.arange(1.0, 41.0)), method=method)
+    wrong = ~(np.abs(model.simulate(x)[:, -1] - held(width, x[:, 1])) < 1e-6)
+    assert wrong.any()
+    assert not wrong[width > 4.5 / 20].any()
+    short = replace(model, method="explicit", step=1e-3 / 4.5)
+    np.testing.assert_allclose(
+        short.simulate(x[wrong][:20])[:, -1], held(*x[wrong][:20].T), atol=1e-6
+    )
+
+
 def test_a_solution_that_ends_at_a_pole_has_no_readings_behind_it():
     """y^2 = 1 - 2 k t, and with a rate that has a place to settle beyond the pole."""
     model = Ode({"y": "-k/y"}, {"k": 0.5}, {"y": 1.0}, times=(0.2, 0.6, 2.0))
