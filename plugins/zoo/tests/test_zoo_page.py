@@ -21,15 +21,14 @@ COMMANDS = [
 
 def test_its_tables_name_all_that_there_is():
     named = re.findall(
-        r"^\| `\+?(measurement|baseline|experiment)=\[?(\w+)\]?`", PAGE, re.MULTILINE
+        r"^\| `\+?(measurement|state_model|baseline|experiment)=\[?(\w+)\]?`", PAGE, re.MULTILINE
     )
     there = [
         path.relative_to(ZOO / "ipe_bench_zoo/conf").with_suffix("").parts
         for path in ZOO.rglob("conf/*/*.yaml")
     ]
-    assert set(named) == {
-        one for one in there if one[0] in ("measurement", "baseline", "experiment")
-    }
+    kinds = ("measurement", "state_model", "baseline", "experiment")
+    assert set(named) == {one for one in there if one[0] in kinds}
 
 
 @pytest.mark.slow
