@@ -121,7 +121,6 @@ class Finding:
         undecided = [one for one in self.standings if one.possible >= most > one.sure]
         clauses = [self._winners(winners, undecided)]
         clauses += self._covariances(winners)
-        clauses += self._beyond(most) if self.ascending and most < len(self.places) else []
         clauses += [f"{named(undecided, self.standings)}: undecided"] if undecided else []
         clauses += self._parted(most) if self.ascending else []
         return "; ".join(clauses)
@@ -202,14 +201,6 @@ class Finding:
             return ""
         goes_on = list(columns) == list(range(first, number)) and len(columns) > 1
         return f"{'from' if goes_on else 'at'} {self._scale(first)}{' on' if goes_on else ''}"
-
-    def _beyond(self, most: int) -> Iterator[str]:
-        """States who may hold at the next scale, too."""
-        going_on = [one for one in self.standings if one.possible > most]
-        at = self._scale(most)
-        yield (
-            f"at {at} {named(going_on, self.standings)}: undecided" if going_on else f"none at {at}"
-        )
 
     def _parted(self, most: int) -> Iterator[str]:
         """States where the best filters or the best IPE fail, unless both may be among those that hold longest."""

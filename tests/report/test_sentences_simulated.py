@@ -124,7 +124,6 @@ CLAUSES = {
     "winners": rf"(?P<only>Only )?{NAMED} holds? {UP_TO} \({NUMBERS}\)",
     "covariance": rf"(?:(?P<theirs>its|their) covariance|the covariance of {NAMED}) is too small"
     r"(?: (?P<extent>from|at) (?P<scale>[\d.]+)(?: on)?)?",
-    "next": rf"at (?P<scale>[\d.]+) {NAMED}: undecided|none at (?P<none>[\d.]+)",
     "undecided": rf"{NAMED}: undecided",
     "fails": rf"{NAMED} fails?(?: (?P<extent>from|at) (?P<scale>[\d.]+)(?: on)?)?"
     r"(?:, with too small a covariance (?P<wrong>from|at) (?P<first>[\d.]+)(?: on)?)?",
@@ -139,7 +138,7 @@ FINDING = r"(?:Only |All |No estimator |Too few |\d+ of \d+ |e\d+).*(?:hold|tell
 @sentence(FINDING, of_one=True)
 def finding(report: Report, match: Any) -> Iterator[tuple[str, str, bool]]:
     """Holds: infers that 90 % succeed, in the population, up to that scale; only: that they do of no other. Fails,
-    none, no estimator: infers that fewer do at those scales. Too small a covariance: infers that the mean NEES is
+    no estimator: infers that fewer do at those scales. Too small a covariance: infers that the mean NEES is
     above n at those scales. Counts who is undecided or has the most success, and the numbers that were seen."""
     winners: list[str] = []
     for clause in match[0].split("; "):
@@ -232,17 +231,6 @@ def covariance(report: Report, found: Any, winners: list[str]) -> Iterator[tuple
     yield "covariance too small", INFERS, false
 
 
-def at_the_next(report: Report, found: Any, winners: list[str]) -> Iterator[tuple[str, str, bool]]:
-    at = place(report, found["scale"] or found["none"])
-    possible = possible_up_to(report, at)
-    if found["none"]:
-        yield "none at the next", COUNTS, bool(possible)
-        every = report.board.populations
-        yield "none holds", INFERS, any(truly_holds(report, e, at) for e in every)
-    else:
-        yield "undecided at the next", COUNTS, set(named_in(found, possible)) != set(possible)
-
-
 def undecided(report: Report, found: Any, winners: list[str]) -> Iterator[tuple[str, str, bool]]:
     last = max(at for at in range(len(report.board.scales)) if holding_up_to(report, at))
     meant = set(possible_up_to(report, last)) - set(holding_up_to(report, last))
@@ -306,7 +294,6 @@ def most(report: Report, found: Any, winners: list[str]) -> Iterator[tuple[str, 
 
 JUDGES = {
     "covariance": covariance,
-    "next": at_the_next,
     "undecided": undecided,
     "fails": fails,
     "nobody": nobody,

@@ -103,20 +103,15 @@ def _units(collection: Collection | None) -> dict[str, str]:
 def _names(rows: pd.DataFrame, apart: Sequence[str], view: View) -> list[str]:
     """Words the setting of each row by what is in it: options that are there and not 0, with their units."""
     units = _units(view.collection)
-    scenarios = _scenarios(view.collection)
-    # Scenarios of states that move have a model in place of a measurement.
-    assumed = [one["measurement"] for one in scenarios if "measurement" in one]
-    models = {config[TARGET].rpartition(".")[2] for config in assumed}
-    options = [c for c in apart if "." in c]
+    assumed = [one.get("measurement", {}) for one in _scenarios(view.collection)]
+    models = {config.get(TARGET, "").rpartition(".")[2] for config in assumed}
     told = []
     for row in rows.to_dict("records"):
-        here = [c for c in options if value_text(row[c]) not in ("-", "0")]
-        words = [f"{_worded(c)} {value_text(row[c])} {units.get(c, '')}".strip() for c in here]
-        richer = any(c.startswith("truth.") for c in here)
-        kinds = [value_text(row[c]) for c in apart if c not in (*options, "truth")]
-        if "truth" in apart and not richer:
-            kinds.append(RIGHT if row["truth"] in models else value_text(row["truth"]))
-        told.append(", ".join([*kinds, *words]) or "-")
+        kind = value_text(row.get("truth"))
+        values = {c: value_text(row[c]) for c in apart if c != "truth"}
+        there = {c: value for c, value in values.items() if value not in ("-", "0")}
+        words = [f"{_worded(c)} {value} {units.get(c, '')}".strip() for c, value in there.items()]
+        told.append(", ".join(words) or (RIGHT if kind in models else kind))
     return told
 
 
@@ -171,7 +166,6 @@ def _rows(view: View, rows: pd.DataFrame, scale: float) -> Iterator[Drawing]:
         "settings",
         f"Error by setting at error scale {scale:g}",
         "Median error, bar to the 95 % quantile; misfit detected in % of trials.",
-        _worst(error, kinds, detected),
     )
 
 
@@ -218,16 +212,6 @@ def _write(ax: Any, rows: pd.DataFrame, look: Mapping[str, Look]) -> int:
         ax.annotate("\n".join(lines).replace("$", r"\$"), (0, i), **above, **style)
         most = max(most, len(lines))
     return most
-
-
-def _worst(error: pd.DataFrame, kinds: Sequence[str], detected: pd.Series[Any]) -> str:
-    """Names the largest error whose misfit goes undetected."""
-    hidden = [name for name, kind in zip(error.index, kinds, strict=True) if kind == "undetected"]
-    if not hidden:
-        return ""
-    name = hidden[0]
-    share, most = percent(detected[name]), brief(error.loc[name].median())
-    return f"Largest undetected: {name}, {most} times the bound, detected in {share}."
 
 
 FIGURES = (Figure(draw, ("summary",), together=True, main=True),)
