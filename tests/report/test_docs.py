@@ -144,6 +144,15 @@ def test_todays_program_draws_every_page_from_what_is_stored(path):
     assert page.html.count("<tr") > (len(totals(found)) if simulated else 1)
 
 
+def test_the_report_that_the_repository_shows_is_what_todays_program_writes_of_what_is_stored():
+    """If it is not, `make gallery` writes it again."""
+    (option,) = (one for one in discovery.options("experiment") if one.name == pages.SHOWN.stem)
+    text = pages.SHOWN.read_text(encoding="utf-8")
+    assert text.splitlines() == pages.stored_as_markdown(option).splitlines()
+    for link in re.findall(r"\]\(([^)]+)\)", text):
+        assert (pages.SHOWN.parent / link).exists(), link
+
+
 def totals(found: Computed) -> pd.DataFrame:
     summary = found.analysis.summary
     return summary[summary["parameter"] == ALL]

@@ -13,7 +13,7 @@ import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from itertools import islice
 from pathlib import Path
@@ -37,7 +37,7 @@ from ipe_bench.report.page.headline import headline
 from ipe_bench.report.sections import report_tables
 from ipe_bench.report.style import house_style
 from ipe_bench.report.tables.reports import certified_tables
-from ipe_bench.report.tables.table import environment, html
+from ipe_bench.report.tables.table import environment, html, markdown
 from ipe_bench.report.words import brief, enumerate_few, percent
 from ipe_bench.statistics.analysis import Analysis, analyse
 from ipe_bench.statistics.records import MAIN, NOT_MAIN, STATISTICS
@@ -116,6 +116,8 @@ _OF_PARAMETERS = ("paper", "pendulum_book", "states")
 """Experiments whose pages show single parameters."""
 SOURCES = Path(ipe_bench.__file__).parent / "report" / "docs"
 """The folder of what the site is made of."""
+SHOWN = SOURCES.parents[2] / ".assets" / "headline.md"
+"""The stored report that the repository shows without a site."""
 STORED = SOURCES / "gallery"
 """The folder of what pages of the gallery are drawn from."""
 
@@ -271,6 +273,25 @@ def write_gallery(folder: Path, results: Path, trials: int) -> None:
     write_page(folder / "best.inc", "best", rows=best)
 
 
+def stored_as_markdown(option: Option) -> str:
+    """Returns the finding, figure, matrix and full table of an experiment's stored results, for readers of the
+    repository."""
+    computed = read(STORED / f"{option.name}{SUFFIX}")
+    finding, *parts = headline(computed.analysis)
+    with house_style():
+        (figure,) = islice(drawings(computed.analysis, "main"), 1)
+    table, *_ = report_tables(computed.analysis)
+    made = environment().overlay(autoescape=False)
+    return made.get_template("docs/stored.md.j2").render(
+        option=option,
+        computed=computed,
+        finding=finding,
+        parts=[part if isinstance(part, str) else markdown(part) for part in parts],
+        figure=figure,
+        table=markdown(replace(table, title="")),
+    )
+
+
 def store(
     option: Option, folder: Path, results: Path, trials: int, part: Sequence[str] = ()
 ) -> Path:
@@ -372,6 +393,8 @@ def store_all(output: Path, trials: int, names: Sequence[str]) -> int:
     for option in _ours("experiment"):
         computed = read(STORED / f"{option.name}{SUFFIX}")
         print(f"{option.name}: {computed.extent}, by ipe-bench {computed.version}")
+        if option.name == SHOWN.stem:
+            write_text(SHOWN, stored_as_markdown(option))
     return 0
 
 
