@@ -64,7 +64,7 @@ class Grid(Tracker):
         if not (allowed > 0).all():
             return f"needs process noise at every step of {model.name}; leave it out"
         steps = [_widest_step(model, grids, k) for k in epochs]
-        excess = np.max(steps / allowed)
+        excess = np.max(steps / allowed, initial=0.0)
         if not excess > 1:
             return None
         least = 1.1 * self.points * excess

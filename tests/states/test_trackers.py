@@ -331,6 +331,23 @@ def test_a_grid_gives_the_kalman_filter_and_its_smoother_of_a_linear_model(moved
         np.testing.assert_array_equal(found.mean[26:], grid.track(model, z[26:]).mean)
 
 
+def test_a_grid_takes_a_single_reading_without_a_transition():
+    """A reading of variance 1 of a state of variance 4: both are four fifths of the reading's."""
+    model = Formulas(
+        next={"x": "x"},
+        readings={"z": "x"},
+        deviation={"z": 1.0},
+        spread={"x": 2.0},
+        count=1,
+        moved_first=False,
+    )
+    assert Grid(400).hindrance(model) is None
+    z = model.draw(0, 5).z
+    track = Grid(400).track(model, z)
+    np.testing.assert_allclose(track.mean, 0.8 * z, atol=1e-6)
+    np.testing.assert_allclose(track.covariance, 0.8, atol=1e-6)
+
+
 def test_an_iterated_update_is_the_most_probable_state_after_a_reading():
     """Of one prediction and one reading: the minimum of both misfits (Bell and Cathey 1993), by SciPy."""
     model = Pendulum(count=1, start=(1.2, 0.0), spread=0.5, variance=1e-3)
