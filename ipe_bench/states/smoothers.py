@@ -214,10 +214,9 @@ def _smooth_by_scores(model: StateModel, tracks: Tracks, out: Tracks, rows: Mask
 
         m[k] <- m[k] + P[k] r,   P[k] <- P[k] - P[k] N P[k]
 
-    and, on the way from after the reading of an epoch to after that of the epoch before, C = I - P-
-    H' S^-1 H,
+    and, on the way from after the reading of an epoch to after that of the epoch before,
 
-        r <- A' (H' S^-1 y + C' r),   N <- A' (H' S^-1 H + C' N C) A.
+        C = I - P- H' S^-1 H,   r <- A' (H' S^-1 y + C' r),   N <- A' (H' S^-1 H + C' N C) A.
     """
     n = model.n
     first = 0 if model.moved_first else 1
