@@ -1,10 +1,12 @@
-"""Tracks real readings: trackers follow the states of a model through a log, and find the constants of the model under
-which the log is most likely (Schweppe, IEEE Trans. Information Theory 11, 1965)."""
+"""Tracks real readings: trackers follow the states of a model through a log, and find the constants
+of the model under which the log is most likely (Schweppe, IEEE Trans. Information Theory 11, 1965).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Any
@@ -42,25 +44,35 @@ from ipe_bench.trials.whiteness import white_p
 _SAME_TIME = 1e-3
 """Part of the shortest step by which a time of a log may differ from that of its epoch."""
 _KEYS = ("constants", "noise", "deviation")
-"""The numbers of a model by formulas that can be found; the latter two are positive, and found by their logarithms."""
+"""The numbers of a model by formulas that can be found; the latter two are positive, and found by
+their logarithms."""
 _POSITIVE = (Positive, NonNegative)
 """Types of options of a model in Python that are found by their logarithms."""
 _FAR_BELOW = 10.0
-"""By how much more than a tenth of the number of readings a log likelihood lies far below the largest of the log."""
+"""By how much more than a tenth of the number of readings a log likelihood lies far below the
+largest of the log."""
 _COLLAPSED = 2.0
 """Effective sample sizes below this have no covariance."""
 SEARCHES = 4
-"""Searches for a maximum of the likelihood: from the values of the model, and from draws about them."""
+"""Searches for a maximum of the likelihood: from the values of the model, and from draws about
+them."""
 _ALIKE = 2.0
-"""Log likelihood by which one maximum has to exceed another: two constants of a 95 % interval differ by 1.92."""
+"""Log likelihood by which one maximum has to exceed another: two constants of a 95 % interval
+differ by 1.92."""
 _STEP = 0.02
 """Step of differences, in standard errors."""
-EVALUATIONS, _OF_SIMPLEX = 500, 300
-"""Evaluations of the likelihood in one search at most, and in its first part."""
-_ROUNDS, _DONE = 20, 1e-8
-"""Newton steps at most behind the search, and the squared step, in standard errors, that ends them."""
-_FAR, _VAGUE = 30.0, 5.0
-"""Logarithms of factors beyond which nothing is looked for, and their standard errors where there is no maximum."""
+EVALUATIONS = 500
+"""Evaluations of the likelihood in one search at most."""
+_OF_SIMPLEX = 300
+"""Those in its first part."""
+_ROUNDS = 20
+"""Newton steps at most behind the search."""
+_DONE = 1e-8
+"""The squared step, in standard errors, that ends them."""
+_FAR = 30.0
+"""Logarithms of factors beyond which nothing is looked for."""
+_VAGUE = 5.0
+"""Their standard errors where there is no maximum."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +80,8 @@ class Log:
     """Holds the readings of a model's epochs."""
 
     model: StateModel
-    """The model with an epoch per row of the file, and with the inputs of the file if it is written in formulas."""
+    """The model with an epoch per row of the file, and with the inputs of the file if it is written
+    in formulas."""
     z: Array
     """(K, m); NaN where a reading is missing."""
     file: tuple[str, str] | None = None
@@ -78,8 +91,8 @@ class Log:
     def of(
         cls, model: StateModel, readings: Path | Array | None, ignored: Sequence[str] = ()
     ) -> Log:
-        """Reads a CSV or Parquet file without the columns `ignored`, an array z (K, m), or the readings that come with
-        the model.
+        """Reads a CSV or Parquet file without the columns `ignored`, an array z (K, m), or the
+        readings that come with the model.
 
         Raises:
             UserError: they are not readings of this model.
@@ -91,7 +104,8 @@ class Log:
                 f"readings: is not given; write readings=FILE, with the columns {','.join(_wanted(model))}"
             )
         z = model.draw(0, 1).z[0] if readings is None else unmasked(readings).copy()
-        if z.shape != (shape := (model.epochs, len(model.reading_names))):
+        shape = (model.epochs, len(model.reading_names))
+        if z.shape != shape:
             raise UserError(
                 f"readings: has shape {z.shape}, where {shape} belongs: epochs and readings of {model.name}"
             )
@@ -107,10 +121,60 @@ def _wanted(model: StateModel) -> list[str]:
 
 
 def _read(table: TextTable, model: StateModel) -> Log:
-    wanted = _wanted(model)
-    columns = {
-        name: heading for name in ("epoch", "time", *wanted) if (heading := table.find(name))
-    }
+    columns = _headings(table, _wanted(model))
+    _require_rows(table)
+    cells = {}
+    for name, heading in columns.items():
+        cells[name] = np.array([table.value(*cell) for cell in table.column(heading)])
+
+    def refuse(bad: Array, name: str, what: str) -> None:
+        if bad.any():
+            row, _ = table.rows[int(np.argmax(bad))]
+            raise table.error(f"row {row}, column {columns[name]}: {what}")
+
+    # Known inputs and readings as the model takes them.
+    z = np.stack([cells[name] for name in model.reading_names], axis=1)
+    for name in model.log_inputs:
+        refuse(np.isnan(cells[name]), name, "is empty; a known input has a value at each epoch")
+    for fault in model.faults({name: cells[name] for name in _wanted(model)}):
+        refuse(fault.where, fault.column, fault.reason)
+    if "time" in model.log_inputs:
+        refuse(
+            np.diff(cells["time"], prepend=-np.inf) <= 0,
+            "time",
+            "is not after the time of the row before; give rows in the order of their times",
+        )
+    model = model.with_log(len(z), {name: cells[name] for name in model.log_inputs})
+    if len(z) != model.epochs:
+        raise table.error(
+            f"has {len(z)} rows, and {model.name} {model.epochs} epochs; give a row for each of"
+            " them"
+        )
+
+    # Numbers and times of epochs, where the file has them, are those of the model.
+    near = _SAME_TIME * (model.times[-1] - model.times[0]) / len(z)
+    numbers = np.arange(1.0, len(z) + 1)
+    for name, right, off in (("epoch", numbers, 0.0), ("time", model.times, near)):
+        wrong = ~(np.abs(cells.get(name, right) - right) <= off)
+        refuse(
+            wrong,
+            name,
+            f"{right[np.argmax(wrong)]:g} belongs here; give a row for each epoch, in order, or"
+            f" set ignore_columns=[{name}]",
+        )
+    if not np.isfinite(z).any():
+        raise table.error("has no reading")
+    return Log(model, z, (str(table.path), table.digest))
+
+
+def _headings(table: TextTable, wanted: Sequence[str]) -> dict[str, str]:
+    """Finds the headings of the columns that are wanted, and of epochs and times if they are
+    there."""
+    columns = {}
+    for name in ("epoch", "time", *wanted):
+        heading = table.find(name)
+        if heading:
+            columns[name] = heading
     for name in wanted:
         if name not in columns:
             raise table.error(f"column {name} is missing (the header must be {','.join(wanted)})")
@@ -119,51 +183,19 @@ def _read(table: TextTable, model: StateModel) -> Log:
             f"column {columns['time']}: the unit must be s, as in time [s]; convert the values"
         )
     table.require_known(list(columns.values()), wanted)
+    return columns
+
+
+def _require_rows(table: TextTable) -> None:
+    """Refuses a table without rows, or with an empty one among them."""
     if not table.rows:
         raise table.error("has a header and no rows")
-    if gap := next((a + 1 for (a, _), (b, _) in pairwise(table.rows) if b > a + 1), None):
-        raise table.error(
-            f"row {gap}: is empty; if a reading is missing there, number the rows in a column epoch"
-        )
-
-    def refuse(bad: Array, name: str, what: str) -> None:
-        if bad.any():
+    for (row, _), (following, _) in pairwise(table.rows):
+        if following > row + 1:
             raise table.error(
-                f"row {table.rows[int(np.argmax(bad))][0]}, column {columns[name]}: {what}"
+                f"row {row + 1}: is empty; if a reading is missing there, number the rows in a"
+                " column epoch"
             )
-
-    cells = {
-        name: np.array([table.value(*cell) for cell in table.column(at)])
-        for name, at in columns.items()
-    }
-    z = np.stack([cells[name] for name in model.reading_names], axis=1)
-    for name in model.log_inputs:
-        refuse(np.isnan(cells[name]), name, "is empty; a known input has a value at each epoch")
-    for fault in model.faults({name: cells[name] for name in wanted}):
-        refuse(fault.where, fault.column, fault.reason)
-    if "time" in model.log_inputs:
-        back = np.diff(cells["time"], prepend=-np.inf) <= 0
-        refuse(
-            back,
-            "time",
-            "is not after the time of the row before; give rows in the order of their times",
-        )
-    model = model.with_log(len(z), {name: cells[name] for name in model.log_inputs})
-    if len(z) != model.epochs:
-        raise table.error(
-            f"has {len(z)} rows, and {model.name} {model.epochs} epochs; give a row for each of them"
-        )
-    near = _SAME_TIME * (model.times[-1] - model.times[0]) / len(z)
-    for name, right, off in (
-        ("epoch", np.arange(1.0, len(z) + 1), 0.0),
-        ("time", model.times, near),
-    ):
-        wrong = ~(np.abs(cells.get(name, right) - right) <= off)
-        said = f"{right[np.argmax(wrong)]:g} belongs here; give a row for each epoch, in order, or set ignore_columns"
-        refuse(wrong, name, f"{said}=[{name}]")
-    if not np.isfinite(z).any():
-        raise table.error("has no reading")
-    return Log(model, z, (str(table.path), table.digest))
 
 
 @dataclass(frozen=True)
@@ -175,7 +207,8 @@ class Constant:
     error: float
     """Its standard error, by the curvature of the log likelihood."""
     low: float
-    """The lower end of its 95 % interval, which for a standard deviation is symmetric in the logarithm."""
+    """The lower end of its 95 % interval, which for a standard deviation is symmetric in the
+    logarithm."""
     high: float
 
 
@@ -191,32 +224,35 @@ class LogTracks:
     covariance: Array
     """Their covariance (K, n, n)."""
     predicted: Array
-    """The readings (K, m) that were predicted from those before; NaN where a reading is missing, and if the tracker has
-    no innovations."""
+    """The readings (K, m) that were predicted from those before; NaN where a reading is missing,
+    and if the tracker has no innovations."""
     predicted_deviation: Array
     """Their standard deviations (K, m)."""
     nis: Array
-    """Squared normalised innovations (K,); NaN at epochs without readings, and if the tracker has none."""
+    """Squared normalised innovations (K,); NaN at epochs without readings, and if the tracker has
+    none."""
     mean_nis: float
-    """Their sum over the number of readings, or the cost of the path of a smoother: 1 on average if the model is right;
-    NaN if the tracker has neither."""
+    """Their sum over the number of readings, or the cost of the path of a smoother: 1 on average if
+    the model is right; NaN if the tracker has neither."""
     limits: tuple[float, float]
     """The interval that holds that mean with a probability of 95 % if the filter is right."""
     fit_p: float
-    """The probability of a larger sum, or cost, if the model is right: chi-square with a degree per reading."""
+    """The probability of a larger sum, or cost, if the model is right: chi-square with a degree per
+    reading."""
     white_p: float
-    """The p-value of Ljung and Box's test that innovations are white: those of the filter that is smoothed, if any."""
+    """The p-value of Ljung and Box's test that innovations are white: those of the filter that is
+    smoothed, if any."""
     log_likelihood: float
     """The log likelihood of the readings; NaN for a smoother."""
     passes: bool
-    """Whether there is a track that is not lost, whose iteration, if it has one, has converged, whose innovations, or
-    path, are no further from the model than chance explains, and whose innovations are white; and one maximum, if
-    constants were asked for."""
+    """Whether there is a track that is not lost, whose iteration, if it has one, has converged,
+    whose innovations, or path, are no further from the model than chance explains, and whose
+    innovations are white; and one maximum, if constants were asked for."""
     message: str
     """The reason why there is no track, or no constant; empty if there is one."""
     lost_from: int | None = None
-    """The epoch, from 1 on, from which most innovations are larger than all but one in a million by chance; None if
-    there is none."""
+    """The epoch, from 1 on, from which most innovations are larger than all but one in a million by
+    chance; None if there is none."""
     effective: float = np.nan
     """The median effective sample size of an epoch, of a weighted sample; NaN if there is none."""
     constants: Sequence[Constant] = ()
@@ -231,54 +267,56 @@ class LogTracks:
     @classmethod
     def of(cls, log: Log, label: str, tracker: Tracker) -> LogTracks:
         tracks, messages = track_safely(tracker, log.model, log.z[None])
-        sizes, innovations = (
-            np.array([state.size for state in log.model.states]),
-            tracks.innovations.swapaxes(1, 2),
-        )
-        mean, deviation = tracks.mean[0] * sizes, deviations(tracks.covariance[0]) * sizes
-        covariance = tracks.covariance[0] * np.outer(sizes, sizes)
+        sizes = np.array([state.size for state in log.model.states])
+        mean = tracks.mean[0] * sizes
+        deviation = deviations(tracks.covariance[0]) * sizes
+        innovations = tracks.innovations.swapaxes(1, 2)
         predicted, predicted_deviation = tracks.predicted_readings(log.z[None])
         nis = np.where(tracks.degrees[0] > 0, tracks.nis[0], np.nan)
-        size = np.nan if tracks.effective is None else float(np.median(tracks.effective))
-        m, total = int(np.isfinite(innovations).sum()), float(np.nansum(nis))
+
+        # The squared misfit of the whole log, which is chi-square with a degree per reading.
+        total = float(np.nansum(nis))
+        m = int(np.isfinite(innovations).sum())
         if tracks.cost is not None:
-            m, total = int(np.isfinite(log.z).sum()), float(tracks.cost[0])
+            total = float(tracks.cost[0])
+            m = int(np.isfinite(log.z).sum())
         fit_p = float(chdtrc(m, total)) if m else np.nan
-        ended = Status.CONVERGED if tracks.status is None else Status(int(tracks.status[0]))
-        lost_from = _lost_from(nis, tracks.degrees[0])
         white = float(white_p(_judged_innovations(log, tracker, innovations))[0])
+
+        effective = np.nan if tracks.effective is None else float(np.median(tracks.effective))
+        lost_from = _lost_from(nis, tracks.degrees[0])
+        ended = Status.CONVERGED if tracks.status is None else Status(int(tracks.status[0]))
+        message = "" if ended == Status.CONVERGED else f"{ended.label}: {ended.reason}"
+        # What is not known, NaN, is no reason against a track.
+        whole = bool(np.isfinite([mean, deviation]).all())
+        fits = not fit_p < FIT_LEVEL and not white < FIT_LEVEL
+        held = not effective < _COLLAPSED and lost_from is None
         return cls(
             label,
             mean,
             deviation,
-            covariance,
-            predicted[0],
-            predicted_deviation[0],
-            nis,
+            covariance=tracks.covariance[0] * np.outer(sizes, sizes),
+            predicted=predicted[0],
+            predicted_deviation=predicted_deviation[0],
+            nis=nis,
             mean_nis=total / m if m else np.nan,
             limits=mean_limits(m, 1),
             fit_p=fit_p,
             white_p=white,
             log_likelihood=float(tracks.log_likelihood[0]) if tracks.degrees.any() else np.nan,
-            passes=bool(np.isfinite([mean, deviation]).all())
-            and not fit_p < FIT_LEVEL
-            and not white < FIT_LEVEL
-            and not size < _COLLAPSED
-            and lost_from is None
-            and ended == Status.CONVERGED,
-            message=messages.get(
-                0, "" if ended == Status.CONVERGED else f"{ended.label}: {ended.reason}"
-            ),
+            passes=whole and fits and held and ended == Status.CONVERGED,
+            message=messages.get(0, message),
             lost_from=lost_from,
-            effective=size,
+            effective=effective,
             smooths=tracker.smooths,
             notes=_copies(log, tracks),
         )
 
     @property
     def verdict(self) -> str:
-        """Tells whether innovations are white and, as a smoother's path, as far from the model as it says, from where
-        the track is lost, or what is wrong with the constants that were found."""
+        """Tells whether innovations are white and, as a smoother's path, as far from the model as
+        it says, from where the track is lost, or what is wrong with the constants that were
+        found."""
         if self.lost_from is not None:
             return f"{LOST} from epoch {self.lost_from}"
         if self.effective < _COLLAPSED:
@@ -309,7 +347,8 @@ def _copies(log: Log, tracks: Tracks) -> list[str]:
 
 
 def _judged_innovations(log: Log, tracker: Tracker, innovations: Array) -> Array:
-    """Returns innovations (1, m, K) of a tracker, or of the filter that it smooths, as a smoother has none."""
+    """Returns innovations (1, m, K) of a tracker, or of the filter that it smooths, as a smoother
+    has none."""
     if not isinstance(tracker, Smoother):
         return innovations
     tracks, _ = track_safely(tracker.filter, log.model, log.z[None])
@@ -317,38 +356,40 @@ def _judged_innovations(log: Log, tracker: Tracker, innovations: Array) -> Array
 
 
 def _lost_from(nis: Array, degrees: Array) -> int | None:
-    """The first epoch, from 1 on, whose NIS (K,) lies beyond the gate, and from which on most do, if there is one."""
+    """Finds the first epoch, from 1 on, whose NIS (K,) lies beyond the gate, and from which on most
+    do; None without one."""
     at = np.flatnonzero(np.isfinite(nis))
     beyond = chdtrc(degrees[at], nis[at]) < GATE
-    share = np.cumsum(beyond[::-1])[::-1] / np.arange(len(at), 0, -1)
+    following = np.cumsum(beyond[::-1])[::-1]
+    share = following / np.arange(len(at), 0, -1)
     lost = at[beyond & (share > 0.5)]
     return int(lost[0]) + 1 if len(lost) else None
 
 
 def far_below(tracks: Sequence[LogTracks]) -> list[str]:
-    """A line for each track whose predictions are far less likely than the best of those whose innovations fit.
+    """Returns a line for each track whose predictions are far less likely than the best of those
+    whose innovations fit.
 
-    A filter that linearises has the likelihood of its own approximation, so that the largest one may be of a track that
-    is lost: an overconfident track, or one whose innovations are not white, is no standard for others.
+    A filter that linearises has the likelihood of its own approximation, so that the largest one
+    may be of a track that is lost: an overconfident track, or one whose innovations are not white,
+    is no standard for others.
     """
-    sound = [
-        one
-        for one in tracks
-        if one.verdict in (CONSISTENT, TOO_CAUTIOUS) and np.isfinite(one.log_likelihood)
-    ]
+    fitting = [one for one in tracks if one.verdict in (CONSISTENT, TOO_CAUTIOUS)]
+    sound = [one for one in fitting if np.isfinite(one.log_likelihood)]
     if not sound:
         return []
     best = max(sound, key=lambda one: one.log_likelihood)
     limit = _FAR_BELOW + np.isfinite(best.nis).sum() / 10
     below = {one.label: best.log_likelihood - one.log_likelihood for one in tracks}
     return [
-        f"{label}: {best.label} predicts each next reading far better, by {less:.4g} in log likelihood"
+        f"{label}: {best.label} predicts each next reading far better, by {less:.4g} in log"
+        " likelihood"
         for label, less in below.items()
         if less > limit
     ]
 
 
-# Constants -----------------------------------------------------------------------------------------------------------
+# Constants ---------------------------------------------------------------------------------------
 
 
 def require_likelihood(log: Log, label: str, tracker: Tracker) -> None:
@@ -372,79 +413,53 @@ def found_and_tracked(
     find: Sequence[str],
     watch: Callable[[str], object] = str,
 ) -> LogTracks:
-    """Finds the constants `find` under which a tracker finds the log most likely, and its track with them; `watch` is
-    told at each evaluation of the likelihood how far the search is.
+    """Finds the constants `find` under which a tracker finds the log most likely, and its track
+    with them; `watch` is told at each evaluation of the likelihood how far the search is.
 
     Raises:
         UserError: the model has no such constant.
     """
-    model = log.model
-    numbers = _numbers(model)
-    places = [_place(list(numbers), name) for name in find]
-    if twice := next(
-        (name for name, place in zip(find, places, strict=True) if places.count(place) > 1), None
-    ):
-        raise UserError(f"find={twice}: is named twice; name it once")
-    start = np.array([numbers[place][0] for place in places])
-    positive = np.array([numbers[place][1] for place in places])
-    if (positive & ~(start > 0)).any():
-        raise UserError(
-            f"find={find[int(np.argmax(positive & ~(start > 0)))]}: is 0; give a value above to start from"
-        )
-    size = np.where(start == 0, 1.0, np.abs(start))
-
-    def values(u: Array) -> Array:
-        return np.where(positive, start * np.exp(np.where(positive, u, 0.0)), start + size * u)
-
-    def model_at(u: Array) -> StateModel:
-        parts: dict[str, Any] = {}
-        for (key, name), value in zip(places, values(u).tolist(), strict=True):
-            parts[key] = {**parts.get(key, getattr(model, key)), name: value} if name else value
-        return replace(model, **parts)  # type: ignore[type-var]
+    sought = _Sought.of(log.model, find)
 
     def cost(u: Array) -> float:
-        if not (np.abs(u[positive]) < _FAR).all() or tracker.hindrance(model_at(u)):
+        """Computes minus the log likelihood; infinite where there is none."""
+        if not (np.abs(u[sought.positive]) < _FAR).all() or tracker.hindrance(sought.at(u)):
             return np.inf
-        tracks, _ = track_safely(tracker, model_at(u), log.z[None])
+        tracks, _ = track_safely(tracker, sought.at(u), log.z[None])
         value = -float(tracks.log_likelihood[0])
         return value if tracks.degrees.any() and np.isfinite(value) else np.inf
 
     with np.errstate(invalid="ignore"):
-        best, *others = _minima(cost, positive, watch)
+        best, *others = _minima(cost, sought.positive, watch)
     if not np.isfinite(best.error).all():
         message = (
-            f"no maximum of the likelihood was found in {', '.join(find)}: the log may not determine all of them; the"
-            f" search ended after {best.evaluations} evaluations at {_written(find, values(best.u))}, and the track"
-            " uses the model's own values"
+            f"no maximum of the likelihood was found in {', '.join(find)}: the log may not"
+            f" determine all of them; the search ended after {best.evaluations} evaluations at"
+            f" {sought.written(best.u)}, and the track uses the model's own values"
         )
-        return replace(
-            LogTracks.of(log, label, tracker), message=message, found=NO_MAXIMUM, passes=False
-        )
-    ends = [values(best.u + sign * float(ndtri(0.975)) * best.error) for sign in (-1, 1)]
-    rows = zip(
-        find,
-        values(best.u),
-        np.where(positive, values(best.u), size) * best.error,
-        *ends,
-        strict=True,
-    )
-    track = LogTracks.of(replace(log, model=model_at(best.u)), label, tracker)
+        own = LogTracks.of(log, label, tracker)
+        return replace(own, message=message, found=NO_MAXIMUM, passes=False)
+    track = LogTracks.of(replace(log, model=sought.at(best.u)), label, tracker)
     notes = [
-        f"another maximum, of a log likelihood {one.cost - best.cost:.3g} lower, is at {_written(find, values(one.u))}"
+        f"another maximum, of a log likelihood {one.cost - best.cost:.3g} lower, is at"
+        f" {sought.written(one.u)}"
         for one in others
         if np.isfinite(one.error).all()
     ]
-    found, message = "", track.message
+    found = ""
+    message = track.message
     if track.fit_p < FIT_LEVEL or track.white_p < FIT_LEVEL:
         message = (
-            f"find= ended at a maximum whose innovations do not fit (NIS: p = {track.fit_p:.2g}; white: p ="
-            f" {track.white_p:.2g}): the model does not describe the log, and neither values nor errors can be trusted"
+            "find= ended at a maximum whose innovations do not fit (NIS: p ="
+            f" {track.fit_p:.2g}; white: p = {track.white_p:.2g}): the model does not describe the"
+            " log, and neither values nor errors can be trusted"
         )
     elif any(one.cost - best.cost < _ALIKE for one in others):
-        found, message = SEVERAL_MAXIMA, "the log hardly distinguishes the maxima of the likelihood"
+        found = SEVERAL_MAXIMA
+        message = "the log hardly distinguishes the maxima of the likelihood"
     return replace(
         track,
-        constants=[Constant(name, *map(float, numbers)) for name, *numbers in rows],
+        constants=sought.constants(best),
         notes=[*track.notes, *notes],
         found=found,
         message=message,
@@ -452,13 +467,73 @@ def found_and_tracked(
     )
 
 
-def _written(names: Sequence[str], values: Array) -> str:
-    return ", ".join(f"{name}={value:.4g}" for name, value in zip(names, values, strict=True))
+@dataclass(frozen=True)
+class _Sought:
+    """Holds the numbers of a model that are looked for, as functions of coordinates u that are 0 at
+    the model's own values."""
+
+    model: StateModel
+    names: Sequence[str]
+    places: Sequence[tuple[str, str]]
+    """Their keys and names, as `_numbers` has them."""
+    start: Array
+    """The model's own values."""
+    positive: Mask
+    """Which have the logarithm of their factor as a coordinate."""
+
+    @classmethod
+    def of(cls, model: StateModel, find: Sequence[str]) -> _Sought:
+        numbers = _numbers(model)
+        places = [_place(list(numbers), name) for name in find]
+        for name, place in zip(find, places, strict=True):
+            if places.count(place) > 1:
+                raise UserError(f"find={name}: is named twice; name it once")
+        start = np.array([numbers[place][0] for place in places])
+        positive = np.array([numbers[place][1] for place in places])
+        zero = positive & ~(start > 0)
+        if zero.any():
+            name = find[int(np.argmax(zero))]
+            raise UserError(f"find={name}: is 0; give a value above to start from")
+        return cls(model, find, places, start, positive)
+
+    @cached_property
+    def size(self) -> Array:
+        """The units of the coordinates that are no logarithms."""
+        return np.where(self.start == 0, 1.0, np.abs(self.start))
+
+    def values(self, u: Array) -> Array:
+        logarithms = np.where(self.positive, u, 0.0)
+        scaled = self.start * np.exp(logarithms)
+        return np.where(self.positive, scaled, self.start + self.size * u)
+
+    def written(self, u: Array) -> str:
+        """Words the numbers at u."""
+        values = zip(self.names, self.values(u), strict=True)
+        return ", ".join(f"{name}={value:.4g}" for name, value in values)
+
+    def at(self, u: Array) -> StateModel:
+        """Returns the model with the numbers at u."""
+        parts: dict[str, Any] = {}
+        for (key, name), value in zip(self.places, self.values(u).tolist(), strict=True):
+            if name:
+                value = {**parts.get(key, getattr(self.model, key)), name: value}
+            parts[key] = value
+        return replace(self.model, **parts)  # type: ignore[type-var]
+
+    def constants(self, best: _Minimum) -> list[Constant]:
+        """Returns the numbers at a minimum, with intervals that are normal in u."""
+        values = self.values(best.u)
+        errors = np.where(self.positive, values, self.size) * best.error
+        reach = float(ndtri(0.975)) * best.error
+        low = self.values(best.u - reach)
+        high = self.values(best.u + reach)
+        rows = np.column_stack([values, errors, low, high]).tolist()
+        return [Constant(name, *row) for name, row in zip(self.names, rows, strict=True)]
 
 
 def _numbers(model: StateModel) -> dict[tuple[str, str], tuple[float, bool]]:
-    """Returns the numbers of a model that can be found, and whether each is positive: by key and name of a model by
-    formulas, by option of one in Python."""
+    """Returns the numbers of a model that can be found, and whether each is positive: by key and
+    name of a model by formulas, by option of one in Python."""
     if isinstance(model, Formulas):
         return {
             (key, name): (value, key != "constants")
@@ -466,12 +541,12 @@ def _numbers(model: StateModel) -> dict[tuple[str, str], tuple[float, bool]]:
             for name, value in getattr(model, key).items()
             if not isinstance(value, str)
         }
-    options = [
-        (name, hint)
+    options = {
+        name: hint
         for name, hint in option_types(type(model)).items()
         if hint in (*_POSITIVE, float, Finite)
-    ]
-    return {(name, ""): (getattr(model, name), hint in _POSITIVE) for name, hint in options}
+    }
+    return {(name, ""): (getattr(model, name), hint in _POSITIVE) for name, hint in options.items()}
 
 
 def _place(known: Sequence[tuple[str, str]], name: str) -> tuple[str, str]:
@@ -482,9 +557,8 @@ def _place(known: Sequence[tuple[str, str]], name: str) -> tuple[str, str]:
             f"find={name}: is a name of two numbers; write {' or '.join(map('.'.join, found))}"
         )
     if not found:
-        raise UserError(
-            f"find={name}: {unknown(name, [label or key for key, label in known], 'constant')}"
-        )
+        names = [label or key for key, label in known]
+        raise UserError(f"find={name}: {unknown(name, names, 'constant')}")
     return found[0]
 
 
@@ -503,7 +577,8 @@ class _Minimum:
 
     def holds(self, u: Array) -> bool:
         """Whether u is within a standard error of this minimum."""
-        return bool((u - self.u) @ self.H @ (u - self.u) < 1)
+        away = u - self.u
+        return bool(away @ self.H @ away < 1)
 
 
 @dataclass
@@ -529,50 +604,74 @@ class _Search:
 def _minima(
     cost: Callable[[Array], float], positive: Mask, watch: Callable[[str], object] = str
 ) -> list[_Minimum]:
-    """The different ends of `SEARCHES` searches, the lowest first. They begin at 0 and at draws of N(0, I), or nearer
-    to 0 if the cost is infinite there. Those that are `positive` are logarithms."""
+    """Finds the different ends of `SEARCHES` searches, the lowest first. They begin at 0 and at
+    draws of N(0, I), or nearer to 0 if the cost is infinite there. Those that are `positive` are
+    logarithms."""
     n = len(positive)
     found: list[_Minimum] = []
-    starts = [np.zeros(n), *np.random.default_rng(0).standard_normal((SEARCHES - 1, n))]
-    for number, start in enumerate(starts, 1):
+    draws = np.random.default_rng(0).standard_normal((SEARCHES - 1, n))
+    for number, start in enumerate([np.zeros(n), *draws], 1):
         search = _Search(cost, f"search {number} of {SEARCHES}", watch)
-        u = next(u for u in (start, start / 2, start / 8, 0 * start) if np.isfinite(search(u)))
-        u = _descended(search, u)
-        if not any(one.holds(u) for one in found):
-            end = _polished(search, u, positive)
-            if not any(one.holds(end.u) for one in found):
-                found.append(end)
+        nearer = (start, start / 2, start / 8, 0 * start)
+        first = next(u for u in nearer if np.isfinite(search(u)))
+        u = _descended(search, first)
+        # A search that comes near a minimum that is known need not be ended.
+        if any(one.holds(u) for one in found):
+            continue
+        end = _polished(search, u, positive)
+        if not any(one.holds(end.u) for one in found):
+            found.append(end)
     return sorted(found, key=lambda one: one.cost)
 
 
 def _descended(search: _Search, u: Array) -> Array:
-    """Where a search by Nelder and Mead's simplex ends."""
+    """Finds where a search by Nelder and Mead's simplex ends."""
     from scipy.optimize import minimize
 
     simplex = np.vstack([u, u + 0.5 * np.eye(len(u))])
     options = {"initial_simplex": simplex, "xatol": 0.1, "fatol": 0.1, "maxfev": _OF_SIMPLEX}
-    return np.asarray(minimize(search, u, method="Nelder-Mead", options=options).x)
+    ended = minimize(search, u, method="Nelder-Mead", options=options)
+    return np.asarray(ended.x)
 
 
 def _polished(cost: _Search, u: Array, positive: Mask) -> _Minimum:
-    """The end of Newton's iteration from u, which stops where a logarithm has hardly any effect on the cost."""
+    """Finds the end of Newton's iteration from u, which stops where a logarithm has hardly any
+    effect on the cost."""
     n = len(u)
-    h, H = np.full(n, 1e-2), np.full((n, n), np.nan)
+    h = np.full(n, 1e-2)
     rounds = cost.left // (n**2 + n + 1)
     for _ in range(min(_ROUNDS, rounds)):
-        E, here = np.diag(h), cost(u)
-        up, down = (np.array([cost(u + sign * e) for e in E]) for sign in (1, -1))
-        g, H = (up - down) / (2 * h), np.diag((up - 2 * here + down) / h**2)
-        for i, j in combinations(range(n), 2):
-            both = cost(u + E[i] + E[j]) + cost(u - E[i] - E[j]) + 2 * here
-            H[i, j] = H[j, i] = (both - up[i] - up[j] - down[i] - down[j]) / (2 * h[i] * h[j])
+        here, g, H = _derivatives(cost, u, h)
+        # Without a positive definite H there is no minimum near.
         if not (np.isfinite(H).all() and np.linalg.eigvalsh(H)[0] > 0):
             break
+        # The inverse of the second derivatives of minus the log likelihood is the covariance of
+        # its maximum.
         P = np.linalg.inv(H)
         error = np.sqrt(np.diagonal(P))
         if (error[positive] >= _VAGUE).any():
             break
-        u, h = u - P @ g, _STEP * error
+        u = u - P @ g
+        h = _STEP * error
         if g @ P @ g < _DONE:
             return _Minimum(u, here, h / _STEP, H, cost.evaluations)
-    return _Minimum(u, cost(u), np.full(n, np.nan), np.full((n, n), np.nan), cost.evaluations)
+    nothing = np.full((n, n), np.nan)
+    return _Minimum(u, cost(u), nothing[0], nothing, cost.evaluations)
+
+
+def _derivatives(cost: _Search, u: Array, h: Array) -> tuple[float, Array, Array]:
+    """Computes a cost with its first (n,) and second (n, n) derivatives by central differences of
+    the steps h (n,)."""
+    steps = np.diag(h)
+    here = cost(u)
+    up = np.array([cost(u + step) for step in steps])
+    down = np.array([cost(u - step) for step in steps])
+    g = (up - down) / (2 * h)
+    H = np.diag((up - 2 * here + down) / h**2)
+    for i, j in combinations(range(len(u)), 2):
+        step = steps[i] + steps[j]
+        both = cost(u + step) + cost(u - step) + 2 * here
+        mixed = both - up[i] - up[j] - down[i] - down[j]
+        H[i, j] = mixed / (2 * h[i] * h[j])
+        H[j, i] = H[i, j]
+    return here, g, H
