@@ -167,8 +167,14 @@ class Unscented(SigmaPoints):
         return max(3.0 - n, 0.0) if self.kappa is None else self.kappa
 
     def points(self, n: int) -> tuple[Array, Array]:
+        kappa = self.kappa_of(n)
+        if n + kappa <= 0:
+            raise UserError(
+                f"kappa={kappa:g}: the points of {n} states need a kappa above {-n}; leave it out, "
+                "or give a larger one"
+            )
         # c = n + lambda with lambda = alpha^2 (n + kappa) - n
-        c = self.alpha**2 * (n + self.kappa_of(n))
+        c = self.alpha**2 * (n + kappa)
         directions = np.concatenate([np.zeros((1, n)), np.eye(n), -np.eye(n)])
         weights = np.concatenate([[1 - n / c], np.full(2 * n, 0.5 / c)])
         return np.sqrt(c) * directions, weights

@@ -348,6 +348,14 @@ def test_a_grid_takes_a_single_reading_without_a_transition():
     np.testing.assert_allclose(track.covariance, 0.8, atol=1e-6)
 
 
+def test_unscented_points_have_unit_covariance_or_a_kappa_that_is_refused():
+    s, w = Unscented(kappa=-1.9).points(2)
+    np.testing.assert_allclose(s.T @ (w[:, None] * s), np.eye(2), atol=1e-12)
+    for kappa in (-2.0, -3.0):
+        with pytest.raises(ib.UserError, match=rf"kappa={kappa:g}: .* need a kappa above -2;"):
+            Unscented(kappa=kappa).points(2)
+
+
 def test_an_iterated_update_is_the_most_probable_state_after_a_reading():
     """Of one prediction and one reading: the minimum of both misfits (Bell and Cathey 1993), by SciPy."""
     model = Pendulum(count=1, start=(1.2, 0.0), spread=0.5, variance=1e-3)
