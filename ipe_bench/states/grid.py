@@ -57,6 +57,8 @@ class Grid(Tracker):
             return f"is exact for one state, and {model.name} has {model.n}; leave it out"
         if model.state_periods:
             return f"has no place for a periodic state, as in {model.name}; leave it out"
+        if self.points < 3:
+            return "needs three points at least; leave trackers.LABEL.points out"
         grids = self._grids(model)
         epochs = [k for k in range(model.epochs) if model.moves(k)]
         # The widest step that process noise still bridges, of each epoch.

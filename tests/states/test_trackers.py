@@ -400,6 +400,8 @@ def test_particles_have_the_likelihood_of_the_kalman_filter_of_a_linear_model():
 def test_a_grid_refuses_what_it_cannot_be_exact_for():
     growth = Growth(count=20)
     assert "is exact for one state, and pendulum has 2" in Grid().hindrance(NEAR)
+    for points in (1, 2):
+        assert "needs three points at least" in Grid(points).hindrance(growth)
     with pytest.raises(
         ib.UserError,
         match=r"trackers\.grid: its points are farther apart than process noise reaches",
