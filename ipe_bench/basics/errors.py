@@ -19,28 +19,32 @@ class _Plain(Exception):
 
 
 class UserError(_Plain):
-    """Reports a mistake in a config, a command or a file: one line that names the key or row, and the remedy.
+    """Reports a mistake in a config, a command or a file: one line that names the key or row, and
+    the remedy.
 
-    The command line and a notebook print it without a traceback; the command line exits with code 2.
+    The command line and a notebook print it without a traceback; the command line exits with code
+    2.
     """
 
 
 class StorageError(_Plain):
     """Results cannot be stored any more: a full disk, a folder that went away. One line.
 
-    What was stored before is whole. The command line and a notebook print it without a traceback; the command line
-    exits with code 1.
+    What was stored before is whole. The command line and a notebook print it without a traceback;
+    the command line exits with code 1.
     """
 
 
 def one_line(text: Any) -> str:
-    """Returns the first line of a text, at most 1000 letters of it, with ? for what no file can hold."""
+    """Returns the first line of a text, at most 1000 letters of it, with ? for what no file can
+    hold."""
     lines = str(text)[:1000].encode("utf-8", "replace").decode().splitlines()
     return lines[0] if lines else ""
 
 
 def describe_exception(error: BaseException) -> str:
-    """Describes an exception in one line for a table: the type and the first line of the message."""
+    """Describes an exception in one line for a table: its type and the first line of its
+    message."""
     line = one_line(error)
     if "read-only" in line:
         line += " (it writes into what it is given: work on a copy)"
@@ -48,11 +52,15 @@ def describe_exception(error: BaseException) -> str:
 
 
 def place_of(error: BaseException, within: str | None = None) -> str:
-    """Returns the exception's type, and the file and line where; the last running line of the file `within`, if any."""
+    """Returns the exception's type, and the file and line where; the last running line of the file
+    `within`, if any."""
     if isinstance(error, SyntaxError):
         return f"{error.filename}, line {error.lineno}: {type(error).__name__}: {error.msg}"
     frames = traceback.extract_tb(error.__traceback__)
-    frame = [*frames[-1:], *(frame for frame in frames if frame.filename == within)][-1]
+    frame = frames[-1]
+    for one in frames:
+        if one.filename == within:
+            frame = one
     return f"{_shown(frame.filename)}, line {frame.lineno}: {describe_exception(error)}"
 
 
@@ -61,17 +69,14 @@ def _shown(filename: str) -> str:
 
 
 def definition(function: Any) -> str:
-    """Returns the file and line in which a function or method is written, if they are known, and its name."""
+    """Returns the file and line in which a function or method is written, if they are known, and
+    its name."""
     function = inspect.unwrap(getattr(function, "__func__", function))
-    code, name = (
-        getattr(function, "__code__", None),
-        getattr(function, "__qualname__", str(function)),
-    )
-    return (
-        f"{code.co_filename.removeprefix(os.getcwd() + os.sep)}, line {code.co_firstlineno}: {name}"
-        if code
-        else name
-    )
+    code = getattr(function, "__code__", None)
+    name = getattr(function, "__qualname__", str(function))
+    if not code:
+        return name
+    return f"{_shown(code.co_filename)}, line {code.co_firstlineno}: {name}"
 
 
 def shortened(text: str, length: int = 120) -> str:
@@ -118,18 +123,22 @@ def moved(name: str) -> str:
 
 
 def unknown(name: str, known: Iterable[str], noun: str) -> str:
-    """Says that there is no such option; names the nearest, or else all there are, or where it is now."""
+    """Says that there is no such option; names the nearest, or else all there are, or where it is
+    now."""
     known = sorted(known)
-    if noun in ("option", "estimator", "group") and (place := moved(name)):
+    place = moved(name)
+    if place and noun in ("option", "estimator", "group"):
         return place
     listed = f" (there are: {', '.join(known) or 'none'})"
     return f"there is no such {noun}{did_you_mean(name, known) or listed}"
 
 
 def without_modules(room: str, names: Sequence[str]) -> None:
-    """Takes a package's modules off its attributes, so that `measurements.gins` is answered with the class `Gins`."""
+    """Takes a package's modules off its attributes, so that `measurements.gins` is answered with
+    the class `Gins`."""
     content = vars(sys.modules[room])
-    for name in [name for name, thing in content.items() if isinstance(thing, ModuleType)]:
+    modules = [name for name, thing in content.items() if isinstance(thing, ModuleType)]
+    for name in modules:
         del content[name]
 
     def missing(name: str) -> Any:
