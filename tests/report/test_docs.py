@@ -153,6 +153,50 @@ def test_the_report_that_the_repository_shows_is_what_todays_program_writes_of_w
         assert (pages.SHOWN.parent / link).exists(), link
 
 
+def rows_under(heading: str) -> dict[str, list[str]]:
+    """The first table below a heading of the results: the cells of a row by its estimator, or by its first cell."""
+    below = (PAGES / "results.md").read_text(encoding="utf-8").partition(f"## {heading}\n")[2]
+    table = re.search(r"^\|-+\|.*\n((?:\|.*\n)+)", below, re.MULTILINE)
+    assert table
+    found = {}
+    for line in table[1].splitlines():
+        first, *cells = (cell.strip() for cell in line.strip("|").split("|"))
+        label = re.search(r"`(\w+)`", first)
+        found[label[1] if label else first] = cells
+    return found
+
+
+def test_the_results_far_from_the_start_are_the_stored_ones():
+    known = totals(read(pages.STORED / f"beyond{SUFFIX}")).set_index(["estimator", "error_scale"])
+    for label, (*shares, cost) in rows_under("Far from the start").items():
+        found = [100 * known["success"][label, scale] for scale in (300, 1000, 3000, 10_000)]
+        assert shares == [f"{share:.0f}" for share in found], label
+        assert cost == f"{known['simulations_median'][label, 1000]:.0f}", label
+
+
+def test_the_digits_of_certified_answers_are_the_stored_ones():
+    stored = read(pages.STORED / f"nist{SUFFIX}").analysis.collection
+    known = pages.certified_tables(stored)[0].data.set_index(["estimator", "start"])
+    for label, cells in rows_under("Certified problems").items():
+        both = [known.loc[(label, start)] for start in (1, 2)]
+        solved = [f"{one['solved']:.0f}" for one in both]
+        digits = [f"{one['mean_lre_parameters']:.2f}" for one in both]
+        assert cells == [*solved, *digits], label
+
+
+def test_the_errors_under_a_wrong_model_are_the_stored_ones():
+    every = totals(read(pages.STORED / f"mismatch{SUFFIX}"))
+    known = every[every["estimator"] == "gauss_newton"]
+    columns = ["rmse_over_linear_bound", "predicted_rmse", "nees", "misfit"]
+    stored = known.sort_values("predicted_rmse")[columns].to_numpy().tolist()
+    shown = [
+        [float(cell.removesuffix(" %")) for cell in cells]
+        for cells in rows_under("A wrong model").values()
+    ]
+    for row, (*others, misfit) in zip(sorted(shown), stored, strict=True):
+        assert row == pytest.approx([*others, 100 * misfit], rel=0.02)
+
+
 def totals(found: Computed) -> pd.DataFrame:
     summary = found.analysis.summary
     return summary[summary["parameter"] == ALL]
