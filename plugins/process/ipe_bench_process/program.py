@@ -167,7 +167,7 @@ class Program:
             hint = "" if self.said or data else "; does it flush its output after `end`?"
             raise ProgramError(f"gave no whole answer within the time limit{hint}")
         ready, free, _ = select.select(
-            self.listening, [self.into] if data else [], [], min(left, 0.1)
+            self.listening, [self.into] if data else [], [], min(left, seconds)
         )
         for pipe in ready:
             if not (chunk := os.read(pipe, 1 << 16)):

@@ -15,7 +15,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from ipe_bench_process import Process, process
+from ipe_bench_process import Process, process, program
 from shared.oracles import assert_agrees
 
 import ipe_bench as ib
@@ -212,6 +212,23 @@ def test_what_a_program_has_started_ends_with_the_bench(tmp_path):
     assert left("killed")
     bench.communicate(b"\n")
     assert none_is_left("killed")
+
+
+def test_a_look_at_whether_a_program_has_read_on_does_not_wait_for_it(monkeypatch):
+    """A program that is at work on its readings has nothing to say: a tenth of a second for each trial otherwise."""
+    waits, select = [], program.select.select
+
+    def recorded(ready, free, broken, seconds):
+        waits.append(seconds)
+        return select(ready, free, broken, 0.0)
+
+    monkeypatch.setattr(program.select, "select", recorded)
+    busy = program.Program(["sleep", "100"], ".", "")
+    busy.deadline = time.monotonic() + 10.0
+    for seconds in (0.0, 5e-5):
+        busy.wait(seconds)
+    busy.end()
+    assert waits == [0.0, 5e-5]
 
 
 REFUSED = {
