@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 import re
+import shlex
 import subprocess
 import sys
 import textwrap
@@ -103,6 +104,48 @@ def shown_shares() -> dict[str, tuple[dict[float, float], list[str]]]:
 
 def test_it_opens_with_the_finding_and_the_matrix_of_the_stored_experiment():
     assert_opening(read(STORED / f"headline{SUFFIX}").analysis)
+
+
+def test_nees_and_cost_at_100_are_those_of_the_stored_experiment():
+    summary = read(STORED / f"headline{SUFFIX}").analysis.summary
+    at_100 = summary[(summary["parameter"] == "all") & (summary["error_scale"] == 100.0)]
+    totals = at_100.set_index("estimator")
+    shares = shown_shares()
+    assert len(shares) == 8
+    for name, (_, (nees, cost, _time)) in shares.items():
+        assert_rounded(nees, totals.loc[name, "nees_median"])
+        assert_rounded(cost, totals.loc[name, "simulations_median"])
+
+
+def assert_rounded(shown: str, value: float) -> None:
+    """A number of three digits, such as 1.03 or 126M, is the value as far as it goes."""
+    assert float(shown.replace("M", "e6")) == pytest.approx(value, rel=0.005)
+
+
+def test_every_run_that_it_shows_is_accepted_as_it_stands(ipe_bench):
+    """Which computes nothing; the slow test of all lines in their order does."""
+    text = "\n".join(LINES)
+    shown = [shlex.split(line) for line in re.findall(r"^ipe-bench (run .*)$", text, re.MULTILINE)]
+    runs = [words for words in shown if not any("my_newton" in word for word in words)]
+    assert len(runs) >= 3
+    for words in [*runs, ["run", "+experiment=headline"]]:
+        assert ipe_bench(*words, "--dry-run")[0] == 0, words
+
+
+def test_what_make_is_asked_for_in_texts_and_in_ci_is_there():
+    made = (ROOT / "Makefile").read_text(encoding="utf-8")
+    (phony,) = re.findall(r"^\.PHONY: (.*)$", made, re.MULTILINE)
+    contributing = (ROOT / ".github/CONTRIBUTING.md").read_text(encoding="utf-8")
+    before_landing = (ROOT / ".ci/run").read_text(encoding="utf-8")
+    named = re.findall(r"(?:`|^ *)make (\w+)", README + contributing, re.MULTILINE)
+    landing = re.findall(r"^make (\w+)$", before_landing, re.MULTILINE)
+    assert {"run", "test", "dist", "slow", "lint", "mutants", "cluster"} <= {*named}
+    assert landing == ["lint", "test", "slow"]
+    assert {*named, *landing} <= {*phony.split()}
+    # What takes more than a second is said wherever the tests run as a whole.
+    wholes = re.findall(r"^(?:test|slow):.*\n\t(.*)$", made, re.MULTILINE)
+    assert len(wholes) == 2
+    assert all("--durations-min=1" in command for command in wholes)
 
 
 def cells(row: str) -> list[str]:
