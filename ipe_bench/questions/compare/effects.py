@@ -3,7 +3,6 @@ repeated looks, and the number of trials that a difference of success takes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -117,13 +116,13 @@ def ratio_effect(
     can be; None: the largest number seen. It is never widened over a ratio of 1 that the test
     rejects.
     """
-    a, b = _sharing_signs(first, second)
+    signed = _Signed.of(first, second)
     means = _means(first, second)
-    p_equal = _p_of_ratio(a, b)(1.0)
+    p_equal = signed.p(1.0)
     # The first trial is the unit: whoever looks later divides by the same.
     evidence = no_lean(second - first, float(first[0] + second[0]) or 1.0)
-    total_a = float(a.sum())
-    total_b = float(b.sum())
+    total_a = float(signed.a.sum())
+    total_b = float(signed.b.sum())
     if not total_a > 0:
         return Effect(*means, np.nan, p=p_equal, e=evidence)
     value = total_b / total_a
@@ -131,8 +130,8 @@ def ratio_effect(
         return Effect(*means, value, p=p_equal, e=evidence)
 
     # What the test does not reject of a over b is the inverse of what it does not of b over a.
-    low = _least_ratio(a, b, alpha)
-    inverse = _least_ratio(b, a, alpha)
+    low = signed.least_ratio(alpha)
+    inverse = signed.swapped.least_ratio(alpha)
     high = 1 / inverse if inverse > 0 else np.inf
     unseen = _unseen(first, second, alpha)
     if unseen:
@@ -159,7 +158,7 @@ def mean_effect(first: Array, second: Array, alpha: float, largest: float) -> Ef
     normal = quantile * float(d.std()) / np.sqrt(trials)
     reach = normal + _unseen(ones, d, alpha) * largest
     # A mean of 0 is a ratio of 0 to ones.
-    p = _p_of_ratio(*_sharing_signs(ones, d))(0.0)
+    p = _Signed.of(ones, d).p(0.0)
     size = abs(first[0]) + abs(second[0])
     evidence = no_lean(d, float(size) or 1.0)
     means = _means(first, second)
@@ -167,44 +166,50 @@ def mean_effect(first: Array, second: Array, alpha: float, largest: float) -> Ef
     return Effect(*means, mean, mean - reach, mean + reach, p, evidence)
 
 
-def _sharing_signs(first: Array, second: Array) -> Array:
-    """Returns both columns (2, signs), with the trials that share a sign put together."""
-    columns = np.array([first, second], dtype=float)
-    return grouped(columns, MOST_SIGNS).T.copy()
+@dataclass(frozen=True)
+class _Signed:
+    """Holds two columns, the trials that share a sign put together, and their sums under random
+    signs (FLIPS,), which serve every ratio."""
 
+    a: Array
+    b: Array
+    flipped_a: Array
+    flipped_b: Array
 
-def _p_of_ratio(a: Array, b: Array) -> Callable[[float], float]:
-    """Computes the p of b being r times a: the share of sums with random signs at least as far from
-    0 as the sum of b - r a, itself included; if it is alone, Hoeffding's bound of this share (J.
-    Amer. Statist. Assoc. 58, 1963)."""
-    signs = _signs(len(a))
-    flipped_a = signs @ a
-    flipped_b = signs @ b
-    size_a = float(a.sum())
-    size_b = float(np.abs(b).sum())
-    least = 1 / (FLIPS + 1)
+    @classmethod
+    def of(cls, first: Array, second: Array) -> _Signed:
+        columns = np.array([first, second], dtype=float)
+        a, b = grouped(columns, MOST_SIGNS).T.copy()
+        signs = _signs(len(a))
+        return cls(a, b, signs @ a, signs @ b)
 
-    def p(ratio: float) -> float:
-        d = b - ratio * a
+    @property
+    def swapped(self) -> _Signed:
+        """The same with a in the place of b."""
+        return _Signed(self.b, self.a, self.flipped_b, self.flipped_a)
+
+    def p(self, ratio: float) -> float:
+        """Computes the p of b being `ratio` times a: the share of sums with random signs at least
+        as far from 0 as the sum of b - r a, itself included; if it is alone, Hoeffding's bound of
+        this share (J. Amer. Statist. Assoc. 58, 1963)."""
+        least = 1 / (FLIPS + 1)
+        d = self.b - ratio * self.a
         total = abs(float(d.sum()))
-        flipped = np.abs(flipped_b - ratio * flipped_a)
-        roundoff = 1e-12 * (size_b + ratio * size_a)
-        count = int((flipped >= total - roundoff).sum())
+        flipped = np.abs(self.flipped_b - ratio * self.flipped_a)
+        size = float(np.abs(self.b).sum()) + ratio * float(self.a.sum())
+        count = int((flipped >= total - 1e-12 * size).sum())
         if count:
             return (1 + count) * least
         # Hoeffding: |sum of +-d| is t or more in a share of at most 2 exp(-t^2 / (2 d'd)).
         exponent = -(total**2) / (2 * float(d @ d))
         return min(least, 2 * float(np.exp(exponent)))
 
-    return p
-
-
-def _least_ratio(a: Array, b: Array, alpha: float) -> float:
-    """Finds the least ratio of b over a that is not rejected."""
-    p = _p_of_ratio(a, b)
-    if p(0.0) >= alpha:
-        return 0.0
-    return first_that(lambda ratio: p(ratio) >= alpha, 0.0, float(b.sum() / a.sum()))
+    def least_ratio(self, alpha: float) -> float:
+        """Finds the least ratio of b over a that is not rejected."""
+        if self.p(0.0) >= alpha:
+            return 0.0
+        whole = float(self.b.sum() / self.a.sum())
+        return first_that(lambda ratio: self.p(ratio) >= alpha, 0.0, whole)
 
 
 def _unseen(first: Array, second: Array, alpha: float) -> float:
