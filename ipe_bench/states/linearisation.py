@@ -148,8 +148,8 @@ class Unscented(SigmaPoints):
 
     >>> import ipe_bench as ib
     >>> model = ib.component("state_model/pendulum", count=20, spread={"angle": 0.3, "rate": 0.3})
-    >>> table = ib.run(model, {"ukf": ib.states.Filter(rule=ib.states.Unscented(alpha=0.3))},
-    trials=20)
+    >>> trackers = {"ukf": ib.states.Filter(rule=ib.states.Unscented(alpha=0.3))}
+    >>> table = ib.run(model, trackers, trials=20)
     >>> float(table.iloc[-1]["success"])
     1.0
     """
@@ -192,8 +192,8 @@ class GaussHermite(SigmaPoints):
 
     >>> import ipe_bench as ib
     >>> model = ib.component("state_model/pendulum", count=20, spread={"angle": 0.3, "rate": 0.3})
-    >>> table = ib.run(model, {"ghkf": ib.states.Filter(rule=ib.states.GaussHermite(order=3))},
-    trials=20)
+    >>> trackers = {"ghkf": ib.states.Filter(rule=ib.states.GaussHermite(order=3))}
+    >>> table = ib.run(model, trackers, trials=20)
     >>> float(table.iloc[-1]["success"])
     1.0
     """

@@ -64,8 +64,8 @@ class IteratedSmoother(Tracker):
 
     >>> import ipe_bench as ib
     >>> model = ib.component("state_model/pendulum", count=20, spread={"angle": 0.3, "rate": 0.3})
-    >>> table = ib.run(model, {"ieks": ib.states.IteratedSmoother(first=ib.states.ukf())},
-    trials=20)
+    >>> trackers = {"ieks": ib.states.IteratedSmoother(first=ib.states.ukf())}
+    >>> table = ib.run(model, trackers, trials=20)
     >>> float(table.iloc[-1]["success"])
     1.0
     """

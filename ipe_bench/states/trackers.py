@@ -152,9 +152,8 @@ class Tracker(Component, ABC):
     ... class DeadReckoning(Tracker):
     ...     def track(self, model, z):
     ...         return filtered(model, np.full_like(z, np.nan), Taylor())
-    >>> drift = {"next": {"p": "p + w"}, "readings": {"z": "p"}, "noise": {"w": 1}, "deviation":
-    {"z": 2}}
-    >>> model = Formulas(**drift, spread={"p": 1}, count=3)
+    >>> drift = {"next": {"p": "p + w"}, "readings": {"z": "p"}, "noise": {"w": 1}}
+    >>> model = Formulas(**drift, deviation={"z": 2}, spread={"p": 1}, count=3)
     >>> print(DeadReckoning().track(model, model.draw(0, 5).z).covariance[4, :, 0, 0])
     [2. 3. 4.]
     """
@@ -298,8 +297,8 @@ class Filter(Tracker):
 
     >>> import ipe_bench as ib
     >>> model = ib.component("state_model/pendulum", count=20, spread={"angle": 0.3, "rate": 0.3})
-    >>> table = ib.run(model, {"iekf": ib.states.Filter(rule=ib.states.Taylor(), iterations=5)},
-    trials=20)
+    >>> trackers = {"iekf": ib.states.Filter(rule=ib.states.Taylor(), iterations=5)}
+    >>> table = ib.run(model, trackers, trials=20)
     >>> float(table.iloc[-1]["success"])
     1.0
     """

@@ -29,7 +29,8 @@ ROOMS_OF_ZOO = {"basics", "measurements", "estimators", "baselines", "statistics
 
 
 def written(folder: Path, suffix: str = ".py") -> list[Path]:
-    return sorted(path for path in folder.rglob(f"*{suffix}") if "tests" not in path.parts)
+    found = folder.rglob(f"*{suffix}")
+    return sorted(path for path in found if "tests" not in path.relative_to(folder).parts)
 
 
 def imported(path: Path) -> set[tuple[str, str]]:
