@@ -47,7 +47,9 @@ def imported(path: Path) -> set[tuple[str, str]]:
     return {(module, name) for module, name in found if module.split(".")[0] == "ipe_bench"}
 
 
-OTHERS = [path for path in written(PLUGINS) if "zoo" not in path.relative_to(PLUGINS).parts]
+STUDIES = {"zoo", "lost_tracks"}
+"""Folders that enter rooms: the zoo, which is tested with the package, and scripts that are no plugins."""
+OTHERS = [path for path in written(PLUGINS) if STUDIES.isdisjoint(path.relative_to(PLUGINS).parts)]
 MADE = [path for path in written(TEMPLATES, ".py.template") if "test" not in path.name]
 
 
