@@ -22,6 +22,7 @@ from typing import Any
 
 from llvmlite import ir
 
+from ipe_bench.engine.chains import ChainSize
 from ipe_bench.engine.plan import StepPlan
 from ipe_bench.engine.trace import Program, RowPrograms
 
@@ -99,6 +100,253 @@ def rows(source: RowPrograms, width: int) -> str:
                 b.store(value, b.gep(to, [integer(j * n)], source_etype=F64), align=8)
     b.ret_void()
     return str(made.module)
+
+
+def chains(size: ChainSize, width: int) -> str:
+    """Writes void chains(double *A, double *B, double *D, double *G, double *a, double *v, double *x, double *P,
+    int64 trials, int64 epochs, double *frame), which `engine.chains` describes; P may be null. A lane is a trial; a
+    group that is not full repeats its last one."""
+    return str(_ChainWriter(size, width).module)
+
+
+class _ChainWriter:
+    """Writes the solver of chains of one size."""
+
+    def __init__(self, size: ChainSize, width: int) -> None:
+        self.size, self.width, self.n, self.rows = size, width, size.n, size.m + size.n
+        self.module = ir.Module("chains")
+        kinds = [*[PTR] * 8, I64, I64, PTR]
+        made: Any = ir.Function(self.module, ir.FunctionType(VOID, kinds), "chains")
+        *self.arrays, self.trials, self.epochs, frame = made.args
+        self.b: Any = ir.IRBuilder(made.append_basic_block())
+        self.v = _Vectors(self.b, width)
+        self.W, self.t, self.y, self.first = self._parts(frame, size.working)
+        with loop(self.b, integer(0), self.trials, width) as self.group:
+            with self._each(self.epochs) as k:
+                self._begin(k)
+                self._spread(k)
+            with self._each(2):
+                with self._each(self.epochs) as k:
+                    self._forward(k)
+                with self._each(self.n) as i:
+                    self._keep(self.v.constant(0.0), self.y, i)
+                with self._each(self.epochs) as i:
+                    self._backward(self._back(self.epochs, i))
+                with self._each(self.epochs) as k:
+                    self._refine(k)
+            with self._each(self.epochs) as k:
+                self._end(k)
+        self.b.ret_void()
+
+    def _at(self, k: Value, back: int = 0) -> list[Value]:
+        """The parts of epoch k. Before the first epoch lies one of zeros."""
+        place = self.b.mul(self.b.add(k, integer(1 - back)), integer(sum(self.size.parts)))
+        return self._parts(self.v.place(self.first, place), self.size.parts)[:-1]
+
+    def _begin(self, k: Value) -> None:
+        """Takes what is given of an epoch."""
+        b, n, m = self.b, self.n, self.size.m
+        A, B, a, v, _, u, x, _, S, size, *_ = self._at(k)
+        steps, seen, damping, _, moves, values, *_ = self.arrays
+        moved, before = b.sub(self.epochs, integer(1)), b.sub(k, integer(1))
+        with b.if_then(b.icmp_signed(">", k, integer(0))):
+            self._copy(steps, A, n * n, before, moved)
+            self._copy(seen, B, m * n, before, moved)
+            self._copy(values, v, m, before, moved)
+        self._copy(damping, u, n, k, self.epochs)
+        self._copy(moves, a, n, k, self.epochs)
+        with self._each(n) as i:
+            place = b.add(integer(m * n), b.mul(i, integer(n + 1)))
+            self._keep(self.v.call("sqrt", self._entry(u, i)), B, place)
+            self._keep(self.v.constant(0.0), x, i)
+            # Until a row is taken in, which those without damping are not; v of damping is 0.
+            self._keep(self.v.constant(0.0), v, b.add(i, integer(m)))
+            self._keep(self.v.constant(1.0), size, b.add(i, integer(m)))
+            with self._each(n) as j:
+                self._keep(self.v.constant(0.0), self._under(S, b.add(i, integer(m))), j)
+
+    def _spread(self, k: Value) -> None:
+        """Writes F of an epoch, F F' = W W' with W = (A F, G), and takes in its rows."""
+        b, n, m, wide = self.b, self.n, self.size.m, self.n + self.size.q
+        A, B, _, _, F, _, _, _, S, size, _ = self._at(k)
+        before = self._at(k, 1)[4]
+        with self._each(n) as i:
+            along, row = self._row(A, i), self._under(self.W, i, wide)
+            with self._each(n) as j:
+                self._keep(self._dot(along, self._column(before, j)), row, j)
+            with self._each(self.size.q) as j:
+                self._keep(self._G(k, i, j), row, b.add(j, integer(n)))
+        with self._each(n) as i:
+            row = self.v.load(self._under(self.W, i, wide), range(wide))
+            square = self._dot(row, row)
+            some = b.fcmp_ordered(">", square, self.v.constant(0.0))
+            inverse = b.fdiv(self.v.constant(1.0), square)
+            inverse = b.select(some, inverse, self.v.constant(0.0))
+            root = self.v.call("sqrt", square)
+            self._keep(root, self._under(F, i), i)
+            with loop(b, b.add(i, integer(1)), integer(n)) as j:
+                place = self._under(self.W, j, wide)
+                other = self.v.load(place, range(wide))
+                share = b.fmul(self._dot(other, row), inverse)
+                self._keep(b.fmul(share, root), self._under(F, j), i)
+                less = [b.fneg(share)] * wide
+                rest = map(partial(self.v.call, "fma"), less, row, other)
+                self.v.store(list(rest), place, range(wide))
+        with self._each(self.rows) as r:
+            row, read = self._under(B, r), b.icmp_signed("<", r, integer(m))
+            damped = b.icmp_signed(">=", r, integer(m))
+            i = b.select(damped, b.sub(r, integer(m)), integer(0))
+            damped = b.fcmp_unordered("!=", self._entry(row, i), self.v.constant(0.0))
+            some = b.bitcast(damped, ir.IntType(self.width))
+            some = b.icmp_unsigned("!=", some, ir.Constant(some.type, 0))
+            with b.if_then(b.or_(read, some)):
+                self._take_in(F, self.v.load(row, range(n)), self._under(S, r), size, r)
+
+    def _take_in(self, F: Value, row: list[Value], s: Value, sizes: Value, r: Value) -> None:
+        """Writes F F' <- ((F F')^-1 + b b')^-1 for a row b, from the last column on, with s = F F' b and 1 + b' s."""
+        b, n = self.b, self.n
+        with self._each(n) as j:
+            self._keep(self._dot(self._column(F, j), row), self.t, j)
+            self._keep(self.v.constant(0.0), s, j)
+        self._keep(self.v.constant(1.0), sizes, r)
+        with self._each(n) as i:
+            j = self._back(integer(n), i)
+            v, size = self._entry(self.t, j), self._entry(sizes, r)
+            larger = self.v.call("fma", v, v, size)
+            root = self.v.call("sqrt", b.fmul(size, larger))
+            kept, share = b.fdiv(size, root), b.fneg(b.fdiv(v, root))
+            with loop(b, j, integer(n)) as i:
+                old, so_far = self._entry(self._under(F, i), j), self._entry(s, i)
+                new = self.v.call("fma", share, so_far, b.fmul(old, kept))
+                self._keep(new, self._under(F, i), j)
+                self._keep(self.v.call("fma", old, v, so_far), s, i)
+            self._keep(larger, sizes, r)
+
+    def _forward(self, k: Value) -> None:
+        b, n = self.b, self.n
+        A, B, a, v, _, u, _, _, S, size, told = self._at(k)
+        before = self.v.load(self._at(k, 1)[5], range(n))
+        with self._each(n) as i:
+            self._keep(self._dot(self._row(A, i), before, self._entry(a, i)), u, i)
+        with self._each(self.rows) as r:
+            innovation = b.fsub(self._entry(v, r), self._along(B, r, u))
+            share = b.fdiv(innovation, self._entry(size, r))
+            self._keep(share, told, r)
+            self._add(share, self._under(S, r), u)
+
+    def _backward(self, k: Value) -> None:
+        b, n = self.b, self.n
+        A, B, _, _, F, u, x, multipliers, S, size, told = self._at(k)
+        later = self.v.load(self.y, range(n))
+        with self._each(n) as j:
+            self._keep(self._dot(self._column(F, j), later), self.t, j)
+        with self._each(n) as i:
+            t = self.v.load(self.t, range(n))
+            self._keep(self._dot(self._row(F, i), t, self._entry(u, i)), u, i)
+            self._keep(b.fadd(self._entry(x, i), self._entry(u, i)), x, i)
+        with self._each(self.rows) as i:
+            r = self._back(integer(self.rows), i)
+            later = b.fdiv(self._along(S, r, self.y), self._entry(size, r))
+            share = b.fsub(self._entry(told, r), later)
+            self._keep(share, told, r)
+            self._add(share, self._under(B, r), self.y)
+        found = self.v.load(self.y, range(n))
+        self.v.store(found, multipliers, range(n))
+        with self._each(n) as i:
+            self._keep(self._dot(self._column(A, i), found), self.y, i)
+
+    def _refine(self, k: Value) -> None:
+        """Writes what the step so far leaves of the right sides."""
+        b, n, q = self.b, self.n, self.size.q
+        A, B, a, v, _, u, _, multipliers, _, _, told = self._at(k)
+        before = self.v.load(self._at(k, 1)[5], range(n))
+        with self._each(q) as j:
+            gains = [self._G(k, integer(i), j) for i in range(n)]
+            self._keep(self._dot(gains, self.v.load(multipliers, range(n))), self.t, j)
+        with self._each(n) as i:
+            left = b.fsub(self._entry(a, i), self._entry(u, i))
+            gains = [self._G(k, i, integer(j)) for j in range(q)]
+            left = self._dot(gains, self.v.load(self.t, range(q)), left)
+            self._keep(self._dot(self._row(A, i), before, left), a, i)
+        with self._each(self.rows) as r:
+            left = b.fsub(self._entry(v, r), self._along(B, r, u))
+            self._keep(b.fsub(left, self._entry(told, r)), v, r)
+
+    def _end(self, k: Value) -> None:
+        b, n = self.b, self.n
+        A, _, _, _, F, _, steps, *_ = self._at(k)
+        *_, x, P = self.arrays
+        self._copy(x, steps, n, k, self.epochs, back=True)
+        with b.if_then(b.icmp_signed("!=", b.ptrtoint(P, I64), integer(0))):
+            # A is no longer needed.
+            with self._each(n) as i, self._each(n) as j:
+                self._keep(self._dot(self._row(F, i), self._row(F, j)), self._under(A, i), j)
+            self._copy(P, A, n * n, k, self.epochs, back=True)
+
+    def _along(self, array: Value, r: Value, x: Value) -> Value:
+        """Row r of an array times x."""
+        return self._dot(self._row(array, r), self.v.load(x, range(self.n)))
+
+    def _add(self, share: Value, row: Value, to: Value) -> None:
+        with self._each(self.n) as i:
+            new = self.v.call("fma", share, self._entry(row, i), self._entry(to, i))
+            self._keep(new, to, i)
+
+    def _back(self, count: Value, i: Value) -> Value:
+        """Counts from the last down."""
+        return self.b.sub(self.b.sub(count, integer(1)), i)
+
+    def _G(self, k: Value, i: Value, j: Value) -> Value:
+        b, n, q = self.b, integer(self.n), integer(self.size.q)
+        place = b.add(b.mul(b.add(b.mul(k, n), i), q), j)
+        return self.v.spread(number_at(b, self.arrays[3], place))
+
+    def _copy(
+        self, array: Value, lanes: Value, count: int, k: Value, length: Value, back: bool = False
+    ) -> None:
+        """Copies `count` numbers of epoch k of an array (trials, length, count) into lanes, or back."""
+        b = self.b
+        with self._each(self.width) as lane:
+            trial = b.add(self.group, lane)
+            last = b.sub(self.trials, integer(1))
+            trial = b.select(b.icmp_signed("<", trial, last), trial, last)
+            begin = b.mul(b.add(b.mul(trial, length), k), integer(count))
+            with self._each(count) as j:
+                outside = b.add(begin, j)
+                inside = b.add(b.mul(j, integer(self.width)), lane)
+                if back:
+                    put(b, number_at(b, lanes, inside), array, outside)
+                else:
+                    put(b, number_at(b, array, outside), lanes, inside)
+
+    def _parts(self, array: Value, sizes: Sequence[int]) -> list[Value]:
+        """Begins of parts of so many vectors each, and of what follows them."""
+        return [self.v.place(array, begin) for begin in itertools.accumulate(sizes, initial=0)]
+
+    def _each(self, count: int | Value) -> Any:
+        count = integer(count) if isinstance(count, int) else count
+        return loop(self.b, integer(0), count)
+
+    def _under(self, array: Value, i: Value, count: int = 0) -> Value:
+        return self.v.place(array, self.b.mul(i, integer(count or self.n)))
+
+    def _row(self, array: Value, i: Value) -> list[Value]:
+        return self.v.load(self._under(array, i), range(self.n))
+
+    def _column(self, array: Value, j: Value) -> list[Value]:
+        return self.v.load(self.v.place(array, j), range(0, self.n**2, self.n))
+
+    def _entry(self, array: Value, i: Value) -> Value:
+        return self.v.load(array, [i])[0]
+
+    def _keep(self, value: Value, array: Value, i: Value) -> None:
+        self.v.store([value], self.v.place(array, i), [0])
+
+    def _dot(
+        self, one: Sequence[Value], other: Sequence[Value], start: Value | None = None
+    ) -> Value:
+        slopes = [[value] for value in other]
+        return self.v.combine([start or self.v.constant(0.0)], list(one), slopes)[0]
 
 
 class _Writer:

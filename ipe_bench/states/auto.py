@@ -59,12 +59,12 @@ class AutoTracker(Tracker):
         if model.gain_by_state or model.R_by_state:
             return self._likelier(model, z, first, doubtful)
         density = PathDensity.of(model, z)
-        paths = Descent.of(density, smoothed(model, first))
+        paths = Descent.of(density, first)
         stage = np.full(len(z), EXTENDED)
         if doubtful.size:
             some = density.subset(doubtful)
-            other = Descent.of(some, smoothed(model, filtered(model, some.z, Unscented())))
-            stage[doubtful[other.at.cost < paths.at.cost[doubtful]]] = UNSCENTED
+            other = Descent.of(some, filtered(model, some.z, Unscented()))
+            stage[doubtful[paths.beaten(other, doubtful)]] = UNSCENTED
             paths = paths.improved(other, doubtful)
         paths = self.descent.descended(density, paths)
         arrived = (paths.status == Status.CONVERGED) & (paths.iterations == 1)
@@ -75,7 +75,7 @@ class AutoTracker(Tracker):
                 break
             some = density.subset(rows)
             other = self.descent.descended(some, self.descent.drawn(some, number))
-            stage[rows[other.at.cost < paths.at.cost[rows]]] = AGAIN + number
+            stage[rows[paths.beaten(other, rows)]] = AGAIN + number
             paths = paths.improved(other, rows)
         return replace(reported(density, paths), stage=stage)
 

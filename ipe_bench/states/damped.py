@@ -13,10 +13,10 @@ from ipe_bench.basics.linalg import Array, Mask, multiply
 from ipe_bench.basics.options import Count, Positive, Share, Whole
 from ipe_bench.basics.statuses import Status
 from ipe_bench.basics.streams import normals, own_generators
-from ipe_bench.states.algebra import root
+from ipe_bench.states.algebra import lower_solve, root, transposed
 from ipe_bench.states.base import Normal, StateModel
 from ipe_bench.states.linearisation import Taylor, Unscented
-from ipe_bench.states.smoothers import covariances, path_p, smoothed, whole
+from ipe_bench.states.smoothers import path_p, whole
 from ipe_bench.states.trackers import Tracker, Tracks, filtered
 from ipe_bench.states.whole_paths import PathDensity, Settled, Tangents
 from ipe_bench.states.widened import widened
@@ -24,7 +24,7 @@ from ipe_bench.states.widened import widened
 _TRIES, _FACTOR = 15, 10.0
 """Dampings that are tried about one path, and the factor between them."""
 _ROUND_OFF = 1e-12
-"""Part of a cost by which it may rise."""
+"""Part of a cost that counts as round-off."""
 _SHARE = 0.5
 """Standard deviations of the prior about a further start, in those of the prior."""
 _SLOW, _HARDLY = 3, 0.9
@@ -50,15 +50,19 @@ class Descent:
 
     @classmethod
     def of(cls, density: PathDensity, tracks: Tracks) -> Descent:
-        """Begins at a smoother's tracks."""
-        at = density.settled(whole(tracks)[0])
+        """Begins at the smoothed paths of a filter's tracks."""
+        at = density.settled(smoothed_path(tracks))
         trials = len(at.x)
         running, none = np.full(trials, Status.RUNNING, np.int8), np.zeros(trials, np.int64)
         return cls(np.zeros(trials), at, running, none, tracks.calls + at.calls, none)
 
+    def beaten(self, other: Descent, rows: NDArray[np.intp]) -> Mask:
+        """Whether a path of `other`, of the trials `rows`, costs less by more than round-off."""
+        return other.at.cost < self.at.cost[rows] * (1 - _ROUND_OFF)
+
     def improved(self, other: Descent, rows: NDArray[np.intp]) -> Descent:
         """These paths with those of `other`, of the trials `rows`, that cost less; both have been paid for."""
-        better = other.at.cost < self.at.cost[rows]
+        better = self.beaten(other, rows)
         calls = self.calls.copy()
         calls[rows] += other.calls
         return replace(put(self, rows[better], take(other, better)), calls=calls)
@@ -108,8 +112,7 @@ class LevenbergMarquardtSmoother(Tracker):
     def track(self, model: StateModel, z: Array) -> Tracks:
         density = PathDensity.of(model, z)
         first, other = (
-            Descent.of(density, smoothed(model, filtered(model, z, rule)))
-            for rule in (Taylor(), Unscented())
+            Descent.of(density, filtered(model, z, rule)) for rule in (Taylor(), Unscented())
         )
         paths = self.descended(density, first.improved(other, np.arange(len(z))))
         rows = np.flatnonzero(self.improbable(z, paths.at.cost))
@@ -140,9 +143,7 @@ class LevenbergMarquardtSmoother(Tracker):
         one = density.subset(np.repeat(np.arange(trials), starts))
         P = np.repeat(_SHARE**2 * density.model.prior.covariance[None], len(one.z), axis=0)
         start = Normal(draws.reshape(-1, n), P)
-        found = Descent.of(
-            one, smoothed(one.model, filtered(one.model, one.z, Unscented(), start=start))
-        )
+        found = Descent.of(one, filtered(one.model, one.z, Unscented(), start=start))
         least = found.at.cost.reshape(trials, starts).argmin(axis=1)
         calls = found.calls.reshape(trials, starts).sum(axis=1)
         return replace(take(found, least + starts * np.arange(trials)), calls=calls)
@@ -212,13 +213,33 @@ class LevenbergMarquardtSmoother(Tracker):
         return short
 
 
+def smoothed_path(tracks: Tracks) -> Array:
+    """The smoothed means (trials, 1 + K, n) of a filter's tracks from before the first transition, without their
+    covariances: by the scores r of later readings (Bierman, Automatica 9, 1973), with those of `Tracks.reads`,
+
+        r <- r + H' S^-1 (y - H P- r),   r <- A' r,   m[k-1] <- m[k-1] + P[k-1] r.
+    """
+    H, L = (np.stack(each, axis=1) for each in zip(*tracks.reads, strict=True))
+    W, e = lower_solve(L, H), np.nan_to_num(tracks.innovations)
+    r = np.zeros((len(e), 1 + len(tracks.reads), H.shape[-1]))
+    first = len(tracks.reads) - len(tracks.moves)
+    later = r[:, -1]
+    for k in range(len(tracks.reads) - 1, first - 1, -1):
+        P = tracks.predicted[k - first].covariance
+        left = e[:, k] - multiply(W[:, k], multiply(P, later))
+        later = later + multiply(transposed(W[:, k]), left)
+        later = r[:, k] = multiply(transposed(tracks.moves[k - first].A), later)
+    m, P = whole(tracks)
+    return m + multiply(P, r)
+
+
 def reported(density: PathDensity, paths: Descent) -> Tracks:
     """The tracks of the paths, with covariances that the cost itself widens."""
     model = density.model
     at = density.settled_exactly(paths.at)
     out = Tracks.empty(model, len(at.x))
     tangents = density.tangents(at)
-    P, calls = widened(density, at, tangents, covariances(density, tangents))
+    P, calls = widened(density, at, tangents)
     out.start, out.mean, out.covariance = Normal(at.x[:, 0], P[:, 0]), at.x[:, 1:], P[:, 1:]
     out.cost, out.status, out.iterations = at.cost, paths.status, paths.iterations
     out.calls = paths.calls + at.calls + calls + Taylor().calls(model.n) * model.evaluations

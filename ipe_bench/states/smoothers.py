@@ -13,9 +13,9 @@ from ipe_bench.basics.linalg import Array, Mask, multiply
 from ipe_bench.basics.options import Count, NonNegative
 from ipe_bench.states.algebra import half, lower_solve, symmetric, transposed
 from ipe_bench.states.base import Normal, StateModel
-from ipe_bench.states.linearisation import Affine, Rule, Taylor
-from ipe_bench.states.trackers import Filter, Tracker, Tracks, filtered, predict, update
-from ipe_bench.states.whole_paths import PathDensity, Settled, Tangents
+from ipe_bench.states.linearisation import Rule, Taylor
+from ipe_bench.states.trackers import Filter, Tracker, Tracks, filtered
+from ipe_bench.states.whole_paths import PathDensity, Settled
 
 _HALVINGS = 12
 """Halvings of a damped step."""
@@ -127,7 +127,7 @@ class IteratedSmoother(Tracker):
             end = density.settled_exactly(end)
             x = end.x
             calls = calls + end.calls
-        P = covariances(density, tangents)
+        P, _ = density.spread(tangents)
         out = Tracks.empty(model, len(x))
         out.start = Normal(x[:, 0], P[:, 0])
         out.mean = x[:, 1:]
@@ -243,26 +243,6 @@ def _smooth_by_scores(model: StateModel, tracks: Tracks, out: Tracks, rows: Mask
         at = out.at(k - 1)
         at.mean[rows] = before.mean[rows] + multiply(P, r)
         at.covariance[rows] = smooth
-
-
-def covariances(density: PathDensity, tangents: Tangents) -> Array:
-    """Computes the covariances (trials, 1 + K, n, n) of the path of an affine model."""
-    model = density.model
-    # No covariance of an affine model depends on the values of its readings.
-    blank = np.where(np.isfinite(density.z), 0.0, np.nan)
-    out = Tracks.empty(model, len(blank))
-    x = out.start
-    for k in range(model.epochs):
-        if model.moves(k):
-            A = tangents.A[:, k]
-            move = Affine(A, np.zeros(A.shape[:2]), np.zeros(A.shape))
-            x = predict(x, move, model.Q(k))
-            out.moves.append(move)
-            out.predicted.append(x)
-        H = tangents.H[:, k]
-        read = Affine(H, np.zeros(H.shape[:2]), np.zeros((1, 1)))
-        x = out.note(k, update(x, read, model.R(k), blank[:, k]))
-    return whole(smoothed(model, out)).covariance
 
 
 def whole(tracks: Tracks) -> Normal:

@@ -1,21 +1,28 @@
-"""Whole paths as unknowns: their density along all epochs at once, and Gauss-Newton steps by one banded solve each."""
+"""Whole paths as unknowns: their density along all epochs at once, and Gauss-Newton steps of all of a path."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
-from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
-from ipe_bench.basics.linalg import Array, finite, multiply
-from ipe_bench.states.algebra import factor, half, lower_solve, mahalanobis, transposed
+from ipe_bench.basics.linalg import Array, multiply
+from ipe_bench.engine.chains import solve_chains
+from ipe_bench.states.algebra import (
+    factor,
+    half,
+    lower_solve,
+    mahalanobis,
+    root,
+    symmetric,
+    transposed,
+)
 from ipe_bench.states.base import StateModel
 
 _REACHED = 1e-9
 """Part of a state by which a path may miss the range of its noise or of the prior: round-off of a solve."""
-_NUMBERS = 3e5
-"""Numbers of the banded matrices that are held at once: they stay in a processor's cache."""
 
 
 @dataclass(frozen=True)
@@ -175,32 +182,66 @@ class PathDensity:
         """The affine model about settled paths."""
         return self.about(at.x)[1]
 
-    def left(self, tangents: Tangents, at: Settled) -> Array:
-        """What the equations of a step leave at step 0 (trials, 1 + K, 2, n): of multipliers and of states."""
-        left = np.zeros((*at.x.shape[:2], 2, self.model.n))
-        left[:, 0, 0] = self.model.prior.mean - at.x[:, 0]
-        left[:, 1:, 0] = -at.gap
-        v = multiply(self.whitener, at.residual)
-        left[:, 1:, 1] = multiply(transposed(tangents.B), v)
-        return left
-
     def step(self, tangents: Tangents, at: Settled, damping: Array | None = None) -> Array:
-        """The steps dx (trials, 1 + K, n) from settled paths, NaN of a trial that has none; with
+        """The steps dx (trials, 1 + K, n) from settled paths, not finite of a trial that has none; with
         D = diag(damping (trials, 1 + K, n))."""
-        return self.solved(tangents, self.left(tangents, at)[..., None], damping)[..., 0]
+        a = np.concatenate([self.model.prior.mean - at.x[:, :1], -at.gap], axis=1)
+        v = multiply(self.whitener, at.residual)
+        D = np.zeros_like(a) if damping is None else damping
+        return solve_chains(tangents.A, tangents.B, D, self._noise, a, v)[0]
 
-    def solved(self, tangents: Tangents, right: Array, damping: Array | None = None) -> Array:
-        """dx (trials, 1 + K, n, r) of the equations of a step, for r right sides (trials, 1 + K, 2, n, r)."""
-        trials, K, n = len(right), self.model.epochs, self.model.n
-        noise = np.matmul(self.gains, transposed(self.gains))
-        Q = np.concatenate([self.model.prior.covariance[None], noise])
-        C = np.zeros((trials, K + 1, n, n))
-        C[:, 1:] = np.matmul(transposed(tangents.B), tangents.B)
-        if damping is not None:
-            np.einsum("tkii->tki", C)[:] += damping
-        at_once = max(1, int(_NUMBERS / ((K + 1) * 2 * n * 6 * n)))
-        parts = [slice(i, i + at_once) for i in range(0, trials, at_once)]
-        return np.concatenate([_solved(Q, tangents.A[one], C[one], right[one]) for one in parts])
+    @cached_property
+    def _noise(self) -> Array:
+        """G (1 + K, n, q) with that of P0 in front."""
+        first = root(self.model.prior.covariance)
+        columns = max(first.shape[1], self.gains.shape[2])
+        G = np.zeros((1 + self.model.epochs, self.model.n, columns))
+        G[0, :, : first.shape[1]] = first
+        G[1:, :, : self.gains.shape[2]] = self.gains
+        return G
+
+    def filtered(self, tangents: Tangents) -> Array:
+        """The covariances (trials, 1 + K, n, n) of the affine model's states by the readings up to each epoch."""
+        A, B = tangents.A, tangents.B
+        nothing = np.zeros((len(A), 1 + self.model.epochs, self.model.n))
+        v = np.zeros(B.shape[:3])
+        return solve_chains(A, B, nothing, self._noise, nothing, v, spread=True)[1]
+
+    def spread(self, tangents: Tangents) -> tuple[Array, Array]:
+        """The covariances P (trials, 1 + K, n, n) of the states of the affine model, and those of them with the last
+        states.
+
+        Later readings tell of a state by their scores alone, so that no covariance of states is inverted (Bierman,
+        Automatica 9, 1973): with S = A P A' + Q, what an epoch sees is C - C P C = B' (I + B S B')^-1 B, and
+
+            N[k] = C - C P C + (I - C P) A' N[k+1] A (I - P C),   P[k] <- P[k] - P[k] A' N[k+1] A P[k].
+        """
+        A, B, n = tangents.A, tangents.B, self.model.n
+        P = self.filtered(tangents)
+        Q = np.matmul(self.gains, transposed(self.gains))
+        S = np.matmul(np.matmul(A, P[:, :-1]), transposed(A)) + Q
+        innovation = np.matmul(np.matmul(B, S), transposed(B)) + np.eye(B.shape[2])
+        W = lower_solve(factor(innovation), B)
+        seen = np.matmul(transposed(W), W)
+        rest = np.eye(n) - np.matmul(seen, S)
+        back = np.matmul(rest[:, :-1], transposed(A[:, 1:]))
+        told, shares = seen.copy(), np.empty_like(rest)
+        shares[:, -1] = rest[:, -1]
+        for k in range(self.model.epochs - 2, -1, -1):
+            told[:, k] += np.matmul(np.matmul(back[:, k], told[:, k + 1]), transposed(back[:, k]))
+            shares[:, k] = np.matmul(back[:, k], shares[:, k + 1])
+        ahead = np.matmul(P[:, :-1], transposed(A))
+        crossed = np.empty_like(P)
+        crossed[:, 0] = np.matmul(ahead[:, 0], shares[:, 0])
+        # So that they are steps of the model but for round-off.
+        noise = np.matmul(Q, shares)
+        for k in range(self.model.epochs):
+            crossed[:, k + 1] = np.matmul(A[:, k], crossed[:, k]) + noise[:, k]
+        P[:, :-1] -= np.matmul(np.matmul(ahead, told), transposed(ahead))
+        variances = np.einsum("tkii->tki", P)
+        # Round-off of states that are known exactly.
+        np.maximum(variances, 0.0, out=variances)
+        return symmetric(P), crossed
 
     def size(self, tangents: Tangents, step: Array) -> Array:
         """dx' (Hessian of Gauss and Newton) dx (trials,): a step's squared length in deviations of the path."""
@@ -211,50 +252,5 @@ class PathDensity:
 
     def blind_variances(self, tangents: Tangents) -> Array:
         """The variances (trials, 1 + K, n) of states that nothing is read of, along paths."""
-        A, K = tangents.A, self.model.epochs
-        P = np.repeat(self.model.prior.covariance[None], len(A), axis=0)
-        noise = np.matmul(self.gains, transposed(self.gains))
-        variances = [np.diagonal(P, axis1=1, axis2=2)]
-        for k in range(K):
-            P = np.matmul(np.matmul(A[:, k], P), transposed(A[:, k])) + noise[k]
-            variances.append(np.diagonal(P, axis1=1, axis2=2))
-        return np.stack(variances, axis=1)
-
-
-def _solved(Q: Array, A: Array, C: Array, right: Array) -> Array:
-    """dx (trials, 1 + K, n, r) of the equations of `PathDensity`, their unknowns (l, dx) from epoch to epoch, by Q
-    (1 + K, n, n), A (trials, K, n, n), C = H' R^-1 H + D (trials, 1 + K, n, n) and right sides."""
-    # Imported late: SciPy's LAPACK costs a tenth of a second.
-    from scipy.linalg.lapack import dgbsv  # pyright: ignore[reportAttributeAccessIssue]
-
-    trials, epochs, _, n, columns = right.shape
-    beside = 2 * n - 1
-    band = np.zeros((trials, 2 * n * epochs, 3 * beside + 1))
-    one = np.eye(n)
-    _blocks(band, 0, 0, epochs)[:] = -Q
-    _blocks(band, 0, 1, epochs)[:] = one
-    _blocks(band, 1, 0, epochs)[:] = one
-    _blocks(band, 1, 1, epochs)[:] = C
-    _blocks(band, 2, 1, epochs - 1)[:] = -A
-    _blocks(band, 1, 2, epochs - 1)[:] = -transposed(A)
-    found = np.full((trials, epochs, n, columns), np.nan)
-    for i in np.flatnonzero(finite(A) & finite(C) & finite(right)):
-        _, _, unknowns, failed = dgbsv(
-            beside, beside, band[i].T, right[i].reshape(-1, columns), overwrite_ab=1
-        )
-        if not failed:
-            found[i] = unknowns.reshape(epochs, 2, n, columns)[:, 1]
-    return found
-
-
-def _blocks(band: Array, row: int, column: int, count: int) -> Array:
-    """A view (trials, count, n, n) of blocks of matrices in LAPACK's band storage, band[trial, column, place]: the
-    block in this row and column of blocks, and those two blocks further down and right each."""
-    trials, _, width = band.shape
-    n = (width + 2) // 6
-    # One further down is one place further on, one further right a column but for one place.
-    down, right = band.itemsize, band.itemsize * (width - 1)
-    first = 2 * (2 * n - 1) + n * row + n * column * (width - 1)
-    start = band.reshape(trials, -1)[:, first:]
-    strides = (band.strides[0], 2 * n * (down + right), down, right)
-    return as_strided(start, (trials, count, n, n), strides)
+        blind = replace(tangents, B=np.zeros_like(tangents.B))
+        return np.diagonal(self.filtered(blind), axis1=2, axis2=3)

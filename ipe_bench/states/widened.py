@@ -19,8 +19,8 @@ _NUMBERS = 5e5
 """Numbers of the slopes that are held at once: they stay in a processor's cache."""
 
 
-def widened(density: PathDensity, at: Settled, tangents: Tangents, P: Array) -> tuple[Array, Array]:
-    """Covariances P (trials, 1 + K, n, n) of the affine model about paths, widened by what the cost says, and the
+def widened(density: PathDensity, at: Settled, tangents: Tangents) -> tuple[Array, Array]:
+    """The covariances (trials, 1 + K, n, n) of the affine model about paths, widened by what the cost says, and the
     evaluations (trials,) that this took.
 
     Along each axis of the last states' covariance the path is moved by c = 3 deviations to both sides, and a step of
@@ -30,23 +30,28 @@ def widened(density: PathDensity, at: Settled, tangents: Tangents, P: Array) -> 
     """
     model = density.model
     at_once = max(1, int(_NUMBERS / (2 * model.n**3 * model.epochs)))
-    P, calls = P.copy(), np.zeros(len(P))
-    for first in range(0, len(P), at_once):
-        rows = np.arange(first, min(first + at_once, len(P)))
-        some = density.subset(rows), take(at, rows), take(tangents, rows)
-        P[rows], calls[rows] = _of_some(*some, P[rows])
+    parts = np.split(np.arange(len(at.x)), range(at_once, len(at.x), at_once))
+    P, crossed = density.spread(tangents)
+    calls = np.zeros(len(P))
+    for i in parts:
+        some = density.subset(i), take(at, i), take(tangents, i)
+        more, calls[i] = _of_some(*some, P[i, -1], crossed[i])
+        P[i] += more
     return P, calls
 
 
 def _of_some(
-    density: PathDensity, at: Settled, tangents: Tangents, P: Array
+    density: PathDensity, at: Settled, tangents: Tangents, P: Array, crossed: Array
 ) -> tuple[Array, Array]:
+    """What is added to the covariances, from those P (trials, n, n) of the last states and those of all states with
+    these."""
     trials, epochs, n = at.x.shape
-    _, inverse = principal(P[:, -1])
-    unit = np.zeros((trials, epochs, 2, n, n))
-    unit[:, -1, 1] = transposed(inverse)
+    _, inverse = principal(P)
     # Row i moves the last states by a deviation along axis i, and the path as the affine model has it.
-    lines = np.moveaxis(density.solved(tangents, unit), -1, 1)
+    lines = np.moveaxis(np.matmul(crossed, transposed(inverse)[:, None]), -1, 1)
+    along = np.sum(inverse * lines[:, :, -1], axis=-1)
+    # But for round-off they do so already.
+    lines = lines / np.where(along > 0, along, 1.0)[..., None, None]
     sides = np.stack([lines, -lines], axis=1).reshape(-1, epochs, n)
     owner, axis = np.repeat(np.arange(trials), 2 * n), np.tile(np.arange(n), 2 * trials)
     moved = density.subset(owner).settled(at.x[owner] + _FAR * sides)
@@ -72,7 +77,7 @@ def _of_some(
     # E t^4 = 3 of a standard normal t.
     wide = np.concatenate([np.sqrt(extra)[..., None, None] * lines, np.sqrt(3.0) * bend], axis=1)
     wide = np.moveaxis(wide, 1, -1)
-    return P + np.matmul(wide, transposed(wide)), calls.reshape(trials, -1).sum(axis=1)
+    return np.matmul(wide, transposed(wide)), calls.reshape(trials, -1).sum(axis=1)
 
 
 def _rarer(rise: Array) -> Array:

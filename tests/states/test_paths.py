@@ -26,7 +26,7 @@ from ipe_bench.states import (
     ukf,
 )
 from ipe_bench.states.damped import Descent
-from ipe_bench.states.smoothers import covariances, path_p, smoothed, whole
+from ipe_bench.states.smoothers import path_p, smoothed, whole
 from ipe_bench.states.trackers import filtered, linearised_move
 from ipe_bench.states.whole_paths import PathDensity
 from ipe_bench.trials.paths import PathBlock, StateScenario
@@ -65,7 +65,7 @@ def test_levenberg_and_marquardt_find_the_minimum_that_halved_steps_find():
     other = IteratedSmoother(ukf(), Taylor(), 50, damped=True, tolerance=1e-10).track(NEAR, z)
     np.testing.assert_allclose(found.mean, other.mean, atol=1e-7)
     density = PathDensity.of(NEAR, z)
-    P = covariances(density, density.tangents(density.settled(whole(found)[0])))[:, 1:]
+    P = density.spread(density.tangents(density.settled(whole(found)[0])))[0][:, 1:]
     np.testing.assert_allclose(P, other.covariance, rtol=1e-5)
     np.testing.assert_allclose(
         found.cost, path_cost(NEAR, z, other.start.mean, other.mean), rtol=1e-9
@@ -135,7 +135,7 @@ def test_a_damped_step_is_the_same_in_any_unit_of_the_states():
     steps = []
     for model in (NEAR, Scaled(count=25, start=(1.0, 0.0), spread=0.2)):
         density = PathDensity.of(model, NEAR.draw(0, 4).z)
-        track = smoothed(model, filtered(model, density.z, Taylor()))
+        track = filtered(model, density.z, Taylor())
         begun = replace(Descent.of(density, track), damping=np.ones(4))
         steps.append(LevenbergMarquardtSmoother(iterations=1).descended(density, begun).at)
     np.testing.assert_allclose(steps[1].x / sizes, steps[0].x, atol=1e-9)

@@ -11,7 +11,7 @@ from shared.state_models import ConstantVelocity, Pendulum
 
 from ipe_bench.measurements import Parameter
 from ipe_bench.states import Formulas, LevenbergMarquardtSmoother, Normal, Smoother, StateModel, ekf
-from ipe_bench.states.smoothers import covariances, whole
+from ipe_bench.states.smoothers import whole
 from ipe_bench.states.whole_paths import PathDensity
 
 
@@ -77,7 +77,7 @@ def test_a_step_from_anywhere_ends_at_the_smoothed_path_of_a_linear_model(number
     found = density.settled(at.x + density.step(tangents, at))
     assert_agrees(found.x, mean, rtol=1e-9, atol=1e-9)
     assert_agrees(found.cost, tracks.cost, rtol=1e-9, atol=1e-12)
-    assert_agrees(covariances(density, tangents), P, rtol=1e-9, atol=1e-12)
+    assert_agrees(density.spread(tangents)[0], P, rtol=1e-9, atol=1e-12)
 
 
 def test_the_length_of_a_step_is_in_deviations_of_the_path():
@@ -118,7 +118,7 @@ def test_a_covariance_holds_where_the_valley_of_the_cost_bends():
     w = np.exp(-(x**2 + y**2 + ((y + x**2 / 16) / 0.1) ** 2) / 2)
     exact = np.sum(w * y**2) / np.sum(w)
     density = PathDensity.of(model, z)
-    narrow = covariances(density, density.tangents(density.settled(whole(found)[0])))
+    narrow, _ = density.spread(density.tangents(density.settled(whole(found)[0])))
     assert narrow[0, 0, 1, 1] < 0.6 * exact
     assert exact < found.covariance[0, 0, 1, 1] < 1.3 * exact
 
