@@ -26,7 +26,7 @@ from ipe_bench.states import (
     ukf,
 )
 from ipe_bench.states.damped import Descent
-from ipe_bench.states.smoothers import path_p, smoothed, whole
+from ipe_bench.states.smoothers import path_p, whole
 from ipe_bench.states.trackers import filtered, linearised_move
 from ipe_bench.states.whole_paths import PathDensity
 from ipe_bench.trials.paths import PathBlock, StateScenario
