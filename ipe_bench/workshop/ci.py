@@ -11,15 +11,16 @@ from ipe_bench.workshop.new import fill, require_absent
 
 
 def write_ci() -> str:
-    """Writes a workflow that compares the estimators in plugins/ with those of a base, and its trials.
+    """Writes a workflow that compares the estimators in plugins/ with those of a base, and its
+    trials.
 
     Returns what to try next.
     """
-    ours, place = {"solver": "", "baseline": ""}, Path("plugins").resolve()
-    for option in (
-        o for o in plugins.options() if o.group in ours and place in o.path.resolve().parents
-    ):
-        ours[option.group] += ", " * bool(ours[option.group]) + option.name
+    place = Path("plugins").resolve()
+    options = [o for o in plugins.options() if place in o.path.resolve().parents]
+    ours = {}
+    for group in ("solver", "baseline"):
+        ours[group] = ", ".join(option.name for option in options if option.group == group)
     if not any(ours.values()):
         raise UserError(
             "new ci: plugins/ has no estimator to guard; write one, such as `ipe-bench new baseline my_fit`"

@@ -1,7 +1,7 @@
 """Checks the promises that every component makes: plugin authors run on theirs what we run on ours.
 
-A check raises an AssertionError whose message is for the author, or returns why it does not apply; the first line of
-its docstring is the promise.
+A check raises an AssertionError whose message is for the author, or returns why it does not apply;
+the first line of its docstring is the promise.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ TRIALS = 8
 SCATTERED = 60
 """Trials from which the scatter of estimates is known to about 10 %."""
 DRAWS = 10_000
-"""Draws from which the covariance of a noise is known to about 1 %, or several where its tails are heavy."""
+"""Draws from which the covariance of a noise is known to about 1 %, or several where its tails are
+heavy."""
 _USUAL_NOISE = UsualNoise(deviation=0.007, step=0.02)
 """Noise for components whose options leave out how large it is."""
 _IMPROBABLE = 1e-6
@@ -71,9 +72,10 @@ class Finding:
 
 
 def check_component(name: str, component: Any) -> Iterator[Finding]:
-    """Runs the checks of the component's kind; a component of no kind is a finding itself. A model that takes inputs
-    from a file is tried with columns that are made up."""
-    checks = next((c for kind, c in _CHECKS.items() if isinstance(component, kind)), None)
+    """Runs the checks of the component's kind; a component of no kind is a finding itself. A model
+    that takes inputs from a file is tried with columns that are made up."""
+    kinds = (checks for kind, checks in _CHECKS.items() if isinstance(component, kind))
+    checks = next(kinds, None)
     if checks is None:
         yield Finding(
             name,
@@ -92,34 +94,43 @@ def check_component(name: str, component: Any) -> Iterator[Finding]:
     if isinstance(component, Noise):
         component = component.completed(_USUAL_NOISE)
     for check in (describes_itself, *checks):
-        complaint, inapplicable = "", None
-        try:
-            with np.errstate(all="ignore"):
-                inapplicable = check(component)
-        except (AssertionError, UserError) as error:
-            complaint = str(error) or "it does not"
-        except Exception as error:
-            complaint = f"it raises {describe_exception(error)}"
-            if "read-only" in complaint:
-                complaint = f"it raises {place_of(error)}"
-        note = f"does not apply, {inapplicable}" if inapplicable else ""
-        yield Finding(name, (check.__doc__ or "").splitlines()[0].rstrip("."), complaint, note)
+        promise = (check.__doc__ or "").splitlines()[0].rstrip(".")
+        yield replace(_outcome(check, component), component=name, check=promise)
+
+
+def _outcome(check: Callable[[Any], str | None], component: Any) -> Finding:
+    """Makes a check, of which nothing but its outcome is told."""
+    try:
+        with np.errstate(all="ignore"):
+            inapplicable = check(component)
+    except (AssertionError, UserError) as error:
+        return Finding("", "", complaint=str(error) or "it does not")
+    except Exception as error:
+        said = describe_exception(error)
+        # Where it writes into what it is given is what its author has to find.
+        if "read-only" in said:
+            said = place_of(error)
+        return Finding("", "", complaint=f"it raises {said}")
+    return Finding("", "", note=f"does not apply, {inapplicable}" if inapplicable else "")
 
 
 def check_option(option: Option) -> Iterator[Finding]:
-    """Runs the checks on the component that an option of a plugin describes; of an experiment only its file is read."""
+    """Runs the checks on the component that an option of a plugin describes; of an experiment only
+    its file is read."""
     name = f"{option.group}={option.name}"
     if option.fault is not None or option.group not in COMPONENT_GROUPS:
         yield Finding(name, "Has a config that can be read", option.fault or "")
         return
     try:
         config = composed(option)
-        if required := _required(config, option.package or option.group):
+        where = option.package or option.group
+        required = _required(config, where)
+        if required:
             yield Finding(
                 name, f"Names what is to be given, {', '.join(required)}, and is tried where it is"
             )
             return
-        yield from check_component(name, construct(config, option.package or option.group))
+        yield from check_component(name, construct(config, where))
     except UserError as error:
         yield Finding(name, "Can be made from its config", str(error))
     except Exception as error:
@@ -132,26 +143,23 @@ def check_option(option: Option) -> Iterator[Finding]:
 def left_of_skeleton(options: Sequence[Option]) -> Iterator[Finding]:
     """Finds the texts of `ipe-bench new` that authors replace, in the packages of these options."""
     homes = dict.fromkeys(option.source.conf.parent for option in options)
-    for path in (
-        p for home in homes for p in sorted(home.rglob("*")) if p.suffix in (".py", ".yaml")
-    ):
-        for number, line in enumerate(
-            path.read_text(encoding="utf-8", errors="replace").splitlines(), 1
-        ):
-            if found := _PLACEHOLDER.search(line):
-                note = f'line {number} still says "{found[0].strip()}": say what yours is'
-                yield Finding(path.name, "Describes itself", note=note)
+    for home in homes:
+        for path in [p for p in sorted(home.rglob("*")) if p.suffix in (".py", ".yaml")]:
+            lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+            for number, line in enumerate(lines, 1):
+                found = _PLACEHOLDER.search(line)
+                if found:
+                    note = f'line {number} still says "{found[0].strip()}": say what yours is'
+                    yield Finding(path.name, "Describes itself", note=note)
 
 
 def _required(config: dict[str, Any], where: str) -> list[str]:
     """Returns the options without a value for which the class has no default."""
     if "???" not in config.values():
         return []
-    return [
-        f.name
-        for f in fields(find_class(config[TARGET], where))
-        if config.get(f.name) == "???" and f.default is f.default_factory
-    ]
+    options = fields(find_class(config[TARGET], where))
+    without = [f.name for f in options if f.default is f.default_factory]
+    return [name for name in without if config.get(name) == "???"]
 
 
 def describes_itself(component: Any) -> None:
@@ -166,15 +174,17 @@ def describes_itself(component: Any) -> None:
 
 
 def _shaped(what: str, value: Any, wanted: tuple[int, ...], meaning: str = "") -> None:
+    shape = np.shape(value)
     expected = f"{meaning}, which is {wanted} here" if meaning else f"{wanted}"
-    assert np.shape(value) == wanted, f"{what} has shape {np.shape(value)}, and not {expected}"
+    assert shape == wanted, f"{what} has shape {shape}, and not {expected}"
 
 
 # Estimators
 
 
 def _scenario(estimator: Estimator, strength: float = 0.005) -> Scenario:
-    """Returns a mildly bent polynomial model; for estimators that need differential equations a short epidemic."""
+    """Returns a mildly bent polynomial model; for estimators that need differential equations a
+    short epidemic."""
     if "differential equations" in estimator.needs:
         return Scenario(Sir(), Gaussian(5.0), error_scale=0.5, seed=5)
     return Scenario(Polynomial(strength=strength), Gaussian(0.01), seed=5)
@@ -204,7 +214,8 @@ def steps_to_a_state(estimator: Estimator) -> str | None:
 def finds_the_parameters(estimator: Estimator) -> None:
     """Recovers the parameters of a mildly bent model, with covariances that agree with the scatter of its estimates."""
     scenario = _scenario(estimator, strength=0.0005)
-    drawn, n = scenario.draw(0, SCATTERED), scenario.measurement.n
+    drawn = scenario.draw(0, SCATTERED)
+    n = scenario.measurement.n
     estimates = estimator.estimate(scenario.problem, drawn.z)
     assert isinstance(estimates, Estimates), (
         f"estimate returns {type(estimates).__name__}, and not Estimates"
@@ -218,23 +229,26 @@ def finds_the_parameters(estimator: Estimator) -> None:
     P = estimates.covariance
     if P is not None:
         _shaped("covariance", P, (SCATTERED, n, n), "(trials, n, n)")
-        known = (estimates.status == Status.CONVERGED) & np.isfinite(P).all(axis=(1, 2))
+        known = np.isfinite(P).all(axis=(1, 2))
+        known &= estimates.status == Status.CONVERGED
         if known.sum() >= SCATTERED // 2:
             _agrees("the reported variances are", nees(error, P)[known], n)
 
 
 def _bound(problem: Problem) -> Array:
-    """The standard deviations (n,) of the linear bound."""
+    """Computes the standard deviations (n,) of the linear bound (H' R^-1 H)^-1."""
     H = problem.R.whiten_jacobian(problem.H)
     return np.sqrt(np.diag(np.linalg.inv(H.T @ H)))
 
 
 def _agrees(what: str, squared: Array, n: int) -> None:
-    """Tells whether the mean NEES of trials (trials,) is about n."""
-    ratio = float(squared.mean()) / n
-    size = f"{max(ratio, 1 / ratio):.3g} times too {'small' if ratio > 1 else 'large'}"
+    """Tells whether the mean NEES of trials (trials,) is about n: E[e' P^-1 e] = n where the
+    reported P is that of the errors e."""
+    mean = float(squared.mean())
+    ratio = mean / n
+    times = f"{ratio:.3g} times too small" if ratio > 1 else f"{1 / ratio:.3g} times too large"
     assert 0.5 < ratio < 2, (
-        f"{what} {size}: the mean NEES of {len(squared)} trials is {n * ratio:.3g} for {n} numbers"
+        f"{what} {times}: the mean NEES of {len(squared)} trials is {n * ratio:.3g} for {n} numbers"
     )
 
 
@@ -249,16 +263,20 @@ def answers_alike(estimator: Estimator) -> None:
     for i in range(len(z)):
         alone = estimator.estimate(problem, z[i : i + 1])
         for name in ("x", "status", "iterations", "simulations", "covariance"):
-            a, b = getattr(whole, name), getattr(alone, name)
-            remedy = "more than rounding: what it does to a trial must not depend on the others of the batch"
-            if a is not None and np.allclose(
-                a[i], b[0], rtol=_ROUND_OFF, atol=_ROUND_OFF, equal_nan=True
-            ):
-                remedy = (
-                    "rounding alone: use stacked matmul, einsum or batched solve, one per trial"
-                )
-            same = a is None or np.array_equal(a[i], b[0], equal_nan=True)
-            assert same, f"{name} of trial {i} differs, by {remedy}"
+            together = getattr(whole, name)
+            if together is not None:
+                _same_bits(f"{name} of trial {i}", together[i], getattr(alone, name)[0])
+
+
+def _same_bits(what: str, together: Array, alone: Array) -> None:
+    """Tells whether an answer depends on the batch, and whether by round-off alone."""
+    remedy = (
+        "more than rounding: what it does to a trial must not depend on the others of the batch"
+    )
+    if np.allclose(together, alone, rtol=_ROUND_OFF, atol=_ROUND_OFF, equal_nan=True):
+        remedy = "rounding alone: use stacked matmul, einsum or batched solve, one per trial"
+    same = np.array_equal(together, alone, equal_nan=True)
+    assert same, f"{what} differs, by {remedy}"
 
 
 @dataclass(frozen=True)
@@ -275,12 +293,16 @@ class _Circular(Polynomial):
 def turns_with_its_angles(estimator: Estimator) -> str | None:
     """Gives the same estimate whatever whole turns are added to readings that are angles."""
     scenario = Scenario(_Circular(), Gaussian(0.01), seed=5)
-    if why := estimator.hindrance(scenario.problem):
+    problem = scenario.problem
+    why = estimator.hindrance(problem)
+    if why:
         return f"it {why}"
     z = scenario.draw(0, TRIALS).z
-    turned = z + _TURN * np.random.default_rng(5).integers(-1, 2, z.shape)
-    x, other = (estimator.estimate(scenario.problem, readings).x for readings in (z, turned))
-    apart = np.abs(other - x) / _bound(scenario.problem)
+    turns = np.random.default_rng(5).integers(-1, 2, z.shape)
+    turned = z + _TURN * turns
+    x = estimator.estimate(problem, z).x
+    other = estimator.estimate(problem, turned).x
+    apart = np.abs(other - x) / _bound(problem)
     remedy = "take residuals from z - model.near(model.simulate(x), z)"
     assert (apart < 8).all(), (
         f"whole turns move it by {apart.max():.3g} standard deviations of the bound: {remedy}"
@@ -292,14 +314,16 @@ def takes_process_noise(estimator: Estimator) -> str | None:
     if not isinstance(estimator, Sequential):
         return "it is no Sequential and has no process_noise"
     problem, z = _readings(estimator)
-    still, walking = (replace(estimator, process_noise=q).estimate(problem, z) for q in (0.0, 0.3))
+    still = replace(estimator, process_noise=0.0).estimate(problem, z)
+    walking = replace(estimator, process_noise=0.3).estimate(problem, z)
     message = "; ".join(dict.fromkeys(walking.messages.values()))
     assert (walking.status == Status.CONVERGED).all(), (
         f"with process_noise=0.3 trials end: {message}"
     )
-    P = [one.covariance for one in (still, walking) if one.covariance is not None]
-    assert len(P) == 2, "it reports no covariance"
-    small, large = (np.einsum("tii->ti", one).mean(axis=0) for one in P)
+    assert still.covariance is not None, "it reports no covariance"
+    assert walking.covariance is not None, "it reports no covariance"
+    small = np.einsum("tii->ti", still.covariance).mean(axis=0)
+    large = np.einsum("tii->ti", walking.covariance).mean(axis=0)
     assert (large > small).all(), (
         "with process_noise=0.3 a variance is not larger: add Q to P in predict"
     )
@@ -309,13 +333,14 @@ def a_bad_trial_disturbs_no_other(estimator: Estimator) -> None:
     """Ends a trial of NaN readings as a status, and leaves the others as they were."""
     problem, z = _readings(estimator)
     bad = np.arange(len(z)) == 2
-    before, after = (
-        estimate_safely(estimator, problem, zs) for zs in (z, np.where(bad[:, None], np.nan, z))
-    )
+    spoiled = np.where(bad[:, None], np.nan, z)
+    before = estimate_safely(estimator, problem, z)
+    after = estimate_safely(estimator, problem, spoiled)
     assert (after.status[bad] != Status.CONVERGED).all(), (
         "a trial of NaN readings counts as converged"
     )
-    assert np.array_equal(before.x[~bad], after.x[~bad], equal_nan=True), "the other trials changed"
+    same = np.array_equal(before.x[~bad], after.x[~bad], equal_nan=True)
+    assert same, "the other trials changed"
 
 
 def accounts_for_itself(estimator: Estimator) -> None:
@@ -327,7 +352,10 @@ def accounts_for_itself(estimator: Estimator) -> None:
     spent = cost(estimates.simulations, estimates.jacobians, problem.measurement.n)
     assert (spent > 0).all(), "simulations and jacobians are not counted"
     P = estimates.covariance
-    if P is not None and np.shape(P) == (*estimates.x.shape, estimates.x.shape[1]):
+    if P is None:
+        return
+    trials, n = estimates.x.shape
+    if np.shape(P) == (trials, n, n):
         P = P[np.isfinite(P).all(axis=(1, 2))]
         assert np.allclose(P, P.swapaxes(1, 2), rtol=1e-6), "a covariance is not symmetric"
         assert (np.diagonal(P, axis1=1, axis2=2) > 0).all(), "a variance is not positive"
@@ -336,7 +364,8 @@ def accounts_for_itself(estimator: Estimator) -> None:
 def keeps_a_history_if_asked(estimator: Estimator) -> str | None:
     """Returns the iterates that lead to the estimate, where it keeps any."""
     estimates = estimator.estimate(*_readings(estimator), history=True)
-    if (history := estimates.history) is None:
+    history = estimates.history
+    if history is None:
         return "it keeps none"
     assert len(history) == len(estimates.x), "history has not one entry per trial"
     for x, iterates in zip(estimates.x, history, strict=True):
@@ -350,13 +379,17 @@ def keeps_a_history_if_asked(estimator: Estimator) -> str | None:
 
 
 def _with_columns(model: Measurement) -> Measurement | None:
-    """Returns the model with columns of no particular numbers, about 1, or where those must be one number with that;
-    None where it makes no sense with either."""
-    count, rng = 2 * model.n + 4, np.random.default_rng(2)
-    numbers = [i.heading for i in model.inputs if i.default is None and not i.label]
-    varied = {name: rng.permutation(np.linspace(0.5, 1.5, count)).tolist() for name in numbers}
-    same = varied | dict.fromkeys(numbers[1:], [1.0] * count)
-    labels = {i.heading: [1 if i.default is None else i.default] * count for i in model.inputs}
+    """Returns the model with columns of no particular numbers, about 1, or where those must be one
+    number with that; None where it makes no sense with either."""
+    count = 2 * model.n + 4
+    rng = np.random.default_rng(2)
+    grid = np.linspace(0.5, 1.5, count)
+    required = [i.heading for i in model.inputs if i.default is None and not i.label]
+    varied = {name: rng.permutation(grid).tolist() for name in required}
+    same = varied | dict.fromkeys(required[1:], [1.0] * count)
+    labels = {}
+    for one in model.inputs:
+        labels[one.heading] = [1 if one.default is None else one.default] * count
     for columns in (labels | varied, labels | same):
         try:
             tried = model.with_inputs(columns, count)
@@ -370,7 +403,8 @@ def _with_columns(model: Measurement) -> Measurement | None:
 
 def _points(model: Measurement) -> Array:
     """Returns points a tenth of a unit around the nominal point, where every model makes sense."""
-    x = model.nominal + 0.1 * np.random.default_rng(11).standard_normal((4, model.n))
+    deviates = np.random.default_rng(11).standard_normal((4, model.n))
+    x = model.nominal + 0.1 * deviates
     x.flags.writeable = False
     return x
 
@@ -379,20 +413,14 @@ def names_its_readings(model: Measurement) -> None:
     """Has at least as many readings as parameters, each with its own label, and units."""
     assert model.m >= model.n, f"{model.m} readings are too few for {model.n} parameters"
     lengths = {name: len(column) for name, column in model.index.items()}
-    assert set(lengths.values()) == {model.m}, (
-        f"the columns of index have lengths {lengths}, and not {model.m}"
-    )
-    assert len(set(zip(*model.index.values(), strict=True))) == model.m, (
-        "two readings have one label in index"
-    )
+    right = set(lengths.values()) == {model.m}
+    assert right, f"the columns of index have lengths {lengths}, and not {model.m}"
+    labels = set(zip(*model.index.values(), strict=True))
+    assert len(labels) == model.m, "two readings have one label in index"
     assert len({p.name for p in model.parameters}) == model.n, "two parameters have one name"
     _shaped("nominal", model.nominal, (model.n,), "one number for each parameter")
-    _shaped(
-        "periods",
-        model.periods,
-        (model.m if len(model.periods) else 0,),
-        "one number for each reading",
-    )
+    if len(model.periods):
+        _shaped("periods", model.periods, (model.m,), "one number for each reading")
     assert (model.sizes > 0).all(), "a parameter's size is not above 0"
 
 
@@ -412,26 +440,36 @@ def simulates_batches(model: Measurement) -> None:
 def differentiates(model: Measurement) -> None:
     """Has the Jacobian that differences of its readings show."""
     x = _points(model)
-    J, differences = model.jacobian(x), differentiate(model.simulate, x, analytic=False)
+    J = model.jacobian(x)
+    differences = differentiate(model.simulate, x, analytic=False)
     _shaped("what jacobian returns", J, (len(x), model.m, model.n), "(trials, m, n)")
     # Differences cannot tell more than the round-off of h over their step.
-    round_off = 10 * np.finfo(float).eps ** (2 / 3) * np.abs(model.simulate(x)).max()
+    readings = np.abs(model.simulate(x)).max()
+    round_off = 10 * np.finfo(float).eps ** (2 / 3) * readings
     largest = np.abs(differences).max(axis=1, keepdims=True) + 1e-300
-    off = np.nan_to_num(np.maximum(np.abs(J - differences) - round_off, 0.0) / largest, nan=np.inf)
-    t, i, j = _largest(off)
-    reading = ", ".join(f"{name}={column[i]}" for name, column in model.index.items())
+    excess = np.maximum(np.abs(J - differences) - round_off, 0.0)
+    off = np.nan_to_num(excess / largest, nan=np.inf)
+    at = _largest(off)
+    _, i, j = at
+    entries = [f"{name}={column[i]}" for name, column in model.index.items()]
     hint = ""
     if model.analytic and type(model).jacobian is Measurement.jacobian:
-        hint = "; `analytic` is set, so it is a complex step, which np.abs, np.sign, np.maximum and the like do not "
-        hint += "survive: write np.where(u.real < 0, -u, u) for np.abs(u), or leave `analytic` out"
-    assert off[t, i, j] < 1e-5, (
-        f"it is off by {off[t, i, j]:.1e} of a column's largest entry, most for parameter {model.parameters[j].name} "
-        f"in reading {reading}: it says {J[t, i, j]:.6g}, and differences {differences[t, i, j]:.6g}{hint}"
+        hint = (
+            "; `analytic` is set, so it is a complex step, which np.abs, np.sign, np.maximum and"
+            " the like do not survive: write np.where(u.real < 0, -u, u) for np.abs(u), or leave"
+            " `analytic` out"
+        )
+    assert off[at] < 1e-5, (
+        f"it is off by {off[at]:.1e} of a column's largest entry, most for parameter"
+        f" {model.parameters[j].name} in reading {', '.join(entries)}: it says {J[at]:.6g}, and"
+        f" differences {differences[at]:.6g}{hint}"
     )
 
 
 def _largest(values: Array) -> tuple[int, ...]:
-    return tuple(int(k) for k in np.unravel_index(int(values.argmax()), values.shape))
+    """Finds the place of the largest value."""
+    place = np.unravel_index(int(values.argmax()), values.shape)
+    return tuple(int(k) for k in place)
 
 
 def orders_its_epochs(model: Measurement) -> str | None:
@@ -440,19 +478,16 @@ def orders_its_epochs(model: Measurement) -> str | None:
         return "it has no epochs"
     rows = np.sort(np.concatenate(model.epochs))
     assert np.array_equal(rows, np.arange(model.m)), "the epochs do not hold every reading once"
-    x, stop = _points(model), max(1, len(model.epochs or ()) // 2)
+    x = _points(model)
+    stop = max(1, len(model.epochs) // 2)
     whole = model.simulate(x)[:, model.rows(stop)]
-    prefix, coarse, largest = (
-        model.simulate_until(x, stop),
-        model.coarse_simulate_until(x, stop),
-        np.abs(whole).max(),
-    )
-    assert np.allclose(prefix, whole, rtol=1e-12, atol=1e-12 * largest), (
-        "a prefix differs from the whole"
-    )
-    assert np.allclose(coarse, whole, rtol=1e-3, atol=1e-3 * largest), (
-        "a coarse prefix is far from the whole"
-    )
+    largest = np.abs(whole).max()
+    prefix = model.simulate_until(x, stop)
+    coarse = model.coarse_simulate_until(x, stop)
+    same = np.allclose(prefix, whole, rtol=1e-12, atol=1e-12 * largest)
+    assert same, "a prefix differs from the whole"
+    near = np.allclose(coarse, whole, rtol=1e-3, atol=1e-3 * largest)
+    assert near, "a coarse prefix is far from the whole"
 
 
 # Noises and priors
@@ -463,31 +498,37 @@ def _repeatable(
 ) -> None:
     """Tells whether a function draws alike from one stream."""
     given.flags.writeable = False
-    first, second = (draw(given, np.random.default_rng(3)) for _ in range(2))
+    first = draw(given, np.random.default_rng(3))
+    second = draw(given, np.random.default_rng(3))
     _shaped(f"what {name} returns", first, given.shape)
     assert np.array_equal(first, second), "it uses randomness besides the stream that it is given"
 
 
 def _scatter_as_stated(w: Array, C: Array, slack: float, noun: str) -> None:
-    """Tells whether draws w (draws, k) in stated deviations have mean zero and the correlations C (k, k), but for the
-    slack and for what chance does."""
-    products, chance = w[:, :, None] * w[:, None, :], 6 / np.sqrt(len(w))
-    mean, moments = np.abs(w.mean(axis=0)), products.mean(axis=0)
-    off = np.abs(moments - C) - chance * products.std(axis=0)
+    """Tells whether draws w (draws, k) in stated deviations have mean zero and the correlations C
+    (k, k), but for the slack and for what chance does: six standard errors."""
+    chance = 6 / np.sqrt(len(w))
+    mean = np.abs(w.mean(axis=0))
     near = (mean < slack + chance * w.std(axis=0)).all()
     assert near, f"the mean of the draws is off by up to {mean.max():.3g} of the stated deviation"
-    i, (j, k) = int(np.diag(off).argmax()), _largest(off)
-    assert off[i, i] <= slack, (
-        f"the draws of {noun} {i + 1} have {w[:, i].std():.3g} times the stated deviation"
-    )
-    said = f"the correlation {moments[j, k]:.2f}, and {C[j, k]:.2f} is stated"
-    assert off[j, k] <= slack, f"the draws of {noun}s {j + 1} and {k + 1} have {said}"
+    products = w[:, :, None] * w[:, None, :]
+    moments = products.mean(axis=0)
+    off = np.abs(moments - C) - chance * products.std(axis=0)
+    i = int(np.diag(off).argmax())
+    times = f"{w[:, i].std():.3g} times"
+    assert off[i, i] <= slack, f"the draws of {noun} {i + 1} have {times} the stated deviation"
+    at = _largest(off)
+    j, k = at
+    said = f"the correlation {moments[at]:.2f}, and {C[at]:.2f} is stated"
+    assert off[at] <= slack, f"the draws of {noun}s {j + 1} and {k + 1} have {said}"
 
 
 def _count(noise: Noise) -> int:
-    """Counts the readings that the noise is tried on: a few, or as many as an option that is a list has."""
-    lists = [getattr(noise, f.name) for f in fields(noise)]  # type: ignore[arg-type]
-    for m in (_READINGS, *(len(value) for value in lists if isinstance(value, tuple))):
+    """Counts the readings that the noise is tried on: a few, or as many as an option that is a list
+    has."""
+    options = [getattr(noise, f.name) for f in fields(noise)]  # type: ignore[arg-type]
+    lengths = [len(value) for value in options if isinstance(value, tuple)]
+    for m in (_READINGS, *lengths):
         with suppress(UserError):
             noise.covariance(m)
             return m
@@ -495,16 +536,19 @@ def _count(noise: Noise) -> int:
 
 
 def _draws(noise: Noise) -> bool:
-    """Tells whether the noise draws errors itself: readings are simulated, and R is neither estimated nor a model's."""
+    """Tells whether the noise draws errors itself: readings are simulated, and R is neither
+    estimated nor a model's."""
     return not (noise.real or noise.estimated or isinstance(noise, ModelNoise))
 
 
 def _errors(noise: Noise, draws: int, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Draws errors of the noise, also whitened by R (draws, m); h is spread over many steps of rounding."""
+    """Draws errors of the noise, also whitened by R (draws, m); h is spread over many steps of
+    rounding."""
     m = _count(noise)
     R = noise.covariance(m)
     h = rng.uniform(-1000.0, 1000.0, (draws, m)) * R.deviations
-    v = np.array([noise.corrupt(row.copy(), np.zeros(m), rng) - row for row in h])
+    z = np.array([noise.corrupt(row.copy(), np.zeros(m), rng) for row in h])
+    v = z - h
     return v, R.whiten(v)
 
 
@@ -517,9 +561,8 @@ def corrupts_reproducibly(noise: Noise) -> str | None:
     assert R.m == m, f"covariance({m}) is for {R.m} readings"
     assert (R.deviations > 0).all(), "a standard deviation is not above 0"
     if _draws(noise):
-        _repeatable(
-            "corrupt", np.linspace(-1.0, 1.0, m), lambda h, rng: noise.corrupt(h, np.zeros(m), rng)
-        )
+        h = np.linspace(-1.0, 1.0, m)
+        _repeatable("corrupt", h, lambda h, rng: noise.corrupt(h, np.zeros(m), rng))
 
 
 def draws_what_it_states(noise: Noise) -> str | None:
@@ -528,9 +571,8 @@ def draws_what_it_states(noise: Noise) -> str | None:
         return _NO_LAW
     v, _ = _errors(noise, DRAWS, np.random.default_rng(7))
     R = noise.covariance(v.shape[1])
-    _scatter_as_stated(
-        v / R.deviations, R.matrix() / np.outer(R.deviations, R.deviations), 0.02, "reading"
-    )
+    C = R.matrix() / np.outer(R.deviations, R.deviations)
+    _scatter_as_stated(v / R.deviations, C, 0.02, "reading")
 
 
 def states_its_law(noise: Noise) -> str | None:
@@ -544,11 +586,13 @@ def states_its_law(noise: Noise) -> str | None:
     stated = noise.whitened(w.shape, rng)
     law = rng.standard_normal(w.shape) if stated is None else stated
     words = "normal, since there is no `whitened`" if stated is None else "what `whitened` draws"
-    # Of each trial its chi-square, which is what the test of fit looks at, and one reading: trials are independent.
-    for what, found, said in (
-        ("reading", w[:, 0], law[:, 0]),
-        ("chi-square", (w**2).sum(1), (law**2).sum(1)),
-    ):
+    # Of each trial its chi-square, which is what the test of fit looks at, and one reading: trials
+    # are independent.
+    compared = {
+        "reading": (w[:, 0], law[:, 0]),
+        "chi-square": ((w**2).sum(1), (law**2).sum(1)),
+    }
+    for what, (found, said) in compared.items():
         p = float(tuple(ks_2samp(found, said))[1])  # type: ignore[arg-type]
         distributed = f"distributed as {words} (Kolmogorov-Smirnov, p = {p:.1g})"
         assert p > _IMPROBABLE, f"the {what} of whitened errors is not {distributed}"
@@ -556,14 +600,18 @@ def states_its_law(noise: Noise) -> str | None:
 
 def _point(prior: Prior) -> Array:
     """Returns a point of four parameters, or as many as the prior is made for."""
-    n = len(getattr(prior, "deviations", None) or getattr(prior, "correlations", None) or range(4))
-    return np.linspace(-1.0, 1.0, n)
+    for name in ("deviations", "correlations"):
+        options = getattr(prior, name, None)
+        if options:
+            return np.linspace(-1.0, 1.0, len(options))
+    return np.linspace(-1.0, 1.0, 4)
 
 
 def states_its_deviations(prior: Prior) -> None:
     """States a standard deviation for each parameter, which grows with the error scale."""
     n = len(_point(prior))
-    deviation, tenfold = (np.asarray(prior.deviation(n, scale)) for scale in (1.0, 10.0))
+    deviation = np.asarray(prior.deviation(n, 1.0))
+    tenfold = np.asarray(prior.deviation(n, 10.0))
     _shaped("what deviation returns", deviation, (n,))
     assert np.isfinite(deviation).all(), "a deviation is not finite"
     assert (deviation >= 0).all(), "a deviation is negative"
@@ -582,15 +630,19 @@ def draws_what_is_told(prior: Prior) -> None:
     so."""
     from scipy.stats import kstest
 
-    x0, rng = _point(prior), np.random.default_rng(7)
-    n, deviation = len(x0), np.asarray(prior.deviation(len(x0), 2.0))
-    stated, varies = prior.correlation(n), deviation > 0
+    x0 = _point(prior)
+    rng = np.random.default_rng(7)
+    n = len(x0)
+    deviation = np.asarray(prior.deviation(n, 2.0))
+    varies = deviation > 0
+    stated = prior.correlation(n)
     C = np.eye(n) if stated is None else stated
     _shaped("what correlation returns", C, (n, n))
     C = C[np.ix_(varies, varies)]
-    x = np.array([prior.draw(x0.copy(), 2.0, rng) for _ in range(DRAWS)]) - x0
-    assert not x[:, ~varies].any(), "a parameter of deviation 0 varies"
-    w = x[:, varies] / deviation[varies]
+    x = np.array([prior.draw(x0.copy(), 2.0, rng) for _ in range(DRAWS)])
+    away = x - x0
+    assert not away[:, ~varies].any(), "a parameter of deviation 0 varies"
+    w = away[:, varies] / deviation[varies]
     _scatter_as_stated(w, C, 0.0, "parameter")
     p = min(float(kstest(column, "norm").pvalue) for column in w.T)
     assert not prior.normal or p > _IMPROBABLE, (
@@ -608,35 +660,41 @@ def suits_itself(model: StateModel) -> None:
 
 def moves_batches(model: StateModel) -> None:
     """Moves and reads a stack of states as one by one, bit for bit, and analytically: slopes are complex steps."""
-    x, k = StateModel.draw(model, 0, 4).x[:, -1], model.epochs - 1
+    x = StateModel.draw(model, 0, 4).x[:, -1]
+    k = model.epochs - 1
     by_state = {"gain_at": model.gain_by_state, "R_at": model.R_by_state}
-    for name in ("transition", "observe", *(name for name, varies in by_state.items() if varies)):
+    varying = [name for name, varies in by_state.items() if varies]
+    for name in ("transition", "observe", *varying):
         function = getattr(model, name)
         values = function(x, k)
         alone = np.concatenate([function(one[None], k) for one in x])
-        assert np.array_equal(values, alone), (
-            f"{name} gives a state alone other bits: compute each by itself"
-        )
-        if name in by_state:
-            continue
-        exact, rough = (
-            differentiate(lambda u, f=function: f(u, k), x, analytic=how) for how in (True, False)
-        )
-        close = np.allclose(exact, rough, rtol=1e-4, atol=1e-6 * np.abs(rough).max())
-        assert close, (
-            f"{name} is not analytic: write np.where(u.real < 0, -u, u) for np.abs(u), and the like"
-        )
+        same = np.array_equal(values, alone)
+        assert same, f"{name} gives a state alone other bits: compute each by itself"
+        if name not in by_state:
+            _require_analytic(name, lambda u, f=function: f(u, k), x)
+
+
+def _require_analytic(name: str, function: Callable[[Array], Array], x: Array) -> None:
+    """Tells whether complex steps find the slopes that differences find."""
+    exact = differentiate(function, x, analytic=True)
+    rough = differentiate(function, x, analytic=False)
+    largest = np.abs(rough).max()
+    assert np.allclose(exact, rough, rtol=1e-4, atol=1e-6 * largest), (
+        f"{name} is not analytic: write np.where(u.real < 0, -u, u) for np.abs(u), and the like"
+    )
 
 
 def is_recorded(model: StateModel) -> str | None:
     """Has the same transition and readings along whole paths, recorded and compiled, as epoch by epoch."""
-    x, whys = StateModel.draw(model, 0, 4).x, []
+    x = StateModel.draw(model, 0, 4).x
+    whys = []
     for name, functions in zip(("transition", "observe"), model.epoch_functions, strict=True):
         if functions.why:
             whys.append(f"{name} runs epoch by epoch: {functions.why}")
             continue
         for k in filter(model.moves, range(model.epochs)):
-            same = agree(functions.at[k](x[:, k]), getattr(model, name)(x[:, k], k))
+            here = x[:, k]
+            same = agree(functions.at[k](here), getattr(model, name)(here, k))
             assert same, f"{name} of epoch {k + 1} is not as recorded; mend `alike`"
     return "; ".join(whys) or None
 
@@ -644,19 +702,19 @@ def is_recorded(model: StateModel) -> str | None:
 def wraps_its_angles(model: StateModel) -> None:
     """States the periods of readings and states that jump by a whole turn."""
     x = StateModel.draw(model, 0, TRIALS).x[:, -1]
-    ways = np.linspace(
-        x, -np.roll(x, 1, axis=0), 2001
-    )  # from each state to the far side of another
+    # From each state to the far side of another.
+    ways = np.linspace(x, -np.roll(x, 1, axis=0), 2001)
     sides = (
         ("reading", model.observe, model.periods),
         ("state", model.transition, model.state_periods),
     )
     for what, function, periods in sides:
-        steps = np.abs(np.diff(function(ways, model.epochs - 1), axis=0)).max(axis=(0, 1))
-        for i, (step, period) in enumerate(
-            zip(steps, periods or np.zeros(len(steps)), strict=True)
-        ):
-            turns = any(0.98 * turn < step < 1.02 * turn for turn in (2 * np.pi, 360.0))
+        values = function(ways, model.epochs - 1)
+        steps = np.abs(np.diff(values, axis=0)).max(axis=(0, 1))
+        if not len(periods):
+            periods = np.zeros(len(steps))
+        for i, (step, period) in enumerate(zip(steps, periods, strict=True)):
+            turns = [turn for turn in (2 * np.pi, 360.0) if 0.98 * turn < step < 1.02 * turn]
             assert period or not turns, (
                 f"{what} {i + 1} jumps by {step:.3g}: it is an angle; state its period"
             )
@@ -671,10 +729,10 @@ def tracks_its_trials(tracker: Tracker) -> None:
     _shaped("mean", tracks.mean, paths.x.shape)
     _shaped("covariance", tracks.covariance, (*paths.x.shape, model.n))
     alone = tracker.track(model, paths.z[:1])
-    assert np.array_equal(alone.mean[0], tracks.mean[0], equal_nan=True), (
-        "trial 0 alone has other bits than in a batch"
-    )
-    last = nees((tracks.mean - paths.x)[:, -1], tracks.covariance[:, -1])
+    same = np.array_equal(alone.mean[0], tracks.mean[0], equal_nan=True)
+    assert same, "trial 0 alone has other bits than in a batch"
+    error = tracks.mean[:, -1] - paths.x[:, -1]
+    last = nees(error, tracks.covariance[:, -1])
     _agrees("the reported variances of the last epoch are", last, model.n)
 
 
@@ -692,15 +750,15 @@ def does_every_task(execution: Execution) -> None:
     """Tells of every step of every task in order, once of its end, and of a task that raises as a failure."""
     told = _told(execution)
     for i, right in _told(Serial()).items():
-        assert told[i] == right, (
-            f"of task {i} it reports {', '.join(told[i]) or 'nothing'}; right is {', '.join(right)}"
-        )
+        reported = ", ".join(told[i]) or "nothing"
+        assert told[i] == right, f"of task {i} it reports {reported}; right is {', '.join(right)}"
 
 
 def _told(execution: Execution) -> dict[int, list[str]]:
     """Returns what an execution reports of a task that raises and of others, by task."""
     found: dict[int, list[str]] = {0: [], 1: [], 2: []}
-    for event in execution.run(_work, (range(3), ValueError("wrong"), range(0))):
+    tasks = (range(3), ValueError("wrong"), range(0))
+    for event in execution.run(_work, tasks):
         end = "end" if event.failure is None else f"a Failure {event.failure.message}"
         found[event.index].append(end if event.ended else f"step {event.step}")
     return found

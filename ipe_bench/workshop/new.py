@@ -25,7 +25,8 @@ ALONE = {
 
 
 def new(kind: str, name: str, language: str | None = None) -> str:
-    """Writes plugins/NAME in the working folder, or the file of a model; returns what to try next."""
+    """Writes plugins/NAME in the working folder, or the file of a model; returns what to try
+    next."""
     added = plugins.kinds_to_copy()
     if kind in added:
         return copy_kind(kind, added[kind], name, language)
@@ -39,13 +40,9 @@ def new(kind: str, name: str, language: str | None = None) -> str:
     group = "baseline" if kind == "filter" else kind
     _check_name(group, name)
     if kind in ALONE:
-        file, choice = (text.format(name=name) for text in ALONE[kind])
-        require_absent(Path(file))
-        fill(Path(file), f"{kind}{Path(file).suffix}", {"name": name})
-        noise = "noise=gaussian noise.deviation=0.01 " if kind == "function" else ""
-        tried = f"ipe-bench run {choice} {noise}error_scale=0.1 trials=100"
-        return f"{file} is ready. Try:\n  ipe-bench check {choice}\n  {tried}"
-    folder, package = Path("plugins") / name, f"ipe_bench_{name}"
+        return _new_file(kind, name)
+    folder = Path("plugins") / name
+    package = f"ipe_bench_{name}"
     require_absent(folder)
     class_name = "".join(part.title() for part in name.split("_"))
     words = {
@@ -68,14 +65,28 @@ def new(kind: str, name: str, language: str | None = None) -> str:
         del texts[f"{package}/{name}.py"]
     for target, source in texts.items():
         fill(folder / target, source, words)
+    tried = f"ipe-bench run {_choice(group, name)}trials=100"
+    return f"{folder} is ready. Try:\n  ipe-bench check {folder}\n  {tried}"
+
+
+def _choice(group: str, name: str) -> str:
+    """Returns the words by which a run takes the option."""
     choices = {"solver": f'"solver=[{name}]" ', "baseline": f'"baseline=[{name}]" '}
     choices |= {"experiment": f"+experiment={name} ", **dict.fromkeys(RECORDS, "")}
     choices["tracker"] = f'state_model=pendulum "tracker=[{name}]" '
     choices["figure"] = "figures=all "  # the figures of main are chosen among our own
-    choose = choices.get(group, f"{group}={name} ")
-    return (
-        f"{folder} is ready. Try:\n  ipe-bench check {folder}\n  ipe-bench run {choose}trials=100"
-    )
+    return choices.get(group, f"{group}={name} ")
+
+
+def _new_file(kind: str, name: str) -> str:
+    """Writes a model that is one file."""
+    file, choice = (text.format(name=name) for text in ALONE[kind])
+    path = Path(file)
+    require_absent(path)
+    fill(path, f"{kind}{path.suffix}", {"name": name})
+    noise = "noise=gaussian noise.deviation=0.01 " if kind == "function" else ""
+    tried = f"ipe-bench run {choice} {noise}error_scale=0.1 trials=100"
+    return f"{file} is ready. Try:\n  ipe-bench check {choice}\n  {tried}"
 
 
 def copy_kind(kind: str, home: Path, name: str, language: str | None) -> str:
@@ -85,16 +96,17 @@ def copy_kind(kind: str, home: Path, name: str, language: str | None) -> str:
     if languages and language not in languages:
         why = "is not given" if language is None else unknown(language, languages, "language")
         raise UserError(f"--language={language or ''}: {why}; choose one of {', '.join(languages)}")
-    sources = (home / kind, *([home / f"{kind}-{language}"] if language else ()))
-    texts = {
-        path: path.relative_to(source)
-        for source in sources
-        for path in source.rglob("*")
-        if path.is_file()
-    }
-    group = next(
-        (place.parts[2] for place in texts.values() if place.parts[1:2] == ("conf",)), kind
-    )
+    sources = [home / kind]
+    if languages:
+        sources.append(home / f"{kind}-{language}")
+    texts = {}
+    for source in sources:
+        for path in source.rglob("*"):
+            if path.is_file():
+                texts[path] = path.relative_to(source)
+    # The group is the folder of its config.
+    groups = (place.parts[2] for place in texts.values() if place.parts[1:2] == ("conf",))
+    group = next(groups, kind)
     _check_name(group, name)
     folder = Path("plugins") / name
     require_absent(folder)
@@ -115,9 +127,8 @@ def require_absent(path: Path) -> None:
 def fill(path: Path, source: str, words: Mapping[str, str]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     template = files("ipe_bench.workshop") / "templates" / f"{source}.template"
-    path.write_text(
-        Template(template.read_text(encoding="utf-8")).substitute(words), encoding="utf-8"
-    )
+    text = Template(template.read_text(encoding="utf-8"))
+    path.write_text(text.substitute(words), encoding="utf-8")
 
 
 def _check_name(group: str, name: str) -> None:

@@ -23,14 +23,14 @@ from ipe_bench.workshop.conformance import Finding
 
 
 def check_records(options: Sequence[Option]) -> list[Finding]:
-    """Checks what each of these options adds to the reports on a small sweep and on a single trial."""
+    """Checks what each of these options adds to the reports on a small sweep and on a single
+    trial."""
     if not options:
         return []
     problems = use_statistics()
     # The fixed point fails at the largest scale.
-    scenarios = [
-        Scenario(Polynomial(), Gaussian(0.01), error_scale=scale) for scale in (1.0, 10.0, 100.0)
-    ]
+    scales = (1.0, 10.0, 100.0)
+    scenarios = [Scenario(Polynomial(), Gaussian(0.01), error_scale=scale) for scale in scales]
     estimators = {
         "linear_lse": LinearLSE(),
         "fixed_point": FixedPoint(),
@@ -46,13 +46,15 @@ def check_records(options: Sequence[Option]) -> list[Finding]:
                 drawing.save(Path(folder, str(number)))
             problems += analysis.collection.extra_problems
     findings = []
-    for name in (f"{option.group}={option.name}" for option in options):
-        own = [line.removeprefix(f"{name}: ") for line in problems if line.startswith(f"{name}: ")]
+    for option in options:
+        name = f"{option.group}={option.name}"
+        own = [line for line in problems if line.startswith(f"{name}: ")]
+        complaints = [line.removeprefix(f"{name}: ") for line in own[:1]]
         findings.append(
             Finding(
                 name,
                 "Is part of reports on a small sweep and on a single trial",
-                "; ".join(own[:1]),
+                "; ".join(complaints),
             )
         )
     return findings

@@ -1,5 +1,5 @@
-"""Writes the pages by which a coding agent writes plugins; `run` is the
-command line, which tries what the pages say."""
+"""Writes the pages by which a coding agent writes plugins; `run` is the command line, which tries
+what the pages say."""
 
 from __future__ import annotations
 
@@ -39,69 +39,63 @@ PAGES["figure"] = PAGES["figure"].replace("figures=none", "figures=all")
 
 
 def write_skill(folder: Path, run: Callable[[list[str]], int]) -> list[Path]:
-    """Writes SKILL.md and a page for each kind into a new folder, by which a coding agent writes plugins; `run` is the
-    command line, which tries what the pages say."""
+    """Writes SKILL.md and a page for each kind into a new folder, by which a coding agent writes
+    plugins; `run` is the command line, which tries what the pages say."""
     require_absent(folder)
     folder = folder.resolve()
     with tempfile.TemporaryDirectory(prefix="ipe-bench-") as place, contextlib.chdir(place):
-        plugins.sources.cache_clear()  # no plugins are known there but those that are installed or made
-        known = [
-            f"- {group}: {', '.join(o.name for o in plugins.options(group))}"
-            for group in plugins.groups()
-        ]
+        # No plugins are known there but those that are installed or made.
+        plugins.sources.cache_clear()
+        known = [f"- {group}: {_options(group)}" for group in plugins.groups()]
         texts = {f"new-{kind}": _page(kind, run) for kind in PAGES}
     plugins.sources.cache_clear()
     pages = [f"- a new {kind}: `new-{kind}.md`" for kind in PAGES]
-    words = {"version": ib.__version__, "bent": BENT, "small": SMALL}
-    fill(
-        folder / "SKILL.md",
-        "skill.md",
-        {**words, "pages": "\n".join(pages), "options": "\n".join(known)},
-    )
+    words = {
+        "version": ib.__version__,
+        "bent": BENT,
+        "small": SMALL,
+        "pages": "\n".join(pages),
+        "options": "\n".join(known),
+    }
+    fill(folder / "SKILL.md", "skill.md", words)
     for name, text in texts.items():
         (folder / f"{name}.md").write_text(text, encoding="utf-8")
     return sorted(folder.iterdir())
 
 
+def _options(group: str) -> str:
+    return ", ".join(option.name for option in plugins.options(group))
+
+
 def _page(kind: str, run: Callable[[list[str]], int]) -> str:
-    """Returns instructions for a component of a kind: its contract, the skeleton, and what `check` tests."""
+    """Returns instructions for a component of a kind: its contract, the skeleton, and what `check`
+    tests."""
     name = f"my_{kind}"
-    tried = [
-        line.strip()
-        for line in _said(f"new {kind} {name}", run).splitlines()
-        if "ipe-bench check" in line
-    ]
+    made = f"new {kind} {name}"
+    tried = [line.strip() for line in _said(made, run) if "ipe-bench check" in line]
     check = tried[0].removeprefix("ipe-bench ")
-    promises = [
-        line.partition(": ")[2] for line in _said(check, run).splitlines() if line.startswith("ok")
-    ]
+    kept = [line for line in _said(check, run) if line.startswith("ok")]
+    promises = [f"- {line.partition(': ')[2]}" for line in kept]
     lines = [f"# A new {kind}", ""]
-    lines += [f"    ipe-bench {command}" for command in (f"new {kind} {name}", check, PAGES[kind])]
+    lines += [f"    ipe-bench {command}" for command in (made, check, PAGES[kind])]
     for place in plugins.CONTRACTS.get(kind, ()):
-        lines += [
-            "",
-            f"The contract of `{place}`:",
-            "",
-            "```text",
-            inspect.getdoc(resolve_name(place)) or "",
-            "```",
-        ]
-    for path in (p for p in sorted(Path().rglob(f"{name}.*")) if p.suffix in (".py", ".yaml")):
-        lines += [
-            "",
-            f"`{path}`",
-            "",
-            f"```{path.suffix[1:]}",
-            path.read_text(encoding="utf-8").strip(),
-            "```",
-        ]
-    return "\n".join(
-        [*lines, "", "`check` asks of it:", "", *(f"- {promise}" for promise in promises), ""]
-    )
+        contract = inspect.getdoc(resolve_name(place)) or ""
+        lines += ["", f"The contract of `{place}`:", *_fenced("text", contract)]
+    files = [path for path in sorted(Path().rglob(f"{name}.*")) if path.suffix in (".py", ".yaml")]
+    for path in files:
+        content = path.read_text(encoding="utf-8").strip()
+        lines += ["", f"`{path}`", *_fenced(path.suffix[1:], content)]
+    lines += ["", "`check` asks of it:", "", *promises, ""]
+    return "\n".join(lines)
 
 
-def _said(command: str, run: Callable[[list[str]], int]) -> str:
+def _fenced(language: str, text: str) -> list[str]:
+    return ["", f"```{language}", text, "```"]
+
+
+def _said(command: str, run: Callable[[list[str]], int]) -> list[str]:
+    """Returns the lines that a command prints."""
     with contextlib.redirect_stdout(io.StringIO()) as out:
         code = run(shlex.split(command))
     assert code == 0, f"{command}: {out.getvalue()}"
-    return out.getvalue()
+    return out.getvalue().splitlines()
