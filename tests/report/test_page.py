@@ -208,6 +208,21 @@ def test_a_phone_never_scrolls_the_page_sideways(browser, page_file):
     assert browser.run(f"{box}.getBoundingClientRect().right") <= 390
 
 
+def test_matrices_stand_side_by_side_and_below_each_other_on_a_phone(browser, tmp_path):
+    store = Synthetic(tmp_path)
+    for sigma in (1.25, 2.25, 3.25, 4.25, 5.25):
+        fill(store, sigma=sigma, trials=30, scales=(1.0, 10.0), labels=("one", "two"))
+    page = write_report([store.directory], store.directory).report
+    lefts = "Array.from(document.querySelectorAll('.matrix'), m => m.getBoundingClientRect().left)"
+    browser.go(page)
+    assert len(set(browser.run(lefts))) > 1
+    browser.go(page, 390, 844, phone=True)
+    assert len(browser.run(lefts)) == 5
+    assert len(set(browser.run(lefts))) == 1
+    assert browser.run("document.querySelectorAll('p.files a').length") == 5
+    assert browser.run("document.documentElement.scrollWidth") <= 390
+
+
 def test_title_matrix_and_figure_stand_on_the_first_printed_page(browser, tmp_path):
     """An A4 page upright: 210 by 297 mm less two margins of 12 mm, at 96 pixels an inch."""
     width, height = (round((side - 24) / 25.4 * 96) for side in (210, 297))
