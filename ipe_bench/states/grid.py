@@ -139,7 +139,7 @@ class _Densities(NamedTuple):
 
 
 def _smooth(model: StateModel, grids: Array, kept: list[_Densities], out: Tracks) -> None:
-    """Passes back from the last epoch (Kitagawa, 1987, eq. 2.9):
+    """Passes back from the last epoch (Kitagawa, 1987):
 
     p(x_k | z) = p(x_k | z_1..k) integral of p(x_k+1 | x_k) p(x_k+1 | z) / p(x_k+1 | z_1..k) dx_k+1
     """
