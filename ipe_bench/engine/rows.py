@@ -34,6 +34,7 @@ class RowFunction:
 
     def __call__(self, x: Array, c: Array) -> Array:
         """Computes y (rows, m)."""
+        self._require_width(x)
         if compiled.available():
             y = np.empty((len(x), self.programs.m))
             self._compiled(at(x), at(c), len(c), None, at(y), None, len(x))
@@ -42,6 +43,7 @@ class RowFunction:
 
     def slopes(self, x: Array, c: Array) -> tuple[Array, Array]:
         """Computes y (rows, m) and dy/dx (rows, m, n)."""
+        self._require_width(x)
         (rows, n), m, unit = x.shape, self.programs.m, self._directions
         if compiled.available():
             y, J = np.empty((rows, m)), np.empty((rows, m, n))
@@ -52,6 +54,12 @@ class RowFunction:
         moved = self.programs.tangents([*unit[:, :, None], *found[m:]])
         J = _joined(moved, (n, rows)).transpose(1, 2, 0)
         return _joined(found[:m], (rows,)), np.ascontiguousarray(J)
+
+    def _require_width(self, x: Array) -> None:
+        """Raises ValueError unless x is (rows, n): compiled code would read beyond it."""
+        n = self.programs.n
+        if x.shape[1] != n:
+            raise ValueError(f"rows of {x.shape[1]} numbers, where {n} belong")
 
     def _by_numpy(self, x: Array, c: Array) -> list[Any]:
         """Runs the program on columns, each in one piece of memory, where a number has the same bits in any place."""

@@ -121,6 +121,16 @@ def test_a_path_has_the_same_bits_alone_and_in_a_batch(name):
             np.testing.assert_array_equal(a[rows], b)
 
 
+@pytest.mark.parametrize("columns", [1, 3])
+def test_states_of_another_number_are_refused(columns):
+    """Compiled code read beyond the array, and gave whatever lay there."""
+    f = DRIVEN.transition_into(1)
+    x = np.ones((4, columns))
+    for run in (f, f.slope):
+        with pytest.raises(ValueError, match=f"rows of {columns} numbers, where 2 belong"):
+            run(x)
+
+
 @pytest.mark.parametrize("name", MODELS)
 def test_without_machine_code_it_is_the_same_to_round_off(name):
     model, x = MODELS[name], path(MODELS[name])
