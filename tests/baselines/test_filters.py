@@ -118,7 +118,11 @@ def test_readings_correlated_between_epochs_are_refused(estimator):
         estimator.estimate(problem, np.zeros((1, 7)))
 
 
-@pytest.mark.parametrize("estimator", [*FILTERS, *INFORMATION], ids=label)
+@pytest.mark.parametrize(
+    "estimator",
+    slow_if(lambda one: isinstance(one, (CKF, IPLF)), [*FILTERS, *INFORMATION]),
+    ids=label,
+)
 def test_nis_is_chi_square_on_a_linear_model(estimator):
     """The innovations of a Kalman filter are white, so their squares over m have the limits of chi-square."""
     model = Linear()
@@ -167,6 +171,8 @@ def test_where_linearising_once_fails_and_iterating_holds(scale, extended, itera
 
 LINEAR = Scenario(Linear(), Gaussian(0.1), GaussianPrior(), 3.0)
 ALIKE = [(LINEAR, {}), (LINEAR, {"process_noise": 0.1}), (LINEAR, {"prior_inflation": 2.0})]
+DEAR = CKF, IteratedEKF
+"""Filters that filterpy computes slowly on many readings."""
 ALIKE += [
     (Scenario(Gins(), Quantization(0.02286), GaussianPrior(), scale), {}) for scale in (10.0, 300.0)
 ]
@@ -180,7 +186,7 @@ ALIKE += [
 @pytest.mark.parametrize(
     ("estimator", "scenario", "changes"),
     slow_if(
-        lambda one, scenario, changes: isinstance(one, CKF) and scenario is not LINEAR,
+        lambda one, scenario, changes: isinstance(one, DEAR) and scenario is not LINEAR,
         ((one, *case) for one in KALMAN for case in ALIKE),
     ),
     ids=lambda given: getattr(given, "error_scale", getattr(given, "name", given)),

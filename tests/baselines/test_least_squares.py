@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from scipy.optimize import curve_fit
+from shared.families import slow_if
 from shared.oracles import agreed
 from shared.small_models import Bent, Written
 
@@ -204,7 +205,7 @@ def certified_digits(dataset, start, estimator):
     "parameters from the far start",
     1e-9,
 )
-@pytest.mark.parametrize("dataset", HARD)
+@pytest.mark.parametrize("dataset", slow_if(lambda dataset: dataset.startswith("MGH"), HARD))
 def test_the_hardest_certified_problems_are_solved_from_the_far_start(dataset):
     reached = certified_digits(dataset, 1, MultiscaleLM())
     agreed(10.0**-reached.parameters, 1e-9)

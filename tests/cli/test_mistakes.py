@@ -465,7 +465,7 @@ def test_a_broken_plugin_is_named_where_it_is_chosen(answer, plugin, tmp_path, k
     assert stored(tmp_path) == []
 
 
-@pytest.mark.parametrize("kind", one_in(12, BROKEN, pytest.mark.slow))
+@pytest.mark.parametrize("kind", one_in(24, BROKEN, pytest.mark.slow))
 def test_a_broken_plugin_stops_nobody_who_does_not_use_it(answer, plugin, capsys, kind):
     plugin(**BROKEN[kind])
     assert answer("run", "solver=[newton]", *SMALL, "--cfg", "job")[0] == 0

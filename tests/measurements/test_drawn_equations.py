@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from drawn_equations import ANSWERS, COUNT, HARD, drawn
+from shared.families import slow_if
 from shared.oracles import agreed
 
 from ipe_bench.engine.ladder import NOT_FOLLOWED
@@ -53,12 +54,14 @@ def answers():
     "readings of 10 drawn models, in tolerances of the model",
     3.0,
 )
-@pytest.mark.parametrize("number", QUICK)
+@pytest.mark.parametrize("number", slow_if(lambda number: number % 50 or number > 200, QUICK))
 def test_readings_of_drawn_equations_are_those_of_scipy(number):
     check(number, answers()[number])
 
 
-@pytest.mark.parametrize("number", range(HARD, COUNT, 100))
+@pytest.mark.parametrize(
+    "number", slow_if(lambda number: number > HARD + 100, range(HARD, COUNT, 100))
+)
 def test_readings_beside_poles_and_pulses_or_magnified_are_right_or_absent(number):
     check_hard(number, answers()[number])
 

@@ -59,8 +59,15 @@ def test_a_battery_follows_its_current(method):
     )
     assert np.array_equal(model.simulate(x[1:])[0], z[1])
     assert np.array_equal(model.simulate_until(x, 30), z[:, :30])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["explicit", "implicit"])
+def test_a_battery_has_the_same_readings_without_a_compiler(method):
+    x = BATTERY.nominal * np.array([[1.0, 1.0, 1.0], [1.2, 0.8, 1.5]])
+    z = replace(BATTERY, method=method).simulate(x)
     with patch.object(compiled, "available", lambda: False):
-        np.testing.assert_allclose(replace(model).simulate(x), z, atol=1e-12)
+        np.testing.assert_allclose(replace(BATTERY, method=method).simulate(x), z, atol=1e-12)
 
 
 @pytest.mark.parametrize("method", ["explicit", "implicit"])

@@ -167,7 +167,7 @@ def test_a_pulse_is_met_by_both_methods(width, method):
 
 
 @pytest.mark.parametrize(
-    "method", ["auto", "explicit", pytest.param("implicit", marks=pytest.mark.slow)]
+    "method", slow_if(lambda method: method != "explicit", ["auto", "explicit", "implicit"])
 )
 def test_an_output_that_magnifies_a_state_beyond_its_digits_has_no_reading(method):
     """cos(y) of y = e^(4 x): the last digit of y is 5e-6 at x = 6, and more than a turn at 11."""

@@ -221,9 +221,10 @@ PLACES = ["trials", "runs", "failed", "figures", "tables"]
 @pytest.mark.parametrize(
     ("command", "name"),
     [
-        *(("report", name) for name in PLACES),
-        ("run", "trials"),
+        ("report", "trials"),
+        *(pytest.param("report", name, marks=pytest.mark.slow) for name in PLACES[1:]),
         ("run", "tables"),
+        pytest.param("run", "trials", marks=pytest.mark.slow),
         ("status", "runs"),
     ],
 )

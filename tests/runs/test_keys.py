@@ -75,9 +75,10 @@ def test_keys_do_not_depend_on_the_order_of_sets_or_of_files_in_a_folder(copy, m
     assert len(seen) == 1
 
 
-def test_prose_edited_anywhere_leaves_every_key_as_it_was(copy, before):
+@pytest.mark.parametrize("room", ["trials", pytest.param(".", marks=pytest.mark.slow)])
+def test_prose_edited_anywhere_leaves_every_key_as_it_was(copy, before, room):
     edited = 0
-    for path in (copy / "ipe_bench").rglob("*.py"):
+    for path in (copy / "ipe_bench" / room).rglob("*.py"):
         text = path.read_text(encoding="utf-8")
         new = (
             re.sub(r'^( *)"""', r'\1# A remark.\n\1"""In other words: ', text, flags=re.MULTILINE)
@@ -89,7 +90,7 @@ def test_prose_edited_anywhere_leaves_every_key_as_it_was(copy, before):
             new = text + "\n# The end.\n"
         edited += new.count("In other words")
         path.write_text(new, encoding="utf-8")
-    assert edited > 200
+    assert edited > 20
     assert keys(copy) == before
 
 

@@ -195,7 +195,10 @@ def test_a_maximum_whose_innovations_do_not_fit_is_no_answer():
     assert "find= ended at a maximum whose innovations do not fit" in one.message
 
 
-@pytest.mark.parametrize(("deviation", "verdict"), [(30.0, "several maxima"), (3.0, "consistent")])
+@pytest.mark.parametrize(
+    ("deviation", "verdict"),
+    [(30.0, "several maxima"), pytest.param(3.0, "consistent", marks=pytest.mark.slow)],
+)
 def test_maxima_that_differ_are_named(deviation, verdict):
     """(b - .2)^2 = 1 at b = 1.2 and -.8, between which one coarse reading has to tell; no state is unknown, and the
     difference of the log likelihoods is that of sums of squares."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from filterpy.kalman import CubatureKalmanFilter, spherical_radial_sigmas
 from scipy.optimize import least_squares
 from scipy.optimize._numdiff import approx_derivative
+from shared.families import slow_if
 from shared.filterpy_tracks import Filterpy
 from shared.oracles import assert_agrees
 from shared.state_models import ConstantVelocity, CoordinatedTurn, Growth, Pendulum, path_cost
@@ -287,18 +289,22 @@ class Sharp(Scalar):
         return 1e-8 * np.eye(2)
 
 
+RULES = Taylor(), Unscented(), Unscented(0.0, 0.5, 2.0)
+FOLLOWED = NEAR, ConstantVelocity(count=40), CoordinatedTurn(count=50), Scalar(False)
+
+
 @pytest.mark.oracle(
     "library: filterpy's EKF, UKF and smoothers",
     "means and covariances, in standard deviations",
     1e-10,
 )
 @pytest.mark.parametrize(
-    "rule", [Taylor(), Unscented(), Unscented(0.0, 0.5, 2.0)], ids=["ekf", "ukf", "scaled"]
-)
-@pytest.mark.parametrize(
-    "model",
-    [NEAR, ConstantVelocity(count=40), CoordinatedTurn(count=50), Scalar(False)],
-    ids=lambda m: m.name,
+    ("model", "rule"),
+    slow_if(
+        lambda model, rule: isinstance(model, CoordinatedTurn) and rule != Unscented(),
+        product(FOLLOWED, RULES),
+    ),
+    ids=lambda given: getattr(given, "name", type(given).__name__),
 )
 def test_filterpy_has_the_same_tracks(model, rule):
     z = model.draw(0, 4).z

@@ -101,7 +101,9 @@ def coverage(law: str, trials: int, repeats: int) -> float:
     return float(np.mean((low <= 1.0) & (high >= 1.0)))
 
 
-@pytest.mark.parametrize("law", ["normal", "Student's t, 5 degrees"])
+@pytest.mark.parametrize(
+    "law", [pytest.param("normal", marks=pytest.mark.slow), "Student's t, 5 degrees"]
+)
 def test_intervals_of_few_trials_hold_the_truth(law):
     """A percentile interval of 20 trials holds it in 88 and 81 of 100; one at the level of 90 % in fewer than these."""
     repeats = 2000

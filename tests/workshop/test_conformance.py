@@ -42,8 +42,8 @@ def complaints(component) -> str:
     return "; ".join(f.complaint for f in check_component("mine", component) if f.complaint)
 
 
-DEAR = ("enkf", "ukf_wide", "iplf", "ekf", "ukf", "ckf", "iterated_ekf", "grid")
-"""Ensembles, points and iterations for every reading, one trial at a time, take seconds."""
+DEAR = ("enkf", "ukf_wide", "iplf", "ekf", "ukf", "ckf", "iterated_ekf", "grid", "walking_gins")
+"""Ensembles, points and iterations for every reading, one trial at a time, and long paths take seconds."""
 
 
 @pytest.mark.parametrize(

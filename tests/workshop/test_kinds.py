@@ -88,7 +88,7 @@ def files(folder: str) -> dict[str, str]:
     }
 
 
-DEAR = ("figure", "table", "section", "experiment", "filter")
+DEAR = ("figure", "table", "section", "experiment", "filter", "statistic")
 """Each draws a report, as `test_a_report_has_what_plugins_add_beside_all_that_is_ours` does of all of them at once, or
 runs many trials."""
 

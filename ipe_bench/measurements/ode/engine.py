@@ -113,7 +113,7 @@ class DescribedEquations(OdeMeasurement):
     def stiff(self) -> bool:
         """Whether every trial is integrated by the implicit method: if stability alone takes more
         than `STIFF` times as many explicit steps along the nominal solution, or these do not follow
-        it; and the implicit method does."""
+        it and the implicit method does, or nothing tells that they are right."""
         if self.described.method != "auto":
             return self.described.method == "implicit"
         if self.step is not None:
@@ -122,6 +122,8 @@ class DescribedEquations(OdeMeasurement):
         rung = self._rungs[self._nominal_place]
         easy = rung <= _EASY
         if not lost and (easy or not np.isfinite(self._finest).all()) and self.missed > 0:
+            # Even where implicit steps do not follow either: no reading is better than one that
+            # nothing supports, and the model is refused with the reason.
             return True
         if not lost and easy:
             return False

@@ -174,7 +174,11 @@ def none_is_left(fault: str) -> bool:
 
 
 @pytest.mark.parametrize(
-    "fault", [pytest.param(each, marks=WAITS.get(each, ())) for each in (*LINES, *STATUS)]
+    "fault",
+    [
+        pytest.param(each, marks=WAITS.get(each, pytest.mark.slow if i % 2 else ()))
+        for i, each in enumerate((*LINES, *STATUS))
+    ],
 )
 def test_a_fault_costs_its_own_trial_and_a_line(fault):
     found, right = answers(fault), answers("none")
