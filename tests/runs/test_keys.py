@@ -75,8 +75,10 @@ def test_keys_do_not_depend_on_the_order_of_sets_or_of_files_in_a_folder(copy, m
     assert len(seen) == 1
 
 
-@pytest.mark.parametrize("room", ["trials", pytest.param(".", marks=pytest.mark.slow)])
-def test_prose_edited_anywhere_leaves_every_key_as_it_was(copy, before, room):
+@pytest.mark.parametrize(
+    ("room", "least"), [("trials", 10), pytest.param(".", 200, marks=pytest.mark.slow)]
+)
+def test_prose_edited_anywhere_leaves_every_key_as_it_was(copy, before, room, least):
     edited = 0
     for path in (copy / "ipe_bench" / room).rglob("*.py"):
         text = path.read_text(encoding="utf-8")
@@ -90,7 +92,7 @@ def test_prose_edited_anywhere_leaves_every_key_as_it_was(copy, before, room):
             new = text + "\n# The end.\n"
         edited += new.count("In other words")
         path.write_text(new, encoding="utf-8")
-    assert edited > 20
+    assert edited > least
     assert keys(copy) == before
 
 
