@@ -91,7 +91,7 @@ class Component:
     """
 
     name: ClassVar[str] = ""
-    """Its name in tables: that of the class in small letters with underscores, unless the class states one."""
+    """Its name in tables: the name of the class in small letters with underscores, unless the class states one."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)

@@ -115,7 +115,7 @@ class Estimator(Component, ABC):
     needs: ClassVar[frozenset[Need]] = frozenset()
     """What a problem must have for this estimator to run: epochs, a prior, a model by differential equations."""
     equation: ClassVar[Equation | None] = None
-    """The estimating equation whose root is sought: that of the frozen H (eq. 11), of least squares, or of the maximum
+    """The estimating equation whose root is sought: with the frozen H (eq. 11), of least squares, or of the maximum
     a posteriori; None if an estimate is no root of anything. Bounds and first-order covariances follow from it."""
     family: ClassVar[Family | None] = None
     """The kind of estimator that it is shown with; None if its needs and its equation say: those that take epochs
@@ -125,7 +125,7 @@ class Estimator(Component, ABC):
 
     @abstractmethod
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
-        """Returns estimates the parameters from readings z (trials, m); `history` asks for the iterates as well."""
+        """Estimates the parameters from readings z (trials, m); `history` asks for the iterates as well."""
 
     def hindrance(self, problem: Problem) -> str | None:
         """Says, in words that follow the estimator's label, why it does not suit the problem; None if it does."""

@@ -215,7 +215,7 @@ class IPE(Method[FrozenSystem, S], Estimator, Generic[S]):
     """
 
     start: Start = "linear_lse"
-    """Start of the iteration: the linear LSE, eq. (16), the nominal point, or that of the two where the readings fit
+    """Start of the iteration: the linear LSE, eq. (16), the nominal point, or the one of the two where the readings fit
     better (`best`)."""
     max_iterations: Count = 100
     """Steps at most, then the trial ends as `max_iterations`."""

@@ -149,6 +149,8 @@ def test_the_report_that_the_repository_shows_is_what_todays_program_writes_of_w
     (option,) = (one for one in discovery.options("experiment") if one.name == pages.SHOWN.stem)
     text = pages.SHOWN.read_text(encoding="utf-8")
     assert text.splitlines() == pages.stored_as_markdown(option).splitlines()
+    finding = text.splitlines()[0].removeprefix("# ")
+    assert f"**{finding}**" in (PAGES / "index.md").read_text(encoding="utf-8")
     for link in re.findall(r"\]\(([^)]+)\)", text):
         assert (pages.SHOWN.parent / link).exists(), link
 
@@ -195,6 +197,33 @@ def test_the_errors_under_a_wrong_model_are_the_stored_ones():
     ]
     for row, (*others, misfit) in zip(sorted(shown), stored, strict=True):
         assert row == pytest.approx([*others, 100 * misfit], rel=0.02)
+
+
+STATES = {
+    "": "bearings_only",
+    "turn": "coordinated_turn",
+    "pendulum": "pendulum",
+    "walking": "walking_gins",
+}
+"""State models by their names in the rows of the page of tables."""
+
+
+def test_the_shares_of_states_that_move_are_the_stored_ones():
+    stored = totals(read(pages.STORED / f"states{SUFFIX}"))
+    known = stored.set_index(["measurement", "error_scale", "estimator"])["success"]
+    text = (PAGES / "explanation" / "tables_of_states.md").read_text(encoding="utf-8")
+    section = text.partition("## Success and cost\n")[2].partition("\n## ")[0]
+    labels, compared = [], 0
+    for line in re.findall(r"^\| (.*) \|$", section, re.MULTILINE):
+        first, *cells = line.split(" | ")
+        model, _, scale = first.rpartition(", ")
+        if "`auto`" in cells:
+            labels = [cell.strip("`") for cell in cells]
+        elif scale in ("1", "10", "100"):
+            shares = [100 * known[STATES[model], float(scale), label] for label in labels]
+            assert [float(cell) for cell in cells] == pytest.approx(shares), line
+            compared += 1
+    assert compared == 12
 
 
 def totals(found: Computed) -> pd.DataFrame:
