@@ -31,7 +31,16 @@ _MOST = 1e15
 
 @dataclass
 class Estimates:
-    """The result of a batch; every field has a leading trials axis."""
+    """The result of a batch; every field has a leading trials axis.
+
+    Example:
+
+    >>> import ipe_bench as ib
+    >>> bench = ib.Scenario(ib.measurements.Ranging(), ib.noise.Gaussian(0.1), error_scale=10.0)
+    >>> found = ib.baselines.LevenbergMarquardt().estimate(bench.problem, bench.draw(0, 3).z)
+    >>> print(found.x.shape, found.covariance.shape, (found.status == ib.Status.CONVERGED).all())
+    (3, 4) (3, 4, 4) True
+    """
 
     x: Array
     """(trials, n), in multiples of the parameters' units; the last iterate if the status is not converged."""

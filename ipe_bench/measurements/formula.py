@@ -180,7 +180,15 @@ class Formula(WrittenModel):
     functions, angles in rad. Parameters stand in the order of their starts, each in multiples of
     its magnitude; they have no units but those that the formula gives them. Readings have the order
     of the file, and no epochs.
-    """
+
+    Example:
+
+    >>> import ipe_bench as ib
+    >>> start = {"b1": 20.0, "b2": 0.5}
+    >>> model = ib.measurements.Formula("b1*(1-exp(-b2*t))", start, columns={"t": [1, 2, 4]})
+    >>> print(model.simulate(model.nominal[None]).round(2))
+    [[ 7.87 12.64 17.29]]
+"""
 
     expression: str
     """The formula of a reading, such as b1*(1-exp(-b2*t))."""

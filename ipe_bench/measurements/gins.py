@@ -62,6 +62,13 @@ class Gins(OdeMeasurement):
 
     `step` is the integration step in s; None chooses it for each trial by its parameters, so that
     the readings are within 1e-6 m/s to an error scale of 5000, and within 1.3e-6 at 10,000.
+
+    Example:
+
+    >>> import ipe_bench as ib
+    >>> model = ib.measurements.Gins()
+    >>> print(model.n, "parameters from", model.m, "velocities:", model.parameters[0].name, "...")
+    11 parameters from 240 velocities: bx ...
     """
 
     latitude_deg: float = 36.35
@@ -284,6 +291,15 @@ class RicherGins(Gins):
     Random walk of the drifts: each reading interval of each case begins with an independent
     increment of deviation `gyro_random_walk` times the root of the interval, and the drift is
     constant within it.
+
+    Example, in which a tilt of the platform stays undetected:
+
+    >>> import ipe_bench as ib
+    >>> plain, tilted = ib.measurements.Gins(), ib.measurements.RicherGins(platform_misalignment=5.0)
+    >>> bench = ib.Scenario(plain, truth=tilted)
+    >>> row = ib.run(bench, {"gn": ib.baselines.GaussNewton()}, trials=5).iloc[-1]
+    >>> print(row["error_median"] > 10, row["misfit"])
+    True 0.0
     """
 
     gyro_random_walk: NonNegative = 0.0

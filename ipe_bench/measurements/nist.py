@@ -120,6 +120,13 @@ class Nist(Measurement):
     The nominal point is that start, and each parameter's size is its magnitude there, so x0
     consists of ones and minus ones. There is no order of arrival and no prior. A reading is one
     observation y; for Nelson it is log(y), as NIST fits it.
+
+    Example:
+
+    >>> import ipe_bench as ib
+    >>> model = ib.measurements.Nist("Misra1a")
+    >>> print([parameter.name for parameter in model.parameters], model.m)
+    ['b1', 'b2'] 14
     """
 
     dataset: str = "Misra1a"

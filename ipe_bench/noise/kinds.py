@@ -58,7 +58,16 @@ class ScaledNoise(Noise):
 
 @dataclass(frozen=True)
 class Gaussian(ScaledNoise):
-    """Draws z = h + v with independent normal v."""
+    """Draws z = h + v with independent normal v.
+
+    Example, in which noise twice as large doubles the bound:
+
+    >>> import ipe_bench as ib
+    >>> model = ib.measurements.Polynomial()
+    >>> small, large = (ib.Scenario(model, ib.noise.Gaussian(sigma)) for sigma in (0.01, 0.02))
+    >>> print(large.linear_bound / small.linear_bound)
+    [2. 2. 2. 2.]
+    """
 
     deviation: Positive | tuple[Positive, ...] | None = None
     """One standard deviation in the unit of the readings, or one for each; None: that of the
@@ -80,7 +89,16 @@ class Gaussian(ScaledNoise):
 
 @dataclass(frozen=True)
 class NoNoise(ScaledNoise):
-    """Returns z = h exactly, while estimators assume readings of the nominal standard deviation."""
+    """Returns z = h exactly, while estimators assume readings of the nominal standard deviation.
+
+    Example:
+
+    >>> import numpy as np, ipe_bench as ib
+    >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.NoNoise(0.01))
+    >>> drawn = bench.draw(0, 2)
+    >>> print(np.ptp(drawn.z - bench.measurement.simulate(drawn.x)))
+    0.0
+    """
 
     name = "none"
     true_covariance = False
@@ -95,6 +113,15 @@ class StudentT(ScaledNoise):
     deviation.
 
     Estimators are given the true covariance R = deviation^2 I, and do not know the shape.
+
+    Example, in which the largest of 4000 errors lies far beyond what normal ones reach:
+
+    >>> import numpy as np, ipe_bench as ib
+    >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.StudentT(0.1))
+    >>> drawn = bench.draw(0, 100)
+    >>> errors = drawn.z - bench.measurement.simulate(drawn.x)
+    >>> print(np.abs(errors).max() > 10 * 0.1)
+    True
     """
 
     degrees_of_freedom: Annotated[float, Gt(2)] = 3.0
@@ -117,6 +144,17 @@ class Outliers(ScaledNoise):
     `deviation` is the standard deviation of a good reading. `assumed` is what estimators assume: `nominal`, the
     variance of the good readings, as if there were no outliers; or `total`, that of the mixture,
     deviation^2 (1 - share + share factor^2).
+
+    Example, in which an R that knows of the outliers makes the covariance wide enough:
+
+    >>> import ipe_bench as ib
+    >>> lm = {"lm": ib.baselines.LevenbergMarquardt()}
+    >>> for assumed in ("nominal", "total"):
+    ...     noise = ib.noise.Outliers(0.1, assumed=assumed)
+    ...     bench = ib.Scenario(ib.measurements.Polynomial(), noise, error_scale=0.1)
+    ...     print(assumed, ib.run(bench, lm, trials=20).iloc[-1]["nees"] < 1.5)
+    nominal False
+    total True
     """
 
     share: Share = 0.05
@@ -162,6 +200,14 @@ class Quantization(Noise):
     error is taken to be uniform, R = step^2 / 12, unless `deviation` states it. With `dither` a
     uniform error of one step is added before rounding and taken off again: then the error is
     uniform and independent of h, which at small h it otherwise is not.
+
+    Example, whose readings are multiples of the step:
+
+    >>> import numpy as np, ipe_bench as ib
+    >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Quantization(0.5))
+    >>> z = bench.draw(0, 1).z
+    >>> print(np.array_equal(z, 0.5 * np.round(z / 0.5)))
+    True
     """
 
     step: Positive | None = None
@@ -208,6 +254,17 @@ class Colored(ScaledNoise):
     readings of each the series start anew. GINS has 2 channels (the axes) and a length of 30 (the
     times of a case). `assumed` is what estimators assume: `white`, R = deviation^2 I, which is the
     mistake that the paper warns of; or `full`, the truth.
+
+    Example, in which R decides whether the reported covariance is right:
+
+    >>> import ipe_bench as ib
+    >>> lm = {"lm": ib.baselines.LevenbergMarquardt()}
+    >>> for assumed in ("white", "full"):
+    ...     noise = ib.noise.Colored(0.1, 0.9, assumed=assumed)
+    ...     bench = ib.Scenario(ib.measurements.Polynomial(), noise, error_scale=0.1)
+    ...     print(assumed, ib.run(bench, lm, trials=100).iloc[-1]["verdict"])
+    white overconfident
+    full consistent
     """
 
     correlation: Annotated[float, Gt(-1), Lt(1)] = 0.5
@@ -260,6 +317,18 @@ class Correlated(ScaledNoise):
     come in blocks of `block` that follow one another and share an error, such that two of a block
     have the given correlation. `assumed` is what estimators assume: `full`, R itself; or `white`,
     its diagonal.
+
+    Example:
+
+    >>> import numpy as np, ipe_bench as ib
+    >>> noise = ib.noise.Correlated(0.01, 0.5, block=2)
+    >>> bench = ib.Scenario(ib.measurements.Polynomial(), noise)
+    >>> drawn = bench.draw(0, 2000)
+    >>> errors = drawn.z - bench.measurement.simulate(drawn.x)
+    >>> print(np.corrcoef(errors[:, :3].T).round(1))
+    [[1.  0.5 0. ]
+     [0.5 1.  0. ]
+     [0.  0.  1. ]]
     """
 
     correlation: Annotated[float, Ge(0), Lt(1)] = 0.5
@@ -320,6 +389,14 @@ class Certified(_StandIn):
     truth, and no prior.
 
     A scenario with it has one trial. R is what the model states of its readings.
+
+    Example:
+
+    >>> import ipe_bench as ib
+    >>> bench = ib.Scenario(ib.measurements.Nist("Misra1a"), ib.noise.Certified())
+    >>> table = ib.run(bench, {"lm": ib.baselines.LevenbergMarquardt()}, trials=1)
+    >>> bool(table.iloc[-1]["success"])
+    True
     """
 
     real = True
@@ -331,6 +408,12 @@ class ModelNoise(_StandIn):
     where given.
 
     A scenario never holds it: it holds what it stands for.
+
+    Example:
+
+    >>> import ipe_bench as ib
+    >>> print(ib.Scenario(ib.measurements.Gins(), ib.noise.ModelNoise()).noise.name)
+    quantization
     """
 
     name = "model"

@@ -54,6 +54,16 @@ class Scenario:
 
     With a noise that is `real` nothing is drawn: the one trial is the readings that come with the
     measurement, and its truth is their certified answer.
+
+    Example:
+
+    >>> import ipe_bench as ib
+    >>> bench = ib.Scenario(ib.measurements.Ranging(), ib.noise.Gaussian(0.1), error_scale=10.0)
+    >>> drawn = bench.draw(0, 3)
+    >>> print(drawn.x.shape, drawn.z.shape)
+    (3, 4) (3, 21)
+    >>> print(bench.linear_bound.round(4))
+    [0.0034 0.0034 0.0068 0.0029]
     """
 
     measurement: Measurement

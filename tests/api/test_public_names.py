@@ -64,11 +64,12 @@ PUBLIC = {f"ipe_bench.{name}" for name in ib.__all__} - {"ipe_bench.__version__"
 
 
 def parts() -> list[str]:
-    """The classes that users construct by name: estimators, trackers, rules and state models."""
-    kinds = (ib.Estimator, ib.states.Tracker, ib.states.StateModel, ib.states.Taylor.__base__)
+    """The classes that users construct by name: estimators, trackers, rules, state models and noises."""
+    states = (ib.states.Tracker, ib.states.StateModel, ib.states.Taylor.__base__)
+    kinds = (ib.Estimator, ib.Noise, *states)
     return [
         f"ipe_bench.{room.__name__.rpartition('.')[2]}.{name}"
-        for room in (ib.solvers, ib.baselines, ib.states)
+        for room in (ib.solvers, ib.baselines, ib.states, ib.noise)
         for name in room.__all__
         if isinstance(thing := getattr(room, name), type)
         if issubclass(thing, kinds) and not inspect.isabstract(thing)
