@@ -17,7 +17,7 @@ from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.errors import BARS, draw_panels
 from ipe_bench.report.figures.views import Figure, View, in_focus
 from ipe_bench.report.style import FAMILIES, WHITE, Look
-from ipe_bench.report.words import brief, enumerate_few, percent, value_text, varying
+from ipe_bench.report.words import brief, percent, value_text, varying
 from ipe_bench.runs.provenance import TARGET
 
 if TYPE_CHECKING:
@@ -25,17 +25,15 @@ if TYPE_CHECKING:
 
 MOST_ROWS = 25
 """Settings that have a row; the tables have all."""
-MOST_GROUPS = 3
-"""Panels of estimators that are not alike."""
 DETECTED = 0.5
 """Share of trials from which on a misfit counts as detected."""
 RIGHT = "right model"
 _ALIKE = 0.05
-"""Part by which the errors of estimators in one panel differ at most."""
+"""Part by which the errors of estimators that are alike differ at most."""
 _MOST_ERROR = 1e4
 """Errors beyond are drawn here."""
 _WIDTH = 4.4
-"""Inches of a panel: its letters are read on a phone."""
+"""Inches of the figure: its letters are read on a phone."""
 _LETTERS = 56
 """Length of a line above a row."""
 _COLORS = {
@@ -136,55 +134,34 @@ def _swept(view: View, rows: pd.DataFrame, column: str, scale: float) -> Iterato
 
 
 def _rows(view: View, rows: pd.DataFrame, scale: float) -> Iterator[Drawing]:
-    """Draws a row for each setting, a panel of errors for estimators that are alike, and writes above each row in how
-    many trials the misfit is detected."""
-    error = rows.pivot_table("error_median", "setting", "estimator")
-    error = error.loc[error.median(axis=1).sort_values().index[::-1]].iloc[:MOST_ROWS]
-    groups = _groups(error)[:MOST_GROUPS]
-    detected = rows.groupby("setting")["misfit"].median()
-    kinds = [_kind(name, detected[name]) for name in error.index]
-    look = {n: Look(_COLORS[kind], "o") for n, kind in zip(error.index, kinds, strict=True)}
-    fig, axes = common.panels(len(groups), look, scales=[scale], row=2)
-    fig.set_figwidth(_WIDTH * min(len(groups), 2))
-    deepest = 1
-    for group, ax in zip(groups, axes, strict=True):
-        part = rows[rows["estimator"] == group[0]]
-        common.decades(ax, part["error_median"].clip(upper=_MOST_ERROR), ends=part["error_q95"])
-        common.bound_line(ax, 1.0, "1: the bound")
-        ends: Any = {"interval": ("error_median", "error_q95"), "most": _MOST_ERROR}
-        words: Any = {"by": "setting", "label": "error over the bound"}
-        common.curves(ax, part, "error_median", look, [scale], **words, **ends)
-        ax.set_title(_who(group, error).replace("$", r"\$"))
-        ax.set_yticks([])
-        ax.set_ylim(len(look) - 0.6, -1.0)
-        deepest = max(deepest, _write(ax, part.set_index("setting"), look))
-    row = 0.4 + 0.16 * deepest
-    fig.set_figheight((1.2 + row * len(look)) * -(-len(axes) // 2))
-    common.legend(fig, axes)
+    """Draws the error of the best estimator in a row for each setting, and writes above it in how many trials the
+    misfit is detected."""
+    errors = rows.pivot_table("error_median", "setting", "estimator")
+    best = next((label for label in view.focus if label in errors), errors.columns[0])
+    own = rows[rows["estimator"] == best].set_index("setting")
+    own = own.sort_values("error_median", ascending=False).iloc[:MOST_ROWS]
+    colors = [_COLORS[_kind(str(name), share)] for name, share in own["misfit"].items()]
+    look = {name: Look(color, "o") for name, color in zip(own.index, colors, strict=True)}
+    fig, (ax,) = common.panels(1, look, scales=[scale])
+    common.decades(ax, own["error_median"].clip(upper=_MOST_ERROR), ends=own["error_q95"])
+    common.bound_line(ax, 1.0, "1: the bound")
+    ends: Any = {"interval": ("error_median", "error_q95"), "most": _MOST_ERROR}
+    words: Any = {"by": "setting", "label": "error over the bound"}
+    common.curves(ax, own.reset_index(), "error_median", look, [scale], **words, **ends)
+    ratios = errors.div(errors[best], axis=0)
+    alike = len(errors.columns) > 1 and bool((abs(ratios - 1) <= _ALIKE).all(axis=None))
+    common.title(ax, f"all {len(errors.columns)} estimators" if alike else best)
+    ax.set_yticks([])
+    ax.set_ylim(len(look) - 0.6, -1.0)
+    deepest = _write(ax, own, look)
+    fig.set_size_inches(_WIDTH, 1.2 + (0.4 + 0.16 * deepest) * len(look))
+    common.legend(fig, [ax])
     yield view.drawing(
         fig,
         "settings",
         f"Error by setting at error scale {scale:g}",
         "Median error, bar to the 95 % quantile; misfit detected in % of trials.",
     )
-
-
-def _groups(error: pd.DataFrame) -> list[list[str]]:
-    """Returns estimators whose errors are alike in every setting."""
-    groups: list[list[str]] = []
-    for name in error.columns:
-        ratios = [error[group[0]] / error[name] for group in groups]
-        near = [np.allclose(ratio, 1.0, rtol=0, atol=_ALIKE) for ratio in ratios]
-        if any(near):
-            groups[near.index(True)].append(str(name))
-        else:
-            groups.append([str(name)])
-    return groups
-
-
-def _who(group: Sequence[str], error: pd.DataFrame) -> str:
-    whole = len(group) == len(error.columns)
-    return f"all {len(group)} estimators" if whole and len(group) > 1 else enumerate_few(group, 2)
 
 
 def _kind(name: str, detected: float) -> str:
@@ -198,8 +175,6 @@ def _write(ax: Any, rows: pd.DataFrame, look: Mapping[str, Look]) -> int:
     returns the largest number of lines."""
     most = 1
     for i, (name, one) in enumerate(look.items()):
-        if name not in rows.index:
-            continue
         row: Any = rows.loc[name]
         style: Any = {"color": one.color, "textcoords": "offset points", "annotation_clip": False}
         at = min(row["error_median"], _MOST_ERROR)
