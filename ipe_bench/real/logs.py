@@ -101,13 +101,15 @@ class Log:
             return _read(read_tables([readings], ignored)[0], model)
         if readings is None and not isinstance(model, RecordedFormulas):
             raise UserError(
-                f"readings: is not given; write readings=FILE, with the columns {','.join(_wanted(model))}"
+                "readings: is not given; write readings=FILE, with the columns"
+                f" {','.join(_wanted(model))}"
             )
         z = model.draw(0, 1).z[0] if readings is None else unmasked(readings).copy()
         shape = (model.epochs, len(model.reading_names))
         if z.shape != shape:
             raise UserError(
-                f"readings: has shape {z.shape}, where {shape} belongs: epochs and readings of {model.name}"
+                f"readings: has shape {z.shape}, where {shape} belongs: epochs and readings of"
+                f" {model.name}"
             )
         if np.isinf(z).any():
             raise UserError("readings: inf is not a reading; give NaN if it is missing")
@@ -341,8 +343,8 @@ def _copies(log: Log, tracks: Tracks) -> list[str]:
     periods = zip(log.model.states, log.model.state_periods, strict=True)
     names = " or ".join(state.name for state, period in periods if period)
     return [
-        f"AMBIGUOUS: the path is right with a probability of {p[0]:.2g} among its copies, in which {names} is shifted"
-        " by whole periods"
+        f"AMBIGUOUS: the path is right with a probability of {p[0]:.2g} among its copies, in which"
+        f" {names} is shifted by whole periods"
     ]
 
 

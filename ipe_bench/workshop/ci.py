@@ -23,7 +23,8 @@ def write_ci() -> str:
         ours[group] = ", ".join(option.name for option in options if option.group == group)
     if not any(ours.values()):
         raise UserError(
-            "new ci: plugins/ has no estimator to guard; write one, such as `ipe-bench new baseline my_fit`"
+            "new ci: plugins/ has no estimator to guard; write one, such as `ipe-bench new"
+            " baseline my_fit`"
         )
     texts = {".github/workflows/estimator.yml": "ci.yml", "ci/experiment/guard.yaml": "ci.yaml"}
     for target in texts:

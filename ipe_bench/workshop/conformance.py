@@ -257,8 +257,8 @@ def answers_alike(estimator: Estimator) -> None:
     problem, z = _readings(estimator)
     whole, again = (estimator.estimate(problem, z) for _ in range(2))
     assert np.array_equal(whole.x, again.x, equal_nan=True), (
-        "a second call with the same readings gave another answer: it draws random numbers (draw them from a stream "
-        "that is seeded by the trial's readings) or remembers something"
+        "a second call with the same readings gave another answer: it draws random numbers (draw"
+        " them from a stream that is seeded by the trial's readings) or remembers something"
     )
     for i in range(len(z)):
         alone = estimator.estimate(problem, z[i : i + 1])

@@ -90,8 +90,8 @@ def _new_file(kind: str, name: str) -> str:
 
 
 def copy_kind(kind: str, home: Path, name: str, language: str | None) -> str:
-    """Copies the files of a plugin's kind, and those of one of its languages, into plugins/NAME; returns what to
-    read."""
+    """Copies the files of a plugin's kind, and those of one of its languages, into plugins/NAME; returns
+    what to read."""
     languages = sorted(path.name.removeprefix(f"{kind}-") for path in home.glob(f"{kind}-*"))
     if languages and language not in languages:
         why = "is not given" if language is None else unknown(language, languages, "language")
@@ -134,7 +134,8 @@ def fill(path: Path, source: str, words: Mapping[str, str]) -> None:
 def _check_name(group: str, name: str) -> None:
     if not re.fullmatch(r"[a-z][a-z0-9_]{,59}", name):
         raise UserError(
-            f"{name[:80]}: give a name of at most 60 small letters, digits and underscores that starts with a letter"
+            f"{name[:80]}: give a name of at most 60 small letters, digits and underscores that"
+            " starts with a letter"
         )
     if keyword.iskeyword(name):
         raise UserError(f"{name}: is a word of Python; choose another name")

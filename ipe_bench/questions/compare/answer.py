@@ -54,23 +54,24 @@ class Comparison(Shown, pd.DataFrame):
             notes = [_needed(row) for row in planned]
             yield Table("comparison", title, "", columns, notes=notes)
         yield (
-            "error is its length in standard deviations of the bound (Mahalanobis), where a trial counts as at most"
-            " the radius of the gate of success; cost counts simulations. Both are means over the common trials,"
-            " where the table of a run has medians, and errors over the bound. p comes from McNemar's exact test for"
-            " success and from random signs for the others, with Holm's correction over all tests. e is evidence that"
-            " may be looked at repeatedly; e = 20 is as rare as p = 0.05. Each interval holds for its row alone."
-            " Times are not tested."
+            "error is its length in standard deviations of the bound (Mahalanobis), where a trial"
+            " counts as at most the radius of the gate of success; cost counts simulations. Both"
+            " are means over the common trials, where the table of a run has medians, and errors"
+            " over the bound. p comes from McNemar's exact test for success and from random signs"
+            " for the others, with Holm's correction over all tests. e is evidence that may be"
+            " looked at repeatedly; e = 20 is as rare as p = 0.05. Each interval holds for its row"
+            " alone. Times are not tested."
         )
         margins = ", ".join(f"{name} {margin:g}" for name, margin in self.attrs["margins"].items())
         yield (
-            f"better and worse are significant changes larger than a margin: {margins}. different is a significant"
-            " change that may be smaller than the margin."
+            f"better and worse are significant changes larger than a margin: {margins}. different"
+            " is a significant change that may be smaller than the margin."
         )
         if self["quantity"].str.match("honesty|bias").any():
             yield (
-                "NEES (honesty) is the squared error over the reported variance, by the number of parameters, where"
-                " both converge: right is 1. bias is the mean error in deviations of the bound, where both succeed:"
-                " right is 0."
+                "NEES (honesty) is the squared error over the reported variance, by the number of"
+                " parameters, where both converge: right is 1. bias is the mean error in"
+                " deviations of the bound, where both succeed: right is 0."
             )
         if (self["matched_by"] == "order").any():
             yield "Without common trials pairing gains no precision: the intervals are wider."
@@ -138,9 +139,10 @@ def _finding_sentences(frame: pd.DataFrame) -> Iterator[str]:
 
 def _needed(row: dict[str, Any]) -> str:
     return (
-        f"{row['trials_needed']:,} trials find a difference of {100 * row['difference']:g} % in success with a"
-        f" probability of {100 * row['power']:g} %: one alone succeeds in {row['discordant']} of {row['trials']}"
-        f" trials, so in at most {percent(row['discordant_high'])} of all (80 % limit)."
+        f"{row['trials_needed']:,} trials find a difference of {100 * row['difference']:g} % in"
+        f" success with a probability of {100 * row['power']:g} %: one alone succeeds in"
+        f" {row['discordant']} of {row['trials']} trials, so in at most"
+        f" {percent(row['discordant_high'])} of all (80 % limit)."
     )
 
 
@@ -301,7 +303,8 @@ def _require_two(
     if label == other and _places(first) == _places(second or first):
         named = "one folder" if label is None else f"{label} of one folder"
         raise UserError(
-            f"compare: {named} is compared with itself; name another, or first=LABEL and second=LABEL"
+            f"compare: {named} is compared with itself; name another, or first=LABEL and"
+            " second=LABEL"
         )
 
 

@@ -111,8 +111,9 @@ def _further(design: Design) -> Iterator[Table]:
         words("of", [names[int(np.argmin(share))] for share in shares]),
     ]
     note = (
-        "Bounds are shares of today's. Each further reading is the one of the candidates that cuts the mean square of"
-        " these shares most; an input's candidates reach to four times its range."
+        "Bounds are shares of today's. Each further reading is the one of the candidates that cuts"
+        " the mean square of these shares most; an input's candidates reach to four times its"
+        " range."
     )
     title = "What to read next, beside today's readings"
     yield Table("further", title, "", columns, notes=[note])
@@ -167,9 +168,11 @@ def _parameters(name: str, design: Design) -> Table:
         columns.append(words("strongest", strongest))
     s = np.median(seen.singular_values, axis=0)
     notes = [
-        "bound: smallest standard deviation of an unbiased estimator, root mean square over the prior. Correlations of"
-        " the errors: multiple correlation with all others, and the strongest with one other.",
-        f"Singular values of the whitened Jacobian, per parameter's size: {short(s[0])} to {short(s[-1])}.",
+        "bound: smallest standard deviation of an unbiased estimator, root mean square over the"
+        " prior. Correlations of the errors: multiple correlation with all others, and the"
+        " strongest with one other.",
+        f"Singular values of the whitened Jacobian, per parameter's size: {short(s[0])} to"
+        f" {short(s[-1])}.",
     ]
     setting = f"{name}, {scenario.noise.name}, error scale {scenario.error_scale:g}"
     title = f"{setting}: what {scenario.measurement.m} readings determine"
@@ -181,9 +184,9 @@ def _suspects(design: Design) -> Iterator[Part]:
         return
     shown = design.suspects[:_MOST_SUSPECTS]
     note = (
-        f"detected: share of trials in which the test of fit at {FIT_LEVEL:g} reports the error. An error is hidden"
-        " if it makes a parameter wrong by more than its bound and is detected in less than half of the trials. The"
-        " readings hardly change along the unseen direction."
+        f"detected: share of trials in which the test of fit at {FIT_LEVEL:g} reports the error."
+        " An error is hidden if it makes a parameter wrong by more than its bound and is detected"
+        " in less than half of the trials. The readings hardly change along the unseen direction."
     )
     columns = [
         words("error", [s.name for s in shown]),
@@ -237,8 +240,9 @@ def _ways(design: Design) -> Iterator[Part]:
     ]
     title = f"Which readings to take instead (bounds as shares of today's, criterion {design.criterion})"
     note = (
-        f"fewest readings is the number whose bound is no larger than today's {today}. Among {design.candidates.m}"
-        " candidates those that gain most are taken one after another; another choice may be slightly better."
+        f"fewest readings is the number whose bound is no larger than today's {today}. Among"
+        f" {design.candidates.m} candidates those that gain most are taken one after another;"
+        " another choice may be slightly better."
     )
     yield Table("ways", title, "", columns, notes=[note])
     for way in design.ways:

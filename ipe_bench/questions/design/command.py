@@ -36,7 +36,8 @@ def answer(asked: Asked, **given: Any) -> Answered:
     scenario = asked.scenario
     if scenario.noise.real:
         raise UserError(
-            "noise=certified: a design is of readings that are still to be taken; choose another noise"
+            "noise=certified: a design is of readings that are still to be taken; choose another"
+            " noise"
         )
     errors = richer_models(scenario)
     found = designed(scenario, errors=errors, **given)

@@ -82,17 +82,19 @@ def posterior_parts(name: str, found: Sequence[Reference]) -> list[Table]:
 
 def _notes(found: Sequence[Reference]) -> Iterator[str]:
     yield (
-        "divergence: KL divergence of the estimator's Gaussian from the moments of the posterior, in nats; noise: its"
-        " value between two populations of particles, so a smaller divergence is chance. shift: difference of the"
-        " means, in standard deviations of the posterior per root of the number of parameters. width: geometric mean"
-        " of the ratios of standard deviations. energy: distance between draws. A Gaussian is adequate if there is a"
-        f" single mode, the divergence is at most {HONEST:g} or twice the noise, and the energy at most {SAME_LAW:g}."
+        "divergence: KL divergence of the estimator's Gaussian from the moments of the posterior,"
+        " in nats; noise: its value between two populations of particles, so a smaller divergence"
+        " is chance. shift: difference of the means, in standard deviations of the posterior per"
+        " root of the number of parameters. width: geometric mean of the ratios of standard"
+        " deviations. energy: distance between draws. A Gaussian is adequate if there is a single"
+        f" mode, the divergence is at most {HONEST:g} or twice the noise, and the energy at most"
+        f" {SAME_LAW:g}."
     )
     for one in found:
         if not one.posterior.settled:
             yield (
-                f"Trial {one.trial}: the populations differ by {one.posterior.apart:.2g} deviations, so its posterior"
-                " cannot be relied on; take more particles."
+                f"Trial {one.trial}: the populations differ by {one.posterior.apart:.2g}"
+                " deviations, so its posterior cannot be relied on; take more particles."
             )
         if len(one.posterior.modes) > 1:
             shares = ", ".join(percent(float(share)) for share in one.posterior.shares)

@@ -64,7 +64,8 @@ class Posterior:
     x: Array
     """(draws, n), equally weighted."""
     modes: Array
-    """(modes, n): local maxima of the posterior that draws lead to, the one with most draws first."""
+    """(modes, n): local maxima of the posterior that draws lead to, the one with most draws
+    first."""
     shares: Array
     """(modes,) of the draws that lead there."""
     apart: float
@@ -152,7 +153,8 @@ def require_particles(problem: Problem, particles: int) -> None:
     population."""
     if problem.prior_deviation is None:
         raise UserError(
-            "posterior: needs a prior; choose a noise and an error_scale that parameters are drawn with"
+            "posterior: needs a prior; choose a noise and an error_scale that parameters are drawn"
+            " with"
         )
     least = 20 * problem.measurement.n
     if particles < least:
