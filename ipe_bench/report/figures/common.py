@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -41,6 +41,14 @@ _AROUND = 90.0
 """Points of a figure's height above and below a panel, about."""
 BEYOND = "beyond the axis"
 """Label of the arrow at points that lie there."""
+_HOLLOW = "hollow: trials missing, or few"
+"""Label of points that not all trials carry."""
+_EMPTY: dict[str, Any] = {
+    "linestyle": "none",
+    "markerfacecolor": "white",
+    "markeredgewidth": 1.1,
+}
+"""Arguments of hollow markers."""
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -59,15 +67,17 @@ def panels(
     down = -(-count // min(row, _across()))
     across = -(-count // down)
     width = print_width() or min(2.0 + 3.2 * across, 11.0)
-    size = width, min(height, 0.85 * width / across) * down + 0.4 + 0.05 * len(look or ())
+    names = list(look or ())
+    each = min(height, 0.85 * width / across)
+    size = (width, each * down + 0.4 + 0.05 * len(names))
     fig = Figure(figsize=size, layout="constrained")
     axes: list[Axes] = list(fig.subplots(down, across, squeeze=False).flat)
     for ax in axes[count:]:
         ax.set_axis_off()
     if len(scales) == 1:
-        fig.set_figheight((0.22 * len(look or ()) + 0.9) * down + 0.3)
+        fig.set_figheight((0.22 * len(names) + 0.9) * down + 0.3)
         for ax in axes[:count]:
-            name_axis(ax, list(look or ()))
+            name_axis(ax, names)
     return fig, axes[:count]
 
 
@@ -106,28 +116,34 @@ def panels_of_scales(
 ) -> tuple[Figure, list[tuple[Axes, pd.DataFrame]]]:
     """Makes a figure with a panel per error scale, or for some with both ends; returns it and the panels' rows."""
     every = sorted(set(rows["error_scale"]))
-    scales = [
-        every[round(i)] for i in np.linspace(0, len(every) - 1, min(most_panels(), len(every)))
-    ]
+    count = min(most_panels(), len(every))
+    scales = [every[round(i)] for i in np.linspace(0, len(every) - 1, count)]
     fig, axes = panels(len(scales), look)
+    found = []
     for scale, ax in zip(scales, axes, strict=True):
         title(ax, f"error scale {value_text(scale)}")
-    return fig, [
-        (ax, rows[rows["error_scale"] == scale]) for scale, ax in zip(scales, axes, strict=True)
-    ]
+        found.append((ax, rows[rows["error_scale"] == scale]))
+    return fig, found
 
 
 def left_out(scales: Sequence[float], panels: Sequence[Any]) -> str:
     """Says how many of the scales have panels, unless all have."""
-    return f"Panels: {len(panels)} of {len(scales)} scales." if len(panels) < len(scales) else ""
+    if len(panels) >= len(scales):
+        return ""
+    return f"Panels: {len(panels)} of {len(scales)} scales."
 
 
 def text(value: Any) -> str:
     """Returns a name for use in a figure: never read as mathematics, never longer than a line."""
-    words, most = str(value), 16 if print_width() else 42
-    words = (words if len(words) <= most else words[: most - 1] + "…").replace("$", r"\$")
+    words = _cut(str(value), 16 if print_width() else 42)
     # A leading underscore would hide the name from legends.
-    return "\u200b" + words if words.startswith("_") else words
+    return f"\u200b{words}" if words.startswith("_") else words
+
+
+def _cut(words: str, most: int) -> str:
+    if len(words) > most:
+        words = f"{words[: most - 1]}…"
+    return words.replace("$", r"\$")
 
 
 def _size(name: Any) -> float:
@@ -145,18 +161,17 @@ def _letters(inches: float, size: str) -> float:
 def _room(ax: Axes, size: str) -> float:
     """Estimates how many letters fit the width of a panel, before the layout."""
     across = ax.get_subplotspec().get_gridspec().ncols  # type: ignore[union-attr]
-    names = (
-        max((len(label.get_text()) for label in ax.get_yticklabels()), default=0)
-        if _value(ax) == "x"
-        else 7
-    )
-    return _letters(ax.figure.get_figwidth() / across, size) - names  # type: ignore[union-attr]
+    width = ax.figure.get_figwidth() / across  # type: ignore[union-attr]
+    names = 7
+    if _value(ax) == "x":
+        names = max((len(label.get_text()) for label in ax.get_yticklabels()), default=0)
+    return _letters(width, size) - names
 
 
 def title(ax: Axes, words: str) -> None:
     """Sets the title of a panel, in one line."""
-    most = max(12, int(_room(ax, "axes.titlesize")) + 3)
-    ax.set_title((words if len(words) <= most else words[: most - 1] + "…").replace("$", r"\$"))
+    most = int(_room(ax, "axes.titlesize")) + 3
+    ax.set_title(_cut(words, max(12, most)))
 
 
 def axis_labels(fig: Figure, x: str, y: str) -> None:
@@ -167,11 +182,12 @@ def axis_labels(fig: Figure, x: str, y: str) -> None:
 
 def number(value: float) -> str:
     """Formats a number of an axis: 0.005, 2000, 10⁴ or 5·10⁻⁷, with a typographic minus."""
-    digits, _, exponent = (
-        f"{value:g}" if 0.001 <= abs(value) < 1e4 or value == 0 else f"{value:e}"
-    ).partition("e")
-    words = f"{float(digits):g}·10{str(int(exponent)).translate(_RAISED)}" if exponent else digits
-    return words.removeprefix("1·").replace("-", "\N{MINUS SIGN}")
+    is_plain = 0.001 <= abs(value) < 1e4 or value == 0
+    words, _, exponent = (f"{value:g}" if is_plain else f"{value:e}").partition("e")
+    if exponent:
+        power = str(int(exponent)).translate(_RAISED)
+        words = f"{float(words):g}·10{power}".removeprefix("1·")
+    return words.replace("-", "\N{MINUS SIGN}")
 
 
 def scale_axis(ax: Axes, scales: Sequence[float]) -> None:
@@ -188,13 +204,14 @@ def scale_axis(ax: Axes, scales: Sequence[float]) -> None:
 
 def labelled(scales: Sequence[float], letter: float) -> list[float]:
     """Selects ascending scales whose labels fit, a letter taking so many decades: both ends, and those between."""
+
+    def fit(low: float, high: float) -> bool:
+        letters = (len(value_text(low)) + len(value_text(high)) + 1) / 2
+        return np.log10(high / low) > letter * letters
+
     kept = [scales[0]]
     for scale in scales[1:-1]:
-        beside = (kept[-1], scale), (scale, scales[-1])
-        if all(
-            np.log10(b / a) > letter * (len(value_text(a)) + len(value_text(b)) + 1) / 2
-            for a, b in beside
-        ):
+        if fit(kept[-1], scale) and fit(scale, scales[-1]):
             kept.append(scale)
     return [*kept, *scales[1:][-1:]]
 
@@ -205,30 +222,34 @@ def decades(ax: Axes, values: Any, least: float = 10.0, *, ends: Any = ()) -> No
     The `ends` of intervals widen it by no more than `REACH` of the values' own span, or a decade: those of heavy tails,
     which may be as wide as numbers go, end at the panel's edge.
     """
-    values, ends = (np.asarray(v, dtype=float).ravel() for v in (values, ends))
-    values, ends = (v[np.isfinite(v) & (v > 0)] for v in (values, ends))
+    values = _positive(values)
+    ends = _positive(ends)
     if len(values) == 0:
         # A logarithmic axis without anything to show makes matplotlib warn.
         return
-    low, high = values.min(), values.max()
+    low = values.min()
+    high = values.max()
     room = max(least, (high / low) ** REACH)
-    low, high = (
-        max(low / room, ends.min(initial=low)) / 1.6,
-        min(high * room, ends.max(initial=high)) * 1.6,
-    )
-    wider = max(np.sqrt(least * low / high), 1.0)
-    axis, ends = _value(ax), (low / wider, high * wider)
-    ax.set(**{f"{axis}scale": "log", f"{axis}lim": ends})
-    log_ticks(ax.xaxis if axis == "x" else ax.yaxis, *ends)
+    bottom = max(low / room, ends.min(initial=low)) / 1.6
+    top = min(high * room, ends.max(initial=high)) * 1.6
+    wider = max(np.sqrt(least * bottom / top), 1.0)
+    limits = (bottom / wider, top * wider)
+    axis = _value(ax)
+    ax.set(**{f"{axis}scale": "log", f"{axis}lim": limits})
+    log_ticks(ax.xaxis if axis == "x" else ax.yaxis, *limits)
+
+
+def _positive(values: Any) -> Array:
+    values = np.asarray(values, dtype=float).ravel()
+    return values[np.isfinite(values) & (values > 0)]
 
 
 def log_ticks(axis: Axis, low: float, high: float) -> None:
     """Labels that do not crowd: powers of ten, and 2 and 5 between if those are few."""
     from matplotlib.ticker import LogLocator, NullLocator
 
-    axis.set_major_locator(
-        LogLocator(subs=(1, 2, 5)) if high / low < 200 else LogLocator(numticks=7)
-    )
+    few = high / low < 200
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5)) if few else LogLocator(numticks=7))
     axis.set_major_formatter(lambda value, _: number(value))
     axis.set_minor_locator(NullLocator())
 
@@ -237,9 +258,11 @@ def full_ticks(ax: Axes, most: int = 4) -> None:
     """Labels the horizontal axis with whole numbers, of which no part is set aside at its end, as many as fit."""
     from matplotlib.ticker import MaxNLocator
 
-    (low, high), room = ax.get_xlim(), _room(ax, "xtick.labelsize")
+    low, high = ax.get_xlim()
+    room = _room(ax, "xtick.labelsize")
     for intervals in range(most, 1, -1):
-        ticks = np.asarray(MaxNLocator(intervals, steps=[1, 2, 5, 10]).tick_values(low, high))
+        locator = MaxNLocator(intervals, steps=[1, 2, 5, 10])
+        ticks = np.asarray(locator.tick_values(low, high))
         ticks = ticks[(ticks >= low) & (ticks <= high)]
         step = np.diff(ticks).min(initial=1.0)
         decimals = -int(np.floor(np.log10(step) + 1e-9))
@@ -253,7 +276,8 @@ def shares(ax: Axes) -> None:
     """Sets an axis of shares from 0 to 1."""
     axis = _value(ax)
     ax.set(**{f"{axis}lim": (-0.03, 1.03)})
-    (ax.xaxis if axis == "x" else ax.yaxis).set_major_formatter(lambda v, _: f"{100 * v:.0f} %")
+    of_values = ax.xaxis if axis == "x" else ax.yaxis
+    of_values.set_major_formatter(lambda share, _: f"{100 * share:.0f} %")
 
 
 def bound_line(ax: Axes, at: float, label: str) -> None:
@@ -268,12 +292,8 @@ def band(ax: Axes, low: float, high: float, label: str = "") -> None:
 
 def beyond(ax: Axes, x: Any, y: Any, one: Look) -> None:
     """Draws points that lie beyond the axis at its end: hollow, with an arrow."""
-    edge: dict[str, Any] = {
-        "markeredgecolor": one.color,
-        "markerfacecolor": "white",
-        "markeredgewidth": 1.1,
-    }
-    ax.plot(x, y, marker=one.marker, linestyle="none", clip_on=False, zorder=3, **edge)
+    edge: dict[str, Any] = {"marker": one.marker, "markeredgecolor": one.color}
+    ax.plot(x, y, clip_on=False, zorder=3, **edge, **_EMPTY)
     _arrows(ax, x, y, one.color, points=7)
 
 
@@ -284,22 +304,18 @@ def _arrows(
     legend what they mean."""
     from matplotlib.transforms import ScaledTranslation
 
-    across = _value(ax) == "x"
-    back, forth = ("left", "right") if across else ("down", "up")
     inches = (-points if downwards else points) / 72
-    outwards = ScaledTranslation(
-        *((inches, 0) if across else (0, inches)), ax.figure.dpi_scale_trans
-    )
-    marker = rf"$\{back if downwards else forth}arrow$"
-    arrow: dict[str, Any] = {
-        "marker": marker,
-        "markersize": 8,
-        "linestyle": "none",
-        "markeredgewidth": 0.0,
-    }
-    (drawn,) = ax.plot(
-        x, y, transform=ax.transData + outwards, color=color, clip_on=False, zorder=3, **arrow
-    )
+    if _value(ax) == "x":
+        way = "left" if downwards else "right"
+        shift = (inches, 0)
+    else:
+        way = "down" if downwards else "up"
+        shift = (0, inches)
+    outwards = ScaledTranslation(*shift, ax.figure.dpi_scale_trans)
+    arrow: dict[str, Any] = {"marker": rf"$\{way}arrow$", "markersize": 8}
+    arrow |= {"linestyle": "none", "markeredgewidth": 0.0}
+    place: Any = {"transform": ax.transData + outwards, "clip_on": False, "zorder": 3}
+    (drawn,) = ax.plot(x, y, color=color, **place, **arrow)
     drawn.set_in_layout(False)
     if BEYOND not in ax.get_legend_handles_labels()[1]:
         ax.plot([], [], label=BEYOND, color=BOUND_COLOR, **arrow)
@@ -336,13 +352,24 @@ def lines(
     seen."""
     import seaborn as sns
 
-    dashes, before = {label: one.dash for label, one in look.items()}, len(ax.lines)
+    before = len(ax.lines)
+    dashes = {label: one.dash for label, one in look.items()}
     style = {**seaborn_style(look), "dashes": dashes, "estimator": None, "sort": False, **style}
     sns.lineplot(rows, x=x, y=y, ax=ax, **style)
     drawn = ax.lines[before:]
     for i, line in enumerate(drawn):
-        line.set_markevery([] if line.get_color() == GREY else (0.05 + 0.25 * i / len(drawn), 0.25))
+        first = 0.05 + 0.25 * i / len(drawn)
+        line.set_markevery([] if line.get_color() == GREY else (first, 0.25))
     ax.set(xlabel="", ylabel="")
+
+
+class _Points(NamedTuple):
+    """The points of a curve, of which some are hollow and some lie over the axis."""
+
+    place: Any
+    value: Any
+    hollow: Any
+    over: Any
 
 
 def curves(
@@ -367,90 +394,88 @@ def curves(
     an interval if they are fewer than `FEW`. Of an interval that lacks an end the other is drawn. What exceeds `most`
     stands there, and an interval that is cut there or at the end of the axis has an arrow.
     """
-    across, one_scale = _value(ax) == "x", len(scales) == 1
+    one_scale = len(scales) == 1
     least, top = _limits(ax)
     top = min(top, most)
     if not one_scale:
         scale_axis(ax, scales)
-    elif not across:
+    elif _value(ax) == "y":
         ax.set_xticks([])
     gap = float(np.diff(np.log10(scales)).min(initial=1.0))
-    all_trials = rows["trials"].max()
-    emptied: dict[str, Any] = {
-        "linestyle": "none",
-        "markerfacecolor": "white",
-        "markeredgewidth": 1.1,
-    }
-    hollow = False
     colored = [name for name, one in look.items() if one.color != GREY]
     shifts = {name: (i + 0.5) / len(colored) - 0.5 for i, name in enumerate(colored)}
+    all_trials = rows["trials"].max()
+    hollow = False
     for i, (name, one) in enumerate(look.items()):
         part: Any = rows[rows[by] == name].sort_values("error_scale", kind="stable")
         beside = 10 ** (0.3 * gap * shifts.get(name, 0.0))
-        place, values = (
-            np.full(len(part), i) if one_scale else part["error_scale"] * beside,
-            part[y].clip(upper=most),
-        )
-        few, over = part[trials] < FEW, part[y] > most
+        place = np.full(len(part), i) if one_scale else part["error_scale"] * beside
+        few = part[trials] < FEW
+        over = part[y] > most
+        empty = few | (part[trials] < all_trials)
+        values = part[y].clip(upper=most)
         ends = None
         if interval and one.color != GREY:
             low, high = (part[end] for end in interval)
-            sizes = np.array([values - low.clip(lower=least), high.clip(upper=top) - values]).clip(
-                min=0
-            )
-            known = np.isfinite(sizes) & ~few.to_numpy()
-            ends = np.where(known, sizes, np.where(known.any(axis=0), 0.0, np.nan))
+            ends = _lengths(values, low.clip(lower=least), high.clip(upper=top), few)
             shown = ~over & ~few
             mark_cut(ax, place[shown & (low < least)], least, one.color, downwards=True)
             mark_cut(ax, place[shown & (high > top)], top, one.color, downwards=False)
-        line: dict[str, Any] = {**one.line, "zorder": 2} | (
-            {"linestyle": "none"} if one_scale else {}
-        )
-        empty = few | (part[trials] < all_trials)
-        if one.color == GREY and not one_scale:  # the background, where estimators are alike
-            line, empty = line | {"marker": ",", "zorder": 1}, empty & False
+        line: dict[str, Any] = {**one.line, "zorder": 2}
+        if one_scale:
+            line["linestyle"] = "none"
+        elif one.color == GREY:  # the background, where estimators are alike
+            line |= {"marker": ",", "zorder": 1}
+            empty &= False
         hollow |= bool(empty.any())
-        values = values.where(np.isfinite(values))
-        right, up = (values, place) if across else (place, values)
-        before = set(ax.get_children())
-        ax.errorbar(right, up, elinewidth=0.8, **{"xerr" if across else "yerr": ends}, **line)
-        inside = empty & ~over
-        ax.plot(
-            right[inside],
-            up[inside],
-            marker=one.marker,
-            markeredgecolor=one.color,
-            zorder=3,
-            **emptied,
-        )
-        if over.any():
-            beyond(ax, right[over], up[over], one)
-        own = [artist for artist in ax.get_children() if artist not in before]
-        for number, artist in enumerate(own):
-            mark_name(ax, artist, str(name), number)
+        _draw_curve(ax, _Points(place, values, empty, over), ends, name, one, line)
     if hollow:
-        ax.plot(
-            [],
-            [],
-            marker="o",
-            markeredgecolor=BOUND_COLOR,
-            label="hollow: trials missing, or few",
-            **emptied,
-        )
+        ax.plot([], [], marker="o", markeredgecolor=BOUND_COLOR, label=_HOLLOW, **_EMPTY)
     ax.set(**{f"{_value(ax)}label": label})
     if heading:
         title(ax, heading)
 
 
+def _lengths(values: Any, low: Any, high: Any, few: Any) -> Array:
+    """Returns how far intervals reach below and above their values (2, points), 0 on a side without an end; NaN without
+    any end, or where trials are few."""
+    lengths = np.array([values - low, high - values]).clip(min=0)
+    known = np.isfinite(lengths) & ~few.to_numpy()
+    missing = np.where(known.any(axis=0), 0.0, np.nan)
+    return np.where(known, lengths, missing)
+
+
+def _draw_curve(
+    ax: Axes, points: _Points, ends: Array | None, name: str, one: Look, line: dict[str, Any]
+) -> None:
+    """Draws a curve with its intervals, then its hollow points and those over the axis, all marked with its name."""
+    across = _value(ax) == "x"
+    values = points.value.where(np.isfinite(points.value))
+    right, up = (values, points.place) if across else (points.place, values)
+    before = set(ax.get_children())
+    line |= {"xerr" if across else "yerr": ends, "elinewidth": 0.8}
+    ax.errorbar(right, up, **line)
+    inside = points.hollow & ~points.over
+    edge: dict[str, Any] = {"marker": one.marker, "markeredgecolor": one.color, "zorder": 3}
+    ax.plot(right[inside], up[inside], **edge, **_EMPTY)
+    if points.over.any():
+        beyond(ax, right[points.over], up[points.over], one)
+    own = [artist for artist in ax.get_children() if artist not in before]
+    for number, artist in enumerate(own):
+        mark_name(ax, artist, name, number)
+
+
 def mark_name(ax: Axes, artist: Artist, name: str, number: int) -> None:
     """Marks an artist, with a number among those of its panel and estimator, so that a page finds it by the name."""
-    artist.set_gid(f"{NAMED}{name}#{ax.figure.axes.index(ax)}-{number}")
+    panel = ax.figure.axes.index(ax)
+    artist.set_gid(f"{NAMED}{name}#{panel}-{number}")
 
 
 def spread(wanted: Sequence[float], gap: float, low: float, high: float) -> Array:
     """Returns places at least `gap` apart from `low` to `high`, nearest to where they are wanted: by adjacent violators
     that are pooled (Ayer and others, Annals of Mathematical Statistics 26, 1955)."""
     order = np.argsort(wanted, kind="stable")
+    # Less these shifts, places that are `gap` apart only have to ascend.
     shifts = gap * np.arange(len(order))
     pools: list[list[float]] = []
     for value in np.asarray(wanted, dtype=float)[order] - shifts:
@@ -458,45 +483,40 @@ def spread(wanted: Sequence[float], gap: float, low: float, high: float) -> Arra
         while len(pools) > 1 and np.mean(pools[-2]) > np.mean(pools[-1]):
             last = pools.pop()
             pools[-1] += last
-    ascending = np.concatenate([np.full(len(pool), np.mean(pool)) for pool in pools])
-    places = np.clip(ascending, low, max(low, high - shifts[-1])) + shifts
+    means = [np.full(len(pool), np.mean(pool)) for pool in pools]
+    highest = max(low, high - shifts[-1])
     found = np.empty(len(order))
-    found[order] = places
+    found[order] = np.clip(np.concatenate(means), low, highest) + shifts
     return found
+
+
+class _End(NamedTuple):
+    """Where a curve ends."""
+
+    scale: float
+    value: float
 
 
 def end_names(ax: Axes, rows: pd.DataFrame, y: str, look: Mapping[str, Look]) -> None:
     """Writes the name of each curve at its end, in its colour; curves that end at one place share a label."""
-    from matplotlib.offsetbox import AnnotationBbox, HPacker, TextArea
+    from matplotlib.offsetbox import AnnotationBbox, HPacker
 
     known = rows[rows[y].notna()].sort_values("error_scale", kind="stable")
     last = known.groupby("estimator", sort=False).tail(1).set_index("estimator")
-    ends = {name: (last["error_scale"][name], last[y][name]) for name in look if name in last.index}
-    labels: list[list[str]] = []
-    for name in sorted(ends, key=lambda name: (ends[name][1], ends[name][0])):
-        near = labels and np.allclose(ends[labels[-1][0]], ends[name], rtol=0, atol=_SAME_END)
-        if near and len(", ".join([*labels[-1], name])) <= _MOST_LETTERS:
-            labels[-1].append(name)
-        else:
-            labels.append([name])
+    named = [name for name in look if name in last.index]
+    ends = {name: _End(last["error_scale"][name], last[y][name]) for name in named}
+    labels = _shared(ends)
     low, high = ax.get_ylim()
     size = _size("legend.fontsize")
     height = 72 * ax.figure.get_figheight() - _AROUND  # type: ignore[union-attr]
-    wanted = [(ends[names[0]][1] - low) / (high - low) for names in labels]
+    firsts = [ends[names[0]] for names in labels]
+    wanted = [(end.value - low) / (high - low) for end in firsts]
     places = spread(wanted, 1.3 * size / height, 0.0, 1.0)
-    for names, place in zip(labels, places, strict=True):
-        words = []
-        for i, name in enumerate(names):
-            one = look[name]
-            color = SOFT if one.color == GREY else strong(one.color)
-            comma = "," if i < len(names) - 1 else ""
-            style: Any = {"color": color, "fontsize": size}
-            style |= {"fontweight": "bold"} if one.width > 1 else {}
-            words.append(TextArea(f"{text(name)}{comma}", textprops=style))
-            mark_name(ax, words[-1].get_children()[0], name, _TEXT)
+    for names, end, place in zip(labels, firsts, places, strict=True):
+        words = _named(ax, names, look, size)
         box = AnnotationBbox(
             HPacker(children=words, pad=0, sep=0.3 * size, align="baseline"),
-            ends[names[0]],
+            end,
             (1.06, place),
             boxcoords="axes fraction",
             box_alignment=(0.0, 0.5),
@@ -506,6 +526,37 @@ def end_names(ax: Axes, rows: pd.DataFrame, y: str, look: Mapping[str, Look]) ->
             arrowprops={"arrowstyle": "-", "color": SOFT, "linewidth": 0.4, "shrinkB": 2},
         )
         ax.add_artist(box)
+
+
+def _shared(ends: Mapping[str, _End]) -> list[list[str]]:
+    """Returns the names of each label, the lowest first: those of curves that end at one place, as far as they fit."""
+    labels: list[list[str]] = []
+    for name in sorted(ends, key=lambda name: (ends[name].value, ends[name].scale)):
+        if labels:
+            near = np.allclose(ends[labels[-1][0]], ends[name], rtol=0, atol=_SAME_END)
+            letters = len(", ".join([*labels[-1], name]))
+            if near and letters <= _MOST_LETTERS:
+                labels[-1].append(name)
+                continue
+        labels.append([name])
+    return labels
+
+
+def _named(ax: Axes, names: Sequence[str], look: Mapping[str, Look], size: float) -> list[Any]:
+    """Returns the names of a label, each in its curve's colour and bold where that line is."""
+    from matplotlib.offsetbox import TextArea
+
+    words = []
+    for name in names:
+        one = look[name]
+        color = SOFT if one.color == GREY else strong(one.color)
+        style: Any = {"color": color, "fontsize": size}
+        if one.width > 1:
+            style["fontweight"] = "bold"
+        comma = "" if name == names[-1] else ","
+        words.append(TextArea(f"{text(name)}{comma}", textprops=style))
+        mark_name(ax, words[-1].get_children()[0], name, _TEXT)
+    return words
 
 
 def legend(
@@ -519,33 +570,31 @@ def legend(
     labels in the panels."""
     from matplotlib.lines import Line2D
 
-    named = {} if any(_value(ax) == "x" for ax in axes) else look or {}
+    on_axes = any(_value(ax) == "x" for ax in axes)
+    named = {} if on_axes else look or {}
     colored = {label: one for label, one in named.items() if one.color != GREY}
     plain: dict[str, Any] = {"linestyle": "none"} if points else {}
-    handles: dict[str, Any] = {
-        text(label): Line2D([], [], **one.line | plain) for label, one in colored.items()
-    }
-    if len(colored) < len(named):
-        handles[f"{len(named) - len(colored)} others"] = Line2D([], [], color=GREY)
+    handles: dict[str, Any] = {}
+    for label, one in colored.items():
+        handles[text(label)] = Line2D([], [], **one.line | plain)
+    others = len(named) - len(colored)
+    if others:
+        handles[f"{others} others"] = Line2D([], [], color=GREY)
     for ax in axes:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
     if not handles:
         return
-    # The most columns that fit side by side, each as wide as its longest label.
-    lengths, room = (
-        np.array([7 + len(label) for label in handles]),
-        _letters(fig.get_figwidth(), "legend.fontsize"),
-    )
-    fitting = [
-        n
-        for n in range(1, len(handles) + 1)
-        if sum(p.max() for p in np.array_split(lengths, n)) <= room
-    ]
+    lengths = np.array([7 + len(label) for label in handles])
+    room = _letters(fig.get_figwidth(), "legend.fontsize")
+    counts = range(1, len(handles) + 1)
+    fitting = [columns for columns in counts if _width(lengths, columns) <= room]
     rows = -(-len(handles) // max(fitting, default=1))
-    fig.legend(
-        list(handles.values()),
-        list(handles),
-        loc="outside upper center",
-        ncols=-(-len(handles) // rows),
-    )
+    columns = -(-len(handles) // rows)
+    place = "outside upper center"
+    fig.legend(list(handles.values()), list(handles), loc=place, ncols=columns)
+
+
+def _width(lengths: Array, columns: int) -> int:
+    """Returns the letters of so many columns side by side, each as wide as its longest label."""
+    return sum(part.max() for part in np.array_split(lengths, columns))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from itertools import compress
@@ -36,7 +36,9 @@ if TYPE_CHECKING:
     from ipe_bench.report.figures.drawing import Drawing
     from ipe_bench.report.progress import Shows
 
-NAME, RESIDUALS, SCHEMA = "estimate", "residuals.csv", 3
+NAME = "estimate"
+RESIDUALS = "residuals.csv"
+SCHEMA = 3
 FILES = (RESIDUALS, "fit.png", "residuals.png", "residuals.pdf")
 LEAST_FIT_P = 1 / (DRAWS + 1)
 """Least p of the test of fit if the law of the noise is simulated."""
@@ -46,7 +48,8 @@ _FEW = 0.05
 _FITS = {True: "yes", False: "NO", None: "not tested"}
 _INFLUENTIAL = 1.0
 """Standard errors by which a parameter moves without a reading from which on that reading is named."""
-_MOST_READINGS, _MOST_MINIMA = 5, 3
+_MOST_READINGS = 5
+_MOST_MINIMA = 3
 
 
 T = TypeVar("T")
@@ -87,17 +90,18 @@ class Answer(Shown):
         `ipe_bench.estimate`."""
         from ipe_bench.report.progress import counting
 
-        model, z = question.found.model, question.found.z
+        model = question.found.model
         with counting("estimate", len(question.estimators), progress) as begin:
             fitted = question.fitted(begin)
-        return cls(name or model.name, model, z, *fitted, ", ".join(question.ignored))
+        ignored = ", ".join(question.ignored)
+        return cls(name or model.name, model, question.found.z, *fitted, ignored)
 
     @property
     def passes(self) -> bool:
         """Whether the answer of any estimator passes every test."""
-        return (self.examination is None or self.examination.least) and any(
-            one.passes for one in self.fits
-        )
+        if self.examination is not None and not self.examination.least:
+            return False
+        return any(one.passes for one in self.fits)
 
     def __iter__(self) -> Iterator[Fit]:
         return iter(self.fits)
@@ -115,48 +119,51 @@ class Answer(Shown):
 
         frames = []
         for one in self.fits:
-            names, units = zip(
-                *((p.name, p.unit) for p in one.model.physical_parameters), strict=True
-            )
+            parameters = one.model.physical_parameters
             low, high = one.interval()
-            own = {"estimator": one.label, "parameter": names, "unit": units, "estimate": one.x}
-            own |= {
+            columns = {
+                "estimator": one.label,
+                "parameter": [p.name for p in parameters],
+                "unit": [p.unit for p in parameters],
+                "estimate": one.x,
                 "standard_error": one.standard_errors,
                 "low95": low,
                 "high95": high,
                 "passes": one.passes,
             }
-            frames.append(pd.DataFrame(own))
+            frames.append(pd.DataFrame(columns))
         return pd.concat(frames, ignore_index=True)
 
     def parts(self) -> Iterator[Part]:
-        found, one = structure(self.model), self.examination
-        yield from (
-            Strong(f"Not identifiable: {sentence}.")
-            for sentence in (found.sentences if found else ())
-        )
-        if lacking := next(
-            (f"{'; '.join(f.undetermined)} (at {f.label})" for f in self.fits if f.undetermined), ""
-        ):
-            yield Strong(
-                f"The readings do not determine {lacking}; fix parameters, or give prior, until they do."
-            )
+        yield from self._identifiability()
+        one = self.examination
         # Without the parameters that are held on bounds, and the levels.
         model = one.whole.measurement if one else self.model
-        yield from (
-            f"Note: {sentence}."
-            for sentence in model.remarks(one.inner[: model.n] if one else model.nominal)
-        )
+        for sentence in model.remarks(one.inner[: model.n] if one else model.nominal):
+            yield f"Note: {sentence}."
         yield _estimates(self)
         yield _verdicts(self)
         yield from _outliers(self)
-        if one is not None:
-            passes = self[one.label].passes
-            if passes and not one.overstated:
-                yield _intervals(one)
-            if passes or not one.least:
-                for remark in remarks(one, _reading_labels(self.model)):
-                    yield Strong(remark) if remark.split(":")[0].isupper() else remark
+        if one is None:
+            return
+        passes = self[one.label].passes
+        if passes and not one.overstated:
+            yield _intervals(one)
+        if passes or not one.least:
+            for remark in remarks(one, _reading_labels(self.model)):
+                yield Strong(remark) if remark.split(":")[0].isupper() else remark
+
+    def _identifiability(self) -> Iterator[Strong]:
+        """Says what the model, or these readings, cannot determine."""
+        found = structure(self.model)
+        for sentence in found.sentences if found else ():
+            yield Strong(f"Not identifiable: {sentence}.")
+        lacking = [one for one in self.fits if one.undetermined]
+        for one in lacking[:1]:
+            what = "; ".join(one.undetermined)
+            yield Strong(
+                f"The readings do not determine {what} (at {one.label}); fix parameters, or give prior, until they do."
+            )
 
     def sentences(self) -> list[str]:
         """Says who has an answer, what it is, and what a reader should know first."""
@@ -165,38 +172,36 @@ class Answer(Shown):
         if not self.passes:
             return [f"No answer that passes: {others or 'a better minimum was found'}."]
         labels = enumerate_few([one.label for one in passing])
-        tests = (
-            "every test"
-            if passing[0].fits
-            else "the available tests; the size of the residuals is not tested, for the noise level is unknown"
-        )
-        found = [f"Passing {tests}: {labels}{f'; no answer: {others}' if others else ''}."]
+        tests = "every test"
+        if not passing[0].fits:
+            tests = "the available tests; the size of the residuals is not tested, for the noise level is unknown"
+        without = f"; no answer: {others}" if others else ""
         told = self.examination
-        one = next((one for one in passing if told and one.label == told.label), passing[0])
+        examined = [one for one in passing if told and one.label == told.label]
+        one = [*examined, *passing][0]
         parameters = zip(one.model.physical_parameters, one.x, one.standard_errors, strict=True)
         values = [f"{p.name} = {with_error(x, s)} {p.unit}".rstrip() for p, x, s in parameters]
+        found = [f"Passing {tests}: {labels}{without}."]
         found.append(f"{one.label}: {enumerate_few(values, 4)}.")
-        return [*found, *(remarks(told, _reading_labels(self.model)) if told else ())][:3]
+        if told:
+            found += remarks(told, _reading_labels(self.model))
+        return found[:3]
 
 
 def _estimates(answer: Answer) -> Table:
     """Returns estimates with their errors; an invalid one stands in brackets, without its meaningless errors."""
     parameters = answer.fits[0].model.physical_parameters
-    columns = [
-        words("parameter", [p.name for p in parameters]),
-        words("unit", [p.unit for p in parameters]),
-    ]
+    columns = [words("parameter", [p.name for p in parameters])]
+    columns.append(words("unit", [p.unit for p in parameters]))
     for one in answer.fits:
         if one.passes:
             columns.append(texts(one.label, map(with_error, one.x, one.standard_errors)))
-        else:
-            failing = (
-                "MISFIT"
-                if one.status is Status.CONVERGED
-                else one.status.label.replace("_", " ").upper()
-            )
-            cells = [f"({value:.4g})" if math.isfinite(value) else "-" for value in one.x]
-            columns.append(texts(f"{one.label}: {failing}", cells))
+            continue
+        failing = "MISFIT"
+        if one.status is not Status.CONVERGED:
+            failing = one.status.label.replace("_", " ").upper()
+        cells = [f"({value:.4g})" if math.isfinite(value) else "-" for value in one.x]
+        columns.append(texts(f"{one.label}: {failing}", cells))
     return Table("estimates", f"{answer.name}: estimate ± standard error", "", columns)
 
 
@@ -207,7 +212,9 @@ def with_error(value: float, error: float) -> str:
     if error < 1e-14 * abs(value):
         return f"{_number(value, 15)} ± {error:.2g}"
     # 0.0999 rounds to 0.10.
-    return _together((value, error), " ± ", math.floor(math.log10(float(f"{error:.1e}"))) - 1)
+    rounded = float(f"{error:.1e}")
+    place = math.floor(math.log10(rounded)) - 1
+    return _together((value, error), " ± ", place)
 
 
 def _together(values: Sequence[float], between: str, place: int) -> str:
@@ -217,7 +224,8 @@ def _together(values: Sequence[float], between: str, place: int) -> str:
         return between.join(f"{round(v, -place):.{max(-place, 0)}f}" for v in values)
     power = math.floor(math.log10(largest or 10.0**place))
     figures = min(max(power - place, 0), 15)
-    return f"({between.join(f'{Decimal(v).scaleb(-power):.{figures}f}' for v in values)})e{power}"
+    digits = [f"{Decimal(v).scaleb(-power):.{figures}f}" for v in values]
+    return f"({between.join(digits)})e{power}"
 
 
 def _number(value: float, figures: int = 4) -> str:
@@ -233,42 +241,67 @@ def _verdicts(answer: Answer) -> Table:
         words("fits", [_FITS[one.fits] for one in fits]),
     ]
     if any(one.level is None for one in fits):
-        # The least p that simulated fits resolve is an upper limit.
-        columns += [
-            texts(
-                "p",
-                [p_value(one.p_value, LEAST_FIT_P * (one.p_value == LEAST_FIT_P)) for one in fits],
-            ),
-            texts("chi2", [_number(one.chi_square) if one.level is None else "-" for one in fits]),
-        ]
-    columns += [
-        texts("dof", [str(one.degrees_of_freedom) for one in fits]),
-        texts("white p", [p_value(one.white_p, LEAST_P) for one in fits]),
-        texts("outliers", [str(int(one.outliers.sum())) for one in fits]),
-        texts("deviation", [_number(one.residual_deviation) for one in fits]),
-    ]
+        squares = [_number(one.chi_square) if one.level is None else "-" for one in fits]
+        columns.append(texts("p", [_fit_p(one.p_value) for one in fits]))
+        columns.append(texts("chi2", squares))
+    columns.append(texts("dof", [str(one.degrees_of_freedom) for one in fits]))
+    columns.append(texts("white p", [p_value(one.white_p, LEAST_P) for one in fits]))
+    columns.append(texts("outliers", [str(int(one.outliers.sum())) for one in fits]))
+    columns.append(texts("deviation", [_number(one.residual_deviation) for one in fits]))
     return Table("verdicts", "Does the model fit?", "", columns, notes=list(_notes(answer)))
 
 
+def _fit_p(p: float) -> str:
+    # The least p that simulated fits resolve is an upper limit.
+    return p_value(p, LEAST_FIT_P if p == LEAST_FIT_P else 0.0)
+
+
 def _notes(answer: Answer) -> Iterator[str]:
+    """Yields the notes on the fits: what tests mean, each estimator's own ones, noise and priors."""
     fits = answer.fits
     yield (
         f"An estimate fits if p of chi-square is at least {FIT_LEVEL:g}. white p: p-value of the Ljung-Box test,"
         " which is small if successive residuals resemble each other. deviation is the standard deviation of the"
         " residuals, in the unit of the readings."
     )
-    yield from (f"{one.label}: {one.message}" for one in fits if one.message)
     for one in fits:
-        if one.beaten_by:
-            yield f"{one.label}: {one.beaten_by} found a better fit, by more than chance explains; this is no answer."
-        if one.lower_at:
-            yield f"{one.label}: {one.lower_at} ended at a lower minimum, which is the better answer."
-        if one.held_at:
-            at = {one.model.physical_parameters[k].name: value for k, value in one.held_at.items()}
-            yield (
-                f"{one.label}: on its bound: {_values(at)}; the readings favour a value beyond. It has no error, and"
-                " the errors of the others hold it there."
-            )
+        if one.message:
+            yield f"{one.label}: {one.message}"
+    for one in fits:
+        yield from _notes_on_fit(one)
+    yield from _notes_on_noise(answer)
+    yield from _notes_on_priors(answer)
+    if answer.model.fixed:
+        yield f"Fixed: {_values(answer.model.fixed)}"
+    if answer.left_out:
+        yield f"Left out on purpose: columns {answer.left_out}."
+    failing = _labels(one for one in fits if not one.passes)
+    if failing:
+        yield f"Values in brackets do not fit, and have no standard errors: {failing}."
+
+
+def _labels(fits: Iterable[Fit]) -> str:
+    return ", ".join(one.label for one in fits)
+
+
+def _notes_on_fit(one: Fit) -> Iterator[str]:
+    if one.beaten_by:
+        yield f"{one.label}: {one.beaten_by} found a better fit, by more than chance explains; this is no answer."
+    if one.lower_at:
+        yield f"{one.label}: {one.lower_at} ended at a lower minimum, which is the better answer."
+    if one.held_at:
+        parameters = one.model.physical_parameters
+        at = {parameters[k].name: value for k, value in one.held_at.items()}
+        yield (
+            f"{one.label}: on its bound: {_values(at)}; the readings favour a value beyond. It has no error, and"
+            " the errors of the others hold it there."
+        )
+
+
+def _notes_on_noise(answer: Answer) -> Iterator[str]:
+    """Yields what is known of the noise's level, and what residuals say against it."""
+    fits = answer.fits
+    levelled = [one for one in fits if one.level is not None]
     if any(one.levels for one in fits):
         yield (
             "The noise levels are estimated with the parameters by restricted maximum likelihood. They make chi-square"
@@ -276,22 +309,25 @@ def _notes(answer: Answer) -> Iterator[str]:
             " white p, outliers, and a comparison of the levels with each other and with what is known of the"
             " instruments."
         )
-        if known := [one.label for one in fits if one.estimated and not one.estimated.maximal]:
-            yield f"{', '.join(known)}: takes the levels of its own residuals as known."
-    elif any(one.level is not None for one in fits):
+        known = _labels(one for one in fits if one.estimated and not one.estimated.maximal)
+        if known:
+            yield f"{known}: takes the levels of its own residuals as known."
+    elif levelled:
         yield (
             "The noise level is estimated from the residuals. Standard errors are scaled by it, intervals use"
             " Student's t, and the size of the residuals cannot test the model."
         )
-    if suspect := [one.label for one in fits if one.level is not None and one.white_p < FIT_LEVEL]:
+    suspect = _labels(one for one in levelled if one.white_p < FIT_LEVEL)
+    if suspect:
         yield (
-            f"{', '.join(suspect)}: successive residuals resemble each other (white p below {FIT_LEVEL:g}); the model"
+            f"{suspect}: successive residuals resemble each other (white p below {FIT_LEVEL:g}); the model"
             " is in doubt, and standard errors are too small."
         )
-    if small := [one for one in fits if one.overstated > 1]:
+    small = [one for one in fits if one.overstated > 1]
+    if small:
         times = max(one.overstated for one in small)
         yield (
-            f"{', '.join(one.label for one in small)}: the residuals are up to {times:.2g} times smaller than the"
+            f"{_labels(small)}: the residuals are up to {times:.2g} times smaller than the"
             f" stated noise, by chance in less than {1 - TOO_WELL:.1g} of cases; if it is overstated, so are standard"
             " errors."
         )
@@ -300,18 +336,16 @@ def _notes(answer: Answer) -> Iterator[str]:
             "By noise that is so far overstated no interval means anything, and none is computed: state the noise of"
             " these readings, or choose noise=unknown, whose level is estimated."
         )
-    if told := [one.label for one in fits if one.with_prior]:
-        yield f"{', '.join(told)}: with a prior, which counts in the standard errors as further readings would."
-    elif isinstance(answer.model, ConstrainedModel) and (
-        stated := [one.name for one in answer.model.known if one.deviation is not None]
-    ):
-        yield f"The prior of {', '.join(stated)} counts in no estimate here; add one with a prior, such as map_lm."
-    if answer.model.fixed:
-        yield f"Fixed: {_values(answer.model.fixed)}"
-    if answer.left_out:
-        yield f"Left out on purpose: columns {answer.left_out}."
-    if failing := [one.label for one in fits if not one.passes]:
-        yield f"Values in brackets do not fit, and have no standard errors: {', '.join(failing)}."
+
+
+def _notes_on_priors(answer: Answer) -> Iterator[str]:
+    told = _labels(one for one in answer.fits if one.with_prior)
+    if told:
+        yield f"{told}: with a prior, which counts in the standard errors as further readings would."
+    elif isinstance(answer.model, ConstrainedModel):
+        stated = [one.name for one in answer.model.known if one.deviation is not None]
+        if stated:
+            yield f"The prior of {', '.join(stated)} counts in no estimate here; add one with a prior, such as map_lm."
 
 
 def _values(values: Mapping[str, float], figures: int = 6) -> str:
@@ -325,22 +359,17 @@ def _outliers(answer: Answer) -> Iterator[Table]:
         return
     beyond = np.flatnonzero(np.any([f.outliers for f in told], axis=0))
     worst = {i: max((float(f.normalised[i]) for f in told), key=abs) for i in beyond}
-    listed, labels = (
-        sorted(worst, key=lambda i: -abs(worst[i]))[:_MOST_OUTLIERS],
-        _reading_labels(answer.model),
-    )
+    listed = sorted(worst, key=lambda i: -abs(worst[i]))[:_MOST_OUTLIERS]
+    labels = _reading_labels(answer.model)
     columns = [
         words("reading", [_where(labels[i]) for i in listed]),
         texts("residual", [f"{worst[i]:.1f}" for i in listed]),
-        words("of", [", ".join(f.label for f in told if f.outliers[i]) for i in listed]),
+        words("of", [_labels(f for f in told if f.outliers[i]) for i in listed]),
     ]
-    more = (
-        [f"And {len(worst) - _MOST_OUTLIERS} others: see {RESIDUALS}."]
-        if len(worst) > _MOST_OUTLIERS
-        else []
-    )
+    further = len(worst) - len(listed)
+    notes = [f"And {further} others: see {RESIDUALS}."] if further else []
     title = f"Outliers: normalised residual beyond ±{told[0].outlier_limit:.2f}"
-    yield Table("outliers", title, "", columns, notes=more)
+    yield Table("outliers", title, "", columns, notes=notes)
 
 
 def _where(label: Mapping[str, Any]) -> str:
@@ -348,31 +377,26 @@ def _where(label: Mapping[str, Any]) -> str:
 
 
 def _reading_labels(model: Measurement) -> list[dict[str, Any]]:
-    columns = model.index
-    return [
-        {k: as_json(v) for k, v in zip(columns, row, strict=True)}
-        for row in zip(*columns.values(), strict=True)
-    ]
+    rows = zip(*model.index.values(), strict=True)
+    return [dict(zip(model.index, as_json(row), strict=True)) for row in rows]
 
 
 def _intervals(found: Examination) -> Table:
     """Returns three intervals of each parameter; for a parameter on a bound, that of its profile."""
-    on_bounds, absent = found.on_bounds, ["-"] * len(found.on_bounds)
-    parameters = [*found.model.physical_parameters, *(b.parameter for b in on_bounds)]
-    middle = [*found.x, *(math.nan for _ in on_bounds)]
-    ends = [*zip(*found.profiles, strict=True), *(sorted((b.bound, b.other)) for b in on_bounds)]
+    on_bounds = found.on_bounds
+    absent = ["-"] * len(on_bounds)
+    parameters = [*found.model.physical_parameters, *(one.parameter for one in on_bounds)]
+    profiles = [*map(_interval, *found.profiles, found.x)]
+    for one in on_bounds:
+        low, high = sorted((one.bound, one.other))
+        profiles.append(_interval(low, high, math.nan))
+    bootstrap = map(_interval, found.bootstrap.low, found.bootstrap.high, found.x)
     columns = [
         words("parameter", [p.name for p in parameters]),
         words("unit", [p.unit for p in parameters]),
         texts("standard error", [*map(_interval, *found.wald, found.x), *absent]),
-        texts(
-            "profile",
-            [_interval(low, high, at) for (low, high), at in zip(ends, middle, strict=True)],
-        ),
-        texts(
-            "bootstrap",
-            [*map(_interval, found.bootstrap.low, found.bootstrap.high, found.x), *absent],
-        ),
+        texts("profile", profiles),
+        texts("bootstrap", [*bootstrap, *absent]),
     ]
     title = f"{100 * CONFIDENCE:.0f} % intervals of {found.label}, in three ways"
     return Table("intervals", title, "", columns)
@@ -382,17 +406,45 @@ def _interval(low: float, high: float, middle: float) -> str:
     """Rounds the ends to a hundredth of twice the lesser distance to the estimate `middle`, or of the width if
     outside."""
     if not math.isfinite(high - low) or high <= low:
-        text = (
-            f"{low:.6g} … {high:.6g}".replace("-inf", "−∞").replace("inf", "∞").replace("nan", "-")
-        )
+        text = f"{low:.6g} … {high:.6g}".replace("-inf", "−∞")
+        text = text.replace("inf", "∞").replace("nan", "-")
         return "-" if text == "- … -" else text
-    reach = 2 * min(middle - low, high - middle) if low < middle < high else high - low
+    reach = high - low
+    if low < middle < high:
+        reach = 2 * min(middle - low, high - middle)
     return _together((low, high), " … ", math.floor(math.log10(reach)) - 2)
 
 
 def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     """Yields what a reader should know before relying on the answer, one sentence each."""
     names = [p.name for p in found.model.physical_parameters]
+    yield from _other_minima(found, names)
+    if found.overstated:
+        return
+    rivals = [one for one in found.ambiguous if not one.same_readings]
+    for one in rivals[:_MOST_MINIMA]:
+        at = _values(dict(zip(names, one.x, strict=True)), 5)
+        yield f"AMBIGUOUS: the readings fit as well at {at} (chi-square {one.chi_square:.5g})."
+    yield from _on_profiles(found, names)
+    for one in found.on_bounds:
+        yield (
+            f"{one.parameter.name}: its estimate is on the bound {one.bound:g}, which is one end of its interval; the"
+            " other is where the profile has risen as far as inside of bounds, so it holds the true value at least as"
+            " often as it says. Profiles of the others let it move inwards; their standard errors do not."
+        )
+    shift = np.nan_to_num(found.shift, nan=0.0)
+    for i in np.argsort(-shift)[:_MOST_READINGS]:
+        if shift[i] >= _INFLUENTIAL:
+            where = _where(labels[i])
+            yield f"Without the reading {where} a parameter would move by {shift[i]:.1f} standard errors."
+    drawn = found.bootstrap.drawn
+    lost = drawn - found.bootstrap.converged
+    if lost > 0:
+        yield f"Bootstrap: {lost} of {drawn} simulated sets of readings gave no estimate."
+
+
+def _other_minima(found: Examination, names: Sequence[str]) -> Iterator[str]:
+    """Says where chi-square is lower, and which parameters give the same readings."""
 
     def at(x: Array) -> str:
         return _values(dict(zip(names, x, strict=True)), 5)
@@ -403,57 +455,45 @@ def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator
             f"NOT THE GLOBAL MINIMUM: chi-square is {best.chi_square:.5g} at {at(best.x)}; start there, or choose an"
             " estimator that searches, such as multiscale_lm."
         )
-    equal = [one for one in found.ambiguous if one.same_readings]
+    equal = [one.x for one in found.ambiguous if one.same_readings]
     if equal:
-        ways = dict.fromkeys(
-            _changed(names, found.x, one.x, found.standard_errors) or at(one.x) for one in equal
-        )
+        errors = found.standard_errors
+        ways = dict.fromkeys(_changed(names, found.x, x, errors) or at(x) for x in equal)
         listed = "; with ".join(list(ways)[:_MOST_MINIMA])
         yield f"The readings are exactly the same with {listed}: choose one of these answers."
-    if found.overstated:
-        return
-    for one in [one for one in found.ambiguous if not one.same_readings][:_MOST_MINIMA]:
-        yield f"AMBIGUOUS: the readings fit as well at {at(one.x)} (chi-square {one.chi_square:.5g})."
+
+
+def _on_profiles(found: Examination, names: Sequence[str]) -> Iterator[str]:
+    """Says for which parameters the profile differs from the Wald interval, or lacks an end."""
     if found.bent.any():
-        rows = zip(names, *found.profiles, found.x, strict=True)
-        ends = [
-            f"{name} {_interval(low, high, x)}" for name, low, high, x in compress(rows, found.bent)
-        ]
+        intervals = map(_interval, *found.profiles, found.x)
+        each = [f"{name} {text}" for name, text in zip(names, intervals, strict=True)]
+        ends = enumerate_few(list(compress(each, found.bent)), 3)
         level = f"{100 * CONFIDENCE:.0f} %"
-        yield f"The model is strongly nonlinear here: use the {level} profile intervals, {enumerate_few(ends, 3)}."
-    if unlimited := list(compress(names, np.any(np.isinf(found.profiles), axis=0))):
+        yield f"The model is strongly nonlinear here: use the {level} profile intervals, {ends}."
+    unlimited = list(compress(names, np.any(np.isinf(found.profiles), axis=0)))
+    if unlimited:
         yield f"The readings set no limit to one side of {', '.join(unlimited)}."
-    if lost := list(compress(names, np.any(np.isnan(found.profiles), axis=0))):
+    lost = list(compress(names, np.any(np.isnan(found.profiles), axis=0)))
+    if lost:
         yield f"An end of the profile is missing: {', '.join(lost)}; a better fit, or no minimum, was met on the way."
-    for one in found.on_bounds:
-        yield (
-            f"{one.parameter.name}: its estimate is on the bound {one.bound:g}, which is one end of its interval; the"
-            " other is where the profile has risen as far as inside of bounds, so it holds the true value at least as"
-            " often as it says. Profiles of the others let it move inwards; their standard errors do not."
-        )
-    shift = np.nan_to_num(found.shift, nan=0.0)
-    for i in [i for i in np.argsort(-shift)[:_MOST_READINGS] if shift[i] >= _INFLUENTIAL]:
-        where = _where(labels[i])
-        yield f"Without the reading {where} a parameter would move by {shift[i]:.1f} standard errors."
-    drawn, converged = found.bootstrap.drawn, found.bootstrap.converged
-    if converged < drawn:
-        yield f"Bootstrap: {drawn - converged} of {drawn} simulated sets of readings gave no estimate."
 
 
 def _changed(names: Sequence[str], x: Array, y: Array, errors: Array) -> str:
     """Names the signs and exchanges of parameters that lead from x to y; empty if others are needed."""
     near = 0.01 * errors
-    words, left = [], [i for i in range(len(x)) if abs(y[i] - x[i]) > near[i]]
+    words = []
+    left = [i for i in range(len(x)) if abs(y[i] - x[i]) > near[i]]
     while left:
         i = left.pop(0)
         if abs(x[i] + y[i]) <= near[i]:
             words.append(f"{names[i]} of the other sign")
             continue
-        other = next(
-            (j for j in left if abs(y[i] - x[j]) <= near[j] and abs(y[j] - x[i]) <= near[i]), None
-        )
-        if other is None:
+        taking = [j for j in left if abs(y[i] - x[j]) <= near[j]]
+        exchanged = [j for j in taking if abs(y[j] - x[i]) <= near[i]]
+        if not exchanged:
             return ""
+        other = exchanged[0]
         left.remove(other)
         words.append(f"{names[i]} and {names[other]} exchanged")
     return ", ".join(words)
@@ -470,10 +510,16 @@ def write_answer(
     """Writes estimate.json, the page, residuals.csv and the figure; returns the files."""
     content = {"schema": SCHEMA, "command": command, **estimate_content(answer), **provenance}
     write_text(folder / f"{NAME}.json", json.dumps(content, indent=1) + "\n")
-    shown = answer.sentences(), answer.parts(), _drawings(answer) if figures else ()
-    told = {"facts": [f"{np.isfinite(answer.z).sum()} readings"], "sources": read_from(provenance)}
     files = write_files(
-        folder, NAME, (RESIDUALS, _residuals(answer)), f"{answer.name}: estimates", *shown, **told
+        folder,
+        NAME,
+        (RESIDUALS, _residuals(answer)),
+        f"{answer.name}: estimates",
+        answer.sentences(),
+        answer.parts(),
+        _drawings(answer) if figures else (),
+        facts=[f"{np.isfinite(answer.z).sum()} readings"],
+        sources=read_from(provenance),
     )
     for old in {folder / each for each in FILES} - set(files):
         old.unlink(missing_ok=True)
@@ -484,9 +530,10 @@ def _drawings(answer: Answer) -> Iterator[Drawing]:
     from ipe_bench.report.figures.answers import draw_fit, draw_residuals
     from ipe_bench.report.figures.views import looks_of
 
-    look = looks_of({one.label: one.estimator for one in answer.fits})
-    if answer.examination is not None and answer[answer.examination.label].passes:
-        yield from draw_fit(answer.examination, answer.z, look[answer.examination.label])
+    found = answer.examination
+    if found is not None and answer[found.label].passes:
+        look = looks_of({one.label: one.estimator for one in answer.fits})
+        yield from draw_fit(found, answer.z, look[found.label])
     yield from draw_residuals(answer.model, answer.fits)
 
 
@@ -497,13 +544,14 @@ def read_from(provenance: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def estimate_content(answer: Answer) -> dict[str, Any]:
     """Returns the content of estimate.json: readings, estimates, and the least minimum."""
-    model, z, found = answer.model, answer.z, answer.examination
+    model = answer.model
+    found = answer.examination
     labels = _reading_labels(model)
     return {
         "measurement": model.name,
         "reading_unit": model.reading_unit,
-        "readings_present": int(np.isfinite(z).sum()),
-        "readings_missing": int(np.isnan(z).sum()),
+        "readings_present": int(np.isfinite(answer.z).sum()),
+        "readings_missing": int(np.isnan(answer.z).sum()),
         "fixed": dict(model.fixed),
         "left_out": answer.left_out,
         "passes": answer.passes,
@@ -512,19 +560,18 @@ def estimate_content(answer: Answer) -> dict[str, Any]:
     }
 
 
+_STORED = (
+    *("message", "chi_square", "degrees_of_freedom", "fits", "passes", "with_prior", "beaten_by"),
+    *("lower_at", "iterations", "simulations", "correlation", "residual_deviation"),
+)
+
+
 def _fitted(one: Fit, labels: list[dict[str, Any]]) -> dict[str, Any]:
     names = [p.name for p in one.model.physical_parameters]
-    rows = (
-        "message",
-        "chi_square",
-        "degrees_of_freedom",
-        "fits",
-        "passes",
-        "with_prior",
-        "beaten_by",
-        "lower_at",
-    )
-    rows += ("iterations", "simulations", "correlation", "residual_deviation")
+    normalised = as_json(one.normalised)
+    outliers = [
+        {**labels[i], "normalised_residual": normalised[i]} for i in np.flatnonzero(one.outliers)
+    ]
     return {
         "status": one.status.label,
         "estimates": _by_name(names, one.x),
@@ -534,11 +581,8 @@ def _fitted(one: Fit, labels: list[dict[str, Any]]) -> dict[str, Any]:
         "white_p": as_json(one.white_p),
         "on_bounds": {names[k]: value for k, value in one.held_at.items()},
         "noise_level_estimated": one.levels or as_json(one.level),
-        "outliers": [
-            {**labels[i], "normalised_residual": as_json(one.normalised[i])}
-            for i in np.flatnonzero(one.outliers)
-        ],
-        **{name: as_json(getattr(one, name)) for name in rows},
+        "outliers": outliers,
+        **{name: as_json(getattr(one, name)) for name in _STORED},
     }
 
 
@@ -569,27 +613,25 @@ def _residuals(answer: Answer) -> pd.DataFrame:
     """Returns a row per estimator and reading, with influences and predictions where missing for the examined one."""
     import pandas as pd
 
-    model, z, found = answer.model, answer.z, answer.examination
+    model = answer.model
+    z = answer.z
     unit = f" [{model.reading_unit}]" if model.reading_unit else ""
     frames = []
     for one in answer.fits:
-        examined = found if found is not None and one.label == found.label else None
-        fitted = (
-            z - one.residuals
-            if examined is None
-            else np.where(np.isnan(z), examined.fitted, z - one.residuals)
-        )
-        own: dict[str, Any] = {
-            f"reading{unit}": z,
-            f"fitted{unit}": fitted,
-            f"residual{unit}": one.residuals,
-        }
-        own |= {
-            "normalised_residual": one.normalised,
-            "outlier": np.where(one.outliers, "yes", "no"),
-        }
-        own["shift"] = np.nan if examined is None else examined.shift
-        own[f"fitted_error{unit}"] = np.nan if examined is None else examined.fitted_errors
-        own[f"prediction_error{unit}"] = np.nan if examined is None else examined.new_errors
-        frames.append(pd.DataFrame({"estimator": one.label, **model.index, **own}))
+        found = answer.examination
+        if found is not None and one.label != found.label:
+            found = None
+        fitted = z - one.residuals
+        if found is not None:
+            fitted = np.where(np.isnan(z), found.fitted, fitted)
+        columns: dict[str, Any] = {"estimator": one.label, **model.index}
+        columns[f"reading{unit}"] = z
+        columns[f"fitted{unit}"] = fitted
+        columns[f"residual{unit}"] = one.residuals
+        columns["normalised_residual"] = one.normalised
+        columns["outlier"] = np.where(one.outliers, "yes", "no")
+        columns["shift"] = np.nan if found is None else found.shift
+        columns[f"fitted_error{unit}"] = np.nan if found is None else found.fitted_errors
+        columns[f"prediction_error{unit}"] = np.nan if found is None else found.new_errors
+        frames.append(pd.DataFrame(columns))
     return pd.concat(frames)

@@ -21,7 +21,31 @@ from ipe_bench.statistics.verdicts import NO_VERDICT, shown
 if TYPE_CHECKING:
     import pandas as pd
 
-NAME, TABLE, SCHEMA = "track", "track.csv", 1
+NAME = "track"
+TABLE = "track.csv"
+SCHEMA = 1
+_NOTE = (
+    "Innovations are readings less their predictions, in predicted standard deviations, and NIS / m is their"
+    " mean square. A smoother has none: it is judged by the cost of its path, and one behind a filter by NIS"
+    " and whiteness of that filter. If the model is right both are chi-square with a degree per reading, and"
+    " fit p is the probability of larger ones. Innovations are white if the filter is right (Ljung and Box)."
+    " The verdict is on innovations alone: an error that readings do not show, such as the turn of a whole map,"
+    " leaves them as they are. A track is lost from the epoch from which most of them are larger than all but"
+    " one in a million by chance. A dash: the tracker has none of it."
+)
+_OF_PARTICLES = (
+    " Innovations of particles are by the mean and covariance of the readings that they predict; effective"
+    " particles: 1 / sum of squared weights, the median of all epochs; collapsed: below 2."
+)
+_OF_CONSTANTS = (
+    f" Constants have the largest likelihood that {SEARCHES} searches found. Since innovations determined"
+    " them, the mean square of innovations hardly tests the model; whiteness does."
+)
+_STORED = (
+    *("lost_from", "effective", "message", "notes", "mean_nis", "limits", "verdict"),
+    *("fit_p", "white_p", "log_likelihood", "passes"),
+)
+"""What track.json says of each tracker, by its names in Python."""
 
 
 @dataclass(frozen=True)
@@ -51,100 +75,84 @@ class LogAnswer(Shown):
         readings, and NIS."""
         import pandas as pd
 
-        model, frames = self.log.model, []
-        for one in self.tracks:
-            columns = {
-                "tracker": one.label,
-                "epoch": range(1, model.epochs + 1),
-                "time [s]": model.times,
-            }
-            for i, state in enumerate(model.states):
-                unit = f" [{state.unit}]" if state.unit else ""
-                columns |= {
-                    f"{state.name}{unit}": one.mean[:, i],
-                    f"{state.name}_deviation{unit}": one.deviation[:, i],
-                }
-            for j, name in enumerate(model.reading_names):
-                columns |= {
-                    f"{name}_reading": self.log.z[:, j],
-                    f"{name}_predicted": one.predicted[:, j],
-                    f"{name}_predicted_deviation": one.predicted_deviation[:, j],
-                }
-            frames.append(pd.DataFrame(columns | {"nis": one.nis}))
-        return pd.concat(frames, ignore_index=True)
+        return pd.concat([self._rows(one) for one in self.tracks], ignore_index=True)
+
+    def _rows(self, one: LogTracks) -> pd.DataFrame:
+        """Returns a row per epoch of one tracker."""
+        import pandas as pd
+
+        model = self.log.model
+        columns: dict[str, Any] = {"tracker": one.label}
+        columns |= {"epoch": range(1, model.epochs + 1), "time [s]": model.times}
+        for i, state in enumerate(model.states):
+            unit = f" [{state.unit}]" if state.unit else ""
+            columns[f"{state.name}{unit}"] = one.mean[:, i]
+            columns[f"{state.name}_deviation{unit}"] = one.deviation[:, i]
+        for j, name in enumerate(model.reading_names):
+            columns[f"{name}_reading"] = self.log.z[:, j]
+            columns[f"{name}_predicted"] = one.predicted[:, j]
+            columns[f"{name}_predicted_deviation"] = one.predicted_deviation[:, j]
+        columns["nis"] = one.nis
+        return pd.DataFrame(columns)
 
     def parts(self) -> list[Part]:
         """Returns the test of the innovations of each tracker, and the states at the last epoch."""
-        found, states = self.tracks, self.log.model.states
-        limits = [one.limits[0] for one in found], [one.limits[1] for one in found]
+        said = [
+            f"{one.label}: {text}"
+            for one in self.tracks
+            for text in (one.message, *one.notes)
+            if text
+        ]
+        warnings = [Strong(text) for text in (*said, *far_below(self.tracks))]
+        return [*warnings, *self._constants(), self._innovations(), self._last_states()]
+
+    def _innovations(self) -> Table:
+        found = self.tracks
+        low = [one.limits[0] for one in found]
+        high = [one.limits[1] for one in found]
+        likelihoods = [f"{one.log_likelihood:.2f}".replace("nan", "-") for one in found]
         columns = [
             words("tracker", [one.label for one in found]),
             texts("NIS or cost / m", [short(one.mean_nis) for one in found]),
-            interval("95 % if right", *limits, short),
+            interval("95 % if right", low, high, short),
             words("verdict", [shown(one.verdict) for one in found]),
             texts("fit p", [p_value(one.fit_p) for one in found]),
             texts("white p", [p_value(one.white_p) for one in found]),
-            texts(
-                "log likelihood", [f"{one.log_likelihood:.2f}".replace("nan", "-") for one in found]
-            ),
+            texts("log likelihood", likelihoods),
         ]
-        note = (
-            "Innovations are readings less their predictions, in predicted standard deviations, and NIS / m is their"
-            " mean square. A smoother has none: it is judged by the cost of its path, and one behind a filter by NIS"
-            " and whiteness of that filter. If the model is right both are chi-square with a degree per reading, and"
-            " fit p is the probability of larger ones. Innovations are white if the filter is right (Ljung and Box)."
-            " The verdict is on innovations alone: an error that readings do not show, such as the turn of a whole map,"
-            " leaves them as they are. A track is lost from the epoch from which most of them are larger than all but"
-            " one in a million by chance. A dash: the tracker has none of it."
-        )
+        note = _NOTE
         if np.isfinite([one.effective for one in found]).any():
             columns.append(texts("effective particles", [short(one.effective) for one in found]))
-            note += (
-                " Innovations of particles are by the mean and covariance of the readings that they predict; effective"
-                " particles: 1 / sum of squared weights, the median of all epochs; collapsed: below 2."
-            )
+            note += _OF_PARTICLES
         if any(one.constants for one in found):
-            note += (
-                f" Constants have the largest likelihood that {SEARCHES} searches found. Since innovations determined"
-                " them, the mean square of innovations hardly tests the model; whiteness does."
-            )
-        ends = [
-            words("state", [state.name for state in states]),
-            words("unit", [state.unit for state in states]),
+            note += _OF_CONSTANTS
+        title = f"{self.log.model.name}: is the filter right?"
+        return Table("innovations", title, "", columns, notes=[note])
+
+    def _last_states(self) -> Table:
+        states = self.log.model.states
+        columns = [words("state", [state.name for state in states])]
+        columns.append(words("unit", [state.unit for state in states]))
+        for one in self.tracks:
+            ends = map(with_error, one.mean[-1], one.deviation[-1])
+            columns.append(texts(one.label, ends))
+        return Table("last", "States at the last epoch ± standard deviation", "", columns)
+
+    def _constants(self) -> list[Table]:
+        """Returns the table of constants that were found; none if all are known."""
+        labels = [one.label for one in self.tracks for _ in one.constants]
+        found = [constant for one in self.tracks for constant in one.constants]
+        if not found:
+            return []
+        low = [each.low for each in found]
+        high = [each.high for each in found]
+        columns = [
+            words("tracker", labels),
+            words("constant", [each.name for each in found]),
+            texts("value ± standard error", [with_error(each.value, each.error) for each in found]),
+            interval("95 %", low, high, short),
         ]
-        ends += [
-            texts(one.label, map(with_error, one.mean[-1], one.deviation[-1])) for one in found
-        ]
-        constants = [(one.label, each) for one in found for each in one.constants]
-        rows = [each for _, each in constants]
-        maximum = [
-            words("tracker", [label for label, _ in constants]),
-            words("constant", [each.name for each in rows]),
-            texts("value ± standard error", [with_error(each.value, each.error) for each in rows]),
-            interval("95 %", [each.low for each in rows], [each.high for each in rows], short),
-        ]
-        return [
-            *(
-                Strong(f"{one.label}: {text}")
-                for one in found
-                for text in (one.message, *one.notes)
-                if text
-            ),
-            *map(Strong, far_below(found)),
-            *(
-                [Table("constants", "Constants of largest likelihood", "", maximum)]
-                if constants
-                else ()
-            ),
-            Table(
-                "innovations",
-                f"{self.log.model.name}: is the filter right?",
-                "",
-                columns,
-                notes=[note],
-            ),
-            Table("last", "States at the last epoch ± standard deviation", "", ends),
-        ]
+        return [Table("constants", "Constants of largest likelihood", "", columns)]
 
 
 def write_tracks(
@@ -158,38 +166,44 @@ def write_tracks(
     """Writes track.json, track.csv, track.html and the picture; returns the files."""
     from ipe_bench.report.figures.log import draw_log
 
-    log, rows = (
-        answer.log,
-        ("lost_from", "effective", "message", "notes", "mean_nis", "limits", "verdict"),
-    )
-    rows = (*rows, "fit_p", "white_p", "log_likelihood", "passes")
-    trackers = {one.label: {name: as_json(getattr(one, name)) for name in rows} for one in answer}
-    for one in answer:
-        trackers[one.label]["constants"] = {
-            each.name: as_json([each.value, each.error]) for each in one.constants
-        }
-    content = {"schema": SCHEMA, "command": command, "trackers": trackers, **provenance}
+    content = {"schema": SCHEMA, "command": command, "trackers": _trackers(answer), **provenance}
     write_text(folder / f"{NAME}.json", json.dumps(content, indent=1) + "\n")
-    facts = [f"{int(np.isfinite(log.z).sum())} readings at {log.model.epochs} epochs"]
-    verdicts = dict.fromkeys(one.verdict for one in answer if one.verdict != NO_VERDICT)
-    found = {
-        word: enumerate_few([one.label for one in answer if one.verdict == word])
-        for word in verdicts
-    }
-    listed = "; ".join(f"{who} {shown(word)}" for word, who in found.items())
-    said = [f"Tested by innovations or the cost of a path: {listed}."] if found else []
-    smoothers = [one.label for one in answer if one.smooths]
-    if smoothers:
-        said.append(f"Smoothers, which use later readings: {enumerate_few(smoothers)}.")
-    told = {"facts": facts, "sources": read_from(provenance)}
+    log = answer.log
+    readings = int(np.isfinite(log.z).sum())
     files = write_files(
         folder,
         NAME,
         (TABLE, answer.table()),
         f"{log.model.name}: tracks",
-        said,
+        _sentences(answer),
         answer.parts(),
         draw_log(log, answer.tracks) if figures else (),
-        **told,
+        facts=[f"{readings} readings at {log.model.epochs} epochs"],
+        sources=read_from(provenance),
     )
     return [folder / f"{NAME}.json", *files]
+
+
+def _trackers(answer: LogAnswer) -> dict[str, dict[str, Any]]:
+    found = {}
+    for one in answer:
+        found[one.label] = {name: as_json(getattr(one, name)) for name in _STORED}
+        constants = {each.name: as_json([each.value, each.error]) for each in one.constants}
+        found[one.label]["constants"] = constants
+    return found
+
+
+def _sentences(answer: LogAnswer) -> list[str]:
+    """Says which trackers have each verdict, and which are smoothers."""
+    by_verdict: dict[str, list[str]] = {}
+    for one in answer:
+        if one.verdict != NO_VERDICT:
+            by_verdict.setdefault(one.verdict, []).append(one.label)
+    said = []
+    if by_verdict:
+        each = [f"{enumerate_few(who)} {shown(word)}" for word, who in by_verdict.items()]
+        said.append(f"Tested by innovations or the cost of a path: {'; '.join(each)}.")
+    smoothers = [one.label for one in answer if one.smooths]
+    if smoothers:
+        said.append(f"Smoothers, which use later readings: {enumerate_few(smoothers)}.")
+    return said
