@@ -81,13 +81,13 @@ class Recording(NamedTuple):
         """Computes values (..., m) at states x (..., n) of one epoch, or (trials, e, m) at those (trials, e, n) of
         all."""
         values = self.function(own(x.reshape(-1, x.shape[-1])), self.numbers)
-        return values.reshape(*x.shape[:-1], -1)
+        return values.reshape(*x.shape[:-1], values.shape[-1])
 
     def slope(self, x: Array) -> tuple[Array, Array]:
         """Computes values (..., m) and Jacobians (..., m, n) likewise."""
         *stack, n = x.shape
         values, slopes = self.function.slopes(own(x.reshape(-1, n)), self.numbers)
-        return values.reshape(*stack, -1), slopes.reshape(*stack, -1, n)
+        return values.reshape(*stack, values.shape[-1]), slopes.reshape(*stack, *slopes.shape[1:])
 
 
 @dataclass(frozen=True)

@@ -47,6 +47,8 @@ class Descent:
     """Evaluations of f and of h (trials,) so far."""
     slow: NDArray[np.int64]
     """Damped steps (trials,) in a row that hardly lowered an improbable cost."""
+    tries: NDArray[np.int64]
+    """Dampings (trials,) that were too small for the step that is tried."""
 
     @classmethod
     def of(cls, density: PathDensity, tracks: Tracks) -> Descent:
@@ -54,7 +56,7 @@ class Descent:
         at = density.settled(smoothed_path(tracks))
         trials = len(at.x)
         running, none = np.full(trials, Status.RUNNING, np.int8), np.zeros(trials, np.int64)
-        return cls(np.zeros(trials), at, running, none, tracks.calls + at.calls, none)
+        return cls(np.zeros(trials), at, running, none, tracks.calls + at.calls, none, none)
 
     def beaten(self, other: Descent, rows: NDArray[np.intp]) -> Mask:
         """Whether a path of `other`, of the trials `rows`, costs less by more than round-off."""
@@ -149,66 +151,71 @@ class LevenbergMarquardtSmoother(Tracker):
         return replace(take(found, least + starts * np.arange(trials)), calls=calls)
 
     def descended(self, density: PathDensity, paths: Descent) -> Descent:
-        """The paths after steps down, until each has converged or gets no further."""
-        active = np.flatnonzero(np.isfinite(paths.at.cost))
-        scale = np.zeros_like(paths.at.x)
-        for iteration in range(self.iterations):
-            if not active.size:
-                break
-            some, part = density.subset(active), take(paths, active)
-            tangents = some.tangents(part.at)
-            if not iteration:
-                scale[active] = some.blind_variances(tangents)
-            weights = 1 / np.where(scale[active] > 0, scale[active], np.inf)
-            paths = put(paths, active, self._stepped(some, part, tangents, weights))
-            active = active[paths.status[active] == Status.RUNNING]
-        unfinished = np.where(np.isfinite(paths.at.cost), Status.MAX_ITERATIONS, Status.NONFINITE)
-        running = paths.status == Status.RUNNING
-        return replace(paths, status=np.where(running, unfinished, paths.status))
+        """The paths after steps down, until each has converged or gets no further.
 
-    def _stepped(
+        In one pass each trial tries one step, of the damping that it has come to: none waits for another, and the few
+        that need many steps take as many passes as one of them alone.
+        """
+        finite = np.isfinite(paths.at.cost)
+        paths = replace(paths, status=np.where(finite, paths.status, Status.NONFINITE))
+        active = np.flatnonzero(finite)
+        part, some = take(paths, active), density.subset(active)
+        tangents = some.tangents(part.at)
+        scale = some.blind_variances(tangents)
+        weights = 1 / np.where(scale > 0, scale, np.inf)
+        slopes = Taylor().calls(density.model.n) * density.model.evaluations
+        part.calls[:] += slopes
+        while active.size:
+            part = self._tried(some, part, tangents, weights)
+            running = part.status == Status.RUNNING
+            going = running & (part.iterations < self.iterations)
+            if not going.all():
+                paths = put(paths, active[~going], take(part, ~going))
+                active, part = active[going], take(part, going)
+                tangents, weights = take(tangents, going), weights[going]
+                some = density.subset(active)
+            moved = np.flatnonzero(part.tries == 0)
+            if moved.size:
+                new = some.subset(moved).tangents(take(part.at, moved))
+                tangents = put(tangents, moved, new)
+                part.calls[moved] += slopes
+        running = paths.status == Status.RUNNING
+        return replace(paths, status=np.where(running, Status.MAX_ITERATIONS, paths.status))
+
+    def _tried(
         self, density: PathDensity, paths: Descent, tangents: Tangents, weights: Array
     ) -> Descent:
-        """The paths after one step, at the least damping that does not raise the cost."""
-        model = density.model
-        calls = paths.calls + Taylor().calls(model.n) * model.evaluations
-        at, damping = paths.at, paths.damping.copy()
-        todo = np.arange(len(calls))
-        there = np.zeros(len(calls), dtype=bool)
-        for attempt in range(_TRIES):
-            some, about = density.subset(todo), take(tangents, todo)
-            begun = take(paths.at, todo)
-            step = some.step(about, begun, damping[todo, None, None] * weights[todo])
-            if not attempt:
-                there = self._converged(some, about, begun, step, damping)
-            found = some.settled(begun.x + step)
-            calls[todo] += found.calls
-            lower = found.cost <= begun.cost * (1 + _ROUND_OFF)
-            at = put(at, todo[lower], take(found, lower))
-            todo = todo[~lower & ~there[todo]]
-            if not todo.size:
-                break
-            damping[todo] = np.maximum(_FACTOR * damping[todo], self.damping)
+        """The paths after one try each: moved by a step that does not raise the cost, or else with more damping."""
+        damping, first = paths.damping, paths.tries == 0
+        step = density.step(tangents, paths.at, damping[:, None, None] * weights)
+        there = self._converged(density, tangents, paths, step)
+        found = density.settled(paths.at.x + step)
+        lower = found.cost <= paths.at.cost * (1 + _ROUND_OFF)
+        at = put(paths.at, lower, take(found, lower))
+        over = lower | there
         eased = np.where(damping > self.damping, damping / _FACTOR, 0.0)
-        damping = np.where(damping == paths.damping, eased, damping)
-        status = np.where(there, Status.CONVERGED, Status.RUNNING).astype(np.int8)
+        raised = np.maximum(_FACTOR * damping, self.damping)
+        damping = np.where(over, np.where(first, eased, damping), raised)
         improbable = self.improbable(density.z, at.cost)
         hardly = improbable & (damping > 0) & (at.cost > _HARDLY * paths.at.cost)
-        slow = np.where(hardly, paths.slow + 1, 0)
-        status[~there & (slow >= _SLOW)] = Status.STALLED
-        status[todo] = Status.STALLED
-        return Descent(damping, at, status, paths.iterations + 1, calls, slow)
+        slow = np.where(over, np.where(hardly, paths.slow + 1, 0), paths.slow)
+        tries = np.where(over, 0, paths.tries + 1)
+        stalled = (slow >= _SLOW) | (tries >= _TRIES)
+        status = np.where(stalled, Status.STALLED, Status.RUNNING).astype(np.int8)
+        status[there] = Status.CONVERGED
+        iterations = paths.iterations + (over | stalled)
+        return Descent(damping, at, status, iterations, paths.calls + found.calls, slow, tries)
 
     def _converged(
-        self, density: PathDensity, tangents: Tangents, at: Settled, step: Array, damping: Array
+        self, density: PathDensity, tangents: Tangents, paths: Descent, step: Array
     ) -> Mask:
-        """Whether the undamped step is short (trials,). It is longer than a damped one, so that it is asked for only
-        where the latter is short."""
-        short = density.size(tangents, step) <= self.tolerance**2
-        rows = np.flatnonzero(short & (damping > 0))
+        """Whether the undamped step from a path is short (trials,), at the first try. It is longer than a damped one,
+        so that it is asked for only where the latter is short."""
+        short = (paths.tries == 0) & (density.size(tangents, step) <= self.tolerance**2)
+        rows = np.flatnonzero(short & (paths.damping > 0))
         if rows.size:
             some, about = density.subset(rows), take(tangents, rows)
-            undamped = some.step(about, take(at, rows))
+            undamped = some.step(about, take(paths.at, rows))
             short[rows] = some.size(about, undamped) <= self.tolerance**2
         return short
 

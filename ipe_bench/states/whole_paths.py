@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 from ipe_bench.basics.linalg import Array, multiply
 from ipe_bench.engine.chains import solve_chains
 from ipe_bench.states.algebra import (
+    Half,
     factor,
     half,
     lower_solve,
@@ -79,6 +79,10 @@ class PathDensity:
     """G^+ (K, q, n)."""
     unreached: Array
     """I - G G^+ (K, n, n), onto what the noise of a step does not reach; 0 if each step's noise reaches every state."""
+    noise: Array
+    """G (1 + K, n, q) with that of P0 in front."""
+    start: Half
+    """Of P0 (n, n)."""
     whitener: Array
     """R^-1/2 (trials, K, m, m), of missing readings that of unit variance."""
 
@@ -99,7 +103,13 @@ class PathDensity:
         if (np.abs(unreached) < _REACHED).all():
             unreached = np.zeros_like(unreached)
         whitener = lower_solve(L, np.broadcast_to(one, L.shape))
-        return cls(model, z, gains, inverses, unreached, whitener)
+        first = root(model.prior.covariance)
+        columns = max(first.shape[1], gains.shape[2])
+        noise = np.zeros((1 + model.epochs, model.n, columns))
+        noise[0, :, : first.shape[1]] = first
+        noise[1:, :, : gains.shape[2]] = gains
+        start = half(model.prior.covariance)
+        return cls(model, z, gains, inverses, unreached, noise, start, whitener)
 
     def subset(self, rows: NDArray[np.intp]) -> PathDensity:
         """The density of the trials `rows`."""
@@ -146,13 +156,16 @@ class PathDensity:
         w = multiply(self.inverses, gap)
         v = multiply(self.whitener, r)
         m, P = self.model.prior
-        cost = mahalanobis(x[:, 0] - m, P) + np.sum(w**2, axis=(1, 2)) + np.sum(v**2, axis=(1, 2))
+        cost = (
+            mahalanobis(x[:, 0] - m, P, self.start)
+            + np.sum(w**2, axis=(1, 2))
+            + np.sum(v**2, axis=(1, 2))
+        )
         return Settled(x, gap, r, np.nan_to_num(cost, nan=np.inf), calls)
 
     def _begun(self, start: Array) -> Array:
         """The starts (trials, n), without the round-off by which they miss the range of the prior."""
-        m, P = self.model.prior
-        prior = half(P)
+        m, prior = self.model.prior.mean, self.start
         if not prior.singular:
             return start
         within = m + np.matmul(prior.whitened(start - m), transposed(prior.G))
@@ -188,24 +201,14 @@ class PathDensity:
         a = np.concatenate([self.model.prior.mean - at.x[:, :1], -at.gap], axis=1)
         v = multiply(self.whitener, at.residual)
         D = np.zeros_like(a) if damping is None else damping
-        return solve_chains(tangents.A, tangents.B, D, self._noise, a, v)[0]
-
-    @cached_property
-    def _noise(self) -> Array:
-        """G (1 + K, n, q) with that of P0 in front."""
-        first = root(self.model.prior.covariance)
-        columns = max(first.shape[1], self.gains.shape[2])
-        G = np.zeros((1 + self.model.epochs, self.model.n, columns))
-        G[0, :, : first.shape[1]] = first
-        G[1:, :, : self.gains.shape[2]] = self.gains
-        return G
+        return solve_chains(tangents.A, tangents.B, D, self.noise, a, v)[0]
 
     def filtered(self, tangents: Tangents) -> Array:
         """The covariances (trials, 1 + K, n, n) of the affine model's states by the readings up to each epoch."""
         A, B = tangents.A, tangents.B
         nothing = np.zeros((len(A), 1 + self.model.epochs, self.model.n))
         v = np.zeros(B.shape[:3])
-        return solve_chains(A, B, nothing, self._noise, nothing, v, spread=True)[1]
+        return solve_chains(A, B, nothing, self.noise, nothing, v, spread=True)[1]
 
     def spread(self, tangents: Tangents) -> tuple[Array, Array]:
         """The covariances P (trials, 1 + K, n, n) of the states of the affine model, and those of them with the last
@@ -247,7 +250,7 @@ class PathDensity:
         """dx' (Hessian of Gauss and Newton) dx (trials,): a step's squared length in deviations of the path."""
         w = multiply(self.inverses, step[:, 1:] - multiply(tangents.A, step[:, :-1]))
         v = multiply(tangents.B, step[:, 1:])
-        e = half(self.model.prior.covariance).whitened(step[:, :1])
+        e = self.start.whitened(step[:, :1])
         return np.sum(w**2, axis=(1, 2)) + np.sum(v**2, axis=(1, 2)) + np.sum(e**2, axis=(1, 2))
 
     def blind_variances(self, tangents: Tangents) -> Array:

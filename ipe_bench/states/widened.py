@@ -17,6 +17,8 @@ _MOST = 100.0
 """Times its variance that a direction gets at most."""
 _NUMBERS = 5e5
 """Numbers of the slopes that are held at once: they stay in a processor's cache."""
+_LANES = 8
+"""Trials at least that are held at once: machine code takes no more time for them than for one."""
 
 
 def widened(density: PathDensity, at: Settled, tangents: Tangents) -> tuple[Array, Array]:
@@ -28,44 +30,49 @@ def widened(density: PathDensity, at: Settled, tangents: Tangents) -> tuple[Arra
     the variance along the axis is multiplied by the larger of both c^2 / dJ, but not made smaller. The step itself is
     b c^2 where the valley of the cost bends: it adds the second moment of that, 3 b b'.
     """
-    model = density.model
-    at_once = max(1, int(_NUMBERS / (2 * model.n**3 * model.epochs)))
-    parts = np.split(np.arange(len(at.x)), range(at_once, len(at.x), at_once))
-    P, crossed = density.spread(tangents)
-    calls = np.zeros(len(P))
-    for i in parts:
-        some = density.subset(i), take(at, i), take(tangents, i)
-        more, calls[i] = _of_some(*some, P[i, -1], crossed[i])
-        P[i] += more
+    P = np.empty((*at.x.shape, at.x.shape[-1]))
+    calls = np.empty(len(P))
+    sides = 2 * density.model.n
+    at_once = max(_LANES, _slopes_at_once(density) // sides)
+    for i in np.split(np.arange(len(P)), range(at_once, len(P), at_once)):
+        P[i], calls[i] = _of_some(density.subset(i), take(at, i), take(tangents, i))
     return P, calls
 
 
-def _of_some(
-    density: PathDensity, at: Settled, tangents: Tangents, P: Array, crossed: Array
-) -> tuple[Array, Array]:
-    """What is added to the covariances, from those P (trials, n, n) of the last states and those of all states with
-    these."""
+def _slopes_at_once(density: PathDensity) -> int:
+    """Paths whose slopes are held at once."""
+    return max(1, int(_NUMBERS / (density.model.n**2 * density.model.epochs)))
+
+
+def _of_some(density: PathDensity, at: Settled, tangents: Tangents) -> tuple[Array, Array]:
     trials, epochs, n = at.x.shape
-    _, inverse = principal(P)
+    P, crossed = density.spread(tangents)
+    _, inverse = principal(P[:, -1])
     # Row i moves the last states by a deviation along axis i, and the path as the affine model has it.
     lines = np.moveaxis(np.matmul(crossed, transposed(inverse)[:, None]), -1, 1)
     along = np.sum(inverse * lines[:, :, -1], axis=-1)
     # But for round-off they do so already.
     lines = lines / np.where(along > 0, along, 1.0)[..., None, None]
     sides = np.stack([lines, -lines], axis=1).reshape(-1, epochs, n)
-    owner, axis = np.repeat(np.arange(trials), 2 * n), np.tile(np.arange(n), 2 * trials)
+    owner = np.repeat(np.arange(trials), 2 * n)
     moved = density.subset(owner).settled(at.x[owner] + _FAR * sides)
-    cost, calls, bends = moved.cost, moved.calls, np.zeros(sides.shape)
+    cost = moved.cost
+    calls = moved.calls
+    bends = np.zeros(sides.shape)
     known = (sides == 0).all(axis=(1, 2))
     rise = cost / _FAR**2 - at.cost[owner] / _FAR**2
-    rows = np.flatnonzero(~known & ~(np.abs(rise - 1.0) <= _NORMAL))
-    if rows.size:
+    bent = ~known & ~(np.abs(rise - 1.0) <= _NORMAL)
+    at_once = _slopes_at_once(density)
+    bent = np.flatnonzero(bent)
+    for rows in np.split(bent, range(at_once, len(bent), at_once)):
         own = owner[rows]
-        some, there = density.subset(own), take(moved, rows)
+        some = density.subset(own)
+        there = take(moved, rows)
         step = some.step(take(tangents, own), there)
+        axis = rows % n
         # What the step would move along the axis itself is taken back.
-        back = np.sum(inverse[own, axis[rows]] * step[:, -1], axis=1)
-        step = step - lines[own, axis[rows]] * back[:, None, None]
+        back = np.sum(inverse[own, axis] * step[:, -1], axis=1)
+        step = step - lines[own, axis] * back[:, None, None]
         followed = some.settled(there.x + step)
         lower = followed.cost <= there.cost
         bends[rows[lower]] = step[lower]
@@ -77,7 +84,8 @@ def _of_some(
     # E t^4 = 3 of a standard normal t.
     wide = np.concatenate([np.sqrt(extra)[..., None, None] * lines, np.sqrt(3.0) * bend], axis=1)
     wide = np.moveaxis(wide, 1, -1)
-    return np.matmul(wide, transposed(wide)), calls.reshape(trials, -1).sum(axis=1)
+    P = P + np.matmul(wide, transposed(wide))
+    return P, calls.reshape(trials, -1).sum(axis=1)
 
 
 def _rarer(rise: Array) -> Array:
