@@ -132,7 +132,7 @@ def check_option(option: Option) -> Iterator[Finding]:
             return
         yield from check_component(name, construct(config, where))
     except UserError as error:
-        yield Finding(name, "Can be made from its config", str(error))
+        yield Finding(name, f"Can be made from its config, {option.path.name}", str(error))
     except Exception as error:
         complaint = blame(error)
         if complaint is None:

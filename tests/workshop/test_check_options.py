@@ -62,6 +62,13 @@ def test_an_option_that_can_be_used_passes(checked, place):
         assert len(findings) >= 4
 
 
+def test_an_option_that_the_class_has_no_more_is_told_of_with_its_file(checked):
+    text = "_target_: ipe_bench.noise.Gaussian\nkappa: 1.0\n"
+    (finding,) = checked({"noise/leftover": text}, "noise/leftover")
+    assert finding.check.endswith("leftover.yaml")
+    assert "kappa: there is no such option" in finding.complaint
+
+
 def test_what_is_to_be_given_is_named(checked):
     place = "measurement/to_be_given"
     (finding,) = checked({place: GOOD[place]}, place)
