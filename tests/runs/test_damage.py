@@ -13,6 +13,7 @@ from pathlib import Path
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
+from shared.families import slow_if
 from shared.small_models import Bent
 
 import ipe_bench as ib
@@ -137,7 +138,7 @@ SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.campaign) for seed in range(1
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", slow_if(lambda kind: kind != KINDS[0], KINDS))
 @pytest.mark.parametrize("harm", HARMS, ids=lambda harm: harm.__name__)
 def test_whatever_is_done_to_a_file_is_named_and_healed(folder, expected, kind, harm, seed):
     """Or changed nothing that is read; the next run makes the folder whole."""
