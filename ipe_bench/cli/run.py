@@ -63,6 +63,12 @@ class Outcome:
             or Path(self.output).name
         )
 
+    def label(self, command: str) -> str:
+        """Returns the words that the sweep of a command gives to this job, or `job` where there is no sweep."""
+        typed = {word.lstrip("+~") for word in shlex.split(command)}
+        swept = tuple(word for word in self.words if word.lstrip("+~") not in typed)
+        return replace(self, words=swept).job if swept else self.job
+
     def __float__(self) -> float:
         """Returns the objective of sweepers that optimise; they cannot go on from a job that was refused."""
         if self.mistake or self.objective is None:
@@ -245,7 +251,7 @@ def _computed(job: Spec, begun: Outcome, command: str) -> Outcome:
         "command": command,
     }
     done = replace(begun, remarks=job.measurement.remarks(job.measurement.nominal))
-    with watching(begun.job, lines=True) as watch:
+    with watching(begun.label(command), lines=True) as watch:
         if job.precision is None:
             done = replace(done, failures=compute(*asked, **options, watch=watch))
         else:

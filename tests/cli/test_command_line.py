@@ -17,6 +17,7 @@ import ipe_bench as ib
 from ipe_bench.basics.options import Count, Whole
 from ipe_bench.cli.keys import ROWS, WHOLE
 from ipe_bench.cli.main import COMMANDS, main
+from ipe_bench.cli.run import Outcome
 from ipe_bench.cli.spec import KEYS, PARTS, Spec
 from ipe_bench.report import figures
 from ipe_bench.statistics.records import SCORES, STATISTICS
@@ -656,3 +657,16 @@ def test_a_launcher_that_is_missing_is_installed_under_the_name_that_it_has(
         pytest.skip(f"{launcher} is installed")
     assert main(["run", "-m", f"hydra/launcher={launcher}", "error_scale=1,2"]) == 2
     assert f"is not installed; pip install {package}, or choose basic" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("command", "label"),
+    [
+        ("ipe-bench run -m measurement=gins noise.deviation=2 error_scale=1,3", "error_scale=3"),
+        ("ipe-bench run noise.deviation=2 error_scale=3", "noise.deviation=2, error_scale=3"),
+    ],
+)
+def test_progress_names_what_the_sweep_gives_to_a_job(command, label):
+    typed = ("measurement=gins",) if " -m " in command else ()
+    job = Outcome("outputs/mine", (*typed, "+noise.deviation=2", "error_scale=3"))
+    assert job.label(command) == label
