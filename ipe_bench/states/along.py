@@ -1,7 +1,7 @@
 """The functions f and h of a state model with their slopes, at one epoch and along whole paths.
 
-They are recorded once and run as compiled code along all epochs of all paths. What cannot be recorded is called epoch
-by epoch, with slopes by complex steps.
+They are recorded once and run as compiled code along all epochs of all paths. What cannot be
+recorded is called epoch by epoch, with slopes by complex steps.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from ipe_bench.states.base import StateModel
 
 _MOST_OPERATIONS = 20_000
-"""Operations of a function at one epoch, with its tangents, at most: they take ten seconds to compile, once per
-machine."""
+"""Operations of a function at one epoch, with its tangents, at most: they take ten seconds to
+compile, once per machine."""
 _MOST_IN_ALL = 200_000
 """Operations that are recorded of a function over all epochs at most, in a second or two."""
 _MOST_FORMS = 8
@@ -44,7 +44,8 @@ class Along(NamedTuple):
     """Holds f and h of a state model along paths of K epochs, with their slopes."""
 
     f: Array
-    """f of the states before each epoch (trials, K, n); those states themselves if no transition leads there."""
+    """f of the states before each epoch (trials, K, n); those states themselves if no transition
+    leads there."""
     h: Array
     """h of the states at each epoch (trials, K, m)."""
     F: Array
@@ -78,8 +79,8 @@ class Recording(NamedTuple):
     """(e, p)"""
 
     def __call__(self, x: Array) -> Array:
-        """Computes values (..., m) at states x (..., n) of one epoch, or (trials, e, m) at those (trials, e, n) of
-        all."""
+        """Computes values (..., m) at states x (..., n) of one epoch, or (trials, e, m) at those
+        (trials, e, n) of all."""
         values = self.function(own(x.reshape(-1, x.shape[-1])), self.numbers)
         return values.reshape(*x.shape[:-1], values.shape[-1])
 
@@ -139,7 +140,8 @@ class _Written(NamedTuple):
     y: Sequence[Expression]
     x: Sequence[Expression]
     form: tuple[Any, ...]
-    """Its operations and outputs but for the values of constants, which are the same at epochs that can be joined."""
+    """Its operations and outputs but for the values of constants, which are the same at epochs that
+    can be joined."""
     constants: Sequence[float]
 
     @classmethod
@@ -157,8 +159,8 @@ class _Written(NamedTuple):
 def recorded_by_epoch(
     function: Function, n: int, epochs: Sequence[int], alike: Callable[[int], int]
 ) -> list[Recording]:
-    """Records a function of n states at each epoch, and joins epochs at which only its constants differ; `alike` names
-    the epoch whose function that of another is.
+    """Records a function of n states at each epoch, and joins epochs at which only its constants
+    differ; `alike` names the epoch whose function that of another is.
 
     Raises:
         ValueError: it has too many operations or forms.
@@ -181,8 +183,8 @@ def recorded_by_epoch(
 
 
 def _joined_form(epochs: Mapping[int, _Written]) -> Recording:
-    """Joins recordings of one form. All constants become numbers of the epoch, so that other values of a model's
-    options need no other machine code."""
+    """Joins recordings of one form. All constants become numbers of the epoch, so that other values
+    of a model's options need no other machine code."""
     y, x, _, first = next(iter(epochs.values()))
     graph = x[0].graph
     c = graph.inputs("c", len(first))
@@ -193,7 +195,8 @@ def _joined_form(epochs: Mapping[int, _Written]) -> Recording:
 
 
 def functions_of(model: StateModel) -> tuple[EpochFunctions, EpochFunctions]:
-    """Returns f and h of a model, recorded where they can be and then agree with the model's own on drawn paths."""
+    """Returns f and h of a model, recorded where they can be and then agree with the model's own on
+    drawn paths."""
     every = range(model.epochs)
     moving = [k for k in every if model.moves(k)]
     f = _recorded(model, "transition", moving)
@@ -223,7 +226,8 @@ def _recorded(model: StateModel, name: str, epochs: Sequence[int]) -> EpochFunct
 
 
 def _held(functions: EpochFunctions, function: Function, k: int, x: Array) -> EpochFunctions:
-    """Returns the functions; by epoch if that of epoch k differs from the model's own at x (trials, n)."""
+    """Returns the functions; by epoch if that of epoch k differs from the model's own at x (trials,
+    n)."""
     if functions.why:
         return functions
     found = functions.at[k].slope(x)

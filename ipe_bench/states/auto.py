@@ -1,4 +1,5 @@
-"""One tracker for those who do not want to choose: it goes further only where the readings say that it has to."""
+"""One tracker for those who do not want to choose: it goes further only where the readings say that
+it has to."""
 
 from __future__ import annotations
 
@@ -19,20 +20,23 @@ from ipe_bench.states.trackers import Filter, Tracker, Tracks, filtered
 from ipe_bench.states.whole_paths import PathDensity
 
 EXTENDED, UNSCENTED, DAMPED, AGAIN = 1, 2, 3, 4
-"""The stages, as the column `extra_stage` names them; the second round of restarts is 5, and so on."""
+"""The stages, as the column `extra_stage` names them; the second round of restarts is 5, and so
+on."""
 
 
 @dataclass(frozen=True)
 class AutoTracker(Tracker):
     """Estimates the path of largest posterior density by as much as each trial needs.
 
-    1. The extended filter and its smoother.
-    2. Where its innovations are improbable, the unscented ones, if their path costs less.
-    3. Levenberg-Marquardt steps from there. A path that the first of them would hardly move, such as that of a linear
+    1. The extended filter and its smoother. 2. Where its innovations are improbable, the unscented
+    ones, if their path costs less. 3. Levenberg-Marquardt steps from there. A path that the first
+    of them would hardly move, such as that of a linear
        model, is the answer of the stage that it comes from.
-    4. Where the path at the end is improbable, up to three rounds of steps from draws of the prior, other ones in each.
+    4. Where the path at the end is improbable, up to three rounds of steps from draws of the prior,
+    other ones in each.
 
-    Noise that depends on the states leaves no density to descend on: the more likely smoother of the two is the answer.
+    Noise that depends on the states leaves no density to descend on: the more likely smoother of
+    the two is the answer.
 
     Example:
 
@@ -82,6 +86,8 @@ class AutoTracker(Tracker):
     def _likelier(
         self, model: StateModel, z: Array, first: Tracks, doubtful: NDArray[np.intp]
     ) -> Tracks:
+        """Smooths the filter by tangents, or in doubtful trials that by points if it is
+        likelier."""
         tracks = smoothed(model, first)
         cost = tracks.cost = first.nis.sum(axis=1)
         stage = tracks.stage = np.full(len(z), EXTENDED)
@@ -94,10 +100,8 @@ class AutoTracker(Tracker):
         rows = doubtful[likelier]
         stage[rows] = UNSCENTED
         cost[rows] = second.nis.sum(axis=1)[likelier]
-        tracks.mean[rows], tracks.covariance[rows] = (
-            other.mean[likelier],
-            other.covariance[likelier],
-        )
+        tracks.mean[rows] = other.mean[likelier]
+        tracks.covariance[rows] = other.covariance[likelier]
         for mine, its in zip(tracks.start, other.start, strict=True):
             mine[rows] = its[likelier]
         return tracks

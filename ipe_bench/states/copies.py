@@ -1,4 +1,5 @@
-"""Copies of a path that differ from it by whole periods of a state, such as turns of an angle read by its sine."""
+"""Copies of a path that differ from it by whole periods of a state, such as turns of an angle read
+by its sine."""
 
 from __future__ import annotations
 
@@ -19,12 +20,14 @@ _MOST = 30
 
 
 def copy_p(model: StateModel, z: Array, tracks: Tracks) -> Array | None:
-    """The probability (trials,) that each path and none of its copies is the right one, by their costs J,
+    """The probability (trials,) that each path and none of its copies is the right one, by their
+    costs J,
 
         p = exp(-J / 2) / sum of exp(-J_s / 2) over the path and its copies.
 
-    A copy has one state shifted by whole periods from beginning to end. NaN for a path that is not finite; None if the
-    model has no periods or noise by state, and for trackers without a path of a cost."""
+    A copy has one state shifted by whole periods from beginning to end. NaN for a path that is not
+    finite; None if the model has no periods or noise by state, and for trackers without a path of a
+    cost."""
     by_state = model.gain_by_state or model.R_by_state
     if tracks.cost is None or by_state or not any(model.state_periods):
         return None

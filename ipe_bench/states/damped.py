@@ -1,4 +1,5 @@
-"""The iterated smoother of Levenberg and Marquardt, which finds the path of largest posterior density from far away."""
+"""The iterated smoother of Levenberg and Marquardt, which finds the path of largest posterior
+density from far away."""
 
 from __future__ import annotations
 
@@ -21,15 +22,19 @@ from ipe_bench.states.trackers import Tracker, Tracks, filtered
 from ipe_bench.states.whole_paths import PathDensity, Settled, Tangents
 from ipe_bench.states.widened import widened
 
-_TRIES, _FACTOR = 15, 10.0
-"""Dampings that are tried about one path, and the factor between them."""
+_TRIES = 15
+"""Dampings that are tried about one path."""
+_FACTOR = 10.0
+"""The factor between them."""
 _ROUND_OFF = 1e-12
 """Part of a cost that counts as round-off."""
 _SHARE = 0.5
 """Standard deviations of the prior about a further start, in those of the prior."""
-_SLOW, _HARDLY = 3, 0.9
-"""Damped steps in a row after which a search ends that each leave more than this share of an improbable cost: of those
+_SLOW = 3
+"""Damped steps in a row that hardly lower an improbable cost, after which a search ends: of those
 that crawled so for 30 steps, one in ten arrived."""
+_HARDLY = 0.9
+"""Share of the cost above which a step has hardly lowered it."""
 _NUMBERS = 2e7
 """Numbers of the covariances of further starts that are held at once."""
 
@@ -55,7 +60,8 @@ class Descent:
         """Begins at the smoothed paths of a filter's tracks."""
         at = density.settled(smoothed_path(tracks))
         trials = len(at.x)
-        running, none = np.full(trials, Status.RUNNING, np.int8), np.zeros(trials, np.int64)
+        running = np.full(trials, Status.RUNNING, np.int8)
+        none = np.zeros(trials, np.int64)
         return cls(np.zeros(trials), at, running, none, tracks.calls + at.calls, none, none)
 
     def beaten(self, other: Descent, rows: NDArray[np.intp]) -> Mask:
@@ -63,7 +69,8 @@ class Descent:
         return other.at.cost < self.at.cost[rows] * (1 - _ROUND_OFF)
 
     def improved(self, other: Descent, rows: NDArray[np.intp]) -> Descent:
-        """These paths with those of `other`, of the trials `rows`, that cost less; both have been paid for."""
+        """These paths with those of `other`, of the trials `rows`, that cost less; both have been
+        paid for."""
         better = self.beaten(other, rows)
         calls = self.calls.copy()
         calls[rows] += other.calls
@@ -72,19 +79,21 @@ class Descent:
 
 @dataclass(frozen=True)
 class LevenbergMarquardtSmoother(Tracker):
-    r"""Damped Gauss-Newton steps to the path of largest posterior density (Särkkä and Svensson, ICASSP 2020: LM-IEKS).
+    r"""Damped Gauss-Newton steps to the path of largest posterior density (Särkkä and Svensson,
+    ICASSP 2020: LM-IEKS).
 
-    Each step is the exact solution of the model linearised about the last path, in which every state is read once more,
-    where it was, with a variance of `scale / damping`. The scale of a state is its variance before anything is read,
-    along the first path. The damping is 0 as long as steps lower the cost of the path, and grows tenfold where one does
-    not,
+    Each step is the exact solution of the model linearised about the last path, in which every
+    state is read once more, where it was, with a variance of `scale / damping`. The scale of a
+    state is its variance before anything is read, along the first path. The damping is 0 as long as
+    steps lower the cost of the path, and grows tenfold where one does not,
 
     .. math:: J(x) = |x_0 - m_0|^2_{P_0^{-1}} + \sum_k |w_k|^2 + \sum_k |z_k - h(x_k)|^2_{R_k^{-1}}.
 
-    The first path is the smoothed track of the EKF or of the UKF, whichever costs less. At its minimum J is chi-square
-    with as many degrees as there are readings. Where it is too large for that, the trial begins again at draws of the
-    prior, each smoothed by a UKF of half the prior's deviations, from the one that costs least. The covariance is that
-    of the affine model, widened where the cost rises more slowly or bends; see `widened`.
+    The first path is the smoothed track of the EKF or of the UKF, whichever costs less. At its
+    minimum J is chi-square with as many degrees as there are readings. Where it is too large for
+    that, the trial begins again at draws of the prior, each smoothed by a UKF of half the prior's
+    deviations, from the one that costs least. The covariance is that of the affine model, widened
+    where the cost rises more slowly or bends; see `widened`.
 
     Example:
 
@@ -100,8 +109,8 @@ class LevenbergMarquardtSmoother(Tracker):
     iterations: Count = 30
     """Steps at most from one start."""
     tolerance: Positive = 1e-2
-    """A path has converged if its undamped step is shorter than this many of its own standard deviations, over all
-    states and epochs together."""
+    """A path has converged if its undamped step is shorter than this many of its own standard
+    deviations, over all states and epochs together."""
     damping: Positive = 1e-2
     """The first damping of a step that raises the cost."""
     level: Share = 1e-3
@@ -124,17 +133,20 @@ class LevenbergMarquardtSmoother(Tracker):
         return reported(density, paths)
 
     def improbable(self, z: Array, cost: Array) -> Mask:
-        """Whether a path costs too much for its readings (trials,); one without a finite cost does."""
+        """Whether a path costs too much for its readings (trials,); one without a finite cost
+        does."""
         return ~(path_p(z, cost) >= self.level)
 
     def drawn(self, density: PathDensity, number: int = 0) -> Descent:
-        """For each trial, the smoothed UKF of least cost among those that begin at draws of the prior; each number of a
-        round has its own draws."""
-        model, trials = density.model, len(density.z)
+        """For each trial, the smoothed UKF of least cost among those that begin at draws of the
+        prior; each number of a round has its own draws."""
+        model = density.model
+        trials = len(density.z)
         m, P = model.prior
-        spread, generators = root(P), own_generators(self.seed, density.z.reshape(trials, -1))
-        draws = normals(generators, number + 1, self.starts, spread.shape[1])[:, -1]
-        draws = m + multiply(spread, draws)
+        spread = root(P)
+        generators = own_generators(self.seed, density.z.reshape(trials, -1))
+        drawn = normals(generators, number + 1, self.starts, spread.shape[1])
+        draws = m + multiply(spread, drawn[:, -1])
         at_once = max(1, int(_NUMBERS / (self.starts * model.epochs * model.n**2)))
         parts = np.split(np.arange(trials), range(at_once, trials, at_once))
         return join([self._best(density.subset(rows), draws[rows]) for rows in parts])
@@ -153,15 +165,17 @@ class LevenbergMarquardtSmoother(Tracker):
     def descended(self, density: PathDensity, paths: Descent) -> Descent:
         """The paths after steps down, until each has converged or gets no further.
 
-        In one pass each trial tries one step, of the damping that it has come to: none waits for another, and the few
-        that need many steps take as many passes as one of them alone.
+        In one pass each trial tries one step, of the damping that it has come to: none waits for
+        another, and the few that need many steps take as many passes as one of them alone.
         """
         finite = np.isfinite(paths.at.cost)
         paths = replace(paths, status=np.where(finite, paths.status, Status.NONFINITE))
         active = np.flatnonzero(finite)
-        part, some = take(paths, active), density.subset(active)
+        part = take(paths, active)
+        some = density.subset(active)
         tangents = some.tangents(part.at)
         scale = some.blind_variances(tangents)
+        # A state that is known exactly is not damped.
         weights = 1 / np.where(scale > 0, scale, np.inf)
         slopes = Taylor().calls(density.model.n) * density.model.evaluations
         part.calls[:] += slopes
@@ -171,9 +185,12 @@ class LevenbergMarquardtSmoother(Tracker):
             going = running & (part.iterations < self.iterations)
             if not going.all():
                 paths = put(paths, active[~going], take(part, ~going))
-                active, part = active[going], take(part, going)
-                tangents, weights = take(tangents, going), weights[going]
+                active = active[going]
+                part = take(part, going)
+                tangents = take(tangents, going)
+                weights = weights[going]
                 some = density.subset(active)
+            # A path that has moved is linearised anew.
             moved = np.flatnonzero(part.tries == 0)
             if moved.size:
                 new = some.subset(moved).tangents(take(part.at, moved))
@@ -185,14 +202,19 @@ class LevenbergMarquardtSmoother(Tracker):
     def _tried(
         self, density: PathDensity, paths: Descent, tangents: Tangents, weights: Array
     ) -> Descent:
-        """The paths after one try each: moved by a step that does not raise the cost, or else with more damping."""
-        damping, first = paths.damping, paths.tries == 0
+        """The paths after one try each: moved by a step that does not raise the cost, or else with
+        more damping."""
+        damping = paths.damping
+        first = paths.tries == 0
+        # (Hessian of Gauss and Newton + D) dx = -gradient / 2, with D = damping / scale.
         step = density.step(tangents, paths.at, damping[:, None, None] * weights)
         there = self._converged(density, tangents, paths, step)
         found = density.settled(paths.at.x + step)
         lower = found.cost <= paths.at.cost * (1 + _ROUND_OFF)
         at = put(paths.at, lower, take(found, lower))
+        # The damping grows until a step is taken, and falls where the first try was.
         over = lower | there
+        # The next step begins with less damping where this one needed no more.
         eased = np.where(damping > self.damping, damping / _FACTOR, 0.0)
         raised = np.maximum(_FACTOR * damping, self.damping)
         damping = np.where(over, np.where(first, eased, damping), raised)
@@ -209,33 +231,40 @@ class LevenbergMarquardtSmoother(Tracker):
     def _converged(
         self, density: PathDensity, tangents: Tangents, paths: Descent, step: Array
     ) -> Mask:
-        """Whether the undamped step from a path is short (trials,), at the first try. It is longer than a damped one,
-        so that it is asked for only where the latter is short."""
+        """Whether the undamped step from a path is short (trials,), at the first try. It is longer
+        than a damped one, so that it is asked for only where the latter is short."""
         short = (paths.tries == 0) & (density.size(tangents, step) <= self.tolerance**2)
         rows = np.flatnonzero(short & (paths.damping > 0))
         if rows.size:
-            some, about = density.subset(rows), take(tangents, rows)
+            some = density.subset(rows)
+            about = take(tangents, rows)
             undamped = some.step(about, take(paths.at, rows))
             short[rows] = some.size(about, undamped) <= self.tolerance**2
         return short
 
 
 def smoothed_path(tracks: Tracks) -> Array:
-    """The smoothed means (trials, 1 + K, n) of a filter's tracks from before the first transition, without their
-    covariances: by the scores r of later readings (Bierman, Automatica 9, 1973), with those of `Tracks.reads`,
+    """The smoothed means (trials, 1 + K, n) of a filter's tracks from before the first transition,
+    without their covariances: by the scores r of later readings (Bierman, Automatica 9, 1973), with
+    those of `Tracks.reads`,
 
         r <- r + H' S^-1 (y - H P- r),   r <- A' r,   m[k-1] <- m[k-1] + P[k-1] r.
     """
-    H, L = (np.stack(each, axis=1) for each in zip(*tracks.reads, strict=True))
-    W, e = lower_solve(L, H), np.nan_to_num(tracks.innovations)
-    r = np.zeros((len(e), 1 + len(tracks.reads), H.shape[-1]))
-    first = len(tracks.reads) - len(tracks.moves)
+    H = np.stack([H for H, _ in tracks.reads], axis=1)
+    L = np.stack([L for _, L in tracks.reads], axis=1)
+    # H' S^-1 H = W' W and H' S^-1 y = W' e, with W = L^-1 H and S = L L'.
+    W = lower_solve(L, H)
+    e = np.nan_to_num(tracks.innovations)
+    epochs = len(tracks.reads)
+    r = np.zeros((len(e), 1 + epochs, H.shape[-1]))
+    first = epochs - len(tracks.moves)
     later = r[:, -1]
-    for k in range(len(tracks.reads) - 1, first - 1, -1):
+    for k in range(epochs - 1, first - 1, -1):
         P = tracks.predicted[k - first].covariance
         left = e[:, k] - multiply(W[:, k], multiply(P, later))
         later = later + multiply(transposed(W[:, k]), left)
-        later = r[:, k] = multiply(transposed(tracks.moves[k - first].A), later)
+        later = multiply(transposed(tracks.moves[k - first].A), later)
+        r[:, k] = later
     m, P = whole(tracks)
     return m + multiply(P, r)
 
@@ -247,7 +276,12 @@ def reported(density: PathDensity, paths: Descent) -> Tracks:
     out = Tracks.empty(model, len(at.x))
     tangents = density.tangents(at)
     P, calls = widened(density, at, tangents)
-    out.start, out.mean, out.covariance = Normal(at.x[:, 0], P[:, 0]), at.x[:, 1:], P[:, 1:]
-    out.cost, out.status, out.iterations = at.cost, paths.status, paths.iterations
-    out.calls = paths.calls + at.calls + calls + Taylor().calls(model.n) * model.evaluations
+    out.start = Normal(at.x[:, 0], P[:, 0])
+    out.mean = at.x[:, 1:]
+    out.covariance = P[:, 1:]
+    out.cost = at.cost
+    out.status = paths.status
+    out.iterations = paths.iterations
+    of_tangents = Taylor().calls(model.n) * model.evaluations
+    out.calls = paths.calls + at.calls + calls + of_tangents
     return out

@@ -1,4 +1,5 @@
-"""Whole paths as unknowns: their density along all epochs at once, and Gauss-Newton steps of all of a path."""
+"""Whole paths as unknowns: their density along all epochs at once, and Gauss-Newton steps of all of
+a path."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ from ipe_bench.states.algebra import (
 from ipe_bench.states.base import StateModel
 
 _REACHED = 1e-9
-"""Part of a state by which a path may miss the range of its noise or of the prior: round-off of a solve."""
+"""Part of a state by which a path may miss the range of its noise or of the prior: round-off of a
+solve."""
 
 
 @dataclass(frozen=True)
@@ -59,15 +61,16 @@ class PathDensity:
 
     .. math:: J(x) = |x_0 - m_0|^2_{P_0^{-1}} + \sum_k |w_k|^2 + \sum_k |z_k - h(x_k)|^2_{R_k^{-1}}.
 
-    A step dx from a path solves the affine problem about it exactly. With gaps d, residuals r and multipliers l,
+    A step dx from a path solves the affine problem about it exactly. With gaps d, residuals r and
+    multipliers l,
 
     .. math::
         dx_0 - P_0 l_0 &= m_0 - x_0 \\
         dx_k - A_k dx_{k-1} - Q_k l_k &= -d_k \\
         (H_k^T R_k^{-1} H_k + D_k) dx_k + l_k - A_{k+1}^T l_{k+1} &= H_k^T R_k^{-1} r_k
 
-    where D damps it. Neither P0 nor Q is inverted, so that singular ones are no special case. Without a transition
-    into the first epoch, the states of both are the same: A = I and Q = 0.
+    where D damps it. Neither P0 nor Q is inverted, so that singular ones are no special case.
+    Without a transition into the first epoch, the states of both are the same: A = I and Q = 0.
     """
 
     model: StateModel
@@ -78,7 +81,8 @@ class PathDensity:
     inverses: Array
     """G^+ (K, q, n)."""
     unreached: Array
-    """I - G G^+ (K, n, n), onto what the noise of a step does not reach; 0 if each step's noise reaches every state."""
+    """I - G G^+ (K, n, n), onto what the noise of a step does not reach; 0 if each step's noise
+    reaches every state."""
     noise: Array
     """G (1 + K, n, q) with that of P0 in front."""
     start: Half
@@ -88,20 +92,24 @@ class PathDensity:
 
     @classmethod
     def of(cls, model: StateModel, z: Array) -> PathDensity:
+        epochs = range(model.epochs)
         still = np.zeros((model.n, 0))
-        own = [model.gain(k) if model.moves(k) else still for k in range(model.epochs)]
-        gains = np.zeros((model.epochs, model.n, max(G.shape[1] for G in own)))
+        own = [model.gain(k) if model.moves(k) else still for k in epochs]
+        most = max(G.shape[1] for G in own)
+        gains = np.zeros((model.epochs, model.n, most))
         for k, G in enumerate(own):
             gains[k, :, : G.shape[1]] = G
-        there = np.isfinite(z)
-        both = there[..., :, None] & there[..., None, :]
-        one = np.eye(z.shape[2])
-        R = np.stack([model.R(k) for k in range(model.epochs)])
-        L = factor(np.where(both, R, one))
+        # G G^+ projects onto the range of the noise.
         inverses = np.linalg.pinv(gains)
         unreached = np.eye(model.n) - np.matmul(gains, inverses)
         if (np.abs(unreached) < _REACHED).all():
             unreached = np.zeros_like(unreached)
+        # R^-1/2 = L^-1 with R = L L'.
+        there = np.isfinite(z)
+        both = there[..., :, None] & there[..., None, :]
+        one = np.eye(z.shape[2])
+        R = np.stack([model.R(k) for k in epochs])
+        L = factor(np.where(both, R, one))
         whitener = lower_solve(L, np.broadcast_to(one, L.shape))
         first = root(model.prior.covariance)
         columns = max(first.shape[1], gains.shape[2])
@@ -120,7 +128,8 @@ class PathDensity:
 
         x[k] <- f(x[k-1]) + G w,  w = G^+ (x[k] - f(x[k-1]))
 
-        The cost is infinite if the start lies outside the range of the prior, where a path has no density.
+        The cost is infinite if the start lies outside the range of the prior, where a path has no
+        density.
         """
         x = x.copy()
         if not self.model.moved_first:
@@ -128,8 +137,11 @@ class PathDensity:
         x[:, 0] = self._begun(x[:, 0])
         f, h = self.model.values_along(x)
         gap = x[:, 1:] - self.model.nearest_state(f, x[:, 1:])
+        # A gap out of the range of its noise moves the epochs after it, too: one after another.
         missed = np.abs(multiply(self.unreached, gap)).max(axis=1)
-        rows = np.flatnonzero(~(missed <= _REACHED * np.abs(x).max(axis=1)).all(axis=1))
+        largest = np.abs(x).max(axis=1)
+        within = (missed <= _REACHED * largest).all(axis=1)
+        rows = np.flatnonzero(~within)
         if rows.size:
             x[rows], gap[rows] = self._led(x[rows])
             h[rows] = self.model.values_along(x[rows])[1]
@@ -138,12 +150,13 @@ class PathDensity:
         return self._weighed(x, gap, h, calls)
 
     def settled_exactly(self, at: Settled) -> Settled:
-        """The same paths without the round-off by which steps still miss the range of their noise; the calls are those
-        beyond what was paid for."""
+        """The same paths without the round-off by which steps still miss the range of their noise;
+        the calls are those beyond what was paid for."""
         if not self.unreached.any():
             return replace(at, calls=np.zeros(len(at.x)))
         x, gap = self._led(at.x)
-        return self._weighed(x, gap, self.model.values_along(x)[1], np.full(len(x), self._leading))
+        _, h = self.model.values_along(x)
+        return self._weighed(x, gap, h, np.full(len(x), self._leading))
 
     @property
     def _leading(self) -> float:
@@ -152,34 +165,39 @@ class PathDensity:
 
     def _weighed(self, x: Array, gap: Array, h: Array, calls: Array) -> Settled:
         there = np.isfinite(self.z)
-        r = np.where(there, self.z - self.model.nearest(h, np.where(there, self.z, h)), 0.0)
+        h = self.model.nearest(h, np.where(there, self.z, h))
+        r = np.where(there, self.z - h, 0.0)
+        # J = |x0 - m0|^2 + sum |w|^2 + sum |v|^2, with w = G^+ gap and v = R^-1/2 r.
+        m, P = self.model.prior
+        begun = mahalanobis(x[:, 0] - m, P, self.start)
         w = multiply(self.inverses, gap)
         v = multiply(self.whitener, r)
-        m, P = self.model.prior
-        cost = (
-            mahalanobis(x[:, 0] - m, P, self.start)
-            + np.sum(w**2, axis=(1, 2))
-            + np.sum(v**2, axis=(1, 2))
-        )
+        cost = begun + _squared(w) + _squared(v)
         return Settled(x, gap, r, np.nan_to_num(cost, nan=np.inf), calls)
 
     def _begun(self, start: Array) -> Array:
-        """The starts (trials, n), without the round-off by which they miss the range of the prior."""
-        m, prior = self.model.prior.mean, self.start
+        """The starts (trials, n), without the round-off by which they miss the range of the
+        prior."""
+        m = self.model.prior.mean
+        prior = self.start
         if not prior.singular:
             return start
-        within = m + np.matmul(prior.whitened(start - m), transposed(prior.G))
+        # m0 + G G^- (x0 - m0), with P0 = G G'.
+        u = prior.whitened(start - m)
+        within = m + np.matmul(u, transposed(prior.G))
         missed = np.abs(start - within) > _REACHED * np.abs(start)
         return np.where(missed, start, within)
 
     def _led(self, x: Array) -> tuple[Array, Array]:
         """The paths x, moved into the range of the noise from epoch to epoch, and their gaps."""
-        model, x = self.model, x.copy()
+        model = self.model
+        x = x.copy()
         gap = np.zeros_like(x[:, 1:])
         for k in range(model.epochs):
             f = model.transition_into(k)(x[:, k]) if model.moves(k) else x[:, k]
             f = model.nearest_state(f, x[:, k + 1])
-            gap[:, k] = multiply(self.gains[k], multiply(self.inverses[k], x[:, k + 1] - f))
+            w = multiply(self.inverses[k], x[:, k + 1] - f)
+            gap[:, k] = multiply(self.gains[k], w)
             x[:, k + 1] = f + gap[:, k]
         return x, gap
 
@@ -188,47 +206,58 @@ class PathDensity:
         f, h, A, H = self.model.slopes_along(x)
         gap = x[:, 1:] - self.model.nearest_state(f, x[:, 1:])
         calls = np.full(len(x), float(self.model.evaluations * (1 + self.model.n)))
-        seen = np.where(np.isfinite(self.z)[..., None], H, 0.0)
-        return self._weighed(x, gap, h, calls), Tangents(A, H, np.matmul(self.whitener, seen))
+        at = self._weighed(x, gap, h, calls)
+        there = np.isfinite(self.z)
+        B = np.matmul(self.whitener, np.where(there[..., None], H, 0.0))
+        return at, Tangents(A, H, B)
 
     def tangents(self, at: Settled) -> Tangents:
         """The affine model about settled paths."""
         return self.about(at.x)[1]
 
     def step(self, tangents: Tangents, at: Settled, damping: Array | None = None) -> Array:
-        """The steps dx (trials, 1 + K, n) from settled paths, not finite of a trial that has none; with
-        D = diag(damping (trials, 1 + K, n))."""
+        """The steps dx (trials, 1 + K, n) from settled paths, not finite of a trial that has none;
+        with D = diag(damping (trials, 1 + K, n))."""
+        # The right sides: m0 - x0, then -d_k, and H' R^-1 r = B' v.
         a = np.concatenate([self.model.prior.mean - at.x[:, :1], -at.gap], axis=1)
         v = multiply(self.whitener, at.residual)
         D = np.zeros_like(a) if damping is None else damping
         return solve_chains(tangents.A, tangents.B, D, self.noise, a, v)[0]
 
     def filtered(self, tangents: Tangents) -> Array:
-        """The covariances (trials, 1 + K, n, n) of the affine model's states by the readings up to each epoch."""
-        A, B = tangents.A, tangents.B
+        """The covariances (trials, 1 + K, n, n) of the affine model's states by the readings up to
+        each epoch."""
+        A = tangents.A
+        B = tangents.B
         nothing = np.zeros((len(A), 1 + self.model.epochs, self.model.n))
         v = np.zeros(B.shape[:3])
         return solve_chains(A, B, nothing, self.noise, nothing, v, spread=True)[1]
 
     def spread(self, tangents: Tangents) -> tuple[Array, Array]:
-        """The covariances P (trials, 1 + K, n, n) of the states of the affine model, and those of them with the last
-        states.
+        """The covariances P (trials, 1 + K, n, n) of the states of the affine model, and those of
+        them with the last states.
 
-        Later readings tell of a state by their scores alone, so that no covariance of states is inverted (Bierman,
-        Automatica 9, 1973): with S = A P A' + Q, what an epoch sees is C - C P C = B' (I + B S B')^-1 B, and
+        Later readings tell of a state by their scores alone, so that no covariance of states is
+        inverted (Bierman, Automatica 9, 1973): with S = A P A' + Q, what an epoch sees is C - C P C
+        = B' (I + B S B')^-1 B, and
 
-            N[k] = C - C P C + (I - C P) A' N[k+1] A (I - P C),   P[k] <- P[k] - P[k] A' N[k+1] A P[k].
+            N[k] = C - C P C + (I - C P) A' N[k+1] A (I - P C),   P[k] <- P[k] - P[k] A' N[k+1] A
+            P[k].
         """
-        A, B, n = tangents.A, tangents.B, self.model.n
+        A = tangents.A
+        B = tangents.B
         P = self.filtered(tangents)
         Q = np.matmul(self.gains, transposed(self.gains))
         S = np.matmul(np.matmul(A, P[:, :-1]), transposed(A)) + Q
+        # What an epoch sees is W' W, with W = L^-1 B and L L' = I + B S B'.
         innovation = np.matmul(np.matmul(B, S), transposed(B)) + np.eye(B.shape[2])
         W = lower_solve(factor(innovation), B)
         seen = np.matmul(transposed(W), W)
-        rest = np.eye(n) - np.matmul(seen, S)
+        # I - W' W S leads what is told of the states after its readings to before them.
+        rest = np.eye(self.model.n) - np.matmul(seen, S)
         back = np.matmul(rest[:, :-1], transposed(A[:, 1:]))
-        told, shares = seen.copy(), np.empty_like(rest)
+        told = seen.copy()
+        shares = np.empty_like(rest)
         shares[:, -1] = rest[:, -1]
         for k in range(self.model.epochs - 2, -1, -1):
             told[:, k] += np.matmul(np.matmul(back[:, k], told[:, k + 1]), transposed(back[:, k]))
@@ -247,13 +276,21 @@ class PathDensity:
         return symmetric(P), crossed
 
     def size(self, tangents: Tangents, step: Array) -> Array:
-        """dx' (Hessian of Gauss and Newton) dx (trials,): a step's squared length in deviations of the path."""
-        w = multiply(self.inverses, step[:, 1:] - multiply(tangents.A, step[:, :-1]))
-        v = multiply(tangents.B, step[:, 1:])
-        e = self.start.whitened(step[:, :1])
-        return np.sum(w**2, axis=(1, 2)) + np.sum(v**2, axis=(1, 2)) + np.sum(e**2, axis=(1, 2))
+        """dx' (Hessian of Gauss and Newton) dx (trials,): a step's squared length in deviations of
+        the path."""
+        # The terms of J that the step adds, in the affine model.
+        after = step[:, 1:]
+        w = multiply(self.inverses, after - multiply(tangents.A, step[:, :-1]))
+        v = multiply(tangents.B, after)
+        u = self.start.whitened(step[:, :1])
+        return _squared(w) + _squared(v) + _squared(u)
 
     def blind_variances(self, tangents: Tangents) -> Array:
         """The variances (trials, 1 + K, n) of states that nothing is read of, along paths."""
         blind = replace(tangents, B=np.zeros_like(tangents.B))
         return np.diagonal(self.filtered(blind), axis1=2, axis2=3)
+
+
+def _squared(a: Array) -> Array:
+    """Computes |a|^2 (trials,) of vectors at all epochs (trials, K, n)."""
+    return np.sum(a**2, axis=(1, 2))
