@@ -23,40 +23,46 @@ _STEPS = {0: RAMP[9], 1: RAMP[7], 2: RAMP[3], 3: RAMP[2], SOLVED: RAMP[1], 8: RA
 
 def draw_digits(view: View) -> Iterator[Drawing]:
     """Draws the digits of each certified problem by estimator, the hardest problem and the best estimator first."""
-    import seaborn as sns
-    from matplotlib.colors import BoundaryNorm, ListedColormap
-
     table = pd.DataFrame() if view.collection is None else certified_table(view.collection)
     if table.empty:
         return
     table["digits"] = np.floor(table["lre_parameters"].fillna(0.0))
-    mean = {by: table.groupby(by)["digits"].mean().sort_values() for by in ("dataset", "estimator")}
-    problems, estimators = mean["dataset"].index, mean["estimator"].index[::-1]
+    of_problems = table.groupby("dataset")["digits"].mean().sort_values()
+    of_estimators = table.groupby("estimator")["digits"].mean().sort_values()
+    problems = of_problems.index
+    estimators = of_estimators.index[::-1]
     starts = sorted(set(table["start"]))
     fig, axes = common.panels(len(starts), row=2)
     fig.set_size_inches(1.3 + 4.4 * len(axes), 1.8 + 0.2 * len(problems))
-    norm = BoundaryNorm([*_STEPS, 99], len(_STEPS))
     for start, ax in zip(starts, axes, strict=True):
         here = table[table["start"] == start].pivot_table("digits", "dataset", "estimator")
-        cells = here.reindex(index=problems, columns=estimators)
-        style: Any = {"cbar": False, "annot": True, "fmt": ".0f", "linewidths": 0.8}
-        sns.heatmap(cells, ax=ax, cmap=ListedColormap(list(_STEPS.values())), norm=norm, **style)
-        for text in ax.texts:
-            step = max(k for k in _STEPS if k <= int(text.get_text()))
-            text.set(color=ink(_STEPS[step]), fontsize="small")
+        _draw_cells(ax, here.reindex(index=problems, columns=estimators))
         ax.set(xlabel="", ylabel="", title=f"start {start}")
         ax.set_xticks(ax.get_xticks(), [common.text(e) for e in estimators], rotation=90)
         ax.set_yticks(np.arange(len(problems)) + 0.5, list(problems), rotation=0)
-    solved = table["digits"] >= SOLVED
     best = str(estimators[0])
-    share = percent(float(solved[table["estimator"] == best].mean()))
+    solved = table["digits"][table["estimator"] == best] >= SOLVED
     yield view.drawing(
         fig,
         "digits",
         "Correct digits of certified parameters, of 11",
         f"Of the parameter with fewest; blue: {SOLVED} or more, solved. Hardest problems first, best estimators left:"
-        f" {best} solves {share}.",
+        f" {best} solves {percent(float(solved.mean()))}.",
     )
+
+
+def _draw_cells(ax: Any, digits: pd.DataFrame) -> None:
+    """Draws a coloured cell with each number of digits."""
+    import seaborn as sns
+    from matplotlib.colors import BoundaryNorm, ListedColormap
+
+    norm = BoundaryNorm([*_STEPS, 99], len(_STEPS))
+    colors = ListedColormap(list(_STEPS.values()))
+    style: Any = {"cbar": False, "annot": True, "fmt": ".0f", "linewidths": 0.8}
+    sns.heatmap(digits, ax=ax, cmap=colors, norm=norm, **style)
+    for text in ax.texts:
+        step = max(k for k in _STEPS if k <= int(text.get_text()))
+        text.set(color=ink(_STEPS[step]), fontsize="small")
 
 
 def draw_published(view: View) -> Iterator[Drawing]:

@@ -32,7 +32,8 @@ def draw(view: View) -> Iterator[Drawing]:
     if view.totals.empty:
         return
     iterated = [e for e in view.look if view.equations[e] == "frozen"]
-    for label in (REFERENCE, *sorted(iterated, key=lambda e: e != "fixed_point")[:1]):
+    iterated.sort(key=lambda e: e != "fixed_point")
+    for label in (REFERENCE, *iterated[:1]):
         if label in view.look:
             yield _of_one(view, label)
 
@@ -42,65 +43,14 @@ def _of_one(view: View, estimator: str) -> Drawing:
     rows = view["summary"].query("estimator == @estimator and parameter != @ALL")
     rows = rows.assign(solved_trials=(rows["solved"] * rows["trials"]).round())
     totals = view.totals[view.totals["estimator"] == estimator].assign(parameter=ALL)
-    groups, several = _groups(view.parameters), len(view.scales) > 1
+    groups = _groups(view.parameters)
     fig, axes = common.panels(len(groups) + 1, height=2.4)
-    if not several:
+    if len(view.scales) == 1:
         fig.set_figheight(fig.get_figheight() + 0.08 * len(view.parameters))
     for (group, inside), ax in zip(groups.items(), axes, strict=False):
-        look = {
-            p["name"]: Look(COLORS[i % len(COLORS)], MARKERS[i % len(MARKERS)])
-            for i, p in enumerate(inside)
-        }
-        if not several:
-            common.name_axis(ax, list(look))
-        part = rows[rows["parameter"].isin(list(look))]
-        common.decades(ax, part[["rmse", "linear_bound"]], ends=part[["rmse_low", "rmse_high"]])
-        for i, (name, one) in enumerate(look.items()):
-            bound = part[part["parameter"] == name].sort_values("error_scale")
-            style: Any = {"color": one.color, "linestyle": BOUND_DASH, "linewidth": 1.0}
-            if several:
-                ax.plot(bound["error_scale"], bound["linear_bound"], **style)
-            else:
-                ax.vlines(bound["linear_bound"], i - 0.3, i + 0.3, **style)
-        legend = len(inside) > 1 and several
-        if legend:
-            low, high = ax.get_ylim()
-            ax.set_ylim(low, high * (high / low) ** (0.05 * (len(inside) + 1)))
-        _curves(ax, part, look, view, group, inside[0]["unit"])
-        if legend:
-            lines: list[Any] = [one.line | {"linestyle": "none"} for one in look.values()]
-            handles = [ax.plot([], [], **line)[0] for line in lines]
-            tight: Any = {
-                "handlelength": 0.4,
-                "handletextpad": 0.4,
-                "columnspacing": 0.8,
-                "borderaxespad": 0.2,
-            }
-            ax.legend(
-                handles,
-                list(map(common.text, look)),
-                ncols=2,
-                fontsize="small",
-                loc="upper left",
-                **tight,
-            )
-    ratio, last = "rmse_over_linear_bound", axes[-1]
-    each, together = {p["name"]: Look(GREY, ",") for p in view.parameters}, {ALL: Look(BLACK, "o")}
-    if not several:
-        common.name_axis(last, [ALL])
-    common.decades(
-        last, np.append(rows[ratio], [1.0, *totals["rmse"]]), ends=totals[["rmse_low", "rmse_high"]]
-    )
-    if several:
-        _curves(last, rows.assign(rmse=rows[ratio]), each, view)
-        last.plot([], [], color=GREY, label="each parameter")
-    _curves(last, totals, together, view, "all parameters", "bounds")
-    common.bound_line(last, 1.0, "linear bound, eq. (5)")
+        _draw_group(ax, rows, view, group, inside)
+    _draw_ratios(axes[-1], rows, totals, view)
     common.legend(fig, axes[-1:])
-    at = [
-        f"{brief(v)} at scale {value_text(s)}"
-        for s, v in totals[["error_scale", "rmse"]].dropna().to_numpy()[-1:]
-    ]
     number = 2 if estimator == REFERENCE else 3
     of_paper = f"Figure {number} of the paper: " if view.paper else ""
     return view.drawing(
@@ -108,8 +58,73 @@ def _of_one(view: View, estimator: str) -> Drawing:
         f"figure_{number}" if view.paper else f"parameter_errors_{estimator}",
         f"{of_paper}error of {estimator}, solved trials",
         f"Root mean square error and 95 % interval of the trials solved ({_missing(totals)}). Dotted: linear bounds.",
-        f"All together: {at[0]}." if at else "",
+        _together(totals),
     )
+
+
+def _draw_group(
+    ax: Any, rows: pd.DataFrame, view: View, group: str, inside: Sequence[Mapping[str, Any]]
+) -> None:
+    """Draws the errors of a group's parameters with their bounds: over the scales, or a row for each."""
+    several = len(view.scales) > 1
+    look: dict[str, Look] = {}
+    for i, parameter in enumerate(inside):
+        look[parameter["name"]] = Look(COLORS[i % len(COLORS)], MARKERS[i % len(MARKERS)])
+    if not several:
+        common.name_axis(ax, list(look))
+    part = rows[rows["parameter"].isin(list(look))]
+    common.decades(ax, part[["rmse", "linear_bound"]], ends=part[["rmse_low", "rmse_high"]])
+    for i, (name, one) in enumerate(look.items()):
+        own = part[part["parameter"] == name].sort_values("error_scale")
+        style: Any = {"color": one.color, "linestyle": BOUND_DASH, "linewidth": 1.0}
+        if several:
+            ax.plot(own["error_scale"], own["linear_bound"], **style)
+        else:
+            ax.vlines(own["linear_bound"], i - 0.3, i + 0.3, **style)
+    has_legend = len(inside) > 1 and several
+    if has_legend:
+        low, high = ax.get_ylim()
+        room = 0.05 * (len(inside) + 1)
+        ax.set_ylim(low, high * (high / low) ** room)
+    _curves(ax, part, look, view, group, inside[0]["unit"])
+    if has_legend:
+        _name_parameters(ax, look)
+
+
+def _name_parameters(ax: Any, look: Mapping[str, Look]) -> None:
+    """Adds a legend of markers within the panel."""
+    handles = []
+    for one in look.values():
+        style = one.line | {"linestyle": "none"}
+        handles += ax.plot([], [], **style)
+    tight: Any = {"handlelength": 0.4, "handletextpad": 0.4}
+    tight |= {"columnspacing": 0.8, "borderaxespad": 0.2, "fontsize": "small"}
+    ax.legend(handles, list(map(common.text, look)), ncols=2, loc="upper left", **tight)
+
+
+def _draw_ratios(ax: Any, rows: pd.DataFrame, totals: pd.DataFrame, view: View) -> None:
+    """Draws the errors over their linear bounds, of all parameters together and each in grey."""
+    several = len(view.scales) > 1
+    ratio = rows["rmse_over_linear_bound"]
+    if not several:
+        common.name_axis(ax, [ALL])
+    values = np.append(ratio, [1.0, *totals["rmse"]])
+    common.decades(ax, values, ends=totals[["rmse_low", "rmse_high"]])
+    if several:
+        grey = {parameter["name"]: Look(GREY, ",") for parameter in view.parameters}
+        _curves(ax, rows.assign(rmse=ratio), grey, view)
+        ax.plot([], [], color=GREY, label="each parameter")
+    _curves(ax, totals, {ALL: Look(BLACK, "o")}, view, "all parameters", "bounds")
+    common.bound_line(ax, 1.0, "linear bound, eq. (5)")
+
+
+def _together(totals: pd.DataFrame) -> str:
+    """States the error of all parameters at the largest scale that has one."""
+    known = totals[["error_scale", "rmse"]].dropna()
+    if known.empty:
+        return ""
+    scale, error = known.to_numpy()[-1]
+    return f"All together: {brief(error)} at scale {value_text(scale)}."
 
 
 def _groups(parameters: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
@@ -131,13 +146,12 @@ def _curves(ax: Any, rows: Any, look: Any, view: View, heading: str = "", unit: 
 
 def _missing(totals: pd.DataFrame) -> str:
     """Says in how many trials an estimator solved the equation at the largest scale where it did not in all."""
-    lacking = totals[totals["solved_trials"] < totals["trials"]].tail(1)
-    rows = lacking[["solved_trials", "trials", "error_scale"]].to_numpy()
-    seen = [
-        f"{solved:.0f} of {trials:.0f} at scale {value_text(scale)}"
-        for solved, trials, scale in rows
-    ]
-    return "".join(seen) or f"all of {totals['trials'].min():.0f}"
+    lacking = totals[totals["solved_trials"] < totals["trials"]]
+    if lacking.empty:
+        return f"all of {totals['trials'].min():.0f}"
+    last = lacking.iloc[-1]
+    share = f"{last['solved_trials']:.0f} of {last['trials']:.0f}"
+    return f"{share} at scale {value_text(float(last['error_scale']))}"
 
 
 def draw_tracks(view: View) -> Iterator[Drawing]:
@@ -146,63 +160,62 @@ def draw_tracks(view: View) -> Iterator[Drawing]:
     rows = view["tracks"]
     if rows.empty:
         return
-    rows = rows[rows["error_scale"] == (scale := rows["error_scale"].max())]
+    scale = rows["error_scale"].max()
+    rows = rows[rows["error_scale"] == scale]
     look = view.with_look(rows["estimator"])
     states = list(dict.fromkeys(rows["parameter"]))[: common.MOST_PANELS - 1]
     fig, axes = common.panels(len(states) + 1, look)
     for state, ax in zip(states, axes, strict=False):
         part = rows[rows["parameter"] == state]
         common.lines(ax, part, "at", "rmse", look, legend=False)
-        one = part[part["estimator"] == part["estimator"].iloc[0]]
-        for smooths, dash, kind in ((False, "--", "filter"), (True, (0, (5, 1)), "smoother")):
-            those = part[part["smooths"] == smooths]
-            if len(those) and np.isfinite(those["bound"]).any():
-                same = those[those["estimator"] == those["estimator"].iloc[0]]
-                style: Any = {"color": BOUND_COLOR, "linewidth": 1.0, "zorder": 1}
-                ax.plot(
-                    same["at"],
-                    same["bound"],
-                    linestyle=dash,
-                    label=f"{kind} linearised at the truth",
-                    **style,
-                )
-        for name, dash, label in (
-            ("posterior", ":", "posterior bound of filters"),
-            ("posterior_smoothed", "-.", "posterior bound of smoothers"),
-        ):
-            if np.isfinite(one[name]).any():
-                ax.plot(
-                    one["at"],
-                    one[name],
-                    dash,
-                    color=BOUND_COLOR,
-                    linewidth=1.0,
-                    label=label,
-                    zorder=1,
-                )
+        _draw_bounds(ax, part)
         common.decades(ax, part[["rmse", "bound", "posterior", "posterior_smoothed"]])
-        unit = f" [{one['unit'].iloc[0]}]" if one["unit"].iloc[0] else ""
         common.title(ax, state)
-        ax.set(xlabel="time [s]", ylabel=common.text(f"rms error{unit}"))
-    first, ax = rows[rows["parameter"] == states[0]], axes[-1]
-    common.lines(ax, first, "at", "nees", look, legend=False)
-    low, high = (first[f"nees_{end}_if_honest"].iloc[0] for end in ("low", "high"))
-    common.band(ax, low, high, "95 % limits for a right covariance")
-    common.decades(ax, first["nees"])
-    common.title(ax, "NEES")
-    ax.set(xlabel="time [s]", ylabel="NEES / n")
+        unit = part["unit"].iloc[0]
+        error = f"rms error [{unit}]" if unit else "rms error"
+        ax.set(xlabel="time [s]", ylabel=common.text(error))
+    first = rows[rows["parameter"] == states[0]]
+    _draw_nees(axes[-1], first, look)
     common.legend(fig, axes, look)
-    total = {
-        name: np.sqrt(np.mean(part["rmse"] ** 2))
-        for name, part in first.groupby("estimator", sort=False)
-    }
+    total = []
+    for name, part in first.groupby("estimator", sort=False):
+        error = np.sqrt(np.mean(part["rmse"] ** 2))
+        total.append(f"{name} {error:.3g}")
     yield view.drawing(
         fig,
         "tracks",
         f"Tracks at error scale {value_text(scale)}, converged trials",
         "Root mean square error at each epoch, with the bound along the true path; NEES over states.",
-        f"{states[0]} over all epochs: {enumerate_few([f'{k} {v:.3g}' for k, v in total.items()], 3)}.",
+        f"{states[0]} over all epochs: {enumerate_few(total, 3)}.",
     )
+
+
+def _draw_bounds(ax: Any, rows: pd.DataFrame) -> None:
+    """Draws the bounds along the true path, then the posterior ones, which are the same for every estimator."""
+    style: Any = {"color": BOUND_COLOR, "linewidth": 1.0, "zorder": 1}
+    for smooths, dash, kind in ((False, "--", "filter"), (True, (0, (5, 1)), "smoother")):
+        own = rows[rows["smooths"] == smooths]
+        if np.isfinite(own["bound"]).any():
+            one = own[own["estimator"] == own["estimator"].iloc[0]]
+            label = f"{kind} linearised at the truth"
+            ax.plot(one["at"], one["bound"], linestyle=dash, label=label, **style)
+    one = rows[rows["estimator"] == rows["estimator"].iloc[0]]
+    for name, dash, kind in (
+        ("posterior", ":", "filters"),
+        ("posterior_smoothed", "-.", "smoothers"),
+    ):
+        if np.isfinite(one[name]).any():
+            ax.plot(one["at"], one[name], dash, label=f"posterior bound of {kind}", **style)
+
+
+def _draw_nees(ax: Any, rows: pd.DataFrame, look: Mapping[str, Look]) -> None:
+    """Draws NEES over all states with the limits that it keeps if covariances are right."""
+    common.lines(ax, rows, "at", "nees", look, legend=False)
+    low, high = (rows[f"nees_{end}_if_honest"].iloc[0] for end in ("low", "high"))
+    common.band(ax, low, high, "95 % limits for a right covariance")
+    common.decades(ax, rows["nees"])
+    common.title(ax, "NEES")
+    ax.set(xlabel="time [s]", ylabel="NEES / n")
 
 
 FIGURES = (Figure(draw, ("summary",)), Figure(draw_tracks, ("tracks",), main=True))
