@@ -22,7 +22,7 @@ from ipe_bench.runs.store import Store
 if TYPE_CHECKING:
     import pandas as pd
 
-    from ipe_bench.statistics.analysis import Begun
+    from ipe_bench.statistics.analysis import Analysis, Begun
 
 STAMP = ".report.json"
 """The file that says what a report was made from."""
@@ -85,14 +85,14 @@ class Pending:
         from ipe_bench.report.figures import draw_all
         from ipe_bench.report.page.headline import headline
         from ipe_bench.report.page.html import render_page
-        from ipe_bench.report.sections import CURVES, report_tables, written
+        from ipe_bench.report.sections import report_tables, written
         from ipe_bench.report.tables.table import write_table
-        from ipe_bench.statistics.registry import main_columns
-        from ipe_bench.statistics.statistic import ALL
 
-        analysis, output = self.begun.finish(), self.output
+        output = self.output
+        analysis = self.begun.finish()
         problems = analysis.collection.extra_problems
-        known, tables = len(problems), report_tables(analysis)
+        known = len(problems)
+        tables = report_tables(analysis)
         sections = written("section", analysis, tables)
         added = [table for section in sections for table in section.tables]
         opening = headline(analysis)
@@ -100,22 +100,10 @@ class Pending:
         matrices = [
             replace(part, title=part.title or found) for part in opening if isinstance(part, Table)
         ]
-        main = main_columns(analysis.summary)
-        is_total = main["parameter"] == ALL
-        write_text(output / "summary.csv", main[is_total].to_csv(index=False))
-        write_text(output / "parameters.csv", main[~is_total].to_csv(index=False))
-        write_text(output / "summary_all.csv", analysis.summary.to_csv(index=False))
-        files = [output / "summary_all.csv", output / "parameters.csv"]
-        files += [
-            path
-            for table in (*tables, *added, *matrices)
-            for path in write_table(table, output / "tables", self.formats)
-        ]
-        simulated = analysis.simulated
-        for name, frame in {n: getattr(simulated, n) for n in CURVES}.items():
-            if len(frame):
-                files.append(output / "tables" / f"{name}.csv")
-                write_text(files[-1], frame.to_csv(index=False))
+        files = _write_summaries(analysis.summary, output)
+        for table in (*tables, *added, *matrices):
+            files += write_table(table, output / "tables", self.formats)
+        files += _write_curves(analysis.simulated, output / "tables")
         kinds = [kind for kind in FIGURES if kind in self.formats]
         drawn = draw_all(analysis, output / "figures", which=self.figures, formats=kinds)
         write_text(output / "report.html", render_page(analysis, tables, drawn, sections))
@@ -129,17 +117,41 @@ class Pending:
             stale=tuple(analysis.collection.stale),
             headline=tuple(opening),
         )
-        earlier = {
-            path.name
-            for path in map(Path, _stamped(output).get("files", ()))
-            if path.parent.name == "tables"
-        }
-        for name in earlier - {path.name for path in files}:
+        earlier = map(Path, _stamped(output).get("files", ()))
+        names = {path.name for path in earlier if path.parent.name == "tables"}
+        for name in names - {path.name for path in files}:
             (output / "tables" / name).unlink(missing_ok=True)
         if len(problems) == known:  # what plugins cannot make is said each time
             stamp = {"from": self.made, "files": _digests(result.files)}
             write_text(output / STAMP, json.dumps(stamp, indent=1) + "\n")
         return result
+
+
+def _write_summaries(summary: pd.DataFrame, output: Path) -> list[Path]:
+    """Writes the summary over all parameters, which is not returned, that of each, and both with every column."""
+    from ipe_bench.statistics.registry import main_columns
+    from ipe_bench.statistics.statistic import ALL
+
+    main = main_columns(summary)
+    is_total = main["parameter"] == ALL
+    files = [output / "summary_all.csv", output / "parameters.csv"]
+    write_text(output / "summary.csv", main[is_total].to_csv(index=False))
+    write_text(files[0], summary.to_csv(index=False))
+    write_text(files[1], main[~is_total].to_csv(index=False))
+    return files
+
+
+def _write_curves(analysis: Analysis, folder: Path) -> list[Path]:
+    """Writes the frames of the analysis that are too long for tables."""
+    from ipe_bench.report.sections import CURVES
+
+    files = []
+    for name in CURVES:
+        frame = getattr(analysis, name)
+        if len(frame):
+            files.append(folder / f"{name}.csv")
+            write_text(files[-1], frame.to_csv(index=False))
+    return files
 
 
 def begin_report(
@@ -157,9 +169,11 @@ def begin_report(
     from ipe_bench.statistics.analysis import Begun
     from ipe_bench.statistics.collect import collect
 
-    kinds, which = file_formats(formats), which_figures(figures)
+    kinds = file_formats(formats)
+    which = which_figures(figures)
     place = folders[0] if output is None else Path(output)
-    made, faults = _made_from(folders, place, which, kinds), use_statistics()
+    made = _made_from(folders, place, which, kinds)
+    faults = use_statistics()
     begun = Begun(collect(folders))
     begun.collection.extra_problems += faults
     return Pending(begun, place, which, kinds, made)
@@ -191,9 +205,8 @@ def _is_current(output: Path, made: str) -> bool:
 def _stamped(output: Path) -> dict[str, Any]:
     """Returns the stamp of the report under `output`; empty if there is none."""
     with contextlib.suppress(OSError, ValueError):
-        if isinstance(
-            known := json.loads(regular(output / STAMP).read_text(encoding="utf-8")), dict
-        ):
+        known = json.loads(regular(output / STAMP).read_text(encoding="utf-8"))
+        if isinstance(known, dict):
             return known
     return {}
 
