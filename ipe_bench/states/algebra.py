@@ -139,8 +139,8 @@ def principal(P: Array) -> tuple[Array, Array]:
 
 
 def mahalanobis(e: Array, P: Array, parts: Half | None = None) -> Array:
-    """Computes e' P^+ e (trials,) for e (trials, n) and positive semidefinite P (n, n), whose half is taken if it is
-    not given; infinite outside the range of P."""
+    """Computes e' P^+ e (trials,) for e (trials, n) and positive semidefinite P (n, n), whose half
+    is taken if it is not given; infinite outside the range of P."""
     parts = parts or half(P)
     w = parts.whitened(e)
     # What no w gives lies outside the range of G.

@@ -20,8 +20,8 @@ _MOST = 30
 
 
 def copy_p(model: StateModel, z: Array, tracks: Tracks) -> Array | None:
-    """The probability (trials,) that each path and none of its copies is the right one, by their
-    costs J,
+    """Computes the probability (trials,) that each path and none of its copies is the right one, by
+    their costs J,
 
         p = exp(-J / 2) / sum of exp(-J_s / 2) over the path and its copies.
 
@@ -36,7 +36,7 @@ def copy_p(model: StateModel, z: Array, tracks: Tracks) -> Array | None:
 
 
 def _p(density: PathDensity, x: Array) -> Array:
-    """The probability (trials,) of paths x (trials, 1 + K, n) among their copies."""
+    """Computes the probability (trials,) of paths x (trials, 1 + K, n) among their copies."""
     model = density.model
     m, P = model.prior
     cost = density.settled(x).cost

@@ -65,12 +65,13 @@ class Descent:
         return cls(np.zeros(trials), at, running, none, tracks.calls + at.calls, none, none)
 
     def beaten(self, other: Descent, rows: NDArray[np.intp]) -> Mask:
-        """Whether a path of `other`, of the trials `rows`, costs less by more than round-off."""
+        """Tells whether a path of `other`, of the trials `rows`, costs less by more than
+        round-off."""
         return other.at.cost < self.at.cost[rows] * (1 - _ROUND_OFF)
 
     def improved(self, other: Descent, rows: NDArray[np.intp]) -> Descent:
-        """These paths with those of `other`, of the trials `rows`, that cost less; both have been
-        paid for."""
+        """Returns these paths with those of `other`, of the trials `rows`, that cost less; both
+        have been paid for."""
         better = self.beaten(other, rows)
         calls = self.calls.copy()
         calls[rows] += other.calls
@@ -133,13 +134,13 @@ class LevenbergMarquardtSmoother(Tracker):
         return reported(density, paths)
 
     def improbable(self, z: Array, cost: Array) -> Mask:
-        """Whether a path costs too much for its readings (trials,); one without a finite cost
+        """Tells whether a path costs too much for its readings (trials,); one without a finite cost
         does."""
         return ~(path_p(z, cost) >= self.level)
 
     def drawn(self, density: PathDensity, number: int = 0) -> Descent:
-        """For each trial, the smoothed UKF of least cost among those that begin at draws of the
-        prior; each number of a round has its own draws."""
+        """Finds, for each trial, the smoothed UKF of least cost among those that begin at draws of
+        the prior; each number of a round has its own draws."""
         model = density.model
         trials = len(density.z)
         m, P = model.prior
@@ -152,7 +153,7 @@ class LevenbergMarquardtSmoother(Tracker):
         return join([self._best(density.subset(rows), draws[rows]) for rows in parts])
 
     def _best(self, density: PathDensity, draws: Array) -> Descent:
-        """The best of those that begin at draws (trials, starts, n)."""
+        """Selects the best of those that begin at draws (trials, starts, n)."""
         trials, starts, n = draws.shape
         one = density.subset(np.repeat(np.arange(trials), starts))
         P = np.repeat(_SHARE**2 * density.model.prior.covariance[None], len(one.z), axis=0)
@@ -163,13 +164,14 @@ class LevenbergMarquardtSmoother(Tracker):
         return replace(take(found, least + starts * np.arange(trials)), calls=calls)
 
     def descended(self, density: PathDensity, paths: Descent) -> Descent:
-        """The paths after steps down, until each has converged or gets no further.
+        """Moves the paths down, until each has converged or gets no further.
 
         In one pass each trial tries one step, of the damping that it has come to: none waits for
         another, and the few that need many steps take as many passes as one of them alone.
         """
         finite = np.isfinite(paths.at.cost)
-        paths = replace(paths, status=np.where(finite, paths.status, Status.NONFINITE))
+        status = np.where(finite, paths.status, Status.NONFINITE)
+        paths = replace(paths, status=status)
         active = np.flatnonzero(finite)
         part = take(paths, active)
         some = density.subset(active)
@@ -202,8 +204,8 @@ class LevenbergMarquardtSmoother(Tracker):
     def _tried(
         self, density: PathDensity, paths: Descent, tangents: Tangents, weights: Array
     ) -> Descent:
-        """The paths after one try each: moved by a step that does not raise the cost, or else with
-        more damping."""
+        """Returns the paths after one try each: moved by a step that does not raise the cost, or
+        else with more damping."""
         damping = paths.damping
         first = paths.tries == 0
         # (Hessian of Gauss and Newton + D) dx = -gradient / 2, with D = damping / scale.
@@ -212,12 +214,12 @@ class LevenbergMarquardtSmoother(Tracker):
         found = density.settled(paths.at.x + step)
         lower = found.cost <= paths.at.cost * (1 + _ROUND_OFF)
         at = put(paths.at, lower, take(found, lower))
-        # The damping grows until a step is taken, and falls where the first try was.
+        # Damping grows until a step is taken; where the first try was, the next begins with less.
         over = lower | there
-        # The next step begins with less damping where this one needed no more.
         eased = np.where(damping > self.damping, damping / _FACTOR, 0.0)
         raised = np.maximum(_FACTOR * damping, self.damping)
         damping = np.where(over, np.where(first, eased, damping), raised)
+        # A search that crawls at an improbable cost hardly ever arrives.
         improbable = self.improbable(density.z, at.cost)
         hardly = improbable & (damping > 0) & (at.cost > _HARDLY * paths.at.cost)
         slow = np.where(over, np.where(hardly, paths.slow + 1, 0), paths.slow)
@@ -231,8 +233,8 @@ class LevenbergMarquardtSmoother(Tracker):
     def _converged(
         self, density: PathDensity, tangents: Tangents, paths: Descent, step: Array
     ) -> Mask:
-        """Whether the undamped step from a path is short (trials,), at the first try. It is longer
-        than a damped one, so that it is asked for only where the latter is short."""
+        """Tells whether the undamped step from a path is short (trials,), at the first try. It is
+        longer than a damped one, so that it is asked for only where the latter is short."""
         short = (paths.tries == 0) & (density.size(tangents, step) <= self.tolerance**2)
         rows = np.flatnonzero(short & (paths.damping > 0))
         if rows.size:
@@ -244,9 +246,9 @@ class LevenbergMarquardtSmoother(Tracker):
 
 
 def smoothed_path(tracks: Tracks) -> Array:
-    """The smoothed means (trials, 1 + K, n) of a filter's tracks from before the first transition,
-    without their covariances: by the scores r of later readings (Bierman, Automatica 9, 1973), with
-    those of `Tracks.reads`,
+    """Computes the smoothed means (trials, 1 + K, n) of a filter's tracks from before the first
+    transition, without their covariances: by the scores r of later readings (Bierman, Automatica 9,
+    1973), with those of `Tracks.reads`,
 
         r <- r + H' S^-1 (y - H P- r),   r <- A' r,   m[k-1] <- m[k-1] + P[k-1] r.
     """
@@ -270,7 +272,7 @@ def smoothed_path(tracks: Tracks) -> Array:
 
 
 def reported(density: PathDensity, paths: Descent) -> Tracks:
-    """The tracks of the paths, with covariances that the cost itself widens."""
+    """Returns the tracks of the paths, with covariances that the cost itself widens."""
     model = density.model
     at = density.settled_exactly(paths.at)
     out = Tracks.empty(model, len(at.x))

@@ -120,11 +120,11 @@ class PathDensity:
         return cls(model, z, gains, inverses, unreached, noise, start, whitener)
 
     def subset(self, rows: NDArray[np.intp]) -> PathDensity:
-        """The density of the trials `rows`."""
+        """Returns the density of the trials `rows`."""
         return replace(self, z=self.z[rows], whitener=self.whitener[rows])
 
     def settled(self, x: Array) -> Settled:
-        """The paths x (trials, 1 + K, n), each step moved into the range of its noise:
+        """Returns the paths x (trials, 1 + K, n), each step moved into the range of its noise:
 
         x[k] <- f(x[k-1]) + G w,  w = G^+ (x[k] - f(x[k-1]))
 
@@ -150,8 +150,8 @@ class PathDensity:
         return self._weighed(x, gap, h, calls)
 
     def settled_exactly(self, at: Settled) -> Settled:
-        """The same paths without the round-off by which steps still miss the range of their noise;
-        the calls are those beyond what was paid for."""
+        """Returns the same paths without the round-off by which steps still miss the range of their
+        noise; the calls are those beyond what was paid for."""
         if not self.unreached.any():
             return replace(at, calls=np.zeros(len(at.x)))
         x, gap = self._led(at.x)
@@ -176,7 +176,7 @@ class PathDensity:
         return Settled(x, gap, r, np.nan_to_num(cost, nan=np.inf), calls)
 
     def _begun(self, start: Array) -> Array:
-        """The starts (trials, n), without the round-off by which they miss the range of the
+        """Returns the starts (trials, n), without the round-off by which they miss the range of the
         prior."""
         m = self.model.prior.mean
         prior = self.start
@@ -189,7 +189,8 @@ class PathDensity:
         return np.where(missed, start, within)
 
     def _led(self, x: Array) -> tuple[Array, Array]:
-        """The paths x, moved into the range of the noise from epoch to epoch, and their gaps."""
+        """Returns the paths x, moved into the range of the noise from epoch to epoch, and their
+        gaps."""
         model = self.model
         x = x.copy()
         gap = np.zeros_like(x[:, 1:])
@@ -202,7 +203,7 @@ class PathDensity:
         return x, gap
 
     def about(self, x: Array) -> tuple[Settled, Tangents]:
-        """The paths x (trials, 1 + K, n) as they are, and the affine model about them."""
+        """Computes the paths x (trials, 1 + K, n) as they are, and the affine model about them."""
         f, h, A, H = self.model.slopes_along(x)
         gap = x[:, 1:] - self.model.nearest_state(f, x[:, 1:])
         calls = np.full(len(x), float(self.model.evaluations * (1 + self.model.n)))
@@ -212,12 +213,12 @@ class PathDensity:
         return at, Tangents(A, H, B)
 
     def tangents(self, at: Settled) -> Tangents:
-        """The affine model about settled paths."""
+        """Computes the affine model about settled paths."""
         return self.about(at.x)[1]
 
     def step(self, tangents: Tangents, at: Settled, damping: Array | None = None) -> Array:
-        """The steps dx (trials, 1 + K, n) from settled paths, not finite of a trial that has none;
-        with D = diag(damping (trials, 1 + K, n))."""
+        """Computes the steps dx (trials, 1 + K, n) from settled paths, not finite of a trial that
+        has none; with D = diag(damping (trials, 1 + K, n))."""
         # The right sides: m0 - x0, then -d_k, and H' R^-1 r = B' v.
         a = np.concatenate([self.model.prior.mean - at.x[:, :1], -at.gap], axis=1)
         v = multiply(self.whitener, at.residual)
@@ -225,8 +226,8 @@ class PathDensity:
         return solve_chains(tangents.A, tangents.B, D, self.noise, a, v)[0]
 
     def filtered(self, tangents: Tangents) -> Array:
-        """The covariances (trials, 1 + K, n, n) of the affine model's states by the readings up to
-        each epoch."""
+        """Computes the covariances (trials, 1 + K, n, n) of the affine model's states by the
+        readings up to each epoch."""
         A = tangents.A
         B = tangents.B
         nothing = np.zeros((len(A), 1 + self.model.epochs, self.model.n))
@@ -234,15 +235,15 @@ class PathDensity:
         return solve_chains(A, B, nothing, self.noise, nothing, v, spread=True)[1]
 
     def spread(self, tangents: Tangents) -> tuple[Array, Array]:
-        """The covariances P (trials, 1 + K, n, n) of the states of the affine model, and those of
-        them with the last states.
+        """Computes the covariances P (trials, 1 + K, n, n) of the states of the affine model, and
+        those of them with the last states.
 
         Later readings tell of a state by their scores alone, so that no covariance of states is
         inverted (Bierman, Automatica 9, 1973): with S = A P A' + Q, what an epoch sees is C - C P C
         = B' (I + B S B')^-1 B, and
 
-            N[k] = C - C P C + (I - C P) A' N[k+1] A (I - P C),   P[k] <- P[k] - P[k] A' N[k+1] A
-            P[k].
+            N[k] = C - C P C + (I - C P) A' N[k+1] A (I - P C)
+            P[k] <- P[k] - P[k] A' N[k+1] A P[k].
         """
         A = tangents.A
         B = tangents.B
@@ -276,8 +277,8 @@ class PathDensity:
         return symmetric(P), crossed
 
     def size(self, tangents: Tangents, step: Array) -> Array:
-        """dx' (Hessian of Gauss and Newton) dx (trials,): a step's squared length in deviations of
-        the path."""
+        """Computes dx' (Hessian of Gauss and Newton) dx (trials,): a step's squared length in
+        deviations of the path."""
         # The terms of J that the step adds, in the affine model.
         after = step[:, 1:]
         w = multiply(self.inverses, after - multiply(tangents.A, step[:, :-1]))
@@ -286,7 +287,8 @@ class PathDensity:
         return _squared(w) + _squared(v) + _squared(u)
 
     def blind_variances(self, tangents: Tangents) -> Array:
-        """The variances (trials, 1 + K, n) of states that nothing is read of, along paths."""
+        """Computes the variances (trials, 1 + K, n) of states that nothing is read of, along
+        paths."""
         blind = replace(tangents, B=np.zeros_like(tangents.B))
         return np.diagonal(self.filtered(blind), axis1=2, axis2=3)
 
