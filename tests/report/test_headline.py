@@ -77,9 +77,7 @@ def test_the_headline_says_who_holds_who_agrees_and_who_fails_undetected(synthet
         "IPE (solver) and filters (filter) agree up to error scale 10: all of 100 trials succeed at each"
         in str(agree)
     )
-    assert (
-        silent == "Undetected failures: at most 25.0 % of the trials (filter at error scale 100)."
-    )
+    assert silent == "Undetected failures: up to 25.0 % of the trials (filter at error scale 100)."
     (model,) = about(analysis)
     assert model.startswith("repeated: Each parameter read `repeats` times directly")
     assert "12 readings determine 3 parameters" in model
@@ -113,7 +111,7 @@ def test_several_settings_are_counted_and_the_worst_is_named(synthetic):
     assert matrix == "matrix"
     assert finding.startswith("Only good holds in both settings (100 % of 50 trials)")
     assert silent == (
-        "Undetected failures: at most 40.0 % of the trials (bad at error scale 1, noise.deviation=0.2)."
+        "Undetected failures: up to 40.0 % of the trials (bad at error scale 1, noise.deviation=0.2)."
     )
 
 

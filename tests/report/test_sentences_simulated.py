@@ -345,7 +345,7 @@ def who_agree(report: Report, match: Any) -> Iterator[tuple[str, str, bool]]:
 
 
 SILENT = (
-    r"Undetected failures: at most (?P<most>\S+ %) of the trials \((?P<label>e\d+) at error scale"
+    r"Undetected failures: up to (?P<most>\S+ %) of the trials \((?P<label>e\d+) at error scale"
     r" (?P<scale>\S+)\)\."
 )
 
