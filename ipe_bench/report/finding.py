@@ -24,7 +24,9 @@ MOST_PLACES = 2
 """Settings, each at an error scale, that a title names; more are counted."""
 MEANING = f"Holds: at least {100 * HELD:.0f} % of all trials succeed, with 95 % confidence."
 """What a reader of the title needs to know."""
-HOLDS, FAILS, UNDECIDED = "holds", "fails", "undecided"
+HOLDS = "holds"
+FAILS = "fails"
+UNDECIDED = "undecided"
 _SIDES = ("filters", "IPE")
 """The families whose best are named if they part."""
 
@@ -91,8 +93,9 @@ class Finding:
         """Judges the rows of a summary over all parameters; a `setting` tells those of several apart."""
         table: dict[tuple[str, Place], Row] = {}
         for row in rows:
-            setting, scale = str(row.get("setting", "")), float(row["error_scale"])
-            label, place = str(row["estimator"]), (setting, scale)
+            label = str(row["estimator"])
+            scale = float(row["error_scale"])
+            place = (str(row.get("setting", "")), scale)
             # Settings whose texts are equal are different all the same.
             while (label, place) in table:
                 place = (f"{place[0]}'", scale)
@@ -183,7 +186,8 @@ class Finding:
         phrases: dict[str, list[Standing]] = {}
         for one in winners:
             number = one.sure if self.ascending else len(self.places)
-            if wrong := one.overconfident(number):
+            wrong = one.overconfident(number)
+            if wrong:
                 phrases.setdefault(self._extent(wrong, number), []).append(one)
         for phrase, whose in phrases.items():
             if len(whose) == len(winners):

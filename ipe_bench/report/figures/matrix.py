@@ -14,8 +14,10 @@ from ipe_bench.report.tables.matrix import MATRIX, Tile, matrices
 
 WIDTH = 5.0
 """Inches: 750 pixels, the width of a text on GitHub."""
-_ROW, _HEAD = 0.24, 0.9
-"""Inches of a row, and of what stands above and below the rows, in the width of a page."""
+_ROW = 0.24
+"""Inches of a row, in the width of a page."""
+_HEAD = 0.9
+"""Inches of what stands above and below the rows, in the width of a page."""
 _LETTERS = 13
 """Letters of the title to an inch."""
 
