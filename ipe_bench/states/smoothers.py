@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from ipe_bench.basics.batches import put
-from ipe_bench.basics.linalg import Array, Mask, multiply
+from ipe_bench.basics.linalg import Array, Mask, finite, multiply
 from ipe_bench.basics.options import Count, NonNegative
 from ipe_bench.states.algebra import half, lower_solve, symmetric, transposed
 from ipe_bench.states.base import Normal, StateModel
@@ -237,9 +237,14 @@ def _smooth_by_scores(model: StateModel, tracks: Tracks, out: Tracks, rows: Mask
         N = symmetric(np.matmul(np.matmul(transposed(A), information), A))
         before = tracks.at(k - 1)
         P = before.covariance[rows]
-        smooth = symmetric(P - np.matmul(np.matmul(P, N), P))
-        variances = np.einsum("tii->ti", smooth)  # a view
-        np.maximum(variances, 0.0, out=variances)  # round-off of states that are known exactly
+        # P - P N P, but definite where later readings leave hardly anything of a wide P.
+        G = half(P).G
+        left = np.eye(n) - np.matmul(np.matmul(transposed(G), N), G)
+        usable = finite(left)
+        values, axes = np.linalg.eigh(np.where(usable[:, None, None], symmetric(left), 0.0))
+        values[~usable] = np.nan
+        deviations = np.matmul(G, axes * np.sqrt(np.maximum(values, 0.0))[:, None])
+        smooth = np.matmul(deviations, transposed(deviations))
         at = out.at(k - 1)
         at.mean[rows] = before.mean[rows] + multiply(P, r)
         at.covariance[rows] = smooth

@@ -56,3 +56,15 @@ def test_trackers_of_singular_covariances_are_calibrated():
     assert rows["nees"].between(*mean_limits(11, 12, 0.9999)).all(), rows["nees"]
     assert np.isnan(rows["van_trees"]).all()
     assert len(table) == len(TRACKERS) * (len(Gins().parameters) + 1)  # the motion is not scored
+
+
+def test_a_smoothed_covariance_stays_definite_where_readings_leave_hardly_anything_of_a_wide_prior():
+    """It was indefinite by round-off, and posterior linearisation about it lost every trial."""
+    model = StateScenario(WalkingGins(), error_scale=100.0).assumed
+    z = model.draw(0, 1).z
+    with np.errstate(all="ignore"):
+        P = Smoother(ukf()).track(model, z).covariance[0]
+    deviations = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+    size = np.where(deviations > 0, deviations, 1.0)
+    correlations = P / (size[:, :, None] * size[:, None, :])
+    assert np.linalg.eigvalsh(correlations).min() > -1e-12
