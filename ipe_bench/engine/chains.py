@@ -87,26 +87,33 @@ def _by_numpy(A: Array, B: Array, D: Array, G: Array, a: Array, v: Array) -> tup
     F, S, size = np.zeros((trials, epochs, n, n)), np.zeros_like(B), np.ones_like(v)
     for k in range(epochs):
         noise = np.broadcast_to(G[k], (trials, *G[k].shape))
+        # Prediction: F F' <- A F F' A' + G G', by orthogonal rows of (A F, G).
         F[:, k] = _lower(np.concatenate([np.matmul(A[:, k], F[:, k - 1]), noise], axis=2))
         for r in range(B.shape[2]):
+            # Update by one reading after another: s = F F' b and 1 + b' s.
             S[:, k, r], size[:, k, r] = _take_in(F[:, k], B[:, k, r])
     x = np.zeros((trials, epochs, n))
+    # The second pass solves for what the first leaves of the right sides.
     for _ in range(2):
         u, multipliers, told = np.zeros_like(x), np.zeros_like(x), np.zeros_like(v)
         for k in range(epochs):
+            # Forward: u <- A u + a, then u <- u + s w with w = (v - b' u) / (1 + b' s).
             u[:, k] = multiply(A[:, k], u[:, k - 1]) + a[:, k]
             for r in range(B.shape[2]):
                 told[:, k, r] = (v[:, k, r] - np.sum(B[:, k, r] * u[:, k], axis=1)) / size[:, k, r]
                 u[:, k] += S[:, k, r] * told[:, k, r, None]
         later = np.zeros((trials, n))
         for k in range(epochs - 1, -1, -1):
+            # Back: x = u + F F' A' l[k+1].
             u[:, k] += multiply(F[:, k], multiply(_transposed(F[:, k]), later))
+            # l <- l + b (w - s' l / (1 + b' s)), from the last reading to the first.
             for r in range(B.shape[2] - 1, -1, -1):
                 told[:, k, r] -= np.sum(S[:, k, r] * later, axis=1) / size[:, k, r]
                 later = later + B[:, k, r] * told[:, k, r, None]
             multipliers[:, k] = later
             later = multiply(_transposed(A[:, k]), later)
         x += u
+        # What x and l leave of a and of v.
         noise = multiply(np.matmul(G, _transposed(G)), multipliers)
         a = a - u + multiply(A, np.roll(u, 1, axis=1)) + noise
         v = v - multiply(B, u) - told
@@ -121,6 +128,7 @@ def _lower(W: Array) -> Array:
         square = np.sum(W[:, i] ** 2, axis=1)
         inverse = np.where(square > 0, 1 / np.where(square > 0, square, 1.0), 0.0)
         F[:, i, i] = np.sqrt(square)
+        # The rows below lose their part along row i (modified Gram-Schmidt).
         share = multiply(W[:, i + 1 :], W[:, i]) * inverse[:, None]
         F[:, i + 1 :, i] = share * F[:, i, i, None]
         W[:, i + 1 :] -= share[:, :, None] * W[:, i, None, :]
@@ -132,6 +140,7 @@ def _take_in(F: Array, row: Array) -> tuple[Array, Array]:
     v = multiply(_transposed(F), row)
     size, s = np.ones(len(v)), np.zeros_like(v)
     for j in range(v.shape[1] - 1, -1, -1):
+        # From the last column to the first, size is 1 plus the squares of v so far (Carlson, 1973).
         larger = size + v[:, j] ** 2
         moved = F[:, :, j] * v[:, j, None]
         root = np.sqrt(size * larger)

@@ -19,7 +19,10 @@ from ipe_bench.states.smoothers import smoothed
 from ipe_bench.states.trackers import Filter, Tracker, Tracks, filtered
 from ipe_bench.states.whole_paths import PathDensity
 
-EXTENDED, UNSCENTED, DAMPED, AGAIN = 1, 2, 3, 4
+EXTENDED = 1
+UNSCENTED = 2
+DAMPED = 3
+AGAIN = 4
 """The stages, as the column `extra_stage` names them; the second round of restarts is 5, and so
 on."""
 
