@@ -136,7 +136,11 @@ class PathDensity:
             x[:, 0] = x[:, 1]
         x[:, 0] = self._begun(x[:, 0])
         f, h = self.model.values_along(x)
-        gap = x[:, 1:] - self.model.nearest_state(f, x[:, 1:])
+        near = self.model.nearest_state(f, x[:, 1:])
+        gap = x[:, 1:] - near
+        if any(self.model.state_periods):
+            # A jump by a whole period costs nothing: the path goes on in the turn of its start.
+            x[:, 1:] -= np.cumsum(near - f, axis=1)
         # A gap out of the range of its noise moves the epochs after it, too: one after another.
         missed = np.abs(multiply(self.unreached, gap)).max(axis=1)
         largest = np.abs(x).max(axis=1)

@@ -89,7 +89,7 @@ def _of_some(density: PathDensity, at: Settled, tangents: Tangents) -> tuple[Arr
     # P + W W', with a column of W for each line and each bend.
     W = np.moveaxis(np.concatenate([stretched, bends], axis=1), 1, -1)
     P = P + np.matmul(W, transposed(W))
-    return P, calls.reshape(trials, -1).sum(axis=1)
+    return P, calls.reshape(trials, 2 * n).sum(axis=1)
 
 
 def _lines(P: Array, crossed: Array) -> tuple[Array, Array]:

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from shared.state_models import Pendulum, path_cost
 
+import ipe_bench as ib
 from ipe_bench.plugins.construct import construct
 from ipe_bench.plugins.discovery import composed, options
 from ipe_bench.real.logs import Log, LogTracks
 from ipe_bench.states import Formulas, LevenbergMarquardtSmoother, Smoother, ekf
 from ipe_bench.states.copies import SURE, copy_p
+from ipe_bench.states.smoothers import whole
 from ipe_bench.trials.paths import PathBlock, StateScenario
 
 TURN = 2 * np.pi
@@ -136,3 +138,14 @@ def test_the_turns_of_a_pendulum_are_as_probable_as_is_said():
     wrong = ~columns["success"] & (columns["fit_p"] >= 1e-3)
     assert wrong.any()
     assert (columns["extra_ambiguous"][wrong] == 1).all()
+
+
+def test_a_path_goes_on_in_the_turn_of_its_start():
+    """Steps are told from each other but for whole turns, so that a jump by one of them costs nothing."""
+    wide = {"angle": 4.0, "rate": 4.0}
+    model = ib.component("state_model/pendulum", count=150, spread=wide)
+    tracks = LevenbergMarquardtSmoother().track(model, model.draw(0, 40).z)
+    x, _ = whole(tracks)
+    f, _ = model.values_along(x)
+    jumps = np.round((x[:, 1:, 0] - f[..., 0]) / TURN)
+    assert not jumps.any()

@@ -174,7 +174,7 @@ def write_tracks(
         folder,
         NAME,
         (TABLE, answer.table()),
-        f"{log.model.name}: tracks",
+        f"{log.model.name}: {_verdicts(answer) or 'tracks'}",
         _sentences(answer),
         answer.parts(),
         draw_log(log, answer.tracks) if figures else (),
@@ -193,16 +193,20 @@ def _trackers(answer: LogAnswer) -> dict[str, dict[str, Any]]:
     return found
 
 
-def _sentences(answer: LogAnswer) -> list[str]:
-    """Says which trackers have each verdict, and which are smoothers."""
+def _verdicts(answer: LogAnswer) -> str:
+    """Names the trackers of each verdict; empty if none was tested."""
     by_verdict: dict[str, list[str]] = {}
     for one in answer:
         if one.verdict != NO_VERDICT:
             by_verdict.setdefault(one.verdict, []).append(one.label)
+    return "; ".join(f"{enumerate_few(who)} {shown(word)}" for word, who in by_verdict.items())
+
+
+def _sentences(answer: LogAnswer) -> list[str]:
+    """Says what the verdicts of the title are of, and which trackers are smoothers."""
     said = []
-    if by_verdict:
-        each = [f"{enumerate_few(who)} {shown(word)}" for word, who in by_verdict.items()]
-        said.append(f"Tested by innovations or the cost of a path: {'; '.join(each)}.")
+    if _verdicts(answer):
+        said.append("Tested: the innovations of filters, and the cost of a smoother's path.")
     smoothers = [one.label for one in answer if one.smooths]
     if smoothers:
         said.append(f"Smoothers, which use later readings: {enumerate_few(smoothers)}.")
