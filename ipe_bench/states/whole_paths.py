@@ -49,8 +49,6 @@ class Tangents:
 
     A: Array
     """df/dx (trials, K, n, n)."""
-    H: Array
-    """dh/dx (trials, K, m, n)."""
     B: Array
     """R^-1/2 dh/dx (trials, K, m, n); 0 of missing readings."""
 
@@ -214,7 +212,7 @@ class PathDensity:
         at = self._weighed(x, gap, h, calls)
         there = np.isfinite(self.z)
         B = np.matmul(self.whitener, np.where(there[..., None], H, 0.0))
-        return at, Tangents(A, H, B)
+        return at, Tangents(A, B)
 
     def tangents(self, at: Settled) -> Tangents:
         """Computes the affine model about settled paths."""
