@@ -3,6 +3,7 @@ filter's tracks."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
@@ -17,8 +18,8 @@ from ipe_bench.states.linearisation import Rule, Taylor
 from ipe_bench.states.trackers import Filter, Tracker, Tracks, filtered
 from ipe_bench.states.whole_paths import PathDensity, Settled
 
-_HALVINGS = 12
-"""Halvings of a damped step."""
+_HALVINGS = 11
+"""Halvings of a damped step at most."""
 _ROUND_OFF = 1e-12
 """Part of a cost by which it may rise."""
 
@@ -79,7 +80,7 @@ class IteratedSmoother(Tracker):
     iterations: Count = 10
     """Paths at most, after the first."""
     damped: bool = False
-    """Whether steps that raise the cost of the path are halved; for Taylor's rule."""
+    """Whether steps that raise the cost of the path are halved."""
     tolerance: NonNegative = 0.0
     """A trial ends where its path moves by at most so many of its own standard deviations: by
     tangents over all states and epochs together, by points those of each state."""
@@ -153,9 +154,12 @@ class IteratedSmoother(Tracker):
             deviation = np.sqrt(np.maximum(variances, 0.0))
             moved = np.abs(new.mean - path.mean) > self.tolerance * deviation
             on = (moved & (deviation > 0)).any(axis=(1, 2))
+            # A trial that has ended stays where it is, as if it were alone.
+            for mine, its in zip(_arrays(new), _arrays(path), strict=True):
+                mine[~going] = its[~going]
             path = new
             going &= on
-            if not on.any():
+            if not going.any():
                 break
         path.calls = calls
         if not (model.gain_by_state or model.R_by_state):
@@ -163,6 +167,13 @@ class IteratedSmoother(Tracker):
             path.cost = end.cost
             path.calls = calls + end.calls
         return path
+
+
+def _arrays(tracks: Tracks) -> Iterator[Array]:
+    """Yields what smoothed tracks say of states, the trials in front."""
+    yield tracks.mean
+    yield tracks.covariance
+    yield from tracks.start
 
 
 def smoothed(model: StateModel, tracks: Tracks) -> Tracks:
@@ -274,7 +285,7 @@ def _shortened(density: PathDensity, old: Array, new: Array) -> Settled:
     found = density.settled(new)
     calls = before.calls + found.calls
     share = 1.0
-    for _ in range(_HALVINGS - 1):
+    for _ in range(_HALVINGS):
         # A cost that is not finite counts as a rise.
         lowered = found.cost <= before.cost * (1 + _ROUND_OFF)
         rows = np.flatnonzero(~lowered)

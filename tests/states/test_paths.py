@@ -289,3 +289,18 @@ def test_the_fit_of_a_linear_path_is_that_of_the_innovations():
     fewer = trackers[2].track(LINEAR, z)
     assert_agrees(path_p(z, fewer.cost), chi2.sf(fewer.cost, 7), rtol=1e-9)
     assert kstest(path_p(z, fewer.cost), "uniform").pvalue > 1e-3
+
+
+@pytest.mark.parametrize("rule", [Taylor(), Cubature()], ids=["tangents", "points"])
+def test_a_path_that_has_arrived_waits_for_the_others(rule):
+    """An iterated smoother with a tolerance leaves a trial at the same bits alone and beside slower ones."""
+    tracker = IteratedSmoother(rule=rule, iterations=20, tolerance=0.05)
+    model = bearings(10.0)
+    z = model.draw(0, 6).z
+    together = tracker.track(model, z)
+    assert len(set(together.calls)) > 1
+    for trial in range(len(z)):
+        alone = tracker.track(model, z[trial : trial + 1])
+        np.testing.assert_array_equal(alone.mean[0], together.mean[trial])
+        np.testing.assert_array_equal(alone.covariance[0], together.covariance[trial])
+        assert alone.calls[0] == together.calls[trial]
