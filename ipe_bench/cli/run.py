@@ -67,7 +67,8 @@ class Outcome:
         """Returns the words that the sweep of a command gives to this job, or `job` where there is no sweep."""
         typed = {word.lstrip("+~") for word in shlex.split(command)}
         swept = tuple(word for word in self.words if word.lstrip("+~") not in typed)
-        return replace(self, words=swept).job if swept else self.job
+        # Without a folder it has no name where no word of the sweep tells it.
+        return replace(self, words=swept, output="").job or self.job
 
     def __float__(self) -> float:
         """Returns the objective of sweepers that optimise; they cannot go on from a job that was refused."""
