@@ -84,14 +84,7 @@ def _by_numpy(A: Array, B: Array, D: Array, G: Array, a: Array, v: Array) -> tup
     B = np.concatenate([np.zeros((trials, 1, *B.shape[2:])), B], axis=1)
     B = np.concatenate([B, np.sqrt(D)[..., None] * np.eye(n)], axis=2)
     v = np.pad(v, [(0, 0), (1, 0), (0, n)])
-    F, S, size = np.zeros((trials, epochs, n, n)), np.zeros_like(B), np.ones_like(v)
-    for k in range(epochs):
-        noise = np.broadcast_to(G[k], (trials, *G[k].shape))
-        # Prediction: F F' <- A F F' A' + G G', by orthogonal rows of (A F, G).
-        F[:, k] = _lower(np.concatenate([np.matmul(A[:, k], F[:, k - 1]), noise], axis=2))
-        for r in range(B.shape[2]):
-            # Update by one reading after another: s = F F' b and 1 + b' s.
-            S[:, k, r], size[:, k, r] = _take_in(F[:, k], B[:, k, r])
+    F, S, size = filtered_roots(A, B, G)
     x = np.zeros((trials, epochs, n))
     # The second pass solves for what the first leaves of the right sides.
     for _ in range(2):
@@ -120,7 +113,24 @@ def _by_numpy(A: Array, B: Array, D: Array, G: Array, a: Array, v: Array) -> tup
     return x, np.matmul(F, _transposed(F))
 
 
-def _lower(W: Array) -> Array:
+def filtered_roots(A: Array, B: Array, G: Array) -> tuple[Array, Array, Array]:
+    """Returns F (trials, 1 + K, n, n), where F F' is the covariance of x by the rows B (trials, 1 + K, r, n) up to each
+    epoch, and s and 1 + b' s of each row b; A (trials, 1 + K, n, n)."""
+    trials, epochs, rows, n = B.shape
+    F = np.zeros((trials, epochs, n, n))
+    S = np.zeros_like(B)
+    size = np.ones((trials, epochs, rows))
+    for k in range(epochs):
+        noise = np.broadcast_to(G[k], (trials, *G[k].shape))
+        # Prediction: F F' <- A F F' A' + G G', by orthogonal rows of (A F, G).
+        F[:, k] = lower(np.concatenate([np.matmul(A[:, k], F[:, k - 1]), noise], axis=2))
+        for r in range(rows):
+            # Update by one reading after another: s = F F' b and 1 + b' s.
+            S[:, k, r], size[:, k, r] = _take_in(F[:, k], B[:, k, r])
+    return F, S, size
+
+
+def lower(W: Array) -> Array:
     """The lower triangular F (trials, n, n) with F F' = W W'."""
     W, n = W.copy(), W.shape[1]
     F = np.zeros((*W.shape[:1], n, n))

@@ -19,6 +19,8 @@ _ROUND_OFF = 1e-15
 """Eigenvalues of the correlations, over their number, that count as 0."""
 _INDEFINITE = 1e-6
 """The eigenvalue below -1e-6 of correlations that are no covariance's."""
+_UNLIKE = 1e-14
+"""Part of the largest variance below which another is of another kind, as of other units."""
 _OUTSIDE = 1e-6
 """Standard deviations by which a vector may lie outside the range of a covariance."""
 
@@ -152,7 +154,14 @@ def mahalanobis(e: Array, P: Array, parts: Half | None = None) -> Array:
 def root(P: Array) -> Array:
     """Computes G (n, r) with G G' = P for positive semidefinite P (n, n), of as many columns as P
     has rank."""
-    values, V = np.linalg.eigh(symmetric(np.asarray(P, dtype=float)))
+    P = symmetric(np.asarray(P, dtype=float))
+    variances = np.diagonal(P)
+    some = variances[variances > 0]
+    if some.size and some.min() < _UNLIKE * some.max():
+        # Beside a variance as large as that, eigenvalues of P itself lose the small ones.
+        G = principal(P[None])[0][0]
+        return G[:, G.any(axis=0)]
+    values, V = np.linalg.eigh(P)
     round_off = len(values) * np.finfo(float).eps * max(values[-1], 0.0)
     kept = values > round_off
     return V[:, kept] * np.sqrt(values[kept])

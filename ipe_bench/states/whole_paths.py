@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.linalg import Array, multiply
-from ipe_bench.engine.chains import solve_chains
+from ipe_bench.engine.chains import filtered_roots, lower, solve_chains
 from ipe_bench.states.algebra import (
     Half,
     factor,
@@ -25,6 +25,9 @@ from ipe_bench.states.base import StateModel
 _REACHED = 1e-9
 """Part of a state by which a path may miss the range of its noise or of the prior: round-off of a
 solve."""
+_LEFT = 1e-6
+"""Part of a variance that readings leave, below which a difference of both has lost too many
+digits."""
 
 
 @dataclass(frozen=True)
@@ -272,11 +275,51 @@ class PathDensity:
         noise = np.matmul(Q, shares)
         for k in range(self.model.epochs):
             crossed[:, k + 1] = np.matmul(A[:, k], crossed[:, k]) + noise[:, k]
+        before = np.einsum("tkii->tki", P).copy()
         P[:, :-1] -= np.matmul(np.matmul(ahead, told), transposed(ahead))
         variances = np.einsum("tkii->tki", P)
+        # Where readings leave hardly anything of a variance, what they told has lost its digits.
+        lost = (variances < _LEFT * before).any(axis=(1, 2))
+        lost |= (np.einsum("tkii->tki", innovation) > 1 / _LEFT).any(axis=(1, 2))
+        rows = np.flatnonzero(lost)
+        if rows.size:
+            P[rows], crossed[rows] = self._spread_by_roots(A[rows], B[rows])
         # Round-off of states that are known exactly.
         np.maximum(variances, 0.0, out=variances)
         return symmetric(P), crossed
+
+    def _spread_by_roots(self, A: Array, B: Array) -> tuple[Array, Array]:
+        """Computes the same without a difference of covariances, which costs the digits of states
+        that are known much better afterwards: with F F' of the readings up to an epoch and Y' Y of
+        what later ones say,
+
+            P = F (I + F' Y' Y F)^-1 F'
+            Y <- (I + C' Q C)^-1/2 C' A,  C C' = B' B + Y' Y
+
+        and x[k] = (I + Q C C')^-1 A x[k-1] + ... by the readings from epoch k on.
+        """
+        A = np.pad(A, [(0, 0), (1, 0), (0, 0), (0, 0)])
+        B = np.pad(B, [(0, 0), (1, 0), (0, 0), (0, 0)])
+        F = filtered_roots(A, B, self.noise)[0]
+        P = np.empty_like(F)
+        crossed = np.empty_like(F)
+        one = np.broadcast_to(np.eye(self.model.n), F[:, 0].shape)
+        Y = np.zeros_like(one)
+        ahead = one
+        for k in range(self.model.epochs, -1, -1):
+            seen = transposed(np.matmul(Y, F[:, k]))
+            L = lower(np.concatenate([one, seen], axis=2))
+            part = lower_solve(L, transposed(F[:, k]))
+            P[:, k] = np.matmul(transposed(part), part)
+            crossed[:, k] = np.matmul(P[:, k], ahead)
+            C = lower(transposed(np.concatenate([B[:, k], Y], axis=1)))
+            X = np.matmul(transposed(C), self.noise[k])
+            L = lower(np.concatenate([one, X], axis=2))
+            Y = lower_solve(L, np.matmul(transposed(C), A[:, k]))
+            noise = np.matmul(X, transposed(self.noise[k]))
+            follows = A[:, k] - np.matmul(transposed(lower_solve(L, noise)), Y)
+            ahead = np.matmul(transposed(follows), ahead)
+        return P, crossed
 
     def size(self, tangents: Tangents, step: Array) -> Array:
         """Computes dx' (Hessian of Gauss and Newton) dx (trials,): a step's squared length in

@@ -514,3 +514,12 @@ def test_the_root_of_a_covariance_has_as_many_columns_as_that_has_rank(size):
         np.testing.assert_allclose(G @ G.T, size * A @ A.T, rtol=1e-12, atol=1e-13 * size)
     # A variance that is small beside the others is one all the same.
     assert root(size * np.diag([1.0, 1e-14, 0.0])).shape == (3, 2)
+
+
+def test_states_of_other_units_keep_their_deviations_in_what_is_drawn():
+    """A bias of mm beside a position of 1000 km: variances of 1e-6 and 1e12, and one that is known."""
+    P = np.diag([1e12, 0.0, 1e-6, 1e-6])
+    P[2, 3] = P[3, 2] = 5e-7
+    G = root(P)
+    assert G.shape == (4, 3)
+    np.testing.assert_allclose(G @ G.T, P, rtol=1e-14, atol=1e-20)

@@ -10,7 +10,16 @@ from shared.oracles import assert_agrees
 from shared.state_models import ConstantVelocity, Pendulum
 
 from ipe_bench.measurements import Parameter
-from ipe_bench.states import Formulas, LevenbergMarquardtSmoother, Normal, Smoother, StateModel, ekf
+from ipe_bench.states import (
+    Formulas,
+    IteratedSmoother,
+    LevenbergMarquardtSmoother,
+    Normal,
+    Smoother,
+    StateModel,
+    ekf,
+)
+from ipe_bench.states.base import widened
 from ipe_bench.states.smoothers import whole
 from ipe_bench.states.whole_paths import PathDensity
 
@@ -78,6 +87,57 @@ def test_a_step_from_anywhere_ends_at_the_smoothed_path_of_a_linear_model(number
     assert_agrees(found.x, mean, rtol=1e-9, atol=1e-9)
     assert_agrees(found.cost, tracks.cost, rtol=1e-9, atol=1e-12)
     assert_agrees(density.spread(tangents)[0], P, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize(("spread", "deviation"), [(1e3, 1e-3), (1e6, 1e-2), (1e7, 1.0)])
+def test_a_wide_prior_costs_a_path_no_digits_of_its_covariance(spread, deviation):
+    """A line through ten readings, of which the prior says nothing: (X' X)^-1 deviation^2 at its start."""
+    model = Formulas(
+        next={"p": "p + v", "v": "v"},
+        readings={"z": "p"},
+        deviation={"z": deviation},
+        spread={"p": spread, "v": spread},
+        count=10,
+    )
+    z = model.draw(0, 2).z
+    X = np.stack([np.ones(10), np.arange(1.0, 11.0)], axis=1)
+    exact = deviation**2 * np.linalg.inv(X.T @ X)
+    found = IteratedSmoother().track(model, z)
+    np.testing.assert_allclose(found.start.covariance, np.stack([exact, exact]), rtol=1e-9)
+    F = np.array([[1.0, 1.0], [0.0, 1.0]])
+    np.testing.assert_allclose(found.covariance[:, 0], np.stack([F @ exact @ F.T] * 2), rtol=1e-9)
+    # A cost may rise by a twentieth less than that of a normal density before it counts as bent.
+    bent = LevenbergMarquardtSmoother().track(model, z)
+    np.testing.assert_allclose(bent.start.covariance, found.start.covariance, rtol=5e-2)
+
+
+@pytest.mark.parametrize("number", [0, 2, 3, 4])
+def test_covariances_with_the_last_states_keep_their_digits_beside_a_wide_prior(number):
+    """Against x = T u, u ~ N(0, I), by orthogonal rows: cov(x | readings) = T (I + T' B' B T)^-1 T'."""
+    model = widened(Drawn(number, moved_first=number % 2 == 0), 1e5)
+    z = model.draw(0, 1).z
+    density = PathDensity.of(model, z)
+    tangents = density.tangents(density.settled(np.zeros((1, 9, model.n))))
+    P, crossed = density.spread(tangents)
+    q = density.noise.shape[2]
+    T = np.zeros((9, model.n, 9 * q))
+    T[0, :, :q] = density.noise[0]
+    rows = [np.eye(9 * q)]
+    for k in range(1, 9):
+        T[k] = tangents.A[0, k - 1] @ T[k - 1]
+        T[k, :, k * q : (k + 1) * q] = density.noise[k]
+        rows.append(tangents.B[0, k - 1] @ T[k])
+    R = np.linalg.qr(np.concatenate(rows))[1]
+    Z = np.linalg.solve(R.T, T.reshape(-1, 9 * q).T).T.reshape(T.shape)
+    size = np.sqrt(np.sum(Z**2, axis=2))
+    exact = Z @ Z.swapaxes(1, 2)
+    np.testing.assert_array_less(
+        np.abs(P[0] - exact), 1e-6 * size[:, :, None] * size[:, None] + 1e-12
+    )
+    exact = Z @ Z[-1].T
+    np.testing.assert_array_less(
+        np.abs(crossed[0] - exact), 1e-6 * size[:, :, None] * size[-1] + 1e-12
+    )
 
 
 def test_the_length_of_a_step_is_in_deviations_of_the_path():
