@@ -6,9 +6,11 @@ A chain has states x and multipliers l of epochs k = 0 ... K, with x[-1] = 0 and
     (B' B + D) x[k] + l[k] - A[k+1]' l[k+1] = B' v,   Q = G G' and a diagonal D
 
 They are those of a Kalman filter and smoother with readings v of B x and readings of 0 of x, of variance 1 / D. Its
-covariances are kept as F F' with a triangular F: from epoch to epoch by orthogonal rows of (A F, G), and by taking in
-one reading after another, with a row b of B or of a root of D and s = F F' b (Carlson, AIAA J. 11, 1973). On the way
-there it is u <- u + s w, w = (v - b' u) / (1 + b' s), and on the way back
+covariances are kept as F F' with a triangular F (Bierman, Factorization Methods for Discrete Sequential Estimation,
+1977): from epoch to epoch by orthogonal rows of (A F, G) (Morf and Kailath, IEEE Trans. Autom. Control 20, 1975), and
+by taking in one reading after another, with a row b of B or of a root of D and s = F F' b (Carlson, AIAA J. 11, 1973).
+On the way there it is u <- u + s w, w = (v - b' u) / (1 + b' s), and on the way back, by the multipliers (Bryson and
+Frazier, 1963),
 
     x = u + F F' A' l[k+1],   l <- A' l[k+1],   l <- l + b (w - s' l / (1 + b' s)) from the last reading to the first.
 
@@ -21,7 +23,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -33,25 +35,50 @@ from ipe_bench.engine.integrator import emitted
 _ARGUMENTS = (*[POINTER] * 8, INTEGER, INTEGER, POINTER)
 
 
+class Epoch(NamedTuple):
+    """Holds what is kept of an epoch: arrays, or in machine code how many numbers each has and where they lie."""
+
+    A: Any
+    B: Any
+    """The m readings' rows, then a row of a root of D for each state."""
+    a: Any
+    v: Any
+    F: Any
+    u: Any
+    """The state of this pass, on the way there and back."""
+    x: Any
+    """The sum of u over the passes."""
+    multipliers: Any
+    S: Any
+    """s = F F' b of each row."""
+    size: Any
+    """1 + b' s of each row."""
+    w: Any
+
+
 class ChainSize(NamedTuple):
     """Holds the numbers on which machine code depends."""
 
     n: int
     """States of an epoch."""
     m: int
-    """Rows of B."""
+    """Rows of B that are readings."""
     q: int
     """Columns of G."""
-    parts: tuple[int, ...]
-    """Numbers of A, rows, a, v, F, u, x and l, and of s, 1 + b' s and w of each row: what is kept of each epoch."""
+    parts: Epoch
+    """Numbers of what is kept of each epoch."""
     working: tuple[int, ...]
     """Numbers of (A F, G), of products and of A' l: what is kept of one epoch at a time."""
 
     @classmethod
     def of(cls, n: int, m: int, q: int) -> ChainSize:
+        square = n * n
         rows = m + n
-        parts = n * n, rows * n, n, rows, n * n, n, n, n, rows * n, rows, rows
-        return cls(n, m, q, parts, (n * (n + q), n + q, n))
+        across = rows * n
+        # In the order in which they are declared.
+        parts = Epoch(square, across, n, rows, square, n, n, n, across, rows, rows)
+        working = n * (n + q), n + q, n
+        return cls(n, m, q, parts, working)
 
 
 def solve_chains(
@@ -64,11 +91,14 @@ def solve_chains(
     if not compiled.available():
         return _by_numpy(*given)
     size = ChainSize.of(n, B.shape[2], G.shape[2])
-    x, P = np.empty((trials, epochs, n)), np.empty((trials, epochs, n, n) if spread else 0)
+    x = np.empty(D.shape)
+    P = np.empty((trials, epochs, n, n) if spread else 0)
+    # Before the first epoch lies one of zeros.
     room = sum(size.working) + (epochs + 1) * sum(size.parts)
     memory, frame = aligned(room * compiled.width())
     memory[:] = 0.0
-    _compiled(size)(*map(at, given), at(x), at(P), trials, epochs, frame)
+    pointers = map(at, (*given, x, P))
+    _compiled(size)(*pointers, trials, epochs, frame)
     return x, P
 
 
@@ -79,86 +109,130 @@ def _compiled(size: ChainSize) -> Callable[..., None]:
 
 def _by_numpy(A: Array, B: Array, D: Array, G: Array, a: Array, v: Array) -> tuple[Array, Array]:
     trials, epochs, n = D.shape
-    # Nothing moves into the first epoch, and nothing is read there.
-    A = np.concatenate([np.zeros((trials, 1, n, n)), A], axis=1)
-    B = np.concatenate([np.zeros((trials, 1, *B.shape[2:])), B], axis=1)
-    B = np.concatenate([B, np.sqrt(D)[..., None] * np.eye(n)], axis=2)
-    v = np.pad(v, [(0, 0), (1, 0), (0, n)])
-    F, S, size = filtered_roots(A, B, G)
-    x = np.zeros((trials, epochs, n))
+    chain = _begun(A, B, D, G, a, v)
+    each = [Epoch(*[part[:, k] for part in chain]) for k in range(epochs)]
     # The second pass solves for what the first leaves of the right sides.
     for _ in range(2):
-        u, multipliers, told = np.zeros_like(x), np.zeros_like(x), np.zeros_like(v)
-        for k in range(epochs):
-            # Forward: u <- A u + a, then u <- u + s w with w = (v - b' u) / (1 + b' s).
-            u[:, k] = multiply(A[:, k], u[:, k - 1]) + a[:, k]
-            for r in range(B.shape[2]):
-                told[:, k, r] = (v[:, k, r] - np.sum(B[:, k, r] * u[:, k], axis=1)) / size[:, k, r]
-                u[:, k] += S[:, k, r] * told[:, k, r, None]
+        chain.u[:] = 0.0
+        for k, here in enumerate(each):
+            # What lies before the first epoch counts for nothing: A is 0 there.
+            _forward(here, each[k - 1].u)
         later = np.zeros((trials, n))
-        for k in range(epochs - 1, -1, -1):
-            # Back: x = u + F F' A' l[k+1].
-            u[:, k] += multiply(F[:, k], multiply(_transposed(F[:, k]), later))
-            # l <- l + b (w - s' l / (1 + b' s)), from the last reading to the first.
-            for r in range(B.shape[2] - 1, -1, -1):
-                told[:, k, r] -= np.sum(S[:, k, r] * later, axis=1) / size[:, k, r]
-                later = later + B[:, k, r] * told[:, k, r, None]
-            multipliers[:, k] = later
-            later = multiply(_transposed(A[:, k]), later)
-        x += u
-        # What x and l leave of a and of v.
-        noise = multiply(np.matmul(G, _transposed(G)), multipliers)
-        a = a - u + multiply(A, np.roll(u, 1, axis=1)) + noise
-        v = v - multiply(B, u) - told
-    return x, np.matmul(F, _transposed(F))
+        for here in reversed(each):
+            later = _backward(here, later)
+        chain.x[:] += chain.u
+        _refine(chain, G)
+    return chain.x, np.matmul(chain.F, chain.F.mT)
+
+
+def _begun(A: Array, B: Array, D: Array, G: Array, a: Array, v: Array) -> Epoch:
+    """All epochs of a chain before its first pass."""
+    n = D.shape[2]
+    # Nothing moves into the first epoch, and nothing is read there.
+    first = [(0, 0), (1, 0), (0, 0), (0, 0)]
+    A = np.pad(A, first)
+    # D stands for readings of 0, by rows of its root.
+    roots = np.sqrt(D)[..., None] * np.eye(n)
+    B = np.concatenate([np.pad(B, first), roots], axis=2)
+    v = np.pad(v, [(0, 0), (1, 0), (0, n)])
+    F, S, size = filtered_roots(A, B, G)
+    u, x, multipliers = map(np.zeros_like, (a, a, a))
+    return Epoch(A, B, a.copy(), v, F, u, x, multipliers, S, size, np.zeros_like(v))
 
 
 def filtered_roots(A: Array, B: Array, G: Array) -> tuple[Array, Array, Array]:
     """Returns F (trials, 1 + K, n, n), where F F' is the covariance of x by the rows B (trials, 1 + K, r, n) up to each
     epoch, and s and 1 + b' s of each row b; A (trials, 1 + K, n, n)."""
-    trials, epochs, rows, n = B.shape
-    F = np.zeros((trials, epochs, n, n))
+    trials, epochs, rows, _ = B.shape
+    F = np.zeros(A.shape)
     S = np.zeros_like(B)
     size = np.ones((trials, epochs, rows))
     for k in range(epochs):
+        # Prediction: F F' <- A F F' A' + G G' = W W' with W = (A F, G).
+        moved = np.matmul(A[:, k], F[:, k - 1])
         noise = np.broadcast_to(G[k], (trials, *G[k].shape))
-        # Prediction: F F' <- A F F' A' + G G', by orthogonal rows of (A F, G).
-        F[:, k] = lower(np.concatenate([np.matmul(A[:, k], F[:, k - 1]), noise], axis=2))
+        W = np.concatenate([moved, noise], axis=2)
+        F[:, k] = lower(W)
         for r in range(rows):
             # Update by one reading after another: s = F F' b and 1 + b' s.
-            S[:, k, r], size[:, k, r] = _take_in(F[:, k], B[:, k, r])
+            s, larger = _take_in(F[:, k], B[:, k, r])
+            S[:, k, r] = s
+            size[:, k, r] = larger
     return F, S, size
 
 
 def lower(W: Array) -> Array:
     """The lower triangular F (trials, n, n) with F F' = W W'."""
-    W, n = W.copy(), W.shape[1]
-    F = np.zeros((*W.shape[:1], n, n))
+    n = W.shape[1]
+    W = W.copy()
+    F = np.zeros((len(W), n, n))
     for i in range(n):
-        square = np.sum(W[:, i] ** 2, axis=1)
-        inverse = np.where(square > 0, 1 / np.where(square > 0, square, 1.0), 0.0)
-        F[:, i, i] = np.sqrt(square)
+        row = W[:, i]
+        below = W[:, i + 1 :]
+        square = np.sum(row**2, axis=1)
+        root = np.sqrt(square)
+        F[:, i, i] = root
+        # Singular noise leaves rows of zeros, which have no share in others.
+        inverse = np.divide(1.0, square, out=np.zeros_like(square), where=square > 0)
         # The rows below lose their part along row i (modified Gram-Schmidt).
-        share = multiply(W[:, i + 1 :], W[:, i]) * inverse[:, None]
-        F[:, i + 1 :, i] = share * F[:, i, i, None]
-        W[:, i + 1 :] -= share[:, :, None] * W[:, i, None, :]
+        share = multiply(below, row) * inverse[:, None]
+        F[:, i + 1 :, i] = share * root[:, None]
+        below -= share[:, :, None] * row[:, None]
     return F
 
 
 def _take_in(F: Array, row: Array) -> tuple[Array, Array]:
     """F F' <- ((F F')^-1 + b b')^-1 for a row b, in place; returns F F' b (trials, n) and 1 + b' F F' b (trials,)."""
-    v = multiply(_transposed(F), row)
-    size, s = np.ones(len(v)), np.zeros_like(v)
-    for j in range(v.shape[1] - 1, -1, -1):
-        # From the last column to the first, size is 1 plus the squares of v so far (Carlson, 1973).
-        larger = size + v[:, j] ** 2
-        moved = F[:, :, j] * v[:, j, None]
+    t = multiply(F.mT, row)
+    s = np.zeros_like(t)
+    size = np.ones(len(t))
+    for j in reversed(range(t.shape[1])):
+        # From the last column to the first, size is 1 plus the squares of t so far (Carlson, 1973).
+        column = F[:, :, j]
+        along = t[:, j]
+        larger = size + along**2
         root = np.sqrt(size * larger)
-        F[:, :, j] = F[:, :, j] * (size / root)[:, None] - s * (v[:, j] / root)[:, None]
+        kept = size / root
+        share = along / root
+        # F <- F size / root - s t / root in this column, then s <- s + F t by the old one.
+        moved = column * along[:, None]
+        column[:] = column * kept[:, None] - s * share[:, None]
         s = s + moved
         size = larger
     return s, size
 
 
-def _transposed(A: Array) -> Array:
-    return A.swapaxes(-1, -2)
+def _forward(here: Epoch, before: Array) -> None:
+    # Prediction: u <- A u + a.
+    here.u[:] = multiply(here.A, before) + here.a
+    for r in range(here.B.shape[1]):
+        # Update: w = (v - b' u) / (1 + b' s), then u <- u + s w.
+        known = np.sum(here.B[:, r] * here.u, axis=1)
+        innovation = here.v[:, r] - known
+        w = innovation / here.size[:, r]
+        here.w[:, r] = w
+        here.u[:] += here.S[:, r] * w[:, None]
+
+
+def _backward(here: Epoch, later: Array) -> Array:
+    """Takes A' l of the epoch after, and returns that of this one."""
+    # Smoothing: x = u + F F' A' l[k+1].
+    here.u[:] += multiply(here.F, multiply(here.F.mT, later))
+    for r in reversed(range(here.B.shape[1])):
+        # Readings from the last to the first: w <- w - s' l / (1 + b' s), then l <- l + b w.
+        known = np.sum(here.S[:, r] * later, axis=1)
+        w = here.w[:, r] - known / here.size[:, r]
+        here.w[:, r] = w
+        later = later + here.B[:, r] * w[:, None]
+    here.multipliers[:] = later
+    return multiply(here.A.mT, later)
+
+
+def _refine(chain: Epoch, G: Array) -> None:
+    """Computes what u and the multipliers leave of a and of v."""
+    # a <- a - u + A u[k-1] + G G' l.
+    moved = multiply(chain.A, np.roll(chain.u, 1, axis=1))
+    noise = multiply(np.matmul(G, G.mT), chain.multipliers)
+    chain.a[:] = chain.a - chain.u + moved + noise
+    # v <- v - B u - w.
+    chain.v[:] = chain.v - multiply(chain.B, chain.u) - chain.w

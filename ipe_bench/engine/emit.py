@@ -17,12 +17,13 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 from llvmlite import ir
 
-from ipe_bench.engine.chains import ChainSize
+from ipe_bench.engine.chains import ChainSize, Epoch
 from ipe_bench.engine.plan import StepPlan
 from ipe_bench.engine.trace import Program, RowPrograms
 
@@ -109,244 +110,341 @@ def chains(size: ChainSize, width: int) -> str:
     return str(_ChainWriter(size, width).module)
 
 
+@dataclass(frozen=True)
+class _Lanes:
+    """Numbers in the frame, a vector for each, or a matrix of them in rows of n."""
+
+    v: _Vectors
+    begin: Value
+    n: int
+
+    def __getitem__(self, i: Value) -> Value:
+        return self.v.load(self.begin, [i])[0]
+
+    def __setitem__(self, i: Value, value: Value) -> None:
+        self.v.store([value], self.v.place(self.begin, i), [0])
+
+    def row(self, i: Value) -> _Lanes:
+        place = self.v.builder.mul(i, integer(self.n))
+        return _Lanes(self.v, self.v.place(self.begin, place), self.n)
+
+    def all(self) -> list[Value]:
+        return self.v.load(self.begin, range(self.n))
+
+    def column(self, j: Value) -> list[Value]:
+        return self.v.load(self.v.place(self.begin, j), range(0, self.n**2, self.n))
+
+    def keep(self, values: list[Value]) -> None:
+        self.v.store(values, self.begin, range(self.n))
+
+
 class _ChainWriter:
-    """Writes the solver of chains of one size."""
+    """Writes the solver of chains of one size: a square-root filter, and a pass back by multipliers. What is given of
+    all trials has a name of `self`, as `self.A`; what lies in the frame has one of its epoch, as `here.A`."""
 
     def __init__(self, size: ChainSize, width: int) -> None:
-        self.size, self.width, self.n, self.rows = size, width, size.n, size.m + size.n
+        self.size = size
+        self.n = size.n
+        self.rows = size.m + size.n
         self.module = ir.Module("chains")
         kinds = [*[PTR] * 8, I64, I64, PTR]
         made: Any = ir.Function(self.module, ir.FunctionType(VOID, kinds), "chains")
-        *self.arrays, self.trials, self.epochs, frame = made.args
+        *arrays, self.trials, self.epochs, frame = made.args
+        self.A, self.B, self.D, self.G, self.a, self.values, self.x, self.P = arrays
         self.b: Any = ir.IRBuilder(made.append_basic_block())
         self.v = _Vectors(self.b, width)
-        self.W, self.t, self.y, self.first = self._parts(frame, size.working)
+        self.zero = self.v.constant(0.0)
+        self.one = self.v.constant(1.0)
+        W, t, y, self.first = self._parts(frame, size.working)
+        self.W = _Lanes(self.v, W, size.n + size.q)
+        self.t = self._lanes(t)
+        self.y = self._lanes(y)
         with loop(self.b, integer(0), self.trials, width) as self.group:
-            with self._each(self.epochs) as k:
-                self._begin(k)
-                self._spread(k)
-            with self._each(2):
-                with self._each(self.epochs) as k:
-                    self._forward(k)
-                with self._each(self.n) as i:
-                    self._keep(self.v.constant(0.0), self.y, i)
-                with self._each(self.epochs) as i:
-                    self._backward(self._back(self.epochs, i))
-                with self._each(self.epochs) as k:
-                    self._refine(k)
-            with self._each(self.epochs) as k:
-                self._end(k)
+            self._solve()
         self.b.ret_void()
 
-    def _at(self, k: Value, back: int = 0) -> list[Value]:
-        """The parts of epoch k. Before the first epoch lies one of zeros."""
-        place = self.b.mul(self.b.add(k, integer(1 - back)), integer(sum(self.size.parts)))
-        return self._parts(self.v.place(self.first, place), self.size.parts)[:-1]
+    def _solve(self) -> None:
+        """Writes the solution of a group of trials."""
+        with self._each(self.epochs) as k:
+            self._begin(k)
+            self._spread(k)
+        # The second pass solves for what the first leaves of the right sides.
+        with self._each(2):
+            with self._each(self.epochs) as k:
+                self._forward(k)
+            # Nothing follows the last epoch: A' l = 0.
+            with self._each(self.n) as i:
+                self.y[i] = self.zero
+            with self._down(self.epochs) as k:
+                self._backward(k)
+            with self._each(self.epochs) as k:
+                self._refine(k)
+        with self._each(self.epochs) as k:
+            self._end(k)
 
     def _begin(self, k: Value) -> None:
-        """Takes what is given of an epoch."""
-        b, n, m = self.b, self.n, self.size.m
-        A, B, a, v, _, u, x, _, S, size, *_ = self._at(k)
-        steps, seen, damping, _, moves, values, *_ = self.arrays
-        moved, before = b.sub(self.epochs, integer(1)), b.sub(k, integer(1))
+        """Writes what is given of an epoch into its place."""
+        b = self.b
+        n = self.n
+        m = self.size.m
+        here = self._at(k)
+        moved = b.sub(self.epochs, integer(1))
+        before = b.sub(k, integer(1))
+        # Nothing moves into the first epoch, and nothing is read there.
         with b.if_then(b.icmp_signed(">", k, integer(0))):
-            self._copy(steps, A, n * n, before, moved)
-            self._copy(seen, B, m * n, before, moved)
-            self._copy(values, v, m, before, moved)
-        self._copy(damping, u, n, k, self.epochs)
-        self._copy(moves, a, n, k, self.epochs)
+            self._take(self.A, here.A, n * n, before, moved)
+            self._take(self.B, here.B, m * n, before, moved)
+            self._take(self.values, here.v, m, before, moved)
+        # D waits where u will be.
+        self._take(self.D, here.u, n, k, self.epochs)
+        self._take(self.a, here.a, n, k, self.epochs)
         with self._each(n) as i:
-            place = b.add(integer(m * n), b.mul(i, integer(n + 1)))
-            self._keep(self.v.call("sqrt", self._entry(u, i)), B, place)
-            self._keep(self.v.constant(0.0), x, i)
-            # Until a row is taken in, which those without damping are not; v of damping is 0.
-            self._keep(self.v.constant(0.0), v, b.add(i, integer(m)))
-            self._keep(self.v.constant(1.0), size, b.add(i, integer(m)))
-            with self._each(n) as j:
-                self._keep(self.v.constant(0.0), self._under(S, b.add(i, integer(m))), j)
+            self._damp(here, i)
+
+    def _damp(self, here: Epoch, i: Value) -> None:
+        """Writes the row of a root of D for state i, which is a reading of 0, as one that is not taken in yet."""
+        b = self.b
+        m = integer(self.size.m)
+        # The roots stand on a diagonal below the rows of the m readings.
+        diagonal = b.add(integer(self.size.m * self.n), b.mul(i, integer(self.n + 1)))
+        here.B[diagonal] = self.v.call("sqrt", here.u[i])
+        here.x[i] = self.zero
+        here.v[b.add(i, m)] = self.zero
+        # s = 0 and 1 + b' s = 1 stay where there is no damping, and the row is not taken in.
+        here.size[b.add(i, m)] = self.one
+        with self._each(self.n) as j:
+            here.S.row(b.add(i, m))[j] = self.zero
 
     def _spread(self, k: Value) -> None:
-        """Writes F of an epoch, F F' = W W' with W = (A F, G), and takes in its rows."""
-        b, n, m, wide = self.b, self.n, self.size.m, self.n + self.size.q
-        A, B, _, _, F, _, _, _, S, size, _ = self._at(k)
-        before = self._at(k, 1)[4]
-        with self._each(n) as i:
-            along, row = self._row(A, i), self._under(self.W, i, wide)
-            with self._each(n) as j:
-                self._keep(self._dot(along, self._column(before, j)), row, j)
-            with self._each(self.size.q) as j:
-                self._keep(self._G(k, i, j), row, b.add(j, integer(n)))
-        with self._each(n) as i:
-            row = self.v.load(self._under(self.W, i, wide), range(wide))
-            square = self._dot(row, row)
-            some = b.fcmp_ordered(">", square, self.v.constant(0.0))
-            inverse = b.fdiv(self.v.constant(1.0), square)
-            inverse = b.select(some, inverse, self.v.constant(0.0))
-            root = self.v.call("sqrt", square)
-            self._keep(root, self._under(F, i), i)
-            with loop(b, b.add(i, integer(1)), integer(n)) as j:
-                place = self._under(self.W, j, wide)
-                other = self.v.load(place, range(wide))
-                share = b.fmul(self._dot(other, row), inverse)
-                self._keep(b.fmul(share, root), self._under(F, j), i)
-                less = [b.fneg(share)] * wide
-                rest = map(partial(self.v.call, "fma"), less, row, other)
-                self.v.store(list(rest), place, range(wide))
+        """Writes F of an epoch: predicted, and then updated by one row after another."""
+        here = self._at(k)
+        before = self._at(k, back=1)
+        self._predict(k, here.A, before.F)
+        self._triangle(here.F)
         with self._each(self.rows) as r:
-            row, read = self._under(B, r), b.icmp_signed("<", r, integer(m))
-            damped = b.icmp_signed(">=", r, integer(m))
-            i = b.select(damped, b.sub(r, integer(m)), integer(0))
-            damped = b.fcmp_unordered("!=", self._entry(row, i), self.v.constant(0.0))
-            some = b.bitcast(damped, ir.IntType(self.width))
-            some = b.icmp_unsigned("!=", some, ir.Constant(some.type, 0))
-            with b.if_then(b.or_(read, some)):
-                self._take_in(F, self.v.load(row, range(n)), self._under(S, r), size, r)
+            self._update(here, r)
 
-    def _take_in(self, F: Value, row: list[Value], s: Value, sizes: Value, r: Value) -> None:
-        """Writes F F' <- ((F F')^-1 + b b')^-1 for a row b, from the last column on, with s = F F' b and 1 + b' s."""
-        b, n = self.b, self.n
-        with self._each(n) as j:
-            self._keep(self._dot(self._column(F, j), row), self.t, j)
-            self._keep(self.v.constant(0.0), s, j)
-        self._keep(self.v.constant(1.0), sizes, r)
-        with self._each(n) as i:
-            j = self._back(integer(n), i)
-            v, size = self._entry(self.t, j), self._entry(sizes, r)
-            larger = self.v.call("fma", v, v, size)
+    def _predict(self, k: Value, A: _Lanes, F: _Lanes) -> None:
+        """Writes W = (A F, G), with W W' = A F F' A' + G G'."""
+        with self._each(self.n) as i:
+            along = A.row(i).all()
+            row = self.W.row(i)
+            with self._each(self.n) as j:
+                row[j] = self._dot(along, F.column(j))
+            with self._each(self.size.q) as j:
+                gain = self._gain(k, i, j)
+                row[self.b.add(j, integer(self.n))] = gain
+
+    def _triangle(self, F: _Lanes) -> None:
+        """Writes the triangular F with F F' = W W', by orthogonal rows of W (modified Gram-Schmidt)."""
+        b = self.b
+        with self._each(self.n) as i:
+            row = self.W.row(i).all()
+            square = self._dot(row, row)
+            # Singular noise leaves rows of zeros, which have no share in others.
+            some = b.fcmp_ordered(">", square, self.zero)
+            inverse = b.select(some, b.fdiv(self.one, square), self.zero)
+            root = self.v.call("sqrt", square)
+            F.row(i)[i] = root
+            # The rows below lose their part along row i.
+            with loop(b, b.add(i, integer(1)), integer(self.n)) as j:
+                below = self.W.row(j)
+                numbers = below.all()
+                share = b.fmul(self._dot(numbers, row), inverse)
+                F.row(j)[i] = b.fmul(share, root)
+                rest = self.v.combine(numbers, [b.fneg(share)], [row])
+                below.keep(rest)
+
+    def _update(self, here: Epoch, r: Value) -> None:
+        """Writes whether row r is taken in: a reading always, and damping if some lane has any."""
+        b = self.b
+        m = integer(self.size.m)
+        row = here.B.row(r)
+        read = b.icmp_signed("<", r, m)
+        damping = b.icmp_signed(">=", r, m)
+        i = b.select(damping, b.sub(r, m), integer(0))
+        damped = b.fcmp_unordered("!=", row[i], self.zero)
+        lanes = b.bitcast(damped, ir.IntType(self.v.width))
+        some = b.icmp_unsigned("!=", lanes, ir.Constant(lanes.type, 0))
+        with b.if_then(b.or_(read, some)):
+            self._take_in(here, r, row.all())
+
+    def _take_in(self, here: Epoch, r: Value, row: list[Value]) -> None:
+        """Writes F F' <- ((F F')^-1 + b b')^-1 for a row b, with s = F F' b and 1 + b' s (Carlson, 1973)."""
+        b = self.b
+        s = here.S.row(r)
+        # t = F' b, of which s and 1 + b' s are sums over columns.
+        with self._each(self.n) as j:
+            self.t[j] = self._dot(here.F.column(j), row)
+            s[j] = self.zero
+        here.size[r] = self.one
+        # From the last column to the first, size is 1 plus the squares of t so far.
+        with self._down(integer(self.n)) as j:
+            t = self.t[j]
+            size = here.size[r]
+            larger = self.v.call("fma", t, t, size)
             root = self.v.call("sqrt", b.fmul(size, larger))
-            kept, share = b.fdiv(size, root), b.fneg(b.fdiv(v, root))
-            with loop(b, j, integer(n)) as i:
-                old, so_far = self._entry(self._under(F, i), j), self._entry(s, i)
+            kept = b.fdiv(size, root)
+            share = b.fneg(b.fdiv(t, root))
+            # F <- F size / root - s t / root in this column, then s <- s + F t by the old one.
+            with loop(b, j, integer(self.n)) as i:
+                old = here.F.row(i)[j]
+                so_far = s[i]
                 new = self.v.call("fma", share, so_far, b.fmul(old, kept))
-                self._keep(new, self._under(F, i), j)
-                self._keep(self.v.call("fma", old, v, so_far), s, i)
-            self._keep(larger, sizes, r)
+                here.F.row(i)[j] = new
+                s[i] = self.v.call("fma", old, t, so_far)
+            here.size[r] = larger
 
     def _forward(self, k: Value) -> None:
-        b, n = self.b, self.n
-        A, B, a, v, _, u, _, _, S, size, told = self._at(k)
-        before = self.v.load(self._at(k, 1)[5], range(n))
-        with self._each(n) as i:
-            self._keep(self._dot(self._row(A, i), before, self._entry(a, i)), u, i)
+        """Writes the state u of an epoch by its readings and those before."""
+        here = self._at(k)
+        before = self._at(k, back=1).u.all()
+        # Prediction: u <- A u + a.
+        with self._each(self.n) as i:
+            along = here.A.row(i).all()
+            here.u[i] = self._dot(along, before, here.a[i])
+        # Update by a reading: w = (v - b' u) / (1 + b' s), then u <- u + s w.
         with self._each(self.rows) as r:
-            innovation = b.fsub(self._entry(v, r), self._along(B, r, u))
-            share = b.fdiv(innovation, self._entry(size, r))
-            self._keep(share, told, r)
-            self._add(share, self._under(S, r), u)
+            w = self.b.fdiv(self._left(here, r), here.size[r])
+            here.w[r] = w
+            self._add(w, here.S.row(r), here.u)
 
     def _backward(self, k: Value) -> None:
-        b, n = self.b, self.n
-        A, B, _, _, F, u, x, multipliers, S, size, told = self._at(k)
-        later = self.v.load(self.y, range(n))
-        with self._each(n) as j:
-            self._keep(self._dot(self._column(F, j), later), self.t, j)
-        with self._each(n) as i:
-            t = self.v.load(self.t, range(n))
-            self._keep(self._dot(self._row(F, i), t, self._entry(u, i)), u, i)
-            self._keep(b.fadd(self._entry(x, i), self._entry(u, i)), x, i)
-        with self._each(self.rows) as i:
-            r = self._back(integer(self.rows), i)
-            later = b.fdiv(self._along(S, r, self.y), self._entry(size, r))
-            share = b.fsub(self._entry(told, r), later)
-            self._keep(share, told, r)
-            self._add(share, self._under(B, r), self.y)
-        found = self.v.load(self.y, range(n))
-        self.v.store(found, multipliers, range(n))
-        with self._each(n) as i:
-            self._keep(self._dot(self._column(A, i), found), self.y, i)
+        """Writes the multipliers of an epoch, and its state by all readings."""
+        here = self._at(k)
+        later = self.y.all()
+        # Smoothing (Bryson and Frazier, 1963): x = u + F t with t = F' A' l[k+1].
+        with self._each(self.n) as j:
+            self.t[j] = self._dot(here.F.column(j), later)
+        with self._each(self.n) as i:
+            t = self.t.all()
+            along = here.F.row(i).all()
+            here.u[i] = self._dot(along, t, here.u[i])
+            here.x[i] = self.b.fadd(here.x[i], here.u[i])
+        # Readings from the last to the first: w <- w - s' l / (1 + b' s), then l <- l + b w.
+        with self._down(integer(self.rows)) as r:
+            known = self._along(here.S, r, self.y)
+            share = self.b.fdiv(known, here.size[r])
+            w = self.b.fsub(here.w[r], share)
+            here.w[r] = w
+            self._add(w, here.B.row(r), self.y)
+        multipliers = self.y.all()
+        here.multipliers.keep(multipliers)
+        # A' l is what the epoch before takes.
+        with self._each(self.n) as i:
+            self.y[i] = self._dot(here.A.column(i), multipliers)
 
     def _refine(self, k: Value) -> None:
-        """Writes what the step so far leaves of the right sides."""
-        b, n, q = self.b, self.n, self.size.q
-        A, B, a, v, _, u, _, multipliers, _, _, told = self._at(k)
-        before = self.v.load(self._at(k, 1)[5], range(n))
+        """Writes what u and the multipliers leave of the right sides."""
+        q = self.size.q
+        here = self._at(k)
+        before = self._at(k, back=1).u.all()
+        # t = G' l.
         with self._each(q) as j:
-            gains = [self._G(k, integer(i), j) for i in range(n)]
-            self._keep(self._dot(gains, self.v.load(multipliers, range(n))), self.t, j)
-        with self._each(n) as i:
-            left = b.fsub(self._entry(a, i), self._entry(u, i))
-            gains = [self._G(k, i, integer(j)) for j in range(q)]
-            left = self._dot(gains, self.v.load(self.t, range(q)), left)
-            self._keep(self._dot(self._row(A, i), before, left), a, i)
+            column = [self._gain(k, integer(i), j) for i in range(self.n)]
+            self.t[j] = self._dot(column, here.multipliers.all())
+        # a <- a - u + G t + A u[k-1].
+        with self._each(self.n) as i:
+            left = self.b.fsub(here.a[i], here.u[i])
+            gains = [self._gain(k, i, integer(j)) for j in range(q)]
+            left = self._dot(gains, self.v.load(self.t.begin, range(q)), left)
+            along = here.A.row(i).all()
+            here.a[i] = self._dot(along, before, left)
+        # v <- v - B u - w.
         with self._each(self.rows) as r:
-            left = b.fsub(self._entry(v, r), self._along(B, r, u))
-            self._keep(b.fsub(left, self._entry(told, r)), v, r)
+            left = self._left(here, r)
+            here.v[r] = self.b.fsub(left, here.w[r])
 
     def _end(self, k: Value) -> None:
-        b, n = self.b, self.n
-        A, _, _, _, F, _, steps, *_ = self._at(k)
-        *_, x, P = self.arrays
-        self._copy(x, steps, n, k, self.epochs, back=True)
-        with b.if_then(b.icmp_signed("!=", b.ptrtoint(P, I64), integer(0))):
-            # A is no longer needed.
-            with self._each(n) as i, self._each(n) as j:
-                self._keep(self._dot(self._row(F, i), self._row(F, j)), self._under(A, i), j)
-            self._copy(P, A, n * n, k, self.epochs, back=True)
+        """Writes x of an epoch and, if it is asked for, P = F F' to the results."""
+        here = self._at(k)
+        self._give(here.x, self.x, self.n, k)
+        asked = self.b.icmp_signed("!=", self.b.ptrtoint(self.P, I64), integer(0))
+        with self.b.if_then(asked):
+            # P takes the place of A, which is no longer needed.
+            with self._each(self.n) as i, self._each(self.n) as j:
+                along = here.F.row(i).all()
+                P = self._dot(along, here.F.row(j).all())
+                here.A.row(i)[j] = P
+            self._give(here.A, self.P, self.n**2, k)
 
-    def _along(self, array: Value, r: Value, x: Value) -> Value:
-        """Row r of an array times x."""
-        return self._dot(self._row(array, r), self.v.load(x, range(self.n)))
+    def _take(self, array: Value, lanes: _Lanes, count: int, k: Value, length: Value) -> None:
+        """Copies `count` numbers of epoch k of an array (trials, length, count) into lanes."""
+        with self._places(count, k, length) as (outside, inside):
+            put(self.b, number_at(self.b, array, outside), lanes.begin, inside)
 
-    def _add(self, share: Value, row: Value, to: Value) -> None:
-        with self._each(self.n) as i:
-            new = self.v.call("fma", share, self._entry(row, i), self._entry(to, i))
-            self._keep(new, to, i)
+    def _give(self, lanes: _Lanes, array: Value, count: int, k: Value) -> None:
+        """Copies lanes into `count` numbers of epoch k of an array (trials, epochs, count)."""
+        with self._places(count, k, self.epochs) as (outside, inside):
+            put(self.b, number_at(self.b, lanes.begin, inside), array, outside)
 
-    def _back(self, count: Value, i: Value) -> Value:
-        """Counts from the last down."""
-        return self.b.sub(self.b.sub(count, integer(1)), i)
-
-    def _G(self, k: Value, i: Value, j: Value) -> Value:
-        b, n, q = self.b, integer(self.n), integer(self.size.q)
-        place = b.add(b.mul(b.add(b.mul(k, n), i), q), j)
-        return self.v.spread(number_at(b, self.arrays[3], place))
-
-    def _copy(
-        self, array: Value, lanes: Value, count: int, k: Value, length: Value, back: bool = False
-    ) -> None:
-        """Copies `count` numbers of epoch k of an array (trials, length, count) into lanes, or back."""
+    @contextmanager
+    def _places(self, count: int, k: Value, length: Value) -> Iterator[tuple[Value, Value]]:
+        """Writes a loop over places in an array (trials, length, count) and those in lanes."""
         b = self.b
-        with self._each(self.width) as lane:
+        width = self.v.width
+        with self._each(width) as lane:
             trial = b.add(self.group, lane)
+            # A group that is not full repeats the last trial.
             last = b.sub(self.trials, integer(1))
             trial = b.select(b.icmp_signed("<", trial, last), trial, last)
-            begin = b.mul(b.add(b.mul(trial, length), k), integer(count))
+            epoch = b.add(b.mul(trial, length), k)
+            begin = b.mul(epoch, integer(count))
             with self._each(count) as j:
                 outside = b.add(begin, j)
-                inside = b.add(b.mul(j, integer(self.width)), lane)
-                if back:
-                    put(b, number_at(b, lanes, inside), array, outside)
-                else:
-                    put(b, number_at(b, array, outside), lanes, inside)
+                inside = b.add(b.mul(j, integer(width)), lane)
+                yield outside, inside
+
+    def _at(self, k: Value, back: int = 0) -> Epoch:
+        """What is kept of epoch k - back. Before the first epoch lies one of zeros."""
+        number = self.b.add(k, integer(1 - back))
+        begin = self.b.mul(number, integer(sum(self.size.parts)))
+        *places, _ = self._parts(self.v.place(self.first, begin), self.size.parts)
+        return Epoch(*map(self._lanes, places))
 
     def _parts(self, array: Value, sizes: Sequence[int]) -> list[Value]:
         """Begins of parts of so many vectors each, and of what follows them."""
         return [self.v.place(array, begin) for begin in itertools.accumulate(sizes, initial=0)]
 
+    def _lanes(self, begin: Value) -> _Lanes:
+        return _Lanes(self.v, begin, self.n)
+
     def _each(self, count: int | Value) -> Any:
         count = integer(count) if isinstance(count, int) else count
         return loop(self.b, integer(0), count)
 
-    def _under(self, array: Value, i: Value, count: int = 0) -> Value:
-        return self.v.place(array, self.b.mul(i, integer(count or self.n)))
+    @contextmanager
+    def _down(self, count: Value) -> Iterator[Value]:
+        """Writes a loop from count - 1 down to 0."""
+        with self._each(count) as i:
+            last = self.b.sub(count, integer(1))
+            yield self.b.sub(last, i)
 
-    def _row(self, array: Value, i: Value) -> list[Value]:
-        return self.v.load(self._under(array, i), range(self.n))
+    def _gain(self, k: Value, i: Value, j: Value) -> Value:
+        """G[k, i, j], the same in all lanes."""
+        b = self.b
+        row = b.add(b.mul(k, integer(self.n)), i)
+        place = b.add(b.mul(row, integer(self.size.q)), j)
+        return self.v.spread(number_at(b, self.G, place))
 
-    def _column(self, array: Value, j: Value) -> list[Value]:
-        return self.v.load(self.v.place(array, j), range(0, self.n**2, self.n))
+    def _left(self, here: Epoch, r: Value) -> Value:
+        """What u leaves of reading r, v - b' u."""
+        return self.b.fsub(here.v[r], self._along(here.B, r, here.u))
 
-    def _entry(self, array: Value, i: Value) -> Value:
-        return self.v.load(array, [i])[0]
+    def _along(self, array: _Lanes, r: Value, x: _Lanes) -> Value:
+        """Row r of an array times x."""
+        return self._dot(array.row(r).all(), x.all())
 
-    def _keep(self, value: Value, array: Value, i: Value) -> None:
-        self.v.store([value], self.v.place(array, i), [0])
+    def _add(self, share: Value, row: _Lanes, to: _Lanes) -> None:
+        """Writes to <- to + share row."""
+        with self._each(self.n) as i:
+            to[i] = self.v.call("fma", share, row[i], to[i])
 
     def _dot(
         self, one: Sequence[Value], other: Sequence[Value], start: Value | None = None
     ) -> Value:
         slopes = [[value] for value in other]
-        return self.v.combine([start or self.v.constant(0.0)], list(one), slopes)[0]
+        return self.v.combine([start or self.zero], list(one), slopes)[0]
 
 
 class _Writer:
