@@ -190,7 +190,12 @@ class _ChainWriter:
         here = self._at(k)
         moved = b.sub(self.epochs, integer(1))
         before = b.sub(k, integer(1))
-        # Nothing moves into the first epoch, and nothing is read there.
+        # Nothing moves into the first epoch, and nothing is read there; nor is anything left there of
+        # the trials before, which may not be finite.
+        with self._each(n * n) as i:
+            here.A[i] = self.zero
+        with self._each(m) as r:
+            here.v[r] = self.zero
         with b.if_then(b.icmp_signed(">", k, integer(0))):
             self._take(self.A, here.A, n * n, before, moved)
             self._take(self.B, here.B, m * n, before, moved)

@@ -71,6 +71,19 @@ def test_a_wide_start_costs_no_digits():
     np.testing.assert_allclose(P[0, 2], 1e-8 * np.array([[1.0, 1.0], [1.0, 2.0]]), rtol=1e-6)
 
 
+@pytest.mark.parametrize("spread", [False, True])
+@pytest.mark.usefixtures("engine")
+def test_a_trial_that_is_not_finite_leaves_nothing_to_those_in_its_place_of_later_vectors(spread):
+    given = chains(20)
+    x, P = solve_chains(*given, spread=spread)
+    given[0][2, 0] = np.nan
+    after = solve_chains(*given, spread=spread)
+    others = np.arange(20) != 2
+    np.testing.assert_array_equal(after[0][others], x[others])
+    if spread:
+        np.testing.assert_array_equal(after[1][others], P[others])
+
+
 @pytest.mark.usefixtures("engine")
 def test_a_trial_has_the_same_bits_alone_and_beside_one_that_is_not_finite():
     A, B, D, G, a, v = chains(10)
