@@ -358,6 +358,7 @@ ELSEWHERE = {
         "{}: is not given; both go together",
         "{}: is there and holds",
     ),
+    "of a log's rows": ("{} belongs here; give a row for each epoch",),
     "of a plugin or a class": (
         "measurement.step=null",
         "write the model in Python",
