@@ -25,6 +25,9 @@ from ipe_bench.states.base import StateModel
 _REACHED = 1e-9
 """Part of a state by which a path may miss the range of its noise or of the prior: round-off of a
 solve."""
+_AS_GOOD = 1e-6
+"""Part of a cost by which it may rise where whole turns are taken from a path: round-off of large
+angles."""
 _LEFT = 1e-6
 """Part of a variance that readings leave, below which a difference of both has lost too many
 digits."""
@@ -139,9 +142,11 @@ class PathDensity:
         f, h = self.model.values_along(x)
         near = self.model.nearest_state(f, x[:, 1:])
         gap = x[:, 1:] - near
-        if any(self.model.state_periods):
-            # A jump by a whole period costs nothing: the path goes on in the turn of its start.
-            x[:, 1:] -= np.cumsum(near - f, axis=1)
+        turned = np.flatnonzero((np.abs(near - f) > 0).any(axis=(1, 2)))
+        if turned.size:
+            shift = np.cumsum(near - f, axis=1)[turned]
+            at = (x[turned], gap[turned], h[turned])
+            x[turned], gap[turned], h[turned] = self.subset(turned)._unwound(*at, shift)
         # A gap out of the range of its noise moves the epochs after it, too: one after another.
         missed = np.abs(multiply(self.unreached, gap)).max(axis=1)
         largest = np.abs(x).max(axis=1)
@@ -151,8 +156,26 @@ class PathDensity:
             x[rows], gap[rows] = self._led(x[rows])
             h[rows] = self.model.values_along(x[rows])[1]
         calls = np.full(len(x), float(self.model.evaluations))
+        calls[turned] += self.model.evaluations
         calls[rows] += self._leading
         return self._weighed(x, gap, h, calls)
+
+    def _unwound(self, x: Array, gap: Array, h: Array, shift: Array) -> tuple[Array, Array, Array]:
+        """Returns the paths x, each in the turn of its start where that costs no more, with gaps
+        and readings; a jump by a whole period between two epochs costs nothing.
+
+        Where f or h of a state are other ones a period away, a path stays as it is.
+        """
+        moved = x.copy()
+        moved[:, 1:] -= shift
+        f, read = self.model.values_along(moved)
+        left = moved[:, 1:] - f
+        none = np.zeros(len(x))
+        before = self._weighed(x, gap, h, none).cost
+        after = self._weighed(moved, left, read, none).cost
+        better = after <= before * (1 + _AS_GOOD)
+        at = better[:, None, None]
+        return np.where(at, moved, x), np.where(at, left, gap), np.where(at, read, h)
 
     def settled_exactly(self, at: Settled) -> Settled:
         """Returns the same paths without the round-off by which steps still miss the range of their

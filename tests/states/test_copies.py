@@ -149,3 +149,24 @@ def test_a_path_goes_on_in_the_turn_of_its_start():
     f, _ = model.values_along(x)
     jumps = np.round((x[:, 1:, 0] - f[..., 0]) / TURN)
     assert not jumps.any()
+
+
+def test_turns_are_taken_from_a_path_only_where_that_costs_nothing():
+    """A reading without a period tells the turns of a state with one: the cost is that of the path that is returned."""
+    model = Formulas(
+        next={"angle": "angle+w"},
+        readings={"z": "angle"},
+        noise={"w": 4.0},
+        deviation={"z": 0.1},
+        spread={"angle": 1.0},
+        state_period={"angle": TURN},
+        count=8,
+    )
+    z = model.draw(0, 8).z
+    tracks = LevenbergMarquardtSmoother().track(model, z)
+    angle = np.concatenate([tracks.start.mean, tracks.mean[..., 0]], axis=1)
+    step = np.diff(angle, axis=1)
+    step -= TURN * np.round(step / TURN)
+    missed = z[..., 0] - angle[:, 1:]
+    cost = angle[:, 0] ** 2 + np.sum((step / 4.0) ** 2 + (missed / 0.1) ** 2, axis=1)
+    np.testing.assert_allclose(tracks.cost, cost, rtol=1e-9)
