@@ -142,9 +142,11 @@ class PathDensity:
         f, h = self.model.values_along(x)
         near = self.model.nearest_state(f, x[:, 1:])
         gap = x[:, 1:] - near
-        turned = np.flatnonzero((np.abs(near - f) > 0).any(axis=(1, 2)))
+        # Whole turns between epochs; models without periods look for none.
+        turns = near - f if any(self.model.state_periods) else np.zeros((0, 1, 1))
+        turned = np.flatnonzero((np.abs(turns) > 0).any(axis=(1, 2)))
         if turned.size:
-            shift = np.cumsum(near - f, axis=1)[turned]
+            shift = np.cumsum(turns[turned], axis=1)
             at = (x[turned], gap[turned], h[turned])
             x[turned], gap[turned], h[turned] = self.subset(turned)._unwound(*at, shift)
         # A gap out of the range of its noise moves the epochs after it, too: one after another.
