@@ -2,9 +2,11 @@
 
     import ipe_bench as ib
 
-    bench = ib.Scenario(ib.measurements.Gins(), ib.noise.Quantization(step=0.02286), error_scale=33.0)
-    table = ib.run(bench, {"newton": ib.solvers.Newton(max_iterations=20), "ekf": ib.baselines.EKF()}, trials=200)
-    fits = ib.estimate(ib.measurements.Gins(), "my.csv", noise=ib.noise.Quantization(step=0.02286))
+    noise = ib.noise.Quantization(step=0.02286)
+    bench = ib.Scenario(ib.measurements.Gins(), noise, error_scale=33.0)
+    newton = ib.solvers.Newton(max_iterations=20)
+    table = ib.run(bench, {"newton": newton, "ekf": ib.baselines.EKF()}, trials=200)
+    fits = ib.estimate(ib.measurements.Gins(), "my.csv", noise=noise)
     ib.load("outputs/paper").groupby(["estimator", "error_scale"])["nees"].mean()
 
 The import is quick, because each name is loaded when it is first used.
@@ -74,7 +76,8 @@ _HOMES = {
 _ROOMS = ("baselines", "measurements", "noise", "priors", "solvers", "states")
 __all__ = sorted(["__version__", *_ROOMS, *itertools.chain(*_HOMES.values())])  # pyright: ignore[reportUnsupportedDunderAll]
 
-# The room of the report is imported first, so that its name stands for the function `report` from then on.
+# The room of the report is imported first, so that its name stands for the function `report` from
+# then on.
 importlib.import_module(f"{__name__}.report")
 del globals()["report"]
 

@@ -1,4 +1,5 @@
-"""Offers the whole bench as functions, by which the command line does its work. They know no Hydra."""
+"""Offers the whole bench as functions, by which the command line does its work. They know no
+Hydra."""
 
 from __future__ import annotations
 
@@ -63,34 +64,39 @@ def run(
     watch: Watcher | None = None,
     progress: bool = True,
 ) -> Summary:
-    """Runs every estimator on the same trials of every scenario, and summarises what is known of them.
+    """Runs every estimator on the same trials of every scenario, and summarises what is known of
+    them.
 
     Parameters:
-        scenarios: one or several. A measurement with its `noise`, `prior` and `error_scale` stands for a scenario, a
-            state model for its `StateScenario`, whose estimators are trackers.
+        scenarios: one or several. A measurement with its `noise`, `prior` and `error_scale` stands
+            for a scenario, a state model for its `StateScenario`, whose estimators are trackers.
         estimators: by label.
         seed: number that all draws follow from; that of each scenario unless given.
-        trials: of each scenario, 1000 unless given; with `precision` the most, 100,000 unless given.
-        precision: 0.01, or {"success": 0.01, "rmse": 0.05} (relative): trials are added until intervals are so narrow.
+        trials: of each scenario, 1000 unless given; with `precision` the most, 100,000 unless
+            given.
+        precision: 0.01, or {"success": 0.01, "rmse": 0.05} (relative): trials are added until
+            intervals are so narrow.
         time_limit: seconds after which no more blocks are added.
         output: folder of the results; what it has is not computed again. None: nothing is kept.
         execution, block_size: where trials are computed, and how many in a block.
         progress: whether a terminal or a notebook shows how far the run is.
-        watch: called at each event in place of that; its argument has the `trials` of the `total` that are done, where
-            each estimator's count as its own.
+        watch: called at each event in place of that; its argument has the `trials` of the `total`
+            that are done, where each estimator's count as its own.
 
     Returns:
-        A frame with a row per scenario, estimator and parameter, in the parameter's own unit, and one of the parameter
-        `all`, the root mean square over parameters of error over bound. It shows the table of the terminal; `.trials`
-        has a row per trial, `.figures` Matplotlib's figures by name, and `.report(output)` writes the report. With
-        `precision`, `attrs["stops"]` has trials and reason of each scenario. Warnings name what was not computed.
+        A frame with a row per scenario, estimator and parameter, in the parameter's own unit, and
+        one of the parameter `all`, the root mean square over parameters of error over bound. It
+        shows the table of the terminal; `.trials` has a row per trial, `.figures` Matplotlib's
+        figures by name, and `.report(output)` writes the report. With `precision`, `attrs["stops"]`
+        has trials and reason of each scenario. Warnings name what was not computed.
 
     Raises:
         UserError: what was asked for cannot be computed; nothing has been computed then.
 
     >>> import ipe_bench as ib
     >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
-    >>> table = ib.run(bench, {"newton": ib.solvers.Newton(), "linear": ib.baselines.LinearLSE()}, trials=20)
+    >>> both = {"newton": ib.solvers.Newton(), "linear": ib.baselines.LinearLSE()}
+    >>> table = ib.run(bench, both, trials=20)
     >>> table[table["parameter"] == "all"].set_index("estimator")["converged"].to_dict()
     {'newton': 1.0, 'linear': 1.0}
     >>> table = ib.run(bench, {"newton": ib.solvers.Newton()}, precision=0.05)
@@ -125,17 +131,19 @@ def load(directories: Directories) -> pd.DataFrame:
     """Reads every stored trial of one directory or bundle, or of several.
 
     Returns:
-        A row per trial and estimator: measurement, noise, prior, error_scale, seed, estimator, and every key of the
-        config that differs; trial, status, success, solved, `error_NAME`, `crlb_distance` (the squared Mahalanobis
-        distance by the bound at the truth), nees, fit_p, iterations, simulations, jacobians, time_s, message, the truth
-        `x_NAME`, `deviation_NAME` as the estimator reports it, the bounds `crlb_NAME` and `bayes_NAME`, in multiples of
-        the parameters' sizes; columns that only some rows have come last. A warning names what is missing or damaged;
-        stale results are left out.
+        A row per trial and estimator: measurement, noise, prior, error_scale, seed, estimator, and
+        every key of the config that differs; trial, status, success, solved, `error_NAME`,
+        `crlb_distance` (the squared Mahalanobis distance by the bound at the truth), nees, fit_p,
+        iterations, simulations, jacobians, time_s, message, the truth `x_NAME`, `deviation_NAME` as
+        the estimator reports it, the bounds `crlb_NAME` and `bayes_NAME`, in multiples of the
+        parameters' sizes; columns that only some rows have come last. A warning names what is
+        missing or damaged; stale results are left out.
 
     >>> import tempfile, ipe_bench as ib
     >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
+    >>> both = {"newton": ib.solvers.Newton(), "linear": ib.baselines.LinearLSE()}
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     _ = ib.run(bench, {"newton": ib.solvers.Newton(), "linear": ib.baselines.LinearLSE()}, 20, output=folder)
+    ...     _ = ib.run(bench, both, 20, output=folder)
     ...     rows = ib.load(folder)
     >>> rows.groupby("estimator", sort=False)["trial"].count().to_dict()
     {'newton': 20, 'linear': 20}
@@ -171,7 +179,7 @@ def report(
     >>> import ipe_bench as ib
     >>> ib.report("outputs/nowhere")
     Traceback (most recent call last):
-    ipe_bench.basics.errors.UserError: outputs/nowhere: holds no results of ipe-bench; give the output folder of a run
+    ipe_bench.basics.errors.UserError: outputs/nowhere: holds no results of ipe-bench; give the ...
     """
     from ipe_bench.report.page.run import begin_report
 
@@ -199,32 +207,39 @@ def compare(
     difference: float | None = None,
     output: Path | str | None = None,
 ) -> Comparison:
-    """Tests whether a second version, setting or estimator is better or worse than a first, trial by trial.
+    """Tests whether a second version, setting or estimator is better or worse than a first, trial
+    by trial.
 
     Parameters:
-        first_directory, second_directory: whose estimators and scenarios are compared, if both have them, on trials
-            matched by seed and number, else in their order; without a second both versions are in the first.
+        first_directory, second_directory: whose estimators and scenarios are compared, if both have
+            them, on trials matched by seed and number, else in their order; without a second both
+            versions are in the first.
         first, second: labels, if one estimator is compared with another.
-        alpha: error probability below which a finding is made, of `p` corrected over all tests (Holm).
-        anytime: findings are made by `e`, evidence that may be looked at after any number of trials.
-        fail_on: quantities that are tested, and listed in `attrs["worse"]` if they get worse: success, error, cost,
-            honesty (ratio of mean squared errors over claimed variances, worse farther from 1), bias of each parameter
-            (difference of mean errors in deviations of the bound, worse farther from 0). Unless given: success, error.
+        alpha: error probability below which a finding is made, of `p` corrected over all tests
+            (Holm).
+        anytime: findings are made by `e`, evidence that may be looked at after any number of
+            trials.
+        fail_on: quantities that are tested, and listed in `attrs["worse"]` if they get worse:
+            success, error, cost, honesty (ratio of mean squared errors over claimed variances,
+            worse farther from 1), bias of each parameter (difference of mean errors in deviations
+            of the bound, worse farther from 0). Unless given: success, error.
         margins: changes that matter, by quantity; the interval of a finding lies beyond.
         complete: what the second lacks of the first is among the problems.
         power, difference: `trials_needed` find such a difference of success with that probability.
         output: folder for comparison.csv and a page.
 
     Returns:
-        A row per comparison and quantity: success (a difference of shares), error (a ratio of mean Mahalanobis errors,
-        each at most the radius of the gate), cost in simulations (a ratio), and time, which is not tested. `low` and
-        `high` are the ends of the row's own interval, `finding` says what the second is. `attrs` has lines on what is
-        `worse`, on `problems`, `stale` results and `notes`.
+        A row per comparison and quantity: success (a difference of shares), error (a ratio of mean
+        Mahalanobis errors, each at most the radius of the gate), cost in simulations (a ratio), and
+        time, which is not tested. `low` and `high` are the ends of the row's own interval,
+        `finding` says what the second is. `attrs` has lines on what is `worse`, on `problems`,
+        `stale` results and `notes`.
 
     >>> import tempfile, ipe_bench as ib
     >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
+    >>> both = {"newton": ib.solvers.Newton(), "linear": ib.baselines.LinearLSE()}
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     _ = ib.run(bench, {"newton": ib.solvers.Newton(), "linear": ib.baselines.LinearLSE()}, 20, output=folder)
+    ...     _ = ib.run(bench, both, 20, output=folder)
     ...     rows = ib.compare(folder, first="linear", second="newton")
     >>> rows.set_index("quantity")["finding"].to_dict()
     {'success': 'better', 'error': 'better', 'cost': 'worse', 'time': ''}
@@ -251,14 +266,16 @@ def audit(table: Path | str | pd.DataFrame, *, output: Path | str | None = None)
     """Tests whether the covariance that another program reports describes its errors.
 
     Parameters:
-        table: a CSV or Parquet file, or a frame, with a row per run: NAME_true and NAME (or NAME_error), NAME_std (or
-            NAME_var), and cov_A_B as far as there are any; see `ipe_bench.questions.audit.maths.read_claims`.
+        table: a CSV or Parquet file, or a frame, with a row per run: NAME_true and NAME (or
+            NAME_error), NAME_std (or NAME_var), and cov_A_B as far as there are any; see
+            `ipe_bench.questions.audit.maths.read_claims`.
         output: folder for audit.csv and audit.html.
 
     Returns:
-        An audit: at most three `sentences`, the strongest first; `verdict` on the covariance, "too small", "too large",
-        "right" or "undecided"; `scale`, true errors over reported standard deviations, with an interval that needs no
-        normal law; and `table()`, the same for each parameter.
+        An audit: at most three `sentences`, the strongest first; `verdict` on the covariance, "too
+        small", "too large", "right" or "undecided"; `scale`, true errors over reported standard
+        deviations, with an interval that needs no normal law; and `table()`, the same for each
+        parameter.
 
     >>> import numpy as np, pandas as pd, ipe_bench as ib
     >>> error = np.random.default_rng(0).normal(0, 0.3, 200)
@@ -275,9 +292,9 @@ def status(directories: Directories) -> pd.DataFrame:
     """Counts the trials that runs asked for.
 
     Returns:
-        A row per scenario and estimator (`truth`: the truth and its bounds), with the numbers of trials `expected`,
-        `done`, `missing`, `failed` and `stale`, and `messages`, why trials failed. `attrs["problems"]` has a line for
-        everything that is missing, failed or damaged.
+        A row per scenario and estimator (`truth`: the truth and its bounds), with the numbers of
+        trials `expected`, `done`, `missing`, `failed` and `stale`, and `messages`, why trials
+        failed. `attrs["problems"]` has a line for everything that is missing, failed or damaged.
 
     >>> import tempfile, ipe_bench as ib
     >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
@@ -340,25 +357,33 @@ def estimate(
     find: str | Sequence[str] = (),
     progress: Shows = True,
 ) -> Answer | LogAnswer:
-    """Estimates parameters from real readings by every estimator, with standard errors, residuals and a test of fit.
+    """Estimates parameters from real readings by every estimator, with standard errors, residuals
+    and a test of fit.
 
     Parameters:
-        model: or a scenario, which states `noise`, `prior`, `error_scale`; or a state model, which takes none.
-        readings: a CSV or Parquet file, several that share parameters, or an array z (m,) in the model's order and
-            unit, NaN if missing; None: those of the model. Of a state model one log, a row per epoch, or (K, m).
+        model: or a scenario, which states `noise`, `prior`, `error_scale`; or a state model, which
+            takes none.
+        readings: a CSV or Parquet file, several that share parameters, or an array z (m,) in the
+            model's order and unit, NaN if missing; None: those of the model. Of a state model one
+            log, a row per epoch, or (K, m).
         estimators: by label; of a state model trackers. None: a few that suit most models.
-        noise: states R. None: R is that of the file's column sigma, or of the model's own noise, or else one level is
-            estimated from the residuals (`Unknown`), whose size then cannot test the fit.
-        prior, error_scale: of filters and `map_lm`: deviations of `error_scale` sizes, which `prior` widens or narrows.
-        parameters: as {"k": {"fixed": 2.0}, "c": {"positive": True, "nominal": 3.0}}; also lower, upper, deviation.
+        noise: states R. None: R is that of the file's column sigma, or of the model's own noise, or
+            else one level is estimated from the residuals (`Unknown`), whose size then cannot test
+            the fit.
+        prior, error_scale: of filters and `map_lm`: deviations of `error_scale` sizes, which
+            `prior` widens or narrows.
+        parameters: as {"k": {"fixed": 2.0}, "c": {"positive": True, "nominal": 3.0}}; also lower,
+            upper, deviation.
         ignore_columns: columns of the files that are left out.
-        find: constants, noises or readings of a state model by formulas, found as `constants` by largest likelihood.
-        progress: whether a terminal or a notebook shows what is at work; "lines" prints a line now and then elsewhere.
+        find: constants, noises or readings of a state model by formulas, found as `constants` by
+            largest likelihood.
+        progress: whether a terminal or a notebook shows what is at work; "lines" prints a line now
+            and then elsewhere.
 
     Returns:
-        The sequence of the fits, each with its estimates by name in `values`, and `x` and `covariance` in the
-        parameters' own units; of a state model a track of each (see `ipe_bench.real.logs`). It shows itself in a
-        notebook, and `table()` is a frame.
+        The sequence of the fits, each with its estimates by name in `values`, and `x` and
+        `covariance` in the parameters' own units; of a state model a track of each (see
+        `ipe_bench.real.logs`). It shows itself in a notebook, and `table()` is a frame.
 
     Raises:
         UserError: the readings are not this model's, or an estimator needs what is not given.
@@ -387,7 +412,8 @@ def estimate(
         }
         if other := [name for name, value in stated.items() if value is not None]:
             raise UserError(
-                f"{other[0]}=: is of a measurement, and this is a model of states that move; leave it out"
+                f"{other[0]}=: is of a measurement, and this is a model of states that move; leave"
+                " it out"
             )
         return _tracked(model, readings, estimators, ignore_columns, find, progress)
     if find:
@@ -438,7 +464,8 @@ def _tracked(
             )
         (readings,) = readings
     if trackers is None:
-        # A search for constants needs a likelihood, which an estimate of the whole path does not have.
+        # A search for constants needs a likelihood, which an estimate of the whole path does not
+        # have.
         best = {} if find else {"auto": AutoTracker()}
         trackers = {**best, "ekf": ekf(), "ukf": ukf()}
     else:
@@ -468,24 +495,29 @@ def design(
     criterion: Criterion = "A",
     errors: Sequence[Measurement] | None = None,
 ) -> Design:
-    """Evaluates, without simulation, what a scenario's readings say about each parameter, and which would say more.
+    """Evaluates, without simulation, what a scenario's readings say about each parameter, and which
+    would say more.
 
     Parameters:
         scenario: or a measurement, with its `noise`, `prior` and `error_scale`.
-        by: columns of the model's index by which the one way chooses; None: ways by each column, and by reading.
+        by: columns of the model's index by which the one way chooses; None: ways by each column,
+            and by reading.
         readings: number that the sharpest choice has; None: as many as today.
-        criterion: bounds are averaged over truths from the prior, as squares over parameters in units of today's bound
-            (A), or as the volume of the ellipsoid (D).
-        errors: richer models; None: the truth, or every option of `measurement` that is the model with more errors.
+        criterion: bounds are averaged over truths from the prior, as squares over parameters in
+            units of today's bound (A), or as the volume of the ellipsoid (D).
+        errors: richer models; None: the truth, or every option of `measurement` that is the model
+            with more errors.
 
     Returns:
-        A design with `observability` (singular values, bounds, correlations, the least observable direction),
-        `suspects` (what each error of the richer models does to the estimates, and whether a test of residuals will
-        notice) and `ways`. Of a way, `saving` has the fewest readings whose mean bound is not above today's, `sharpest`
-        the smallest mean bound; `measurement(choice)` is the model of a choice.
+        A design with `observability` (singular values, bounds, correlations, the least observable
+        direction), `suspects` (what each error of the richer models does to the estimates, and
+        whether a test of residuals will notice) and `ways`. Of a way, `saving` has the fewest
+        readings whose mean bound is not above today's, `sharpest` the smallest mean bound;
+        `measurement(choice)` is the model of a choice.
 
     Raises:
-        UserError: the errors of readings are correlated, a column is unknown, or there are too few readings.
+        UserError: the errors of readings are correlated, a column is unknown, or there are too few
+            readings.
 
     >>> import ipe_bench as ib
     >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
@@ -513,21 +545,26 @@ def posterior(
     particles: int = 1000,
     watch: Callable[[int], None] | None = None,
 ) -> list[Reference]:
-    """Samples the posterior of a scenario's first trials, and measures how far each estimator's Gaussian is from it.
+    """Samples the posterior of a scenario's first trials, and measures how far each estimator's
+    Gaussian is from it.
 
     Parameters:
-        scenario: or a measurement, with its `noise`, `prior` and `error_scale`; errors are taken as N(0, R).
-        particles: number of each of two populations that sequential Monte Carlo takes to the posterior.
+        scenario: or a measurement, with its `noise`, `prior` and `error_scale`; errors are taken as
+            N(0, R).
+        particles: number of each of two populations that sequential Monte Carlo takes to the
+            posterior.
         watch: called with the number of each trial before that is sampled.
 
     Returns:
-        Of each trial the `truth` (n,), the `posterior` (draws `x` (draws, n) in multiples of the parameters' sizes,
-        `mean`, `covariance`, `modes` with their `shares`, and whether it has `settled`: two populations agree), and by
-        label `estimates` and `divergences`, which have `kl` in nats, `shift`, `width` and `energy`.
+        Of each trial the `truth` (n,), the `posterior` (draws `x` (draws, n) in multiples of the
+        parameters' sizes, `mean`, `covariance`, `modes` with their `shares`, and whether it has
+        `settled`: two populations agree), and by label `estimates` and `divergences`, which have
+        `kl` in nats, `shift`, `width` and `energy`.
 
     >>> import ipe_bench as ib
     >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
-    >>> (found,) = ib.posterior(bench, {"newton": ib.solvers.Newton(), "linear": ib.baselines.LinearLSE()}, trials=1)
+    >>> both = {"newton": ib.solvers.Newton(), "linear": ib.baselines.LinearLSE()}
+    >>> (found,) = ib.posterior(bench, both, trials=1)
     >>> found.posterior.settled, len(found.posterior.modes)
     (True, 1)
     >>> found.divergences["newton"].kl < 1 < found.divergences["linear"].kl
@@ -569,10 +606,12 @@ def component(name: str, **options: Any) -> Any:
 
 
 def check(component: Any) -> list[Finding]:
-    """Checks that a component, or each option of the plugin in a folder, keeps the promises of its kind.
+    """Checks that a component, or each option of the plugin in a folder, keeps the promises of its
+    kind.
 
     Returns:
-        A finding per check; one whose `complaint` is empty passed, or did not apply, which its `note` says.
+        A finding per check; one whose `complaint` is empty passed, or did not apply, which its
+        `note` says.
 
     >>> import ipe_bench as ib
     >>> findings = ib.check(ib.noise.Gaussian(0.1))
@@ -585,23 +624,27 @@ def check(component: Any) -> list[Finding]:
 
 
 def _scenario(given: Any, **stated: Any) -> Scenario:
-    """Returns the given scenario, or that of a model with the stated noise, prior and error scale."""
+    """Returns the given scenario, or that of a model with the stated noise, prior and error
+    scale."""
     stated = {name: value for name, value in stated.items() if value is not None}
     if isinstance(given, Scenario):
         if stated:
             raise UserError(
-                f"{next(iter(stated))}=: is part of the scenario; leave it out, or give the model alone"
+                f"{next(iter(stated))}=: is part of the scenario; leave it out, or give the model"
+                " alone"
             )
         return given
     if not isinstance(given, Measurement):
         raise UserError(
-            f"{_described(given)}; give a scenario, ib.Scenario(model, noise), or a measurement model"
+            f"{_described(given)}; give a scenario, ib.Scenario(model, noise), or a measurement"
+            " model"
         )
     return Scenario(given, **stated)
 
 
 def _tracking(given: Any, **stated: Any) -> StateScenario | None:
-    """Returns the scenario of a state model under what is stated of it; None for one of constants."""
+    """Returns the scenario of a state model under what is stated of it; None for one of
+    constants."""
     stated = {name: value for name, value in stated.items() if value is not None}
     if not isinstance(given, StateModel | StateScenario):
         return None
@@ -619,7 +662,8 @@ def _labelled(estimators: Any, kind: Any = Estimator | Tracker) -> Mapping[str, 
     for label, one in estimators.items():
         if not isinstance(one, kind):
             raise UserError(
-                f"estimators: {label}: {_described(one)}; give an estimator such as ib.solvers.Newton()"
+                f"estimators: {label}: {_described(one)}; give an estimator such as"
+                " ib.solvers.Newton()"
             )
     return estimators
 

@@ -25,7 +25,8 @@ def pytest_configure(config):
 def pytest_collection_finish():
     """Collects garbage seldom: the modules and tests that are there stay until the end.
 
-    To look through them again took 7 % of `pytest tests/cli/test_hydra_keys.py tests/cli/test_mistakes.py`.
+    To look through them again took 7 % of `pytest tests/cli/test_hydra_keys.py
+    tests/cli/test_mistakes.py`.
     """
     gc.freeze()
     gc.set_threshold(100_000, 20, 100)
@@ -33,7 +34,8 @@ def pytest_collection_finish():
 
 @pytest.fixture
 def ipe_bench(monkeypatch, capsys, tmp_path):
-    """Runs a command in an empty folder, whose plugins are forgotten afterwards: its exit code, stdout and stderr."""
+    """Runs a command in an empty folder, whose plugins are forgotten afterwards: its exit code,
+    stdout and stderr."""
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "PYTHONPATH"):
         monkeypatch.setenv(variable, "1" if variable != "PYTHONPATH" else "")
     monkeypatch.setattr(sys, "path", list(sys.path))

@@ -1,7 +1,7 @@
 """Differential equations that are drawn, and the readings that SciPy computes of them.
 
-`python tests/drawn_equations.py` draws them all and stores the readings, in ten minutes. Those from `HARD` on have
-poles, pulses, or outputs that magnify the states, and ten readings far apart.
+`python tests/drawn_equations.py` draws them all and stores the readings, in ten minutes. Those from
+`HARD` on have poles, pulses, or outputs that magnify the states, and ten readings far apart.
 """
 
 from __future__ import annotations
@@ -69,11 +69,13 @@ class Drawn:
     halts: tuple[float, ...] = ()
     """Times at which SciPy begins anew, so that it meets a pulse."""
     exact: Any = None
-    """The readings (m,) where a formula tells them; not numbers where they are below the last digit of a state."""
+    """The readings (m,) where a formula tells them; not numbers where they are below the last digit
+    of a state."""
 
 
 def drawn(number: int) -> Drawn:
-    """Draws a model of the first kind, or, from `HARD` on, one with a pole, a pulse or an output that magnifies."""
+    """Draws a model of the first kind, or, from `HARD` on, one with a pole, a pulse or an output
+    that magnifies."""
     if HARD <= number < COUNT:
         r = np.random.default_rng(number)
         return (with_pole, with_pulse, magnifying)[number % 3](r)
@@ -85,8 +87,8 @@ def _far_apart(r: np.random.Generator) -> tuple[float, ...]:
 
 
 def with_pole(r: np.random.Generator) -> Drawn:
-    """Saturating kinetics, whose fast decay ends at a pole just below 0, fed steadily, for a while or in waves, from 0
-    or from a dose; and a slower state behind it."""
+    """Saturating kinetics, whose fast decay ends at a pole just below 0, fed steadily, for a while
+    or in waves, from 0 or from a dose; and a slower state behind it."""
     times = _far_apart(r)
     constants = {
         "L": float(f"{10 ** r.uniform(1.5, 3.7):.4g}"),
@@ -108,7 +110,8 @@ def with_pole(r: np.random.Generator) -> Drawn:
 
 
 def with_pulse(r: np.random.Generator) -> Drawn:
-    """One or two short pulses, of a fifth to a thousandth of the interval between readings, and a slower state."""
+    """One or two short pulses, of a fifth to a thousandth of the interval between readings, and a
+    slower state."""
     times = _far_apart(r)
     pulses, halts = [], list[float]()
     for _ in range(r.integers(1, 3)):
@@ -133,7 +136,8 @@ def with_pulse(r: np.random.Generator) -> Drawn:
 
 
 def magnifying(r: np.random.Generator) -> Drawn:
-    """Outputs that tell apart what states of double precision do not: of a state that grows, or turns."""
+    """Outputs that tell apart what states of double precision do not: of a state that grows, or
+    turns."""
     times, x = _far_apart(r), np.exp(r.choice([0.05, 0.3, 1.0]) * r.standard_normal(1))
     t, wide = np.array(times, dtype=np.longdouble), np.longdouble
     if r.random() < 0.5:
@@ -153,8 +157,9 @@ def magnifying(r: np.random.Generator) -> Drawn:
 
 
 def easy(number: int) -> Drawn:
-    """Fast and slow states, readings that saturate, turn and are clipped, one reading and many, at t = 0, too, cases,
-    inputs that are held or straight between rows, and rates that jump at known times."""
+    """Fast and slow states, readings that saturate, turn and are clipped, one reading and many, at
+    t = 0, too, cases, inputs that are held or straight between rows, and rates that jump at known
+    times."""
     r = np.random.default_rng(number)
     states = [f"y{i}" for i in range(r.integers(1, 4))]
     start = {"k0": r.uniform(0.2, 2.0), "k1": r.uniform(0.2, 2.0), "L": 10 ** r.uniform(1.0, 4.5)}
@@ -221,7 +226,8 @@ def easy(number: int) -> Drawn:
 
 
 def solved(one: Drawn, method: str, rtol: float) -> np.ndarray:
-    """The readings (m,) by SciPy and Python's own arithmetic, by intervals; ValueError if it does not get there."""
+    """The readings (m,) by SciPy and Python's own arithmetic, by intervals; ValueError if it does
+    not get there."""
     model, z = one.model, []
     p = {name: value * x for (name, value), x in zip(model.start.items(), one.x, strict=True)}
     for case in range(len(model.cases)):
@@ -285,7 +291,8 @@ def _compiled(formula: str) -> Any:
 
 
 def answer(number: int) -> np.ndarray:
-    """The readings (m,); none where SciPy does not get there, or two of its methods do not agree."""
+    """The readings (m,); none where SciPy does not get there, or two of its methods do not
+    agree."""
     one = drawn(number)
     if one.exact is not None:
         return one.exact

@@ -1,8 +1,9 @@
-"""How large and how dense each room is, as the table that `make lint` prints: for a maintainer to read, and no test.
+"""How large and how dense each room is, as the table that `make lint` prints: for a maintainer to
+read, and no test.
 
-Content is counted in nodes of the syntax tree, without docstrings, annotations, imports and signatures, so that neither
-lines nor prose weigh. A dense statement has more than fifteen nodes; in well-kept libraries of the field three to
-nine statements in a hundred are dense.
+Content is counted in nodes of the syntax tree, without docstrings, annotations, imports and
+signatures, so that neither lines nor prose weigh. A dense statement has more than fifteen nodes; in
+well-kept libraries of the field three to nine statements in a hundred are dense.
 """
 
 from __future__ import annotations
@@ -61,7 +62,8 @@ def own_nodes(statement: ast.stmt) -> int:
 
 
 def gauges(path: Path) -> Counter[str]:
-    """Counts content, statements, dense ones, packed assignments `a, b = c, d`, and walruses of a file."""
+    """Counts content, statements, dense ones, packed assignments `a, b = c, d`, and walruses of a
+    file."""
     source = path.read_text(encoding="utf-8")
     tree = without_prose(ast.parse(source))
     nodes = list(ast.walk(tree))

@@ -46,7 +46,8 @@ MODULES = [
 
 @functools.cache
 def statements(path: Path) -> list[tuple[frozenset[str], bool, bool]]:
-    """What each import of a file names, whether it is for type checkers alone, and whether it stands in a function."""
+    """What each import of a file names, whether it is for type checkers alone, and whether it
+    stands in a function."""
     found = []
 
     def visit(node: ast.AST, for_types: bool, late: bool) -> None:
@@ -66,7 +67,8 @@ def statements(path: Path) -> list[tuple[frozenset[str], bool, bool]]:
 
 
 def imported(path: Path, *, checked_types: bool, late: bool = True) -> set[str]:
-    """The modules that a file imports: late ones too unless told otherwise, those for type checkers where asked for."""
+    """The modules that a file imports: late ones too unless told otherwise, those for type checkers
+    where asked for."""
     kept = (
         names
         for names, types, inside in statements(path)

@@ -70,8 +70,8 @@ class Batch(Estimator):
     """Minimises least squares iteratively; a subclass states the objective and the method."""
 
     start: Start = "nominal"
-    """Start of the iteration: the linear LSE, eq. (16), the nominal point, or the one of the two where
-    the readings fit better (`best`)."""
+    """Start of the iteration: the linear LSE, eq. (16), the nominal point, or the one of the two
+    where the readings fit better (`best`)."""
     max_iterations: Count = 100
     """Steps tried."""
     tolerance: Positive = 1e-6
@@ -313,8 +313,8 @@ class LeastSquares(Estimator):
     method: Literal["trf", "lm", "dogbox"] = "trf"
     """Trust region, MINPACK's Levenberg-Marquardt, or dogleg."""
     start: Start = "best"
-    """The linear LSE, eq. (16), the nominal point, or the one of the two where the readings fit better
-    (`best`)."""
+    """The linear LSE, eq. (16), the nominal point, or the one of the two where the readings fit
+    better (`best`)."""
     loss: Literal["linear", "soft_l1", "huber", "cauchy", "arctan"] = "linear"
     """Anything but linear bounds what one bad reading can do; `lm` knows linear only."""
     f_scale: Positive = 1.0

@@ -1,9 +1,10 @@
 """Digests classes and functions as they are in this process, whatever a file says of them.
 
-A cell of a notebook, `exec`, a factory, `importlib.reload` and an assignment to a module's constant change what a name
-stands for while the process runs. So a definition is digested with all that it reaches: code, constants, defaults,
-values of closures, bases, class attributes, and by name the functions, classes and variables of its module and of other
-modules that are not installed. Installed packages stand for themselves by name.
+A cell of a notebook, `exec`, a factory, `importlib.reload` and an assignment to a module's constant
+change what a name stands for while the process runs. So a definition is digested with all that it
+reaches: code, constants, defaults, values of closures, bases, class attributes, and by name the
+functions, classes and variables of its module and of other modules that are not installed.
+Installed packages stand for themselves by name.
 """
 
 from __future__ import annotations
@@ -31,24 +32,28 @@ _PLAIN = (type(None), type(...), bool, int, float, complex, str, bytes)
 _DEFINED = (type, types.FunctionType, types.MethodType, types.ModuleType)
 _DEFINED += (staticmethod, classmethod, property, functools.cached_property)
 _PARTS = ("__func__", "__self__", "__wrapped__", "fget", "func")
-"""Attributes that hold the functions of a method, of a property, and of what functools or a compiler makes of one."""
+"""Attributes that hold the functions of a method, of a property, and of what functools or a
+compiler makes of one."""
 _BEYOND_NAMES = {"eval", "exec", "globals", "__import__"}
 """Built-in functions by which code reaches what no name in it tells."""
 _PIN = "_definition"
 """Attribute that holds the digest of a component's definition from when a run of it began."""
 _tokens: dict[int, tuple[Any, str]] = {}
-"""Tokens of what cannot be digested, by its id, with the thing itself, so that its id stays its own."""
+"""Tokens of what cannot be digested, by its id, with the thing itself, so that its id stays its
+own."""
 
 
 def definition_digest(component: Any) -> str:
-    """Computes a digest of what the numbers of a component depend on beside options and installed packages; empty if it
-    is of installed packages alone. That of a component that is `pinned` stays as it was then."""
+    """Computes a digest of what the numbers of a component depend on beside options and installed
+    packages; empty if it is of installed packages alone. That of a component that is `pinned` stays
+    as it was then."""
     held = getattr(component, "__dict__", {}).get(_PIN)
     return _digest(component_classes(component), Definitions()) if held is None else held
 
 
 def importable_digest(component: Any) -> str:
-    """Computes a digest of the code that another process imports by name, whatever its variables hold."""
+    """Computes a digest of the code that another process imports by name, whatever its variables
+    hold."""
     named = [thing for thing in component_classes(component) if _is_named(thing)]
     return _digest(named, Definitions(values=False))
 
@@ -59,8 +64,9 @@ def _digest(things: list[Any], definitions: Definitions) -> str:
 
 
 def pinned(component: Any) -> Any:
-    """Copies a component with the digest of its definition, and without what it has worked out, its components alike:
-    code that it works with can have changed since. One of installed packages alone is returned as it is."""
+    """Copies a component with the digest of its definition, and without what it has worked out, its
+    components alike: code that it works with can have changed since. One of installed packages
+    alone is returned as it is."""
     if isinstance(component, tuple | list):
         return type(component)(map(pinned, component))
     if not dataclasses.is_dataclass(component) or _PIN in getattr(
@@ -89,7 +95,8 @@ def _state_of(thing: Any) -> dict[str, Any]:
 
 @functools.cache
 def is_installed(module: str) -> bool:
-    """Tells whether a module belongs to this package, to Python or to an installed package, which no session edits."""
+    """Tells whether a module belongs to this package, to Python or to an installed package, which
+    no session edits."""
     top = module.partition(".")[0]
     if top == "__main__":
         return False
@@ -106,7 +113,8 @@ def is_installed(module: str) -> bool:
 
 
 def _is_named(thing: Any) -> bool:
-    """Tells whether another process that imports the module finds this class or function by its name."""
+    """Tells whether another process that imports the module finds this class or function by its
+    name."""
     module, name = getattr(thing, "__module__", None), getattr(thing, "__qualname__", None)
     if not isinstance(module, str) or not isinstance(name, str) or module == "__main__":
         return False
@@ -117,7 +125,8 @@ def _is_named(thing: Any) -> bool:
 
 
 def _stands_by_name(thing: Any) -> bool:
-    """Tells whether a class or function is one of an installed package, and not one that a factory there made."""
+    """Tells whether a class or function is one of an installed package, and not one that a factory
+    there made."""
     return _is_named(thing) and is_installed(thing.__module__)
 
 
@@ -135,7 +144,8 @@ class Definitions:
     def __init__(self, *, values: bool = True) -> None:
         self.values = values
         self.met: dict[int, tuple[int, Any]] = {}
-        """Place in the order of meeting of each thing by its id, with the thing itself, so that its id stays so."""
+        """Place in the order of meeting of each thing by its id, with the thing itself, so that its
+        id stays so."""
 
     def of(self, thing: Any) -> Any:
         """Describes one thing."""
@@ -185,7 +195,8 @@ class Definitions:
             name: value for name, value in sorted(vars(cls).items()) if not isinstance(value, slots)
         }
         attributes = self._kept(own, in_file=_is_named(cls))
-        # What Python and dataclasses note in a class is no number's: annotations, docstring, lines, fields.
+        # What Python and dataclasses note in a class is no number's: annotations, docstring, lines,
+        # fields.
         noted = [
             name
             for name in attributes
@@ -218,8 +229,8 @@ class Definitions:
         )
 
     def _kept(self, variables: Mapping[str, Any], *, in_file: bool) -> dict[str, Any]:
-        """Keeps those variables that belong to a definition. What a file fills a container with is in its source, and
-        what is put in later is mostly a cache."""
+        """Keeps those variables that belong to a definition. What a file fills a container with is
+        in its source, and what is put in later is mostly a cache."""
         kinds = (
             *_DEFINED,
             *(_PLAIN if self.values else ()),
@@ -231,7 +242,8 @@ class Definitions:
         }
 
     def _reached(self, value: Any, attributes: Set[str]) -> Any:
-        """Describes what a name stands for: of a module those of its attributes that the code asks for."""
+        """Describes what a name stands for: of a module those of its attributes that the code asks
+        for."""
         if not isinstance(value, types.ModuleType) or is_installed(value.__name__):
             return self.of(value)
         asked = self._kept(
@@ -256,8 +268,9 @@ def _token(thing: Any) -> str:
 
 @functools.lru_cache(maxsize=4096)
 def _read(code: types.CodeType) -> tuple[Any, frozenset[str], frozenset[str]]:
-    """Returns the instructions of code without its lines and docstring, the names of variables of the module that it
-    reads and of modules that it imports, and all names in it, attributes among them."""
+    """Returns the instructions of code without its lines and docstring, the names of variables of
+    the module that it reads and of modules that it imports, and all names in it, attributes among
+    them."""
     arguments = code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount, code.co_flags
     text: list[Any] = [arguments, code.co_varnames[: sum(arguments[:3])], code.co_exceptiontable]
     names: set[str] = set()

@@ -18,7 +18,8 @@ from ipe_bench.basics.errors import StorageError
 
 
 def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
-    """Calls `write(temporary path)` in the same folder and renames the result: readers see all of it or nothing.
+    """Calls `write(temporary path)` in the same folder and renames the result: readers see all of
+    it or nothing.
 
     Raises:
         StorageError: the disk is full, or the folder cannot be written to any more.
@@ -33,8 +34,8 @@ def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
     except OSError as error:
         reason = error.strerror if error.errno is None else os.strerror(error.errno)
         raise StorageError(
-            f"{path.parent}: cannot be written to any more ({reason or error}); what was stored before is whole, "
-            "and the same command goes on from there"
+            f"{path.parent}: cannot be written to any more ({reason or error}); what was stored"
+            " before is whole, and the same command goes on from there"
         ) from error
     finally:
         with contextlib.suppress(OSError):
@@ -72,8 +73,8 @@ def write_text(path: Path, text: str) -> None:
 
 
 def cache_folder() -> Path:
-    """Returns the folder of compiled files: `IPE_BENCH_CACHE`, or the user's cache; if that cannot be written to, a
-    folder of the user's own among temporary files."""
+    """Returns the folder of compiled files: `IPE_BENCH_CACHE`, or the user's cache; if that cannot
+    be written to, a folder of the user's own among temporary files."""
     for place in (_chosen_cache, _spare_cache):
         with contextlib.suppress(
             OSError, KeyError, RuntimeError
@@ -93,7 +94,8 @@ def _chosen_cache() -> Path:
 
 
 def _spare_cache() -> Path:
-    """Returns a folder that belongs to this user alone, whoever may write to the folder of temporary files."""
+    """Returns a folder that belongs to this user alone, whoever may write to the folder of
+    temporary files."""
     folder = (
         Path(tempfile.gettempdir()) / f"ipe-bench-{os.geteuid() if os.name == 'posix' else 'cache'}"
     )
@@ -107,7 +109,8 @@ def _spare_cache() -> Path:
 
 
 def own_conf() -> Path:
-    """Returns the folder of our configs: inside the installed package, or beside it in a checkout."""
+    """Returns the folder of our configs: inside the installed package, or beside it in a
+    checkout."""
     package = Path(__file__).resolve().parents[1]
     for folder in (package / "conf", package.parent / "conf"):
         if (folder / "config.yaml").is_file():

@@ -1,7 +1,8 @@
-"""Computes batched linear algebra, in which no trial's result depends on the other trials of the batch.
+"""Computes batched linear algebra, in which no trial's result depends on the other trials of the
+batch.
 
-Matrix products are stacked, one per trial: a product over a whole batch would change a trial's bits with the size of
-the batch. A singular matrix spoils its own trial only.
+Matrix products are stacked, one per trial: a product over a whole batch would change a trial's bits
+with the size of the batch. A singular matrix spoils its own trial only.
 """
 
 from __future__ import annotations
@@ -17,16 +18,19 @@ from numpy.typing import NDArray
 Array: TypeAlias = NDArray[Any]
 Mask: TypeAlias = NDArray[Any]
 
-# glibc keeps freed memory for the next array up to the size of the largest block that it has mapped and freed, at most
-# 32 MB (mallopt(3), M_MMAP_THRESHOLD): fetching the pages of Jacobians anew took a fifth of an estimation.
+# glibc keeps freed memory for the next array up to the size of the largest block that it has mapped
+# and freed, at most 32 MB (mallopt(3), M_MMAP_THRESHOLD): fetching the pages of Jacobians anew took
+# a fifth of an estimation.
 np.empty(31 << 20, np.uint8)
 
 _WELL_CONDITIONED = 1e3
-"""The condition of J, its columns scaled, up to which J' J has enough of its digits: nine or more."""
+"""The condition of J, its columns scaled, up to which J' J has enough of its digits: nine or
+more."""
 
 
 def own(x: Array) -> Array:
-    """Returns the same numbers in the layout of compiled code: contiguous, and not marked as read-only."""
+    """Returns the same numbers in the layout of compiled code: contiguous, and not marked as
+    read-only."""
     x = np.ascontiguousarray(x, dtype=float)
     return x if x.flags.writeable else x.copy()
 
@@ -63,7 +67,8 @@ def plain_numbers(what: str, values: Any, shape: tuple[int, ...]) -> Array:
 
 
 def nearest(z: Array, to: Array, periods: Array | Sequence[float]) -> Array:
-    """Shifts z (..., m) by whole periods next to `to` (..., m); a period of 0, or none at all, shifts no entry."""
+    """Shifts z (..., m) by whole periods next to `to` (..., m); a period of 0, or none at all,
+    shifts no entry."""
     if not len(periods):
         return z
     period = np.asarray(periods)
@@ -124,8 +129,8 @@ def quadratic_form(P_inverse: Array, e: Array) -> Array:
 class Covariance:
     """Holds a covariance R of m readings, by the factor that whitens them.
 
-    `factor` is the vector (m,) of standard deviations where readings are independent, else the lower Cholesky factor
-    (m, m) of R.
+    `factor` is the vector (m,) of standard deviations where readings are independent, else the
+    lower Cholesky factor (m, m) of R.
     """
 
     factor: Array
@@ -189,11 +194,12 @@ def information(J: Array, R: Covariance) -> Array:
 
 
 def definite_factor(G: Array) -> tuple[Array, Array, Mask]:
-    """Computes U (trials, n, n) with U' U = G of each G = J' J (trials, n, n), its inverse, and the mask (trials,) of
-    where J is well enough conditioned for this, a third of the work of QR; elsewhere they are not to be used.
+    """Computes U (trials, n, n) with U' U = G of each G = J' J (trials, n, n), its inverse, and the
+    mask (trials,) of where J is well enough conditioned for this, a third of the work of QR;
+    elsewhere they are not to be used.
 
-    The columns of J are scaled first; what is lost of U is n eps times the condition squared (Higham, Accuracy and
-    Stability of Numerical Algorithms, 2002, section 20.4).
+    The columns of J are scaled first; what is lost of U is n eps times the condition squared
+    (Higham, Accuracy and Stability of Numerical Algorithms, 2002, section 20.4).
     """
     n = G.shape[1]
     with np.errstate(all="ignore"):
@@ -209,7 +215,8 @@ def definite_factor(G: Array) -> tuple[Array, Array, Mask]:
 
 
 def _inverse_of_upper(U: Array) -> Array:
-    """Inverts upper triangular matrices (trials, n, n), by back substitution in all trials at once."""
+    """Inverts upper triangular matrices (trials, n, n), by back substitution in all trials at
+    once."""
     V = np.zeros(U.shape)
     for i in reversed(range(U.shape[1])):
         V[:, i] = -np.matmul(U[:, i, None, i + 1 :], V[:, i + 1 :])[:, 0]
@@ -237,7 +244,8 @@ def pseudo_inverse(H: Array, R: Covariance) -> tuple[Array, Mask]:
 
 
 def _by_orthogonal_factor(H: Array) -> tuple[Array, Mask]:
-    """Computes the pseudo-inverse of any H (trials, m, n), and where it has not full column rank."""
+    """Computes the pseudo-inverse of any H (trials, m, n), and where it has not full column
+    rank."""
     usable = finite(H)
     Q, U = np.linalg.qr(np.where(usable[:, None, None], H, 0.0))
     diagonal = np.abs(np.diagonal(U, axis1=1, axis2=2))

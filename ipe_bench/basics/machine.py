@@ -21,7 +21,8 @@ _LIBRARIES = (
 
 
 def cores() -> int:
-    """Counts the cores that this process may use: fewer than there are where an affinity mask says so."""
+    """Counts the cores that this process may use: fewer than there are where an affinity mask says
+    so."""
     affinity = getattr(os, "sched_getaffinity", None)
     return len(affinity(0)) if affinity else os.cpu_count() or 1
 

@@ -1,8 +1,9 @@
-"""What the options of a component may be: a constraint stands in the field's type, and `Component` reads it.
+"""What the options of a component may be: a constraint stands in the field's type, and `Component`
+reads it.
 
 Types that options share have a name here; a constraint of one option stands in its class, as
-`Annotated[float, Gt(1)]` with the words of annotated-types. Where in a config an option stands is left to
-`plugins.construct`.
+`Annotated[float, Gt(1)]` with the words of annotated-types. Where in a config an option stands is
+left to `plugins.construct`.
 """
 
 from __future__ import annotations
@@ -64,7 +65,8 @@ _NOUNS = {
 
 
 def as_python(value: Any) -> str:
-    """Writes a component as Python with the options that are not the defaults, shortened to a line, or any value."""
+    """Writes a component as Python with the options that are not the defaults, shortened to a line,
+    or any value."""
     if not isinstance(value, Component) or not dataclasses.is_dataclass(value):
         return shortened(repr(value))
     own = []
@@ -85,13 +87,15 @@ def in_lines(self: Any) -> str:
 
 
 class Component:
-    """Describes a component by a config: a frozen dataclass whose fields are its options and its identity.
+    """Describes a component by a config: a frozen dataclass whose fields are its options and its
+    identity.
 
     A class whose options must suit one another writes `__post_init__` and calls this one first.
     """
 
     name: ClassVar[str] = ""
-    """Its name in tables: the name of the class in small letters with underscores, unless the class states one."""
+    """Its name in tables: the name of the class in small letters with underscores, unless the class
+    states one."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -111,7 +115,8 @@ class Component:
         return super().__new__(cls)
 
     def __post_init__(self) -> None:
-        """Checks each option by its type, and keeps it as that type has it: 1 as 1.0, a list as a tuple.
+        """Checks each option by its type, and keeps it as that type has it: 1 as 1.0, a list as a
+        tuple.
 
         Raises:
             UserError: `KEY=VALUE: give ...`, by the option's name.
@@ -124,7 +129,8 @@ class Component:
 
 
 def component_classes(component: Any) -> list[Any]:
-    """Collects the classes of a component and its components, with bases and the functions that they compute with."""
+    """Collects the classes of a component and its components, with bases and the functions that
+    they compute with."""
     if isinstance(component, tuple | list):
         return [cls for item in component for cls in component_classes(item)]
     if not dataclasses.is_dataclass(component) or isinstance(component, type):
@@ -153,8 +159,8 @@ def option_types(cls: type) -> dict[str, Any]:
         hints = typing.get_type_hints(cls, include_extras=True)
     except Exception as error:
         raise UserError(
-            f"{cls.__module__}.{cls.__qualname__}: the type of an option cannot be read ({describe_exception(error)}); "
-            "its module must import it outside of TYPE_CHECKING"
+            f"{cls.__module__}.{cls.__qualname__}: the type of an option cannot be read"
+            f" ({describe_exception(error)}); its module must import it outside of TYPE_CHECKING"
         ) from None
     return {f.name: hints[f.name] for f in dataclasses.fields(cls) if f.init}  # type: ignore[arg-type]
 
@@ -163,7 +169,8 @@ def checked(value: Any, hint: Any, key: str) -> Any:
     """Checks a value and converts it where the type allows (1 for 1.0, a list for a tuple).
 
     Raises:
-        UserError: `KEY=VALUE: give ...`, where the value is not of the type or not within its constraints.
+        UserError: `KEY=VALUE: give ...`, where the value is not of the type or not within its
+            constraints.
     """
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if hint is Any or isinstance(hint, typing.TypeVar):

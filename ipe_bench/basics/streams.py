@@ -11,7 +11,8 @@ from ipe_bench.basics.linalg import Array
 
 
 def own_generators(seed: int, z: Array) -> list[np.random.Generator]:
-    """Makes a generator for each trial of z (trials, m), which depends on `seed` and on these readings alone."""
+    """Makes a generator for each trial of z (trials, m), which depends on `seed` and on these
+    readings alone."""
     digests = [
         hashlib.sha256(np.ascontiguousarray(row, dtype=float).tobytes()).digest() for row in z
     ]
@@ -27,7 +28,8 @@ def normals(generators: Sequence[np.random.Generator], *shape: int) -> Array:
 
 
 def numbered(seed: int, start: int, stop: int, child: int) -> Iterator[np.random.Generator]:
-    """Makes a generator for each of the trials start to stop; a trial has as many streams as there are children."""
+    """Makes a generator for each of the trials start to stop; a trial has as many streams as there
+    are children."""
     for trial in range(start, stop):
         yield np.random.Generator(
             np.random.Philox(np.random.SeedSequence(seed, spawn_key=(trial, child)))

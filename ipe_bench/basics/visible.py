@@ -1,4 +1,5 @@
-"""Keeps a terminal from obeying what names say: every text of a command goes through here on its way out."""
+"""Keeps a terminal from obeying what names say: every text of a command goes through here on its
+way out."""
 
 from __future__ import annotations
 
@@ -7,11 +8,13 @@ from collections.abc import Iterable
 from typing import Any
 
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
-"""Control characters besides tabs and the ends of lines, and those that reverse the direction of a text."""
+"""Control characters besides tabs and the ends of lines, and those that reverse the direction of a
+text."""
 
 
 def visible(text: str) -> str:
-    r"""Writes control characters as Python does, such as \x1b: they colour, clear and rename a terminal."""
+    r"""Writes control characters as Python does, such as \x1b: they colour, clear and rename a
+    terminal."""
     return _CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 

@@ -21,7 +21,8 @@ _WIDTH_WITHOUT_TERMINAL = 120
 
 
 def console() -> Console:
-    """Makes the console for tables: as wide as the terminal, or wide enough for a table in a file."""
+    """Makes the console for tables: as wide as the terminal, or wide enough for a table in a
+    file."""
     from ipe_bench.report.screen import Screen
 
     out = Screen()
@@ -67,7 +68,8 @@ def say_files(files: Sequence[Path]) -> None:
 def places_and_keys(
     command: str, words: Sequence[str], kinds: Mapping[str, Any]
 ) -> tuple[list[str], dict[str, Any]]:
-    """Splits off the files and folders after a command that Hydra does not read, and keys' values by their types."""
+    """Splits off the files and folders after a command that Hydra does not read, and keys' values
+    by their types."""
     from ipe_bench.basics.options import Count, checked
     from ipe_bench.questions.question import NAMES
 

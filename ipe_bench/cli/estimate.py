@@ -18,7 +18,8 @@ from ipe_bench.states.base import StateModel
 STANDARD_ESTIMATORS = ("solver=[auto]", "baseline=[linear_lse,levenberg_marquardt]")
 """Estimators of `estimate`: one that chooses its method itself, and two to compare it with."""
 TRACKERS_THAT_FIND = "tracker=[ekf,ukf]"
-"""Trackers of `find=`: a search needs a likelihood, which an estimate of the whole path does not have."""
+"""Trackers of `find=`: a search needs a likelihood, which an estimate of the whole path does not
+have."""
 
 
 def _described(estimators: Any) -> dict[str, Any]:
@@ -26,7 +27,8 @@ def _described(estimators: Any) -> dict[str, Any]:
 
 
 def estimate_command(arguments: Sequence[str]) -> int:
-    """Estimates with every chosen estimator, prints tables and writes files; returns 1 if no fit passes."""
+    """Estimates with every chosen estimator, prints tables and writes files; returns 1 if no fit
+    passes."""
     from ipe_bench.report.page.answer import FILES, NAME, Answer, write_answer
 
     standard = STANDARD_ESTIMATORS
@@ -55,7 +57,8 @@ def estimate_command(arguments: Sequence[str]) -> int:
 
 
 def _track(asked: Single, model: StateModel) -> int:
-    """Tracks the states by every chosen tracker, prints tables and writes files; exit code 1 where no track passes."""
+    """Tracks the states by every chosen tracker, prints tables and writes files; exit code 1 where
+    no track passes."""
     from ipe_bench.report.page.log import NAME, TABLE, write_tracks
 
     asked.words.refuse(

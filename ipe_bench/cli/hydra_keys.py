@@ -1,5 +1,5 @@
-"""Keeps what a config says to Hydra to a list: Hydra calls, imports and overwrites whatever else it is told to, and an
-experiment may come from anywhere."""
+"""Keeps what a config says to Hydra to a list: Hydra calls, imports and overwrites whatever else it
+is told to, and an experiment may come from anywhere."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ from ipe_bench.cli import words as w
 class Guarded(ConfigLoaderImpl):
     """Loads configs as Hydra does, and refuses one that says to Hydra what is not on the list.
 
-    Every config comes from here: that of a command, those of its sweep's jobs, and those in a launcher's processes.
+    Every config comes from here: that of a command, those of its sweep's jobs, and those in a
+    launcher's processes.
     """
 
     def load_configuration(
@@ -38,7 +39,8 @@ class Guarded(ConfigLoaderImpl):
 
 
 def _leaves(node: Any, key: str = "") -> Iterator[tuple[str, Any]]:
-    """Yields the values in a config, each with its key; empty lists and dictionaries are values, too."""
+    """Yields the values in a config, each with its key; empty lists and dictionaries are values,
+    too."""
     items = (
         enumerate(node)
         if isinstance(node, list)
@@ -72,7 +74,8 @@ _CLASS = re.compile(
     r"hydra\._internal\.core_plugins\.\w+\.[A-Z]\w*|hydra_plugins\.(\w+\.){1,2}[A-Z]\w*"
     r"|optuna\.(samplers|pruners)\.[A-Z]\w*"
 )
-"""Classes of Hydra, of the launchers and sweepers that are installed, and those by which Optuna chooses trials."""
+"""Classes of Hydra, of the launchers and sweepers that are installed, and those by which Optuna
+chooses trials."""
 _COMMANDS = {
     "_args_",
     "additional_parameters",
@@ -82,17 +85,23 @@ _COMMANDS = {
     "srun_args",
 }
 """Parameters of launchers and sweepers that name a function or hold lines of a shell."""
-_OF_HYDRA = r"\$\{hydra\.(job\.(name|num|id|override_dirname)|run\.dir|sweep\.(sub)?dir|runtime\.(cwd|output_dir))\}"
+_OF_HYDRA = (
+    r"\$\{hydra\.(job\.(name|num|id|override_dirname)|run\.dir|sweep\.(sub)?dir"
+    r"|runtime\.(cwd|output_dir))\}"
+)
 _TEXTS = re.compile(_OF_HYDRA)
 """Interpolations that Hydra's own types keep texts."""
 _KEYS = re.compile(rf"{_OF_HYDRA}|\$\{{[\w.]+\}}|\$\{{now:[^{{}}$]*\}}")
-"""Interpolations of keys and of the time; others compute a value, as `oc.decode` makes a config of a text."""
+"""Interpolations of keys and of the time; others compute a value, as `oc.decode` makes a config of
+a text."""
 
 
 def require_listed(hydra: DictConfig, words: Sequence[str]) -> None:
-    """Refuses a config of Hydra with a key or a value that is not on the list; `words` are those of the command line.
+    """Refuses a config of Hydra with a key or a value that is not on the list; `words` are those of
+    the command line.
 
-    It is judged before interpolations are resolved: until Hydra does so, what they stand for can change.
+    It is judged before interpolations are resolved: until Hydra does so, what they stand for can
+    change.
     """
     said: Any = OmegaConf.to_container(hydra, resolve=False)
     if not {*said["overrides"]["hydra"], *said["overrides"]["task"]} <= set(words):
@@ -119,7 +128,8 @@ def _typed(words: Sequence[str]) -> dict[str, Any]:
 
 
 def _require_harmless(key: str, value: Any, is_typed: bool) -> None:
-    """Refuses what Hydra, a launcher or a sweeper would call, and interpolations that compute a value."""
+    """Refuses what Hydra, a launcher or a sweeper would call, and interpolations that compute a
+    value."""
     part, *names = key.split(".")
     if names[-1:] == ["_target_"]:
         if not _CLASS.fullmatch(str(value)):

@@ -9,7 +9,8 @@ class Key(NamedTuple):
     """A key of the config, or a word that stands for several."""
 
     kind: str
-    """Subject of the key: parameters that stand still, moving states, estimators, trials, a run of many, files, ..."""
+    """Subject of the key: parameters that stand still, moving states, estimators, trials, a run of
+    many, files, ..."""
     written: str
     """The word as help writes it: N stands for a whole number, [A,B] for a list of names."""
     meaning: str
@@ -61,8 +62,8 @@ _ROWS = (
     (
         "scale",
         "error_scale=X",
-        "standard deviation of the true parameters in multiples of their sizes, or of states in multiples of"
-        " the prior of a state model (1)",
+        "standard deviation of the true parameters in multiples of their sizes, or of states in"
+        " multiples of the prior of a state model (1)",
     ),
     ("trials", "seed=N", "number that all random draws follow from (0)"),
     ("trials", "trials=N", "number of trials (1000); with precision= the largest number"),
@@ -95,7 +96,8 @@ _ROWS = (
     (
         "run",
         "write_readings=FILE",
-        "write the simulated readings of trial write_readings_trial=N to a file, and estimate nothing",
+        "write the simulated readings of trial write_readings_trial=N to a file, and estimate"
+        " nothing",
     ),
     ("run", "write_readings_trial=N", ""),
     ("files", "readings=FILE", "readings of `ipe-bench estimate`, with ignore_columns= and find="),

@@ -17,7 +17,8 @@ _GONE = {"keys": "`ipe-bench run --help` explains every key of a run"}
 
 
 def list_command(names: Sequence[str], verbose: bool) -> int:
-    """Prints one line per option of each group, with its own options if `verbose`; for GROUP/NAME only that option."""
+    """Prints one line per option of each group, with its own options if `verbose`; for GROUP/NAME
+    only that option."""
     print_problems(plugins.take_problems())
     known = [*plugins.groups(), *({"statistic", "figure"} - set(plugins.groups()))]
     for name in names or plugins.groups():
@@ -53,7 +54,8 @@ def list_command(names: Sequence[str], verbose: bool) -> int:
 
 
 def _ours(group: str) -> dict[str, str]:
-    """Returns the statistics and figures that come with the bench, which are no options, with descriptions."""
+    """Returns the statistics and figures that come with the bench, which are no options, with
+    descriptions."""
     if group == "statistic":
         from ipe_bench.statistics.records import SCORES, STATISTICS
 

@@ -1,4 +1,5 @@
-"""Defines the command `ipe-bench`: finds the command, and turns a user's mistake into one line and exit code 2."""
+"""Defines the command `ipe-bench`: finds the command, and turns a user's mistake into one line and
+exit code 2."""
 
 from __future__ import annotations
 
@@ -30,8 +31,8 @@ HOMES = {
 }
 """The module of each command that is no question, which is loaded when the command is given."""
 GONE = {
-    "completion": 'eval "$(ipe-bench -sc install=bash)" lets bash complete (install=zsh, install=fish likewise); names '
-    "inside of lists are no longer completed",
+    "completion": 'eval "$(ipe-bench -sc install=bash)" lets bash complete (install=zsh, '
+    "install=fish likewise); names inside of lists are no longer completed",
     "schema": "`ipe-bench list GROUP/NAME` shows every option with its type and default",
 }
 """Commands of earlier versions, and what to use instead."""
@@ -48,7 +49,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     # Batched linear algebra is small per trial: more BLAS threads only get in each other's way.
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
-    # Arrow's own allocator keeps what it was given back: of a million rows, as much again as is in use.
+    # Arrow's own allocator keeps what it was given back: of a million rows, as much again as is in
+    # use.
     os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
     COMMAND.set(shlex.join(["ipe-bench", *words]))
     with (
@@ -81,7 +83,8 @@ def _answer(words: list[str]) -> int:
 
 
 def _explain(error: BaseException, command: Sequence[str]) -> tuple[int, str]:
-    """Returns the exit code and the line for the exception that ended a command; raises again a bug."""
+    """Returns the exit code and the line for the exception that ended a command; raises again a
+    bug."""
     from ipe_bench.plugins.discovery import blame
 
     if isinstance(error, KeyboardInterrupt):
@@ -95,11 +98,13 @@ def _explain(error: BaseException, command: Sequence[str]) -> tuple[int, str]:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             return (
                 1,
-                f"{where}: {reason}; what was stored before is whole, and the same command goes on from there",
+                f"{where}: {reason}; what was stored before is whole, and the same command goes on"
+                " from there",
             )
         return (
             2,
-            f"{where}: cannot be used ({reason}); choose another file or folder, for results with output=",
+            f"{where}: cannot be used ({reason}); choose another file or folder, for results with"
+            " output=",
         )
     line = blame(error)
     if line is None:

@@ -229,7 +229,8 @@ bundle beside their own results:
         },
     ),
 }
-"""Each command's line, its exit codes besides 2, the rest of its help, and its arguments; None for a question."""
+"""Each command's line, its exit codes besides 2, the rest of its help, and its arguments; None for
+a question."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -255,7 +256,10 @@ class Parser(argparse.ArgumentParser):
             return values
         word, (flag, equals, _) = surplus[0], surplus[0].partition("=")
         if self.command == "run" and flag in ("-cp", "--config-path", "-cn", "--config-name"):
-            remedy = "put options and experiments of your own into a folder and name it with --config-dir"
+            remedy = (
+                "put options and experiments of your own into a folder and name it with"
+                " --config-dir"
+            )
             raise UserError(f"run: {word}: is no flag any more; {remedy}")
         flags = [flag for action in self._actions for flag in action.option_strings]
         takes_keys = equals or any(action.metavar == "KEY=VALUE" for action in self._actions)

@@ -1,4 +1,5 @@
-"""Runs the commands of `ipe_bench.questions`: the table of their names, composed scenarios, and what they show."""
+"""Runs the commands of `ipe_bench.questions`: the table of their names, composed scenarios, and
+what they show."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ class Row(NamedTuple):
     line: str
     """Its line in `ipe-bench --help`."""
     without: tuple[str, ...] | None = None
-    """Keys of a scenario that have no meaning for it; None if it takes folders or files in place of a scenario."""
+    """Keys of a scenario that have no meaning for it; None if it takes folders or files in place of
+    a scenario."""
     moving: str = ""
     """What serves in its place for states that move."""
 
@@ -32,7 +34,8 @@ QUESTIONS = {
     "posterior": Row(
         "sample the posterior of a few trials, and compare estimators with it",
         of("run", "figures"),
-        "use `ipe-bench run state_model=NAME`, with tracker=[grid] for one state, or tracker=[bootstrap]",
+        "use `ipe-bench run state_model=NAME`, with tracker=[grid] for one state, or"
+        " tracker=[bootstrap]",
     ),
     "compare": Row("compare two versions, settings or estimators on paired trials"),
     "audit": Row("test whether the covariance of another program describes its errors"),

@@ -23,12 +23,14 @@ _PAPER = {"output": str, "paper": NAMES, "columns": NAMES, "width": float}
 
 
 def bundle_command(arguments: Sequence[str]) -> int:
-    """Writes the archive, or checks one; exit code 1 where the folders lack something that was asked for."""
+    """Writes the archive, or checks one; exit code 1 where the folders lack something that was
+    asked for."""
     places, keys = places_and_keys("bundle", arguments, {"output": str})
     paths = [Path(place) for place in places]
     if not paths:
         raise UserError(
-            "bundle: name at least one folder of results, such as outputs/paper, or a bundle to check"
+            "bundle: name at least one folder of results, such as outputs/paper, or a bundle to"
+            " check"
         )
     checked = any(map(is_bundle, paths))
     if checked and (len(paths) > 1 or keys):
@@ -41,14 +43,18 @@ def bundle_command(arguments: Sequence[str]) -> int:
         found = write_bundle(paths, path.with_name(path.name.removesuffix(SUFFIX) + SUFFIX))
         problems = Results.read(paths).problems
         print_problems(problems)
-    held = f"{len(found.files)} files of {', '.join(found.folders)}; {found.path.stat().st_size:,} bytes"
+    held = (
+        f"{len(found.files)} files of {', '.join(found.folders)}; {found.path.stat().st_size:,}"
+        " bytes"
+    )
     say(f"{'Whole' if checked else 'Bundle':<8}{found.path} ({held})")
     say(f"Digest  sha256:{found.digest}")
     return 1 if problems else 0
 
 
 def status_command(arguments: Sequence[str], verbose: bool = False) -> int:
-    """Prints a line per complete directory, else a table; returns 1 if any trial is missing or damaged."""
+    """Prints a line per complete directory, else a table; returns 1 if any trial is missing or
+    damaged."""
     if not arguments:
         raise UserError("status: name at least one directory of results, such as outputs/paper")
     with opened(arguments) as folders:
@@ -85,7 +91,8 @@ def _states(directory: str, cells: Sequence[CellState]) -> Table:
 
 
 def report_command(arguments: Sequence[str]) -> int:
-    """Writes the report on these folders, or bundles; exit code 1 where something that was asked for is missing."""
+    """Writes the report on these folders, or bundles; exit code 1 where something that was asked
+    for is missing."""
     for_paper = any(word.startswith(("paper=", "columns=", "width=")) for word in arguments)
     named, keys = places_and_keys("report", arguments, _PAPER if for_paper else _REPORT)
     output = Path(keys["output"]) if "output" in keys else None
@@ -114,8 +121,8 @@ def show_report(
     formats: Any,
     cells: Mapping[str, str] | None = None,
 ) -> int:
-    """Writes the report on all that folders hold, and prints it, or its rows of the `cells`, whose keys have a line for
-    people each; returns the exit code."""
+    """Writes the report on all that folders hold, and prints it, or its rows of the `cells`, whose
+    keys have a line for people each; returns the exit code."""
     from ipe_bench.report.page.run import begin_report
     from ipe_bench.statistics.analysis import Begun
     from ipe_bench.statistics.collect import collect
@@ -136,7 +143,8 @@ def show_report(
     pending.write_unless_current()
     told = [*collection.problems, *([] if cells else collection.stale)]
     if cells:
-        # What is wrong with a file or a folder may concern anybody; what other commands lack does not.
+        # What is wrong with a file or a folder may concern anybody; what other commands lack does
+        # not.
         of_cells = [line for line in told if line.startswith(("missing: ", "failed: "))]
         elsewhere = [line for line in of_cells if not any(cell in line for cell in cells.values())]
         told = [line for line in told if line not in elsewhere]
@@ -150,11 +158,13 @@ def show_report(
     if drawn and (left_out := drawn_settings(collection.settings, figures)[1]):
         drawn += f" ({left_out})"
     say(
-        f"\nSummary  {output / 'summary.csv'}\nTables   {output / 'tables'}{drawn}\nReport   {output / 'report.html'}"
+        f"\nSummary  {output / 'summary.csv'}\nTables   {output / 'tables'}{drawn}\nReport  "
+        f" {output / 'report.html'}"
     )
     if others:
         print(
-            f"Here too  {counted(others, 'result')} of other commands; `ipe-bench report {output}` shows all"
+            f"Here too  {counted(others, 'result')} of other commands; `ipe-bench report {output}`"
+            " shows all"
         )
     return 1 if collection.problems else 0
 

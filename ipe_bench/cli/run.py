@@ -1,4 +1,5 @@
-"""Defines `ipe-bench run`: reads the words, checks every job, computes what is missing, and shows the results."""
+"""Defines `ipe-bench run`: reads the words, checks every job, computes what is missing, and shows
+the results."""
 
 from __future__ import annotations
 
@@ -64,14 +65,16 @@ class Outcome:
         )
 
     def label(self, command: str) -> str:
-        """Returns the words that the sweep of a command gives to this job, or `job` where there is no sweep."""
+        """Returns the words that the sweep of a command gives to this job, or `job` where there is
+        no sweep."""
         typed = {word.lstrip("+~") for word in shlex.split(command)}
         swept = tuple(word for word in self.words if word.lstrip("+~") not in typed)
         # Without a folder it has no name where no word of the sweep tells it.
         return replace(self, words=swept, output="").job or self.job
 
     def __float__(self) -> float:
-        """Returns the objective of sweepers that optimise; they cannot go on from a job that was refused."""
+        """Returns the objective of sweepers that optimise; they cannot go on from a job that was
+        refused."""
         if self.mistake or self.objective is None:
             raise UserError(
                 self.mistake or "objective: is not given; a sweeper that optimises needs it"
@@ -142,7 +145,8 @@ def _missing(jobs: Jobs) -> list[str]:
 
 
 def _there_already(jobs: Jobs) -> list[str]:
-    """Warns of each folder that holds results of other commands; refuses the name of another experiment."""
+    """Warns of each folder that holds results of other commands; refuses the name of another
+    experiment."""
     lines = []
     for output in dict.fromkeys(job.output for job in jobs.specs if job.write_readings is None):
         found = Results.read([output], keys=()).runs if (Path(output) / "runs").is_dir() else ()
@@ -207,7 +211,8 @@ class Task:
     standard: bool
     """Whether the baselines are those of a plain run."""
     outcomes: list[Outcome] = field(default_factory=list)
-    """Outcomes of the jobs in this process: a sweeper that optimises keeps to itself what they return."""
+    """Outcomes of the jobs in this process: a sweeper that optimises keeps to itself what they
+    return."""
 
     def __call__(self, config: DictConfig) -> Outcome:
         """Computes a job that Hydra has composed and launched."""
@@ -320,7 +325,8 @@ def _refused(outcomes: Sequence[Outcome], *, told: bool) -> str:
 
 
 def _best(outcomes: Sequence[Outcome], maximises: bool) -> list[str]:
-    """Names the best job in a line, with its words that not all jobs have; empty if no job has an objective."""
+    """Names the best job in a line, with its words that not all jobs have; empty if no job has an
+    objective."""
     known = [one for one in outcomes if one.objective is not None and not one.mistake]
     if not known:
         return []

@@ -1,7 +1,7 @@
 """Composes, sweeps and launches with Hydra, and returns each job's result.
 
-`GlobalHydra.instance().hydra` is what `hydra.compose` itself works with. Its `multirun` returns what the jobs returned,
-from other processes as well (joblib, submitit).
+`GlobalHydra.instance().hydra` is what `hydra.compose` itself works with. Its `multirun` returns
+what the jobs returned, from other processes as well (joblib, submitit).
 """
 
 from __future__ import annotations
@@ -61,7 +61,8 @@ def session(folder: Path | None = None) -> Iterator[None]:
     for name in ("config.yaml", "schema.yaml", "hydra/config.yaml"):
         if folder is not None and (folder / name).exists():
             raise UserError(
-                f"{folder / name}: would replace ipe-bench's own config; move it to experiment/NAME.yaml"
+                f"{folder / name}: would replace ipe-bench's own config; move it to"
+                " experiment/NAME.yaml"
             )
     store, registry = ConfigStore.instance(), Plugins.instance()
     store.store("schema", node=DEFAULTS, provider="ipe-bench")
@@ -100,12 +101,13 @@ class Jobs:
     multirun: bool
     maximises: bool = False
     told: list[list[str]] = field(default_factory=list)
-    """The words of each job that this process runs; empty where Hydra's sweepers and launchers are to run them. Hydra's
-    own launcher composes each job twice again, longer than a job of a few trials takes (`hydra/launcher=basic`)."""
+    """The words of each job that this process runs; empty where Hydra's sweepers and launchers are
+    to run them. Hydra's own launcher composes each job twice again, longer than a job of a few
+    trials takes (`hydra/launcher=basic`)."""
 
     def launch(self, task: Callable[[DictConfig], Any]) -> list[Any]:
-        """Returns each job's result, run by the launcher and the sweeper that the words choose; empty for a sweeper
-        that optimises."""
+        """Returns each job's result, run by the launcher and the sweeper that the words choose;
+        empty for a sweeper that optimises."""
         try:
             if not self.multirun:
                 return [_hydra().run("config", task, self.words.text).return_value]
@@ -122,7 +124,8 @@ def jobs_of(words: Words, *, multirun: bool) -> Jobs:
     if hydra.runtime.choices.get("model"):
         print_problems(
             [
-                f"+experiment={words.chosen('experiment')}: model is called state_model now; write that there"
+                f"+experiment={words.chosen('experiment')}: model is called state_model now; write"
+                " that there"
             ]
         )
     params = [f"{key}={value}" for key, value in (hydra.sweeper.get("params") or {}).items()]
@@ -139,8 +142,8 @@ def jobs_of(words: Words, *, multirun: bool) -> Jobs:
             raise UserError(f"{w.said(one)}: is a sweep; add -m{remedy}")
         if one.is_interval_sweep() and not optimises:
             raise UserError(
-                f"{w.said(one)}: interval() is for sweepers that optimise (hydra/sweeper=optuna); give the values, "
-                "such as 1,10,100"
+                f"{w.said(one)}: interval() is for sweepers that optimise (hydra/sweeper=optuna);"
+                " give the values, such as 1,10,100"
             )
     if multirun and optimises:
         return Jobs(
@@ -222,7 +225,8 @@ def complete(words: Sequence[str]) -> None:
     if asked is None or (asked[1] == "query" and line is None):
         shown = " ".join(words) or "nothing"
         raise UserError(
-            f"-sc {shown}: write -sc install=SHELL or -sc uninstall=SHELL, SHELL being bash, fish, zsh"
+            f"-sc {shown}: write -sc install=SHELL or -sc uninstall=SHELL, SHELL being bash, fish,"
+            " zsh"
         )
     if (
         line is not None
@@ -249,9 +253,9 @@ def explain(error: BaseException) -> UserError:
         for line in lines
         if not line.startswith(("object_type=", "full_key:", "reference_type=", "See "))
     ]
-    return UserError(
-        f"{full_key.group(1) + ': ' if full_key else ''}{' '.join(kept) or describe_exception(error)}"
-    )
+    where = f"{full_key.group(1)}: " if full_key else ""
+    what = " ".join(kept) or describe_exception(error)
+    return UserError(where + what)
 
 
 _EXTRAS = ("joblib", "submitit", "optuna")

@@ -37,8 +37,8 @@ class Single:
         return self.words.chosen(group) or model.name
 
     def folder(self, name: str, identity: Any, files: Sequence[str] = ()) -> Path:
-        """Reserves the named folder, or one named after the command and the model, for a command that `identity` tells
-        from others in NAME.json, and for its further `files`."""
+        """Reserves the named folder, or one named after the command and the model, for a command
+        that `identity` tells from others in NAME.json, and for its further `files`."""
         output, named = Path(self.spec.output), not {"name", "output"}.isdisjoint(self.words.keys)
         folder = (
             output
@@ -55,8 +55,9 @@ def single(
     moving: str = "",
     **refused: Sequence[str],
 ) -> Single:
-    """Composes the one job that the arguments of a command ask for; `standard` are default words, and `refused` are
-    keys without meaning for it, by whom they are for; `moving` says what else serves for states that move."""
+    """Composes the one job that the arguments of a command ask for; `standard` are default words,
+    and `refused` are keys without meaning for it, by whom they are for; `moving` says what else
+    serves for states that move."""
     with session():
         words = w.read(command, arguments)
         for whose, keys in refused.items():
@@ -77,8 +78,8 @@ def single(
 
 
 def require_one_kind(words: Words, spec: Spec) -> None:
-    """Refuses a tracker without a state model, and a state model together with a key of measurements, typed or from an
-    experiment."""
+    """Refuses a tracker without a state model, and a state model together with a key of
+    measurements, typed or from an experiment."""
     if spec.state_model is None:
         words.refuse((*OF_STATES[1:], "find"), "goes with state_model=NAME")
         return

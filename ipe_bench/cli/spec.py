@@ -88,7 +88,8 @@ class Spec(Component):
                 raise UserError(f"{key}={getattr(self, key)}: name a folder")
         if ".." in Path(self.name).parts:
             raise UserError(
-                f"name={self.name}: leaves the folder outputs; give another name, or the folder as output="
+                f"name={self.name}: leaves the folder outputs; give another name, or the folder as"
+                " output="
             )
         if "://" in self.output or self.output.startswith("file:"):
             raise UserError(f"output={self.output}: is an address; name a folder of this machine")
@@ -171,8 +172,8 @@ class Spec(Component):
         return replace(self, estimators=kept) if unsuited else self
 
     def question(self, stated: Collection[str]) -> Question:
-        """Returns the question on real readings; `stated` are the keys that a user has given, so that a default part
-        counts as unstated."""
+        """Returns the question on real readings; `stated` are the keys that a user has given, so
+        that a default part counts as unstated."""
         from ipe_bench.real.estimation import Question
 
         given = (self.readings,) if isinstance(self.readings, str) else self.readings
@@ -257,7 +258,8 @@ def _labelled(key: str, label: str, options: Any, known: Sequence[plugins.Option
 
 
 def _of_kind(part: Any, key: str, kind: type) -> Any:
-    """Returns the part, if it is of the right kind and can be stored and sent to other processes."""
+    """Returns the part, if it is of the right kind and can be stored and sent to other
+    processes."""
     if not isinstance(part, kind):
         name = type(part).__name__
         raise UserError(

@@ -1,7 +1,8 @@
 """Reads the words KEY=VALUE of a command once, by Hydra's grammar.
 
-What Hydra would answer in words of its own, or take and not do, is refused here by a line that names the word and the
-remedy. What the values of options may be is checked where a job is constructed.
+What Hydra would answer in words of its own, or take and not do, is refused here by a line that
+names the word and the remedy. What the values of options may be is checked where a job is
+constructed.
 """
 
 from __future__ import annotations
@@ -93,7 +94,8 @@ def _first(override: Override) -> str:
 
 
 def forced(override: Override) -> str:
-    """Writes a word in Hydra's form. Options that a file does not name are added: their class judges them."""
+    """Writes a word in Hydra's form. Options that a file does not name are added: their class
+    judges them."""
     line = override.input_line or ""
     option = "." in override.key_or_group and not override.key_or_group.startswith("hydra")
     return f"++{line}" if option and override.type is OverrideType.CHANGE else line
@@ -232,8 +234,10 @@ def _parse(command: str, word: str, groups: Groups) -> Override:
         found = OverridesParser.create().parse_override(word)
     except (HydraException, ValueError, RecursionError):
         raise UserError(
-            f"{word}: the value cannot be read; a text with other signs than letters, digits and -_./:% needs quotes "
-            f'that reach ipe-bench, such as "{key}={_quoted(value)}", and brackets have to be closed'
+            f"{word}: the value cannot be read; a text with other signs than letters, digits"
+            " and -_./:% needs quotes "
+            f'that reach ipe-bench, such as "{key}={_quoted(value)}", and brackets'
+            " have to be closed"
         ) from None
     if not found.key_or_group:
         raise UserError(f"{word}: there is no key in front of the value; write KEY=VALUE")
@@ -284,7 +288,8 @@ def _check(override: Override, groups: Groups) -> None:
         raise UserError(f"{word}: {unknown(first, {*KEYS, *groups, 'experiment'}, 'key')}")
     if group == "estimators":
         raise UserError(
-            f"{word}: choose with solver= and baseline=, and set options by estimators.LABEL.KEY=VALUE"
+            f"{word}: choose with solver= and baseline=, and set options by"
+            " estimators.LABEL.KEY=VALUE"
         )
     for value in values(override):
         if group in WHOLE and isinstance(value, float) and value.is_integer():
@@ -301,7 +306,8 @@ def _choosing(group: str, name: str) -> str:
 
 
 def _by_label(group: str, word: str) -> str:
-    """Writes GROUP.NAME.OPTION=VALUE as the word that sets an option of that name, or the nearest there is."""
+    """Writes GROUP.NAME.OPTION=VALUE as the word that sets an option of that name, or the nearest
+    there is."""
     key, _, value = word.lstrip("+").partition("=")
     _, name, *path = key.split(".")
     if not path:
@@ -365,12 +371,16 @@ def _check_choice(override: Override, groups: Groups) -> None:
             ]:
                 raise UserError(f"{key}={name}: {faults[0]}")
             if names.count(name) > 1:
-                remedy = f"+{group}@{plugins.PACKAGES[group]}.{name}_2={name} runs it again under a label of its own"
+                remedy = (
+                    f"+{group}@{plugins.PACKAGES[group]}.{name}_2={name} runs it again under a"
+                    " label of its own"
+                )
                 raise UserError(f"{word}: {name} stands there twice and would run once; {remedy}")
 
 
 def no_option(group: str, name: str, groups: Groups) -> str:
-    """Suggests a replacement of an option that its group lacks: its own group, where another group has it."""
+    """Suggests a replacement of an option that its group lacks: its own group, where another group
+    has it."""
     for other, names in groups.items():
         if name in names and other != group:
             return f"{name} is a {other}, not a {group}; write {_choosing(other, name)}"
@@ -395,7 +405,8 @@ def _check_labels(overrides: Sequence[Override]) -> None:
             if place in taken and (package or taken[place] is not override):
                 word = said(override)
                 raise UserError(
-                    f"{word}: {label} is the label of {said(taken[place])} already; choose another label"
+                    f"{word}: {label} is the label of {said(taken[place])} already; choose another"
+                    " label"
                 )
             taken[place] = override
 
@@ -441,8 +452,8 @@ _LONGEST_NAME = 80
 
 
 def default_name(words: Words) -> str:
-    """Names the folder of a command, such as ranging-gaussian-deviation=0.1: the same for the same settings in any
-    order, without keys that change no setting or add trials to it."""
+    """Names the folder of a command, such as ranging-gaussian-deviation=0.1: the same for the same
+    settings in any order, without keys that change no setting or add trials to it."""
     parts: dict[str, str] = {}
     held = ""
     for override in words.overrides:

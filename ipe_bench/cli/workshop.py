@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
 
 def check_command(words: Sequence[str]) -> int:
-    """Checks every option of the plugins in the given folders, and what the keys choose; exit code 1 if any fails."""
+    """Checks every option of the plugins in the given folders, and what the keys choose; exit code
+    1 if any fails."""
     keys = [word for word in words if "=" in word and not Path(word).is_dir()]
     folders = [word for word in words if word not in keys]
     if not words:
@@ -43,7 +44,8 @@ def check_command(words: Sequence[str]) -> int:
             say(f"{outcome:7}{one.component}: {one.check}{said}")
         wrong = sum(bool(finding.complaint) for finding in findings)
         say(
-            f"{folder}: {f'{wrong} of {len(findings)} checks failed' if wrong else 'all checks passed'}"
+            f"{folder}:"
+            f" {f'{wrong} of {len(findings)} checks failed' if wrong else 'all checks passed'}"
         )
         failed += wrong
     return 1 if failed else 0
@@ -84,7 +86,8 @@ def _check_experiments(folder: str) -> Iterator[Finding]:
 
 
 def new_command(kind: str, name: str | None, language: str | None = None) -> int:
-    """Writes plugins/NAME in the working folder, or the files of a model, of a skill or of a guard in CI."""
+    """Writes plugins/NAME in the working folder, or the files of a model, of a skill or of a guard
+    in CI."""
     if kind == "ci" and name is None:
         print(write_ci())
         return 0

@@ -1,22 +1,25 @@
-"""Solves the equations of chains of epochs, each trial by itself: in machine code, or by NumPy where none can be made.
+"""Solves the equations of chains of epochs, each trial by itself: in machine code, or by NumPy
+where none can be made.
 
 A chain has states x and multipliers l of epochs k = 0 ... K, with x[-1] = 0 and l[K+1] = 0:
 
     x[k] - A[k] x[k-1] - Q[k] l[k] = a[k]
     (B' B + D) x[k] + l[k] - A[k+1]' l[k+1] = B' v,   Q = G G' and a diagonal D
 
-They are those of a Kalman filter and smoother with readings v of B x and readings of 0 of x, of variance 1 / D. Its
-covariances are kept as F F' with a triangular F (Bierman, Factorization Methods for Discrete Sequential Estimation,
-1977): from epoch to epoch by orthogonal rows of (A F, G) (Morf and Kailath, IEEE Trans. Autom. Control 20, 1975), and
-by taking in one reading after another, with a row b of B or of a root of D and s = F F' b (Carlson, AIAA J. 11, 1973).
-On the way there it is u <- u + s w, w = (v - b' u) / (1 + b' s), and on the way back, by the multipliers (Bryson and
+They are those of a Kalman filter and smoother with readings v of B x and readings of 0 of x, of
+variance 1 / D. Its covariances are kept as F F' with a triangular F (Bierman, Factorization Methods
+for Discrete Sequential Estimation, 1977): from epoch to epoch by orthogonal rows of (A F, G) (Morf
+and Kailath, IEEE Trans. Autom. Control 20, 1975), and by taking in one reading after another, with
+a row b of B or of a root of D and s = F F' b (Carlson, AIAA J. 11, 1973). On the way there it is u
+<- u + s w, w = (v - b' u) / (1 + b' s), and on the way back, by the multipliers (Bryson and
 Frazier, 1963),
 
-    x = u + F F' A' l[k+1],   l <- A' l[k+1],   l <- l + b (w - s' l / (1 + b' s)) from the last reading to the first.
+    x = u + F F' A' l[k+1],   l <- A' l[k+1],   l <- l + b (w - s' l / (1 + b' s)) from the last
+    reading to the first.
 
-Nothing is inverted, so that G may be of any rank, and a prior however wide costs no digits. What the first x leaves of
-the right sides is solved for once more, after which steps hold but for round-off. A trial has the same bits in any
-batch.
+Nothing is inverted, so that G may be of any rank, and a prior however wide costs no digits. What
+the first x leaves of the right sides is solved for once more, after which steps hold but for
+round-off. A trial has the same bits in any batch.
 """
 
 from __future__ import annotations
@@ -36,7 +39,8 @@ _ARGUMENTS = (*[POINTER] * 8, INTEGER, INTEGER, POINTER)
 
 
 class Epoch(NamedTuple):
-    """Holds what is kept of an epoch: arrays, or in machine code how many numbers each has and where they lie."""
+    """Holds what is kept of an epoch: arrays, or in machine code how many numbers each has and
+    where they lie."""
 
     A: Any
     B: Any
@@ -84,8 +88,9 @@ class ChainSize(NamedTuple):
 def solve_chains(
     A: Array, B: Array, D: Array, G: Array, a: Array, v: Array, spread: bool = False
 ) -> tuple[Array, Array]:
-    """Returns x (trials, 1 + K, n) and, if `spread`, P (trials, 1 + K, n, n), of A (trials, K, n, n), B (trials, K, m,
-    n) and v (trials, K, m) of the epochs from the second on, and of D and a (trials, 1 + K, n) and G (1 + K, n, q)."""
+    """Returns x (trials, 1 + K, n) and, if `spread`, P (trials, 1 + K, n, n), of A (trials, K, n,
+    n), B (trials, K, m, n) and v (trials, K, m) of the epochs from the second on, and of D and a
+    (trials, 1 + K, n) and G (1 + K, n, q)."""
     trials, epochs, n = D.shape
     given = [own(one) for one in (A, B, D, G, a, v)]
     if not compiled.available():
@@ -141,8 +146,8 @@ def _begun(A: Array, B: Array, D: Array, G: Array, a: Array, v: Array) -> Epoch:
 
 
 def filtered_roots(A: Array, B: Array, G: Array) -> tuple[Array, Array, Array]:
-    """Returns F (trials, 1 + K, n, n), where F F' is the covariance of x by the rows B (trials, 1 + K, r, n) up to each
-    epoch, and s and 1 + b' s of each row b; A (trials, 1 + K, n, n)."""
+    """Returns F (trials, 1 + K, n, n), where F F' is the covariance of x by the rows B (trials, 1 +
+    K, r, n) up to each epoch, and s and 1 + b' s of each row b; A (trials, 1 + K, n, n)."""
     trials, epochs, rows, _ = B.shape
     F = np.zeros(A.shape)
     S = np.zeros_like(B)
@@ -182,7 +187,8 @@ def lower(W: Array) -> Array:
 
 
 def _take_in(F: Array, row: Array) -> tuple[Array, Array]:
-    """F F' <- ((F F')^-1 + b b')^-1 for a row b, in place; returns F F' b (trials, n) and 1 + b' F F' b (trials,)."""
+    """F F' <- ((F F')^-1 + b b')^-1 for a row b, in place; returns F F' b (trials, n) and 1 + b' F
+    F' b (trials,)."""
     t = multiply(F.mT, row)
     s = np.zeros_like(t)
     size = np.ones(len(t))

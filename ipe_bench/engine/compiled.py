@@ -1,7 +1,8 @@
-"""Compiles LLVM's intermediate representation to machine code for this processor, kept in files between processes.
+"""Compiles LLVM's intermediate representation to machine code for this processor, kept in files
+between processes.
 
-A function takes pointers and whole numbers and returns nothing; a call lets other threads run. Where no machine code
-can be made, `available` says so, and callers compute the same with NumPy.
+A function takes pointers and whole numbers and returns nothing; a call lets other threads run.
+Where no machine code can be made, `available` says so, and callers compute the same with NumPy.
 """
 
 from __future__ import annotations
@@ -41,8 +42,8 @@ _IN_LIBRARY = (
     "pow",
 )
 _IN_LIBRARY += ("fma", "memset", "memcpy")
-"""Functions of the C library that machine code may call: those of recorded programs, and those LLVM puts in place of
-an instruction that the processor lacks or of a loop."""
+"""Functions of the C library that machine code may call: those of recorded programs, and those LLVM
+puts in place of an instruction that the processor lacks or of a loop."""
 _DIGEST = 32
 
 POINTER, INTEGER = ctypes.c_void_p, ctypes.c_int64
@@ -102,10 +103,11 @@ def width() -> int:
 def load(
     key: str, write: Callable[[], str], name: str, arguments: tuple[Any, ...]
 ) -> Callable[..., None]:
-    """Loads the function `name` of the module that `write` writes and `key` identifies, compiled once per machine.
+    """Loads the function `name` of the module that `write` writes and `key` identifies, compiled
+    once per machine.
 
-    A kept file is used only if it was made of this key for this processor, is whole, and belongs to this user or the
-    system.
+    A kept file is used only if it was made of this key for this processor, is whole, and belongs to
+    this user or the system.
     """
     import llvmlite.binding as llvm
 
@@ -135,7 +137,8 @@ def load(
 
 
 def _own_bytes(path: Path) -> bytes:
-    """Reads a file that belongs to this user or the system and is writable by no other user; returns b"" otherwise."""
+    """Reads a file that belongs to this user or the system and is writable by no other user;
+    returns b"" otherwise."""
     if not path.is_file():
         return b""
     with path.open("rb") as file:
@@ -177,8 +180,8 @@ def _machine() -> tuple[str, ...]:
 
 @functools.cache
 def digest_of(file: Path) -> str:
-    """Stands for the code of a module that writes intermediate representation: what it compiled before a change is not
-    used after it."""
+    """Stands for the code of a module that writes intermediate representation: what it compiled
+    before a change is not used after it."""
     return hashlib.sha256(file.read_bytes() + Path(__file__).read_bytes()).hexdigest()
 
 
@@ -187,7 +190,8 @@ DOUBLE, WHOLE = np.dtype(np.float64), np.dtype(np.int64)
 
 
 def at(a: Any, kind: Any = DOUBLE) -> int:
-    """Returns the address of a C-contiguous array's numbers, in a third of the time that `a.ctypes.data` takes."""
+    """Returns the address of a C-contiguous array's numbers, in a third of the time that
+    `a.ctypes.data` takes."""
     if a.dtype != kind:
         raise TypeError(f"an array of {a.dtype}, where one of {kind} is taken")
     if not a.size:
@@ -196,6 +200,7 @@ def at(a: Any, kind: Any = DOUBLE) -> int:
 
 
 def aligned(numbers: int) -> tuple[np.ndarray[Any, Any], int]:
-    """Allocates memory for this many numbers; returns it and its first address on the border of a cache line."""
+    """Allocates memory for this many numbers; returns it and its first address on the border of a
+    cache line."""
     memory = np.empty(numbers + 8)
     return memory, -(-at(memory) // 64) * 64

@@ -1,15 +1,17 @@
 """Writes the integrator of a plan as a module of LLVM's intermediate representation.
 
-    void integrate(double *x, double *si, double *cases, int64 n_cases, int64 *rows, int64 first, int64 last,
-                   double *times, int64 *steps, int64 n_times, double *offset, int64 stride, double *out,
-                   double *states, double *frame)
+    void integrate(double *x, double *si, double *cases, int64 n_cases, int64 *rows, int64 first,
+    int64 last,
+                   double *times, int64 *steps, int64 n_times, double *offset, int64 stride, double
+                   *out, double *states, double *frame)
 
-Lane l is the problem of trial rows[l / n_cases] in case l % n_cases, for first <= l < last; a group that is not full
-repeats its last lane. Where constants are driven, `cases` holds those of every interval, and those after the last time.
-`states` takes those of every lane at the start and at each time, unless it is null; behind them, where steps are
-watched, whether one was in doubt.
-Every operation is IEEE arithmetic in a fixed order, so the bits of a lane do not depend on the number of lanes.
-`basics.compiled` makes machine code of such modules; this file is imported only where something is compiled.
+Lane l is the problem of trial rows[l / n_cases] in case l % n_cases, for first <= l < last; a group
+that is not full repeats its last lane. Where constants are driven, `cases` holds those of every
+interval, and those after the last time. `states` takes those of every lane at the start and at each
+time, unless it is null; behind them, where steps are watched, whether one was in doubt. Every
+operation is IEEE arithmetic in a fixed order, so the bits of a lane do not depend on the number of
+lanes. `basics.compiled` makes machine code of such modules; this file is imported only where
+something is compiled.
 """
 
 from __future__ import annotations
@@ -36,7 +38,8 @@ F64, I32, I64, PTR, VOID = (
 )
 _ARITHMETIC = {"add": "fadd", "sub": "fsub", "mul": "fmul", "div": "fdiv"}
 _FILLED = 4
-"""Numbers of a tangent from which on one alone keeps the processor busy; below, two advance side by side."""
+"""Numbers of a tangent from which on one alone keeps the processor busy; below, two advance side by
+side."""
 
 Value = Any
 """A value of LLVM's intermediate representation."""
@@ -48,8 +51,8 @@ def integrate(plan: StepPlan, width: int) -> str:
 
 
 def rates(program: Program, width: int) -> str:
-    """Writes void rates(double *x, double *si, double *out, int64 trials): one number from the parameters x[i] times
-    si, for one trial at a time, a width of 1."""
+    """Writes void rates(double *x, double *si, double *out, int64 trials): one number from the
+    parameters x[i] times si, for one trial at a time, a width of 1."""
     made: Any = ir.Function(
         ir.Module("rates"), ir.FunctionType(VOID, [PTR, PTR, PTR, I64]), "rates"
     )
@@ -69,9 +72,10 @@ def rates(program: Program, width: int) -> str:
 
 
 def rows(source: RowPrograms, width: int) -> str:
-    """Writes void rows(double *x, double *c, int64 count, double *unit, double *y, double *J, int64 total): for each
-    row i of x (total, n), with row i % count of the numbers c, the values y (total, m) and, unless J is null, their
-    slopes J (total, m, n). A vector holds tangents in `width` directions, of the unit matrix (n, n)."""
+    """Writes void rows(double *x, double *c, int64 count, double *unit, double *y, double *J, int64
+    total): for each row i of x (total, n), with row i % count of the numbers c, the values y
+    (total, m) and, unless J is null, their slopes J (total, m, n). A vector holds tangents in
+    `width` directions, of the unit matrix (n, n)."""
     made: Any = ir.Function(
         ir.Module("rows"), ir.FunctionType(VOID, [PTR, PTR, I64, PTR, PTR, PTR, I64]), "rows"
     )
@@ -104,9 +108,9 @@ def rows(source: RowPrograms, width: int) -> str:
 
 
 def chains(size: ChainSize, width: int) -> str:
-    """Writes void chains(double *A, double *B, double *D, double *G, double *a, double *v, double *x, double *P,
-    int64 trials, int64 epochs, double *frame), which `engine.chains` describes; P may be null. A lane is a trial; a
-    group that is not full repeats its last one."""
+    """Writes void chains(double *A, double *B, double *D, double *G, double *a, double *v, double
+    *x, double *P, int64 trials, int64 epochs, double *frame), which `engine.chains` describes; P
+    may be null. A lane is a trial; a group that is not full repeats its last one."""
     return str(_ChainWriter(size, width).module)
 
 
@@ -139,8 +143,9 @@ class _Lanes:
 
 
 class _ChainWriter:
-    """Writes the solver of chains of one size: a square-root filter, and a pass back by multipliers. What is given of
-    all trials has a name of `self`, as `self.A`; what lies in the frame has one of its epoch, as `here.A`."""
+    """Writes the solver of chains of one size: a square-root filter, and a pass back by
+    multipliers. What is given of all trials has a name of `self`, as `self.A`; what lies in the
+    frame has one of its epoch, as `here.A`."""
 
     def __init__(self, size: ChainSize, width: int) -> None:
         self.size = size
@@ -190,8 +195,8 @@ class _ChainWriter:
         here = self._at(k)
         moved = b.sub(self.epochs, integer(1))
         before = b.sub(k, integer(1))
-        # Nothing moves into the first epoch, and nothing is read there; nor is anything left there of
-        # the trials before, which may not be finite.
+        # Nothing moves into the first epoch, and nothing is read there; nor is anything left there
+        # of the trials before, which may not be finite.
         with self._each(n * n) as i:
             here.A[i] = self.zero
         with self._each(m) as r:
@@ -207,7 +212,8 @@ class _ChainWriter:
             self._damp(here, i)
 
     def _damp(self, here: Epoch, i: Value) -> None:
-        """Writes the row of a root of D for state i, which is a reading of 0, as one that is not taken in yet."""
+        """Writes the row of a root of D for state i, which is a reading of 0, as one that is not
+        taken in yet."""
         b = self.b
         m = integer(self.size.m)
         # The roots stand on a diagonal below the rows of the m readings.
@@ -241,7 +247,8 @@ class _ChainWriter:
                 row[self.b.add(j, integer(self.n))] = gain
 
     def _triangle(self, F: _Lanes) -> None:
-        """Writes the triangular F with F F' = W W', by orthogonal rows of W (modified Gram-Schmidt)."""
+        """Writes the triangular F with F F' = W W', by orthogonal rows of W (modified
+        Gram-Schmidt)."""
         b = self.b
         with self._each(self.n) as i:
             row = self.W.row(i).all()
@@ -275,7 +282,8 @@ class _ChainWriter:
             self._take_in(here, r, row.all())
 
     def _take_in(self, here: Epoch, r: Value, row: list[Value]) -> None:
-        """Writes F F' <- ((F F')^-1 + b b')^-1 for a row b, with s = F F' b and 1 + b' s (Carlson, 1973)."""
+        """Writes F F' <- ((F F')^-1 + b b')^-1 for a row b, with s = F F' b and 1 + b' s (Carlson,
+        1973)."""
         b = self.b
         s = here.S.row(r)
         # t = F' b, of which s and 1 + b' s are sums over columns.
@@ -494,8 +502,8 @@ class _Writer:
     def _function(
         self, name: str, kinds: Sequence[ir.Type], body: Callable[..., None]
     ) -> ir.Function:
-        """Writes a function of its own, never inlined, whose stack is aligned: registers that spill would else lie
-        across cache lines, which takes half as long again."""
+        """Writes a function of its own, never inlined, whose stack is aligned: registers that spill
+        would else lie across cache lines, which takes half as long again."""
         made: Any = ir.Function(self.module, ir.FunctionType(VOID, kinds), name)
         made.linkage = "internal"
         made.attributes.add("noinline")
@@ -510,7 +518,8 @@ class _Writer:
         v.store(v.run(plan.begin, v.load(frame, [*plan.x, *plan.constants])), frame, plan.begun)
 
     def _weigh(self, v: _Vectors, frame: Value, h: Value) -> None:
-        """Writes h times the weights of the formula, behind the vectors of the frame, a vector at a time."""
+        """Writes h times the weights of the formula, behind the vectors of the frame, a vector at a
+        time."""
         share = v.spread(h)
         weighed = [
             v.builder.fmul(share, weight) for weight in v.load(self.table, range(self.count))
@@ -688,7 +697,8 @@ class _Writer:
             with loop(b, integer(0), n_times) as k:
                 # From reading to reading: h = (times[k] - t) / steps[k].
                 to, since = number_at(b, times, k), b.load(t, typ=F64)
-                # No step to a time that is reached already: at the start, or where two readings share a time.
+                # No step to a time that is reached already: at the start, or where two readings
+                # share a time.
                 count = b.select(
                     b.fcmp_ordered("==", to, since), integer(0), number_at(b, steps, k, I64)
                 )
@@ -746,7 +756,8 @@ class _Writer:
 
 
 class _Vectors:
-    """Writes instructions on vectors of `width` doubles. A frame is a pointer to an array of such vectors."""
+    """Writes instructions on vectors of `width` doubles. A frame is a pointer to an array of such
+    vectors."""
 
     def __init__(self, builder: ir.IRBuilder, width: int) -> None:
         self.builder, self.width = builder, width

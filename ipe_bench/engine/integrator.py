@@ -1,7 +1,9 @@
-"""Runs plans: in machine code on every core, or step by step in NumPy where no machine code can be made.
+"""Runs plans: in machine code on every core, or step by step in NumPy where no machine code can be
+made.
 
-One lane is one initial value problem, a trial in a case; the lanes of a vector register advance together. The bits of a
-lane depend on its own numbers alone: neither on its neighbours, nor on how many threads.
+One lane is one initial value problem, a trial in a case; the lanes of a vector register advance
+together. The bits of a lane depend on its own numbers alone: neither on its neighbours, nor on how
+many threads.
 """
 
 from __future__ import annotations
@@ -32,16 +34,19 @@ if TYPE_CHECKING:
     from ipe_bench.engine.chains import ChainSize
 
 _WORTH_THREADS = 40_000
-"""Steps times lanes times states from which a second thread gains more than it costs, some 150 microseconds."""
+"""Steps times lanes times states from which a second thread gains more than it costs, some 150
+microseconds."""
 _NARROW = 4
-"""Lanes up to which half of the usual vectors do: one simulation of GINS in two thirds of the time."""
+"""Lanes up to which half of the usual vectors do: one simulation of GINS in two thirds of the
+time."""
 Integers = NDArray[np.integer[Any]]
 _EMIT = Path(__file__).with_name("emit.py")
 _ARGUMENTS = tuple(INTEGER if i in (3, 5, 6, 9, 11) else POINTER for i in range(15))
 
 
 def threads() -> int:
-    """Threads that one integration may use: `IPE_BENCH_THREADS`, else every core of this process."""
+    """Threads that one integration may use: `IPE_BENCH_THREADS`, else every core of this
+    process."""
     chosen = os.environ.get("IPE_BENCH_THREADS")
     return max(1, int(chosen)) if chosen else cores()
 
@@ -86,7 +91,8 @@ class Kernel:
         return self._machine_code(compiled.width())
 
     def _machine_code(self, width: int) -> tuple[Callable[..., None], int]:
-        """Returns the function for groups of so many lanes, and the numbers that it needs room for."""
+        """Returns the function for groups of so many lanes, and the numbers that it needs room
+        for."""
         # Behind the plan's vectors lie h times the weights of the formula, in whole vectors.
         weights = -(-sum(map(len, self.plan.tableau.weights)) // width)
         return emitted("integrate", self.plan, width, _ARGUMENTS), (
@@ -104,12 +110,13 @@ class Kernel:
         *more: Array,
         states: Array | None = None,
     ) -> None:
-        """Integrates the trials in these rows of x (trials, n) from time 0, in every case, `steps[k]` equal steps to
-        `times[k]`. `cases` has the constants (cases, constants), or where some are driven those of every interval and
-        those after the last time (times + 1, cases, constants). The last of `more` takes the results, C-contiguous, in
-        the same rows; before it, for simulations, what is subtracted from the readings. `states` (trials, cases,
-        states, times + 1) takes those at the start and at each time; where steps are watched, behind the states, 1 once
-        one was rough or crossed a pole."""
+        """Integrates the trials in these rows of x (trials, n) from time 0, in every case,
+        `steps[k]` equal steps to `times[k]`. `cases` has the constants (cases, constants), or where
+        some are driven those of every interval and those after the last time (times + 1, cases,
+        constants). The last of `more` takes the results, C-contiguous, in the same rows; before it,
+        for simulations, what is subtracted from the readings. `states` (trials, cases, states,
+        times + 1) takes those at the start and at each time; where steps are watched, behind the
+        states, 1 once one was rough or crossed a pole."""
         count = cases.shape[-2]
         lanes = len(rows) * count
         *offset, out = more
@@ -163,8 +170,8 @@ class Kernel:
 
     @functools.cached_property
     def _programs(self) -> tuple[Program, Program, Program]:
-        """Evaluates from the time, the state with its tangents, and constants: their starts, their slopes, and
-        readings."""
+        """Evaluates from the time, the state with its tangents, and constants: their starts, their
+        slopes, and readings."""
         tape = Recording(self.equations)
         # For Jacobians, each number is a tangent in all directions at once, an array (n, lanes).
         d, dp, slopes, shown, starts = (
@@ -188,7 +195,8 @@ class Kernel:
         *more: Array,
         states: Array | None = None,
     ) -> None:
-        """Implements `run` in NumPy, all lanes at once; products are rounded before they are added."""
+        """Implements `run` in NumPy, all lanes at once; products are rounded before they are
+        added."""
         begin, slope, read = self._programs
         intervals = cases if cases.ndim == 3 else cases[None]
         count, n = intervals.shape[1], x.shape[1]
@@ -253,8 +261,8 @@ class Kernel:
 
 
 def compiled_rates(program: Program) -> Callable[[Array, Array, Array], None]:
-    """Compiles a function that fills its third argument (trials,) with the number that a recorded program computes of
-    the parameters x (trials, n), times their sizes (n,)."""
+    """Compiles a function that fills its third argument (trials,) with the number that a recorded
+    program computes of the parameters x (trials, n), times their sizes (n,)."""
     if compiled.available():
         function = emitted("rates", program, 1, (POINTER, POINTER, POINTER, INTEGER))
         return lambda x, si, out: function(at(x), at(si), at(out), len(x))

@@ -1,4 +1,5 @@
-"""Plans what an integrator of recorded equations computes: formulas, programs, and where their numbers lie."""
+"""Plans what an integrator of recorded equations computes: formulas, programs, and where their
+numbers lie."""
 
 from __future__ import annotations
 
@@ -16,21 +17,22 @@ Recordable = Callable[..., Sequence[Any]]
 _POINTS, _NEWTON = 64, 30
 """Points at which a comparison is examined, and the steps that move them to where it changes."""
 ROUGH = 0.005
-"""Error of a single step, by the embedded formula of fifth order, that puts a trial in doubt, as a share of the state's
-largest magnitude so far and of its next change. Right steps to 1e-8 leave 1e-6, one that jumps 0.007. What changes with
-t alone, as a pulse does, is no doubt."""
+"""Error of a single step, by the embedded formula of fifth order, that puts a trial in doubt, as a
+share of the state's largest magnitude so far and of its next change. Right steps to 1e-8 leave
+1e-6, one that jumps 0.007. What changes with t alone, as a pulse does, is no doubt."""
 
 
 @dataclass(frozen=True)
 class Tableau:
-    """Holds an explicit formula: stage s starts from y + h sum_j A[s][j] k_j at t + C[s] h, the step ends at y + h
-    sum_s B[s] k_s."""
+    """Holds an explicit formula: stage s starts from y + h sum_j A[s][j] k_j at t + C[s] h, the
+    step ends at y + h sum_s B[s] k_s."""
 
     A: tuple[tuple[float, ...], ...]
     B: tuple[float, ...]
     C: tuple[float, ...]
     E: tuple[float, ...] = ()
-    """Weights of the difference from an embedded formula of lower order; none: there is no such formula."""
+    """Weights of the difference from an embedded formula of lower order; none: there is no such
+    formula."""
 
     @property
     def stages(self) -> int:
@@ -53,42 +55,50 @@ DOP853 = Tableau(
         (0.037037037037037035, 0.0, 0.0, 0.17082860872947386, 0.12546768756682242),
         (0.037109375, 0.0, 0.0, 0.17025221101954405, 0.06021653898045596, -0.017578125),
         (
-            0.03709200011850479, 0.0, 0.0, 0.17038392571223998, 0.10726203044637328, -0.015319437748624402,
+            0.03709200011850479, 0.0, 0.0, 0.17038392571223998, 0.10726203044637328,
+            -0.015319437748624402,
             0.008273789163814023,
         ),
         (
-            0.6241109587160757, 0.0, 0.0, -3.3608926294469414, -0.868219346841726, 27.59209969944671,
+            0.6241109587160757, 0.0, 0.0, -3.3608926294469414, -0.868219346841726,
+            27.59209969944671,
             20.154067550477894, -43.48988418106996,
         ),
         (
-            0.47766253643826434, 0.0, 0.0, -2.4881146199716677, -0.590290826836843, 21.230051448181193,
+            0.47766253643826434, 0.0, 0.0, -2.4881146199716677, -0.590290826836843,
+            21.230051448181193,
             15.279233632882423, -33.28821096898486, -0.020331201708508627,
         ),
         (
-            -0.9371424300859873, 0.0, 0.0, 5.186372428844064, 1.0914373489967295, -8.149787010746927,
+            -0.9371424300859873, 0.0, 0.0, 5.186372428844064, 1.0914373489967295,
+            -8.149787010746927,
             -18.52006565999696, 22.739487099350505, 2.4936055526796523, -3.0467644718982196,
         ),
         (
-            2.273310147516538, 0.0, 0.0, -10.53449546673725, -2.0008720582248625, -17.9589318631188, 27.94888452941996,
+            2.273310147516538, 0.0, 0.0, -10.53449546673725, -2.0008720582248625, -17.9589318631188,
+            27.94888452941996,
             -2.8589982771350235, -8.87285693353063, 12.360567175794303, 0.6433927460157636,
         ),
     ),
     B=(
-        0.054293734116568765, 0.0, 0.0, 0.0, 0.0, 4.450312892752409, 1.8915178993145003, -5.801203960010585,
+        0.054293734116568765, 0.0, 0.0, 0.0, 0.0, 4.450312892752409, 1.8915178993145003,
+        -5.801203960010585,
         0.3111643669578199, -0.1521609496625161, 0.20136540080403034, 0.04471061572777259,
     ),
     C=(
-        0.0, 0.05260015195876773, 0.0789002279381516, 0.1183503419072274, 0.2816496580927726, 0.3333333333333333, 0.25,
+        0.0, 0.05260015195876773, 0.0789002279381516, 0.1183503419072274, 0.2816496580927726,
+        0.3333333333333333, 0.25,
         0.3076923076923077, 0.6512820512820513, 0.6, 0.8571428571428571, 1.0,
     ),
     E=(
-        0.01312004499419488, 0.0, 0.0, 0.0, 0.0, -1.2251564463762044, -0.4957589496572502, 1.6643771824549864,
+        0.01312004499419488, 0.0, 0.0, 0.0, 0.0, -1.2251564463762044, -0.4957589496572502,
+        1.6643771824549864,
         -0.3503288487499737, 0.3341791187130175, 0.08192320648511571, -0.0223553078638863,
     ),
 )
 # fmt: on
-"""Eighth order in twelve stages (Dormand and Prince; Hairer, Norsett, Wanner, Solving Ordinary Differential Equations
-I, 2nd ed. 1993, II.5, table 5.4 and the code DOP853)."""
+"""Eighth order in twelve stages (Dormand and Prince; Hairer, Norsett, Wanner, Solving Ordinary
+Differential Equations I, 2nd ed. 1993, II.5, table 5.4 and the code DOP853)."""
 
 RK4 = Tableau(
     A=((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)),
@@ -104,7 +114,8 @@ class Variation:
 
     freedoms: int
     slope: Recordable
-    """(t, y, p, c, d, dp): the time derivative of a deviation d (freedoms,) along the direction dp (n,)."""
+    """(t, y, p, c, d, dp): the time derivative of a deviation d (freedoms,) along the direction dp
+    (n,)."""
     moved: Recordable
     """(y, d): by how much the state (states,) deviates, linear in d."""
 
@@ -122,13 +133,15 @@ class Equations:
     read: Recordable
     variation: Variation | None = None
     driven: int = 0
-    """Number of constants, the last ones, that change from one interval between readings to the next."""
+    """Number of constants, the last ones, that change from one interval between readings to the
+    next."""
     watched: bool = False
     """Whether simulations note a step that is rough, or that crosses a pole."""
 
 
 class Recording:
-    """Holds equations as expressions of the time t, states y, parameters p and constants c; `moving` change."""
+    """Holds equations as expressions of the time t, states y, parameters p and constants c;
+    `moving` change."""
 
     def __init__(self, equations: Equations) -> None:
         self.equations = equations
@@ -179,7 +192,8 @@ class Recording:
 
     @cached_property
     def side(self) -> Expression:
-        """A number that tells the signs of all that the rates divide by: where it changes, a pole has been crossed."""
+        """A number that tells the signs of all that the rates divide by: where it changes, a pole
+        has been crossed."""
         side = self.graph.constant(0.0)
         for i, divisor in enumerate(self.divisors):
             # Each divisor has a binary digit: 1 where it is negative.
@@ -188,14 +202,16 @@ class Recording:
 
     @cached_property
     def noted(self) -> list[Expression]:
-        """What is noted of the start: magnitudes of the states, the side of the poles, and no doubt."""
+        """What is noted of the start: magnitudes of the states, the side of the poles, and no
+        doubt."""
         at_start = {self.t: self.graph.constant(0.0)} | dict(zip(self.y, self.start, strict=True))
         sizes = [self.graph.apply("add", np.abs(y), 0.0) for y in self.start]
         return [*sizes, *trace.substitute([self.side], at_start), self.graph.constant(0.0)]
 
     def watch(self, formula: Tableau) -> Program:
-        """Notes whether a step crossed a pole or was rough, from its length, the states at its end, the slopes of its
-        stages, where the rates depend on t those with the states held, the sides of its stages, and what was noted."""
+        """Notes whether a step crossed a pole or was rough, from its length, the states at its end,
+        the slopes of its stages, where the rates depend on t those with the states held, the sides
+        of its stages, and what was noted."""
         g, n, stages = self.graph, self.equations.states, formula.stages
         h, ended, slopes = g.input("h"), g.inputs("ended", n), g.inputs("k", n * stages)
         held = g.inputs("held", n * stages) if self.timed else ()
@@ -222,7 +238,8 @@ class Recording:
 
     @cached_property
     def tangents(self) -> tuple[Any, Any, list[Expression], list[Expression], list[Expression]]:
-        """A deviation d, a direction dp of the parameters, and how slope, readings and start move along them."""
+        """A deviation d, a direction dp of the parameters, and how slope, readings and start move
+        along them."""
         graph, variation = self.graph, self.equations.variation
         dp = graph.inputs("dp", self.equations.parameters)
         starts = trace.tangent(self.start, dict(zip(self.p, dp, strict=True)))
@@ -235,7 +252,8 @@ class Recording:
             d = graph.inputs("d", variation.freedoms)
             if any(e.value != 0.0 for e in starts):
                 raise ValueError(
-                    "equations of small deviations need a start that does not depend on the parameters"
+                    "equations of small deviations need a start that does not depend on the"
+                    " parameters"
                 )
             dy = variation.moved(self.y, d)
             slopes = self._values(
@@ -259,12 +277,14 @@ class Recording:
         return [trace.substitute(tangents, unit) for unit in units]
 
     def fixed(self, *outputs: Expression) -> list[Expression]:
-        """Returns what is computed once for each lane: it depends on the parameters and the case alone."""
+        """Returns what is computed once for each lane: it depends on the parameters and the case
+        alone."""
         return trace.border(outputs, trace.dependent(outputs, self.moving))
 
 
 class _Linear:
-    """Holds tangents of some outputs: their program, its inputs from the state, and the sources of each direction."""
+    """Holds tangents of some outputs: their program, its inputs from the state, and the sources of
+    each direction."""
 
     def __init__(
         self,
@@ -290,7 +310,8 @@ class _Linear:
         self.inputs, self.outputs = [*d, *names, *self.saved], outputs
 
     def placed(self, at: range, fixed: Sequence[Expression]) -> Tangents:
-        """Places the program: saved, driving and constant inputs lie one after another from the start of `at`."""
+        """Places the program: saved, driving and constant inputs lie one after another from the
+        start of `at`."""
         order = {
             e: at.start + i for i, e in enumerate([*self.saved, *self.driving, *self.constant])
         }
@@ -309,7 +330,8 @@ class Tangents:
     """Holds derivatives of slopes or readings along each direction."""
 
     program: Program
-    """Program of a tangent of the state, its sources, what is saved of the state, and what is fixed."""
+    """Program of a tangent of the state, its sources, what is saved of the state, and what is
+    fixed."""
     sources: tuple[tuple[int, ...], ...]
     """The places (n, sources) of what drives each direction; of slopes, in the first stage."""
     saved: range
@@ -324,7 +346,8 @@ class StepPlan:
     constants: range
     begin: Program
     begun: tuple[int, ...]
-    """Places of the results of `begin`: state, what is fixed, and for Jacobians tangents and constant sources."""
+    """Places of the results of `begin`: state, what is fixed, and for Jacobians tangents and
+    constant sources."""
     y: range
     driven: range
     """Places of the constants that change from interval to interval, the last ones."""
@@ -344,7 +367,8 @@ class StepPlan:
     motion: Tangents
     reading: Tangents
     rates: Program
-    """What `step` computes but for the side of the poles: what a step costs is what the solution needs."""
+    """What `step` computes but for the side of the poles: what a step costs is what the solution
+    needs."""
     timed: bool
     """Whether the rates depend on t itself."""
     watch: Program
@@ -370,9 +394,10 @@ class StepPlan:
 
 
 def jumps(equations: Equations) -> bool:
-    """Tells whether the rates jump at a moment that the solution decides: it is no end of a step, and slopes would lack
-    what they owe to it. Both sides of a comparison are evaluated at points that are moved to where its operands are
-    equal; if they agree there, it is a kink and no jump. `floor`, and `mod` by it, jumps whatever it is taken of."""
+    """Tells whether the rates jump at a moment that the solution decides: it is no end of a step,
+    and slopes would lack what they owe to it. Both sides of a comparison are evaluated at points
+    that are moved to where its operands are equal; if they agree there, it is a kink and no jump.
+    `floor`, and `mod` by it, jumps whatever it is taken of."""
     tape = Recording(equations)
     graph, inputs = tape.graph, [tape.t, *tape.y, *tape.p, *tape.c]
     moving = trace.dependent(tape.slope, (tape.t, *tape.y))
@@ -414,8 +439,8 @@ def jumps(equations: Equations) -> bool:
 
 
 def planned(equations: Equations, tableau: Tableau, *, sensitive: bool) -> StepPlan:
-    """Plans how readings or their Jacobians are computed: the state once, and beside it one tangent for each parameter,
-    by the variational equations in the stages of the state's own steps."""
+    """Plans how readings or their Jacobians are computed: the state once, and beside it one tangent
+    for each parameter, by the variational equations in the stages of the state's own steps."""
     tape, size = Recording(equations), 0
 
     def room(count: int) -> range:
@@ -467,7 +492,8 @@ def planned(equations: Equations, tableau: Tableau, *, sensitive: bool) -> StepP
         y=y, driven=constants[len(constants) - equations.driven :], fixed=fixed_at,
         step=step, kept=tuple(stage[:k] for stage in stages), stage_size=len(stages[0]),
         read=read, noted=noted_at[:r], shown=shown_at, size=size,
-        tangents=lie, motion=motion.placed(stages[0], fixed), reading=reading.placed(noted_at, fixed),
+        tangents=lie, motion=motion.placed(stages[0], fixed),
+        reading=reading.placed(noted_at, fixed),
         rates=rates, timed=tape.timed, watch=tape.watch(tableau) if watched else Program.of([], []),
         reach=reach, side=side, doubt=doubt,
     )  # fmt: skip

@@ -1,12 +1,13 @@
-"""Integrates stiff equations of a batch of trials by Rodas5P, with the exact derivatives of its steps.
+"""Integrates stiff equations of a batch of trials by Rodas5P, with the exact derivatives of its
+steps.
 
-A Rosenbrock method of order 5 with 8 stages, stiffly accurate and L-stable: one Jacobian and one LU decomposition a
-step, no Newton iteration. Coefficients: Steinebach, BIT Numerical Mathematics 63:27, 2023, in the transformed form of
-Hairer and Wanner, Solving Ordinary Differential Equations II, section IV.7. Sensitivities are the derivatives of the
-discrete steps with their lengths held.
+A Rosenbrock method of order 5 with 8 stages, stiffly accurate and L-stable: one Jacobian and one LU
+decomposition a step, no Newton iteration. Coefficients: Steinebach, BIT Numerical Mathematics
+63:27, 2023, in the transformed form of Hairer and Wanner, Solving Ordinary Differential Equations
+II, section IV.7. Sensitivities are the derivatives of the discrete steps with their lengths held.
 
-A lane is one trial of one case, with its own time, step and order of pivots. Operations act on lanes one by one, and
-the error norm is a maximum, so bits do not depend on the batch.
+A lane is one trial of one case, with its own time, step and order of pivots. Operations act on
+lanes one by one, and the error norm is a maximum, so bits do not depend on the batch.
 """
 
 from __future__ import annotations
@@ -49,13 +50,16 @@ C: tuple[tuple[float, ...], ...] = (
     (-17.97296035885952, -2.859693295451294),
     (147.12150275711716, -1.41221402718213, 71.68940251302358),
     (165.43517024871676, -0.4592823456491126, 42.90938336958603, -5.961986721573306),
-    (24.854864614690072, -3.0009227002832186, 47.4931110020768, 5.5814197821558125, -0.6610691825249471),
+    (24.854864614690072, -3.0009227002832186, 47.4931110020768, 5.5814197821558125,
+     -0.6610691825249471),
     (
-        30.91273214028599, -3.1208243349937974, 77.79954646070892, 34.28646028294783, -19.097331116725623,
+        30.91273214028599, -3.1208243349937974, 77.79954646070892, 34.28646028294783,
+        -19.097331116725623,
         -28.087943162872662,
     ),
     (
-        37.80277123390563, -3.2571969029072276, 112.26918849496327, 66.9347231244047, -40.06618937091002,
+        37.80277123390563, -3.2571969029072276, 112.26918849496327, 66.9347231244047,
+        -40.06618937091002,
         -54.66780262877968, -9.48861652309627,
     ),
 )
@@ -83,8 +87,8 @@ TIME_WEIGHTS = (
     0.0,
 )
 _REACH, STABLE = 6.0, 5.0
-"""About where the stability region of DOP853 ends on the negative real axis, and a step over the fastest rate to which
-it is stable."""
+"""About where the stability region of DOP853 ends on the negative real axis, and a step over the
+fastest rate to which it is stable."""
 MOST_STEPS = 4000
 SHAPE = 1e-4
 """A relative tolerance that shows the shape of a solution."""
@@ -92,11 +96,11 @@ _SMALLEST = 1e-9
 """Absolute tolerance over the relative one, in units of the states."""
 _SAFETY, _SHRINK, _GROW = 0.9, 0.2, 6.0
 _THROUGH = 1e-5
-"""Share of the usual interval below which a step may change the sign of what the rates divide by: longer ones would
-jump over a pole."""
+"""Share of the usual interval below which a step may change the sign of what the rates divide by:
+longer ones would jump over a pole."""
 _LOOKS, _UNSEEN = 1024, 0.01
-"""Moments within the usual interval at which rates that depend on t are looked at, lest a step misses a pulse; and the
-share of a state by which a step may miss what is seen there."""
+"""Moments within the usual interval at which rates that depend on t are looked at, lest a step
+misses a pulse; and the share of a state by which a step may miss what is seen there."""
 
 
 @dataclass(frozen=True)
@@ -106,8 +110,8 @@ class Effort:
     steps: int
     """Rejected ones included, each with a decomposition."""
     explicit: float
-    """Steps that an explicit method would need for stability alone: the integral of the spectral radius of the Jacobian
-    along the solution, over what a step may cover."""
+    """Steps that an explicit method would need for stability alone: the integral of the spectral
+    radius of the Jacobian along the solution, over what a step may cover."""
     fastest: float
     """The largest spectral radius, and `met`, when that was."""
     met: float
@@ -174,7 +178,8 @@ class Rodas5P:
         return bool(Recording(self.of.equations).divisors)
 
     def measured(self, x: Array) -> tuple[Array, Effort]:
-        """Computes the readings (1, m) at x (1, n), and the effort; a tolerance that shows the shape will do."""
+        """Computes the readings (1, m) at x (1, n), and the effort; a tolerance that shows the
+        shape will do."""
         run = _Run(self, x, len(self.of.times), stretched=True)
         k = int(np.argmax(run.stretch))
         explicit, fastest, met = (float(a[k]) for a in (run.stretch, run.fastest, run.met))
@@ -183,12 +188,13 @@ class Rodas5P:
         )
 
     def simulate(self, x: Array, stop: int, most: int = MOST_STEPS) -> Array:
-        """Computes readings (trials, cases x stop x outputs) at the first `stop` times; NaN from where a trial breaks
-        down, or exceeds the limit on steps."""
+        """Computes readings (trials, cases x stop x outputs) at the first `stop` times; NaN from
+        where a trial breaks down, or exceeds the limit on steps."""
         return _Run(self, x, stop, most).readings
 
     def with_reach(self, x: Array, stop: int) -> tuple[Array, Array]:
-        """Computes the same readings, and how far each is moved by states that move by their largest magnitudes."""
+        """Computes the same readings, and how far each is moved by states that move by their
+        largest magnitudes."""
         run = _Run(self, x, stop, reaching=True)
         return run.readings, run.reach.transpose(2, 1, 0).reshape(len(x), -1)
 
@@ -270,7 +276,8 @@ class _Run:
             if not len(live):
                 return
             left = self.times[self.place[live]] - self.t[live]
-            # A step that would leave a sliver before the next reading is halved, one that overshoots is cut.
+            # A step that would leave a sliver before the next reading is halved, one that
+            # overshoots is cut.
             now = np.where(
                 h[live] >= left * (1 - 1e-9), left, np.where(2 * h[live] > left, left / 2, h[live])
             )
@@ -319,13 +326,15 @@ class _Run:
             self.place[here] += 1
 
     def _constants(self, lanes: Array, later: int = 0) -> Array:
-        """Returns the constants of the interval to the next time of each lane, or those that hold from that time on."""
+        """Returns the constants of the interval to the next time of each lane, or those that hold
+        from that time on."""
         return self.tables[
             np.minimum(self.place[lanes] + later, len(self.tables) - 1), self.case[lanes]
         ].T
 
     def _step(self, live: Array, h: Array) -> tuple[Array, Array, Array]:
-        """Computes states, sensitivities and the error in units of the tolerance after a step h of the lanes `live`."""
+        """Computes states, sensitivities and the error in units of the tolerance after a step h of
+        the lanes `live`."""
         q, lanes = self.q, len(live)
         t, y, p, c, S = (
             self.t[live],
@@ -388,8 +397,8 @@ class _Run:
         return y1, V + D[-1] if q else S, error
 
     def _unseen(self, live: Array, h: Array) -> Array:
-        """Computes the mean of the rates over a step with the states held, less what its ends and its middle say, each
-        (states, lanes)."""
+        """Computes the mean of the rates over a step with the states held, less what its ends and
+        its middle say, each (states, lanes)."""
         found = np.zeros((len(self.y), len(live)))
         # As many looks as fall into the step, in powers of two so that few sizes occur.
         wanted = np.maximum(_LOOKS * h / self.interval, 1.0)
@@ -419,7 +428,8 @@ class _Run:
 
 
 def _factor(W: Array) -> list[Array]:
-    """Factors each lane of W (n, n, lanes) into LU, in place; returns the pivot rows (lanes,) that were exchanged."""
+    """Factors each lane of W (n, n, lanes) into LU, in place; returns the pivot rows (lanes,) that
+    were exchanged."""
     lanes, exchanged = np.arange(W.shape[2]), []
     for k in range(len(W)):
         # The pivot is the largest entry on or below the diagonal; its row comes up.

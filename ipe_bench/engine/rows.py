@@ -1,4 +1,5 @@
-"""Runs recorded functions of rows of numbers, with their slopes: in machine code, or by NumPy where none can be made.
+"""Runs recorded functions of rows of numbers, with their slopes: in machine code, or by NumPy where
+none can be made.
 
 The bits of a row depend on its own numbers alone.
 """
@@ -23,8 +24,8 @@ _ARGUMENTS = (POINTER, POINTER, INTEGER, POINTER, POINTER, POINTER, INTEGER)
 
 @dataclass(frozen=True)
 class RowFunction:
-    """A function y(x, c) of rows: of x (rows, n), by which it is differentiated, and c (count, p), of which row i takes
-    number i modulo count. Both lie in memory as compiled code takes them."""
+    """A function y(x, c) of rows: of x (rows, n), by which it is differentiated, and c (count, p),
+    of which row i takes number i modulo count. Both lie in memory as compiled code takes them."""
 
     programs: RowPrograms
 
@@ -62,7 +63,8 @@ class RowFunction:
             raise ValueError(f"rows of {x.shape[1]} numbers, where {n} belong")
 
     def _by_numpy(self, x: Array, c: Array) -> list[Any]:
-        """Runs the program on columns, each in one piece of memory, where a number has the same bits in any place."""
+        """Runs the program on columns, each in one piece of memory, where a number has the same
+        bits in any place."""
         known = c[np.arange(len(x)) % len(c)]
         return self.programs.values([*np.ascontiguousarray(x.T), *np.ascontiguousarray(known.T)])
 

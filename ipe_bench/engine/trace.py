@@ -1,7 +1,8 @@
 """Records plain arithmetic as an expression graph, and differentiates it.
 
-A function that is called with an `Expression` in place of every number returns all its operations, which can be listed
-as a straight-line program (`Program`) or differentiated exactly in forward mode (`tangent`).
+A function that is called with an `Expression` in place of every number returns all its operations,
+which can be listed as a straight-line program (`Program`) or differentiated exactly in forward mode
+(`tangent`).
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ FUNCTIONS |= {
     name: lambda a, name=name: getattr(importlib.import_module("scipy.special"), name)(a)
     for name in ("erf", "erfc")
 }
-"""The elementary functions that can be recorded, of numbers, arrays and expressions; log is the natural logarithm."""
+"""The elementary functions that can be recorded, of numbers, arrays and expressions; log is the
+natural logarithm."""
 _UFUNCS = {
     "add": "add",
     "subtract": "sub",
@@ -44,7 +46,8 @@ FLAT = (*COMPARING, "floor")
 
 
 class Graph:
-    """Holds all expressions of one recording; equal expressions are the same object, so each is computed once."""
+    """Holds all expressions of one recording; equal expressions are the same object, so each is
+    computed once."""
 
     def __init__(self, most: float = math.inf) -> None:
         """Holds `most` expressions at most; ValueError beyond."""
@@ -72,7 +75,8 @@ class Graph:
         return self._known[key]
 
     def apply(self, operation: str, *operands: Any) -> Expression:
-        """Applies an operation to operands, with constants folded and trivial operations dropped."""
+        """Applies an operation to operands, with constants folded and trivial operations
+        dropped."""
         args = [a if isinstance(a, Expression) else self.constant(a) for a in operands]
         values = [a.value for a in args]
         # An operation on constants is a constant.
@@ -117,7 +121,8 @@ def _operator(name: str, *, reflected: bool = False) -> Any:
 
 @dataclass(eq=False, repr=False, slots=True)
 class Expression:
-    """Represents an unknown quantity: supports + - * / **, NumPy's elementary functions, comparisons and np.where."""
+    """Represents an unknown quantity: supports + - * / **, NumPy's elementary functions,
+    comparisons and np.where."""
 
     graph: Graph
     operation: str
@@ -144,7 +149,8 @@ class Expression:
     def __bool__(self) -> bool:
         remedy = "np.where, np.minimum and np.maximum are recorded"
         raise TypeError(
-            f"a recorded expression has no truth value: write the model without if, min and max; {remedy}"
+            "a recorded expression has no truth value: write the model without if, min and max;"
+            f" {remedy}"
         )
 
     __lt__, __gt__ = _operator("less"), _operator("less", reflected=True)
@@ -269,7 +275,8 @@ def in_order(
     stop: Collection[Expression] = (),
     needs: Callable[[Expression], Iterable[Expression]] = operands,
 ) -> list[Expression]:
-    """Lists what the outputs need, operands before their users; what `stop` is computed from is left out."""
+    """Lists what the outputs need, operands before their users; what `stop` is computed from is
+    left out."""
     # Depth first from the outputs; the order of recording puts operands before their users.
     ends = {e.order for e in stop}
     needed: dict[int, Expression] = {}
@@ -294,7 +301,8 @@ def dependent(outputs: Iterable[Expression], inputs: Iterable[Expression]) -> se
 
 
 def border(outputs: Sequence[Expression], varying: Collection[Expression]) -> list[Expression]:
-    """Selects what the varying expressions need, or the outputs are, without being varying or a number."""
+    """Selects what the varying expressions need, or the outputs are, without being varying or a
+    number."""
     # The operands of varying operations, and outputs, that do not vary themselves.
     used = [a for e in in_order(outputs) if e in varying for a in operands(e)]
     distinct = {e.order: e for e in [*used, *outputs] if e not in varying and e.value is None}
@@ -313,7 +321,8 @@ def substitute(
 
 
 def slopes(output: Expression, inputs: Iterable[Expression]) -> list[Expression]:
-    """Differentiates the output by each input; of thousands of inputs, each is followed to its own users alone."""
+    """Differentiates the output by each input; of thousands of inputs, each is followed to its own
+    users alone."""
     users: defaultdict[Expression, list[Expression]] = defaultdict(list)
     for e in in_order([output]):
         for a in operands(e):
@@ -327,8 +336,8 @@ def tangent(
     direction: Mapping[Expression, Expression],
     varying: Iterable[Expression] | None = None,
 ) -> list[Expression]:
-    """Differentiates each output along `direction`, which gives the tangent of every input that varies; `varying` is
-    what depends on these, operands before their users, where it is known."""
+    """Differentiates each output along `direction`, which gives the tangent of every input that
+    varies; `varying` is what depends on these, operands before their users, where it is known."""
     if not outputs:
         return []
     # Forward mode: along[e] is the tangent of e (Griewank and Walther, Evaluating Derivatives,
@@ -359,10 +368,12 @@ def tangent(
 def separate(
     tangents: Sequence[Expression], moving: Sequence[Expression], direction: Sequence[Expression]
 ) -> tuple[list[Expression], list[Expression]]:
-    """Returns tangents, linear in the tangents of the state (`moving`) and in a `direction` of the parameters, with
-    inputs source0, source1, ... in place of what depends on the direction alone; and what these stand for.
+    """Returns tangents, linear in the tangents of the state (`moving`) and in a `direction` of the
+    parameters, with inputs source0, source1, ... in place of what depends on the direction alone;
+    and what these stand for.
 
-    The sources are gathered before they are multiplied, so a direction along one parameter has few that are not zero.
+    The sources are gathered before they are multiplied, so a direction along one parameter has few
+    that are not zero.
     """
     # What depends on the tangents of the state, and what depends on the direction alone.
     parts: dict[int, _Parts] = {e.order: (e, None) for e in moving}
@@ -419,11 +430,13 @@ def _linear(e: Expression, own: Sequence[_Parts], joined: Callable[[_Parts], Exp
 
 @dataclass(frozen=True)
 class Program:
-    """Holds straight-line arithmetic on numbered values: first the inputs, then the result of each operation.
+    """Holds straight-line arithmetic on numbered values: first the inputs, then the result of each
+    operation.
 
-    An operation is its name and the numbers of its operands, or ("constant", value). A product that is added to
-    something and used nowhere else is part of a fused multiply-add, which rounds once: ("fma", a, b, c) is a b + c,
-    ("fms", a, b, c) is a b - c, ("fnma", a, b, c) is c - a b. So the bits do not hang on what a compiler contracts.
+    An operation is its name and the numbers of its operands, or ("constant", value). A product that
+    is added to something and used nowhere else is part of a fused multiply-add, which rounds once:
+    ("fma", a, b, c) is a b + c, ("fms", a, b, c) is a b - c, ("fnma", a, b, c) is c - a b. So the
+    bits do not hang on what a compiler contracts.
     """
 
     inputs: int
@@ -432,7 +445,8 @@ class Program:
 
     @classmethod
     def of(cls, outputs: Sequence[Expression], inputs: Sequence[Expression]) -> Program:
-        """Computes the outputs from the inputs, which may be expressions that are computed elsewhere."""
+        """Computes the outputs from the inputs, which may be expressions that are computed
+        elsewhere."""
         given = set(inputs)
         needed = [e for e in in_order(outputs, inputs) if e not in given]
         # A product that is used once, in a sum, is computed in the sum (fused multiply-add).
@@ -467,7 +481,8 @@ class Program:
         return tuple(reversed(released))
 
     def __call__(self, inputs: Sequence[Any]) -> list[Any]:
-        """Computes the outputs by NumPy, entry by entry; a formula on a million rows keeps few arrays."""
+        """Computes the outputs by NumPy, entry by entry; a formula on a million rows keeps few
+        arrays."""
         values = list(inputs)
         for (name, *numbers), released in zip(self.operations, self._released, strict=True):
             result = (
@@ -483,7 +498,8 @@ class Program:
 
 @dataclass(frozen=True)
 class RowPrograms:
-    """Holds a function y(x, c) of rows of numbers as programs: its m values, and its tangents by the n numbers x."""
+    """Holds a function y(x, c) of rows of numbers as programs: its m values, and its tangents by
+    the n numbers x."""
 
     n: int
     m: int
@@ -506,8 +522,8 @@ class RowPrograms:
 
 
 class Recorded(np.ndarray):
-    """An array of expressions, for models that are written for arrays: each function of NumPy is recorded entry by
-    entry."""
+    """An array of expressions, for models that are written for arrays: each function of NumPy is
+    recorded entry by entry."""
 
     @classmethod
     def of(cls, expressions: Sequence[Expression]) -> Recorded:
@@ -541,7 +557,8 @@ class Recorded(np.ndarray):
 def _fusion(
     e: Expression, uses: Mapping[int, int], inputs: Collection[Expression]
 ) -> tuple[str, Expression, Expression] | None:
-    """Returns the name of the fused operation that an expression can be, the product in it, and the other operand."""
+    """Returns the name of the fused operation that an expression can be, the product in it, and the
+    other operand."""
     if e.operation in ("add", "sub"):
         # a b + c, a b - c, or c - a b.
         a, b = operands(e)

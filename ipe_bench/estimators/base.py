@@ -43,7 +43,8 @@ class Estimates:
     """
 
     x: Array
-    """(trials, n), in multiples of the parameters' units; the last iterate if the status is not converged."""
+    """(trials, n), in multiples of the parameters' units; the last iterate if the status is not
+    converged."""
     status: NDArray[np.int8]
     covariance: Array | None = None
     """(trials, n, n): the covariance that the estimator itself reports."""
@@ -59,9 +60,11 @@ class Estimates:
     history: list[Array] | None = None
     """The iterates (iterations + 1, n) of each trial, if asked for."""
     extras: dict[str, Array] = field(default_factory=dict)
-    """Further numbers per trial (trials,) that this estimator reports, by name: NIS of a filter, say."""
+    """Further numbers per trial (trials,) that this estimator reports, by name: NIS of a filter,
+    say."""
     alternatives: list[Array] | None = None
-    """The other answers (count, n) that fit the readings of each trial as well, of estimators that look for them."""
+    """The other answers (count, n) that fit the readings of each trial as well, of estimators that
+    look for them."""
 
     def __post_init__(self) -> None:
         for name in ("iterations", "simulations", "jacobians", "seconds"):
@@ -70,7 +73,8 @@ class Estimates:
 
     @classmethod
     def of(cls, ended: Any, tally: EvaluationCount, **further: Any) -> Estimates:
-        """Makes the estimates of an ended iteration, with its cost; `further` are fields of the estimator's own."""
+        """Makes the estimates of an ended iteration, with its cost; `further` are fields of the
+        estimator's own."""
         counts = {"simulations": tally.simulations.copy(), "jacobians": tally.jacobians.copy()}
         found = {
             "x": ended.x,
@@ -82,7 +86,8 @@ class Estimates:
 
     @classmethod
     def join(cls, parts: Sequence[Estimates]) -> Estimates:
-        """Joins batches one after another; what trials lack that others have is NaN, and none in their lists."""
+        """Joins batches one after another; what trials lack that others have is NaN, and none in
+        their lists."""
         starts = np.cumsum([0, *(len(part.x) for part in parts)]).tolist()
         messages = {
             s + i: m
@@ -103,11 +108,12 @@ class Estimates:
 class Estimator(Component, ABC):
     """Turns readings into parameters: a frozen dataclass of its options.
 
-    Required: `estimate`. Optional: `needs`, `equation`, `family`, `look`, and `hindrance`, asked before any work.
-    Promised: a trial has the same bits alone and in any batch, its random numbers included, so products are stacked
-    `matmul` or `einsum`; a trial that fails ends with a status, or raises if it is alone, and disturbs no other; a
-    UserError is raised if no trial can be estimated, and ends the run;
-    readings that are not finite end as `Status.NONFINITE`; readings and problem are not written into.
+    Required: `estimate`. Optional: `needs`, `equation`, `family`, `look`, and `hindrance`, asked
+    before any work. Promised: a trial has the same bits alone and in any batch, its random numbers
+    included, so products are stacked `matmul` or `einsum`; a trial that fails ends with a status,
+    or raises if it is alone, and disturbs no other; a UserError is raised if no trial can be
+    estimated, and ends the run; readings that are not finite end as `Status.NONFINITE`; readings
+    and problem are not written into.
 
     >>> import ipe_bench as ib
     >>> @dataclass(frozen=True)
@@ -122,22 +128,28 @@ class Estimator(Component, ABC):
     """
 
     needs: ClassVar[frozenset[Need]] = frozenset()
-    """What a problem must have for this estimator to run: epochs, a prior, a model by differential equations."""
+    """What a problem must have for this estimator to run: epochs, a prior, a model by differential
+    equations."""
     equation: ClassVar[Equation | None] = None
-    """The estimating equation whose root is sought: with the frozen H (eq. 11), of least squares, or of the maximum
-    a posteriori; None if an estimate is no root of anything. Bounds and first-order covariances follow from it."""
+    """The estimating equation whose root is sought: with the frozen H (eq. 11), of least squares,
+    or of the maximum a posteriori; None if an estimate is no root of anything. Bounds and
+    first-order covariances follow from it."""
     family: ClassVar[Family | None] = None
-    """The kind of estimator that it is shown with; None if its needs and its equation say: those that take epochs
-    are filters, those that seek the root of the frozen H are IPE, and all others are least squares."""
+    """The kind of estimator that it is shown with; None if its needs and its equation say: those
+    that take epochs are filters, those that seek the root of the frozen H are IPE, and all others
+    are least squares."""
     look: ClassVar[tuple[str, str] | None] = None
-    """Colour and marker in every figure, in matplotlib's words such as `("#c51b7d", "s")`; None: one of the pool."""
+    """Colour and marker in every figure, in matplotlib's words such as `("#c51b7d", "s")`; None:
+    one of the pool."""
 
     @abstractmethod
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
-        """Estimates the parameters from readings z (trials, m); `history` asks for the iterates as well."""
+        """Estimates the parameters from readings z (trials, m); `history` asks for the iterates as
+        well."""
 
     def hindrance(self, problem: Problem) -> str | None:
-        """Says, in words that follow the estimator's label, why it does not suit the problem; None if it does."""
+        """Says, in words that follow the estimator's label, why it does not suit the problem; None
+        if it does."""
         has = {
             "differential equations": problem.measurement.by_differential_equations,
             "epochs": problem.measurement.epochs is not None,
@@ -159,10 +171,12 @@ class Estimator(Component, ABC):
 def estimate_safely(
     estimator: Estimator, problem: Problem, z: Array, *, history: bool = False
 ) -> Estimates:
-    """Calls `estimator.estimate`, timed; an exception becomes the status of the trials that cause it.
+    """Calls `estimator.estimate`, timed; an exception becomes the status of the trials that cause
+    it.
 
-    A batch that raises is estimated again trial by trial. Readings and problem are read-only. A UserError, which
-    concerns the estimator with all its trials, and a MemoryError, which concerns the machine, are raised.
+    A batch that raises is estimated again trial by trial. Readings and problem are read-only. A
+    UserError, which concerns the estimator with all its trials, and a MemoryError, which concerns
+    the machine, are raised.
     """
     began, z = time.perf_counter(), read_only(z)
     try:
@@ -212,8 +226,8 @@ def _make_plain(estimator: Estimator, estimates: Any, trials: int, n: int) -> No
 
 
 def plain_counts(name: str, part: str, values: Any, trials: int) -> Any:
-    """Returns statuses, iterations, evaluations or seconds (trials,) as ordinary arrays; ValueError, which begins with
-    `name`, if they cannot be such."""
+    """Returns statuses, iterations, evaluations or seconds (trials,) as ordinary arrays;
+    ValueError, which begins with `name`, if they cannot be such."""
     values = plain_numbers(f"{name} {part}", values, (trials,))
     if part == "status" and not np.isin(values, _ENDED).all():
         raise ValueError(
@@ -227,8 +241,8 @@ def plain_counts(name: str, part: str, values: Any, trials: int) -> Any:
 
 
 def one_by_one(trials: Iterable[Any], estimate: Any, n: int) -> Estimates:
-    """Joins `estimate(trial)` over trials, for libraries that take one at a time; exceptions become statuses as in
-    `estimate_safely`."""
+    """Joins `estimate(trial)` over trials, for libraries that take one at a time; exceptions become
+    statuses as in `estimate_safely`."""
     parts = []
     for trial in trials:
         began = time.perf_counter()

@@ -1,4 +1,5 @@
-"""Iterates any method on a batch of trials until each has an answer, or a failure that has a name."""
+"""Iterates any method on a batch of trials until each has an answer, or a failure that has a
+name."""
 
 from __future__ import annotations
 
@@ -17,7 +18,8 @@ from ipe_bench.measurements.counted import CountingModel
 FAR = 1e8
 """An iteration has diverged once its residual is this many times that of the start."""
 TINY_STEP = 1e-3
-"""Steps below this share of the tolerance, while the equation does not hold within it, mean a stall."""
+"""Steps below this share of the tolerance, while the equation does not hold within it, mean a
+stall."""
 
 
 class IteratedSystem(Protocol):
@@ -40,7 +42,8 @@ class IteratedSystem(Protocol):
 
 E = TypeVar("E", bound=IteratedSystem, contravariant=True)
 S = TypeVar("S", bound=Any)
-"""A state: a frozen dataclass whose fields are arrays with the trials in front, x (trials, n) among them."""
+"""A state: a frozen dataclass whose fields are arrays with the trials in front, x (trials, n) among
+them."""
 R = TypeVar("R", bound=Any)
 
 
@@ -49,9 +52,11 @@ class ConvergenceCheck:
     """Measures how far each trial has come after a step; every field is (trials,)."""
 
     size: Array
-    """Residual of the equation in standard deviations; within the tolerance, the trial has converged."""
+    """Residual of the equation in standard deviations; within the tolerance, the trial has
+    converged."""
     growth: Array
-    """A size that grows if the iteration diverges; not finite if the model or the algebra has overflowed."""
+    """A size that grows if the iteration diverges; not finite if the model or the algebra has
+    overflowed."""
     moved: Array
     """The last step, in standard deviations; infinite before the first."""
     stuck: Mask | bool = False
@@ -61,7 +66,8 @@ class ConvergenceCheck:
 
 
 class Method(ABC, Generic[E, S]):
-    """A method that the driver iterates: where it begins, one step of it, and how far it has come."""
+    """A method that the driver iterates: where it begins, one step of it, and how far it has
+    come."""
 
     @abstractmethod
     def begin(self, system: E, x: Array) -> S:
@@ -73,7 +79,8 @@ class Method(ABC, Generic[E, S]):
 
     @abstractmethod
     def check(self, system: E, before: S | None, state: S) -> ConvergenceCheck:
-        """Measures how far the trials have come; `before` is the state of a step ago, None at the start."""
+        """Measures how far the trials have come; `before` is the state of a step ago, None at the
+        start."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +116,8 @@ class SolveResult(Generic[S]):
 
 
 def iterate(equations: E, method: Method[E, S], start: Array | S, limits: Limits) -> SolveResult[S]:
-    """Iterates from `start`, which is x (trials, n) or a state, until every trial has ended; those leave the batch."""
+    """Iterates from `start`, which is x (trials, n) or a state, until every trial has ended; those
+    leave the batch."""
     state = method.begin(equations, start) if isinstance(start, np.ndarray) else start
     trials, n = state.x.shape
     tally, active = equations.model.tally, np.arange(trials)
@@ -156,7 +164,8 @@ def iterate(equations: E, method: Method[E, S], start: Array | S, limits: Limits
 
 
 def continued(first: Any, second: R) -> R:
-    """Joins the iterates of two iterations, results with `iterations` and `history`; all else is the second's."""
+    """Joins the iterates of two iterations, results with `iterations` and `history`; all else is
+    the second's."""
     history = second.history
     if history is not None:
         history = [np.concatenate([a, b[1:]]) for a, b in zip(first.history, history, strict=True)]

@@ -1,4 +1,5 @@
-"""Defines iterative parameter estimation: the nonlinear system of eq. (11), and IPE, the base of its solvers."""
+"""Defines iterative parameter estimation: the nonlinear system of eq. (11), and IPE, the base of
+its solvers."""
 
 from __future__ import annotations
 
@@ -30,13 +31,16 @@ if TYPE_CHECKING:
     from ipe_bench.measurements.problem import Problem
 
 Start = Literal["linear_lse", "nominal", "best"]
-"""The start of an iteration: the linear LSE, eq. (16), the nominal point, or the better fit of the two."""
+"""The start of an iteration: the linear LSE, eq. (16), the nominal point, or the better fit of the
+two."""
 _COARSE_BEYOND = 0.03
-"""Size of F, in standard deviations of the linear bound, above which a coarse Jacobian is as good for a step."""
+"""Size of F, in standard deviations of the linear bound, above which a coarse Jacobian is as good
+for a step."""
 
 
 class System(Protocol):
-    """Holds a square system F(x) = 0 for each trial of a batch: all that a solver sees of the problem.
+    """Holds a square system F(x) = 0 for each trial of a batch: all that a solver sees of the
+    problem.
 
     x and F are (trials, n) in multiples of the parameters' units.
     """
@@ -46,24 +50,26 @@ class System(Protocol):
         ...
 
     def J(self, x: Array, F: Array | None = None) -> Array:
-        """Computes dF/dx (trials, n, n); if F is given, for a step from there: near enough for that, and exact near a
-        root, so that an order of two is not lost."""
+        """Computes dF/dx (trials, n, n); if F is given, for a step from there: near enough for
+        that, and exact near a root, so that an order of two is not lost."""
         ...
 
     def solve(self, A: Array, b: Array) -> Array:
-        """Computes A^-1 b for each trial: A (trials, n, n), b (trials, n) or (trials, n, k). A singular A ends its
-        trial."""
+        """Computes A^-1 b for each trial: A (trials, n, n), b (trials, n) or (trials, n, k). A
+        singular A ends its trial."""
         ...
 
     def subset(self, kept: Mask) -> System:
-        """Restricts the system to some of its trials: a line search goes on with the rows that need it."""
+        """Restricts the system to some of its trials: a line search goes on with the rows that need
+        it."""
         ...
 
 
 @dataclass(frozen=True)
 class State:
-    """Holds the state of a solver between steps. Every field is an array with the trials axis in front, so that the
-    driver can drop the trials that have finished; a solver with a memory adds fields in a subclass."""
+    """Holds the state of a solver between steps. Every field is an array with the trials axis in
+    front, so that the driver can drop the trials that have finished; a solver with a memory adds
+    fields in a subclass."""
 
     x: Array
     F: Array
@@ -78,7 +84,8 @@ class FrozenSystem:
 
     .. math:: F(x) = x - x_0 - H^+ \left( z - h(x_0) - N(x) \right) = H^+ \left( h(x) - z \right)
 
-    H+ is frozen: one (1, n, m) for all trials, or one per trial (trials, n, m) where it was re-linearised.
+    H+ is frozen: one (1, n, m) for all trials, or one per trial (trials, n, m) where it was
+    re-linearised.
     """
 
     model: CountingModel
@@ -98,9 +105,10 @@ class FrozenSystem:
         """
         if problem.rankless:
             raise np.linalg.LinAlgError(
-                f"measurement={problem.measurement.name}: H has not full column rank at the nominal point: some "
-                "parameters cannot be distinguished there, so there is no linear estimate to start from; give another "
-                "nominal point, start=nominal or best for least squares, or an estimator with a prior"
+                f"measurement={problem.measurement.name}: H has not full column rank at the"
+                " nominal point: some parameters cannot be distinguished there, so there is no"
+                " linear estimate to start from; give another nominal point, start=nominal or best"
+                " for least squares, or an estimator with a prior"
             )
         model, H_plus = (
             CountingModel(problem.measurement, EvaluationCount.zeros(len(z))),
@@ -131,7 +139,8 @@ class FrozenSystem:
         return dataclasses.replace(self, z=self.z[kept], rows=self.rows[kept], **slopes)
 
     def relinearized(self, x: Array) -> FrozenSystem:
-        """Returns the system with H+ of dh/dx at x (trials, n), for each trial its own; a deficient one is singular."""
+        """Returns the system with H+ of dh/dx at x (trials, n), for each trial its own; a deficient
+        one is singular."""
         J = self.model.jacobian(x, self.rows)
         H_plus, deficient = pseudo_inverse(J, self.R)
         self.model.tally.singular[self.rows[deficient & finite(J)]] = True
@@ -144,7 +153,8 @@ class FrozenSystem:
         return frozen_covariance(self.H_plus, self.R)
 
     def sandwich(self, x: Array) -> Array:
-        """Computes (H+ J)^-1 H+ R H+' (H+ J)^-T at x: the first-order covariance (trials, n, n) of eq. (11)'s root."""
+        """Computes (H+ J)^-1 H+ R H+' (H+ J)^-T at x: the first-order covariance (trials, n, n) of
+        eq. (11)'s root."""
         inverse_slope = np.full((len(x), x.shape[1], x.shape[1]), np.nan)
         if (usable := finite(x)).any():
             part = self.subset(usable)
@@ -154,18 +164,23 @@ class FrozenSystem:
 
 
 def frozen_covariance(H_plus: Array, R: Covariance) -> Array:
-    r"""Computes the covariance (trials, n, n) of the linear estimate, eq. (5) for any R, from H+ (trials, n, m).
+    r"""Computes the covariance (trials, n, n) of the linear estimate, eq. (5) for any R, from H+
+    (trials, n, m).
 
-    .. math:: H^+ R H^{+T} = (H^T R^{-1} H)^{-1}, \quad \sigma^2 (H^T H)^{-1} \text{ if } R = \sigma^2 I
+    .. math::
+        H^+ R H^{+T} = (H^T R^{-1} H)^{-1},
+        \quad \sigma^2 (H^T H)^{-1} \text{ if } R = \sigma^2 I
     """
     scaled = H_plus * R.factor if R.factor.ndim == 1 else np.matmul(H_plus, R.factor)
     return np.matmul(scaled, scaled.swapaxes(1, 2))
 
 
 def begin(problem: Problem, z: Array, start: Start) -> tuple[Array, FrozenSystem]:
-    """Returns the start x (trials, n) of an iteration, and the paper's system, which has counted the cost of it.
+    """Returns the start x (trials, n) of an iteration, and the paper's system, which has counted
+    the cost of it.
 
-    F(x0) = H+ (h(x0) - z), so the linear LSE of eq. (2) is one fixed-point step from the nominal point: eq. (16).
+    F(x0) = H+ (h(x0) - z), so the linear LSE of eq. (2) is one fixed-point step from the nominal
+    point: eq. (16).
     """
     system = FrozenSystem.at_nominal(problem, z)
     x0 = np.repeat(problem.x0[None], len(z), axis=0)
@@ -181,8 +196,8 @@ def begin(problem: Problem, z: Array, start: Start) -> tuple[Array, FrozenSystem
 
 
 def starting_points(problem: Problem, z: Array, start: Start, tally: EvaluationCount) -> Array:
-    """Returns the starts (trials, n) of least squares, at the nominal point if H has not full column rank, and adds
-    their cost to the tally."""
+    """Returns the starts (trials, n) of least squares, at the nominal point if H has not full
+    column rank, and adds their cost to the tally."""
     if start == "nominal" or problem.rankless:
         return np.repeat(problem.x0[None], len(z), axis=0)
     x, system = begin(problem, z, start)
@@ -193,11 +208,13 @@ def starting_points(problem: Problem, z: Array, start: Start, tally: EvaluationC
 
 @dataclass(frozen=True, kw_only=True)
 class IPE(Method[FrozenSystem, S], Estimator, Generic[S]):
-    r"""Solves eq. (11), H frozen at the nominal point, by an iteration that a subclass writes: the paper's estimator.
+    r"""Solves eq. (11), H frozen at the nominal point, by an iteration that a subclass writes: the
+    paper's estimator.
 
-    Required: `step`. Optional: `init`, of a solver with a memory, which names its state: `IPE[BroydenState]`.
-    Promised, beside what an `Estimator` promises: the fields of a state have the trials in front, x and F among them;
-    the driver does the loop, the tests of convergence and divergence, and the counting. The reported covariance is
+    Required: `step`. Optional: `init`, of a solver with a memory, which names its state:
+    `IPE[BroydenState]`. Promised, beside what an `Estimator` promises: the fields of a state have
+    the trials in front, x and F among them; the driver does the loop, the tests of convergence and
+    divergence, and the counting. The reported covariance is
 
     .. math:: (H^+ J)^{-1} H^+ R H^{+T} (H^+ J)^{-T}
 
@@ -215,8 +232,8 @@ class IPE(Method[FrozenSystem, S], Estimator, Generic[S]):
     """
 
     start: Start = "linear_lse"
-    """Start of the iteration: the linear LSE, eq. (16), the nominal point, or the one of the two where the readings fit
-    better (`best`)."""
+    """Start of the iteration: the linear LSE, eq. (16), the nominal point, or the one of the two
+    where the readings fit better (`best`)."""
     max_iterations: Count = 100
     """Steps at most, then the trial ends as `max_iterations`."""
     tolerance: Positive = 1e-6

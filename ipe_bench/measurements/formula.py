@@ -102,7 +102,8 @@ class WrittenModel(Measurement):
             raise UserError(
                 f"measurement: {name} is neither a column nor a parameter; give a parameter its"
                 f" start, measurement.start.{name}=VALUE, or the column,"
-                f" measurement.columns.{name}=[...]; `ipe-bench estimate` takes it from readings=FILE"
+                f" measurement.columns.{name}=[...]; `ipe-bench estimate` takes it from"
+                " readings=FILE"
             )
         column = self.columns[name]
         try:

@@ -295,7 +295,8 @@ class RicherGins(Gins):
     Example, in which a tilt of the platform stays undetected:
 
     >>> import ipe_bench as ib
-    >>> plain, tilted = ib.measurements.Gins(), ib.measurements.RicherGins(platform_misalignment=5.0)
+    >>> plain = ib.measurements.Gins()
+    >>> tilted = ib.measurements.RicherGins(platform_misalignment=5.0)
     >>> bench = ib.Scenario(plain, truth=tilted)
     >>> row = ib.run(bench, {"gn": ib.baselines.GaussNewton()}, trials=5).iloc[-1]
     >>> print(row["error_median"] > 10, row["misfit"])

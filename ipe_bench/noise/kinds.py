@@ -141,9 +141,9 @@ class Outliers(ScaledNoise):
     """Draws from Tukey's contaminated normal: with probability `share` a reading is `factor` times
     as noisy.
 
-    `deviation` is the standard deviation of a good reading. `assumed` is what estimators assume: `nominal`, the
-    variance of the good readings, as if there were no outliers; or `total`, that of the mixture,
-    deviation^2 (1 - share + share factor^2).
+    `deviation` is the standard deviation of a good reading. `assumed` is what estimators assume:
+    `nominal`, the variance of the good readings, as if there were no outliers; or `total`, that of
+    the mixture, deviation^2 (1 - share + share factor^2).
 
     Example, in which an R that knows of the outliers makes the covariance wide enough:
 

@@ -1,5 +1,5 @@
-"""Constructs components from config, and describes their options: `_target_` names the class, the other keys are its
-fields. Only classes of registered packages are constructed."""
+"""Constructs components from config, and describes their options: `_target_` names the class, the
+other keys are its fields. Only classes of registered packages are constructed."""
 
 from __future__ import annotations
 
@@ -85,7 +85,8 @@ def known_parameters(parameters: Mapping[str, Any]) -> tuple[ParameterInfo, ...]
 
 
 def instantiate(cls: type, options: Mapping[str, Any], where: str) -> Any:
-    """Constructs a dataclass with these options; the key `where` stands before their names in messages if not empty."""
+    """Constructs a dataclass with these options; the key `where` stands before their names in
+    messages if not empty."""
     prefix = f"{where}." if where else ""
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}
     for name in options:

@@ -1,7 +1,8 @@
 """Finds plugins: installed distributions, and the folders `plugins/*/` of the working folder.
 
-A plugin is a Python package with a `conf` folder inside that mirrors the groups of ours. Installed plugins state the
-package in the entry-point group `ipe_bench.plugins`; a plugin in a folder needs nothing but to be there.
+A plugin is a Python package with a `conf` folder inside that mirrors the groups of ours. Installed
+plugins state the package in the entry-point group `ipe_bench.plugins`; a plugin in a folder needs
+nothing but to be there.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ from ipe_bench.basics.files import own_conf, regular
 ENTRY_POINTS = "ipe_bench.plugins"
 ESTIMATOR_GROUPS = ("solver", "baseline")
 PACKAGES = {**dict.fromkeys(ESTIMATOR_GROUPS, "estimators"), "tracker": "trackers"}
-"""Groups of which several options are chosen, each under a label of its own, by the key that holds them."""
+"""Groups of which several options are chosen, each under a label of its own, by the key that holds
+them."""
 COMPONENT_GROUPS = (
     "measurement",
     "noise",
@@ -61,15 +63,16 @@ CONTRACTS = {
     "table": ("ipe_bench.report.tables.Table",),
     "section": ("ipe_bench.report.sections.Section",),
 }
-"""The classes by which a plugin of each kind is written: their docstrings say what is required, optional, promised."""
+"""The classes by which a plugin of each kind is written: their docstrings say what is required,
+optional, promised."""
 _TARGET_LINE = re.compile(r"^_target_:\s*['\"]?([\w.]+)", re.MULTILINE)
 _PACKAGE_HEADER = re.compile(r"^#\s*@package\s+(\S+)", re.MULTILINE)
 _COMMENT_BEHIND = re.compile(r"^(\w+):.*? # *(.+)$", re.MULTILINE)
 
 
 class _Loader(yaml.SafeLoader):
-    """Reads 1e-6 as a number, as Hydra does; YAML 1.1 wants 1.0e-6. Of a key that stands twice one value would be lost,
-    and an alias hides what a short file stands for: both are refused."""
+    """Reads 1e-6 as a number, as Hydra does; YAML 1.1 wants 1.0e-6. Of a key that stands twice one
+    value would be lost, and an alias hides what a short file stands for: both are refused."""
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.AliasEvent):
@@ -196,13 +199,17 @@ class Option:
 
     @functools.cached_property
     def fault(self) -> str | None:
-        """Why it cannot be used, in a line with the remedy; None where it can, as far as the file tells."""
+        """Why it cannot be used, in a line with the remedy; None where it can, as far as the file
+        tells."""
         if self.rival is not None:
             return f"{self.rival} and {self.path} offer it both; rename one of the two files"
         if "\ufffd" in self.text:
             return f"{self.path}: is not UTF-8; save it as UTF-8"
         if (key := PACKAGES.get(self.group)) is not None and self.package != f"{key}.{self.label}":
-            return f"{self.path}: its first line must be '# @package {key}.{self.label}', or it never runs"
+            return (
+                f"{self.path}: its first line must be '# @package {key}.{self.label}', or it never"
+                " runs"
+            )
         try:
             return (
                 None
@@ -221,7 +228,8 @@ _problems: dict[str, None] = {}
 
 
 def take_problems() -> list[str]:
-    """Returns what cannot be used of the plugins that were found, each in a line and once; the rest is used."""
+    """Returns what cannot be used of the plugins that were found, each in a line and once; the rest
+    is used."""
     sources()
     taken = list(_problems)
     _problems.clear()
@@ -230,9 +238,11 @@ def take_problems() -> list[str]:
 
 @functools.cache
 def sources() -> tuple[Source, ...]:
-    """Returns our source, then the installed plugins, then the folders `plugins/*/`; their packages become importable.
+    """Returns our source, then the installed plugins, then the folders `plugins/*/`; their packages
+    become importable.
 
-    A plugin that is installed and lies in a folder as well is the folder's: its author edits what runs.
+    A plugin that is installed and lies in a folder as well is the folder's: its author edits what
+    runs.
     """
     found: dict[str, Source] = {}
     folders = sorted(Path("plugins").resolve().iterdir()) if Path("plugins").is_dir() else []
@@ -253,7 +263,8 @@ def sources() -> tuple[Source, ...]:
 
 
 def _take(found: dict[str, Source], source: Source) -> bool:
-    """Tells whether a source is added; a present one of its name is kept, and this one named as a problem."""
+    """Tells whether a source is added; a present one of its name is kept, and this one named as a
+    problem."""
     known = found.setdefault(source.name, source)
     if known.conf.resolve() != source.conf.resolve():
         home, other = source.conf.parent, known.conf.parent
@@ -262,14 +273,15 @@ def _take(found: dict[str, Source], source: Source) -> bool:
 
 
 def _imported_elsewhere(source: Source) -> bool:
-    """Tells whether this process has imported the package from another place, which is what runs then."""
+    """Tells whether this process has imported the package from another place, which is what runs
+    then."""
     file = getattr(sys.modules.get(source.name), "__file__", None)
     return file is not None and Path(file).resolve().parent != source.conf.parent.resolve()
 
 
 def _make_importable(source: Source, before: Source | None = None) -> None:
-    """Puts a plugin's folder on the import path of this process and of the workers that it starts, at its end or before
-    the place of another source."""
+    """Puts a plugin's folder on the import path of this process and of the workers that it starts,
+    at its end or before the place of another source."""
     path, other = (None if one is None else str(one.conf.parents[1]) for one in (source, before))
 
     def placed(paths: list[str]) -> list[str]:
@@ -346,7 +358,8 @@ def options(group: str | None = None) -> list[Option]:
 
 
 def kinds_to_copy() -> dict[str, Path]:
-    """The kinds of plugins that plugins add to `ipe-bench new`, with the folder that holds KIND and KIND-LANGUAGE."""
+    """The kinds of plugins that plugins add to `ipe-bench new`, with the folder that holds KIND and
+    KIND-LANGUAGE."""
     return {
         path.name: path.parent
         for source in sources()[1:]
@@ -356,8 +369,9 @@ def kinds_to_copy() -> dict[str, Path]:
 
 
 def composed(option: Option) -> dict[str, Any]:
-    """Composes an option with the options of its group that its `defaults` name, as Hydra does: later ones replace what
-    earlier ones say, and the file itself comes last unless `_self_` stands elsewhere."""
+    """Composes an option with the options of its group that its `defaults` name, as Hydra does:
+    later ones replace what earlier ones say, and the file itself comes last unless `_self_` stands
+    elsewhere."""
     config = dict(option.config or {})
     entries = [str(entry) for entry in config.pop("defaults", [])]
     known = {o.name: o for o in options(option.group)} if entries else {}
@@ -381,7 +395,8 @@ def merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any
 
 
 def options_in(folder: Path) -> list[Option]:
-    """Lists the options of a plugin's folder that can be checked, with those that they clash with."""
+    """Lists the options of a plugin's folder that can be checked, with those that they clash
+    with."""
     if not folder.is_dir():
         beside = Path("plugins") / folder.name.rpartition("=")[2]
         meant = beside if beside.is_dir() else "a plugin's folder, such as plugins/my_plugin"
@@ -418,11 +433,15 @@ def groups() -> list[str]:
 
 
 def blame(error: BaseException) -> str | None:
-    """Finds the plugin whose code raised this, with file, line and message; None where no plugin's code was running."""
+    """Finds the plugin whose code raised this, with file, line and message; None where no plugin's
+    code was running."""
     homes = {str(source.conf.parent) + os.sep: source.origin for source in sources()[1:]}
     found = None
     for frame in traceback.extract_tb(error.__traceback__):
         for home, origin in homes.items():
             if frame.filename.startswith(home):
-                found = f"plugin {origin}: {frame.filename}, line {frame.lineno}: {describe_exception(error)}"
+                found = (
+                    f"plugin {origin}: {frame.filename}, line {frame.lineno}:"
+                    f" {describe_exception(error)}"
+                )
     return found

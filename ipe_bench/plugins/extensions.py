@@ -1,6 +1,8 @@
-"""Collects what plugins add: richer models of an instrument, and statistics, figures, tables and sections of a report.
+"""Collects what plugins add: richer models of an instrument, and statistics, figures, tables and
+sections of a report.
 
-Each of those is a record: `conf/figure/NAME.yaml` has one key, `_target_`, its dotted name in the plugin's package.
+Each of those is a record: `conf/figure/NAME.yaml` has one key, `_target_`, its dotted name in the
+plugin's package.
 """
 
 from __future__ import annotations
@@ -19,8 +21,9 @@ from ipe_bench.trials.scenario import Scenario
 
 
 def richer_models(scenario: Scenario) -> list[Measurement]:
-    """Returns the richer models of a scenario: the truth that simulates its readings, or every option of `measurement`
-    that is the same model with more errors, with the model's own options."""
+    """Returns the richer models of a scenario: the truth that simulates its readings, or every
+    option of `measurement` that is the same model with more errors, with the model's own
+    options."""
     model, truth = scenario.measurement, scenario.truth
     if truth is not None:
         if not truth.nuisance_deviation.any():
@@ -68,8 +71,8 @@ def find_record(option: Option) -> Any:
 
 
 def added(group: str, problems: list[str], make: Callable[[Any], Any]) -> Iterator[tuple[str, Any]]:
-    """Yields what `make` makes of each record of a group, with its name; a line is added to the problems for every one
-    that cannot be found or raises."""
+    """Yields what `make` makes of each record of a group, with its name; a line is added to the
+    problems for every one that cannot be found or raises."""
     for option in options(group):
         name = f"{group}={option.name}: "
         try:
@@ -90,7 +93,8 @@ def require_type(thing: Any, kind: type, says: str = "gives") -> Any:
 
 
 def use_statistics() -> list[str]:
-    """Registers the statistics of all plugins beside ours; returns a line for each that cannot be."""
+    """Registers the statistics of all plugins beside ours; returns a line for each that cannot
+    be."""
     from ipe_bench.statistics.registry import add_statistics
     from ipe_bench.statistics.statistic import Statistic
 

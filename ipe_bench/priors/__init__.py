@@ -1,4 +1,5 @@
-"""Priors: where true parameters are drawn from, and what estimators assume of that. Config group `prior`."""
+"""Priors: where true parameters are drawn from, and what estimators assume of that. Config group
+`prior`."""
 
 from __future__ import annotations
 
@@ -15,7 +16,8 @@ from ipe_bench.basics.options import Component, Finite, NonNegative
 __all__ = ["GaussianPrior", "Prior"]
 
 _SYMMETRIC = 1e-6
-"""Entries that should be equal may differ by this share of the deviations: files are printed with few digits."""
+"""Entries that should be equal may differ by this share of the deviations: files are printed with
+few digits."""
 _DEFINITE = 1e-12
 """The least eigenvalue of a correlation: below it P0 has no inverse to working precision."""
 
@@ -23,10 +25,11 @@ _DEFINITE = 1e-12
 class Prior(Component, ABC):
     """Draws true parameters about the nominal point: a frozen dataclass of its options.
 
-    Required: `deviation` and `draw`. Optional: `correlation`, and `normal`. Promised: draws have the nominal point as
-    mean, and the covariance P0 of these deviations and correlations; they come from `rng` alone. Estimators that use a
-    prior are given N(nominal, P0), and the Bayesian bound is the one under that; if draws are not normal, it is one for
-    estimators that know no more than mean and covariance.
+    Required: `deviation` and `draw`. Optional: `correlation`, and `normal`. Promised: draws have
+    the nominal point as mean, and the covariance P0 of these deviations and correlations; they come
+    from `rng` alone. Estimators that use a prior are given N(nominal, P0), and the Bayesian bound
+    is the one under that; if draws are not normal, it is one for estimators that know no more than
+    mean and covariance.
 
     >>> import ipe_bench as ib
     >>> @dataclass(frozen=True)
@@ -36,7 +39,8 @@ class Prior(Component, ABC):
     ...         return np.full(n, error_scale)
     ...     def draw(self, x0, error_scale, rng):
     ...         return x0 + np.sqrt(3) * error_scale * rng.uniform(-1, 1, len(x0))
-    >>> scenario = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), Uniform(), error_scale=2.0)
+    >>> noise = ib.noise.Gaussian(0.01)
+    >>> scenario = ib.Scenario(ib.measurements.Polynomial(), noise, Uniform(), error_scale=2.0)
     >>> print(np.abs(scenario.draw(0, 1000).x).max() < 2 * np.sqrt(3))
     True
     """
@@ -49,24 +53,27 @@ class Prior(Component, ABC):
         """Returns the standard deviations (n,) of the parameters in multiples of their units."""
 
     def correlation(self, n: int) -> Array | None:
-        """Returns the correlation (n, n) of the parameters, positive definite; None: they are independent."""
+        """Returns the correlation (n, n) of the parameters, positive definite; None: they are
+        independent."""
         del n
 
     @abstractmethod
     def draw(self, x0: Array, error_scale: float, rng: np.random.Generator) -> Array:
-        """Returns one parameter vector (n,) about the nominal point x0 (n,), in multiples of the units."""
+        """Returns one parameter vector (n,) about the nominal point x0 (n,), in multiples of the
+        units."""
 
 
 @dataclass(frozen=True)
 class GaussianPrior(Prior):
-    """Draws from N(x0, P0), of deviations error_scale x unit and independent parameters; `deviations` widens or narrows
-    some of them, and `correlations` makes them depend on each other.
+    """Draws from N(x0, P0), of deviations error_scale x unit and independent parameters;
+    `deviations` widens or narrows some of them, and `correlations` makes them depend on each other.
 
     Example, in which the last of four parameters is known ten times better:
 
     >>> import ipe_bench as ib
     >>> prior = ib.priors.GaussianPrior(deviations=(1, 1, 1, 0.1))
-    >>> bench = ib.Scenario(ib.measurements.Ranging(), ib.noise.Gaussian(0.1), prior, error_scale=10.0)
+    >>> noise = ib.noise.Gaussian(0.1)
+    >>> bench = ib.Scenario(ib.measurements.Ranging(), noise, prior, error_scale=10.0)
     >>> print(bench.draw(0, 2000).x.std(axis=0).round(0))
     [10. 10. 10.  1.]
     """
@@ -85,30 +92,33 @@ class GaussianPrior(Prior):
         for i, row in enumerate(rows, start=1):
             if len(row) != len(rows):
                 raise UserError(
-                    f"correlations: row {i} has {len(row)} numbers; give a square matrix, {len(rows)} in each row"
+                    f"correlations: row {i} has {len(row)} numbers; give a square matrix,"
+                    f" {len(rows)} in each row"
                 )
         if self.correlations is not None:
             C = np.array(self.correlations)
             if not np.allclose(np.diag(C), 1.0, atol=_SYMMETRIC):
                 raise UserError(
-                    "correlations: has a diagonal that is not 1; give correlations, deviations aside"
+                    "correlations: has a diagonal that is not 1; give correlations, deviations"
+                    " aside"
                 )
             if (np.abs(C - C.T) > _SYMMETRIC).any():
                 i, j = np.unravel_index(np.abs(C - C.T).argmax(), C.shape)
                 raise UserError(
-                    f"correlations: is not symmetric; row {i + 1}, column {j + 1} is {C[i, j]:g}, and row {j + 1}, "
-                    f"column {i + 1} is {C[j, i]:g}"
+                    f"correlations: is not symmetric; row {i + 1}, column {j + 1} is {C[i, j]:g},"
+                    f" and row {j + 1}, column {i + 1} is {C[j, i]:g}"
                 )
             if (least := float(np.linalg.eigvalsh((C + C.T) / 2)[0])) <= _DEFINITE:
                 raise UserError(
-                    f"correlations: is not positive definite; the least eigenvalue is {least:.2g}, so that some "
-                    "combination of the parameters would have no variance"
+                    f"correlations: is not positive definite; the least eigenvalue is {least:.2g},"
+                    " so that some combination of the parameters would have no variance"
                 )
 
     def deviation(self, n: int, error_scale: float) -> Array:
         if self.deviations is not None and len(self.deviations) != n:
             raise UserError(
-                f"prior.deviations: has {len(self.deviations)} numbers; give one for each of {n} parameters"
+                f"prior.deviations: has {len(self.deviations)} numbers; give one for each of {n}"
+                " parameters"
             )
         return error_scale * (
             np.ones(n) if self.deviations is None else np.asarray(self.deviations, dtype=float)
@@ -119,7 +129,8 @@ class GaussianPrior(Prior):
             return None
         if len(self.correlations) != n:
             raise UserError(
-                f"prior.correlations: has {len(self.correlations)} rows; give one for each of {n} parameters"
+                f"prior.correlations: has {len(self.correlations)} rows; give one for each of {n}"
+                " parameters"
             )
         C = np.array(self.correlations, dtype=float)
         return (C + C.T) / 2

@@ -1,2 +1,2 @@
-"""Answers questions about a scenario, stored results or a table: one folder each, with its mathematics, answer,
-figure and command."""
+"""Answers questions about a scenario, stored results or a table: one folder each, with its
+mathematics, answer, figure and command."""

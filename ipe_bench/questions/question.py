@@ -1,4 +1,5 @@
-"""Defines what the command line needs to know of a question: its help, its options, and what answers it.
+"""Defines what the command line needs to know of a question: its help, its options, and what
+answers it.
 
 A `command.py` imports what answers only when it is asked, so that help is quick.
 """
@@ -30,7 +31,8 @@ class Asked:
     trials: int | None
     """Number of trials; None unless it was given."""
     folder: Callable[[str, Any, Sequence[str]], Path]
-    """Reserves the folder of an answer, by the name of its page, what identifies the command, and its further files."""
+    """Reserves the folder of an answer, by the name of its page, what identifies the command, and
+    its further files."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,7 @@ class Question:
     argument: tuple[str, str]
     """Placeholder of its arguments, and their meaning."""
     run: Callable[..., Answered]
-    """Answers, given the scenario that was `Asked` or the folders and files, and the options by name."""
+    """Answers, given the scenario that was `Asked` or the folders and files, and the options by
+    name."""
     options: Callable[[], Mapping[str, Any]]
     """Returns the types of its own options KEY=VALUE."""

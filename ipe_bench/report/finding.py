@@ -1,7 +1,8 @@
 """States what a comparison found in one sentence, the title wherever its results are shown.
 
-Holding is judged here alone: an estimator holds where at least `HELD` of its trials succeed with 95 % confidence, fails
-where fewer do, and is undecided otherwise. Rows are those of a summary over all parameters.
+Holding is judged here alone: an estimator holds where at least `HELD` of its trials succeed with 95
+% confidence, fails where fewer do, and is undecided otherwise. Rows are those of a summary over all
+parameters.
 """
 
 from __future__ import annotations
@@ -37,13 +38,15 @@ Place = tuple[str, float]
 
 @dataclass(frozen=True)
 class Standing:
-    """Holds how an estimator stands in every column; a column that it lacks is None, and undecided."""
+    """Holds how an estimator stands in every column; a column that it lacks is None, and
+    undecided."""
 
     label: str
     rows: tuple[Row | None, ...]
     judged: tuple[str, ...]
     ascending: bool
-    """Whether the columns are ascending error scales, of which it holds up to one, rather than settings."""
+    """Whether the columns are ascending error scales, of which it holds up to one, rather than
+    settings."""
 
     @property
     def family(self) -> str:
@@ -90,7 +93,8 @@ class Finding:
 
     @classmethod
     def of(cls, rows: Iterable[Row]) -> Finding:
-        """Judges the rows of a summary over all parameters; a `setting` tells those of several apart."""
+        """Judges the rows of a summary over all parameters; a `setting` tells those of several
+        apart."""
         table: dict[tuple[str, Place], Row] = {}
         for row in rows:
             label = str(row["estimator"])
@@ -115,8 +119,8 @@ class Finding:
         return self.standings[0].ascending
 
     def sentence(self) -> str:
-        """States who holds, who is undecided, whose covariance is too small, and at which scales the best filter or IPE
-        fails."""
+        """States who holds, who is undecided, whose covariance is too small, and at which scales
+        the best filter or IPE fails."""
         most = max(one.sure for one in self.standings)
         if not most:
             return self._nobody()
@@ -172,7 +176,8 @@ class Finding:
         return value_text(self.places[at][1])
 
     def _numbers(self, winners: Sequence[Standing]) -> str:
-        """States what share of how many trials succeeds: at the last scale, or over the settings where they hold."""
+        """States what share of how many trials succeeds: at the last scale, or over the settings
+        where they hold."""
         last = [one.rows[one.sure - 1] for one in winners]
         held = [
             row
@@ -197,7 +202,8 @@ class Finding:
             yield f"{of} is too small {phrase}".rstrip()
 
     def _extent(self, columns: Sequence[int], number: int) -> str:
-        """States in which of the first columns something is so, for certain of those that are named."""
+        """States in which of the first columns something is so, for certain of those that are
+        named."""
         first = columns[0]
         if not self.ascending:
             return f"in {len(columns)} {self._columns[: -1 if len(columns) == 1 else None]}"
@@ -207,7 +213,8 @@ class Finding:
         return f"{'from' if goes_on else 'at'} {self._scale(first)}{' on' if goes_on else ''}"
 
     def _parted(self, most: int) -> Iterator[str]:
-        """States where the best filters or the best IPE fail, unless both may be among those that hold longest."""
+        """States where the best filters or the best IPE fail, unless both may be among those that
+        hold longest."""
         phrases: dict[str, list[Standing]] = {}
         families = {one.family for one in self.standings}
         for side in _SIDES if families.issuperset(_SIDES) else ():
@@ -221,7 +228,8 @@ class Finding:
             yield f"{named(who, self.standings)} {verb} {phrase}".rstrip()
 
     def _failing(self, one: Standing) -> str:
-        """States where an estimator fails, and from where on its covariance is too small, if that is before."""
+        """States where an estimator fails, and from where on its covariance is too small, if that
+        is before."""
         number = len(self.places)
         lost = [at for at, word in enumerate(one.judged) if word == FAILS]
         wrong = one.overconfident(number)
@@ -231,7 +239,8 @@ class Finding:
         return f"{failing}, with too small a covariance {self._extent(wrong, number)}"
 
     def _nobody(self) -> str:
-        """States that nowhere an estimator significantly holds, and who did succeed longest or in most settings."""
+        """States that nowhere an estimator significantly holds, and who did succeed longest or in
+        most settings."""
         most = max(one.seen for one in self.standings)
         at = max(most - 1, 0)
         ahead = [one for one in self.standings if one.seen == most]
@@ -250,7 +259,8 @@ class Finding:
 
 
 def judged(row: Row | None, columns: int) -> str:
-    """Judges whether an estimator holds by its exact 95 % interval; failing shares that level among the columns."""
+    """Judges whether an estimator holds by its exact 95 % interval; failing shares that level among
+    the columns."""
     if row is None:
         return UNDECIDED
     if row["success_low"] >= HELD:

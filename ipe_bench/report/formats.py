@@ -1,4 +1,5 @@
-"""Names the formats of figures and tables, once for those who write them, for help, and for refusals."""
+"""Names the formats of figures and tables, once for those who write them, for help, and for
+refusals."""
 
 PAGE = "png"
 """The format of figures that is always written, as the page shows it."""

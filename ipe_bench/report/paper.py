@@ -1,4 +1,5 @@
-"""Exports tables and figures for a paper: chosen columns, and figures in the width of one or two columns of print."""
+"""Exports tables and figures for a paper: chosen columns, and figures in the width of one or two
+columns of print."""
 
 from __future__ import annotations
 
@@ -21,8 +22,8 @@ def export(
     columns: Sequence[str] = (),
     width: float = COLUMN,
 ) -> list[Path]:
-    """Writes the tables and figures of these names into the folder, and returns the files: NAME.tex, or NAME.pdf and
-    NAME.png, and the figures' captions.
+    """Writes the tables and figures of these names into the folder, and returns the files:
+    NAME.tex, or NAME.pdf and NAME.png, and the figures' captions.
 
     Raises:
         UserError: there is no such table, figure or column, or the width is none of paper.
@@ -46,8 +47,8 @@ def export(
 
 
 def _with_columns(table: Table, names: Sequence[str]) -> Table:
-    """Returns the table with these columns, in this order, or all; a column's name is its title in letters, digits and
-    underscores."""
+    """Returns the table with these columns, in this order, or all; a column's name is its title in
+    letters, digits and underscores."""
     known: dict[str, Column] = {}
     for column in table.columns:
         words = re.sub(r"[^a-z0-9]+", "_", column.title.lower())

@@ -1,4 +1,5 @@
-"""Shows how far a computation is: as a bar in a terminal, as a line in a notebook, and nowhere else unless asked to."""
+"""Shows how far a computation is: as a bar in a terminal, as a line in a notebook, and nowhere else
+unless asked to."""
 
 from __future__ import annotations
 
@@ -27,7 +28,8 @@ _NOTEBOOK_EVERY_S = 0.5
 
 @contextlib.contextmanager
 def watching(title: str, *, lines: bool = False, off: bool = False) -> Iterator[Watcher]:
-    """Yields a callback of `compute`; `lines` prints a line now and then on a stderr that is no terminal."""
+    """Yields a callback of `compute`; `lines` prints a line now and then on a stderr that is no
+    terminal."""
     with _telling(title, lines=lines, kept=lines, off=off) as tell:
 
         def watch(progress: Progress) -> None:
@@ -44,8 +46,8 @@ def watching(title: str, *, lines: bool = False, off: bool = False) -> Iterator[
 def counting(
     title: str, total: int, progress: Shows = True
 ) -> Iterator[Callable[[str], Callable[[str], None]]]:
-    """Yields a callback that is given the name of each of `total` pieces of work before it begins, and returns one that
-    is told how far that is."""
+    """Yields a callback that is given the name of each of `total` pieces of work before it begins,
+    and returns one that is told how far that is."""
     begun = itertools.count(0)
     with _telling(title, lines=progress == "lines", off=not progress) as tell:
 
@@ -60,7 +62,8 @@ def counting(
 def _telling(
     title: str, *, lines: bool = False, kept: bool = False, off: bool = False
 ) -> AbstractContextManager[Tell]:
-    """Yields a callback that shows progress in a notebook, in a terminal or, by `lines`, anywhere."""
+    """Yields a callback that shows progress in a notebook, in a terminal or, by `lines`,
+    anywhere."""
     if _in_notebook() and not off:
         return _line_of_notebook(title)
     if lines or (not off and sys.stderr is not None and sys.stderr.isatty()):
@@ -75,7 +78,8 @@ def _in_notebook() -> bool:
 
 @contextlib.contextmanager
 def _line_of_notebook(title: str) -> Iterator[Tell]:
-    """Shows a line that is empty again in the end, and that a computation of less than a moment never shows."""
+    """Shows a line that is empty again in the end, and that a computation of less than a moment
+    never shows."""
     from IPython.display import display  # pyright: ignore[reportMissingImports]
 
     last = time.monotonic()
@@ -101,8 +105,8 @@ def _line_of_notebook(title: str) -> Iterator[Tell]:
 
 @contextlib.contextmanager
 def _bar(title: str, *, lines: bool, kept: bool) -> Iterator[Tell]:
-    """Shows a bar on stderr, with warnings of ipe-bench above it; one that is `kept` stays there. Where stderr is no
-    terminal, `lines` prints a line now and then."""
+    """Shows a bar on stderr, with warnings of ipe-bench above it; one that is `kept` stays there.
+    Where stderr is no terminal, `lines` prints a line now and then."""
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
 

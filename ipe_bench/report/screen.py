@@ -1,4 +1,5 @@
-"""Makes the consoles whose texts reach a terminal: a name in them is shown, and neither obeyed nor styled."""
+"""Makes the consoles whose texts reach a terminal: a name in them is shown, and neither obeyed nor
+styled."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Tables and sections that plugins write; one that raises, or gives something else, is left out with a line."""
+"""Tables and sections that plugins write; one that raises, or gives something else, is left out
+with a line."""
 
 from __future__ import annotations
 
@@ -20,10 +21,13 @@ CURVES = ("distributions",)
 class Section:
     """Defines a section of report.html, which follows our tables.
 
-    Required: `title` and `write`. Optional: none. Promised: `write` does not write into the analysis, whose
-    frames our tables are made of, and its tables have new names; one that raises is left out with a line.
+    Required: `title` and `write`. Optional: none. Promised: `write` does not write into the
+    analysis, whose frames our tables are made of, and its tables have new names; one that raises is
+    left out with a line.
 
-    >>> section = Section("Settings", lambda analysis: iter([f"There are {len(analysis.summary)} rows."]))
+    >>> def settings(analysis):
+    ...     yield f"There are {len(analysis.summary)} rows."
+    >>> section = Section("Settings", settings)
     >>> section.title
     'Settings'
     """
@@ -47,7 +51,8 @@ class Written:
 
 
 def report_tables(analysis: Analysis) -> list[Table]:
-    """Returns all tables of the report: on certified readings, ours on simulated trials, and those of plugins."""
+    """Returns all tables of the report: on certified readings, ours on simulated trials, and those
+    of plugins."""
     shown = certified_tables(analysis.collection) + all_tables(analysis.simulated, analysis)
     added = written("table", analysis, shown)
     return [*shown, *(table for one in added for table in one.tables)]

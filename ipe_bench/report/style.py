@@ -1,5 +1,5 @@
-"""Chooses a report's figures, their files and their looks: a colour family per kind of estimator, a marker and a dash
-per member, one theme."""
+"""Chooses a report's figures, their files and their looks: a colour family per kind of estimator, a
+marker and a dash per member, one theme."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ FAMILIES: dict[str, tuple[str, ...]] = {
     "least squares": ("#1b7837", "#5aae61", "#00441b", "#8a9a1b"),
     "ensembles": ("#c2188f", "#b07cc6", "#6a1b9a", "#f07fc0"),
 }
-"""Colours by kind of estimator, neighbours differing in lightness; all of them are told apart on white and in print."""
+"""Colours by kind of estimator, neighbours differing in lightness; all of them are told apart on
+white and in print."""
 COLORS = tuple(family[i] for i in range(4) for family in FAMILIES.values())
 """Colours of the families by turns, for parameters and settings."""
 BLACK = "#000000"
@@ -57,8 +58,8 @@ RAMP = (
     *("#dcf0fa", "#bfe0f2", "#ffcf9f", "#fdbf85", "#fbab66"),
     *("#f59145", "#e67a2e", "#ad4a0a", "#983d06", "#842f04"),
 )
-"""Colours of success from all to none: blue where an estimator holds, then orange to brown. Luminance falls with
-success alone, for grey print."""
+"""Colours of success from all to none: blue where an estimator holds, then orange to brown.
+Luminance falls with success alone, for grey print."""
 DARK_RAMP = (
     *("#173e55", "#205172", "#70501d", "#7a541c", "#885a1a"),
     *("#cf7526", "#dd832f", "#ea913c", "#f5a04b", "#ffb062"),
@@ -82,7 +83,8 @@ def which_figures(asked: Any) -> Which:
 
 
 def drawn_settings(number: int, which: Which) -> tuple[int, str]:
-    """Returns how many of the settings have figures of their own, and a sentence on the others if there are any."""
+    """Returns how many of the settings have figures of their own, and a sentence on the others if
+    there are any."""
     most = MOST_SETTINGS if which == "all" or number <= MOST_SETTINGS else FIRST_SETTINGS
     if number <= most:
         return number, ""
@@ -91,8 +93,8 @@ def drawn_settings(number: int, which: Which) -> tuple[int, str]:
 
 
 def file_formats(asked: Any) -> tuple[str, ...]:
-    """Returns the formats asked for, in one word or several, with those that are always written; raises UserError if
-    one is unknown."""
+    """Returns the formats asked for, in one word or several, with those that are always written;
+    raises UserError if one is unknown."""
     words = asked
     if isinstance(asked, str) or not isinstance(asked, Sequence):
         words = str(asked).strip("[]").split(",")
@@ -139,8 +141,8 @@ FACES = {
     "ekf": Look("#6a0010", "^", (5, 2)),
     "ukf": Look("#f29a17", "v", (5, 2)),
 }
-"""The looks of those that the bench is about, which no other has and which are never grey. They differ from each other
-in hue, marker and lightness, also for the colour-blind and in grey."""
+"""The looks of those that the bench is about, which no other has and which are never grey. They
+differ from each other in hue, marker and lightness, also for the colour-blind and in grey."""
 POOL = (
     *(
         "gauss_newton",
@@ -165,7 +167,8 @@ POOL = (
     ),
     *("geodesic_lm", "multiscale_lm", "multistart", "ghkf", "ieks", "ipls", "grid", "bootstrap"),
 )
-"""Our others, of which each has its own place among the markers and dashes; a name from elsewhere has one by chance."""
+"""Our others, of which each has its own place among the markers and dashes; a name from elsewhere
+has one by chance."""
 _ALIKE = {"iekf": "iterated_ekf", "ipe_fixed_point": "fixed_point", "ipe_newton": "newton"}
 """Trackers under another name than the estimator of constants that does the same."""
 
@@ -175,11 +178,11 @@ def looks(
     kinds: Mapping[str, str] | None = None,
     own: Mapping[str, Sequence[str]] | None = None,
 ) -> dict[str, Look]:
-    """Returns a look per label, the same whichever others are there: its `own` colour and marker, its face, or a place
-    of the pool in the colours of its kind.
+    """Returns a look per label, the same whichever others are there: its `own` colour and marker,
+    its face, or a place of the pool in the colours of its kind.
 
-    Of two labels from elsewhere that chance gives one place, the later takes the next. What follows a name in brackets
-    changes marker and dash alone.
+    Of two labels from elsewhere that chance gives one place, the later takes the next. What follows
+    a name in brackets changes marker and dash alone.
     """
     found: dict[str, Look] = {}
     for label in labels:
@@ -207,7 +210,8 @@ def _place(name: str) -> int:
 
 
 def _from_pool(at: int, family: Sequence[str]) -> Look:
-    """Returns the look at a place: markers change first, then dashes, and colours with each place."""
+    """Returns the look at a place: markers change first, then dashes, and colours with each
+    place."""
     markers = len(MARKERS)
     places = markers * len(DASHES)
     color = family[(at + at // places) % len(family)]
@@ -215,7 +219,8 @@ def _from_pool(at: int, family: Sequence[str]) -> Look:
 
 
 def strong(color: str) -> str:
-    """Returns the colour, darkened until letters of it are read on white: a contrast of 4.5, as WCAG 2 asks for."""
+    """Returns the colour, darkened until letters of it are read on white: a contrast of 4.5, as
+    WCAG 2 asks for."""
     rgb = _rgb(color)
     while _luminance(rgb) > _LEGIBLE:
         rgb = [0.97 * c for c in rgb]
@@ -243,8 +248,9 @@ def _linear(c: float) -> float:
 
 
 def dark(color: str, *, letters: bool = False) -> str:
-    """Returns what a colour on white becomes on a dark page: that of success is of the dark colours of success, greys
-    change places, and the others are lighter, those of `letters` until they have a contrast of 4.5."""
+    """Returns what a colour on white becomes on a dark page: that of success is of the dark colours
+    of success, greys change places, and the others are lighter, those of `letters` until they have
+    a contrast of 4.5."""
     if color in RAMP:
         return DARK_RAMP[RAMP.index(color)]
     rgb = _rgb(color)
@@ -295,7 +301,8 @@ _print_width: ContextVar[float] = ContextVar("print_width", default=0.0)
 
 
 def print_width() -> float:
-    """Returns the width in inches of the column of print that figures are drawn for; 0 for those of the page."""
+    """Returns the width in inches of the column of print that figures are drawn for; 0 for those of
+    the page."""
     return _print_width.get()
 
 
@@ -316,7 +323,8 @@ def house_style(scale: float = 0.95, more: Mapping[str, Any] | None = None) -> I
 
 @contextmanager
 def print_style(width: float) -> Iterator[None]:
-    """Sets the same look in a column of print, which is not scaled any more: letters of 7 points, as IEEE's."""
+    """Sets the same look in a column of print, which is not scaled any more: letters of 7 points,
+    as IEEE's."""
     token = _print_width.set(width)
     try:
         with house_style(0.74, _PRINT):

@@ -1,4 +1,5 @@
-"""The summary that `ib.run` returns: a frame that shows itself, with its trials, figures and report."""
+"""The summary that `ib.run` returns: a frame that shows itself, with its trials, figures and
+report."""
 
 from __future__ import annotations
 
@@ -38,7 +39,8 @@ class Stored:
 
 
 class Summary(pd.DataFrame):
-    """Shows a row per scenario, estimator and parameter as the terminal does, while it has the columns for that."""
+    """Shows a row per scenario, estimator and parameter as the terminal does, while it has the
+    columns for that."""
 
     _metadata: ClassVar = ["_stored"]
     _stored: Stored | None = None

@@ -13,9 +13,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 CITATION = (
-    f"The ipe-bench developers (2026). ipe-bench, version {__version__} [computer program]. Beside it, state the"
-    " command, the git commit and the source's digest that stand with the provenance, and the digest of the bundle"
-    " where results are shared as one (ipe-bench bundle)."
+    f"The ipe-bench developers (2026). ipe-bench, version {__version__} [computer program]. Beside"
+    " it, state the command, the git commit and the source's digest that stand with the"
+    " provenance, and the digest of the bundle where results are shared as one (ipe-bench bundle)."
 )
 """Citation of the bench."""
 
@@ -55,7 +55,8 @@ def percent(share: float) -> str:
 
 
 def ends_in_percent(low: float, high: float) -> tuple[str, str]:
-    """Formats the ends of an interval of a share, with a decimal more for each tenth of its width below 2 per cent."""
+    """Formats the ends of an interval of a share, with a decimal more for each tenth of its width
+    below 2 per cent."""
     decimals = 0
     if low < high:
         decimals = max(0, math.ceil(math.log10(0.02 / (high - low))))
@@ -113,7 +114,8 @@ def cost(median: float, mean: float) -> str:
 
 
 def compact(value: float) -> str:
-    """Formats three figures in at most five characters if possible: thousands as k, millions as M."""
+    """Formats three figures in at most five characters if possible: thousands as k, millions as
+    M."""
     if not math.isfinite(value):
         return "inf" if value == math.inf else "-"
     rounded = float(f"{value:.2e}")
@@ -135,7 +137,8 @@ def duration(seconds: float, figures: int = 3) -> str:
 
 
 def _in_unit(value: float, figures: int, units: Mapping[str, float]) -> str:
-    """Formats so many figures of a number in the first of the descending units that it reaches, or in the last."""
+    """Formats so many figures of a number in the first of the descending units that it reaches, or
+    in the last."""
     *_, smallest = units
     reached = [unit for unit, size in units.items() if abs(value) >= size]
     unit = reached[0] if reached else smallest
@@ -146,7 +149,8 @@ def _in_unit(value: float, figures: int, units: Mapping[str, float]) -> str:
 
 
 def p_value(p: float, least: float = 0.0) -> str:
-    """Formats a probability, a very small one by its order; `least` is its lower limit in a count of simulations."""
+    """Formats a probability, a very small one by its order; `least` is its lower limit in a count
+    of simulations."""
     if not math.isfinite(p):
         return "-"
     if p <= least and least > 0:
@@ -157,7 +161,8 @@ def p_value(p: float, least: float = 0.0) -> str:
 
 
 def varying(columns: Sequence[str], rows: pd.DataFrame) -> list[str]:
-    """Returns the columns that differ among the rows; the model's name alone if that tells every two settings apart."""
+    """Returns the columns that differ among the rows; the model's name alone if that tells every
+    two settings apart."""
     apart = [c for c in columns if len(set(rows[c].astype(str))) > 1]
     settings = rows[apart].astype(str).drop_duplicates()
     if "measurement" in apart and settings["measurement"].is_unique:

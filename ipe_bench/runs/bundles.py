@@ -1,7 +1,8 @@
-"""Bundles: results of one or several folders in a plain zip, whose manifest is what `sha256sum --check` reads.
+"""Bundles: results of one or several folders in a plain zip, whose manifest is what `sha256sum
+--check` reads.
 
-The same results give the same bytes, so that the digest of the manifest stands for all of them and can be printed in a
-paper. A reader gets nothing unless everything is as the manifest says.
+The same results give the same bytes, so that the digest of the manifest stands for all of them and
+can be printed in a paper. A reader gets nothing unless everything is as the manifest says.
 """
 
 from __future__ import annotations
@@ -65,12 +66,14 @@ def write_bundle(directories: Sequence[Path | str], path: Path) -> Bundle:
         )
         if any(known.startswith(f"{name}/") for known in contents):
             raise UserError(
-                f"{directory}: another folder has the name {name} too; bundle them apart, or rename one"
+                f"{directory}: another folder has the name {name} too; bundle them apart, or"
+                " rename one"
             )
         contents |= {f"{name}/{file}": content for file, content in _contents(directory).items()}
     if not contents:
         raise UserError(
-            f"{', '.join(map(str, directories))}: holds no whole results to bundle; run something first"
+            f"{', '.join(map(str, directories))}: holds no whole results to bundle; run something"
+            " first"
         )
     digests = {name: _digest(content) for name, content in sorted(contents.items())}
     contents[MANIFEST] = "".join(f"{digest}  {name}\n" for name, digest in digests.items()).encode()
@@ -78,7 +81,8 @@ def write_bundle(directories: Sequence[Path | str], path: Path) -> Bundle:
         found = read_bundle(path)
         if found.files != digests:
             raise UserError(
-                f"{path}: is there and holds other results; choose another name with output=, or remove it"
+                f"{path}: is there and holds other results; choose another name with output=, or"
+                " remove it"
             )
         return found
 
@@ -94,7 +98,8 @@ def write_bundle(directories: Sequence[Path | str], path: Path) -> Bundle:
 
 
 def _contents(directory: Path) -> dict[str, bytes]:
-    """Reads what is whole below a directory, by name; lists it again if a file was merged into another meanwhile."""
+    """Reads what is whole below a directory, by name; lists it again if a file was merged into
+    another meanwhile."""
     store = Store(directory)
     while True:
         damaged = Results.read([directory]).damaged
@@ -121,7 +126,8 @@ def read_bundle(path: Path) -> Bundle:
                 > _MOST_COMPRESSED * path.stat().st_size
             ):
                 raise UserError(
-                    f"{path}: would unpack to over {_MOST_COMPRESSED} times its size; the bundle is not read"
+                    f"{path}: would unpack to over {_MOST_COMPRESSED} times its size; the bundle"
+                    " is not read"
                 )
             there = set(archive.namelist())
             manifest = archive.read(MANIFEST)
@@ -135,7 +141,8 @@ def read_bundle(path: Path) -> Bundle:
                     )
                 if name not in there or digests.get(name) != _digest_of(archive, name):
                     raise UserError(
-                        f"{path}: was damaged or changed: {name} differs from its manifest; get it anew"
+                        f"{path}: was damaged or changed: {name} differs from its manifest; get it"
+                        " anew"
                     )
     except UserError:
         raise
@@ -150,8 +157,9 @@ def read_bundle(path: Path) -> Bundle:
 
 @contextlib.contextmanager
 def opened(paths: Sequence[Path | str], into: Path | None = None) -> Iterator[list[Path]]:
-    """Yields folders of results, with those of every bundle in its place: unpacked below `into`, or for as long as this
-    lasts. Refuses a file that is not a whole bundle, and a folder that no run ever wrote to."""
+    """Yields folders of results, with those of every bundle in its place: unpacked below `into`, or
+    for as long as this lasts. Refuses a file that is not a whole bundle, and a folder that no run
+    ever wrote to."""
     with contextlib.ExitStack() as stack:
         found: list[Path] = []
         for path in map(Path, paths):
@@ -179,7 +187,8 @@ def _require_results(folder: Path) -> None:
 
 
 def _digest_of(archive: zipfile.ZipFile, name: str) -> str:
-    """Computes the digest of a file in an archive, in pieces, of no more bytes than the archive's list states."""
+    """Computes the digest of a file in an archive, in pieces, of no more bytes than the archive's
+    list states."""
     digest = hashlib.sha256()
     with archive.open(name) as file:
         while piece := file.read(1 << 20):

@@ -1,9 +1,11 @@
-"""Where tasks run: one after another in this process, or in worker processes. Config group `execution`.
+"""Where tasks run: one after another in this process, or in worker processes. Config group
+`execution`.
 
-A pool of joblib or concurrent.futures breaks as a whole when one worker dies, does not say which task it died of, and
-cannot stop one task; pebble can, but has no steps within a task, by which a limit on time begins after compilation, and
-leaves alive the processes that a task has started. Here each worker has a pipe and a session of its own: the task of a
-dead worker is known, and a task that exceeds its time is ended with all that it started, while the others go on.
+A pool of joblib or concurrent.futures breaks as a whole when one worker dies, does not say which
+task it died of, and cannot stop one task; pebble can, but has no steps within a task, by which a
+limit on time begins after compilation, and leaves alive the processes that a task has started. Here
+each worker has a pipe and a session of its own: the task of a dead worker is known, and a task that
+exceeds its time is ended with all that it started, while the others go on.
 """
 
 from __future__ import annotations
@@ -33,10 +35,12 @@ from ipe_bench.basics.machine import cores
 from ipe_bench.basics.options import Component, Count
 
 Work = Callable[[Any], Iterable[Any]]
-"""Does a task, which is anything that can be pickled, in steps: what it yields after each step is handed on."""
+"""Does a task, which is anything that can be pickled, in steps: what it yields after each step is
+handed on."""
 
 _LONGEST = 1e9
-"""Seconds, and 1e9 bytes, beyond which no limit is meant: thirty years, and more memory than there is."""
+"""Seconds, and 1e9 bytes, beyond which no limit is meant: thirty years, and more memory than there
+is."""
 Limit = Annotated[float, Gt(0), Lt(_LONGEST), doc(f"a number above 0 and below {_LONGEST:g}")]
 """A limit on seconds or gigabytes."""
 FATAL = (UserError, StorageError)
@@ -52,7 +56,8 @@ class Failure:
     """Says why a task did not end well."""
 
     status: Literal["error", "timeout", "died"]
-    """It raised; it exceeded a time limit; or it never began, or the process that it ran in ended."""
+    """It raised; it exceeded a time limit; or it never began, or the process that it ran in
+    ended."""
     message: str
     detail: str = ""
     """The traceback, where there is one."""
@@ -74,12 +79,13 @@ class Event:
 
 
 class Execution(Component, ABC):
-    """Runs the tasks of a bench. A new execution is a frozen dataclass whose fields are its options.
+    """Runs the tasks of a bench. A new execution is a frozen dataclass whose fields are its
+    options.
 
-    Required: `run(work, tasks)`, which yields an event per step of `work(task)`, and one with `ended` per task.
-    Optional: nothing else. Tasks, and `work`, can be pickled, and may run in any order, process or machine.
-    Promised: an exception in `work` fails its task alone, with `Failure.of`; one of `FATAL`, or closing the iterator,
-    stops what is under way.
+    Required: `run(work, tasks)`, which yields an event per step of `work(task)`, and one with
+    `ended` per task. Optional: nothing else. Tasks, and `work`, can be pickled, and may run in any
+    order, process or machine. Promised: an exception in `work` fails its task alone, with
+    `Failure.of`; one of `FATAL`, or closing the iterator, stops what is under way.
 
     >>> @dataclass(frozen=True)
     ... class LastFirst(Execution):
@@ -87,7 +93,8 @@ class Execution(Component, ABC):
     ...         for index in reversed(range(len(tasks))):
     ...             yield from (Event(index, step) for step in work(tasks[index]))
     ...             yield Event(index, ended=True)
-    >>> [(event.index, event.step) for event in LastFirst().run(lambda word: word.split(), ["one", "two three"])]
+    >>> events = LastFirst().run(lambda word: word.split(), ["one", "two three"])
+    >>> [(event.index, event.step) for event in events]
     [(1, 'two'), (1, 'three'), (1, None), (0, 'one'), (0, None)]
     """
 
@@ -100,7 +107,8 @@ class Execution(Component, ABC):
 class Serial(Execution):
     """Runs tasks in this process; compiled models still use every core.
 
-    An estimator is not isolated from this process: one that never returns, or ends the process, ends the run.
+    An estimator is not isolated from this process: one that never returns, or ends the process,
+    ends the run.
     """
 
     def run(self, work: Work, tasks: Sequence[Any]) -> Iterator[Event]:
@@ -118,17 +126,18 @@ class Serial(Execution):
 
 @dataclass(frozen=True)
 class Processes(Execution):
-    """Runs tasks in processes of this machine, with one thread in BLAS and one in compiled models each.
+    """Runs tasks in processes of this machine, with one thread in BLAS and one in compiled models
+    each.
 
-    Workers outlive a run and serve the next one in this process. Fewer tasks than workers leave cores idle, so then the
-    compiled models get several threads.
+    Workers outlive a run and serve the next one in this process. Fewer tasks than workers leave
+    cores idle, so then the compiled models get several threads.
     """
 
     workers: Count | None = None
     """How many processes; None: one per core."""
     block_timeout_s: Limit | None = None
-    """Seconds that one estimator may take for one block, besides a minute for imports and compilation; None: no
-    limit."""
+    """Seconds that one estimator may take for one block, besides a minute for imports and
+    compilation; None: no limit."""
     memory_limit_gb: Limit | None = None
     """Memory that one worker may use, in 1e9 bytes; None: no limit. Linux only."""
 
@@ -147,9 +156,11 @@ class Processes(Execution):
 
 @dataclass(frozen=True)
 class Auto(Processes):
-    """Worker processes as in `Processes`, except that a single task without limits runs in this process.
+    """Worker processes as in `Processes`, except that a single task without limits runs in this
+    process.
 
-    A worker takes seconds to start, which a job of one block does not win back; compiled models use every core without.
+    A worker takes seconds to start, which a job of one block does not win back; compiled models use
+    every core without.
     """
 
     def run(self, work: Work, tasks: Sequence[Any]) -> Iterator[Event]:
@@ -166,9 +177,9 @@ def supervise(
     timeout_s: float | None = None,
     memory_gb: float | None = None,
 ) -> Iterator[Event]:
-    """Runs tasks in at most `workers` processes with `threads` threads each; see `Execution.run`. A worker whose task
-    takes longer than `timeout_s` from the step `PREPARED` to the next one is ended, and one that takes longer than a
-    minute, too, to get there."""
+    """Runs tasks in at most `workers` processes with `threads` threads each; see `Execution.run`. A
+    worker whose task takes longer than `timeout_s` from the step `PREPARED` to the next one is
+    ended, and one that takes longer than a minute, too, to get there."""
     prepares_s = None if timeout_s is None else max(timeout_s, _PREPARATION_S)
     waiting = deque(range(len(tasks)))
     busy: dict[Connection, _Worker] = {}
@@ -243,7 +254,8 @@ class _Worker:
         there.close()
         self.index, self.deadline = -1, math.inf
         self.fresh = True
-        """Whether a death is the work of the task at hand: false from when it has waited until its next task starts."""
+        """Whether a death is the work of the task at hand: false from when it has waited until its
+        next task starts."""
 
     def extend(self, seconds: float | None) -> None:
         """Resets the deadline of the next step; None: there is none."""
@@ -260,10 +272,12 @@ class _Worker:
             )
 
     def end(self) -> None:
-        """Ends the process, and those that it started in its session, without waiting for the task."""
+        """Ends the process, and those that it started in its session, without waiting for the
+        task."""
         with contextlib.suppress(OSError):
             self.connection.close()
-        # One that has closed its pipe is on its way out: give it the time to leave its own exit code.
+        # One that has closed its pipe is on its way out: give it the time to leave its own exit
+        # code.
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.process.wait(0.1)
         if sys.platform != "win32":
@@ -282,7 +296,8 @@ def _describe_exit(code: int) -> str:
 
 
 _idle: dict[int, list[_Worker]] = {}
-"""Idle workers by the process that started them, since a forked process does not own those of its parent."""
+"""Idle workers by the process that started them, since a forked process does not own those of its
+parent."""
 
 
 def _begun(index: int, message: Any) -> _Worker:

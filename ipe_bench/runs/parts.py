@@ -1,8 +1,9 @@
 """Stored files that prove what they are: Parquet parts with the rows of trials, and JSON records.
 
-Parquet's own CRC-32 covers the pages and nothing else; a SHA-256 digest covers the footer, which says where the pages
-are, what they belong to and by what they were made. It stands between the pages and the footer, where every reader of
-Parquet passes over it. `runs.results` finds out which files there are.
+Parquet's own CRC-32 covers the pages and nothing else; a SHA-256 digest covers the footer, which
+says where the pages are, what they belong to and by what they were made. It stands between the
+pages and the footer, where every reader of Parquet passes over it. `runs.results` finds out which
+files there are.
 """
 
 from __future__ import annotations
@@ -93,9 +94,9 @@ class StoredPart:
         return self.start, -self.stop, str(self.path)
 
     def read(self, columns: Keys[str] | None = None) -> tuple[Mapping[str, Any], pa.Table]:
-        """Reads what the rows belong to, and the rows, without metadata: all columns, or those of `columns` that are
-        there. Raises FileNotFoundError if there is no such file any more, and Unusable if it is damaged, or not one of
-        ours.
+        """Reads what the rows belong to, and the rows, without metadata: all columns, or those of
+        `columns` that are there. Raises FileNotFoundError if there is no such file any more, and
+        Unusable if it is damaged, or not one of ours.
         """
         footers, tables = zip(*self.groups(columns), strict=True)
         return footers[0], pa.concat_tables(tables)
@@ -103,7 +104,8 @@ class StoredPart:
     def groups(
         self, columns: Keys[str] | None = None
     ) -> Iterator[tuple[Mapping[str, Any], pa.Table]]:
-        """Reads the same, at most `GROUP` rows at a time: those of a million trials take gigabytes."""
+        """Reads the same, at most `GROUP` rows at a time: those of a million trials take
+        gigabytes."""
         with _opened(self.path) as file:
             footer, names, reached = self._footer(file), file.schema_arrow.names, self.start
             names = [name for name in names if columns is None or name in {"trial", *columns}]
@@ -117,7 +119,8 @@ class StoredPart:
                 raise self._miscounted
 
     def head(self) -> tuple[Mapping[str, Any], pa.Schema]:
-        """Reads what the rows belong to, and the types of their columns; raises what `read` does."""
+        """Reads what the rows belong to, and the types of their columns; raises what `read`
+        does."""
         with _opened(self.path) as file:
             return self._footer(file), file.schema_arrow.remove_metadata()
 
@@ -134,7 +137,8 @@ class StoredPart:
         return footer
 
     def history(self) -> dict[str, Array] | None:
-        """Reads the iterates of its first trials, by column; None if there are none. Raises what `read` does."""
+        """Reads the iterates of its first trials, by column; None if there are none. Raises what
+        `read` does."""
         with _opened(self.path) as file:
             text = file.metadata.metadata.get(HISTORY)
         return (
@@ -145,7 +149,8 @@ class StoredPart:
 
 
 def join_histories(several: Iterable[Mapping[str, Array] | None]) -> dict[str, Array] | None:
-    """Joins the iterates that parts have in the order of reading, by column, each trial once; None if none has any."""
+    """Joins the iterates that parts have in the order of reading, by column, each trial once; None
+    if none has any."""
     found: dict[str, Array] = {}
     for one in several:
         new = None if one is None else ~np.isin(one["trial"], found.get("trial", ()))
@@ -158,7 +163,8 @@ def join_histories(several: Iterable[Mapping[str, Array] | None]) -> dict[str, A
 
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[pq.ParquetFile]:
-    """Opens a file whose footer matches its digest; its pages will be checked against their checksums."""
+    """Opens a file whose footer matches its digest; its pages will be checked against their
+    checksums."""
     try:
         with pa.OSFile(str(regular(path))) as source:
             _require_footer(source)
@@ -214,8 +220,8 @@ def write_groups(
     *,
     lasting: bool = False,
 ) -> None:
-    """Writes the rows of tables in succession to a file that appears complete or not at all (see `write_atomically`);
-    if `lasting`, past the system's buffer."""
+    """Writes the rows of tables in succession to a file that appears complete or not at all (see
+    `write_atomically`); if `lasting`, past the system's buffer."""
     # Texts are few different ones, numbers are all different and alike in their first bytes.
     texts = [field.name for field in schema if pa.types.is_string(field.type)]
     floats = [field.name for field in schema if pa.types.is_floating(field.type)]
@@ -250,7 +256,8 @@ def write_groups(
 
 
 def _grouped(tables: Iterable[pa.Table]) -> Iterator[pa.Table]:
-    """Joins tables in succession, that have the columns of one schema, to larger ones of at most `GROUP` rows."""
+    """Joins tables in succession, that have the columns of one schema, to larger ones of at most
+    `GROUP` rows."""
     waiting: list[pa.Table] = []
     for table in tables:
         if waiting and sum(map(len, waiting)) + len(table) > GROUP:
@@ -269,7 +276,8 @@ def table_of(columns: Mapping[str, Array]) -> pa.Table:
 
 
 def _arrow(values: Array) -> pa.Array:
-    """Converts a column to Arrow. `pa.array` would import pandas, a second that a worker can do without."""
+    """Converts a column to Arrow. `pa.array` would import pandas, a second that a worker can do
+    without."""
     if values.dtype == object:
         texts = [str(value).encode() for value in values]
         ends = np.cumsum([0, *(len(text) for text in texts)], dtype=np.int32)
@@ -302,7 +310,8 @@ def write_record(path: Path, record: Mapping[str, Any]) -> None:
 
 
 def read_record(path: Path, shape: Any) -> dict[str, Any]:
-    """Reads a JSON record of this shape that says what was written; raises Unusable if it is damaged or foreign."""
+    """Reads a JSON record of this shape that says what was written; raises Unusable if it is
+    damaged or foreign."""
     try:
         record = json.loads(regular(path).read_bytes())
     except (OSError, ValueError, RecursionError) as error:
@@ -325,7 +334,8 @@ def _shaped(value: Any, shape: Any) -> Any:
 
 
 def _fits(value: Any, shape: Any) -> bool:
-    """Tells whether a value is of a type, a list of such values, or a mapping with such values under the same keys."""
+    """Tells whether a value is of a type, a list of such values, or a mapping with such values
+    under the same keys."""
     if isinstance(shape, dict):
         there = isinstance(value, dict) and shape.keys() <= value.keys()
         return there and all(_fits(value[key], inner) for key, inner in shape.items())

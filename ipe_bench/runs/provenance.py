@@ -1,4 +1,5 @@
-"""Describes what a result was made of: components as plain data, versions of packages, and a digest of their source."""
+"""Describes what a result was made of: components as plain data, versions of packages, and a digest
+of their source."""
 
 from __future__ import annotations
 
@@ -34,11 +35,13 @@ WITHOUT_NUMBERS = tuple(
         *("runs", "statistics", "real", "plugins", "report", "questions", "workshop", "api", "cli"),
     )
 )
-"""Modules and rooms that no number of a trial comes from: they word messages, name, store, summarise and show."""
+"""Modules and rooms that no number of a trial comes from: they word messages, name, store,
+summarise and show."""
 
 
 def describe(value: Any) -> Any:
-    """Describes a component as plain JSON data: its class and all fields that count in a comparison; 10.0 is 10."""
+    """Describes a component as plain JSON data: its class and all fields that count in a
+    comparison; 10.0 is 10."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         cls = type(value)
         fields = {
@@ -59,8 +62,8 @@ def describe(value: Any) -> Any:
 
 
 def identified(value: Any) -> Any:
-    """A description whose classes of this package are named by room and class, as every version finds them, in
-    any file of the room."""
+    """A description whose classes of this package are named by room and class, as every version
+    finds them, in any file of the room."""
     if isinstance(value, Mapping):
         return {k: _found_by(v) if k == TARGET else identified(v) for k, v in value.items()}
     return [identified(v) for v in value] if isinstance(value, list) else value
@@ -82,11 +85,13 @@ def digest(value: Any) -> str:
 
 
 def fingerprint(components: Sequence[Any]) -> dict[str, Any]:
-    """Returns the versions of the packages, and a digest of the numerical source, that components are made of.
+    """Returns the versions of the packages, and a digest of the numerical source, that components
+    are made of.
 
-    The source of a component is the module of its class with all modules of its package that it imports, and the
-    scoring of trials, without comments, docstrings, the texts of exceptions and the modules of `WITHOUT_NUMBERS`; and
-    what is not of an installed package as it is in this process, which may differ from its file.
+    The source of a component is the module of its class with all modules of its package that it
+    imports, and the scoring of trials, without comments, docstrings, the texts of exceptions and
+    the modules of `WITHOUT_NUMBERS`; and what is not of an installed package as it is in this
+    process, which may differ from its file.
     """
     modules = _modules_of(_homes(components))
     defined = [found for component in components if (found := definition_digest(component))]
@@ -94,7 +99,8 @@ def fingerprint(components: Sequence[Any]) -> dict[str, Any]:
 
 
 def importable(components: Sequence[Any]) -> dict[str, Any]:
-    """Returns the part of the fingerprint that another process has to agree with, since it imports it by name."""
+    """Returns the part of the fingerprint that another process has to agree with, since it imports
+    it by name."""
     modules = _modules_of(_homes(components) - {"__main__"})
     defined = [importable_digest(component) for component in components]
     return {"versions": _versions_of(modules), "source": _source_digest(modules, defined)}
@@ -121,7 +127,8 @@ def _source_digest(modules: Iterable[str], defined: Iterable[str]) -> str:
 
 @functools.cache
 def _package_version(package: str) -> str:
-    """Returns the version of the distribution that a top-level package comes from, where it is installed as one."""
+    """Returns the version of the distribution that a top-level package comes from, where it is
+    installed as one."""
     if package == "ipe_bench":
         from ipe_bench import __version__
 
@@ -132,7 +139,8 @@ def _package_version(package: str) -> str:
 
 
 def _import_closure(module: str) -> frozenset[str]:
-    """Collects the module and, recursively, what it imports from its own top-level package or from ipe_bench."""
+    """Collects the module and, recursively, what it imports from its own top-level package or from
+    ipe_bench."""
     return _installed_closure(module) if is_installed(module) else _closure(module)
 
 
@@ -159,10 +167,12 @@ _installed_closure = functools.cache(_closure)
 
 @functools.cache
 def _spec_of(module: str) -> ModuleSpec | None:
-    """Finds the source of a module; None if there is no such module, or none that can be found again."""
+    """Finds the source of a module; None if there is no such module, or none that can be found
+    again."""
     parent = module.rpartition(".")[0]
     try:
-        # To look for something in a module would import the module; and only a package has modules in it.
+        # To look for something in a module would import the module; and only a package has modules
+        # in it.
         if parent and (
             (package := _spec_of(parent)) is None or package.submodule_search_locations is None
         ):
@@ -173,8 +183,8 @@ def _spec_of(module: str) -> ModuleSpec | None:
 
 
 def _source_of(module: str) -> tuple[str, frozenset[str]]:
-    """Computes a digest of what a module computes with, its code and the JSON files beside it, tables of constants; and
-    the names of modules, and of what may be modules, that it imports."""
+    """Computes a digest of what a module computes with, its code and the JSON files beside it,
+    tables of constants; and the names of modules, and of what may be modules, that it imports."""
     path = None if is_installed(module) else _file_of(module)
     files = () if path is None else (path, *_tables_beside(path))
     return _source_when(
@@ -200,7 +210,8 @@ def _source_when(module: str, written: tuple[tuple[int, int], ...]) -> tuple[str
 
 
 def _file_of(module: str) -> Path | None:
-    """Returns the file of a module or script; None if no file holds it, such as the cells of a notebook."""
+    """Returns the file of a module or script; None if no file holds it, such as the cells of a
+    notebook."""
     spec = _spec_of(module)
     found = None if spec is None else spec.origin
     origin = getattr(sys.modules.get(module), "__file__", found)  # a script has no spec
@@ -224,8 +235,8 @@ def _imported(tree: ast.Module, package: str) -> frozenset[str]:
 
 
 def numerical_code(tree: ast.Module) -> str:
-    """Writes source as one text without what no number depends on: comments, layout, docstrings (also those of fields),
-    and the words of exceptions that are raised. The tree is used up."""
+    """Writes source as one text without what no number depends on: comments, layout, docstrings
+    (also those of fields), and the words of exceptions that are raised. The tree is used up."""
     return ast.unparse(_Wordless().visit(tree))
 
 

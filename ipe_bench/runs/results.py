@@ -1,7 +1,8 @@
-"""Finds what is stored under output folders: what is there, done, missing, failed, refused, stale and damaged.
+"""Finds what is stored under output folders: what is there, done, missing, failed, refused, stale
+and damaged.
 
-`run` asks it what to compute, `status` and `report` what to show, `load` for the rows, so they cannot disagree. A file
-is used, or named with its fault; no file is guessed, mixed or deleted.
+`run` asks it what to compute, `status` and `report` what to show, `load` for the rows, so they
+cannot disagree. A file is used, or named with its fault; no file is guessed, mixed or deleted.
 """
 
 from __future__ import annotations
@@ -47,7 +48,8 @@ _OF_ZOO = re.compile(rf"ipe_bench\.(measurements|baselines)\.[\w.]*\.({'|'.join(
 
 @dataclass(frozen=True)
 class StoredCell:
-    """Describes one scenario (one seed) under one estimator, or its truth, with all its parts from all directories."""
+    """Describes one scenario (one seed) under one estimator, or its truth, with all its parts from
+    all directories."""
 
     footer: Mapping[str, Any]
     parts: tuple[StoredPart, ...]
@@ -97,10 +99,12 @@ class StoredCell:
 
 @dataclass(frozen=True)
 class CellState:
-    """Counts the trials of one scenario under one estimator. `done`, `failed` and `missing` add up to `expected`."""
+    """Counts the trials of one scenario under one estimator. `done`, `failed` and `missing` add up
+    to `expected`."""
 
     names: Mapping[str, Any]
-    """measurement, noise, prior, error_scale, seed, estimator (`truth` for the truth and its bounds)."""
+    """measurement, noise, prior, error_scale, seed, estimator (`truth` for the truth and its
+    bounds)."""
     expected: int
     """Trials that were asked for; 0 if no run in the directories asks for this cell."""
     done: int
@@ -165,7 +169,8 @@ class Results:
     extra_problems: list[str] = field(default_factory=list)
     """Problems that are not one file's: a line for each."""
     _kept: dict[Path, pa.Table] = field(default_factory=dict, repr=False)
-    """Rows of the first files, which hundreds of small runs would otherwise read a dozen times each."""
+    """Rows of the first files, which hundreds of small runs would otherwise read a dozen times
+    each."""
     _arrays: dict[Path, dict[str, Array]] = field(
         default_factory=lambda: defaultdict(dict), repr=False
     )
@@ -174,7 +179,8 @@ class Results:
 
     @classmethod
     def read(cls, directories: Sequence[Path | str], keys: Keys[str] | None = None) -> Self:
-        """Reads what is stored under the directories, or the trials of the cells with these keys alone."""
+        """Reads what is stored under the directories, or the trials of the cells with these keys
+        alone."""
         results = cls(tuple(map(Path, directories)))
         for path in results.directories:
             if not path.is_dir():
@@ -190,7 +196,8 @@ class Results:
             ):
                 self.extra_problems.append(f"{folder}: cannot be listed; what is in it is left out")
         listed: set[Path] = set()
-        # What is gone before it is read is in a larger file, which may not have been there when these were listed.
+        # What is gone before it is read is in a larger file, which may not have been there when
+        # these were listed.
         while fresh := [part for part in store.parts(keys) if part.path not in listed]:
             for part in fresh:
                 listed.add(part.path)
@@ -255,7 +262,8 @@ class Results:
 
     @property
     def stale(self) -> list[str]:
-        """A line for what older code computed: left out, and no problem if the present code has computed it."""
+        """A line for what older code computed: left out, and no problem if the present code has
+        computed it."""
         lines = [
             f"stale: {name} {moved(name.rpartition('.')[2])}; left out: its results ({count})"
             for name, count in Counter(self.moved.values()).items()
@@ -269,7 +277,8 @@ class Results:
             lines.append(f"stale: {what} {made_by}; left out")
         for folder, count in Counter(path.parents[1] for path in self.outdated).items():
             lines.append(
-                f"stale: {folder}: {count} files were written by an older version of ipe-bench; left out: {_AGAIN}"
+                f"stale: {folder}: {count} files were written by an older version of ipe-bench;"
+                f" left out: {_AGAIN}"
             )
         return lines
 
@@ -286,7 +295,8 @@ class Results:
         return sum(cell.complete for cell in self.cells[: len(self._asked_for)])
 
     def announces(self, cells: Iterable[ResultKey], trials: int) -> bool:
-        """Tells whether the records of runs ask for all this already, and a further one would change none."""
+        """Tells whether the records of runs ask for all this already, and a further one would
+        change none."""
         asked = [(cell, self._asked_for.get(cell.identity_key)) for cell in cells]
         return all(
             a and (a.key, a.refused) == (cell.key, "") and a.trials >= trials for cell, a in asked
@@ -294,7 +304,8 @@ class Results:
 
     @cached_property
     def _asked_for(self) -> dict[str, _Asked]:
-        """Requests of runs, by identity: the newest decides on the key, the largest number of trials counts."""
+        """Requests of runs, by identity: the newest decides on the key, the largest number of
+        trials counts."""
         asked: dict[str, _Asked] = {}
         for run in self.runs:
             for cell in (one for one in run["cells"] if one["identity_key"] not in self.moved):
@@ -310,8 +321,8 @@ class Results:
 
     @cached_property
     def _rivals(self) -> dict[str, tuple[StoredCell | None, list[StoredCell]]]:
-        """Current and stale cells by identity: the one that the newest run expects, or else the one that was written
-        last, if it is stored; and the stale ones."""
+        """Current and stale cells by identity: the one that the newest run expects, or else the one
+        that was written last, if it is stored; and the stale ones."""
         rivals: dict[str, list[StoredCell]] = {}
         for cell in self.stored.values():
             rivals.setdefault(cell.footer["identity_key"], []).append(cell)
@@ -331,7 +342,8 @@ class Results:
 
     @cached_property
     def cells(self) -> tuple[CellState, ...]:
-        """States of all cells: those that runs asked for in their order, then others that are there."""
+        """States of all cells: those that runs asked for in their order, then others that are
+        there."""
         others, states = (
             [cell for cell in self.current if cell.footer["identity_key"] not in self._asked_for],
             [],
@@ -356,7 +368,8 @@ class Results:
         )
 
     def set_aside(self) -> list[str]:
-        """Renames what is damaged, so that it is computed again under its own name; returns a line for each file."""
+        """Renames what is damaged, so that it is computed again under its own name; returns a line
+        for each file."""
         lines = []
         for path, reason in self.damaged.items():
             aside = path.with_name(f"{path.stem}.damaged-{uuid.uuid4().hex[:8]}")
@@ -371,15 +384,17 @@ class Results:
         return self.stored[key].covered if key in self.stored else ()
 
     def missing(self, key: str, trials: int) -> list[tuple[int, int]]:
-        """Returns the ranges of trials 0 to `trials` that no usable file of the cell with this key covers."""
+        """Returns the ranges of trials 0 to `trials` that no usable file of the cell with this key
+        covers."""
         return gaps(self._covered(key), 0, trials)
 
     def load(
         self, cell: StoredCell, columns: Sequence[str] | None, optional: Sequence[str] = ()
     ) -> dict[str, Array]:
-        """Loads the rows of a cell as arrays, by ascending trial, each trial once; all columns if `columns` is None. A
-        part that cannot be used any more, or lacks one of the `columns`, is named in `problems`, and left out. What
-        some parts lack of the `optional` columns is NaN or None there."""
+        """Loads the rows of a cell as arrays, by ascending trial, each trial once; all columns if
+        `columns` is None. A part that cannot be used any more, or lacks one of the `columns`, is
+        named in `problems`, and left out. What some parts lack of the `optional` columns is NaN or
+        None there."""
         names = None if columns is None else list(dict.fromkeys(["trial", *columns, *optional]))
         if (
             len(cell.parts) == 1
@@ -424,7 +439,8 @@ class Results:
                 yield part.history()
 
     def _of_parts(self, cell: StoredCell, read: Callable[[Sequence[StoredPart]], T]) -> T:
-        """Applies `read` to the parts of a cell; to those that are there now, if some were merged meanwhile."""
+        """Applies `read` to the parts of a cell; to those that are there now, if some were merged
+        meanwhile."""
         parts: Sequence[StoredPart] = cell.parts
         while True:
             try:

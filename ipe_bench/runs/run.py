@@ -1,4 +1,5 @@
-"""The run of a bench: what is asked for is checked, what is missing is computed and stored, and all of it recorded."""
+"""The run of a bench: what is asked for is checked, what is missing is computed and stored, and all
+of it recorded."""
 
 from __future__ import annotations
 
@@ -34,7 +35,8 @@ log = logging.getLogger(__name__)
 
 MOST_BLOCKS = 1_000_000
 LARGEST = 1e100
-"""Bound on scales: the squares of larger numbers, and of those below its inverse, are not representable."""
+"""Bound on scales: the squares of larger numbers, and of those below its inverse, are not
+representable."""
 _FEW = 4
 
 
@@ -51,12 +53,13 @@ def compute(
     further: Mapping[str, Any] | None = None,
     command: str | None = None,
 ) -> tuple[str, ...]:
-    """Computes and stores what is missing under `output`, in blocks of `block_size` trials, which changes no number;
-    returns the messages of what failed.
+    """Computes and stores what is missing under `output`, in blocks of `block_size` trials, which
+    changes no number; returns the messages of what failed.
 
-    The run is recorded, unless nothing is missing and the same was asked for before: under a new name, or under
-    `record_as`, in place of what is there; with `further` facts, and the `command` as it was typed. Raises UserError,
-    before anything is computed, if that is impossible, and StorageError if nothing can be stored any more.
+    The run is recorded, unless nothing is missing and the same was asked for before: under a new
+    name, or under `record_as`, in place of what is there; with `further` facts, and the `command`
+    as it was typed. Raises UserError, before anything is computed, if that is impossible, and
+    StorageError if nothing can be stored any more.
     """
     # Absolute: workers may have another working folder.
     store = Store(Path(output).absolute())
@@ -98,7 +101,8 @@ def compute(
             log.warning(f"{store.directory}: the files of {key} stay as they are: {error}")
     if record is not None and not record.is_file():
         raise StorageError(
-            f"{store.directory}: lost the record of this run; the same command computes what is missing"
+            f"{store.directory}: lost the record of this run; the same command computes what is"
+            " missing"
         )
     return failures
 
@@ -111,8 +115,8 @@ def validate(
     *,
     untried: Sequence[AnyScenario] | None = None,
 ) -> None:
-    """Raises one UserError with everything that stands in the way of this run; trials are drawn of the scenarios
-    `untried` (all if None), to see whether numbers hold what is asked for."""
+    """Raises one UserError with everything that stands in the way of this run; trials are drawn of
+    the scenarios `untried` (all if None), to see whether numbers hold what is asked for."""
     size = block_size_for(trials) if block_size is None else block_size
     mistakes = [
         f"{name}={value}: give a whole number above 0"
@@ -129,7 +133,8 @@ def validate(
         )
     if not estimators:
         mistakes.append(
-            "there is no estimator; choose with solver= and baseline=, or with tracker= for a state model"
+            "there is no estimator; choose with solver= and baseline=, or with tracker= for a"
+            " state model"
         )
     for scenario in scenarios:
         if scenario.noise.real and trials != 1:
@@ -169,13 +174,16 @@ def validate(
 def _beyond_numbers(scenario: Scenario) -> Iterator[str]:
     """Scales at which every statistic would be infinite or 0, as no number holds their squares."""
     if scenario.error_scale > LARGEST:
-        yield f"error_scale={scenario.error_scale:g}: its square overflows; give a number up to {LARGEST:g}"
+        yield (
+            f"error_scale={scenario.error_scale:g}: its square overflows; give a number up to"
+            f" {LARGEST:g}"
+        )
         return
     model, real = scenario.measurement, scenario.noise.real
     if model.m < model.n:
         yield (
-            f"measurement={model.name}: {model.m} readings are too few for {model.n} parameters; take more readings, or"
-            " fix a parameter by parameters.NAME.fixed=VALUE"
+            f"measurement={model.name}: {model.m} readings are too few for {model.n} parameters;"
+            " take more readings, or fix a parameter by parameters.NAME.fixed=VALUE"
         )
         return
     with np.errstate(all="ignore"):
@@ -188,11 +196,15 @@ def _beyond_numbers(scenario: Scenario) -> Iterator[str]:
             return
     if not real and not np.isfinite(few.z).all(axis=1).any():
         reason = scenario.simulator.hindrance(few.x[0])
-        yield f"measurement={model.name}: none of the first {_FEW} trials has readings: {reason}; choose smaller scales"
+        yield (
+            f"measurement={model.name}: none of the first {_FEW} trials has readings: {reason};"
+            " choose smaller scales"
+        )
         return
     beyond = ~((bound >= 1 / LARGEST) & (bound <= LARGEST) | (bound == 0))
     if real and np.isnan(bound).any():
-        return  # J lacks rank at the start, or is not finite there: that is a hard start, and no mistake
+        # J lacks rank at the start, or is not finite there: that is a hard start, and no mistake.
+        return
     if np.isnan(bound).any():
         H = scenario.problem.H
         still = [
@@ -203,19 +215,21 @@ def _beyond_numbers(scenario: Scenario) -> Iterator[str]:
             where = "readings at the nominal point do not determine"
             where += f" {', '.join(_undetermined(scenario)) or 'all parameters'}"
         yield (
-            f"measurement={model.name}: {where}; choose another nominal point or further readings, or try `ipe-bench"
-            " check` if the slopes are wrong"
+            f"measurement={model.name}: {where}; choose another nominal point or further readings,"
+            " or try `ipe-bench check` if the slopes are wrong"
         )
         return
     for i in np.flatnonzero(beyond)[:1]:
         yield (
-            f"noise={scenario.noise.name}: {model.parameters[i].name} has a linear bound of {bound[i]:g} of its size, "
-            "whose square is beyond numbers; choose another scale of the noise"
+            f"noise={scenario.noise.name}: {model.parameters[i].name} has a linear bound of"
+            f" {bound[i]:g} of its size, whose square is beyond numbers; choose another scale of"
+            " the noise"
         )
 
 
 def _undetermined(scenario: Scenario) -> list[str]:
-    """Names the parameters that readings at the nominal point leave open; none if H is not finite."""
+    """Names the parameters that readings at the nominal point leave open; none if H is not
+    finite."""
     H = scenario.problem.R.whiten_jacobian(scenario.problem.H)
     if not np.isfinite(H).all():
         return []
@@ -247,8 +261,8 @@ def record_refusal(
     estimators: Mapping[str, Any] | None = None,
     trials: int = 1,
 ) -> None:
-    """Notes in a folder of results that a job of a sweep, which `job` tells from the others, was asked for and refused;
-    scenario and estimators are given if the job came to them."""
+    """Notes in a folder of results that a job of a sweep, which `job` tells from the others, was
+    asked for and refused; scenario and estimators are given if the job came to them."""
     store = Store(Path(output))
     if store.trials.is_dir():
         store.prepare()
@@ -284,7 +298,8 @@ def _record(
 
 @functools.cache
 def _git_commit(folder: Path) -> str | None:
-    """Returns the commit of the folder, if any; asked once per process, as a sweep records it per job."""
+    """Returns the commit of the folder, if any; asked once per process, as a sweep records it per
+    job."""
     command = ["git", "rev-parse", "HEAD"]
     try:
         return subprocess.run(

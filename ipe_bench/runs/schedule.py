@@ -1,7 +1,8 @@
 """The work of a run, cut into tasks, and how the run completes them although parts of it may fail.
 
-A task is the cells of one scenario that are missing in one block. Each cell is stored as soon as it is there, so a task
-that dies has lost no more than the cell it died of: that one is tried again alone, the rest goes on.
+A task is the cells of one scenario that are missing in one block. Each cell is stored as soon as it
+is there, so a task that dies has lost no more than the cell it died of: that one is tried again
+alone, the rest goes on.
 """
 
 from __future__ import annotations
@@ -34,10 +35,12 @@ log = logging.getLogger(__name__)
 BLOCK_SIZE = 250
 """Trials of a block, at least, by default."""
 LARGEST_BLOCK = 1000
-"""Largest default block: beyond it arrays leave a processor's cache, and each trial takes longer."""
+"""Largest default block: beyond it arrays leave a processor's cache, and each trial takes
+longer."""
 _WORTH_BLOCKS = 100
 TRIES = 2
-"""Number of times that a cell of a block may take its process with it before it counts as failed."""
+"""Number of times that a cell of a block may take its process with it before it counts as
+failed."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +64,8 @@ class Progress:
         """Trials times estimators that are done."""
         self.failures: list[str] = []
         self.began: float | None = None
-        """Time when the first estimator began, by the monotonic clock: code is imported and compiled before."""
+        """Time when the first estimator began, by the monotonic clock: code is imported and
+        compiled before."""
         self._left = Counter((id(cell.scenario), task.start, task.stop) for task, cell in cells)
         """Cells of each task that are not done."""
 
@@ -86,14 +90,16 @@ Watcher = Callable[[Progress], None]
 
 
 def block_size_for(trials: int) -> int:
-    """Returns the default size of a block: 250 trials, and more if there still are a hundred blocks."""
+    """Returns the default size of a block: 250 trials, and more if there still are a hundred
+    blocks."""
     return min(max(trials // _WORTH_BLOCKS // BLOCK_SIZE, 1) * BLOCK_SIZE, LARGEST_BLOCK)
 
 
 def plan(
     directory: Path, cells: Sequence[ResultKey], results: Results, trials: int, block_size: int
 ) -> list[Task]:
-    """Cuts missing trials into blocks on a fixed grid, each with the cells of one scenario that lack some of them."""
+    """Cuts missing trials into blocks on a fixed grid, each with the cells of one scenario that
+    lack some of them."""
     lacking: dict[tuple[int, int], list[ResultKey]] = {}
     for cell in cells:
         _ = cell.importable  # as it is here, and not where the cell is sent
@@ -105,9 +111,9 @@ def plan(
 
 
 def run_task(task: Task) -> Iterator[str | tuple[int, Failure | None]]:
-    """Computes one task and stores each cell's rows as soon as they are there; then yields the cell's place in the
-    task, and its failure if there was one: an exception fails its cell alone. Libraries are imported and models
-    compiled before time is taken."""
+    """Computes one task and stores each cell's rows as soon as they are there; then yields the
+    cell's place in the task, and its failure if there was one: an exception fails its cell alone.
+    Libraries are imported and models compiled before time is taken."""
     store, cells = Store(task.directory), _recalled(task)
     with _alone():
         block = block_of(cells[0].scenario, task.start, task.stop)
@@ -135,8 +141,9 @@ _MOST_RECENT = 64
 
 
 def _recalled(task: Task) -> tuple[ResultKey, ...]:
-    """Returns the cells of a task as this process had them before, with all that they have worked out meanwhile: to
-    trace a model and to describe what is constructed takes as long as some ten trials."""
+    """Returns the cells of a task as this process had them before, with all that they have worked
+    out meanwhile: to trace a model and to describe what is constructed takes as long as some ten
+    trials."""
     if len(_recent) > _MOST_RECENT:
         _recent.clear()
     for cell in task.cells:
@@ -153,8 +160,8 @@ def _require_same_source(cell: ResultKey) -> None:
     """Raises RuntimeError if this process does not compute with what the run began with."""
     if importable(cell.components) != cell.importable:
         raise RuntimeError(
-            "the numerical source of ipe-bench or of a plugin is not what it was where the run began: "
-            "install the same versions on all machines, or start the run again"
+            "the numerical source of ipe-bench or of a plugin is not what it was where the run"
+            " began: install the same versions on all machines, or start the run again"
         )
 
 
@@ -230,15 +237,16 @@ class _Run:
     def tried_again(
         self, task: Task, cells: Sequence[ResultKey], failure: Failure
     ) -> Iterator[Task]:
-        """Closes the cells that a task failed of, and yields tasks for those of its `cells` that are tried again."""
+        """Closes the cells that a task failed of, and yields tasks for those of its `cells` that
+        are tried again."""
         left = []
         for cell in cells:
             if self.store.has(cell, task.start, task.stop):  # stored, and the news of it was lost
                 self.close(task, cell)
             else:
                 left.append(cell)
-        # Cells are computed in order, so the first one that is not there is the one that it happened in; an error
-        # outside of cells is of what all of them need.
+        # Cells are computed in order, so the first one that is not there is the one that it
+        # happened in; an error outside of cells is of what all of them need.
         blamed = len(left) if failure.status == "error" else 1
         for cell in left[:blamed]:
             self.tries[cell.key, task.start] += 1
@@ -254,7 +262,8 @@ class _Run:
 def run_tasks(
     tasks: Sequence[Task], execution: Execution, store: Store, watch: Watcher
 ) -> tuple[str, ...]:
-    """Runs tasks until each of their cells is stored or has failed; returns the messages of those that failed."""
+    """Runs tasks until each of their cells is stored or has failed; returns the messages of those
+    that failed."""
     run = _Run(tasks, store, watch)
     while tasks:
         waiting, again = [dict(enumerate(task.cells)) for task in tasks], []

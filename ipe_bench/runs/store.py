@@ -1,11 +1,12 @@
-"""What a stored file belongs to, and where it lies: blocks of trials as they come, and one file per result at the end.
+"""What a stored file belongs to, and where it lies: blocks of trials as they come, and one file per
+result at the end.
 
-    OUTPUT/trials/KEY-START-STOP.parquet   rows of trials START to STOP of a scenario under an estimator, or its truth
-    OUTPUT/runs/RUN.json                   what a run was asked for
+    OUTPUT/trials/KEY-START-STOP.parquet   rows of trials START to STOP of a scenario under an
+    estimator, or its truth OUTPUT/runs/RUN.json                   what a run was asked for
     OUTPUT/failed/KEY-START-STOP.json      trials that could not be computed, and why
 
-The rows of one key are a union of ranges. Every file appears complete or not at all, and no locks are needed. What is
-there is said by `runs.results`.
+The rows of one key are a union of ranges. Every file appears complete or not at all, and no locks
+are needed. What is there is said by `runs.results`.
 """
 
 from __future__ import annotations
@@ -69,15 +70,17 @@ class ResultKey:
 
     @cached_property
     def key(self) -> str:
-        """Sixteen hexadecimal digits that stand for the identity, the schema and the numerical source, but not for the
-        version: a release that changes no number leaves what is stored valid."""
+        """Sixteen hexadecimal digits that stand for the identity, the schema and the numerical
+        source, but not for the version: a release that changes no number leaves what is stored
+        valid."""
         return digest(
             {"schema": SCHEMA, "identity": self.identity, "source": self.made_by["source"]}
         )
 
     @cached_property
     def identity_key(self) -> str:
-        """Sixteen hexadecimal digits that stand for the identity alone, in whichever files its classes stand."""
+        """Sixteen hexadecimal digits that stand for the identity alone, in whichever files its
+        classes stand."""
         return digest(identified(self.identity))
 
     @cached_property
@@ -140,7 +143,8 @@ class ResultKey:
 
 
 def traits(estimator: Any) -> dict[str, Any]:
-    """Returns the kind and the look of an estimator or tracker, by which reports tell families apart."""
+    """Returns the kind and the look of an estimator or tracker, by which reports tell families
+    apart."""
     return {
         "equation": getattr(estimator, "equation", None),
         "family": getattr(estimator, "family", None),
@@ -160,7 +164,8 @@ class Store:
         self.failed = self.directory / "failed"
 
     def prepare(self) -> None:
-        """Refuses a folder that cannot be written to, and clears away what writers that were killed left half done."""
+        """Refuses a folder that cannot be written to, and clears away what writers that were killed
+        left half done."""
         try:
             self.trials.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=self.trials):
@@ -176,7 +181,8 @@ class Store:
                     path.unlink()
 
     def parts(self, keys: Keys[str] | None = None) -> list[StoredPart]:
-        """Returns the parts that lie here, or those of these keys, by key and in the order of reading."""
+        """Returns the parts that lie here, or those of these keys, by key and in the order of
+        reading."""
         found = [
             part
             for path in self.trials.glob("*.parquet")
@@ -195,7 +201,8 @@ class Store:
         columns: Mapping[str, Array],
         history: Mapping[str, Array] | None = None,
     ) -> None:
-        """Stores the rows of trials start to stop, with the iterates of the first trials of all if there are any."""
+        """Stores the rows of trials start to stop, with the iterates of the first trials of all if
+        there are any."""
         table = parts.table_of(
             {name: _typed(name, np.asarray(values)) for name, values in columns.items()}
         )
@@ -211,7 +218,8 @@ class Store:
         return self._path(result, start, stop).is_file()
 
     def write_failure(self, result: ResultKey, start: int, stop: int, failure: Failure) -> None:
-        """States that these trials could not be computed, and why; the next run tries them again."""
+        """States that these trials could not be computed, and why; the next run tries them
+        again."""
         record = {"key": result.key, "identity_key": result.identity_key, "names": result.names}
         record |= {"start": start, "stop": stop, **asdict(failure), "host": socket.gethostname()}
         record["when"] = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
@@ -227,11 +235,13 @@ class Store:
         return path
 
     def merge(self, key: str) -> int:
-        """Makes one part of the parts of a result for each range without gaps; returns how many files are gone.
+        """Makes one part of the parts of a result for each range without gaps; returns how many
+        files are gone.
 
-        It may be stopped, or done twice, at any moment, while others read and write in the folder: a merged part is on
-        the disk and was read back before those go whose rows it holds, and until they do, a reader takes each trial
-        once. If a part is damaged (Unusable) or nothing can be written any more (StorageError), all stay as they are.
+        It may be stopped, or done twice, at any moment, while others read and write in the folder:
+        a merged part is on the disk and was read back before those go whose rows it holds, and
+        until they do, a reader takes each trial once. If a part is damaged (Unusable) or nothing
+        can be written any more (StorageError), all stay as they are.
         """
         found, gone, reached = self.parts({key}), 0, 0
         groups: list[tuple[Mapping[str, Any], list[StoredPart], list[pa.Schema]]] = []
@@ -249,7 +259,8 @@ class Store:
 
 
 def _typed(name: str, values: Array) -> Array:
-    """Converts a column to one type for all blocks: numbers that are no counts of trials and iterations are floats."""
+    """Converts a column to one type for all blocks: numbers that are no counts of trials and
+    iterations are floats."""
     if values.dtype.kind in "fiu" and name not in ("trial", "iterations"):
         return values.astype(np.float64)
     return values.astype(np.int64) if values.dtype.kind in "iu" else values
@@ -258,7 +269,8 @@ def _typed(name: str, values: Array) -> Array:
 def _join(
     footer: Mapping[str, Any], group: Sequence[StoredPart], schemas: Sequence[pa.Schema]
 ) -> int:
-    """Writes one part with the rows of a group, unless there is one, and removes the others; returns their number."""
+    """Writes one part with the rows of a group, unless there is one, and removes the others;
+    returns their number."""
     first, stop = group[0], max(part.stop for part in group)
     whole = replace(
         first, path=first.path.with_name(f"{first.key}-{first.start}-{stop}.parquet"), stop=stop

@@ -1,7 +1,7 @@
 """The process that a task runs in: `python -m ipe_bench.runs.worker FD`.
 
-It imports next to nothing before it listens, computes with one thread in BLAS, holds itself to the memory limit of a
-task, and ends when its parent ends.
+It imports next to nothing before it listens, computes with one thread in BLAS, holds itself to the
+memory limit of a task, and ends when its parent ends.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ def _listen(connection: Connection, messages: queue.SimpleQueue[Any]) -> None:
         try:
             messages.put(connection.recv())
         except (EOFError, OSError):
-            # The parent is gone. This session holds nothing but this process and those that a task has started.
+            # The parent is gone. This session holds nothing but this process and those that a task
+            # has started.
             if sys.platform != "win32" and os.getsid(0) == os.getpid():
                 os.killpg(0, signal.SIGKILL)
             os._exit(0)
@@ -96,7 +97,8 @@ def _limit_memory(memory_gb: float | None) -> None:
     if sys.platform.startswith("linux"):
         import resource
 
-        # Data, not address space: compiled code and thread pools reserve far more addresses than they use.
+        # Data, not address space: compiled code and thread pools reserve far more addresses than
+        # they use.
         _, most = resource.getrlimit(resource.RLIMIT_DATA)
         limit = most if memory_gb is None else int(memory_gb * 1e9)
         resource.setrlimit(resource.RLIMIT_DATA, (limit, most))

@@ -1,4 +1,5 @@
-"""Implements Broyden's quasi-Newton method (Burden and Faires, Numerical Analysis, chapter 10, algorithm 10.2)."""
+"""Implements Broyden's quasi-Newton method (Burden and Faires, Numerical Analysis, chapter 10,
+algorithm 10.2)."""
 
 from __future__ import annotations
 
@@ -20,10 +21,12 @@ class BroydenState(State):
 
 @dataclass(frozen=True)
 class Broyden(IPE[BroydenState]):
-    """Iterates x <- x - B F(x), where B is the inverse Jacobian as the steps so far have shown it ("good" Broyden).
+    """Iterates x <- x - B F(x), where B is the inverse Jacobian as the steps so far have shown it
+    ("good" Broyden).
 
-    The least change of the Jacobian that satisfies the secant equation is of rank one, so the Sherman-Morrison formula
-    updates its inverse: no Jacobian after the first, no linear system, superlinear convergence.
+    The least change of the Jacobian that satisfies the secant equation is of rank one, so the
+    Sherman-Morrison formula updates its inverse: no Jacobian after the first, no linear system,
+    superlinear convergence.
 
     Example:
 
@@ -35,7 +38,8 @@ class Broyden(IPE[BroydenState]):
     """
 
     initial: Literal["jacobian", "identity"] = "jacobian"
-    """B at the start: J(x)^-1, or I, which makes the first step one of fixed-point iteration and needs no Jacobian."""
+    """B at the start: J(x)^-1, or I, which makes the first step one of fixed-point iteration and
+    needs no Jacobian."""
 
     def init(self, system: System, x: Array, F: Array) -> BroydenState:
         n = x.shape[1]

@@ -1,4 +1,5 @@
-"""Adds a line search to Newton's method (Dennis, Schnabel, Numerical Methods for Unconstrained Optimization, 6.3)."""
+"""Adds a line search to Newton's method (Dennis, Schnabel, Numerical Methods for Unconstrained
+Optimization, 6.3)."""
 
 from __future__ import annotations
 
@@ -17,9 +18,11 @@ _HALVINGS = 30
 
 @dataclass(frozen=True)
 class DampedNewton(IPE):
-    """Iterates x <- x - t J(x)^-1 F(x) with t = 1, 1/2, 1/4, ... until |F| has decreased enough (Armijo's rule).
+    """Iterates x <- x - t J(x)^-1 F(x) with t = 1, 1/2, 1/4, ... until |F| has decreased enough
+    (Armijo's rule).
 
-    Newton's method near a root. A trial whose |F| decreases for no t stays where it is, and has stalled.
+    Newton's method near a root. A trial whose |F| decreases for no t stays where it is, and has
+    stalled.
 
     Example:
 
@@ -38,7 +41,8 @@ class DampedNewton(IPE):
         size = _norm(state.F)
         t = np.ones(len(size))
         F = system.F(state.x + direction)
-        # A singular trial has no direction to search along: its NaN goes back to the driver at once.
+        # A singular trial has no direction to search along: its NaN goes back to the driver at
+        # once.
         searching = np.isfinite(direction).all(axis=1)
         for _ in range(_HALVINGS):
             searching &= ~(_norm(F) <= (1 - self.decrease * t) * size)

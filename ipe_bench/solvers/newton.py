@@ -11,7 +11,9 @@ from ipe_bench.estimators.ipe import IPE, State, System
 class Newton(IPE):
     r"""Iterates eq. (20), and converges quadratically near a root with regular J, eq. (23).
 
-    .. math:: x_{k+1} = x_k - J(x_k)^{-1} F(x_k), \quad J = \partial F / \partial x = H^+ \, \partial h / \partial x
+    .. math::
+        x_{k+1} = x_k - J(x_k)^{-1} F(x_k),
+        \quad J = \partial F / \partial x = H^+ \, \partial h / \partial x
 
     Example:
 

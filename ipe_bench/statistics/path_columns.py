@@ -188,8 +188,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "path_rmse",
         "rmse, all epochs",
         "solved trials of trackers",
-        "Root mean square error over all epochs; over all states, root mean square of its ratio to the bound at the"
-        " truth. Interval: as for rmse, over trials.",
+        "Root mean square error over all epochs; over all states, root mean square of its ratio to"
+        " the bound at the truth. Interval: as for rmse, over trials.",
         rmse,
         limits=rmse_limits,
         given="solved",
@@ -201,8 +201,9 @@ STATISTICS: tuple[Statistic, ...] = (
         "path_bound",
         "bound at the truth",
         "all trials of trackers",
-        "Standard deviation of the extended Kalman filter that is linearised at the true path (Taylor, IEEE TAC 24,"
-        " 1979), or of the smoother behind it if the tracker smooths, root mean square over all epochs.",
+        "Standard deviation of the extended Kalman filter that is linearised at the true path"
+        " (Taylor, IEEE TAC 24, 1979), or of the smoother behind it if the tracker smooths, root"
+        " mean square over all epochs.",
         bound,
         kind="physical",
         where=("tracks",),
@@ -211,8 +212,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "path_success",
         "path held",
         "all trials of trackers",
-        "Share of trials whose mean squared error over all epochs, each state in multiples of this bound, lies in the"
-        " gate of a success. Interval: Clopper and Pearson.",
+        "Share of trials whose mean squared error over all epochs, each state in multiples of this"
+        " bound, lies in the gate of a success. Interval: Clopper and Pearson.",
         lambda s: path_success(s)[0],
         limits=lambda s: path_success(s)[1:],
         kind="share",
@@ -222,8 +223,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "path_nees",
         "mean NEES / n, all epochs",
         "solved trials of trackers",
-        "Mean over trials and all epochs of e' P⁻¹ e / n with the covariance P that the tracker reports: 1 where it is"
-        " right; none where P is singular by the model.",
+        "Mean over trials and all epochs of e' P⁻¹ e / n with the covariance P that the tracker"
+        " reports: 1 where it is right; none where P is singular by the model.",
         lambda s: mean_score(s, "path_nees") / s.n,
         where=("tracks",),
     ),
@@ -231,7 +232,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "path_verdict",
         "verdict, all epochs",
         "converged trials of trackers",
-        "The verdict on each trial's mean NEES over all epochs: epochs are dependent, trials are not.",
+        "The verdict on each trial's mean NEES over all epochs: epochs are dependent, trials are"
+        " not.",
         path_verdict,
         kind="word",
         where=("tracks",),
@@ -240,7 +242,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "path_nis",
         "NIS / m",
         "all trials of filters of states",
-        "Mean normalised innovation squared over the number of readings, 1 where the filter is right.",
+        "Mean normalised innovation squared over the number of readings, 1 where the filter is"
+        " right.",
         lambda s: f.mean_nis(s) if is_track(s) else np.nan,
         where=("tracks",),
     ),
@@ -248,8 +251,9 @@ STATISTICS: tuple[Statistic, ...] = (
         "nis_verdict",
         "verdict of NIS",
         "converged trials of filters of states",
-        "The verdict on each trial's mean NIS, which needs no truth; wrong where significantly (95 %) more than"
-        f" {100 * _TOLERATED:g} % of the trials have innovations that are not white at the level {FIT_LEVEL:g}.",
+        "The verdict on each trial's mean NIS, which needs no truth; wrong where significantly (95"
+        f" %) more than {100 * _TOLERATED:g} % of the trials have innovations that are not white"
+        f" at the level {FIT_LEVEL:g}.",
         nis_verdict,
         kind="word",
         where=("tracks",),
@@ -258,9 +262,10 @@ STATISTICS: tuple[Statistic, ...] = (
         "not_white",
         "not white",
         "converged trials of filters of states",
-        f"Share of trials whose normalised innovations are autocorrelated at the level {NOT_WHITE:g}, by Ljung and"
-        " Box's test (Biometrika 65, 1978) pooled over readings, lags 1 to 10 at most and to a fifth of the epochs:"
-        f" {NOT_WHITE:g} where the filter is right. Interval: Clopper and Pearson.",
+        "Share of trials whose normalised innovations are autocorrelated at the level"
+        f" {NOT_WHITE:g}, by Ljung and Box's test (Biometrika 65, 1978) pooled over readings, lags"
+        f" 1 to 10 at most and to a fifth of the epochs: {NOT_WHITE:g} where the filter is right."
+        " Interval: Clopper and Pearson.",
         lambda s: not_white(s)[0],
         limits=lambda s: not_white(s)[1:],
         kind="share",
@@ -278,7 +283,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "first_bad_epoch",
         "first bad epoch",
         "solved trials of trackers that have one",
-        f"Mean number of the first epoch whose error lies where a share of {GATE:g} should by the bound at the truth.",
+        f"Mean number of the first epoch whose error lies where a share of {GATE:g} should by the"
+        " bound at the truth.",
         lambda s: mean_score(s, "first_bad_epoch"),
         where=("tracks",),
     ),
@@ -286,9 +292,10 @@ STATISTICS: tuple[Statistic, ...] = (
         "copy_p",
         "p among copies",
         "solved trials of trackers of whole paths, if a state has a period",
-        "Mean probability of a path among its copies, in which one state is shifted by whole periods from beginning to"
-        " end, by their costs: the share of paths that are right, if those are that differ by no more than whole"
-        f" periods. Below {SURE:g} a trial counts as ambiguous.",
+        "Mean probability of a path among its copies, in which one state is shifted by whole"
+        " periods from beginning to end, by their costs: the share of paths that are right, if"
+        f" those are that differ by no more than whole periods. Below {SURE:g} a trial counts as"
+        " ambiguous.",
         lambda s: mean_score(s, "copy_p"),
         where=("tracks",),
         rare=True,

@@ -1,7 +1,8 @@
 """Lists every statistic of ours, a record each; those of states that move are in `tracks`.
 
-`summary_all.csv`, the appendix of the report, tables and the terminal are read from these lists; `summary.csv` has what
-`MAIN` names. `registry` adds those of plugins; formulas longer than a line are in `formulas`.
+`summary_all.csv`, the appendix of the report, tables and the terminal are read from these lists;
+`summary.csv` has what `MAIN` names. `registry` adds those of plugins; formulas longer than a line
+are in `formulas`.
 """
 
 from __future__ import annotations
@@ -51,8 +52,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "no_readings",
         "no readings",
         "further trials",
-        "Number of trials whose true parameters give no finite readings. They count neither for nor against an"
-        " estimator in any column.",
+        "Number of trials whose true parameters give no finite readings. They count neither for"
+        " nor against an estimator in any column.",
         lambda s: len(s.unread),
         kind="count",
         where=("overview", "terminal", "all_trials"),
@@ -61,8 +62,8 @@ STATISTICS: tuple[Statistic, ...] = (
     _all(
         "converged",
         "converged",
-        "Share of trials in which the estimating equation holds within the tolerance. The other endings have their own"
-        " names and messages.",
+        "Share of trials in which the estimating equation holds within the tolerance. The other"
+        " endings have their own names and messages.",
         lambda s: f.share(s.converged),
         kind="share",
         where=("all_trials",),
@@ -70,9 +71,9 @@ STATISTICS: tuple[Statistic, ...] = (
     _all(
         "solved",
         "solved",
-        f"Share that converged to the root, within {SAME_ROOT:g} standard deviations, that the same estimating equation"
-        " reaches if it starts at the truth. Filters and the linear LSE solve no equation; they count as solved if"
-        " they finished.",
+        f"Share that converged to the root, within {SAME_ROOT:g} standard deviations, that the"
+        " same estimating equation reaches if it starts at the truth. Filters and the linear LSE"
+        " solve no equation; they count as solved if they finished.",
         lambda s: f.share(s.solved),
         kind="share",
         where=("solved_trials",),
@@ -80,9 +81,10 @@ STATISTICS: tuple[Statistic, ...] = (
     _all(
         "success",
         "success",
-        "Share whose error lies inside the ellipsoid of the bound at the truth that all but a share of"
-        f" {GATE:g} of efficient estimates lie in (chi-square quantile); the Bayesian bound's for estimators that use a"
-        " prior. Interval: Clopper and Pearson, Biometrika 26, 1934.",
+        "Share whose error lies inside the ellipsoid of the bound at the truth that all but a"
+        f" share of {GATE:g} of efficient estimates lie in (chi-square quantile); the Bayesian"
+        " bound's for estimators that use a prior. Interval: Clopper and Pearson, Biometrika 26,"
+        " 1934.",
         lambda s: int(s.scalars["success"].sum()) / len(s),
         limits=lambda s: clopper_pearson(int(s.scalars["success"].sum()), len(s)),
         kind="share",
@@ -90,10 +92,9 @@ STATISTICS: tuple[Statistic, ...] = (
     _all(
         "success_anytime",
         "success, any time",
-        "The same share with a 95 % interval that stays valid if it is looked at repeatedly and at any time of"
-        " stopping, as runs with `precision` do (beta-binomial confidence sequence: Robbins, Ann. Math. Statist. 41,"
-        " 1970;"
-        " Howard et al., Ann. Statist. 49, 2021).",
+        "The same share with a 95 % interval that stays valid if it is looked at repeatedly and at"
+        " any time of stopping, as runs with `precision` do (beta-binomial confidence sequence:"
+        " Robbins, Ann. Math. Statist. 41, 1970; Howard et al., Ann. Statist. 49, 2021).",
         lambda s: int(s.scalars["success"].sum()) / len(s),
         limits=lambda s: share_sequence(int(s.scalars["success"].sum()), len(s)),
         kind="share",
@@ -101,9 +102,10 @@ STATISTICS: tuple[Statistic, ...] = (
     _all(
         "failed_known",
         "failed and known",
-        "Share of trials without success that the estimator itself reports: it did not converge, its residuals fail"
-        " the test of fit, or several minima or copies fit. A filter of states is tested by its innovations, an"
-        " iterated smoother by the cost of its path, chi-square with a degree of freedom per reading.",
+        "Share of trials without success that the estimator itself reports: it did not converge,"
+        " its residuals fail the test of fit, or several minima or copies fit. A filter of states"
+        " is tested by its innovations, an iterated smoother by the cost of its path, chi-square"
+        " with a degree of freedom per reading.",
         lambda s: f.failed(s, known=True),
         kind="share",
         where=("all_trials",),
@@ -111,7 +113,8 @@ STATISTICS: tuple[Statistic, ...] = (
     _all(
         "failed_silent",
         "undetected failures",
-        "Share of trials without success that converged to residuals that fit. These answers are wrong and look right.",
+        "Share of trials without success that converged to residuals that fit. These answers are"
+        " wrong and look right.",
         lambda s: f.failed(s, known=False),
         kind="share",
         where=("all_trials",),
@@ -119,9 +122,9 @@ STATISTICS: tuple[Statistic, ...] = (
     _all(
         "error_median",
         "median error",
-        "Median of the error over the bound, sqrt(e' J' R⁻¹ J e / n) at the truth: about 1 if an estimate attains the"
-        " Cramér-Rao bound, which is used for estimators with a prior too. A value that is not finite counts as"
-        " infinite.",
+        "Median of the error over the bound, sqrt(e' J' R⁻¹ J e / n) at the truth: about 1 if an"
+        " estimate attains the Cramér-Rao bound, which is used for estimators with a prior too. A"
+        " value that is not finite counts as infinite.",
         lambda s: quantile(f.over_bound(s), 0.5),
     ),
     _all(
@@ -133,10 +136,12 @@ STATISTICS: tuple[Statistic, ...] = (
     _all(
         "efficiency_capped",
         "efficiency",
-        f"One over the root mean square error over the bound, each trial counting at most {f.CAP:g}, so that no single"
-        f" trial decides; {1 / f.CAP:g} where all count that. Interval: as for rmse, but its lower end is where it"
-        f" would be if a share of trials (95 %) that may be unusual beyond those seen counted {f.CAP:g} each; 0 from"
-        f" {intervals.RARE} unusual ones on. Unusual is what {intervals.UNUSUAL:g} of normal errors exceed.",
+        "One over the root mean square error over the bound, each trial counting at most"
+        f" {f.CAP:g}, so that no single trial decides; {1 / f.CAP:g} where all count that."
+        " Interval: as for rmse, but its lower end is where it would be if a share of trials (95"
+        f" %) that may be unusual beyond those seen counted {f.CAP:g} each; 0 from"
+        f" {intervals.RARE} unusual ones on. Unusual is what {intervals.UNUSUAL:g} of normal"
+        " errors exceed.",
         f.efficiency_capped,
         limits=f.efficiency_capped_limits,
         where=("all_trials",),
@@ -145,9 +150,10 @@ STATISTICS: tuple[Statistic, ...] = (
     _all(
         "nees_median",
         "NEES",
-        "Median of e' P⁻¹ e with the covariance P that the estimator reports, over the median of chi-square with n"
-        " degrees: 1 if the covariance is right. A value that is not finite counts as infinite. Limits: 95 % of"
-        " medians over this number of trials lie between them if the covariance is right.",
+        "Median of e' P⁻¹ e with the covariance P that the estimator reports, over the median of"
+        " chi-square with n degrees: 1 if the covariance is right. A value that is not finite"
+        " counts as infinite. Limits: 95 % of medians over this number of trials lie between them"
+        " if the covariance is right.",
         f.nees_median,
         limits=f.nees_median_limits,
         where=("calibration",),
@@ -157,7 +163,8 @@ STATISTICS: tuple[Statistic, ...] = (
     _all(
         "solved_trials",
         "solved trials",
-        "Number of solved trials, over which bias, std, rmse, bounds, efficiency and NEES are computed.",
+        "Number of solved trials, over which bias, std, rmse, bounds, efficiency and NEES are"
+        " computed.",
         lambda s: int(s.solved.sum()),
         kind="count",
         where=("solved_trials",),
@@ -173,8 +180,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "equation",
         "equation",
         "no trials: the same for all",
-        "The equation that the estimator solves: eq. (11) with the frozen H, the least-squares condition or the"
-        " maximum a posteriori condition. Filters and the linear LSE have none.",
+        "The equation that the estimator solves: eq. (11) with the frozen H, the least-squares"
+        " condition or the maximum a posteriori condition. Filters and the linear LSE have none.",
         lambda s: s.group.footer.get("equation") or "-",
         kind="word",
     ),
@@ -182,14 +189,16 @@ STATISTICS: tuple[Statistic, ...] = (
         "family",
         "family",
         "no trials: the same for all",
-        "The kind of the estimator: IPE, filters (smoothers among them), least squares or one that its class names.",
+        "The kind of the estimator: IPE, filters (smoothers among them), least squares or one that"
+        " its class names.",
         lambda s: family_of(s.group.footer),
         kind="word",
     ),
     _all(
         "false_root",
         "false root",
-        "Share of trials that converged to another root of the same equation, so that they are not solved.",
+        "Share of trials that converged to another root of the same equation, so that they are not"
+        " solved.",
         lambda s: f.share(s.converged & ~s.solved),
         kind="share",
         where=("solved_trials", "covariances"),
@@ -198,8 +207,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "false_root_distance",
         "false root at",
         "converged trials that are not solved",
-        "Median over trials of the largest distance of a parameter from the right root, in standard deviations of the"
-        " Cramér-Rao bound.",
+        "Median over trials of the largest distance of a parameter from the right root, in"
+        " standard deviations of the Cramér-Rao bound.",
         f.false_root_distance,
         where=("covariances",),
     ),
@@ -222,12 +231,14 @@ STATISTICS: tuple[Statistic, ...] = (
     _solved(
         "rmse",
         "rmse",
-        "Root mean square error. Interval: 95 %, by the studentised bootstrap of its logarithm over trials (Efron and"
-        f" Tibshirani, An Introduction to the Bootstrap, 1993, ch. 12), {intervals.RESAMPLES} resamples, the same for"
-        f" every estimator; above {intervals.LARGEST_SAMPLE} trials, groups of consecutive trials are resampled. None"
-        f" for fewer than {FEW} trials. No upper end where larger errors may be unseen (rmse_unseen above 0), and where"
-        " a few trials carry the sum of squares: where its effective number of trials, (Σ e²)² / Σ e⁴ (Kish, Survey"
-        f" Sampling, 1965), is less than for normal errors in all but {100 * intervals.HEAVY:g} % of cases.",
+        "Root mean square error. Interval: 95 %, by the studentised bootstrap of its logarithm"
+        " over trials (Efron and Tibshirani, An Introduction to the Bootstrap, 1993, ch. 12),"
+        f" {intervals.RESAMPLES} resamples, the same for every estimator; above"
+        f" {intervals.LARGEST_SAMPLE} trials, groups of consecutive trials are resampled. None for"
+        f" fewer than {FEW} trials. No upper end where larger errors may be unseen (rmse_unseen"
+        " above 0), and where a few trials carry the sum of squares: where its effective number of"
+        " trials, (Σ e²)² / Σ e⁴ (Kish, Survey Sampling, 1965), is less than for normal errors in"
+        f" all but {100 * intervals.HEAVY:g} % of cases.",
         f.of_each(f.rmse),
         limits=f.ends_in_units(f.rmse_ends),
         kind="physical",
@@ -237,19 +248,20 @@ STATISTICS: tuple[Statistic, ...] = (
     _solved(
         "rmse_unseen",
         "unseen",
-        "Share of trials that may have larger errors than those seen: the upper limit (95 %, Clopper and Pearson) of"
-        f" the share of errors that {intervals.UNUSUAL:g} of normal ones with the same median exceed, less the share"
-        f" seen; about 3 / N where none of N trials has one, and 0 from {intervals.RARE} on. No interval of the root"
-        " mean square knows of errors that are so rare.",
+        "Share of trials that may have larger errors than those seen: the upper limit (95 %,"
+        f" Clopper and Pearson) of the share of errors that {intervals.UNUSUAL:g} of normal ones"
+        " with the same median exceed, less the share seen; about 3 / N where none of N trials has"
+        f" one, and 0 from {intervals.RARE} on. No interval of the root mean square knows of"
+        " errors that are so rare.",
         f.rmse_unseen,
         kind="share",
     ),
     _solved(
         "effective_trials",
         "effective trials",
-        "Number of equal trials that would share the sum of squared errors as evenly, (Σ e²)² / Σ e⁴ (Kish,"
-        " Survey Sampling, 1965): a third of the trials for normal errors of one parameter, one if a single trial"
-        " carries the whole sum.",
+        "Number of equal trials that would share the sum of squared errors as evenly, (Σ e²)² / Σ"
+        " e⁴ (Kish, Survey Sampling, 1965): a third of the trials for normal errors of one"
+        " parameter, one if a single trial carries the whole sum.",
         lambda s: f.squares(s).effective,
         where=("parameters",),
     ),
@@ -266,7 +278,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "linear_bound",
         "linear bound",
         "no trials: the same for all",
-        "Standard deviation of the linear least-squares estimate, eq. (5), if the model were linear.",
+        "Standard deviation of the linear least-squares estimate, eq. (5), if the model were"
+        " linear.",
         lambda s: np.append(s.linear_bound * s.sizes, 1.0),
         kind="physical",
         where=("parameters",),
@@ -282,9 +295,9 @@ STATISTICS: tuple[Statistic, ...] = (
     _solved(
         "bayes_bound",
         "Bayesian bound",
-        "(J' R⁻¹ J + P₀⁻¹)⁻¹ at the truth, which estimators that use a prior are compared with: root mean square of its"
-        " standard deviation. It is a local bound, for each truth its own, and not Van Trees's. Of states that move: of"
-        " the filter that is linearised at the truth.",
+        "(J' R⁻¹ J + P₀⁻¹)⁻¹ at the truth, which estimators that use a prior are compared with:"
+        " root mean square of its standard deviation. It is a local bound, for each truth its own,"
+        " and not Van Trees's. Of states that move: of the filter that is linearised at the truth.",
         f.of_each(f.bayes),
         kind="physical",
         where=("parameters",),
@@ -293,11 +306,13 @@ STATISTICS: tuple[Statistic, ...] = (
         "van_trees",
         "Van Trees's bound",
         "truths drawn from the prior",
-        "(E[J' R⁻¹ J] + P₀⁻¹)⁻¹, which no estimator can beat on average over the prior, biased or not (Van Trees,"
-        " Detection, Estimation, and Modulation Theory I, 1968, sec. 2.4): standard deviation. The mean E is over"
-        f" {EXPECTED} truths of each seed; its interval, 95 %, holds for this mean, and there is none where few"
-        f" truths carry it: where their effective number (Kish, Survey Sampling, 1965) is less than {EVEN:g} of them."
-        " Of states that move: the posterior Cramér-Rao bound (Tichavský, Muravchik and Nehorai, IEEE TSP 46, 1998).",
+        "(E[J' R⁻¹ J] + P₀⁻¹)⁻¹, which no estimator can beat on average over the prior, biased or"
+        " not (Van Trees, Detection, Estimation, and Modulation Theory I, 1968, sec. 2.4):"
+        f" standard deviation. The mean E is over {EXPECTED} truths of each seed; its interval, 95"
+        " %, holds for this mean, and there is none where few truths carry it: where their"
+        f" effective number (Kish, Survey Sampling, 1965) is less than {EVEN:g} of them. Of states"
+        " that move: the posterior Cramér-Rao bound (Tichavský, Muravchik and Nehorai, IEEE TSP"
+        " 46, 1998).",
         f.of_each(lambda s: f.van_trees(s)[0]),
         limits=f.van_trees_limits,
         kind="physical",
@@ -307,9 +322,10 @@ STATISTICS: tuple[Statistic, ...] = (
         "predicted_bias",
         "bias by theory",
         "solved trials under a wrong model, else the first trials",
-        "Mean error of least squares by theory. Under a wrong model it is the distance to the parameters that come"
-        " closest to the error-free readings (Vuong, Caltech working paper 652, 1986); under the right one it is the"
-        " bias of second order (Box, J. R. Stat. Soc. B 33, 1971).",
+        "Mean error of least squares by theory. Under a wrong model it is the distance to the"
+        " parameters that come closest to the error-free readings (Vuong, Caltech working paper"
+        " 652, 1986); under the right one it is the bias of second order (Box, J. R. Stat. Soc. B"
+        " 33, 1971).",
         f.of_each(lambda s: f.predicted(s)[0]),
         given="solved",
         kind="physical",
@@ -318,10 +334,11 @@ STATISTICS: tuple[Statistic, ...] = (
     _solved(
         "predicted_rmse",
         "rmse by theory",
-        "Root mean square error of least squares by theory, without any draw of noise. Under a wrong model it combines"
-        " that distance with the asymptotic covariance A⁻¹ B A⁻¹ of least squares about it (Vuong, 1986; Richmond and"
-        " Horowitz, IEEE Trans. Signal Processing 63, 2015), which is not a bound, since another estimator may have a"
-        " smaller error; under the right one it combines the Cramér-Rao bound with the bias of second order.",
+        "Root mean square error of least squares by theory, without any draw of noise. Under a"
+        " wrong model it combines that distance with the asymptotic covariance A⁻¹ B A⁻¹ of least"
+        " squares about it (Vuong, 1986; Richmond and Horowitz, IEEE Trans. Signal Processing 63,"
+        " 2015), which is not a bound, since another estimator may have a smaller error; under the"
+        " right one it combines the Cramér-Rao bound with the bias of second order.",
         f.of_each(lambda s: f.predicted(s)[1]),
         kind="physical",
         where=("theory",),
@@ -330,8 +347,9 @@ STATISTICS: tuple[Statistic, ...] = (
         "curvature_intrinsic",
         "intrinsic curvature",
         "the first trials",
-        "Median relative curvature of the surface of readings at the truth, within the 95 % region of the bound (Bates"
-        " and Watts, J. R. Stat. Soc. B 42, 1980): linear theory holds well below 0.3.",
+        "Median relative curvature of the surface of readings at the truth, within the 95 % region"
+        " of the bound (Bates and Watts, J. R. Stat. Soc. B 42, 1980): linear theory holds well"
+        " below 0.3.",
         lambda s: f.median_of_truth(s, "curvature_intrinsic"),
         where=("theory",),
     ),
@@ -346,8 +364,8 @@ STATISTICS: tuple[Statistic, ...] = (
     _solved(
         "reported",
         "reported",
-        "Root mean square of the standard deviation that the estimator itself reports: eq. (5) for the linear LSE, the"
-        " sandwich (H⁺J)⁻¹ H⁺RH⁺' (H⁺J)⁻ᵀ at the estimate for the frozen root.",
+        "Root mean square of the standard deviation that the estimator itself reports: eq. (5) for"
+        " the linear LSE, the sandwich (H⁺J)⁻¹ H⁺RH⁺' (H⁺J)⁻ᵀ at the estimate for the frozen root.",
         f.of_each(
             lambda s: f.rms_columns(s.deviation, s.solved & np.isfinite(s.deviation).all(axis=1))
         ),
@@ -357,9 +375,10 @@ STATISTICS: tuple[Statistic, ...] = (
     _solved(
         "eq_14",
         "eq. (14)",
-        "Standard deviation by eq. (14), eq. (5) with the compensation error N(x) - N(x̂) of a root of eq. (11) added"
-        " as if it were independent of the noise. It is not: x̂ is made from the noise, and the cross terms that"
-        " eq. (14) leaves out are of the same order. The sandwich has them, to first order.",
+        "Standard deviation by eq. (14), eq. (5) with the compensation error N(x) - N(x̂) of a"
+        " root of eq. (11) added as if it were independent of the noise. It is not: x̂ is made"
+        " from the noise, and the cross terms that eq. (14) leaves out are of the same order. The"
+        " sandwich has them, to first order.",
         f.of_each(f.eq_14),
         kind="physical",
         where=("covariances",),
@@ -373,8 +392,9 @@ STATISTICS: tuple[Statistic, ...] = (
     _solved(
         "efficiency",
         "efficiency, solved",
-        "Bound over rmse, as standard deviations: 1 for an efficient estimator. The bound is the one at the truth,"
-        " Cramér and Rao's or, for estimators that use a prior, the Bayesian one. Interval: from the interval of rmse.",
+        "Bound over rmse, as standard deviations: 1 for an efficient estimator. The bound is the"
+        " one at the truth, Cramér and Rao's or, for estimators that use a prior, the Bayesian"
+        " one. Interval: from the interval of rmse.",
         f.efficiency,
         limits=f.efficiency_limits,
         where=("solved_trials",),
@@ -393,8 +413,8 @@ STATISTICS: tuple[Statistic, ...] = (
     _all(
         "efficiency_all",
         "efficiency, all",
-        "The same bound over the root mean square error of all trials. Because no trial is left out, it compares"
-        " estimators that solve an equation with those that do not.",
+        "The same bound over the root mean square error of all trials. Because no trial is left"
+        " out, it compares estimators that solve an equation with those that do not.",
         f.efficiency_all,
         where=("all_trials",),
         titles={"all_trials": "efficiency, uncapped"},
@@ -402,8 +422,9 @@ STATISTICS: tuple[Statistic, ...] = (
     _all(
         "median_abs_error",
         "median abs error",
-        "Median of the absolute error, where a value that is not finite counts as infinite. Over all parameters it is"
-        " the median of the root mean square over parameters of the error over the linear bound.",
+        "Median of the absolute error, where a value that is not finite counts as infinite. Over"
+        " all parameters it is the median of the root mean square over parameters of the error"
+        " over the linear bound.",
         lambda s: f.error_quantile(s, 0.5),
         kind="physical",
         where=("parameters",),
@@ -419,10 +440,10 @@ STATISTICS: tuple[Statistic, ...] = (
     _solved(
         "nees",
         "mean NEES / n, solved",
-        "Mean of e' P⁻¹ e / n with the covariance P that the estimator reports: 1 if it is right. For a parameter it"
-        " is the mean of the squared error over the reported variance. Limits: 95 % of chi-square, which hold for a"
-        " right covariance and normal errors (Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking"
-        " and Navigation, 2001, sec."
+        "Mean of e' P⁻¹ e / n with the covariance P that the estimator reports: 1 if it is right."
+        " For a parameter it is the mean of the squared error over the reported variance. Limits:"
+        " 95 % of chi-square, which hold for a right covariance and normal errors (Bar-Shalom, Li"
+        " and Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, sec."
         " 5.4).",
         f.nees,
         limits=f.nees_limits,
@@ -434,8 +455,8 @@ STATISTICS: tuple[Statistic, ...] = (
     _all(
         "coverage95",
         "coverage",
-        "Share of trials whose truth lies inside the 95 % ellipsoid that the estimator reports, or for a parameter"
-        " inside its interval. A value that is not finite counts as not covered.",
+        "Share of trials whose truth lies inside the 95 % ellipsoid that the estimator reports, or"
+        " for a parameter inside its interval. A value that is not finite counts as not covered.",
         f.coverage,
         kind="share",
         where=("calibration", "parameters"),
@@ -443,12 +464,14 @@ STATISTICS: tuple[Statistic, ...] = (
     Statistic(
         "verdict",
         "verdict",
-        "converged trials with a reported covariance: a trial that the estimator itself gives up on makes no claim",
-        "Whether the reported covariance is right. Overconfident, too cautious: the mean NEES lies significantly (95 %"
-        " for all estimators and error scales of a setting together, for errors of any law) above or below n, and below"
-        f" it also with a NEES of {intervals.UNSEEN_NEES:g} n in the number of trials that may be unusual and unseen;"
-        " consistent: neither; undecided: a few trials carry that mean, or it seems to lie below n and rare large"
-        f" errors may be missing. None for fewer than {FEW} trials.",
+        "converged trials with a reported covariance: a trial that the estimator itself gives up"
+        " on makes no claim",
+        "Whether the reported covariance is right. Overconfident, too cautious: the mean NEES lies"
+        " significantly (95 % for all estimators and error scales of a setting together, for"
+        " errors of any law) above or below n, and below it also with a NEES of"
+        f" {intervals.UNSEEN_NEES:g} n in the number of trials that may be unusual and unseen;"
+        " consistent: neither; undecided: a few trials carry that mean, or it seems to lie below n"
+        f" and rare large errors may be missing. None for fewer than {FEW} trials.",
         lambda s: f.verdict_on(s.scalars["nees"], s.n, s),
         kind="word",
         where=("calibration",),
@@ -456,7 +479,8 @@ STATISTICS: tuple[Statistic, ...] = (
     _all(
         "claims",
         "claims",
-        "Number of trials that converged and report a covariance, over which calibration is computed.",
+        "Number of trials that converged and report a covariance, over which calibration is"
+        " computed.",
         lambda s: int((s.converged & ~np.isnan(s.scalars["nees"])).sum()),
         kind="count",
         where=("calibration",),
@@ -465,10 +489,11 @@ STATISTICS: tuple[Statistic, ...] = (
         "calibration_p",
         "p of calibration",
         "converged trials with a reported covariance",
-        "Of a parameter, the probability that the distribution of the truth under the reported Gaussian, or of the"
-        " squared error under chi-square, is so far from uniform by chance: both are compared with bands that a right"
-        " covariance leaves anywhere with a stated probability (Säilynoja, Bürkner and Vehtari, Stat. Comput. 32,"
-        " 2022), and the smaller p is doubled. Of all, the smallest p times n + 1 (Bonferroni).",
+        "Of a parameter, the probability that the distribution of the truth under the reported"
+        " Gaussian, or of the squared error under chi-square, is so far from uniform by chance:"
+        " both are compared with bands that a right covariance leaves anywhere with a stated"
+        " probability (Säilynoja, Bürkner and Vehtari, Stat. Comput. 32, 2022), and the smaller p"
+        " is doubled. Of all, the smallest p times n + 1 (Bonferroni).",
         f.calibration_p,
         kind="probability",
         where=("calibration",),
@@ -477,8 +502,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "calibration_excursion",
         "excursion",
         "the same trials",
-        "The largest difference between these distribution functions and the uniform one; over all parameters, the"
-        " one of NEES.",
+        "The largest difference between these distribution functions and the uniform one; over all"
+        " parameters, the one of NEES.",
         lambda s: [part.excursion for part in s.calibrations] or np.nan,
         where=("calibration",),
     ),
@@ -486,11 +511,12 @@ STATISTICS: tuple[Statistic, ...] = (
         "calibration",
         "calibration",
         "the same trials",
-        "How the reported covariance is wrong, if it significantly is, at 5 % for an estimator and all its parameters"
-        " together: shifted is the median of error over reported deviation (estimate less truth); most errors larger"
-        " or smaller, the median of its size over the median for a right covariance, which ignores rare large errors;"
-        f" far outside, the share beyond the quantile that {GATE:g} should lie beyond, after a factor above 1."
-        " Over all parameters: NEES, and the parameter that is farthest off.",
+        "How the reported covariance is wrong, if it significantly is, at 5 % for an estimator and"
+        " all its parameters together: shifted is the median of error over reported deviation"
+        " (estimate less truth); most errors larger or smaller, the median of its size over the"
+        " median for a right covariance, which ignores rare large errors; far outside, the share"
+        f" beyond the quantile that {GATE:g} should lie beyond, after a factor above 1. Over all"
+        " parameters: NEES, and the parameter that is farthest off.",
         f.calibration,
         kind="word",
         where=("calibration", "parameters"),
@@ -498,10 +524,11 @@ STATISTICS: tuple[Statistic, ...] = (
     _all(
         "misfit",
         "misfit",
-        "Share whose residuals fail the test of fit: |R^-1/2 (z - h(x))|² is larger than it would be in 0.1 % of trials"
-        " if model and noise were right. Its law is chi-square with m - n degrees for least squares and normal noise."
-        " For other noise it is simulated; for other estimators it is scaled to the effective degrees of what they"
-        " leave, m less the trace of their influence. It needs no truth, so it is known for real readings too.",
+        "Share whose residuals fail the test of fit: |R^-1/2 (z - h(x))|² is larger than it would"
+        " be in 0.1 % of trials if model and noise were right. Its law is chi-square with m - n"
+        " degrees for least squares and normal noise. For other noise it is simulated; for other"
+        " estimators it is scaled to the effective degrees of what they leave, m less the trace of"
+        " their influence. It needs no truth, so it is known for real readings too.",
         f.misfit,
         kind="share",
         where=("all_trials",),
@@ -510,8 +537,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "ambiguous",
         "ambiguous",
         "the trials in which the estimator has looked for it",
-        "Share in which several distinct minima fit the readings, so that no residual can tell which is the truth, or"
-        " copies of a path by whole periods of a state do.",
+        "Share in which several distinct minima fit the readings, so that no residual can tell"
+        " which is the truth, or copies of a path by whole periods of a state do.",
         f.ambiguous,
         kind="share",
         where=("all_trials",),
@@ -558,8 +585,8 @@ STATISTICS: tuple[Statistic, ...] = (
     _all(
         "time_mean_s",
         "time, mean",
-        "Mean wall clock of a trial. The time of a block of trials is shared out evenly among them, so that a median or"
-        " a scatter over trials has no meaning.",
+        "Mean wall clock of a trial. The time of a block of trials is shared out evenly among"
+        " them, so that a median or a scatter over trials has no meaning.",
         lambda s: float(np.mean(s.scalars["time_s"])),
         kind="seconds",
         where=("costs",),
@@ -591,7 +618,8 @@ MAIN = (
 )
 """The statistics of estimators of constants that `summary.csv` has, with their intervals."""
 NOT_MAIN = ("rmse_high",)
-"""Ends of intervals that it leaves out: in fewer than a thousand trials this one is hardly ever known."""
+"""Ends of intervals that it leaves out: in fewer than a thousand trials this one is hardly ever
+known."""
 RENAMED = {
     "time_median_s": "time_mean_s",
     "nees_median_low": "nees_median_low_if_honest",
@@ -611,9 +639,9 @@ SCORES: tuple[Statistic, ...] = (
         "capped_error",
         "capped error",
         "the trials that every estimator of the scenario has",
-        "Mean Mahalanobis error sqrt(e' J' R⁻¹ J e), the error in standard deviations of the Cramér-Rao bound, about √n"
-        " when efficient; each trial's counts at most the radius of the gate of success, so that failing badly is"
-        " failing once.",
+        "Mean Mahalanobis error sqrt(e' J' R⁻¹ J e), the error in standard deviations of the"
+        " Cramér-Rao bound, about √n when efficient; each trial's counts at most the radius of the"
+        " gate of success, so that failing badly is failing once.",
         f.capped_error,
         where=("all_trials",),
     ),
@@ -628,8 +656,9 @@ SCORES: tuple[Statistic, ...] = (
         "cost_to_limit_median",
         f"to {CLOSE:g} σ of limit",
         "converged trials with a stored history",
-        f"Median cost until all further iterates are within {CLOSE:g} standard deviations of the last, in every"
-        " parameter; iterate k of K is taken to cost (k + 1) / (K + 1) of the trial.",
+        f"Median cost until all further iterates are within {CLOSE:g} standard deviations of the"
+        " last, in every parameter; iterate k of K is taken to cost (k + 1) / (K + 1) of the"
+        " trial.",
         lambda s: quantile(
             np.array(
                 [
@@ -664,7 +693,8 @@ SCORES: tuple[Statistic, ...] = (
         "eq_18_trials",
         "K below 1",
         "converged trials of fixed-point iteration with a stored history",
-        "Number of those in which the K of eq. (15) at the truth is below 1, so that eq. (18) applies.",
+        "Number of those in which the K of eq. (15) at the truth is below 1, so that eq. (18)"
+        " applies.",
         lambda s: len(f.fixed_point_bounds(s)),
         kind="count",
         where=("iterations",),
@@ -673,9 +703,10 @@ SCORES: tuple[Statistic, ...] = (
         "eq_18_holds",
         "eq. (18) holds",
         "those trials in which K is below 1",
-        "Share in which no iterate is farther from the limit than K^k / (1 - K) times the first step, eq. (18) with the"
-        " k that the print lost (Burden and Faires, Numerical Analysis, have it). K is that at the truth: the theorem"
-        " wants the largest on the way, so this is an observation and no proof.",
+        "Share in which no iterate is farther from the limit than K^k / (1 - K) times the first"
+        " step, eq. (18) with the k that the print lost (Burden and Faires, Numerical Analysis,"
+        " have it). K is that at the truth: the theorem wants the largest on the way, so this is"
+        " an observation and no proof.",
         lambda s: float(f.mean(f.fixed_point_bounds(s))[0]),
         kind="share",
         where=("iterations",),
@@ -684,7 +715,8 @@ SCORES: tuple[Statistic, ...] = (
         "eq_18_error_over_bound",
         "error / bound of eq. (18)",
         "those trials in which K is below 1",
-        "Median of the largest distance of an iterate after the first from the limit, over its bound.",
+        "Median of the largest distance of an iterate after the first from the limit, over its"
+        " bound.",
         lambda s: quantile(f.fixed_point_bounds(s)[:, 1], 0.5),
         where=("iterations",),
     ),
@@ -692,8 +724,8 @@ SCORES: tuple[Statistic, ...] = (
         "eq_23_observed",
         "M observed",
         "converged trials of Newton's method with a stored history",
-        "Median of the least M with which eq. (23), |x_(k+1) - root| <= n² M / 2 |x_k - root|², explains the history;"
-        " the last iterate stands for the root.",
+        "Median of the least M with which eq. (23), |x_(k+1) - root| <= n² M / 2 |x_k - root|²,"
+        " explains the history; the last iterate stands for the root.",
         lambda s: quantile(f.constants(s)[:, 0], 0.5),
         where=("iterations",),
     ),
@@ -701,8 +733,8 @@ SCORES: tuple[Statistic, ...] = (
         "eq_23_M",
         "M at the truth",
         "the same trials",
-        "Median of the largest |∂²g_i / ∂x_j ∂x_k| of Newton's g at the truth, by central differences. The theorem"
-        " wants the largest over a neighbourhood.",
+        "Median of the largest |∂²g_i / ∂x_j ∂x_k| of Newton's g at the truth, by central"
+        " differences. The theorem wants the largest over a neighbourhood.",
         lambda s: quantile(f.constants(s)[:, 1], 0.5),
         where=("iterations",),
     ),
@@ -723,7 +755,8 @@ SCORES: tuple[Statistic, ...] = (
         NIS,
         "NIS",
         "all trials of filters",
-        "Mean normalised innovation squared over the number of readings: like NEES, but it needs no truth.",
+        "Mean normalised innovation squared over the number of readings: like NEES, but it needs"
+        " no truth.",
         f.mean_nis,
     ),
 )

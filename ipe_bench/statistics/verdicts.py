@@ -1,7 +1,8 @@
-"""Holds every word of verdict in one table: its value in files, the word shown, its rule and the words it replaces.
+"""Holds every word of verdict in one table: its value in files, the word shown, its rule and the
+words it replaces.
 
-The rules themselves are computed where their numbers are: `intervals.verdict` judges covariances, and
-`real.tracks.LogTracks.verdict` the track of a log.
+The rules themselves are computed where their numbers are: `intervals.verdict` judges covariances,
+and `real.tracks.LogTracks.verdict` the track of a log.
 """
 
 from __future__ import annotations
@@ -47,15 +48,16 @@ VERDICTS = (
         OVERCONFIDENT,
         "overconfident",
         "+",
-        "The reported covariance is too small: the mean NEES lies significantly (95 %) above the number of parameters.",
+        "The reported covariance is too small: the mean NEES lies significantly (95 %) above the"
+        " number of parameters.",
         replaces=("optimistic", "diverged but confident"),
     ),
     Word(
         TOO_CAUTIOUS,
         "too cautious",
         "-",
-        "The reported covariance is too large: the mean NEES lies significantly (95 %) below the number of parameters,"
-        " even if errors that no trial shows are large.",
+        "The reported covariance is too large: the mean NEES lies significantly (95 %) below the"
+        " number of parameters, even if errors that no trial shows are large.",
         replaces=("pessimistic",),
     ),
     Word(
@@ -68,28 +70,31 @@ VERDICTS = (
         UNDECIDED,
         "undecided",
         "?",
-        "A few trials carry the mean NEES, or it seems too small and rare large errors may be missing.",
+        "A few trials carry the mean NEES, or it seems too small and rare large errors may be"
+        " missing.",
     ),
     Word(
         WRONG,
         "wrong (not white)",
         "!",
-        f"Successive innovations of a filter are correlated: a log has p below {FIT_LEVEL:g}, or significantly"
-        " more than 1 % of the simulated trials have. The size of the innovations then proves nothing.",
+        f"Successive innovations of a filter are correlated: a log has p below {FIT_LEVEL:g}, or"
+        " significantly more than 1 % of the simulated trials have. The size of the innovations"
+        " then proves nothing.",
         replaces=("does not fit",),
     ),
     Word(
         NO_VERDICT,
         "-",
         "-",
-        f"Fewer than {FEW} trials converged with a reported covariance, or a tracker has neither innovations nor a"
-        " path's cost.",
+        f"Fewer than {FEW} trials converged with a reported covariance, or a tracker has neither"
+        " innovations nor a path's cost.",
     ),
     Word(
         LOST,
         "lost",
         "!",
-        "From the named epoch of a log on, most innovations are larger than all but one in a million by chance.",
+        "From the named epoch of a log on, most innovations are larger than all but one in a"
+        " million by chance.",
     ),
     Word(
         COLLAPSED,
@@ -115,7 +120,8 @@ _WORDS = {name: word for word in VERDICTS for name in (word.value, *word.replace
 
 
 def current(value: str) -> str:
-    """Returns the value of a verdict from files of any version; a value that is no verdict stays."""
+    """Returns the value of a verdict from files of any version; a value that is no verdict
+    stays."""
     return _WORDS[value].value if value in _WORDS else value
 
 

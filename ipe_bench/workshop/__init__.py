@@ -1,1 +1,2 @@
-"""Serves authors of plugins: templates to start from, conformance tests, pages for coding agents, a guard in CI."""
+"""Serves authors of plugins: templates to start from, conformance tests, pages for coding agents, a
+guard in CI."""

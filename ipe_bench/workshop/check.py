@@ -15,7 +15,8 @@ def findings(component: Any) -> list[Finding]:
     if not isinstance(component, Path | str):
         name = getattr(component, "name", type(component).__name__)
         return list(check_component(name, component))
-    # The statistics of a plugin that is checked do not stand in the reports that this process writes later.
+    # The statistics of a plugin that is checked do not stand in the reports that this process
+    # writes later.
     with added_for_now():
         chosen = options_in(Path(component))
         parts = [option for option in chosen if option.group not in RECORD_GROUPS]

@@ -31,4 +31,7 @@ def write_ci() -> str:
         require_absent(Path(target))
     for target, source in texts.items():
         fill(Path(target), source, {"version": ib.__version__, **ours})
-    return f"{' and '.join(texts)} are ready. Try:\n  ipe-bench run --config-dir ci +experiment=guard figures=none"
+    return (
+        f"{' and '.join(texts)} are ready. Try:\n  ipe-bench run --config-dir ci +experiment=guard"
+        " figures=none"
+    )

@@ -68,7 +68,8 @@ class Finding:
     complaint: str = ""
     """Empty where the check passed."""
     note: str = ""
-    """Why the check tested nothing, or what the author has left to do; empty where neither is so."""
+    """Why the check tested nothing, or what the author has left to do; empty where neither is
+    so."""
 
 
 def check_component(name: str, component: Any) -> Iterator[Finding]:
@@ -212,7 +213,8 @@ def steps_to_a_state(estimator: Estimator) -> str | None:
 
 
 def finds_the_parameters(estimator: Estimator) -> None:
-    """Recovers the parameters of a mildly bent model, with covariances that agree with the scatter of its estimates."""
+    """Recovers the parameters of a mildly bent model, with covariances that agree with the scatter
+    of its estimates."""
     scenario = _scenario(estimator, strength=0.0005)
     drawn = scenario.draw(0, SCATTERED)
     n = scenario.measurement.n
@@ -473,7 +475,8 @@ def _largest(values: Array) -> tuple[int, ...]:
 
 
 def orders_its_epochs(model: Measurement) -> str | None:
-    """Splits its readings into epochs, each reading in one, and computes a prefix as the whole does."""
+    """Splits its readings into epochs, each reading in one, and computes a prefix as the whole
+    does."""
     if model.epochs is None:
         return "it has no epochs"
     rows = np.sort(np.concatenate(model.epochs))
@@ -553,7 +556,8 @@ def _errors(noise: Noise, draws: int, rng: np.random.Generator) -> tuple[Array, 
 
 
 def corrupts_reproducibly(noise: Noise) -> str | None:
-    """States a covariance R of the readings, and gives the same readings from the same random stream."""
+    """States a covariance R of the readings, and gives the same readings from the same random
+    stream."""
     if noise.real or isinstance(noise, ModelNoise):
         return "R comes with the readings or with the model"
     m = _count(noise)
@@ -576,7 +580,8 @@ def draws_what_it_states(noise: Noise) -> str | None:
 
 
 def states_its_law(noise: Noise) -> str | None:
-    """Says by `whitened` how its errors are distributed, where they are not normal: the test of fit takes that law."""
+    """Says by `whitened` how its errors are distributed, where they are not normal: the test of fit
+    takes that law."""
     from scipy.stats import ks_2samp
 
     if not (_draws(noise) and noise.true_covariance):
@@ -626,8 +631,8 @@ def draws_reproducibly(prior: Prior) -> None:
 
 
 def draws_what_is_told(prior: Prior) -> None:
-    """Draws parameters of the mean x0 and of the deviations and correlations that it states, normal where it says
-    so."""
+    """Draws parameters of the mean x0 and of the deviations and correlations that it states, normal
+    where it says so."""
     from scipy.stats import kstest
 
     x0 = _point(prior)
@@ -659,7 +664,8 @@ def suits_itself(model: StateModel) -> None:
 
 
 def moves_batches(model: StateModel) -> None:
-    """Moves and reads a stack of states as one by one, bit for bit, and analytically: slopes are complex steps."""
+    """Moves and reads a stack of states as one by one, bit for bit, and analytically: slopes are
+    complex steps."""
     x = StateModel.draw(model, 0, 4).x[:, -1]
     k = model.epochs - 1
     by_state = {"gain_at": model.gain_by_state, "R_at": model.R_by_state}
@@ -685,7 +691,8 @@ def _require_analytic(name: str, function: Callable[[Array], Array], x: Array) -
 
 
 def is_recorded(model: StateModel) -> str | None:
-    """Has the same transition and readings along whole paths, recorded and compiled, as epoch by epoch."""
+    """Has the same transition and readings along whole paths, recorded and compiled, as epoch by
+    epoch."""
     x = StateModel.draw(model, 0, 4).x
     whys = []
     for name, functions in zip(("transition", "observe"), model.epoch_functions, strict=True):
@@ -721,7 +728,8 @@ def wraps_its_angles(model: StateModel) -> None:
 
 
 def tracks_its_trials(tracker: Tracker) -> None:
-    """Tracks a linear model with covariances that agree with its errors, and a trial alone with the same bits."""
+    """Tracks a linear model with covariances that agree with its errors, and a trial alone with the
+    same bits."""
     linear = {"next": {"x": "0.9*x + w"}, "readings": {"z": "x"}, "noise": {"w": 1.0}}
     model = Formulas(**linear, deviation={"z": 0.5}, spread={"x": 3.0}, count=20)
     paths = model.draw(0, SCATTERED)
@@ -747,7 +755,8 @@ def _work(task: Any) -> Iterator[int]:
 
 
 def does_every_task(execution: Execution) -> None:
-    """Tells of every step of every task in order, once of its end, and of a task that raises as a failure."""
+    """Tells of every step of every task in order, once of its end, and of a task that raises as a
+    failure."""
     told = _told(execution)
     for i, right in _told(Serial()).items():
         reported = ", ".join(told[i]) or "nothing"
@@ -765,7 +774,8 @@ def _told(execution: Execution) -> dict[int, list[str]]:
 
 
 def ends_with_the_run(execution: Execution) -> None:
-    """Hands on what ends the whole run, a UserError or StorageError, and can be closed before its end."""
+    """Hands on what ends the whole run, a UserError or StorageError, and can be closed before its
+    end."""
     with suppress(UserError):
         list(execution.run(_work, (UserError("wrong"), range(3))))
         raise AssertionError(

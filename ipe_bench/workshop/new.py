@@ -90,8 +90,8 @@ def _new_file(kind: str, name: str) -> str:
 
 
 def copy_kind(kind: str, home: Path, name: str, language: str | None) -> str:
-    """Copies the files of a plugin's kind, and those of one of its languages, into plugins/NAME; returns
-    what to read."""
+    """Copies the files of a plugin's kind, and those of one of its languages, into plugins/NAME;
+    returns what to read."""
     languages = sorted(path.name.removeprefix(f"{kind}-") for path in home.glob(f"{kind}-*"))
     if languages and language not in languages:
         why = "is not given" if language is None else unknown(language, languages, "language")

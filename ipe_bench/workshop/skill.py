@@ -23,10 +23,14 @@ PAGES = {
     "solver": f'run {BENT} "solver=[fixed_point,newton,my_solver]"',
     "filter": f'run {BENT} "baseline=[linear_lse,ekf,ukf,my_filter]"',
     "baseline": f'run {BENT} "baseline=[linear_lse,gauss_newton,my_baseline]"',
-    "measurement": f'run measurement=my_measurement {SMALL} "solver=[newton,auto]" "baseline=[gauss_newton,ekf,ukf]"',
+    "measurement": (
+        f'run measurement=my_measurement {SMALL} "solver=[newton,auto]"'
+        ' "baseline=[gauss_newton,ekf,ukf]"'
+    ),
     "function": "run measurement=function measurement.of=my_function:my_function "
     f"measurement.columns.t=[0,1,2,3,4,5,6,7] error_scale=0.1 {SMALL}",
-    "ode": "run measurement=ode measurement.file=my_ode.yaml error_scale=0.1 trials=50 figures=none",
+    "ode": "run measurement=ode measurement.file=my_ode.yaml error_scale=0.1 trials=50"
+    " figures=none",
     "state_model": "run state_model=my_state_model trials=50 figures=none",
     "tracker": 'run state_model=pendulum "tracker=[ekf,ukf,my_tracker]" trials=50 figures=none',
     "noise": "run measurement=polynomial noise=my_noise trials=50 figures=none",

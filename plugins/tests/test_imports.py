@@ -48,7 +48,8 @@ def imported(path: Path) -> set[tuple[str, str]]:
 
 
 STUDIES = {"zoo", "lost_tracks"}
-"""Folders that enter rooms: the zoo, which is tested with the package, and scripts that are no plugins."""
+"""Folders that enter rooms: the zoo, which is tested with the package, and scripts that are no
+plugins."""
 OTHERS = [path for path in written(PLUGINS) if STUDIES.isdisjoint(path.relative_to(PLUGINS).parts)]
 MADE = [path for path in written(TEMPLATES, ".py.template") if "test" not in path.name]
 

@@ -1,4 +1,5 @@
-"""What functions return shows itself, stays a frame under pandas, and answers wrong arguments in one sentence."""
+"""What functions return shows itself, stays a frame under pandas, and answers wrong arguments in
+one sentence."""
 
 # pyright: reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false
 # (what is wrong here is wrong on purpose)

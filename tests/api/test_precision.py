@@ -1,4 +1,5 @@
-"""Just enough trials: the same trials as ever, no more than are needed, going on from what is stored."""
+"""Just enough trials: the same trials as ever, no more than are needed, going on from what is
+stored."""
 
 import json
 import re
@@ -142,7 +143,10 @@ def test_the_command_says_how_many_trials_it_took_and_why(tmp_path, monkeypatch,
     out = capsys.readouterr().out
     assert " trials; every interval is narrow enough (newton: success ± " in out
     assert main(["run", *words, "precision={success:0.05,rmse:0.001}", "trials=200"]) == 1
-    said = "200 trials; the precision is not reached: the largest number of trials is reached (newton: rmse ± "
+    said = (
+        "200 trials; the precision is not reached: the largest number of trials is reached"
+        " (newton: rmse ± "
+    )
     assert said in capsys.readouterr().out
     assert main(["run", *words, "precision=0.01", "--dry-run"]) == 0
     assert "at most" in capsys.readouterr().out

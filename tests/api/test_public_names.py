@@ -1,4 +1,5 @@
-"""`import ipe_bench as ib` is enough for all that the command line does, and costs nothing until it is used."""
+"""`import ipe_bench as ib` is enough for all that the command line does, and costs nothing until it
+is used."""
 
 import doctest
 import inspect
@@ -36,7 +37,10 @@ FUNCTIONS = (
     "use", ["pass", "ib.Scenario, ib.Status, ib.UserError, ib.Estimator", "ib.noise.Gaussian"]
 )
 def test_nothing_heavy_is_imported_until_it_is_used(use):
-    script = f"import sys, ipe_bench as ib\n{use}\nprint(*[name for name in {HEAVY} if name in sys.modules])"
+    script = (
+        f"import sys, ipe_bench as ib\n{use}\nprint(*[name for name in {HEAVY} if name in"
+        " sys.modules])"
+    )
     loaded = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, check=True
     ).stdout
@@ -64,7 +68,8 @@ PUBLIC = {f"ipe_bench.{name}" for name in ib.__all__} - {"ipe_bench.__version__"
 
 
 def parts() -> list[str]:
-    """The classes that users construct by name: estimators, trackers, rules, state models and noises."""
+    """The classes that users construct by name: estimators, trackers, rules, state models and
+    noises."""
     states = (ib.states.Tracker, ib.states.StateModel, ib.states.Taylor.__base__)
     kinds = (ib.Estimator, ib.Noise, *states)
     return [
@@ -242,7 +247,8 @@ def test_status_and_report_agree_and_the_report_is_still_a_function_afterwards(
 def test_a_component_is_what_the_command_line_constructs():
     assert ib.component("solver/newton", max_iterations=20) == ib.solvers.Newton(max_iterations=20)
     assert ib.component("noise/gaussian", deviation=0.1) == ib.noise.Gaussian(0.1)
-    # A mapping changes the keys that it has, and an option stands on the options that its defaults name.
+    # A mapping changes the keys that it has, and an option stands on the options that its defaults
+    # name.
     pendulum = ib.component("state_model/pendulum", spread={"rate": 0.3})
     assert pendulum.spread == {"angle": 1.0, "rate": 0.3}
     book = ib.component("tracker/ekf_rts")

@@ -1,5 +1,5 @@
-"""The filters against closed forms, textbook loops and the batch answer on GINS, and against themselves one trial at a
-time."""
+"""The filters against closed forms, textbook loops and the batch answer on GINS, and against
+themselves one trial at a time."""
 
 from dataclasses import dataclass, replace
 
@@ -124,7 +124,8 @@ def test_readings_correlated_between_epochs_are_refused(estimator):
     ids=label,
 )
 def test_nis_is_chi_square_on_a_linear_model(estimator):
-    """The innovations of a Kalman filter are white, so their squares over m have the limits of chi-square."""
+    """The innovations of a Kalman filter are white, so their squares over m have the limits of
+    chi-square."""
     model = Linear()
     scenario = Scenario(model, Gaussian(0.7), GaussianPrior(), 1.0)
     found = estimator.estimate(scenario.problem, scenario.draw(0, 200).z)
@@ -282,7 +283,8 @@ def bent(bend: float, deviation: float, trials: int):
 
 
 def textbook_iplf(model, z, variance, iterations):
-    """García-Fernández et al.'s algorithm in covariance form, undamped, at the 2n points of the cubature rule."""
+    """García-Fernández et al.'s algorithm in covariance form, undamped, at the 2n points of the
+    cubature rule."""
     n = 3
     x, P = np.zeros(n), np.eye(n)
     for rows in model.epochs:
@@ -309,8 +311,8 @@ def textbook_iplf(model, z, variance, iterations):
     0.02,
 )
 def test_posterior_linearization_has_the_fixed_point_of_the_textbook():
-    """Damping and the order of the loops change the way, not the end. The bend is symmetric about the mean, so that
-    Cholesky's square root and ours give the same regression to second order."""
+    """Damping and the order of the loops change the way, not the end. The bend is symmetric about
+    the mean, so that Cholesky's square root and ours give the same regression to second order."""
     problem, trials = bent(0.05, 0.1, 6)
     found = IPLF(tolerance=1e-9, max_iterations=300).estimate(problem, trials.z)
     for z, x_found, P_found in zip(trials.z, found.x, found.covariance, strict=True):
@@ -368,7 +370,8 @@ def test_ukf_with_a_small_alpha_loses_digits():
 
 @pytest.mark.parametrize("estimator", [UKF(), CKF()], ids=["ukf", "ckf"])
 def test_p_minus_ksk_cancels_where_the_prior_is_wide(estimator):
-    """Prior deviations 1e5 times those of the posterior: filterpy as it stands, on the same sigma points, loses P."""
+    """Prior deviations 1e5 times those of the posterior: filterpy as it stands, on the same sigma
+    points, loses P."""
     model = Linear(sizes=(8, 8), unknowns=4)
     scenario = Scenario(model, Gaussian(1e-5), GaussianPrior(), 1.0)
     problem, z = scenario.problem, scenario.draw(0, 1).z

@@ -1,4 +1,5 @@
-"""Least squares of readings: SciPy's, from where an iteration begins, and on the certified problems of NIST."""
+"""Least squares of readings: SciPy's, from where an iteration begins, and on the certified problems
+of NIST."""
 
 from dataclasses import dataclass, replace
 
@@ -176,7 +177,8 @@ def test_an_estimator_that_starts_at_the_best_is_one_of_its_two_selves(estimator
 
 
 def test_gauss_newton_leaves_a_start_at_which_a_column_of_j_is_zero():
-    """A peak of height 0 has neither a place nor a width: the shortest step gives it a height, and then they count."""
+    """A peak of height 0 has neither a place nor a width: the shortest step gives it a height, and
+    then they count."""
     t = np.linspace(0, 10, 40)
     model = Formula("c+A*exp(-(t-mu)**2/2)", {"c": 1.0, "A": 0.0, "mu": 5.0}, {"t": t.tolist()})
     problem = Scenario(model, Gaussian(0.01)).problem
@@ -236,7 +238,8 @@ def test_all_27_certified_problems_are_solved_from_both_starts(estimator, mean):
     deviations = np.array([[d.deviations for d in row] for row in reached])
     agreed(10.0**-parameters, 1e-4)
     assert (parameters.mean(axis=1) >= mean).all()
-    # Lanczos1's certified deviations belong to residuals of 1e-13, which double precision does not resolve.
+    # Lanczos1's certified deviations belong to residuals of 1e-13, which double precision does not
+    # resolve.
     assert ((deviations >= 6).sum(axis=1) == 26).all()
 
 
@@ -246,7 +249,8 @@ def test_all_27_certified_problems_are_solved_from_both_starts(estimator, mean):
 MIRRORED = Written(lambda a, b: (a**2,) * 3 + (b,) * 3, 2, 6, first=1.0)
 """a^2 and b, each read three times: a and -a fit alike, and nothing else does."""
 WAVE = Written(lambda w: tuple(np.sin(w * t) for t in np.linspace(0.0, 20.0, 40)), 1, 40, first=2.0)
-"""sin(w t) over forty times: least squares in w has a minimum every 0.3 or so, one of them at the truth."""
+"""sin(w t) over forty times: least squares in w has a minimum every 0.3 or so, one of them at the
+truth."""
 
 
 def draw(model: Measurement, deviation: float, scale: float, trials: int):

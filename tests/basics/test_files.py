@@ -1,4 +1,5 @@
-"""Files appear under their names whole or not at all, and nothing else is left of a write that fails."""
+"""Files appear under their names whole or not at all, and nothing else is left of a write that
+fails."""
 
 import pytest
 

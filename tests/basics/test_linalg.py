@@ -26,7 +26,8 @@ def conditioned(condition: float, trials: int = 4) -> np.ndarray:
 @pytest.mark.parametrize("condition", [1.0, 20.0, 900.0, 3e3, 1e6, 1e10])
 @pytest.mark.parametrize("units", [1.0, 1e9])
 def test_a_pseudo_inverse_loses_no_more_digits_than_its_matrix(condition, units):
-    """Round-off of eps times the condition, from normal equations that squared; whatever units the columns have."""
+    """Round-off of eps times the condition, from normal equations that squared; whatever units the
+    columns have."""
     H = conditioned(condition) * np.geomspace(1.0, units, N)
     R = Covariance(np.linspace(0.1, 0.3, M))
     found, deficient = pseudo_inverse(H, R)

@@ -1,7 +1,9 @@
-"""Other people's integrators on the equations of a model by differential equations, batched as each does it best.
+"""Other people's integrators on the equations of a model by differential equations, batched as each
+does it best.
 
-They come with the extra `peers`; a library that is not installed has no row. Each is told an accuracy at which its
-readings are within the tolerance that ours hold, which the caller checks before it takes the time.
+They come with the extra `peers`; a library that is not installed has no row. Each is told an
+accuracy at which its readings are within the tolerance that ours hold, which the caller checks
+before it takes the time.
 """
 
 import importlib.util
@@ -57,7 +59,8 @@ def _run(program: Program, inputs: list[Any], library: Any) -> list[Any]:
 
 
 def _programs(model: OdeMeasurement) -> tuple[Program, Program, Program]:
-    """From p and c: the first state and what stays fixed; from t, the state and that: its slope, and what is read."""
+    """From p and c: the first state and what stays fixed; from t, the state and that: its slope,
+    and what is read."""
     tape = Recording(model.equations)
     fixed = tape.fixed(*tape.slope, *tape.shown)
     along = [tape.t, *tape.y, *fixed]

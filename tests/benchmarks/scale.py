@@ -1,6 +1,8 @@
-"""A million trials of two estimators with their report, as a user runs them: time, memory of every process, and disk.
+"""A million trials of two estimators with their report, as a user runs them: time, memory of every
+process, and disk.
 
-`SCALE` in the environment is another number of trials. A tenth of it is run first: what is flat is the same for both.
+`SCALE` in the environment is another number of trials. A tenth of it is run first: what is flat is
+the same for both.
 """
 
 import os

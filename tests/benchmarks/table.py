@@ -1,8 +1,9 @@
-"""What everything costs, in one table: `make bench` writes it as Markdown and as JSON to outputs/bench.
+"""What everything costs, in one table: `make bench` writes it as Markdown and as JSON to
+outputs/bench.
 
-All figures of a row are taken in one process, in turns, as CPU time, and the least of several rounds is kept: so their
-ratios hold on a busy machine, too. The Makefile sets one thread for each library. Whole commands are timed as
-processes, beside the import of the libraries that they use.
+All figures of a row are taken in one process, in turns, as CPU time, and the least of several
+rounds is kept: so their ratios hold on a busy machine, too. The Makefile sets one thread for each
+library. Whole commands are timed as processes, beside the import of the libraries that they use.
 """
 
 import json
@@ -149,7 +150,8 @@ def jacobians() -> Iterator[Row]:
 
 
 def stiff() -> Iterator[Row]:
-    """Robertson's equations to t = 4e5, beside what SciPy has for stiff ones, all with a relative tolerance of 1e-8."""
+    """Robertson's equations to t = 4e5, beside what SciPy has for stiff ones, all with a relative
+    tolerance of 1e-8."""
     rates = {"a": "-k1*a + k3*b*c", "b": "k1*a - k3*b*c - k2*b*b", "c": "k2*b*b"}
     times = tuple(np.logspace(0, np.log10(4e5), 20).tolist())
     model = ib.measurements.Ode(rates, {"k1": 0.04, "k2": 3e7, "k3": 1e4}, {"a": 1.0}, times=times)
@@ -243,7 +245,8 @@ def filters() -> Iterator[Row]:
 
 
 def trackers() -> Iterator[Row]:
-    """A pendulum of 500 epochs, all trials at once, beside filterpy's filters trial by trial and epoch by epoch."""
+    """A pendulum of 500 epochs, all trials at once, beside filterpy's filters trial by trial and
+    epoch by epoch."""
     from filterpy import kalman
 
     S, step, gravity = ib.states, 0.01, 9.81
@@ -350,7 +353,8 @@ def loop() -> Iterator[Row]:
 
 
 def scale() -> Iterator[Row]:
-    """Many trials with their report, beside a tenth of them; not among the parts unless it is asked for."""
+    """Many trials with their report, beside a tenth of them; not among the parts unless it is asked
+    for."""
     few, many = measured(TRIALS // 10), measured(TRIALS)
     what, tenth = f"{TRIALS:,} trials, two estimators", f"{few.trials:,} trials"
     for name, a, b in (
@@ -399,7 +403,8 @@ def markdown(facts: dict[str, Any], rows: list[Row]) -> str:
         "|---|---|--:|---|--:|--:|",
     ]
     lines += [
-        f"| {r.part} | {r.what} | {r.value:.3g} {r.unit} | {r.beside} | {r.other:.3g} | {r.ratio:.3g} |"
+        f"| {r.part} | {r.what} | {r.value:.3g} {r.unit} | {r.beside} | {r.other:.3g} |"
+        f" {r.ratio:.3g} |"
         for r in rows
     ]
     return "\n".join(lines) + "\n"
@@ -413,7 +418,8 @@ def main(folder: Path, parts: list[str]) -> None:
         for row in (PARTS | LONG)[part]():
             rows.append(row)
             print(
-                f"{row.part:11s} {row.what:52s} {row.value:9.3g} {row.unit:7s} x{row.ratio:<8.3g} {row.beside}"
+                f"{row.part:11s} {row.what:52s} {row.value:9.3g} {row.unit:7s} x{row.ratio:<8.3g}"
+                f" {row.beside}"
             )
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "bench.md").write_text(markdown(facts, rows), encoding="utf-8")

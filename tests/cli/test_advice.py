@@ -17,15 +17,21 @@ FORMULA = "run measurement=formula measurement.expression=b1*t measurement.colum
 FITTED = "estimate measurement=formula measurement.expression=b1*t+c"
 STARTED = f"{FITTED} measurement.start.b1=1 measurement.start.c=1"
 FEW = (
-    "run measurement=formula measurement.expression=b1*t+c measurement.columns.t=[1] measurement.start.b1=1"
-    " measurement.start.c=1 noise.deviation=1"
+    "run measurement=formula measurement.expression=b1*t+c measurement.columns.t=[1]"
+    " measurement.start.b1=1 measurement.start.c=1 noise.deviation=1"
 )
-ODE = "run measurement=ode measurement.start.k=1 measurement.initial.y=1 noise.deviation=1 measurement.times=[1,2]"
+ODE = (
+    "run measurement=ode measurement.start.k=1 measurement.initial.y=1 noise.deviation=1"
+    " measurement.times=[1,2]"
+)
 ROBUST = (
     "estimate measurement=nist/misra1a baseline=[least_squares] estimators.least_squares.loss=huber"
     " estimators.least_squares"
 )
-SWUNG = "run measurement=function measurement.of=swing:{} measurement.columns.t=[1,2,3] noise.deviation=1"
+SWUNG = (
+    "run measurement=function measurement.of=swing:{} measurement.columns.t=[1,2,3]"
+    " noise.deviation=1"
+)
 DECAY = "run measurement=ode measurement.rates.y=-k*y+c measurement.times=[1,2,3] noise.deviation=1"
 READ = "run state_model=formulas state_model.readings.z=x"
 STATES = "run state_model=formulas state_model.next.x=x+w state_model.noise.w=1"
@@ -183,7 +189,8 @@ ADVICE = [
     (
         "run measurement=formula",
         WORD,
-        "run measurement=formula measurement.start.b=1 measurement.columns.t=[1,2] noise.deviation=1 {}",
+        "run measurement=formula measurement.start.b=1 measurement.columns.t=[1,2]"
+        " noise.deviation=1 {}",
         {"FORMULA": "b*t"},
     ),
     (
@@ -196,7 +203,8 @@ ADVICE = [
     (
         "run state_model=formulas",
         WORD,
-        "run state_model=formulas {} state_model.readings.z=x state_model.deviation.z=1 state_model.spread.x=1",
+        "run state_model=formulas {} state_model.readings.z=x state_model.deviation.z=1"
+        " state_model.spread.x=1",
         {"STATE": "x", "FORMULA": "x"},
     ),
     (
@@ -395,8 +403,9 @@ def command(ipe_bench, monkeypatch, tmp_path):
     Path("l.yaml").write_text("[1]\n")
     Path("written.yaml").write_text("c0: {nominal: 1}\n")
     Path("swing.py").write_text(
-        "def good(t, length=1.0):\n    return length*t\n\ndef bare(t, length):\n    return length*t\n\n"
-        "def need(t, length=1.0, *, g):\n    return g*length*t\n\ndef two(t, u, length=1.0):\n    return length*t + u\n"
+        "def good(t, length=1.0):\n    return length*t\n\ndef bare(t, length):\n    return"
+        " length*t\n\ndef need(t, length=1.0, *, g):\n    return g*length*t\n\ndef two(t, u,"
+        " length=1.0):\n    return length*t + u\n"
     )
 
     def run(line: str) -> tuple[int, str]:

@@ -410,7 +410,8 @@ import sys
 from ipe_bench.cli.main import COMMANDS, main
 main(["--help"])
 main(["list", "--help"])
-print(sorted(m for m in ("pandas", "seaborn", "filterpy", "llvmlite", "hydra", "numpy", "rich") if m in sys.modules))
+known = ("pandas", "seaborn", "filterpy", "llvmlite", "hydra", "numpy", "rich")
+print(sorted(m for m in known if m in sys.modules))
 """
 
 
@@ -632,7 +633,8 @@ def test_a_model_that_brings_its_own_certified_readings_has_a_table(ipe_bench):
 
 
 def test_the_list_names_our_statistics_and_figures_too(capsys):
-    """Also where no plugin adds any; without a name they are left out, since they are no options."""
+    """Also where no plugin adds any; without a name they are left out, since they are no
+    options."""
     for group, names in (
         ("statistic", [one.name for one in (*STATISTICS, *SCORES)]),
         ("figure", list(figures.NAMES)),

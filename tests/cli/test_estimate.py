@@ -1,4 +1,5 @@
-"""`estimate` as people with readings of their own type it: the command, its exit code, and the numbers it leaves."""
+"""`estimate` as people with readings of their own type it: the command, its exit code, and the
+numbers it leaves."""
 
 import hashlib
 import json
@@ -25,7 +26,8 @@ LM = ("solver=[]", "baseline=[levenberg_marquardt]")
 
 @pytest.fixture
 def estimate(ipe_bench):
-    """Runs `estimate` in an empty folder; the exit code, what it printed, and its JSON file where it left one.
+    """Runs `estimate` in an empty folder; the exit code, what it printed, and its JSON file where
+    it left one.
 
     Figures are drawn where the command says so.
     """
@@ -62,8 +64,8 @@ def curve(t, b1, b2):
 
 
 def test_a_formula_and_a_file_are_enough_where_nobody_knows_the_noise(estimate, misra):
-    """Certified values and standard deviations, without a word about noise, and three estimators unless others are
-    chosen."""
+    """Certified values and standard deviations, without a word about noise, and three estimators
+    unless others are chosen."""
     code, printed, answer = estimate(*SATURATION, "readings=my.csv", "figures=all")
     assert code == 0, printed
     assert list(Path("outputs").rglob("*.png"))
@@ -196,18 +198,23 @@ MISTAKES = {
     "noise twice": (("readings=weighted.csv", "noise.deviation=0.3"),
                     "noise: is given, and the readings have a column"),
     "unknown parameter": (("readings=my.csv", "parameters.b3.fixed=1"), "parameters.b3: "),
-    "all fixed": (("readings=my.csv", "parameters.b1.fixed=1", "parameters.b2.fixed=1"), "parameters: all are fixed"),
+    "all fixed": (("readings=my.csv", "parameters.b1.fixed=1", "parameters.b2.fixed=1"),
+                  "parameters: all are fixed"),
     "no start": (("readings=my.csv", "~measurement.start.b2"), "start"),
     "one file twice": (("readings=[my.csv,my.csv]",), "names a file twice"),
-    "rows left out": (("readings=my.csv", "ignore_rows=[3,9]"), "is no key any more; empty the cells of these"),
+    "rows left out": (("readings=my.csv", "ignore_rows=[3,9]"),
+                      "is no key any more; empty the cells of these"),
     "a covariance": (("readings=my.csv", "prior_covariance=p.csv"),
                      "is no key any more; give parameters.NAME.deviation"),
     "a number for a column": (("readings=my.csv", "ignore_columns=[3]"), "ignore_columns"),
-    "no such file": (("readings=my.csv", "parameters=no.yaml"), "parameters=no.yaml: cannot be read"),
+    "no such file": (("readings=my.csv", "parameters=no.yaml"),
+                     "parameters=no.yaml: cannot be read"),
     "a key twice": (("readings=my.csv", "parameters=twice.yaml"),
                     "is not YAML that can be read (the key b1 is there twice)"),
-    "an alias": (("readings=my.csv", "parameters=alias.yaml"), "an alias (*NAME); write out what is meant"),
-    "deviations too few": (("readings=my.csv", "noise.deviation=[1,2]"), "has 2 numbers; give one for each of 14"),
+    "an alias": (("readings=my.csv", "parameters=alias.yaml"),
+                 "an alias (*NAME); write out what is meant"),
+    "deviations too few": (("readings=my.csv", "noise.deviation=[1,2]"),
+                           "has 2 numbers; give one for each of 14"),
 }
 # fmt: on
 
@@ -298,7 +305,8 @@ def test_noise_that_is_overstated_is_said_and_rounded_intervals_hold_the_estimat
     assert "no interval means anything" in far
     assert "95 % intervals" not in far
     less = printed(0.4)
-    # A straight line, with b near zero and a as large as one likes to both sides, is within the stated noise.
+    # A straight line, with b near zero and a as large as one likes to both sides, is within the
+    # stated noise.
     assert "a -2.34 … 6.70 −∞ … ∞" in less
     assert "b -3.12 … 4.78 −∞ … ∞" in less
     assert (

@@ -1,4 +1,5 @@
-"""A config of a foreign hand has no function called, no file emptied and no environment changed by Hydra."""
+"""A config of a foreign hand has no function called, no file emptied and no environment changed by
+Hydra."""
 
 from pathlib import Path
 
@@ -13,8 +14,14 @@ from ipe_bench.cli.session import Jobs, jobs_of, session
 
 COPY = "{_target_: shutil.copyfile, src: a, dst: b}"
 DECODED = "'${oc.decode:\"{x:{_target_:shutil.copyfile,src:a,dst:b}}\"}'"
-EMPTIES = "{version: 1, handlers: {x: {class: logging.FileHandler, filename: a, mode: w}}, root: {handlers: [x]}}"
-READ = "{version: 1, handlers: {x: {class: logging.StreamHandler, stream: 'ext://mine.x'}}, root: {handlers: [x]}}"
+EMPTIES = (
+    "{version: 1, handlers: {x: {class: logging.FileHandler, filename: a, mode: w}}, root:"
+    " {handlers: [x]}}"
+)
+READ = (
+    "{version: 1, handlers: {x: {class: logging.StreamHandler, stream: 'ext://mine.x'}}, root:"
+    " {handlers: [x]}}"
+)
 ATTACKS = {
     # What an experiment says below hydra, and the key that is named.
     "a callback": (f"callbacks: {{mine: {COPY}}}", "hydra.callbacks.mine._target_=shutil.copyfile"),

@@ -1,4 +1,5 @@
-"""Hundreds of wrong command lines and broken plugins: each answered in one line, and none taken without a word."""
+"""Hundreds of wrong command lines and broken plugins: each answered in one line, and none taken
+without a word."""
 
 from __future__ import annotations
 
@@ -98,18 +99,24 @@ OPTIONS = {
 }
 # fmt: off
 CHOICES = (
-    "null", "5", "1.5", "true", "[]", "[null]", "[1]", "{a: 1}", "../noise/none", "nothing", "''", LONG, "a/b", "*",
+    "null", "5", "1.5", "true", "[]", "[null]", "[1]", "{a: 1}", "../noise/none", "nothing", "''",
+    LONG, "a/b", "*",
 )
 FLAGS = {
     "run": (
-        "--trials=5", "-x", "--verbose", "-make", "--cfg", "--cfg nope", "-i nope", "--resolve", "-m --cfg job",
-        "--config-dir=/nope", "-cd /nope", "-cp /nope", "-cn nope", "--experimental-rerun nope", "-sc",
-        "-sc install=nope", "-sc install=bash uninstall=bash", "-sc query=bash", "--dry", "-r -m", "--multirun=5",
+        "--trials=5", "-x", "--verbose", "-make", "--cfg", "--cfg nope", "-i nope", "--resolve",
+        "-m --cfg job",
+        "--config-dir=/nope", "-cd /nope", "-cp /nope", "-cn nope", "--experimental-rerun nope",
+        "-sc",
+        "-sc install=nope", "-sc install=bash uninstall=bash", "-sc query=bash", "--dry", "-r -m",
+        "--multirun=5",
         "-c job -p",
     ),
     "estimate": (
-        "-m", "--cfg job", "-x", "--dry-run", "trials=5", "seed=1", "block_size=5", "formats=pdf", "execution=serial",
-        "truth_measurement=gins", "write_readings=x.csv", "readings=absent.csv", f"readings={LONG}", "readings=/",
+        "-m", "--cfg job", "-x", "--dry-run", "trials=5", "seed=1", "block_size=5", "formats=pdf",
+        "execution=serial",
+        "truth_measurement=gins", "write_readings=x.csv", "readings=absent.csv", f"readings={LONG}",
+        "readings=/",
         "",
     ),
     "report": (
@@ -122,37 +129,52 @@ FLAGS = {
         "-x", "solvers", "solver nothing", "--verbos", "-v=3", "solver/newton/x", "../conf",
     ),
     "new": (
-        "", "solver", "solver a b", "nothing x", "solver Abc", "solver 1a", "solver ../x", f"solver {LONG}",
-        "solver class", "solver newton", "noise gaussian", "solver -x", "solver ü", "solver a/b", "solver a-b",
+        "", "solver", "solver a b", "nothing x", "solver Abc", "solver 1a", "solver ../x",
+        f"solver {LONG}",
+        "solver class", "solver newton", "noise gaussian", "solver -x", "solver ü", "solver a/b",
+        "solver a-b",
     ),
     "check": (
         "", "nowhere", ".", "-x", "loop", LONG,
     ),
 }
 SYNTAX = (
-    "trials", "+", "~", "=5", "+=5", "~=", "solver=[newton", "solver=newton]", "a=b=c", "output=out/ünï", "trials=5,",
-    "trials=,5", "error_scale=1,,2", "error_scale=(1,2)", "x@y@z=3", "output=a{b", "name='a", 'name="a', "++",
-    "~~trials", "error_scale=range(1", "solver=[newton,,ekf]", "name=a(b)", "trials:5", "@x=3", "solver=[[newton]]",
+    "trials", "+", "~", "=5", "+=5", "~=", "solver=[newton", "solver=newton]", "a=b=c",
+    "output=out/ünï", "trials=5,",
+    "trials=,5", "error_scale=1,,2", "error_scale=(1,2)", "x@y@z=3", "output=a{b", "name='a",
+    'name="a', "++",
+    "~~trials", "error_scale=range(1", "solver=[newton,,ekf]", "name=a(b)", "trials:5", "@x=3",
+    "solver=[[newton]]",
 )
-SWEEPS = ("error_scale=1,2", "seed=range(0,3)", "measurement=gins,ranging", "solver=[newton],[fixed_point]")
+SWEEPS = ("error_scale=1,2", "seed=range(0,3)", "measurement=gins,ranging",
+          "solver=[newton],[fixed_point]")
 BAD_SWEEPS = (
-    "error_scale=range(1,nan)", "error_scale=range(1,inf)", "seed=range(0,1000000000)", "seed=range(3,0)",
-    "error_scale=range(1,2,0)", "error_scale=interval(1,2)", "measurement=glob(nothing*)", "noise=nothing,none",
-    "measurement=gins,gims", "solver=[newton],[newtn]", "solver=[newton,newton],[newton]", "+experiment=paper,nist",
-    "error_scale=1,-1 trials=1 output=/proc/x", "error_scale=choice()", "hydra/launcher=joblib", "hydra/sweeper=optuna",
+    "error_scale=range(1,nan)", "error_scale=range(1,inf)", "seed=range(0,1000000000)",
+    "seed=range(3,0)",
+    "error_scale=range(1,2,0)", "error_scale=interval(1,2)", "measurement=glob(nothing*)",
+    "noise=nothing,none",
+    "measurement=gins,gims", "solver=[newton],[newtn]", "solver=[newton,newton],[newton]",
+    "+experiment=paper,nist",
+    "error_scale=1,-1 trials=1 output=/proc/x", "error_scale=choice()", "hydra/launcher=joblib",
+    "hydra/sweeper=optuna",
 )
 PLACES = (
     "+noise@estimators.x=gaussian", "+measurement@estimators.x=polynomial", "+solver@x=newton",
     "solver@estimators.x=newton", "+solver@estimators=newton", "+solver@estimators.a.b=newton",
-    "+solver@estimators.fixed_point=newton", "+baseline@estimators.fixed_point=ekf", "+solver@estimators.truth=newton",
-    "noise@prior=gaussian", "+nothing@x=y", "+measurement=gins", "+noise=gaussian", "+execution=serial",
-    "+truth_measurement=gins", "experiment=paper", "+experiment=nothing", "+experiment=null", "+experiment=[paper]",
+    "+solver@estimators.fixed_point=newton", "+baseline@estimators.fixed_point=ekf",
+    "+solver@estimators.truth=newton",
+    "noise@prior=gaussian", "+nothing@x=y", "+measurement=gins", "+noise=gaussian",
+    "+execution=serial",
+    "+truth_measurement=gins", "experiment=paper", "+experiment=nothing", "+experiment=null",
+    "+experiment=[paper]",
     "+experiment=paper +experiment=nist", "solver=[newton,newton]", "solver=['newton',newton]",
-    "solver=[newton] +baseline@estimators.newton=ekf", "solver=[] baseline=[]", "execution=serial execution.workers=2",
+    "solver=[newton] +baseline@estimators.newton=ekf", "solver=[] baseline=[]",
+    "execution=serial execution.workers=2",
     "noise=certified",
 )
 DELETED = (
-    "trials", "seed", "name", "output", "noise", "measurement", "prior", "execution", "estimators", "truth_measurement",
+    "trials", "seed", "name", "output", "noise", "measurement", "prior", "execution", "estimators",
+    "truth_measurement",
     "noise.step", "solver.x", "experiment", "nothing", "noise=quantization",
 )
 # fmt: on
@@ -403,7 +425,10 @@ BROKEN_WHEN_IMPORTED: dict[str, dict[str, str | bytes]] = {
     "circle": imports("from ipe_bench_no import thing\n"),
     "not a dataclass": {"code": "class Bad:\n    pass\n"},
     "not a component": {
-        "code": "from dataclasses import dataclass\n@dataclass(frozen=True)\nclass Bad:\n    x: int = 3\n"
+        "code": (
+            "from dataclasses import dataclass\n@dataclass(frozen=True)\nclass Bad:\n    x: int ="
+            " 3\n"
+        )
     },
     "abstract": {"code": CODE.format(fields="", step="").replace("def step", "def stepp")},
     "type that is nowhere": fields("x: Nothing = 3"),

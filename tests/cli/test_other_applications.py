@@ -16,7 +16,8 @@ from hydra.utils import instantiate
 
 @hydra.main(version_base="1.3", config_path="my_conf", config_name="config")
 def main(config):
-    model, noise = instantiate(config.measurement, _convert_="all"), instantiate(config.noise, _convert_="all")
+    model = instantiate(config.measurement, _convert_="all")
+    noise = instantiate(config.noise, _convert_="all")
     print(type(model).__name__, model.m, model.rounds, noise, sorted(config.estimators))
     print(instantiate(config.estimators.newton, _convert_="all").max_iterations)
 

@@ -42,7 +42,8 @@ def folders(tmp_path_factory):
 
 @pytest.fixture(params=WIDTHS)
 def screen(request, monkeypatch, capsys):
-    """Runs a command on a screen of that width: its lines but for those that are left to the terminal to fold."""
+    """Runs a command on a screen of that width: its lines but for those that are left to the
+    terminal to fold."""
     monkeypatch.setattr(ipe_bench.cli, "_WIDTH_WITHOUT_TERMINAL", request.param)
     monkeypatch.setattr(figures, "FIGURES", ())
 
@@ -63,7 +64,8 @@ def rows(lines: list[str], name: str) -> int:
 
 
 def unfolded(lines: list[str]) -> list[str]:
-    """The long name as often as it stands there, put together from the lines that it is folded into."""
+    """The long name as often as it stands there, put together from the lines that it is folded
+    into."""
     found, folded = [], False
     for line in lines:
         begun = [word for word in line.split() if LONG.startswith(word) and len(word) > 10]
@@ -91,7 +93,10 @@ def test_a_report_of_many_settings_takes_two_screens_and_names_what_is_left_out(
     titles = sum("30 trials per row" in line for line in lines)
     # Each has a table of its two estimators at one scale.
     shown = 2 * titles
-    left_out = f"{80 - shown} of 80 rows are left out here, {8 - titles} of 8 settings whole; summary.csv and"
+    left_out = (
+        f"{80 - shown} of 80 rows are left out here, {8 - titles} of 8 settings whole; summary.csv"
+        " and"
+    )
     assert any(line.startswith(left_out) for line in lines)
     drawn = set((store.directory / "figures").glob("headline_*.png"))
     without = f"{8 - len(drawn)} further settings are in the tables; figures=all draws 6 of the 8"

@@ -1,4 +1,5 @@
-"""What a command answers is about what it asked for: its scenarios, a folder of its own, what it would do."""
+"""What a command answers is about what it asked for: its scenarios, a folder of its own, what it
+would do."""
 
 import re
 import signal
@@ -78,8 +79,13 @@ NAMES = {
     "trials=50 seed=3 execution=serial block_size=10": "gins",
     "error_scale=300": "gins-error_scale=300",
     "error_scale=1,10,100": "gins-error_scale=1,10,100",
-    "measurement=ranging noise=gaussian noise.deviation=0.1": "ranging-gaussian-noise.deviation=0.1",
-    "noise.deviation=0.1 noise=gaussian measurement=ranging": "ranging-gaussian-noise.deviation=0.1",
+    **dict.fromkeys(
+        (
+            "measurement=ranging noise=gaussian noise.deviation=0.1",
+            "noise.deviation=0.1 noise=gaussian measurement=ranging",
+        ),
+        "ranging-gaussian-noise.deviation=0.1",
+    ),
     "solver=[newton,fixed_point] baseline=[ekf]": "gins-newton+fixed_point-ekf",
     "solver=[] baseline=[ekf]": "gins-no_solver-ekf",
     "measurement=nist/misra1a noise=certified": "nist-misra1a-certified",
@@ -203,14 +209,16 @@ def test_an_experiment_of_ones_own_sweeps_as_ours_do(ipe_bench):
         "run", "--config-dir", "conf", "+experiment=mine", "execution=serial", "figures=none"
     )
     assert code == 0
-    # One in the matrix, where scales that say the same are one column, and one in the table of one scale.
+    # One in the matrix, where scales that say the same are one column, and one in the table of one
+    # scale.
     assert rows_of(out, "newton") == 2
     assert re.search(r"error scale → +[\d.]+ to 10", out)
     assert [path.name for path in Path("outputs").iterdir()] == ["mine"]
 
 
 CALLED = {
-    "a callback": """callbacks: '${oc.decode:"{x:{_target_:shutil.copyfile,src:mine,dst:copy}}"}'""",
+    "a callback": "callbacks: '${oc.decode:"
+    """"{x:{_target_:shutil.copyfile,src:mine,dst:copy}}"}'""",
     "a handler of logs": "job_logging: {version: 1, root: {handlers: [x]},"
     " handlers: {x: {class: logging.FileHandler, filename: mine, mode: w}}}",
 }

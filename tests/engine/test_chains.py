@@ -61,7 +61,8 @@ def test_a_chain_fulfils_all_its_equations_at_once():
 
 @pytest.mark.usefixtures("engine")
 def test_a_wide_start_costs_no_digits():
-    """A start of variance 1e16 that two readings settle: x is what they say, to more than half of the digits."""
+    """A start of variance 1e16 that two readings settle: x is what they say, to more than half of
+    the digits."""
     A, B = np.array([[[[1.0, 1.0], [0.0, 1.0]]] * 2]), np.array([[[[1e4, 0.0]]] * 2])
     G, nothing = np.zeros((3, 2, 2)), np.zeros((1, 3, 2))
     G[0] = 1e8 * np.eye(2)

@@ -153,8 +153,8 @@ print("ipe_bench.engine.emit" in sys.modules)
 def test_what_machine_code_comes_from_is_part_of_the_source_that_results_depend_on(
     monkeypatch, module
 ):
-    """It is imported only where something is compiled, and yet a change to it makes stored results those of other
-    code."""
+    """It is imported only where something is compiled, and yet a change to it makes stored results
+    those of other code."""
     before = provenance.fingerprint([LotkaVolterra()])["source"]
     read, changed = provenance._source_of, f"ipe_bench.{module}"
     altered = lambda name: (read(name)[0] + "#" * (name == changed), read(name)[1])  # noqa: E731

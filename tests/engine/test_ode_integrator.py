@@ -41,7 +41,8 @@ class Pulse(OdeMeasurement):
 
 @dataclass(frozen=True)
 class Cases(Pulse):
-    """The same, with a factor to the rate and an amount to add, that differ between two cases; two outputs."""
+    """The same, with a factor to the rate and an amount to add, that differ between two cases; two
+    outputs."""
 
     outputs = ("y", "rate")
 
@@ -160,7 +161,8 @@ def test_the_example_in_the_docs_of_ode_works():
     pendulum = scope["Pendulum"]()
     x = pendulum.nominal[None] + np.array([[0.0, 0.0], [1.0, 2.0]])
     z = pendulum.simulate(x)
-    # A pendulum of 1 m that swings by half a radian takes 2.0382 s (series of the elliptic integral): a turning point.
+    # A pendulum of 1 m that swings by half a radian takes 2.0382 s (series of the elliptic
+    # integral): a turning point.
     assert z[0, 3] == pytest.approx(0.5 * np.cos(2 * np.pi / 2.0382 * 2.0), abs=2e-3)
     np.testing.assert_allclose(
         pendulum.jacobian(x), differentiate(pendulum.simulate, x, analytic=False), atol=1e-8

@@ -1,4 +1,5 @@
-"""Readings that are angles: whole turns of theirs say nothing, to any estimator, test, residual or picture."""
+"""Readings that are angles: whole turns of theirs say nothing, to any estimator, test, residual or
+picture."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -160,7 +161,8 @@ def test_slopes_by_differences_do_not_see_the_jump(tmp_path, monkeypatch):
 def test_estimates_of_files_their_residuals_and_predictions_are_those_without_turns(
     tmp_path, monkeypatch
 ):
-    """By a function in deg, whose readings are written with whole turns, or without; one is missing."""
+    """By a function in deg, whose readings are written with whole turns, or without; one is
+    missing."""
     monkeypatch.chdir(tmp_path)
     Path("west.py").write_text(LAW)
     rng, t, s = np.random.default_rng(4), np.arange(0.0, 12.0, 0.5), np.repeat([0.0, 15.0], 12)
@@ -231,7 +233,8 @@ def test_angles_and_conditionals_are_remarked_on_together():
 
 
 def test_a_reading_at_the_very_jump_takes_no_finer_steps():
-    """At half time the target is due west to the last digit, so levels of steps differ by a whole turn there."""
+    """At half time the target is due west to the last digit, so levels of steps differ by a whole
+    turn there."""
     apart = replace(PASSING, start=START | {"b": -6.1})
     assert PASSING.engine._nominal_place == apart.engine._nominal_place
     assert not PASSING.hindrance(PASSING.nominal)

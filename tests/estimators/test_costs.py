@@ -1,4 +1,5 @@
-"""What is booked is what is evaluated: calls of the model, counted from outside, of every estimator and tracker."""
+"""What is booked is what is evaluated: calls of the model, counted from outside, of every estimator
+and tracker."""
 
 from collections import Counter
 from dataclasses import dataclass, replace
@@ -64,7 +65,8 @@ def test_the_cost_of_an_estimator_is_what_it_evaluates(name, scenario):
     ],
 )
 def test_failures_cost_what_they_evaluate(name):
-    """Where a search ends far from a minimum, the Jacobian for the covariance there is an evaluation of its own."""
+    """Where a search ends far from a minimum, the Jacobian for the covariance there is an
+    evaluation of its own."""
     check_cost(ESTIMATORS[name], Scenario(Gins(readings_per_case=6), NOISE, error_scale=1e4), 1)
 
 
@@ -109,8 +111,8 @@ def dear(name: str, model: str, moved_first: bool) -> bool:
 
 
 def watched(model: StateModel, seen: Counter[str], first: bool) -> StateModel:
-    """The model, counting the states of which it evaluates f and h; `first`: read before they move or after, and
-    recorded or not."""
+    """The model, counting the states of which it evaluates f and h; `first`: read before they move
+    or after, and recorded or not."""
 
     class Watching(type(model)):
         moved_first = first

@@ -96,7 +96,8 @@ def test_sandwich_is_the_spread_of_the_roots():
 
 
 def test_the_reported_covariance_is_that_of_small_errors_of_the_readings():
-    """x(z + dz) - x(z) = G dz to first order, so R spreads estimates by G R G'; G by differences of estimates."""
+    """x(z + dz) - x(z) = G dz to first order, so R spreads estimates by G R G'; G by differences of
+    estimates."""
     problem = problem_of(bend=0.02)
     z = problem.measurement.simulate(np.array([[2.0, -1.5, 1.0]]))[0]
     step = 1e-5

@@ -1,5 +1,6 @@
-"""What every estimator promises: trials that do not know of each other, failures that have a name, options that are
-checked. The conformance checks hold the same on mild problems; here problems are far from linear."""
+"""What every estimator promises: trials that do not know of each other, failures that have a name,
+options that are checked. The conformance checks hold the same on mild problems; here problems are
+far from linear."""
 
 from dataclasses import dataclass
 

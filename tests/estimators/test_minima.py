@@ -1,4 +1,5 @@
-"""Minima that are found again, replaced, counted and reported: by definition, and by the model's own calls."""
+"""Minima that are found again, replaced, counted and reported: by definition, and by the model's
+own calls."""
 
 from dataclasses import dataclass, replace
 
@@ -101,7 +102,8 @@ class Coarse(Bent):
 
 
 def test_a_slope_for_the_report_ends_no_trial():
-    """The search ends far away, by coarse slopes; the covariance there would take an exact one, which raises."""
+    """The search ends far away, by coarse slopes; the covariance there would take an exact one,
+    which raises."""
     z = Bent(0.3).simulate(np.array([[1.0, 0.5, -0.5]]))
     found = LevenbergMarquardt(max_iterations=1).estimate(
         replace(LINEAR, measurement=Coarse(0.3)).problem, z
@@ -114,7 +116,8 @@ def test_a_slope_for_the_report_ends_no_trial():
 
 
 def test_no_start_begins_beyond_a_budget():
-    """A step on three parameters costs 1 + 3: whatever was begun within 6 ends before two more of them."""
+    """A step on three parameters costs 1 + 3: whatever was begun within 6 ends before two more of
+    them."""
     z = LINEAR.draw(0, 6).z
     found = Multistart(starts=8, confirmations=8, budget=6.0).estimate(LINEAR.problem, z)
     assert (found.simulations + 3 * found.jacobians <= 6 + 2 * (1 + 3)).all()

@@ -74,7 +74,8 @@ def test_on_one_leg_every_scaled_relative_motion_has_the_same_bearings(factor):
 ALONG_SIGHT = Bearings(
     legs=((900.0, 0.0, 3.0), (900.0, 0.0, 9.0)), target=(0.0, 20000.0, 0.0, -2.0)
 )
-"""The observer accelerates, but the bearing stays what it would have been (Nardone and Aidala 1981)."""
+"""The observer accelerates, but the bearing stays what it would have been (Nardone and Aidala
+1981)."""
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,5 @@
-"""Differential equations of several cases that a file describes, against their solution in closed form."""
+"""Differential equations of several cases that a file describes, against their solution in closed
+form."""
 
 from dataclasses import replace
 
@@ -37,7 +38,8 @@ def solution(case, t, k, gain):
 
 @pytest.fixture
 def file(tmp_path):
-    """Three cases, each at times of its own, in no order; and the columns case (from 0), t, reading."""
+    """Three cases, each at times of its own, in no order; and the columns case (from 0), t,
+    reading."""
     rng = np.random.default_rng(2)
     case = np.repeat([0, 1, 2], [4, 6, 5])
     t = np.round(rng.uniform(0.1, 6.0, 15), 3)
@@ -133,13 +135,15 @@ def test_a_constant_of_the_config_stands_for_a_column(tmp_path):
 REFUSED = {
     "two numbers of a case": ("case,time,feed,begin,reading\n1,1,2,1,3\n1,2,3,1,3\n",
                               "case=1: feed is 2 in one row and 3"),
-    "no column of cases": ("time,feed,begin,reading\n1,2,1,3\n2,3,1,3\n", "number the cases in a column case"),
+    "no column of cases": ("time,feed,begin,reading\n1,2,1,3\n2,3,1,3\n",
+                           "number the cases in a column case"),
     "a case left out": ("case,time,feed,begin,reading\n1,1,2,1,3\n3,2,3,1,3\n",
                         "case=3: cases are numbered 1, 2 and so"),
     "a column left out": ("time,begin,reading\n1,2,3\n2,2,3\n",
                           "column feed is missing; there are time, begin, reading"),
     "times of another name": ("t,feed,begin,reading\n1,2,2,3\n2,2,2,3\n",
-                              "column time is missing; there are t, feed, begin, reading; call the times `time`"),
+                              "column time is missing; there are t, feed, begin, reading; call the"
+                              " times `time`"),
 }
 # fmt: on
 
@@ -155,7 +159,10 @@ def test_a_wrong_file_is_refused(tmp_path, case):
 def test_a_file_that_does_not_say_which_state_was_read_is_refused(tmp_path):
     (tmp_path / "a.csv").write_text("time,reading\n1,2\n2,3\n")
     model = Ode({"angle": "speed", "speed": "-k*angle"}, {"k": 0.5})
-    said = "column output is missing; 2 states are read; name the one that is: measurement.outputs.angle=angle"
+    said = (
+        "column output is missing; 2 states are read; name the one that is:"
+        " measurement.outputs.angle=angle"
+    )
     with pytest.raises(UserError, match=said):
         open_together([tmp_path / "a.csv"], model)
 
@@ -172,12 +179,14 @@ EPIDEMIC = "1,3\n2,8\n3,26\n4,76\n5,225\n6,298\n7,258\n"
 
 
 def test_one_case_needs_times_and_readings_alone(tmp_path):
-    """What a packaged model knows of its case is in no file, and a heading without its unit is no other unit."""
+    """What a packaged model knows of its case is in no file, and a heading without its unit is no
+    other unit."""
     path, model = tmp_path / "flu.csv", packaged("sir")()
     for heading, remedy in {
         "time,reading [people]": "column time: has no unit; call it time .day. if that is the unit",
         "time [day],reading": "column reading: has no unit; call it reading .people. if",
-        "time [h],reading [people]": "column time .h.: the unit must be the unit of time .day.; convert",
+        "time [h],reading [people]": "column time .h.: the unit must be the unit of time .day.;"
+        " convert",
         "t,reading [people]": "there are t, reading .people.; call the times `time .day.`",
     }.items():
         path.write_text(f"{heading}\n{EPIDEMIC}")

@@ -15,7 +15,8 @@ QUICK = (100, 140, 150, 180, 200, 260, 300, 340, 380, 460)
 
 
 def check(number, expected):
-    """Readings at a truth are those of the solution, or the model is refused, or there is a word."""
+    """Readings at a truth are those of the solution, or the model is refused, or there is a
+    word."""
     one = drawn(number)
     model, x = one.model, one.x[None]
     if not len(expected) or model.hindrance(
@@ -33,7 +34,8 @@ def check(number, expected):
 
 
 def check_hard(number, expected):
-    """Readings are those of the solution, or there are none, and the reason is told; returns whether there are."""
+    """Readings are those of the solution, or there are none, and the reason is told; returns
+    whether there are."""
     one = drawn(number)
     model, z = one.model, one.model.simulate(one.x[None])[0]
     has_readings = bool(np.isfinite(z).all())

@@ -1,4 +1,5 @@
-"""Equations that change with time: inputs held or straight between rows, and rates in pieces, by both integrators."""
+"""Equations that change with time: inputs held or straight between rows, and rates in pieces, by
+both integrators."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -94,7 +95,8 @@ def test_a_rate_that_depends_on_time_has_its_exact_solution(method, there):
 def test_a_reading_at_a_jump_shows_the_input_from_then_on(method):
     columns = {"time": [0.0, 1.0, 2.0], "u": [3.0, -1.0, 0.5]}
     model = Ode(
-        {"y": "u - k*y"}, {"k": 0.7}, outputs={"z": "y + 10*u"}, times=(0.0, 0.5, 1.0, 1.5, 2.0, 3.0),
+        {"y": "u - k*y"}, {"k": 0.7}, outputs={"z": "y + 10*u"},
+        times=(0.0, 0.5, 1.0, 1.5, 2.0, 3.0),
         driven_by={"u": "hold"}, columns=columns, method=method, tolerance=1e-11,
     )  # fmt: skip
     y, k, exact = 0.0, 0.7, []
@@ -118,7 +120,8 @@ def test_a_stiff_follower_of_a_straight_input_has_its_exact_solution(method):
         y = b - s / k + (y - a + s / k) * np.exp(-k * 0.5)
         exact.append(y)
     columns = {"time": t.tolist(), "u": u.tolist()}
-    model = Ode({"y": "k*(u-y)"}, {"k": k}, times=tuple(t), driven_by={"u": "linear"}, columns=columns, method=method,
+    model = Ode({"y": "k*(u-y)"}, {"k": k}, times=tuple(t), driven_by={"u": "linear"},
+                columns=columns, method=method,
                 tolerance=1e-11)  # fmt: skip
     x = model.nominal[None]
     assert_agrees(model.simulate(x)[0], exact, atol=1e-10)
@@ -165,7 +168,8 @@ def test_rates_in_pieces_of_time_have_their_exact_solution(method, dose):
     """y' = dose - k y within [1, 2.3) and -k y outside, then with a ramp q (t - 3)."""
     model = Ode(
         {"y": f"{dose} - k*y + q*max(0, t-3)"}, {"k": 0.7, "q": 0.2},
-        times=(0.5, 1.5, 2.5, 6.0), constants={"dose": (2.0, 3.0), "begin": 1.0}, tolerance=1e-11, method=method,
+        times=(0.5, 1.5, 2.5, 6.0), constants={"dose": (2.0, 3.0), "begin": 1.0}, tolerance=1e-11,
+        method=method,
     )  # fmt: skip
     k, q = 0.7, 0.2
 
@@ -220,7 +224,8 @@ def test_a_jump_at_an_unknown_moment_is_refused(rate, message, method):
 
 @pytest.mark.parametrize("method", ["explicit", "implicit"])
 def test_angles_lengths_and_steps_are_read_of_a_solution_with_their_slopes(method):
-    """A wheel of radius r that turns at a steady rate, more than once; readings on the whole plane and over its cut."""
+    """A wheel of radius r that turns at a steady rate, more than once; readings on the whole plane
+    and over its cut."""
     shown = {
         "bearing": "arctan2(r*sin(a), r*cos(a) - 0.5)",
         "range": "hypot(r*sin(a), r*cos(a) - 0.5)",

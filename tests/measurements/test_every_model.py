@@ -1,4 +1,5 @@
-"""Every model under every estimator that it admits: at small error scale the efficient ones reach the bound."""
+"""Every model under every estimator that it admits: at small error scale the efficient ones reach
+the bound."""
 
 import pytest
 from omegaconf import OmegaConf
@@ -21,8 +22,8 @@ SLOW_TO_CONVERGE = {("paper", "multiscale_lm")}
 
 
 def scenario(experiment: str) -> Scenario:
-    """The model of an experiment with the experiment's noise, at error scale 0.1; GINS with white noise, since
-    quantisation at that scale is none."""
+    """The model of an experiment with the experiment's noise, at error scale 0.1; GINS with white
+    noise, since quantisation at that scale is none."""
     words = [f"+experiment={experiment}", "error_scale=0.1"]
     if experiment == "paper":
         words.append("noise=gaussian")
@@ -49,9 +50,10 @@ def every_estimator(experiment: str, scenario: Scenario) -> dict[str, Estimator]
 @pytest.mark.slow
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_efficient_estimators_reach_the_bound(experiment):
-    """The 95 % interval of the row `all`, widened for as many models as there are, contains the Cramér-Rao bound, or
-    for estimators with a prior the Bayesian one. Its upper end is taken to be as many times the value as that is of the
-    lower one: the errors of efficient estimators are nearly normal, so none is rare and large."""
+    """The 95 % interval of the row `all`, widened for as many models as there are, contains the
+    Cramér-Rao bound, or for estimators with a prior the Bayesian one. Its upper end is taken to be
+    as many times the value as that is of the lower one: the errors of efficient estimators are
+    nearly normal, so none is rare and large."""
     one = scenario(experiment)
     estimators = every_estimator(experiment, one)
     table = run(one, estimators, TRIALS)

@@ -1,4 +1,5 @@
-"""Readings are those of the solution, or there are none: poles, wells, pulses, and outputs that magnify states."""
+"""Readings are those of the solution, or there are none: poles, wells, pulses, and outputs that
+magnify states."""
 
 from dataclasses import replace
 from itertools import product
@@ -16,8 +17,8 @@ FAR = (8.0, 16.0, 24.0)
 
 
 def kinetics(start="0", loss="L*y/(K+y)", **options):
-    """Saturating loss of y, fed by 2 a unit of time, and z behind it: they settle where L y/(K+y) = 2 and z = 2/k1.
-    Steps that are not stable jump beyond y = -K, where y runs off smoothly."""
+    """Saturating loss of y, fed by 2 a unit of time, and z behind it: they settle where L y/(K+y) =
+    2 and z = 2/k1. Steps that are not stable jump beyond y = -K, where y runs off smoothly."""
     options = {"constants": {"L": 1000.0, "K": 0.05}, "times": FAR} | options
     rates = {"y": f"2-{loss}", "z": f"{loss}-k1*z"}
     return Ode(rates, {"k1": 1.0}, {"y": start}, {"z": "z/(0.3+z)"}, **options)
@@ -68,7 +69,8 @@ def test_a_truth_that_explicit_steps_do_not_follow_has_no_readings_though_the_no
 
 
 def test_a_truth_whose_well_is_narrower_than_any_step_has_no_readings():
-    """The loss of y falls off on both sides of K: steps that miss it go on below 0, where y never is."""
+    """The loss of y falls off on both sides of K: steps that miss it go on below 0, where y never
+    is."""
     rates = {"y": "0.5-5*y**2/(K**2+y**2)", "z": "5*y**2/(K**2+y**2)-z"}
     model = Ode(rates, {"K": 1.0}, {"y": 2.0}, {"z": "z/(0.3+z)"}, FAR)
     z = model.simulate(np.array([[1.0], [0.03], [0.001]]))
@@ -89,7 +91,8 @@ def test_numpy_notes_the_same_steps_in_doubt_as_machine_code(rate, doubt):
 
 
 def well(width="K", **options):
-    """A body that moves at 4.5 a unit of time and is held near 0, where the rate is zero on the far side of a well."""
+    """A body that moves at 4.5 a unit of time and is held near 0, where the rate is zero on the far
+    side of a well."""
     rates = {"y": f"5*exp(-((y-c)/({width}))**2)-4.5"}
     return Ode(rates, {"K": 1.0, "c": 1.0}, {"y": 9.0}, **options)
 
@@ -110,7 +113,8 @@ def test_a_nominal_well_that_long_implicit_steps_agree_to_pass_over_is_met_or_to
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["auto", "implicit"])
 def test_drawn_wells_are_met_that_are_a_twentieth_of_the_way_between_readings_or_wider(method):
-    """What a trial alone has is met by chance where it is narrower, unless its steps are told to be short."""
+    """What a trial alone has is met by chance where it is narrower, unless its steps are told to be
+    short."""
     rng = np.random.default_rng(1)
     width = np.exp(rng.uniform(np.log(1e-3), 0.0, 300))
     x = np.stack([width, rng.uniform(0.2, 8.8, 300)], axis=1)
@@ -198,5 +202,6 @@ def test_an_output_that_magnifies_a_state_beyond_its_digits_has_no_reading(metho
     ids=["unstable", "lorenz"],
 )
 def test_equations_that_no_method_follows_are_not_handed_to_the_implicit_one(model):
-    """Solutions that begin a rounding error apart end as far apart as they are large, as e^t or e^(0.9 t)."""
+    """Solutions that begin a rounding error apart end as far apart as they are large, as e^t or
+    e^(0.9 t)."""
     assert np.isnan(model.simulate(model.nominal[None])).all()

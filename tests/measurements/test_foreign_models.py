@@ -20,7 +20,8 @@ TIMES = tuple(np.arange(0.0, 241.0, 20.0).tolist())
 
 
 def stiff(rate):
-    """y' = -rate (y - cos t): an explicit formula of eighth order is stable to steps of about 5 / rate."""
+    """y' = -rate (y - cos t): an explicit formula of eighth order is stable to steps of about 5 /
+    rate."""
     start = {"k": rate, "y0": 2.0}
     return Ode(
         {"y": "-k*(y-cos(t))"}, start, {"y": "y0"}, times=TIMES, time_unit="s", method="explicit"

@@ -1,4 +1,5 @@
-"""A formula without a plugin: its language, its derivatives, and NIST's problems as a user types them."""
+"""A formula without a plugin: its language, its derivatives, and NIST's problems as a user types
+them."""
 
 import contextlib
 import csv
@@ -29,10 +30,14 @@ NIST = {
     "Misra1a": "b1*(1-exp(-b2*x))", "Chwirut2": "exp(-b1*x)/(b2+b3*x)", "DanWood": "b1*x**b2",
     "Gauss1": "b1*exp(-b2*x) + b3*exp(-(x-b4)**2/b5**2) + b6*exp(-(x-b7)**2/b8**2)",
     "Misra1b": "b1*(1-(1+b2*x/2)**(-2))", "Kirby2": "(b1 + b2*x + b3*x**2)/(1 + b4*x + b5*x**2)",
-    "Hahn1": "(b1+b2*x+b3*x**2+b4*x**3)/(1+b5*x+b6*x**2+b7*x**3)", "Nelson": "b1 - b2*time*exp(-b3*temperature)",
-    "Lanczos1": "b1*exp(-b2*x) + b3*exp(-b4*x) + b5*exp(-b6*x)", "Roszman1": "b1 - b2*x - arctan(b3/(x-b4))/pi",
-    "ENSO": "b1 + b2*cos(2*pi*x/12) + b3*sin(2*pi*x/12) + b5*cos(2*pi*x/b4) + b6*sin(2*pi*x/b4) + b8*cos(2*pi*x/b7)"
-            " + b9*sin(2*pi*x/b7)",
+    "Hahn1": "(b1+b2*x+b3*x**2+b4*x**3)/(1+b5*x+b6*x**2+b7*x**3)",
+    "Nelson": "b1 - b2*time*exp(-b3*temperature)",
+    "Lanczos1": "b1*exp(-b2*x) + b3*exp(-b4*x) + b5*exp(-b6*x)",
+    "Roszman1": "b1 - b2*x - arctan(b3/(x-b4))/pi",
+    "ENSO": (
+        "b1 + b2*cos(2*pi*x/12) + b3*sin(2*pi*x/12) + b5*cos(2*pi*x/b4) + b6*sin(2*pi*x/b4) +"
+        " b8*cos(2*pi*x/b7) + b9*sin(2*pi*x/b7)"
+    ),
     "MGH09": "b1*(x**2+x*b2)/(x**2+x*b3+b4)", "Rat43": "b1/((1+exp(b2-b3*x))**(1/b4))",
     "Bennett5": "b1*(b2+x)**(-1/b3)",
 }
@@ -47,8 +52,8 @@ NIST = {
 )
 @pytest.mark.parametrize("dataset", NIST)
 def test_nist_answers_come_from_the_formula_with_an_unknown_noise(dataset, tmp_path):
-    """Certified parameters and standard deviations to 6 digits, from a file with columns and the text of the formula,
-    from NIST's second start."""
+    """Certified parameters and standard deviations to 6 digits, from a file with columns and the
+    text of the formula, from NIST's second start."""
     nist = Nist(dataset, start=2)
     names = ("time", "temperature") if dataset == "Nelson" else ("x",)
     path = tmp_path / "readings.csv"
@@ -68,7 +73,8 @@ def test_nist_answers_come_from_the_formula_with_an_unknown_noise(dataset, tmp_p
     )[0]
     agreed(10.0 ** -digits(result.x[order], nist.certified.parameters), 1e-6)
     if dataset == "Lanczos1":
-        # Generated without noise to 14 digits: the certified sum of squares, 1.4e-25, is of their rounding.
+        # Generated without noise to 14 digits: the certified sum of squares, 1.4e-25, is of their
+        # rounding.
         assert digits(result.standard_errors[order], nist.certified.deviations) >= 2
         return
     agreed(10.0 ** -digits(result.standard_errors[order], nist.certified.deviations), 1e-6)
@@ -77,12 +83,17 @@ def test_nist_answers_come_from_the_formula_with_an_unknown_noise(dataset, tmp_p
 
 # fmt: off
 ALGEBRA = {
-    "-2**2": -4, "2**-1": 0.5, "2**3**2": 512, "2^3": 8, "-a/b*c": -3, "a-b-c": -3, "--a": 2, "1.5e-3*2": 0.003,
-    ".5+5.": 5.5, "log10(1000)+ln(1)": 3, "4*atan(1)-pi": 0, "sqrt(a*b*4)-tanh(0)": 4, "min(a, 5, c) + max(1, b)": 4,
-    "abs(a-c) + abs(1)": 2, "erf(0.5) + erfc(0.5)": 1, "arctan2(-1, -c)": -math.pi + math.atan(1 / 3),
-    "atan2(a, 0) - pi/2 + hypot(3, 4) + hypot(1, a, 2)": 8, "mod(-1, c) + 10*mod(7.5, 2) + 100*floor(-0.5)": -83,
+    "-2**2": -4, "2**-1": 0.5, "2**3**2": 512, "2^3": 8, "-a/b*c": -3, "a-b-c": -3, "--a": 2,
+    "1.5e-3*2": 0.003,
+    ".5+5.": 5.5, "log10(1000)+ln(1)": 3, "4*atan(1)-pi": 0, "sqrt(a*b*4)-tanh(0)": 4,
+    "min(a, 5, c) + max(1, b)": 4,
+    "abs(a-c) + abs(1)": 2, "erf(0.5) + erfc(0.5)": 1,
+    "arctan2(-1, -c)": -math.pi + math.atan(1 / 3),
+    "atan2(a, 0) - pi/2 + hypot(3, 4) + hypot(1, a, 2)": 8,
+    "mod(-1, c) + 10*mod(7.5, 2) + 100*floor(-0.5)": -83,
     "sign(a - 5) + 10*sign(a - b) + 100*sign(c)": 99, "(1 < a <= 2) + (c != 3) + (a == b)": 2,
-    "1 if a > 2 else 2 if c > 2 else 3": 2, "not a > 1 or c > 2 and b < 3": 1, "1/(a-2) if a != b else c": 3,
+    "1 if a > 2 else 2 if c > 2 else 3": 2, "not a > 1 or c > 2 and b < 3": 1,
+    "1/(a-2) if a != b else c": 3,
     "min(lambda, c)\n  + 1.e0*(is - 1)": 2,
 }
 # fmt: on
@@ -95,14 +106,18 @@ def test_the_language_is_that_of_algebra(text):
 
 
 REFUSED = [
-    "__import__('os')", "b1.real", "b1[0]", "b1 if t", "b1 else t", "lambda: 1", "b1; b2", "b1=2", "open(b1)",
+    "__import__('os')", "b1.real", "b1[0]", "b1 if t", "b1 else t", "lambda: 1", "b1; b2", "b1=2",
+    "open(b1)",
     "eval(b1)", "b1*(t",
-    "b1*t)", "2t", "b1 b2", "", "()", "b1**", "*b1", "1,5*t", "b1 and", "not", "b1 < ", "min(b1)", "abs(b1,t)",
+    "b1*t)", "2t", "b1 b2", "", "()", "b1**", "*b1", "1,5*t", "b1 and", "not", "b1 < ", "min(b1)",
+    "abs(b1,t)",
     "arctan2(b1)", "arctan2(b1,t,2)", "mod(b1)", "hypot(b1)", "sign(b1,t)", "b1*mod(1,0)",
     "'b1'", "b1@t", "b1//t*", "exp", "exp()",
     "exp(b1,t)",
-    "b1%t", "{b1}", "b1\\n", "0x10", "1e", "1_000*b1", "1j*b1", "b1!", "é*t", "sin t", "None*b1", "exp(a=b1)",
-    "(" * 300 + "b1" + ")" * 300, "-" * 500 + "b1", "not " * 500 + "b1", "1 if t else " * 500 + "b1",
+    "b1%t", "{b1}", "b1\\n", "0x10", "1e", "1_000*b1", "1j*b1", "b1!", "é*t", "sin t", "None*b1",
+    "exp(a=b1)",
+    "(" * 300 + "b1" + ")" * 300, "-" * 500 + "b1", "not " * 500 + "b1",
+    "1 if t else " * 500 + "b1",
     "b1*" * 4000 + "t", "9**9**9*b1", "b1*log(0)", "b1/(1-1)", "b1*sqrt(-1)", "...*b1",
 ]  # fmt: skip
 
@@ -126,8 +141,9 @@ def test_nothing_that_looks_like_a_formula_reaches_the_interpreter():
 
 
 _EVERYTHING = (
-    "b1*sin(t*b2)+b2*cos(t)-tan(b1*t/9)+arctan(b2*t)+exp(-b1*t)/b2+log(b1+t)*sqrt(b2*t)+sinh(b1/t)-cosh(b2)*tanh(t*b1)"
-    "+t**b1+b2**t-(b1-5)**2+(-t)**3*b1+2**(b1*b2)+1.5/b2+b1**-2+(b1+b2)*(b1+b2)/(1+(b1+b2)**2)"
+    "b1*sin(t*b2)+b2*cos(t)-tan(b1*t/9)+arctan(b2*t)+exp(-b1*t)/b2+log(b1+t)*sqrt(b2*t)"
+    "+sinh(b1/t)-cosh(b2)*tanh(t*b1)+t**b1+b2**t-(b1-5)**2+(-t)**3*b1+2**(b1*b2)+1.5/b2+b1**-2"
+    "+(b1+b2)*(b1+b2)/(1+(b1+b2)**2)"
 )
 
 
@@ -144,7 +160,10 @@ def test_derivatives_are_exact_and_those_of_a_power_of_zero_are_zero():
     )
 
 
-_PLANE = "hypot(b1*t - 1, b2, t) + arctan2(b1 - t, b2 - t) + b1*floor(3*b2*t) + b2*sign(b1 - t) + mod(b1*t, b2 - 0.4)"
+_PLANE = (
+    "hypot(b1*t - 1, b2, t) + arctan2(b1 - t, b2 - t) + b1*floor(3*b2*t) + b2*sign(b1 - t) +"
+    " mod(b1*t, b2 - 0.4)"
+)
 
 
 def test_slopes_of_angles_lengths_and_steps_are_exact_on_the_whole_plane():
@@ -198,7 +217,8 @@ def test_a_formula_of_thousands_of_names_has_its_slopes_in_seconds():
 
 
 def test_comparisons_within_comparisons_are_evaluated_or_refused_however_deep():
-    """The middle of a < b < c counts twice, so the size doubles with each level; at 100 it would exceed 1e30."""
+    """The middle of a < b < c counts twice, so the size doubles with each level; at 100 it would
+    exceed 1e30."""
     text, value = "t*b1", 0.25
     for level in range(100):
         text, value = f"0.5<1-({text})<2", float(0.5 < 1 - value < 2)

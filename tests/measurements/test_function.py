@@ -1,4 +1,5 @@
-"""Models that are Python functions: beside the same law as a formula, by all ways to slopes, and with mistakes."""
+"""Models that are Python functions: beside the same law as a formula, by all ways to slopes, and
+with mistakes."""
 
 import sys
 
@@ -22,7 +23,8 @@ def swing(t, length: Annotated[float, "m"] = 1.2, damping=0.1, *, g=9.80665):
     return np.exp(-damping * t / 2) * np.cos(np.sqrt(g / length) * t)
 
 def by_math(t, length=1.2, damping=0.1):
-    return np.array([math.exp(-damping * s / 2) * math.cos(math.sqrt(9.80665 / length) * s) for s in t])
+    w = math.sqrt(9.80665 / length)
+    return np.array([math.exp(-damping * s / 2) * math.cos(w * s) for s in t])
 
 def absolute(t, k=0.7):
     return np.abs(np.sin(k * t))
@@ -269,7 +271,10 @@ def test_what_the_function_raises_is_one_line_with_its_place(laws, capsys):
         main(["run", *words, "noise=gaussian", "noise.deviation=0.01", "trials=2", "figures=none"])
         == 2
     )
-    said = f"measurement.of=some_laws:boom: some_laws.py, line {line}: AttributeError: module 'numpy' has no attribute"
+    said = (
+        f"measurement.of=some_laws:boom: some_laws.py, line {line}: AttributeError: module 'numpy'"
+        " has no attribute"
+    )
     assert capsys.readouterr().err.startswith(f"ipe-bench: {said} 'expp'")
     assert main(["check", *words[:2]]) == 2
     assert capsys.readouterr().err.startswith(f"ipe-bench: {said} 'expp'")

@@ -1,4 +1,5 @@
-"""The gimballed INS: closed forms, other integrators, the reference values of its linear bound, and richer truths."""
+"""The gimballed INS: closed forms, other integrators, the reference values of its linear bound, and
+richer truths."""
 
 import csv
 import json
@@ -22,7 +23,8 @@ from ipe_bench.trials.scenario import Scenario
 NOISE = Quantization(0.02286)
 STEP = 0.075 * 0.3048
 LINEAR_BOUND = [
-    0.001105, 0.001321, 0.01559, 0.01560, 0.002182, 0.001645, 0.001446, 0.001660, 0.001549, 0.001558, 0.001663
+    0.001105, 0.001321, 0.01559, 0.01560, 0.002182, 0.001645, 0.001446, 0.001660, 0.001549,
+    0.001558, 0.001663
 ]  # fmt: skip
 
 
@@ -77,7 +79,8 @@ def test_every_step_keeps_its_promise_whatever_the_scale(scale, trials, limit):
 
 
 def lopsided(trials, seed):
-    """Draws in which few parameters dominate, which a bound from their sizes alone would judge wrongly."""
+    """Draws in which few parameters dominate, which a bound from their sizes alone would judge
+    wrongly."""
     rng = np.random.default_rng(seed)
     x = rng.normal(size=(3, trials, 11))
     x[0] *= rng.random((trials, 11)) < 0.2
@@ -94,7 +97,8 @@ def test_every_step_keeps_its_promise_where_few_parameters_dominate(scale):
 
 @pytest.mark.slow
 def test_bits_of_a_trial_depend_on_itself_alone_where_steps_differ(monkeypatch):
-    """In one batch of several levels, alone, in another order, up to a stop, and after other calls or none."""
+    """In one batch of several levels, alone, in another order, up to a stop, and after other calls
+    or none."""
     x = np.concatenate([draw(scale, 8, seed=9) for scale in (33.0, 1000.0, 3000.0, 10000.0)])
     model = Gins()
     z, J = model.simulate(x), model.jacobian(x)
@@ -245,7 +249,8 @@ def test_an_estimate_that_fits_is_right_at_large_errors(tmp_path, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("scale", [300.0, 1000.0, 3000.0, 10_000.0])
 def test_without_a_prior_estimates_succeed_as_often_as_with_one(scale):
-    """Who has a file alone cannot say how far the parameters may lie: windows then take it from the linear estimate."""
+    """Who has a file alone cannot say how far the parameters may lie: windows then take it from the
+    linear estimate."""
     scenario = Scenario(Gins(), NOISE, error_scale=scale)
     trials = scenario.draw(0, 60)
     problem = replace(scenario.problem, prior_deviation=None)
@@ -257,7 +262,8 @@ def test_without_a_prior_estimates_succeed_as_often_as_with_one(scale):
     assert (found.extras["fit_p"][~success] < 1e-6).all()
 
 
-# Truths richer than the model: exact, of their own draws, and seen or not seen by the test of the fit
+# Truths richer than the model: exact, of their own draws, and seen or not seen by the test of the
+# fit
 
 
 def scenario(scale=33.0, **errors):
@@ -332,7 +338,8 @@ def test_nuisances_do_not_scale_with_the_errors():
 
 
 def test_who_is_noticed():
-    """Drifts that walk leave residuals; an initial tilt looks like a bias and leaves none, however wrong the bias."""
+    """Drifts that walk leave residuals; an initial tilt looks like a bias and leaves none, however
+    wrong the bias."""
     found = {}
     for name, errors in {
         "none": {},

@@ -17,7 +17,8 @@ from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo
 # fmt: off
 CASES = {
     # Lotka-Volterra with the prey alone: b and the predators only as a product.
-    "prey": ({"u": "a*u-b*u*v", "v": "-c*v+d*u*v"}, {"u": "u0", "v": "v0"}, {"y": "u"}, {}, {"b", "v0"}),
+    "prey": ({"u": "a*u-b*u*v", "v": "-c*v+d*u*v"}, {"u": "u0", "v": "v0"}, {"y": "u"}, {},
+             {"b", "v0"}),
     # SIR in fractions, y = K I (Tuncer and Le, Math. Biosci. 299, 2018).
     "sir": ({"S": "-beta*S*I", "I": "beta*S*I-gamma*I"}, {"S": "S0", "I": "I0"}, {"y": "K*I"}, {},
             {"beta", "K", "S0", "I0"}),
@@ -28,38 +29,52 @@ CASES = {
     # Goodwin's oscillator (STRIKE-GOLDD).
     "goodwin": ({"x1": "-b*x1+1/(c+x4)", "x2": "alpha*x1-beta*x2", "x3": "gamma*x2-delta*x3",
                  "x4": "sigma*x4*(gamma*x2-delta*x3)/x3"},
-                {"x1": "p1", "x2": "p2", "x3": "p3", "x4": "p4"}, {"y": "x1"}, {}, {"alpha", "gamma", "p2", "p3"}),
-    # Two compartments, a known dose into the first, losses from both (Bellman and Astrom, Math. Biosci. 7, 1970).
-    "compartments": ({"x1": "-(k01+k21)*x1+k12*x2", "x2": "k21*x1-(k12+k02)*x2"}, {"x1": "dose"}, {"y": "x1/V"},
+                {"x1": "p1", "x2": "p2", "x3": "p3", "x4": "p4"}, {"y": "x1"}, {},
+                {"alpha", "gamma", "p2", "p3"}),
+    # Two compartments, a known dose into the first, losses from both (Bellman and Astrom, Math.
+    # Biosci. 7, 1970).
+    "compartments": ({"x1": "-(k01+k21)*x1+k12*x2", "x2": "k21*x1-(k12+k02)*x2"}, {"x1": "dose"},
+                     {"y": "x1/V"},
                      {"dose": 5.0}, {"k01", "k21", "k12", "k02"}),
     # The same without a loss from the second: all.
-    "one loss": ({"x1": "-(k01+k21)*x1+k12*x2", "x2": "k21*x1-k12*x2"}, {"x1": "dose"}, {"y": "x1/V"}, {"dose": 5.0},
+    "one loss": ({"x1": "-(k01+k21)*x1+k12*x2", "x2": "k21*x1-k12*x2"}, {"x1": "dose"},
+                 {"y": "x1/V"}, {"dose": 5.0},
                  set()),
     # Viral dynamics, the virus read (Xia and Moog, IEEE TAC 48, 2003).
-    "virus": ({"T": "lam-d*T-k*T*V", "I": "k*T*V-delta*I", "V": "p*I-c*V"}, {"T": "T0", "I": "I0", "V": "V0"},
+    "virus": ({"T": "lam-d*T-k*T*V", "I": "k*T*V-delta*I", "V": "p*I-c*V"},
+              {"T": "T0", "I": "I0", "V": "V0"},
               {"y": "V"}, {}, {"lam", "p", "T0", "I0"}),
     "one temperature": ({"y": "-A*exp(-E/T)*y"}, {"y": "y0"}, {"r": "y"}, {"T": 300.0}, {"A", "E"}),
-    "two temperatures": ({"y": "-A*exp(-E/T)*y"}, {"y": "y0"}, {"r": "y"}, {"T": (300.0, 350.0)}, set()),
+    "two temperatures": ({"y": "-A*exp(-E/T)*y"}, {"y": "y0"}, {"r": "y"}, {"T": (300.0, 350.0)},
+                         set()),
     "exponent": ({"y": "-k*y**n"}, {"y": "y0"}, {"r": "y"}, {}, set()),
     "scaled exponent": ({"y": "-k*y**n"}, {"y": "y0"}, {"r": "s*y"}, {}, {"k", "s", "y0"}),
     "weir": ({"h": "-c*h**1.5"}, {"h": "h0"}, {"r": "g*h"}, {}, {"c", "g", "h0"}),
     "torricelli": ({"h": "-c*sqrt(h)"}, {"h": "h0"}, {"r": "g*h"}, {}, {"c", "g", "h0"}),
 
-    # One compartment (Godfrey, Compartmental Models and their Application, 1983): y = (dose / V) exp(-k t).
+    # One compartment (Godfrey, Compartmental Models and their Application, 1983): y = (dose / V)
+    # exp(-k t).
     "bolus": ({"x": "-k*x"}, {"x": "dose"}, {"y": "x/V"}, {"dose": 5.0}, set()),
     "bolus of unknown size": ({"x": "-k*x"}, {"x": "D"}, {"y": "x/V"}, {}, {"D", "V"}),
     # Two exits: only their sum is seen, until what leaves by one of them is collected.
     "two exits": ({"x": "-(kr+km)*x"}, {"x": "dose"}, {"y": "x/V"}, {"dose": 5.0}, {"kr", "km"}),
-    "two exits, one collected": ({"x": "-(kr+km)*x", "u": "kr*x"}, {"x": "dose"}, {"y": "x/V", "u": "u"}, {"dose": 5.0},
+    "two exits, one collected": ({"x": "-(kr+km)*x", "u": "kr*x"}, {"x": "dose"},
+                                 {"y": "x/V", "u": "u"}, {"dose": 5.0},
                                  set()),
-    # Absorption, x = 0 at first: y = dose ka (exp(-ke t) - exp(-ka t)) / (V (ka - ke)), with two answers (flip-flop).
-    "absorption": ({"a": "-ka*a", "x": "ka*a-ke*x"}, {"a": "dose"}, {"y": "x/V"}, {"dose": 5.0}, set()),
-    "absorbed part": ({"a": "-ka*a", "x": "ka*a-ke*x"}, {"a": "F*dose"}, {"y": "x/V"}, {"dose": 5.0}, {"F", "V"}),
-    # Decay chains (Bateman 1910), all but the first at 0: the rates are the exponents, in any order.
+    # Absorption, x = 0 at first: y = dose ka (exp(-ke t) - exp(-ka t)) / (V (ka - ke)), with two
+    # answers (flip-flop).
+    "absorption": ({"a": "-ka*a", "x": "ka*a-ke*x"}, {"a": "dose"}, {"y": "x/V"}, {"dose": 5.0},
+                   set()),
+    "absorbed part": ({"a": "-ka*a", "x": "ka*a-ke*x"}, {"a": "F*dose"}, {"y": "x/V"},
+                      {"dose": 5.0}, {"F", "V"}),
+    # Decay chains (Bateman 1910), all but the first at 0: the rates are the exponents, in any
+    # order.
     "second of a chain": ({"A": "-k1*A", "B": "k1*A-k2*B"}, {"A": "A0"}, {"y": "B"}, {}, set()),
-    "fourth of a chain": ({"A": "-k1*A", "B": "k1*A-k2*B", "C": "k2*B-k3*C", "D": "k3*C-k4*D"}, {"A": "2"}, {"y": "D"},
+    "fourth of a chain": ({"A": "-k1*A", "B": "k1*A-k2*B", "C": "k2*B-k3*C", "D": "k3*C-k4*D"},
+                          {"A": "2"}, {"y": "D"},
                           {}, set()),
-    "chain and counter": ({"A": "-k1*A", "B": "k1*A-k2*B", "C": "k2*B-k3*C"}, {"A": "A0"}, {"y": "e*k3*C"}, {},
+    "chain and counter": ({"A": "-k1*A", "B": "k1*A-k2*B", "C": "k2*B-k3*C"}, {"A": "A0"},
+                          {"y": "e*k3*C"}, {},
                           {"A0", "e"}),
     # Cold starts with a constant inflow: coefficients 3 and 4 are the first to hold the unknowns.
     "cold cascade": ({"y": "2-y", "z": "y-k1*z"}, {}, {"r": "z"}, {}, set()),
@@ -67,57 +82,78 @@ CASES = {
     # Transcription and translation from nothing: p is a b g(t; d, e).
     "protein": ({"m": "a-d*m", "p": "b*m-e*p"}, {}, {"y": "p"}, {}, {"a", "b"}),
     "protein and messenger": ({"m": "a-d*m", "p": "b*m-e*p"}, {}, {"y": "p", "z": "m"}, {}, set()),
-    # A chain with feedback, x' = u - a z, y' = x, z' = y: the first slope that is not 0 is that of z at order 6.
+    # A chain with feedback, x' = u - a z, y' = x, z' = y: the first slope that is not 0 is that of
+    # z at order 6.
     "cold feedback": ({"x": "1-a*z", "y": "x", "z": "y"}, {}, {"r": "z"}, {}, set()),
     # Cooperative steps: z = a t^5 / (5 K^4) at first, and K by itself at order 9.
     "cold Hill step": ({"y": "1-y", "z": "a*y**4/(K**4+y**4)-z"}, {}, {"r": "z"}, {}, set()),
-    "two cold Hill steps": ({"x": "1-x", "y": "x**4/(K**4+x**4)-y", "z": "a*y**4/(M**4+y**4)-z"}, {}, {"r": "z"}, {},
+    "two cold Hill steps": ({"x": "1-x", "y": "x**4/(K**4+x**4)-y", "z": "a*y**4/(M**4+y**4)-z"},
+                            {}, {"r": "z"}, {},
                             set()),
     # A branch that is never entered: what leaves it changes nothing.
     "empty branch": ({"x": "-k*x", "w": "-d*w"}, {"x": "5"}, {"y": "x+w"}, {}, {"d"}),
-    # Michaelis-Menten elimination: amounts, Vm and Km scale with V unless the dose is known (Godfrey and Fitch, J.
-    # Pharmacokinet. Biopharm. 12, 1984).
+    # Michaelis-Menten elimination: amounts, Vm and Km scale with V unless the dose is known
+    # (Godfrey and Fitch, J. Pharmacokinet. Biopharm. 12, 1984).
     "saturable": ({"x": "-Vm*x/(Km+x)"}, {"x": "dose"}, {"y": "x/V"}, {"dose": 5.0}, set()),
-    "saturable, of unknown dose": ({"x": "-Vm*x/(Km+x)"}, {"x": "D"}, {"y": "x/V"}, {}, {"Vm", "Km", "D", "V"}),
+    "saturable, of unknown dose": ({"x": "-Vm*x/(Km+x)"}, {"x": "D"}, {"y": "x/V"}, {},
+                                   {"Vm", "Km", "D", "V"}),
     "saturable from 0": ({"x": "2-Vm*x/(Km+x)"}, {}, {"y": "x/V"}, {}, set()),
-    # E + S <-> C -> P: with y = P, y'' = k1 k2 E0 S0 - k1 k2 E0 y - (k1 (E0 + S0) + kr + k2) y' + k1/k2 y'^2 + k1 y y'.
+    # E + S <-> C -> P: with y = P, y'' = k1 k2 E0 S0 - k1 k2 E0 y - (k1 (E0 + S0) + kr + k2) y' +
+    # k1/k2 y'^2 + k1 y y'.
     "enzyme": ({"C": "k1*(E0-C)*(S0-C-P)-(kr+k2)*C", "P": "k2*C"}, {}, {"y": "P"}, {}, set()),
     "enzyme, scaled": ({"C": "k1*(E0-C)*(S0-C-P)-(kr+k2)*C", "P": "k2*C"}, {}, {"y": "s*P"}, {},
                        {"k1", "E0", "S0", "s"}),
-    # Loss from the first alone, read in the second: k21 is the numerator, k01 + k21 + k12 and k01 k12 the denominator.
-    "read in the second": ({"x1": "-(k01+k21)*x1+k12*x2", "x2": "k21*x1-k12*x2"}, {"x1": "1"}, {"y": "x2"}, {}, set()),
-    "read in the second, two losses": ({"x1": "-(k01+k21)*x1+k12*x2", "x2": "k21*x1-(k12+k02)*x2"}, {"x1": "1"},
+    # Loss from the first alone, read in the second: k21 is the numerator, k01 + k21 + k12 and k01
+    # k12 the denominator.
+    "read in the second": ({"x1": "-(k01+k21)*x1+k12*x2", "x2": "k21*x1-k12*x2"}, {"x1": "1"},
+                           {"y": "x2"}, {}, set()),
+    "read in the second, two losses": ({"x1": "-(k01+k21)*x1+k12*x2", "x2": "k21*x1-(k12+k02)*x2"},
+                                       {"x1": "1"},
                                        {"y": "x2"}, {}, {"k01", "k12", "k02"}),
-    # Three compartments about a centre, in a circle: all with one loss, none with a loss from each (Meshkat and
-    # Sullivant, J. Symb. Comput. 63, 2014).
-    "about a centre": ({"x": "-(k0+k2+k3)*x+a2*y+a3*z", "y": "k2*x-a2*y", "z": "k3*x-a3*z"}, {"x": "dose"},
+    # Three compartments about a centre, in a circle: all with one loss, none with a loss from each
+    # (Meshkat and Sullivant, J. Symb. Comput. 63, 2014).
+    "about a centre": ({"x": "-(k0+k2+k3)*x+a2*y+a3*z", "y": "k2*x-a2*y", "z": "k3*x-a3*z"},
+                       {"x": "dose"},
                        {"r": "x/V"}, {"dose": 5.0}, set()),
-    "circle": ({"x": "-(l1+a)*x+c*z", "y": "a*x-b*y", "z": "b*y-c*z"}, {"x": "1"}, {"r": "x"}, {}, set()),
-    "circle, three losses": ({"x": "-(l1+a)*x+c*z", "y": "a*x-(b+l2)*y", "z": "b*y-(c+l3)*z"}, {"x": "1"}, {"r": "x"},
+    "circle": ({"x": "-(l1+a)*x+c*z", "y": "a*x-b*y", "z": "b*y-c*z"}, {"x": "1"}, {"r": "x"}, {},
+               set()),
+    "circle, three losses": ({"x": "-(l1+a)*x+c*z", "y": "a*x-(b+l2)*y", "z": "b*y-(c+l3)*z"},
+                             {"x": "1"}, {"r": "x"},
                              {}, {"a", "b", "c", "l1", "l2", "l3"}),
     # Lotka-Volterra with both read: v' / v = d u - c and u' / u = a - b v hold all.
-    "both species": ({"u": "a*u-b*u*v", "v": "-c*v+d*u*v"}, {"u": "u0", "v": "v0"}, {"y": "u", "z": "v"}, {}, set()),
-    # SIR of N known, y = r I: with w = y' / y + g, w' / w = -b y / (N r), w(0) = b - (b / (N r)) y(0).
-    "reported part": ({"S": "-b*S*I/N", "I": "b*S*I/N-g*I"}, {"S": "N-I0", "I": "I0"}, {"y": "r*I"}, {"N": 100.0},
+    "both species": ({"u": "a*u-b*u*v", "v": "-c*v+d*u*v"}, {"u": "u0", "v": "v0"},
+                     {"y": "u", "z": "v"}, {}, set()),
+    # SIR of N known, y = r I: with w = y' / y + g, w' / w = -b y / (N r), w(0) = b - (b / (N r))
+    # y(0).
+    "reported part": ({"S": "-b*S*I/N", "I": "b*S*I/N-g*I"}, {"S": "N-I0", "I": "I0"}, {"y": "r*I"},
+                      {"N": 100.0},
                       set()),
-    # Monod growth (Holmberg, Math. Biosci. 62, 1982): all by cells and substrate; by cells alone that has no scale.
-    "growth": ({"x": "mu*S/(K+S)*x", "S": "-mu*S/(K+S)*x/Y"}, {"x": "x0", "S": "S0"}, {"c": "x", "s": "S"}, {}, set()),
-    "growth by cells": ({"x": "mu*S/(K+S)*x", "S": "-mu*S/(K+S)*x/Y"}, {"x": "x0", "S": "S0"}, {"c": "x"}, {},
+    # Monod growth (Holmberg, Math. Biosci. 62, 1982): all by cells and substrate; by cells alone
+    # that has no scale.
+    "growth": ({"x": "mu*S/(K+S)*x", "S": "-mu*S/(K+S)*x/Y"}, {"x": "x0", "S": "S0"},
+               {"c": "x", "s": "S"}, {}, set()),
+    "growth by cells": ({"x": "mu*S/(K+S)*x", "S": "-mu*S/(K+S)*x/Y"}, {"x": "x0", "S": "S0"},
+                        {"c": "x"}, {},
                         {"K", "Y", "S0"}),
     "logistic": ({"x": "r*x*(1-x/K)"}, {"x": "x0"}, {"y": "x"}, {}, set()),
     "logistic, scaled": ({"x": "r*x*(1-x/K)"}, {"x": "x0"}, {"y": "s*x"}, {}, {"K", "x0", "s"}),
     # FitzHugh-Nagumo by v: v'' = c (1 - v^2) v' - v + a - b v' / c + b v - b v^3 / 3.
-    "spikes": ({"v": "c*(v-v**3/3+w)", "w": "-(v-a+b*w)/c"}, {"v": "v0", "w": "w0"}, {"y": "v"}, {}, set()),
+    "spikes": ({"v": "c*(v-v**3/3+w)", "w": "-(v-a+b*w)/c"}, {"v": "v0", "w": "w0"}, {"y": "v"}, {},
+               set()),
     # A spring is known by ratios, until a known force acts.
     "spring": ({"x": "v", "v": "-(c*v+k*x)/m"}, {"x": "1"}, {"y": "x"}, {}, {"c", "k", "m"}),
     "spring from rest": ({"x": "v", "v": "(F-c*v-k*x)/m"}, {}, {"y": "x"}, {"F": 2.0}, set()),
-    # Bergman's minimal model after a step of insulin, X = 0 at first (Bergman et al., Am. J. Physiol. 236, 1979).
-    "glucose": ({"G": "-(p1+X)*G+p1*Gb", "X": "-p2*X+10*p3"}, {"G": "G0"}, {"y": "G"}, {"Gb": 90.0}, set()),
+    # Bergman's minimal model after a step of insulin, X = 0 at first (Bergman et al., Am. J.
+    # Physiol. 236, 1979).
+    "glucose": ({"G": "-(p1+X)*G+p1*Gb", "X": "-p2*X+10*p3"}, {"G": "G0"}, {"y": "G"}, {"Gb": 90.0},
+                set()),
 }
-"""Rates, initial states, outputs and constants; and the parameters that the outputs do not determine."""
+"""Rates, initial states, outputs and constants; and the parameters that the outputs do not
+determine."""
 FORMULAS = {
     "a*b*t+c": "ab", "a*exp(b*t+c)": "ac", "a*exp(-b*t)+c": "", "a*t**n": "", "sqrt(a*b)*t": "ab",
-    "a*sqrt(b*t)+c": "ab", "a*(b*t)**0.5+c": "ab", "a*sqrt(b+t)+c": "", "a/sqrt(b*t)+c": "ab", "a+b*t**0": "ab",
+    "a*sqrt(b*t)+c": "ab", "a*(b*t)**0.5+c": "ab", "a*sqrt(b+t)+c": "", "a/sqrt(b*t)+c": "ab",
+    "a+b*t**0": "ab",
     "a+b*t**0+c*t": "ab", "c*a**2.5*t + c*a*a**1.5*t**2": "ac",
 }
 # fmt: on
@@ -177,7 +213,8 @@ def test_a_cold_saturable_cascade_is_told(inflow, output):
 
 
 def test_nothing_is_said_against_the_readings():
-    """k acts from order 17 of the output on, later than orders are computed; readings at late times change with it."""
+    """k acts from order 17 of the output on, later than orders are computed; readings at late times
+    change with it."""
     late = Ode({"y": "k*t**8*t**8-y"}, {"k": 1.0}, {"y": 1.0}, times=(0.5, 1.0, 2.0))
     assert np.linalg.norm(late.linearization()) > 1.0
     assert structure(late) is None
@@ -199,8 +236,8 @@ def test_what_an_exponential_is_at_its_start():
 
 
 def compartments(seed):
-    """Draws compartments with flows between them and losses, of which some are known: flows by (to, from), to 0 if
-    lost; which is filled; which is read."""
+    """Draws compartments with flows between them and losses, of which some are known: flows by (to,
+    from), to 0 if lost; which is filled; which is read."""
     draw = random.Random(seed)
     n = draw.randint(2, 4)
     flows: dict[tuple[int, int], int | None] = {(i + 1, i): None for i in range(1, n)}
@@ -218,7 +255,8 @@ def times_polynomial(a, b):
 
 
 def transfer(n, flows, filled, read):
-    """Returns numerator and denominator of the transfer function, n + 1 coefficients each (Faddeev and LeVerrier)."""
+    """Returns numerator and denominator of the transfer function, n + 1 coefficients each (Faddeev
+    and LeVerrier)."""
     A = [[Fraction(0)] * n for _ in range(n)]
     for (to, source), rate in flows.items():
         A[source - 1][source - 1] -= rate
@@ -250,8 +288,9 @@ def rank(rows):
 
 
 def lost_by_transfer(n, flows, filled, read):
-    """Finds the unknown flows that the transfer function N / D does not determine: those along which N' D - N D' has no
-    slope of its own. N and D are of first degree in each flow, so differences are slopes."""
+    """Finds the unknown flows that the transfer function N / D does not determine: those along
+    which N' D - N D' has no slope of its own. N and D are of first degree in each flow, so
+    differences are slopes."""
     draw = random.Random(1)
     unknown = [pair for pair, rate in flows.items() if rate is None]
     values = {pair: Fraction(rate or draw.randint(1, 10**6)) for pair, rate in flows.items()}
@@ -271,7 +310,8 @@ def lost_by_transfer(n, flows, filled, read):
 
 
 def described(n, flows, filled, read, *, inflow):
-    """The same compartments, all empty at first but for a dose in one of them, or with an inflow into it."""
+    """The same compartments, all empty at first but for a dose in one of them, or with an inflow
+    into it."""
     rates = {f"x{i}": "2" if inflow and i == filled else "0" for i in range(1, n + 1)}
     for (to, source), rate in flows.items():
         moved = f"{rate or f'k{to}_{source}'}*x{source}"

@@ -9,9 +9,12 @@ from ipe_bench.measurements.nist import FORMULAS, digits, score
 
 # What NIST's headers say: observations and parameters.
 SIZES = {
-    "Misra1a": (14, 2), "Chwirut2": (54, 3), "Chwirut1": (214, 3), "Lanczos3": (24, 6), "Gauss1": (250, 8),
-    "Gauss2": (250, 8), "DanWood": (6, 2), "Misra1b": (14, 2), "Kirby2": (151, 5), "Hahn1": (236, 7),
-    "Nelson": (128, 3), "MGH17": (33, 5), "Lanczos1": (24, 6), "Lanczos2": (24, 6), "Gauss3": (250, 8),
+    "Misra1a": (14, 2), "Chwirut2": (54, 3), "Chwirut1": (214, 3), "Lanczos3": (24, 6),
+    "Gauss1": (250, 8),
+    "Gauss2": (250, 8), "DanWood": (6, 2), "Misra1b": (14, 2), "Kirby2": (151, 5),
+    "Hahn1": (236, 7),
+    "Nelson": (128, 3), "MGH17": (33, 5), "Lanczos1": (24, 6), "Lanczos2": (24, 6),
+    "Gauss3": (250, 8),
     "Misra1c": (14, 2), "Misra1d": (14, 2), "Roszman1": (25, 4), "ENSO": (168, 9), "MGH09": (11, 4),
     "Thurber": (37, 7), "BoxBOD": (6, 2), "Rat42": (9, 3), "MGH10": (16, 3), "Eckerle4": (35, 3),
     "Rat43": (15, 4), "Bennett5": (154, 3),
@@ -41,7 +44,8 @@ def test_certified_parameters_reproduce_the_certified_residuals_and_deviations(d
     reached = score(model, x, least_squares_deviations(model, x))
     assert reached.parameters == 11.0
     if dataset == "Lanczos1":
-        # Residuals of 1e-13 from parameters near 1: eleven printed digits cannot reproduce their squares.
+        # Residuals of 1e-13 from parameters near 1: eleven printed digits cannot reproduce their
+        # squares.
         residuals = model.readings - model.simulate(x[None])[0]
         agreed(np.abs(residuals), 1e-10)
         return

@@ -1,4 +1,5 @@
-"""Every path that computes readings or slopes of differential equations, against closed forms and SciPy."""
+"""Every path that computes readings or slopes of differential equations, against closed forms and
+SciPy."""
 
 from __future__ import annotations
 
@@ -29,8 +30,8 @@ TOLERANCE = 1e-8
 
 @dataclass(frozen=True)
 class Law:
-    """Equations as functions and as formulas, with parameters p about 1 and one constant c; and their solution, where
-    it has a closed form that takes complex p."""
+    """Equations as functions and as formulas, with parameters p about 1 and one constant c; and
+    their solution, where it has a closed form that takes complex p."""
 
     start: Callable[..., Sequence[Any]]
     rhs: Callable[..., Sequence[Any]]
@@ -47,7 +48,8 @@ class Law:
 
 def scalar(rate: Any, formula: str, solution: Any, **more: Any) -> Law:
     """One state that starts at the second parameter."""
-    return Law(lambda p, c: (p[1],), lambda t, y, p, c: (rate(t, y[0], p, c[0]),), (formula,), ("p1",),
+    return Law(lambda p, c: (p[1],), lambda t, y, p, c: (rate(t, y[0], p, c[0]),), (formula,),
+               ("p1",),
                lambda t, p, c: (solution(t, *p, c[0]),), **more)  # fmt: skip
 
 
@@ -60,7 +62,8 @@ LAWS = {
                     lambda t, k, b, c: b * np.exp(k * np.sin(t))),
     "logistic": scalar(lambda t, y, p, c: p[0] * y * (1.0 - y / 3.0), "p0*a*(1-a/3)",
                        lambda t, r, b, c: 3.0 / (1.0 + (3.0 / b - 1.0) * np.exp(-r * t))),
-    "riccati": scalar(lambda t, y, p, c: -p[0] * y * y, "-p0*a**2", lambda t, k, b, c: b / (1.0 + k * b * t)),
+    "riccati": scalar(lambda t, y, p, c: -p[0] * y * y, "-p0*a**2", lambda t, k, b,
+                      c: b / (1.0 + k * b * t)),
     "power": scalar(lambda t, y, p, c: -p[0] * y**1.5, "-p0*a**1.5",
                     lambda t, k, b, c: (b**-0.5 + 0.5 * k * t) ** -2.0),
     "quadrature": scalar(lambda t, y, p, c: p[0] / (1.0 + t) + c, "p0/(1+t)+c",
@@ -68,19 +71,24 @@ LAWS = {
     "oscillator": Law(lambda p, c: (p[1], 0.0), lambda t, y, p, c: (y[1], -p[0] * p[0] * y[0]),
                       ("b", "-p0^2*a"), ("p1", "0"),
                       lambda t, p, c: (p[1] * np.cos(p[0] * t), -p[1] * p[0] * np.sin(p[0] * t))),
-    "chain": Law(lambda p, c: (p[2], c[0]), lambda t, y, p, c: (-p[0] * y[0], p[0] * y[0] - (2.0 + p[1]) * y[1]),
+    "chain": Law(lambda p, c: (p[2], c[0]), lambda t, y, p,
+                 c: (-p[0] * y[0], p[0] * y[0] - (2.0 + p[1]) * y[1]),
                  ("-p0*a", "p0*a-(2+p1)*b"), ("p2", "c"),
                  lambda t, p, c: (p[2] * np.exp(-p[0] * t),
-                                  p[0] * p[2] / (2.0 + p[1] - p[0]) * (np.exp(-p[0] * t) - np.exp(-(2.0 + p[1]) * t))
+                                  p[0] * p[2] / (2.0 + p[1] - p[0])
+                                  * (np.exp(-p[0] * t) - np.exp(-(2.0 + p[1]) * t))
                                   + c[0] * np.exp(-(2.0 + p[1]) * t)),
                  parameters=3, spread=0.2),
     "predators": Law(lambda p, c: (2.0, p[2]),
-                     lambda t, y, p, c: (p[0] * y[0] - y[0] * y[1], p[1] * y[0] * y[1] - c[0] * y[1]),
+                     lambda t, y, p, c: (p[0] * y[0] - y[0] * y[1],
+                                         p[1] * y[0] * y[1] - c[0] * y[1]),
                      ("p0*a-a*b", "p1*a*b-c*b"), ("2", "p2"), parameters=3),
-    "pendulum": Law(lambda p, c: (p[1], 0.0), lambda t, y, p, c: (y[1], -4.0 * p[0] * np.sin(y[0]) - c[0] * y[1]),
+    "pendulum": Law(lambda p, c: (p[1], 0.0), lambda t, y, p,
+                    c: (y[1], -4.0 * p[0] * np.sin(y[0]) - c[0] * y[1]),
                     ("b", "-4*p0*sin(a)-c*b"), ("p1", "0")),
     "driven": Law(lambda p, c: (1.0, p[1]),
-                  lambda t, y, p, c: (y[1], p[0] * (1.0 - y[0] * y[0]) * y[1] - y[0] + c[0] * np.tanh(t)),
+                  lambda t, y, p,
+                  c: (y[1], p[0] * (1.0 - y[0] * y[0]) * y[1] - y[0] + c[0] * np.tanh(t)),
                   ("b", "p0*(1-a^2)*b-a+c*tanh(t)"), ("1", "p1")),
 }
 # fmt: on
@@ -204,7 +212,8 @@ def check(law, gaps, given, batch, seed):
         same(model.simulate(x[i : i + 1])[0], z[i]), same(fresh.jacobian(x[i : i + 1])[0], J[i])
     same(model.simulate(x[::-1]), z[::-1])
 
-    # A window has the readings of the whole, and so have some of its readings, and several files together.
+    # A window has the readings of the whole, and so have some of its readings, and several files
+    # together.
     for stop in {1, (len(gaps) + 1) // 2, len(gaps)}:
         rows = model.rows(stop)
         (
@@ -274,12 +283,16 @@ def test_every_path_solves_the_equations_with_the_same_bits_in_many_draws(draw):
 
 # fmt: off
 OPERATIONS = {
-    "+": lambda a, b: a + b, "-": lambda a, b: a - b, "*": lambda a, b: a * b, "over": lambda a, b: a / (2.0 + b * b),
-    "power": lambda a, b: (1.0 + a * a) ** 1.5 - b, "root": lambda a, b: np.sqrt(1.0 + a * a) - b**2,
-    "sin": lambda a, b: np.sin(a) - b, "cos": lambda a, b: np.cos(a + b), "exp": lambda a, b: np.exp(np.tanh(a)) * b,
+    "+": lambda a, b: a + b, "-": lambda a, b: a - b, "*": lambda a, b: a * b, "over": lambda a,
+    b: a / (2.0 + b * b),
+    "power": lambda a, b: (1.0 + a * a) ** 1.5 - b, "root": lambda a,
+    b: np.sqrt(1.0 + a * a) - b**2,
+    "sin": lambda a, b: np.sin(a) - b, "cos": lambda a, b: np.cos(a + b), "exp": lambda a,
+    b: np.exp(np.tanh(a)) * b,
     "log": lambda a, b: np.log(3.0 + np.sin(a)) + b, "arctan": lambda a, b: np.arctan(a) * b,
     "hyperbolic": lambda a, b: np.sinh(np.sin(a)) - np.cosh(np.cos(b)),
-    "tan": lambda a, b: np.tan(np.sin(a) / 2.0) - b, "hypot": lambda a, b: SEVERAL["hypot"](a, 2.0 + np.sin(b)),
+    "tan": lambda a, b: np.tan(np.sin(a) / 2.0) - b, "hypot": lambda a,
+    b: SEVERAL["hypot"](a, 2.0 + np.sin(b)),
     "arctan2": lambda a, b: PAIRS["arctan2"](a, np.sin(b) + 1.5),
 }
 # fmt: on
@@ -343,7 +356,8 @@ class Drawn(OdeMeasurement):
         return [np.arctan(value(shown, t, y, p, c)) + y[0] for shown in self.shown]
 
     def slowly(self, x):
-        """Readings (m,) for one x that may be complex: a plain loop over intervals, steps and stages."""
+        """Readings (m,) for one x that may be complex: a plain loop over intervals, steps and
+        stages."""
         p, z = list(x * self.sizes), []
         for c in self.cases:
             t, y = 0.0, np.array(self.start(p, c)) + 0.0 * p[0]

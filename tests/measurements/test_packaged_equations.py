@@ -1,4 +1,5 @@
-"""The models that are described in the configs, against closed forms, invariants and other integrators."""
+"""The models that are described in the configs, against closed forms, invariants and other
+integrators."""
 
 from dataclasses import replace
 
@@ -18,7 +19,8 @@ from ipe_bench.measurements.problem import Problem
 from ipe_bench.workshop.conformance import check_component
 
 FOOT = 0.3048
-# Boys confined to bed, 22 January to 4 February 1978 (British Medical Journal, 4 March 1978, p. 587).
+# Boys confined to bed, 22 January to 4 February 1978 (British Medical Journal, 4 March 1978, p.
+# 587).
 IN_BED = np.array([3, 8, 26, 76, 225, 298, 258, 233, 189, 128, 68, 29, 14, 4], dtype=float)
 COUNTED = {"susceptible": "S", "infected": "I", "removed": "population - S - I"}
 PAPER = np.array([0.0, 0.0, 1.0])
@@ -122,7 +124,8 @@ def test_the_boarding_school_is_estimated_as_scipy_estimates_it():
 
 
 def altitude(t, h0, v0, b, gamma):
-    """With u = exp(-gamma h): gamma v0 t = exp(-a u0) (Ei(a u) - Ei(a u0)), a = b / gamma, by separation."""
+    """With u = exp(-gamma h): gamma v0 t = exp(-a u0) (Ei(a u) - Ei(a u0)), a = b / gamma, by
+    separation."""
     a, u0 = b / gamma, np.exp(-gamma * h0)
     time = lambda u: np.exp(-a * u0) * (expi(a * u) - expi(a * u0)) / (gamma * v0) - t  # noqa: E731
     return -np.log(brentq(time, u0, 700.0 / a, xtol=1e-18, rtol=1e-14)) / gamma
@@ -144,7 +147,8 @@ def test_ranges_of_a_falling_body_are_those_of_the_closed_form():
     "ln_ballistic", [*(pytest.param(far, marks=pytest.mark.slow) for far in (10.0, 17.0)), 18.0]
 )
 def test_a_body_that_is_stopped_at_once_is_followed_as_well(ln_ballistic):
-    """With steps of half a second the ranges are off by 13.5 m at 17, by 297 m at 17.4, and no numbers at 18."""
+    """With steps of half a second the ranges are off by 13.5 m at 17, by 297 m at 17.4, and no
+    numbers at 18."""
     model = FallingBody()
     x = model.nominal + np.array([0.0, 0.0, ln_ballistic]) / model.sizes
     b, gamma = 3e-5 / FOOT * np.exp(ln_ballistic), 5e-5 / FOOT

@@ -44,7 +44,8 @@ def test_readings_grow_with_u_whatever_the_strength():
 
 @pytest.mark.parametrize("few", [1, 7, 50])
 def test_bits_of_a_jacobian_do_not_depend_on_how_many_trials_there_are(few):
-    """NumPy multiplies large complex arrays in place, and rounds otherwise than it rounds small ones."""
+    """NumPy multiplies large complex arrays in place, and rounds otherwise than it rounds small
+    ones."""
     model = Polynomial(4, 40)
     x = np.random.default_rng(0).normal(size=(300, 4))
     parts = [model.jacobian(x[i : i + few]) for i in range(0, len(x), few)]

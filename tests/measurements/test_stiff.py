@@ -1,4 +1,5 @@
-"""Stiff equations: published digits, exact solutions, SciPy's Radau, and which method a model is given."""
+"""Stiff equations: published digits, exact solutions, SciPy's Radau, and which method a model is
+given."""
 
 import pickle
 from dataclasses import dataclass, replace
@@ -14,9 +15,11 @@ from ipe_bench.measurements.base import differentiate
 
 # fmt: off
 HIRES = {
-    "y1": "-1.71*y1+0.43*y2+8.32*y3+0.0007", "y2": "1.71*y1-8.75*y2", "y3": "-10.03*y3+0.43*y4+0.035*y5",
+    "y1": "-1.71*y1+0.43*y2+8.32*y3+0.0007", "y2": "1.71*y1-8.75*y2",
+    "y3": "-10.03*y3+0.43*y4+0.035*y5",
     "y4": "8.32*y2+1.71*y3-1.12*y4", "y5": "-1.745*y5+0.43*y6+0.43*y7",
-    "y6": "-k*y6*y8+0.69*y4+1.71*y5-0.43*y6+0.69*y7", "y7": "k*y6*y8-1.81*y7", "y8": "-k*y6*y8+1.81*y7",
+    "y6": "-k*y6*y8+0.69*y4+1.71*y5-0.43*y6+0.69*y7", "y7": "k*y6*y8-1.81*y7",
+    "y8": "-k*y6*y8+1.81*y7",
 }
 # fmt: on
 
@@ -181,8 +184,8 @@ FAST = [
 
 
 def check_fast(shown, rate, times):
-    """y follows k (1.2 + sin t) with a time constant of 1 / rate, which an explicit step leaves for 1e30; where a
-    reading saturates, one such state reads as another."""
+    """y follows k (1.2 + sin t) with a time constant of 1 / rate, which an explicit step leaves for
+    1e30; where a reading saturates, one such state reads as another."""
     model = Ode(
         {"y": "-L*(y-(1.2+sin(t))*k)"},
         {"k": 0.5},
@@ -288,7 +291,7 @@ def test_readings_at_the_start_alone_need_no_step():
 
 @pytest.mark.oracle("closed form: a fast state that follows a sine", "readings", 1e-8)
 @pytest.mark.slow
-def test_equations_that_the_shortest_explicit_steps_do_not_follow_are_integrated_by_the_implicit_method():
+def test_equations_that_the_shortest_explicit_steps_do_not_follow_are_integrated_implicitly():
     model = Ode({"y": "-280*(y-k*sin(3*t))"}, {"k": 1.0}, outputs={"z": "tanh(y)"}, times=(20.0,))
     lag = 280 * (280 * np.sin(60.0) - 3 * np.cos(60.0)) / (280**2 + 9)
     assert not model.hindrance(model.nominal)

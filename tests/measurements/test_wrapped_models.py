@@ -1,4 +1,5 @@
-"""A model inside of another: what is restricted, constrained or joined is the whole model in other coordinates."""
+"""A model inside of another: what is restricted, constrained or joined is the whole model in other
+coordinates."""
 
 import numpy as np
 import pytest

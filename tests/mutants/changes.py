@@ -1,7 +1,9 @@
-"""Changes that would make ipe-bench wrong, and the quick tests that notice each; `notice.py` tries them.
+"""Changes that would make ipe-bench wrong, and the quick tests that notice each; `notice.py` tries
+them.
 
-A change replaces a snippet that stands exactly once in the package, wherever that is: white space and commas before a
-bracket do not count, so that neither reformatting nor moving a module makes a change stale.
+A change replaces a snippet that stands exactly once in the package, wherever that is: white space
+and commas before a bracket do not count, so that neither reformatting nor moving a module makes a
+change stale.
 """
 
 from __future__ import annotations
@@ -26,7 +28,8 @@ class Change:
     before: str
     after: str
     tests: str
-    """Names of test files or of folders of them, wherever they stand; those that notice it soonest come first."""
+    """Names of test files or of folders of them, wherever they stand; those that notice it soonest
+    come first."""
     survives: str = ""
     """Why no quick test notices it; empty if one does."""
 
@@ -463,7 +466,8 @@ CHANGES = {
     "linear-covariance": Change(
         "estimators",
         "a root reports the covariance of the linear estimate",
-        "return np.matmul(np.matmul(inverse_slope, self.covariance()), inverse_slope.swapaxes(1, 2))",
+        "return np.matmul(np.matmul(inverse_slope, self.covariance()), inverse_slope.swapaxes(1,"
+        " 2))",
         "return self.covariance() + 0 * inverse_slope",
         "test_equations.py test_solver_matrix.py",
     ),
@@ -648,7 +652,10 @@ CHANGES = {
         "return self.start, -self.stop, str(self.path)",
         "return self.start, self.stop, str(self.path)",
         "test_store.py test_damage.py",
-        survives="nothing is wrong: parts of one key hold the same bits, and each trial is taken once in either order",
+        survives=(
+            "nothing is wrong: parts of one key hold the same bits, and each trial is taken once"
+            " in either order"
+        ),
     ),
     "footer-unchecked": Change(
         "runs",

@@ -1,6 +1,8 @@
-"""Whether the quick tests notice the changes of `changes.py`: `make mutants` writes outputs/mutants/notice.md.
+"""Whether the quick tests notice the changes of `changes.py`: `make mutants` writes
+outputs/mutants/notice.md.
 
-Each is made in a copy of the package that stands in front of it, one at a time; the tests that are named must fail.
+Each is made in a copy of the package that stands in front of it, one at a time; the tests that are
+named must fail.
 """
 
 from __future__ import annotations
@@ -25,7 +27,8 @@ FAILED = 1
 
 
 def failing(files: Iterable[Path], change: Change | None) -> str:
-    """What pytest says of the files if a test fails with a change, or without one; empty if all pass.
+    """What pytest says of the files if a test fails with a change, or without one; empty if all
+    pass.
 
     Raises:
         RuntimeError: they could not be run.

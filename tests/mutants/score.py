@@ -1,7 +1,9 @@
-"""How many random changes the tests notice, room by room: `make mutants SAMPLE=40` writes outputs/mutants/score.md.
+"""How many random changes the tests notice, room by room: `make mutants SAMPLE=40` writes
+outputs/mutants/score.md.
 
-Cosmic Ray finds the places and makes the changes, one at a time, each in a copy of the project; the tests of the room
-must then fail. Of the changes at one place one is drawn at random; annotations are left out.
+Cosmic Ray finds the places and makes the changes, one at a time, each in a copy of the project; the
+tests of the room must then fail. Of the changes at one place one is drawn at random; annotations
+are left out.
 """
 
 from __future__ import annotations
@@ -33,7 +35,8 @@ LEFT_OUT = (
     "_NotEq_IsNot",
     "_IsNot_NotEq",
 )
-"""Parts of the names of operators that make no change, none that a run survives, or none without arguments."""
+"""Parts of the names of operators that make no change, none that a run survives, or none without
+arguments."""
 
 ROOMS = {
     "scoring": (

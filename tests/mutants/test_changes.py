@@ -1,4 +1,5 @@
-"""Changes on purpose can be made: each snippet stands once, what replaces it is Python, and its tests are there."""
+"""Changes on purpose can be made: each snippet stands once, what replaces it is Python, and its
+tests are there."""
 
 import ast
 

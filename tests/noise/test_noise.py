@@ -150,7 +150,7 @@ def test_outliers_that_estimators_are_not_told_of_leave_the_law_normal():
     assert Outliers(0.3).whitened((4, 4), np.random.default_rng(0)) is None
 
 
-# What is left out ----------------------------------------------------------------------------------------------------
+# What is left out ---------------------------------------------------------------------------------
 
 SCALED = [
     ib.noise.Gaussian(),

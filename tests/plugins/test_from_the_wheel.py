@@ -1,4 +1,5 @@
-"""Outside of the checkout, from the wheel: every kind of plugin is made, checked, run and seen in the report."""
+"""Outside of the checkout, from the wheel: every kind of plugin is made, checked, run and seen in
+the report."""
 
 import os
 import subprocess

@@ -1,4 +1,5 @@
-"""Names that earlier versions had, and results stored under them, are refused with the place where they are now."""
+"""Names that earlier versions had, and results stored under them, are refused with the place where
+they are now."""
 
 from dataclasses import dataclass
 
@@ -59,7 +60,10 @@ def test_results_that_are_of_an_old_class(ipe_bench, synthetic):
     synthetic.add(scenario, "other", error)
     synthetic.record(5)
     found = Results.read([synthetic.directory])
-    said = f"stale: ipe_bench.baselines.es_mda.EsMda is ipe_bench_zoo.EsMda {PLACE}; left out: its results (1)"
+    said = (
+        f"stale: ipe_bench.baselines.es_mda.EsMda is ipe_bench_zoo.EsMda {PLACE}; left out: its"
+        " results (1)"
+    )
     assert (found.problems, found.stale) == ([], [said])
     assert [(cell.names["estimator"], cell.done) for cell in found.cells] == [
         ("truth", 5),

@@ -1,4 +1,5 @@
-"""Options are checked by their types, alike from Python and from a config; and conf says what the classes say."""
+"""Options are checked by their types, alike from Python and from a config; and conf says what the
+classes say."""
 
 from __future__ import annotations
 
@@ -104,7 +105,8 @@ def test_values_are_kept_as_their_type_has_them():
 # fmt: off
 WRONG = [
     (Newton, "tolerance", -1.0), (Newton, "start", "home"), (Relinearized, "budget", 0.0),
-    (Gaussian, "deviation", True), (LevenbergMarquardt, "damping", inf), (EKF, "prior_inflation", nan),
+    (Gaussian, "deviation", True), (LevenbergMarquardt, "damping", inf),
+    (EKF, "prior_inflation", nan),
     (Gins, "readings_per_case", 0), (Nist, "dataset", "Iris"), (Processes, "workers", 0),
     (SteepestDescent, "max_iterations", "many"),
 ]
@@ -204,7 +206,10 @@ def test_an_import_that_fails_is_named_by_its_line(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(tmp_path))
     (tmp_path / "my_library.py").write_text("import math\nimport nunpy\n")
     discovery.packages.add("my_library")
-    said = r"my_library\.py, line 2: ModuleNotFoundError: No module named 'nunpy'; install what the plugin needs$"
+    said = (
+        r"my_library\.py, line 2: ModuleNotFoundError: No module named 'nunpy';"
+        r" install what the plugin needs$"
+    )
     with pytest.raises(UserError, match=said):
         construct({"_target_": "my_library.Model"}, "part")
 

@@ -28,7 +28,8 @@ def run(*words: str, site: Path) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture
 def site(tmp_path, monkeypatch):
-    """A solver in `plugins/twin`, and the same distribution installed in another folder, where its source is broken."""
+    """A solver in `plugins/twin`, and the same distribution installed in another folder, where its
+    source is broken."""
     monkeypatch.chdir(tmp_path)
     assert main(["new", "solver", "twin"]) == 0
     discovery.sources.cache_clear()

@@ -1,4 +1,5 @@
-"""What is said of answers that cannot all be right, and of parameters that the readings do not determine."""
+"""What is said of answers that cannot all be right, and of parameters that the readings do not
+determine."""
 
 import re
 from dataclasses import dataclass
@@ -45,7 +46,8 @@ def test_of_two_minima_far_apart_the_worse_does_not_fit(noise):
 
 
 def test_parameters_that_the_readings_do_not_tell_apart_are_named():
-    """Two lengths on parallel axes count by their sum alone, and an offset of nothing does not count at all."""
+    """Two lengths on parallel axes count by their sum alone, and an offset of nothing does not
+    count at all."""
     model = Formula(
         "(d2+d3)*cos(t)+a*sin(t)+0*k", {"d2": 0.4, "d3": 0.1, "a": 1.0, "k": 2.0}, {"t": T.tolist()}
     )
@@ -154,7 +156,8 @@ def test_noise_that_is_less_overstated_or_estimated_has_intervals(deviation):
 
 @pytest.mark.oracle("closed form: Student's t of a left-out reading", "normalised residuals", 1e-4)
 def test_with_an_unknown_level_a_normalised_residual_is_as_probable_as_its_error_of_prediction():
-    """The reading, foretold by a fit to all others, is off by so many of its errors: Student's t with m - n - 1."""
+    """The reading, foretold by a fit to all others, is off by so many of its errors: Student's t
+    with m - n - 1."""
     z = A @ [1.0, 1.2, 0.8] + 0.3 * np.random.default_rng(3).standard_normal(12)
     z[5] += 4.0
     found = ib.estimate(LINE, z, {"lm": LevenbergMarquardt(tolerance=1e-12)}, noise=Unknown())["lm"]
@@ -169,7 +172,8 @@ def test_with_an_unknown_level_a_normalised_residual_is_as_probable_as_its_error
 
 @pytest.mark.parametrize(("excess", "as_good"), [(5.0, True), (9.0, False)])
 def test_with_an_unknown_level_another_minimum_is_as_good_within_snedecors_region(excess, as_good):
-    """Of y = c^2 t + b, c has two minima, which a small odd term tells apart; n F of the 95 % region is 6.9 here."""
+    """Of y = c^2 t + b, c has two minima, which a small odd term tells apart; n F of the 95 %
+    region is 6.9 here."""
     rng, t = np.random.default_rng(4), np.linspace(-1, 1, 23)
     s = rng.standard_normal(23)
     s -= (
@@ -243,7 +247,8 @@ def test_answers_of_one_curve_are_told_apart_from_ambiguous_ones(expression, tru
 
 
 def test_answers_of_different_curves_are_ambiguous():
-    """Readings at whole numbers do not tell a frequency from one that is 2 pi larger but for a short interval."""
+    """Readings at whole numbers do not tell a frequency from one that is 2 pi larger but for a
+    short interval."""
     t = np.arange(12.0)
     t[3] += 0.02
     model = Formula("sin(w*t)", {"w": 1.0}, {"t": t.tolist()})

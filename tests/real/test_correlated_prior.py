@@ -1,4 +1,5 @@
-"""Priors whose parameters depend on each other, against conditional normal distributions in closed form."""
+"""Priors whose parameters depend on each other, against conditional normal distributions in closed
+form."""
 
 import numpy as np
 import pytest
@@ -29,7 +30,8 @@ def bench() -> Scenario:
 
 
 def conditional(bench: Scenario, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and covariance of x given z, by the joint normal distribution of both and not by least squares."""
+    """Mean and covariance of x given z, by the joint normal distribution of both and not by least
+    squares."""
     d = 1.5 * np.array(DEVIATIONS)
     P0 = np.array(CORRELATIONS) * np.outer(d, d)
     A = np.asarray(bench.measurement.A)  # type: ignore[attr-defined]

@@ -1,4 +1,5 @@
-"""What is signed of an answer: intervals that hold what they promise, and readings, directions and minima by name."""
+"""What is signed of an answer: intervals that hold what they promise, and readings, directions and
+minima by name."""
 
 import numpy as np
 import pytest
@@ -77,7 +78,8 @@ def test_ends_of_a_profile_are_where_chi_square_has_risen_by_the_quantile():
 
 @pytest.mark.parametrize(("decades", "low"), [(8.6, 10**-8.6), (12.9, 0.0)])
 def test_an_end_is_on_a_bound_if_it_is_as_near_as_round_off(decades, low):
-    """And no other: of a positive parameter that starts at 1, 10^-8.6 is a value, and 10^-12.9 is 0."""
+    """And no other: of a positive parameter that starts at 1, 10^-8.6 is a value, and 10^-12.9 is
+    0."""
     model = informed(
         Formula("b*t", {"b": 1.0}, {"t": (1.0,)}), (ParameterInfo("b", positive=True),)
     )
@@ -100,7 +102,8 @@ def test_a_parameter_that_the_readings_do_not_bound_has_an_open_interval():
 @pytest.mark.campaign
 @pytest.mark.parametrize("unknown", [False, True])
 def test_profile_intervals_cover_the_truth_as_often_as_they_say(unknown):
-    """In 1,000 simulated sets of six readings, .95 ± .02 for every parameter, where standard errors give less."""
+    """In 1,000 simulated sets of six readings, .95 ± .02 for every parameter, where standard errors
+    give less."""
     noise, rng, truth, held = Gaussian(0.8), np.random.default_rng(11), SATURATION.sizes, []
     z = SATURATION.simulate(np.ones((1, 2))) + noise.deviation * rng.standard_normal((1000, 6))
     problem, freedom = Problem(SATURATION, noise.covariance(6)), 4 if unknown else None
@@ -126,7 +129,8 @@ def test_profile_intervals_cover_the_truth_as_often_as_they_say(unknown):
 )
 @pytest.mark.parametrize("noise", [Gaussian(0.5), Correlated(0.5, correlation=0.6)])
 def test_the_reading_that_carries_the_answer_is_named(noise):
-    """Without it the estimate moves by as much as leaving it out and fitting again moves it (a linear model)."""
+    """Without it the estimate moves by as much as leaving it out and fitting again moves it (a
+    linear model)."""
     t = np.array([0.0, 1.0, 2.0, 3.0, 20.0])
     model = Formula("a+b*t", {"a": 1.0, "b": 1.0}, {"t": tuple(t)})
     z = 1 + t + np.array([0.3, -0.2, 0.1, -0.3, 2.0])
@@ -151,7 +155,8 @@ def test_the_reading_that_carries_the_answer_is_named(noise):
 )
 @pytest.mark.parametrize("unknown", [False, True])
 def test_rows_without_a_reading_are_predicted_with_their_band(unknown):
-    """A straight line beyond its readings: the textbook's error of the line and of a further reading there."""
+    """A straight line beyond its readings: the textbook's error of the line and of a further
+    reading there."""
     t = np.array([0.0, 1.0, 2.0, 3.0, 7.0, 20.0])
     z = np.array([0.8, 2.3, 2.9, 4.2, np.nan, np.nan])
     model = Formula("a+b*t", {"a": 1.0, "b": 1.0}, {"t": tuple(t)})
@@ -166,7 +171,8 @@ def test_rows_without_a_reading_are_predicted_with_their_band(unknown):
 
 
 def test_another_minimum_that_fits_as_well_is_told():
-    """a and b of exp(-a t) + exp(-b t) can be exchanged; a phase has a lower minimum than the one near its start."""
+    """a and b of exp(-a t) + exp(-b t) can be exchanged; a phase has a lower minimum than the one
+    near its start."""
     model = Formula(
         "exp(-a*t)+exp(-b*t)", {"a": 1.0, "b": 2.0}, {"t": tuple(np.linspace(0.1, 3, 20))}
     )
@@ -192,8 +198,8 @@ def test_an_estimate_that_is_not_the_least_minimum_does_not_pass():
 
 
 def test_a_profile_that_comes_upon_a_better_fit_is_no_interval():
-    """Of (a^2 - 1) / 2 and (a - 1) / 10, both read as 0: the readings fit best at a = 1, and better at -.98 than
-    around it."""
+    """Of (a^2 - 1) / 2 and (a - 1) / 10, both read as 0: the readings fit best at a = 1, and better
+    at -.98 than around it."""
     model = Formula("s*(a**2-1)/2 + (1-s)*(a-1)/10", {"a": -1.0}, {"s": (1.0, 0.0)})
     found = examined(model, np.zeros(2), Gaussian(1.0))
     assert found.x == pytest.approx([-0.98], abs=0.005)

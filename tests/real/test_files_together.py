@@ -1,5 +1,5 @@
-"""Several files of a model whose parameters are fixed, bounded or one file's own, against SciPy; and what is left out
-of a file on purpose, against a file without it."""
+"""Several files of a model whose parameters are fixed, bounded or one file's own, against SciPy;
+and what is left out of a file on purpose, against a file without it."""
 
 from pathlib import Path
 
@@ -96,7 +96,8 @@ def test_a_bound_acts_in_the_file_that_it_is_of(files):
 
 
 def test_the_noise_of_a_model_is_that_of_its_files_in_whatever_order_they_are(tmp_path):
-    """Rows of an epidemic that are no grid, alone and with another file: the level is known, and not estimated."""
+    """Rows of an epidemic that are no grid, alone and with another file: the level is known, and
+    not estimated."""
     rows = ["11,65", "3,26", "4.5,140", "6,293", "7.25,285", "9,190"]
     for name, own in (("a", rows), ("b", rows[::-1])):
         (tmp_path / f"{name}.csv").write_text("\n".join(["time [day],reading [people]", *own]))

@@ -25,7 +25,8 @@ SAMPLES = Path(str(files("ipe_bench.real") / "samples"))
 
 
 def test_missing_readings_are_no_obstacle_to_any_estimator():
-    """Ten readings gone: every estimator still finds the truth, within 5 of the standard errors that it states."""
+    """Ten readings gone: every estimator still finds the truth, within 5 of the standard errors
+    that it states."""
     scenario = Scenario(Gins(), Gaussian(0.0066), GaussianPrior(), 10.0)
     trial = scenario.draw(0, 1)
     z = trial.z[0].copy()
@@ -80,7 +81,7 @@ def test_the_oxygen_demand_of_bates_and_watts_is_estimated_as_r_estimates_it():
     )
 
 
-def test_the_chi_square_test_rejects_a_true_model_as_often_as_it_says_and_a_wrong_deviation_always():
+def test_the_chi_square_test_rejects_a_true_model_as_often_as_it_says_and_a_wrong_one_always():
     scenario = Scenario(Polynomial(), Gaussian(0.01), GaussianPrior(), 0.1)
     optimist = Scenario(Polynomial(), Gaussian(0.005), GaussianPrior(), 0.1).problem
     z = scenario.draw(0, 200).z
@@ -91,7 +92,8 @@ def test_the_chi_square_test_rejects_a_true_model_as_often_as_it_says_and_a_wron
 
 
 def test_rounded_readings_are_held_to_the_law_of_rounding():
-    """Uniform errors have a chi-square of .4 of the variance: 20 % too large a sum is then improbable."""
+    """Uniform errors have a chi-square of .4 of the variance: 20 % too large a sum is then
+    improbable."""
     noise = Quantization(0.3, dither=True)
     scenario = Scenario(Polynomial(), noise, GaussianPrior(), 0.1)
     z = scenario.draw(0, 500).z
@@ -123,7 +125,8 @@ def test_a_value_is_shown_to_two_figures_of_its_error(value, error, expected):
 
 
 def test_of_two_fits_with_noise_of_their_own_size_the_worse_is_beaten():
-    """Residuals that made their own R are as large as it says in both; the sums of squares tell them apart."""
+    """Residuals that made their own R are as large as it says in both; the sums of squares tell
+    them apart."""
     t = np.linspace(0, 10, 40)
     model = ib.measurements.Formula("a*sin(w*t)", {"a": 1.0, "w": 2.0}, {"t": t.tolist()})
     z = 1.5 * np.sin(2.2 * t) + 0.05 * np.random.default_rng(0).normal(size=40)

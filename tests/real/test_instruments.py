@@ -44,7 +44,8 @@ def test_bounds_move_neither_a_minimum_inside_of_them_nor_its_standard_errors(tm
 @pytest.mark.parametrize("unknown", [False, True])
 @pytest.mark.parametrize("upper", [220.0, 231.0])
 def test_an_estimate_on_its_bound_is_the_minimum_within_the_bounds(tmp_path, upper, unknown):
-    """Against SciPy's bounded solution; what is on the bound has no error, and the others' are with it held there."""
+    """Against SciPy's bounded solution; what is on the bound has no error, and the others' are with
+    it held there."""
     path, columns = simulated(tmp_path / "a.csv", 240.0, 3)
     t, y, sigma = columns.T
     known = (

@@ -37,8 +37,8 @@ def examined(model, z, deviation: float, *known: ParameterInfo):
 @pytest.mark.parametrize("beyond", [0.0, 0.5, 3.0])
 @pytest.mark.parametrize("side", [-1, 1])
 def test_the_interval_of_a_linear_parameter_on_its_bound_is_known(beyond, side):
-    """Chi-square about an unbounded estimate e deviations beyond the bound has risen by q^2 at -e + sqrt(e^2 + q^2)
-    inside of it."""
+    """Chi-square about an unbounded estimate e deviations beyond the bound has risen by q^2 at -e +
+    sqrt(e^2 + q^2) inside of it."""
     s = 0.7 * np.sqrt(np.linalg.inv(A.T @ A)[1, 1])
     bound = 5 - side * (beyond * s + 1e-9)  # the unbounded estimate is 5
     known = ParameterInfo("b", nominal=5 - 9 * side, **{"upper" if side > 0 else "lower": bound})
@@ -50,7 +50,8 @@ def test_the_interval_of_a_linear_parameter_on_its_bound_is_known(beyond, side):
 
 @pytest.mark.parametrize("sizes", [(1.0, 10.0), (-2.0, 0.1), (-1.0, -3.0)])
 def test_the_interval_of_a_linear_parameter_has_its_ends_in_order_in_any_unit(sizes):
-    """Four readings of each, of deviation .4 in its unit: plus or minus 1.96 times .2, whatever sign the unit has."""
+    """Four readings of each, of deviation .4 in its unit: plus or minus 1.96 times .2, whatever
+    sign the unit has."""
     model, x = Repeated(names=("a", "b"), sizes_given=sizes), np.array([3.0, 7.0])
     z = np.tile(x, 4) + 0.1 * np.array([-1, 2, -1, 2, 1, -2, 1, -2])
     low, high = profiles(Scenario(model, Gaussian(0.4)).problem, z, x, 0.04 * np.eye(2))
@@ -60,7 +61,8 @@ def test_the_interval_of_a_linear_parameter_has_its_ends_in_order_in_any_unit(si
 
 @pytest.mark.parametrize("side", [-1, 1])
 def test_profiles_of_the_others_let_a_parameter_leave_its_bound_inwards(side):
-    """Of an intercept whose slope is on its bound, against the quadratic form: the bound acts to one side only."""
+    """Of an intercept whose slope is on its bound, against the quadratic form: the bound acts to
+    one side only."""
     P = 0.49 * np.linalg.inv(A.T @ A)
     sa, sb, c = *np.sqrt(np.diag(P)), P[0, 1]
     bound = 5 - side * 0.8 * sb
@@ -130,7 +132,8 @@ def decay_above_zero(c: float, seed: int, bootstraps: int = 500):
     ("seed", "drawn"), [(0, 500), (2, 60)], ids=["estimate inside", "estimate on the bound"]
 )
 def test_simulated_sets_are_minimised_within_the_bounds_as_the_readings_were(seed, drawn):
-    """Each once more by SciPy; about half are on the bound, and without those 0 would not be in the interval."""
+    """Each once more by SciPy; about half are on the bound, and without those 0 would not be in the
+    interval."""
     one, found = decay_above_zero(0.0, seed, bootstraps=drawn)
     assert found is not None
     assert one.held_at == ({} if seed == 0 else {2: 0.0})
@@ -154,8 +157,9 @@ def test_simulated_sets_are_minimised_within_the_bounds_as_the_readings_were(see
 
 
 def test_intervals_end_on_the_bound_that_they_reach():
-    """The estimate is .005, a tenth of a standard error above the bound. In the logarithm of c its standard errors
-    reach from 1e-12 to millions; in c they end on the bound, as the profile does."""
+    """The estimate is .005, a tenth of a standard error above the bound. In the logarithm of c its
+    standard errors reach from 1e-12 to millions; in c they end on the bound, as the profile
+    does."""
     one, found = decay_above_zero(0.0, 0)
     assert found is not None
     assert 0 < one.x[2] < 0.01
@@ -196,8 +200,8 @@ def test_standard_errors_of_what_is_far_from_its_bound_are_of_its_logarithm():
 @pytest.mark.campaign
 @pytest.mark.parametrize("c", [0.0, 0.02])
 def test_1000_truths_on_and_near_a_bound_are_in_every_interval(c):
-    """Profile and standard error, and the bootstrap in 200 of them, hold c in .93 of cases or more, up to 2 standard
-    errors; beside it their median widths."""
+    """Profile and standard error, and the bootstrap in 200 of them, hold c in .93 of cases or more,
+    up to 2 standard errors; beside it their median widths."""
     studies, drawn = 1000, 200
     inside, widths = np.zeros(3), []
     for seed in range(studies):
@@ -216,7 +220,8 @@ def test_1000_truths_on_and_near_a_bound_are_in_every_interval(c):
         widths.append([high - low for low, high in ends])
     covered = inside / [studies, studies, drawn]
     print(
-        f"c = {c}: covered {covered} (profile, standard error, bootstrap), widths {np.median(widths, axis=0)}"
+        f"c = {c}: covered {covered} (profile, standard error, bootstrap), widths"
+        f" {np.median(widths, axis=0)}"
     )
     assert (covered >= 0.93 - 2 * np.sqrt(0.07 * 0.93 / np.array([studies, studies, drawn]))).all()
 

@@ -1,4 +1,5 @@
-"""Levels of the noise that are estimated with the parameters: the likelihood, its intervals, and what is refused."""
+"""Levels of the noise that are estimated with the parameters: the likelihood, its intervals, and
+what is refused."""
 
 from dataclasses import replace
 
@@ -29,7 +30,8 @@ DECAY = Formula(
     {"a": 10.0, "k": 0.9, "l": 0.3},
     {"t": tuple(TIMES), "second": tuple(SECOND)},
 )
-"""A substance that decays into another, both read; its parameters at the truth are 1 in multiples of their sizes."""
+"""A substance that decays into another, both read; its parameters at the truth are 1 in multiples
+of their sizes."""
 NOISES = {
     "by output": (Unknown(by="second"), np.array([0.4, 0.1])),
     "a + b h": (Unknown(sigma="floor + share*h"), np.array([0.1, 0.08])),
@@ -180,7 +182,8 @@ def test_profile_ends_are_where_the_likelihood_has_risen_by_the_quantile(case, d
                 return deviance(whole)
 
             options = {"xatol": 1e-8, "fatol": 1e-10, "maxiter": 5000, "maxfev": 5000}
-            # A level of zero is far, in its logarithm, from where it is in the profile of another parameter.
+            # A level of zero is far, in its logarithm, from where it is in the profile of another
+            # parameter.
             starts = (best[others], np.maximum(best[others], np.log(0.01)))
             tried = [
                 nelder_mead(held, start, method="Nelder-Mead", options=options).fun
@@ -202,7 +205,8 @@ def test_intervals_hold_the_truth_and_levels_have_no_bias(case):
         low, high = one.interval()
         held += (low <= true) & (true <= high)
         if case == "by output":
-            # What the logarithm of a variance is beyond that of the same errors about the truth, whose mean is known.
+            # What the logarithm of a variance is beyond that of the same errors about the truth,
+            # whose mean is known.
             about = np.array([np.mean((z - decay(np.ones(3)))[j == SECOND] ** 2) for j in (0, 1)])
             f = np.bincount(SECOND, one.estimated.model.spare)
             mean = [digamma(v / 2) - np.log(v / 2) for v in (f, 30.0)]
@@ -308,7 +312,8 @@ def test_a_parameter_on_its_bound_is_held_there_beside_the_levels():
         ({"sigma": "a + b*h"}, "a is a parameter of the model; give the level another name"),
         (
             {"sigma": "a0 + b0*y"},
-            r"the readings do not distinguish its levels a0, b0, y; leave some out \(h is the reading",
+            r"the readings do not distinguish its levels a0, b0, y;"
+            r" leave some out \(h is the reading",
         ),
         ({"sigma": "a*1e400"}, "the readings do not distinguish its levels a;"),
         ({"sigma": "floor + "}, r"noise.sigma: 'floor \+ ' is not a formula"),

@@ -1,5 +1,5 @@
-"""More than 200 files as instruments, spreadsheets and people write them: each is read as it was meant, or refused with
-the row and the column, and none is read as something else."""
+"""More than 200 files as instruments, spreadsheets and people write them: each is read as it was
+meant, or refused with the row and the column, and none is read as something else."""
 
 import gzip
 import io
@@ -68,12 +68,18 @@ def with_cell(column: str, text: str) -> bytes:
 
 
 NO_NUMBERS = {
-    "word": "high", "not available": "N/A", "na": "NA", "null": "null", "dash": "-", "question": "?", "true": "True",
-    "underscore": "1_0", "hexadecimal": "0x1F", "no exponent": "1e", "two points": "1.2.3", "two signs": "--1",
-    "unit": "1 V", "per cent": "5%", "money": "$1", "date": "2024-01-31", "clock": "00:01:00", "fraction": "1/2",
-    "gap between thousands": "1 017", "minus sign of a typesetter": "−1", "full-width digits": "１２",
-    "arabic digits": "٣", "quoted comma": '"1,5"', "less than": "<0.1", "formula": "=A1+1", "complex": "1j",
-    "zero byte": "1\0", "D exponent": "1D3", "infinite": "inf", "not a number": "nan", "beyond numbers": "1e999",
+    "word": "high", "not available": "N/A", "na": "NA", "null": "null", "dash": "-",
+    "question": "?", "true": "True",
+    "underscore": "1_0", "hexadecimal": "0x1F", "no exponent": "1e", "two points": "1.2.3",
+    "two signs": "--1",
+    "unit": "1 V", "per cent": "5%", "money": "$1", "date": "2024-01-31", "clock": "00:01:00",
+    "fraction": "1/2",
+    "gap between thousands": "1 017", "minus sign of a typesetter": "−1",
+    "full-width digits": "１２",
+    "arabic digits": "٣", "quoted comma": '"1,5"', "less than": "<0.1", "formula": "=A1+1",
+    "complex": "1j",
+    "zero byte": "1\0", "D exponent": "1D3", "infinite": "inf", "not a number": "nan",
+    "beyond numbers": "1e999",
 }  # fmt: skip
 
 
@@ -144,7 +150,8 @@ REFUSED = {
     "a sum below": (text(*GOOD, ",999,"), r"row 8, column t: is empty"),
     "decimal commas between commas": (
         text(GOOD[0], *(line.replace(".", ",") for line in GOOD[1:])),
-        "row 2: has 6 cells and the header 3; with decimal commas, separate the cells by semicolons",
+        "row 2: has 6 cells and the header 3; with decimal commas, separate the cells by"
+        " semicolons",
     ),
     "thousands": (
         text(GOOD[0], '1,"1,017.5",1', *GOOD[1:]),
@@ -368,7 +375,8 @@ def test_a_file_is_read_as_meant_or_refused_with_its_row(case, tmp_path):
         )
         np.testing.assert_array_equal(found.deviations, expected)
     else:
-        # In whatever order the rows stand, each reading is that of the model which the file describes.
+        # In whatever order the rows stand, each reading is that of the model which the file
+        # describes.
         z = found.model.simulate(case.model.nominal[None])[0]
         assert (found.deviations is None) == (b"sigma" not in case.content)
     z[list(case.missing)] = np.nan

@@ -1,4 +1,5 @@
-"""A file of readings is read as it was meant, or refused with the row and the column: never something in between."""
+"""A file of readings is read as it was meant, or refused with the row and the column: never
+something in between."""
 
 from pathlib import Path
 
@@ -62,7 +63,8 @@ def test_every_number_survives_both_ways_of_writing_it(tmp_path, value):
     text=st.text(st.characters(codec="utf-8", exclude_characters='"\n\r'), min_size=1, max_size=8)
 )
 def test_no_text_is_read_as_a_number_that_it_does_not_say(tmp_path, text):
-    """What is accepted consists of the signs that numbers are written with, and is what Python reads."""
+    """What is accepted consists of the signs that numbers are written with, and is what Python
+    reads."""
     path = with_reading(tmp_path, text)
     try:
         value = open_together([path], Bent(count=5)).z[2]

@@ -1,4 +1,5 @@
-"""Tests of residuals against what they promise: false alarms as often as they say, and power where there is a fault."""
+"""Tests of residuals against what they promise: false alarms as often as they say, and power where
+there is a fault."""
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ from ipe_bench.real.residuals import DRAWS, explained, normalised, outlier_limit
 from ipe_bench.trials.whiteness import ljung_box, white_p
 
 M, N = 60, 5
-# Smooth columns take low frequencies out of the residuals, which a test with chi-square limits would call coloured.
+# Smooth columns take low frequencies out of the residuals, which a test with chi-square limits
+# would call coloured.
 J = np.cos(np.pi * np.outer(np.arange(M) + 0.5, np.arange(N)) / M)
 SERIES = np.arange(M).reshape(2, M // 2)
 
@@ -71,7 +73,8 @@ def test_residuals_that_cannot_be_tested():
 
 
 def test_a_single_degree_of_freedom_says_nothing_of_succession():
-    """All residuals are multiples of one vector; round-off, or where an estimator stopped, would decide."""
+    """All residuals are multiples of one vector; round-off, or where an estimator stopped, would
+    decide."""
     J = np.column_stack([np.ones(3), np.arange(3.0)])
     Q, _ = np.linalg.qr(J)
     w = np.array([1.0, -2.0, 1.0]) + 1e-7 * J[:, 1]
@@ -107,7 +110,8 @@ def test_normalised_residuals_are_standard_normal_and_flag_a_gross_error(correla
 
 @pytest.mark.oracle("closed form: Baarda's w-test, by plain inverses", "normalised residuals", 1e-8)
 def test_normalised_residuals_of_correlated_readings_are_those_of_the_w_test():
-    """(R^-1 r)_i over the root of the diagonal of R^-1 - R^-1 J (J' R^-1 J)^-1 J' R^-1, by plain inverses."""
+    """(R^-1 r)_i over the root of the diagonal of R^-1 - R^-1 J (J' R^-1 J)^-1 J' R^-1, by plain
+    inverses."""
     lag = np.abs(np.subtract.outer(np.arange(M), np.arange(M)))
     R = np.outer(np.linspace(0.5, 2.0, M), np.linspace(0.5, 2.0, M)) * 0.8**lag
     inverse = np.linalg.inv(R)
@@ -145,7 +149,8 @@ def test_one_of_many_good_readings_is_an_outlier_as_often_as_the_level_says(m):
 
 @pytest.mark.oracle("closed form: Ljung and Box (1978)", "statistic of whiteness", 1e-12)
 def test_the_statistic_of_whiteness_is_ljung_and_boxs():
-    """n (n + 2) sum_k r_k^2 / (n - k), with the autocorrelations r_k to lag 10, about a mean of 0."""
+    """n (n + 2) sum_k r_k^2 / (n - k), with the autocorrelations r_k to lag 10, about a mean of
+    0."""
     e, n = np.random.default_rng(4).standard_normal(60), 60
     r = [e[k:] @ e[: n - k] / (e @ e) for k in range(1, 11)]
     Q = n * (n + 2) * sum(one**2 / (n - k) for k, one in enumerate(r, 1))
@@ -155,7 +160,8 @@ def test_the_statistic_of_whiteness_is_ljung_and_boxs():
 
 
 def test_a_lag_without_two_readings_is_no_degree_of_freedom():
-    """With every other reading missing, five of ten lags are left: those of the readings that are present."""
+    """With every other reading missing, five of ten lags are left: those of the readings that are
+    present."""
     e = np.random.default_rng(5).standard_normal((20, 1, 30))
     apart = np.full((20, 1, 60), np.nan)
     apart[:, :, ::2] = e

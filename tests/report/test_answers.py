@@ -1,4 +1,5 @@
-"""The pages and pictures of single questions: what was asked and read stands on them, and the curve's band is right."""
+"""The pages and pictures of single questions: what was asked and read stands on them, and the
+curve's band is right."""
 
 from __future__ import annotations
 
@@ -115,7 +116,7 @@ def test_absolute_paths_are_shortened_and_formulas_are_not(text, shown):
     assert public(text) == shown
 
 
-# The axes of single questions ----------------------------------------------------------------------------------------
+# The axes of single questions ---------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -212,7 +213,8 @@ def test_a_design_has_the_units_of_its_table_and_says_where_candidates_are_what_
 
 
 def test_each_change_is_worded_beside_its_margin_and_filled_if_it_is_beyond(tmp_path):
-    """All errors 1.5 % larger, where changes from 2 % on matter; costs 30 % larger; success alike."""
+    """All errors 1.5 % larger, where changes from 2 % on matter; costs 30 % larger; success
+    alike."""
     error = 0.03 * np.random.default_rng(0).standard_normal((1000, 3))
     for name, factor, cost in (("a", 1.0, 5.0), ("b", 1.015, 6.5)):
         filled = Synthetic(tmp_path / name)
@@ -250,12 +252,13 @@ def test_each_change_is_worded_beside_its_margin_and_filled_if_it_is_beyond(tmp_
     assert re.search(r"mean error .* different", str(frame))
 
 
-# Tracks of a log -----------------------------------------------------------------------------------------------------
+# Tracks of a log ----------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
 def walked():
-    """A log of a position that is read directly, with a missing reading and one that is 200 m off."""
+    """A log of a position that is read directly, with a missing reading and one that is 200 m
+    off."""
     model = ConstantVelocity(count=60)
     z = model.draw(3, 4).z[0]
     z[11] = np.nan
@@ -329,7 +332,8 @@ def test_what_is_beyond_the_axis_of_a_track_is_marked_there():
 
 @dataclass(frozen=True)
 class Overflowing(Tracker):
-    """A filter of a plugin, which keeps nothing of its readings, and whose states are infinite from epoch 20 on."""
+    """A filter of a plugin, which keeps nothing of its readings, and whose states are infinite from
+    epoch 20 on."""
 
     def track(self, model, z):
         tracks = ekf().track(model, z)

@@ -1,4 +1,5 @@
-"""The documentation: what its pages tell readers to type works, links lead somewhere, and nothing is fetched."""
+"""The documentation: what its pages tell readers to type works, links lead somewhere, and nothing
+is fetched."""
 
 from __future__ import annotations
 
@@ -52,7 +53,8 @@ def ids(path: Path) -> str:
 
 @pytest.fixture(scope="module")
 def generated(tmp_path_factory) -> Path:
-    """The pages that nobody writes; of the gallery their names and words alone, as nothing is drawn."""
+    """The pages that nobody writes; of the gallery their names and words alone, as nothing is
+    drawn."""
     folder = tmp_path_factory.mktemp("generated")
     blank = pages.Page("", [], SimpleNamespace(savefig=lambda *_, **__: None))
     with pytest.MonkeyPatch.context() as patch:
@@ -70,12 +72,13 @@ def blocks(page: Path, language: str) -> list[str]:
 FILTERS = blocks(PAGES / "howto" / "write_filter.md", "python")
 
 
-# The gallery ---------------------------------------------------------------------------------------------------------
+# The gallery --------------------------------------------------------------------------------------
 
 
 STORED = sorted(pages.STORED.glob(f"*{SUFFIX}"))
 SOON = ("headline", "pendulum_book")
-"""Experiments, of constants and of states, whose page is held to what they ask for in the quick tests."""
+"""Experiments, of constants and of states, whose page is held to what they ask for in the quick
+tests."""
 LONG = ("nist",)
 """Experiments of so many jobs that to compose them takes longer than a second."""
 every_experiment = pytest.mark.parametrize(
@@ -156,7 +159,8 @@ def test_the_report_that_the_repository_shows_is_what_todays_program_writes_of_w
 
 
 def rows_under(heading: str) -> dict[str, list[str]]:
-    """The first table below a heading of the results: the cells of a row by its estimator, or by its first cell."""
+    """The first table below a heading of the results: the cells of a row by its estimator, or by
+    its first cell."""
     below = (PAGES / "results.md").read_text(encoding="utf-8").partition(f"## {heading}\n")[2]
     table = re.search(r"^\|-+\|.*\n((?:\|.*\n)+)", below, re.MULTILINE)
     assert table
@@ -413,7 +417,8 @@ def write_files(page: Path, folder: Path) -> None:
 
 
 def commands(page: Path) -> list[list[str]]:
-    """Returns the arguments of each command of a page, one that goes on behind a backslash as a whole."""
+    """Returns the arguments of each command of a page, one that goes on behind a backslash as a
+    whole."""
     typed = "".join(blocks(page, "console")).replace("\\\n", "")
     return [shlex.split(line.removeprefix("$ ipe-bench ")) for line in typed.splitlines()]
 
@@ -502,14 +507,16 @@ def site(tmp_path_factory) -> tuple[Path, str]:
     """The folder of the site and what its building printed."""
     pytest.importorskip("pydata_sphinx_theme")
     folder = tmp_path_factory.mktemp("site")
-    # In a process of its own, as a user builds it: what its libraries will do away with is no error of ours.
+    # In a process of its own, as a user builds it: what its libraries will do away with is no error
+    # of ours.
     command = [sys.executable, pages.__file__, str(folder), "--trials=1"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return folder / "html", done.stdout
 
 
-CUT = """[...document.querySelectorAll(".bd-article :is(table, pre, .pst-scrollable-table-container)")]
+CUT = """[...document.querySelectorAll(
+        ".bd-article :is(table, pre, .pst-scrollable-table-container)")]
     .filter(part => part.scrollWidth > part.clientWidth + 1)
     .map(part => part.innerText.slice(0, 60))"""
 """Tables and code of a page that are wider than their place."""

@@ -1,7 +1,8 @@
-"""Figures show what the frames hold: at its place, with what is missing, on the page and in a column of print."""
+"""Figures show what the frames hold: at its place, with what is missing, on the page and in a
+column of print."""
 
-# pyright: reportAttributeAccessIssue=false, reportIndexIssue=false, reportCallIssue=false, reportArgumentType=false
-# (matplotlib's collections are not typed)
+# pyright: reportAttributeAccessIssue=false, reportIndexIssue=false, reportCallIssue=false,
+# reportArgumentType=false (matplotlib's collections are not typed)
 from __future__ import annotations
 
 import os
@@ -100,7 +101,8 @@ def only_view(store: Synthetic) -> View:
 
 
 def points(ax, color: str) -> dict[float, tuple[float, bool]]:
-    """The points in a colour by the nearest error scale: the ordinate, and whether the marker is hollow."""
+    """The points in a colour by the nearest error scale: the ordinate, and whether the marker is
+    hollow."""
     found = {}
     for line in ax.lines:
         if str(line.get_markeredgecolor()) == color or line.get_color() == color:
@@ -123,7 +125,7 @@ def bars(ax) -> list[np.ndarray]:
     return [segment for segment in segments if len(segment) == 2 and np.isfinite(segment).all()]
 
 
-# Errors and costs ----------------------------------------------------------------------------------------------------
+# Errors and costs ---------------------------------------------------------------------------------
 
 
 def test_costs_and_errors_stand_at_quantiles_of_all_trials(synthetic):
@@ -161,7 +163,8 @@ def test_costs_and_errors_stand_at_quantiles_of_all_trials(synthetic):
 
 
 def test_points_are_in_view_however_heavy_the_tails(synthetic):
-    """A few trials err a million times: their interval goes to where it ends, the axis does not; so with costs."""
+    """A few trials err a million times: their interval goes to where it ends, the axis does not; so
+    with costs."""
     fill(synthetic, labels=(REFERENCE, "two"))
     error = 0.1 * np.random.default_rng(0).standard_normal((60, 3))
     error[:3] *= 1e6
@@ -185,7 +188,7 @@ def test_points_are_in_view_however_heavy_the_tails(synthetic):
         assert all(low <= y <= high for y in places)
 
 
-# Curves over the error scale -----------------------------------------------------------------------------------------
+# Curves over the error scale ----------------------------------------------------------------------
 
 
 def test_points_of_few_trials_are_hollow_without_an_interval_and_missing_ones_break_the_line(
@@ -265,10 +268,11 @@ def test_scales_are_labelled_as_far_as_there_is_room_with_both_ends():
     assert [common.number(v) for v in shown] == list(shown.values())
 
 
-# Colours -------------------------------------------------------------------------------------------------------------
+# Colours ------------------------------------------------------------------------------------------
 
 
-# Deuteranopia and protanopia on linear RGB: Machado, Oliveira, Fernandes, IEEE Trans. Vis. Comput. Graph. 15, 2009.
+# Deuteranopia and protanopia on linear RGB: Machado, Oliveira, Fernandes, IEEE Trans. Vis. Comput.
+# Graph. 15, 2009.
 SIGHT = {
     "normal": np.eye(3),
     "deuteranopia": np.array(
@@ -394,12 +398,13 @@ def test_an_estimator_is_in_the_colours_of_its_family_and_of_many_the_best_are_i
     assert colored == {"filter0", "iterated0", "filter1", "iterated1"}
 
 
-# Names at the ends ---------------------------------------------------------------------------------------------------
+# Names at the ends --------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
 def parted():
-    """Seven estimators that are alike up to scale 10; then five lose all trials, one none, and one some."""
+    """Seven estimators that are alike up to scale 10; then five lose all trials, one none, and one
+    some."""
     rows = []
     for scale in (1.0, 10.0, 30.0, 100.0, 300.0):
         for label in ("ekf", "newton", "wins", "some", *"abc"):
@@ -518,7 +523,8 @@ def test_places_of_labels_are_the_nearest_that_keep_their_distance():
 
 
 def test_errors_of_tracks_are_over_all_epochs_each_state_over_the_bound_of_filters():
-    """At the last epoch the smoother is its filter; over all epochs one of its two states has half the error."""
+    """At the last epoch the smoother is its filter; over all epochs one of its two states has half
+    the error."""
     rows = []
     for label, errors_of in (("ukf", (2.0, 3.0)), ("ukf_rts", (1.0, 3.0))):
         for scale in (1.0, 10.0):
@@ -546,7 +552,7 @@ def test_errors_of_tracks_are_over_all_epochs_each_state_over_the_bound_of_filte
     ]
 
 
-# Certified and published answers -------------------------------------------------------------------------------------
+# Certified and published answers ------------------------------------------------------------------
 
 
 def with_collection() -> View:
@@ -592,7 +598,7 @@ def test_published_errors_are_rings_about_those_that_are_found():
     assert "2.5e-02" in drawing.caption
 
 
-# Settings ------------------------------------------------------------------------------------------------------------
+# Settings -----------------------------------------------------------------------------------------
 
 
 def swept_view(name: str, values, errors_of, **more) -> View:
@@ -667,11 +673,12 @@ def test_settings_whose_words_are_alike_have_rows_of_their_own():
     assert [text.partition(":")[0] for text in told] == ["truth.width=-", "truth.width=0"]
 
 
-# Distributions and convergence ---------------------------------------------------------------------------------------
+# Distributions and convergence --------------------------------------------------------------------
 
 
 def test_distributions_of_all_trials_leave_the_panel_where_trials_diverge(synthetic):
-    """A fifth of the trials are lost: the curve goes through the quantiles of the others, and ends below 80 %."""
+    """A fifth of the trials are lost: the curve goes through the quantiles of the others, and ends
+    below 80 %."""
     error = 0.1 * np.random.default_rng(3).standard_normal((200, 3))
     error[160:] *= 1e6
     error[199] = np.inf
@@ -697,7 +704,8 @@ def test_distributions_of_all_trials_leave_the_panel_where_trials_diverge(synthe
 
 
 def test_neither_the_last_iterate_nor_the_epochs_of_filters_are_drawn_as_convergence(synthetic):
-    """An iterate's distance from itself is zero; trials that have come to it count as nearer than those under way."""
+    """An iterate's distance from itself is zero; trials that have come to it count as nearer than
+    those under way."""
     paths = [[8.0, 4.0, 0.0], [6.0, 3.0, 2.0, 1.0, 0.0], [9.0, 0.0]]
     histories = [History(np.zeros((len(d), 1)), np.array(d), 1.0, np.nan, np.nan) for d in paths]
     assert median_distances(histories).tolist() == [8.0, 3.0, 0.0, 0.0, 0.0]
@@ -717,7 +725,7 @@ def test_neither_the_last_iterate_nor_the_epochs_of_filters_are_drawn_as_converg
     assert "newton 2" in drawing.caption
 
 
-# Parameters ----------------------------------------------------------------------------------------------------------
+# Parameters ---------------------------------------------------------------------------------------
 
 
 def test_only_the_papers_setting_has_the_papers_figures(synthetic):
@@ -742,7 +750,7 @@ def test_only_the_papers_setting_has_the_papers_figures(synthetic):
     assert set(rows["rmse"]) <= set(shown)
 
 
-# Folders and pages ---------------------------------------------------------------------------------------------------
+# Folders and pages --------------------------------------------------------------------------------
 
 
 def test_long_settings_have_file_names_of_their_own(synthetic):

@@ -1,4 +1,5 @@
-"""The finding says who holds, by intervals, with the numbers that were seen; what is undecided is called so."""
+"""The finding says who holds, by intervals, with the numbers that were seen; what is undecided is
+called so."""
 
 from __future__ import annotations
 
@@ -43,7 +44,8 @@ def test_only_the_one_that_holds_is_named_and_where_the_best_filter_fails():
 
 
 def test_only_needs_every_rival_surely_below():
-    """Of 200 trials 172 are as likely as not those of an estimator that holds 90 %, given three scales."""
+    """Of 200 trials 172 are as likely as not those of an estimator that holds 90 %, given three
+    scales."""
     assert found(sweep(newton=(200, 200, 200), ekf=(200, 200, 172))) == (
         "newton holds up to error scale 100 (100 % of 200 trials); ekf: undecided"
     )
@@ -82,11 +84,12 @@ def test_one_scale_and_one_estimator():
 
 def test_nobody_holds_or_the_trials_are_too_few_to_tell():
     assert found(sweep(a=(100, 0, 0), b=(20, 0, 0))) == (
-        "No estimator holds, even at error scale 1; a and b succeed in 10.0 to 50.0 % of 200 trials at"
-        " error scale 1"
+        "No estimator holds, even at error scale 1; a and b succeed in 10.0 to 50.0 % of 200"
+        " trials at error scale 1"
     )
     assert found(sweep(trials=20, a=(20, 19, 2), b=(20, 20, 3))) == (
-        "Too few trials to tell who holds; b and a succeed in 95.0 to 100 % of 20 trials at error scale 10"
+        "Too few trials to tell who holds; b and a succeed in 95.0 to 100 % of 20 trials at error"
+        " scale 10"
     )
 
 

@@ -1,4 +1,5 @@
-"""The sentences that open a page are true of what is stored, also where estimators have different trials."""
+"""The sentences that open a page are true of what is stored, also where estimators have different
+trials."""
 
 from __future__ import annotations
 
@@ -55,7 +56,8 @@ def cells(table: Any) -> list[list[str]]:
 
 
 def test_the_headline_says_who_holds_who_agrees_and_who_fails_undetected(synthetic):
-    """A filter that is as good as its rival to scale 10, where it claims half its errors, and lost from 100 on."""
+    """A filter that is as good as its rival to scale 10, where it claims half its errors, and lost
+    from 100 on."""
     rng = np.random.default_rng(1)
     fits = {100.0: np.where(np.arange(100) < 25, 0.5, 0.0), 1000.0: 0.0}
     for scale in (1.0, 10.0, 100.0, 1000.0):
@@ -74,8 +76,8 @@ def test_the_headline_says_who_holds_who_agrees_and_who_fails_undetected(synthet
         " filter fails from 100 on, with too small a covariance from 10 on"
     )
     assert (
-        "IPE (solver) and filters (filter) agree up to error scale 10: all of 100 trials succeed at each"
-        in str(agree)
+        "IPE (solver) and filters (filter) agree up to error scale 10: all of 100 trials succeed"
+        " at each" in str(agree)
     )
     assert silent == "Undetected failures: up to 25.0 % of the trials (filter at error scale 100)."
     (model,) = about(analysis)
@@ -87,7 +89,8 @@ def test_the_headline_says_who_holds_who_agrees_and_who_fails_undetected(synthet
 def test_one_row_in_many_that_is_off_by_chance_does_not_make_a_covariance_too_small(
     synthetic, tmp_path
 ):
-    """A mean NEES of 2.3 standard errors above n is one in a hundred: much for one row, little for the worst of six."""
+    """A mean NEES of 2.3 standard errors above n is one in a hundred: much for one row, little for
+    the worst of six."""
     e = 0.1 * np.random.default_rng(3).normal(size=(100, 3))
     e /= np.sqrt(((e / 0.1) ** 2).mean())
     off = e * np.sqrt(1 + 2.3 * np.sqrt(2 / 300))
@@ -111,11 +114,12 @@ def test_several_settings_are_counted_and_the_worst_is_named(synthetic):
     assert matrix == "matrix"
     assert finding.startswith("Only good holds in both settings (100 % of 50 trials)")
     assert silent == (
-        "Undetected failures: up to 40.0 % of the trials (bad at error scale 1, noise.deviation=0.2)."
+        "Undetected failures: up to 40.0 % of the trials (bad at error scale 1,"
+        " noise.deviation=0.2)."
     )
 
 
-# Random results -------------------------------------------------------------------------------------------------------
+# Random results -----------------------------------------------------------------------------------
 
 
 @dataclass
@@ -206,7 +210,8 @@ def filled(store: Synthetic, seed: int) -> Results:
 
 
 def finding_is_so(sentence: str, results: Results) -> None:
-    """Computes the winners anew: who surely holds in most columns, or at most scales from the first on."""
+    """Computes the winners anew: who surely holds in most columns, or at most scales from the first
+    on."""
     places = list(dict.fromkeys(sorted(results.success)))
     sweep = len({sigma for sigma, _ in places}) == 1
     level = 0.05 / len(places)
@@ -290,7 +295,7 @@ def test_problems_in_common_alone_are_counted():
     assert in_common(rows.iloc[1:], "problem").empty
 
 
-# Experiments ----------------------------------------------------------------------------------------------------------
+# Experiments --------------------------------------------------------------------------------------
 
 FEW = r"Too few trials to tell who holds; .* succeed in 100 % of 20 trials"
 SWEEP = (rf"{FEW} at error scale 1", "matrix")
@@ -320,8 +325,8 @@ PAGES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ),
     ),
 }
-"""For each experiment the part of it that is stored here, with errors as large as their bound, and what its page says
-first."""
+"""For each experiment the part of it that is stored here, with errors as large as their bound, and
+what its page says first."""
 
 
 OURS = [o for o in discovery.options("experiment") if o.source.name == "ipe-bench"]
@@ -400,13 +405,15 @@ def test_certified_readings_of_no_collection_are_found_too_and_an_empty_folder_i
 
 
 def test_states_that_move_have_words_of_their_own(tmp_path):
-    """A smoother and its filter have the same readings at the last epoch; over all epochs it has later ones too."""
+    """A smoother and its filter have the same readings at the last epoch; over all epochs it has
+    later ones too."""
     model = ConstantVelocity(count=30, spread=3.0)
     table = ib.run(StateScenario(model), {"kf": ekf(), "rts": Smoother(ekf())}, 20, output=tmp_path)
     kept, meaning, errors, paths = said(tmp_path)
     assert meaning == MEANING
     assert kept == (
-        "Too few trials to tell who holds; kf and rts succeed in 100 % of 20 trials at error scale 1"
+        "Too few trials to tell who holds; kf and rts succeed in 100 % of 20 trials at error scale"
+        " 1"
     )
     median = table[table["parameter"] == "all"].set_index("estimator")["error_median"]
     assert errors.endswith(f": kf ({median['kf']:.2f}), rts ({median['rts']:.2f}).")
@@ -435,7 +442,8 @@ def test_states_that_move_have_words_of_their_own(tmp_path):
 
 
 def test_the_line_below_the_title_says_which_error_makes_a_trial_a_success(synthetic):
-    """Chi-square with three degrees of freedom: all but one in a million errors lie within 3.2 deviations."""
+    """Chi-square with three degrees of freedom: all but one in a million errors lie within 3.2
+    deviations."""
     limit = np.sqrt(chi2.isf(1e-6, 3) / 3)
     scenario = synthetic.scenario()
     synthetic.bound = lambda scenario: np.ones(3)  # type: ignore[method-assign]

@@ -1,4 +1,5 @@
-"""The matrix shows what the table says: success as number and colour, and a sign for the covariance."""
+"""The matrix shows what the table says: success as number and colour, and a sign for the
+covariance."""
 
 from __future__ import annotations
 
@@ -123,8 +124,8 @@ def test_a_cell_says_all_that_is_known_of_it():
     ((_, tile, _),) = matrix.rows
     assert isinstance(tile, Tile)
     assert tile.says == (
-        "ekf, error scale 0.1: success 34.0 % of 200 trials (95 %: 27 to 41); error 0.98 × the bound, 95 % of"
-        " trials below 1.35; NEES 1.04: covariance too small; cost 21/30, 2.0 ms"
+        "ekf, error scale 0.1: success 34.0 % of 200 trials (95 %: 27 to 41); error 0.98 × the"
+        " bound, 95 % of trials below 1.35; NEES 1.04: covariance too small; cost 21/30, 2.0 ms"
     )
     assert f'title="{tile.says}"' in html([matrix])
 

@@ -81,7 +81,8 @@ def test_the_page_is_dark_where_the_reader_has_it_so(desktop, page_file):
     )
     try:
         assert max(map(int, re.findall(r"\d+", desktop.run(color)))) < 50
-        # Figures are dark by their own colours: the axes' ground is the page's, and their letters are light.
+        # Figures are dark by their own colours: the axes' ground is the page's, and their letters
+        # are light.
         fill = "(e => getComputedStyle(document.querySelector(e)).fill)"
         assert desktop.run(f"{fill}('.panels svg path')") == desktop.run(color)
         assert min(map(int, re.findall(r"\d+", desktop.run(f"{fill}('.panels text')")))) > 150
@@ -95,8 +96,8 @@ def test_the_page_is_dark_where_the_reader_has_it_so(desktop, page_file):
 def test_the_page_opens_with_the_answer_and_a_link_unfolds_the_rest(browser, page_file):
     browser.go(page_file)
     order = browser.run(
-        "Array.from(document.querySelectorAll('h1, .matrix, #headline, #figure-headline, .about, details.part'),"
-        " e => e.getBoundingClientRect().y)"
+        "Array.from(document.querySelectorAll('h1, .matrix, #headline, #figure-headline, .about,"
+        " details.part'), e => e.getBoundingClientRect().y)"
     )
     assert order == sorted(order)
     assert browser.run(
@@ -141,7 +142,10 @@ def test_a_cell_tells_what_it_knows_to_pointer_finger_and_keyboard(desktop):
         assert desktop.run(told) == ""
     # One stop of the tabulator; arrows go on from there.
     assert desktop.run("document.querySelectorAll('.matrix td[tabindex=\"0\"]').length") == 1
-    arrow = "document.activeElement.dispatchEvent(new KeyboardEvent('keydown', {key: 'ArrowDown', bubbles: true}))"
+    arrow = (
+        "document.activeElement.dispatchEvent(new KeyboardEvent('keydown', {key: 'ArrowDown',"
+        " bubbles: true}))"
+    )
     desktop.run(f"{CELL}.focus(); {arrow}")
     assert desktop.run(told) == desktop.run(
         "document.querySelector('.matrix').rows[3].cells[1].dataset.says"
@@ -177,8 +181,8 @@ def test_columns_sort_by_number_and_by_word(desktop):
 
 def test_rows_are_filtered_by_words_and_whole_numbers(desktop):
     script = (
-        "(function (text) { const i = document.querySelector('.tools input[data-table=table-overview]');"
-        " i.value = text; i.dispatchEvent(new Event('input'));"
+        "(function (text) { const i = document.querySelector('.tools"
+        " input[data-table=table-overview]'); i.value = text; i.dispatchEvent(new Event('input'));"
         " return i.parentElement.querySelector('output').textContent; })"
     )
     assert desktop.run(f"{script}('TWO 10')") == "1 of 13 rows"
@@ -193,12 +197,15 @@ def test_a_phone_never_scrolls_the_page_sideways(browser, page_file):
     assert browser.run("document.body.scrollWidth") <= 390
     # The panels of a figure stand below each other.
     tops = browser.run(
-        "Array.from(document.querySelectorAll('#figure-headline .panels svg'), s => s.getBoundingClientRect().y)"
+        "Array.from(document.querySelectorAll('#figure-headline .panels svg'), s =>"
+        " s.getBoundingClientRect().y)"
     )
     assert len(tops) == len(set(tops)) >= 2
-    # The names of the curves in colour stand above each but the first, where they are at the curves.
+    # The names of the curves in colour stand above each but the first, where they are at the
+    # curves.
     names = browser.run(
-        "Array.from(document.querySelectorAll('#figure-headline .names'), l => l.offsetHeight ? l.innerText : '')"
+        "Array.from(document.querySelectorAll('#figure-headline .names'), l => l.offsetHeight ?"
+        " l.innerText : '')"
     )
     assert len(names) == len(tops) - 1
     assert all("one" in line and "two" in line for line in names)
@@ -262,7 +269,8 @@ def test_it_prints_and_the_answer_on_a_few_pages(browser, page_file, desktop):
         desktop.call("Emulation.setEmulatedMedia", media="")
     browser.go(page_file)
     assert len(re.findall(rb"/Type\s*/Page\b", browser.pdf())) <= 4
-    # The title, the matrix and the first figure stand on the first sheet, upright, if nothing is missing.
+    # The title, the matrix and the first figure stand on the first sheet, upright, if nothing is
+    # missing.
     desktop.run("document.querySelector('.problems').remove()")
     desktop.call("Emulation.setEmulatedMedia", media="print")
     desktop.call(

@@ -1,4 +1,5 @@
-"""What goes into a paper: figures as wide as a column, and tables that a strict reader of LaTeX accepts."""
+"""What goes into a paper: figures as wide as a column, and tables that a strict reader of LaTeX
+accepts."""
 
 from __future__ import annotations
 
@@ -57,8 +58,8 @@ TOKENS = re.compile(r"\\([a-zA-Z]+)|\\([^a-zA-Z])|%[^\n]*\n|([{}])|([^\\{}%]+)")
 def read(text: str) -> list[list[str]]:
     """The cells of a table, as they are typeset.
 
-    Fails where a command is not known, a brace is not closed, a sign has a meaning in LaTeX that is not meant here, a
-    number is not one of siunitx, or rows differ in their number of cells.
+    Fails where a command is not known, a brace is not closed, a sign has a meaning in LaTeX that is
+    not meant here, a number is not one of siunitx, or rows differ in their number of cells.
     """
     depth, at, environments = 0, 0, []
     for match in TOKENS.finditer(text):

@@ -1,4 +1,5 @@
-"""README: its links lead somewhere, its lines run in the order in which they stand, and its numbers come out."""
+"""README: its links lead somewhere, its lines run in the order in which they stand, and its numbers
+come out."""
 
 from __future__ import annotations
 
@@ -67,7 +68,8 @@ def test_it_has_at_most_1100_words():
 
 
 def opening(analysis: Analysis) -> tuple[str, list[list[str]]]:
-    """What the page of these results opens with: its finding, and the cells of its matrix as they stand on paper."""
+    """What the page of these results opens with: its finding, and the cells of its matrix as they
+    stand on paper."""
     parts = headline(analysis)
     (matrix,) = [part for part in parts if isinstance(part, Matrix)]
     lines = markdown(matrix.folded()).splitlines()
@@ -86,7 +88,8 @@ def assert_opening(analysis: Analysis) -> None:
 
 
 def shown_shares() -> dict[str, tuple[dict[float, float], list[str]]]:
-    """Success in per cent at each error scale, a folded column for both of its ends, and what stands behind."""
+    """Success in per cent at each error scale, a folded column for both of its ends, and what
+    stands behind."""
     header, *rows = [
         line for line in README.splitlines() if line.startswith(("| error scale →", "| `"))
     ]
@@ -175,7 +178,8 @@ def test_its_rows_of_states_are_those_of_the_page_of_tables():
 
 
 def recomputed(folder: Path) -> pd.DataFrame:
-    """What a reader computes from the trials alone, with pandas: a row per error scale and estimator."""
+    """What a reader computes from the trials alone, with pandas: a row per error scale and
+    estimator."""
     rows = ib.load(folder)
     n = sum(column.startswith("error_") for column in rows) - 1  # the error scale is no parameter
     rows["error"] = np.sqrt(rows["crlb_distance"] / n).fillna(np.inf)
@@ -197,7 +201,8 @@ def recomputed(folder: Path) -> pd.DataFrame:
 
 
 def check(folder: Path) -> pd.DataFrame:
-    """Holds the summary of a folder against what pandas makes of its trials, and returns the latter."""
+    """Holds the summary of a folder against what pandas makes of its trials, and returns the
+    latter."""
     summary = pd.read_csv(folder / "summary_all.csv")
     summary = (
         summary[summary["parameter"] == "all"].set_index(["error_scale", "estimator"]).sort_index()

@@ -91,7 +91,8 @@ def test_what_is_written_is_whole_and_the_page_stands_alone(result):
         assert path.stat().st_size > 100
     assert not list(result.report.parent.rglob("*.tmp"))
     page = result.report.read_text(encoding="utf-8")
-    # It shows nothing but what is in it; it leads to the figures' files beside it, as far as there are any.
+    # It shows nothing but what is in it; it leads to the figures' files beside it, as far as there
+    # are any.
     assert not re.search(r"""src\s*=\s*["'](?!data:)""", page)
     led_to = set(re.findall(r"""href\s*=\s*["'](?!data:|#)([^"']*)""", page))
     assert led_to == {f"figures/{path.name}" for path in result.figures}
@@ -107,8 +108,8 @@ def test_what_is_written_is_whole_and_the_page_stands_alone(result):
 
 
 def test_survivors_are_shown_as_survivors(synthetic):
-    """One trial of 200 is solved, and by luck well: its errors have no interval, their number beside them, and all
-    trials' errors in the next column; who solves nothing has those alone."""
+    """One trial of 200 is solved, and by luck well: its errors have no interval, their number
+    beside them, and all trials' errors in the next column; who solves nothing has those alone."""
     rng = np.random.default_rng(3)
     e = 0.1 * rng.normal(size=(200, 3))
     solved = np.arange(200) == 7
@@ -180,7 +181,8 @@ def test_hostile_names_are_shown_and_not_run(synthetic, figures):
 
 
 def test_a_record_is_all_that_a_statistic_needs(result):
-    """Its column, its definition, and its heading in every table that it names, the terminal's among them."""
+    """Its column, its definition, and its heading in every table that it names, the terminal's
+    among them."""
     page = result.report.read_text(encoding="utf-8")
     tables = {t.name: t for t in all_tables(analyse([result.report.parent]))}
     rows = result.summary.to_dict("records")
@@ -213,7 +215,8 @@ def test_numbers_are_written_for_readers():
         "1.0 s",
         "0 s",
     ]
-    # The mean stands behind a median from which it differs by more than a twentieth, to either side.
+    # The mean stands behind a median from which it differs by more than a twentieth, to either
+    # side.
     assert [cost(100.0, v) for v in (60.0, 96.0, 104.0, 250.0)] == [
         "100/60",
         "100",
@@ -248,7 +251,8 @@ def test_settings_that_differ_have_figures_of_their_own(synthetic, tmp_path, mon
 
 
 def test_rows_of_equal_settings_each_have_a_dash():
-    """Also with the lowest pandas that is allowed, which forgets the rows of a frame without columns."""
+    """Also with the lowest pandas that is allowed, which forgets the rows of a frame without
+    columns."""
     rows = pd.DataFrame({"size": [1.0, 1.0], "shape": ["round", "round"]})
     assert differing(rows, ["size", "shape"]) == differing(rows, []) == ["-", "-"]
     assert differing(rows.assign(size=[1.0, 2.0]), ["size", "shape"]) == ["size=1", "size=2"]
@@ -310,7 +314,8 @@ def _luminance(color: str) -> float:
 
 
 def test_words_show_on_the_dark_ground(synthetic):
-    """A contrast of 4.5 at least, as WCAG 2.1 asks of text; the ground is the one that the page has."""
+    """A contrast of 4.5 at least, as WCAG 2.1 asks of text; the ground is the one that the page
+    has."""
     fill(synthetic)
     analysis = analyse([synthetic.directory])
     style = render_page(analysis, all_tables(analysis), []).partition("</style>")[0]

@@ -1,12 +1,14 @@
-"""What a page counts is so, and what it infers is false of the population in at most 5 % of the reports that say it.
+"""What a page counts is so, and what it infers is false of the population in at most 5 % of the
+reports that say it.
 
-A thousand reports are simulated from populations that are known (`shared.simulated_reports`). Every sentence of the
-headline, the finding first, every verdict and every row in bold has a kind below: a function whose docstring says
-what the kind claims, and which answers for each claim whether it is false. A sentence without a kind fails the test, so
-that a new sentence needs a new kind: a function under `@sentence(pattern)` or `@entries`.
+A thousand reports are simulated from populations that are known (`shared.simulated_reports`). Every
+sentence of the headline, the finding first, every verdict and every row in bold has a kind below: a
+function whose docstring says what the kind claims, and which answers for each claim whether it is
+false. A sentence without a kind fails the test, so that a new sentence needs a new kind: a function
+under `@sentence(pattern)` or `@entries`.
 
-The table "kind, times printed, times false, upper limit" of as many reports as one likes, from the first on:
-`PYTHONPATH=tests python tests/report/test_sentences_simulated.py 1000`
+The table "kind, times printed, times false, upper limit" of as many reports as one likes, from the
+first on: `PYTHONPATH=tests python tests/report/test_sentences_simulated.py 1000`
 """
 
 from __future__ import annotations
@@ -41,9 +43,11 @@ from ipe_bench.statistics.verdicts import (
 from ipe_bench.trials.thresholds import FEW, FIT_LEVEL
 
 COUNTS, INFERS, READ = "counts", "infers", "read"
-"""What a claim does. What is only read into a sentence is listed, to show how much so few trials leave open."""
+"""What a claim does. What is only read into a sentence is listed, to show how much so few trials
+leave open."""
 RIGHT = 1.5
-"""Mean NEES over n up to which, and down to whose inverse, a covariance that is called right is nearly so."""
+"""Mean NEES over n up to which, and down to whose inverse, a covariance that is called right is
+nearly so."""
 TOLERATED = 0.05
 """Share of the reports that say it in which what a kind infers may be false."""
 ENOUGH = 100
@@ -66,8 +70,8 @@ ENTRIES: list[Callable[[Report], Iterator[Claim]]] = []
 
 
 def sentence(pattern: str, *, of_one: bool = False) -> Callable[[Judge], Judge]:
-    """Registers a judge of the sentences that match, on reports of several scales or of one: it yields (kind, counts or
-    infers, whether it is false)."""
+    """Registers a judge of the sentences that match, on reports of several scales or of one: it
+    yields (kind, counts or infers, whether it is false)."""
 
     def add(judge: Judge) -> Judge:
         SENTENCES.append((pattern, judge, of_one))
@@ -101,7 +105,7 @@ def claims_of(report: Report) -> Iterator[Claim]:
         yield from judge(report)
 
 
-# What was seen, computed anew from the trials -------------------------------------------------------------------------
+# What was seen, computed anew from the trials -----------------------------------------------------
 
 
 def successes(report: Report, at: int, label: str) -> np.ndarray:
@@ -113,7 +117,7 @@ def shares_named(text: str) -> dict[str, str]:
     return dict(re.findall(r"(e\d+) \(([^)]*)\)", text))
 
 
-# Sentences ------------------------------------------------------------------------------------------------------------
+# Sentences ----------------------------------------------------------------------------------------
 
 NAMED = (
     r"(?:[Aa]ll (?P<all>\d+) estimators|(?P<count>\d+) of \d+ estimators|(?P<names>e\d+[\w, ]*?))"
@@ -137,9 +141,10 @@ FINDING = r"(?:Only |All |No estimator |Too few |\d+ of \d+ |e\d+).*(?:hold|tell
 @sentence(FINDING)
 @sentence(FINDING, of_one=True)
 def finding(report: Report, match: Any) -> Iterator[tuple[str, str, bool]]:
-    """Holds: infers that 90 % succeed, in the population, up to that scale; only: that they do of no other. Fails,
-    no estimator: infers that fewer do at those scales. Too small a covariance: infers that the mean NEES is
-    above n at those scales. Counts who is undecided or has the most success, and the numbers that were seen."""
+    """Holds: infers that 90 % succeed, in the population, up to that scale; only: that they do of
+    no other. Fails, no estimator: infers that fewer do at those scales. Too small a covariance:
+    infers that the mean NEES is above n at those scales. Counts who is undecided or has the most
+    success, and the numbers that were seen."""
     winners: list[str] = []
     for clause in match[0].split("; "):
         kinds = {kind: re.fullmatch(pattern, clause) for kind, pattern in CLAUSES.items()}
@@ -170,7 +175,8 @@ def named_in(found: Any, counted: list[str]) -> list[str]:
 
 
 def ends(report: Report, at: int, label: str) -> tuple[float, float]:
-    """Computes the exact limits of success: the lower one of one scale, the upper one shared by all scales."""
+    """Computes the exact limits of success: the lower one of one scale, the upper one shared by all
+    scales."""
     success, tail = successes(report, at, label), 0.025 / len(report.board.scales)
     good, bad = int(success.sum()), int((~success).sum())
     low = beta.ppf(0.025, good, bad + 1) if good else 0.0
@@ -309,14 +315,16 @@ def compared_by(report: Report) -> list[str]:
 
 
 @sentence(
-    WHO
-    + r" agree (?:at every error scale|up to error scale (?P<last>[\d.]+)): (?P<share>all|at least \S+ %) of"
-    r" (?P<trials>\d+) trials succeed at each, with an efficiency of (?P<low>[\d.]+\d)(?: to (?P<high>[\d.]+\d))?\."
+    WHO + r" agree (?:at every error scale|up to error scale (?P<last>[\d.]+)):"
+    r" (?P<share>all|at least \S+ %) of"
+    r" (?P<trials>\d+) trials succeed at each, with an efficiency of (?P<low>[\d.]+\d)"
+    r"(?: to (?P<high>[\d.]+\d))?\."
 )
 def who_agree(report: Report, match: Any) -> Iterator[tuple[str, str, bool]]:
-    """Counts the least success and the range of efficiencies of so many trials at these scales, which lie within 5 % at
-    each; infers that in the population success differs by less than 10 points, and efficiency by less than a quarter,
-    between any two at one scale: errors that are too rare for so many trials may make up as much."""
+    """Counts the least success and the range of efficiencies of so many trials at these scales,
+    which lie within 5 % at each; infers that in the population success differs by less than 10
+    points, and efficiency by less than a quarter, between any two at one scale: errors that are too
+    rare for so many trials may make up as much."""
     drawn, labels = report.board, compared_by(report)
     last = drawn.scales.index(float(match["last"])) if match["last"] else len(drawn.scales) - 1
     cells = [(at, label) for at in range(last + 1) for label in labels]
@@ -392,7 +400,7 @@ def path_errors(report: Report, match: Any) -> Iterator[tuple[str, str, bool]]:
     yield "errors over all epochs", COUNTS, not are_told(match, values) or "(0" in match["each"]
 
 
-# Entries of tables ---------------------------------------------------------------------------------------------------
+# Entries of tables --------------------------------------------------------------------------------
 
 
 @entries
@@ -418,9 +426,10 @@ def tiles(report: Report) -> Iterator[Claim]:
 
 @entries
 def verdicts(report: Report) -> Iterator[Claim]:
-    """Overconfident: infers that the mean NEES of converged trials is above n, or the mean NIS above the number of
-    readings; too cautious: that it is below; wrong: that more than 1 % of the trials have innovations whose whiteness
-    has a p below 0.001; the others count that nothing was found, in enough trials."""
+    """Overconfident: infers that the mean NEES of converged trials is above n, or the mean NIS
+    above the number of readings; too cautious: that it is below; wrong: that more than 1 % of the
+    trials have innovations whose whiteness has a p below 0.001; the others count that nothing was
+    found, in enough trials."""
     whole = report.analysis.summary.query("parameter == 'all'")
     for row in whole.to_dict("records"):
         there = report.population(row["error_scale"], row["estimator"])
@@ -469,7 +478,7 @@ def bold(report: Report) -> Iterator[Claim]:
             )
 
 
-# The reports ----------------------------------------------------------------------------------------------------------
+# The reports --------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -485,7 +494,8 @@ class Tally:
 
     @property
     def upper(self) -> float:
-        """The upper limit (95 %, Clopper and Pearson) of the share of reports in which it is false."""
+        """The upper limit (95 %, Clopper and Pearson) of the share of reports in which it is
+        false."""
         return float(
             beta.ppf(0.95, self.false_reports + 1, self.reports - self.false_reports) or 1.0
         )
@@ -519,10 +529,14 @@ def tallies(reports: list[list[Claim]]) -> list[Tally]:
 
 
 def shown(found: list[Tally]) -> str:
-    head = f"{'':8}{'kind':34}{'reports':>9}{'false':>7}{'share %':>9}{'upper %':>9}{'times':>9}{'false':>7}"
+    head = (
+        f"{'':8}{'kind':34}{'reports':>9}{'false':>7}{'share %':>9}{'upper %':>9}"
+        f"{'times':>9}{'false':>7}"
+    )
     lines = [
-        f"{t.does:8}{t.kind:34}{t.reports:9}{t.false_reports:7}{100 * t.false_reports / t.reports:9.1f}"
-        f"{100 * t.upper:9.1f}{t.times:9}{t.false_times:7}{'' if t.reports >= ENOUGH else '  few'}"
+        f"{t.does:8}{t.kind:34}{t.reports:9}{t.false_reports:7}"
+        f"{100 * t.false_reports / t.reports:9.1f}{100 * t.upper:9.1f}{t.times:9}{t.false_times:7}"
+        f"{'' if t.reports >= ENOUGH else '  few'}"
         for t in found
     ]
     return "\n".join([head, *lines])
@@ -536,7 +550,8 @@ def test_what_a_report_counts_is_so(first):
 
 
 def test_a_simulated_report_says_what_the_stored_trials_say(synthetic):
-    """The frames that are put together here are those that the product reads from files of the same trials."""
+    """The frames that are put together here are those that the product reads from files of the same
+    trials."""
     report = next(r for r in map(of_constants, range(100)) if r is not None)
     kinds = {"IPE": Seeker(), "filters": Filter(), "least squares": Pretender()}
     names = tuple(f"x{i}" for i in range(report.board.n))
@@ -565,7 +580,8 @@ def test_all_verdicts_of_a_page_share_one_level():
 
 
 def of_constants(seed: int) -> Report | None:
-    """Simulates a report if it is on several scales, and opens with where estimators agree or lead."""
+    """Simulates a report if it is on several scales, and opens with where estimators agree or
+    lead."""
     drawn = board(seed, largest=False)
     cells = len(drawn.scales) * len(drawn.populations)
     if drawn.moving or len(drawn.scales) == 1 or drawn.n == 1 or cells > 6:

@@ -33,7 +33,8 @@ FORBIDDEN = {
 
 
 def stumbles(text: str) -> list[str]:
-    """Returns the phrases of a text that are forbidden, with the remedy; code, files and links are no text."""
+    """Returns the phrases of a text that are forbidden, with the remedy; code, files and links are
+    no text."""
     read = re.sub(r"`[^`\n]*`|\]\([^)]*\)|\[[^]]*\]\(reference/checked[^)]*\)", "", text)
     return [
         f"{found[0]}: {remedy}"

@@ -1,4 +1,5 @@
-"""A bundle is what it was made of, the same bytes wherever it is made, and nothing at all once anything is changed."""
+"""A bundle is what it was made of, the same bytes wherever it is made, and nothing at all once
+anything is changed."""
 
 import hashlib
 import shutil
@@ -71,9 +72,11 @@ def test_a_report_on_ones_own_and_a_bundle(bundle, tmp_path, capsys):
 
 
 CHANGES = {
-    "a value": lambda name, content: [(name, content.replace(b"PAR1", b"PAR2") if "trials" in name else content)],
+    "a value": lambda name, content: [(name,
+        content.replace(b"PAR1", b"PAR2") if "trials" in name else content)],
     "a file less": lambda name, content: [] if "runs/" in name else [(name, content)],
-    "a file more": lambda name, content: [(name, content), *([("theirs/trials/x.parquet", b"")] * (name == MANIFEST))],
+    "a file more": lambda name, content: [(name, content),
+        *([("theirs/trials/x.parquet", b"")] * (name == MANIFEST))],
     "a digest": lambda name, content: [(name, content.swapcase() if name == MANIFEST else content)],
     "no manifest": lambda name, content: [] if name == MANIFEST else [(name, content)],
 }  # fmt: skip
@@ -97,7 +100,8 @@ def test_a_bundle_that_was_changed_is_refused_in_one_line_and_leaves_nothing(
 
 
 def test_any_byte_that_is_changed_is_noticed(bundle, tmp_path):
-    """Or is one of the zip's own, which says nothing of the results: then these are read as they were."""
+    """Or is one of the zip's own, which says nothing of the results: then these are read as they
+    were."""
     whole = bundle.path.read_bytes()
     expected = ib.load(bundle.path)
     noticed = 0

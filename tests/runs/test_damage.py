@@ -1,4 +1,5 @@
-"""Whatever is done to stored files, no number changes: what is damaged is named, left out, and computed again."""
+"""Whatever is done to stored files, no number changes: what is damaged is named, left out, and
+computed again."""
 
 import json
 import os
@@ -176,7 +177,8 @@ def test_trials_are_read_although_their_failures_cannot_be(folder, expected):
 
 
 def between_columns(path: Path) -> set[int]:
-    """The bytes that belong to no column: pyarrow 17 repeats there what the footer says, for no reader."""
+    """The bytes that belong to no column: pyarrow 17 repeats there what the footer says, for no
+    reader."""
     group = pq.read_metadata(path).row_group(0)
     columns = [group.column(i) for i in range(group.num_columns)]
     starts = [

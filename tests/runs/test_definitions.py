@@ -1,4 +1,5 @@
-"""What is redefined while a process runs has numbers and results of its own, and what is not is computed once."""
+"""What is redefined while a process runs has numbers and results of its own, and what is not is
+computed once."""
 
 import importlib
 import os
@@ -19,7 +20,8 @@ from ipe_bench.runs.run import compute
 from ipe_bench.runs.store import ResultKey
 from ipe_bench.trials.fit_test import Spread, fit_probability
 
-# Ways to say how far estimates are shifted: the part of a cell that is edited, and the part that uses it.
+# Ways to say how far estimates are shifted: the part of a cell that is edited, and the part that
+# uses it.
 WAYS = {
     "constant": ("class By:\n    def by(self):\n        return {v}", ""),
     "inner function": (
@@ -31,7 +33,8 @@ WAYS = {
     "attribute": ("class By:\n    v = {v}\n    def by(self):\n        return self.v", ""),
     "static": ("class By:\n    @staticmethod\n    def by():\n        return {v}", ""),
     "property": (
-        "class By:\n    value = property(lambda self: {v})\n    def by(self):\n        return self.value",
+        "class By:\n    value = property(lambda self: {v})\n    def by(self):\n        return"
+        " self.value",
         "",
     ),
     "closure": ("def method(v):\n    return lambda self: v\nclass By:\n    by = method({v})", ""),
@@ -40,7 +43,8 @@ WAYS = {
         "",
     ),
     "factory": (
-        "def kind(v):\n    class By:\n        def by(self):\n            return v\n    return By\nBy = kind({v})",
+        "def kind(v):\n    class By:\n        def by(self):\n            return v\n    return"
+        " By\nBy = kind({v})",
         "",
     ),
     "variable": ("V = {v}", "class By:\n    def by(self):\n        return V"),
@@ -54,8 +58,9 @@ WAYS = {
         "class By:\n    def by(self):\n        return f()",
     ),
     "decorator": (
-        "class Times:\n    def __init__(self, f):\n        self.f, self.k = functools.update_wrapper(self, f), {v}\n"
-        "    def __call__(self):\n        return self.k * self.__wrapped__()\n@Times\ndef f():\n    return 1.0",
+        "class Times:\n    def __init__(self, f):\n        self.f, self.k ="
+        " functools.update_wrapper(self, f), {v}\n    def __call__(self):\n        return self.k *"
+        " self.__wrapped__()\n@Times\ndef f():\n    return 1.0",
         "class By:\n    def by(self):\n        return f()",
     ),
     "partial": (
@@ -120,7 +125,10 @@ WALK = {"next": {"p": "p + w"}, "readings": {"z": "p"}, "noise": {"w": 1.0}}
 TRACK = ib.StateScenario(
     ib.states.Formulas(**WALK, deviation={"z": 0.5}, spread={"p": 3.0}, count=5)
 )
-SETUP = "import functools\nfrom dataclasses import dataclass\nimport numpy as np\nimport ipe_bench as ib"
+SETUP = (
+    "import functools\nfrom dataclasses import dataclass\nimport numpy as np\nimport ipe_bench as"
+    " ib"
+)
 
 
 class Session:
@@ -247,7 +255,10 @@ def test_a_rerun_computes_nothing_though_the_code_fills_its_variables(tmp_path):
 
 def test_the_test_of_residuals_follows_a_noise_whose_helper_was_edited():
     session = Session("noise", "helper", 1.0)
-    text = "@dataclass(frozen=True)\nclass Mine(ib.noise.Gaussian):\n    def whitened(self, shape, rng):\n"
+    text = (
+        "@dataclass(frozen=True)\nclass Mine(ib.noise.Gaussian):\n    def whitened(self, shape,"
+        " rng):\n"
+    )
     exec(f"{text}        return helper() * rng.uniform(-1, 1, shape)", session.names)
     problem, noise = SCENARIO.problem, session.names["Mine"](0.01)
     spread = Spread(problem.measurement.m - problem.measurement.n, np.empty((1, 0)))

@@ -1,4 +1,5 @@
-"""Whatever happens to the parts of a run, the other parts are complete, and have the same bits everywhere."""
+"""Whatever happens to the parts of a run, the other parts are complete, and have the same bits
+everywhere."""
 
 import os
 import signal
@@ -75,7 +76,8 @@ def reference(tmp_path_factory) -> dict[str, np.ndarray]:
 
 
 class Dying(Serial):
-    """An execution in which the process of every task with an estimator of this name ends before it is computed."""
+    """An execution in which the process of every task with an estimator of this name ends before it
+    is computed."""
 
     def run(self, work, tasks):
         for index, task in enumerate(tasks):
@@ -230,7 +232,8 @@ def test_an_estimator_cannot_change_the_readings_and_the_problem_of_the_others(t
 def test_ctrl_c_stops_a_serial_run(tmp_path):
     code = f"""
 import signal, sys
-signal.signal(signal.SIGINT, signal.default_int_handler)  # which what runs in the background ignores
+# What runs in the background ignores it.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 from test_execution import *
 from ipe_bench.basics.errors import StorageError
 try:
@@ -246,7 +249,8 @@ except KeyboardInterrupt:
 
 @pytest.mark.parametrize("execution", [Serial(), Processes(1)], ids=repr)
 def test_what_a_process_does_first_is_not_booked_as_time_of_estimation(tmp_path, execution):
-    """As an import or a compilation, of half a second here: in 10 trials, 0.05 s for each of them."""
+    """As an import or a compilation, of half a second here: in 10 trials, 0.05 s for each of
+    them."""
     rogues._begun.clear()
     compute([scenario()], {"once": Rogue("once")}, 20, tmp_path, execution=execution, block_size=10)
     assert rows_of(tmp_path, "once")["time_s"].max() < 0.03
@@ -343,8 +347,9 @@ def test_a_task_handed_to_a_worker_that_is_ending_is_handed_to_another():
 def test_a_script_needs_no_guard_against_being_imported_by_its_workers(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
-        "from shared import rogues\nfrom ipe_bench.runs.execution import Processes\nprint('begins')\n"
-        "print([event.step for event in Processes(2).run(rogues.square, [1]) if not event.ended])\n"
+        "from shared import rogues\nfrom ipe_bench.runs.execution import"
+        " Processes\nprint('begins')\nprint([event.step for event in"
+        " Processes(2).run(rogues.square, [1]) if not event.ended])\n"
     )
     ran = subprocess.run(
         [sys.executable, script], env=environment(), capture_output=True, text=True, check=True

@@ -1,4 +1,5 @@
-"""Trial by fire: writers that are killed, two at once on an older folder, and a reader meanwhile."""
+"""Trial by fire: writers that are killed, two at once on an older folder, and a reader
+meanwhile."""
 
 from __future__ import annotations
 
@@ -32,7 +33,8 @@ def run(folder: str | Path, trials: int, **more: Any) -> None:
 
 
 def write(folder: Path, trials: int, told: Any) -> None:
-    """A run that tells what it has stored: how many estimates; then that only merging is left, and that it ended."""
+    """A run that tells what it has stored: how many estimates; then that only merging is left, and
+    that it ended."""
 
     def watch(progress: Any) -> None:
         told.send(progress.trials)
@@ -44,7 +46,8 @@ def write(folder: Path, trials: int, told: Any) -> None:
 
 
 def rows_and_faults(folder: Path, expected: Rows) -> tuple[Rows, list[str]]:
-    """All rows by key; and everything that is not as in a run that nobody disturbed, but for what is not computed."""
+    """All rows by key; and everything that is not as in a run that nobody disturbed, but for what
+    is not computed."""
     results = Results.read([folder])
     found = {key: results.load(cell, None) for key, cell in results.stored.items()}
     wrong = [
@@ -88,7 +91,8 @@ def told_by(connection: Any) -> list[Any]:
     "kills", [pytest.param(4, marks=pytest.mark.slow), pytest.param(40, marks=pytest.mark.campaign)]
 )
 def test_kills_of_two_writers_on_an_older_folder_change_nothing_and_lose_nothing(tmp_path, kills):
-    """Two writers on more and more trials, of which one or both are killed at any moment, while somebody reads."""
+    """Two writers on more and more trials, of which one or both are killed at any moment, while
+    somebody reads."""
     context, dice = multiprocessing.get_context("forkserver"), random.Random(0)
     context.set_forkserver_preload(
         ["ipe_bench.runs.run", "ipe_bench.solvers", "ipe_bench.baselines", "pyarrow.parquet"]

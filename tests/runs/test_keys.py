@@ -22,10 +22,12 @@ KEYS = """
 import ipe_bench as ib
 from ipe_bench.runs.store import ResultKey
 bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01))
-for name, estimator in {"ukf": ib.baselines.UKF(), "newton": ib.solvers.Newton(), "truth": None}.items():
+named = {"ukf": ib.baselines.UKF(), "newton": ib.solvers.Newton(), "truth": None}
+for name, estimator in named.items():
     print(name, ResultKey(bench, name, estimator).key)
 walk = {"next": {"p": "p + w"}, "readings": {"z": "p"}, "noise": {"w": 1.0}}
-track = ib.StateScenario(ib.states.Formulas(**walk, deviation={"z": 0.5}, spread={"p": 3.0}, count=20))
+model = ib.states.Formulas(**walk, deviation={"z": 0.5}, spread={"p": 3.0}, count=20)
+track = ib.StateScenario(model)
 for name, tracker in {"track": ib.states.ekf(), "path": None}.items():
     print(name, ResultKey(track, name, tracker).key)
 """
@@ -67,7 +69,10 @@ def edit(path: Path, old: str, new: str) -> None:
 @pytest.mark.slow
 def test_keys_do_not_depend_on_the_order_of_sets_or_of_files_in_a_folder(copy, monkeypatch):
     (copy / "ipe_bench/measurements/another.json").write_text("{}", encoding="utf-8")
-    listed = "from pathlib import Path; glob = Path.glob; Path.glob = lambda *a: iter(sorted(glob(*a), reverse={}))\n"
+    listed = (
+        "from pathlib import Path; glob = Path.glob; Path.glob = lambda *a: iter(sorted(glob(*a),"
+        " reverse={}))\n"
+    )
     seen = set()
     for seed, reverse in (("1", False), ("2", True)):
         monkeypatch.setenv("PYTHONHASHSEED", seed)
@@ -115,7 +120,8 @@ def test_a_changed_constant_makes_stale_what_was_computed_with_it_and_nothing_el
 def test_a_change_to_states_that_move_makes_stale_what_is_computed_with_them_and_no_constants(
     copy, before
 ):
-    # Filters of constants update as trackers do; bounds of states are those of a filter and of a smoother.
+    # Filters of constants update as trackers do; bounds of states are those of a filter and of a
+    # smoother.
     changed = {"states/trackers.py": {"track", "path", "ukf"}, "trials/paths.py": {"track", "path"}}
     changed |= {"states/smoothers.py": {"track", "path"}, "states/particles.py": set()}
     for module, stale in changed.items():
@@ -152,9 +158,12 @@ def code(source: str) -> str:
 
 # fmt: off
 OTHERS = [
-    ("x = 1", "x = 2"), ("x = 1", "x = 1.0"), ("x = None", "x = ..."), ("x = 'a'", "x = 'b'"), ("x = []", "x = [None]"),
-    ("raise ValueError('a')", "raise KeyError('a')"), ("raise E(1)", "raise E(2)"), ("f(a, b)", "f(b, a)"),
-    ("f(a, k=b)", "f(a, b)"), ("def f(a=1): pass", "def f(*, a=1): pass"), ("x + y - z", "x + (y - z)"),
+    ("x = 1", "x = 2"), ("x = 1", "x = 1.0"), ("x = None", "x = ..."), ("x = 'a'", "x = 'b'"),
+    ("x = []", "x = [None]"),
+    ("raise ValueError('a')", "raise KeyError('a')"), ("raise E(1)", "raise E(2)"),
+    ("f(a, b)", "f(b, a)"),
+    ("f(a, k=b)", "f(a, b)"), ("def f(a=1): pass", "def f(*, a=1): pass"),
+    ("x + y - z", "x + (y - z)"),
     ("if a: b\nc", "if a:\n  b\n  c"),
 ]
 # fmt: on
@@ -212,7 +221,10 @@ def test_a_base_class_in_another_module_is_part_of_the_source(copy):
         "@dataclass(frozen=True)\nclass Mine(ib.baselines.LinearLSE):\n    pass\n",
         encoding="utf-8",
     )
-    code = "from mine import Mine; from ipe_bench.runs.provenance import fingerprint; print(fingerprint([Mine()]))"
+    code = (
+        "from mine import Mine; from ipe_bench.runs.provenance import fingerprint;"
+        " print(fingerprint([Mine()]))"
+    )
     before = said(code, copy)
     edit(copy / "ipe_bench/baselines/least_squares.py", "FACTOR = 2", "FACTOR = 3")
     assert said(code, copy) != before

@@ -1,5 +1,5 @@
-"""What is stored is found again, what is missing is computed, no half file is ever read, and nothing is lost when files
-are merged."""
+"""What is stored is found again, what is missing is computed, no half file is ever read, and
+nothing is lost when files are merged."""
 
 import signal
 import subprocess
@@ -101,7 +101,8 @@ from ipe_bench.runs.run import compute
 bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
 compute([bench], {{"newton": ib.solvers.Newton()}}, 20, {str(tmp_path)!r}, block_size=10)
 results = Results.read([{str(tmp_path)!r}])
-print(*[len(results.load(cell, None)["trial"]) for cell in results.current], "pandas" in sys.modules)
+sizes = [len(results.load(cell, None)["trial"]) for cell in results.current]
+print(*sizes, "pandas" in sys.modules)
 """
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, check=True
@@ -297,7 +298,8 @@ LATER = [pytest.param(moment, marks=pytest.mark.slow) for moment in (1, 2, 3, 5,
 
 @pytest.mark.parametrize("moment", [4, *LATER])
 def test_killed_at_any_moment_every_trial_is_there_and_the_next_time_it_ends(tmp_path, moment):
-    """Before and after a large file is on the disk, between its name and the first removal, and amid the removals."""
+    """Before and after a large file is on the disk, between its name and the first removal, and
+    amid the removals."""
     filled(tmp_path)
     expected = everything(tmp_path)
     done = subprocess.run(

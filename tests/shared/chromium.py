@@ -1,4 +1,5 @@
-"""A headless Chromium, driven through its DevTools pipe: no further package, no port, no network."""
+"""A headless Chromium, driven through its DevTools pipe: no further package, no port, no
+network."""
 
 from __future__ import annotations
 
@@ -109,13 +110,15 @@ class Page:
 
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Page]:
-    """A page of a headless Chromium, whose pipe is on descriptors 3 and 4; skips where there is none."""
+    """A page of a headless Chromium, whose pipe is on descriptors 3 and 4; skips where there is
+    none."""
     program = next(
         filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
     )
     if program is None:
         pytest.skip("there is no Chromium")
-    # Chromium reads descriptor 3 and writes 4: ours are kept above, so that the shell's redirections cannot meet them.
+    # Chromium reads descriptor 3 and writes 4: ours are kept above, so that the shell's
+    # redirections cannot meet them.
     low = [*os.pipe(), *os.pipe()]
     to_read, to_write, from_read, from_write = (
         fcntl.fcntl(fd, fcntl.F_DUPFD_CLOEXEC, 10) for fd in low

@@ -1,4 +1,5 @@
-"""Marks the dear members of a family of tests, one of which stands for all while the others wait."""
+"""Marks the dear members of a family of tests, one of which stands for all while the others
+wait."""
 
 from __future__ import annotations
 

@@ -54,7 +54,8 @@ def _of_filterpy(rule, n: int, m: int) -> Any:
 
 
 def _take_in(f: Any, model, k: int, R, z, h, H) -> None:
-    """Updates a filter by readings z (m,) near h (m,); a missing one reads 0, with no slope and unit variance."""
+    """Updates a filter by readings z (m,) near h (m,); a missing one reads 0, with no slope and
+    unit variance."""
     seen = np.isfinite(z)
     z, R = (
         np.where(seen, model.nearest(z, h), 0.0),

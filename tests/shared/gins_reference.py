@@ -1,4 +1,5 @@
-"""The gimballed INS once more, written from its equations in vectors and integrated by SciPy to round-off."""
+"""The gimballed INS once more, written from its equations in vectors and integrated by SciPy to
+round-off."""
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -10,8 +11,9 @@ SI = np.array([1e-4 * GRAVITY] * 2 + [1e-4] * 2 + [0.01 * ARC] * 2 + [0.1 * ARC]
 
 
 def velocities(x, walk=None, rtol=1e-13):
-    """Velocities (trials, 240) that the platform shows, with the velocities of the error-free system among them; x
-    (trials, 11). `walk` (trials, 4, 30, 3) in rad/s is added to the drifts of each interval."""
+    """Velocities (trials, 240) that the platform shows, with the velocities of the error-free
+    system among them; x (trials, 11). `walk` (trials, 4, 30, 3) in rad/s is added to the drifts of
+    each interval."""
     lanes = 4 * len(x)
     p = np.repeat(x * SI, 4, axis=0)
     axis = np.array([0.0, np.cos(LATITUDE), np.sin(LATITUDE)])

@@ -34,7 +34,8 @@ def simulated(path: Path, b1: float, seed: int, readings: int = 16) -> tuple[Pat
 
 
 def solution(residuals, start) -> tuple[np.ndarray, np.ndarray]:
-    """SciPy's minimum, polished by Gauss-Newton steps with complex-step slopes, and the deviations there."""
+    """SciPy's minimum, polished by Gauss-Newton steps with complex-step slopes, and the deviations
+    there."""
     found = least_squares(residuals, start, x_scale=np.abs(start), **EXACT).x
     for _ in range(4):
         steps = np.eye(len(found)) * 1e-100j

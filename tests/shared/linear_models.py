@@ -79,7 +79,8 @@ def block_of_gins(scale: float, trials: int, seed: int = 0) -> Block:
 def linear_map(
     problem: Problem, matrix: Array, z: Array, inflation: float = 1.0
 ) -> tuple[Array, Array]:
-    """The maximum a posteriori (trials, n) of a linear model and its covariance (n, n), by one orthogonal solution."""
+    """The maximum a posteriori (trials, n) of a linear model and its covariance (n, n), by one
+    orthogonal solution."""
     assert problem.prior_deviation is not None
     d, x0 = problem.prior_deviation, problem.x0
     A = np.vstack([problem.R.whiten_jacobian(matrix) * d, np.eye(len(d)) / inflation])

@@ -1,6 +1,8 @@
-"""Numbers held against sources that nobody here wrote: the mark `oracle`, how closely they agreed, and the page of it.
+"""Numbers held against sources that nobody here wrote: the mark `oracle`, how closely they agreed,
+and the page of it.
 
-`make oracles` records what was seen in tests/oracles.json, and writes the tables of reference/checked.md from it.
+`make oracles` records what was seen in tests/oracles.json, and writes the tables of
+reference/checked.md from it.
 """
 
 from __future__ import annotations
@@ -44,7 +46,8 @@ BEGIN, END = "<!-- written by `make oracles`, from here -->\n", "<!-- to here --
 
 @dataclass(frozen=True)
 class Oracle:
-    """What the mark of a test says: its source, what is compared, and the loosest tolerance of the comparison."""
+    """What the mark of a test says: its source, what is compared, and the loosest tolerance of the
+    comparison."""
 
     source: str
     what: str
@@ -60,7 +63,8 @@ class Oracle:
 
 @dataclass(frozen=True)
 class Row(Oracle):
-    """A row of the page: a mark with the name of its test, and with the largest difference that was seen."""
+    """A row of the page: a mark with the name of its test, and with the largest difference that was
+    seen."""
 
     test: str
     relative: bool
@@ -69,7 +73,8 @@ class Row(Oracle):
 
 @dataclass(frozen=True)
 class Held:
-    """One comparison: the largest difference seen in it, the tolerance, and whether both are relative."""
+    """One comparison: the largest difference seen in it, the tolerance, and whether both are
+    relative."""
 
     difference: float
     tolerance: float
@@ -87,9 +92,11 @@ def agreed(difference: ArrayLike, tolerance: float) -> None:
 
 
 def assert_agrees(actual: Any, desired: Any, rtol: float = 0.0, atol: float = 0.0) -> None:
-    """Asserts what NumPy's assert_allclose does with these tolerances, and records the largest difference.
+    """Asserts what NumPy's assert_allclose does with these tolerances, and records the largest
+    difference.
 
-    The difference is relative to the desired value, and to `atol / rtol` beside it; it is absolute if `rtol` is 0.
+    The difference is relative to the desired value, and to `atol / rtol` beside it; it is absolute
+    if `rtol` is 0.
     """
     np.testing.assert_allclose(actual, desired, rtol=rtol, atol=atol)
     found, right = np.broadcast_arrays(np.asarray(actual), np.asarray(desired))
@@ -102,14 +109,16 @@ def assert_agrees(actual: Any, desired: Any, rtol: float = 0.0, atol: float = 0.
 
 
 def join(config: Any) -> None:
-    """Lets pytest call what stands below, for the tests of plugins too where those of the package are named."""
+    """Lets pytest call what stands below, for the tests of plugins too where those of the package
+    are named."""
     if not config.pluginmanager.has_plugin(__name__):
         config.pluginmanager.register(sys.modules[__name__], __name__)
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item: Any) -> Iterator[None]:
-    """Hands on how closely a marked test agreed, and fails one that compares at a looser tolerance than is marked."""
+    """Hands on how closely a marked test agreed, and fails one that compares at a looser tolerance
+    than is marked."""
     _held.clear()
     yield
     mark = item.get_closest_marker("oracle")
@@ -139,13 +148,15 @@ def pytest_sessionfinish(session: Any) -> None:
 
 
 def record() -> None:
-    """Writes what this run has seen; the rows of tests that did not run stay, and those without a mark go."""
+    """Writes what this run has seen; the rows of tests that did not run stay, and those without a
+    mark go."""
     known, marks = {anchor(row.test): row for row in rows()}, marked()
     for test in marks.keys() & _seen.keys():
         seen, asked = _seen[test], max(one.tolerance for one in _seen[test])
         if asked != marks[test].tolerance:
             print(
-                f"\n{test}: not recorded, as its loosest tolerance was {asked:g}, not {marks[test].tolerance:g}"
+                f"\n{test}: not recorded, as its loosest tolerance was {asked:g}, not"
+                f" {marks[test].tolerance:g}"
             )
             continue
         largest = one_digit(max(one.difference for one in seen))
@@ -249,7 +260,8 @@ def tables(recorded: Iterable[Row]) -> str:
 
 
 def in_page() -> tuple[str, str, str]:
-    """Returns what stands on the page before its tables, they themselves, and what stands after them."""
+    """Returns what stands on the page before its tables, they themselves, and what stands after
+    them."""
     before, _, rest = PAGE.read_text(encoding="utf-8").partition(BEGIN)
     written, _, after = rest.partition(END)
     return before, written, after

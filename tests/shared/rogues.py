@@ -1,4 +1,5 @@
-"""Estimators and tasks that misbehave in every way that a plugin can; a module, so that workers can import it."""
+"""Estimators and tasks that misbehave in every way that a plugin can; a module, so that workers can
+import it."""
 
 import os
 import signal
@@ -17,7 +18,8 @@ _begun: set[int] = set()
 
 @dataclass(frozen=True)
 class Rogue(Estimator):
-    """Estimates nothing but zeros, or does what it says; `until` names a file from whose existence on it behaves."""
+    """Estimates nothing but zeros, or does what it says; `until` names a file from whose existence
+    on it behaves."""
 
     does: str
     until: str = ""
@@ -86,7 +88,8 @@ class Rogue(Estimator):
 
 
 def surroundings(task):
-    """What a worker sees: its process, its BLAS threads, and the threads that compiled models may use."""
+    """What a worker sees: its process, its BLAS threads, and the threads that compiled models may
+    use."""
     from threadpoolctl import threadpool_info
 
     from ipe_bench.engine.integrator import threads

@@ -1,5 +1,6 @@
-"""Simulates whole reports of estimators whose merits are known: trials are drawn from a population and put straight
-into the frames that a page is written from, without estimators, models or files."""
+"""Simulates whole reports of estimators whose merits are known: trials are drawn from a population
+and put straight into the frames that a page is written from, without estimators, models or
+files."""
 
 from __future__ import annotations
 
@@ -44,7 +45,8 @@ _READ = {
     ),
     *("simulations_median", "simulations_mean", "time_mean_s", "path_verdict", "nis_verdict"),
 }
-"""Statistics that sentences, boxes and verdicts are made of; their other intervals take long and are left out."""
+"""Statistics that sentences, boxes and verdicts are made of; their other intervals take long and
+are left out."""
 _KEPT = [
     s if s.name == "success" else replace(s, limits=None) for s in STATISTICS if s.name in _READ
 ]
@@ -52,14 +54,16 @@ _KEPT = [
 
 @dataclass(frozen=True)
 class Population:
-    """Describes an estimator at one error scale: the law of its errors, and what it says of them."""
+    """Describes an estimator at one error scale: the law of its errors, and what it says of
+    them."""
 
     law: str = "normal"
     """Of the errors that are not lost: normal, t3 (Student's, 3 degrees) or contaminated."""
     spread: float = 1.0
     """Root mean square error over the bound, without bias and wild errors."""
     claim: float = 1.0
-    """Mean square of these errors over the variance that is reported: 1 if honest, above 1 if too sure."""
+    """Mean square of these errors over the variance that is reported: 1 if honest, above 1 if too
+    sure."""
     bias: float = 0.0
     """Of each parameter, in deviations of the bound."""
     lost: float = 0.0
@@ -123,7 +127,7 @@ def _sizes(law: str, u: np.ndarray) -> np.ndarray:
     return np.where((u < OFTEN) & (law == "contaminated"), WILD, 1.0)
 
 
-# What is simulated ----------------------------------------------------------------------------------------------------
+# What is simulated --------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +140,8 @@ class Board:
     n: int
     trials: int
     alike: float
-    """Correlation of the errors of different estimators, and of one at different scales, in the same trial."""
+    """Correlation of the errors of different estimators, and of one at different scales, in the
+    same trial."""
     moving: bool
     seed: int
 
@@ -160,7 +165,8 @@ def board(seed: int, *, largest: bool = True) -> Board:
 
 
 def _estimator(rng: np.random.Generator, count: int, *, honest: bool) -> Iterator[Population]:
-    """Draws the populations of one estimator: it is right at small scales and begins to be wrong at one of them."""
+    """Draws the populations of one estimator: it is right at small scales and begins to be wrong at
+    one of them."""
     kinds = (
         ["honest"]
         if honest
@@ -170,7 +176,8 @@ def _estimator(rng: np.random.Generator, count: int, *, honest: bool) -> Iterato
         rng.choice(kinds, p=None if honest else [0.3, 0.15, 0.05, 0.1, 0.1, 0.15, 0.1, 0.05])
     )
     law = str(rng.choice(["t3", "contaminated"])) if kind == "heavy" else "normal"
-    # An estimator that reports the variance of the bulk is too sure where 1 % of its errors are wild.
+    # An estimator that reports the variance of the bulk is too sure where 1 % of its errors are
+    # wild.
     of_bulk = 1 - OFTEN + OFTEN * WILD**2 if law == "contaminated" else 1.5
     heavy_claim = float(rng.choice([1.0, of_bulk]))
     claim = {
@@ -344,7 +351,8 @@ def _analysis(drawn: Board, collection: Any, samples: Mapping[tuple[int, str], S
 
 
 def _rows(s: Sample, may_be_the_best: bool) -> list[dict[str, Any]]:
-    """Returns rows of the summary: one per state with its error over all epochs, and one over all parameters."""
+    """Returns rows of the summary: one per state with its error over all epochs, and one over all
+    parameters."""
     head = dict(s.group.columns) | {"estimator": s.group.estimator, BEST: may_be_the_best}
     whole = head | {"parameter": "all"} | rows_of(_KEPT, s)[-1]
     errors = np.sqrt((s.error**2).mean(axis=0))

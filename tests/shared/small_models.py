@@ -73,7 +73,8 @@ class Written(Measurement):
 
 
 def bock(mu: float) -> Ode:
-    """Bock's notorious problem with unknown initial values, presumed to be (0, pi): x grows like exp(mu t)."""
+    """Bock's notorious problem with unknown initial values, presumed to be (0, pi): x grows like
+    exp(mu t)."""
     return Ode(
         title="bock",
         rates={"x1": "x2", "x2": "mu**2*x1 - (mu**2 + p**2)*sin(p*t)"},

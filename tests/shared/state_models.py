@@ -1,4 +1,5 @@
-"""Models of the literature in Python: what those of conf/state_model, by formulas, are held against."""
+"""Models of the literature in Python: what those of conf/state_model, by formulas, are held
+against."""
 
 from __future__ import annotations
 
@@ -14,13 +15,15 @@ from ipe_bench.states.algebra import mahalanobis, root
 
 
 def white_acceleration(step: float, density: float) -> Array:
-    """Covariance (2, 2) that a white acceleration of this density adds to position and velocity in `step` seconds."""
+    """Covariance (2, 2) that a white acceleration of this density adds to position and velocity in
+    `step` seconds."""
     return density * np.array([[step**3 / 3, step**2 / 2], [step**2 / 2, step]])
 
 
 def path_cost(model: StateModel, z: Array, start: Array, mean: Array) -> Array:
-    """-2 log p(path | readings) (trials,) up to a constant, of a path that begins at `start` (trials, n) before the
-    first transition; infinite where a step lies outside the range of its noise."""
+    """-2 log p(path | readings) (trials,) up to a constant, of a path that begins at `start`
+    (trials, n) before the first transition; infinite where a step lies outside the range of its
+    noise."""
     total, before = mahalanobis(start - model.prior.mean, model.prior.covariance), start
     for k in range(model.epochs):
         if model.moves(k):
@@ -50,8 +53,8 @@ class Steady(StateModel):
 
 @dataclass(frozen=True)
 class CoordinatedTurn(Steady):
-    """An aircraft that turns at an unknown rate, seen by range and bearing (Arasaratnam and Haykin, IEEE TAC 54, 2009,
-    section VI.B)."""
+    """An aircraft that turns at an unknown rate, seen by range and bearing (Arasaratnam and Haykin,
+    IEEE TAC 54, 2009, section VI.B)."""
 
     density: NonNegative = 0.1
     """Spectral density of the accelerations, m^2/s^3."""
@@ -119,8 +122,8 @@ def bearing(x: Array, y: Array) -> Array:
 
 @dataclass(frozen=True)
 class Pendulum(Steady):
-    """Angle and rate of a pendulum pushed by white noise, seen by the sine of the angle (Särkkä and Svensson, Bayesian
-    Filtering and Smoothing, 2nd ed., 2023, examples 3.7 and 4.6)."""
+    """Angle and rate of a pendulum pushed by white noise, seen by the sine of the angle (Särkkä and
+    Svensson, Bayesian Filtering and Smoothing, 2nd ed., 2023, examples 3.7 and 4.6)."""
 
     count: Count = 500
     step: Positive = 0.01
@@ -161,8 +164,9 @@ class Pendulum(Steady):
 
 @dataclass(frozen=True)
 class Growth(Steady):
-    """The univariate nonstationary growth model: the reading is the square of the state, so that its sign stays open
-    (Netto, Gimeno, Mendes, IFAC 1978; Gordon, Salmond, Smith, IEE Proc. F 140, 1993)."""
+    """The univariate nonstationary growth model: the reading is the square of the state, so that
+    its sign stays open (Netto, Gimeno, Mendes, IFAC 1978; Gordon, Salmond, Smith, IEE Proc. F 140,
+    1993)."""
 
     variance: NonNegative = 10.0
     """Of the process noise."""
@@ -190,7 +194,8 @@ class Growth(Steady):
 
 @dataclass(frozen=True)
 class ConstantVelocity(Steady):
-    """A position with a nearly constant velocity, whose position is read: linear, so the Kalman filter is exact."""
+    """A position with a nearly constant velocity, whose position is read: linear, so the Kalman
+    filter is exact."""
 
     density: NonNegative = 1.0
     """Spectral density of the acceleration, m^2/s^3."""

@@ -25,7 +25,8 @@ from ipe_bench.trials.thresholds import GATE
 
 @dataclass(frozen=True)
 class Repeated(Measurement):
-    """Each parameter read `repeats` times directly: with noise of deviation s its bound is s / sqrt(repeats)."""
+    """Each parameter read `repeats` times directly: with noise of deviation s its bound is s /
+    sqrt(repeats)."""
 
     names: tuple[str, ...] = ("a", "b", "c")
     sizes_given: tuple[float, ...] = (1.0, 10.0, 0.1)
@@ -83,7 +84,8 @@ class Filter(Pretender):
 
 
 class Synthetic:
-    """Writes stores: `scenario(...)`, `add(...)` rows under an estimator, `record()` what a run expects."""
+    """Writes stores: `scenario(...)`, `add(...)` rows under an estimator, `record()` what a run
+    expects."""
 
     Repeated = Repeated
     Pretender = Pretender
@@ -118,7 +120,8 @@ class Synthetic:
         history: Mapping[str, np.ndarray] | None = None,
         **columns: Any,
     ) -> ResultKey:
-        """Rows with these errors (trials, n), in multiples of sizes; further columns replace the defaults."""
+        """Rows with these errors (trials, n), in multiples of sizes; further columns replace the
+        defaults."""
         trials, n = error.shape
         names = [p.name for p in scenario.measurement.parameters]
         bound = self.bound(scenario)
@@ -181,7 +184,8 @@ def rows_true(trials: int) -> np.ndarray:
 
 
 def forge(path: Path, change: Callable[[dict[str, Any], dict[str, Any]], Any]) -> None:
-    """Writes the rows and the footer of a stored file anew after `change(rows, footer)`, with a digest that fits."""
+    """Writes the rows and the footer of a stored file anew after `change(rows, footer)`, with a
+    digest that fits."""
     table = pq.read_table(path)
     rows = {name: table[name].to_numpy() for name in table.column_names}
     footer = json.loads(pq.ParquetFile(path).metadata.metadata[parts.FOOTER])

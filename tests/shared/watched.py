@@ -13,7 +13,8 @@ from ipe_bench.trials.scenario import Scenario
 
 @dataclass(frozen=True)
 class Watched(WrappedModel):
-    """A model that notes what its evaluations cost: a Jacobian what the model says, the first epochs their share."""
+    """A model that notes what its evaluations cost: a Jacobian what the model says, the first
+    epochs their share."""
 
     whole: Measurement
     seen: Counter[str] = field(default_factory=Counter, compare=False)

@@ -1,7 +1,8 @@
-"""Builds the documentation: pages about ipe-bench, a reference read from the code, and a gallery of experiments.
+"""Builds the documentation: pages about ipe-bench, a reference read from the code, and a gallery of
+experiments.
 
-`make docs` builds the site into outputs/docs/html by the extra `docs`. As an extension of Sphinx this module writes
-formulas as MathML, which needs no script and no network.
+`make docs` builds the site into outputs/docs/html by the extra `docs`. As an extension of Sphinx
+this module writes formulas as MathML, which needs no script and no network.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ _STYLE = "margin: 1rem 0; padding: .5rem 0; overflow-x: auto"
 
 
 def show_type(app: Any, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
-    """Gives an attribute its type; napoleon, which comes before, takes the words before a colon of its docstring."""
+    """Gives an attribute its type; napoleon, which comes before, takes the words before a colon of
+    its docstring."""
     if what in ("attribute", "property") and lines:
         for line in [line for line in lines if line.startswith(":type: ")]:
             lines.remove(line)
@@ -30,7 +32,8 @@ def show_type(app: Any, what: str, name: str, thing: Any, options: Any, lines: l
 
 
 def type_of(cls: type, attribute: str) -> str:
-    """Returns the type of an attribute or a property as its class writes it, without constraints, or an empty text."""
+    """Returns the type of an attribute or a property as its class writes it, without constraints,
+    or an empty text."""
     for base in cls.__mro__:
         member = vars(base).get(attribute)
         getter = getattr(member, "fget", None) or getattr(member, "func", None)

@@ -1,6 +1,8 @@
-"""Keeps what a page of the gallery is drawn from: frames of an analysis, and what its results say of themselves.
+"""Keeps what a page of the gallery is drawn from: frames of an analysis, and what its results say
+of themselves.
 
-Sentences, tables, captions and figures are not kept: they are drawn again by whoever builds the site.
+Sentences, tables, captions and figures are not kept: they are drawn again by whoever builds the
+site.
 """
 
 from __future__ import annotations
@@ -29,7 +31,8 @@ KEPT = ("summary", "scores", "pairs")
 _LEFT_OUT = ("libraries", "linear_correlation", "linear_bound", "source", "versions")
 """What a footer says that no page shows."""
 _COLUMNS = ("status", "error_", "deviation_", "path_")
-"""Columns of a single trial behind digits of certified answers and published errors, or what they begin with."""
+"""Columns of a single trial behind digits of certified answers and published errors, or what they
+begin with."""
 
 
 @dataclass
@@ -99,7 +102,8 @@ class Computed:
 
 
 def read(path: Path) -> Computed:
-    """Reads what `Computed.write` wrote: statistics of the bench alone, so that those of plugins are forgotten."""
+    """Reads what `Computed.write` wrote: statistics of the bench alone, so that those of plugins
+    are forgotten."""
     add_statistics([])
     content = json.loads(lzma.decompress(path.read_bytes()))
     groups = tuple(_group(one) for one in content["groups"])

@@ -1,5 +1,6 @@
-"""`python tests/site/make_docs.py [OUTPUT] [--trials N]`: builds the site by Sphinx, of written pages, of what the
-program says of itself, and of what is stored of its experiments, which `--store NAME` computes."""
+"""`python tests/site/make_docs.py [OUTPUT] [--trials N]`: builds the site by Sphinx, of written
+pages, of what the program says of itself, and of what is stored of its experiments, which `--store
+NAME` computes."""
 
 from __future__ import annotations
 
@@ -100,7 +101,8 @@ IN_USE = (
     "status",
     "StateScenario",
 )
-"""Names of the reference of Python in the order in which they are used; the others follow by the alphabet."""
+"""Names of the reference of Python in the order in which they are used; the others follow by the
+alphabet."""
 CLASSES = {place for places in CONTRACTS.values() for place in places}
 ORDINARY, LEAST = 1000, 3
 """Trials of an ordinary experiment, and the least number that a costly one is cut to."""
@@ -123,7 +125,8 @@ STORED = SOURCES / "gallery"
 
 
 def build(output: Path, trials: int) -> int:
-    """Writes the site to OUTPUT/html and what it is made of beside it; returns Sphinx's exit code."""
+    """Writes the site to OUTPUT/html and what it is made of beside it; returns Sphinx's exit
+    code."""
     from sphinx.application import Sphinx  # pyright: ignore[reportMissingImports]
 
     source = output / "source"
@@ -140,7 +143,8 @@ def build(output: Path, trials: int) -> int:
 
 
 def printed_by(command: Sequence[str], columns: int = 80) -> str:
-    """Returns the output of `ipe-bench COMMAND`, without blanks at the ends of lines; a UserError if it fails."""
+    """Returns the output of `ipe-bench COMMAND`, without blanks at the ends of lines; a UserError
+    if it fails."""
     program = [sys.executable, "-m", "ipe_bench", *command]
     environment = os.environ | {"COLUMNS": str(columns), "NO_COLOR": "1"}
     done = subprocess.run(program, capture_output=True, text=True, env=environment, check=False)
@@ -152,7 +156,8 @@ def printed_by(command: Sequence[str], columns: int = 80) -> str:
 
 
 def write_page(path: Path, template: str, **content: Any) -> None:
-    """Writes a page from its template, in which the filter `cell` makes any text a cell of a Markdown table."""
+    """Writes a page from its template, in which the filter `cell` makes any text a cell of a
+    Markdown table."""
     made = environment().overlay(autoescape=False)
     made.filters["cell"] = lambda text: " ".join(
         str(text).replace("|", "\\|").replace("<", "&lt;").split()
@@ -237,8 +242,8 @@ class Page:
 
 
 def write_gallery(folder: Path, results: Path, trials: int) -> None:
-    """Draws a page per experiment, their list, and a table of the best estimators by model, of what is stored; of an
-    experiment without a stored result, `trials` replaces the default of 1000."""
+    """Draws a page per experiment, their list, and a table of the best estimators by model, of what
+    is stored; of an experiment without a stored result, `trials` replaces the default of 1000."""
     chosen, found = _ours("experiment"), {}
     make_folder(pictures := folder / "pictures")
     for option in chosen:
@@ -274,8 +279,8 @@ def write_gallery(folder: Path, results: Path, trials: int) -> None:
 
 
 def stored_as_markdown(option: Option) -> str:
-    """Returns the finding, figure, matrix and full table of an experiment's stored results, for readers of the
-    repository."""
+    """Returns the finding, figure, matrix and full table of an experiment's stored results, for
+    readers of the repository."""
     computed = read(STORED / f"{option.name}{SUFFIX}")
     finding, *parts = headline(computed.analysis)
     with house_style():
@@ -295,7 +300,8 @@ def stored_as_markdown(option: Option) -> str:
 def store(
     option: Option, folder: Path, results: Path, trials: int, part: Sequence[str] = ()
 ) -> Path:
-    """Runs an experiment, or a part of it, and keeps what its page is drawn from; returns the file."""
+    """Runs an experiment, or a part of it, and keeps what its page is drawn from; returns the
+    file."""
     name, command = option.name, ["run", f"+experiment={option.name}", *part]
     own = (option.config or {}).get("trials", ORDINARY)
     number = min(own, max(round(own * trials / ORDINARY), min(trials, LEAST)))
@@ -331,8 +337,8 @@ def _asked(experiment: str) -> int:
 
 
 def _small(analysis: Analysis) -> Any:
-    """Draws one legible panel: success over the error scale, of the first of several settings by the alphabet, or a bar
-    for each estimator."""
+    """Draws one legible panel: success over the error scale, of the first of several settings by
+    the alphabet, or a bar for each estimator."""
     parts, _ = views(analysis)
     if parts and len(parts[0].scales) > 1:
         view = min(parts, key=lambda part: part.label)
@@ -361,8 +367,8 @@ def _small(analysis: Analysis) -> Any:
 
 
 def _best(experiment: str, summary: pd.DataFrame) -> Iterator[tuple[str, ...]]:
-    """Yields who succeeds most often, and at what cost, at the least and the largest error scale of a simulated
-    experiment, and who is not there."""
+    """Yields who succeeds most often, and at what cost, at the least and the largest error scale of
+    a simulated experiment, and who is not there."""
     if "truth" in summary or not {"measurement", "noise", "success"} <= set(summary):
         return
     totals = summary[(summary["parameter"] == ALL) & (summary["noise"] != "certified")]
@@ -377,14 +383,17 @@ def _best(experiment: str, summary: pd.DataFrame) -> Iterator[tuple[str, ...]]:
         names = dict.fromkeys((str(best["measurement"].iloc[0]), experiment))
         link = f"[{', '.join(names)}](gallery/{experiment}.md)"
         lacking = [label for label in every if label not in set(here["estimator"])]
-        told = f"{enumerate_few(list(best['estimator']), 5)}{f' (not run: {enumerate_few(lacking)})' * bool(lacking)}"
+        told = enumerate_few(list(best["estimator"]), 5)
+        if lacking:
+            told += f" (not run: {enumerate_few(lacking)})"
         share = f"{percent(best['success'].iloc[0])} of {best['trials'].iloc[0]}"
         cost = brief(best["simulations_median"].iloc[0])
         yield link, f"{scale:g}", told, share, cost
 
 
 def store_all(output: Path, trials: int, names: Sequence[str]) -> int:
-    """Computes the experiments that are named and keeps what their pages are drawn from; draws all pages again."""
+    """Computes the experiments that are named and keeps what their pages are drawn from; draws all
+    pages again."""
     for option in _ours("experiment"):
         if option.name in names:
             print(f"{option.name} ...", flush=True)

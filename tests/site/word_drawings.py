@@ -1,4 +1,5 @@
-"""Draws error scale, bound and NEES, each by trials of the bench itself, for the page that explains the words."""
+"""Draws error scale, bound and NEES, each by trials of the bench itself, for the page that explains
+the words."""
 
 from __future__ import annotations
 
@@ -32,7 +33,8 @@ def scenario(error_scale: float) -> ib.Scenario:
 
 
 def error_scale() -> Figure:
-    """Draws true parameters at three error scales, and the readings that they would give without noise."""
+    """Draws true parameters at three error scales, and the readings that they would give without
+    noise."""
     fig, axes = _axes(2)
     days = np.linspace(0, 20, 100)
     for scale, color in zip(reversed(SCALES), (ORANGE, BLUE, "black"), strict=True):
@@ -51,7 +53,8 @@ def error_scale() -> Figure:
 
 
 def estimates(estimator: ib.Estimator, scale: float) -> tuple[Array, Array]:
-    """Returns whitened errors (trials, n) and squared errors over the reported variance (trials,)."""
+    """Returns whitened errors (trials, n) and squared errors over the reported variance
+    (trials,)."""
     bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=scale)
     trials = bench.draw(0, TRIALS)
     found = estimator.estimate(bench.problem, trials.z)
@@ -65,7 +68,8 @@ def estimates(estimator: ib.Estimator, scale: float) -> tuple[Array, Array]:
 
 
 def bound() -> Figure:
-    """Draws errors of an efficient and of a linear estimator beside the ellipse of the Cramér-Rao bound."""
+    """Draws errors of an efficient and of a linear estimator beside the ellipse of the Cramér-Rao
+    bound."""
     fig, axes = _axes(2)
     angle = np.linspace(0, 2 * np.pi, 200)
     radius = np.sqrt(chi2.ppf(0.95, 2))
@@ -91,7 +95,8 @@ def bound() -> Figure:
 
 
 def nees() -> Figure:
-    """Draws squared errors over the reported variance, where it is right and where it is four times too small."""
+    """Draws squared errors over the reported variance, where it is right and where it is four times
+    too small."""
     fig, axes = _axes(2)
     _, square = estimates(ib.solvers.Newton(), 1.0)
     n = ib.measurements.Polynomial().n
@@ -108,7 +113,8 @@ def nees() -> Figure:
 
 
 def track() -> Figure:
-    """Draws the true angle of the stored pendulum between the bands of a filter and of its smoother."""
+    """Draws the true angle of the stored pendulum between the bands of a filter and of its
+    smoother."""
     model = ib.component("state_model/pendulum_book")
     trackers = {label: ib.component(f"tracker/{label}") for label in ("ukf", "ukf_rts")}
     seen = slice(0, 200)

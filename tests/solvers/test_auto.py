@@ -1,4 +1,5 @@
-"""`auto` and `progressive`: the least-squares answer everywhere, when a better fit is looked for, and its cost."""
+"""`auto` and `progressive`: the least-squares answer everywhere, when a better fit is looked for,
+and its cost."""
 
 import numpy as np
 import pytest
@@ -35,7 +36,8 @@ def test_it_finds_the_least_squares_minimum_next_to_the_truth(scale):
 
 
 def test_of_minima_that_fit_alike_the_most_probable_one_counts():
-    """A cubic has three roots; the answer is the one of them, of those found, whose posterior density is largest."""
+    """A cubic has three roots; the answer is the one of them, of those found, whose posterior
+    density is largest."""
     model = Written(lambda a: (a**3 - 3 * a, 2 * (a**3 - 3 * a)), first=0.9)
     problem = Problem(model, Covariance(np.full(2, 0.01)), np.array([1.0]))
     level = np.linspace(-1.8, 1.8, 25)
@@ -58,7 +60,8 @@ def test_what_is_nearly_linear_costs_no_more_than_fixed_point_iteration_and_half
 
 @pytest.mark.parametrize("scale", [1000.0, 2000.0])
 def test_what_is_far_is_left_to_progressive(scale):
-    """Fixed-point iteration finds no root there: less than the cost of one Jacobian goes into seeing that."""
+    """Fixed-point iteration finds no root there: less than the cost of one Jacobian goes into
+    seeing that."""
     scenario = Scenario(Gins(), Quantization(0.02286), error_scale=scale)
     z = scenario.draw(0, 10).z
     with np.errstate(all="ignore"):
@@ -84,8 +87,8 @@ def test_residuals_that_do_not_fit_are_no_answer_of_the_first_stage():
     ("model", "scale"), [(Bearings(), 1.0), (LotkaVolterra(), 1.0)], ids=["bearings", "lotka"]
 )
 def test_a_jacobian_that_changes_on_the_way_is_renewed(model, scale):
-    """With that of the frozen root alone, two in five of these answers are a thousandth to a tenth of a deviation off,
-    and chord steps cannot see it: they converge."""
+    """With that of the frozen root alone, two in five of these answers are a thousandth to a tenth
+    of a deviation off, and chord steps cannot see it: they converge."""
     estimates, off = off_the_minimum(Scenario(model, Gaussian(0.5), error_scale=scale), 100)
     first = estimates.extras["stage"] == CHORDS
     assert first.mean() > 0.9
@@ -158,8 +161,8 @@ def fits(model: Formula, z: NDArray[np.float64], noise, estimator) -> Fit:
     ids=["known level", "unknown level"],
 )
 def test_a_noisy_peak_is_found_from_anywhere(noise, starts):
-    """From random starts, among flat lines and dips that are minima, too; an unknown level has no test of the fit to
-    tell them."""
+    """From random starts, among flat lines and dips that are minima, too; an unknown level has no
+    test of the fit to tell them."""
     rng = np.random.default_rng(7)
     truth = {"c": 1.0, "A": 3.0, "mu": 6.2, "w": 0.5}
     for i in range(starts):
@@ -198,7 +201,8 @@ def test_a_saturating_law_is_found_from_a_bad_start(start, noise):
 ANGLES = np.arange(6) * np.pi / 3
 RING = [(1000 * np.cos(a), 1000 * np.sin(a), 16.0 + 14.0 * np.cos(3 * a)) for a in ANGLES]
 NEAR_THE_GROUND = Ranging(beacons=(*RING, (0.0, 0.0, 10.0)))
-"""Beacons of about one height: a receiver above them has an image below, where the ranges are nearly the same."""
+"""Beacons of about one height: a receiver above them has an image below, where the ranges are
+nearly the same."""
 
 
 @pytest.mark.parametrize("estimator", [Auto(), Progressive()], ids=["auto", "progressive"])
@@ -217,7 +221,8 @@ def test_an_image_below_the_ground_is_not_believed(estimator):
 def test_noise_that_is_understated_is_no_reason_for_a_long_search(
     model, true, told, scale, estimator
 ):
-    """Nothing ever fits, and draws lead to the same minimum: some ten to thirty times the first fit."""
+    """Nothing ever fits, and draws lead to the same minimum: some ten to thirty times the first
+    fit."""
     z = Scenario(model, Gaussian(true), error_scale=scale).draw(0, 4).z
     problem = Problem(model, Scenario(model, Gaussian(told)).problem.R)
     with np.errstate(all="ignore"):
@@ -263,7 +268,8 @@ def test_a_search_ends_where_restarts_land_on_one_point(name, noise):
 
 
 def test_a_search_without_an_answer_ends():
-    """A sigmoid has no best fit to a growth without end: its ceiling and its middle leave for infinity."""
+    """A sigmoid has no best fit to a growth without end: its ceiling and its middle leave for
+    infinity."""
     t = np.linspace(0.2, 8, 20)
     z = np.exp(0.4 * t) + 0.05 * np.random.default_rng(5).standard_normal(20)
     model = Formula("a/(1+exp(b-c*t))", {"a": 10.0, "b": 2.0, "c": 0.5}, {"t": t.tolist()})

@@ -1,4 +1,5 @@
-"""Batch least squares, re-linearised and progressive IPE against SciPy, closed forms and the truth."""
+"""Batch least squares, re-linearised and progressive IPE against SciPy, closed forms and the
+truth."""
 
 import itertools
 from dataclasses import dataclass
@@ -62,8 +63,8 @@ def test_the_minimum_is_that_of_scipy(estimator):
 
 @pytest.mark.parametrize("bend", [0.05, -0.05])
 def test_geodesic_acceleration_makes_the_second_order_of_a_step_right(bend):
-    """Along a parabola z = x + b x^2 the plain step from 0 is z, and the bent one z - b z^2; the root is
-    z - b z^2 + 2 b^2 z^3 - ..."""
+    """Along a parabola z = x + b x^2 the plain step from 0 is z, and the bent one z - b z^2; the
+    root is z - b z^2 + 2 b^2 z^3 - ..."""
     model = Written(lambda a: (a + bend * a**2, 2 * (a + bend * a**2)))
     problem = Problem(model, Covariance(np.ones(2)), np.array([1.0]))
     z = np.array([[1.0, 2.0], [-0.5, -1.0]])
@@ -138,7 +139,8 @@ def test_progressive_ipe_from_far_away(estimator, scale, trials, share):
 
 @pytest.mark.slow
 def test_candidates_that_differ_find_what_a_common_prior_hides():
-    """Trials whose first windows have a second minimum of the same depth, to which the prior draws every candidate."""
+    """Trials whose first windows have a second minimum of the same depth, to which the prior draws
+    every candidate."""
     scenario = Scenario(Gins(), Quantization(0.02286), GaussianPrior(), 5000.0)
     z = np.concatenate([scenario.draw(t, t + 1).z for t in (32, 392, 538, 959, 3042)])
     with np.errstate(all="ignore"):
@@ -194,7 +196,8 @@ def test_a_coarse_jacobian_counts_as_what_it_costs():
     "solver", [Newton(tolerance=1e-12), DampedNewton(tolerance=1e-12)], ids=repr
 )
 def test_newtons_method_is_coarse_far_away_and_of_order_two_near_a_root(solver):
-    """A Jacobian that is off by one part in a hundred would gain a factor of a hundred in a step."""
+    """A Jacobian that is off by one part in a hundred would gain a factor of a hundred in a
+    step."""
     problem = Problem(Crude(0.01), Covariance(np.full(12, 0.03)), None)
     z = problem.measurement.simulate(np.random.default_rng(3).normal(size=(20, 3)))
     found = solver.estimate(problem, z, history=True)

@@ -1,4 +1,5 @@
-"""Every solver on every system: roots where theory promises them, the right status where there are none."""
+"""Every solver on every system: roots where theory promises them, the right status where there are
+none."""
 
 import numpy as np
 import pytest
@@ -86,8 +87,8 @@ def test_every_solver_finds_the_root_of_a_contraction(solver):
 
 @pytest.mark.parametrize("depth", [1, 2, 3])
 def test_anderson_s_method_of_full_depth_solves_linear_equations_in_one_step_per_unknown(depth):
-    """With n differences of F behind it the next step is the root (Walker and Ni 2011: as GMRES is); with fewer it is
-    not there yet."""
+    """With n differences of F behind it the next step is the root (Walker and Ni 2011: as GMRES
+    is); with fewer it is not there yet."""
     A = np.array([[1.3, 0.4, -0.2], [0.1, 0.8, 0.3], [-0.3, 0.2, 1.1]])
     model = Written(lambda *x: tuple(A @ np.array(x)), 3, 3)
     start = np.array([[1.0, -2.0, 0.5], [3.0, 1.0, 4.0]])
@@ -96,7 +97,8 @@ def test_anderson_s_method_of_full_depth_solves_linear_equations_in_one_step_per
 
 
 def test_a_line_search_takes_no_step_that_decreases_nothing():
-    """Newton's steps on sign(a) sqrt(abs(a)) lead from a to -a, for ever; half of one leads to the root."""
+    """Newton's steps on sign(a) sqrt(abs(a)) lead from a to -a, for ever; half of one leads to the
+    root."""
 
     def signed_root(a):
         at = np.real(a)
@@ -187,7 +189,8 @@ def test_newton_is_quadratic(solver):
 
 @pytest.mark.parametrize("solver", [Broyden(), Broyden("identity"), Anderson(2)], ids=repr)
 def test_quasi_newton_is_superlinear(solver):
-    """Ratios of successive errors go to zero, those of fixed-point iteration stay where they are."""
+    """Ratios of successive errors go to zero, those of fixed-point iteration stay where they
+    are."""
     start, root = (0.8, -0.5), (0.0, 0.0)
     fast, slow = (_errors(s, CUBIC, start, root, max_iterations=60) for s in (solver, FixedPoint()))
     fast, slow = fast[fast > 1e-14], slow[slow > 1e-14]

@@ -1,4 +1,5 @@
-"""f and h of a state model along whole paths, against its own functions by epoch and quotients of differences."""
+"""f and h of a state model along whole paths, against its own functions by epoch and quotients of
+differences."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ from ipe_bench.workshop.conformance import check_component
 
 @dataclass(frozen=True)
 class Angles(Steady):
-    """A model of Python whose steps differ in form from epoch to epoch, and of which one piece can be replaced."""
+    """A model of Python whose steps differ in form from epoch to epoch, and of which one piece can
+    be replaced."""
 
     count: int = 6
     piece: Any = None

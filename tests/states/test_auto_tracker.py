@@ -45,7 +45,8 @@ def test_a_linear_model_is_answered_by_its_first_stage():
 
 
 def test_each_stage_answers_where_those_before_it_do_not():
-    """More rounds keep or lower the cost, and only those trials change that the earlier stages leave improbable."""
+    """More rounds keep or lower the cost, and only those trials change that the earlier stages
+    leave improbable."""
     z = LOST.draw(0, 40).z
     with np.errstate(all="ignore"):
         tracks = [AutoTracker(rounds=rounds).track(LOST, z) for rounds in (0, 1, 2)]

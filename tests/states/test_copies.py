@@ -1,4 +1,5 @@
-"""Copies of a path by whole periods of a state: their probabilities against closed forms, slow sums and frequencies."""
+"""Copies of a path by whole periods of a state: their probabilities against closed forms, slow sums
+and frequencies."""
 
 from __future__ import annotations
 
@@ -27,7 +28,8 @@ COMPASS = Formulas(
     state_period={"angle": TURN},
     count=1,
 )
-"""A needle of which the turn is known by the prior alone, and the rest by a reading without error."""
+"""A needle of which the turn is known by the prior alone, and the rest by a reading without
+error."""
 
 
 class Swinging(Pendulum):
@@ -48,7 +50,8 @@ def test_of_a_needle_read_without_error_it_is_the_ratio_of_prior_densities():
 
 
 def test_so_many_paths_are_right_as_are_said_to_be():
-    """The reading cannot tell the turn: of 2,000 needles the share at the turn of the track is the mean of p."""
+    """The reading cannot tell the turn: of 2,000 needles the share at the turn of the track is the
+    mean of p."""
     paths = COMPASS.draw(0, 2000)
     tracks = Smoother(ekf()).track(COMPASS, paths.z)
     p = copy_p(COMPASS, paths.z, tracks)
@@ -141,7 +144,8 @@ def test_the_turns_of_a_pendulum_are_as_probable_as_is_said():
 
 
 def test_a_path_goes_on_in_the_turn_of_its_start():
-    """Steps are told from each other but for whole turns, so that a jump by one of them costs nothing."""
+    """Steps are told from each other but for whole turns, so that a jump by one of them costs
+    nothing."""
     wide = {"angle": 4.0, "rate": 4.0}
     model = ib.component("state_model/pendulum", count=150, spread=wide)
     tracks = LevenbergMarquardtSmoother().track(model, model.draw(0, 40).z)
@@ -152,7 +156,8 @@ def test_a_path_goes_on_in_the_turn_of_its_start():
 
 
 def test_turns_are_taken_from_a_path_only_where_that_costs_nothing():
-    """A reading without a period tells the turns of a state with one: the cost is that of the path that is returned."""
+    """A reading without a period tells the turns of a state with one: the cost is that of the path
+    that is returned."""
     model = Formulas(
         next={"angle": "angle+w"},
         readings={"z": "angle"},

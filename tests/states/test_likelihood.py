@@ -1,4 +1,5 @@
-"""Constants of state models by maximum likelihood: a published estimate, dense likelihoods, and their coverage."""
+"""Constants of state models by maximum likelihood: a published estimate, dense likelihoods, and
+their coverage."""
 
 from __future__ import annotations
 
@@ -19,10 +20,11 @@ from ipe_bench.report import progress
 from ipe_bench.states import Bootstrap, Formulas, Grid, Smoother, ekf
 
 NILE = """
-1120 1160 963 1210 1160 1160 813 1230 1370 1140 995 935 1110 994 1020 960 1180 799 958 1140 1100 1210 1150 1250 1260
-1220 1030 1100 774 840 874 694 940 833 701 916 692 1020 1050 969 831 726 456 824 702 1120 1100 832 764 821 768 845 864
-862 698 845 744 796 1040 759 781 865 845 944 984 897 822 1010 771 676 649 846 812 742 801 1040 860 874 848 890 744 749
-838 1050 918 986 797 923 975 815 1020 906 901 1170 912 746 919 718 714 740
+1120 1160 963 1210 1160 1160 813 1230 1370 1140 995 935 1110 994 1020 960 1180 799 958 1140
+1100 1210 1150 1250 1260 1220 1030 1100 774 840 874 694 940 833 701 916 692 1020 1050 969
+831 726 456 824 702 1120 1100 832 764 821 768 845 864 862 698 845 744 796 1040 759
+781 865 845 944 984 897 822 1010 771 676 649 846 812 742 801 1040 860 874 848 890
+744 749 838 1050 918 986 797 923 975 815 1020 906 901 1170 912 746 919 718 714 740
 """
 """Annual flow of the Nile at Aswan, 1871 to 1970, in 1e8 m^3 (Cobb, Biometrika 65, 1978)."""
 LEVEL = Formulas(
@@ -44,13 +46,15 @@ DAMPED = Formulas(
 
 
 @pytest.mark.oracle(
-    "published: Durbin and Koopman, Time Series Analysis by State Space Methods (2012), section 2.10.3",
+    "published: Durbin and Koopman, Time Series Analysis by State Space Methods (2012), section"
+    " 2.10.3",
     "two variances of the Nile's flow",
     5e-4,
 )
 @pytest.mark.slow
 def test_the_variances_of_the_nile_are_those_of_durbin_and_koopman():
-    """Time Series Analysis by State Space Methods, 2012, section 2.10.3: 15099 and 1469.1, from a diffuse prior."""
+    """Time Series Analysis by State Space Methods, 2012, section 2.10.3: 15099 and 1469.1, from a
+    diffuse prior."""
     z = np.array(NILE.split(), dtype=float)[:, None]
     assert z.sum() == 91935
     (one,) = ib.estimate(LEVEL, z, {"kf": ekf()}, find=["flow", "w"])
@@ -78,7 +82,8 @@ def test_constants_and_errors_are_those_of_the_dense_likelihood():
         (a, w, s), errors = ([getattr(c, key) for c in one.constants] for key in ("value", "error"))
 
         def cost(u, a=a, w=w, s=s):
-            """By the constant and the logarithms of the standard deviations, from where the maximum is said to be."""
+            """By the constant and the logarithms of the standard deviations, from where the maximum
+            is said to be."""
             return -dense_log_likelihood(a + u[0], w * np.exp(u[1]), s * np.exp(u[2]), z[:, 0])
 
         assert_agrees(one.log_likelihood, -cost(np.zeros(3)), atol=1e-6)
@@ -180,13 +185,15 @@ def test_a_log_without_noise_determines_no_noise():
     assert one.constants == ()
     assert one.verdict == "no maximum"
     assert re.match(
-        r"no maximum of the likelihood was found in w: .* ended after \d+ evaluations at w=[\d.]+e-",
+        r"no maximum of the likelihood was found in w: .* ended after \d+"
+        r" evaluations at w=[\d.]+e-",
         one.message,
     )
 
 
 def test_a_maximum_whose_innovations_do_not_fit_is_no_answer():
-    """White states for a log that is a sine: noise of its size is most likely, and successive innovations are alike."""
+    """White states for a log that is a sine: noise of its size is most likely, and successive
+    innovations are alike."""
     white = replace(DAMPED, next={"x": "w"}, constants={})
     (one,) = ib.estimate(white, 3 * np.sin(np.arange(60.0) / 5)[:, None], {"kf": ekf()}, find="w")
     assert one.constants[0].value == pytest.approx(np.sqrt(9 / 2 - 1), rel=0.05)
@@ -200,8 +207,8 @@ def test_a_maximum_whose_innovations_do_not_fit_is_no_answer():
     [(30.0, "several maxima"), pytest.param(3.0, "consistent", marks=pytest.mark.slow)],
 )
 def test_maxima_that_differ_are_named(deviation, verdict):
-    """(b - .2)^2 = 1 at b = 1.2 and -.8, between which one coarse reading has to tell; no state is unknown, and the
-    difference of the log likelihoods is that of sums of squares."""
+    """(b - .2)^2 = 1 at b = 1.2 and -.8, between which one coarse reading has to tell; no state is
+    unknown, and the difference of the log likelihoods is that of sums of squares."""
     model = Formulas(
         next={"x": "x"},
         readings={"square": "x + (b - 0.2)**2", "coarse": "x + b"},

@@ -1,4 +1,5 @@
-"""Tracks of readings from a file: the same numbers as in a run, the closed form with known inputs, and refusals."""
+"""Tracks of readings from a file: the same numbers as in a run, the closed form with known inputs,
+and refusals."""
 
 from __future__ import annotations
 
@@ -98,7 +99,8 @@ def test_a_log_is_tracked_with_the_bits_of_a_run(tmp_path):
 
 @pytest.mark.oracle("closed form: quadratic form of all readings", "mean NIS", 1e-6)
 def test_smoothers_are_judged_by_the_cost_of_their_path():
-    """Of a linear model: z' S^-1 z, with S the covariance of all readings, is the cost and the NIS of the filter."""
+    """Of a linear model: z' S^-1 z, with S the covariance of all readings, is the cost and the NIS
+    of the filter."""
     model = replace(DRIVEN, next={"x": "x + w"}, inputs={}, count=20)
     k = np.arange(1.0, 21.0)
     S = 1.0 + 0.25 * np.minimum.outer(k, k) + 0.04 * np.eye(20)
@@ -288,8 +290,8 @@ def test_a_model_of_formulas_may_stand_in_a_file(tmp_path, estimate):
     )
     assert code == 2
     assert (
-        "state_model.file=copied.yaml: has a _target_; the model is chosen by state_model=, so leave it out"
-        in err
+        "state_model.file=copied.yaml: has a _target_; the model is chosen by state_model=, so"
+        " leave it out" in err
     )
 
 

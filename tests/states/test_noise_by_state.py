@@ -1,4 +1,5 @@
-"""Noise that depends on the states, and states that come round: augmented loops, quadrature, Monte Carlo, refusals."""
+"""Noise that depends on the states, and states that come round: augmented loops, quadrature, Monte
+Carlo, refusals."""
 
 from __future__ import annotations
 
@@ -38,7 +39,8 @@ ALONG, TURN = 0.3, 0.1
 
 @dataclass(frozen=True)
 class Rover(StateModel):
-    """A vehicle whose steps err along its heading, read by range and bearing, the range worse from far away."""
+    """A vehicle whose steps err along its heading, read by range and bearing, the range worse from
+    far away."""
 
     count: int = 12
     moved_first: bool = True
@@ -106,8 +108,9 @@ def unscented(n):
 
 
 def augmented(rule, g, G, m, P):
-    """Mean, covariance and cross covariance with x of g(x) + G(x) w for x ~ N(m, P) and w ~ N(0, I): by tangents in the
-    augmented state (x, w), or by points of it, those of the unscented rule in x, each with the cubature points in w."""
+    """Mean, covariance and cross covariance with x of g(x) + G(x) w for x ~ N(m, P) and w ~ N(0,
+    I): by tangents in the augmented state (x, w), or by points of it, those of the unscented rule
+    in x, each with the cubature points in w."""
     n, q = len(m), G(m).shape[1]
     if isinstance(rule, Taylor):
         F = np.array([g(m + step).imag for step in 1e-20j * np.eye(n)]).T / 1e-20
@@ -125,7 +128,8 @@ def augmented(rule, g, G, m, P):
 
 
 def loop(rule, model, z):
-    """Means and covariances of a filter of one trial by an augmented prediction and an augmented update."""
+    """Means and covariances of a filter of one trial by an augmented prediction and an augmented
+    update."""
     m, P = model.prior
     means, covariances = [], []
     for k, reading in enumerate(z):
@@ -156,7 +160,8 @@ def test_extended_and_unscented_filters_are_those_of_an_augmented_state(rule):
 
 
 def test_a_step_has_the_mean_and_the_covariance_of_many_draws():
-    """Start, noise and reading drawn, against rules that integrate them; Q of the mean alone is 10 errors off."""
+    """Start, noise and reading drawn, against rules that integrate them; Q of the mean alone is 10
+    errors off."""
     rng, (m, P), N = np.random.default_rng(3), ROVER.prior, 300_000
     rule, blind = GaussHermite(5), np.full((1, 1, 2), np.nan)
     before = rng.multivariate_normal(m, P, N)
@@ -237,7 +242,8 @@ def test_trackers_are_calibrated_and_give_a_trial_the_same_bits_alone(label):
 
 
 SCALAR = {
-    "next": {"x": "x + w"}, "readings": {"z": "x"}, "noise": {"w": 1.0}, "deviation": {"z": 1.0}, "spread": {"x": 1.0},
+    "next": {"x": "x + w"}, "readings": {"z": "x"}, "noise": {"w": 1.0}, "deviation": {"z": 1.0},
+    "spread": {"x": 1.0},
     "count": 3,
 }  # fmt: skip
 VOLATILITY = Formulas(
@@ -259,7 +265,8 @@ GROWING = Formulas(
 
 
 def quadrature(model, z):
-    """Filtered means (K,) and log likelihood of a scalar model, by the trapezoidal rule on one grid of 1,201 points."""
+    """Filtered means (K,) and log likelihood of a scalar model, by the trapezoidal rule on one grid
+    of 1,201 points."""
     g = np.linspace(-9.0, 9.0, 1201)
     Q, R = (
         np.broadcast_to(at(g[:, None], 0)[..., 0, 0], g.shape) for at in (model.Q_at, model.R_at)
@@ -328,11 +335,17 @@ def test_the_bound_at_the_truth_takes_the_noise_of_the_true_states():
 
 def test_what_takes_fixed_noise_refuses_before_any_work(tmp_path):
     for label in ("ieks", "lm_ieks", "ipe_fixed_point", "ipe_newton"):
-        fixed = f"trackers.{label}: takes noise that does not depend on the states; in rover it does; leave it out"
+        fixed = (
+            f"trackers.{label}: takes noise that does not depend on the states; in rover it does;"
+            " leave it out"
+        )
         with pytest.raises(ib.UserError, match=fixed):
             ib.run(StateScenario(ROVER), {label: TRACKERS[label]}, 1, output=tmp_path / "out")
     for label in ("ukf_rts", "ipls"):
-        mean = f"trackers.{label}: takes in readings by their mean, which in formulas no state changes; choose boot"
+        mean = (
+            f"trackers.{label}: takes in readings by their mean, which in formulas no state"
+            " changes; choose boot"
+        )
         with pytest.raises(ib.UserError, match=mean):
             ib.estimate(VOLATILITY, np.zeros((15, 1)), {label: TRACKERS[label]})
     assert not (tmp_path / "out").exists()
@@ -411,7 +424,8 @@ TURNING = Formulas(
     "label", ["ekf", "iplf", "ukf_rts", "ieks", "ipls", "lm_ieks", "ipe_newton", "bootstrap"]
 )
 def test_a_heading_that_is_kept_within_half_a_turn_is_tracked_as_one_that_is_not(label):
-    """Only the branch differs, of the heading's true path, its transition and what the compass shows."""
+    """Only the branch differs, of the heading's true path, its transition and what the compass
+    shows."""
     wrapped = replace(
         TURNING,
         next={**TURNING.next, "a": "mod(a + 0.7 + pi, 2*pi) - pi + w"},

@@ -1,4 +1,5 @@
-"""Estimates of whole paths: Levenberg-Marquardt smoothers, eq. (11), and the fit of a path, against dense solutions."""
+"""Estimates of whole paths: Levenberg-Marquardt smoothers, eq. (11), and the fit of a path, against
+dense solutions."""
 
 from __future__ import annotations
 
@@ -36,7 +37,8 @@ LINEAR = ConstantVelocity(count=12, spread=2.0)
 
 
 def unknowns(model, start, x):
-    """Start and process noises of paths (K, n) in their own deviations, for a diagonal prior and square gains."""
+    """Start and process noises of paths (K, n) in their own deviations, for a diagonal prior and
+    square gains."""
     before = np.vstack([start, x[:-1]])
     noise = [
         np.linalg.solve(model.gain(k), x[k] - model.transition(before[k], k))
@@ -48,7 +50,8 @@ def unknowns(model, start, x):
 
 
 def run(model, u):
-    """All states (K + 1, n) of unknowns u, and whitened readings (K,) of a model that is read once an epoch."""
+    """All states (K + 1, n) of unknowns u, and whitened readings (K,) of a model that is read once
+    an epoch."""
     x = [model.prior.mean + np.sqrt(np.diag(model.prior.covariance)) * u[: model.n]]
     for k, w in enumerate(u[model.n :].reshape(model.epochs, -1)):
         x.append(model.transition(x[-1], k) + model.gain(k) @ w)
@@ -112,7 +115,8 @@ def bearings(scale):
 
 
 def test_a_damped_step_is_the_same_in_any_unit_of_the_states():
-    """Damping is in variances of the states: with that of one unit the step depends on the units."""
+    """Damping is in variances of the states: with that of one unit the step depends on the
+    units."""
     sizes = np.array([1e-3, 50.0])
 
     class Scaled(Pendulum):
@@ -143,7 +147,8 @@ def test_a_damped_step_is_the_same_in_any_unit_of_the_states():
 
 
 def test_levenberg_and_marquardt_begin_at_the_better_of_two_filters():
-    """No step raises the cost, so that the path after one of them costs no more than that of either smoother."""
+    """No step raises the cost, so that the path after one of them costs no more than that of either
+    smoother."""
     model = Growth(count=15)
     z = model.draw(0, 40).z
     found = LevenbergMarquardtSmoother(iterations=1, starts=0).track(model, z)
@@ -156,7 +161,8 @@ def test_levenberg_and_marquardt_begin_at_the_better_of_two_filters():
 
 
 def test_further_starts_are_draws_of_the_prior_with_half_its_deviations():
-    """Readings without a say leave the start where it was drawn; one as good as that start moves it half way."""
+    """Readings without a say leave the start where it was drawn; one as good as that start moves it
+    half way."""
     spread = 2.0
     for deviation, size in ((1e6, spread), (spread / 2, spread / 2)):
         model = ConstantVelocity(count=1, step=1e-9, spread=spread, deviation=deviation)
@@ -275,7 +281,8 @@ def test_eq_11_of_a_path_says_so_where_it_does_not_converge():
 
 @pytest.mark.oracle("library: SciPy's chi2", "p of the cost of a path", 1e-9)
 def test_the_fit_of_a_linear_path_is_that_of_the_innovations():
-    """The cost of the smoothed path of a linear model is the sum of the filter's NIS: chi-square."""
+    """The cost of the smoothed path of a linear model is the sum of the filter's NIS:
+    chi-square."""
     block = PathBlock.draw(StateScenario(LINEAR), 0, 400)
     trackers = ekf(), Smoother(ekf()), IteratedSmoother(ekf(), iterations=1)
     filtered, smooth, path = (block.estimate(tracker)[1]["fit_p"] for tracker in trackers)
@@ -293,7 +300,8 @@ def test_the_fit_of_a_linear_path_is_that_of_the_innovations():
 
 @pytest.mark.parametrize("rule", [Taylor(), Cubature()], ids=["tangents", "points"])
 def test_a_path_that_has_arrived_waits_for_the_others(rule):
-    """An iterated smoother with a tolerance leaves a trial at the same bits alone and beside slower ones."""
+    """An iterated smoother with a tolerance leaves a trial at the same bits alone and beside slower
+    ones."""
     tracker = IteratedSmoother(rule=rule, iterations=20, tolerance=0.05)
     model = bearings(10.0)
     z = model.draw(0, 6).z

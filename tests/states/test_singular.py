@@ -35,7 +35,8 @@ from ipe_bench.trials.paths import StateScenario
 
 @dataclass(frozen=True)
 class Linear(StateModel):
-    """x[k] = F x[k-1] + G w, z = H x + v, of numbers that are exact in binary; the prior is G0 G0'."""
+    """x[k] = F x[k-1] + G w, z = H x + v, of numbers that are exact in binary; the prior is G0
+    G0'."""
 
     F: tuple = ((1.0, 1.0), (0.0, 1.0))
     G0: tuple = ((1.0, 0.0), (0.0, 1.0))
@@ -81,15 +82,20 @@ CASES = {
     "process noise of rank 1": Linear(G=((0.0,), (0.25,))),
     "a state that is forgotten": Linear(F=((0.0, 1.0), (0.0, 1.0)), G=((0.0,), (0.25,))),
     "states that become one": Linear(F=((1.0, 1.0), (1.0, 1.0)), G=NONE, V=((4.0,),)),
-    "readings of what is known": Linear(F=((1.0, 0.0), (0.0, 1.0)), G0=((0.0, 0.0), (0.0, 1.0)), G=NONE),
-    "the same reading twice": Linear(G0=NONE, H=((1.0, 0.0),) * 2, V=((1.0, 0.5), (0.5, 1.0)), G=((1.0,), (1.0,))),
+    "readings of what is known": Linear(F=((1.0, 0.0), (0.0, 1.0)), G0=((0.0, 0.0), (0.0, 1.0)),
+                                        G=NONE),
+    "the same reading twice": Linear(G0=NONE, H=((1.0, 0.0),) * 2, V=((1.0, 0.5), (0.5, 1.0)),
+                                     G=((1.0,), (1.0,))),
     "nearly exact readings": Linear(G0=((2.0, 0.0), (0.0, 0.0)), V=((2.0**-30,),)),
     "a vague and a known state": Linear(G0=((2.0**12, 0.0), (0.0, 0.0)), G=((0.0,), (0.25,))),
-    "no first transition": Linear(G0=((1.0, 0.0), (2.0, 0.0)), G=((0.0,), (0.25,)), moved_first=False),
-    "constants, read before any transition": Linear(F=((1.0, 0.0), (0.0, 1.0)), G=NONE, moved_first=False),
+    "no first transition": Linear(G0=((1.0, 0.0), (2.0, 0.0)), G=((0.0,), (0.25,)),
+                                  moved_first=False),
+    "constants, read before any transition": Linear(F=((1.0, 0.0), (0.0, 1.0)), G=NONE,
+                                                    moved_first=False),
     "three states of rank 1": Linear(
         F=((1.0, 0.5, 0.25), (0.0, 1.0, 0.5), (0.0, 0.0, 1.0)),
-        G0=((1.0,), (0.5,), (0.25,)), G=((0.0,), (0.0,), (0.5,)), H=((1.0, 0.0, 0.0),), mean=(0.0, 1.0, 2.0),
+        G0=((1.0,), (0.5,), (0.25,)), G=((0.0,), (0.0,), (0.5,)), H=((1.0, 0.0, 0.0),),
+        mean=(0.0, 1.0, 2.0),
     ),
 }  # fmt: skip
 FILTERS = {
@@ -108,8 +114,8 @@ SMOOTHERS = {name: Smoother(tracker) for name, tracker in FILTERS.items()} | {
 
 
 def exact(model, z):
-    """Means (K, n) and covariances (K, n, n) of the states given all readings, and given those up to each epoch, in
-    fractions: conditional expectations of one joint normal distribution."""
+    """Means (K, n) and covariances (K, n, n) of the states given all readings, and given those up
+    to each epoch, in fractions: conditional expectations of one joint normal distribution."""
 
     def rational(a):
         return np.vectorize(Fraction)(np.array(a, dtype=float))

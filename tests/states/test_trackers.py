@@ -1,4 +1,5 @@
-"""Filters and smoothers of states that move: published figures, filterpy, dense solvers and closed forms."""
+"""Filters and smoothers of states that move: published figures, filterpy, dense solvers and closed
+forms."""
 
 from __future__ import annotations
 
@@ -49,8 +50,8 @@ BOOK = {
     "GHKF": (GaussHermite(5), 1, 0.0998062421916222, 0.03710181978632009),
     "IPLF": (GaussHermite(3), 10, 0.14055766458714145, 0.034733224044175594),
 }
-"""RMSE of the angle over 500 epochs, filter and smoother, as stored in the notebooks of the book (see the NOTICE.md of
-the data)."""
+"""RMSE of the angle over 500 epochs, filter and smoother, as stored in the notebooks of the book
+(see the NOTICE.md of the data)."""
 NEAR = Pendulum(count=60, start=(1.0, 0.0), spread=0.1)
 
 
@@ -112,8 +113,8 @@ def _moved(model):
 
 
 def dense(model, z):
-    """Means (K, n) and covariances (K, n, n) of a linear model's states given all readings, by one dense solve over the
-    start and the disturbances."""
+    """Means (K, n) and covariances (K, n, n) of a linear model's states given all readings, by one
+    dense solve over the start and the disturbances."""
     n, q, K = model.n, model.gain(0).shape[1], model.epochs
     prior = np.zeros((n + q * K, n + q * K))
     prior[:n, :n], prior[n:, n:] = model.prior.covariance, np.eye(q * K)
@@ -187,7 +188,8 @@ def test_the_damped_gauss_newton_smoother_finds_the_path_of_a_dense_solver():
     "closed form: mean slope of a sine over a normal law", "slopes of ghkf and ukf at 2 rad", 1e-9
 )
 def test_an_unscented_slope_has_the_wrong_sign_where_the_prior_spans_the_sine():
-    """exp(-P / 2) is .14 for a deviation of 2 rad; two points at the root of 3 deviations have sin(a) / a, -.09."""
+    """exp(-P / 2) is .14 for a deviation of 2 rad; two points at the root of 3 deviations have
+    sin(a) / a, -.09."""
     m, P = np.zeros((1, 2)), np.diag([4.0, 1.0])[None]
     slopes = [
         rule.linearise(lambda x: np.sin(x[..., :1]), m, P).A[0, 0, 0]
@@ -224,7 +226,8 @@ def test_missing_readings_are_as_if_they_had_never_been_taken(rule):
 )
 @pytest.mark.parametrize("m", [0.0, 1.0, 3.0, -3.1])
 def test_points_of_an_angle_lie_about_that_of_their_centre(rule, m):
-    """Two points .6 of half a turn to either side: next to each other they would be .8 of half a turn apart."""
+    """Two points .6 of half a turn to either side: next to each other they would be .8 of half a
+    turn apart."""
 
     def wrapped(x):
         return (x + np.pi) % (2 * np.pi) - np.pi
@@ -237,7 +240,8 @@ def test_points_of_an_angle_lie_about_that_of_their_centre(rule, m):
 
 
 def test_bearings_come_round():
-    """A turn whose track crosses the negative x axis: without wrapping the filters lose it at once."""
+    """A turn whose track crosses the negative x axis: without wrapping the filters lose it at
+    once."""
     model = CoordinatedTurn(count=60)
     paths = model.draw(0, 40)
     angle = np.arctan2(paths.x[..., 2], paths.x[..., 0])
@@ -252,7 +256,8 @@ def test_bearings_come_round():
 
 @dataclass(frozen=True)
 class Scalar(StateModel):
-    """A scalar state that forgets, with some readings missing: linear, so that the Kalman filter is exact."""
+    """A scalar state that forgets, with some readings missing: linear, so that the Kalman filter is
+    exact."""
 
     moved_first: bool = True
 
@@ -363,7 +368,8 @@ def test_unscented_points_have_unit_covariance_or_a_kappa_that_is_refused():
 
 
 def test_an_iterated_update_is_the_most_probable_state_after_a_reading():
-    """Of one prediction and one reading: the minimum of both misfits (Bell and Cathey 1993), by SciPy."""
+    """Of one prediction and one reading: the minimum of both misfits (Bell and Cathey 1993), by
+    SciPy."""
     model = Pendulum(count=1, start=(1.2, 0.0), spread=0.5, variance=1e-3)
     z = np.array([[[0.6]], [[0.85]], [[0.99]]])
     tracks = Filter(Taylor(), 60).track(model, z)
@@ -426,7 +432,8 @@ def test_a_grid_refuses_what_it_cannot_be_exact_for():
 
 
 def test_a_grid_is_refused_where_no_number_of_points_would_do():
-    # Asked for by the moves of a coarse grid, the points of the finer one took all memory there was.
+    # Asked for by the moves of a coarse grid, the points of the finer one took all memory there
+    # was.
     of_pole = Formulas(
         next={"x": "1/x + w"},
         readings={"z": "x"},
@@ -477,7 +484,8 @@ def test_the_bounds_of_a_linear_model_are_its_covariances():
     "model", [Pendulum(count=12), Growth(count=12)], ids=lambda model: model.name
 )
 def test_the_posterior_bound_is_the_inverse_of_the_information_of_whole_paths(model):
-    """The second derivatives of the log density, one matrix for all epochs up to each, by differences of slopes."""
+    """The second derivatives of the log density, one matrix for all epochs up to each, by
+    differences of slopes."""
     paths, n = model.draw(0, 40), model.n
     filtered, smoothed = posterior_bounds(model, paths)
     path = np.concatenate([paths.start[:, None], paths.x], axis=1)

@@ -1,4 +1,5 @@
-"""State models on trial: what is stored, pooled and shown of tracks, against direct computation and closed forms."""
+"""State models on trial: what is stored, pooled and shown of tracks, against direct computation and
+closed forms."""
 
 from __future__ import annotations
 
@@ -247,7 +248,8 @@ def test_blocks_and_further_trials_change_no_trial(tmp_path):
 
 @dataclass(frozen=True)
 class Brittle(Tracker):
-    """The Kalman filter, which raises where a reading is large and is lost where one is very negative."""
+    """The Kalman filter, which raises where a reading is large and is lost where one is very
+    negative."""
 
     def track(self, model, z):
         if (z > 1e5).any():
@@ -280,7 +282,8 @@ def test_a_tracker_that_fails_in_one_trial_fails_in_that_alone():
 
 @dataclass(frozen=True)
 class Astray(Tracker):
-    """The states themselves, but for the epochs `where`, at which the position is `by` deviations of the bound off."""
+    """The states themselves, but for the epochs `where`, at which the position is `by` deviations
+    of the bound off."""
 
     block: PathBlock
     where: slice
@@ -303,13 +306,15 @@ class Astray(Tracker):
     ],
 )
 def test_a_path_succeeds_if_its_mean_square_error_is_within_the_gate(where, by, success):
-    """The gate of two states is at 27.6: 25^2 / 30 and 5^2 are inside, 30^2 / 30 and 5.5^2 are not."""
+    """The gate of two states is at 27.6: 25^2 / 30 and 5^2 are inside, 30^2 / 30 and 5.5^2 are
+    not."""
     block = PathBlock.draw(StateScenario(LINEAR), 0, 3)
     assert (block.estimate(Astray(block, where, by))[1]["path_success"] == success).all()
 
 
 def test_the_posterior_bound_tells_its_own_error():
-    """The scatter of the bound over 40 seeds, each with paths of its own, is known to 1 / sqrt(80), 11 %."""
+    """The scatter of the bound over 40 seeds, each with paths of its own, is known to 1 / sqrt(80),
+    11 %."""
     found = []
     for seed in range(40):
         columns = PathBlock.draw(
@@ -375,7 +380,8 @@ def test_a_model_whose_parts_do_not_suit_one_another_is_refused(part, complaint)
 
 @pytest.mark.slow
 def test_nees_of_the_kalman_filter_lies_within_its_limits_as_often_as_is_said():
-    """1,000 studies of 40 trials: the mean NEES at the last epoch, and the verdict on the whole path."""
+    """1,000 studies of 40 trials: the mean NEES at the last epoch, and the verdict on the whole
+    path."""
     table = ib.run([StateScenario(LINEAR, seed=s) for s in range(2)], {"kf": ekf()}, 20)
     low, high = row(table, "kf")["nees_low_if_honest"], row(table, "kf")["nees_high_if_honest"]
     paths = LINEAR.draw(0, 40_000)
@@ -517,7 +523,8 @@ def test_the_root_of_a_covariance_has_as_many_columns_as_that_has_rank(size):
 
 
 def test_states_of_other_units_keep_their_deviations_in_what_is_drawn():
-    """A bias of mm beside a position of 1000 km: variances of 1e-6 and 1e12, and one that is known."""
+    """A bias of mm beside a position of 1000 km: variances of 1e-6 and 1e12, and one that is
+    known."""
     P = np.diag([1e12, 0.0, 1e-6, 1e-6])
     P[2, 3] = P[3, 2] = 5e-7
     G = root(P)

@@ -1,4 +1,5 @@
-"""The inertial system whose drifts walk: against GINS where they stand still, and by how far they walk."""
+"""The inertial system whose drifts walk: against GINS where they stand still, and by how far they
+walk."""
 
 from dataclasses import replace
 
@@ -47,7 +48,8 @@ TRACKERS = {
 
 @pytest.mark.slow
 def test_trackers_of_singular_covariances_are_calibrated():
-    """The motion follows from the parameters after each first reading of a run: ranks of 11 to 22 of 22."""
+    """The motion follows from the parameters after each first reading of a run: ranks of 11 to 22
+    of 22."""
     table = ib.run(
         StateScenario(WalkingGins(gins=Gins(readings_per_case=4)), error_scale=10.0), TRACKERS, 12
     )
@@ -58,7 +60,7 @@ def test_trackers_of_singular_covariances_are_calibrated():
     assert len(table) == len(TRACKERS) * (len(Gins().parameters) + 1)  # the motion is not scored
 
 
-def test_a_smoothed_covariance_stays_definite_where_readings_leave_hardly_anything_of_a_wide_prior():
+def test_a_smoothed_covariance_stays_definite_where_readings_leave_little_of_a_wide_prior():
     """It was indefinite by round-off, and posterior linearisation about it lost every trial."""
     model = StateScenario(WalkingGins(), error_scale=100.0).assumed
     z = model.draw(0, 1).z

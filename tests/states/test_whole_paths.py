@@ -1,4 +1,5 @@
-"""Steps of whole paths: against filters and smoothers of the same affine model, where covariances are singular."""
+"""Steps of whole paths: against filters and smoothers of the same affine model, where covariances
+are singular."""
 
 from __future__ import annotations
 
@@ -26,7 +27,8 @@ from ipe_bench.states.whole_paths import PathDensity
 
 @dataclass(frozen=True)
 class Drawn(StateModel):
-    """A linear model of numbers that are drawn, from epoch to epoch, its prior and its noise of any rank."""
+    """A linear model of numbers that are drawn, from epoch to epoch, its prior and its noise of any
+    rank."""
 
     number: int
     moved_first: bool = True
@@ -91,7 +93,8 @@ def test_a_step_from_anywhere_ends_at_the_smoothed_path_of_a_linear_model(number
 
 @pytest.mark.parametrize(("spread", "deviation"), [(1e3, 1e-3), (1e6, 1e-2), (1e7, 1.0)])
 def test_a_wide_prior_costs_a_path_no_digits_of_its_covariance(spread, deviation):
-    """A line through ten readings, of which the prior says nothing: (X' X)^-1 deviation^2 at its start."""
+    """A line through ten readings, of which the prior says nothing: (X' X)^-1 deviation^2 at its
+    start."""
     model = Formulas(
         next={"p": "p + v", "v": "v"},
         readings={"z": "p"},
@@ -113,7 +116,8 @@ def test_a_wide_prior_costs_a_path_no_digits_of_its_covariance(spread, deviation
 
 @pytest.mark.parametrize("number", [0, 2, 3, 4])
 def test_covariances_with_the_last_states_keep_their_digits_beside_a_wide_prior(number):
-    """Against x = T u, u ~ N(0, I), by orthogonal rows: cov(x | readings) = T (I + T' B' B T)^-1 T'."""
+    """Against x = T u, u ~ N(0, I), by orthogonal rows: cov(x | readings) = T (I + T' B' B T)^-1
+    T'."""
     model = widened(Drawn(number, moved_first=number % 2 == 0), 1e5)
     z = model.draw(0, 1).z
     density = PathDensity.of(model, z)
@@ -164,7 +168,8 @@ def test_readings_beyond_numbers_lose_their_own_trial_alone():
 
 
 def test_a_covariance_holds_where_the_valley_of_the_cost_bends():
-    """Against quadrature: y = -x^2/16 along the valley, where tangents see a variance of y that is half the exact."""
+    """Against quadrature: y = -x^2/16 along the valley, where tangents see a variance of y that is
+    half the exact."""
     model = Formulas(
         next={"x": "x", "y": "y"},
         spread={"x": 1.0, "y": 1.0},
@@ -184,7 +189,8 @@ def test_a_covariance_holds_where_the_valley_of_the_cost_bends():
 
 
 def test_a_covariance_holds_on_the_side_where_the_cost_rises_slowly():
-    """Against quadrature: 2/(2 + x) tells little of large x, and tangents at the path see half of the variance."""
+    """Against quadrature: 2/(2 + x) tells little of large x, and tangents at the path see half of
+    the variance."""
     model = Formulas(
         next={"x": "x"},
         spread={"x": 4.0},

@@ -1,4 +1,5 @@
-"""Calibration: exact bands against simulation and closed forms, false alarms at their level, faults found and named."""
+"""Calibration: exact bands against simulation and closed forms, false alarms at their level, faults
+found and named."""
 
 import re
 
@@ -27,7 +28,8 @@ from ipe_bench.statistics.calibration import (
 
 
 def claims(trials: int, ratio: float = 1.0, shift: float = 0.0, n: int = 1, seed: int = 0):
-    """Calibrations of n independent errors that are `ratio` times what is reported, shifted by `shift`."""
+    """Calibrations of n independent errors that are `ratio` times what is reported, shifted by
+    `shift`."""
     rng = np.random.default_rng(seed)
     error = ratio * rng.standard_normal((trials, n)) + shift
     every = np.ones(trials, dtype=bool)
@@ -41,13 +43,13 @@ def curves_of(u: np.ndarray):
     )
 
 
-# The bands -----------------------------------------------------------------------------------------------------------
+# The bands ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.oracle("closed form: one uniform draw", "coverage of the band of calibration", 1e-12)
 def test_one_trial_in_closed_form():
-    """One draw u leaves 'tails above t' where a point p <= 1/2 has u < p <= t, or symmetrically: 2 floor(100 t) / 100
-    of the unit interval, for a tail that is no multiple of 0.01."""
+    """One draw u leaves 'tails above t' where a point p <= 1/2 has u < p <= t, or symmetrically: 2
+    floor(100 t) / 100 of the unit interval, for a tail that is no multiple of 0.01."""
     tails = np.array([0.005, 0.015, 0.034, 0.105])
     assert_agrees(covered(1, tails), 1 - 2 * np.floor(100 * tails) / 100, atol=1e-12)
 
@@ -81,7 +83,8 @@ def test_a_band_has_its_level_and_a_curve_its_p(trials):
     assert 0 < curve.p <= 1
     assert abs(edge).max() < 1.0
     if trials == 100_000:
-        # Kolmogorov's bands (1933) are 1.358 / sqrt(trials) wide everywhere; these are wider in the middle only.
+        # Kolmogorov's bands (1933) are 1.358 / sqrt(trials) wide everywhere; these are wider in the
+        # middle only.
         assert 1.358 < high[49] * np.sqrt(trials) < 1.7
         assert high[4] * np.sqrt(trials) < 1.0
 
@@ -95,13 +98,13 @@ def test_p_values_are_uniform():
         assert abs((p <= level).mean() - level) < 4 * np.sqrt(level / 3000)
 
 
-# Verdicts ------------------------------------------------------------------------------------------------------------
+# Verdicts -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
 def test_false_alarms_keep_to_their_level():
-    """Of 400 honest estimators of five parameters at most 5 % are called anything, up to 3 deviations; NEES alone
-    exactly 5 %."""
+    """Of 400 honest estimators of five parameters at most 5 % are called anything, up to 3
+    deviations; NEES alone exactly 5 %."""
     verdicts = [claims(200, n=5, seed=s) for s in range(400)]
     alarms = np.mean([overall_words(parts, list("abcde")) != INSIDE for parts in verdicts])
     assert alarms < 0.05 + 3 * np.sqrt(0.05 * 0.95 / 400)
@@ -147,7 +150,8 @@ def test_faults_are_named(ratio, shift, words):
     "library: SciPy's t", "share of 20,000 errors of Student's law far outside", 0.3
 )
 def test_heavy_tails_of_the_stated_variance_are_no_variance_that_is_too_large():
-    """Student's law with 5 degrees has a median of squares 1.45 times smaller than the normal one of its variance."""
+    """Student's law with 5 degrees has a median of squares 1.45 times smaller than the normal one
+    of its variance."""
     rng = np.random.default_rng(0)
     error = rng.standard_t(5, (20_000, 1)) * np.sqrt(3 / 5)
     parts = calibrations(error, np.ones_like(error), error[:, 0] ** 2, np.ones(20_000, dtype=bool))
@@ -166,8 +170,9 @@ def test_few_far_outside_an_honest_bulk_are_named_as_such():
 
 
 def test_the_interval_of_a_median_is_between_the_order_statistics_of_the_binomial():
-    """Of 24 numbers those in places 7 and 18: a fair coin falls on one side 6 times or fewer in .011 of cases, 7 or
-    fewer in .032 > .025. Places 8 and 17, at .05 in one tail, hold the median in .936 only."""
+    """Of 24 numbers those in places 7 and 18: a fair coin falls on one side 6 times or fewer in
+    .011 of cases, 7 or fewer in .032 > .025. Places 8 and 17, at .05 in one tail, hold the median
+    in .936 only."""
     values = np.random.default_rng(0).permutation(np.arange(1.0, 25.0))
     assert median_limits(values) == (7.0, 18.0)
     assert 1 - 2 * binom.cdf(6, 24, 0.5) >= 0.95 > 1 - 2 * binom.cdf(7, 24, 0.5)
@@ -223,7 +228,7 @@ def test_the_parameter_that_is_off_is_named_among_honest_ones():
     assert [part.words for part in (parts[0], parts[2])] == [INSIDE] * 2
 
 
-# In the report -------------------------------------------------------------------------------------------------------
+# In the report ------------------------------------------------------------------------------------
 
 
 def test_summary_table_and_figures_say_so(synthetic):

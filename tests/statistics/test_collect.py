@@ -87,7 +87,8 @@ def test_a_file_with_fewer_rows_than_its_name_says_is_damaged(filled):
 
 @pytest.mark.parametrize("file", ["kinds", "base"])
 def test_stale_results_are_named_and_never_mixed_in(filled, file):
-    # The same identity under the key of another source, as older code would have stored it, with noise in this file.
+    # The same identity under the key of another source, as older code would have stored it, with
+    # noise in this file.
     for path in pieces(filled):
         footer, table = parts.StoredPart.parse(path).read()
         identity = json.loads(

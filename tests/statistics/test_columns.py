@@ -1,4 +1,5 @@
-"""Every column of the summary is the statistic that its name says: recomputed in plain NumPy from random trials."""
+"""Every column of the summary is the statistic that its name says: recomputed in plain NumPy from
+random trials."""
 
 from __future__ import annotations
 
@@ -87,7 +88,8 @@ class Trials:
         return np.sqrt(((self.error / self.linear) ** 2).mean(axis=1))
 
     def units(self, values: np.ndarray, linear: np.ndarray | None = None) -> np.ndarray:
-        """Returns values in the parameters' units, and over all the root mean square of their ratio to the bound."""
+        """Returns values in the parameters' units, and over all the root mean square of their ratio
+        to the bound."""
         ratios = values / (self.linear if linear is None else linear)
         return np.append(values * self.sizes, np.sqrt(np.mean(ratios**2)))
 
@@ -97,7 +99,8 @@ class Trials:
 
 
 def middle(values: np.ndarray, q: float = 0.5) -> float:
-    """Returns the quantile, linear between order statistics, where a value that is not finite counts as infinite."""
+    """Returns the quantile, linear between order statistics, where a value that is not finite
+    counts as infinite."""
     if not len(values):
         return np.nan
     ordered = np.sort(np.where(np.isfinite(values), values, np.inf))
@@ -313,7 +316,8 @@ DEFINITIONS: dict[str, Callable[[Trials], Any]] = {
 
 
 def drawn(folder, seed: int) -> Trials:
-    """Stores random trials of two estimators in blocks, two without readings and some lost, and reads their summary."""
+    """Stores random trials of two estimators in blocks, two without readings and some lost, and
+    reads their summary."""
     rng = np.random.default_rng(seed)
     n, N = int(rng.integers(1, 5)), int(rng.integers(40, 90))
     names, store = [f"p{i}" for i in range(n)], Synthetic(folder)

@@ -1,4 +1,5 @@
-"""Tests between estimators give the values of their textbooks, and no difference where there is none."""
+"""Tests between estimators give the values of their textbooks, and no difference where there is
+none."""
 
 import itertools
 
@@ -89,7 +90,8 @@ def test_equal_estimators_are_told_apart_in_at_most_one_of_twenty_repeats():
 
 
 def test_the_best_are_left_out_no_oftener_than_stated():
-    """600 boards of six estimators, of which two are truly best: how often a given one of them is left out."""
+    """600 boards of six estimators, of which two are truly best: how often a given one of them is
+    left out."""
     rng, left_out = np.random.default_rng(5), 0
     share = np.array([0.9, 0.9, 0.88, 0.85, 0.7, 0.2])
     for _ in range(600):
@@ -129,7 +131,8 @@ def test_who_may_be_the_best_is_mcnemar_s_exact_test_against_every_rival():
 
 
 def test_many_small_losses_do_not_outweigh_in_number_what_they_lose_in_rank():
-    """A wins 60 of 100 trials by little and loses 40 by much: by ranks B is closer, whoever wins more often."""
+    """A wins 60 of 100 trials by little and loses 40 by much: by ranks B is closer, whoever wins
+    more often."""
     d = np.concatenate([np.full(60, -0.01), np.full(40, 1.0)]) * (1 + np.arange(100) / 1e4)
     pair = compare_pairs({"A": outcomes(5 + d), "B": outcomes(np.full(100, 5.0))})[0]
     assert pair["wins"] > pair["losses"]
@@ -174,7 +177,8 @@ def test_known_differences_are_found_in_a_store(synthetic):
 
 
 def test_the_error_that_is_compared_is_a_distance_and_not_its_square(synthetic):
-    """Every error 3 bounds in each of 3 parameters: the distance is 3 sqrt(3), which the gate does not cap."""
+    """Every error 3 bounds in each of 3 parameters: the distance is 3 sqrt(3), which the gate does
+    not cap."""
     synthetic.add(synthetic.scenario(), "one", np.full((30, 3), 0.3))
     synthetic.add(synthetic.scenario(), "two", np.full((30, 3), 0.1), start=10)
     analysis = analyse([synthetic.directory])
@@ -215,7 +219,8 @@ def test_success_of_all_estimators_is_by_the_same_gate(synthetic):
 
 
 def test_p_in_a_report_is_corrected_over_the_whole_sweep(synthetic):
-    """Ten scenarios of two equal estimators, one with a difference that is significant by itself and not among ten."""
+    """Ten scenarios of two equal estimators, one with a difference that is significant by itself
+    and not among ten."""
     rng = np.random.default_rng(11)
     raw = []
     for i in range(10):

@@ -23,7 +23,8 @@ def draw(trials: int, claimed: float = 1.0, seed: int = 0):
     5e-4,
 )
 def test_limits_are_those_of_the_textbook():
-    """Bar-Shalom, Li, Kirubarajan, example 5.4.2: 50 runs of 2 degrees, [74.2, 129.6] / 50 for the sum over runs."""
+    """Bar-Shalom, Li, Kirubarajan, example 5.4.2: 50 runs of 2 degrees, [74.2, 129.6] / 50 for the
+    sum over runs."""
     low, high = mean_limits(2, 50)
     assert_agrees(2 * low, 74.22 / 50, atol=5e-4)
     assert_agrees(2 * high, 129.56 / 50, atol=5e-4)
@@ -67,7 +68,7 @@ def test_nothing_claimed_nothing_judged():
     assert verdict(np.full(5, np.nan), 3) == "-"
 
 
-# Errors of other laws ------------------------------------------------------------------------------------------------
+# Errors of other laws -----------------------------------------------------------------------------
 
 
 def normal(rng, shape):
@@ -91,8 +92,8 @@ def contaminated(rng, shape):
 def verdicts(
     noise, n: int, m: int, trials: int, studies: int, claimed: float = 1.0
 ) -> dict[str, float]:
-    """How often each verdict is given on n parameters estimated from m readings with errors of that law, when the
-    reported standard deviations are `claimed` times the true ones."""
+    """How often each verdict is given on n parameters estimated from m readings with errors of that
+    law, when the reported standard deviations are `claimed` times the true ones."""
     rng = np.random.default_rng([n, m, trials])
     found = []
     for _ in range(studies):
@@ -108,7 +109,8 @@ def false_alarms(found: dict[str, float]) -> float:
 
 @pytest.mark.parametrize("noise", [normal, student, contaminated])
 def test_an_honest_covariance_is_seldom_called_otherwise_whatever_the_law_of_the_noise(noise):
-    """Chi-square limits, which are of normal errors, alarm in .40 of these where the noise has outliers."""
+    """Chi-square limits, which are of normal errors, alarm in .40 of these where the noise has
+    outliers."""
     found = verdicts(noise, 1, 6, 100, 150)
     assert false_alarms(found) <= 0.07 + 2 * np.sqrt(0.07 * 0.93 / 150)
 
@@ -132,8 +134,9 @@ def test_a_covariance_that_is_right_on_average_is_not_called_overconfident():
 
 @pytest.mark.parametrize(("trials", "word"), [(145, "undecided"), (146, "too cautious")])
 def test_small_errors_of_few_trials_are_no_sure_sign_of_caution(trials, word):
-    """In 145 trials, with a probability of .05, none is seen of a share 1 - .05^(1/145) = .02045; a NEES of 50 n there,
-    49 n more than efficient errors have, makes up a mean of 1.002 n, and of 146 trials one of .995 n."""
+    """In 145 trials, with a probability of .05, none is seen of a share 1 - .05^(1/145) = .02045; a
+    NEES of 50 n there, 49 n more than efficient errors have, makes up a mean of 1.002 n, and of 146
+    trials one of .995 n."""
     assert verdict(np.full(trials, 1e-9), 1) == word
 
 
@@ -142,7 +145,8 @@ def test_small_errors_of_few_trials_are_no_sure_sign_of_caution(trials, word):
 def test_a_right_covariance_is_seldom_called_too_cautious_by_trials_without_their_outliers(
     n, share, times
 ):
-    """Of 60 trials .55 show none of the errors that one in a hundred has, and their mean NEES is half of n."""
+    """Of 60 trials .55 show none of the errors that one in a hundred has, and their mean NEES is
+    half of n."""
     rng = np.random.default_rng(n)
     for trials in (60, 200):
         squares = rng.chisquare(n, (100, trials)) * np.where(
@@ -158,8 +162,8 @@ def test_a_right_covariance_is_seldom_called_too_cautious_by_trials_without_thei
 def test_a_mean_above_1_that_few_trials_carry_is_sure_where_bets_on_it_win_40_times_their_stake(
     times, word
 ):
-    """Ville: they win as much in at most 1 / 40, which is the half of 5 % that one side of 1 has. 1 - 2^-k of the stake
-    .99 is kept back."""
+    """Ville: they win as much in at most 1 / 40, which is the half of 5 % that one side of 1 has. 1
+    - 2^-k of the stake .99 is kept back."""
 
     def fortune(size: float) -> float:
         x = np.append(np.full(196, 0.5), np.full(4, size))
@@ -170,7 +174,8 @@ def test_a_mean_above_1_that_few_trials_carry_is_sure_where_bets_on_it_win_40_ti
 
 
 def test_where_few_trials_carry_the_mean_only_too_large_a_mean_is_sure():
-    """Markov: numbers of mean 1 exceed 40 with a probability of at most 1 / 40, whatever else they are."""
+    """Markov: numbers of mean 1 exceed 40 with a probability of at most 1 / 40, whatever else they
+    are."""
     few = np.full(200, 0.5)
     few[0] = 200 * 1.0 - 99.5  # the mean is 1
     assert verdict(few, 1) == "undecided"

@@ -52,7 +52,8 @@ def test_clopper_pearson_is_scipys_exact_interval(seen):
     0.2,
 )
 def test_bootstrap_interval_has_the_width_of_theory():
-    # The rms of N normal errors has a relative deviation of 1 / sqrt(2 N), whichever way it is resampled.
+    # The rms of N normal errors has a relative deviation of 1 / sqrt(2 N), whichever way it is
+    # resampled.
     rng = np.random.default_rng(1)
     for trials in (1500, 40_000):
         e = rng.normal(size=(trials, 3)) * [1.0, 2.0, 3.0]
@@ -61,7 +62,8 @@ def test_bootstrap_interval_has_the_width_of_theory():
 
 
 def test_a_bootstrap_interval_is_as_wide_as_theory_says_where_no_resample_reaches():
-    """Of 2000 resamples none lies beyond one in a million; nearly normal squares have a normal law's quantile there."""
+    """Of 2000 resamples none lies beyond one in a million; nearly normal squares have a normal
+    law's quantile there."""
     x = np.random.default_rng(4).chisquare(30, (400, 1)) / 30
     low, high = rms_interval(x, level=1 - 1e-6)
     width = np.log(high[0] ** 2 / low[0] ** 2) / 2
@@ -94,7 +96,8 @@ HEAVY = {
 
 
 def coverage(law: str, trials: int, repeats: int) -> float:
-    """How often the interval holds the root mean square of such errors, a fifth of the trials being left out."""
+    """How often the interval holds the root mean square of such errors, a fifth of the trials being
+    left out."""
     (draw, mean_square), rng = LAWS[law], np.random.default_rng(trials)
     used = np.arange(trials * 5 // 4) % 5 > 0
     low, high = rms_interval(draw(rng, (len(used), repeats)) ** 2 / mean_square, used)
@@ -105,7 +108,8 @@ def coverage(law: str, trials: int, repeats: int) -> float:
     "law", [pytest.param("normal", marks=pytest.mark.slow), "Student's t, 5 degrees"]
 )
 def test_intervals_of_few_trials_hold_the_truth(law):
-    """A percentile interval of 20 trials holds it in 88 and 81 of 100; one at the level of 90 % in fewer than these."""
+    """A percentile interval of 20 trials holds it in 88 and 81 of 100; one at the level of 90 % in
+    fewer than these."""
     repeats = 2000
     floor = 0.94 - 3 * np.sqrt(0.94 * 0.06 / repeats)
     for trials in (20, 48):
@@ -128,7 +132,7 @@ def test_the_table_of_coverage():
     assert min(map(min, found.values())) >= 0.94 - 3 * np.sqrt(0.94 * 0.06 / 4000)
 
 
-# Whether few trials carry the sum ------------------------------------------------------------------------------------
+# Whether few trials carry the sum -----------------------------------------------------------------
 
 
 def carried(squares: np.ndarray, degrees: int) -> np.ndarray:
@@ -152,13 +156,15 @@ def test_no_scale_changes_what_carries_a_sum():
 
 
 def test_one_trial_has_to_make_up_a_twentieth():
-    """Of 400 trials 15 or 25 have all the errors, each as large: one makes up a fifteenth, or a twenty-fifth."""
+    """Of 400 trials 15 or 25 have all the errors, each as large: one makes up a fifteenth, or a
+    twenty-fifth."""
     squares = (np.arange(400)[:, None] < [15, 25]).astype(float)
     assert carried(squares, 1).tolist() == [True, False]
 
 
 def test_many_trials_that_are_a_little_uneven_carry_a_sum_together():
-    """Half of the errors are twice as large: of 20,000 trials none matters, though the errors are surely not normal."""
+    """Half of the errors are twice as large: of 20,000 trials none matters, though the errors are
+    surely not normal."""
     rng = np.random.default_rng(0)
     squares = (
         np.where(rng.random((20_000, 20)) < 0.5, 2.0, 1.0) * rng.normal(size=(20_000, 20))
@@ -167,8 +173,8 @@ def test_many_trials_that_are_a_little_uneven_carry_a_sum_together():
 
 
 def missed(law: str, trials: int, studies: int) -> tuple[float, float, float]:
-    """How often an interval is given that does not hold the rms, how often none is, and the median width of those given
-    over that of the exact interval of normal errors."""
+    """How often an interval is given that does not hold the rms, how often none is, and the median
+    width of those given over that of the exact interval of normal errors."""
     draw, mean_square = HEAVY[law]
     rng = np.random.default_rng(trials)
     miss, none, widths = 0, 0, []
@@ -198,12 +204,13 @@ def test_intervals_that_miss_are_not_given(law):
 @pytest.mark.campaign
 @pytest.mark.parametrize("law", HEAVY)
 def test_1000_studies_of_a_root_mean_square(law):
-    """From 200 trials on at most 7 % miss, up to 3 deviations. Of the studies of 20 trials .36, of 50 still .08 have
-    none of the errors that one trial in twenty has, and nothing in them tells."""
+    """From 200 trials on at most 7 % miss, up to 3 deviations. Of the studies of 20 trials .36, of
+    50 still .08 have none of the errors that one trial in twenty has, and nothing in them tells."""
     for trials in (20, 50, 100, 200, 1000):
         miss, none, width = missed(law, trials, 1000)
         print(
-            f"{law}, {trials} trials: missed {miss:.3f}, not given {none:.3f}, width over the exact {width:.2f}"
+            f"{law}, {trials} trials: missed {miss:.3f}, not given {none:.3f}, width over the"
+            f" exact {width:.2f}"
         )
         if trials >= 200 or law == "normal":
             assert miss <= 0.07 + 3 * np.sqrt(0.07 * 0.93 / 1000)
@@ -212,15 +219,16 @@ def test_1000_studies_of_a_root_mean_square(law):
             assert none <= 0.02
 
 
-# What no trial has shown ----------------------------------------------------------------------------------------------
+# What no trial has shown --------------------------------------------------------------------------
 
 
 @pytest.mark.oracle(
     "closed form: upper limit of a share that no trial shows", "share that may be unseen", 1e-9
 )
 def test_what_may_be_unseen_is_the_upper_limit_of_unusual_errors_less_those_seen():
-    """Of none in N, 1 - .05^(1/N); of k the share whose binomial law gives k or fewer with .05, less k / N; of ten or
-    more nothing. Unusual is 3.29 normal deviations, and the median absolute deviation is .6745 of them."""
+    """Of none in N, 1 - .05^(1/N); of k the share whose binomial law gives k or fewer with .05,
+    less k / N; of ten or more nothing. Unusual is 3.29 normal deviations, and the median absolute
+    deviation is .6745 of them."""
     squares = (np.full(200, 0.67449 * 7) * np.tile([0.5, 1.0, 1.5, 1.0], 50)) ** 2
     seen = {}
     for k in (0, 1, 9, 10):
@@ -245,7 +253,8 @@ RARELY = {
 
 
 def missed_capped(law: str, n: int, trials: int, studies: int, size: float = 1.0) -> float:
-    """How often the interval does not hold the root mean square of errors of n parameters that count 5 at most."""
+    """How often the interval does not hold the root mean square of errors of n parameters that
+    count 5 at most."""
     share, times = RARELY[law]
     rng = np.random.default_rng([n, trials])
 
@@ -265,20 +274,21 @@ def missed_capped(law: str, n: int, trials: int, studies: int, size: float = 1.0
 @pytest.mark.parametrize("law", RARELY)
 @pytest.mark.parametrize("n", [1, 11])
 def test_efficiency_has_an_interval_that_allows_for_errors_that_no_trial_shows(law, n):
-    """Of the intervals made of trials alone .57 miss if one error in a hundred is ten times larger, n is 11 and there
-    are 50 trials."""
+    """Of the intervals made of trials alone .57 miss if one error in a hundred is ten times larger,
+    n is 11 and there are 50 trials."""
     for trials in (20, 50, 200):
         assert missed_capped(law, n, trials, 200) <= 0.05 + 3 * np.sqrt(0.05 * 0.95 / 200)
 
 
 def test_an_error_is_unusual_beside_those_of_the_same_estimator():
-    """Of errors that are all twice the bound, more than ten of 100 lie far outside the law of an efficient one; .10 of
-    the intervals miss if that is taken for having seen the rare ones."""
+    """Of errors that are all twice the bound, more than ten of 100 lie far outside the law of an
+    efficient one; .10 of the intervals miss if that is taken for having seen the rare ones."""
     assert missed_capped("1 % ten times larger", 11, 100, 400, size=2.0) <= 0.05
 
 
 def test_an_error_that_the_bound_allows_is_not_unusual_however_small_the_others_are():
-    """A dozen errors of one deviation beside 188 of a hundredth: the rare ones of an efficient estimator are unseen."""
+    """A dozen errors of one deviation beside 188 of a hundredth: the rare ones of an efficient
+    estimator are unseen."""
     squares = np.where(np.arange(200) < 12, 1.0, 1e-4)[None]
     _, high = capped_interval(squares, np.array([1]), 5.0)
     _, seen = rms_interval(squares.T, np.ones(200, dtype=bool))

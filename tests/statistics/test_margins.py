@@ -1,4 +1,5 @@
-"""How much worse the second of two is, against a search over the interval, and the trials that each question is of."""
+"""How much worse the second of two is, against a search over the interval, and the trials that each
+question is of."""
 
 import numpy as np
 import pytest
@@ -14,7 +15,8 @@ BOUND = 0.1
 
 
 def farther(right, start, low, high):
-    """The least and the largest that a start can go away from what is right, over all changes in an interval."""
+    """The least and the largest that a start can go away from what is right, over all changes in an
+    interval."""
     change = np.linspace(low, high, 100_001)
     moved = np.abs(start + change - right) - np.abs(start - right)
     return pytest.approx((moved.min(), moved.max()), abs=1e-4)
@@ -59,7 +61,8 @@ def test_a_success_that_falls_and_an_error_that_grows_are_worse(sign):
 
 
 def test_bias_is_of_the_trials_in_which_both_succeed(synthetic):
-    """The first fails in 100 trials and the second in 100 others, each by an error of 10,000 deviations."""
+    """The first fails in 100 trials and the second in 100 others, each by an error of 10,000
+    deviations."""
     scenario, deviates = synthetic.scenario(), DEVIATES[:400]
     for label, lost in (("a", slice(0, 100)), ("b", slice(100, 200))):
         error = BOUND * (deviates + 0.2 * (label == "b"))

@@ -1,4 +1,5 @@
-"""Only seeds are pooled; whatever else two experiments differ in is named wherever they are shown."""
+"""Only seeds are pooled; whatever else two experiments differ in is named wherever they are
+shown."""
 
 import io
 import re

@@ -1,4 +1,5 @@
-"""What is summed up of stored trials is what pandas makes of them, however they are cut into files."""
+"""What is summed up of stored trials is what pandas makes of them, however they are cut into
+files."""
 
 import tracemalloc
 from pathlib import Path
@@ -22,8 +23,9 @@ RNG = np.random.default_rng
 
 
 def fill(folder: Path, blocks: tuple[int, int, int]) -> Synthetic:
-    """Two estimators, a filter-like one and one that seeks a root, on two seeds; every 25th trial has no finite
-    estimate, others are not solved, and the truth of some is not stored. Cut into blocks of three sizes."""
+    """Two estimators, a filter-like one and one that seeks a root, on two seeds; every 25th trial
+    has no finite estimate, others are not solved, and the truth of some is not stored. Cut into
+    blocks of three sizes."""
     synthetic = Synthetic(folder)
     for seed in (0, 4):
         scenario = synthetic.scenario(seed=seed)
@@ -131,7 +133,8 @@ def test_no_bit_depends_on_how_rows_are_cut_into_files(analysis, tmp_path):
 
 
 def test_a_truth_that_is_missing_is_not_a_number_beside_its_estimates(synthetic):
-    """Of five blocks of the truth the second and the last are lost, and one estimator has fewer trials."""
+    """Of five blocks of the truth the second and the last are lost, and one estimator has fewer
+    trials."""
     scenario, rng = synthetic.scenario(), RNG(3)
     synthetic.add(scenario, "long", 0.1 * rng.standard_normal((50, 3)), block=10)
     synthetic.add(

@@ -1,4 +1,5 @@
-"""Intervals that stay valid however often one looks: exact probabilities, simulated studies, and trials saved."""
+"""Intervals that stay valid however often one looks: exact probabilities, simulated studies, and
+trials saved."""
 
 import numpy as np
 import pytest
@@ -15,8 +16,8 @@ from ipe_bench.statistics.stopping import next_trials, precision_of
 
 
 def ever_missed(p: float, step: int, looks: int) -> float:
-    """The exact probability that any of the intervals after `step`, 2 `step`, ... trials misses p: counts are carried
-    from look to look, and those that missed are taken out."""
+    """The exact probability that any of the intervals after `step`, 2 `step`, ... trials misses p:
+    counts are carried from look to look, and those that missed are taken out."""
     alive = np.ones(1)
     steps = binom.pmf(np.arange(step + 1), step, p)
     for look in range(1, looks + 1):
@@ -55,7 +56,8 @@ def test_an_interval_of_a_share_holds_what_was_seen_and_that_of_a_fixed_number(c
     "closed form: Robbins's normal mixture", "width of the interval that holds at all times", 0.02
 )
 def test_looking_costs_half_as_much_again_at_a_thousand_trials():
-    """Robbins's normal mixture, tightest there, is 3.04 deviations wide where a fixed number has 1.96."""
+    """Robbins's normal mixture, tightest there, is 3.04 deviations wide where a fixed number has
+    1.96."""
     low, high = share_sequence(500, 1000)
     assert_agrees((high - low) / 2, 3.04 * np.sqrt(0.25 / 1000), rtol=0.02)
 
@@ -64,7 +66,8 @@ def test_looking_costs_half_as_much_again_at_a_thousand_trials():
     "closed form: the narrowest normal mixture", "width of the sequence of a root mean square", 5e-3
 )
 def test_the_sequence_of_a_mean_is_as_narrow_as_a_mixture_can_be_at_a_thousand_trials():
-    """Over all variances r of it: sqrt(2 (1000 r + 1) / (1000 r) ln(sqrt(1000 r + 1) / .05)) standard errors."""
+    """Over all variances r of it: sqrt(2 (1000 r + 1) / (1000 r) ln(sqrt(1000 r + 1) / .05))
+    standard errors."""
 
     def errors(log_r: float) -> float:
         grown = 1000 * np.exp(log_r) + 1
@@ -94,7 +97,8 @@ def test_a_root_mean_square_scales_with_its_errors_and_narrows_with_trials():
 
 @pytest.mark.parametrize(("trials", "known"), [(400, False), (20_000, True)])
 def test_the_upper_end_of_rmse_is_known_once_rare_errors_have_been_seen(synthetic, trials, known):
-    """One normal error in a thousand is beyond 3.29 deviations: ten of them are seen in 20,000 and not in 400."""
+    """One normal error in a thousand is beyond 3.29 deviations: ten of them are seen in 20,000 and
+    not in 400."""
     error = 0.1 * np.random.default_rng(1).standard_normal((trials, 1))
     synthetic.add(synthetic.scenario(names=("a",)), "one", error)
     collection = collect([synthetic.directory])
@@ -149,8 +153,8 @@ LAWS = {
 
 
 def ever_missing(law: str, studies: int) -> tuple[float, float]:
-    """The share of studies of 4000 trials with 40 looks in which an interval that is given ever misses, and that of the
-    last looks at which none is given."""
+    """The share of studies of 4000 trials with 40 looks in which an interval that is given ever
+    misses, and that of the last looks at which none is given."""
     n, draw, mean_square = LAWS[law]
     rng = np.random.default_rng(2)
     looks = np.unique(np.geomspace(20, 4000, 40).astype(int))
@@ -167,7 +171,8 @@ def ever_missing(law: str, studies: int) -> tuple[float, float]:
 @pytest.mark.campaign
 @pytest.mark.parametrize("law", LAWS)
 def test_1000_studies_of_a_root_mean_square_are_covered_however_often_one_looks(law):
-    """An asymptotic promise of 95 %; .12 to .44 of the last three are missed without the rule, from 20 trials on."""
+    """An asymptotic promise of 95 %; .12 to .44 of the last three are missed without the rule, from
+    20 trials on."""
     miss, none = ever_missing(law, 1000)
     print(f"{law}: ever missed {miss:.3f}, none given at 4000 trials {none:.3f}")
     assert miss <= 0.07 + 2 * np.sqrt(0.07 * 0.93 / 1000)

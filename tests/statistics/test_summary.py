@@ -172,7 +172,8 @@ def rewrite_truth(synthetic, kind: str, value: float) -> None:
 
 
 def test_efficiency_is_against_the_bound_that_applies_and_not_the_linear_one(synthetic):
-    """Bound at the truth 0.08, linear bound 0.1, errors of exactly 0.1: in every row, with its interval."""
+    """Bound at the truth 0.08, linear bound 0.1, errors of exactly 0.1: in every row, with its
+    interval."""
     synthetic.add(synthetic.scenario(), "one", errors(300, bias=(0, 0, 0)))
     rewrite_truth(synthetic, "crlb", 0.08)
     frame = summarize([synthetic.directory])
@@ -232,7 +233,8 @@ def test_one_runaway_does_not_decide(synthetic):
 
 
 def test_everybody_is_judged_by_the_same_trials(synthetic):
-    """A filter, an estimator that seeks a root and fails in half of the trials, one that returns nothing at all."""
+    """A filter, an estimator that seeks a root and fails in half of the trials, one that returns
+    nothing at all."""
     e = errors(100, bias=(0, 0, 0))
     half = np.arange(100) < 50
     ended = np.where(half, "converged", "nonfinite")
@@ -268,7 +270,8 @@ def test_the_median_of_honest_nees_lies_within_its_limits_in_95_per_cent_of_runs
 
 
 def test_a_failure_is_known_or_silent(synthetic):
-    """Four wrong of ten: one did not converge, one does not fit, one is flagged as ambiguous, and one looks right."""
+    """Four wrong of ten: one did not converge, one does not fit, one is flagged as ambiguous, and
+    one looks right."""
     right = np.arange(10) >= 4
     e = np.where(right[:, None], 0.0, 5.0) + np.zeros(3)
     status = np.array(["max_iterations"] + ["converged"] * 9, dtype=object)

@@ -1,4 +1,5 @@
-"""The paper's theory against systems whose answers are known in closed form, and as it stands in a report."""
+"""The paper's theory against systems whose answers are known in closed form, and as it stands in a
+report."""
 
 import numpy as np
 import pytest
@@ -87,7 +88,8 @@ def test_the_constant_of_eq_23_is_that_of_a_quadratic():
 
 @pytest.mark.oracle("closed form: derivatives of two polynomials", "constant of eq. (23)", 1e-12)
 def test_eq_23_takes_the_largest_second_derivative_over_all_pairs():
-    """A square model whose second derivatives are known: h = (x + x y, y + 3 y^2) at 0 has the largest, 6, in y, y."""
+    """A square model whose second derivatives are known: h = (x + x y, y + 3 y^2) at 0 has the
+    largest, 6, in y, y."""
     J, second = np.eye(2)[None], np.array([[[[0.0, 1.0], [1.0, 0.0]], [[0.0, 0.0], [0.0, 6.0]]]])
     assert_agrees(curvature(J, second, np.eye(2)[None]), 6.0, rtol=1e-12)
 
@@ -136,7 +138,8 @@ def analysis(tmp_path_factory):
 
 
 def test_eq_14_and_the_sandwich_stand_beside_what_happened(analysis):
-    """Eq. (14) is H+ R H+' + E[c c'] with c = H+ (N(x) - N(x^)); the same from the model's own values."""
+    """Eq. (14) is H+ R H+' + E[c c'] with c = H+ (N(x) - N(x^)); the same from the model's own
+    values."""
     total = analysis.summary[analysis.summary["parameter"] == "all"].set_index(
         ["estimator", "error_scale"]
     )
@@ -165,7 +168,8 @@ def test_eq_14_and_the_sandwich_stand_beside_what_happened(analysis):
 
 
 def test_how_iterations_converge_is_in_the_report(analysis):
-    """Newton's iteration converges quadratically, eq. (23), the fixed point's linearly, eq. (18)."""
+    """Newton's iteration converges quadratically, eq. (23), the fixed point's linearly, eq.
+    (18)."""
     orders = analysis.scores.set_index(["estimator", "error_scale"])["order_median"]
     assert orders["newton", 5.0] == pytest.approx(2.0, abs=0.4)
     assert orders["fixed_point", 5.0] == pytest.approx(1.0, abs=0.2)

@@ -1,4 +1,5 @@
-"""Words of verdict: one table has all that is said, reads the words of older files, and decides who passes."""
+"""Words of verdict: one table has all that is said, reads the words of older files, and decides who
+passes."""
 
 from dataclasses import replace
 from typing import Any, get_args
@@ -66,7 +67,8 @@ def test_every_row_says_its_verdict_on_any_screen(synthetic):
 
 
 def test_a_log_whose_innovations_are_not_white_is_wrong_however_small_they_are():
-    """A sine of amplitude 3 is small for states of deviation 6, but neighbouring readings are alike."""
+    """A sine of amplitude 3 is small for states of deviation 6, but neighbouring readings are
+    alike."""
     trackers = {"ekf": ekf(), "ekf_rts": Smoother(ekf())}
     answer = ib.estimate(WHITE, SINE, trackers)
     for one in answer:
@@ -106,7 +108,8 @@ def test_far_less_likely_is_ten_and_a_tenth_of_the_number_of_readings(less, said
 def test_simulated_trackers_are_wrong_where_surely_more_than_one_trial_in_a_hundred_is_not_white(
     synthetic,
 ):
-    """If the share is 1 %, 5 or more of 200 trials have a probability of .052, and 6 or more one of .016 < .025."""
+    """If the share is 1 %, 5 or more of 200 trials have a probability of .052, and 6 or more one of
+    .016 < .025."""
     rng = np.random.default_rng(0)
     error, nis = 0.1 * rng.standard_normal((200, 1)), rng.chisquare(4, 200) / 4
     of_path = {"path_nees": 1.0, "path_a": 0.1, "path_bound_a": 0.1, NIS: nis}

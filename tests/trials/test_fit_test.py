@@ -1,4 +1,5 @@
-"""The p of the test of fit is uniform where model and noise are right, whatever the noise and the estimator."""
+"""The p of the test of fit is uniform where model and noise are right, whatever the noise and the
+estimator."""
 
 import numpy as np
 import pytest
@@ -66,8 +67,9 @@ def test_p_is_uniform_for_estimators_with_a_prior(estimator):
 
 
 def test_p_is_about_uniform_with_a_prior_where_the_noise_is_not_normal():
-    """Eight readings for six parameters that the prior knows: the residuals have eight degrees of freedom and not two,
-    and their sum of squares a spread twice as large as that of least squares."""
+    """Eight readings for six parameters that the prior knows: the residuals have eight degrees of
+    freedom and not two, and their sum of squares a spread twice as large as that of least
+    squares."""
     t = np.linspace(-1, 1, 8)
     powers = "+".join(f"c{k}*t**{k}" for k in range(6))
     model = Formula(powers, {f"c{k}": 1.0 for k in range(6)}, {"t": t.tolist()})
@@ -95,7 +97,8 @@ def spectrum(T, covariance):
 
 @pytest.mark.parametrize("m", [4, 5, 6, 9])
 def test_residuals_of_the_frozen_root_scatter_as_their_projection_says(m):
-    """Of few readings the directions that both ranges share are spent, and the most oblique ones are left."""
+    """Of few readings the directions that both ranges share are spent, and the most oblique ones
+    are left."""
     rng, n = np.random.default_rng(m), 3
     H, J = rng.normal(size=(2, m, n))
     spread = frozen_spread(J[None], H, Covariance(np.ones(m)))

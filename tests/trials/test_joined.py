@@ -1,4 +1,5 @@
-"""A trial that raises costs no other trial anything: what is computed one by one is what is computed together."""
+"""A trial that raises costs no other trial anything: what is computed one by one is what is
+computed together."""
 
 from dataclasses import dataclass, fields, replace
 from functools import cache
@@ -43,7 +44,8 @@ def drawn_for(z, *shape):
 
 @dataclass(frozen=True)
 class Drawn:
-    """Raises if one of these trials is in its batch; reports those of the optional fields that are `given`."""
+    """Raises if one of these trials is in its batch; reports those of the optional fields that are
+    `given`."""
 
     refused: tuple[float, ...] = ()
     given: tuple[str, ...] = OPTIONAL

@@ -38,7 +38,8 @@ def test_a_prior_that_fixes_a_parameter_leaves_finite_bounds():
 
 @pytest.mark.parametrize("mu", [2.0, 20.0])
 def test_bounds_of_ill_conditioned_models_are_those_of_their_singular_values(mu):
-    """Bock's equations at mu = 20: singular values from 1e10 to .2, of which J'J keeps the largest alone."""
+    """Bock's equations at mu = 20: singular values from 1e10 to .2, of which J'J keeps the largest
+    alone."""
     block = Block.draw(Scenario(bock(mu), Gaussian(0.05)), 0, 5)
     J, columns = block.problem.R.whiten_jacobian(block.jacobian), block.truth_columns()
     prior = np.diag(1 / np.asarray(block.problem.prior_deviation))
@@ -62,7 +63,8 @@ def test_bounds_of_ill_conditioned_models_are_those_of_their_singular_values(mu)
 
 
 def test_residuals_of_angles_are_within_half_a_turn():
-    """By a bearing of about pi, whose readings are on both sides of it; more turns of the model change nothing."""
+    """By a bearing of about pi, whose readings are on both sides of it; more turns of the model
+    change nothing."""
     bearing = ib.measurements.Formula(
         "arctan2(b, a - s)",
         {"a": -1.0, "b": 0.001},
@@ -117,7 +119,8 @@ def test_another_root_is_one_that_lies_a_thousandth_of_a_deviation_away(by, solv
     "closed form: one normal reading of a normal parameter", "Cramér-Rao and Bayesian bounds", 1e-9
 )
 def test_the_bayesian_bound_has_the_prior_in_it_and_so_has_its_gate():
-    """Linear, one reading of each parameter: the variance is 1 / (1 / sigma^2 + 1 / d^2), sigma = d = 1."""
+    """Linear, one reading of each parameter: the variance is 1 / (1 / sigma^2 + 1 / d^2), sigma = d
+    = 1."""
     scenario = Scenario(Repeated(names=("a", "b"), repeats=1), Gaussian(1.0), GaussianPrior(), 1.0)
     block = Block.draw(scenario, 0, 4)
     columns = block.truth_columns()
@@ -133,7 +136,8 @@ def test_the_bayesian_bound_has_the_prior_in_it_and_so_has_its_gate():
             x = block.trials.x + np.array([[3.0, 0.0], [3.5, 0.0], [3.9, 0.0], [5.5, 0.0]])
             return Estimates(x, np.zeros(4, np.int8))
 
-    # The gate is at sqrt(chi2_2(1 - 1e-6)) = 5.26 deviations: 3.72 of the Bayesian bound, 5.26 of the other.
+    # The gate is at sqrt(chi2_2(1 - 1e-6)) = 5.26 deviations: 3.72 of the Bayesian bound, 5.26 of
+    # the other.
     assert block.estimate(Off())[1]["success"].tolist() == [True, True, False, False]
 
 
@@ -141,8 +145,8 @@ def test_the_bayesian_bound_has_the_prior_in_it_and_so_has_its_gate():
     "closed form: one normal reading of a normal parameter", "Van Trees's bound", 1e-9
 )
 def test_van_trees_bound_is_that_of_the_mean_information():
-    """In closed form where h is linear, the same at every truth; and below the mean of the local bounds where it is
-    not, as Jensen's inequality has it."""
+    """In closed form where h is linear, the same at every truth; and below the mean of the local
+    bounds where it is not, as Jensen's inequality has it."""
     linear = Scenario(Repeated(names=("a", "b"), repeats=1), Gaussian(1.0), GaussianPrior(), 1.0)
     columns = Block.draw(linear, 0, 4).truth_columns()
     assert_agrees(columns["van_trees_a"][0], np.sqrt(0.5), rtol=1e-9)
@@ -159,7 +163,8 @@ def test_van_trees_bound_is_that_of_the_mean_information():
 
 
 def test_van_trees_bound_tells_its_own_error():
-    """The scatter of the bound over 60 seeds, each with truths of its own, is known to 1 / sqrt(120), 9 %."""
+    """The scatter of the bound over 60 seeds, each with truths of its own, is known to 1 /
+    sqrt(120), 9 %."""
     found = []
     for seed in range(60):
         columns = Block.draw(
@@ -173,7 +178,8 @@ def test_van_trees_bound_tells_its_own_error():
 
 
 def test_van_trees_bound_tells_no_error_where_few_truths_carry_it():
-    """Rates of decay that scatter as widely as they are large: intervals would hold the bound in .6 of cases."""
+    """Rates of decay that scatter as widely as they are large: intervals would hold the bound in .6
+    of cases."""
     decay = ib.measurements.Formula(
         "a*exp(-b*t)", {"a": 2.0, "b": 0.7}, {"t": tuple(np.linspace(0.5, 5, 10))}
     )

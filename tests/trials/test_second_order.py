@@ -1,4 +1,5 @@
-"""Theory beside experiment: closed forms of curvature, bias and error under a wrong model, and Monte Carlo."""
+"""Theory beside experiment: closed forms of curvature, bias and error under a wrong model, and
+Monte Carlo."""
 
 from dataclasses import replace
 

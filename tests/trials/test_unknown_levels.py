@@ -1,4 +1,5 @@
-"""Runs in which the levels of the noise are not known: bounds are joint, and estimators are told the nominal R."""
+"""Runs in which the levels of the noise are not known: bounds are joint, and estimators are told
+the nominal R."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,5 @@
-"""`check` on options that are made of others, that suit one number of readings, or that want something given."""
+"""`check` on options that are made of others, that suit one number of readings, or that want
+something given."""
 
 import itertools
 import subprocess
@@ -16,11 +17,17 @@ _numbers = itertools.count()
 GOOD = {
     "noise/made_of_another": "defaults: [gaussian]\ndeviation: 0.3\n",
     "noise/made_of_ours": "defaults: [NOISE_made_of_another, _self_]\n",
-    "noise/for_fourteen": "_target_: ipe_bench.noise.Gaussian\ndeviation: [1,1,1,1,1,1,1,1,1,1,1,1,1,2]\n",
-    "prior/for_three": "defaults: [gaussian]\ndeviations: [1,2,3]\ncorrelations: [[1,0.5,0],[0.5,1,0],[0,0,1]]\n",
-    "baseline/tight": "# @package estimators.tight\ndefaults: [levenberg_marquardt@_here_, _self_]\ntolerance: 1e-9\n",
+    "noise/for_fourteen": "_target_: ipe_bench.noise.Gaussian\ndeviation:"
+    " [1,1,1,1,1,1,1,1,1,1,1,1,1,2]\n",
+    "prior/for_three": "defaults: [gaussian]\ndeviations: [1,2,3]\ncorrelations:"
+    " [[1,0.5,0],[0.5,1,0],[0,0,1]]\n",
+    "baseline/tight": (
+        "# @package estimators.tight\ndefaults: [levenberg_marquardt@_here_, _self_]\ntolerance:"
+        " 1e-9\n"
+    ),
     "measurement/of_a_file": (
-        "_target_: ipe_bench.measurements.Formula\nexpression: b1*(1-exp(-b2*t))\nstart: {b1: 250, b2: 5e-4}\n"
+        "_target_: ipe_bench.measurements.Formula\nexpression: b1*(1-exp(-b2*t))\nstart: {b1: 250,"
+        " b2: 5e-4}\n"
     ),
     "measurement/equations": (
         "defaults: [ode, _self_]\nrates: {y: -k*y}\ninitial: {y: dose}\nstart: {k: 1}\nunit: mg\n"
@@ -77,10 +84,13 @@ def test_what_is_to_be_given_is_named(checked):
 
 BAD = {
     "a fault in what is made of another": (
-        {"noise/bad": "defaults: [gaussian]\ndeviation: -1\n"}, "noise/bad", "deviation=-1: give a number above 0"
+        {"noise/bad": "defaults: [gaussian]\ndeviation: -1\n"}, "noise/bad",
+        "deviation=-1: give a number above 0"
     ),
-    "no such option": ({"noise/bad": "defaults: [gausian]\n"}, "noise/bad", "did you mean gaussian"),
-    "of another group": ({"noise/bad": "defaults: [{prior: gaussian}]\n"}, "noise/bad", "no such option of noise"),
+    "no such option": ({"noise/bad": "defaults: [gausian]\n"}, "noise/bad",
+                       "did you mean gaussian"),
+    "of another group": ({"noise/bad": "defaults: [{prior: gaussian}]\n"}, "noise/bad",
+                         "no such option of noise"),
     "no list": ({"noise/bad": "defaults: gaussian\n"}, "noise/bad", "no such option of noise"),
 }  # fmt: skip
 

@@ -1,4 +1,5 @@
-"""Our own components pass the checks that plugins are given, and the checks catch what they are for."""
+"""Our own components pass the checks that plugins are given, and the checks catch what they are
+for."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
@@ -43,7 +44,8 @@ def complaints(component) -> str:
 
 
 DEAR = ("enkf", "ukf_wide", "iplf", "ekf", "ukf", "ckf", "iterated_ekf", "grid", "walking_gins")
-"""Ensembles, points and iterations for every reading, one trial at a time, and long paths take seconds."""
+"""Ensembles, points and iterations for every reading, one trial at a time, and long paths take
+seconds."""
 
 
 @pytest.mark.parametrize(
@@ -181,45 +183,58 @@ FOUND = [
     (Faulty("dicing"), "draws random numbers"),
     (Faulty("timid"), "variances are 1"),
     (Faulty("bold"), "times too small"),
-    (Faulty("diagonal"), "covariance has shape (60, 4), and not (trials, n, n), which is (60, 4, 4) here"),
+    (Faulty("diagonal"),
+     "covariance has shape (60, 4), and not (trials, n, n), which is (60, 4, 4) here"),
     (Faulty("boasting"), "NaN readings counts as converged"),
     (Faulty("wrong"), "standard deviations of the bound"),
     (Faulty("free"), "not counted"),
-    (altered(EKF(), track=lambda self, P0, Q, z: P0.absent), "it raises AttributeError: 'numpy.ndarray'"),
+    (altered(EKF(), track=lambda self, P0, Q, z: P0.absent),
+     "it raises AttributeError: 'numpy.ndarray'"),
     (Faulty("scribbling"), "it writes into what it is given"),
     (Thawed(), "frozen=True"),
     (altered(Newton(), estimate=into_H), "test_conformance.py, line"),
-    (with_predict(raises_if_it_walks), "with process_noise=0.3 trials end: RuntimeError: no such thing"),
+    (with_predict(raises_if_it_walks),
+     "with process_noise=0.3 trials end: RuntimeError: no such thing"),
     (with_predict(forgets_Q), "a variance is not larger: add Q to P in predict"),
-    (altered(LinearLSE(), estimate=blind_to_turns), "take residuals from z - model.near(model.simulate(x), z)"),
+    (altered(LinearLSE(), estimate=blind_to_turns),
+     "take residuals from z - model.near(model.simulate(x), z)"),
     (altered(Newton(), step=lambda self, system, state: state.x - state.F),
      "step returns ndarray, and not a State: return State(x, system.F(x))"),
     (altered(Newton(), step=lambda self, system, state: State(state.x - state.F, state.F[:, :1])),
      "step returns a State whose F has shape (8, 1), and not (8, 4)"),
     (altered(P, jacobian=one_entry), "most for parameter c2 in reading time=-0.6"),
     (altered(P, jacobian=lambda self, x: 1.01 * Polynomial.jacobian(self, x)), "off by"),
-    (altered(P, simulate=lambda self, x: Polynomial.simulate(self, x) + np.abs(x[:, :1])),  # as analytic as np.abs is
+    (altered(P, simulate=lambda self, x: Polynomial.simulate(self, x) + np.abs(x[:, :1])),
+     # as analytic as np.abs is
      "write np.where(u.real < 0, -u, u) for np.abs(u)"),
     (altered(P, simulate=into_x), "test_conformance.py, line"),
-    (altered(P, index=property(lambda self: {"time": [0.0] * self.count})), "two readings have one label"),
+    (altered(P, index=property(lambda self: {"time": [0.0] * self.count})),
+     "two readings have one label"),
     (altered(P, nominal=np.array([5.0])),
      "nominal has shape (1,), and not one number for each parameter, which is (4,) here"),
-    (altered(P, periods=np.full(4, 360.0)), "periods has shape (4,), and not one number for each reading"),
+    (altered(P, periods=np.full(4, 360.0)),
+     "periods has shape (4,), and not one number for each reading"),
     (altered(Quantization(1.0), whitened=lambda *_: None),
      "is not distributed as normal, since there is no `whitened`"),
-    (altered(Gaussian(0.01), corrupt=errors_of_a_hundredth, covariance=lambda _, m: Covariance(np.full(m, 1e-4))),
+    (altered(Gaussian(0.01), corrupt=errors_of_a_hundredth, covariance=lambda _,
+             m: Covariance(np.full(m, 1e-4))),
      "times the stated deviation"),  # the variance for the deviation
-    (altered(Gaussian(0.01), corrupt=lambda self, h, o, rng: Gaussian.corrupt(self, h, o, rng) + 0.001),
+    (altered(Gaussian(0.01), corrupt=lambda self, h, o,
+             rng: Gaussian.corrupt(self, h, o, rng) + 0.001),
      "mean of the draws is off by up to 0.1"),
-    (altered(Colored(0.01, 0.5), true_covariance=True), "have the correlation 0.50, and 0.00 is stated"),
-    (altered(Gaussian(1.0), corrupt=lambda self, h, *_: h + np.random.default_rng().standard_normal(h.shape)),
+    (altered(Colored(0.01, 0.5), true_covariance=True),
+     "have the correlation 0.50, and 0.00 is stated"),
+    (altered(Gaussian(1.0), corrupt=lambda self, h,
+             *_: h + np.random.default_rng().standard_normal(h.shape)),
      "besides the stream"),
-    (altered(TURN, observe=lambda self, x, k: TURN.observe(x, k) + np.abs(x[..., :1])), "observe is not analytic"),
+    (altered(TURN, observe=lambda self, x, k: TURN.observe(x, k) + np.abs(x[..., :1])),
+     "observe is not analytic"),
     (altered(TURN, transition=lambda self, x, k: TURN.transition(x, k) + 1e-9 * len(x)),
      "transition gives a state alone other bits"),
     (altered(TURN, periods=()), "reading 2 jumps by 6.28: it is an angle; state its period"),
     (altered(TURN, R=lambda self, k: np.eye(3)), "h has shape (1, 2), where (1, 3) belongs"),
-    (altered(Filter(), track=changed_tracks(0.25, 0.0)), "the reported variances of the last epoch are"),
+    (altered(Filter(), track=changed_tracks(0.25, 0.0)),
+     "the reported variances of the last epoch are"),
     (altered(Filter(), track=changed_tracks(1.0, 1e-9)), "trial 0 alone has other bits"),
     (42, "neither"),
 ]

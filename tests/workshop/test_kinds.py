@@ -1,4 +1,5 @@
-"""Every kind of plugin that `new` makes works, and one that does not is named and leaves the rest as it was."""
+"""Every kind of plugin that `new` makes works, and one that does not is named and leaves the rest
+as it was."""
 
 import hashlib
 import re
@@ -89,8 +90,8 @@ def files(folder: str) -> dict[str, str]:
 
 
 DEAR = ("figure", "table", "section", "experiment", "filter", "statistic")
-"""Each draws a report, as `test_a_report_has_what_plugins_add_beside_all_that_is_ours` does of all of them at once, or
-runs many trials."""
+"""Each draws a report, as `test_a_report_has_what_plugins_add_beside_all_that_is_ours` does of all
+of them at once, or runs many trials."""
 
 
 @pytest.mark.parametrize(
@@ -143,13 +144,20 @@ def test_a_report_has_what_plugins_add_beside_all_that_is_ours(ours, capsys):
 
 
 RAISING = {
-    "statistic": "from ipe_bench.statistics.records import Statistic\n"
-    "def f(s):\n    raise ValueError('broken')\nSTATISTIC = Statistic('bad_statistic', 'bad', 'all trials', '', f)\n",
-    "figure": "from ipe_bench.report.figures.views import Figure\n"
-    "def f(view):\n    raise ValueError('broken')\n    yield\nFIGURE = Figure(f, ('summary',), main=True)\n",
+    "statistic": (
+        "from ipe_bench.statistics.records import Statistic\ndef f(s):\n    raise"
+        " ValueError('broken')\nSTATISTIC = Statistic('bad_statistic', 'bad', 'all trials', '',"
+        " f)\n"
+    ),
+    "figure": (
+        "from ipe_bench.report.figures.views import Figure\ndef f(view):\n    raise"
+        " ValueError('broken')\n    yield\nFIGURE = Figure(f, ('summary',), main=True)\n"
+    ),
     "table": "def table(analysis):\n    raise ValueError('broken')\n",
-    "section": "from ipe_bench.report.sections import Section\n"
-    "def f(analysis):\n    yield 'so far'\n    raise ValueError('broken')\nSECTION = Section('Bad', f)\n",
+    "section": (
+        "from ipe_bench.report.sections import Section\ndef f(analysis):\n    yield 'so far'\n   "
+        " raise ValueError('broken')\nSECTION = Section('Bad', f)\n"
+    ),
 }
 
 
@@ -303,7 +311,8 @@ class Hasty(Execution):
         (Faulty(power=0.0), "at ten times the error scale"),
         (
             Swallowing(),
-            "of task 1 it reports step 0, step 1, end; right is step 0, step 1, a Failure ValueError: wrong",
+            "of task 1 it reports step 0, step 1, end; right is step 0, step 1, a Failure"
+            " ValueError: wrong",
         ),
         (Hasty(), "of task 0 it reports end; right is step 0, step 1, step 2, end"),
     ],

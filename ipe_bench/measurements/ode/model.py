@@ -56,7 +56,8 @@ class OdeMeasurement(Measurement):
     ... class Pendulum(OdeMeasurement):  # released from half a radian
     ...     states, outputs, reading_unit = 2, ("angle",), "rad"
     ...     tolerance = 1e-9  # of a reading, in the reading's unit
-    ...     parameters = Parameter("length", "m", 0.01), Parameter("damping", "1/s", 0.01)  # x counts in these sizes
+    ...     # x counts in these sizes:
+    ...     parameters = Parameter("length", "m", 0.01), Parameter("damping", "1/s", 0.01)
     ...     nominal = np.array([100.0, 0.0])  # about 1 m and no damping
     ...     times = np.arange(0.5, 10.5, 0.5)
     ...     def start(self, p, c):
@@ -66,7 +67,8 @@ class OdeMeasurement(Measurement):
     ...         return rate, -9.80665 / p[0] * np.sin(angle) - p[1] * rate
     ...     def read(self, t, y, p, c):
     ...         return (y[0],)
-    >>> print(Pendulum().simulate(np.array([[100.0, 0.0]]))[0, 3].round(3))  # after 2 s; the period is 2.038 s
+    >>> # After 2 s; the period is 2.038 s.
+    >>> print(Pendulum().simulate(np.array([[100.0, 0.0]]))[0, 3].round(3))
     0.497
     """
 
@@ -217,8 +219,8 @@ class OdeMeasurement(Measurement):
         if self.step is None and not np.isfinite(self._told(x, len(self.times))).all():
             return (
                 f"neither steps of {shortest:.2g}{unit}, the shortest, nor the implicit method"
-                " determine these readings: outputs magnify what any step leaves of the states, or the"
-                " solution parts from those next to it"
+                " determine these readings: outputs magnify what any step leaves of the states, or"
+                " the solution parts from those next to it"
             )
         needed = STABLE / max(effort.fastest, 1e-300)
         if needed >= shortest:

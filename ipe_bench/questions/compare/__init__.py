@@ -1,1 +1,2 @@
-"""Whether a second version, setting or estimator is better or worse than a first, trial by trial."""
+"""Whether a second version, setting or estimator is better or worse than a first, trial by
+trial."""

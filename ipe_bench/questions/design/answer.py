@@ -238,7 +238,10 @@ def _ways(design: Design) -> Iterator[Part]:
         texts("at most", [f"{choice.readings}" for choice in sharpest]),
         texts("smallest bound", [f"{choice.mean_bound:.3f}" for choice in sharpest]),
     ]
-    title = f"Which readings to take instead (bounds as shares of today's, criterion {design.criterion})"
+    title = (
+        "Which readings to take instead (bounds as shares of today's, criterion"
+        f" {design.criterion})"
+    )
     note = (
         f"fewest readings is the number whose bound is no larger than today's {today}. Among"
         f" {design.candidates.m} candidates those that gain most are taken one after another;"

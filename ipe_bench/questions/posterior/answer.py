@@ -55,7 +55,10 @@ class PosteriorAnswer(Shown, list[Reference]):
 
     def __init__(self, scenario: Scenario, found: Sequence[Reference]) -> None:
         super().__init__(found)
-        self.name = f"{scenario.measurement.name}, {scenario.noise.name}, error scale {scenario.error_scale:g}"
+        self.name = (
+            f"{scenario.measurement.name}, {scenario.noise.name}, error scale"
+            f" {scenario.error_scale:g}"
+        )
 
     def parts(self) -> list[Table]:
         return posterior_parts(self.name, self)
@@ -98,7 +101,8 @@ def _notes(found: Sequence[Reference]) -> Iterator[str]:
             )
         if len(one.posterior.modes) > 1:
             shares = ", ".join(percent(float(share)) for share in one.posterior.shares)
-            yield f"Trial {one.trial}: {len(one.posterior.modes)} modes, with {shares} of the draws."
+            modes = len(one.posterior.modes)
+            yield f"Trial {one.trial}: {modes} modes, with {shares} of the draws."
 
 
 def honest_word(d: Divergence, sampled: Posterior) -> str:

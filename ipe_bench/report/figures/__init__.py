@@ -1,4 +1,5 @@
-"""The figures of a report: each module declares what it draws from; here they are drawn and written into one folder."""
+"""The figures of a report: each module declares what it draws from; here they are drawn and written
+into one folder."""
 
 from __future__ import annotations
 
@@ -23,14 +24,20 @@ FIGURES = ("certified", "settings", "errors", "costs", "parameters", "matrix")
 NAMES = {
     "digits": "digits of certified parameters that agree, by problem and estimator",
     "published": "errors that were found beside published ones",
-    "settings": "error by setting, and how often a misfit is detected; of a number that is swept, an axis of it",
+    "settings": (
+        "error by setting, and how often a misfit is detected; of a number that is swept, an axis"
+        " of it"
+    ),
     "headline": "success, error and reported covariance of all trials",
     "matrix": "success of every estimator at every error scale, best first",
     "distributions": "distribution functions of the error, a panel per error scale",
     "calibration": "distribution of NEES beside the one for a right covariance",
     "cost_against_accuracy": "median cost against the error that 95 % of trials stay below",
     "convergence": "how iterates approach their limit, a panel per estimator",
-    "parameter_errors": "root mean square error of each parameter and its bound; figure_2 and 3 of the paper's setting",
+    "parameter_errors": (
+        "root mean square error of each parameter and its bound; figure_2 and 3 of the paper's"
+        " setting"
+    ),
     "tracks": "error of each state at each epoch beside its bounds, and NEES",
 }
 """Names and subjects of our figures; the names of files go on with the setting."""
@@ -42,7 +49,8 @@ def draw_all(
 ) -> list[Drawn]:
     """Draws the figures that the data allow, in the order of the report, as files in the folder.
 
-    `index.json` in the folder names each with its title and caption; figures of an earlier report are removed.
+    `index.json` in the folder names each with its title and caption; figures of an earlier report
+    are removed.
     """
     drawn: list[Drawn] = []
     old = _names_in(folder / INDEX)
@@ -99,8 +107,8 @@ def added_drawings(
     which: Which = "all",
     taken: set[str] | None = None,
 ) -> Iterator[Drawing]:
-    """Yields the figures of plugins; a failed drawing or a duplicate name adds a line to the problems of the
-    analysis."""
+    """Yields the figures of plugins; a failed drawing or a duplicate name adds a line to the
+    problems of the analysis."""
     names = set() if taken is None else taken
 
     def make(record: Any) -> list[Drawing]:

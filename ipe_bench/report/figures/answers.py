@@ -1,4 +1,5 @@
-"""Draws the answers to single questions: fitted curves and residuals, bounds of designs, posteriors, pairs, audits."""
+"""Draws the answers to single questions: fitted curves and residuals, bounds of designs,
+posteriors, pairs, audits."""
 
 from __future__ import annotations
 
@@ -28,7 +29,8 @@ MOST_ESTIMATORS = 12
 _MANY = 5000
 """Points from which on they are pixels in the PDF, too."""
 _BENT = 30.0
-"""Normalised residuals beyond this are drawn on a logarithmic axis: a model that does not fit at all."""
+"""Normalised residuals beyond this are drawn on a logarithmic axis: a model that does not fit at
+all."""
 _ALIKE = 0.01
 """Residuals, in their deviations, that differ by less are drawn once."""
 _GRID = 200
@@ -36,7 +38,8 @@ _GRID = 200
 
 
 def draw_fit(found: Examination, z: Array, look: Look) -> Iterator[Drawing]:
-    """Draws readings z (m,) with the fitted curve and its band, if one numeric column alone tells readings apart."""
+    """Draws readings z (m,) with the fitted curve and its band, if one numeric column alone tells
+    readings apart."""
     model = found.whole.measurement
     columns = {**model.index, **model.input_columns}
     varying = {name: column for name, column in columns.items() if len(set(column)) > 1}
@@ -73,8 +76,8 @@ def draw_fit(found: Examination, z: Array, look: Look) -> Iterator[Drawing]:
 
 
 def _curve(found: Examination, name: str, x: Array) -> tuple[Array, Array, Array]:
-    """Returns abscissas, the fitted curve there and its standard deviations: between the readings, too, if the model
-    takes the abscissa as an input."""
+    """Returns abscissas, the fitted curve there and its standard deviations: between the readings,
+    too, if the model takes the abscissa as an input."""
     model = found.whole.measurement
     columns = {**model.index, **model.input_columns}
     headings = [one.heading for one in model.inputs]
@@ -90,7 +93,8 @@ def _curve(found: Examination, name: str, x: Array) -> tuple[Array, Array, Array
 
 
 def draw_residuals(model: Measurement, fits: Sequence[Fit]) -> Iterator[Drawing]:
-    """Draws normalised residuals, a panel for each passing estimator, or for all if none passes; equal ones once."""
+    """Draws normalised residuals, a panel for each passing estimator, or for all if none passes;
+    equal ones once."""
     from matplotlib.ticker import MaxNLocator
 
     groups = _alike(fits)
@@ -122,7 +126,8 @@ def draw_residuals(model: Measurement, fits: Sequence[Fit]) -> Iterator[Drawing]
 
 
 def _alike(fits: Sequence[Fit]) -> list[list[Fit]]:
-    """Returns the fits that have residuals, those with equal ones together; of those that pass, if any do."""
+    """Returns the fits that have residuals, those with equal ones together; of those that pass, if
+    any do."""
     known = [one for one in fits if np.isfinite(one.normalised).any()]
     passing = [one for one in known if one.passes]
     groups: list[list[Fit]] = []
@@ -169,7 +174,8 @@ def _tests(fit: Fit) -> str:
 
 
 def _abscissa(model: Measurement) -> tuple[Array, str]:
-    """Returns the abscissa of each reading (m,): its time if there is such a column, else its row."""
+    """Returns the abscissa of each reading (m,): its time if there is such a column, else its
+    row."""
     for name, column in model.index.items():
         values = np.asarray(column)
         if not np.issubdtype(values.dtype, np.number):

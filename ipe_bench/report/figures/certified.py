@@ -1,4 +1,5 @@
-"""Draws answers beside those that are certified or published: the digits that agree, and the errors that are met."""
+"""Draws answers beside those that are certified or published: the digits that agree, and the errors
+that are met."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ _STEPS = {0: RAMP[9], 1: RAMP[7], 2: RAMP[3], 3: RAMP[2], SOLVED: RAMP[1], 8: RA
 
 
 def draw_digits(view: View) -> Iterator[Drawing]:
-    """Draws the digits of each certified problem by estimator, the hardest problem and the best estimator first."""
+    """Draws the digits of each certified problem by estimator, the hardest problem and the best
+    estimator first."""
     table = pd.DataFrame() if view.collection is None else certified_table(view.collection)
     if table.empty:
         return
@@ -46,8 +48,8 @@ def draw_digits(view: View) -> Iterator[Drawing]:
         fig,
         "digits",
         "Correct digits of certified parameters, of 11",
-        f"Of the parameter with fewest; blue: {SOLVED} or more, solved. Hardest problems first, best estimators left:"
-        f" {best} solves {percent(float(solved.mean()))}.",
+        f"Of the parameter with fewest; blue: {SOLVED} or more, solved. Hardest problems first,"
+        f" best estimators left: {best} solves {percent(float(solved.mean()))}.",
     )
 
 

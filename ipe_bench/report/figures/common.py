@@ -1,4 +1,5 @@
-"""Provides what figures share: panels, axes, curves with their intervals, legends and the words of captions."""
+"""Provides what figures share: panels, axes, curves with their intervals, legends and the words of
+captions."""
 
 from __future__ import annotations
 
@@ -60,8 +61,9 @@ def panels(
     scales: Sequence[float] = (),
     row: int = MOST_PANELS,
 ) -> tuple[Figure, list[Axes]]:
-    """Makes a figure with that many panels, at most `row` side by side, and room for the legend of the estimators; if
-    there is one of `scales` their names stand on the vertical axes, and values on the horizontal ones."""
+    """Makes a figure with that many panels, at most `row` side by side, and room for the legend of
+    the estimators; if there is one of `scales` their names stand on the vertical axes, and values
+    on the horizontal ones."""
     from matplotlib.figure import Figure
 
     down = -(-count // min(row, _across()))
@@ -114,7 +116,8 @@ def most_panels() -> int:
 def panels_of_scales(
     rows: pd.DataFrame, look: Mapping[str, Look]
 ) -> tuple[Figure, list[tuple[Axes, pd.DataFrame]]]:
-    """Makes a figure with a panel per error scale, or for some with both ends; returns it and the panels' rows."""
+    """Makes a figure with a panel per error scale, or for some with both ends; returns it and the
+    panels' rows."""
     every = sorted(set(rows["error_scale"]))
     count = min(most_panels(), len(every))
     scales = [every[round(i)] for i in np.linspace(0, len(every) - 1, count)]
@@ -203,7 +206,8 @@ def scale_axis(ax: Axes, scales: Sequence[float]) -> None:
 
 
 def labelled(scales: Sequence[float], letter: float) -> list[float]:
-    """Selects ascending scales whose labels fit, a letter taking so many decades: both ends, and those between."""
+    """Selects ascending scales whose labels fit, a letter taking so many decades: both ends, and
+    those between."""
 
     def fit(low: float, high: float) -> bool:
         letters = (len(value_text(low)) + len(value_text(high)) + 1) / 2
@@ -217,10 +221,11 @@ def labelled(scales: Sequence[float], letter: float) -> list[float]:
 
 
 def decades(ax: Axes, values: Any, least: float = 10.0, *, ends: Any = ()) -> None:
-    """Sets a logarithmic axis around the values that spans at least a decade, so that a scatter of 1 % looks small.
+    """Sets a logarithmic axis around the values that spans at least a decade, so that a scatter of
+    1 % looks small.
 
-    The `ends` of intervals widen it by no more than `REACH` of the values' own span, or a decade: those of heavy tails,
-    which may be as wide as numbers go, end at the panel's edge.
+    The `ends` of intervals widen it by no more than `REACH` of the values' own span, or a decade:
+    those of heavy tails, which may be as wide as numbers go, end at the panel's edge.
     """
     values = _positive(values)
     ends = _positive(ends)
@@ -255,7 +260,8 @@ def log_ticks(axis: Axis, low: float, high: float) -> None:
 
 
 def full_ticks(ax: Axes, most: int = 4) -> None:
-    """Labels the horizontal axis with whole numbers, of which no part is set aside at its end, as many as fit."""
+    """Labels the horizontal axis with whole numbers, of which no part is set aside at its end, as
+    many as fit."""
     from matplotlib.ticker import MaxNLocator
 
     low, high = ax.get_xlim()
@@ -300,8 +306,8 @@ def beyond(ax: Axes, x: Any, y: Any, one: Look) -> None:
 def _arrows(
     ax: Axes, x: Any, y: Any, color: str, *, points: float, downwards: bool = False
 ) -> None:
-    """Draws arrows towards the end of the axis of values, their middles so many points farther out, and says in the
-    legend what they mean."""
+    """Draws arrows towards the end of the axis of values, their middles so many points farther out,
+    and says in the legend what they mean."""
     from matplotlib.transforms import ScaledTranslation
 
     inches = (-points if downwards else points) / 72
@@ -331,7 +337,8 @@ def mark_cut(ax: Axes, place: Any, edge: float, color: str, *, downwards: bool) 
 
 
 def seaborn_style(look: Mapping[str, Look], by: str = "estimator") -> dict[str, Any]:
-    """Arguments of seaborn's functions that give every label its own colour and marker; grey ones lie below."""
+    """Arguments of seaborn's functions that give every label its own colour and marker; grey ones
+    lie below."""
     order = sorted(look, key=lambda label: look[label].color != GREY)
     style: dict[str, Any] = {
         "hue": by,
@@ -348,8 +355,8 @@ def seaborn_style(look: Mapping[str, Look], by: str = "estimator") -> dict[str, 
 def lines(
     ax: Axes, rows: pd.DataFrame, x: str, y: str, look: Mapping[str, Look], **style: Any
 ) -> None:
-    """Draws a line per estimator through dense points, with a few markers, staggered so that coinciding lines are
-    seen."""
+    """Draws a line per estimator through dense points, with a few markers, staggered so that
+    coinciding lines are seen."""
     import seaborn as sns
 
     before = len(ax.lines)
@@ -386,13 +393,15 @@ def curves(
     heading: str = "",
     label: str = "",
 ) -> None:
-    """Draws a column over the error scales, a line with markers per label, on an axis with fixed limits, with the
-    panel's heading and the label of its axis of values; at one scale a row per label of panels that were made for it.
+    """Draws a column over the error scales, a line with markers per label, on an axis with fixed
+    limits, with the panel's heading and the label of its axis of values; at one scale a row per
+    label of panels that were made for it.
 
-    Labels in colour stand side by side about their scale, so that points and intervals that coincide are seen. A line
-    is broken where a value is missing; a point that some of the trials or fewer than `FEW` carry is hollow, and without
-    an interval if they are fewer than `FEW`. Of an interval that lacks an end the other is drawn. What exceeds `most`
-    stands there, and an interval that is cut there or at the end of the axis has an arrow.
+    Labels in colour stand side by side about their scale, so that points and intervals that
+    coincide are seen. A line is broken where a value is missing; a point that some of the trials or
+    fewer than `FEW` carry is hollow, and without an interval if they are fewer than `FEW`. Of an
+    interval that lacks an end the other is drawn. What exceeds `most` stands there, and an interval
+    that is cut there or at the end of the axis has an arrow.
     """
     one_scale = len(scales) == 1
     least, top = _limits(ax)
@@ -437,8 +446,8 @@ def curves(
 
 
 def _lengths(values: Any, low: Any, high: Any, few: Any) -> Array:
-    """Returns how far intervals reach below and above their values (2, points), 0 on a side without an end; NaN without
-    any end, or where trials are few."""
+    """Returns how far intervals reach below and above their values (2, points), 0 on a side without
+    an end; NaN without any end, or where trials are few."""
     lengths = np.array([values - low, high - values]).clip(min=0)
     known = np.isfinite(lengths) & ~few.to_numpy()
     missing = np.where(known.any(axis=0), 0.0, np.nan)
@@ -448,7 +457,8 @@ def _lengths(values: Any, low: Any, high: Any, few: Any) -> Array:
 def _draw_curve(
     ax: Axes, points: _Points, ends: Array | None, name: str, one: Look, line: dict[str, Any]
 ) -> None:
-    """Draws a curve with its intervals, then its hollow points and those over the axis, all marked with its name."""
+    """Draws a curve with its intervals, then its hollow points and those over the axis, all marked
+    with its name."""
     across = _value(ax) == "x"
     values = points.value.where(np.isfinite(points.value))
     right, up = (values, points.place) if across else (points.place, values)
@@ -466,14 +476,16 @@ def _draw_curve(
 
 
 def mark_name(ax: Axes, artist: Artist, name: str, number: int) -> None:
-    """Marks an artist, with a number among those of its panel and estimator, so that a page finds it by the name."""
+    """Marks an artist, with a number among those of its panel and estimator, so that a page finds
+    it by the name."""
     panel = ax.figure.axes.index(ax)
     artist.set_gid(f"{NAMED}{name}#{panel}-{number}")
 
 
 def spread(wanted: Sequence[float], gap: float, low: float, high: float) -> Array:
-    """Returns places at least `gap` apart from `low` to `high`, nearest to where they are wanted: by adjacent violators
-    that are pooled (Ayer and others, Annals of Mathematical Statistics 26, 1955)."""
+    """Returns places at least `gap` apart from `low` to `high`, nearest to where they are wanted:
+    by adjacent violators that are pooled (Ayer and others, Annals of Mathematical Statistics 26,
+    1955)."""
     order = np.argsort(wanted, kind="stable")
     # Less these shifts, places that are `gap` apart only have to ascend.
     shifts = gap * np.arange(len(order))
@@ -498,7 +510,8 @@ class _End(NamedTuple):
 
 
 def end_names(ax: Axes, rows: pd.DataFrame, y: str, look: Mapping[str, Look]) -> None:
-    """Writes the name of each curve at its end, in its colour; curves that end at one place share a label."""
+    """Writes the name of each curve at its end, in its colour; curves that end at one place share a
+    label."""
     from matplotlib.offsetbox import AnnotationBbox, HPacker
 
     known = rows[rows[y].notna()].sort_values("error_scale", kind="stable")
@@ -529,7 +542,8 @@ def end_names(ax: Axes, rows: pd.DataFrame, y: str, look: Mapping[str, Look]) ->
 
 
 def _shared(ends: Mapping[str, _End]) -> list[list[str]]:
-    """Returns the names of each label, the lowest first: those of curves that end at one place, as far as they fit."""
+    """Returns the names of each label, the lowest first: those of curves that end at one place, as
+    far as they fit."""
     labels: list[list[str]] = []
     for name in sorted(ends, key=lambda name: (ends[name].value, ends[name].scale)):
         if labels:
@@ -566,8 +580,8 @@ def legend(
     *,
     points: bool = False,
 ) -> None:
-    """Adds one legend above all panels: the estimators in colour unless their names stand on the axes, then the other
-    labels in the panels."""
+    """Adds one legend above all panels: the estimators in colour unless their names stand on the
+    axes, then the other labels in the panels."""
     from matplotlib.lines import Line2D
 
     on_axes = any(_value(ax) == "x" for ax in axes)

@@ -1,4 +1,5 @@
-"""Draws what accuracy costs: simulations against error, and iterations against the distance from the limit."""
+"""Draws what accuracy costs: simulations against error, and iterations against the distance from
+the limit."""
 
 from __future__ import annotations
 
@@ -58,7 +59,8 @@ def _placed(rows: pd.DataFrame, view: View) -> pd.DataFrame:
     """Adds the place of each point: `cost`, `error`, and whether that is `over` the upper edge."""
     error = rows["error_q95"]
     if not view.moving:
-        # The 95 % quantile of chi, over its root mean square; the errors of an epoch and of the next are dependent.
+        # The 95 % quantile of chi, over its root mean square; the errors of an epoch and of the
+        # next are dependent.
         quantile = chdtri(view.n, 0.05)
         error = error / float(np.sqrt(quantile / view.n))
     cost = rows["simulations_median"].clip(lower=LEAST_COST)
@@ -89,7 +91,8 @@ def _mark(ax: Any, rows: pd.DataFrame, look: Mapping[str, Look]) -> None:
 
 
 def _cheapest(rows: pd.DataFrame, scale: float) -> str:
-    """Names the estimator that reaches about the least error at a scale for the fewest simulations."""
+    """Names the estimator that reaches about the least error at a scale for the fewest
+    simulations."""
     here = rows[rows["error_scale"] == scale]
     good = here[here["error"] <= here["error"].min() * 1.05]
     best = good.sort_values("simulations_median", kind="stable").iloc[0]

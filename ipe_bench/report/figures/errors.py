@@ -1,4 +1,5 @@
-"""Draws success, error and honesty of all trials, the distribution of errors and the calibration of NEES."""
+"""Draws success, error and honesty of all trials, the distribution of errors and the calibration of
+NEES."""
 
 from __future__ import annotations
 
@@ -19,9 +20,13 @@ from ipe_bench.report.words import brief, enumerate_few, value_text
 from ipe_bench.statistics.statistic import ALL
 
 CEILING = {"error_median": 100.0, "error_q95": 100.0, "nees_median": 30.0}
-"""Errors beyond are drawn here: the size of a diverged error carries no information, and the bound needs the room."""
+"""Errors beyond are drawn here: the size of a diverged error carries no information, and the bound
+needs the room."""
 BARS = "Bars: 95 % intervals of success, and errors from the median to the 95 % quantile."
-_ALONG = "Success: share of tracks kept to the last epoch, with 95 % intervals. Hollow: some trials have no track."
+_ALONG = (
+    "Success: share of tracks kept to the last epoch, with 95 % intervals. Hollow: some trials"
+    " have no track."
+)
 _LIMITS = ("nees_median_low_if_honest", "nees_median_high_if_honest")
 _ALL = 0.995
 """Success that all estimators have where they are alike."""
@@ -30,15 +35,15 @@ _APART = 0.1
 _WIDE = 5.0
 """Inches of a column of print from which on there is room for names at curves."""
 LINEAR = 0.1
-"""Differences below this are drawn about in proportion, larger ones by their logarithm: honest curves differ by
-hundredths, dishonest ones by up to 1."""
+"""Differences below this are drawn about in proportion, larger ones by their logarithm: honest
+curves differ by hundredths, dishonest ones by up to 1."""
 _TICKS = (-1.0, -0.3, -0.1, -0.05, 0.0, 0.05, 0.1, 0.3, 1.0)
 """Differences that may have a tick."""
 
 
 def draw(view: View) -> Iterator[Drawing]:
-    """Draws success, error and, where a covariance is reported, NEES: over the error scales with names at the curves'
-    ends, from where estimators part; at one scale a row for each."""
+    """Draws success, error and, where a covariance is reported, NEES: over the error scales with
+    names at the curves' ends, from where estimators part; at one scale a row for each."""
     totals = over_paths(view) if view.moving else view.totals
     if totals.empty:
         return
@@ -62,8 +67,9 @@ def draw(view: View) -> Iterator[Drawing]:
 
 
 def over_paths(view: View) -> pd.DataFrame:
-    """Returns the totals with errors and NEES over all epochs, where a smoother is better than its filter: at the last
-    they are equal by definition. Errors of each state are over those of the filter linearised at the true path."""
+    """Returns the totals with errors and NEES over all epochs, where a smoother is better than its
+    filter: at the last they are equal by definition. Errors of each state are over those of the
+    filter linearised at the true path."""
     states = view["summary"][view["summary"]["parameter"] != ALL]
     filters = [label for label in view.look if view.families.get(label) != "smoothers"]
     place = ["error_scale", "parameter"]
@@ -90,8 +96,8 @@ def _looks(view: View) -> dict[str, Look]:
 
 
 def _parting(view: View, totals: pd.DataFrame) -> float:
-    """Returns the last of the scales up to which all estimators but the reference are alike, so that at least three are
-    left; the first if they never part."""
+    """Returns the last of the scales up to which all estimators but the reference are alike, so
+    that at least three are left; the first if they never part."""
     rows = totals[totals["estimator"] != REFERENCE]
     whole = rows["estimator"].nunique()
     alike = []
@@ -231,8 +237,8 @@ def draw_calibration(view: View) -> Iterator[Drawing]:
         fig,
         "calibration",
         "Calibration of NEES, converged trials",
-        "Share of converged trials whose NEES is below each quantile of chi-square, less its nominal probability. Grey:"
-        f" 95 % bands. Logarithmic beyond ±{LINEAR / 2:g}.",
+        "Share of converged trials whose NEES is below each quantile of chi-square, less its"
+        f" nominal probability. Grey: 95 % bands. Logarithmic beyond ±{LINEAR / 2:g}.",
         common.left_out(view.scales, panels),
     )
 

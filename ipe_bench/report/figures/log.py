@@ -1,4 +1,5 @@
-"""Draws the tracks of a log: each state over time in its band, each reading beside its prediction, and NIS."""
+"""Draws the tracks of a log: each state over time in its band, each reading beside its prediction,
+and NIS."""
 
 from __future__ import annotations
 
@@ -38,8 +39,8 @@ _MANY = 5000
 
 
 def draw_log(log: Log, tracks: Sequence[LogTracks]) -> Iterator[Drawing]:
-    """Draws the states, with the readings where a state is read, each other reading beside its prediction, and NIS of
-    the first filter."""
+    """Draws the states, with the readings where a state is read, each other reading beside its
+    prediction, and NIS of the first filter."""
     groups = _groups(tracks)[:MOST_TRACKS]
     if not groups:
         return
@@ -92,7 +93,8 @@ def _predicted(filters: Sequence[Sequence[LogTracks]]) -> list[int]:
 
 
 def directly_read(model: StateModel) -> dict[int, int]:
-    """Returns which reading of an epoch is a state itself, as the places of readings and of their states."""
+    """Returns which reading of an epoch is a state itself, as the places of readings and of their
+    states."""
     spread = np.sqrt(np.diagonal(model.prior.covariance))
     factors = np.array([[0.3], [-1.1], [0.7]])
     # Different numbers in every state, so that none is read by chance.
@@ -115,7 +117,8 @@ def _name(group: Sequence[LogTracks]) -> str:
 
 
 def _groups(tracks: Sequence[LogTracks]) -> list[list[LogTracks]]:
-    """Returns the tracks that are known, those that pass first, and together those that cannot be told apart."""
+    """Returns the tracks that are known, those that pass first, and together those that cannot be
+    told apart."""
     known = [one for one in tracks if _is_known(one)]
     groups: list[list[LogTracks]] = []
     for one in sorted(known, key=lambda one: not one.passes):
@@ -164,8 +167,8 @@ class _Band(NamedTuple):
 def _draw_bands(
     ax: Axes, times: Array, bands: dict[str, _Band], look: dict[str, Look], readings: Array
 ) -> None:
-    """Draws means with their bands, and readings (K, kinds); marks at the panel's edge what is far from them. What has
-    overflowed is left out."""
+    """Draws means with their bands, and readings (K, kinds); marks at the panel's edge what is far
+    from them. What has overflowed is left out."""
     bands = {name: band.finite for name, band in bands.items()}
     bands = {name: band for name, band in bands.items() if np.isfinite(band.mean).any()}
     _set_limits(ax, list(bands.values()), readings)
@@ -199,8 +202,8 @@ def _set_limits(ax: Axes, bands: Sequence[_Band], readings: Array) -> None:
 def _draw_predictions(
     ax: Axes, log: Log, j: int, filters: Sequence[Sequence[LogTracks]], look: dict[str, Look]
 ) -> None:
-    """Draws the readings of one kind with their predictions, or without them if those jump from epoch to epoch, such as
-    ranges to one beacon after another."""
+    """Draws the readings of one kind with their predictions, or without them if those jump from
+    epoch to epoch, such as ranges to one beacon after another."""
     name = log.model.reading_names[j]
     z = log.z[:, [j]]
     bands: dict[str, _Band] = {}

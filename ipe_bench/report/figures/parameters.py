@@ -1,4 +1,5 @@
-"""Draws errors parameter by parameter: figures 2 and 3 of the paper, and those of trackers from epoch to epoch."""
+"""Draws errors parameter by parameter: figures 2 and 3 of the paper, and those of trackers from
+epoch to epoch."""
 
 from __future__ import annotations
 
@@ -39,7 +40,8 @@ def draw(view: View) -> Iterator[Drawing]:
 
 
 def _of_one(view: View, estimator: str) -> Drawing:
-    """Draws a panel per group of parameters in physical units, and one of all of them over their bounds."""
+    """Draws a panel per group of parameters in physical units, and one of all of them over their
+    bounds."""
     rows = view["summary"].query("estimator == @estimator and parameter != @ALL")
     rows = rows.assign(solved_trials=(rows["solved"] * rows["trials"]).round())
     totals = view.totals[view.totals["estimator"] == estimator].assign(parameter=ALL)
@@ -57,7 +59,8 @@ def _of_one(view: View, estimator: str) -> Drawing:
         fig,
         f"figure_{number}" if view.paper else f"parameter_errors_{estimator}",
         f"{of_paper}error of {estimator}, solved trials",
-        f"Root mean square error and 95 % interval of the trials solved ({_missing(totals)}). Dotted: linear bounds.",
+        f"Root mean square error and 95 % interval of the trials solved ({_missing(totals)})."
+        " Dotted: linear bounds.",
         _together(totals),
     )
 
@@ -65,7 +68,8 @@ def _of_one(view: View, estimator: str) -> Drawing:
 def _draw_group(
     ax: Any, rows: pd.DataFrame, view: View, group: str, inside: Sequence[Mapping[str, Any]]
 ) -> None:
-    """Draws the errors of a group's parameters with their bounds: over the scales, or a row for each."""
+    """Draws the errors of a group's parameters with their bounds: over the scales, or a row for
+    each."""
     several = len(view.scales) > 1
     look: dict[str, Look] = {}
     for i, parameter in enumerate(inside):
@@ -128,7 +132,8 @@ def _together(totals: pd.DataFrame) -> str:
 
 
 def _groups(parameters: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
-    """Returns the parameters of one group and one unit, under the group's name; empty if there are too many groups."""
+    """Returns the parameters of one group and one unit, under the group's name; empty if there are
+    too many groups."""
     groups: dict[str, list[Mapping[str, Any]]] = {}
     for p in parameters:
         group = p.get("group") or p["name"]
@@ -145,7 +150,8 @@ def _curves(ax: Any, rows: Any, look: Any, view: View, heading: str = "", unit: 
 
 
 def _missing(totals: pd.DataFrame) -> str:
-    """Says in how many trials an estimator solved the equation at the largest scale where it did not in all."""
+    """Says in how many trials an estimator solved the equation at the largest scale where it did
+    not in all."""
     lacking = totals[totals["solved_trials"] < totals["trials"]]
     if lacking.empty:
         return f"all of {totals['trials'].min():.0f}"
@@ -155,8 +161,8 @@ def _missing(totals: pd.DataFrame) -> str:
 
 
 def draw_tracks(view: View) -> Iterator[Drawing]:
-    """Draws the root mean square error of each state beside its bounds, and NEES within its limits, at the largest
-    error scale."""
+    """Draws the root mean square error of each state beside its bounds, and NEES within its limits,
+    at the largest error scale."""
     rows = view["tracks"]
     if rows.empty:
         return
@@ -185,13 +191,15 @@ def draw_tracks(view: View) -> Iterator[Drawing]:
         fig,
         "tracks",
         f"Tracks at error scale {value_text(scale)}, converged trials",
-        "Root mean square error at each epoch, with the bound along the true path; NEES over states.",
+        "Root mean square error at each epoch, with the bound along the true path; NEES over"
+        " states.",
         f"{states[0]} over all epochs: {enumerate_few(total, 3)}.",
     )
 
 
 def _draw_bounds(ax: Any, rows: pd.DataFrame) -> None:
-    """Draws the bounds along the true path, then the posterior ones, which are the same for every estimator."""
+    """Draws the bounds along the true path, then the posterior ones, which are the same for every
+    estimator."""
     style: Any = {"color": BOUND_COLOR, "linewidth": 1.0, "zorder": 1}
     for smooths, dash, kind in ((False, "--", "filter"), (True, (0, (5, 1)), "smoother")):
         own = rows[rows["smooths"] == smooths]

@@ -1,5 +1,6 @@
-"""Draws a sweep of settings whose readings come from other models, a row for each with its error and how often its
-misfit is detected, or an axis of the one number that is swept; the matrix shows other settings."""
+"""Draws a sweep of settings whose readings come from other models, a row for each with its error
+and how often its misfit is detected, or an axis of the one number that is swept; the matrix shows
+other settings."""
 
 from __future__ import annotations
 
@@ -73,7 +74,8 @@ def draw(view: View) -> Iterator[Drawing]:
 
 
 def _is_axis(values: pd.Series[Any]) -> bool:
-    """Whether a setting is a positive number with three values or more, so that an axis can have it."""
+    """Whether a setting is a positive number with three values or more, so that an axis can have
+    it."""
     numbers = pd.to_numeric(values, errors="coerce")
     return numbers.nunique() > 2 and bool((numbers > 0).all())
 
@@ -99,7 +101,8 @@ def _units(collection: Collection | None) -> dict[str, str]:
 
 
 def _names(rows: pd.DataFrame, apart: Sequence[str], view: View) -> list[str]:
-    """Words the setting of each row by what is in it: options that are there and not 0, with their units."""
+    """Words the setting of each row by what is in it: options that are there and not 0, with their
+    units."""
     units = _units(view.collection)
     assumed = [one.get("measurement", {}) for one in _scenarios(view.collection)]
     models = {config.get(TARGET, "").rpartition(".")[2] for config in assumed}
@@ -134,8 +137,8 @@ def _swept(view: View, rows: pd.DataFrame, column: str, scale: float) -> Iterato
 
 
 def _rows(view: View, rows: pd.DataFrame, scale: float) -> Iterator[Drawing]:
-    """Draws the error of the best estimator in a row for each setting, and writes above it in how many trials the
-    misfit is detected."""
+    """Draws the error of the best estimator in a row for each setting, and writes above it in how
+    many trials the misfit is detected."""
     errors = rows.pivot_table("error_median", "setting", "estimator")
     best = next((label for label in view.focus if label in errors), errors.columns[0])
     own = rows[rows["estimator"] == best].set_index("setting")
@@ -171,8 +174,8 @@ def _kind(name: str, detected: float) -> str:
 
 
 def _write(ax: Any, rows: pd.DataFrame, look: Mapping[str, Look]) -> int:
-    """Writes each error at its mark, and above each row its setting and in how many trials its misfit is detected;
-    returns the largest number of lines."""
+    """Writes each error at its mark, and above each row its setting and in how many trials its
+    misfit is detected; returns the largest number of lines."""
     most = 1
     for i, (name, one) in enumerate(look.items()):
         row: Any = rows.loc[name]

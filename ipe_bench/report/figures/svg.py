@@ -1,5 +1,5 @@
-"""Turns a drawn figure into what a page shows: an SVG per panel, which stand below each other on a phone, and the keys
-of the legend. Styles are classes, whose colours a dark page changes."""
+"""Turns a drawn figure into what a page shows: an SVG per panel, which stand below each other on a
+phone, and the keys of the legend. Styles are classes, whose colours a dark page changes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 NAMED = "name:"
-"""Begins the id of an artist that is an estimator's; its name ends at `#`. On a page it is `data-name`."""
+"""Begins the id of an artist that is an estimator's; its name ends at `#`. On a page it is
+`data-name`."""
 Ends = tuple[float, float]
 """Ends of a column from the left, or of a row from above, in points."""
 _MARGIN = 3.0
@@ -23,14 +24,15 @@ _WIDER = 0.04
 _FIGURE = re.compile(r'^ <g id="figure_1">\n(.*?)^ </g>\n(.*)^</svg>', re.MULTILINE | re.DOTALL)
 _GROUP = re.compile(r'^  <g id="(axes|legend)_\d+">\n(.*?)^  </g>\n', re.MULTILINE | re.DOTALL)
 _KEY = re.compile(
-    r'(.*?)<g id="text_\d+">\s*<text style="font-size: ([\d.]+)px.*? x="([\d.]+)" y="([\d.]+)".*?>(.*?)</text>\s*</g>',
+    r'(.*?)<g id="text_\d+">\s*<text style="font-size: ([\d.]+)px.*? x="([\d.]+)" y="([\d.]+)"'
+    r".*?>(.*?)</text>\s*</g>",
     re.DOTALL,
 )
 
 
 def page_figure(figure: Figure, svg: str) -> str:
-    """Returns the HTML of a figure that matplotlib wrote as this SVG with texts as texts; one whose panels are in no
-    plain grid is one SVG."""
+    """Returns the HTML of a figure that matplotlib wrote as this SVG with texts as texts; one whose
+    panels are in no plain grid is one SVG."""
     content, definitions = _FIGURE.findall(svg)[0]
     groups = _GROUP.findall(content)
     panels = [inside for kind, inside in groups if kind == "axes"]
@@ -63,7 +65,8 @@ def _view(across: Ends, down: Ends, inside: str) -> str:
 
 
 def _cells(figure: Figure) -> dict[tuple[int, int], list[int]]:
-    """Returns which axes stand at each row and column; empty if they are in no plain grid, or are not all there is."""
+    """Returns which axes stand at each row and column; empty if they are in no plain grid, or are
+    not all there is."""
     specs = [ax.get_subplotspec() for ax in figure.axes]
     single = [spec for spec in specs if spec and spec.num1 == spec.num2]
     if figure.texts or len(single) < len(specs):
@@ -107,7 +110,8 @@ def _widen(ends: dict[int, Ends], at: int, low: float, high: float) -> None:
 
 
 def _key(handle: str, size: str, x: str, y: str, label: str) -> str:
-    """Returns an entry of the legend: its line and marker, which end left of the text, as a drawing, and its text."""
+    """Returns an entry of the legend: its line and marker, which end left of the text, as a
+    drawing, and its text."""
     em = float(size)
     left = float(x) - 2.9 * em
     top = float(y) - em
@@ -140,7 +144,8 @@ def _classed(html: str) -> str:
         short = re.sub(r' transform="rotate\(-0 [^"]*"', "", short)
         return re.sub(r' (?:d|x|y)="[^"]*"', rounded, short)
 
-    # In tags alone: a name between them may read as an attribute, and matplotlib escapes no quotes there.
+    # In tags alone: a name between them may read as an attribute, and matplotlib escapes no quotes
+    # there.
     html = re.sub(r"<\w[^<>]*>", rewritten, html)
     html = re.sub(r">\s*\n\s*<", "><", html)
     rules = [f".{name}{{{style}}}" for name, style in styles.items()]

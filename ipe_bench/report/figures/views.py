@@ -1,4 +1,5 @@
-"""Kinds of figures, and what they are drawn from: the analysis setting by setting, with the looks of its estimators."""
+"""Kinds of figures, and what they are drawn from: the analysis setting by setting, with the looks
+of its estimators."""
 
 from __future__ import annotations
 
@@ -44,22 +45,26 @@ FRAMES = tuple(field.name for field in fields(Analysis) if field.type == "pd.Dat
 
 @dataclass(frozen=True)
 class View:
-    """Holds one setting (measurement, noise and other differing options) over all its error scales, or all settings."""
+    """Holds one setting (measurement, noise and other differing options) over all its error scales,
+    or all settings."""
 
     suffix: str
-    """Suffix of the file names of its figures; empty if there is one setting, and for all settings."""
+    """Suffix of the file names of its figures; empty if there is one setting, and for all
+    settings."""
     label: str
     frames: Mapping[str, pd.DataFrame]
     look: Mapping[str, Look]
     """Look of each estimator in these frames, in the order of the legend."""
     equations: Mapping[str, str | None]
-    """Equation that each estimator solves; None for filters and direct estimates, which have no iterations."""
+    """Equation that each estimator solves; None for filters and direct estimates, which have no
+    iterations."""
     families: Mapping[str, str]
     """Family of each estimator, of which smoothers are one."""
     parameters: Sequence[Mapping[str, Any]] = ()
     """Name, unit, size and group of each; empty for all settings."""
     focus: Sequence[str] = ()
-    """The estimators in colour where not all can be: the best, then those that the bench is about."""
+    """The estimators in colour where not all can be: the best, then those that the bench is
+    about."""
     winner: str = ""
     """The one that holds longest and succeeds most; empty if several do."""
     paper: bool = False
@@ -83,7 +88,8 @@ class View:
 
     @cached_property
     def totals(self) -> pd.DataFrame:
-        """The rows of the summary over all parameters, with the number of trials `solved_trials` behind each."""
+        """The rows of the summary over all parameters, with the number of trials `solved_trials`
+        behind each."""
         rows = self["summary"]
         rows = rows[rows["parameter"] == ALL].sort_values("error_scale", kind="stable")
         return rows.assign(solved_trials=(rows["solved"] * rows["trials"]).round())
@@ -95,14 +101,16 @@ class View:
         return sorted({float(s) for frame in frames for s in frame["error_scale"]})
 
     def with_look(self, estimators: Any) -> dict[str, Look]:
-        """Returns the looks of those of the estimators that are present, of many in grey but for the focus."""
+        """Returns the looks of those of the estimators that are present, of many in grey but for
+        the focus."""
         present = set(estimators)
         colored = self.focus if len(self.look) > MOST_FACES else self.look
         look = in_focus(self.look, colored)
         return {label: one for label, one in look.items() if label in present}
 
     def drawing(self, figure: Canvas, name: str, title: str, *caption: str) -> Drawing:
-        """Returns a figure of this setting, whose label stands with the title; empty parts of the caption go."""
+        """Returns a figure of this setting, whose label stands with the title; empty parts of the
+        caption go."""
         titled = f"{title} ({self.label})" if self.label else title
         words = " ".join(filter(None, caption))
         return Drawing(f"{name}{self.suffix}", titled, words, figure)
@@ -116,9 +124,10 @@ class View:
 class Figure:
     """Declares a kind of figure: the frames that it reads, and how it is drawn.
 
-    Required: `draw` and `frames`. Optional: `together` and `main`. Promised: `draw` reads the view's `frames` and does
-    not write into them; it yields drawings, made by `view.drawing(figure, name, title, ...)`, whose names are new.
-    A statistic of a plugin is a column of the frame `summary`; a figure that raises is left out with a line.
+    Required: `draw` and `frames`. Optional: `together` and `main`. Promised: `draw` reads the
+    view's `frames` and does not write into them; it yields drawings, made by `view.drawing(figure,
+    name, title, ...)`, whose names are new. A statistic of a plugin is a column of the frame
+    `summary`; a figure that raises is left out with a line.
 
     >>> Figure(lambda view: iter(()), ("summary",)).together
     False
@@ -135,8 +144,8 @@ class Figure:
 
 
 def views(analysis: Analysis, which: Which = "all") -> tuple[list[View], View]:
-    """Returns the settings of simulated trials that are drawn, those with most failures first, and all settings
-    together with every estimator."""
+    """Returns the settings of simulated trials that are drawn, those with most failures first, and
+    all settings together with every estimator."""
     every = _looks(analysis)
     collection = analysis.collection
     analysis = analysis.simulated
@@ -202,7 +211,8 @@ def _suffix(words: Iterable[str], taken: Sequence[str]) -> str:
 
 
 def _success(summary: pd.DataFrame) -> float:
-    """Returns the mean rate of success to a tenth, so that settings which are alike keep their order."""
+    """Returns the mean rate of success to a tenth, so that settings which are alike keep their
+    order."""
     success = summary.loc[summary["parameter"] == ALL, "success"]
     return round(success.mean(), 1)
 
@@ -218,7 +228,8 @@ def _split(frame: pd.DataFrame, columns: Sequence[str]) -> dict[tuple[str, ...],
 
 
 def _word(value: Any) -> str:
-    """Returns a setting's value as it is compared and shown; a dash where a setting does not have that option."""
+    """Returns a setting's value as it is compared and shown; a dash where a setting does not have
+    that option."""
     if value is None or (pd.api.types.is_scalar(value) and pd.isna(value)):
         return "-"
     text = value_text(value)
@@ -233,7 +244,8 @@ def _looks(analysis: Analysis) -> dict[str, Look]:
 
 
 def _looks_by(footers: Mapping[str, Mapping[str, Any]]) -> dict[str, Look]:
-    """Returns a look for each label: the colour and marker that its class names, or those of its family."""
+    """Returns a look for each label: the colour and marker that its class names, or those of its
+    family."""
     families = {label: family_of(footer) for label, footer in footers.items()}
     named = [(label, footer.get("look")) for label, footer in footers.items()]
     own = {label: _named(label, look) for label, look in named if look}
@@ -248,7 +260,8 @@ def in_focus(look: Mapping[str, Look], colored: Container[str]) -> dict[str, Loo
 
 
 def focus_of(summary: pd.DataFrame) -> tuple[list[str], str]:
-    """Returns the estimators that are in colour where not all can be, the best first, and the best if it is one."""
+    """Returns the estimators that are in colour where not all can be, the best first, and the best
+    if it is one."""
     totals = summary[summary["parameter"] == ALL]
     rows: Any = totals[totals["estimator"] != REFERENCE]
     if rows.empty:
@@ -268,7 +281,8 @@ def looks_of(estimators: Mapping[str, Any]) -> dict[str, Look]:
 
 
 def _named(label: str, look: Any) -> tuple[str, str]:
-    """Returns the colour and marker that an estimator's class names; raises UserError if there are none such."""
+    """Returns the colour and marker that an estimator's class names; raises UserError if there are
+    none such."""
     from matplotlib.colors import to_hex
     from matplotlib.markers import MarkerStyle
 

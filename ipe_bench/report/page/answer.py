@@ -47,7 +47,8 @@ _FEW = 0.05
 """Share of outliers above which the model is wrong, and no list of readings helps."""
 _FITS = {True: "yes", False: "NO", None: "not tested"}
 _INFLUENTIAL = 1.0
-"""Standard errors by which a parameter moves without a reading from which on that reading is named."""
+"""Standard errors by which a parameter moves without a reading from which on that reading is
+named."""
 _MOST_READINGS = 5
 _MOST_MINIMA = 3
 
@@ -70,7 +71,8 @@ def labelled(parts: Sequence[T], labels: Sequence[str], which: str | int) -> T:
 
 @dataclass(frozen=True)
 class Answer(Shown):
-    """Holds the fits of estimators to real readings, and the examination of the fit with the least minimum."""
+    """Holds the fits of estimators to real readings, and the examination of the fit with the least
+    minimum."""
 
     name: str
     """Name of the model in titles."""
@@ -86,8 +88,8 @@ class Answer(Shown):
 
     @classmethod
     def to(cls, question: Question, name: str = "", progress: Shows = True) -> Answer:
-        """Returns the answer to a question, under its model's name or another `name`; `progress` is that of
-        `ipe_bench.estimate`."""
+        """Returns the answer to a question, under its model's name or another `name`; `progress` is
+        that of `ipe_bench.estimate`."""
         from ipe_bench.report.progress import counting
 
         model = question.found.model
@@ -114,7 +116,8 @@ class Answer(Shown):
         return labelled(self.fits, [one.label for one in self.fits], which)
 
     def table(self) -> pd.DataFrame:
-        """Returns estimate, standard error, 95 % interval, and whether the fit passes, per estimator and parameter."""
+        """Returns estimate, standard error, 95 % interval, and whether the fit passes, per
+        estimator and parameter."""
         import pandas as pd
 
         frames = []
@@ -162,7 +165,8 @@ class Answer(Shown):
         for one in lacking[:1]:
             what = "; ".join(one.undetermined)
             yield Strong(
-                f"The readings do not determine {what} (at {one.label}); fix parameters, or give prior, until they do."
+                f"The readings do not determine {what} (at {one.label}); fix parameters, or give"
+                " prior, until they do."
             )
 
     def sentences(self) -> list[str]:
@@ -174,7 +178,10 @@ class Answer(Shown):
         labels = enumerate_few([one.label for one in passing])
         tests = "every test"
         if not passing[0].fits:
-            tests = "the available tests; the size of the residuals is not tested, for the noise level is unknown"
+            tests = (
+                "the available tests; the size of the residuals is not tested, for the noise level"
+                " is unknown"
+            )
         without = f"; no answer: {others}" if others else ""
         told = self.examination
         examined = [one for one in passing if told and one.label == told.label]
@@ -189,7 +196,8 @@ class Answer(Shown):
 
 
 def _estimates(answer: Answer) -> Table:
-    """Returns estimates with their errors; an invalid one stands in brackets, without its meaningless errors."""
+    """Returns estimates with their errors; an invalid one stands in brackets, without its
+    meaningless errors."""
     parameters = answer.fits[0].model.physical_parameters
     columns = [words("parameter", [p.name for p in parameters])]
     columns.append(words("unit", [p.unit for p in parameters]))
@@ -206,7 +214,8 @@ def _estimates(answer: Answer) -> Table:
 
 
 def with_error(value: float, error: float) -> str:
-    """Returns a value with its standard error: two figures of the error, the value to the same place, one exponent."""
+    """Returns a value with its standard error: two figures of the error, the value to the same
+    place, one exponent."""
     if not (math.isfinite(value) and math.isfinite(error) and error > 0):
         return _number(value, 6)
     if error < 1e-14 * abs(value):
@@ -218,7 +227,8 @@ def with_error(value: float, error: float) -> str:
 
 
 def _together(values: Sequence[float], between: str, place: int) -> str:
-    """Writes numbers to one decimal place, with one exponent for all if they are very large or very small."""
+    """Writes numbers to one decimal place, with one exponent for all if they are very large or very
+    small."""
     largest = max(map(abs, values))
     if 1e-4 <= largest < 1e6 and place >= -6:
         return between.join(f"{round(v, -place):.{max(-place, 0)}f}" for v in values)
@@ -233,7 +243,8 @@ def _number(value: float, figures: int = 4) -> str:
 
 
 def _verdicts(answer: Answer) -> Table:
-    """Returns whether each fit passes; chi-square is omitted if the noise level is estimated from the residuals."""
+    """Returns whether each fit passes; chi-square is omitted if the noise level is estimated from
+    the residuals."""
     fits = answer.fits
     columns = [
         words("estimator", [one.label for one in fits]),
@@ -257,12 +268,13 @@ def _fit_p(p: float) -> str:
 
 
 def _notes(answer: Answer) -> Iterator[str]:
-    """Yields the notes on the fits: what tests mean, each estimator's own ones, noise and priors."""
+    """Yields the notes on the fits: what tests mean, each estimator's own ones, noise and
+    priors."""
     fits = answer.fits
     yield (
-        f"An estimate fits if p of chi-square is at least {FIT_LEVEL:g}. white p: p-value of the Ljung-Box test,"
-        " which is small if successive residuals resemble each other. deviation is the standard deviation of the"
-        " residuals, in the unit of the readings."
+        f"An estimate fits if p of chi-square is at least {FIT_LEVEL:g}. white p: p-value of the"
+        " Ljung-Box test, which is small if successive residuals resemble each other. deviation is"
+        " the standard deviation of the residuals, in the unit of the readings."
     )
     for one in fits:
         if one.message:
@@ -286,15 +298,18 @@ def _labels(fits: Iterable[Fit]) -> str:
 
 def _notes_on_fit(one: Fit) -> Iterator[str]:
     if one.beaten_by:
-        yield f"{one.label}: {one.beaten_by} found a better fit, by more than chance explains; this is no answer."
+        yield (
+            f"{one.label}: {one.beaten_by} found a better fit, by more than chance explains; this"
+            " is no answer."
+        )
     if one.lower_at:
         yield f"{one.label}: {one.lower_at} ended at a lower minimum, which is the better answer."
     if one.held_at:
         parameters = one.model.physical_parameters
         at = {parameters[k].name: value for k, value in one.held_at.items()}
         yield (
-            f"{one.label}: on its bound: {_values(at)}; the readings favour a value beyond. It has no error, and"
-            " the errors of the others hold it there."
+            f"{one.label}: on its bound: {_values(at)}; the readings favour a value beyond. It has"
+            " no error, and the errors of the others hold it there."
         )
 
 
@@ -304,48 +319,54 @@ def _notes_on_noise(answer: Answer) -> Iterator[str]:
     levelled = [one for one in fits if one.level is not None]
     if any(one.levels for one in fits):
         yield (
-            "The noise levels are estimated with the parameters by restricted maximum likelihood. They make chi-square"
-            " equal to the degrees of freedom, so the size of the residuals cannot test the model. Three things can:"
-            " white p, outliers, and a comparison of the levels with each other and with what is known of the"
-            " instruments."
+            "The noise levels are estimated with the parameters by restricted maximum likelihood."
+            " They make chi-square equal to the degrees of freedom, so the size of the residuals"
+            " cannot test the model. Three things can: white p, outliers, and a comparison of the"
+            " levels with each other and with what is known of the instruments."
         )
         known = _labels(one for one in fits if one.estimated and not one.estimated.maximal)
         if known:
             yield f"{known}: takes the levels of its own residuals as known."
     elif levelled:
         yield (
-            "The noise level is estimated from the residuals. Standard errors are scaled by it, intervals use"
-            " Student's t, and the size of the residuals cannot test the model."
+            "The noise level is estimated from the residuals. Standard errors are scaled by it,"
+            " intervals use Student's t, and the size of the residuals cannot test the model."
         )
     suspect = _labels(one for one in levelled if one.white_p < FIT_LEVEL)
     if suspect:
         yield (
-            f"{suspect}: successive residuals resemble each other (white p below {FIT_LEVEL:g}); the model"
-            " is in doubt, and standard errors are too small."
+            f"{suspect}: successive residuals resemble each other (white p below {FIT_LEVEL:g});"
+            " the model is in doubt, and standard errors are too small."
         )
     small = [one for one in fits if one.overstated > 1]
     if small:
         times = max(one.overstated for one in small)
         yield (
-            f"{_labels(small)}: the residuals are up to {times:.2g} times smaller than the"
-            f" stated noise, by chance in less than {1 - TOO_WELL:.1g} of cases; if it is overstated, so are standard"
-            " errors."
+            f"{_labels(small)}: the residuals are up to {times:.2g} times smaller than the stated"
+            f" noise, by chance in less than {1 - TOO_WELL:.1g} of cases; if it is overstated, so"
+            " are standard errors."
         )
     if answer.examination is not None and answer.examination.overstated:
         yield (
-            "By noise that is so far overstated no interval means anything, and none is computed: state the noise of"
-            " these readings, or choose noise=unknown, whose level is estimated."
+            "By noise that is so far overstated no interval means anything, and none is computed:"
+            " state the noise of these readings, or choose noise=unknown, whose level is"
+            " estimated."
         )
 
 
 def _notes_on_priors(answer: Answer) -> Iterator[str]:
     told = _labels(one for one in answer.fits if one.with_prior)
     if told:
-        yield f"{told}: with a prior, which counts in the standard errors as further readings would."
+        yield (
+            f"{told}: with a prior, which counts in the standard errors as further readings would."
+        )
     elif isinstance(answer.model, ConstrainedModel):
         stated = [one.name for one in answer.model.known if one.deviation is not None]
         if stated:
-            yield f"The prior of {', '.join(stated)} counts in no estimate here; add one with a prior, such as map_lm."
+            yield (
+                f"The prior of {', '.join(stated)} counts in no estimate here; add one with a"
+                " prior, such as map_lm."
+            )
 
 
 def _values(values: Mapping[str, float], figures: int = 6) -> str:
@@ -353,7 +374,8 @@ def _values(values: Mapping[str, float], figures: int = 6) -> str:
 
 
 def _outliers(answer: Answer) -> Iterator[Table]:
-    """Yields the most outlying readings, each with its largest residual and the estimators that find it so."""
+    """Yields the most outlying readings, each with its largest residual and the estimators that
+    find it so."""
     told = [f for f in answer.fits if 0 < f.outliers.sum() <= max(3, _FEW * len(f.outliers))]
     if not told:
         return
@@ -382,7 +404,8 @@ def _reading_labels(model: Measurement) -> list[dict[str, Any]]:
 
 
 def _intervals(found: Examination) -> Table:
-    """Returns three intervals of each parameter; for a parameter on a bound, that of its profile."""
+    """Returns three intervals of each parameter; for a parameter on a bound, that of its
+    profile."""
     on_bounds = found.on_bounds
     absent = ["-"] * len(on_bounds)
     parameters = [*found.model.physical_parameters, *(one.parameter for one in on_bounds)]
@@ -403,8 +426,8 @@ def _intervals(found: Examination) -> Table:
 
 
 def _interval(low: float, high: float, middle: float) -> str:
-    """Rounds the ends to a hundredth of twice the lesser distance to the estimate `middle`, or of the width if
-    outside."""
+    """Rounds the ends to a hundredth of twice the lesser distance to the estimate `middle`, or of
+    the width if outside."""
     if not math.isfinite(high - low) or high <= low:
         text = f"{low:.6g} … {high:.6g}".replace("-inf", "−∞")
         text = text.replace("inf", "∞").replace("nan", "-")
@@ -428,15 +451,19 @@ def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator
     yield from _on_profiles(found, names)
     for one in found.on_bounds:
         yield (
-            f"{one.parameter.name}: its estimate is on the bound {one.bound:g}, which is one end of its interval; the"
-            " other is where the profile has risen as far as inside of bounds, so it holds the true value at least as"
-            " often as it says. Profiles of the others let it move inwards; their standard errors do not."
+            f"{one.parameter.name}: its estimate is on the bound {one.bound:g}, which is one end"
+            " of its interval; the other is where the profile has risen as far as inside of"
+            " bounds, so it holds the true value at least as often as it says. Profiles of the"
+            " others let it move inwards; their standard errors do not."
         )
     shift = np.nan_to_num(found.shift, nan=0.0)
     for i in np.argsort(-shift)[:_MOST_READINGS]:
         if shift[i] >= _INFLUENTIAL:
             where = _where(labels[i])
-            yield f"Without the reading {where} a parameter would move by {shift[i]:.1f} standard errors."
+            yield (
+                f"Without the reading {where} a parameter would move by {shift[i]:.1f} standard"
+                " errors."
+            )
     drawn = found.bootstrap.drawn
     lost = drawn - found.bootstrap.converged
     if lost > 0:
@@ -452,8 +479,8 @@ def _other_minima(found: Examination, names: Sequence[str]) -> Iterator[str]:
     if not found.least:
         best = found.minima[0]
         yield (
-            f"NOT THE GLOBAL MINIMUM: chi-square is {best.chi_square:.5g} at {at(best.x)}; start there, or choose an"
-            " estimator that searches, such as multiscale_lm."
+            f"NOT THE GLOBAL MINIMUM: chi-square is {best.chi_square:.5g} at {at(best.x)}; start"
+            " there, or choose an estimator that searches, such as multiscale_lm."
         )
     equal = [one.x for one in found.ambiguous if one.same_readings]
     if equal:
@@ -476,11 +503,15 @@ def _on_profiles(found: Examination, names: Sequence[str]) -> Iterator[str]:
         yield f"The readings set no limit to one side of {', '.join(unlimited)}."
     lost = list(compress(names, np.any(np.isnan(found.profiles), axis=0)))
     if lost:
-        yield f"An end of the profile is missing: {', '.join(lost)}; a better fit, or no minimum, was met on the way."
+        yield (
+            f"An end of the profile is missing: {', '.join(lost)}; a better fit, or no minimum,"
+            " was met on the way."
+        )
 
 
 def _changed(names: Sequence[str], x: Array, y: Array, errors: Array) -> str:
-    """Names the signs and exchanges of parameters that lead from x to y; empty if others are needed."""
+    """Names the signs and exchanges of parameters that lead from x to y; empty if others are
+    needed."""
     near = 0.01 * errors
     words = []
     left = [i for i in range(len(x)) if abs(y[i] - x[i]) > near[i]]
@@ -610,7 +641,8 @@ def _by_name(names: Sequence[str], values: Any) -> dict[str, Any]:
 
 
 def _residuals(answer: Answer) -> pd.DataFrame:
-    """Returns a row per estimator and reading, with influences and predictions where missing for the examined one."""
+    """Returns a row per estimator and reading, with influences and predictions where missing for
+    the examined one."""
     import pandas as pd
 
     model = answer.model

@@ -1,4 +1,5 @@
-"""Renders the page report.html: one file that is readable on a phone, on paper and without a network."""
+"""Renders the page report.html: one file that is readable on a phone, on paper and without a
+network."""
 
 from __future__ import annotations
 
@@ -109,8 +110,8 @@ def _provenance(runs: Sequence[Mapping[str, Any]], older: int) -> list[str]:
 
 
 def _runs(runs: Sequence[Mapping[str, Any]]) -> tuple[list[dict[str, Any]], int]:
-    """Returns what was computed, by command, the last first, and the number of older commands; a run that found
-    everything stored computed no trial."""
+    """Returns what was computed, by command, the last first, and the number of older commands; a
+    run that found everything stored computed no trial."""
     commands: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
     for run in runs:
         if run.get("blocks", 1):
@@ -156,24 +157,37 @@ def _minute(started: str) -> str:
     return started[:16].replace("T", " ")
 
 
-# Definitions ---------------------------------------------------------------------------------------------------------
+# Definitions --------------------------------------------------------------------------------------
 
 DEFINITIONS: dict[str, str] = {
     "trial": "One draw of true parameters and of noise. Trial t is the same for every estimator.",
-    "error scale": "Standard deviation of the true parameters about the nominal point, in multiples of their sizes"
-    " (the magnitude of the start of a function's or a formula's parameter).",
+    "error scale": (
+        "Standard deviation of the true parameters about the nominal point, in multiples of their"
+        " sizes (the magnitude of the start of a function's or a formula's parameter)."
+    ),
     **{record.title: record.definition for record in STATISTICS},
-    "parameter 'all'": "Root mean square over parameters of the statistic over the linear bound, unless its definition"
-    " states another.",
+    "parameter 'all'": (
+        "Root mean square over parameters of the statistic over the linear bound, unless its"
+        " definition states another."
+    ),
     **{record.title: record.definition for record in SCORES},
-    "win, tie, loss": f"Errors are paired by trial. Mahalanobis errors that differ by less than {TIE:g} are a tie,"
-    " because estimators that share a root differ by round-off alone.",
-    "p of error": "Wilcoxon's two-sided signed-rank test without ties (Biometrics Bulletin 1, 1945), with Holm's"
-    " correction over the pairs of a scenario (Scandinavian Journal of Statistics 6, 1979).",
-    "p of success": "McNemar's exact test on the trials in which only one of the two succeeds (Psychometrika 12,"
-    " 1947), with Holm's correction.",
-    "may be the best (bold)": "Other estimators do not succeed significantly more often in the same trials, by the"
-    " gate of the Cramér-Rao bound for all: McNemar's exact one-sided test against every rival at 5 % over their"
-    " number, which leaves a true best out in at most 5 % of scenarios (Hsu, Annals of Statistics 9, 1981). No name"
-    " is bold if no estimator is beaten.",
+    "win, tie, loss": (
+        f"Errors are paired by trial. Mahalanobis errors that differ by less than {TIE:g} are a"
+        " tie, because estimators that share a root differ by round-off alone."
+    ),
+    "p of error": (
+        "Wilcoxon's two-sided signed-rank test without ties (Biometrics Bulletin 1, 1945), with"
+        " Holm's correction over the pairs of a scenario (Scandinavian Journal of Statistics 6,"
+        " 1979)."
+    ),
+    "p of success": (
+        "McNemar's exact test on the trials in which only one of the two succeeds (Psychometrika"
+        " 12, 1947), with Holm's correction."
+    ),
+    "may be the best (bold)": (
+        "Other estimators do not succeed significantly more often in the same trials, by the gate"
+        " of the Cramér-Rao bound for all: McNemar's exact one-sided test against every rival at 5"
+        " % over their number, which leaves a true best out in at most 5 % of scenarios (Hsu,"
+        " Annals of Statistics 9, 1981). No name is bold if no estimator is beaten."
+    ),
 }

@@ -25,21 +25,23 @@ NAME = "track"
 TABLE = "track.csv"
 SCHEMA = 1
 _NOTE = (
-    "Innovations are readings less their predictions, in predicted standard deviations, and NIS / m is their"
-    " mean square. A smoother has none: it is judged by the cost of its path, and one behind a filter by NIS"
-    " and whiteness of that filter. If the model is right both are chi-square with a degree per reading, and"
-    " fit p is the probability of larger ones. Innovations are white if the filter is right (Ljung and Box)."
-    " The verdict is on innovations alone: an error that readings do not show, such as the turn of a whole map,"
-    " leaves them as they are. A track is lost from the epoch from which most of them are larger than all but"
-    " one in a million by chance. A dash: the tracker has none of it."
+    "Innovations are readings less their predictions, in predicted standard deviations, and NIS /"
+    " m is their mean square. A smoother has none: it is judged by the cost of its path, and one"
+    " behind a filter by NIS and whiteness of that filter. If the model is right both are"
+    " chi-square with a degree per reading, and fit p is the probability of larger ones."
+    " Innovations are white if the filter is right (Ljung and Box). The verdict is on innovations"
+    " alone: an error that readings do not show, such as the turn of a whole map, leaves them as"
+    " they are. A track is lost from the epoch from which most of them are larger than all but one"
+    " in a million by chance. A dash: the tracker has none of it."
 )
 _OF_PARTICLES = (
-    " Innovations of particles are by the mean and covariance of the readings that they predict; effective"
-    " particles: 1 / sum of squared weights, the median of all epochs; collapsed: below 2."
+    " Innovations of particles are by the mean and covariance of the readings that they predict;"
+    " effective particles: 1 / sum of squared weights, the median of all epochs; collapsed: below"
+    " 2."
 )
 _OF_CONSTANTS = (
-    f" Constants have the largest likelihood that {SEARCHES} searches found. Since innovations determined"
-    " them, the mean square of innovations hardly tests the model; whiteness does."
+    f" Constants have the largest likelihood that {SEARCHES} searches found. Since innovations"
+    " determined them, the mean square of innovations hardly tests the model; whiteness does."
 )
 _STORED = (
     *("lost_from", "effective", "message", "notes", "mean_nis", "limits", "verdict"),
@@ -71,8 +73,8 @@ class LogAnswer(Shown):
         return labelled(self.tracks, [one.label for one in self.tracks], which)
 
     def table(self) -> pd.DataFrame:
-        """Returns a row per tracker and epoch: each state and each predicted reading with its standard deviation, the
-        readings, and NIS."""
+        """Returns a row per tracker and epoch: each state and each predicted reading with its
+        standard deviation, the readings, and NIS."""
         import pandas as pd
 
         return pd.concat([self._rows(one) for one in self.tracks], ignore_index=True)

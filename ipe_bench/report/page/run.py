@@ -38,7 +38,8 @@ class ReportResult(Shown):
     figures: tuple[Path, ...]
     report: Path
     problems: tuple[str, ...]
-    """Lines about missing, failed, foreign or damaged pieces; the exit code is 1 if there is any."""
+    """Lines about missing, failed, foreign or damaged pieces; the exit code is 1 if there is
+    any."""
     stale: tuple[str, ...]
     """One line per piece that older code computed, which is left out."""
     headline: tuple[Part, ...]
@@ -128,7 +129,8 @@ class Pending:
 
 
 def _write_summaries(summary: pd.DataFrame, output: Path) -> list[Path]:
-    """Writes the summary over all parameters, which is not returned, that of each, and both with every column."""
+    """Writes the summary over all parameters, which is not returned, that of each, and both with
+    every column."""
     from ipe_bench.statistics.registry import main_columns
     from ipe_bench.statistics.statistic import ALL
 
@@ -180,7 +182,8 @@ def begin_report(
 
 
 def _made_from(directories: Sequence[Path], output: Path, *choices: object) -> str:
-    """Computes a digest of the report's sources before they are read: results that come meanwhile change it."""
+    """Computes a digest of the report's sources before they are read: results that come meanwhile
+    change it."""
     sources = [
         p for p in Path(__file__).parents[2].rglob("*") if p.suffix in {".py", ".j2", ".css", ".js"}
     ]
@@ -197,7 +200,8 @@ def _made_from(directories: Sequence[Path], output: Path, *choices: object) -> s
 
 
 def _is_current(output: Path, made: str) -> bool:
-    """Returns whether the report under `output` was made from this, and its files are as written."""
+    """Returns whether the report under `output` was made from this, and its files are as
+    written."""
     known = _stamped(output)
     return known == {"from": made, "files": _digests(map(Path, known.get("files", ())))}
 
@@ -212,7 +216,8 @@ def _stamped(output: Path) -> dict[str, Any]:
 
 
 def _digests(paths: Iterable[Path]) -> dict[str, str]:
-    """Computes SHA-256 by absolute path, without unreadable files and those that another command is removing."""
+    """Computes SHA-256 by absolute path, without unreadable files and those that another command is
+    removing."""
     found = {}
     for path in sorted(paths):
         with contextlib.suppress(OSError):

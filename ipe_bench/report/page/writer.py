@@ -1,4 +1,5 @@
-"""Reserves the folder of a command that answers one question, and writes its page, CSV and figures."""
+"""Reserves the folder of a command that answers one question, and writes its page, CSV and
+figures."""
 
 from __future__ import annotations
 
@@ -33,8 +34,8 @@ COMMAND: ContextVar[str] = ContextVar("command", default="")
 def reserve_output_folder(
     folder: Path, name: str, command: Any, *, elsewhere: bool, files: Sequence[str] = ()
 ) -> Path:
-    """Reserves the folder that a command writes to: a new one, or that of the same command, by `name`.json; with
-    `elsewhere` folder-2, folder-3 and so on, if it has `files` of another one.
+    """Reserves the folder that a command writes to: a new one, or that of the same command, by
+    `name`.json; with `elsewhere` folder-2, folder-3 and so on, if it has `files` of another one.
 
     Raises:
         UserError: the folder is taken.
@@ -46,8 +47,8 @@ def reserve_output_folder(
     while not _is_free(place, result, command, files):
         if not elsewhere:
             raise UserError(
-                f"output={folder}: holds results of another command, which are not overwritten; choose another folder,"
-                " or remove it"
+                f"output={folder}: holds results of another command, which are not overwritten;"
+                " choose another folder, or remove it"
             )
         number += 1
         place = folder.with_name(f"{folder.name}-{number}")
@@ -68,14 +69,16 @@ def _is_free(folder: Path, result: str, command: Any, files: Sequence[str]) -> b
 
 @dataclass(frozen=True)
 class Page:
-    """Holds what a page shows: the answer, a figure and a table are seen at once, and the sections are folded."""
+    """Holds what a page shows: the answer, a figure and a table are seen at once, and the sections
+    are folded."""
 
     kind: str
     title: str
     answer: Sequence[Part]
     shown: Sequence[Any]
     sections: Sequence[tuple[str, str, Sequence[Any]]]
-    """Place, title and parts: sentences, tables, figures or pieces of HTML; one without parts is left out."""
+    """Place, title and parts: sentences, tables, figures or pieces of HTML; one without parts is
+    left out."""
     commands: Sequence[str]
     sources: Sequence[tuple[str, str]]
     """What was read, each with its SHA-256."""
@@ -109,7 +112,8 @@ class Page:
 
 
 def digests(places: Iterable[Path]) -> list[tuple[str, str]]:
-    """Returns each file with its SHA-256, and each folder of results with that of the digests of its trials."""
+    """Returns each file with its SHA-256, and each folder of results with that of the digests of
+    its trials."""
     found = []
     for place in places:
         if place.is_dir():
@@ -137,8 +141,9 @@ def write_files(
     facts: Sequence[str] = (),
     sources: Sequence[tuple[str, str]] = (),
 ) -> list[Path]:
-    """Writes the files of a command and returns them: the `table` under its name, the page `name`.html with at most
-    three sentences and the first of its tables seen at once, and its figures."""
+    """Writes the files of a command and returns them: the `table` under its name, the page
+    `name`.html with at most three sentences and the first of its tables seen at once, and its
+    figures."""
     files = [folder / table[0], folder / f"{name}.html"]
     write_text(files[0], table[1].to_csv(index=False))
     with house_style() if drawings else nullcontext():

@@ -1,4 +1,5 @@
-"""Makes tables, and shows them in terminals and files. Plugins find here what plugins/README promises."""
+"""Makes tables, and shows them in terminals and files. Plugins find here what plugins/README
+promises."""
 
 from typing import Any
 

@@ -1,5 +1,6 @@
-"""Makes the matrix of a comparison: estimators, the best first, by error scales or settings, with success as number and
-colour, and a sign where the reported covariance is too small or not judged."""
+"""Makes the matrix of a comparison: estimators, the best first, by error scales or settings, with
+success as number and colour, and a sign where the reported covariance is too small or not
+judged."""
 
 from __future__ import annotations
 
@@ -89,8 +90,8 @@ class Matrix(Table):
 
     @property
     def on_paper(self) -> list[str]:
-        """Titles of the columns on paper: neighbouring scales whose cells say the same are one, and the further ones
-        have no title."""
+        """Titles of the columns on paper: neighbouring scales whose cells say the same are one, and
+        the further ones have no title."""
 
         def texts(column: Column) -> list[str]:
             return [cell.text for cell in column.cells]
@@ -120,8 +121,8 @@ def opening(rows: Sequence[Row], lines: float = math.inf) -> list[Part]:
 
 
 def matrices(rows: Iterable[Row], lines: float = math.inf) -> list[Matrix]:
-    """Returns the matrix of a sweep, of several settings at one scale, or of each of several settings that are swept;
-    none of a single scale, whose table says it all."""
+    """Returns the matrix of a sweep, of several settings at one scale, or of each of several
+    settings that are swept; none of a single scale, whose table says it all."""
     listed = list(rows)
     finding = Finding.of(listed)
     settings = list(dict.fromkeys(setting for setting, _ in finding.places))
@@ -171,7 +172,8 @@ def _matrix(finding: Finding, name: str, title: str) -> Matrix:
 
 
 def _over(finding: Finding) -> str:
-    """Names what the columns are: error scales, values of the one option that is swept, or settings."""
+    """Names what the columns are: error scales, values of the one option that is swept, or
+    settings."""
     if finding.ascending:
         return "error scale"
     options = {setting.rpartition("=")[0] for setting, _ in finding.places}
@@ -253,7 +255,8 @@ def _says(row: Row, verdict: str, moving: bool) -> str:
 
 
 def points(share: float) -> str:
-    """Formats a share in per cent in at most five letters; it is never rounded to all, none or the level that holds."""
+    """Formats a share in per cent in at most five letters; it is never rounded to all, none or the
+    level that holds."""
     value = 100 * share
     if value in (0, 100):
         return f"{value:.0f}"
@@ -267,7 +270,8 @@ def points(share: float) -> str:
 
 
 def step(share: float) -> int:
-    """Returns the place of a share of success in the colours: two from the level that holds on, the others below."""
+    """Returns the place of a share of success in the colours: two from the level that holds on, the
+    others below."""
     if share >= _WELL:
         return 0
     if share >= HELD:

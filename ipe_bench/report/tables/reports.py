@@ -26,70 +26,72 @@ from ipe_bench.statistics.registry import all_statistics
 from ipe_bench.statistics.statistic import ALL, Where, frame_columns
 
 _OPEN = (
-    " An interval of one end (> or <) stands where larger errors may be unseen, in 3 of N trials or fewer; rmse_unseen"
-    " in summary.csv is that share."
+    " An interval of one end (> or <) stands where larger errors may be unseen, in 3 of N trials"
+    " or fewer; rmse_unseen in summary.csv is that share."
 )
 _RECORDED: dict[Where, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
     "tracks": (
         "States over all epochs",
-        "Over all epochs; all: root mean square over the states, relative to the filter linearised at the true path,"
-        " or for smoothers, which use later readings too, to the smoother behind it; about 1 is good"
-        f" for either.{_OPEN}",
+        "Over all epochs; all: root mean square over the states, relative to the filter linearised"
+        " at the true path, or for smoothers, which use later readings too, to the smoother behind"
+        f" it; about 1 is good for either.{_OPEN}",
         lambda rows: rows["path_rmse"].notna(),
     ),
     "costs": (
         "Costs",
-        "Over all trials, medians where no mean is named; a Jacobian counts the simulations that its model states."
-        " The cost to 0.05 σ of the limit and the order are over the converged trials with a stored history.",
+        "Over all trials, medians where no mean is named; a Jacobian counts the simulations that"
+        " its model states. The cost to 0.05 σ of the limit and the order are over the converged"
+        " trials with a stored history.",
         lambda rows: rows["trials"] > 0,
     ),
     "parameters": (
         "Parameters",
-        "In each parameter's own unit. Bias, std, rmse, bounds and NEES are over solved trials; median and 95 % of the"
-        f" absolute error, and coverage, over all trials.{_OPEN}",
+        "In each parameter's own unit. Bias, std, rmse, bounds and NEES are over solved trials;"
+        f" median and 95 % of the absolute error, and coverage, over all trials.{_OPEN}",
         lambda rows: rows["parameter"] != ALL,
     ),
     "calibration": (
         "Calibration of the reported covariance",
-        "This table tests whether the truth is distributed as the Gaussian that an estimator reports, over converged"
-        " trials with a covariance, for NEES and every parameter together, at 5 % for each row. The median NEES with"
-        " its limits is over all trials.",
+        "This table tests whether the truth is distributed as the Gaussian that an estimator"
+        " reports, over converged trials with a covariance, for NEES and every parameter together,"
+        " at 5 % for each row. The median NEES with its limits is over all trials.",
         lambda rows: rows["claims"] > 0,
     ),
     "all_trials": (
         "All trials",
-        "Over all trials, the same for every estimator. A single trial may decide the root mean square error and the"
-        " uncapped efficiency.",
+        "Over all trials, the same for every estimator. A single trial may decide the root mean"
+        " square error and the uncapped efficiency.",
         lambda rows: rows["trials"] > 0,
     ),
     "solved_trials": (
         "Solved trials",
-        "This table diagnoses estimators that solve an equation and does not compare them with others: each row is"
-        " over the trials in which the estimator found the root that belongs to the truth. Their number stands in"
-        f" brackets if it is not all.{_OPEN}",
+        "This table diagnoses estimators that solve an equation and does not compare them with"
+        " others: each row is over the trials in which the estimator found the root that belongs"
+        f" to the truth. Their number stands in brackets if it is not all.{_OPEN}",
         lambda rows: rows["equation"] != "-",
     ),
     "covariances": (
         "Covariance of the frozen root",
-        "Standard deviations over the linear bound of eq. (5), root mean square over parameters, of the estimators that"
-        " solve eq. (11), over solved trials. rmse comes from Monte Carlo. reported is the sandwich at the estimate,"
-        " which holds to first order. eq. (14) treats the compensation error as independent of the noise, which it is"
-        " not.",
+        "Standard deviations over the linear bound of eq. (5), root mean square over parameters,"
+        " of the estimators that solve eq. (11), over solved trials. rmse comes from Monte Carlo."
+        " reported is the sandwich at the estimate, which holds to first order. eq. (14) treats"
+        " the compensation error as independent of the noise, which it is not.",
         lambda rows: rows["eq_14"].notna(),
     ),
     "theory": (
         "Theory beside experiment",
-        "Estimators that minimise the sum of squares, over solved trials, in the parameters' own units; all: over the"
-        " linear bound, root mean square over parameters. The theory uses the Jacobians of the models and no draw of"
-        " noise; if readings come from another model than the assumed one, it uses the Jacobians of both. Linear"
-        f" theory holds if the relative curvatures are below 0.3.{_OPEN}",
+        "Estimators that minimise the sum of squares, over solved trials, in the parameters' own"
+        " units; all: over the linear bound, root mean square over parameters. The theory uses the"
+        " Jacobians of the models and no draw of noise; if readings come from another model than"
+        " the assumed one, it uses the Jacobians of both. Linear theory holds if the relative"
+        f" curvatures are below 0.3.{_OPEN}",
         lambda rows: rows["predicted_rmse"].notna(),
     ),
     "iterations": (
         "Bounds on the iterations",
-        "Over the first trials, whose iterates are stored. Eq. (18) bounds fixed-point iteration if K of eq. (15) is"
-        " below 1; eq. (23) bounds Newton's method by the curvature M of its g. Constants are taken at the truth, and"
-        " the last iterate is taken for the root.",
+        "Over the first trials, whose iterates are stored. Eq. (18) bounds fixed-point iteration"
+        " if K of eq. (15) is below 1; eq. (23) bounds Newton's method by the curvature M of its"
+        " g. Constants are taken at the truth, and the last iterate is taken for the root.",
         lambda rows: (rows["eq_18_trials"] > 0) | rows["eq_23_observed"].notna(),
     ),
 }
@@ -101,7 +103,8 @@ _APPENDIX = ("all_trials", "solved_trials", "contraction", "covariances", "theor
 
 
 def all_tables(analysis: Analysis, whole: Analysis | None = None) -> list[Table]:
-    """Returns every table that the data allow, in the order of the report, with the endings of the `whole` analysis."""
+    """Returns every table that the data allow, in the order of the report, with the endings of the
+    `whole` analysis."""
     found = {"endings": endings(whole or analysis)}
     if not analysis.summary.empty:
         rows = analysis.summary[analysis.summary["parameter"] == ALL].reset_index(drop=True)
@@ -117,7 +120,8 @@ def all_tables(analysis: Analysis, whole: Analysis | None = None) -> list[Table]
 
 
 def head(analysis: Analysis, rows: pd.DataFrame) -> list[Column]:
-    """Returns the columns that tell rows apart: those settings that differ, of many in one column, and the scale."""
+    """Returns the columns that tell rows apart: those settings that differ, of many in one column,
+    and the scale."""
     apart = varying(analysis.setting_columns, rows)
     if len(apart) > MOST_SETTINGS:
         told = [words("setting", differing(rows, apart))]
@@ -135,7 +139,8 @@ def _counts(rows: pd.DataFrame, *names: str) -> list[Column]:
 
 
 def _recorded(analysis: Analysis, where: Where, totals: pd.DataFrame) -> Table | None:
-    """Returns the table of the statistics whose records name it, behind the estimators and other columns of names."""
+    """Returns the table of the statistics whose records name it, behind the estimators and other
+    columns of names."""
     title, caption, chosen = _RECORDED[where]
     of_parameters = where in _OF_PARAMETERS
     names = ["estimator", "parameter", "unit"] if of_parameters else ["estimator"]
@@ -180,9 +185,10 @@ def contraction(analysis: Analysis) -> Table | None:
         columns.append(column(f"{title}, largest", rows[f"{stored}_max"], short))
         columns.append(column(f"{title} below 1", rows[f"{stored}_below_1"], percent))
     caption = (
-        "Of g' = I - H⁺J at the truth, over all trials. K of eq. (15), or the infinity norm, below 1 in a whole"
-        " neighbourhood is sufficient for fixed-point iteration to converge there; the spectral radius, the rate at"
-        " which the error shrinks, below 1 is necessary and sufficient close to the root."
+        "Of g' = I - H⁺J at the truth, over all trials. K of eq. (15), or the infinity norm, below"
+        " 1 in a whole neighbourhood is sufficient for fixed-point iteration to converge there;"
+        " the spectral radius, the rate at which the error shrinks, below 1 is necessary and"
+        " sufficient close to the root."
     )
     return Table("contraction", "Contraction", caption, columns, rows)
 
@@ -203,9 +209,9 @@ def comparisons(analysis: Analysis) -> Table | None:
     columns.append(column("p of success", rows["p_success"], p_value))
     columns.append(words("finding", closer))
     caption = (
-        "Over the trials that both have. First alone and second alone count trials in which only that one succeeds, by"
-        " the gate of the Cramér-Rao bound. p: Wilcoxon's signed-rank and McNemar's exact test, Holm-corrected over all"
-        " pairs of all scenarios."
+        "Over the trials that both have. First alone and second alone count trials in which only"
+        " that one succeeds, by the gate of the Cramér-Rao bound. p: Wilcoxon's signed-rank and"
+        " McNemar's exact test, Holm-corrected over all pairs of all scenarios."
     )
     return Table("comparisons", "Paired comparisons", caption, columns, rows)
 
@@ -225,8 +231,8 @@ def endings(analysis: Analysis) -> Table | None:
 
 
 def certified_tables(collection: Collection) -> list[Table]:
-    """Returns digits per data set with averages, and published errors, if there are data; a terminal shows those that
-    name the file with the `whole`."""
+    """Returns digits per data set with averages, and published errors, if there are data; a
+    terminal shows those that name the file with the `whole`."""
     digits = certified_table(collection)
     found = [] if digits.empty else _digits(digits)
     published = published_table(collection)
@@ -236,10 +242,12 @@ def certified_tables(collection: Collection) -> list[Table]:
 
 
 def _digits(digits: pd.DataFrame) -> list[Table]:
-    """Returns the mean digits of an estimator from each start, the most first, and its digits per data set."""
+    """Returns the mean digits of an estimator from each start, the most first, and its digits per
+    data set."""
     caption = (
-        "Log relative error against the certified answer, at most 11. It is the smallest over the parameters of a data"
-        " set, the smallest over their standard deviations, and the error of the residual sum of squares."
+        "Log relative error against the certified answer, at most 11. It is the smallest over the"
+        " parameters of a data set, the smallest over their standard deviations, and the error of"
+        " the residual sum of squares."
     )
     columns = [words("data set", digits["dataset"])]
     columns += _counts(digits, "start")
@@ -268,8 +276,8 @@ def _published(rows: pd.DataFrame, collection: Collection) -> Table:
     models = [scenario.get("model", {}) for scenario in scenarios]
     sources = dict.fromkeys(model["source"] for model in models if "source" in model)
     caption = (
-        "Root mean square errors over all epochs of one stored path, beside those that are published."
-        f" {' '.join(sources)}"
+        "Root mean square errors over all epochs of one stored path, beside those that are"
+        f" published. {' '.join(sources)}"
     )
     title = "Published errors of trackers"
     return Table("published", title, caption, columns, rows, whole="tables/published.csv")

@@ -92,8 +92,9 @@ class Table(Shown):
     """Holds a table with its file name, its title, the caption above it and the notes below it.
 
     A plugin offers a function of the analysis that returns one, or None where it would be empty.
-    Required: `name`, `title`, `caption` and `columns` (`head`, `words` and `column` of `ipe_bench.report.tables` make
-    them). Optional: the other fields. Promised: the function does not write into the analysis, and `name` is new.
+    Required: `name`, `title`, `caption` and `columns` (`head`, `words` and `column` of
+    `ipe_bench.report.tables` make them). Optional: the other fields. Promised: the function does
+    not write into the analysis, and `name` is new.
 
     >>> from ipe_bench.report.tables import words
     >>> table = Table("methods", "Methods", "Who takes part.", [words("estimator", ["ekf", "ukf"])])
@@ -111,9 +112,11 @@ class Table(Shown):
     """Whether the page shows it behind the figures."""
     notes: Sequence[str] = ()
     grouped: int = 0
-    """Number of leading columns whose texts identify a group of rows: a terminal shows them once a group."""
+    """Number of leading columns whose texts identify a group of rows: a terminal shows them once a
+    group."""
     whole: str = ""
-    """File with the columns for which a terminal has no room: they are named and not shown below."""
+    """File with the columns for which a terminal has no room: they are named and not shown
+    below."""
 
     def __post_init__(self) -> None:
         """Leaves out columns without content."""
@@ -171,7 +174,8 @@ def cells(texts: Iterable[str], keys: Iterable[Any], best: Iterable[bool] = ()) 
 def interval(
     title: str, low: Iterable[float], high: Iterable[float], show: Callable[[float], str]
 ) -> Column:
-    """Makes a column of intervals, sorted by their lower ends; one end alone has a sign before it."""
+    """Makes a column of intervals, sorted by their lower ends; one end alone has a sign before
+    it."""
 
     def shown(low: float, high: float) -> str:
         if math.isnan(high):
@@ -195,11 +199,12 @@ def sort_key(value: Any) -> str:
     return "1e999" if math.isnan(number) or number == math.inf else repr(number)
 
 
-# Terminal ------------------------------------------------------------------------------------------------------------
+# Terminal -----------------------------------------------------------------------------------------
 
 
 def terminal(parts: Iterable[Part], width: int) -> Group:
-    """Tables and sentences for a terminal; columns without room go below, or are named with the file that has them."""
+    """Tables and sentences for a terminal; columns without room go below, or are named with the
+    file that has them."""
     from rich.console import Group
     from rich.text import Text
 
@@ -216,7 +221,8 @@ def terminal(parts: Iterable[Part], width: int) -> Group:
 
 
 def _pieces(table: Table, width: int) -> Iterator[Any]:
-    """Yields the title, tables below each other with the columns that have room in each, and the notes."""
+    """Yields the title, tables below each other with the columns that have room in each, and the
+    notes."""
     from rich.text import Text
 
     if table.title:
@@ -315,7 +321,7 @@ def _rich(columns: Sequence[Column], table: Table, width: int) -> Any:
     return shown
 
 
-# HTML ----------------------------------------------------------------------------------------------------------------
+# HTML ---------------------------------------------------------------------------------------------
 
 
 @cache
@@ -351,11 +357,12 @@ def html(parts: Iterable[Part]) -> str:
     return environment().get_template("notebook.html.j2").render(parts=list(parts))
 
 
-# Files ---------------------------------------------------------------------------------------------------------------
+# Files --------------------------------------------------------------------------------------------
 
 
 def write_table(table: Table, folder: Path, formats: Sequence[str]) -> list[Path]:
-    """Writes one table in those of the formats that are of tables; as CSV unless another file has it whole."""
+    """Writes one table in those of the formats that are of tables; as CSV unless another file has
+    it whole."""
     writers: dict[str, Any] = dict(zip(TABLES, (comma_separated, markdown, latex), strict=True))
     elsewhere = table.whole not in ("", f"{folder.name}/{table.name}.csv")
     files = []
@@ -425,8 +432,8 @@ _NUMBER = re.compile(r"-?\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?")
 
 
 def latex(table: Table, width: float | None = None) -> str:
-    r"""Renders a table for `\input`, by booktabs and siunitx: bare, or floating with its caption in a column of `width`
-    inches; a longtable if it has more than `LONG` rows."""
+    r"""Renders a table for `\input`, by booktabs and siunitx: bare, or floating with its caption in
+    a column of `width` inches; a longtable if it has more than `LONG` rows."""
     table = table.folded()
     shape = "".join("r" if c.numeric else "l" for c in table.columns)
     rows = [map(_latex_title, table.columns)]
@@ -464,7 +471,8 @@ def _captioned(lines: list[str], table: Table, width: float) -> list[str]:
 
 
 def _latex_title(column: Column) -> str:
-    """Returns the title of a column, stacked if it is longer than its cells and its longest word."""
+    """Returns the title of a column, stacked if it is longer than its cells and its longest
+    word."""
     texts = [cell.text for cell in column.cells]
     letters = max(map(len, ["-", *texts, *column.title.split()]))
     lines = textwrap.wrap(column.title, letters, break_on_hyphens=False)

@@ -1,4 +1,5 @@
-"""Shows the summary as tables in a terminal; a narrow one omits columns from the right, never the names."""
+"""Shows the summary as tables in a terminal; a narrow one omits columns from the right, never the
+names."""
 
 from __future__ import annotations
 
@@ -50,21 +51,24 @@ _HEAD = 4
 _WIDE_ENOUGH = 100
 """Letters of a screen with room for failures, and for verdicts spelt out."""
 _LEGEND = (
-    "success: % of all trials (95 % interval); bold: not significantly worse than the best, unless this holds for all"
-    "{failed}; error: median / 95 % quantile over {reference}; efficiency, NEES (median): 1 is ideal{sign}; cost:"
-    " simulations of a trial, median/mean if they differ; time: mean of a trial. More: ipe-bench list statistic."
+    "success: % of all trials (95 % interval); bold: not significantly worse than the best, unless"
+    " this holds for all{failed}; error: median / 95 % quantile over {reference}; efficiency, NEES"
+    " (median): 1 is ideal{sign}; cost: simulations of a trial, median/mean if they differ; time:"
+    " mean of a trial. More: ipe-bench list statistic."
 )
 _FAILED = "; failed: known / undetected, %"
 _SPELT_OUT = "; verdict: is the reported covariance right?"
 _SIGNS = f", {', '.join(f'{word.sign} {word.shown}' for word in VERDICTS[:4])}"
 _TOLD = (
-    "With noise=unknown every estimator here assumes R with the true levels at the nominal readings; bounds and success"
-    " hold for parameters that are estimated together with the levels."
+    "With noise=unknown every estimator here assumes R with the true levels at the nominal"
+    " readings; bounds and success hold for parameters that are estimated together with the"
+    " levels."
 )
 TRACKED = (
-    "States that move: all columns hold at the last epoch, where filters and smoothers have the same readings. Success:"
-    " the error lies in the gate (all but one in a million) of a filter linearised at the true path. The table of all"
-    " epochs has the whole path. Cost: evaluations of transition and reading."
+    "States that move: all columns hold at the last epoch, where filters and smoothers have the"
+    " same readings. Success: the error lies in the gate (all but one in a million) of a filter"
+    " linearised at the true path. The table of all epochs has the whole path. Cost: evaluations"
+    " of transition and reading."
 )
 """References of a track's errors."""
 
@@ -85,7 +89,8 @@ def overview_notes(noises: Collection[str], *, narrow: bool = False) -> tuple[st
 def summary_tables(
     listed: Sequence[Mapping[str, Any]], totals: Sequence[Table], width: int
 ) -> list[Part]:
-    """Returns a table per setting (measurement, noise, differing options), after the totals of certified runs."""
+    """Returns a table per setting (measurement, noise, differing options), after the totals of
+    certified runs."""
     rows = [row for row in listed if row["parameter"] == ALL]
     if totals:
         # Models whose own readings are certified, without being of a collection, have no totals.
@@ -106,13 +111,15 @@ def summary_tables(
         hidden = len(settings) - len(kept)
         whole = f", {hidden} of {len(settings)} settings whole" if hidden else ""
         parts.append(
-            f"{further} of {len(rows)} rows are left out here{whole}; summary.csv and report.html have all."
+            f"{further} of {len(rows)} rows are left out here{whole}; summary.csv and report.html"
+            " have all."
         )
     return parts or ["no trial is stored yet"]
 
 
 def _columns_of_settings(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Returns the columns of the rows that are of their settings: neither statistics nor the estimator's options."""
+    """Returns the columns of the rows that are of their settings: neither statistics nor the
+    estimator's options."""
     known = {*summary_columns(), "parameter", "unit", "estimator", "error_scale"}
     columns = dict.fromkeys(column for row in rows for column in row)
     return [c for c in columns if c not in known and not c.startswith("estimator.")]
@@ -154,7 +161,8 @@ def _shortened(settings: Mapping[str, Sequence[Any]]) -> dict[str, list[Any]]:
 
 
 def _telling(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """Returns the rows, the best first, of the largest scale at which most estimators may hold, or else of the last."""
+    """Returns the rows, the best first, of the largest scale at which most estimators may hold, or
+    else of the last."""
     finding = Finding.of(rows)
     best_first = [one.label for one in finding.standings]
     scale = finding.places[-1][1]
@@ -168,7 +176,8 @@ def _telling(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
 def _setting(title: str, rows: Sequence[Mapping[str, Any]], width: int) -> Table:
     best = leading(rows, ["error_scale"])
     columns = overview_columns(rows, best, narrow=width < _WIDE_ENOUGH)
-    # A narrow screen leaves out the last columns: cost and time before what a plugin was asked to show.
+    # A narrow screen leaves out the last columns: cost and time before what a plugin was asked to
+    # show.
     columns[-2:-2] = statistics("terminal", rows)
     # The number of trials stands in the title if it is the same for all.
     counts = sorted({row["trials"] for row in rows})
@@ -182,8 +191,8 @@ def _setting(title: str, rows: Sequence[Mapping[str, Any]], width: int) -> Table
 
 
 def differing(rows: pd.DataFrame, columns: Sequence[str]) -> list[str]:
-    """Returns for each row those of its settings that differ among the rows, of many those other than the most frequent
-    ones; a dash if there are none."""
+    """Returns for each row those of its settings that differ among the rows, of many those other
+    than the most frequent ones; a dash if there are none."""
     apart = varying(columns, rows)
     if not apart:  # a frame without columns loses its rows in pandas 2.2
         return ["-"] * len(rows)
@@ -199,7 +208,8 @@ def differing(rows: pd.DataFrame, columns: Sequence[str]) -> list[str]:
 
 
 def leading(rows: Sequence[Mapping[str, Any]], scenario: Sequence[str]) -> list[bool]:
-    """Returns whether each row's estimator may be the best of its scenario, if another one is surely beaten."""
+    """Returns whether each row's estimator may be the best of its scenario, if another one is
+    surely beaten."""
 
     def scenario_of(row: Mapping[str, Any]) -> tuple[str, ...]:
         return tuple(str(row[name]) for name in scenario)
@@ -211,7 +221,8 @@ def leading(rows: Sequence[Mapping[str, Any]], scenario: Sequence[str]) -> list[
 def overview_columns(
     rows: Sequence[Mapping[str, Any]], best: Sequence[bool], *, narrow: bool = False
 ) -> list[Column]:
-    """Returns the columns over all trials for every estimator; a narrow screen has no failures and short verdicts."""
+    """Returns the columns over all trials for every estimator; a narrow screen has no failures and
+    short verdicts."""
 
     def numbers(
         title: str, key: str, show: Callable[[Mapping[str, Any]], str], best: Sequence[bool] = ()
@@ -269,7 +280,7 @@ def _time(row: Mapping[str, Any]) -> str:
     return duration(row["time_mean_s"], 2)
 
 
-# Statistics ----------------------------------------------------------------------------------------------------------
+# Statistics ---------------------------------------------------------------------------------------
 
 
 def statistics(where: Where, rows: Sequence[Mapping[str, Any]]) -> list[Column]:
@@ -295,7 +306,8 @@ def statistics(where: Where, rows: Sequence[Mapping[str, Any]]) -> list[Column]:
 
 
 def reported(record: Statistic, rows: Sequence[Mapping[str, Any]]) -> bool:
-    """Returns whether a table has a statistic's column; a rare one needs a finite value, a rare count one above 0."""
+    """Returns whether a table has a statistic's column; a rare one needs a finite value, a rare
+    count one above 0."""
     if not record.rare:
         return True
     finite = [row[record.name] for row in rows if math.isfinite(row[record.name])]
@@ -315,8 +327,9 @@ def _shown(record: Statistic, where: Where, row: Mapping[str, Any]) -> str:
 
 
 def _applies(record: Statistic, where: Where, row: Mapping[str, Any]) -> bool:
-    """Returns whether a row can have the statistic: an estimator that solves no equation has no solved trials. In the
-    tables of parameters and of states its finished trials stand in for them."""
+    """Returns whether a row can have the statistic: an estimator that solves no equation has no
+    solved trials. In the tables of parameters and of states its finished trials stand in for
+    them."""
     if record.given != "solved" or where in ("parameters", "tracks"):
         return True
     return row["equation"] != "-"

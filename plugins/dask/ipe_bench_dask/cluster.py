@@ -1,4 +1,5 @@
-"""Tasks on a Dask cluster: on this machine, behind a scheduler's address, or in the jobs of a batch system."""
+"""Tasks on a Dask cluster: on this machine, behind a scheduler's address, or in the jobs of a batch
+system."""
 
 from __future__ import annotations
 
@@ -35,11 +36,13 @@ _CANCELLED = asyncio.CancelledError, concurrent.futures.CancelledError
 
 @dataclass(frozen=True)
 class Dask(Processes):
-    """Runs tasks on the workers of a Dask cluster, which write to the output directory themselves: all machines need it
-    under the same path, and the same installation of ipe-bench and its plugins.
+    """Runs tasks on the workers of a Dask cluster, which write to the output directory themselves:
+    all machines need it under the same path, and the same installation of ipe-bench and its
+    plugins.
 
-    Each Dask worker hands its task on to a process of its own, so that what an estimator does to its process never
-    reaches Dask. A task whose Dask worker dies is given to another one by Dask itself.
+    Each Dask worker hands its task on to a process of its own, so that what an estimator does to
+    its process never reaches Dask. A task whose Dask worker dies is given to another one by Dask
+    itself.
     """
 
     workers: Count | None = None
@@ -47,7 +50,8 @@ class Dask(Processes):
     address: str | None = None
     """A running scheduler, such as tcp://10.0.0.1:8786, to use in place of starting one."""
     jobqueue: str | None = None
-    """A cluster class of dask-jobqueue, such as SLURMCluster, to start workers as jobs of a batch system."""
+    """A cluster class of dask-jobqueue, such as SLURMCluster, to start workers as jobs of a batch
+    system."""
     options: Mapping[str, Any] = field(default_factory=dict)
     """Keyword arguments of the cluster class."""
 
@@ -57,7 +61,8 @@ class Dask(Processes):
             self.jobqueue is not None or self.workers is not None or self.options
         ):
             raise UserError(
-                f"address={self.address}: goes with no workers, jobqueue or options; leave out either"
+                f"address={self.address}: goes with no workers, jobqueue or options; leave out"
+                " either"
             )
 
     def run(self, work: Work, tasks: Sequence[Any]) -> Iterator[Event]:
@@ -67,7 +72,8 @@ class Dask(Processes):
         client = _connect(self.workers, self.address, self.jobqueue, options)
         from distributed import as_completed
 
-        # As bytes: what a Dask worker cannot unpickle, such as a plugin that it lacks, is then ours to name.
+        # As bytes: what a Dask worker cannot unpickle, such as a plugin that it lacks, is then ours
+        # to name.
         payloads = [cloudpickle.dumps((work, task)) for task in tasks]
         limits = self.block_timeout_s, self.memory_limit_gb
         futures = {
@@ -108,19 +114,21 @@ class Dask(Processes):
 
 def _lost(client: Any) -> StorageError:
     return StorageError(
-        f"execution=dask: the scheduler at {client.scheduler.address} is gone; what was computed is kept, and the same "
-        "command goes on from there"
+        f"execution=dask: the scheduler at {client.scheduler.address} is gone; what was computed"
+        " is kept, and the same command goes on from there"
     )
 
 
 def _say_when_nobody_works(client: Any, heard: threading.Event) -> None:
-    """A scheduler without workers waits for ever, in case that one comes: says so, again and again."""
+    """A scheduler without workers waits for ever, in case that one comes: says so, again and
+    again."""
     while not heard.wait(_PATIENCE_S):
         with contextlib.suppress(Exception):
             if not client.nthreads():
                 address = client.scheduler.address
                 log.warning(
-                    f"execution=dask: the scheduler at {address} has no workers yet; waiting for one"
+                    f"execution=dask: the scheduler at {address} has no workers yet; waiting for"
+                    " one"
                 )
 
 
@@ -140,7 +148,8 @@ def _run_one(payload: bytes, timeout_s: float | None, memory_gb: float | None) -
 def _connect(
     workers: int | None, address: str | None, jobqueue: str | None, options_json: str
 ) -> Any:
-    """A client of the cluster that these options describe; it serves all runs of this process, then is closed."""
+    """A client of the cluster that these options describe; it serves all runs of this process, then
+    is closed."""
     try:
         import distributed
     except ImportError:

@@ -1,4 +1,5 @@
-"""A Slurm of two nodes on this machine, by Debian's slurm-wlm and munge: `with started(folder) as environment`."""
+"""A Slurm of two nodes on this machine, by Debian's slurm-wlm and munge: `with started(folder) as
+environment`."""
 
 import contextlib
 import os
@@ -61,7 +62,8 @@ def started(folder: Path) -> Iterator[dict[str, str]]:
     key.chmod(0o600)
     config = folder / "slurm.conf"
     nodes = "".join(
-        f"NodeName={name} NodeHostname={host} NodeAddr=127.0.0.1 Port={_free_port()} CPUs=1 RealMemory=4000\n"
+        f"NodeName={name} NodeHostname={host} NodeAddr=127.0.0.1 Port={_free_port()} CPUs=1"
+        " RealMemory=4000\n"
         for name in NODES
     )
     config.write_text(

@@ -107,7 +107,8 @@ def test_a_killed_job_of_workers_loses_nothing(tmp_path, environment, serial):
     importlib.util.find_spec("submitit") is None, reason="hydra-submitit-launcher is not installed"
 )
 def test_a_sweep_whose_job_was_killed_goes_on_where_it_was(tmp_path, environment, serial):
-    """Without Slurm's accounting, submitit waits for ever for a job that was killed: the user ends the command."""
+    """Without Slurm's accounting, submitit waits for ever for a job that was killed: the user ends
+    the command."""
     words = ("-m", "error_scale=1,3", *SUBMITIT, "trials=1000")
     process = start(tmp_path, environment, *words)
     kill_a_job(process, environment, tmp_path)

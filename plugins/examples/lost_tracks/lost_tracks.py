@@ -2,9 +2,10 @@
 
     python plugins/examples/lost_tracks/lost_tracks.py 1000
 
-The first rows count the tracks that `auto` and `lm_ieks` lose, by the error at the last epoch, and the shares of lost
-and of held ones that are reported: by the cost of the path or its status; then by its copies a turn away, too. The
-others hold the probability of a path among its copies against the share of paths whose turn is right.
+The first rows count the tracks that `auto` and `lm_ieks` lose, by the error at the last epoch, and
+the shares of lost and of held ones that are reported: by the cost of the path or its status; then
+by its copies a turn away, too. The others hold the probability of a path among its copies against
+the share of paths whose turn is right.
 """
 
 from __future__ import annotations
@@ -47,7 +48,8 @@ def blocks(model: str, scale: float, trials: int) -> Iterator[PathBlock]:
 
 
 def columns(model: str, scale: float, tracker: str, trials: int) -> Columns:
-    """What is known of each trial, and, of a pendulum, how many turns the start of its path is off."""
+    """What is known of each trial, and, of a pendulum, how many turns the start of its path is
+    off."""
     found: list[Columns] = []
     for block in blocks(model, scale, trials):
         one = block.estimate(TRACKERS[tracker])[1]

@@ -2,11 +2,12 @@
 
     python plugins/examples/when_to_filter/when_to_filter.py 100 outputs/when_to_filter.png
 
-The inertial system of the paper runs its four cases one after another on one platform, and its three gyro drifts walk
-meanwhile (`state_model=walking_gins`). Scored are the eight parameters that stand still, over all trials, in
-multiples of the error that a filter linearised at the truth has. Least squares and iterated estimation take drifts for
-constants; modelled, the walk is in the correlated errors of the readings, linearised at the nominal point. The filters
-are extended Kalman filters with and without the walk.
+The inertial system of the paper runs its four cases one after another on one platform, and its
+three gyro drifts walk meanwhile (`state_model=walking_gins`). Scored are the eight parameters that
+stand still, over all trials, in multiples of the error that a filter linearised at the truth has.
+Least squares and iterated estimation take drifts for constants; modelled, the walk is in the
+correlated errors of the readings, linearised at the nominal point. The filters are extended Kalman
+filters with and without the walk.
 """
 
 from __future__ import annotations
@@ -40,7 +41,8 @@ STYLES = {
 
 
 def errors_by_walk(model: WalkingGins) -> np.ndarray:
-    """Covariance (m, m) of the readings by drifts that walk by one size in an hour, linearised at the nominal point."""
+    """Covariance (m, m) of the readings by drifts that walk by one size in an hour, linearised at
+    the nominal point."""
     x = model.prior.mean
     S = np.zeros((model.n, 3 * model.epochs))
     rows = []
@@ -54,7 +56,8 @@ def errors_by_walk(model: WalkingGins) -> np.ndarray:
 
 
 def ratios(model: WalkingGins, scale: float, walked: np.ndarray, trials: int) -> dict[str, float]:
-    """Root mean square over trials and standing parameters of error over bound, for each estimator."""
+    """Root mean square over trials and standing parameters of error over bound, for each
+    estimator."""
     wide, unaware = (
         ib.StateScenario(m, error_scale=scale).assumed for m in (model, replace(model, walk=0.0))
     )

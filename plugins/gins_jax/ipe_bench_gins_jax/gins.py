@@ -1,6 +1,8 @@
-"""The gimballed INS of `ipe_bench.measurements.gins`, written in vectors and in jax.numpy: on a GPU where there is one.
+"""The gimballed INS of `ipe_bench.measurements.gins`, written in vectors and in jax.numpy: on a GPU
+where there is one.
 
-What its parameters and readings are is that model's; the equations, their integration and their derivatives are not.
+What its parameters and readings are is that model's; the equations, their integration and their
+derivatives are not.
 """
 
 from __future__ import annotations
@@ -25,11 +27,13 @@ jax.config.update("jax_enable_x64", True)
 
 @dataclass(frozen=True)
 class GinsJax(Measurement):
-    """Velocity errors of a gimballed INS over 90 minutes after an injected velocity, in four cases; see `Gins`.
+    """Velocity errors of a gimballed INS over 90 minutes after an injected velocity, in four cases;
+    see `Gins`.
 
-    Runge and Kutta's method of fourth order with even steps, so that readings are within 1e-8 m/s to an error scale of
-    100; Jacobians by forward differentiation of all of it. Trials are computed in chunks of one size, filled up where
-    there are fewer: a trial's bits do not depend on how many others there are, and one compiled program serves all.
+    Runge and Kutta's method of fourth order with even steps, so that readings are within 1e-8 m/s
+    to an error scale of 100; Jacobians by forward differentiation of all of it. Trials are computed
+    in chunks of one size, filled up where there are fewer: a trial's bits do not depend on how many
+    others there are, and one compiled program serves all.
     """
 
     latitude_deg: float = 36.35
@@ -103,7 +107,8 @@ def _in_chunks(program: Callable[[Any], Any], x: Array, size: int) -> Array:
 
 @functools.cache
 def _programs(model: GinsJax) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
-    """The compiled readings (trials, m), velocities of the error-free system among them, and their slopes."""
+    """The compiled readings (trials, m), velocities of the error-free system among them, and their
+    slopes."""
     si, cases = jnp.asarray(model.twin.si_sizes), jnp.asarray(model.twin.cases)
     h = 60.0 * model.interval_min / model.steps_per_interval
     latitude = np.deg2rad(model.latitude_deg)

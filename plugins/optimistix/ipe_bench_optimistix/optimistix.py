@@ -1,4 +1,5 @@
-"""Nonlinear least squares by Optimistix, one trial at a time, on models that know nothing of JAX."""
+"""Nonlinear least squares by Optimistix, one trial at a time, on models that know nothing of
+JAX."""
 
 from __future__ import annotations
 
@@ -31,16 +32,18 @@ _SOLVERS: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Optimistix(Estimator):
-    """`optimistix.least_squares` (Rader, Lyons and Kidger, arXiv:2402.09983) on the whitened residuals, with the
-    model's own Jacobian. Reports (J' J)^-1 of the whitened J.
+    """`optimistix.least_squares` (Rader, Lyons and Kidger, arXiv:2402.09983) on the whitened
+    residuals, with the model's own Jacobian. Reports (J' J)^-1 of the whitened J.
 
-    Optimistix scales nothing, so x is given to it in deviations of the linear bound. Its own rules end the search; the
-    trial has converged if a Gauss-Newton step from there would be below `tolerance` deviations, else it has stalled.
+    Optimistix scales nothing, so x is given to it in deviations of the linear bound. Its own rules
+    end the search; the trial has converged if a Gauss-Newton step from there would be below
+    `tolerance` deviations, else it has stalled.
     """
 
     method: Literal["levenberg_marquardt", "dogleg", "gauss_newton"] = "levenberg_marquardt"
     start: Start = "nominal"
-    """The nominal point, the linear LSE, or that of the two where the readings fit better (`best`)."""
+    """The nominal point, the linear LSE, or that of the two where the readings fit better
+    (`best`)."""
     rtol: Positive = 1e-10
     """Relative change of x and of the residuals at which the search ends."""
     atol: Positive = 1e-10
@@ -106,12 +109,14 @@ class Optimistix(Estimator):
 
 
 _readers: dict[int, _Residuals] = {}
-"""Who reads models now, by the number under which JAX's programs know them: so one program serves all batches."""
+"""Who reads models now, by the number under which JAX's programs know them: so one program serves
+all batches."""
 
 
 @functools.cache
 def _whitened(m: int, n: int) -> Any:
-    """The whitened residuals (m,) of n parameters as a function that JAX compiles and differentiates."""
+    """The whitened residuals (m,) of n parameters as a function that JAX compiles and
+    differentiates."""
 
     @jax.custom_jvp
     def residuals(s: Any, of: Any) -> Any:

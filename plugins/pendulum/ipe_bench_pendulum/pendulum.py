@@ -18,11 +18,13 @@ class Pendulum(OdeMeasurement):
 
         angle'' = -(gravity / length) sin(angle) - damping angle'
 
-    Parameters: the length in m, the damping in 1/s, and the angle in rad and its rate in rad/s at the start. Readings
-    in rad; each is an epoch. Over many swings a slightly wrong length is wrong by a whole swing, so the sum of squares
-    has a minimum for each number of swings: an estimator that starts too far away ends in a neighbouring one.
+    Parameters: the length in m, the damping in 1/s, and the angle in rad and its rate in rad/s at
+    the start. Readings in rad; each is an epoch. Over many swings a slightly wrong length is wrong
+    by a whole swing, so the sum of squares has a minimum for each number of swings: an estimator
+    that starts too far away ends in a neighbouring one.
 
-    Source of the equation: Landau and Lifshitz, Mechanics, section 11, problem 1; damping as in section 25.
+    Source of the equation: Landau and Lifshitz, Mechanics, section 11, problem 1; damping as in
+    section 25.
     """
 
     length: Positive = 1.0

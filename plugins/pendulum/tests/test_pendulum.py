@@ -1,4 +1,5 @@
-"""The pendulum swings as Jacobi's functions say, and decays as a linear oscillator where it swings little."""
+"""The pendulum swings as Jacobi's functions say, and decays as a linear oscillator where it swings
+little."""
 
 import sys
 from pathlib import Path

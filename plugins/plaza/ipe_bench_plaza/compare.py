@@ -1,4 +1,5 @@
-"""Sets the tracks of `ipe-bench estimate state_model=plaza output=FOLDER` beside GPS and the surveyed beacons:
+"""Sets the tracks of `ipe-bench estimate state_model=plaza output=FOLDER` beside GPS and the
+surveyed beacons:
 
 python compare.py FOLDER
 """
@@ -19,13 +20,15 @@ SAMPLES = Path(__file__).parent / "samples"
 
 
 def errors(x: Array, gps: Array) -> tuple[float, float, float]:
-    """Returns root mean square, largest and last distance in m of a path (K, 2) from that of GPS."""
+    """Returns root mean square, largest and last distance in m of a path (K, 2) from that of
+    GPS."""
     distance = np.hypot(*(x - gps).T)
     return float(np.sqrt(np.mean(distance**2))), float(distance.max()), float(distance[-1])
 
 
 def turned(x: Array, gps: Array) -> Array:
-    """Returns a path (K, 2) moved and turned as a whole next to that of GPS, by least squares (Kabsch, 1976)."""
+    """Returns a path (K, 2) moved and turned as a whole next to that of GPS, by least squares
+    (Kabsch, 1976)."""
     path, true = (one @ np.array([1.0, 1j]) for one in (x, gps))
     path, middle = path - path.mean(), true.mean()
     across = np.sum(path.conj() * (true - middle))
@@ -34,7 +37,8 @@ def turned(x: Array, gps: Array) -> Array:
 
 
 def compared(folder: Path, samples: Path = SAMPLES) -> pd.DataFrame:
-    """Returns a row per tracker: errors of path and beacons in m, and the verdict on its innovations."""
+    """Returns a row per tracker: errors of path and beacons in m, and the verdict on its
+    innovations."""
     gps = pd.read_csv(samples / "plaza2_gps.csv")
     surveyed = pd.read_csv(samples / "plaza2_beacons.csv")
     said = json.loads((folder / "track.json").read_text(encoding="utf-8"))["trackers"]

@@ -1,9 +1,12 @@
-"""Makes the log, and the files of the truth, from one of the MATLAB files of the data set, as GTSAM ships them:
+"""Makes the log, and the files of the truth, from one of the MATLAB files of the data set, as GTSAM
+ships them:
 
-    python plugins/plaza/ipe_bench_plaza/make_log.py Plaza2_.mat plugins/plaza/ipe_bench_plaza/samples/plaza2
+    python plugins/plaza/ipe_bench_plaza/make_log.py Plaza2_.mat
+    plugins/plaza/ipe_bench_plaza/samples/plaza2
 
-Odometry comes ten times a second, ranges at times of their own. The log has a row per range, with the motion since the
-range before: odometry is summed along arcs, and its path read at the times of the ranges.
+Odometry comes ten times a second, ranges at times of their own. The log has a row per range, with
+the motion since the range before: odometry is summed along arcs, and its path read at the times of
+the ranges.
 """
 
 from __future__ import annotations
@@ -17,8 +20,8 @@ from ipe_bench.basics.linalg import Array
 
 
 def motion(odometry: Array, times: Array) -> Array:
-    """Returns forward and left in m and turn in rad (K, 3) from each of the times (K,) to the next, 0 before the first,
-    by odometry (rows, 3): time, distance and turn since the row before."""
+    """Returns forward and left in m and turn in rad (K, 3) from each of the times (K,) to the next,
+    0 before the first, by odometry (rows, 3): time, distance and turn since the row before."""
     at, distance, turn = odometry.T
     heading = np.cumsum(turn)
     along = heading - turn / 2

@@ -21,18 +21,19 @@ _LAP = 60
 
 @dataclass(frozen=True)
 class Plaza(StateModel):
-    """Position and heading of a vehicle, and the places of the beacons that it reads its ranges to, one range an epoch:
+    """Position and heading of a vehicle, and the places of the beacons that it reads its ranges to,
+    one range an epoch:
 
         p <- p + rotation(heading) (forward, left) + walk sqrt(h) (w1, w2)
         heading <- heading + turn - drift h + turning sqrt(h) w3
         range = bias + (1 + scale) |p - beacon| + v,   v ~ N(0, deviation^2)
 
-    with h the seconds since the range before. Odometry gives `forward`, `left` (m, in the frame of the vehicle at the
-    range before) and `turn` (rad, anticlockwise); these, `time` (s) and `beacon` are columns of a log. Beacons stand
-    still. Without a log it drives once round a circle.
+    with h the seconds since the range before. Odometry gives `forward`, `left` (m, in the frame of
+    the vehicle at the range before) and `turn` (rad, anticlockwise); these, `time` (s) and `beacon`
+    are columns of a log. Beacons stand still. Without a log it drives once round a circle.
 
-    Source: Djugash, Hamner and Roth, Navigating with Ranging Radios: Five Data Sets with Ground Truth, J. Field
-    Robotics 26 (2009), 689-695.
+    Source: Djugash, Hamner and Roth, Navigating with Ranging Radios: Five Data Sets with Ground
+    Truth, J. Field Robotics 26 (2009), 689-695.
     """
 
     beacons: Mapping[str, tuple[Finite, Finite]]
@@ -64,7 +65,8 @@ class Plaza(StateModel):
         super().__post_init__()
         if not self.beacons:
             raise UserError(
-                "beacons: is empty; give each beacon a presumed place, as in {1: [0, 0], 2: [30, 0]}"
+                "beacons: is empty; give each beacon a presumed place, as in {1: [0, 0], 2: [30,"
+                " 0]}"
             )
         numbers = {}
         for name in self.beacons:

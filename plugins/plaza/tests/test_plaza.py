@@ -52,19 +52,22 @@ def test_a_drive_round_a_circle_ends_where_it_began():
             4,
             1,
             "7",
-            "row 4, column beacon: beacon 7 has no presumed place; give it one by +state_model.beacons.7=[X,Y]",
+            "row 4, column beacon: beacon 7 has no presumed place; give it one by"
+            " +state_model.beacons.7=[X,Y]",
         ),
         (
             9,
             0,
             "3151.5",
-            "row 9, column time [s]: is not after the time of the row before; give rows in the order of",
+            "row 9, column time [s]: is not after the time of the row before; give rows in the"
+            " order of",
         ),
         (
             5,
             5,
             "-3.1",
-            "row 5, column range [m]: is negative; correct it, or leave the cell empty if it is missing",
+            "row 5, column range [m]: is negative; correct it, or leave the cell empty if it is"
+            " missing",
         ),
         (6, 2, "", "row 6, column forward [m]: is empty; a known input has a value at each epoch"),
     ],

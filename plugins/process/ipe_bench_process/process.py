@@ -1,4 +1,5 @@
-"""An estimator in any language: a program that reads a problem and readings, and writes estimates."""
+"""An estimator in any language: a program that reads a problem and readings, and writes
+estimates."""
 
 from __future__ import annotations
 
@@ -34,10 +35,12 @@ _COUNTS = ("iterations", "simulations", "jacobians")
 
 @dataclass(frozen=True)
 class Process(Estimator):
-    """A program that estimates one trial after another, by blocks of numbers on its standard input and output.
+    """A program that estimates one trial after another, by blocks of numbers on its standard input
+    and output.
 
-    It is started once per worker and problem. If it ends, hangs or answers wrongly, that trial fails with a line, and
-    it is started again; after three such trials in a row the rest of the block fails.
+    It is started once per worker and problem. If it ends, hangs or answers wrongly, that trial
+    fails with a line, and it is started again; after three such trials in a row the rest of the
+    block fails.
     """
 
     command: Annotated[tuple[str, ...], MinLen(1)] = field(compare=False)
@@ -66,7 +69,8 @@ class Process(Estimator):
         words = [str(folder / word) if (folder / word).is_file() else word for word in self.command]
         if (program := shutil.which(words[0])) is None:
             raise UserError(
-                f"command={list(self.command)}: {folder} has no such program that can run; build it first"
+                f"command={list(self.command)}: {folder} has no such program that can run; build"
+                " it first"
             )
         if lacking := [file for file in self.files if not (folder / file).is_file()]:
             raise UserError(f"files={lacking}: are not in {folder}")
@@ -123,7 +127,8 @@ class Process(Estimator):
                     program = Program(self.started, self.folder, text)
             if program is None:
                 raise UserError(
-                    f"{' '.join(self.program)}: is not what it was where the run began; run it again"
+                    f"{' '.join(self.program)}: is not what it was where the run began; run it"
+                    " again"
                 )
         _running[key] = program  # the last used is the last to go
         while len(_running) > _KEPT:
@@ -131,7 +136,8 @@ class Process(Estimator):
         return program
 
     def _answer(self, program: Program, problem: Problem, z: Array) -> Estimates:
-        """Estimates from the readings z (m,) of one trial; what is asked counts besides what the program counts."""
+        """Estimates from the readings z (m,) of one trial; what is asked counts besides what the
+        program counts."""
         model, n, asked = (
             problem.measurement,
             problem.measurement.n,
@@ -145,7 +151,8 @@ class Process(Estimator):
             number = len(values) // n
             if number * size > MOST:
                 raise ProgramError(
-                    f"asked for {number * size} numbers at once; ask for {MOST // size} points at most"
+                    f"asked for {number * size} numbers at once; ask for {MOST // size} points at"
+                    " most"
                 )
             asked[count] += number
             yield from np.array_split(values.reshape(-1, n), -(-number // _TOGETHER))
@@ -224,4 +231,7 @@ def _opening(problem: Problem, needs: tuple[Need, ...]) -> str:
             numbers = np.atleast_1d(np.asarray(values, dtype=float))
             if numbers.size and np.isfinite(numbers).all():
                 blocks[re.sub(r"[^\w.]", "_", name, flags=re.ASCII)] = numbers
-    return f"ipe-bench 1 {json.dumps({'model': model.name, 'parameters': told})}\n{written(blocks)}end\n\n"
+    return (
+        "ipe-bench 1"
+        f" {json.dumps({'model': model.name, 'parameters': told})}\n{written(blocks)}end\n\n"
+    )

@@ -1,5 +1,5 @@
-"""A program that runs beside the bench, and the blocks of numbers that go both ways: a line `NAME COUNT`, a line of
-numbers, and the line `end` where one side has said all."""
+"""A program that runs beside the bench, and the blocks of numbers that go both ways: a line `NAME
+COUNT`, a line of numbers, and the line `end` where one side has said all."""
 
 from __future__ import annotations
 
@@ -36,7 +36,10 @@ _QUOTED = 4
 _SPELT = {"nan": "NaN", "inf": "Inf", "-inf": "-Inf"}
 """R reads no others."""
 _MARK = "IPE_BENCH_PROGRAM"
-_END_MARKED = 'for p in $(grep -lsF "$1" /proc/[0-9]*/environ); do p=${p#/proc/}; kill -9 "${p%/environ}"; done'
+_END_MARKED = (
+    'for p in $(grep -lsF "$1" /proc/[0-9]*/environ); do p=${p#/proc/}; kill -9 "${p%/environ}";'
+    " done"
+)
 _END_ALL = f"{_END_MARKED}; {_END_MARKED}"
 """Ends what has the mark in its environment, and what that has started in the meantime."""
 
@@ -63,9 +66,10 @@ def _line(values: Array) -> str:
 class Program:
     """Holds a running program.
 
-    Its process group begins with a shell that waits for the end of this process, and then ends the group: with the
-    program goes what it has started, however this process ends. On Linux this holds for other groups and sessions too:
-    all that it starts inherits a mark in the environment. POSIX only.
+    Its process group begins with a shell that waits for the end of this process, and then ends the
+    group: with the program goes what it has started, however this process ends. On Linux this holds
+    for other groups and sessions too: all that it starts inherits a mark in the environment. POSIX
+    only.
     """
 
     def __init__(self, command: Sequence[str], folder: str, opening: str) -> None:
@@ -106,11 +110,12 @@ class Program:
     def ask(
         self, text: str, replies: Mapping[str, Callable[[Array], str]], seconds: float
     ) -> dict[str, Array]:
-        """Sends a text, and returns the blocks up to `end`; those named in `replies` are questions, answered at once.
-        The first line of the text is that of the next one too.
+        """Sends a text, and returns the blocks up to `end`; those named in `replies` are questions,
+        answered at once. The first line of the text is that of the next one too.
 
         Raises:
-            ProgramError: the program ended, took longer than these seconds, or wrote something else.
+            ProgramError: the program ended, took longer than these seconds, or wrote something
+                else.
         """
         begins, found = bool(self.opening), dict[str, Array]()
         self.deadline = time.monotonic() + (max(seconds, _BEGIN_S) if begins else seconds)
@@ -137,8 +142,9 @@ class Program:
         return found
 
     def require_end(self) -> None:
-        """Waits until the program reads the first line of the next question: it does so once it has written all of this
-        answer. What comes after `end` until then would be taken for the next answer."""
+        """Waits until the program reads the first line of the next question: it does so once it has
+        written all of this answer. What comes after `end` until then would be taken for the next
+        answer."""
         self.send(self.begun)
         pause = 0.0
         while _unread(self.into) and not self.said.strip():
@@ -162,7 +168,8 @@ class Program:
             data = data[self.wait(0.1, data) :]
 
     def wait(self, seconds: float, data: memoryview | None = None) -> int:
-        """Waits for the program, takes what it has written, and returns how much of the data it has read."""
+        """Waits for the program, takes what it has written, and returns how much of the data it has
+        read."""
         if (left := self.deadline - time.monotonic()) <= 0:
             hint = "" if self.said or data else "; does it flush its output after `end`?"
             raise ProgramError(f"gave no whole answer within the time limit{hint}")

@@ -1,5 +1,6 @@
-"""A program that answers with the first readings, except where the first one is 99: there it has the fault that its
-argument names. Faults in capitals show in every trial. Spaces are as R's `cat` leaves them."""
+"""A program that answers with the first readings, except where the first one is 99: there it has
+the fault that its argument names. Faults in capitals show in every trial. Spaces are as R's `cat`
+leaves them."""
 
 import os
 import signal

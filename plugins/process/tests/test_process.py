@@ -1,4 +1,5 @@
-"""An estimator that is a program: its numbers are those of the same estimator in Python, and its faults are its own."""
+"""An estimator that is a program: its numbers are those of the same estimator in Python, and its
+faults are its own."""
 
 import functools
 import os
@@ -73,7 +74,8 @@ def workplace(tmp_path, monkeypatch):
 )
 @pytest.mark.parametrize("name", ["gauss_newton", "ekf"])
 def test_a_program_equals_the_same_estimator_in_python(name, scale, within, programs):
-    """At scale 30 the prior's variance is 1e7 times that of a reading, and an EKF keeps ten digits of sixteen."""
+    """At scale 30 the prior's variance is 1e7 times that of a reading, and an EKF keeps ten digits
+    of sixteen."""
     scenario = ib.Scenario(SCENARIO.measurement, SCENARIO.noise, error_scale=scale, seed=3)
     drawn = scenario.draw(0, 40)
     ours = ib.baselines.EKF() if name == "ekf" else ib.baselines.GaussNewton(start="nominal")
@@ -123,21 +125,26 @@ STATUS = {
 # fmt: off
 LINES = {
     "short": "wrote x with 2 numbers, and not 4", "word": "wrote x with what is no number",
-    "huge": "wrote x with 99999999999 numbers; a block has at most 2500000", "nothing": "answered without x and status",
-    "underscore": "wrote x with what is no number", "hexadecimal": "no number", "digits": "no number",
+    "huge": "wrote x with 99999999999 numbers; a block has at most 2500000",
+    "nothing": "answered without x and status",
+    "underscore": "wrote x with what is no number", "hexadecimal": "no number",
+    "digits": "no number",
     "print": "wrote 'Warning: step rejected', where a line NAME COUNT or `end` belongs",
     "no_status": "answered without status", "status": "wrote status 42, and not one of 0 to 8",
     "half_status": "wrote status 0.5", "twice": "wrote x twice in one answer",
     "count": "wrote iterations -1, which is no count", "skew": "wrote a P that is not symmetric",
-    **dict.fromkeys(("negative", "indefinite", "no_variance", "infinite"), "wrote a P that is not positive definite"),
+    **dict.fromkeys(("negative", "indefinite", "no_variance", "infinite"),
+                    "wrote a P that is not positive definite"),
     "more": "wrote 'x  4' after `end`", "late": "wrote 'x  4' after `end`",
     "blank_and_late": "wrote 'x  4' after `end`",
     "crowd": "asked for 4000000 numbers at once; ask for 62500 points at most",
     "flood": "wrote simulate with 3000000 numbers; a block has at most 2500000",
     "question": "asked with 3 numbers, and not a multiple of 4", "signal": "was ended by signal 11",
-    "exit": "ended with exit code 2: reading settings | matrix is singular", "blocks": "wrote a twice in one answer",
+    "exit": "ended with exit code 2: reading settings | matrix is singular",
+    "blocks": "wrote a twice in one answer",
     "sleep": "gave no whole answer within the time limit; does it flush its output after `end`?",
-    "stderr": "gave no whole answer within the time limit", "close": "closed its output", "line": "",
+    "stderr": "gave no whole answer within the time limit", "close": "closed its output",
+    "line": "",
     "fork_and_exit": "ended with exit code 0", "flee_and_exit": "ended with exit code 0",
 }
 # fmt: on
@@ -166,7 +173,8 @@ def left(fault: str) -> list[str]:
 
 
 def none_is_left(fault: str) -> bool:
-    """Whether all of them end: one that is killed is still listed until the system has time for its end."""
+    """Whether all of them end: one that is killed is still listed until the system has time for its
+    end."""
     until = time.monotonic() + 20.0
     while left(fault) and time.monotonic() < until:
         time.sleep(0.01)
@@ -219,7 +227,8 @@ def test_what_a_program_has_started_ends_with_the_bench(tmp_path):
 
 
 def test_a_look_at_whether_a_program_has_read_on_does_not_wait_for_it(monkeypatch):
-    """A program that is at work on its readings has nothing to say: a tenth of a second for each trial otherwise."""
+    """A program that is at work on its readings has nothing to say: a tenth of a second for each
+    trial otherwise."""
     waits, select = [], program.select.select
 
     def recorded(ready, free, broken, seconds):

@@ -15,8 +15,8 @@ from ipe_bench.solvers import IPE, State, System
 class RelaxedFixedPoint(IPE):
     """x <- x - w F(x) with a relaxation factor w between 0 and 2.
 
-    With w below 1 it converges where plain iteration oscillates: an eigenvalue g of the iteration becomes
-    1 - w + w g (Burden and Faires, Numerical Analysis, section 7.4, for the linear case).
+    With w below 1 it converges where plain iteration oscillates: an eigenvalue g of the iteration
+    becomes 1 - w + w g (Burden and Faires, Numerical Analysis, section 7.4, for the linear case).
     """
 
     relaxation: Annotated[float, Gt(0), Lt(2)] = 0.7

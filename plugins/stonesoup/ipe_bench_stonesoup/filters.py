@@ -1,7 +1,8 @@
-"""The extended and the unscented Kalman filter of Stone Soup on the parameters as a random constant.
+"""The extended and the unscented Kalman filter of Stone Soup on the parameters as a random
+constant.
 
-Which readings arrive when, and all that is not a filter, is our own `Sequential`'s; so the two differ in the equations
-of the filter alone.
+Which readings arrive when, and all that is not a filter, is our own `Sequential`'s; so the two
+differ in the equations of the filter alone.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ _NOW = datetime(2000, 1, 1)
 
 
 class _Known(NonLinearGaussianMeasurement):
-    """What the model reads at the points of an epoch, computed beforehand for all trials at once."""
+    """What the model reads at the points of an epoch, computed beforehand for all trials at
+    once."""
 
     @property
     def ndim_meas(self) -> int:

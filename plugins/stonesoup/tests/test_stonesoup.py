@@ -1,4 +1,5 @@
-"""Stone Soup's filters and ours are the same filters: they agree to round-off on the same readings."""
+"""Stone Soup's filters and ours are the same filters: they agree to round-off on the same
+readings."""
 
 import sys
 from pathlib import Path

@@ -1,4 +1,5 @@
-"""Stone Soup's filters of states that move are those of this package: the same tracks on the same readings."""
+"""Stone Soup's filters of states that move are those of this package: the same tracks on the same
+readings."""
 
 from datetime import datetime, timedelta
 

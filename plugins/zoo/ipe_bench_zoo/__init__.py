@@ -1,4 +1,5 @@
-"""Problems and rivals of kinds that ipe-bench has already, kept beside it: the mission's own stay in the package."""
+"""Problems and rivals of kinds that ipe-bench has already, kept beside it: the mission's own stay
+in the package."""
 
 from pathlib import Path
 

@@ -1,4 +1,5 @@
-"""Tables and a data profile of who attains the known minima of Moré, Garbow and Hillstrom's functions."""
+"""Tables and a data profile of who attains the known minima of Moré, Garbow and Hillstrom's
+functions."""
 
 from __future__ import annotations
 
@@ -36,11 +37,12 @@ BUDGETS = (10, 100, 1000)
 
 
 def attained_table(collection: Collection) -> pd.DataFrame:
-    """A row per function, start and estimator: whether the estimate attains the least minimum (see `score`), else
-    which other one, its sum of squares, its status and its cost; empty without such runs.
+    """A row per function, start and estimator: whether the estimate attains the least minimum (see
+    `score`), else which other one, its sum of squares, its status and its cost; empty without such
+    runs.
 
-    Cost is in simulations, and in simplex gradients of n + 1 simulations, by which problems of different n are
-    comparable (Moré and Wild, SIAM J. Optim. 20, 2009).
+    Cost is in simulations, and in simplex gradients of n + 1 simulations, by which problems of
+    different n are comparable (Moré and Wild, SIAM J. Optim. 20, 2009).
     """
 
     rows = []
@@ -63,8 +65,9 @@ def attained_table(collection: Collection) -> pd.DataFrame:
 
 
 def attained_totals(table: pd.DataFrame) -> pd.DataFrame:
-    """Per estimator: problems solved, in all and from each start; how many of them its status calls converged, and how
-    many converged elsewhere; median cost of all problems, endless where unsolved; and solved within `BUDGETS`."""
+    """Per estimator: problems solved, in all and from each start; how many of them its status calls
+    converged, and how many converged elsewhere; median cost of all problems, endless where
+    unsolved; and solved within `BUDGETS`."""
 
     rows = []
     for estimator, part in table.groupby("estimator", sort=False):
@@ -88,7 +91,8 @@ def attained_totals(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def data_profile(table: pd.DataFrame) -> pd.DataFrame:
-    """The share of problems that each estimator solves within `at` simplex gradients, a step at each solution."""
+    """The share of problems that each estimator solves within `at` simplex gradients, a step at
+    each solution."""
     problems = table.groupby("estimator")["solved"].transform("size")
     solved = table.assign(problems=problems)[table["solved"].astype(bool)].sort_values(
         ["estimator", "gradients"]
@@ -115,11 +119,12 @@ def attained_totals_table(totals: pd.DataFrame) -> Table:
         *(column(f"in {b}", rows[f"within_{b}"], str) for b in BUDGETS),
     ]
     caption = (
-        "A problem is solved if the estimate attains its global minimum, f at most f* (1 + 1e-6) + 1e-12. 1 x and 10 x"
-        " are multiples of the standard start. Converged counts solved problems whose status says so; elsewhere counts"
-        " unsolved problems whose status says converged. Median cost counts simulations over all problems, a Jacobian"
-        " as n, and is infinite for unsolved ones. In 10, 100, 1000 counts problems solved within that number of"
-        " simplex gradients of n + 1 simulations."
+        "A problem is solved if the estimate attains its global minimum, f at most f* (1 + 1e-6) +"
+        " 1e-12. 1 x and 10 x are multiples of the standard start. Converged counts solved"
+        " problems whose status says so; elsewhere counts unsolved problems whose status says"
+        " converged. Median cost counts simulations over all problems, a Jacobian as n, and is"
+        " infinite for unsolved ones. In 10, 100, 1000 counts problems solved within that number"
+        " of simplex gradients of n + 1 simulations."
     )
     return Table("attained", "Known minima", caption, columns, rows, whole="tables/attained.csv")
 
@@ -168,7 +173,8 @@ def draw_known_minima(view: View) -> Iterator[Drawing]:
         fig,
         "data_profile",
         "Data profile on known minima",
-        f"Share of {problems} problems of Moré, Garbow and Hillstrom solved within that cost (Moré and Wild).",
+        f"Share of {problems} problems of Moré, Garbow and Hillstrom solved within that cost (Moré"
+        " and Wild).",
         f"Most, {round(final['share'].max() * problems)}, are solved by {enumerate_few(best, 3)}.",
     )
 

@@ -24,13 +24,14 @@ from ipe_bench_zoo.iterated_filters import geometric_weights
 
 @dataclass(frozen=True)
 class EsMda(Estimator):
-    """All readings at once, assimilated `steps` times by an ensemble with inflated noise (Emerick and Reynolds,
-    Computers & Geosciences 55, 2013).
+    """All readings at once, assimilated `steps` times by an ensemble with inflated noise (Emerick
+    and Reynolds, Computers & Geosciences 55, 2013).
 
-    Step k takes the noise for alpha_k R, with 1 / alpha_k adding up to 1 and growing geometrically from `first` up,
-    perturbs the readings by it for each member, and moves the members by the gain of their own covariances. A member
-    whose simulation overflows is drawn anew from the others. The members' mean and covariance are the estimate; then
-    `polish` Gauss-Newton steps on the maximum a posteriori, whose covariance is reported instead.
+    Step k takes the noise for alpha_k R, with 1 / alpha_k adding up to 1 and growing geometrically
+    from `first` up, perturbs the readings by it for each member, and moves the members by the gain
+    of their own covariances. A member whose simulation overflows is drawn anew from the others. The
+    members' mean and covariance are the estimate; then `polish` Gauss-Newton steps on the maximum a
+    posteriori, whose covariance is reported instead.
     """
 
     members: Annotated[int, Gt(1)] = 100
@@ -104,11 +105,11 @@ class EsMda(Estimator):
 
 
 def assimilated(s: Array, h: Array, z: Array, inflation: float) -> Array:
-    """Members s (trials, members, n) moved by the Kalman gain of their own covariances, for white readings h and z
-    (trials, members, m), z perturbed, whose noise has the variance `inflation`.
+    """Members s (trials, members, n) moved by the Kalman gain of their own covariances, for white
+    readings h and z (trials, members, m), z perturbed, whose noise has the variance `inflation`.
 
-    The system is as large as the readings or the ensemble, whichever is smaller, since with anomalies S and D
-    S' D (D' D + c I)^-1 = S' (D D' + c I)^-1 D, c = (members - 1) alpha.
+    The system is as large as the readings or the ensemble, whichever is smaller, since with
+    anomalies S and D S' D (D' D + c I)^-1 = S' (D D' + c I)^-1 D, c = (members - 1) alpha.
     """
     usable: Mask = np.asarray(np.isfinite(h).all(axis=2))
     count = np.maximum(usable.sum(axis=1), 2)[:, None, None]

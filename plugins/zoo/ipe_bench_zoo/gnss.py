@@ -34,16 +34,20 @@ _LEAST_RADIUS = 6e6
 _SKY = (
     ("gps", 26_560e3, 20.0, 65.0), ("gps", 26_560e3, 75.0, 30.0), ("gps", 26_560e3, 140.0, 50.0),
     ("gps", 26_560e3, 205.0, 18.0), ("gps", 26_560e3, 260.0, 40.0), ("gps", 26_560e3, 320.0, 25.0),
-    ("galileo", 29_600e3, 45.0, 45.0), ("galileo", 29_600e3, 110.0, 15.0), ("galileo", 29_600e3, 185.0, 70.0),
+    ("galileo", 29_600e3, 45.0, 45.0), ("galileo", 29_600e3, 110.0, 15.0),
+    ("galileo", 29_600e3, 185.0, 70.0),
     ("galileo", 29_600e3, 290.0, 35.0),
 )  # fmt: skip
-"""Constellation, radius of the orbit in m, azimuth and elevation in degrees of the satellites that are the default."""
+"""Constellation, radius of the orbit in m, azimuth and elevation in degrees of the satellites that
+are the default."""
 
 
 def east_north_up(position: Array) -> Array:
-    """The rows (3, 3) east, north and up at a place given in ECEF, up along the normal of the WGS 84 ellipsoid.
+    """The rows (3, 3) east, north and up at a place given in ECEF, up along the normal of the WGS
+    84 ellipsoid.
 
-    The latitude is found by Bowring's formula, to better than 1e-9 rad at the surface (Survey Review 23, 1976).
+    The latitude is found by Bowring's formula, to better than 1e-9 rad at the surface (Survey
+    Review 23, 1976).
     """
     x, y, z = position
     minor, p, e2 = (
@@ -71,23 +75,27 @@ def east_north_up(position: Array) -> Array:
 
 @dataclass(frozen=True)
 class Gnss(Measurement):
-    """Pseudo-ranges r + c_e + o_s from a receiver at rest to satellites whose places at transmission are known.
+    """Pseudo-ranges r + c_e + o_s from a receiver at rest to satellites whose places at
+    transmission are known.
 
-    r is the distance that the signal travels: the satellite's place, in the Earth-fixed axes (ECEF, WGS 84) of the time
-    of transmission, is turned by the Earth's rotation during the travel (the Sagnac correction, up to 40 m). c_e is the
-    receiver's clock error in epoch e against the first constellation, o_s the constant offset of every further
-    constellation s, both as lengths. Satellite clocks, troposphere and ionosphere are to be taken off the readings.
+    r is the distance that the signal travels: the satellite's place, in the Earth-fixed axes (ECEF,
+    WGS 84) of the time of transmission, is turned by the Earth's rotation during the travel (the
+    Sagnac correction, up to 40 m). c_e is the receiver's clock error in epoch e against the first
+    constellation, o_s the constant offset of every further constellation s, both as lengths.
+    Satellite clocks, troposphere and ionosphere are to be taken off the readings.
 
-    Parameters, all in m: east, north and up of the presumed position, or its x, y and z; a clock for each epoch; an
-    offset for each further constellation. Readings in m, grouped into epochs by time. The usual noise is 1 m (code).
+    Parameters, all in m: east, north and up of the presumed position, or its x, y and z; a clock
+    for each epoch; an offset for each further constellation. Readings in m, grouped into epochs by
+    time. The usual noise is 1 m (code).
 
-    Sources: Kaplan and Hegarty, Understanding GPS, 2nd ed., section 2.4; Ashby, Relativity in the Global Positioning
-    System, Living Reviews in Relativity 6, 2003 (rotation).
+    Sources: Kaplan and Hegarty, Understanding GPS, 2nd ed., section 2.4; Ashby, Relativity in the
+    Global Positioning System, Living Reviews in Relativity 6, 2003 (rotation).
     """
 
     satellites: tuple[tuple[int, str, float, float, float], ...] | None = None
-    """Number of the epoch, constellation, and x, y, z in m (ECEF) for each reading; None: six GPS and four Galileo
-    satellites over the presumed position, each read once in each of `rounds` epochs."""
+    """Number of the epoch, constellation, and x, y, z in m (ECEF) for each reading; None: six GPS
+    and four Galileo satellites over the presumed position, each read once in each of `rounds`
+    epochs."""
     position: tuple[float, float, float] = (-3120042.0, 4084614.0, 3764026.0)
     """The presumed position in m (ECEF): the nominal point, with clocks of 0."""
     frame: Literal["enu", "ecef"] = "enu"
@@ -207,8 +215,8 @@ class Gnss(Measurement):
                 for i in range(3)
             ]
         x, y, z = self._columns[2].T
-        # The Earth turns while light travels. Each pass takes the error of the distance down by the speed of the
-        # satellite's turning over that of light, 1e-5.
+        # The Earth turns while light travels. Each pass takes the error of the distance down by the
+        # speed of the satellite's turning over that of light, 1e-5.
         distance: Any = 0.0
         for _ in range(3):
             angle = self.earth_rate / LIGHT * distance

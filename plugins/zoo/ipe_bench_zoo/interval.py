@@ -1,4 +1,5 @@
-"""One interval between two readings of a differential model as a model of its own, from any state at its beginning."""
+"""One interval between two readings of a differential model as a model of its own, from any state
+at its beginning."""
 
 from __future__ import annotations
 
@@ -15,9 +16,10 @@ from ipe_bench.measurements.ode.model import OdeMeasurement
 
 @dataclass(frozen=True)
 class Interval(OdeMeasurement):
-    """x is the whole model's p in SI units, the state at the beginning, a case's constants within and at the end (once
-    where none are driven), the time of the beginning and the length, so that all intervals of all trials and cases are
-    one batch; read are the state and the whole model's outputs at the end. Time counts in lengths of the interval."""
+    """x is the whole model's p in SI units, the state at the beginning, a case's constants within
+    and at the end (once where none are driven), the time of the beginning and the length, so that
+    all intervals of all trials and cases are one batch; read are the state and the whole model's
+    outputs at the end. Time counts in lengths of the interval."""
 
     whole: OdeMeasurement
     step: float | None = 0.125
@@ -51,6 +53,7 @@ class Interval(OdeMeasurement):
         ]
 
     def _split(self, p: Sequence[Any]) -> tuple[list[Any], list[Any], list[Any], Any, Any]:
-        """The parameters, the state at the beginning, the constants, the time of the beginning, and the length."""
+        """The parameters, the state at the beginning, the constants, the time of the beginning, and
+        the length."""
         n, end = self.whole.n, self.whole.n + self.states
         return list(p[:n]), list(p[n:end]), list(p[end:-2]), p[-2], p[-1]

@@ -17,17 +17,20 @@ from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
 
 @dataclass(frozen=True)
 class RecursiveUpdate(InformationFilter):
-    """Zanetti's idea (IEEE TAC 57, 2012): an extended Kalman filter moves a part of the way and linearises again.
+    """Zanetti's idea (IEEE TAC 57, 2012): an extended Kalman filter moves a part of the way and
+    linearises again.
 
-    A step takes in the readings as if their information were w_k R^-1, with weights w_k in geometric progression that
-    add up to 1, so that each step multiplies what is known by about the same factor; the first is such that the largest
-    eigenvalue of w_1 H P H' (H whitened) is about `first`. On a linear model all this is the Kalman filter.
+    A step takes in the readings as if their information were w_k R^-1, with weights w_k in
+    geometric progression that add up to 1, so that each step multiplies what is known by about the
+    same factor; the first is such that the largest eigenvalue of w_1 H P H' (H whitened) is about
+    `first`. On a linear model all this is the Kalman filter.
     """
 
     steps: Count = 8
     """Linearisations per epoch."""
     first: Positive = 100.0
-    """The information of the first step over that of the prior, in the direction that the readings see best."""
+    """The information of the first step over that of the prior, in the direction that the readings
+    see best."""
 
     def update(self, readings: EpochReadings) -> tuple[Belief, Array]:
         belief = readings.belief
@@ -54,8 +57,9 @@ def geometric_weights(ratio: Array, steps: int) -> Array:
 
 @dataclass(frozen=True)
 class LMIEKF(InformationFilter):
-    """An iterated EKF that finds each epoch's maximum a posteriori by Levenberg-Marquardt in place of Gauss-Newton
-    (Särkkä and Svensson, ICASSP 2020), so that no step makes the fit of the epoch and its prior worse.
+    """An iterated EKF that finds each epoch's maximum a posteriori by Levenberg-Marquardt in place
+    of Gauss-Newton (Särkkä and Svensson, ICASSP 2020), so that no step makes the fit of the epoch
+    and its prior worse.
 
     Steps are damped in the metric of the prior that the earlier epochs left.
     """
@@ -106,7 +110,8 @@ class _Standardized(Objective):
         )
 
     def residual(self, x: Array) -> Array:
-        """The whitened residuals, followed by x: the maximum a posteriori has the least squares of these."""
+        """The whitened residuals, followed by x: the maximum a posteriori has the least squares of
+        these."""
         return np.concatenate([self.given.misfit(self.x0 + multiply(self.root, x)), x], axis=1)
 
     def jacobian(self, x: Array, *, coarse: Mask | bool = False) -> Array:

@@ -1,8 +1,10 @@
-"""The least-squares test functions of Moré, Garbow and Hillstrom as measurement models, and which minimum is attained.
+"""The least-squares test functions of Moré, Garbow and Hillstrom as measurement models, and which
+minimum is attained.
 
-Functions and numbers are those printed in Moré, Garbow, Hillstrom, Testing unconstrained optimization software, ACM
-Transactions on Mathematical Software 7(1), 1981. Minima agree with the paper to its six digits; their further digits,
-and the minima that it does not list, come from Newton's method on the gradient in double precision.
+Functions and numbers are those printed in Moré, Garbow, Hillstrom, Testing unconstrained
+optimization software, ACM Transactions on Mathematical Software 7(1), 1981. Minima agree with the
+paper to its six digits; their further digits, and the minima that it does not list, come from
+Newton's method on the gradient in double precision.
 """
 
 from __future__ import annotations
@@ -25,7 +27,8 @@ _TEN = np.arange(1.0, 11.0)
 _ALPHA = 0.9794303033498624
 """The root beside 1 of 10 a^10 - 11 a^9 + 1."""
 _RELATIVE, _ABSOLUTE = 1e-6, 1e-12
-"""A minimum f* is attained by f <= f* (1 + 1e-6) + 1e-12; the smallest minimum that is not zero is 1.1e-8."""
+"""A minimum f* is attained by f <= f* (1 + 1e-6) + 1e-12; the smallest minimum that is not zero is
+1.1e-8."""
 _ZERO_RESIDUAL_DEVIATION = 1e-3
 
 Unknowns = Sequence[Any]
@@ -34,7 +37,8 @@ Unknowns = Sequence[Any]
 
 @dataclass(frozen=True)
 class Minimum:
-    """A minimum of the sum of squares, or its infimum along a direction in which parameters grow without limit."""
+    """A minimum of the sum of squares, or its infimum along a direction in which parameters grow
+    without limit."""
 
     sum_of_squares: float
     x: tuple[float, ...] | None = None
@@ -110,8 +114,8 @@ def _meyer(x: Unknowns) -> Any:
 
 
 def _gulf(x: Unknowns) -> Any:
-    # The paper prints "y_i m i x_2" where the source of the problem has a minus sign. The absolute value is written as
-    # the root of a square, which is analytic wherever it is not zero.
+    # The paper prints "y_i m i x_2" where the source of the problem has a minus sign. The absolute
+    # value is written as the root of a square, which is analytic wherever it is not zero.
     t = np.arange(1.0, 100.0) / 100.0
     y = 25.0 + (-50.0 * np.log(t)) ** (2.0 / 3.0)
     return np.exp(-(((y - x[1]) ** 2) ** (x[2] / 2.0)) / x[0]) - t
@@ -141,8 +145,10 @@ def _brown_dennis(x: Unknowns) -> Any:
 
 
 _OSBORNE_1 = np.array([
-    0.844, 0.908, 0.932, 0.936, 0.925, 0.908, 0.881, 0.850, 0.818, 0.784, 0.751, 0.718, 0.685, 0.658, 0.628, 0.603,
-    0.580, 0.558, 0.538, 0.522, 0.506, 0.490, 0.478, 0.467, 0.457, 0.448, 0.438, 0.431, 0.424, 0.420, 0.414, 0.411,
+    0.844, 0.908, 0.932, 0.936, 0.925, 0.908, 0.881, 0.850, 0.818, 0.784, 0.751, 0.718, 0.685,
+    0.658, 0.628, 0.603,
+    0.580, 0.558, 0.538, 0.522, 0.506, 0.490, 0.478, 0.467, 0.457, 0.448, 0.438, 0.431, 0.424,
+    0.420, 0.414, 0.411,
     0.406,
 ])  # fmt: skip
 
@@ -159,10 +165,14 @@ def _biggs_exp6(x: Unknowns) -> Any:
 
 
 _OSBORNE_2 = np.array([
-    1.366, 1.191, 1.112, 1.013, 0.991, 0.885, 0.831, 0.847, 0.786, 0.725, 0.746, 0.679, 0.608, 0.655, 0.616, 0.606,
-    0.602, 0.626, 0.651, 0.724, 0.649, 0.649, 0.694, 0.644, 0.624, 0.661, 0.612, 0.558, 0.533, 0.495, 0.500, 0.423,
-    0.395, 0.375, 0.372, 0.391, 0.396, 0.405, 0.428, 0.429, 0.523, 0.562, 0.607, 0.653, 0.672, 0.708, 0.633, 0.668,
-    0.645, 0.632, 0.591, 0.559, 0.597, 0.625, 0.739, 0.710, 0.729, 0.720, 0.636, 0.581, 0.428, 0.292, 0.162, 0.098,
+    1.366, 1.191, 1.112, 1.013, 0.991, 0.885, 0.831, 0.847, 0.786, 0.725, 0.746, 0.679, 0.608,
+    0.655, 0.616, 0.606,
+    0.602, 0.626, 0.651, 0.724, 0.649, 0.649, 0.694, 0.644, 0.624, 0.661, 0.612, 0.558, 0.533,
+    0.495, 0.500, 0.423,
+    0.395, 0.375, 0.372, 0.391, 0.396, 0.405, 0.428, 0.429, 0.523, 0.562, 0.607, 0.653, 0.672,
+    0.708, 0.633, 0.668,
+    0.645, 0.632, 0.591, 0.559, 0.597, 0.625, 0.739, 0.710, 0.729, 0.720, 0.636, 0.581, 0.428,
+    0.292, 0.162, 0.098,
     0.054,
 ])  # fmt: skip
 
@@ -212,7 +222,8 @@ def _chebyquad(x: Unknowns) -> Any:
 # fmt: off
 PROBLEMS: dict[str, Problem] = {
     "rosenbrock": _problem(
-        lambda x: _side_by_side(10.0 * (x[1] - x[0] ** 2), 1.0 - x[0]), (-1.2, 1.0), (0.0, (1.0, 1.0))),
+        lambda x: _side_by_side(10.0 * (x[1] - x[0] ** 2), 1.0 - x[0]), (-1.2, 1.0),
+        (0.0, (1.0, 1.0))),
     "freudenstein_roth": _problem(
         lambda x: _side_by_side(-13.0 + x[0] + ((5.0 - x[1]) * x[1] - 2.0) * x[1],
                                 -29.0 + x[0] + ((x[1] + 1.0) * x[1] - 14.0) * x[1]),
@@ -222,9 +233,11 @@ PROBLEMS: dict[str, Problem] = {
         lambda x: _side_by_side(1e4 * x[0] * x[1] - 1.0, np.exp(-x[0]) + np.exp(-x[1]) - 1.0001),
         (0.0, 1.0), (0.0, (1.0981593296997557e-05, 9.106146739867036))),
     "brown_badly_scaled": _problem(
-        lambda x: _side_by_side(x[0] - 1e6, x[1] - 2e-6, x[0] * x[1] - 2.0), (1.0, 1.0), (0.0, (1e6, 2e-6))),
+        lambda x: _side_by_side(x[0] - 1e6, x[1] - 2e-6, x[0] * x[1] - 2.0), (1.0, 1.0),
+        (0.0, (1e6, 2e-6))),
     "beale": _problem(
-        lambda x: _side_by_side(*(y - x[0] * (1.0 - x[1] ** i) for i, y in enumerate((1.5, 2.25, 2.625), 1))),
+        lambda x: _side_by_side(*(y - x[0] * (1.0 - x[1] ** i) for i,
+                                  y in enumerate((1.5, 2.25, 2.625), 1))),
         (1.0, 1.0), (0.0, (3.0, 0.5)),
         (0.4520089285714,)),  # x1 to minus infinity with x1 (1 - x2) = 111/112
     "jennrich_sampson": _problem(
@@ -233,53 +246,67 @@ PROBLEMS: dict[str, Problem] = {
         (259.580190134253, (-_INF, 0.331485278480789))),
     "helical_valley": _problem(_helical_valley, (-1.0, 0.0, 0.0), (0.0, (1.0, 0.0, 0.0))),
     "bard": _problem(
-        _bard, (1.0, 1.0, 1.0), (8.21487730657898e-3, (0.08241055974978898, 1.1330360920297224, 2.3436951786425366)),
+        _bard, (1.0, 1.0, 1.0), (8.21487730657898e-3,
+                                 (0.08241055974978898, 1.1330360920297224, 2.3436951786425366)),
         (17.4286933333333, (0.8406666666666667, -_INF, -_INF))),
     "gaussian": _problem(
-        _gaussian, (0.4, 1.0, 0.0), (1.12793276962e-8, (0.3989561378387575, 1.0000190844878132, 0.0))),
+        _gaussian, (0.4, 1.0, 0.0), (1.12793276962e-8,
+                                     (0.3989561378387575, 1.0000190844878132, 0.0))),
     "meyer": _problem(
-        _meyer, (0.02, 4000.0, 250.0), (87.9458551707, (0.005609636471028544, 6181.3463462863, 345.2236346241341))),
+        _meyer, (0.02, 4000.0, 250.0), (87.9458551707,
+            (0.005609636471028544, 6181.3463462863, 345.2236346241341))),
     "gulf": _problem(_gulf, (5.0, 2.5, 0.15), (0.0, (50.0, 25.0, 1.5))),
     "box_3d": _problem(
         _box_3d, (0.0, 10.0, 20.0),
         (0.0, (1.0, 10.0, 1.0)),  # as well at (10, 1, -1), and wherever x1 = x2 and x3 = 0
         (0.075588740755, (0.6136003545073, _INF, 1.3199552081726))),
     "powell_singular": _problem(
-        lambda x: _side_by_side(x[0] + 10.0 * x[1], np.sqrt(5.0) * (x[2] - x[3]), (x[1] - 2.0 * x[2]) ** 2,
+        lambda x: _side_by_side(x[0] + 10.0 * x[1], np.sqrt(5.0) * (x[2] - x[3]),
+                                (x[1] - 2.0 * x[2]) ** 2,
                                 np.sqrt(10.0) * (x[0] - x[3]) ** 2),
         (3.0, -1.0, 0.0, 1.0), (0.0, (0.0,) * 4)),
     "wood": _problem(_wood, (-3.0, -1.0, -3.0, -1.0), (0.0, (1.0,) * 4)),
     "kowalik_osborne": _problem(
         _kowalik_osborne, (0.25, 0.39, 0.415, 0.39),
-        (3.07505603849238e-4, (0.19280693457903791, 0.1912823287343663, 0.12305650692632084, 0.1360623306837945)),
+        (3.07505603849238e-4, (0.19280693457903791, 0.1912823287343663, 0.12305650692632084,
+                               0.1360623306837945)),
         (1.02734304869547e-3, (_INF, -14.0758819895, -_INF, -_INF))),
     "brown_dennis": _problem(
         _brown_dennis, (25.0, 5.0, -5.0, -1.0),
-        (85822.2016263563, (-11.594439904762162, 13.203630051207202, -0.40343948817685954, 0.23677877445573628))),
+        (85822.2016263563, (-11.594439904762162, 13.203630051207202, -0.40343948817685954,
+                            0.23677877445573628))),
     "osborne_1": _problem(
         _osborne_1, (0.5, 1.5, -1.0, 0.01, 0.02),
-        (5.46489469748e-5, (0.3754100521076023, 1.935846912788271, -1.464687136689818, 0.012867534640211172,
+        (5.46489469748e-5, (0.3754100521076023, 1.935846912788271, -1.464687136689818,
+                            0.012867534640211172,
                             0.022122699661365396))),
     "biggs_exp6": _problem(
         _biggs_exp6, (1.0, 2.0, 1.0, 1.0, 1.0, 1.0), (0.0, (1.0, 10.0, 1.0, 5.0, 4.0, 3.0)),
-        # The paper lists it as a minimum; it is one among x with x1 = x5 and x3 = x6, and else a saddle.
-        (5.655649925499946e-3, (1.711415994719587, 17.68319818094906, 1.16314366091889, 5.18656155199345,
+        # The paper lists it as a minimum; it is one among x with x1 = x5 and x3 = x6, and else a
+        # saddle.
+        (5.655649925499946e-3, (1.711415994719587, 17.68319818094906, 1.16314366091889,
+                                5.18656155199345,
                                 1.711415994719588, 1.163143660918888)),
         (0.306366611,)),  # x2 to infinity
     "osborne_2": _problem(
         _osborne_2, (1.3, 0.65, 0.65, 0.7, 0.6, 3.0, 5.0, 7.0, 2.0, 4.5, 5.5),
-        (4.01377362935478e-2, (1.3099771546273005, 0.431553794602989, 0.6336616989607241, 0.5994305347859163,
-                               0.7541832263280114, 0.9042885798596336, 1.365811835237028, 4.823698817227157,
+        (4.01377362935478e-2, (1.3099771546273005, 0.431553794602989, 0.6336616989607241,
+                               0.5994305347859163,
+                               0.7541832263280114, 0.9042885798596336, 1.365811835237028,
+                               4.823698817227157,
                                2.3986848661317546, 4.568874597667672, 5.6753414705806415)),
         (1.78981358688109,)),  # the exponential alone, with every peak outside the record
     "watson": _problem(
         _watson, (0.0,) * 6,
-        (2.28767005355241e-3, (-0.015725086401458498, 1.0124348693691099, -0.23299162595673725, 1.2604300877996073,
+        (2.28767005355241e-3, (-0.015725086401458498, 1.0124348693691099, -0.23299162595673725,
+                               1.2604300877996073,
                                -1.5137289227222785, 0.992996432431134))),
     "trigonometric": _problem(
         _trigonometric, (0.1,) * 10, (0.0, (0.0,) * 10),
-        (2.79505612188e-5, (0.0551509039806912, 0.0568406167947384, 0.0587640017626948, 0.0609906086567606,
-                            0.063626213695854, 0.0668431794527583, 0.208161518569882, 0.164363095885648,
+        (2.79505612188e-5, (0.0551509039806912, 0.0568406167947384, 0.0587640017626948,
+                            0.0609906086567606,
+                            0.063626213695854, 0.0668431794527583, 0.208161518569882,
+                            0.164363095885648,
                             0.0850068956885065, 0.091431450714708))),
     "brown_almost_linear": _problem(
         _brown_almost_linear, (0.5,) * 10,
@@ -287,7 +314,8 @@ PROBLEMS: dict[str, Problem] = {
         (1.0, (*(0.0,) * 9, 11.0))),
     "chebyquad": _problem(
         _chebyquad, tuple(j / 9.0 for j in range(1, 9)),
-        (3.51687372567793e-3, (0.04315276015101663, 0.1930908403841861, 0.26632870689027294, 0.5, 0.5,
+        (3.51687372567793e-3, (0.04315276015101663, 0.1930908403841861, 0.26632870689027294, 0.5,
+                               0.5,
                                0.7336712931097271, 0.8069091596158139, 0.9568472398489833))),
 }
 # fmt: on
@@ -296,20 +324,23 @@ PROBLEMS: dict[str, Problem] = {
 
 @dataclass(frozen=True)
 class Mgh(Measurement):
-    """One test function of Moré, Garbow and Hillstrom, to be started at a multiple of its standard start.
+    """One test function of Moré, Garbow and Hillstrom, to be started at a multiple of its standard
+    start.
 
-    The readings are h(x) = f(x), the residuals of the problem, and what is observed are zeros: the least-squares
-    estimate minimises the sum of f_i(x)^2. There is no order of arrival, no unit and no prior.
+    The readings are h(x) = f(x), the residuals of the problem, and what is observed are zeros: the
+    least-squares estimate minimises the sum of f_i(x)^2. There is no order of arrival, no unit and
+    no prior.
 
-    23 of the paper's 35 functions are here: all of fixed dimension (1 to 19), and of variable dimension those of its
-    list of nonlinear least-squares problems (Watson's with n = 6, Brown's almost linear with 10, Chebyquad with 8) and
-    the trigonometric one (10), known for its local minimum. Dimensions are those for which the paper states minima.
-    Eight functions have as many residuals as parameters (m = n): they can be solved, but there no fit can be tested.
-    At the least minimum of jennrich_sampson, powell_singular and chebyquad J has not full rank.
+    23 of the paper's 35 functions are here: all of fixed dimension (1 to 19), and of variable
+    dimension those of its list of nonlinear least-squares problems (Watson's with n = 6, Brown's
+    almost linear with 10, Chebyquad with 8) and the trigonometric one (10), known for its local
+    minimum. Dimensions are those for which the paper states minima. Eight functions have as many
+    residuals as parameters (m = n): they can be solved, but there no fit can be tested. At the
+    least minimum of jennrich_sampson, powell_singular and chebyquad J has not full rank.
 
-    Each parameter's size is its magnitude at the start, and 1 where it starts at zero, so x0 consists of ones, minus
-    ones and zeros. Watson's standard start is zero throughout: other multiples of it start at (start, ..., start), as
-    in the test drivers of MINPACK.
+    Each parameter's size is its magnitude at the start, and 1 where it starts at zero, so x0
+    consists of ones, minus ones and zeros. Watson's standard start is zero throughout: other
+    multiples of it start at (start, ..., start), as in the test drivers of MINPACK.
     """
 
     function: str = "kowalik_osborne"
@@ -355,9 +386,9 @@ class Mgh(Measurement):
 
     @property
     def recorded(self) -> Recorded:
-        """Zeros, with the place of the lowest minimum f*, and R for independent readings of standard deviation
-        sqrt(f* / (m - n)), m - n counted as 1 where it is 0, and 1e-3 where f* is 0: it only says what a small gradient
-        is."""
+        """Zeros, with the place of the lowest minimum f*, and R for independent readings of
+        standard deviation sqrt(f* / (m - n)), m - n counted as 1 where it is 0, and 1e-3 where f*
+        is 0: it only says what a small gradient is."""
         least = self.minima[0]
         assert least.x is not None
         variance = least.sum_of_squares / max(self.m - self.n, 1)
@@ -374,17 +405,19 @@ class Attained:
     sum_of_squares: float
     """At the estimate; infinite where it is not a number."""
     minimum: int | None
-    """Which of the model's `minima` has this sum of squares, or a lower one than the least: 0; None: it is none."""
+    """Which of the model's `minima` has this sum of squares, or a lower one than the least: 0;
+    None: it is none."""
 
     solved = property(lambda attained: attained.minimum == 0)
     """Whether that is the least there is."""
 
 
 def score(model: Mgh, x: Array) -> Attained:
-    """Compares the sum of squares at an estimate x (n,), in multiples of sizes, with the known minima.
+    """Compares the sum of squares at an estimate x (n,), in multiples of sizes, with the known
+    minima.
 
-    The value decides and not the place: several functions have more than one minimiser, or a minimum so flat that its
-    place says nothing.
+    The value decides and not the place: several functions have more than one minimiser, or a
+    minimum so flat that its place says nothing.
     """
     with np.errstate(all="ignore"):
         f = model.simulate(np.asarray(x, dtype=float)[None])[0]

@@ -1,4 +1,5 @@
-"""Multiple shooting for models by differential equations: the trajectory in pieces, which the fit joins."""
+"""Multiple shooting for models by differential equations: the trajectory in pieces, which the fit
+joins."""
 
 from __future__ import annotations
 
@@ -42,14 +43,16 @@ _SHORTEST = 2.0**-12
 
 @dataclass(frozen=True)
 class MultipleShooting(Estimator):
-    """Bock's method (Numerical treatment of inverse problems in chemical reaction kinetics, Springer Series in Chemical
-    Physics 18, 1981): the states at the beginning of each segment are unknowns beside the parameters, the segments'
-    ends have to meet the next beginnings, and a Gauss-Newton step satisfies the linearised conditions exactly.
+    """Bock's method (Numerical treatment of inverse problems in chemical reaction kinetics,
+    Springer Series in Chemical Physics 18, 1981): the states at the beginning of each segment are
+    unknowns beside the parameters, the segments' ends have to meet the next beginnings, and a
+    Gauss-Newton step satisfies the linearised conditions exactly.
 
-    Segments begin where the readings put them, so what a trajectory from far-off parameters would do later does no
-    harm. The conditions are eliminated by an orthogonal basis of their null space. Steps are halved by Deuflhard's
-    natural monotonicity test (Newton Methods for Nonlinear Problems, 2004, section 4.3.4). Integrating all segments
-    once counts as a simulation, and derivatives as what they cost beside it.
+    Segments begin where the readings put them, so what a trajectory from far-off parameters would
+    do later does no harm. The conditions are eliminated by an orthogonal basis of their null space.
+    Steps are halved by Deuflhard's natural monotonicity test (Newton Methods for Nonlinear
+    Problems, 2004, section 4.3.4). Integrating all segments once counts as a simulation, and
+    derivatives as what they cost beside it.
     """
 
     segments: Count = 10
@@ -59,8 +62,8 @@ class MultipleShooting(Estimator):
     max_iterations: Count = 50
     """Steps tried."""
     tolerance: Positive = 1e-6
-    """Largest step still to go of a parameter, in standard deviations of the local bound, and largest gap between
-    segments in multiples of the states' size."""
+    """Largest step still to go of a parameter, in standard deviations of the local bound, and
+    largest gap between segments in multiples of the states' size."""
     budget: Positive | None = None
     """Simulations that a trial may cost, a Jacobian counting n; None: no limit."""
 
@@ -87,8 +90,8 @@ class MultipleShooting(Estimator):
 
 @dataclass(frozen=True)
 class Pieces:
-    """A model's trajectory cut into segments. A lane is one case in one segment, and the lanes of a segment follow one
-    another; states are (trials, lanes, states)."""
+    """A model's trajectory cut into segments. A lane is one case in one segment, and the lanes of a
+    segment follow one another; states are (trials, lanes, states)."""
 
     problem: Problem
     model: OdeMeasurement
@@ -139,8 +142,8 @@ class Pieces:
         return _with_slope(states, x)
 
     def read(self, x: Array, y: Array, k: int) -> tuple[Array, Array]:
-        """The outputs (trials, cases, outputs) of the states y (trials, cases, states) at times[k], and their
-        derivatives by the states."""
+        """The outputs (trials, cases, outputs) of the states y (trials, cases, states) at times[k],
+        and their derivatives by the states."""
         p, c = (
             (x * self.model.si_sizes)[:, None, None],
             self.model.tables[min(k + 1, len(self.model.tables) - 1)],
@@ -149,7 +152,8 @@ class Pieces:
         return _with_slope(lambda y: _entrywise(read, y.shape[:3], y, p, c), y)
 
     def inputs(self, x: Array, y: Array, k: NDArray[np.intp]) -> Array:
-        """What `interval` takes for states y (trials, lanes, states) at the times grid[k] (lanes,)."""
+        """What `interval` takes for states y (trials, lanes, states) at the times grid[k]
+        (lanes,)."""
         tables, case = self.model.tables, np.arange(len(k)) % self.cases
         c = tables[0 * k, case]
         if self.model.driven is not None:
@@ -160,7 +164,8 @@ class Pieces:
         return np.concatenate(parts, axis=2).reshape(-1, self.interval.n)
 
     def follow(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """The ends of all segments that begin at y, and all readings h (trials, cases, times, outputs)."""
+        """The ends of all segments that begin at y, and all readings h (trials, cases, times,
+        outputs)."""
         h, y = np.empty((len(x), self.cases, len(self.grid) - 1, len(self.model.outputs))), y.copy()
         for lanes, k in self._intervals():
             read = self.interval.simulate(self.inputs(x, y[:, lanes], k)).reshape(
@@ -170,8 +175,8 @@ class Pieces:
         return y, h
 
     def slopes(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Derivatives along [x, state at the beginning] of the segments' ends (trials, lanes, states, n + states) and
-        of all readings (trials, cases, times, outputs, n + states)."""
+        """Derivatives along [x, state at the beginning] of the segments' ends (trials, lanes,
+        states, n + states) and of all readings (trials, cases, times, outputs, n + states)."""
         model, n = self.model, x.shape[1]
         states, size = model.states, np.concatenate([model.si_sizes, np.ones(model.states)])
         M = np.zeros((*y.shape, len(size)))
@@ -205,7 +210,8 @@ class Pieces:
             yield lanes, first[lanes] + j
 
     def guess(self, x: Array, z: Array) -> Array:
-        """Where the segments begin: the trajectory of x, moved as little as the readings there ask for."""
+        """Where the segments begin: the trajectory of x, moved as little as the readings there ask
+        for."""
         y, _ = self.start(x)
         nodes = [y]
         for k in range(self.cuts[-2]):
@@ -216,7 +222,8 @@ class Pieces:
         return np.concatenate(nodes, axis=1)
 
     def _moved(self, x: Array, y: Array, k: int, z: Array) -> Array:
-        """States y (trials, cases, states) moved to where they show the readings z taken at times[k]."""
+        """States y (trials, cases, states) moved to where they show the readings z taken at
+        times[k]."""
         shape = (self.cases, len(self.grid) - 1, len(self.model.outputs))
         whole = np.full((len(z), self.model.m), np.nan)
         whole[:, self.kept] = z + self.model.offset[self.kept]
@@ -234,14 +241,15 @@ class Pieces:
 def _entrywise(
     function: Callable[..., Sequence[Any]], shape: tuple[int, ...], *vectors: Array
 ) -> Array:
-    """A function of the entries of vectors (..., k), each entry of that shape: (*shape, outputs)."""
+    """A function of the entries of vectors (..., k), each entry of that shape: (*shape,
+    outputs)."""
     entries = (list(np.moveaxis(np.broadcast_to(a, (*shape, a.shape[-1])), -1, 0)) for a in vectors)
     return np.stack([np.broadcast_to(value, shape) for value in function(*entries)], axis=-1)
 
 
 def _with_slope(function: Callable[[Array], Array], x: Array) -> tuple[Array, Array]:
-    """A function at x (trials, ..., n) and its derivative (trials, ..., n) there, by complex steps, which come as an
-    axis behind that of the trials."""
+    """A function at x (trials, ..., n) and its derivative (trials, ..., n) there, by complex steps,
+    which come as an axis behind that of the trials."""
     n = x.shape[-1]
     steps = _COMPLEX_STEP * 1j * np.eye(n + 1, n, -1)
     y = function(x[:, None] + steps.reshape(n + 1, *[1] * (x.ndim - 2), n))
@@ -277,7 +285,8 @@ class Linear:
         return cls(Y, U[:, : C.shape[1]], Z, Qz, V, J, weights)
 
     def step(self, d: Array, r: Array) -> Array:
-        """The unknowns' change (trials, unknowns) that closes the gaps d and fits the residuals r best."""
+        """The unknowns' change (trials, unknowns) that closes the gaps d and fits the residuals r
+        best."""
         closing = np.zeros((len(r), self.J.shape[2]))
         if d.shape[1]:
             closing = multiply(self.Y, solve(self.U.swapaxes(1, 2), -d / self.weights)[0])
@@ -336,7 +345,8 @@ class Shooting:
         )
 
     def linear(self, x: Array, nodes: Array, size: Array) -> Linear:
-        """The gaps' and residuals' derivatives along the parameters and the nodes in multiples of `size`."""
+        """The gaps' and residuals' derivatives along the parameters and the nodes in multiples of
+        `size`."""
         pieces, n, (lanes, states) = self.pieces, x.shape[1], nodes.shape[1:]
         # The states in between are simulated beside the derivatives.
         self.model.tally.simulations[self.rows] += 1.0
@@ -435,7 +445,8 @@ class CondensedGaussNewton(Method[Shooting, Trajectory]):
 def _reach(state: Trajectory, change: Array) -> Array:
     """The largest change (trials,) of a parameter in standard deviations of the local bound."""
     change = change[:, : state.x.shape[1]]
-    # Where solutions grow as fast as the readings are many, deviations lie below the round-off of an integration.
+    # Where solutions grow as fast as the readings are many, deviations lie below the round-off of
+    # an integration.
     invisible = np.abs(change) <= _ROUND_OFF * np.fmax(1.0, np.abs(state.x))
     return np.where(invisible, 0.0, np.abs(change / deviations(state.linear.covariance))).max(
         axis=1

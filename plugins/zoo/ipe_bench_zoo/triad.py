@@ -34,10 +34,12 @@ def attitudes() -> Array:
 
 
 class Magnitudes(Measurement):
-    """The magnitude of a vector that a triad was exposed to in each of its attitudes, from the outputs of the triad.
+    """The magnitude of a vector that a triad was exposed to in each of its attitudes, from the
+    outputs of the triad.
 
-    Parameters: three biases in the unit of the outputs, three scale factors in ppm, three angles in mrad. Each attitude
-    is an epoch. Outputs are taken to be exact, with their noise counted in the readings.
+    Parameters: three biases in the unit of the outputs, three scale factors in ppm, three angles in
+    mrad. Each attitude is an epoch. Outputs are taken to be exact, with their noise counted in the
+    readings.
     """
 
     analytic = True
@@ -48,7 +50,8 @@ class Magnitudes(Measurement):
     """The names of the three angles."""
     output_unit: str
     error_sizes: Vector
-    """One unit of error: of a bias in the unit of the outputs, of a scale factor as a fraction, of an angle in rad."""
+    """One unit of error: of a bias in the unit of the outputs, of a scale factor as a fraction, of
+    an angle in rad."""
 
     @property
     @abstractmethod
@@ -88,20 +91,23 @@ class Magnitudes(Measurement):
 
 @dataclass(frozen=True)
 class Triad(Magnitudes):
-    """The magnitude |(I + E)(r_k - b)| of the vector that a triad with outputs r_k was exposed to in attitude k.
+    """The magnitude |(I + E)(r_k - b)| of the vector that a triad with outputs r_k was exposed to
+    in attitude k.
 
-    b is the bias; E is symmetric, with scale-factor errors on its diagonal and misalignments beside it. The reading of
-    attitude k is the magnitude that a reference states: a scalar magnetometer, or the local gravity.
+    b is the bias; E is symmetric, with scale-factor errors on its diagonal and misalignments beside
+    it. The reading of attitude k is the magnitude that a reference states: a scalar magnetometer,
+    or the local gravity.
 
-    Parameters: three biases in `unit`, three scale-factor errors in ppm, three misalignments in mrad. The usual noise
-    is 1e-5 of the field.
+    Parameters: three biases in `unit`, three scale-factor errors in ppm, three misalignments in
+    mrad. The usual noise is 1e-5 of the field.
 
-    Source: Merayo, Brauer, Primdahl, Petersen, Nielsen, Scalar calibration of vector magnetometers, Measurement Science
-    and Technology 11, 2000.
+    Source: Merayo, Brauer, Primdahl, Petersen, Nielsen, Scalar calibration of vector magnetometers,
+    Measurement Science and Technology 11, 2000.
     """
 
     outputs: Annotated[tuple[Vector, ...], MinLen(10)] | None = None
-    """Outputs r_k of the triad (attitudes, 3) in `unit`; None: a field of `field` in 26 directions."""
+    """Outputs r_k of the triad (attitudes, 3) in `unit`; None: a field of `field` in 26
+    directions."""
     field: Positive = 1.0
     """The magnitude about which sizes are chosen, in `unit`."""
     unit: str = "g"
@@ -145,20 +151,24 @@ class Triad(Magnitudes):
 
 @dataclass(frozen=True)
 class Accelerometer(Magnitudes):
-    """The magnitude |T K (r_k - b)| of specific force, from the counts r_k of a triad at rest in attitude k.
+    """The magnitude |T K (r_k - b)| of specific force, from the counts r_k of a triad at rest in
+    attitude k.
 
         T = [[1, -ayz, azy], [0, 1, -azx], [0, 0, 1]],   K = diag(kx, ky, kz)
 
-    b is the bias in counts, K the scale in m/s^2 per count, T leads from the axes of the sensors to orthogonal ones, of
-    which x is the first sensor's (small angles, as in the source). The reading of every attitude is the local gravity
-    `gravity`, in m/s^2. At least 10 attitudes, spread over the sphere.
+    b is the bias in counts, K the scale in m/s^2 per count, T leads from the axes of the sensors to
+    orthogonal ones, of which x is the first sensor's (small angles, as in the source). The reading
+    of every attitude is the local gravity `gravity`, in m/s^2. At least 10 attitudes, spread over
+    the sphere.
 
-    Parameters: three biases in counts, three scale factors in ppm of the presumed ones, three angles in mrad. The
-    usual noise is 5e-3 m/s^2 for the averages of an attitude with consumer sensors.
+    Parameters: three biases in counts, three scale factors in ppm of the presumed ones, three
+    angles in mrad. The usual noise is 5e-3 m/s^2 for the averages of an attitude with consumer
+    sensors.
 
-    Source: Tedaldi, Pretto, Menegatti, A robust and easy to implement method for IMU calibration without external
-    equipments, IEEE International Conference on Robotics and Automation, 2014 (there b is added). `Triad` is the same
-    in another form: its symmetric matrix is the polar factor of T K.
+    Source: Tedaldi, Pretto, Menegatti, A robust and easy to implement method for IMU calibration
+    without external equipments, IEEE International Conference on Robotics and Automation, 2014
+    (there b is added). `Triad` is the same in another form: its symmetric matrix is the polar
+    factor of T K.
     """
 
     counts: Annotated[tuple[Vector, ...], MinLen(10)] | None = None

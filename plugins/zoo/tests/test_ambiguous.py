@@ -1,4 +1,5 @@
-"""Trials in which several minima fit: flagged in what is stored, counted in the summary, shown where somebody looks."""
+"""Trials in which several minima fit: flagged in what is stored, counted in the summary, shown
+where somebody looks."""
 
 import numpy as np
 import pytest

@@ -45,7 +45,8 @@ def table(folder):
 
 @pytest.mark.slow
 def test_the_other_minimum_of_freudenstein_and_roth_is_named(table):
-    """Powell, Levenberg and Marquardt end there from the standard start; it is in every textbook."""
+    """Powell, Levenberg and Marquardt end there from the standard start; it is in every
+    textbook."""
     for local in ("levenberg_marquardt", "minpack"):
         row = table.loc[("freudenstein_roth", 1.0, local)]
         assert (row["solved"], row["minimum"]) == (False, 1)

@@ -34,7 +34,7 @@ def test_bocks_readings_are_those_of_the_closed_form_to_round_off_that_has_grown
     assert (np.abs(model.simulate(x) - exact) < 1e-11 * np.maximum(scale, growth)).all()
 
 
-def test_forward_integration_keeps_bocks_true_trajectory_for_a_mild_rate_and_loses_it_for_the_classic_one():
+def test_forward_integration_keeps_bocks_trajectory_for_a_mild_rate_and_loses_it_for_the_classic():
     mild, classic = Bock(mu=10.0), Bock(mu=60.0)
     assert np.abs(mild.simulate(mild.recorded.x[None])[0] - mild.recorded.z).max() < 1e-9
     # Errors of 1e-17 grow by exp(60) = 1e26, and no two steps agree on them.
@@ -55,7 +55,8 @@ def test_bocks_recorded_readings_are_the_sine_and_the_answer_is_pi():
 
 
 def closed_form(x, mu, t):
-    """x1 = sin(p t) + x1(0) cosh(mu t) + (x2(0) - p) sinh(mu t) / mu and its derivative: (trials, 2 times)."""
+    """x1 = sin(p t) + x1(0) cosh(mu t) + (x2(0) - p) sinh(mu t) / mu and its derivative: (trials, 2
+    times)."""
     values = x[:, :, None]
     p = values[:, 0]
     x1, x2 = (values[:, 1], values[:, 2]) if x.shape[1] == 3 else (0.0, np.pi)

@@ -1,4 +1,5 @@
-"""The ensemble smoother against the closed form of linear models, and against the formula of its paper."""
+"""The ensemble smoother against the closed form of linear models, and against the formula of its
+paper."""
 
 import numpy as np
 import pytest
@@ -27,7 +28,8 @@ def linear(trials: int):
 )
 @pytest.mark.parametrize("members", [20, 5])
 def test_gain_is_that_of_the_paper(members):
-    """C_sh (C_hh + alpha R)^-1 (z - h), Emerick and Reynolds (2013), eq. (12), by inverting a matrix of readings."""
+    """C_sh (C_hh + alpha R)^-1 (z - h), Emerick and Reynolds (2013), eq. (12), by inverting a
+    matrix of readings."""
     rng = np.random.default_rng(1)
     s, h, z = (rng.standard_normal((3, members, k)) for k in (4, 7, 7))
     found = assimilated(s, h, z, 3.0)

@@ -1,4 +1,5 @@
-"""Pseudo-ranges against the flight of light in inertial axes, the ellipsoid's formulas, SciPy and Bancroft."""
+"""Pseudo-ranges against the flight of light in inertial axes, the ellipsoid's formulas, SciPy and
+Bancroft."""
 
 import numpy as np
 import pytest
@@ -21,7 +22,8 @@ LIGHT, EARTH_RATE = 299792458.0, 7.2921151467e-5
 
 
 def flight(satellite, receiver):
-    """The distance to a receiver that the Earth carries along while light flies, in axes that do not turn."""
+    """The distance to a receiver that the Earth carries along while light flies, in axes that do
+    not turn."""
 
     def late(tau):
         a = EARTH_RATE * tau
@@ -43,7 +45,8 @@ def on_ellipsoid(latitude, longitude, height):
 
 
 def sky(model):
-    """Satellites (m, 3) of the default sky, found from the readings' directions: the model's own table."""
+    """Satellites (m, 3) of the default sky, found from the readings' directions: the model's own
+    table."""
     return model._columns[2]
 
 
@@ -172,7 +175,8 @@ def test_clocks_belong_to_epochs_and_offsets_to_constellations():
 
 
 def bancroft(beacons, pseudoranges):
-    """Position and clock bias (4,) from pseudoranges, algebraically (Bancroft 1985); the root that fits better."""
+    """Position and clock bias (4,) from pseudoranges, algebraically (Bancroft 1985); the root that
+    fits better."""
     B = np.column_stack([beacons, pseudoranges])
     lorentz = np.array([1.0, 1.0, 1.0, -1.0])
     a = (B**2) @ lorentz / 2
@@ -210,8 +214,8 @@ def test_a_clock_bias_adds_to_every_range_and_rounds_repeat():
 
 
 def test_a_satellite_file_brings_its_own_sky(tmp_path):
-    """Position and clock of a file with a sky, an order and an epoch of its own, within their intervals, at the answer
-    of an independent solution."""
+    """Position and clock of a file with a sky, an order and an epoch of its own, within their
+    intervals, at the answer of an independent solution."""
     rng = np.random.default_rng(5)
     places = Gnss(rounds=1)._columns[2][[3, 0, 5, 1, 2, 4]] + rng.normal(0, 3e5, (6, 3))
     sky = tuple((1, "gps", *place) for place in places.tolist())

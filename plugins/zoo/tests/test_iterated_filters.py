@@ -1,4 +1,5 @@
-"""Filters that linearise an epoch again, against textbook loops and SciPy; and what every estimator promises."""
+"""Filters that linearise an epoch again, against textbook loops and SciPy; and what every estimator
+promises."""
 
 import numpy as np
 import pytest
@@ -24,7 +25,8 @@ from ipe_bench.trials.scenario import Scenario
     1e-9,
 )
 def test_recursive_steps_are_updates_with_inflated_noise():
-    """The textbook loop in covariance form: at each step the gain for R / w_k, linearised at the last estimate."""
+    """The textbook loop in covariance form: at each step the gain for R / w_k, linearised at the
+    last estimate."""
     scenario = Scenario(Bent(0.05), Gaussian(0.3), GaussianPrior(), 1.0, seed=2)
     problem, trials = scenario.problem, scenario.draw(0, 4)
     model, found = (

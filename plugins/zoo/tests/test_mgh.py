@@ -1,4 +1,5 @@
-"""Moré, Garbow and Hillstrom's functions against published sums of squares, and minima against SciPy."""
+"""Moré, Garbow and Hillstrom's functions against published sums of squares, and minima against
+SciPy."""
 
 import inspect
 from math import exp, sqrt
@@ -17,16 +18,20 @@ from ipe_bench.workshop.conformance import check_component
 
 # m and n, as the paper states them.
 SIZES = {
-    "rosenbrock": (2, 2), "freudenstein_roth": (2, 2), "powell_badly_scaled": (2, 2), "brown_badly_scaled": (3, 2),
-    "beale": (3, 2), "jennrich_sampson": (10, 2), "helical_valley": (3, 3), "bard": (15, 3), "gaussian": (15, 3),
+    "rosenbrock": (2, 2), "freudenstein_roth": (2, 2), "powell_badly_scaled": (2, 2),
+    "brown_badly_scaled": (3, 2),
+    "beale": (3, 2), "jennrich_sampson": (10, 2), "helical_valley": (3, 3), "bard": (15, 3),
+    "gaussian": (15, 3),
     "meyer": (16, 3), "gulf": (99, 3), "box_3d": (10, 3), "powell_singular": (4, 4), "wood": (6, 4),
-    "kowalik_osborne": (11, 4), "brown_dennis": (20, 4), "osborne_1": (33, 5), "biggs_exp6": (13, 6),
-    "osborne_2": (65, 11), "watson": (31, 6), "trigonometric": (10, 10), "brown_almost_linear": (10, 10),
+    "kowalik_osborne": (11, 4), "brown_dennis": (20, 4), "osborne_1": (33, 5),
+    "biggs_exp6": (13, 6),
+    "osborne_2": (65, 11), "watson": (31, 6), "trigonometric": (10, 10),
+    "brown_almost_linear": (10, 10),
     "chebyquad": (8, 8),
 }  # fmt: skip
 
-# Norms of the residuals at 1, 10 and 100 times the standard start: the reference values of MINPACK's tests (Argonne,
-# March 1980), as they stand in the tests of Apache Commons Math 2.2.
+# Norms of the residuals at 1, 10 and 100 times the standard start: the reference values of
+# MINPACK's tests (Argonne, March 1980), as they stand in the tests of Apache Commons Math 2.2.
 MINPACK_NORMS = {
     "rosenbrock": (sqrt(24.2), sqrt(1795769.0), 11.0 * sqrt(169000121.0)),
     "helical_valley": (50.0, 102.95630140987, 991.261822123701),
@@ -55,7 +60,8 @@ BY_HAND = {
 
 # What the paper prints.
 PRINTED = {
-    "freudenstein_roth": (0.0, 48.9842), "jennrich_sampson": (124.362,), "bard": (8.21487e-3, 17.4286),
+    "freudenstein_roth": (0.0, 48.9842), "jennrich_sampson": (124.362,),
+    "bard": (8.21487e-3, 17.4286),
     "gaussian": (1.12793e-8,), "meyer": (87.9458,), "kowalik_osborne": (3.07505e-4, 1.02734e-3),
     "brown_dennis": (85822.2,), "osborne_1": (5.46489e-5,), "biggs_exp6": (0.0, 5.65565e-3),
     "osborne_2": (4.01377e-2,), "watson": (2.28767e-3,), "trigonometric": (0.0, 2.79506e-5),

@@ -1,4 +1,5 @@
-"""Multiple shooting against single shooting, against the closed form of Bock's problem, and against its own pieces."""
+"""Multiple shooting against single shooting, against the closed form of Bock's problem, and against
+its own pieces."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,5 @@
-"""Two problems of smoothers: their equations, the experiment that compares on them, and SciPy's minimum of a path."""
+"""Two problems of smoothers: their equations, the experiment that compares on them, and SciPy's
+minimum of a path."""
 
 from dataclasses import replace
 

@@ -1,4 +1,5 @@
-"""Portfolio and progressive method on problems of the zoo: minima that fit alike, and minima without full rank."""
+"""Portfolio and progressive method on problems of the zoo: minima that fit alike, and minima
+without full rank."""
 
 import numpy as np
 import pytest
@@ -17,7 +18,8 @@ from ipe_bench.trials.scoring import Block
 
 
 def test_a_root_of_a_passed_jacobian_is_no_minimum():
-    """Watson's function from zero, where the first stage is quick and its first Jacobian too old."""
+    """Watson's function from zero, where the first stage is quick and its first Jacobian too
+    old."""
     scenario = Scenario(Mgh("watson", 1.0), Certified())
     estimates = Auto().estimate(scenario.problem, scenario.draw(0, 1).z)
     assert score(scenario.measurement, estimates.x[0]).solved
@@ -25,8 +27,8 @@ def test_a_root_of_a_passed_jacobian_is_no_minimum():
 
 @pytest.mark.slow
 def test_minima_that_fit_alike_are_found_flagged_and_listed():
-    """|M (r - b)|^2 is r'Ar - 2 r'Ab + b'Ab with A = M^2, which has eight symmetric square roots M; and since every r
-    has the length 1, a multiple of I in A can stand for another b'Ab."""
+    """|M (r - b)|^2 is r'Ar - 2 r'Ab + b'Ab with A = M^2, which has eight symmetric square roots M;
+    and since every r has the length 1, a multiple of I in A can stand for another b'Ab."""
     block = Block.draw(Scenario(Triad(), Gaussian(1e-5), error_scale=300.0), 0, 6)
     with np.errstate(all="ignore"):
         estimates, scored = block.estimate(Auto(confirmations=6))
@@ -62,8 +64,8 @@ def test_most_failures_among_equal_minima_are_flagged():
 
 
 def test_a_start_without_full_rank_does_not_hide_that_a_flat_minimum_is_reached():
-    """Chebyquad with n = 8 from 100 times its start: J is singular at the minimum, and to double precision at the
-    start as well, but not on the way."""
+    """Chebyquad with n = 8 from 100 times its start: J is singular at the minimum, and to double
+    precision at the start as well, but not on the way."""
     scenario = Scenario(Mgh("chebyquad", 100.0), Certified())
     with np.errstate(all="ignore"):
         found = Progressive().estimate(scenario.problem, scenario.draw(0, 1).z)
@@ -72,7 +74,8 @@ def test_a_start_without_full_rank_does_not_hide_that_a_flat_minimum_is_reached(
 
 
 def test_a_singular_start_is_not_a_problem_without_an_answer():
-    """Beale's function has a J of rank 1 at its standard start, and its minimum of zero at (3, 1/2)."""
+    """Beale's function has a J of rank 1 at its standard start, and its minimum of zero at (3,
+    1/2)."""
     model = Mgh("beale")
     problem = Problem(model, model.recorded.R)
     z = model.recorded.z[None]

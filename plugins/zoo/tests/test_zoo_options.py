@@ -1,4 +1,5 @@
-"""Options of the zoo's models that cannot be, each refused by its name; and the version that it goes with."""
+"""Options of the zoo's models that cannot be, each refused by its name; and the version that it
+goes with."""
 
 import tomllib
 from pathlib import Path

@@ -1,4 +1,5 @@
-"""Foreign covariances: planted faults are named, honest reports are left in peace, and files are read or refused."""
+"""Foreign covariances: planted faults are named, honest reports are left in peace, and files are
+read or refused."""
 
 import re
 
@@ -14,7 +15,8 @@ from ipe_bench.questions.audit.maths import Claims, _tails, _worst_direction, au
 
 
 def claims(rng, runs=200, n=4, *, factor=1.0, law="normal", stretched=1.0):
-    """Errors whose covariance is `factor` times smaller than reported; one direction has `stretched` the variance."""
+    """Errors whose covariance is `factor` times smaller than reported; one direction has
+    `stretched` the variance."""
     a = rng.standard_normal((n, n))
     covariance = a @ a.T / n + 0.3 * np.eye(n)
     s = np.sqrt(np.diag(covariance))
@@ -71,8 +73,8 @@ def test_a_planted_direction_is_named():
 
 @pytest.mark.slow
 def test_a_direction_is_named_as_a_combination_of_reported_deviations():
-    """Errors of correlation C = [[1, .6], [.6, 1]] with the first whitened one three times too large: C^(-1/2) maps
-    parameters to it by 1.19 and -.40."""
+    """Errors of correlation C = [[1, .6], [.6, 1]] with the first whitened one three times too
+    large: C^(-1/2) maps parameters to it by 1.19 and -.40."""
     rng, C = np.random.default_rng(6), np.array([[1.0, 0.6], [0.6, 1.0]])
     values, vectors = np.linalg.eigh(C)
     error = (rng.standard_normal((2000, 2)) * [3.0, 1.0]) @ ((vectors * values**0.5) @ vectors.T)
@@ -261,7 +263,8 @@ def test_errors_of_any_finite_size_have_a_factor(far):
 
 
 def test_the_farther_of_two_directions_counts_the_other_one():
-    """Twice the share of own draws whose least eigenvalue is smaller, or whose largest is larger, than that found."""
+    """Twice the share of own draws whose least eigenvalue is smaller, or whose largest is larger,
+    than that found."""
     rng = np.random.default_rng(7)
 
     def ends(w):
@@ -290,11 +293,12 @@ def test_tails_of_any_of_eight_parameters_are_found_by_chance_as_often_as_those_
     assert np.mean(p <= 0.1) <= 0.1 + 3 * np.sqrt(0.1 * 0.9 / 100)
 
 
-# One verdict ---------------------------------------------------------------------------------------------------------
+# One verdict --------------------------------------------------------------------------------------
 
 
 def test_sentence_verdict_and_exit_code_say_the_same(tmp_path, capsys):
-    """Near the edge of the interval, where a test of the scale alone refuses more reports than the sentences do."""
+    """Near the edge of the interval, where a test of the scale alone refuses more reports than the
+    sentences do."""
     rng, seen = np.random.default_rng(0), set()
     for _ in range(20):
         table = pd.DataFrame({"x_error": rng.normal(0, 1, 60), "x_std": 0.78})
@@ -314,7 +318,7 @@ def test_sentence_verdict_and_exit_code_say_the_same(tmp_path, capsys):
     assert {"too small", "undecided"} <= seen
 
 
-# A bundle adjustment -------------------------------------------------------------------------------------------------
+# A bundle adjustment ------------------------------------------------------------------------------
 
 SIGMA = 0.5
 """Standard deviation of the image points in pixels."""
@@ -335,10 +339,12 @@ KNOWN = 3
 
 
 def bundle_adjustments(runs: int, assumed: float, seed: int) -> pd.DataFrame:
-    """Errors of the first camera's rotation over simulated images of two cameras, and the covariance (J' J)^-1 of
-    residuals that are divided by `assumed`: what a solver reports that takes them for independent of variance 1.
+    """Errors of the first camera's rotation over simulated images of two cameras, and the
+    covariance (J' J)^-1 of residuals that are divided by `assumed`: what a solver reports that
+    takes them for independent of variance 1.
 
-    A rotation's error is the rotation vector from the true to the estimated one, in which the solver steps, too.
+    A rotation's error is the rotation vector from the true to the estimated one, in which the
+    solver steps, too.
     """
 
     def images(x: np.ndarray) -> np.ndarray:
@@ -366,8 +372,9 @@ def bundle_adjustments(runs: int, assumed: float, seed: int) -> pd.DataFrame:
 
 @pytest.mark.slow
 def test_a_bundle_adjustment_in_pixels_reports_the_covariance_of_errors_of_one_pixel():
-    """The question of users of such solvers: 'the covariance is larger than that of a Monte Carlo simulation'. The
-    residuals were in pixels, and the image points half a pixel wrong; divided by that, it is right."""
+    """The question of users of such solvers: 'the covariance is larger than that of a Monte Carlo
+    simulation'. The residuals were in pixels, and the image points half a pixel wrong; divided by
+    that, it is right."""
     found = audit(read_claims(bundle_adjustments(200, assumed=1.0, seed=1)))
     assert found.verdict == "too large"
     assert found.scale.low < SIGMA < found.scale.high

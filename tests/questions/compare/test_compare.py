@@ -1,4 +1,5 @@
-"""`compare` finds what is there, nothing where there is nothing, and says which trials it compared."""
+"""`compare` finds what is there, nothing where there is nothing, and says which trials it
+compared."""
 
 import re
 from pathlib import Path
@@ -32,7 +33,8 @@ def store(
     fails=0,
     **scenario,
 ):
-    """A folder in which one estimator errs by `factor` times the bound, and fails in the first `fails` trials."""
+    """A folder in which one estimator errs by `factor` times the bound, and fails in the first
+    `fails` trials."""
     filled = Synthetic(folder)
     error = factor * ERROR * np.random.default_rng(draws).standard_normal((trials, 3))
     error[:fails] = 1e3
@@ -43,8 +45,9 @@ def store(
 
 
 def changed(tmp_path, first: dict, second: dict, trials=1000, n=3, **options):
-    """The rows of a comparison of two stores of the same trials, by quantity, where `error` and other columns of each
-    are functions of the same normal deviates (trials, n) in deviations of the bound."""
+    """The rows of a comparison of two stores of the same trials, by quantity, where `error` and
+    other columns of each are functions of the same normal deviates (trials, n) in deviations of the
+    bound."""
     for name, columns in (("a", first), ("b", second)):
         filled, columns = Synthetic(tmp_path / name), dict(columns)
         deviates = np.random.default_rng(0).standard_normal((trials, n))
@@ -58,8 +61,9 @@ def findings(frame: pd.DataFrame) -> dict[str, str]:
 
 
 def test_the_same_trials_are_compared_one_by_one(tmp_path):
-    """Errors half as large in every trial: a ratio of exactly 2, however much the trials differ among themselves. None
-    of 200 trials has another one, so at most 1 - .025^(1/200) of all have (Clopper and Pearson)."""
+    """Errors half as large in every trial: a ratio of exactly 2, however much the trials differ
+    among themselves. None of 200 trials has another one, so at most 1 - .025^(1/200) of all have
+    (Clopper and Pearson)."""
     a, b = store(tmp_path / "a", factor=0.5), store(tmp_path / "b", factor=1.0)
     rows = ib.compare(a, b).set_index("quantity")
     assert rows.loc["error", "change"] == pytest.approx(2.0)
@@ -150,7 +154,8 @@ def test_scenarios_of_one_folder_alone_are_left_out_and_it_is_said(tmp_path):
 
 
 def test_so_few_trials_that_none_can_be_worse_are_named(tmp_path):
-    """Success, error and cost at 5 %: with seven trials the least p is 2/128 and, three times as large, .047."""
+    """Success, error and cost at 5 %: with seven trials the least p is 2/128 and, three times as
+    large, .047."""
     for trials, finding in ((6, ""), (7, "worse")):
         folders = [store(tmp_path / f"{trials} {name}", trials=trials) for name in "ab"]
         folders[1] = store(tmp_path / f"{trials} c", trials=trials, fails=trials)
@@ -161,8 +166,8 @@ def test_so_few_trials_that_none_can_be_worse_are_named(tmp_path):
 
 
 def test_judging_by_evidence(tmp_path):
-    """Three questions at 5 %: evidence of 60 is needed, which nine failures of one alone give. Eight give 50, which is
-    enough for one question only."""
+    """Three questions at 5 %: evidence of 60 is needed, which nine failures of one alone give.
+    Eight give 50, which is enough for one question only."""
     a = store(tmp_path / "a")
     rows = [
         ib.compare(a, store(tmp_path / f"{k}", fails=k), anytime=True)
@@ -175,8 +180,8 @@ def test_judging_by_evidence(tmp_path):
 
 
 def test_costs_are_judged_by_their_means_alone(tmp_path):
-    """Cheaper in 90 % of 400 trials and so much dearer in the others that the mean ratio is 1.01: neither the p nor
-    evidence finds the second worse, as a test of signs would find it better."""
+    """Cheaper in 90 % of 400 trials and so much dearer in the others that the mean ratio is 1.01:
+    neither the p nor evidence finds the second worse, as a test of signs would find it better."""
     folders = []
     for name, costs in (
         ("a", np.full(400, 100.0)),
@@ -257,8 +262,8 @@ MIRRORED = [
     slow_if(lambda *case: case in MIRRORED, [*MATTERS, *MIRRORED]),
 )
 def test_what_matters_is_found_and_nothing_else(tmp_path, first, second, expected):
-    """1,000 trials of the same errors: every change is one of all trials, or of the stated share of them. Eight lost
-    trials in 1,000 are within the margin of success."""
+    """1,000 trials of the same errors: every change is one of all trials, or of the stated share of
+    them. Eight lost trials in 1,000 are within the margin of success."""
     rows = changed(tmp_path, first, second, fail_on=ALL)
     found = {quantity: finding for quantity, finding in rows["finding"].items() if finding}
     assert found == expected
@@ -268,7 +273,8 @@ def test_what_matters_is_found_and_nothing_else(tmp_path, first, second, expecte
 
 
 def test_an_interval_that_holds_what_is_right_is_not_worse(tmp_path):
-    """A bias of 0.4 that becomes -0.05 in all of 60 trials: for what may be unseen, the change is -1.1 to 0.2."""
+    """A bias of 0.4 that becomes -0.05 in all of 60 trials: for what may be unseen, the change is
+    -1.1 to 0.2."""
     first, second = (lambda e, by=by: e - e.mean(axis=0) + [0.0, by, 0.0] for by in (0.4, -0.05))
     row = changed(tmp_path, {"error": first}, {"error": second}, trials=60, fail_on=("bias",)).loc[
         "bias of b"
@@ -279,7 +285,8 @@ def test_an_interval_that_holds_what_is_right_is_not_worse(tmp_path):
 
 
 def test_honesty_and_bias_are_those_of_the_definition(tmp_path):
-    """Mean of the squared errors over the claimed variances, by n, of trials that converge in both; mean error."""
+    """Mean of the squared errors over the claimed variances, by n, of trials that converge in both;
+    mean error."""
     e = np.random.default_rng(0).standard_normal((1000, 3))
     status = np.where(np.arange(1000) < 100, "diverged", "converged").astype(object)
     rows = changed(
@@ -301,7 +308,8 @@ def test_what_no_common_trial_shows_is_a_dash(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_only_what_is_asked_for_is_tested_and_changes_a_p(tmp_path):
-    """Four failures of one alone: McNemar's p of 1/8, multiplied by the number of questions; three without fail_on."""
+    """Four failures of one alone: McNemar's p of 1/8, multiplied by the number of questions; three
+    without fail_on."""
     a, b = store(tmp_path / "a"), store(tmp_path / "b", fails=4)
     asked = (
         None,
@@ -332,7 +340,8 @@ def test_margins_are_for_the_user_to_say(tmp_path, capsys):
 
 
 def test_what_is_gone_is_named_where_completeness_is_asked_for(tmp_path, capsys):
-    """An estimator, half of the trials, a scenario and a covariance: a line each, and none without the word."""
+    """An estimator, half of the trials, a scenario and a covariance: a line each, and none without
+    the word."""
     first, second = Synthetic(tmp_path / "a"), Synthetic(tmp_path / "b")
     error = ERROR * np.random.default_rng(0).standard_normal((200, 3))
     for label, scale in (("it", 1.0), ("it", 7.0), ("lost", 1.0), ("half", 1.0), ("mute", 1.0)):
@@ -364,7 +373,8 @@ def test_what_is_gone_is_named_where_completeness_is_asked_for(tmp_path, capsys)
 
 
 def test_other_sources_of_the_bench_are_said(tmp_path, capsys):
-    """A stored side grows old: an estimator's own version is what is compared, that of the truths is not."""
+    """A stored side grows old: an estimator's own version is what is compared, that of the truths
+    is not."""
     a, b = store(tmp_path / "a"), store(tmp_path / "b")
     assert main(["compare", str(a), str(b)]) == 0
     assert "other sources" not in capsys.readouterr().err
@@ -377,12 +387,15 @@ def test_other_sources_of_the_bench_are_said(tmp_path, capsys):
 # fmt: off
 MISTAKES = {
     "": "name one or two folders", "{a} {b} {a}": "name one or two folders", "{a}": "name another",
-    "{a} {a}": "is compared with itself", "{a} first=it second=it": "it of one folder is compared with itself",
-    "nowhere": "nowhere: there is no such folder", "{a} nowhere": "nowhere: there is no such folder",
+    "{a} {a}": "is compared with itself",
+    "{a} first=it second=it": "it of one folder is compared with itself",
+    "nowhere": "nowhere: there is no such folder",
+    "{a} nowhere": "nowhere: there is no such folder",
     "{a} {b} alpha=2": "between 0 and 1", "{a} {b} alpha=x": "alpha=x: give a number",
     "{a} {b} alfa=0.1": "did you mean alpha", "{a} {b} alpha=": "give it a value",
     "{a} {b} first=it first=it": "stands there twice", "{a} {b} anytime=1": "true or false",
-    "{a} {b} fail_on=time": "there is no such quantity", "{a} {b} margin.time=1": "there is no such key",
+    "{a} {b} fail_on=time": "there is no such quantity",
+    "{a} {b} margin.time=1": "there is no such key",
     "{a} {b} margin.cost=-1": "margin.cost=-1.0: give a number from 0 on",
     "{a} {b} fail_on=cost power=0.9 difference=0.05": "power: concerns success",
     "{a} {b} first=nobody": "there is no such estimator", "{a} {other}": "no estimator is in both",
@@ -444,8 +457,8 @@ def test_newton_is_better_than_fixed_point_at_scale_100_and_costs_less(tmp_path)
 
 @pytest.mark.campaign
 def test_equal_folders_of_other_seeds_are_found_different_as_rarely_as_stated(tmp_path):
-    """500 pairs of folders with shares of failure of 1 in 10 and random costs: at most 5 % findings, up to 3
-    deviations, of any quantity; by evidence fewer."""
+    """500 pairs of folders with shares of failure of 1 in 10 and random costs: at most 5 %
+    findings, up to 3 deviations, of any quantity; by evidence fewer."""
     rng = np.random.default_rng(0)
     alarms = {False: 0, True: 0}
     for number in range(500):
@@ -472,7 +485,8 @@ def test_equal_folders_of_other_seeds_are_found_different_as_rarely_as_stated(tm
 
 @pytest.mark.slow
 def test_a_pilot_says_how_many_trials_a_difference_takes(tmp_path, capsys):
-    """In 15 of 200 trials one alone succeeds, and three questions are asked: McNemar's p is multiplied by 3."""
+    """In 15 of 200 trials one alone succeeds, and three questions are asked: McNemar's p is
+    multiplied by 3."""
     a, b = store(tmp_path / "a"), store(tmp_path / "b", fails=15)
     rows = ib.compare(a, b, power=0.9, difference=0.05).set_index("quantity")
     high = binomtest(15, 200).proportion_ci(0.6).high

@@ -1,4 +1,5 @@
-"""Paired effects against exhaustive enumeration and maximised likelihoods; evidence that keeps its promise."""
+"""Paired effects against exhaustive enumeration and maximised likelihoods; evidence that keeps its
+promise."""
 
 import itertools
 
@@ -23,7 +24,8 @@ def successes(both: int, only_first: int, only_second: int, neither: int):
 
 
 def test_the_p_of_a_ratio_is_the_share_of_all_signs():
-    """All 4,096 assignments of signs to twelve differences, within 4 deviations of the 4,999 that are drawn."""
+    """All 4,096 assignments of signs to twelve differences, within 4 deviations of the 4,999 that
+    are drawn."""
     rng = np.random.default_rng(0)
     a, b = rng.gamma(3, size=12), rng.gamma(4.5, size=12)
     signs = np.array(list(itertools.product([-1.0, 1.0], repeat=12)))
@@ -64,7 +66,8 @@ def test_a_ratio_is_that_of_the_means_and_turns_with_the_order():
 
 
 def test_a_few_trials_that_differ_are_no_finding_however_far():
-    """Three differences of one side have a p of 1/4 by signs; a normal approximation would call them sure."""
+    """Three differences of one side have a p of 1/4 by signs; a normal approximation would call
+    them sure."""
     a = np.ones(1000)
     b = a.copy()
     b[:3] = 7.0
@@ -89,8 +92,8 @@ def test_so_few_trials_leave_the_interval_open(trials):
 
 
 def rarely_worse(q: float, trials: int, studies: int) -> tuple[float, float]:
-    """Coverage and median width of the ratio of mean errors, each at most 6, where the second is the first but for a
-    share q of trials in which it is 6."""
+    """Coverage and median width of the ratio of mean errors, each at most 6, where the second is
+    the first but for a share q of trials in which it is 6."""
     rng = np.random.default_rng(trials)
     true, held, widths = (1 - q) + q * 6 / chi(3).mean(), 0, []
     for _ in range(studies):
@@ -110,15 +113,17 @@ STUDIES = [
 
 @pytest.mark.parametrize(("q", "trials", "studies"), STUDIES)
 def test_intervals_count_the_failures_that_may_be_unseen(q, trials, studies):
-    """Random signs alone cover .35, .61, .65 and .75: where both agree in every trial seen, their interval is a point.
-    Widths are finite: the rule of three, 3.7 / N failures of 6 on top of a mean of 1.6, to either side."""
+    """Random signs alone cover .35, .61, .65 and .75: where both agree in every trial seen, their
+    interval is a point. Widths are finite: the rule of three, 3.7 / N failures of 6 on top of a
+    mean of 1.6, to either side."""
     covered, width = rarely_worse(q, trials, studies)
     assert covered >= 0.93
     assert width < 2.2 * 2 * 3.7 / trials * 6 / 1.6 or q > 0.02
 
 
 def test_an_interval_is_widened_only_where_nearly_all_trials_agree():
-    """Where all trials differ it is that of random signs, 2 x 1.96 standard errors of the ratio wide."""
+    """Where all trials differ it is that of random signs, 2 x 1.96 standard errors of the ratio
+    wide."""
     rng = np.random.default_rng(0)
     a = rng.normal(5, 1, 200)
     b = a + rng.normal(0, 0.5, 200)
@@ -134,7 +139,8 @@ def test_an_interval_is_widened_only_where_nearly_all_trials_agree():
 
 
 def test_a_widened_interval_says_what_the_test_says():
-    """Eight of 400 trials are larger: a p of 2 / 2^8, so that 1 is outside of the interval, however wide it is."""
+    """Eight of 400 trials are larger: a p of 2 / 2^8, so that 1 is outside of the interval, however
+    wide it is."""
     a = np.ones(400)
     b = a.copy()
     b[:8] = 1.5
@@ -157,7 +163,8 @@ def test_a_mean_difference_has_the_normal_interval_and_the_p_of_all_signs():
 
 
 def test_a_mean_difference_counts_trials_that_may_be_unseen():
-    """None of 200 differs by other than 0.3: at most 1 - .025^(1/200) of all do, each by the largest there can be."""
+    """None of 200 differs by other than 0.3: at most 1 - .025^(1/200) of all do, each by the
+    largest there can be."""
     first = np.random.default_rng(5).standard_normal(200)
     effect = mean_effect(first, first + 0.3, 0.05, 8.0)
     reach = 8 * (1 - 0.025 ** (1 / 200))
@@ -189,8 +196,8 @@ def test_success_is_mcnemar_s_test():
 )
 @pytest.mark.parametrize("counts", [(50, 3, 12, 5), (20, 8, 1, 3), (10, 0, 4, 30), (5, 30, 40, 5)])
 def test_the_ends_of_an_interval_of_success_have_the_score_of_the_quantile(counts):
-    """At each end, the shares that are likeliest at that difference give a score of +-1.96: by maximising the
-    likelihood numerically, which the closed form does not."""
+    """At each end, the shares that are likeliest at that difference give a score of +-1.96: by
+    maximising the likelihood numerically, which the closed form does not."""
     _, losses, gains, _ = counts
     effect, trials = success_effect(*successes(*counts)), sum(counts)
 
@@ -214,7 +221,8 @@ def test_the_ends_of_an_interval_of_success_have_the_score_of_the_quantile(count
 
 @pytest.mark.parametrize(("gains", "widened"), [(5, True), (6, False)])
 def test_an_interval_of_success_holds_0_where_the_exact_test_does_not_reject(gains, widened):
-    """Of 5 trials that differ, all to one side, the exact p is 2 / 32, of 6 it is 2 / 64; the score rejects both."""
+    """Of 5 trials that differ, all to one side, the exact p is 2 / 32, of 6 it is 2 / 64; the score
+    rejects both."""
     effect = success_effect(*successes(200, 0, gains, 0))
     assert effect.p == pytest.approx(2 / 2**gains)
     assert (effect.low == 0.0) == widened
@@ -231,7 +239,8 @@ def test_no_trial_that_differs_is_no_evidence_and_a_p_of_1():
 
 @pytest.mark.oracle("closed form: beta functions", "evidence after one and two tosses", 1e-9)
 def test_evidence_against_a_fair_coin_in_closed_form():
-    """After one toss 1, whatever it showed; after two equal ones 2 B(2.5, 0.5) / B(0.5, 0.5) 2 = 3/2."""
+    """After one toss 1, whatever it showed; after two equal ones 2 B(2.5, 0.5) / B(0.5, 0.5) 2 =
+    3/2."""
     assert_agrees(fair_coin(1, 0), 1.0, rtol=1e-9)
     assert_agrees(fair_coin(2, 0), 1.5, rtol=1e-9)
     assert_agrees(fair_coin(1, 1), 0.5, rtol=1e-9)
@@ -249,8 +258,9 @@ def test_evidence_is_1_on_average_where_there_is_nothing():
 
 
 def test_evidence_is_for_the_side_of_the_sum():
-    """90 % of 400 trials are cheaper and 10 % so much dearer that the means are as good as equal: a sign test has
-    e = 3e62 for the side that the means deny. Beyond 1, evidence speaks for the sign of the sum."""
+    """90 % of 400 trials are cheaper and 10 % so much dearer that the means are as good as equal: a
+    sign test has e = 3e62 for the side that the means deny. Beyond 1, evidence speaks for the sign
+    of the sum."""
     d = np.where(np.arange(400) % 10 > 0, -50.0, 460.0)
     assert no_lean(d, 150.0) < 1
     rng = np.random.default_rng(3)
@@ -262,7 +272,8 @@ def test_evidence_is_for_the_side_of_the_sum():
 
 @pytest.mark.slow
 def test_who_looks_after_every_trial_is_misled_no_more_often_than_promised():
-    """1 / alpha is exceeded anywhere among 400 tosses in at most alpha of 300 sequences, up to 3 deviations."""
+    """1 / alpha is exceeded anywhere among 400 tosses in at most alpha of 300 sequences, up to 3
+    deviations."""
     tosses = np.random.default_rng(0).integers(0, 2, (300, 400))
     heads = np.cumsum(tosses, axis=1)
     ever = [max(fair_coin(h, i + 1 - h) for i, h in enumerate(row)) >= 10 for row in heads.tolist()]

@@ -1,4 +1,5 @@
-"""Plans of trials: the power of McNemar's exact test against closed forms and simulation, and what pilots plan."""
+"""Plans of trials: the power of McNemar's exact test against closed forms and simulation, and what
+pilots plan."""
 
 import numpy as np
 import pytest
@@ -60,7 +61,8 @@ def test_the_plan_is_the_least_from_which_on_the_power_stays(share, difference):
     "case", [(0.9, 0.95, 0.3), pytest.param((0.5, 0.6, 0.7), marks=pytest.mark.slow)], ids=str
 )
 def test_plans_of_small_pilots_have_the_power_on_average(case):
-    """Of 25 trials each: by the upper limit of the discordant share, and not by the share that the pilot shows."""
+    """Of 25 trials each: by the upper limit of the discordant share, and not by the share that the
+    pilot shows."""
     p = outcomes(*case)
     share, difference = p[1] + p[2], p[2] - p[1]
     seen = np.random.default_rng(7).binomial(25, share, 200)

@@ -1,4 +1,5 @@
-"""What to measure next: brute force, closed forms, and the Monte Carlo that a designed model is put to."""
+"""What to measure next: brute force, closed forms, and the Monte Carlo that a designed model is put
+to."""
 
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -121,8 +122,9 @@ def test_the_choice_is_near_that_of_brute_force(criterion, seed):
     ("degree", "best"), [(2, (-1.0, 0.0, 1.0)), (3, (-1.0, -(5**-0.5), 5**-0.5, 1.0))]
 )
 def test_polynomials_are_best_read_where_theory_says(degree, best):
-    """The D-optimal points of degree p are the ends and the zeros of P_p', equally often (Smith, Biometrika 12, 1918;
-    Guest, Ann. Math. Stat. 29, 1958); the grid has 0.4 and 0.5 about 1/sqrt(5)."""
+    """The D-optimal points of degree p are the ends and the zeros of P_p', equally often (Smith,
+    Biometrika 12, 1918; Guest, Ann. Math. Stat. 29, 1958); the grid has 0.4 and 0.5 about
+    1/sqrt(5)."""
     (way,) = design(
         scenario(Curve(degree)), by=["time", "repeat"], readings=4 * len(best), criterion="D"
     ).ways
@@ -176,7 +178,8 @@ def test_a_direction_that_no_reading_has_is_named_and_its_bounds_are_infinite():
 
 @dataclass(frozen=True)
 class Hidden(Linear):
-    """With two errors besides: one that looks like 2 a - c, and one that looks like nothing in the model."""
+    """With two errors besides: one that looks like 2 a - c, and one that looks like nothing in the
+    model."""
 
     @property
     def nuisance_deviation(self) -> Array:
@@ -205,7 +208,8 @@ def test_what_the_parameters_imitate_is_found_with_what_it_does():
     np.testing.assert_allclose(stranger.shift, 0.0, atol=1e-9)
     assert stranger.visible == pytest.approx(1.0)
     assert not stranger.hidden
-    # Its residuals have a noncentral chi-square law; over N(0, 3^2) of its size in deviations of a reading.
+    # Its residuals have a noncentral chi-square law; over N(0, 3^2) of its size in deviations of a
+    # reading.
     sizes = 3 * np.random.default_rng(1).standard_normal(4000)
     limit = stats.chi2.isf(1e-3, 6)
     assert stranger.noticed == pytest.approx(np.mean(stats.ncx2.sf(limit, 6, sizes**2)), abs=0.06)
@@ -253,7 +257,8 @@ def test_fewer_readings_at_better_times_are_worth_more(gins):
 
 @pytest.mark.slow
 def test_gauss_newton_reaches_the_bound_of_the_designed_model():
-    """The ratio of its error to that on the paper's four cases is the predicted one, on 400 trials each."""
+    """The ratio of its error to that on the paper's four cases is the predicted one, on 400 trials
+    each."""
     gins = design(scenario(Gins(), NOISE, 33.0), by=["time"], truths=10)
     (way,) = gins.ways
     assert way.saving.readings < 240
@@ -268,7 +273,8 @@ def test_gauss_newton_reaches_the_bound_of_the_designed_model():
             assert (rows["solved"] == 1).all()
             ratio.append(rows["rmse"].to_numpy())
         mean = np.sqrt(np.mean((ratio[0] / ratio[1]) ** 2))
-        # Eleven ratios of deviations of 400 errors each: a standard deviation of 0.05 apiece, 0.02 together.
+        # Eleven ratios of deviations of 400 errors each: a standard deviation of 0.05 apiece, 0.02
+        # together.
         assert mean == pytest.approx(choice.mean_bound, abs=0.05)
 
 
@@ -297,7 +303,7 @@ def test_fewer_readings_than_the_smallest_choice_has_are_refused():
     assert way.sharpest.mean_bound == pytest.approx(np.sqrt(3), rel=1e-6)
 
 
-# What to read next ---------------------------------------------------------------------------------------------------
+# What to read next --------------------------------------------------------------------------------
 
 
 DEMAND = {"expression": "b1*(1 - exp(-b2*t))", "start": {"b1": 20.0, "b2": 0.5}}

@@ -26,7 +26,8 @@ PRIOR = np.array([1.0, 0.5, 2.0])
 
 
 def exact(problem: Problem, z: Array) -> tuple[Array, Array, float]:
-    """Mean, covariance and evidence of a linear model's posterior; the evidence less the constant of R."""
+    """Mean, covariance and evidence of a linear model's posterior; the evidence less the constant
+    of R."""
     A, R, D = problem.measurement.A, problem.R.matrix(), np.diag(problem.prior_deviation**2)
     P = np.linalg.inv(A.T @ np.linalg.inv(R) @ A + np.linalg.inv(D))
     whole = R + A @ D @ A.T
@@ -67,7 +68,8 @@ def test_on_a_linear_model_it_is_the_closed_form(linear):
         atol=0.1,
     )
     assert found.settled
-    # Two populations of 1000 draws know a mean to 1 / sqrt(1000) or worse, as their draws depend on each other.
+    # Two populations of 1000 draws know a mean to 1 / sqrt(1000) or worse, as their draws depend on
+    # each other.
     assert 1e-4 < found.noise < 0.05
     assert len(found.modes) == 1
     np.testing.assert_allclose((found.modes[0] - mean) / deviation, 0.0, atol=1e-4)
@@ -162,7 +164,8 @@ def test_a_model_that_fails_in_places_is_sampled_where_it_does_not():
 
 @pytest.mark.slow
 def test_on_gins_gauss_newton_knows_and_the_ekf_does_not():
-    """Error scale 300: the covariance of Gauss and Newton is the posterior's, and the EKF's Gaussian is elsewhere."""
+    """Error scale 300: the covariance of Gauss and Newton is the posterior's, and the EKF's
+    Gaussian is elsewhere."""
     bench = ib.Scenario(Gins(), ib.noise.Quantization(), error_scale=300.0)
     found = reference(bench, {"gn": ib.baselines.GaussNewton(), "ekf": ib.baselines.EKF()}, 0, 240)
     assert found.posterior.settled

@@ -15,8 +15,9 @@ DONE = 0.99
 def limits(cost: Array, q: float = DONE) -> tuple[float, float]:
     """The distribution-free interval of a quantile, whose ends are costs (trials,) that occurred.
 
-    The number of costs at or below the quantile is binomial, at least (Conover, Practical Nonparametric Statistics,
-    3rd ed., 1999, section 3.2). Too few trials bound the quantile on one side only: the other end is then infinite.
+    The number of costs at or below the quantile is binomial, at least (Conover, Practical
+    Nonparametric Statistics, 3rd ed., 1999, section 3.2). Too few trials bound the quantile on one
+    side only: the other end is then infinite.
     """
     trials, tail = len(cost), (1 - LEVEL) / 2
     # With the cost of rank r as an end, r counted from 1: no more than `tail` beyond either.
@@ -30,8 +31,9 @@ STATISTIC = Statistic(
     "deadline",
     "done by",
     "all trials",
-    "The cost by which 99 % of trials are done, well or not: in simulations, a Jacobian counting as many as it costs."
-    " Interval: distribution-free, from the order of the trials (Conover, Practical Nonparametric Statistics, 1999).",
+    "The cost by which 99 % of trials are done, well or not: in simulations, a Jacobian counting"
+    " as many as it costs. Interval: distribution-free, from the order of the trials (Conover,"
+    " Practical Nonparametric Statistics, 1999).",
     lambda s: quantile(s.cost, DONE),
     limits=lambda s: limits(s.cost),
     where=("terminal", "costs"),

@@ -1,4 +1,5 @@
-"""The deadline is the quantile of what trials cost, its interval holds it as often as it says, and both are shown."""
+"""The deadline is the quantile of what trials cost, its interval holds it as often as it says, and
+both are shown."""
 
 import re
 import sys
@@ -33,7 +34,8 @@ def test_the_interval_holds_the_quantile_as_often_as_it_says(trials, q):
     rng, true = np.random.default_rng(1), expon.ppf(q)
     ends = np.array([limits(rng.exponential(size=trials), q) for _ in range(4000)])
     below, above = (ends[:, 0] > true).mean(), (ends[:, 1] < true).mean()
-    # Each tail has at most 2.5 %, and 4000 samples tell that to within 0.8 %; ranks are whole, so not much less.
+    # Each tail has at most 2.5 %, and 4000 samples tell that to within 0.8 %; ranks are whole, so
+    # not much less.
     assert 0.003 < below < 0.033
     assert 0.003 < above < 0.033
 
