@@ -4,6 +4,8 @@ what they show."""
 from __future__ import annotations
 
 import importlib
+import re
+import shlex
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -57,9 +59,21 @@ def question_command(name: str, arguments: Sequence[str]) -> int:
         places, options = places_and_keys(name, arguments, known)
         return _shown(record.run(places, **options))
     own = [word for word in arguments if word.partition("=")[0] in known]
+    others = [word for word in arguments if word not in own]
+    for word in own:
+        _refuse_file(name, word, others)
     options = places_and_keys(name, own, known)[1]
-    asked = _asked(name, [word for word in arguments if word not in own], row)
-    return _shown(record.run(asked, **options))
+    return _shown(record.run(_asked(name, others, row), **options))
+
+
+def _refuse_file(name: str, word: str, others: Sequence[str]) -> None:
+    """Refuses a file where its key is a number in this command."""
+    key, _, value = word.partition("=")
+    if key in OF_FILES and re.search("[A-Za-z]", value):
+        raise UserError(
+            f"{word}: {key}= is the largest number of {key} in {name}, as in {key}=10; a file is"
+            f" read by `ipe-bench {shlex.join(['estimate', *others, word])}`"
+        )
 
 
 def without_flags(name: str, arguments: Sequence[str]) -> list[str]:

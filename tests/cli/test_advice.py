@@ -330,6 +330,8 @@ ADVICE = [
         f"{STARTED} readings=sigma.csv {{}}",
     ),
     ("design measurement=polynomial readings=50", r"`ipe-bench (.*?)`", "{}"),
+    (f"design {STARTED.partition(' ')[2]} readings=r.csv", r"`ipe-bench (.*?)`", "{}"),
+    ("design measurement=polynomial readings=r.csv", WORD, "design measurement=polynomial {}"),
     ("list solvr", MEANT, "list {}"),
     ("list solver/newtn", MEANT, "list solver/{}"),
     ("list --verbos", MEANT, "list {}"),
