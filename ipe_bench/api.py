@@ -451,37 +451,18 @@ def _tracked(
     find: str | Sequence[str],
     progress: Shows,
 ) -> LogAnswer:
-    from ipe_bench.real.logs import Log, LogTracks, found_and_tracked, require_likelihood
+    from ipe_bench.real.logs import LogQuestion
     from ipe_bench.report.page.log import LogAnswer
-    from ipe_bench.report.progress import counting
     from ipe_bench.states.auto import AutoTracker
     from ipe_bench.states.trackers import ekf, ukf
 
-    if isinstance(readings, Sequence) and not isinstance(readings, str):
-        if len(readings) != 1:
-            raise UserError(
-                f"readings=[{','.join(map(str, readings))}]: a track has one log; name one file"
-            )
-        (readings,) = readings
     if trackers is None:
         # A search for constants needs a likelihood, which an estimate of the whole path does not
         # have.
         best = {} if find else {"auto": AutoTracker()}
         trackers = {**best, "ekf": ekf(), "ukf": ukf()}
-    else:
-        trackers = _labelled(trackers)
-    log = Log.of(model, Path(readings) if isinstance(readings, str) else readings, ignored)
-    validate([StateScenario(log.model)], trackers, 1)
-    names = [find] if isinstance(find, str) else list(find)
-    tracks = []
-    for label, tracker in trackers.items() if names else ():
-        require_likelihood(log, label, tracker)
-    with counting("estimate", len(trackers), progress) as begin:
-        for label, tracker in trackers.items():
-            tell = begin(label)
-            one = log, label, tracker
-            tracks.append(found_and_tracked(*one, names, tell) if names else LogTracks.of(*one))
-    return LogAnswer(log, tracks)
+    question = LogQuestion.of(model, readings, _labelled(trackers), ignored, find)
+    return LogAnswer.to(question, progress)
 
 
 def design(

@@ -6,7 +6,6 @@ import datetime
 from collections.abc import Sequence
 from typing import Any
 
-import ipe_bench as ib
 from ipe_bench.basics.machine import library_versions
 from ipe_bench.cli import say_files, show
 from ipe_bench.cli import words as w
@@ -46,11 +45,12 @@ def estimate_command(arguments: Sequence[str]) -> int:
         "estimators": _described(question.estimators),
         **({"left_out": list(question.ignored)} if question.ignored else {}),
     }
-    folder = asked.folder(NAME, command, FILES)
-    answer = Answer.to(question, asked.measurement, "lines")
     parts = [question.scenario, *question.estimators.values()]
     provenance = _provenance(asked, question.found.files, parts)
-    files = write_answer(folder, answer, command, provenance, figures=asked.spec.figures != "none")
+    drawn = asked.spec.figures != "none"
+    with asked.folder(NAME, command, FILES) as folder:
+        answer = Answer.to(question, asked.measurement, "lines")
+        files = write_answer(folder, answer, command, provenance, figures=drawn)
     show(answer.parts())
     say_files(files)
     return 0 if answer.passes else 1
@@ -59,31 +59,31 @@ def estimate_command(arguments: Sequence[str]) -> int:
 def _track(asked: Single, model: StateModel) -> int:
     """Tracks the states by every chosen tracker, prints tables and writes files; exit code 1 where
     no track passes."""
-    from ipe_bench.report.page.log import NAME, TABLE, write_tracks
+    from ipe_bench.real.logs import LogQuestion
+    from ipe_bench.report.page.log import NAME, TABLE, LogAnswer, write_tracks
 
     asked.words.refuse(
         ("error_scale",), "is of simulated trials; give the state model another prior"
     )
-    given, trackers = asked.spec.readings, asked.spec.estimators
-    find = asked.spec.find or ()
-    answer = ib.estimate(
-        model, given, trackers, ignore_columns=asked.spec.ignored, find=find, progress="lines"
-    )
+    spec = asked.spec
+    trackers = spec.estimators
+    find = spec.find or ()
+    question = LogQuestion.of(model, spec.readings, trackers, spec.ignored, find)
     command = {
-        "readings": given,
+        "readings": spec.readings,
         "find": find,
         "model": describe(model),
         "trackers": _described(trackers),
     }
-    files, parts = (
-        [answer.log.file] if answer.log.file else [],
-        [answer.log.model, *trackers.values()],
-    )
-    folder = asked.folder(NAME, command, [TABLE])
+    log = question.log
+    files = [log.file] if log.file else []
+    provenance = _provenance(asked, files, [log.model, *trackers.values()])
+    drawn = spec.figures != "none"
+    with asked.folder(NAME, command, [TABLE]) as folder:
+        answer = LogAnswer.to(question, "lines")
+        written = write_tracks(folder, answer, command, provenance, figures=drawn)
     show(answer.parts())
-    provenance = _provenance(asked, files, parts)
-    drawn = asked.spec.figures != "none"
-    say_files(write_tracks(folder, answer, command, provenance, figures=drawn))
+    say_files(written)
     return 0 if answer.passes else 1
 
 

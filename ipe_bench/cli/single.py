@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from ipe_bench.cli.session import composed, jobs_of, session
 from ipe_bench.cli.spec import Spec
 from ipe_bench.cli.words import Words
 from ipe_bench.measurements import Nist
-from ipe_bench.report.page.writer import reserve_output_folder
+from ipe_bench.report.page.writer import reserved_folder
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,9 @@ class Single:
             return f"nist/{model.dataset.lower()}"
         return self.words.chosen(group) or model.name
 
-    def folder(self, name: str, identity: Any, files: Sequence[str] = ()) -> Path:
+    def folder(
+        self, name: str, identity: Any, files: Sequence[str] = ()
+    ) -> AbstractContextManager[Path]:
         """Reserves the named folder, or one named after the command and the model, for a command
         that `identity` tells from others in NAME.json, and for its further `files`."""
         output, named = Path(self.spec.output), not {"name", "output"}.isdisjoint(self.words.keys)
@@ -45,7 +48,7 @@ class Single:
             if named
             else output.with_name(f"{self.command}-{self.measurement.replace('/', '-')}")
         )
-        return reserve_output_folder(folder, name, identity, elsewhere=not named, files=files)
+        return reserved_folder(folder, name, identity, elsewhere=not named, files=files)
 
 
 def single(

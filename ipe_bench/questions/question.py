@@ -7,6 +7,7 @@ A `command.py` imports what answers only when it is asked, so that help is quick
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,7 +31,7 @@ class Asked:
     estimators: Mapping[str, Estimator]
     trials: int | None
     """Number of trials; None unless it was given."""
-    folder: Callable[[str, Any, Sequence[str]], Path]
+    folder: Callable[[str, Any, Sequence[str]], AbstractContextManager[Path]]
     """Reserves the folder of an answer, by the name of its page, what identifies the command, and
     its further files."""
 

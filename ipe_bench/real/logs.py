@@ -4,7 +4,7 @@ of the model under which the log is most likely (Schweppe, IEEE Trans. Informati
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations, pairwise
@@ -19,6 +19,7 @@ from ipe_bench.basics.linalg import Array, Mask, deviations, unmasked
 from ipe_bench.basics.options import Finite, NonNegative, Positive, option_types
 from ipe_bench.basics.statuses import Status
 from ipe_bench.real.readings import TextTable, read_tables
+from ipe_bench.runs.run import validate
 from ipe_bench.states.base import StateModel
 from ipe_bench.states.copies import SURE, copy_p
 from ipe_bench.states.formulas import Formulas, RecordedFormulas
@@ -37,7 +38,7 @@ from ipe_bench.statistics.verdicts import (
     TOO_CAUTIOUS,
     WRONG,
 )
-from ipe_bench.trials.paths import track_safely
+from ipe_bench.trials.paths import StateScenario, track_safely
 from ipe_bench.trials.thresholds import FIT_LEVEL, GATE
 from ipe_bench.trials.whiteness import white_p
 
@@ -389,6 +390,47 @@ def far_below(tracks: Sequence[LogTracks]) -> list[str]:
         for label, less in below.items()
         if less > limit
     ]
+
+
+@dataclass(frozen=True)
+class LogQuestion:
+    """Asks for the track of a log by each tracker, and for the constants `find` of its model."""
+
+    log: Log
+    trackers: Mapping[str, Tracker]
+    find: Sequence[str] = ()
+
+    @classmethod
+    def of(
+        cls,
+        model: StateModel,
+        readings: Any,
+        trackers: Mapping[str, Tracker],
+        ignored: Sequence[str] = (),
+        find: str | Sequence[str] = (),
+    ) -> LogQuestion:
+        """Reads the log, and checks that every tracker can follow it.
+
+        Raises:
+            UserError: the readings are not this model's, or a tracker needs what is not given.
+        """
+        if isinstance(readings, Sequence) and not isinstance(readings, str):
+            if len(readings) != 1:
+                raise UserError(
+                    f"readings=[{','.join(map(str, readings))}]: a track has one log; name one file"
+                )
+            (readings,) = readings
+        log = Log.of(model, Path(readings) if isinstance(readings, str) else readings, ignored)
+        validate([StateScenario(log.model)], trackers, 1)
+        names = [find] if isinstance(find, str) else list(find)
+        for label, tracker in trackers.items() if names else ():
+            require_likelihood(log, label, tracker)
+        return cls(log, trackers, names)
+
+    def track(self, label: str, watch: Callable[[str], object] = str) -> LogTracks:
+        """Tracks the log by one tracker; `watch` is told how far a search is."""
+        one = (self.log, label, self.trackers[label])
+        return found_and_tracked(*one, self.find, watch) if self.find else LogTracks.of(*one)
 
 
 # Constants ---------------------------------------------------------------------------------------

@@ -19,6 +19,7 @@ from ipe_bench.cli.keys import ROWS, WHOLE
 from ipe_bench.cli.main import COMMANDS, main
 from ipe_bench.cli.run import Outcome
 from ipe_bench.cli.spec import KEYS, PARTS, Spec
+from ipe_bench.real.logs import LogTracks
 from ipe_bench.report import figures
 from ipe_bench.statistics.records import SCORES, STATISTICS
 
@@ -490,6 +491,24 @@ def test_an_estimate_draws_nothing_where_no_figures_are_asked_for_and_overwrites
     assert code == 2
     assert "output=out: holds results of another command" in error
     assert (tmp_path / "out" / "residuals.csv").read_text() == "mine"
+
+
+@pytest.mark.parametrize("words", ["design by=tim", "posterior particles=5"])
+def test_a_refused_command_leaves_its_folder_to_the_mended_one(words, tmp_path, ipe_bench):
+    command, wrong = words.split()
+    assert ipe_bench(command, "measurement=polynomial", wrong, "output=out")[0] == 2
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_taken_folder_is_refused_before_a_log_is_tracked(tmp_path, ipe_bench, monkeypatch):
+    monkeypatch.setattr(LogTracks, "of", lambda *_: pytest.fail("a tracker has begun"))
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "track.csv").write_text("mine")
+    code, _, error = ipe_bench(
+        "estimate", "state_model=pendulum_book", "tracker=[ekf]", "output=out"
+    )
+    assert code == 2
+    assert "output=out: holds results of another command" in error
 
 
 def test_the_bare_program_and_every_command_have_help(capsys):

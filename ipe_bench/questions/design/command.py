@@ -40,7 +40,6 @@ def answer(asked: Asked, **given: Any) -> Answered:
             " noise"
         )
     errors = richer_models(scenario)
-    found = designed(scenario, errors=errors, **given)
     identity = {
         "scenario": describe(dataclasses.replace(scenario, truth=None)),
         "errors": [describe(error) for error in errors],
@@ -48,8 +47,9 @@ def answer(asked: Asked, **given: Any) -> Answered:
         "readings": given.get("readings"),
         "criterion": given.get("criterion", "A"),
     }
-    folder = asked.folder("design", identity, (READINGS,))
-    files = write_design(folder, asked.measurement, found)
+    with asked.folder("design", identity, (READINGS,)) as folder:
+        found = designed(scenario, errors=errors, **given)
+        files = write_design(folder, asked.measurement, found)
     code = 0 if found.observability.observable else 1
     return Answered(design_parts(asked.measurement, found), code, files=files)
 

@@ -51,14 +51,14 @@ def answer(asked: Asked, particles: int = 1000) -> Answered:
         "trials": trials,
         "particles": particles,
     }
-    folder = asked.folder("posterior", identity, ())
 
     def tell(trial: int) -> None:
         print(f"{name}: trial {trial + 1} of {trials}", file=sys.stderr, flush=True)
 
-    found = sampled(scenario, asked.estimators, trials, particles, tell)
     title = f"{name}, {scenario.noise.name}, error scale {scenario.error_scale:g}"
-    files = write_posteriors(folder, name, title, scenario.measurement, found)
+    with asked.folder("posterior", identity, ()) as folder:
+        found = sampled(scenario, asked.estimators, trials, particles, tell)
+        files = write_posteriors(folder, name, title, scenario.measurement, found)
     settled = all(one.posterior.settled for one in found)
     return Answered(posterior_parts(title, found), 0 if settled else 1, files=files)
 

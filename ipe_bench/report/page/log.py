@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ipe_bench.basics.files import write_text
-from ipe_bench.real.logs import SEARCHES, Log, LogTracks, far_below
+from ipe_bench.real.logs import SEARCHES, Log, LogQuestion, LogTracks, far_below
 from ipe_bench.report.page.answer import as_json, labelled, read_from, with_error
 from ipe_bench.report.page.writer import write_files
 from ipe_bench.report.tables.table import Part, Shown, Strong, Table, interval, texts, words
@@ -20,6 +20,8 @@ from ipe_bench.statistics.verdicts import NO_VERDICT, shown
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from ipe_bench.report.progress import Shows
 
 NAME = "track"
 TABLE = "track.csv"
@@ -56,6 +58,15 @@ class LogAnswer(Shown):
 
     log: Log
     tracks: Sequence[LogTracks]
+
+    @classmethod
+    def to(cls, question: LogQuestion, progress: Shows = True) -> LogAnswer:
+        """Returns the answer to a question; `progress` is as in `ipe_bench.estimate`."""
+        from ipe_bench.report.progress import counting
+
+        labels = list(question.trackers)
+        with counting("estimate", len(labels), progress) as begin:
+            return cls(question.log, [question.track(label, begin(label)) for label in labels])
 
     @property
     def passes(self) -> bool:

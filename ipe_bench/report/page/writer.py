@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Sequence
-from contextlib import nullcontext
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -31,11 +31,14 @@ COMMAND: ContextVar[str] = ContextVar("command", default="")
 """The command that is being run, for its page; empty in Python."""
 
 
-def reserve_output_folder(
+@contextmanager
+def reserved_folder(
     folder: Path, name: str, command: Any, *, elsewhere: bool, files: Sequence[str] = ()
-) -> Path:
-    """Reserves the folder that a command writes to: a new one, or that of the same command, by
-    `name`.json; with `elsewhere` folder-2, folder-3 and so on, if it has `files` of another one.
+) -> Iterator[Path]:
+    """Reserves the folder that a command writes to, by `name`.json: a new one, or one of the same
+    command; a command that fails gives a new one back.
+
+    With `elsewhere` it is folder-2, folder-3 and so on, if the folder has `files` of another one.
 
     Raises:
         UserError: the folder is taken.
@@ -52,9 +55,18 @@ def reserve_output_folder(
             )
         number += 1
         place = folder.with_name(f"{folder.name}-{number}")
-    if not (place / result).exists():
+    is_new = not (place / result).exists()
+    if is_new:
         write_text(place / result, json.dumps({"command": command}, indent=1) + "\n")
-    return place
+    try:
+        yield place
+    except BaseException:
+        if is_new:
+            (place / result).unlink(missing_ok=True)
+            # Other files may be there.
+            with suppress(OSError):
+                place.rmdir()
+        raise
 
 
 def _is_free(folder: Path, result: str, command: Any, files: Sequence[str]) -> bool:
