@@ -35,7 +35,9 @@ from ipe_bench.engine import compiled
 from ipe_bench.engine.compiled import INTEGER, POINTER, aligned, at
 from ipe_bench.engine.integrator import emitted
 
-_ARGUMENTS = (*[POINTER] * 8, INTEGER, INTEGER, POINTER)
+_FIRST = [(0, 0), (1, 0), (0, 0), (0, 0)]
+"""Zeros in front of epochs: nothing moves into the first one, and nothing is read there."""
+_ARGUMENTS = (*[POINTER] * 9, INTEGER, INTEGER, POINTER)
 
 
 class Epoch(NamedTuple):
@@ -72,7 +74,8 @@ class ChainSize(NamedTuple):
     parts: Epoch
     """Numbers of what is kept of each epoch."""
     working: tuple[int, ...]
-    """Numbers of (A F, G), of products and of A' l: what is kept of one epoch at a time."""
+    """Numbers of (A F, G), of products, of A' l, of U, and of two more matrices: what is kept of
+    one epoch at a time."""
 
     @classmethod
     def of(cls, n: int, m: int, q: int) -> ChainSize:
@@ -81,30 +84,61 @@ class ChainSize(NamedTuple):
         across = rows * n
         # In the order in which they are declared.
         parts = Epoch(square, across, n, rows, square, n, n, n, across, rows, rows)
-        working = n * (n + q), n + q, n
+        working = n * (n + max(m, q)), n + q, n, square, square, square
         return cls(n, m, q, parts, working)
 
 
-def solve_chains(
-    A: Array, B: Array, D: Array, G: Array, a: Array, v: Array, spread: bool = False
-) -> tuple[Array, Array]:
-    """Returns x (trials, 1 + K, n) and, if `spread`, P (trials, 1 + K, n, n), of A (trials, K, n,
-    n), B (trials, K, m, n) and v (trials, K, m) of the epochs from the second on, and of D and a
-    (trials, 1 + K, n) and G (1 + K, n, q)."""
-    trials, epochs, n = D.shape
-    given = [own(one) for one in (A, B, D, G, a, v)]
+def solve_chains(A: Array, B: Array, D: Array, G: Array, a: Array, v: Array) -> Array:
+    """Returns x (trials, 1 + K, n) of A (trials, K, n, n), B (trials, K, m, n) and v (trials, K, m)
+    of the epochs from the second on, and of D and a (trials, 1 + K, n) and G (1 + K, n, q)."""
     if not compiled.available():
-        return _by_numpy(*given)
-    size = ChainSize.of(n, B.shape[2], G.shape[2])
+        return _by_numpy(A, B, D, G, a, v)
     x = np.empty(D.shape)
-    P = np.empty((trials, epochs, n, n) if spread else 0)
+    _run(A, B, D, G, a, v, x, None, None)
+    return x
+
+
+def filtered_chains(A: Array, B: Array, G: Array) -> Array:
+    """Returns the covariances P (trials, 1 + K, n, n) of x by the readings up to each epoch,
+    without damping."""
+    return _covariances(A, B, G, smoothed=False)[0]
+
+
+def smoothed_chains(A: Array, B: Array, G: Array) -> tuple[Array, Array]:
+    """Returns the covariances P (trials, 1 + K, n, n) of x by all readings, and those of x with
+    that of the last epoch.
+
+    No covariance is inverted, nor one taken from another: what later readings tell of x, U U', is
+    as if the columns of U were read,
+
+        F F' <- ((F F')^-1 + U U')^-1,   U <- A' C,   C C' = ((B' B + U U')^-1 + Q)^-1.
+    """
+    return _covariances(A, B, G, smoothed=True)
+
+
+def _covariances(A: Array, B: Array, G: Array, smoothed: bool) -> tuple[Array, Array]:
+    if not compiled.available():
+        return _covariances_by_numpy(A, B, G, smoothed)
+    trials, K, m, n = B.shape
+    P = np.empty((trials, 1 + K, n, n))
+    crossed = np.empty(P.shape)
+    nothing = np.zeros(P.shape[:3])
+    v = np.zeros((trials, K, m))
+    _run(A, B, nothing, G, nothing, v, None, P, crossed if smoothed else None)
+    return P, crossed
+
+
+def _run(A: Array, B: Array, D: Array, G: Array, *more: Array | None) -> None:
+    """Runs machine code; what is None is not asked for."""
+    trials, epochs, n = D.shape
+    size = ChainSize.of(n, B.shape[2], G.shape[2])
     # Before the first epoch lies one of zeros.
     room = sum(size.working) + (epochs + 1) * sum(size.parts)
     memory, frame = aligned(room * compiled.width())
     memory[:] = 0.0
-    pointers = map(at, (*given, x, P))
+    arrays = [None if one is None else own(one) for one in (A, B, D, G, *more)]
+    pointers = [None if one is None else at(one) for one in arrays]
     _compiled(size)(*pointers, trials, epochs, frame)
-    return x, P
 
 
 @functools.cache
@@ -112,7 +146,7 @@ def _compiled(size: ChainSize) -> Callable[..., None]:
     return emitted("chains", size, compiled.width(), _ARGUMENTS)
 
 
-def _by_numpy(A: Array, B: Array, D: Array, G: Array, a: Array, v: Array) -> tuple[Array, Array]:
+def _by_numpy(A: Array, B: Array, D: Array, G: Array, a: Array, v: Array) -> Array:
     trials, epochs, n = D.shape
     chain = _begun(A, B, D, G, a, v)
     each = [Epoch(*[part[:, k] for part in chain]) for k in range(epochs)]
@@ -127,18 +161,38 @@ def _by_numpy(A: Array, B: Array, D: Array, G: Array, a: Array, v: Array) -> tup
             later = _backward(here, later)
         chain.x[:] += chain.u
         _refine(chain, G)
-    return chain.x, np.matmul(chain.F, chain.F.mT)
+    return chain.x
+
+
+def _covariances_by_numpy(A: Array, B: Array, G: Array, smoothed: bool) -> tuple[Array, Array]:
+    A = np.pad(A, _FIRST)
+    B = np.pad(B, _FIRST)
+    F = filtered_roots(A, B, G)[0]
+    crossed = np.empty_like(F)
+    U = np.zeros_like(F[:, 0])
+    ahead = np.broadcast_to(np.eye(F.shape[2]), U.shape)
+    for k in reversed(range(F.shape[1] if smoothed else 0)):
+        for column in np.moveaxis(U, 2, 0):
+            _take_in(F[:, k], column)
+        P = np.matmul(F[:, k], F[:, k].mT)
+        crossed[:, k] = np.matmul(P, ahead)
+        C = lower(np.concatenate([B[:, k].mT, U], axis=2))
+        for g in G[k].T:
+            s, size = _take_in(C, np.broadcast_to(g, C.shape[:2]))
+            share = multiply(ahead.mT, g) / size[:, None]
+            ahead = ahead - s[:, :, None] * share[:, None]
+        U = np.matmul(A[:, k].mT, C)
+        ahead = np.matmul(A[:, k].mT, ahead)
+    return np.matmul(F, F.mT), crossed
 
 
 def _begun(A: Array, B: Array, D: Array, G: Array, a: Array, v: Array) -> Epoch:
     """All epochs of a chain before its first pass."""
     n = D.shape[2]
-    # Nothing moves into the first epoch, and nothing is read there.
-    first = [(0, 0), (1, 0), (0, 0), (0, 0)]
-    A = np.pad(A, first)
+    A = np.pad(A, _FIRST)
     # D stands for readings of 0, by rows of its root.
     roots = np.sqrt(D)[..., None] * np.eye(n)
-    B = np.concatenate([np.pad(B, first), roots], axis=2)
+    B = np.concatenate([np.pad(B, _FIRST), roots], axis=2)
     v = np.pad(v, [(0, 0), (1, 0), (0, n)])
     F, S, size = filtered_roots(A, B, G)
     u, x, multipliers = map(np.zeros_like, (a, a, a))

@@ -109,8 +109,9 @@ def rows(source: RowPrograms, width: int) -> str:
 
 def chains(size: ChainSize, width: int) -> str:
     """Writes void chains(double *A, double *B, double *D, double *G, double *a, double *v, double
-    *x, double *P, int64 trials, int64 epochs, double *frame), which `engine.chains` describes; P
-    may be null. A lane is a trial; a group that is not full repeats its last one."""
+    *x, double *P, double *crossed, int64 trials, int64 epochs, double *frame), which
+    `engine.chains` describes; null is what is not asked for. A lane is a trial; a group that is not
+    full repeats its last one."""
     return str(_ChainWriter(size, width).module)
 
 
@@ -152,18 +153,20 @@ class _ChainWriter:
         self.n = size.n
         self.rows = size.m + size.n
         self.module = ir.Module("chains")
-        kinds = [*[PTR] * 8, I64, I64, PTR]
+        kinds = [*[PTR] * 9, I64, I64, PTR]
         made: Any = ir.Function(self.module, ir.FunctionType(VOID, kinds), "chains")
         *arrays, self.trials, self.epochs, frame = made.args
-        self.A, self.B, self.D, self.G, self.a, self.values, self.x, self.P = arrays
+        self.A, self.B, self.D, self.G, self.a, self.values, *results = arrays
+        self.x, self.P, self.crossed = results
         self.b: Any = ir.IRBuilder(made.append_basic_block())
         self.v = _Vectors(self.b, width)
         self.zero = self.v.constant(0.0)
         self.one = self.v.constant(1.0)
-        W, t, y, self.first = self._parts(frame, size.working)
+        W, t, y, told, ahead, product, self.first = self._parts(frame, size.working)
         self.W = _Lanes(self.v, W, size.n + size.q)
-        self.t = self._lanes(t)
-        self.y = self._lanes(y)
+        self.seen = _Lanes(self.v, W, size.n + size.m)
+        parts = map(self._lanes, (t, y, told, ahead, product))
+        self.t, self.y, self.told, self.ahead, self.product = parts
         with loop(self.b, integer(0), self.trials, width) as self.group:
             self._solve()
         self.b.ret_void()
@@ -173,19 +176,26 @@ class _ChainWriter:
         with self._each(self.epochs) as k:
             self._begin(k)
             self._spread(k)
-        # The second pass solves for what the first leaves of the right sides.
-        with self._each(2):
+        with self._asked(self.x):
+            # The second pass solves for what the first leaves of the right sides.
+            with self._each(2):
+                self._pass()
             with self._each(self.epochs) as k:
-                self._forward(k)
-            # Nothing follows the last epoch: A' l = 0.
-            with self._each(self.n) as i:
-                self.y[i] = self.zero
-            with self._down(self.epochs) as k:
-                self._backward(k)
-            with self._each(self.epochs) as k:
-                self._refine(k)
+                self._give(self._at(k).x, self.x, self.n, k)
+        with self._asked(self.P):
+            self._covariances()
+
+    def _pass(self) -> None:
+        """Writes one pass along a path, there and back."""
         with self._each(self.epochs) as k:
-            self._end(k)
+            self._forward(k)
+        # Nothing follows the last epoch: A' l = 0.
+        with self._each(self.n) as i:
+            self.y[i] = self.zero
+        with self._down(self.epochs) as k:
+            self._backward(k)
+        with self._each(self.epochs) as k:
+            self._refine(k)
 
     def _begin(self, k: Value) -> None:
         """Writes what is given of an epoch into its place."""
@@ -231,7 +241,7 @@ class _ChainWriter:
         here = self._at(k)
         before = self._at(k, back=1)
         self._predict(k, here.A, before.F)
-        self._triangle(here.F)
+        self._triangle(self.W, here.F)
         with self._each(self.rows) as r:
             self._update(here, r)
 
@@ -246,12 +256,12 @@ class _ChainWriter:
                 gain = self._gain(k, i, j)
                 row[self.b.add(j, integer(self.n))] = gain
 
-    def _triangle(self, F: _Lanes) -> None:
+    def _triangle(self, W: _Lanes, F: _Lanes) -> None:
         """Writes the triangular F with F F' = W W', by orthogonal rows of W (modified
         Gram-Schmidt)."""
         b = self.b
         with self._each(self.n) as i:
-            row = self.W.row(i).all()
+            row = W.row(i).all()
             square = self._dot(row, row)
             # Singular noise leaves rows of zeros, which have no share in others.
             some = b.fcmp_ordered(">", square, self.zero)
@@ -260,7 +270,7 @@ class _ChainWriter:
             F.row(i)[i] = root
             # The rows below lose their part along row i.
             with loop(b, b.add(i, integer(1)), integer(self.n)) as j:
-                below = self.W.row(j)
+                below = W.row(j)
                 numbers = below.all()
                 share = b.fmul(self._dot(numbers, row), inverse)
                 F.row(j)[i] = b.fmul(share, root)
@@ -279,16 +289,16 @@ class _ChainWriter:
         lanes = b.bitcast(damped, ir.IntType(self.v.width))
         some = b.icmp_unsigned("!=", lanes, ir.Constant(lanes.type, 0))
         with b.if_then(b.or_(read, some)):
-            self._take_in(here, r, row.all())
+            self._take_in(here, here.F, row.all(), r)
 
-    def _take_in(self, here: Epoch, r: Value, row: list[Value]) -> None:
+    def _take_in(self, here: Epoch, F: _Lanes, row: list[Value], r: Value) -> None:
         """Writes F F' <- ((F F')^-1 + b b')^-1 for a row b, with s = F F' b and 1 + b' s (Carlson,
-        1973)."""
+        1973) in the places of row r of an epoch."""
         b = self.b
         s = here.S.row(r)
         # t = F' b, of which s and 1 + b' s are sums over columns.
         with self._each(self.n) as j:
-            self.t[j] = self._dot(here.F.column(j), row)
+            self.t[j] = self._dot(F.column(j), row)
             s[j] = self.zero
         here.size[r] = self.one
         # From the last column to the first, size is 1 plus the squares of t so far.
@@ -301,10 +311,10 @@ class _ChainWriter:
             share = b.fneg(b.fdiv(t, root))
             # F <- F size / root - s t / root in this column, then s <- s + F t by the old one.
             with loop(b, j, integer(self.n)) as i:
-                old = here.F.row(i)[j]
+                old = F.row(i)[j]
                 so_far = s[i]
                 new = self.v.call("fma", share, so_far, b.fmul(old, kept))
-                here.F.row(i)[j] = new
+                F.row(i)[j] = new
                 s[i] = self.v.call("fma", old, t, so_far)
             here.size[r] = larger
 
@@ -368,18 +378,86 @@ class _ChainWriter:
             left = self._left(here, r)
             here.v[r] = self.b.fsub(left, here.w[r])
 
-    def _end(self, k: Value) -> None:
-        """Writes x of an epoch and, if it is asked for, P = F F' to the results."""
+    def _covariances(self) -> None:
+        """Writes covariances from the last epoch to the first: by the readings up to an epoch or,
+        where those with the last states are asked for, by all."""
+        n = self.n
+        with self._each(n * n) as i:
+            self.told[i] = self.zero
+            self.ahead[i] = self.zero
+        with self._each(n) as i:
+            self.ahead.row(i)[i] = self.one
+        with self._down(self.epochs) as k:
+            F = self._at(k).F
+            with self._asked(self.crossed):
+                self._smooth(k)
+            with self._each(n) as i:
+                row = F.row(i).all()
+                with self._each(n) as j:
+                    self.product.row(i)[j] = self._dot(row, F.row(j).all())
+            self._give(self.product, self.P, n * n, k)
+            with self._asked(self.crossed):
+                self._tell(k)
+
+    def _smooth(self, k: Value) -> None:
+        """Writes F of an epoch by all readings: what later ones tell, U U', is as if its columns
+        were read."""
         here = self._at(k)
-        self._give(here.x, self.x, self.n, k)
-        asked = self.b.icmp_signed("!=", self.b.ptrtoint(self.P, I64), integer(0))
-        with self.b.if_then(asked):
-            # P takes the place of A, which is no longer needed.
-            with self._each(self.n) as i, self._each(self.n) as j:
-                along = here.F.row(i).all()
-                P = self._dot(along, here.F.row(j).all())
-                here.A.row(i)[j] = P
-            self._give(here.A, self.P, self.n**2, k)
+        with self._each(self.n) as j:
+            self._take_in(here, here.F, self.told.column(j), integer(0))
+
+    def _tell(self, k: Value) -> None:
+        """Writes the covariance with the last states, and what the epoch before takes of the later
+        readings."""
+        b = self.b
+        n = self.n
+        m = self.size.m
+        here = self._at(k)
+        # W waits for what is seen.
+        crossed = _Lanes(self.v, self.W.begin, n)
+        with self._each(n) as i:
+            row = self.product.row(i).all()
+            with self._each(n) as j:
+                crossed.row(i)[j] = self._dot(row, self.ahead.column(j))
+        self._give(crossed, self.crossed, n * n, k)
+        # C C' = B' B + U U' takes the place of F F', of which nothing is asked any more.
+        with self._each(n) as i:
+            row = self.seen.row(i)
+            with self._each(m) as r:
+                row[r] = here.B.row(r)[i]
+            with self._each(n) as j:
+                row[b.add(j, integer(m))] = self.told.row(i)[j]
+        self._triangle(self.seen, here.F)
+        with self._each(self.size.q) as j:
+            self._blur(k, j)
+        # U <- A' C, and what leads to the last states likewise.
+        self._lead(here, here.F, self.told)
+        self._lead(here, self.ahead, self.product)
+        with self._each(n * n) as i:
+            self.ahead[i] = self.product[i]
+
+    def _blur(self, k: Value, j: Value) -> None:
+        """Writes C C' <- ((C C')^-1 + g g')^-1 for a column g of G, s = C C' g, and ahead <- (I - s
+        g' / (1 + g' s)) ahead."""
+        here = self._at(k)
+        g = [self._gain(k, integer(i), j) for i in range(self.n)]
+        self._take_in(here, here.F, g, integer(0))
+        with self._each(self.n) as c:
+            along = self._dot(g, self.ahead.column(c))
+            share = self.b.fneg(self.b.fdiv(along, here.size[integer(0)]))
+            with self._each(self.n) as i:
+                row = self.ahead.row(i)
+                row[c] = self.v.call("fma", share, here.S[i], row[c])
+
+    def _lead(self, here: Epoch, given: _Lanes, to: _Lanes) -> None:
+        """Writes A' times a matrix."""
+        with self._each(self.n) as i:
+            along = here.A.column(i)
+            with self._each(self.n) as j:
+                to.row(i)[j] = self._dot(along, given.column(j))
+
+    def _asked(self, array: Value) -> Any:
+        return self.b.if_then(self.b.icmp_signed("!=", self.b.ptrtoint(array, I64), integer(0)))
 
     def _take(self, array: Value, lanes: _Lanes, count: int, k: Value, length: Value) -> None:
         """Copies `count` numbers of epoch k of an array (trials, length, count) into lanes."""

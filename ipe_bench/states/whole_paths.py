@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.linalg import Array, multiply
-from ipe_bench.engine.chains import filtered_roots, lower, solve_chains
+from ipe_bench.engine.chains import filtered_chains, smoothed_chains, solve_chains
 from ipe_bench.states.algebra import (
     Half,
     factor,
@@ -17,7 +17,6 @@ from ipe_bench.states.algebra import (
     lower_solve,
     mahalanobis,
     root,
-    symmetric,
     transposed,
 )
 from ipe_bench.states.base import StateModel
@@ -253,98 +252,17 @@ class PathDensity:
         a = np.concatenate([self.model.prior.mean - at.x[:, :1], -at.gap], axis=1)
         v = multiply(self.whitener, at.residual)
         D = np.zeros_like(a) if damping is None else damping
-        return solve_chains(tangents.A, tangents.B, D, self.noise, a, v)[0]
+        return solve_chains(tangents.A, tangents.B, D, self.noise, a, v)
 
     def filtered(self, tangents: Tangents) -> Array:
         """Computes the covariances (trials, 1 + K, n, n) of the affine model's states by the
         readings up to each epoch."""
-        A = tangents.A
-        B = tangents.B
-        nothing = np.zeros((len(A), 1 + self.model.epochs, self.model.n))
-        v = np.zeros(B.shape[:3])
-        return solve_chains(A, B, nothing, self.noise, nothing, v, spread=True)[1]
+        return filtered_chains(tangents.A, tangents.B, self.noise)
 
     def spread(self, tangents: Tangents) -> tuple[Array, Array]:
         """Computes the covariances P (trials, 1 + K, n, n) of the states of the affine model, and
-        those of them with the last states.
-
-        Later readings tell of a state by their scores alone, so that no covariance of states is
-        inverted (Bierman, Automatica 9, 1973): with S = A P A' + Q, what an epoch sees is C - C P C
-        = B' (I + B S B')^-1 B, and
-
-            N[k] = C - C P C + (I - C P) A' N[k+1] A (I - P C)
-            P[k] <- P[k] - P[k] A' N[k+1] A P[k].
-        """
-        A = tangents.A
-        B = tangents.B
-        P = self.filtered(tangents)
-        Q = np.matmul(self.gains, transposed(self.gains))
-        S = np.matmul(np.matmul(A, P[:, :-1]), transposed(A)) + Q
-        # What an epoch sees is W' W, with W = L^-1 B and L L' = I + B S B'.
-        innovation = np.matmul(np.matmul(B, S), transposed(B)) + np.eye(B.shape[2])
-        W = lower_solve(factor(innovation), B)
-        seen = np.matmul(transposed(W), W)
-        # I - W' W S leads what is told of the states after its readings to before them.
-        rest = np.eye(self.model.n) - np.matmul(seen, S)
-        back = np.matmul(rest[:, :-1], transposed(A[:, 1:]))
-        told = seen.copy()
-        shares = np.empty_like(rest)
-        shares[:, -1] = rest[:, -1]
-        for k in range(self.model.epochs - 2, -1, -1):
-            told[:, k] += np.matmul(np.matmul(back[:, k], told[:, k + 1]), transposed(back[:, k]))
-            shares[:, k] = np.matmul(back[:, k], shares[:, k + 1])
-        ahead = np.matmul(P[:, :-1], transposed(A))
-        crossed = np.empty_like(P)
-        crossed[:, 0] = np.matmul(ahead[:, 0], shares[:, 0])
-        # So that they are steps of the model but for round-off.
-        noise = np.matmul(Q, shares)
-        for k in range(self.model.epochs):
-            crossed[:, k + 1] = np.matmul(A[:, k], crossed[:, k]) + noise[:, k]
-        before = np.einsum("tkii->tki", P).copy()
-        P[:, :-1] -= np.matmul(np.matmul(ahead, told), transposed(ahead))
-        variances = np.einsum("tkii->tki", P)
-        # Where readings leave hardly anything of a variance, what they told has lost its digits.
-        lost = (variances < _LEFT * before).any(axis=(1, 2))
-        lost |= (np.einsum("tkii->tki", innovation) > 1 / _LEFT).any(axis=(1, 2))
-        rows = np.flatnonzero(lost)
-        if rows.size:
-            P[rows], crossed[rows] = self._spread_by_roots(A[rows], B[rows])
-        # Round-off of states that are known exactly.
-        np.maximum(variances, 0.0, out=variances)
-        return symmetric(P), crossed
-
-    def _spread_by_roots(self, A: Array, B: Array) -> tuple[Array, Array]:
-        """Computes the same without a difference of covariances, which costs the digits of states
-        that are known much better afterwards: with F F' of the readings up to an epoch and Y' Y of
-        what later ones say,
-
-            P = F (I + F' Y' Y F)^-1 F'
-            Y <- (I + C' Q C)^-1/2 C' A,  C C' = B' B + Y' Y
-
-        and x[k] = (I + Q C C')^-1 A x[k-1] + ... by the readings from epoch k on.
-        """
-        A = np.pad(A, [(0, 0), (1, 0), (0, 0), (0, 0)])
-        B = np.pad(B, [(0, 0), (1, 0), (0, 0), (0, 0)])
-        F = filtered_roots(A, B, self.noise)[0]
-        P = np.empty_like(F)
-        crossed = np.empty_like(F)
-        one = np.broadcast_to(np.eye(self.model.n), F[:, 0].shape)
-        Y = np.zeros_like(one)
-        ahead = one
-        for k in range(self.model.epochs, -1, -1):
-            seen = transposed(np.matmul(Y, F[:, k]))
-            L = lower(np.concatenate([one, seen], axis=2))
-            part = lower_solve(L, transposed(F[:, k]))
-            P[:, k] = np.matmul(transposed(part), part)
-            crossed[:, k] = np.matmul(P[:, k], ahead)
-            C = lower(transposed(np.concatenate([B[:, k], Y], axis=1)))
-            X = np.matmul(transposed(C), self.noise[k])
-            L = lower(np.concatenate([one, X], axis=2))
-            Y = lower_solve(L, np.matmul(transposed(C), A[:, k]))
-            noise = np.matmul(X, transposed(self.noise[k]))
-            follows = A[:, k] - np.matmul(transposed(lower_solve(L, noise)), Y)
-            ahead = np.matmul(transposed(follows), ahead)
-        return P, crossed
+        those of them with the last states."""
+        return smoothed_chains(tangents.A, tangents.B, self.noise)
 
     def size(self, tangents: Tangents, step: Array) -> Array:
         """Computes dx' (Hessian of Gauss and Newton) dx (trials,): a step's squared length in

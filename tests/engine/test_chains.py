@@ -7,7 +7,7 @@ import pytest
 from shared.oracles import assert_agrees
 
 from ipe_bench.engine import compiled
-from ipe_bench.engine.chains import solve_chains
+from ipe_bench.engine.chains import filtered_chains, smoothed_chains, solve_chains
 
 _N, _M, _EPOCHS = 3, 2, 6
 
@@ -23,8 +23,8 @@ def chains(trials, seed=0):
     return A, B, D, G, a, v
 
 
-def dense(A, B, D, G, a, v):
-    """x of one trial by Gaussian elimination of all equations."""
+def equations(A, B, D, G, a, v):
+    """All equations of one trial as a matrix and its right sides."""
     size = _EPOCHS * _N
     moved, noise, C = np.eye(size), np.zeros((size, size)), np.zeros((size, size))
     g = np.zeros(size)
@@ -38,7 +38,26 @@ def dense(A, B, D, G, a, v):
             C[here, here] += B[k - 1].T @ B[k - 1]
             g[here] = B[k - 1].T @ v[k - 1]
     whole = np.block([[moved, -noise], [C, moved.T]])
-    return np.linalg.solve(whole, np.concatenate([a.ravel(), g]))[:size].reshape(_EPOCHS, _N)
+    return whole, np.concatenate([a.ravel(), g])
+
+
+def dense(*given):
+    """x of one trial by Gaussian elimination of all equations."""
+    whole, right = equations(*given)
+    return np.linalg.solve(whole, right)[: _EPOCHS * _N].reshape(_EPOCHS, _N)
+
+
+def dense_covariances(A, B, G):
+    """The covariances of x at all epochs, and those with the last x, by the inverse of all
+    equations."""
+    nothing = np.zeros((_EPOCHS, _N))
+    whole, _ = equations(A, B, nothing, G, nothing, np.zeros((_EPOCHS - 1, _M)))
+    # The covariance is what leads from the right sides B' v to x.
+    inverse = np.linalg.inv(whole)
+    size = _EPOCHS * _N
+    V = inverse[:size, size:].reshape(_EPOCHS, _N, _EPOCHS, _N)
+    each = np.arange(_EPOCHS)
+    return V[each, :, each], V[:, :, -1]
 
 
 @pytest.fixture(params=["machine code", "NumPy"])
@@ -53,7 +72,7 @@ def engine(request, monkeypatch):
 @pytest.mark.usefixtures("engine")
 def test_a_chain_fulfils_all_its_equations_at_once():
     given = chains(11)
-    x, _ = solve_chains(*given)
+    x = solve_chains(*given)
     A, B, D, G, a, v = given
     exact = [dense(*one[:3], G, *one[3:]) for one in zip(A, B, D, a, v, strict=True)]
     assert_agrees(x, np.array(exact), rtol=1e-9, atol=1e-9)
@@ -67,31 +86,59 @@ def test_a_wide_start_costs_no_digits():
     G, nothing = np.zeros((3, 2, 2)), np.zeros((1, 3, 2))
     G[0] = 1e8 * np.eye(2)
     v = 1e4 * np.array([[[3.0], [5.0]]])
-    x, P = solve_chains(A, B, nothing, G, nothing, v, spread=True)
+    x = solve_chains(A, B, nothing, G, nothing, v)
+    P = filtered_chains(A, B, G)
     np.testing.assert_allclose(x[0], [[1.0, 2.0], [3.0, 2.0], [5.0, 2.0]], rtol=1e-12)
     np.testing.assert_allclose(P[0, 2], 1e-8 * np.array([[1.0, 1.0], [1.0, 2.0]]), rtol=1e-6)
 
 
-@pytest.mark.parametrize("spread", [False, True])
+@pytest.mark.oracle(
+    "own second implementation: the inverse of all equations", "covariances of chains", 1e-9
+)
 @pytest.mark.usefixtures("engine")
-def test_a_trial_that_is_not_finite_leaves_nothing_to_those_in_its_place_of_later_vectors(spread):
+def test_covariances_of_a_chain_are_those_of_all_its_equations_at_once():
+    A, B, _, G, _, _ = chains(11)
+    P, crossed = smoothed_chains(A, B, G)
+    exact = [dense_covariances(*one, G) for one in zip(A, B, strict=True)]
+    assert_agrees(P, np.array([one for one, _ in exact]), rtol=1e-9, atol=1e-9)
+    assert_agrees(crossed, np.array([one for _, one in exact]), rtol=1e-9, atol=1e-9)
+    # At the last epoch no reading is later.
+    np.testing.assert_array_equal(P[:, -1], filtered_chains(A, B, G)[:, -1])
+
+
+@pytest.mark.usefixtures("engine")
+def test_a_state_that_later_readings_settle_costs_no_digits():
+    """A start of variance 1e16 that two later readings settle: of x, p and the sum of both are
+    read."""
+    A, B = np.array([[[[1.0, 1.0], [0.0, 1.0]]] * 2]), np.array([[[[1.0, 0.0]]] * 2])
+    G = np.zeros((3, 2, 2))
+    G[0] = 1e8 * np.eye(2)
+    P, _ = smoothed_chains(A, B, G)
+    np.testing.assert_allclose(P[0, 0], [[5.0, -3.0], [-3.0, 2.0]], rtol=1e-12)
+
+
+def results(given):
+    A, B, _, G, _, _ = given
+    return solve_chains(*given), filtered_chains(A, B, G), *smoothed_chains(A, B, G)
+
+
+@pytest.mark.usefixtures("engine")
+def test_a_trial_that_is_not_finite_leaves_nothing_to_those_in_its_place_of_later_vectors():
     given = chains(20)
-    x, P = solve_chains(*given, spread=spread)
+    before = results(given)
     given[0][2, 0] = np.nan
-    after = solve_chains(*given, spread=spread)
     others = np.arange(20) != 2
-    np.testing.assert_array_equal(after[0][others], x[others])
-    if spread:
-        np.testing.assert_array_equal(after[1][others], P[others])
+    for one, after in zip(before, results(given), strict=True):
+        np.testing.assert_array_equal(after[others], one[others])
 
 
 @pytest.mark.usefixtures("engine")
 def test_a_trial_has_the_same_bits_alone_and_beside_one_that_is_not_finite():
     A, B, D, G, a, v = chains(10)
     A[4, 2] = np.nan
-    x, P = solve_chains(A, B, D, G, a, v, spread=True)
-    assert not np.isfinite(x[4]).all()
+    together = results((A, B, D, G, a, v))
+    assert not np.isfinite(together[0][4]).all()
     for some in (slice(3, 4), slice(5, 10)):
-        alone = solve_chains(A[some], B[some], D[some], G, a[some], v[some], spread=True)
-        np.testing.assert_array_equal(alone[0], x[some])
-        np.testing.assert_array_equal(alone[1], P[some])
+        alone = results((A[some], B[some], D[some], G, a[some], v[some]))
+        for one, whole in zip(alone, together, strict=True):
+            np.testing.assert_array_equal(one, whole[some])
