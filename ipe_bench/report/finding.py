@@ -7,6 +7,7 @@ parameters.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -50,7 +51,7 @@ class Standing:
 
     @property
     def family(self) -> str:
-        return next(str(row.get("family", "")) for row in self.rows if row)
+        return next((str(row.get("family", "")) for row in self.rows if row), "")
 
     @cached_property
     def sure(self) -> int:
@@ -76,7 +77,7 @@ class Standing:
     def rank(self) -> tuple[float, ...]:
         """Sorts who surely holds longest first, then who may, then who succeeds most."""
         shares = [row["success"] for row in self.rows if row]
-        return (-self.sure, -self.possible, -sum(shares) / len(shares))
+        return (-self.sure, -self.possible, -sum(shares) / max(len(shares), 1))
 
     def overconfident(self, number: int) -> list[int]:
         """Returns at which of the first columns its reported covariance is too small."""
@@ -95,7 +96,7 @@ class Finding:
     def of(cls, rows: Iterable[Row]) -> Finding:
         """Judges the rows of a summary over all parameters; a `setting` tells those of several
         apart."""
-        table: dict[tuple[str, Place], Row] = {}
+        table: dict[tuple[str, Place], Row | None] = {}
         for row in rows:
             label = str(row["estimator"])
             scale = float(row["error_scale"])
@@ -103,7 +104,8 @@ class Finding:
             # Settings whose texts are equal are different all the same.
             while (label, place) in table:
                 place = (f"{place[0]}'", scale)
-            table[label, place] = row
+            # A share of no trials is no result.
+            table[label, place] = None if math.isnan(row["success"]) else row
         places = tuple(dict.fromkeys(place for _, place in table))
         ascending = len({setting for setting, _ in places}) == 1
         places = tuple(sorted(places, key=lambda place: place[1])) if ascending else places
@@ -287,6 +289,8 @@ def named(standings: Sequence[Standing], among: Sequence[Standing]) -> str:
 
 def seen(rows: Sequence[Row]) -> str:
     """States the successes that were seen, and the number of trials."""
+    if not rows:
+        return "no trial"
     shares = sorted({row["success"] for row in rows})
     share = " to ".join(dict.fromkeys(percent(end) for end in (shares[0], shares[-1])))
     share = share.replace(" % to", " to")

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from report.test_finding import row
 
+from ipe_bench.report.finding import Finding
 from ipe_bench.report.style import DARK, DARK_RAMP, LIGHT, RAMP, WHITE, ink
 from ipe_bench.report.tables.matrix import Tile, matrices, points, step
 from ipe_bench.report.tables.table import html, latex, markdown, plain_text
@@ -192,3 +193,29 @@ def test_a_missing_result_is_a_dash_without_colour():
     assert (missing.text, missing.style) == ("–", "")
     assert isinstance(missing, Tile)
     assert missing.step is None
+
+
+@pytest.mark.parametrize(
+    "missing", [{("b", 1.0)}, {("b", 0.1), ("b", 1.0)}, {("a", 0.1), ("b", 0.1)}]
+)
+def test_a_share_of_no_trials_is_a_dash_and_holds_nowhere(missing):
+    rows = [
+        one | {"success": float("nan"), "success_low": float("nan")}
+        if (one["estimator"], one["error_scale"]) in missing
+        else one
+        for one in rows_of({"a": (200, 200), "b": (200, 200)})
+    ]
+    matrix = matrices(rows)[0]
+    shown = {
+        (name.text, scale): cell.text
+        for name, *cells in matrix.rows
+        for scale, cell in zip((0.1, 1.0), cells, strict=True)
+    }
+    assert {place for place, text in shown.items() if text == "–"} == missing
+    assert "b: undecided" in Finding.of(rows).sentence() or ("a", 0.1) in missing
+
+
+def test_without_any_share_nobody_is_said_to_hold():
+    nothing = {"success": float("nan"), "success_low": float("nan")}
+    rows = [one | nothing for one in rows_of({"a": (200, 200), "b": (200, 200)})]
+    assert Finding.of(rows).sentence().startswith("Too few trials to tell who holds")
