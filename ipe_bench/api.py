@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
-from ipe_bench.basics.errors import UserError, unknown
+from ipe_bench.basics.errors import UserError, refuse_unknown
 from ipe_bench.basics.linalg import Array
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.base import Measurement
@@ -581,8 +581,7 @@ def component(name: str, **options: Any) -> Any:
     from ipe_bench.plugins.discovery import options as offered
 
     known = {f"{one.group}/{one.name}": one for one in offered()}
-    if name not in known:
-        raise UserError(f"{name}: {unknown(name, known, 'option')}")
+    refuse_unknown(name, name, known, "option")
     return construct(merged(composed(known[name]), options), name.replace("/", "."))
 
 

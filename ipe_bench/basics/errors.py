@@ -5,7 +5,7 @@ import inspect
 import os
 import sys
 import traceback
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from types import ModuleType
 from typing import Any
 
@@ -131,6 +131,12 @@ def unknown(name: str, known: Iterable[str], noun: str) -> str:
         return place
     listed = f" (there are: {', '.join(known) or 'none'})"
     return f"there is no such {noun}{did_you_mean(name, known) or listed}"
+
+
+def refuse_unknown(key: str, name: str, known: Collection[str], noun: str) -> None:
+    """Raises a UserError about the key unless the name is known."""
+    if name not in known:
+        raise UserError(f"{key}: {unknown(name, known, noun)}")
 
 
 def without_modules(room: str, names: Sequence[str]) -> None:

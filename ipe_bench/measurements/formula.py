@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ipe_bench.basics.errors import UserError, did_you_mean, shortened, unknown
+from ipe_bench.basics.errors import UserError, did_you_mean, refuse_unknown, shortened
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Finite
 from ipe_bench.engine.trace import Graph, Program, slopes
@@ -151,8 +151,7 @@ class WrittenModel(Measurement):
         and angles that are none of the `readings` or have another unit."""
         known = [*readings, self.reading]
         for name in self.circular:
-            if name not in known:
-                raise UserError(f"circular={name}: {unknown(name, known, 'reading')}")
+            refuse_unknown(f"circular={name}", name, known, "reading")
             if self.unit not in ("", "rad", "deg", "°"):
                 raise UserError(
                     f"unit={self.unit}: circular={name} is an angle, in rad or deg; give one of"

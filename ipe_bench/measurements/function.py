@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.basics.errors import UserError, place_of, unknown
+from ipe_bench.basics.errors import UserError, place_of, refuse_unknown, unknown
 from ipe_bench.basics.linalg import Array, read_only
 from ipe_bench.basics.options import Finite, Positive
 from ipe_bench.measurements.base import contradicted, differentiate
@@ -79,13 +79,9 @@ class Function(WrittenModel):
         object.__setattr__(self, "function", self._found())
         arguments = [name for name in self._signature if name not in self._keywords]
         for name in self.start:
-            if name not in arguments:
-                raise UserError(f"start.{name}: {unknown(name, arguments, 'argument')}")
+            refuse_unknown(f"start.{name}", name, arguments, "argument")
         for name in self.constants:
-            if name not in self._keywords:
-                raise UserError(
-                    f"constants.{name}: {unknown(name, self._keywords, 'keyword-only argument')}"
-                )
+            refuse_unknown(f"constants.{name}", name, self._keywords, "keyword-only argument")
         for name, default in self._keywords.items():
             if default is inspect.Parameter.empty and name not in self.constants:
                 raise UserError(
@@ -97,8 +93,8 @@ class Function(WrittenModel):
                 f"give an argument a number as default, or measurement.start.NAME=VALUE {given}"
             )
             raise UserError(f"start: {self.of} has no parameter; {remedy}")
-        if self.time and self.time not in self.headings:
-            raise UserError(f"time={self.time}: {unknown(self.time, self.headings, 'column')}")
+        if self.time:
+            refuse_unknown(f"time={self.time}", self.time, self.headings, "column")
         for name in self.headings if self.columns else ():
             if name not in self.columns:
                 remedy = f"give measurement.columns.{name}=[...], or measurement.start.{name}=VALUE"

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.basics.errors import UserError, unknown
+from ipe_bench.basics.errors import UserError, refuse_unknown
 from ipe_bench.basics.linalg import Array, Mask
 from ipe_bench.basics.options import Component, Finite, Positive
 from ipe_bench.measurements.base import Measurement, Parameter, Recorded, WrappedModel
@@ -107,8 +107,7 @@ class ConstrainedModel(WrappedModel):
         super().__post_init__()
         names = [p.name for p in self.whole.parameters]
         for one in self.known:
-            if one.name not in names:
-                raise UserError(f"parameters.{one.name}: {unknown(one.name, names, 'parameter')}")
+            refuse_unknown(f"parameters.{one.name}", one.name, names, "parameter")
         for one, v0 in zip(self._known, self._v0, strict=True):
             lower, upper = one.bounds
             if not lower < v0 < upper:

@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ipe_bench.basics.errors import UserError, unknown
+from ipe_bench.basics.errors import refuse_unknown
 from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.measurements.base import Measurement, Parameter, Recorded
 
@@ -138,10 +138,7 @@ class Nist(Measurement):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.dataset not in FORMULAS:
-            raise UserError(
-                f"dataset={self.dataset}: {unknown(self.dataset, FORMULAS, 'data set')}"
-            )
+        refuse_unknown(f"dataset={self.dataset}", self.dataset, FORMULAS, "data set")
 
     def _numbers(self, key: str) -> Array:
         return np.array(_tables()[self.dataset][key], dtype=float)

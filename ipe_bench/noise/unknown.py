@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ipe_bench.basics.errors import UserError, unknown
+from ipe_bench.basics.errors import UserError, refuse_unknown
 from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.basics.options import Positive
 from ipe_bench.measurements.base import Measurement
@@ -75,10 +75,8 @@ class Unknown(Noise):
         """
         if self.by is None and self.sigma == "sigma":
             return None
-        if self.by is not None and self.by not in model.index:
-            raise UserError(
-                f"noise.by={self.by}: {unknown(self.by, model.index, 'column of the readings')}"
-            )
+        if self.by is not None:
+            refuse_unknown(f"noise.by={self.by}", self.by, model.index, "column of the readings")
         column = [""] * model.m if self.by is None else model.index[self.by]
         entries = [f"{entry:g}" if isinstance(entry, float) else str(entry) for entry in column]
         groups = tuple(dict.fromkeys(entries))

@@ -13,7 +13,13 @@ from collections.abc import Mapping
 from dataclasses import MISSING, dataclass
 from typing import Any
 
-from ipe_bench.basics.errors import UserError, did_you_mean, moved, place_of, unknown
+from ipe_bench.basics.errors import (
+    UserError,
+    did_you_mean,
+    moved,
+    place_of,
+    refuse_unknown,
+)
 from ipe_bench.basics.options import checked, describe_type, option_types
 from ipe_bench.measurements.known import ParameterInfo
 from ipe_bench.plugins import discovery
@@ -90,8 +96,7 @@ def instantiate(cls: type, options: Mapping[str, Any], where: str) -> Any:
     prefix = f"{where}." if where else ""
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}
     for name in options:
-        if name not in fields:
-            raise UserError(f"{prefix}{name}: {unknown(name, fields, 'option')}")
+        refuse_unknown(f"{prefix}{name}", name, fields, "option")
     required = [
         f.name for f in fields.values() if f.default is f.default_factory and f.name not in options
     ]

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from ipe_bench.basics.errors import UserError, unknown
+from ipe_bench.basics.errors import UserError, refuse_unknown
 from ipe_bench.basics.files import write_text
 from ipe_bench.report.sections import report_tables
 from ipe_bench.report.tables.table import COLUMN, PAGE, Column, Table, latex
@@ -56,8 +56,7 @@ def _with_columns(table: Table, names: Sequence[str]) -> Table:
         alike = [other for other in known if re.fullmatch(rf"{name}(_\d+)?", other)]
         known[f"{name}_{len(alike) + 1}" if alike else name] = column
     for name in names:
-        if name not in known:
-            raise UserError(f"columns={name}: {unknown(name, known, f'column of {table.name}')}")
+        refuse_unknown(f"columns={name}", name, known, f"column of {table.name}")
     return replace(table, columns=[known[name] for name in names or known])
 
 
@@ -77,9 +76,7 @@ def _figures(
             if set(names) <= captions.keys():
                 break
     for name in names:
-        if name not in captions:
-            known = [*tables, *captions]
-            raise UserError(f"paper={name}: {unknown(name, known, 'table or figure')}")
+        refuse_unknown(f"paper={name}", name, [*tables, *captions], "table or figure")
     if names:
         files.append(folder / "captions.md")
         asked = [captions[name] for name in names]

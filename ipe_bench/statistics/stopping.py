@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ipe_bench.basics.definitions import pinned
-from ipe_bench.basics.errors import UserError, unknown
+from ipe_bench.basics.errors import UserError, refuse_unknown
 from ipe_bench.runs.execution import Execution
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.run import compute, new_name, result_keys, validate
@@ -48,8 +48,7 @@ def precision_of(given: float | Mapping[str, float]) -> Mapping[str, float]:
     else:
         named = {"success": given}
     for name, value in named.items():
-        if name not in WITH_PRECISION:
-            raise UserError(f"precision.{name}: {unknown(name, WITH_PRECISION, 'statistic')}")
+        refuse_unknown(f"precision.{name}", name, WITH_PRECISION, "statistic")
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
         if not is_number or not 0 < value < 1:
             key = f"precision.{name}" if isinstance(given, Mapping) else "precision"

@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from ipe_bench.basics.errors import UserError, unknown
+from ipe_bench.basics.errors import UserError, refuse_unknown
 from ipe_bench.measurements.arithmetic import parse
 
 if TYPE_CHECKING:
@@ -28,8 +28,7 @@ def check(model: Ode) -> None:
     _check_constants(model)
     inputs = ["case", "time", *model.driven_by]
     for name in model.columns:
-        if name not in inputs:
-            raise UserError(f"columns.{name}: {unknown(name, inputs, 'input')}")
+        refuse_unknown(f"columns.{name}", name, inputs, "input")
 
 
 def _check_present(model: Ode) -> None:

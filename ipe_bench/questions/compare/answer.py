@@ -10,7 +10,7 @@ from typing import Any
 
 import pandas as pd
 
-from ipe_bench.basics.errors import UserError, unknown
+from ipe_bench.basics.errors import UserError, refuse_unknown
 from ipe_bench.questions.compare.effects import PowerPlan
 from ipe_bench.questions.compare.maths import (
     JUDGED,
@@ -284,8 +284,7 @@ def _require_known(alpha: float, tested: Sequence[str], margins: Mapping[str, fl
     if not 0 < alpha < 1:
         raise UserError(f"alpha={alpha}: give a number between 0 and 1")
     for name in (*tested, *margins):
-        if name not in MARGINS:
-            raise UserError(f"fail_on={name}: {unknown(name, MARGINS, 'quantity')}")
+        refuse_unknown(f"fail_on={name}", name, MARGINS, "quantity")
     for name, margin in margins.items():
         if not 0 <= margin < math.inf:
             raise UserError(f"margin.{name}={margin}: give a number from 0 on")
