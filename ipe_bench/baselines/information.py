@@ -16,7 +16,17 @@ import numpy as np
 
 from ipe_bench.baselines.epochs import Epoch, Rows, Walk, read_members
 from ipe_bench.basics.batches import put, take
-from ipe_bench.basics.linalg import Array, Mask, finite, inverse, multiply, squared
+from ipe_bench.basics.linalg import (
+    Array,
+    Mask,
+    finite,
+    from_root,
+    gram,
+    inverse,
+    multiply,
+    repeated,
+    squared,
+)
 from ipe_bench.basics.options import Count, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator, Need
@@ -140,7 +150,7 @@ class _Beliefs(Walk):
         information = np.linalg.inv(problem.scaled_prior)
         U0 = np.linalg.cholesky(information).T / filter.prior_inflation
         mean = np.zeros((len(z), len(U0)))
-        self.belief = Belief(mean, np.repeat(U0[None], len(z), axis=0))
+        self.belief = Belief(mean, repeated(U0, len(z)))
 
     def take_in(self, epoch: Epoch, at: Rows) -> None:
         z = self.z[at][:, epoch.rows]
@@ -161,11 +171,11 @@ class _Beliefs(Walk):
         self.status[at[raised]] = Status.ERROR
         S = self.belief.root()
         self.x = self.belief.mean
-        self.P = np.matmul(S, S.swapaxes(1, 2))
+        self.P = from_root(S)
 
     def covariance(self, at: Rows) -> Array:
         S = take(self.belief, at).root() * self.d[:, None]
-        return np.matmul(S, S.swapaxes(1, 2))
+        return from_root(S)
 
 
 def regressed(readings: EpochReadings, x: Array, U: Array) -> tuple[Array, Array, Array]:
@@ -180,8 +190,8 @@ def regressed(readings: EpochReadings, x: Array, U: Array) -> tuple[Array, Array
     # A U^-1, since the points are U^-1 times sqrt(n) unit vectors.
     B = (d[:, :n] - d[:, n:]).swapaxes(1, 2) / (2.0 * np.sqrt(n))
     # Of the covariance of h - z what its slope does not explain.
-    covariance = np.matmul(spread.swapaxes(1, 2), spread) / (2 * n)
-    return r, np.matmul(B, U), covariance - np.matmul(B, B.swapaxes(1, 2))
+    covariance = gram(spread) / (2 * n)
+    return r, np.matmul(B, U), covariance - from_root(B)
 
 
 @dataclass(frozen=True)

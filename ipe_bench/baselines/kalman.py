@@ -13,7 +13,7 @@ import numpy as np
 from annotated_types import Gt, Le
 
 from ipe_bench.baselines.sequential import LARGEST, ConstantFilter, Sequential
-from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.linalg import Array, deviations
 from ipe_bench.basics.options import Count, Finite, NonNegative, Positive, Whole
 from ipe_bench.basics.streams import own_generators
 from ipe_bench.states.algebra import symmetric
@@ -176,7 +176,7 @@ class _EKFTrack(FilterpyFilter):
         if self.iteration == 1:
             # The innovation of the prediction; later ones have seen z.
             self.nis += _squared_innovation(f.y, f.SI)
-        change = np.abs(f.x - at) / np.sqrt(np.diag(f.P))
+        change = np.abs(f.x - at) / deviations(f.P)
         return self.iteration >= self.iterations or bool(change.max() <= self.tolerance)
 
 

@@ -15,7 +15,16 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import take
 from ipe_bench.basics.errors import UserError, describe_exception
-from ipe_bench.basics.linalg import Array, Covariance, Mask, finite, pseudo_inverse
+from ipe_bench.basics.linalg import (
+    Array,
+    Covariance,
+    Mask,
+    deviations,
+    finite,
+    from_root,
+    pseudo_inverse,
+    repeated,
+)
 from ipe_bench.basics.options import Count, Positive, Whole
 from ipe_bench.basics.statuses import Status
 from ipe_bench.basics.streams import normals, own_generators
@@ -212,7 +221,7 @@ class MultiscaleLM(Estimator):
         objective = Objective.of(problem, z)
         length = np.linalg.norm(problem.R.whiten_jacobian(problem.H))
         size = np.full(len(problem.x0), 1.0 / length)
-        start = np.repeat(problem.x0[None], len(z), axis=0)
+        start = repeated(problem.x0, len(z))
         limits = Limits(self.tolerance, self.max_iterations, history=history)
         methods = (LevenbergMarquardtMethod(self.damping, metric) for metric in (size, None))
         by_size, by_columns = (minimize(objective, method, start, limits) for method in methods)
@@ -275,7 +284,7 @@ class Multistart(Estimator):
             """Tells which minima are believed, and notes those that fit."""
             return fitting.note(found, rows) & passes(found, z.shape[1], problem.doubted)
 
-        best = minimize(objective, method, np.repeat(x0[None], trials, axis=0), limits)
+        best = minimize(objective, method, repeated(x0, trials), limits)
         # Starts since the first fit; -1 before it.
         confirmed = np.where(believed(best, np.arange(trials)), 0, -1)
         for k in range(self.starts - 1):
@@ -390,7 +399,7 @@ class LeastSquares(Estimator):
         """Returns the status and (J' J)^-1 (1, n, n) at SciPy's end."""
         white = Covariance(np.ones(len(found.jac)))
         J_plus, deficient = pseudo_inverse(found.jac[None], white)
-        P = np.matmul(J_plus, J_plus.swapaxes(1, 2))
+        P = from_root(J_plus)
         if not (np.isfinite(found.x).all() and np.isfinite(found.jac).all()):
             return Status.NONFINITE, P
         if deficient[0]:
@@ -398,7 +407,7 @@ class LeastSquares(Estimator):
         if found.status == _OUT_OF_EVALUATIONS:
             return Status.MAX_ITERATIONS, P
         # The Gauss-Newton step P J'r, in deviations.
-        to_go = np.abs(P[0] @ found.grad) / np.sqrt(np.diag(P[0]))
+        to_go = np.abs(P[0] @ found.grad) / deviations(P[0])
         return (Status.CONVERGED if to_go.max() <= self.tolerance else Status.STALLED), P
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from ipe_bench.baselines.epochs import Epoch, Rows, Walk
 from ipe_bench.basics.errors import UserError, describe_exception
-from ipe_bench.basics.linalg import Array, deviations, finite, multiply
+from ipe_bench.basics.linalg import Array, deviations, finite, gram, multiply
 from ipe_bench.basics.options import NonNegative, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator, Need
@@ -257,7 +257,7 @@ class _TurnedReadings:
         h, _ = self._read(x, slopes=False)
         centre = h.mean(axis=1, keepdims=True)
         spread = h - centre
-        axes = _principal_axes(np.matmul(spread.swapaxes(1, 2), spread))
+        axes = _principal_axes(gram(spread))
         self.z = multiply(axes.swapaxes(1, 2), self.z - centre[:, 0])
         return np.matmul(spread, axes)
 

@@ -115,6 +115,27 @@ def deviations(P: Array) -> Array:
     return np.sqrt(np.diagonal(P, axis1=-2, axis2=-1))
 
 
+def correlations(P: Array) -> Array:
+    """Returns the correlations (trials, n, n) of the covariances P (trials, n, n)."""
+    d = deviations(P)
+    return P / (d[..., :, None] * d[..., None, :])
+
+
+def gram(A: Array) -> Array:
+    """Computes A' A (trials, n, n) for A (trials, k, n)."""
+    return np.matmul(A.swapaxes(-1, -2), A)
+
+
+def from_root(S: Array) -> Array:
+    """Computes the covariance S S' (trials, n, n) of its root S (trials, n, k)."""
+    return np.matmul(S, S.swapaxes(-1, -2))
+
+
+def repeated(a: Array, times: int) -> Array:
+    """Returns the same array a (...) so many times, (times, ...)."""
+    return np.repeat(a[None], times, axis=0)
+
+
 def squared(r: Array) -> Array:
     """Computes |r|^2 (trials,) of vectors (trials, k)."""
     return np.einsum("ti,ti->t", r, r)
@@ -190,7 +211,7 @@ def information(J: Array, R: Covariance) -> Array:
     """Computes the Fisher information J' R^-1 J for J (..., m, n)."""
     with np.errstate(all="ignore"):
         Jw = np.ascontiguousarray(R.whiten_jacobian(J))
-        return np.matmul(Jw.swapaxes(-1, -2), Jw)
+        return gram(Jw)
 
 
 def definite_factor(G: Array) -> tuple[Array, Array, Mask]:

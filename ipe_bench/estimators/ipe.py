@@ -16,9 +16,11 @@ from ipe_bench.basics.linalg import (
     Mask,
     deviations,
     finite,
+    from_root,
     inverse,
     multiply,
     pseudo_inverse,
+    repeated,
     solve,
     squared,
 )
@@ -172,7 +174,7 @@ def frozen_covariance(H_plus: Array, R: Covariance) -> Array:
         \quad \sigma^2 (H^T H)^{-1} \text{ if } R = \sigma^2 I
     """
     scaled = H_plus * R.factor if R.factor.ndim == 1 else np.matmul(H_plus, R.factor)
-    return np.matmul(scaled, scaled.swapaxes(1, 2))
+    return from_root(scaled)
 
 
 def begin(problem: Problem, z: Array, start: Start) -> tuple[Array, FrozenSystem]:
@@ -183,7 +185,7 @@ def begin(problem: Problem, z: Array, start: Start) -> tuple[Array, FrozenSystem
     point: eq. (16).
     """
     system = FrozenSystem.at_nominal(problem, z)
-    x0 = np.repeat(problem.x0[None], len(z), axis=0)
+    x0 = repeated(problem.x0, len(z))
     if start == "nominal":
         return x0, system
     r0 = system.model.residual(x0, system.rows, system.z)
@@ -199,7 +201,7 @@ def starting_points(problem: Problem, z: Array, start: Start, tally: EvaluationC
     """Returns the starts (trials, n) of least squares, at the nominal point if H has not full
     column rank, and adds their cost to the tally."""
     if start == "nominal" or problem.rankless:
-        return np.repeat(problem.x0[None], len(z), axis=0)
+        return repeated(problem.x0, len(z))
     x, system = begin(problem, z, start)
     tally.simulations += system.model.tally.simulations
     tally.messages.update(system.model.tally.messages)

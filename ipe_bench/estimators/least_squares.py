@@ -17,6 +17,7 @@ from ipe_bench.basics.linalg import (
     Mask,
     definite_factor,
     finite,
+    gram,
     inverse,
     multiply,
     solve,
@@ -130,7 +131,7 @@ class NormalEquations:
         A = np.ascontiguousarray(J)
         with np.errstate(all="ignore"):
             # By the Cholesky factor of J'J where that keeps enough digits, else by QR below.
-            U, inverse_U, well = definite_factor(np.matmul(A.swapaxes(1, 2), A))
+            U, inverse_U, well = definite_factor(gram(A))
             rows = np.ascontiguousarray(r)[:, None]
             along = np.matmul(rows, A)[:, 0]
             gradient = multiply(inverse_U.swapaxes(1, 2), along)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import put, take
-from ipe_bench.basics.linalg import Array, Mask, deviations, finite, inverse, squared
+from ipe_bench.basics.linalg import Array, Mask, deviations, finite, from_root, inverse, squared
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates
 from ipe_bench.estimators.driver import Limits, Method, SolveResult, iterate
@@ -132,7 +132,7 @@ def minima_of(ended: SolveResult[Any], slope: NormalEquations, readings: int) ->
         inverse_there, _ = inverse(slope.U[lost])
         inverse_U = put(inverse_U, lost, inverse_there)
     # U^-1 U^-T: inverting U'U would lose twice the digits, and with them the sign of a variance.
-    covariance = np.matmul(inverse_U, inverse_U.swapaxes(1, 2))
+    covariance = from_root(inverse_U)
     return Minima.of(ended, covariance, ended.state.r[:, :readings])
 
 

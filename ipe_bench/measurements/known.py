@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError, refuse_unknown
-from ipe_bench.basics.linalg import Array, Mask
+from ipe_bench.basics.linalg import Array, Mask, repeated
 from ipe_bench.basics.options import Component, Finite, Positive
 from ipe_bench.measurements.base import Measurement, Parameter, Recorded, WrappedModel
 from ipe_bench.measurements.joint import Joint
@@ -213,7 +213,7 @@ class ConstrainedModel(WrappedModel):
         c = self._coordinates
         own = x[:, : self.n]
         fixed = self._v0 / self.whole.sizes
-        whole = np.repeat(fixed[None], len(x), axis=0).astype(x.dtype)
+        whole = repeated(fixed, len(x)).astype(x.dtype)
         whole[:, self._free] = np.where(c.bounded, c.value(own) / c.size, own)
         return np.concatenate([whole, x[:, self.n :]], axis=1)
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.linalg import Array, Covariance
+from ipe_bench.basics.linalg import Array, Covariance, finite
 from ipe_bench.engine.trace import Graph, Program, slopes
 from ipe_bench.measurements.arithmetic import Arithmetic, parse
 from ipe_bench.measurements.base import Parameter
@@ -46,7 +46,7 @@ def read_sigma(text: str) -> Arithmetic:
     theta = np.log(points[:-1, 0])
     # Levels that no readings tell apart have slopes that are not independent.
     slopes = levels.at(readings[None], theta[None])[2][0]
-    usable = slopes[np.isfinite(slopes).all(axis=1)]
+    usable = slopes[finite(slopes)]
     if len(usable) == 0 or np.linalg.matrix_rank(usable) < len(names):
         raise UserError(
             f"noise.sigma={text}: the readings do not distinguish its levels {', '.join(names)};"

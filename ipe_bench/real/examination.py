@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ipe_bench.basics.linalg import Array, Mask, deviations
+from ipe_bench.basics.linalg import Array, Mask, deviations, finite, repeated
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.least_squares import inverse_factor
 from ipe_bench.measurements.base import Measurement, Parameter
@@ -149,13 +149,13 @@ class Examination:
     @property
     def standard_errors(self) -> Array:
         slope = self.model.physical_slope(self.inner[None])[0]
-        return np.sqrt(np.diag(self.P)) * np.abs(slope)
+        return deviations(self.P) * np.abs(slope)
 
     @cached_property
     def wald(self) -> tuple[Array, Array]:
         """The intervals (n,), (n,) from the standard errors; NaN for levels of the noise."""
         q = half_width(CONFIDENCE, self.freedom)
-        deviation = np.sqrt(np.diag(self.P))
+        deviation = deviations(self.P)
         return self._without_levels(*wald_interval(self.model, self.inner, deviation, q))
 
     def _without_levels(self, low: Array, high: Array) -> tuple[Array, Array]:
@@ -232,7 +232,7 @@ class Examination:
         slopes = self._J if R.factor.ndim == 1 else R.whiten(np.eye(len(w))) @ self._J
         with np.errstate(all="ignore"):
             moved = P @ slopes.T * (statistic / variance)
-            in_errors = np.abs(moved / np.sqrt(np.diag(P))[:, None])
+            in_errors = np.abs(moved / deviations(P)[:, None])
         return self._at_rows(in_errors.max(axis=0))
 
     @cached_property
@@ -248,9 +248,9 @@ class Examination:
         z = self._present + self._drawn_noise(draws)
         free = self.released
         if free is None:
-            values, answered = answers(self.problem, z, _repeated(self.inner, draws))
+            values, answered = answers(self.problem, z, repeated(self.inner, draws))
         else:
-            values, answered = answers(free.problem, z, _repeated(free.x, draws), free)
+            values, answered = answers(free.problem, z, repeated(free.x, draws), free)
             values = np.delete(values, free.places, axis=1)
         values = values[answered]
         if len(values) < draws / 2:
@@ -280,12 +280,8 @@ class Examination:
         """Minima, the least first, reached from the estimate and from starts that the prior
         draws."""
         starts = self._starts()
-        minima = maximise_likelihood(self.problem, _repeated(self.z, len(starts)), starts)
-        usable = (
-            minima.converged
-            & np.isfinite(minima.chi_square)
-            & np.isfinite(minima.covariance).all(axis=(1, 2))
-        )
+        minima = maximise_likelihood(self.problem, repeated(self.z, len(starts)), starts)
+        usable = minima.converged & np.isfinite(minima.chi_square) & finite(minima.covariance)
         least_first = np.argsort(minima.chi_square[usable], kind="stable")
         freedom = self.freedom if isinstance(self.freedom, int) else None
         limit = joint_region(len(self.inner), CONFIDENCE, freedom)
@@ -333,11 +329,6 @@ class Examination:
         apart = _SAME * self.standard_errors
         as_good = [one for one in self.minima if one.as_good]
         return [one for one in as_good if (np.abs(one.x - self.x) > apart).any()]
-
-
-def _repeated(values: Array, sets: int) -> Array:
-    """Repeats values (n,) in each of several sets, (sets, n)."""
-    return np.repeat(values[None], sets, axis=0)
 
 
 def examine(

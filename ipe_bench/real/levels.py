@@ -21,7 +21,7 @@ from functools import cached_property
 import numpy as np
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.linalg import Array, Covariance, Mask
+from ipe_bench.basics.linalg import Array, Covariance, Mask, repeated
 from ipe_bench.estimators.driver import Limits
 from ipe_bench.estimators.least_squares import Objective, inverse_factor
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
@@ -137,7 +137,7 @@ class _Known(Measurement):
         """Skips the checks of options: there are none."""
 
     def simulate(self, x: Array) -> Array:
-        return np.repeat(self.h[None], len(x), axis=0)
+        return repeated(self.h, len(x))
 
     def jacobian(self, x: Array) -> Array:
         return np.zeros((len(x), len(self.h), 0))

@@ -692,7 +692,7 @@ def _polished(cost: _Search, u: Array, positive: Mask) -> _Minimum:
         # The inverse of the second derivatives of minus the log likelihood is the covariance of
         # its maximum.
         P = np.linalg.inv(H)
-        error = np.sqrt(np.diagonal(P))
+        error = deviations(P)
         if (error[positive] >= _VAGUE).any():
             break
         u = u - P @ g

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import chdtri, fdtri, stdtrit
 
-from ipe_bench.basics.linalg import Array, Mask
+from ipe_bench.basics.linalg import Array, Mask, repeated
 from ipe_bench.estimators.driver import Limits
 from ipe_bench.estimators.least_squares import Objective
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
@@ -157,7 +157,7 @@ def profiles(
     limits = natural_limits(model)
     found = []
     for k in range(len(x)) if places is None else places:
-        ends = np.repeat(x[None], 2, axis=0)
+        ends = repeated(x, 2)
         try:
             for row, s in enumerate((-1, 1)):
                 side = _Side(
@@ -343,7 +343,7 @@ def _least_at(
     of their bounds, and NaN where the model has no value."""
     tally = EvaluationCount.zeros(len(starts))
     model = _Pinned(problem.measurement, tally, place=place, value=at)
-    readings = np.repeat(z[None], len(starts), axis=0)
+    readings = repeated(z, len(starts))
     objective = objective_of(problem, readings, model)
     x = np.delete(starts, place, axis=1)
     with np.errstate(all="ignore"):

@@ -17,6 +17,7 @@ import numpy as np
 
 from ipe_bench.basics.definitions import pinned
 from ipe_bench.basics.errors import StorageError, UserError
+from ipe_bench.basics.linalg import finite
 from ipe_bench.basics.machine import cores, library_versions
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.problem import require_function
@@ -194,7 +195,7 @@ def _beyond_numbers(scenario: Scenario) -> Iterator[str]:
             raise
         except Exception:  # what cannot be drawn is a failure of its blocks, and told of there
             return
-    if not real and not np.isfinite(few.z).all(axis=1).any():
+    if not real and not finite(few.z).any():
         reason = scenario.simulator.hindrance(few.x[0])
         yield (
             f"measurement={model.name}: none of the first {_FEW} trials has readings: {reason};"

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import put, take
-from ipe_bench.basics.linalg import Array, Covariance, squared
+from ipe_bench.basics.linalg import Array, Covariance, repeated, squared
 from ipe_bench.estimators.driver import Limits, continued
 from ipe_bench.estimators.ipe import starting_points
 from ipe_bench.estimators.least_squares import Objective
@@ -76,7 +76,7 @@ class Attempts(ABC):
         """Runs Levenberg-Marquardt on all data from the nominal point: in the metric of the
         parameters' sizes (0), and in Marquardt's (1)."""
         method = (LevenbergMarquardtMethod(1.0, sizes=1.0), LevenbergMarquardtMethod(1e-3))[k]
-        x = np.repeat(self.problem.x0[None], len(rows), axis=0)
+        x = repeated(self.problem.x0, len(rows))
         return self.minimize(rows, method, x, max(_LONG, self.limits.max_iterations))
 
     def minimize(
@@ -222,7 +222,7 @@ class Stages(Attempts):
         objective = self.whole(rows)
         cost = []
         for point in points:
-            x = np.repeat(point[None], len(rows), axis=0)
+            x = repeated(point, len(rows))
             cost.append(squared(objective.residual(x)))
         self.charge(rows, objective.model.tally)
         return _finite(np.stack(cost, axis=1))
@@ -371,7 +371,7 @@ class Windows(Attempts):
 
     def _best(self, rows: Rows, owner: Rows, found: Minima) -> Minima:
         """Returns each trial's best candidate; a trial that has none left has not arrived."""
-        x0 = np.repeat(self.problem.x0[None], len(rows), axis=0)
+        x0 = repeated(self.problem.x0, len(rows))
         result = Minima.nowhere(x0, self.limits.history)
         # By trial; those that converged first, and the lowest first among these.
         order = np.lexsort((_finite(found.chi_square), ~found.converged, owner))

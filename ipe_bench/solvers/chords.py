@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ipe_bench.basics.batches import put, take
-from ipe_bench.basics.linalg import Array, Mask, finite, multiply, squared
+from ipe_bench.basics.linalg import Array, Mask, finite, from_root, multiply, repeated, squared
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.driver import (
     ConvergenceCheck,
@@ -99,7 +99,7 @@ class OnChord:
         gone = np.linalg.norm(multiply(self.slope.U, self.x - self.start), axis=1)
         # J' r is 0 for the J of the start: for the turned one it is dJ' r, a step of P dJ' r.
         J_turned = multiply(self.turn.swapaxes(1, 2), self.r) * gone[:, None]
-        P = np.matmul(inverse_U, inverse_U.swapaxes(1, 2))
+        P = from_root(inverse_U)
         deviation = np.sqrt(np.sum(inverse_U**2, axis=2))
         by_turn = np.abs(multiply(P, J_turned) / deviation).max(axis=1)
         return np.fmax(self.bend, by_turn)
@@ -167,7 +167,7 @@ def by_chords(
     point, and where fixed-point iteration contracts well there, eq. (18). Trials that do not arrive
     have not converged."""
     trials = len(objective.rows)
-    x0 = np.repeat(objective.x0[None], trials, axis=0)
+    x0 = repeated(objective.x0, trials)
     minima = Minima.nowhere(x0, history)
     contracts = np.zeros(trials, dtype=bool)
     white = objective.R.whiten_jacobian(H[None])

@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 from annotated_types import Gt, Lt
 
-from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.linalg import Array, finite
 from ipe_bench.estimators.ipe import IPE, State, System
 
 _HALVINGS = 30
@@ -43,7 +43,7 @@ class DampedNewton(IPE):
         F = system.F(state.x + direction)
         # A singular trial has no direction to search along: its NaN goes back to the driver at
         # once.
-        searching = np.isfinite(direction).all(axis=1)
+        searching = finite(direction)
         for _ in range(_HALVINGS):
             searching &= ~(_norm(F) <= (1 - self.decrease * t) * size)
             if not searching.any():

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.linalg import Array, finite
+from ipe_bench.basics.linalg import Array, finite, from_root
 from ipe_bench.basics.options import Count, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator
@@ -164,5 +164,5 @@ def _bound(system: FrozenSystem, state: Round) -> Array:
     if len(lost):
         J = system.model.reporting().jacobian(state.x[lost], lost)
         inverse_U = inverse_factor(system.R.whiten_jacobian(J))
-        P[lost] = np.matmul(inverse_U, inverse_U.swapaxes(1, 2))
+        P[lost] = from_root(inverse_U)
     return P

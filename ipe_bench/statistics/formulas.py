@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 from scipy.special import betaincinv, gammaincinv, ndtri
 
-from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.linalg import Array, finite
 from ipe_bench.statistics.calibration import overall_words
 from ipe_bench.statistics.intervals import (
     LEVEL,
@@ -376,19 +376,14 @@ def predicted(s: Sample) -> tuple[Array, Array]:
     if s.group.footer["identity"]["scenario"].get("truth") is not None:
         wrong = s.of_truth("pseudo_bias")
         scatter = s.of_truth("misspecified")
-        used = s.solved & _finite(wrong) & _finite(scatter)
+        used = s.solved & finite(wrong) & finite(scatter)
         return mean(wrong, used), np.sqrt(mean(wrong**2 + scatter**2, used))
     box = s.of_truth("box_bias")
-    known = _finite(box)
+    known = finite(box)
     variance = mean(s.of_truth("crlb") ** 2, s.solved)
     squared_bias = mean(box**2, known)
     total = variance + np.where(np.isnan(squared_bias), 0.0, squared_bias)
     return mean(box, known), np.sqrt(total)
-
-
-def _finite(values: Array) -> Array:
-    """Returns which trials have finite numbers (trials, n) alone."""
-    return np.asarray(np.isfinite(values).all(axis=1))
 
 
 def median_of_truth(s: Sample, name: str) -> float:
@@ -536,4 +531,4 @@ def constants(s: Sample) -> Array:
     histories = s.histories if _uses(s, "Newton") else ()
     found = [(observed_constant(h.iterates), h.M) for h in histories]
     pairs = np.array(found).reshape(-1, 2)
-    return pairs[np.isfinite(pairs).all(axis=1)]
+    return pairs[finite(pairs)]

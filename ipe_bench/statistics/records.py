@@ -15,6 +15,7 @@ import numpy as np
 import ipe_bench.statistics.formulas as f
 import ipe_bench.statistics.intervals as intervals
 import ipe_bench.statistics.path_columns as t
+from ipe_bench.basics.linalg import finite
 from ipe_bench.statistics.intervals import clopper_pearson, quantile, share_sequence
 from ipe_bench.statistics.sample import CLOSE, NIS, Sample, iterations_to_limit, orders_of
 from ipe_bench.statistics.statistic import Statistic
@@ -366,9 +367,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "reported",
         "Root mean square of the standard deviation that the estimator itself reports: eq. (5) for"
         " the linear LSE, the sandwich (H⁺J)⁻¹ H⁺RH⁺' (H⁺J)⁻ᵀ at the estimate for the frozen root.",
-        f.of_each(
-            lambda s: f.rms_columns(s.deviation, s.solved & np.isfinite(s.deviation).all(axis=1))
-        ),
+        f.of_each(lambda s: f.rms_columns(s.deviation, s.solved & finite(s.deviation))),
         kind="physical",
         where=("covariances",),
     ),

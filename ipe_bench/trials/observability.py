@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.linalg import Array, Covariance, deviations, multiply
+from ipe_bench.basics.linalg import Array, Covariance, correlations, deviations, gram, multiply
 from ipe_bench.measurements.base import Measurement, Parameter
 from ipe_bench.trials.thresholds import FIT_LEVEL
 
@@ -69,7 +69,7 @@ class Observability:
         least = np.finfo(float).eps * self.singular_values[:, :1]
         s = np.maximum(self.singular_values, least)
         scaled = self.right / s[:, :, None]
-        return np.matmul(scaled.swapaxes(1, 2), scaled)
+        return gram(scaled)
 
     @cached_property
     def bound(self) -> Array:
@@ -83,9 +83,7 @@ class Observability:
     @cached_property
     def correlation(self) -> Array:
         """Correlation of the errors of efficient estimates (n, n), over the truths."""
-        P = self.covariance.mean(axis=0)
-        d = deviations(P)
-        return P / np.outer(d, d)
+        return correlations(self.covariance.mean(axis=0))
 
     @cached_property
     def multiple_correlation(self) -> Array:
@@ -266,7 +264,7 @@ def _noticed(left: Array, degrees: int) -> float:
 
     rng = np.random.Generator(np.random.Philox(0))
     drawn = rng.standard_normal((_DRAWS, left.shape[2]))
-    inner = np.matmul(left.swapaxes(1, 2), left)
+    inner = gram(left)
     squares = np.stack([np.einsum("dk,dk->d", drawn, multiply(one, drawn)) for one in inner])
     limit = chdtri(degrees, FIT_LEVEL)
     return float(np.mean(1 - chndtr(limit, degrees, squares)))

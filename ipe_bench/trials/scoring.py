@@ -16,9 +16,11 @@ import numpy as np
 from ipe_bench.basics.linalg import (
     Array,
     Covariance,
+    correlations,
     definite_factor,
     deviations,
     finite,
+    gram,
     inverse,
     multiply,
     quadratic_form,
@@ -327,7 +329,7 @@ class Block:
 def _squared(rows: Array) -> Array:
     """Computes A' A (trials, n, n) of rows A (trials, k, n)."""
     with np.errstate(all="ignore"):
-        return np.matmul(rows.swapaxes(1, 2), rows)
+        return gram(rows)
 
 
 def _below(rows: Array, prior: Covariance) -> Array:
@@ -345,9 +347,8 @@ def nees(error: Array, P: Array) -> Array:
     """
     with np.errstate(all="ignore"):
         # Scaled by the deviations first: parameters' units must not decide what is singular.
-        deviation = deviations(P)
-        e = error / deviation
-        C = P / (deviation[:, :, None] * deviation[:, None, :])
+        e = error / deviations(P)
+        C = correlations(P)
         usable = finite(e) & finite(C)
         e = np.where(usable[:, None], e, 0.0)
         C = np.where(usable[:, None, None], C, np.eye(error.shape[1]))

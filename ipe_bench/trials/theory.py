@@ -12,11 +12,14 @@ from ipe_bench.basics.batches import put
 from ipe_bench.basics.linalg import (
     Array,
     Covariance,
+    correlations,
     definite_factor,
     deviations,
     finite,
+    gram,
     inverse,
     multiply,
+    repeated,
     solve,
 )
 from ipe_bench.estimators.ipe import frozen_covariance
@@ -38,9 +41,7 @@ def linear_bound(problem: Problem) -> Array:
 
 def linear_correlation(problem: Problem) -> Array:
     """Computes the correlation (n, n) of the covariance of eq. (5)."""
-    P = frozen_covariance(problem.H_plus[None], problem.R)[0]
-    d = linear_bound(problem)
-    return P / np.outer(d, d)
+    return correlations(frozen_covariance(problem.H_plus[None], problem.R))[0]
 
 
 def informative_rows(noise: Noise, R: Covariance, J: Array, h: Array) -> Array:
@@ -52,7 +53,7 @@ def informative_rows(noise: Noise, R: Covariance, J: Array, h: Array) -> Array:
     if known is None:
         return R.whiten_jacobian(J)
     levels, theta = known
-    of_each = np.repeat(theta[None], len(h), axis=0)
+    of_each = repeated(theta, len(h))
     log, by_h, by_theta = levels.at(h, of_each)
     # The logarithm of a deviation varies with the parameters as the reading h does.
     varying = by_h[:, :, None] * J
@@ -133,7 +134,7 @@ def box_bias(J: Array, second: Array, R: Covariance) -> Array:
     1971, eq. 2.5).
     """
     Jw = R.whiten_jacobian(J)
-    inner = np.matmul(Jw.swapaxes(1, 2), Jw)
+    inner = gram(Jw)
     identity = np.broadcast_to(np.eye(J.shape[2]), inner.shape)
     P, _ = solve(inner, identity)
     t = R.whiten(np.einsum("tmij,tij->tm", second, P))
@@ -189,7 +190,7 @@ def misspecified(problem: Problem, h: Array, x: Array, root: Array) -> tuple[Arr
     less (Khatib et al., arXiv 2605.20739). Estimates scatter with A^-1 B A^-1, B = J' R^-1 J and A
     = B - sum_i (R^-1 r)_i d2h_i with the residuals r that remain at the minimum.
     """
-    found = np.isfinite(root).all(axis=1)
+    found = finite(root)
     deviation = np.full(x.shape, np.nan)
     if found.any():
         deviation[found] = _scatter(problem, h[found], root[found])
@@ -202,7 +203,7 @@ def _scatter(problem: Problem, h: Array, root: Array) -> Array:
     R = problem.R
     Jw = R.whiten_jacobian(model.jacobian(root))
     r = R.whiten(h - model.near(model.simulate(root), h))
-    B = np.matmul(Jw.swapaxes(1, 2), Jw)
+    B = gram(Jw)
     columns = [np.einsum("tmi,tm->ti", R.whiten_jacobian(one), r) for one in _bends(model, root)]
     bent = np.stack(columns, axis=2)
     inverted, _ = inverse(B - (bent + bent.swapaxes(1, 2)) / 2)

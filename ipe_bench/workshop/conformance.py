@@ -17,7 +17,7 @@ import numpy as np
 
 from ipe_bench.baselines.sequential import Sequential
 from ipe_bench.basics.errors import UserError, describe_exception, place_of
-from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.linalg import Array, deviations, finite
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator, estimate_safely
 from ipe_bench.estimators.ipe import IPE, State, begin
@@ -231,7 +231,7 @@ def finds_the_parameters(estimator: Estimator) -> None:
     P = estimates.covariance
     if P is not None:
         _shaped("covariance", P, (SCATTERED, n, n), "(trials, n, n)")
-        known = np.isfinite(P).all(axis=(1, 2))
+        known = finite(P)
         known &= estimates.status == Status.CONVERGED
         if known.sum() >= SCATTERED // 2:
             _agrees("the reported variances are", nees(error, P)[known], n)
@@ -240,7 +240,7 @@ def finds_the_parameters(estimator: Estimator) -> None:
 def _bound(problem: Problem) -> Array:
     """Computes the standard deviations (n,) of the linear bound (H' R^-1 H)^-1."""
     H = problem.R.whiten_jacobian(problem.H)
-    return np.sqrt(np.diag(np.linalg.inv(H.T @ H)))
+    return deviations(np.linalg.inv(H.T @ H))
 
 
 def _agrees(what: str, squared: Array, n: int) -> None:
@@ -358,7 +358,7 @@ def accounts_for_itself(estimator: Estimator) -> None:
         return
     trials, n = estimates.x.shape
     if np.shape(P) == (trials, n, n):
-        P = P[np.isfinite(P).all(axis=(1, 2))]
+        P = P[finite(P)]
         assert np.allclose(P, P.swapaxes(1, 2), rtol=1e-6), "a covariance is not symmetric"
         assert (np.diagonal(P, axis1=1, axis2=2) > 0).all(), "a variance is not positive"
 

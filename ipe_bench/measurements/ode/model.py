@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.linalg import Array, Mask, own
+from ipe_bench.basics.linalg import Array, Mask, finite, own
 from ipe_bench.engine import compiled, ladder
 from ipe_bench.engine.integrator import Kernel, compiled_rates
 from ipe_bench.engine.plan import DOP853, RK4, Equations, Recording, Variation, jumps
@@ -480,7 +480,7 @@ class OdeMeasurement(Measurement):
         top = len(self._rungs) - 1
         if self._rate_function is None:
             usual = min(self._nominal_place, top - 1)
-            return np.where(np.isfinite(x).all(axis=1), usual, top)
+            return np.where(finite(x), usual, top)
         turned = self._rates(x) * self._longest
         wanted = np.nan_to_num(turned / _ANGLE_AT_START, nan=np.inf)
         return np.clip(np.searchsorted(self._rungs, wanted), 1, top)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri, stdtr, stdtrit
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.linalg import Array, finite
 from ipe_bench.statistics.comparisons import ALPHA, holm
 from ipe_bench.statistics.intervals import rms_interval
 from ipe_bench.trials.observability import in_words
@@ -459,7 +459,7 @@ def read_claims(table: Path | str | pd.DataFrame) -> Claims:
         (_error(frame, parameter, name), _deviation(frame, parameter, name)) for parameter in names
     ]
     error, deviation = np.array(stated).transpose(1, 2, 0)
-    there = ~np.isnan(error).any(axis=1) & np.isfinite(deviation).all(axis=1)
+    there = ~np.isnan(error).any(axis=1) & finite(deviation)
     _require_deviations(deviation, there, names, name)
     correlation = _correlation(frame, names, deviation, name)
     rows = np.flatnonzero(there)
@@ -505,7 +505,7 @@ def _require_deviations(
 
 def _require_positive(correlation: Array, rows: NDArray[np.intp], name: str) -> None:
     """Refuses correlations (rows, n, n), of those rows of the table, that are none."""
-    good = np.array(np.isfinite(correlation).all(axis=(1, 2)))
+    good = finite(correlation)
     good[good] = np.linalg.eigvalsh(correlation[good])[:, 0] > 1e-12
     if not good.all():
         row = rows[np.argmin(good)]

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError, unknown
-from ipe_bench.basics.linalg import Array, Covariance, Mask
+from ipe_bench.basics.linalg import Array, Covariance, Mask, gram
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.trials.observability import TRUTHS, Observability, Suspect, suspects
 from ipe_bench.trials.scenario import Scenario
@@ -183,8 +183,8 @@ def design(
     bounds = np.sqrt(variances)[:, None, :]
     slopes = R_all.whiten_jacobian(candidates.jacobian(x)) * bounds
     own = R.whiten_jacobian(model.jacobian(x)) * bounds
-    judge = _Judge(criterion, _information(slopes))
-    value = judge.value(_information(own))
+    judge = _Judge(criterion, gram(slopes))
+    value = judge.value(gram(own))
     if np.isfinite(value):
         judge = replace(judge, today=value)
     units = [_units(model, candidates, chosen, slopes) for chosen in columns]
@@ -230,11 +230,6 @@ def _refuse_few(readings: int, columns: Sequence[tuple[str, ...]]) -> NoReturn:
         f"readings={readings}: choices {titles} of so few do not determine all parameters, or there"
         f" are fewer than {_FEW} to choose among; give more readings, or choose by other columns"
     )
-
-
-def _information(slopes: Array) -> Array:
-    """Computes the information A' A (truths, n, n) of whitened slopes (truths, m, n)."""
-    return np.matmul(slopes.swapaxes(1, 2), slopes)
 
 
 def _further(scenario: Scenario, today: Observability, x: Array) -> Further | None:

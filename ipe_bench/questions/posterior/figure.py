@@ -17,7 +17,7 @@ from ipe_bench.report.style import BOUND_COLOR
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from ipe_bench.basics.linalg import Array
+    from ipe_bench.basics.linalg import Array, deviations
     from ipe_bench.estimators.base import Estimates
     from ipe_bench.measurements.base import Measurement
     from ipe_bench.questions.posterior.maths import Posterior, Reference
@@ -66,7 +66,7 @@ def _claimed(estimates: Estimates) -> _Gaussian:
     x = estimates.x[0]
     if estimates.covariance is None:
         return _Gaussian(x, np.full(len(x), np.nan))
-    return _Gaussian(x, np.sqrt(np.diag(estimates.covariance[0])))
+    return _Gaussian(x, deviations(estimates.covariance[0]))
 
 
 def _worst(posterior: Posterior, claims: Iterable[_Gaussian]) -> Array:

@@ -17,7 +17,16 @@ from functools import cached_property
 import numpy as np
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.linalg import Array, Covariance, deviations, information, inverse, multiply
+from ipe_bench.basics.linalg import (
+    Array,
+    Covariance,
+    correlations,
+    deviations,
+    finite,
+    information,
+    inverse,
+    multiply,
+)
 from ipe_bench.estimators.base import Estimates, Estimator, estimate_safely
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.trials.roots import least_squares_root
@@ -87,7 +96,7 @@ class Posterior:
 
     @cached_property
     def deviation(self) -> Array:
-        return np.sqrt(np.diag(self.covariance))
+        return deviations(self.covariance)
 
     @property
     def settled(self) -> bool:
@@ -216,7 +225,7 @@ def _modes(problem: Problem, z: Array, x: Array) -> tuple[Array, Array]:
     readings = np.tile(z, (len(starts), 1))
     with np.errstate(all="ignore"):
         ends = least_squares_root(problem, readings, starts, prior=1.0)
-    ends = ends[np.isfinite(ends).all(axis=1)]
+    ends = ends[finite(ends)]
     if not len(ends):
         return np.empty((0, x.shape[1])), np.empty(0)
     P = inverse(_tempered(problem, ends, 1.0))[0]
@@ -339,13 +348,12 @@ class _Population:
         some = self.rng.choice(len(self.x), min(_POOL, len(self.x)), replace=False)
         with np.errstate(all="ignore"):
             P = inverse(_tempered(self.problem, self.x[some], self.beta))[0]
-        P = P[np.isfinite(P).all(axis=(1, 2))]
+        P = P[finite(P)]
         if not len(P):
             return np.diag(_prior(self.problem).deviations)[None]
         D = deviations(P)
         # By eigenvalues, since round-off may leave a correlation a shade beyond 1.
-        correlation = P / (D[:, :, None] * D[:, None, :])
-        values, axes = np.linalg.eigh(correlation)
+        values, axes = np.linalg.eigh(correlations(P))
         roots = np.sqrt(np.maximum(values, 0.0))
         return D[:, :, None] * axes * roots[:, None, :]
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
-from ipe_bench.basics.linalg import Array, nearest
+from ipe_bench.basics.linalg import Array, deviations, nearest
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.style import BOUND_COLOR, Look, looks
@@ -95,7 +95,7 @@ def _predicted(filters: Sequence[Sequence[LogTracks]]) -> list[int]:
 def directly_read(model: StateModel) -> dict[int, int]:
     """Returns which reading of an epoch is a state itself, as the places of readings and of their
     states."""
-    spread = np.sqrt(np.diagonal(model.prior.covariance))
+    spread = deviations(model.prior.covariance)
     factors = np.array([[0.3], [-1.1], [0.7]])
     # Different numbers in every state, so that none is read by chance.
     x = model.prior.mean + spread * factors + np.arange(model.n) / 7
