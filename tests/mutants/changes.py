@@ -800,8 +800,8 @@ CHANGES = {
     "figures-drawn": Change(
         "cli",
         "estimate draws figures though none were asked for",
-        'figures=asked.spec.figures != "none"',
-        "figures=True",
+        'drawn = asked.spec.figures != "none"',
+        "drawn = True",
         "test_estimate.py",
     ),
     "interrupt-is-failure": Change(
