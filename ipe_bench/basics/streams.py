@@ -10,6 +10,11 @@ import numpy as np
 from ipe_bench.basics.linalg import Array
 
 
+def generator(seed: int | np.random.SeedSequence) -> np.random.Generator:
+    """Makes the generator of a seed."""
+    return np.random.Generator(np.random.Philox(seed))
+
+
 def own_generators(seed: int, z: Array) -> list[np.random.Generator]:
     """Makes a generator for each trial of z (trials, m), which depends on `seed` and on these
     readings alone."""
@@ -17,9 +22,7 @@ def own_generators(seed: int, z: Array) -> list[np.random.Generator]:
         hashlib.sha256(np.ascontiguousarray(row, dtype=float).tobytes()).digest() for row in z
     ]
     entropy = [[seed, *np.frombuffer(digest, dtype=np.uint32).tolist()] for digest in digests]
-    return [
-        np.random.Generator(np.random.Philox(np.random.SeedSequence(words))) for words in entropy
-    ]
+    return [generator(np.random.SeedSequence(words)) for words in entropy]
 
 
 def normals(generators: Sequence[np.random.Generator], *shape: int) -> Array:
@@ -31,6 +34,4 @@ def numbered(seed: int, start: int, stop: int, child: int) -> Iterator[np.random
     """Makes a generator for each of the trials start to stop; a trial has as many streams as there
     are children."""
     for trial in range(start, stop):
-        yield np.random.Generator(
-            np.random.Philox(np.random.SeedSequence(seed, spawn_key=(trial, child)))
-        )
+        yield generator(np.random.SeedSequence(seed, spawn_key=(trial, child)))

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.cli import print_problems, say, show
-from ipe_bench.measurements.base import Measurement
+from ipe_bench.measurements.base import Measurement, labels
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.construct import construct, described
 from ipe_bench.report.tables.table import Table, words
@@ -105,7 +105,7 @@ def _describe(option: plugins.Option) -> None:
 
 def _describe_measurement(option: plugins.Option) -> None:
     """Describes the parameters of a measurement model, and the file of readings that it takes."""
-    from ipe_bench.real.readings import header, labels
+    from ipe_bench.real.readings import header
 
     try:
         if "???" in option.config.values():

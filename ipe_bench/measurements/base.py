@@ -40,6 +40,11 @@ class Parameter:
     """Parameters of one group share a panel in figures; empty: the name is the group."""
 
 
+def with_unit(name: str, unit: str) -> str:
+    """Heads numbers with their name, and with their unit if they have one."""
+    return f"{name} [{unit}]" if unit else name
+
+
 def parameter_table(*groups: tuple[Iterable[str], str, float, str]) -> tuple[Parameter, ...]:
     """Builds the parameters of several groups, each of which is names, unit, size and the group's
     name."""
@@ -223,6 +228,14 @@ class Measurement(Component, ABC):
         its readings, in the order of the file, which is that of z from then on."""
         raise NotImplementedError(f"{self.name} takes only readings from a file")
 
+    def along(self, heading: str, entries: Sequence[float]) -> Measurement:
+        """Returns this model with readings at these entries of one of its inputs, the others being
+        as in its first reading."""
+        columns = labels(self)
+        count = len(entries)
+        others = {one.heading: [columns[one.heading][0]] * count for one in self.inputs}
+        return self.with_inputs(others | {heading: entries}, count)
+
     @property
     def n(self) -> int:
         return len(self.parameters)
@@ -305,6 +318,11 @@ class Measurement(Component, ABC):
         """Computes dh/dx in `rows(stop)` alone, good enough for fits that start another, `|I - J~+
         J|` below 0.1."""
         return self.coarse_jacobian(x)[:, self.rows(stop)]
+
+
+def labels(model: Measurement) -> Mapping[str, Sequence[Any]]:
+    """Returns the entries of every column of a readings file but that of the readings."""
+    return {**model.index, **model.input_columns}
 
 
 def single_epochs(model: Measurement) -> Epochs:

@@ -11,16 +11,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from ipe_bench.measurements.base import Parameter
-
 
 FARTHEST = 4.5
 """Standard deviations about the middle that a distribution is drawn to."""
-
-
-def with_unit(parameter: Parameter) -> str:
-    """Names a parameter and its unit, if it has one."""
-    return f"{parameter.name} [{parameter.unit}]" if parameter.unit else parameter.name
 
 
 def labelled_rows(labels: Sequence[str], panels: int) -> tuple[Figure, list[Axes]]:

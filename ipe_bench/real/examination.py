@@ -12,6 +12,7 @@ import numpy as np
 
 from ipe_bench.basics.linalg import Array, Mask, deviations, finite, repeated
 from ipe_bench.basics.statuses import Status
+from ipe_bench.basics.streams import generator
 from ipe_bench.estimators.least_squares import inverse_factor
 from ipe_bench.measurements.base import Measurement, Parameter
 from ipe_bench.measurements.problem import Problem
@@ -263,7 +264,7 @@ class Examination:
     def _drawn_noise(self, draws: int) -> Array:
         """Draws noise (draws, m) of R, with a level of its own in each set if the level is
         estimated."""
-        rng = np.random.Generator(np.random.Philox(0))
+        rng = generator(0)
         e = rng.standard_normal((draws, len(self.z)))
         if isinstance(self.freedom, int):
             # f s^2 / sigma^2 is chi-square of f degrees of freedom.
@@ -307,7 +308,7 @@ class Examination:
         n = len(self.inner)
         spread = np.ones(n) if problem.prior_deviation is None else problem.prior_deviation
         reach = np.repeat(_SPREADS, self._affordable(STARTS) // len(_SPREADS))[:, None]
-        normal = np.random.Generator(np.random.Philox(1)).standard_normal((len(reach), n))
+        normal = generator(1).standard_normal((len(reach), n))
         drawn = problem.x0 + reach * spread * normal
         return np.concatenate([self.inner[None], drawn])
 

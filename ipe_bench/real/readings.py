@@ -24,7 +24,7 @@ import numpy as np
 from ipe_bench.basics.errors import UserError, did_you_mean, unknown
 from ipe_bench.basics.files import write_text
 from ipe_bench.basics.linalg import Array
-from ipe_bench.measurements.base import Input, Measurement
+from ipe_bench.measurements.base import Input, Measurement, labels, with_unit
 from ipe_bench.measurements.joint import Joint
 from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo, informed
 
@@ -265,15 +265,9 @@ def _with_text(table: TextTable, data: bytes) -> TextTable:
 # Files of a model ---------------------------------------------------------------------------------
 
 
-def labels(model: Measurement) -> Mapping[str, Sequence[Any]]:
-    """Returns the entries of every column but that of the readings."""
-    return {**model.index, **model.input_columns}
-
-
 def header(model: Measurement) -> list[str]:
     """Returns the columns of a readings file of this model."""
-    unit = f" [{model.reading_unit}]" if model.reading_unit else ""
-    return [*labels(model), f"reading{unit}"]
+    return [*labels(model), with_unit("reading", model.reading_unit)]
 
 
 def write_readings(path: Path, model: Measurement, z: Array) -> None:
@@ -467,8 +461,8 @@ def _label(text: str, number: Callable[[str], float | None] = _number) -> Any:
 
 def _shown_as(model: Measurement) -> list[str]:
     """Returns the names that the column of the readings may have."""
-    unit = f" [{model.reading_unit}]" if model.reading_unit else ""
-    return [f"{name}{unit}" for name in dict.fromkeys((model.reading_name, "reading"))]
+    names = dict.fromkeys((model.reading_name, "reading"))
+    return [with_unit(name, model.reading_unit) for name in names]
 
 
 def _reading_column(table: TextTable, model: Measurement) -> str:

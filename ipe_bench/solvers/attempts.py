@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import put, take
 from ipe_bench.basics.linalg import Array, Covariance, repeated, squared
+from ipe_bench.basics.streams import generator
 from ipe_bench.estimators.driver import Limits, continued
 from ipe_bench.estimators.ipe import starting_points
 from ipe_bench.estimators.least_squares import Objective
@@ -190,7 +191,7 @@ class Stages(Attempts):
         nominal point."""
         x0 = self.problem.x0
         shape = (_LOOKS, len(x0))
-        rng = np.random.Generator(np.random.Philox(k))
+        rng = generator(k)
         if self.prior is not None:
             return x0 + self.prior * rng.standard_normal(shape)
         if wide:
@@ -364,7 +365,7 @@ class Windows(Attempts):
             spread = np.maximum(1.0, np.where(np.isfinite(distance), distance, 1.0))
         draws = np.zeros((1, n))
         if k > 1:
-            rng = np.random.Generator(np.random.Philox(k))
+            rng = generator(k)
             draws = rng.standard_normal((_draws(k), n))
         of_each = np.broadcast_to(spread, (len(rows), n))[:, None]
         return (x0 + of_each * draws).reshape(-1, n)

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.special import betaincinv, betaln, chdtri, ndtri
 
 from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.streams import generator
 from ipe_bench.statistics.verdicts import (
     CONSISTENT,
     NO_VERDICT,
@@ -153,7 +154,7 @@ def _log_ratio(draws: Array, sums: Array, counts: Array) -> tuple[Array, Array]:
 @lru_cache(maxsize=4)
 def _draws(size: int) -> Array:
     """Draws how often each of `size` items occurs in each resample: (RESAMPLES, size)."""
-    rng = np.random.Generator(np.random.Philox(size))
+    rng = generator(size)
     alike = np.full(size, 1 / size)
     return rng.multinomial(size, alike, size=RESAMPLES).astype(float)
 

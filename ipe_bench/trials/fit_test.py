@@ -22,6 +22,7 @@ import numpy as np
 
 from ipe_bench.basics.definitions import definition_digest
 from ipe_bench.basics.linalg import Array, Covariance, finite, information
+from ipe_bench.basics.streams import generator
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise.base import Noise
@@ -148,7 +149,7 @@ def _reference(noise: Noise, definition: str, m: int, basis: bytes) -> Array | N
     """Simulates ascending sums of squares of least-squares residuals of whitened noise by this
     definition; None where it is normal."""
     Q = np.frombuffer(basis).reshape(m, -1)
-    rng = np.random.Generator(np.random.Philox(0))
+    rng = generator(0)
     sums = []
     for _ in range(0, DRAWS, _AT_ONCE):
         w = noise.whitened((_AT_ONCE, m), rng)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance, correlations, deviations, gram, multiply
+from ipe_bench.basics.streams import generator
 from ipe_bench.measurements.base import Measurement, Parameter
 from ipe_bench.trials.thresholds import FIT_LEVEL
 
@@ -262,7 +263,7 @@ def _noticed(left: Array, degrees: int) -> float:
     m, k)."""
     from scipy.special import chdtri, chndtr
 
-    rng = np.random.Generator(np.random.Philox(0))
+    rng = generator(0)
     drawn = rng.standard_normal((_DRAWS, left.shape[2]))
     inner = gram(left)
     squares = np.stack([np.einsum("dk,dk->d", drawn, multiply(one, drawn)) for one in inner])

@@ -19,7 +19,7 @@ from ipe_bench.engine.integrator import Kernel, compiled_rates
 from ipe_bench.engine.plan import DOP853, RK4, Equations, Recording, Variation, jumps
 from ipe_bench.engine.rodas import MOST_STEPS, SHAPE, STABLE, Effort, Rodas5P, Stepped
 from ipe_bench.engine.trace import Graph, Program
-from ipe_bench.measurements.base import Measurement
+from ipe_bench.measurements.base import Measurement, with_unit
 
 _IN_HAND = 0.3
 """Error of a step of the implicit method, as a share of the tolerance."""
@@ -150,7 +150,7 @@ class OdeMeasurement(Measurement):
         case, time, output = (places.ravel() for places in np.indices(shape))
         return {
             "case": (case + 1).tolist(),
-            time_heading(self.time_unit): self.times[time].tolist(),
+            with_unit("time", self.time_unit): self.times[time].tolist(),
             "output": [self.outputs[i] for i in output],
         }
 
@@ -662,8 +662,3 @@ class OdeMeasurement(Measurement):
             remedy += ", and write comparisons of t where floor or mod is taken of it"
             raise UserError(f"measurement={self.name}: {what}; {remedy}")
         return equations
-
-
-def time_heading(unit: str) -> str:
-    """Returns the heading of the times in a file."""
-    return f"time [{unit}]" if unit else "time"

@@ -12,6 +12,7 @@ from scipy.special import bdtr, betaln, ndtri
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.streams import generator
 from ipe_bench.statistics.calibration import least_count
 from ipe_bench.statistics.comparisons import ALPHA, differences, mcnemar
 from ipe_bench.statistics.intervals import RARE, clopper_pearson, first_that, grouped
@@ -229,7 +230,7 @@ def _unseen(first: Array, second: Array, alpha: float) -> float:
 @lru_cache(maxsize=2)
 def _signs(size: int) -> Array:
     """Draws signs (FLIPS, size) of 1 and -1, the same for all comparisons."""
-    rng = np.random.Generator(np.random.Philox(size))
+    rng = generator(size)
     return rng.integers(0, 2, (FLIPS, size)) * 2.0 - 1
 
 

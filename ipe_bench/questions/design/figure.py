@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ipe_bench.questions.panels import labelled_rows, with_unit
+from ipe_bench.measurements.base import labels, with_unit
+from ipe_bench.questions.panels import labelled_rows
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.style import BOUND_COLOR, BOUND_DASH, COLORS, FAMILIES
@@ -39,8 +40,7 @@ def draw_further(model: Measurement, further: Further) -> Drawing:
         ax.set_xlabel(common.text(further.column))
         at = further.entries[further.taken[0]]
         ax.axvline(at, color=BOUND_COLOR, linestyle=BOUND_DASH, linewidth=1.0, label="next")
-        columns = {**model.index, **model.input_columns}
-        given = np.asarray(columns[further.column], dtype=float)
+        given = np.asarray(labels(model)[further.column], dtype=float)
         style: Any = {"linestyle": "none", "color": BOUND_COLOR, "clip_on": False}
         ax.plot(given, np.ones(len(given)), marker="|", label="today's readings", **style)
     for ax in axes:
@@ -59,7 +59,7 @@ def draw_further(model: Measurement, further: Further) -> Drawing:
 def draw_bounds(now: Observability, after: Observability | None, choice: str) -> Iterator[Drawing]:
     """Draws the bound of each parameter in its unit, today and after a `choice` of readings."""
     sizes = np.array([p.size for p in now.parameters])
-    fig, (ax,) = labelled_rows([with_unit(p) for p in now.parameters], 1)
+    fig, (ax,) = labelled_rows([with_unit(p.name, p.unit) for p in now.parameters], 1)
     y = np.arange(len(now.parameters))
     known = np.isfinite(now.bound)
     today = sizes * now.bound

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array, Covariance, Mask, gram
-from ipe_bench.measurements.base import Measurement
+from ipe_bench.measurements.base import Measurement, labels
+from ipe_bench.report.words import value_text
 from ipe_bench.trials.observability import TRUTHS, Observability, Suspect, suspects
 from ipe_bench.trials.scenario import Scenario
 
@@ -276,7 +277,7 @@ def _candidates(model: Measurement) -> tuple[Measurement, str, list[str]]:
     """Returns a model of readings that may be taken beside today's, the one column that tells them
     apart, if it is a number, and words for each: inputs over several times their range, else those
     that the model offers."""
-    columns = {**model.index, **model.input_columns}
+    columns = labels(model)
     headings = [one.heading for one in model.inputs]
     varying = [name for name in headings if len(set(columns.get(name, ()))) > 1]
     if len(varying) == 1 and columns.keys() >= {*headings}:
@@ -285,9 +286,7 @@ def _candidates(model: Measurement) -> tuple[Measurement, str, list[str]]:
         if np.issubdtype(given.dtype, np.number):
             far = given.min() + _REACH * np.ptp(given)
             grid = [float(f"{at:.2g}") for at in np.linspace(given.min(), far, _GRID)]
-            inputs = {key: [columns[key][0]] * _GRID for key in headings}
-            inputs[name] = grid
-            return model.with_inputs(inputs, _GRID), name, [f"{name} = {at:.4g}" for at in grid]
+            return model.along(name, grid), name, [f"{name} = {at:.4g}" for at in grid]
     offered = model.candidates
     if offered.m == model.m:
         return model, "", []
@@ -422,5 +421,5 @@ def _choice(judge: _Judge, units: Units, taken: Mask) -> Choice:
 def entry_in_words(model: Measurement, column: str, entry: Any) -> str:
     """Words an entry of the index by what it stands for, if the model has words for it."""
     words = model.entry_words.get(column, {})
-    shown = f"{entry:g}" if isinstance(entry, float) else str(entry)
+    shown = value_text(entry)
     return f"{shown} ({words[entry]})" if entry in words else shown

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ipe_bench.questions.panels import FARTHEST, with_unit
+from ipe_bench.measurements.base import with_unit
+from ipe_bench.questions.panels import FARTHEST
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.views import looks_of
@@ -51,7 +52,7 @@ def draw_marginals(model: Measurement, found: Sequence[Reference]) -> Iterator[D
         ax.axvline(p.size * one.truth[i], color=BOUND_COLOR, linestyle=":", label="truth")
         ax.set_xlim(low, high)
         ax.set_yticks([])
-        common.title(ax, with_unit(p))
+        common.title(ax, with_unit(p.name, p.unit))
         common.full_ticks(ax)
     common.legend(fig, axes, {label: replace(each, marker="") for label, each in look.items()})
     caption = (

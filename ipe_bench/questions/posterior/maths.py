@@ -27,6 +27,7 @@ from ipe_bench.basics.linalg import (
     inverse,
     multiply,
 )
+from ipe_bench.basics.streams import generator
 from ipe_bench.estimators.base import Estimates, Estimator, estimate_safely
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.trials.roots import least_squares_root
@@ -183,8 +184,7 @@ def sample_posterior(
     """
     require_particles(problem, particles)
     seeds = np.random.SeedSequence(seed).spawn(2)
-    generators = [np.random.Generator(np.random.Philox(s)) for s in seeds]
-    runs = [_Population.run(problem, z, particles // 2, rng) for rng in generators]
+    runs = [_Population.run(problem, z, particles // 2, generator(s)) for s in seeds]
     parts = [run.x for run in runs]
     evidence = np.array([run.evidence for run in runs])
     # As many draws of each population as its evidence deserves, the best one's all.
@@ -418,7 +418,7 @@ def divergence(posterior: Posterior, estimates: Estimates) -> Divergence:
     # (|P| / |S|)^(1 / 2n) is the mean ratio of deviations.
     log_ratio = float(np.sum(np.log(values)) - np.linalg.slogdet(S)[1])
     width = float(np.exp(0.5 * log_ratio / n))
-    rng = np.random.Generator(np.random.Philox(0))
+    rng = generator(0)
     white = rng.standard_normal((_COMPARED, n))
     draws = d + (white * np.sqrt(values)) @ axes.T
     theirs = _spaced((posterior.x - posterior.mean) / scale, _COMPARED)

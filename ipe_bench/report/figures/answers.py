@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ipe_bench.basics.linalg import Array
+from ipe_bench.measurements.base import labels, with_unit
 from ipe_bench.real.profiles import CONFIDENCE, half_width
 from ipe_bench.real.residuals import LEAST_P
 from ipe_bench.report.figures import common
@@ -41,7 +42,7 @@ def draw_fit(found: Examination, z: Array, look: Look) -> Iterator[Drawing]:
     """Draws readings z (m,) with the fitted curve and its band, if one numeric column alone tells
     readings apart."""
     model = found.whole.measurement
-    columns = {**model.index, **model.input_columns}
+    columns = labels(model)
     varying = {name: column for name, column in columns.items() if len(set(column)) > 1}
     running = list(range(1, model.m + 1))
     # Beside an input the number of the row is no abscissa.
@@ -67,9 +68,8 @@ def draw_fit(found: Examination, z: Array, look: Look) -> Iterator[Drawing]:
     ax.plot(at, fitted, color=look.color, label=common.text(found.label))
     style: Any = {"color": BOUND_COLOR, "markersize": 3.5, "rasterized": len(x) > _MANY}
     ax.plot(x, z, "o", label="readings", zorder=3, **style)
-    unit = f" [{model.reading_unit}]" if model.reading_unit else ""
     ax.set_xlabel(common.text(name))
-    ax.set_ylabel(common.text(f"{model.reading_name}{unit}"))
+    ax.set_ylabel(common.text(with_unit(model.reading_name, model.reading_unit)))
     common.legend(fig, [ax])
     caption = "At any one point the band holds the curve, to first order in the parameters' errors."
     yield Drawing("fit", "Readings and fitted curve", caption, fig)
@@ -79,15 +79,13 @@ def _curve(found: Examination, name: str, x: Array) -> tuple[Array, Array, Array
     """Returns abscissas, the fitted curve there and its standard deviations: between the readings,
     too, if the model takes the abscissa as an input."""
     model = found.whole.measurement
-    columns = {**model.index, **model.input_columns}
+    columns = labels(model)
     headings = [one.heading for one in model.inputs]
     if name not in headings or not columns.keys() >= {*headings}:
         order = np.argsort(x, kind="stable")
         return x[order], found.fitted[order], found.fitted_errors[order]
     at = np.linspace(x.min(), x.max(), _GRID)
-    inputs = {heading: [columns[heading][0]] * _GRID for heading in headings}
-    inputs[name] = at.tolist()
-    dense = replace(found.whole, measurement=model.with_inputs(inputs, _GRID))
+    dense = replace(found.whole, measurement=model.along(name, at.tolist()))
     found = replace(found, whole=dense)
     return at, found.fitted, found.fitted_errors
 

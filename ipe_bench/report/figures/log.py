@@ -10,6 +10,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from ipe_bench.basics.linalg import Array, deviations, nearest
+from ipe_bench.measurements.base import with_unit
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.style import BOUND_COLOR, Look, looks
@@ -65,7 +66,7 @@ def draw_log(log: Log, tracks: Sequence[LogTracks]) -> Iterator[Drawing]:
         to = groups[0][0].mean[:, [i]] / state.size
         readings = state.size * nearest(log.z[:, own], to, periods)
         _draw_bands(ax, model.times, bands, look, readings)
-        common.title(ax, f"{state.name} [{state.unit}]" if state.unit else state.name)
+        common.title(ax, with_unit(state.name, state.unit))
     for j, ax in zip(rest, axes[len(states) :], strict=False):
         _draw_predictions(ax, log, j, filters, look)
     words = [_draw_nis(axes[-1], log, group[0]) for group in filters[:1]]

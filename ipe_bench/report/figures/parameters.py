@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from ipe_bench.measurements.base import with_unit
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.views import Figure, View
@@ -145,7 +146,7 @@ def _groups(parameters: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[s
 
 def _curves(ax: Any, rows: Any, look: Any, view: View, heading: str = "", unit: str = "") -> None:
     given: Any = {"by": "parameter", "trials": "solved_trials", "heading": heading}
-    given["label"] = common.text(f"rms error [{unit}]" if unit else "rms error")
+    given["label"] = common.text(with_unit("rms error", unit))
     common.curves(ax, rows, "rmse", look, view.scales, interval=("rmse_low", "rmse_high"), **given)
 
 
@@ -177,8 +178,7 @@ def draw_tracks(view: View) -> Iterator[Drawing]:
         _draw_bounds(ax, part)
         common.decades(ax, part[["rmse", "bound", "posterior", "posterior_smoothed"]])
         common.title(ax, state)
-        unit = part["unit"].iloc[0]
-        error = f"rms error [{unit}]" if unit else "rms error"
+        error = with_unit("rms error", part["unit"].iloc[0])
         ax.set(xlabel="time [s]", ylabel=common.text(error))
     first = rows[rows["parameter"] == states[0]]
     _draw_nees(axes[-1], first, look)

@@ -17,7 +17,7 @@ from ipe_bench.basics.errors import unknown
 from ipe_bench.basics.files import write_text
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
-from ipe_bench.measurements.base import Measurement
+from ipe_bench.measurements.base import Measurement, with_unit
 from ipe_bench.measurements.identifiability import structure
 from ipe_bench.measurements.known import ConstrainedModel
 from ipe_bench.real.estimation import Question
@@ -647,7 +647,7 @@ def _residuals(answer: Answer) -> pd.DataFrame:
 
     model = answer.model
     z = answer.z
-    unit = f" [{model.reading_unit}]" if model.reading_unit else ""
+    unit = model.reading_unit
     frames = []
     for one in answer.fits:
         found = answer.examination
@@ -657,13 +657,13 @@ def _residuals(answer: Answer) -> pd.DataFrame:
         if found is not None:
             fitted = np.where(np.isnan(z), found.fitted, fitted)
         columns: dict[str, Any] = {"estimator": one.label, **model.index}
-        columns[f"reading{unit}"] = z
-        columns[f"fitted{unit}"] = fitted
-        columns[f"residual{unit}"] = one.residuals
+        columns[with_unit("reading", unit)] = z
+        columns[with_unit("fitted", unit)] = fitted
+        columns[with_unit("residual", unit)] = one.residuals
         columns["normalised_residual"] = one.normalised
         columns["outlier"] = np.where(one.outliers, "yes", "no")
         columns["shift"] = np.nan if found is None else found.shift
-        columns[f"fitted_error{unit}"] = np.nan if found is None else found.fitted_errors
-        columns[f"prediction_error{unit}"] = np.nan if found is None else found.new_errors
+        columns[with_unit("fitted_error", unit)] = np.nan if found is None else found.fitted_errors
+        columns[with_unit("prediction_error", unit)] = np.nan if found is None else found.new_errors
         frames.append(pd.DataFrame(columns))
     return pd.concat(frames)

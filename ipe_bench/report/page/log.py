@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ipe_bench.basics.files import write_text
+from ipe_bench.measurements.base import with_unit
 from ipe_bench.real.logs import SEARCHES, Log, LogQuestion, LogTracks, far_below
 from ipe_bench.report.page.answer import as_json, labelled, read_from, with_error
 from ipe_bench.report.page.writer import write_files
@@ -98,9 +99,9 @@ class LogAnswer(Shown):
         columns: dict[str, Any] = {"tracker": one.label}
         columns |= {"epoch": range(1, model.epochs + 1), "time [s]": model.times}
         for i, state in enumerate(model.states):
-            unit = f" [{state.unit}]" if state.unit else ""
-            columns[f"{state.name}{unit}"] = one.mean[:, i]
-            columns[f"{state.name}_deviation{unit}"] = one.deviation[:, i]
+            name = state.name
+            columns[with_unit(name, state.unit)] = one.mean[:, i]
+            columns[with_unit(f"{name}_deviation", state.unit)] = one.deviation[:, i]
         for j, name in enumerate(model.reading_names):
             columns[f"{name}_reading"] = self.log.z[:, j]
             columns[f"{name}_predicted"] = one.predicted[:, j]
