@@ -60,7 +60,10 @@ def importable_digest(component: Any) -> str:
 
 def _digest(things: list[Any], definitions: Definitions) -> str:
     own = [thing for thing in things if not _stands_by_name(thing)]
-    return hashlib.sha256(repr(definitions.of(own)).encode()).hexdigest()[:16] if own else ""
+    if not own:
+        return ""
+    described = repr(definitions.of(own))
+    return hashlib.sha256(described.encode()).hexdigest()[:16]
 
 
 def pinned(component: Any) -> Any:
@@ -69,9 +72,9 @@ def pinned(component: Any) -> Any:
     alone is returned as it is."""
     if isinstance(component, tuple | list):
         return type(component)(map(pinned, component))
-    if not dataclasses.is_dataclass(component) or _PIN in getattr(
-        component, "__dict__", {_PIN: ""}
-    ):
+    if not dataclasses.is_dataclass(component):
+        return component
+    if _PIN in getattr(component, "__dict__", {_PIN: ""}):
         return component
     found = definition_digest(component)
     if not found:
@@ -85,12 +88,12 @@ def pinned(component: Any) -> Any:
 
 def _state_of(thing: Any) -> dict[str, Any]:
     """Returns an object's attributes without the values of cached properties."""
-    cls, cached = type(thing), functools.cached_property
-    return {
-        k: v
-        for k, v in vars(thing).items()
-        if not isinstance(inspect.getattr_static(cls, k, None), cached)
-    }
+    cls = type(thing)
+    state = dict(vars(thing))
+    for name in vars(thing):
+        if isinstance(inspect.getattr_static(cls, name, None), functools.cached_property):
+            del state[name]
+    return state
 
 
 @functools.cache
@@ -107,15 +110,20 @@ def is_installed(module: str) -> bool:
         spec = loaded.__spec__ if loaded is not None else importlib.util.find_spec(top)
     except (ValueError, ImportError):
         return False
-    origins = [] if spec is None else [spec.origin, *(spec.submodule_search_locations or ())]
+    if spec is None:
+        return False
     homes = {Path(sysconfig.get_path(name)).resolve() for name in ("purelib", "platlib")}
-    return any(homes & set(Path(origin).resolve().parents) for origin in origins if origin)
+    for origin in (spec.origin, *(spec.submodule_search_locations or ())):
+        if origin and not homes.isdisjoint(Path(origin).resolve().parents):
+            return True
+    return False
 
 
 def _is_named(thing: Any) -> bool:
     """Tells whether another process that imports the module finds this class or function by its
     name."""
-    module, name = getattr(thing, "__module__", None), getattr(thing, "__qualname__", None)
+    module = getattr(thing, "__module__", None)
+    name = getattr(thing, "__qualname__", None)
     if not isinstance(module, str) or not isinstance(name, str) or module == "__main__":
         return False
     found: Any = sys.modules.get(module)
@@ -183,11 +191,10 @@ class Definitions:
             return getattr(thing, "__module__", ""), taken
         make, arguments, state, *several = (*taken, None, None, None)[:5]
         if isinstance(state, dict) and hasattr(thing, "__dict__"):
-            state = {name: value for name, value in state.items() if name in _state_of(thing)}
-        return [
-            self.of(part)
-            for part in (make, arguments, state, *(each and list(each) for each in several))
-        ]
+            kept = _state_of(thing)
+            state = {name: value for name, value in state.items() if name in kept}
+        listed = [each and list(each) for each in several]
+        return [self.of(part) for part in (make, arguments, state, *listed)]
 
     def _class(self, cls: type) -> Any:
         slots = types.MemberDescriptorType | types.GetSetDescriptorType
@@ -197,61 +204,50 @@ class Definitions:
         attributes = self._kept(own, in_file=_is_named(cls))
         # What Python and dataclasses note in a class is no number's: annotations, docstring, lines,
         # fields.
-        noted = [
-            name
-            for name in attributes
-            if name.startswith("__") and not isinstance(own[name], _DEFINED)
-        ]
-        for name in (*noted, "_abc_impl"):
-            attributes.pop(name, None)
-        return cls.__qualname__, [self.of(base) for base in cls.__bases__], self.of(attributes)
+        for name, value in own.items():
+            noted = name.startswith("__") and not isinstance(value, _DEFINED)
+            if noted or name == "_abc_impl":
+                attributes.pop(name, None)
+        bases = [self.of(base) for base in cls.__bases__]
+        return cls.__qualname__, bases, self.of(attributes)
 
     def _function(self, function: types.FunctionType) -> Any:
-        code, known = function.__code__, function.__globals__
+        code = function.__code__
+        known = function.__globals__
         text, names, attributes = _read(code)
         if names & _BEYOND_NAMES - known.keys():
             names = frozenset(name for name in known if not name.startswith("_"))
         module = sys.modules.get(function.__module__)
-        in_file = function.__module__ != "__main__" and known is getattr(module, "__dict__", None)
+        of_module = known is getattr(module, "__dict__", None)
+        in_file = of_module and function.__module__ != "__main__"
         found = {name: known.get(name, sys.modules.get(name)) for name in sorted(names)}
         reached = self._kept(found, in_file=in_file)
-        cells = dict(zip(code.co_freevars, map(_content, function.__closure__ or ()), strict=True))
+        contents = map(_content, function.__closure__ or ())
+        cells = dict(zip(code.co_freevars, contents, strict=True))
         reached |= self._kept(cells, in_file=_is_named(function))
-        given = (
-            function.__defaults__,
-            function.__kwdefaults__,
-            vars(function) if self.values else None,
-        )
-        return (
-            text,
-            [(name, self._reached(reached[name], attributes)) for name in reached],
-            self.of(given),
-        )
+        described = [(name, self._reached(one, attributes)) for name, one in reached.items()]
+        own = vars(function) if self.values else None
+        given = (function.__defaults__, function.__kwdefaults__, own)
+        return text, described, self.of(given)
 
     def _kept(self, variables: Mapping[str, Any], *, in_file: bool) -> dict[str, Any]:
         """Keeps those variables that belong to a definition. What a file fills a container with is
         in its source, and what is put in later is mostly a cache."""
-        kinds = (
-            *_DEFINED,
-            *(_PLAIN if self.values else ()),
-            *((tuple, frozenset) if self.values else ()),
-        )
-        everything = self.values and not in_file
-        return {
-            k: v for k, v in variables.items() if everything or isinstance(v, kinds) or _wraps(v)
-        }
+        if self.values and not in_file:
+            return dict(variables)
+        kinds = (*_DEFINED, *_PLAIN, tuple, frozenset) if self.values else _DEFINED
+        return {k: v for k, v in variables.items() if isinstance(v, kinds) or _wraps(v)}
 
     def _reached(self, value: Any, attributes: Set[str]) -> Any:
         """Describes what a name stands for: of a module those of its attributes that the code asks
         for."""
         if not isinstance(value, types.ModuleType) or is_installed(value.__name__):
             return self.of(value)
-        asked = self._kept(
-            {k: vars(value)[k] for k in sorted(attributes & vars(value).keys())}, in_file=True
-        )
-        return value.__name__, [
-            (name, self._reached(one, attributes - {name})) for name, one in asked.items()
-        ]
+        content = vars(value)
+        named = {name: content[name] for name in sorted(attributes & content.keys())}
+        asked = self._kept(named, in_file=True)
+        described = [(name, self._reached(one, attributes - {name})) for name, one in asked.items()]
+        return value.__name__, described
 
 
 def _content(cell: Any) -> Any:
@@ -272,7 +268,8 @@ def _read(code: types.CodeType) -> tuple[Any, frozenset[str], frozenset[str]]:
     the module that it reads and of modules that it imports, and all names in it, attributes among
     them."""
     arguments = code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount, code.co_flags
-    text: list[Any] = [arguments, code.co_varnames[: sum(arguments[:3])], code.co_exceptiontable]
+    parameters = code.co_varnames[: sum(arguments[:3])]
+    text: list[Any] = [arguments, parameters, code.co_exceptiontable]
     names: set[str] = set()
     attributes = set(code.co_names)
     for step in dis.get_instructions(code):
@@ -293,4 +290,6 @@ def _constant(value: Any) -> str:
     """Writes a constant of code, whatever the order of a set in it."""
     if isinstance(value, frozenset):
         return f"frozenset({sorted(map(_constant, value))})"
-    return f"({', '.join(map(_constant, value))})" if isinstance(value, tuple) else repr(value)
+    if isinstance(value, tuple):
+        return f"({', '.join(map(_constant, value))})"
+    return repr(value)

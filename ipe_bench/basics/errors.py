@@ -81,7 +81,9 @@ def definition(function: Any) -> str:
 
 def shortened(text: str, length: int = 120) -> str:
     """Returns the text, or its beginning and its end where it is longer than a line."""
-    return text if len(text) <= length else f"{text[: length - 24]}...{text[-20:]}"
+    if len(text) <= length:
+        return text
+    return f"{text[: length - 24]}...{text[-20:]}"
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

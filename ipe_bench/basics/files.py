@@ -24,9 +24,8 @@ def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
     Raises:
         StorageError: the disk is full, or the folder cannot be written to any more.
     """
-    temporary = path.with_name(
-        f".{path.name}.{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex[:8]}.tmp"
-    )
+    writer = f"{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex[:8]}"
+    temporary = path.with_name(f".{path.name}.{writer}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write(temporary)
@@ -86,9 +85,10 @@ def cache_folder() -> Path:
 
 
 def _chosen_cache() -> Path:
-    chosen, caches = os.environ.get("IPE_BENCH_CACHE"), os.environ.get("XDG_CACHE_HOME")
+    chosen = os.environ.get("IPE_BENCH_CACHE")
     home = "~" if os.environ.get("HOME", "~") else f"~{getpass.getuser()}"
-    folder = Path(chosen or Path(caches or f"{home}/.cache") / "ipe-bench").expanduser()
+    caches = os.environ.get("XDG_CACHE_HOME") or f"{home}/.cache"
+    folder = Path(chosen or Path(caches) / "ipe-bench").expanduser()
     folder.mkdir(parents=True, exist_ok=True)
     return folder
 
@@ -96,15 +96,14 @@ def _chosen_cache() -> Path:
 def _spare_cache() -> Path:
     """Returns a folder that belongs to this user alone, whoever may write to the folder of
     temporary files."""
-    folder = (
-        Path(tempfile.gettempdir()) / f"ipe-bench-{os.geteuid() if os.name == 'posix' else 'cache'}"
-    )
+    owner = os.geteuid() if os.name == "posix" else "cache"
+    folder = Path(tempfile.gettempdir()) / f"ipe-bench-{owner}"
     folder.mkdir(mode=0o700, exist_ok=True)
-    about = folder.lstat()
-    if os.name == "posix" and (
-        about.st_uid != os.geteuid() or about.st_mode & 0o77 or not stat.S_ISDIR(about.st_mode)
-    ):
-        raise OSError(errno.EPERM, "belongs to others")
+    if os.name == "posix":
+        about = folder.lstat()
+        open_to_others = about.st_uid != owner or about.st_mode & 0o77
+        if open_to_others or not stat.S_ISDIR(about.st_mode):
+            raise OSError(errno.EPERM, "belongs to others")
     return folder
 
 

@@ -37,7 +37,8 @@ def own(x: Array) -> Array:
 
 def finite(a: Array) -> Mask:
     """Tells which trials (trials,) of a (trials, ...) are finite throughout."""
-    return np.asarray(np.isfinite(a).all(axis=tuple(range(1, a.ndim))))
+    inner = tuple(range(1, a.ndim))
+    return np.asarray(np.isfinite(a).all(axis=inner))
 
 
 def read_only(a: Array) -> Array:
@@ -72,8 +73,9 @@ def nearest(z: Array, to: Array, periods: Array | Sequence[float]) -> Array:
     if not len(periods):
         return z
     period = np.asarray(periods)
-    turns = np.round(np.real(z - to) / np.where(period > 0, period, np.inf))
-    return z - np.where(period > 0, period * turns, 0.0)
+    shifts = period > 0
+    turns = np.round(np.real(z - to) / np.where(shifts, period, np.inf))
+    return z - np.where(shifts, period * turns, 0.0)
 
 
 def multiply(A: Array, x: Array) -> Array:
@@ -166,7 +168,9 @@ class Covariance:
     @property
     def deviations(self) -> Array:
         """The standard deviation of each reading (m,)."""
-        return self.factor if self.factor.ndim == 1 else np.sqrt(np.sum(self.factor**2, axis=1))
+        if self.factor.ndim == 1:
+            return self.factor
+        return np.sqrt(np.sum(self.factor**2, axis=1))
 
     def whiten(self, r: Array) -> Array:
         """Computes R^-1/2 r for residuals r (..., m): independent, of unit variance."""
@@ -188,7 +192,9 @@ class Covariance:
 
     def matrix(self) -> Array:
         """Computes R itself (m, m)."""
-        return np.diag(self.factor**2) if self.factor.ndim == 1 else self.factor @ self.factor.T
+        if self.factor.ndim == 1:
+            return np.diag(self.factor**2)
+        return self.factor @ self.factor.T
 
     def inverse(self) -> Array:
         """Computes R^-1 (m, m)."""
@@ -227,11 +233,12 @@ def definite_factor(G: Array) -> tuple[Array, Array, Mask]:
         size = np.sqrt(np.diagonal(G, axis1=1, axis2=2))
         scaled = G / (size[:, :, None] * size[:, None, :])
         usable = finite(scaled)
-        U = _of_each(
-            np.linalg.cholesky, np.where(usable[:, None, None], scaled, np.eye(n))
-        ).swapaxes(1, 2)
+        unit = np.where(usable[:, None, None], scaled, np.eye(n))
+        L = _of_each(np.linalg.cholesky, unit)
+        U = L.swapaxes(1, 2)
         inverse_U = _inverse_of_upper(U)
-        well = usable & (np.linalg.norm(inverse_U, axis=(1, 2)) * np.sqrt(n) <= _WELL_CONDITIONED)
+        condition = np.linalg.norm(inverse_U, axis=(1, 2)) * np.sqrt(n)
+        well = usable & (condition <= _WELL_CONDITIONED)
         return U * size[:, None, :], inverse_U / size[:, :, None], well
 
 
@@ -240,7 +247,8 @@ def _inverse_of_upper(U: Array) -> Array:
     once."""
     V = np.zeros(U.shape)
     for i in reversed(range(U.shape[1])):
-        V[:, i] = -np.matmul(U[:, i, None, i + 1 :], V[:, i + 1 :])[:, 0]
+        after = slice(i + 1, None)
+        V[:, i] = -np.matmul(U[:, i, None, after], V[:, after])[:, 0]
         V[:, i, i] += 1.0
         V[:, i] /= U[:, i, i, None]
     return V
@@ -255,7 +263,8 @@ def pseudo_inverse(H: Array, R: Covariance) -> tuple[Array, Mask]:
     _, inverse_U, well = definite_factor(information(H, R))
     with np.errstate(all="ignore"):
         # H+ R^1/2 = U^-1 U^-T Hw'
-        whitened = np.matmul(inverse_U, np.matmul(inverse_U.swapaxes(1, 2), Hw.swapaxes(1, 2)))
+        projected = np.matmul(inverse_U.swapaxes(1, 2), Hw.swapaxes(1, 2))
+        whitened = np.matmul(inverse_U, projected)
     deficient = np.zeros(len(H), dtype=bool)
     if not well.all():
         whitened[~well], deficient[~well] = _by_orthogonal_factor(Hw[~well])
@@ -270,7 +279,8 @@ def _by_orthogonal_factor(H: Array) -> tuple[Array, Mask]:
     usable = finite(H)
     Q, U = np.linalg.qr(np.where(usable[:, None, None], H, 0.0))
     diagonal = np.abs(np.diagonal(U, axis1=1, axis2=2))
-    floor = np.finfo(float).eps * max(H.shape[1:]) * np.linalg.norm(U, axis=(1, 2))
+    size = np.linalg.norm(U, axis=(1, 2))
+    floor = np.finfo(float).eps * max(H.shape[1:]) * size
     deficient: Mask = ~usable | (diagonal.min(axis=1) <= floor)
     U = np.where(deficient[:, None, None], np.nan, U)
     return solve(U, Q.swapaxes(1, 2))[0], deficient

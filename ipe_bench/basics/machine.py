@@ -30,6 +30,5 @@ def cores() -> int:
 @functools.cache
 def library_versions() -> dict[str, str]:
     """Returns Python and the libraries that results depend on, with their versions."""
-    return {"python": platform.python_version()} | {
-        name: importlib.metadata.version(name) for name in _LIBRARIES
-    }
+    versions = {name: importlib.metadata.version(name) for name in _LIBRARIES}
+    return {"python": platform.python_version(), **versions}

@@ -70,19 +70,27 @@ def as_python(value: Any) -> str:
     if not isinstance(value, Component) or not dataclasses.is_dataclass(value):
         return shortened(repr(value))
     own = []
-    for field in (field for field in dataclasses.fields(value) if field.init):
-        option, make = getattr(value, field.name), field.default_factory
-        if repr(option) != repr(field.default if make is dataclasses.MISSING else make()):
+    for field in dataclasses.fields(value):
+        if not field.init:
+            continue
+        option = getattr(value, field.name)
+        if repr(option) != repr(_default(field)):
             own.append(f"{field.name}={as_python(option)}")
     return shortened(f"{type(value).__name__}({', '.join(own)})")
 
 
+def _default(field: dataclasses.Field[Any]) -> Any:
+    make = field.default_factory
+    return field.default if make is dataclasses.MISSING else make()
+
+
 def in_lines(self: Any) -> str:
     """Writes a dataclass with a line for each field that is not None."""
-    values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-    lines = [
-        f"    {name}={as_python(value)},\n" for name, value in values.items() if value is not None
-    ]
+    lines = []
+    for field in dataclasses.fields(self):
+        value = getattr(self, field.name)
+        if value is not None:
+            lines.append(f"    {field.name}={as_python(value)},\n")
     return f"{type(self).__name__}(\n{''.join(lines)})"
 
 
@@ -99,9 +107,8 @@ class Component:
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        if "name" not in {*cls.__dict__, *cls.__annotations__} and not isinstance(
-            cls.name, property
-        ):
+        states_name = "name" in {*cls.__dict__, *cls.__annotations__}
+        if not states_name and not isinstance(cls.name, property):
             cls.name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", cls.__name__).lower()
 
     def __new__(cls, *_: Any, **options: Any) -> Self:
@@ -109,9 +116,8 @@ class Component:
         takes = inspect.signature(cls.__init__).parameters
         if not any(one.kind is one.VAR_KEYWORD for one in takes.values()):
             for name in options.keys() - takes.keys():
-                raise UserError(
-                    f"{cls.__name__}: {name}=: {unknown(name, takes.keys() - {'self'}, 'option')}"
-                )
+                known = takes.keys() - {"self"}
+                raise UserError(f"{cls.__name__}: {name}=: {unknown(name, known, 'option')}")
         return super().__new__(cls)
 
     def __post_init__(self) -> None:
@@ -135,17 +141,12 @@ def component_classes(component: Any) -> list[Any]:
         return [cls for item in component for cls in component_classes(item)]
     if not dataclasses.is_dataclass(component) or isinstance(component, type):
         return []
-    inner = [
-        cls
-        for f in dataclasses.fields(component)
-        for cls in component_classes(getattr(component, f.name))
-    ]
-    own = (
-        cls
-        for cls in type(component).__mro__
-        if cls.__module__ not in ("builtins", "abc", "typing")
-    )
-    return [*own, *getattr(component, "functions", ()), *inner]
+    bases = type(component).__mro__
+    found = [cls for cls in bases if cls.__module__ not in ("builtins", "abc", "typing")]
+    found += getattr(component, "functions", ())
+    for field in dataclasses.fields(component):
+        found += component_classes(getattr(component, field.name))
+    return found
 
 
 @functools.cache
@@ -172,7 +173,8 @@ def checked(value: Any, hint: Any, key: str) -> Any:
         UserError: `KEY=VALUE: give ...`, where the value is not of the type or not within its
             constraints.
     """
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    origin = typing.get_origin(hint)
+    arguments = typing.get_args(hint)
     if hint is Any or isinstance(hint, typing.TypeVar):
         return value
     if origin is Annotated:
@@ -187,10 +189,10 @@ def checked(value: Any, hint: Any, key: str) -> Any:
     if not isinstance(plain, type):
         return value
     if issubclass(plain, Mapping) and isinstance(value, Mapping) and arguments:
-        entries = {
-            name: checked(entry, arguments[1], f"{key}.{name}") for name, entry in value.items()
-        }
-        return value if all(entries[name] is entry for name, entry in value.items()) else entries
+        inner = arguments[1]
+        entries = {name: checked(entry, inner, f"{key}.{name}") for name, entry in value.items()}
+        unchanged = all(entries[name] is entry for name, entry in value.items())
+        return value if unchanged else entries
     # True and false are not numbers; NumPy's are.
     abstract = {int: numbers.Integral, float: numbers.Real}.get(plain)
     if abstract and isinstance(value, abstract) and not isinstance(value, bool):
@@ -203,22 +205,25 @@ def checked(value: Any, hint: Any, key: str) -> Any:
 
 
 def _refusal(value: Any, wanted: str, key: str) -> UserError:
-    text = " ".join(str(list(value) if isinstance(value, tuple) else value).split())
+    shown = list(value) if isinstance(value, tuple) else value
+    text = " ".join(str(shown).split())
     return UserError(f"{key}={shortened(text, 60)}: give {wanted}")
 
 
 def _constrained(value: Any, kind: Any, metadata: Sequence[Any], key: str) -> Any:
     try:
         value = checked(value, kind, key)
-        if all(
-            _COMPARISONS[type(bound)](value, dataclasses.astuple(bound)[0])
-            for bound in _bounds(metadata)
-        ):
+        if all(_holds(bound, value) for bound in _bounds(metadata)):
             return value
     except UserError:
         if typing.get_origin(kind) is tuple:
             raise  # it says which entry is wrong
     raise _refusal(value, describe_type(Annotated[kind, *metadata]), key)
+
+
+def _holds(bound: Any, value: Any) -> bool:
+    limit = dataclasses.astuple(bound)[0]
+    return _COMPARISONS[type(bound)](value, limit)
 
 
 def _bounds(metadata: Sequence[Any]) -> list[Any]:
@@ -248,21 +253,18 @@ def _one_of(value: Any, alternatives: Sequence[Any], key: str) -> Any:
 
 
 def _is_tuple(hint: Any) -> bool:
-    return (
-        typing.get_origin(
-            typing.get_args(hint)[0] if typing.get_origin(hint) is Annotated else hint
-        )
-        is tuple
-    )
+    if typing.get_origin(hint) is Annotated:
+        hint = typing.get_args(hint)[0]
+    return typing.get_origin(hint) is tuple
 
 
 def _choice(value: Any, choices: Sequence[Any], key: str) -> Any:
     for choice in choices:
-        if (
-            isinstance(value, type(choice))
-            and isinstance(value, bool) == isinstance(choice, bool)
-            and value == choice
-        ):
+        if not isinstance(value, type(choice)):
+            continue
+        # True is a whole number, too.
+        alike = isinstance(value, bool) == isinstance(choice, bool)
+        if alike and value == choice:
             return choice
     text = " ".join(str(value).split())
     raise UserError(f"{key}={text}: choose one of {', '.join(map(str, choices))}")
@@ -273,14 +275,16 @@ def _entries(value: Any, arguments: Sequence[Any], key: str) -> tuple[Any, ...]:
         arguments = [arguments[0]] * len(value)
     if len(arguments) != len(value):
         raise _refusal(value, _list_of(arguments), key)
-    return tuple(
-        checked(v, a, f"{key}[{i}]") for i, (v, a) in enumerate(zip(value, arguments, strict=True))
-    )
+    entries = []
+    for i, (entry, hint) in enumerate(zip(value, arguments, strict=True)):
+        entries.append(checked(entry, hint, f"{key}[{i}]"))
+    return tuple(entries)
 
 
 def describe_type(hint: Any) -> str:
     """Describes the values that an option takes: 'a number above 0 or null'."""
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    origin = typing.get_origin(hint)
+    arguments = typing.get_args(hint)
     if origin is Annotated:
         bounds = [bound for bound in _bounds(arguments[1:]) if not isinstance(bound, Predicate)]
         noun = (
@@ -304,4 +308,5 @@ def _list_of(arguments: Sequence[Any]) -> str:
     if len(arguments) == 2 and arguments[1] is Ellipsis:
         return "a list"
     nouns = {describe_type(a).removeprefix("a ") for a in arguments}
-    return f"a list of {len(arguments)}" + (f" {nouns.pop()}s" if len(nouns) == 1 else "")
+    each = f" {nouns.pop()}s" if len(nouns) == 1 else ""
+    return f"a list of {len(arguments)}{each}"

@@ -18,16 +18,19 @@ def generator(seed: int | np.random.SeedSequence) -> np.random.Generator:
 def own_generators(seed: int, z: Array) -> list[np.random.Generator]:
     """Makes a generator for each trial of z (trials, m), which depends on `seed` and on these
     readings alone."""
-    digests = [
-        hashlib.sha256(np.ascontiguousarray(row, dtype=float).tobytes()).digest() for row in z
-    ]
-    entropy = [[seed, *np.frombuffer(digest, dtype=np.uint32).tolist()] for digest in digests]
-    return [generator(np.random.SeedSequence(words)) for words in entropy]
+    generators = []
+    for row in z:
+        readings = np.ascontiguousarray(row, dtype=float).tobytes()
+        digest = hashlib.sha256(readings).digest()
+        words = np.frombuffer(digest, dtype=np.uint32).tolist()
+        generators.append(generator(np.random.SeedSequence([seed, *words])))
+    return generators
 
 
 def normals(generators: Sequence[np.random.Generator], *shape: int) -> Array:
     """Draws standard normal numbers (trials, *shape), each trial's from its own generator."""
-    return np.array([g.standard_normal(shape) for g in generators]).reshape(len(generators), *shape)
+    drawn = [own.standard_normal(shape) for own in generators]
+    return np.array(drawn).reshape(len(generators), *shape)
 
 
 def numbered(seed: int, start: int, stop: int, child: int) -> Iterator[np.random.Generator]:
