@@ -5,12 +5,13 @@ from __future__ import annotations
 import contextlib
 import errno
 import getpass
+import json
 import os
 import socket
 import stat
 import tempfile
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +70,11 @@ def make_folder(path: Path) -> None:
 def write_text(path: Path, text: str) -> None:
     """Writes a text file in one piece; see `write_atomically`."""
     write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Writes a JSON file in one piece; see `write_atomically`."""
+    write_text(path, json.dumps(content, indent=1) + "\n")
 
 
 def cache_folder() -> Path:

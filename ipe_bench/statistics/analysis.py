@@ -21,7 +21,7 @@ from ipe_bench.statistics.path_columns import epoch_curves
 from ipe_bench.statistics.records import SCORES
 from ipe_bench.statistics.registry import summary_rows, to_frame
 from ipe_bench.statistics.sample import CONTRACTION, Sample, label_of, median_distances, samples
-from ipe_bench.statistics.statistic import BEST, rows_of
+from ipe_bench.statistics.statistic import ALL, BEST, rows_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -74,6 +74,11 @@ class Analysis:
         """The columns that tell scenarios apart, but for the error scale."""
         first = self.collection.groups[0].columns if self.collection.groups else {}
         return [c for c in first if c != "error_scale"]
+
+    @property
+    def totals(self) -> pd.DataFrame:
+        """The rows of the summary over all parameters."""
+        return self.summary[self.summary["parameter"] == ALL].reset_index(drop=True)
 
     @cached_property
     def simulated(self) -> Analysis:

@@ -14,7 +14,7 @@ from ipe_bench.measurements.identifiability import structure
 from ipe_bench.plugins.extensions import richer_models
 from ipe_bench.questions.design.maths import Design, Way, design, entry_in_words
 from ipe_bench.report.page.writer import write_files
-from ipe_bench.report.tables.table import Part, Shown, Strong, Table, texts, words
+from ipe_bench.report.tables.table import Part, Shown, Strong, Table, naming, texts, words
 from ipe_bench.report.words import enumerate_few, percent, scientific, short
 from ipe_bench.trials.observability import TRUTHS, Observability
 from ipe_bench.trials.thresholds import FIT_LEVEL
@@ -156,8 +156,7 @@ def _parameters(name: str, design: Design) -> Table:
     parameters = seen.parameters
     bounds = [p.size * bound for p, bound in zip(parameters, seen.bound, strict=True)]
     columns = [
-        words("parameter", [p.name for p in parameters]),
-        words("unit", [p.unit for p in parameters]),
+        *naming("parameter", parameters),
         texts("bound", [scientific(bound) for bound in bounds]),
         texts("correlation with all others", [f"{r:.2f}" for r in seen.multiple_correlation]),
     ]

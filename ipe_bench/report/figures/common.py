@@ -483,22 +483,17 @@ def mark_name(ax: Axes, artist: Artist, name: str, number: int) -> None:
 
 
 def spread(wanted: Sequence[float], gap: float, low: float, high: float) -> Array:
-    """Returns places at least `gap` apart from `low` to `high`, nearest to where they are wanted:
-    by adjacent violators that are pooled (Ayer and others, Annals of Mathematical Statistics 26,
-    1955)."""
+    """Returns places at least `gap` apart from `low` to `high`, nearest to where they are
+    wanted."""
+    from scipy.optimize import isotonic_regression
+
     order = np.argsort(wanted, kind="stable")
     # Less these shifts, places that are `gap` apart only have to ascend.
     shifts = gap * np.arange(len(order))
-    pools: list[list[float]] = []
-    for value in np.asarray(wanted, dtype=float)[order] - shifts:
-        pools.append([value])
-        while len(pools) > 1 and np.mean(pools[-2]) > np.mean(pools[-1]):
-            last = pools.pop()
-            pools[-1] += last
-    means = [np.full(len(pool), np.mean(pool)) for pool in pools]
+    ascending = isotonic_regression(np.asarray(wanted, dtype=float)[order] - shifts).x
     highest = max(low, high - shifts[-1])
     found = np.empty(len(order))
-    found[order] = np.clip(np.concatenate(means), low, highest) + shifts
+    found[order] = np.clip(ascending, low, highest) + shifts
     return found
 
 

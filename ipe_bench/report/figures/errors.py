@@ -45,8 +45,6 @@ def draw(view: View) -> Iterator[Drawing]:
     """Draws success, error and, where a covariance is reported, NEES: over the error scales with
     names at the curves' ends, from where estimators part; at one scale a row for each."""
     totals = over_paths(view) if view.moving else view.totals
-    if totals.empty:
-        return
     several = len(view.scales) > 1
     start = _parting(view, totals) if several else view.scales[0]
     scales = [scale for scale in view.scales if scale >= start]

@@ -31,8 +31,6 @@ MOST_GROUPS = 8
 
 
 def draw(view: View) -> Iterator[Drawing]:
-    if view.totals.empty:
-        return
     iterated = [e for e in view.look if view.equations[e] == "frozen"]
     iterated.sort(key=lambda e: e != "fixed_point")
     for label in (REFERENCE, *iterated[:1]):

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import math
+from abc import abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from itertools import compress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
 
 from ipe_bench.basics.errors import unknown
-from ipe_bench.basics.files import write_text
+from ipe_bench.basics.files import write_json
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.base import Measurement, with_unit
@@ -25,7 +25,7 @@ from ipe_bench.real.examination import CONFIDENCE, Examination
 from ipe_bench.real.fits import TOO_WELL, Fit
 from ipe_bench.real.residuals import LEAST_P
 from ipe_bench.report.page.writer import write_files
-from ipe_bench.report.tables.table import Part, Shown, Strong, Table, texts, words
+from ipe_bench.report.tables.table import Part, Shown, Strong, Table, naming, texts, words
 from ipe_bench.report.words import enumerate_few, p_value
 from ipe_bench.trials.fit_test import DRAWS
 from ipe_bench.trials.thresholds import FIT_LEVEL
@@ -56,21 +56,36 @@ _MOST_MINIMA = 3
 T = TypeVar("T")
 
 
-def labelled(parts: Sequence[T], labels: Sequence[str], which: str | int) -> T:
-    """Returns the part at a place, or at its label.
+class Labelled(Shown, Generic[T]):
+    """Shows parts that are found by their labels, and in their order."""
 
-    Raises:
-        KeyError: there is no such label; those that there are follow, the nearest first.
-    """
-    if isinstance(which, int):
-        return parts[which]
-    if which not in labels:
-        raise KeyError(f"{which}: {unknown(which, labels, 'label')}")
-    return parts[labels.index(which)]
+    @property
+    @abstractmethod
+    def each(self) -> Sequence[Any]:
+        """The parts, which have a `label`."""
+
+    def __iter__(self) -> Iterator[T]:
+        return iter(self.each)
+
+    def __len__(self) -> int:
+        return len(self.each)
+
+    def __getitem__(self, which: str | int) -> T:
+        """Returns the part at a place, or at its label.
+
+        Raises:
+            KeyError: there is no such label; those that there are follow, the nearest first.
+        """
+        if isinstance(which, int):
+            return self.each[which]
+        labels = [one.label for one in self.each]
+        if which not in labels:
+            raise KeyError(f"{which}: {unknown(which, labels, 'label')}")
+        return self.each[labels.index(which)]
 
 
 @dataclass(frozen=True)
-class Answer(Shown):
+class Answer(Labelled[Fit]):
     """Holds the fits of estimators to real readings, and the examination of the fit with the least
     minimum."""
 
@@ -105,15 +120,9 @@ class Answer(Shown):
             return False
         return any(one.passes for one in self.fits)
 
-    def __iter__(self) -> Iterator[Fit]:
-        return iter(self.fits)
-
-    def __len__(self) -> int:
-        return len(self.fits)
-
-    def __getitem__(self, which: str | int) -> Fit:
-        """Returns the fit at this label or place."""
-        return labelled(self.fits, [one.label for one in self.fits], which)
+    @property
+    def each(self) -> Sequence[Fit]:
+        return self.fits
 
     def table(self) -> pd.DataFrame:
         """Returns estimate, standard error, 95 % interval, and whether the fit passes, per
@@ -199,8 +208,7 @@ def _estimates(answer: Answer) -> Table:
     """Returns estimates with their errors; an invalid one stands in brackets, without its
     meaningless errors."""
     parameters = answer.fits[0].model.physical_parameters
-    columns = [words("parameter", [p.name for p in parameters])]
-    columns.append(words("unit", [p.unit for p in parameters]))
+    columns = naming("parameter", parameters)
     for one in answer.fits:
         if one.passes:
             columns.append(texts(one.label, map(with_error, one.x, one.standard_errors)))
@@ -415,8 +423,7 @@ def _intervals(found: Examination) -> Table:
         profiles.append(_interval(low, high, math.nan))
     bootstrap = map(_interval, found.bootstrap.low, found.bootstrap.high, found.x)
     columns = [
-        words("parameter", [p.name for p in parameters]),
-        words("unit", [p.unit for p in parameters]),
+        *naming("parameter", parameters),
         texts("standard error", [*map(_interval, *found.wald, found.x), *absent]),
         texts("profile", profiles),
         texts("bootstrap", [*bootstrap, *absent]),
@@ -540,7 +547,7 @@ def write_answer(
 ) -> list[Path]:
     """Writes estimate.json, the page, residuals.csv and the figure; returns the files."""
     content = {"schema": SCHEMA, "command": command, **estimate_content(answer), **provenance}
-    write_text(folder / f"{NAME}.json", json.dumps(content, indent=1) + "\n")
+    write_json(folder / f"{NAME}.json", content)
     files = write_files(
         folder,
         NAME,

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ipe_bench.basics.files import write_text
+from ipe_bench.basics.files import write_json
 from ipe_bench.measurements.base import with_unit
 from ipe_bench.real.logs import SEARCHES, Log, LogQuestion, LogTracks, far_below
-from ipe_bench.report.page.answer import as_json, labelled, read_from, with_error
+from ipe_bench.report.page.answer import Labelled, as_json, read_from, with_error
 from ipe_bench.report.page.writer import write_files
-from ipe_bench.report.tables.table import Part, Shown, Strong, Table, interval, texts, words
+from ipe_bench.report.tables.table import Part, Strong, Table, interval, naming, texts, words
 from ipe_bench.report.words import enumerate_few, p_value, short
 from ipe_bench.statistics.verdicts import NO_VERDICT, shown
 
@@ -54,7 +53,7 @@ _STORED = (
 
 
 @dataclass(frozen=True)
-class LogAnswer(Shown):
+class LogAnswer(Labelled[LogTracks]):
     """Holds the tracks of one log, one for each tracker."""
 
     log: Log
@@ -74,15 +73,9 @@ class LogAnswer(Shown):
         """Whether the track of any tracker passes every test."""
         return any(one.passes for one in self.tracks)
 
-    def __iter__(self) -> Iterator[LogTracks]:
-        return iter(self.tracks)
-
-    def __len__(self) -> int:
-        return len(self.tracks)
-
-    def __getitem__(self, which: str | int) -> LogTracks:
-        """Returns the track at this label or place."""
-        return labelled(self.tracks, [one.label for one in self.tracks], which)
+    @property
+    def each(self) -> Sequence[LogTracks]:
+        return self.tracks
 
     def table(self) -> pd.DataFrame:
         """Returns a row per tracker and epoch: each state and each predicted reading with its
@@ -144,9 +137,7 @@ class LogAnswer(Shown):
         return Table("innovations", title, "", columns, notes=[note])
 
     def _last_states(self) -> Table:
-        states = self.log.model.states
-        columns = [words("state", [state.name for state in states])]
-        columns.append(words("unit", [state.unit for state in states]))
+        columns = naming("state", self.log.model.states)
         for one in self.tracks:
             ends = map(with_error, one.mean[-1], one.deviation[-1])
             columns.append(texts(one.label, ends))
@@ -181,7 +172,7 @@ def write_tracks(
     from ipe_bench.report.figures.log import draw_log
 
     content = {"schema": SCHEMA, "command": command, "trackers": _trackers(answer), **provenance}
-    write_text(folder / f"{NAME}.json", json.dumps(content, indent=1) + "\n")
+    write_json(folder / f"{NAME}.json", content)
     log = answer.log
     readings = int(np.isfinite(log.z).sum())
     files = write_files(

@@ -12,7 +12,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ipe_bench.basics.files import regular, write_text
+from ipe_bench.basics.files import regular, write_json, write_text
 from ipe_bench.plugins.extensions import files_of_records, use_statistics
 from ipe_bench.report.formats import FIGURES, PAGE
 from ipe_bench.report.style import Which, file_formats, which_figures
@@ -124,7 +124,7 @@ class Pending:
             (output / "tables" / name).unlink(missing_ok=True)
         if len(problems) == known:  # what plugins cannot make is said each time
             stamp = {"from": self.made, "files": _digests(result.files)}
-            write_text(output / STAMP, json.dumps(stamp, indent=1) + "\n")
+            write_json(output / STAMP, stamp)
         return result
 
 

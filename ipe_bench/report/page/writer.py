@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from ipe_bench import __version__
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.files import regular, write_text
+from ipe_bench.basics.files import regular, write_json, write_text
 from ipe_bench.report.formats import PAGE
 from ipe_bench.report.style import house_style
 from ipe_bench.report.tables.table import Part, Table, environment
@@ -57,7 +57,7 @@ def reserved_folder(
         place = folder.with_name(f"{folder.name}-{number}")
     is_new = not (place / result).exists()
     if is_new:
-        write_text(place / result, json.dumps({"command": command}, indent=1) + "\n")
+        write_json(place / result, {"command": command})
     try:
         yield place
     except BaseException:

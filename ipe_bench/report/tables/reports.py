@@ -107,7 +107,7 @@ def all_tables(analysis: Analysis, whole: Analysis | None = None) -> list[Table]
     `whole` analysis."""
     found = {"endings": endings(whole or analysis)}
     if not analysis.summary.empty:
-        rows = analysis.summary[analysis.summary["parameter"] == ALL].reset_index(drop=True)
+        rows = analysis.totals
         scores = analysis.scores[list(frame_columns(SCORES))]
         totals = pd.concat([rows, scores], axis=1)
         found |= {where: _recorded(analysis, where, totals) for where in _RECORDED}
@@ -158,7 +158,7 @@ def _recorded(analysis: Analysis, where: Where, totals: pd.DataFrame) -> Table |
 
 def overview(analysis: Analysis) -> Table:
     """Returns the overview: each estimator over all trials, a population that every one shares."""
-    rows = analysis.summary[analysis.summary["parameter"] == ALL].reset_index(drop=True)
+    rows = analysis.totals
     told: Any = rows.to_dict("records")
     first = head(analysis, rows)
     best = leading(told, [*analysis.setting_columns, "error_scale"])

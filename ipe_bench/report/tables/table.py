@@ -163,6 +163,13 @@ def words(title: str, values: Iterable[Any], best: Iterable[bool] = ()) -> Colum
     return Column(title, cells(map(str, values), repeat(None), best), numeric=False)
 
 
+def naming(title: str, things: Iterable[Any]) -> list[Column]:
+    """Makes the columns of the names of parameters or states, and of their units."""
+    named = [(one.name, one.unit) for one in things]
+    names, units = zip(*named, strict=True)
+    return [words(title, names), words("unit", units)]
+
+
 def cells(texts: Iterable[str], keys: Iterable[Any], best: Iterable[bool] = ()) -> list[Cell]:
     """Makes a cell of each text, with its key, and in bold if it is among the `best`."""
     texts = list(texts)
