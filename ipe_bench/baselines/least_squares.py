@@ -21,6 +21,7 @@ from ipe_bench.basics.linalg import (
     Mask,
     deviations,
     finite,
+    finite_or,
     from_root,
     pseudo_inverse,
     repeated,
@@ -226,7 +227,7 @@ class MultiscaleLM(Estimator):
         methods = (LevenbergMarquardtMethod(self.damping, metric) for metric in (size, None))
         by_size, by_columns = (minimize(objective, method, start, limits) for method in methods)
         both = (by_size.chi_square, by_columns.chi_square)
-        costs = [np.where(np.isfinite(cost), cost, np.inf) for cost in both]
+        costs = [finite_or(np.inf, cost) for cost in both]
         # The first where they fit alike to round-off; without a finite fit anywhere it keeps its
         # status.
         best = by_size.replaced(np.arange(len(z)), by_columns, costs[1] < costs[0] * (1 - 1e-12))

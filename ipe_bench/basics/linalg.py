@@ -41,6 +41,17 @@ def finite(a: Array) -> Mask:
     return np.asarray(np.isfinite(a).all(axis=inner))
 
 
+def finite_or(other: float, a: Array) -> Array:
+    """Returns the numbers a (...), and the other number where they are not finite."""
+    return np.where(np.isfinite(a), a, other)
+
+
+def divisors(size: Array) -> Array:
+    """Returns the sizes (...), and 1 in place of those that are not above 0: what is divided by
+    them stays."""
+    return np.where(size > 0, size, 1.0)
+
+
 def read_only(a: Array) -> Array:
     """Returns a read-only view of the same numbers."""
     view = np.asarray(a).view()

@@ -16,7 +16,9 @@ from ipe_bench.basics.linalg import (
     Covariance,
     Mask,
     definite_factor,
+    divisors,
     finite,
+    finite_or,
     gram,
     inverse,
     multiply,
@@ -144,7 +146,7 @@ class NormalEquations:
                 Q[ill] = Q_there
         columns = np.sqrt(np.sum(U**2, axis=1))
         along = np.abs(multiply(U.swapaxes(1, 2), gradient))
-        along_columns = along / np.where(columns > 0, columns, 1.0)
+        along_columns = along / divisors(columns)
         newton, size = _newton_step(inverse_U, gradient)
         stationary = along_columns.max(axis=1)
         return cls(U, inverse_U, gradient, columns, newton, size, stationary, Q)
@@ -180,7 +182,7 @@ def _newton_step(inverse_U: Array, gradient: Array) -> tuple[Array, Array]:
     newton = -multiply(inverse_U, gradient)
     deviation = np.sqrt(np.sum(inverse_U**2, axis=2))
     size = np.abs(newton / deviation).max(axis=1)
-    return newton, np.where(np.isfinite(size), size, np.inf)
+    return newton, finite_or(np.inf, size)
 
 
 def _damped_step(U: Array, weights: Array, gradient: Array) -> Array:
@@ -203,7 +205,7 @@ def _orthogonal_factors(J: Array, r: Array) -> tuple[Array, Array, Array, Array]
     Q, U = np.linalg.qr(np.where(usable[:, None, None], J, 0.0))
     # J lacks rank if a pivot is round-off, its columns brought to length 1.
     columns = np.sqrt(np.sum(U**2, axis=1))
-    scaled = U / np.where(columns > 0, columns, 1.0)[:, None, :]
+    scaled = U / divisors(columns)[:, None, :]
     pivots = np.abs(np.diagonal(scaled, axis1=1, axis2=2))
     round_off = np.finfo(float).eps * max(m, n) * np.sqrt(n)
     deficient = ~usable | (pivots.min(axis=1) <= round_off)
@@ -280,7 +282,7 @@ class LeastSquaresSystem:
             moved=np.full(trials, np.inf),
             lam=np.full(trials, lam),
             growth=np.full(trials, 2.0),
-            scale=np.where(slope.columns > 0, slope.columns, 1.0),
+            scale=divisors(slope.columns),
             regular=np.isfinite(slope.size),
             mark=cost,
             idle=np.zeros(trials, np.int64),

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ipe_bench.basics.batches import put
-from ipe_bench.basics.linalg import Array, finite, multiply
+from ipe_bench.basics.linalg import Array, divisors, finite, multiply
 from ipe_bench.estimators.driver import ConvergenceCheck, Method
 from ipe_bench.estimators.least_squares import LeastSquaresSystem, Objective, slope_at
 
@@ -93,7 +93,7 @@ class LevenbergMarquardtMethod(Method[Objective, LeastSquaresSystem]):
         elif self.sizes is not None:
             magnitude = np.maximum(np.abs(x), self.sizes)
             whole = np.linalg.norm(state.slope.columns * magnitude, axis=1)
-            whole = np.where(whole > 0, whole, 1.0)
+            whole = divisors(whole)
             state = replace(state, scale=whole[:, None] / magnitude)
         if not self.by_residual:
             return state

@@ -8,10 +8,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-import numpy as np
-
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.linalg import Array, unmasked
+from ipe_bench.basics.linalg import Array, finite_or, unmasked
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo, informed
@@ -134,7 +132,7 @@ class Question:
             return Certified()
         if found.deviations is None:
             return stated or ModelNoise().of(found.model) or Unknown()
-        deviations = tuple(np.where(np.isfinite(found.deviations), found.deviations, 1.0).tolist())
+        deviations = tuple(finite_or(1.0, found.deviations).tolist())
         if isinstance(stated, Unknown):
             return replace(stated, weights=deviations)
         if stated is not None:

@@ -21,7 +21,7 @@ from functools import cached_property
 import numpy as np
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.linalg import Array, Covariance, Mask, repeated
+from ipe_bench.basics.linalg import Array, Covariance, Mask, divisors, repeated
 from ipe_bench.estimators.driver import Limits
 from ipe_bench.estimators.least_squares import Objective, inverse_factor
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
@@ -365,7 +365,7 @@ def _satterthwaite(P: Array, J: Array, by_theta: Array) -> Array:
 def _require_residuals(levels: Levels, z: Array, r: Array, J: Array) -> None:
     """Refuses levels of groups that the parameters can meet exactly, or have met."""
     size = np.linalg.norm(J, axis=0)
-    scaled = J / np.where(size > 0, size, 1.0)
+    scaled = J / divisors(size)
     known = np.isfinite(J).all()
     for k, name in enumerate(levels.groups):
         rows = np.flatnonzero(levels.group == k)
@@ -388,5 +388,5 @@ def first_levels(levels: Levels, z: Array) -> Array:
     """Returns logarithms (k,) of levels as large as each group's readings."""
     squares = np.bincount(levels.group, (z / levels.weights) ** 2)
     mean = np.sqrt(squares / np.bincount(levels.group))
-    logarithms = np.log(np.where(mean > 0, mean, 1.0))
+    logarithms = np.log(divisors(mean))
     return np.repeat(logarithms, len(levels.names))

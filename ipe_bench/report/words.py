@@ -27,9 +27,14 @@ def value_text(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def assigned(column: str, value: str) -> str:
-    """Words a setting by its key and value; models and noises by their names alone."""
-    return value if column in ("measurement", "noise") else f"{column}={value}"
+def assignments(settings: Mapping[Any, str]) -> str:
+    """Words settings by their keys and values, models and noises by their names alone; those that
+    are missing are left out."""
+    there = {key: value for key, value in settings.items() if value != "-"}
+    return ", ".join(
+        value if key in ("measurement", "noise") else f"{key}={value}"
+        for key, value in there.items()
+    )
 
 
 def enumerate_few(items: Sequence[str], most: int = 6) -> str:

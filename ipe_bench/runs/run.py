@@ -140,21 +140,18 @@ def validate(
     for scenario in scenarios:
         if scenario.noise.real and trials != 1:
             mistakes.append(f"trials={trials}: certified readings are one trial; set trials=1")
-        kind, what = Tracker, "estimates constants; a state model takes trackers"
-        if not isinstance(scenario, StateScenario):
-            kind, what = Estimator, "tracks states that move; a measurement model takes estimators"
-        other = [
-            f"estimators.{label}: {what}"
-            for label, one in estimators.items()
-            if not isinstance(one, kind)
-        ]
-        mistakes += other
-        if isinstance(scenario, StateScenario) and not other:
-            found = {
-                label: tracker.hindrance(scenario.assumed) for label, tracker in estimators.items()
-            }
+        moving = isinstance(scenario, StateScenario)
+        kind = Tracker if moving else Estimator
+        what = "tracks states that move; a measurement model takes estimators"
+        if moving:
+            what = "estimates constants; a state model takes trackers"
+        other = [label for label, one in estimators.items() if not isinstance(one, kind)]
+        if other:
+            mistakes += [f"estimators.{label}: {what}" for label in other]
+            continue
+        if isinstance(scenario, StateScenario):
+            found = {label: one.hindrance(scenario.assumed) for label, one in estimators.items()}
             mistakes += [f"trackers.{label}: {why}" for label, why in found.items() if why]
-        if isinstance(scenario, StateScenario) or other:
             continue
         if scenario.noise.estimated and scenario.noise.true_levels(scenario.measurement.m) is None:
             mistakes.append(NO_LEVEL)

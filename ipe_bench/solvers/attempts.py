@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import put, take
-from ipe_bench.basics.linalg import Array, Covariance, repeated, squared
+from ipe_bench.basics.linalg import Array, Covariance, finite_or, repeated, squared
 from ipe_bench.basics.streams import generator
 from ipe_bench.estimators.driver import Limits, continued
 from ipe_bench.estimators.ipe import starting_points
@@ -212,7 +212,7 @@ class Stages(Attempts):
         for steps, kept in _HALVINGS:
             found = self.minimize(owner, _FROM_AFAR, found.x, steps)
             useless = np.full(len(owner), np.inf)
-            chosen = _kept(owner, found.x, _finite(found.chi_square), useless, most=kept)
+            chosen = _kept(owner, found.x, finite_or(np.inf, found.chi_square), useless, most=kept)
             found = take(found, chosen)
             owner = owner[chosen]
         return found
@@ -226,12 +226,7 @@ class Stages(Attempts):
             x = repeated(point, len(rows))
             cost.append(squared(objective.residual(x)))
         self.charge(rows, objective.model.tally)
-        return _finite(np.stack(cost, axis=1))
-
-
-def _finite(cost: Array) -> Array:
-    """Returns the cost, and infinity where it is not a number."""
-    return np.where(np.isfinite(cost), cost, np.inf)
+        return finite_or(np.inf, np.stack(cost, axis=1))
 
 
 _DAMPING = 1.0
@@ -310,7 +305,7 @@ class Windows(Attempts):
         x = starting_points(self.problem, self.z[rows], "linear_lse", tally)
         self.tally.simulations[rows] += tally.simulations
         distance = np.median(np.abs(x - self.problem.x0), axis=1)
-        distance = np.where(np.isfinite(distance), distance, 1.0)
+        distance = finite_or(1.0, distance)
         return 10.0 ** np.ceil(np.log10(np.clip(distance, 1.0, 1e9)))
 
     def _grown(self, k: int, rows: Rows, before: Minima | None, last: bool) -> Minima:
@@ -341,7 +336,7 @@ class Windows(Attempts):
             kept = _kept(
                 owner,
                 minima.x / metric,
-                _finite(fit) / objective.readings,
+                finite_or(np.inf, fit) / objective.readings,
                 useless=np.maximum(known[owner], _GIVEN_UP[min(number, 2)]),
                 most=max(1, _draws(k) // _THINNING[min(number, 6)]),
                 alike=_ONE[min(number, 1)],
@@ -362,7 +357,7 @@ class Windows(Attempts):
         spread = np.ones(n) if self.prior is None else self.prior
         if self.prior is None and before is not None:
             distance = np.abs(before.x - x0)
-            spread = np.maximum(1.0, np.where(np.isfinite(distance), distance, 1.0))
+            spread = np.maximum(1.0, finite_or(1.0, distance))
         draws = np.zeros((1, n))
         if k > 1:
             rng = generator(k)
@@ -375,7 +370,7 @@ class Windows(Attempts):
         x0 = repeated(self.problem.x0, len(rows))
         result = Minima.nowhere(x0, self.limits.history)
         # By trial; those that converged first, and the lowest first among these.
-        order = np.lexsort((_finite(found.chi_square), ~found.converged, owner))
+        order = np.lexsort((finite_or(np.inf, found.chi_square), ~found.converged, owner))
         owners, first = np.unique(owner[order], return_index=True)
         return put(result, np.searchsorted(rows, owners), take(found, order[first]))
 

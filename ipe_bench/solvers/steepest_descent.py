@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ipe_bench.basics.linalg import Array, multiply, squared
+from ipe_bench.basics.linalg import Array, divisors, multiply, squared
 from ipe_bench.basics.options import Count
 from ipe_bench.estimators.ipe import IPE, State, System
 
@@ -39,7 +39,7 @@ class SteepestDescent(IPE):
         g = squared(state.F)
         gradient = multiply(system.J(x).swapaxes(1, 2), state.F)
         length = np.linalg.norm(gradient, axis=1)
-        as_long_as_F = np.sqrt(g) / np.where(length > 0, length, 1.0)
+        as_long_as_F = np.sqrt(g) / divisors(length)
         d = gradient * as_long_as_F[:, None]
 
         # alpha_3: halved until g is below its value at the start.

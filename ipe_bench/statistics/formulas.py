@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 from scipy.special import betaincinv, gammaincinv, ndtri
 
-from ipe_bench.basics.linalg import Array, finite
+from ipe_bench.basics.linalg import Array, divisors, finite, finite_or
 from ipe_bench.statistics.calibration import overall_words
 from ipe_bench.statistics.intervals import (
     LEVEL,
@@ -119,7 +119,7 @@ def rmse(s: Sample) -> Array:
 
 @once
 def rmse_all(s: Sample) -> Array:
-    return rms_columns(np.where(np.isfinite(s.error), s.error, np.inf))
+    return rms_columns(finite_or(np.inf, s.error))
 
 
 @once
@@ -133,7 +133,7 @@ def products(s: Sample) -> Array:
 
 
 def _unit(s: Sample) -> Array:
-    return np.where(s.linear_bound > 0, s.linear_bound, 1.0)
+    return divisors(s.linear_bound)
 
 
 @once

@@ -15,7 +15,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.special import betaincinv, betaln, chdtri, ndtri
 
-from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.linalg import Array, finite_or
 from ipe_bench.basics.streams import generator
 from ipe_bench.statistics.verdicts import (
     CONSISTENT,
@@ -436,7 +436,7 @@ def quantile(values: Array, q: float) -> float:
     position = (len(values) - 1) * q
     below = math.floor(position)
     above = math.ceil(position)
-    ordered = np.partition(np.where(np.isfinite(values), values, np.inf), (below, above))
+    ordered = np.partition(finite_or(np.inf, values), (below, above))
     a = ordered[below]
     b = ordered[above]
     # Between two infinite values nothing is interpolated: inf - inf is not a number.
@@ -447,7 +447,7 @@ def quantile(values: Array, q: float) -> float:
 
 def quantiles(values: Array, q: Array) -> Array:
     """Computes many such quantiles (k,) of one or more numbers from one sort."""
-    ordered = np.sort(np.where(np.isfinite(values), values, np.inf))
+    ordered = np.sort(finite_or(np.inf, values))
     position = (len(values) - 1) * q
     below = np.floor(position)
     a = ordered[below.astype(int)]

@@ -24,7 +24,7 @@ from ipe_bench.report.style import (
     drawn_settings,
     looks,
 )
-from ipe_bench.report.words import assigned, value_text, varying
+from ipe_bench.report.words import assignments, value_text, varying
 from ipe_bench.runs.store import traits
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.records import family_of
@@ -197,8 +197,7 @@ def _setting(values: Mapping[str, Any], columns: Sequence[str]) -> tuple[str, ..
 def _label(setting: Mapping[str, str], own: Mapping[str, str]) -> str:
     """Words a setting: its model and noise, then its own values."""
     first = {column: setting.get(column, "-") for column in ("measurement", "noise")}
-    told = {**first, **own}
-    return ", ".join(assigned(column, value) for column, value in told.items() if value != "-")
+    return assignments({**first, **own})
 
 
 def _suffix(words: Iterable[str], taken: Sequence[str]) -> str:

@@ -24,7 +24,7 @@ from ipe_bench.report.tables.table import (
     words,
 )
 from ipe_bench.report.words import (
-    assigned,
+    assignments,
     brief,
     cost,
     duration,
@@ -127,8 +127,7 @@ def _columns_of_settings(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def _worded(row: Mapping[str, Any], columns: Sequence[str]) -> str:
     """Words a row's setting, without the options that its classes lack."""
-    values = {column: value_text(row.get(column)) for column in columns}
-    return ", ".join(assigned(c, value) for c, value in values.items() if value != "-")
+    return assignments({column: value_text(row.get(column)) for column in columns})
 
 
 def _opening(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> list[Part]:
@@ -202,8 +201,8 @@ def differing(rows: pd.DataFrame, columns: Sequence[str]) -> list[str]:
         usual = {c: values[c].mode().iloc[0] for c in values}
     settings = []
     for row in values.to_dict("records"):
-        told = [assigned(str(c), v) for c, v in row.items() if v not in ("-", usual.get(c))]
-        settings.append(", ".join(told) or "-")
+        told = {c: v for c, v in row.items() if v != usual.get(c)}
+        settings.append(assignments(told) or "-")
     return settings
 
 
