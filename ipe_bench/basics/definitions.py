@@ -21,8 +21,11 @@ import sysconfig
 import types
 import uuid
 from collections.abc import Mapping, Set
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from ipe_bench.basics.options import component_classes
 
@@ -43,12 +46,30 @@ _tokens: dict[int, tuple[Any, str]] = {}
 own."""
 
 
-def definition_digest(component: Any) -> str:
-    """Computes a digest of what the numbers of a component depend on beside options and installed
-    packages; empty if it is of installed packages alone. That of a component that is `pinned` stays
-    as it was then."""
+@dataclass(frozen=True)
+class Definition:
+    """Holds what the numbers of a component depend on beside options and installed packages."""
+
+    digest: str
+    """Empty if the component is of installed packages alone."""
+    modules: frozenset[str]
+    """Modules that the code reaches, whose files may fill variables that are not digested."""
+
+
+def definition_of(component: Any) -> Definition:
+    """Returns the definition of a component; that of a component that is `pinned` stays as it was
+    then."""
     held = getattr(component, "__dict__", {}).get(_PIN)
-    return _digest(component_classes(component), Definitions()) if held is None else held
+    if held is not None:
+        return held
+    definitions = Definitions()
+    digest = _digest(component_classes(component), definitions)
+    return Definition(digest, frozenset(definitions.modules))
+
+
+def definition_digest(component: Any) -> str:
+    """Returns the digest of a component's definition."""
+    return definition_of(component).digest
 
 
 def importable_digest(component: Any) -> str:
@@ -76,8 +97,8 @@ def pinned(component: Any) -> Any:
         return component
     if _PIN in getattr(component, "__dict__", {_PIN: ""}):
         return component
-    found = definition_digest(component)
-    if not found:
+    found = definition_of(component)
+    if not found.digest:
         return component
     fresh = copy.copy(component)
     state = {name: pinned(value) for name, value in _state_of(component).items()}
@@ -151,6 +172,8 @@ class Definitions:
 
     def __init__(self, *, values: bool = True) -> None:
         self.values = values
+        self.modules: set[str] = set()
+        """Modules that are not installed, of what was met."""
         self.met: dict[int, tuple[int, Any]] = {}
         """Place in the order of meeting of each thing by its id, with the thing itself, so that its
         id stays so."""
@@ -172,6 +195,8 @@ class Definitions:
             return thing.__name__
         if _stands_by_name(thing):
             return thing.__module__, thing.__qualname__
+        if isinstance(thing, type | types.FunctionType):
+            self._note(thing.__module__)
         if isinstance(thing, type):
             return self._class(thing)
         if isinstance(thing, types.FunctionType):
@@ -183,6 +208,10 @@ class Definitions:
         if type(thing) in (set, frozenset):
             return sorted(repr(Definitions().of(one)) for one in thing)
         return self._object(thing)
+
+    def _note(self, module: str | None) -> None:
+        if module and not is_installed(module):
+            self.modules.add(module)
 
     def _object(self, thing: Any) -> Any:
         """Describes an object as pickle takes it apart, without what it has worked out."""
@@ -231,23 +260,40 @@ class Definitions:
         return text, described, self.of(given)
 
     def _kept(self, variables: Mapping[str, Any], *, in_file: bool) -> dict[str, Any]:
-        """Keeps those variables that belong to a definition. What a file fills a container with is
-        in its source, and what is put in later is mostly a cache."""
+        """Keeps those variables that belong to a definition: of a file's containers those that hold
+        numbers and words alone, such as tables of constants. Others are mostly caches, and what
+        the file fills them with is in its source."""
         if self.values and not in_file:
             return dict(variables)
-        kinds = (*_DEFINED, *_PLAIN, tuple, frozenset) if self.values else _DEFINED
-        return {k: v for k, v in variables.items() if isinstance(v, kinds) or _wraps(v)}
+
+        def belongs(value: Any) -> bool:
+            if isinstance(value, _DEFINED) or _wraps(value):
+                return True
+            return self.values and (isinstance(value, tuple | frozenset) or _is_table(value))
+
+        return {name: value for name, value in variables.items() if belongs(value)}
 
     def _reached(self, value: Any, attributes: Set[str]) -> Any:
         """Describes what a name stands for: of a module those of its attributes that the code asks
         for."""
         if not isinstance(value, types.ModuleType) or is_installed(value.__name__):
             return self.of(value)
+        self._note(value.__name__)
         content = vars(value)
         named = {name: content[name] for name in sorted(attributes & content.keys())}
         asked = self._kept(named, in_file=True)
         described = [(name, self._reached(one, attributes - {name})) for name, one in asked.items()]
         return value.__name__, described
+
+
+def _is_table(value: Any, depth: int = 5) -> bool:
+    """Tells whether a value is a number, a word, or a container of such, however nested."""
+    if isinstance(value, (*_PLAIN, np.ndarray, np.generic)):
+        return True
+    if not isinstance(value, list | tuple | set | frozenset | dict) or not depth:
+        return False
+    parts = [*value, *value.values()] if isinstance(value, dict) else value
+    return all(_is_table(part, depth - 1) for part in parts)
 
 
 def _content(cell: Any) -> Any:

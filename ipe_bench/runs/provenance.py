@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from ipe_bench.basics.definitions import definition_digest, importable_digest, is_installed
+from ipe_bench.basics.definitions import definition_of, importable_digest, is_installed
 from ipe_bench.basics.options import component_classes
 
 TARGET = "_target_"
@@ -88,13 +88,15 @@ def fingerprint(components: Sequence[Any]) -> dict[str, Any]:
     """Returns the versions of the packages, and a digest of the numerical source, that components
     are made of.
 
-    The source of a component is the module of its class with all modules of its package that it
-    imports, and the scoring of trials, without comments, docstrings, the texts of exceptions and
-    the modules of `WITHOUT_NUMBERS`; and what is not of an installed package as it is in this
+    The source of a component is the module of its class, the modules that its code reaches, all
+    that these import from their package or from files that are not installed, and the scoring of
+    trials, without comments, docstrings, the texts of exceptions and the modules of
+    `WITHOUT_NUMBERS`; and what is not of an installed package as it is in this
     process, which may differ from its file.
     """
     modules = _modules_of(_homes(components))
-    defined = [found for component in components if (found := definition_digest(component))]
+    digests = [definition_of(component).digest for component in components]
+    defined = [digest for digest in digests if digest]
     return {"versions": _versions_of(modules), "source": _source_digest(modules, defined)}
 
 
@@ -107,7 +109,8 @@ def importable(components: Sequence[Any]) -> dict[str, Any]:
 
 
 def _homes(components: Sequence[Any]) -> set[str]:
-    return {cls.__module__ for component in components for cls in component_classes(component)}
+    homes = {cls.__module__ for component in components for cls in component_classes(component)}
+    return homes.union(*(definition_of(component).modules for component in components))
 
 
 def _modules_of(homes: Iterable[str]) -> set[str]:
@@ -139,8 +142,8 @@ def _package_version(package: str) -> str:
 
 
 def _import_closure(module: str) -> frozenset[str]:
-    """Collects the module and, recursively, what it imports from its own top-level package or from
-    ipe_bench."""
+    """Collects the module and, recursively, what it imports from its own top-level package, from
+    ipe_bench, or from files that are not installed."""
     return _installed_closure(module) if is_installed(module) else _closure(module)
 
 
@@ -156,9 +159,12 @@ def _closure(module: str) -> frozenset[str]:
             continue
         found.add(name)
         own = {name.split(".")[0], "ipe_bench"}
-        waiting += [
-            n for n in _source_of(name)[1] if n.split(".")[0] in own and _spec_of(n) is not None
-        ]
+        for imported in _source_of(name)[1]:
+            is_own = imported.split(".")[0] in own
+            # An installed package imports nothing that is not.
+            is_near = is_own or not (is_installed(module) or is_installed(imported))
+            if is_near and _spec_of(imported) is not None:
+                waiting.append(imported)
     return frozenset(found)
 
 

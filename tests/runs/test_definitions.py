@@ -357,6 +357,63 @@ def test_what_is_set_in_a_module_from_outside_is_part_of_the_key(importing, monk
     assert ResultKey(SCENARIO, "mine", module.Reloaded()).key != key
 
 
+TABLES = ["[{v}]", "{{'a': [{v}]}}['a']", "np.array([{v}])", "list(map(float, '{v}'.split()))"]
+USES = {
+    "name": "from helper import TABLE\ndef shift():\n    return TABLE[0]",
+    "module": "import helper\ndef shift():\n    return helper.TABLE[0]",
+}
+
+
+def with_table(folder: Path, table: str, use: str, v: float) -> ib.Estimator:
+    """Writes and imports a module whose estimator reads a table of numbers in another file."""
+    (folder / "helper.py").write_text(f"import numpy as np\nTABLE = {table.format(v=v)}\n")
+    (folder / "mine.py").write_text(MODULE.format(helper=USES[use]))
+    importlib.invalidate_caches()
+    for name in ("helper", "mine"):
+        importlib.reload(importlib.import_module(name))
+    return sys.modules["mine"].Reloaded()
+
+
+@pytest.mark.parametrize("use", USES)
+@pytest.mark.parametrize("table", TABLES)
+def test_numbers_of_a_table_in_another_file_are_part_of_the_key(importing, table, use):
+    keys = [
+        ResultKey(SCENARIO, "mine", with_table(importing, table, use, v)).key
+        for v in (0.0, 1000.0, 0.0)
+    ]
+    assert keys[0] == keys[2] != keys[1]
+
+
+def test_a_file_is_part_of_the_key_though_what_it_fills_is_no_table(importing):
+    keys = []
+    for v in (0.0, 1000.0):
+        table = "type('Object', (), {{'__getitem__': lambda *_: {v}}})()"
+        keys.append(ResultKey(SCENARIO, "mine", with_table(importing, table, "name", v)).key)
+    assert keys[0] != keys[1]
+
+
+def test_a_cell_reaches_the_file_of_a_module_that_it_imports(importing):
+    session = Session("estimator", "constant", 0.0)
+    keys = []
+    for v in (0.0, 1000.0):
+        table = "type('Object', (), {{'__getitem__': lambda *_: {v}}})()"
+        with_table(importing, table, "name", v)
+        exec("import helper\ndef helped():\n    return helper.TABLE[0]", session.names)
+        exec("class By:\n    def by(self):\n        return helped()", session.names)
+        exec(KINDS["estimator"], session.names)
+        keys.append(session.key())
+    assert keys[0] != keys[1]
+
+
+@pytest.mark.parametrize("use", USES)
+@pytest.mark.parametrize("table", TABLES)
+def test_a_table_that_is_changed_from_outside_is_part_of_the_key(importing, table, use):
+    mine = with_table(importing, table, use, 0.0)
+    key = ResultKey(SCENARIO, "mine", mine).key
+    sys.modules["helper"].TABLE[0] = 1000.0
+    assert ResultKey(SCENARIO, "mine", mine).key != key
+
+
 CELLS = """
 import sys
 from dataclasses import dataclass
