@@ -30,6 +30,8 @@ _FOLDER = re.compile(
     r"(?!(?i:con|prn|aux|nul|com\d|lpt\d)(\.|$))[A-Za-z0-9]([A-Za-z0-9._=,+-]{0,98}[A-Za-z0-9])?"
 )
 """Names that mean the same on every system."""
+_PIECE = 1 << 20
+"""Bytes that are read at once."""
 _MOST_COMPRESSED = 100
 """Bytes that a byte of a bundle may stand for; those of records stand for 10."""
 
@@ -60,23 +62,23 @@ def write_bundle(directories: Sequence[Path | str], path: Path) -> Bundle:
     contents: dict[str, bytes] = {}
     for directory in map(Path, directories):
         _require_results(directory)
-        name = (
-            re.sub(r"[^A-Za-z0-9._=,+-]+", "_", directory.resolve().name)[:100].strip("._=,+-")
-            or "results"
-        )
+        plain = re.sub(r"[^A-Za-z0-9._=,+-]+", "_", directory.resolve().name)
+        name = plain[:100].strip("._=,+-") or "results"
         if any(known.startswith(f"{name}/") for known in contents):
             raise UserError(
                 f"{directory}: another folder has the name {name} too; bundle them apart, or"
                 " rename one"
             )
-        contents |= {f"{name}/{file}": content for file, content in _contents(directory).items()}
+        for file, content in _contents(directory).items():
+            contents[f"{name}/{file}"] = content
     if not contents:
         raise UserError(
             f"{', '.join(map(str, directories))}: holds no whole results to bundle; run something"
             " first"
         )
     digests = {name: _digest(content) for name, content in sorted(contents.items())}
-    contents[MANIFEST] = "".join(f"{digest}  {name}\n" for name, digest in digests.items()).encode()
+    manifest = "".join(f"{digest}  {name}\n" for name, digest in digests.items())
+    contents[MANIFEST] = manifest.encode()
     if path.exists():
         found = read_bundle(path)
         if found.files != digests:
@@ -90,7 +92,8 @@ def write_bundle(directories: Sequence[Path | str], path: Path) -> Bundle:
         with zipfile.ZipFile(temporary, "w") as archive:
             for name in (MANIFEST, *digests):
                 entry = zipfile.ZipInfo(name)  # of 1980: times are no part of what is bundled
-                entry.external_attr, entry.create_system = 0o644 << 16, 3
+                entry.external_attr = 0o644 << 16
+                entry.create_system = 3
                 archive.writestr(entry, contents[name])
 
     write_atomically(path, write)
@@ -103,28 +106,22 @@ def _contents(directory: Path) -> dict[str, bytes]:
     store = Store(directory)
     while True:
         damaged = Results.read([directory]).damaged
-        files = [
-            p for folder in (store.trials, store.runs, store.failed) for p in folder.glob("[!.]*.*")
-        ]
-        names = {
-            f"{file.parent.name}/{file.name}": file
-            for file in files
-            if file not in damaged and file.is_file()
-        }
+        names: dict[str, Path] = {}
+        for folder in (store.trials, store.runs, store.failed):
+            for file in folder.glob("[!.]*.*"):
+                name = f"{folder.name}/{file.name}"
+                if _FILE.fullmatch(name) and file not in damaged and file.is_file():
+                    names[name] = file
         with contextlib.suppress(FileNotFoundError):
-            return {
-                name: file.read_bytes() for name, file in names.items() if _FILE.fullmatch(name)
-            }
+            return {name: file.read_bytes() for name, file in names.items()}
 
 
 def read_bundle(path: Path) -> Bundle:
     """Reads all files of a bundle; raises UserError unless they are as its manifest says."""
     try:
         with zipfile.ZipFile(path) as archive:
-            if (
-                sum(one.file_size for one in archive.infolist())
-                > _MOST_COMPRESSED * path.stat().st_size
-            ):
+            unpacked = sum(one.file_size for one in archive.infolist())
+            if unpacked > _MOST_COMPRESSED * path.stat().st_size:
                 raise UserError(
                     f"{path}: would unpack to over {_MOST_COMPRESSED} times its size; the bundle"
                     " is not read"
@@ -191,8 +188,10 @@ def _digest_of(archive: zipfile.ZipFile, name: str) -> str:
     list states."""
     digest = hashlib.sha256()
     with archive.open(name) as file:
-        while piece := file.read(1 << 20):
+        piece = file.read(_PIECE)
+        while piece:
             digest.update(piece)
+            piece = file.read(_PIECE)
     return digest.hexdigest()
 
 

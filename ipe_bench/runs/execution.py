@@ -187,9 +187,8 @@ def supervise(
         while waiting or busy:
             while waiting and len(busy) < workers:
                 index = waiting.popleft()
-                worker = _begun(
-                    index, (sys.path, threads, memory_gb, cloudpickle.dumps((work, tasks[index])))
-                )
+                payload = cloudpickle.dumps((work, tasks[index]))
+                worker = _begun(index, (sys.path, threads, memory_gb, payload))
                 busy[worker.connection] = worker
             deadline = min(worker.deadline for worker in busy.values())
             patience = None if deadline == math.inf else max(0.0, deadline - time.monotonic())
@@ -240,19 +239,18 @@ class _Worker:
             os.set_handle_inheritable(handle, True)
             options = {"close_fds": False}
         # In a session of its own, so that Ctrl-C in a terminal reaches the parent alone.
+        env = {**os.environ, "PYTHONPATH": path}
+        env |= {f"{name}_NUM_THREADS": "1" for name in _THREADED}
         self.process = subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,
-            env={
-                **os.environ,
-                **{f"{name}_NUM_THREADS": "1" for name in _THREADED},
-                "PYTHONPATH": path,
-            },
+            env=env,
             start_new_session=True,
             **options,
         )
         there.close()
-        self.index, self.deadline = -1, math.inf
+        self.index = -1
+        self.deadline = math.inf
         self.fresh = True
         """Whether a death is the work of the task at hand: false from when it has waited until its
         next task starts."""
@@ -309,7 +307,8 @@ def _begun(index: int, message: Any) -> _Worker:
             worker.fresh = False
         else:
             worker = _Worker()
-        worker.index, worker.deadline = index, math.inf
+        worker.index = index
+        worker.deadline = math.inf
         with contextlib.suppress(OSError):
             if worker.process.poll() is None:
                 worker.connection.send(message)

@@ -29,7 +29,8 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.runs.provenance import canonical_json
 
 SCHEMA = 4
-FOOTER, HISTORY = b"ipe_bench", b"history"
+FOOTER = b"ipe_bench"
+HISTORY = b"history"
 TRUTH = "truth"
 """Label of the files that hold the truth and its bounds, in place of an estimator's."""
 _TAIL = 8
@@ -86,7 +87,9 @@ class StoredPart:
     def parse(cls, path: Path) -> StoredPart | None:
         """Parses the part that a file name states; None if it states none."""
         match = _NAME.fullmatch(path.name)
-        return None if match is None else cls(path, match[1], int(match[2]), int(match[3]))
+        if match is None:
+            return None
+        return cls(path, match[1], int(match[2]), int(match[3]))
 
     @property
     def order(self) -> tuple[int, int, str]:
@@ -107,12 +110,16 @@ class StoredPart:
         """Reads the same, at most `GROUP` rows at a time: those of a million trials take
         gigabytes."""
         with _opened(self.path) as file:
-            footer, names, reached = self._footer(file), file.schema_arrow.names, self.start
-            names = [name for name in names if columns is None or name in {"trial", *columns}]
+            footer = self._footer(file)
+            names = file.schema_arrow.names
+            if columns is not None:
+                names = [name for name in names if name in {"trial", *columns}]
+            reached = self.start
             for group in range(file.num_row_groups):
                 table = file.read_row_group(group, names, use_threads=False)
-                first, reached = reached, reached + len(table)
-                if not np.array_equal(as_array(table["trial"]), np.arange(first, reached)):
+                counted = np.arange(reached, reached + len(table))
+                reached += len(table)
+                if not np.array_equal(as_array(table["trial"]), counted):
                     raise self._miscounted
                 yield footer, table.replace_schema_metadata(None)
             if reached != self.stop or not file.num_row_groups:
@@ -141,11 +148,9 @@ class StoredPart:
         `read` does."""
         with _opened(self.path) as file:
             text = file.metadata.metadata.get(HISTORY)
-        return (
-            None
-            if text is None
-            else {name: np.array(x, dtype=float) for name, x in json.loads(text).items()}
-        )
+        if text is None:
+            return None
+        return {name: np.array(x, dtype=float) for name, x in json.loads(text).items()}
 
 
 def join_histories(several: Iterable[Mapping[str, Array] | None]) -> dict[str, Array] | None:
@@ -153,11 +158,10 @@ def join_histories(several: Iterable[Mapping[str, Array] | None]) -> dict[str, A
     if none has any."""
     found: dict[str, Array] = {}
     for one in several:
-        new = None if one is None else ~np.isin(one["trial"], found.get("trial", ()))
-        found = {
-            name: np.append(found.get(name, ()), values[new])
-            for name, values in (one or found).items()
-        }
+        if one is None:
+            continue
+        new = ~np.isin(one["trial"], found.get("trial", ()))
+        found = {name: np.append(found.get(name, ()), x[new]) for name, x in one.items()}
     return found or None
 
 
@@ -186,7 +190,8 @@ def _require_footer(source: pa.NativeFile) -> None:
     if tail[4:] != b"PAR1" or length > size:
         raise Unusable("damaged: is cut short, or no table")
     source.seek(max(0, size - length - _DIGEST))
-    digest, footer = source.read(min(_DIGEST, size - length)), source.read(length)
+    digest = source.read(min(_DIGEST, size - length))
+    footer = source.read(length)
     if any(schema in footer for schema in _OLDER):
         raise Outdated
     if hashlib.sha256(footer).digest() != digest:
@@ -233,9 +238,8 @@ def write_groups(
     how |= {"write_page_checksum": True, "write_statistics": False, "store_schema": False}
     metadata = {FOOTER: canonical_json(footer)}
     if history is not None:
-        metadata[HISTORY] = canonical_json(
-            {name: values.tolist() for name, values in history.items()}
-        )
+        iterates = {name: values.tolist() for name, values in history.items()}
+        metadata[HISTORY] = canonical_json(iterates)
 
     def written(temporary: Path) -> None:
         with temporary.open("w+b") as file:
@@ -244,7 +248,8 @@ def write_groups(
                     writer.write_table(table, GROUP)
                 writer.add_key_value_metadata(metadata)
             file.seek(-_TAIL, os.SEEK_END)
-            start = file.seek(-int.from_bytes(file.read(4), "little") - _TAIL, os.SEEK_END)
+            length = int.from_bytes(file.read(4), "little")
+            start = file.seek(-length - _TAIL, os.SEEK_END)
             end = file.read()
             file.seek(start)
             file.write(hashlib.sha256(end).digest() + end)
@@ -270,9 +275,8 @@ def _grouped(tables: Iterable[pa.Table]) -> Iterator[pa.Table]:
 
 def table_of(columns: Mapping[str, Array]) -> pa.Table:
     """Converts columns to Arrow's types: numbers, flags or texts."""
-    return pa.Table.from_arrays(
-        [_arrow(np.ascontiguousarray(values)) for values in columns.values()], list(columns)
-    )
+    arrays = [_arrow(np.ascontiguousarray(values)) for values in columns.values()]
+    return pa.Table.from_arrays(arrays, list(columns))
 
 
 def _arrow(values: Array) -> pa.Array:
@@ -283,8 +287,10 @@ def _arrow(values: Array) -> pa.Array:
         ends = np.cumsum([0, *(len(text) for text in texts)], dtype=np.int32)
         buffers = [None, pa.py_buffer(ends.tobytes()), pa.py_buffer(b"".join(texts))]
         return pa.Array.from_buffers(pa.string(), len(values), buffers)
-    kind = pa.bool_() if values.dtype == bool else pa.from_numpy_dtype(values.dtype)
-    data = np.packbits(values, bitorder="little") if values.dtype == bool else values
+    kind = pa.from_numpy_dtype(values.dtype)
+    data = values
+    if values.dtype == bool:
+        data = np.packbits(values, bitorder="little")
     return pa.Array.from_buffers(kind, len(values), [None, pa.py_buffer(data.tobytes())])
 
 
@@ -293,14 +299,14 @@ def as_array(column: pa.ChunkedArray) -> Array:
     if pa.types.is_string(column.type):
         # A million words are few different ones, each kept once.
         coded = column.combine_chunks().dictionary_encode(null_encoding="encode")
-        return np.array(coded.dictionary.to_pylist(), dtype=object)[
-            np.asarray(np.from_dlpack(coded.indices), int)
-        ]
+        words = np.array(coded.dictionary.to_pylist(), dtype=object)
+        return words[np.asarray(np.from_dlpack(coded.indices), int)]
     if column.null_count or pa.types.is_null(column.type):
         return column.to_numpy()
     if pa.types.is_boolean(column.type):
         return as_array(column.cast(pa.uint8())).astype(bool)
-    return np.concatenate([np.empty(0, str(column.type)), *map(np.from_dlpack, column.chunks)])
+    nothing = np.empty(0, str(column.type))
+    return np.concatenate([nothing, *map(np.from_dlpack, column.chunks)])
 
 
 def write_record(path: Path, record: Mapping[str, Any]) -> None:

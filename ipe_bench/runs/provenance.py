@@ -22,18 +22,11 @@ from ipe_bench.basics.definitions import definition_of, importable_digest, is_in
 from ipe_bench.basics.options import component_classes
 
 TARGET = "_target_"
-WITHOUT_NUMBERS = tuple(
-    f"ipe_bench.{name}"
-    for name in (
-        *(
-            "basics.definitions",
-            "basics.errors",
-            "basics.files",
-            "basics.machine",
-            "basics.statuses",
-        ),
-        *("runs", "statistics", "real", "plugins", "report", "questions", "workshop", "api", "cli"),
-    )
+_ROOMS = ("runs", "statistics", "real", "plugins", "report", "questions", "workshop", "api", "cli")
+_BASICS = ("definitions", "errors", "files", "machine", "statuses")
+WITHOUT_NUMBERS = (
+    *(f"ipe_bench.basics.{name}" for name in _BASICS),
+    *(f"ipe_bench.{name}" for name in _ROOMS),
 )
 """Modules and rooms that no number of a trial comes from: they word messages, name, store,
 summarise and show."""
@@ -118,13 +111,13 @@ def _modules_of(homes: Iterable[str]) -> set[str]:
 
 
 def _versions_of(modules: Iterable[str]) -> dict[str, str]:
-    return {
-        package: _package_version(package) for package in sorted({m.split(".")[0] for m in modules})
-    }
+    packages = {module.split(".")[0] for module in modules}
+    return {package: _package_version(package) for package in sorted(packages)}
 
 
 def _source_digest(modules: Iterable[str], defined: Iterable[str]) -> str:
-    lines = [*(f"{m} {_source_of(m)[0]}\n" for m in sorted(modules)), *defined]
+    lines = [f"{module} {_source_of(module)[0]}\n" for module in sorted(modules)]
+    lines += defined
     return hashlib.sha256("".join(lines).encode()).hexdigest()[:16]
 
 
@@ -150,9 +143,10 @@ def _import_closure(module: str) -> frozenset[str]:
 def _closure(module: str) -> frozenset[str]:
     found: set[str] = set()
     waiting = [module]
+    without_numbers = tuple(f"{name}." for name in WITHOUT_NUMBERS)
     while waiting:
         name = waiting.pop()
-        if name in found or f"{name}.".startswith(tuple(f"{n}." for n in WITHOUT_NUMBERS)):
+        if name in found or f"{name}.".startswith(without_numbers):
             continue
         if is_installed(name) and not is_installed(module):
             found |= _installed_closure(name)
@@ -179,10 +173,10 @@ def _spec_of(module: str) -> ModuleSpec | None:
     try:
         # To look for something in a module would import the module; and only a package has modules
         # in it.
-        if parent and (
-            (package := _spec_of(parent)) is None or package.submodule_search_locations is None
-        ):
-            return None
+        if parent:
+            package = _spec_of(parent)
+            if package is None or package.submodule_search_locations is None:
+                return None
         return importlib.util.find_spec(module)
     except (ValueError, ImportError):
         return None
@@ -193,23 +187,22 @@ def _source_of(module: str) -> tuple[str, frozenset[str]]:
     tables of constants; and the names of modules, and of what may be modules, that it imports."""
     path = None if is_installed(module) else _file_of(module)
     files = () if path is None else (path, *_tables_beside(path))
-    return _source_when(
-        module, tuple((about.st_mtime_ns, about.st_size) for about in map(Path.stat, files))
-    )
+    written = [(about.st_mtime_ns, about.st_size) for about in map(Path.stat, files)]
+    return _source_when(module, tuple(written))
 
 
 @functools.lru_cache(maxsize=4096)
 def _source_when(module: str, written: tuple[tuple[int, int], ...]) -> tuple[str, frozenset[str]]:
     """Computes the same for files that were `written` then, with these sizes."""
-    path, imported = _file_of(module), frozenset[str]()
+    path = _file_of(module)
+    imported = frozenset[str]()
     if path is None:
         return "", imported
     content = path.read_bytes()
     if path.suffix == ".py":
         tree = ast.parse(content)
-        imported = _imported(
-            tree, module if path.name == "__init__.py" else module.rpartition(".")[0]
-        )
+        package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+        imported = _imported(tree, package)
         content = numerical_code(tree).encode()
     tables = b"".join(table.read_bytes() for table in _tables_beside(path))
     return hashlib.sha256(content + tables).hexdigest(), imported
@@ -236,7 +229,8 @@ def _imported(tree: ast.Module, package: str) -> frozenset[str]:
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             base = importlib.util.resolve_name("." * node.level + (node.module or ""), package)
-            names |= {base} | {f"{base}.{alias.name}" for alias in node.names}
+            names.add(base)
+            names |= {f"{base}.{alias.name}" for alias in node.names}
     return frozenset(names)
 
 

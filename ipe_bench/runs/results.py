@@ -149,6 +149,15 @@ class _Asked(NamedTuple):
     refused: str
 
 
+class _Rivals(NamedTuple):
+    """Holds the cells of one identity."""
+
+    current: StoredCell | None
+    """The one that the newest run expects, or else the one that was written last, if it is
+    stored."""
+    stale: list[StoredCell]
+
+
 @dataclass
 class Results:
     """Holds everything stored under some directories; `Results.read` finds it."""
@@ -191,33 +200,19 @@ class Results:
 
     def _read_directory(self, store: Store, keys: Keys[str] | None) -> None:
         for folder in (store.trials, store.runs, store.failed):
-            if os.path.lexists(folder) and not (
-                folder.is_dir() and os.access(folder, os.R_OK | os.X_OK)
-            ):
+            listable = folder.is_dir() and os.access(folder, os.R_OK | os.X_OK)
+            if os.path.lexists(folder) and not listable:
                 self.extra_problems.append(f"{folder}: cannot be listed; what is in it is left out")
         listed: set[Path] = set()
         # What is gone before it is read is in a larger file, which may not have been there when
         # these were listed.
-        while fresh := [part for part in store.parts(keys) if part.path not in listed]:
+        fresh = store.parts(keys)
+        while fresh:
             for part in fresh:
                 listed.add(part.path)
                 with self._naming(part.path), contextlib.suppress(FileNotFoundError):
-                    ((footer, table),) = deque(part.groups(), maxlen=1)
-                    known = self.stored[part.key].parts if part.key in self.stored else ()
-                    if not known and (found := _OF_ZOO.search(canonical_json(footer["identity"]))):
-                        self.moved[footer["identity_key"]] = found[0]
-                        continue
-                    identity = identified(footer["identity"])
-                    footer = {**footer, "identity": identity, "identity_key": digest(identity)}
-                    self.stored[part.key] = StoredCell(
-                        footer, tuple(sorted([*known, part], key=lambda p: p.order))
-                    )
-                    if (
-                        len(table) == part.stop - part.start
-                        and self._kept_bytes + table.nbytes <= _MOST_KEPT
-                    ):
-                        self._kept_bytes += table.nbytes
-                        self._kept[part.path] = table
+                    self._add(part)
+            fresh = [part for part in store.parts(keys) if part.path not in listed]
         self.runs += tuple(self._records(store.runs, RUN))
         self.attempts += self._records(store.failed, FAILED)
         if keys is None and not listed and not self.runs:
@@ -226,6 +221,23 @@ class Results:
             self.extra_problems.append(
                 f"{store.directory}: was written by an older version of ipe-bench; {_AGAIN}"
             )
+
+    def _add(self, part: StoredPart) -> None:
+        """Adds a file to its cell, unless its class is called otherwise now."""
+        ((footer, table),) = deque(part.groups(), maxlen=1)
+        known = self.stored[part.key].parts if part.key in self.stored else ()
+        found = None if known else _OF_ZOO.search(canonical_json(footer["identity"]))
+        if found is not None:
+            self.moved[footer["identity_key"]] = found[0]
+            return
+        identity = identified(footer["identity"])
+        footer = {**footer, "identity": identity, "identity_key": digest(identity)}
+        parts = sorted([*known, part], key=lambda one: one.order)
+        self.stored[part.key] = StoredCell(footer, tuple(parts))
+        whole = len(table) == part.stop - part.start
+        if whole and self._kept_bytes + table.nbytes <= _MOST_KEPT:
+            self._kept_bytes += table.nbytes
+            self._kept[part.path] = table
 
     def _records(self, folder: Path, shape: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
         for path in sorted(folder.glob("[!.]*.json")):
@@ -246,35 +258,27 @@ class Results:
     def problems(self) -> list[str]:
         """A line for everything that is missing, failed, refused or damaged."""
         lines = [f"{path}: {reason}; left out" for path, reason in self.damaged.items()]
-        lines += [
-            f"refused: {run.get('job', run['file'])}: {why}"
-            for run in self.runs
-            if (why := run.get("refused"))
-        ]
+        refused = [run for run in self.runs if run.get("refused")]
+        lines += [f"refused: {run.get('job', run['file'])}: {run['refused']}" for run in refused]
         lines += [line for cell in self.cells for line in cell.problems if not cell.refused]
         truths = {cell.scenario_id for cell in self.current if cell.label == TRUTH}
-        lines += [
-            f"missing: the truth of {describe_names(cell.names)}: no bound is shown"
-            for cell in self.current
-            if cell.label != TRUTH and cell.scenario_id not in truths
-        ]
+        for cell in self.current:
+            if cell.label != TRUTH and cell.scenario_id not in truths:
+                lines.append(
+                    f"missing: the truth of {describe_names(cell.names)}: no bound is shown"
+                )
         return list(dict.fromkeys([*lines, *self.extra_problems]))
 
     @property
     def stale(self) -> list[str]:
         """A line for what older code computed: left out, and no problem if the present code has
         computed it."""
-        lines = [
-            f"stale: {name} {moved(name.rpartition('.')[2])}; left out: its results ({count})"
-            for name, count in Counter(self.moved.values()).items()
-        ]
-        for cell in (cell for _, stale in self._rivals.values() for cell in stale):
-            versions = ", ".join(
-                f"{package} {version}" for package, version in cell.footer["versions"].items()
-            )
-            made_by = f"({versions}, source {cell.footer['source']}, key {cell.key})"
-            what = f"{describe_names(cell.names)}: {cell.trials} trials were computed by other code"
-            lines.append(f"stale: {what} {made_by}; left out")
+        lines = []
+        for name, count in Counter(self.moved.values()).items():
+            place = moved(name.rpartition(".")[2])
+            lines.append(f"stale: {name} {place}; left out: its results ({count})")
+        for rivals in self._rivals.values():
+            lines += map(_made_by_other_code, rivals.stale)
         for folder, count in Counter(path.parents[1] for path in self.outdated).items():
             lines.append(
                 f"stale: {folder}: {count} files were written by an older version of ipe-bench;"
@@ -285,9 +289,8 @@ class Results:
     @property
     def expected(self) -> int:
         """Cells that the records of runs announce, and refused jobs that came to none."""
-        return len(self._asked_for) + sum(
-            not run["cells"] for run in self.runs if run.get("refused")
-        )
+        refused = [run for run in self.runs if run.get("refused")]
+        return len(self._asked_for) + sum(not run["cells"] for run in refused)
 
     @property
     def complete(self) -> int:
@@ -297,10 +300,13 @@ class Results:
     def announces(self, cells: Iterable[ResultKey], trials: int) -> bool:
         """Tells whether the records of runs ask for all this already, and a further one would
         change none."""
-        asked = [(cell, self._asked_for.get(cell.identity_key)) for cell in cells]
-        return all(
-            a and (a.key, a.refused) == (cell.key, "") and a.trials >= trials for cell, a in asked
-        )
+        for cell in cells:
+            asked = self._asked_for.get(cell.identity_key)
+            if asked is None or asked.key != cell.key:
+                return False
+            if asked.refused != "" or asked.trials < trials:
+                return False
+        return True
 
     @cached_property
     def _asked_for(self) -> dict[str, _Asked]:
@@ -308,63 +314,71 @@ class Results:
         trials counts."""
         asked: dict[str, _Asked] = {}
         for run in self.runs:
-            for cell in (one for one in run["cells"] if one["identity_key"] not in self.moved):
+            for cell in run["cells"]:
+                if cell["identity_key"] in self.moved:
+                    continue
                 new = _Asked(cell["key"], run["trials"], cell["names"], run.get("refused", ""))
                 # Earlier versions made it of the files of classes, too.
-                identity = (self.stored[new.key].footer if new.key in self.stored else cell)[
-                    "identity_key"
-                ]
+                told = self.stored[new.key].footer if new.key in self.stored else cell
+                identity = told["identity_key"]
                 known = asked.get(identity, new)
                 trials = max(new.trials, known.trials) if known.key == new.key else new.trials
                 asked[identity] = new._replace(trials=trials)
         return asked
 
     @cached_property
-    def _rivals(self) -> dict[str, tuple[StoredCell | None, list[StoredCell]]]:
-        """Current and stale cells by identity: the one that the newest run expects, or else the one
-        that was written last, if it is stored; and the stale ones."""
-        rivals: dict[str, list[StoredCell]] = {}
+    def _rivals(self) -> dict[str, _Rivals]:
+        """Current and stale cells by identity."""
+        alike: dict[str, list[StoredCell]] = {}
         for cell in self.stored.values():
-            rivals.setdefault(cell.footer["identity_key"], []).append(cell)
-        result: dict[str, tuple[StoredCell | None, list[StoredCell]]] = {}
-        for identity, cells in rivals.items():
+            alike.setdefault(cell.footer["identity_key"], []).append(cell)
+        rivals: dict[str, _Rivals] = {}
+        for identity, cells in alike.items():
             asked = self._asked_for.get(identity) or max(cells, key=lambda cell: cell.written)
-            result[identity] = (
-                self.stored.get(asked.key),
-                [cell for cell in cells if cell.key != asked.key],
-            )
-        return result
+            stale = [cell for cell in cells if cell.key != asked.key]
+            rivals[identity] = _Rivals(self.stored.get(asked.key), stale)
+        return rivals
 
     @property
     def current(self) -> list[StoredCell]:
         """The stored cells that are not stale."""
-        return [cell for cell, _ in self._rivals.values() if cell is not None]
+        found = [rivals.current for rivals in self._rivals.values()]
+        return [cell for cell in found if cell is not None]
 
     @cached_property
     def cells(self) -> tuple[CellState, ...]:
         """States of all cells: those that runs asked for in their order, then others that are
         there."""
-        others, states = (
-            [cell for cell in self.current if cell.footer["identity_key"] not in self._asked_for],
-            [],
-        )
-        unasked = {
-            cell.footer["identity_key"]: _Asked(cell.key, 0, cell.names, "") for cell in others
-        }
-        for identity, (key, trials, names, refused) in (self._asked_for | unasked).items():
-            covered, tried = self._covered(key), [f for f in self.attempts if f["key"] == key]
-            lost = [f for f in tried if gaps(covered, f["start"], f["stop"])]
-            missing = _count(gaps([*covered, *((f["start"], f["stop"]) for f in lost)], 0, trials))
-            lacking = _count(gaps(covered, 0, trials))
-            done = trials - lacking if trials else self.stored[key].trials
-            stale = sum(cell.trials for cell in self._rivals.get(identity, (None, []))[1])
-            messages = tuple(dict.fromkeys(f"{f['status']}: {f['message']}" for f in lost))
-            counts = trials, done, lacking - missing, missing, stale
-            states.append(CellState(names, *counts, messages, key, refused if missing else ""))
+        all_asked = dict(self._asked_for)
+        for cell in self.current:
+            asked = _Asked(cell.key, 0, cell.names, "")
+            all_asked.setdefault(cell.footer["identity_key"], asked)
+        states = [self._state(identity, asked) for identity, asked in all_asked.items()]
         alike = Counter(describe_names(state.names) for state in states)
-        return tuple(
-            replace(s, tag=f" (#{s.key[:6]})") if alike[describe_names(s.names)] > 1 else s
-            for s in states
+        for i, state in enumerate(states):
+            if alike[describe_names(state.names)] > 1:
+                states[i] = replace(state, tag=f" (#{state.key[:6]})")
+        return tuple(states)
+
+    def _state(self, identity: str, asked: _Asked) -> CellState:
+        covered = self._covered(asked.key)
+        tried = [one for one in self.attempts if one["key"] == asked.key]
+        lost = [one for one in tried if gaps(covered, one["start"], one["stop"])]
+        told_of = [*covered, *((one["start"], one["stop"]) for one in lost)]
+        missing = _count(gaps(told_of, 0, asked.trials))
+        lacking = _count(gaps(covered, 0, asked.trials))
+        rivals = self._rivals.get(identity)
+        messages = dict.fromkeys(f"{one['status']}: {one['message']}" for one in lost)
+        return CellState(
+            names=asked.names,
+            expected=asked.trials,
+            done=asked.trials - lacking if asked.trials else self.stored[asked.key].trials,
+            failed=lacking - missing,
+            missing=missing,
+            stale=0 if rivals is None else sum(cell.trials for cell in rivals.stale),
+            messages=tuple(messages),
+            key=asked.key,
+            refused=asked.refused if missing else "",
         )
 
     def set_aside(self) -> list[str]:
@@ -373,9 +387,8 @@ class Results:
         lines = []
         for path, reason in self.damaged.items():
             aside = path.with_name(f"{path.stem}.damaged-{uuid.uuid4().hex[:8]}")
-            with contextlib.suppress(
-                FileNotFoundError
-            ):  # another run may have done so at this moment
+            # Another run may have done so at this moment.
+            with contextlib.suppress(FileNotFoundError):
                 path.rename(aside)
                 lines.append(f"{path}: {reason}; set aside as {aside.name} and computed again")
         return lines
@@ -396,38 +409,40 @@ class Results:
         named in `problems`, and left out. What some parts lack of the `optional` columns is NaN or
         None there."""
         names = None if columns is None else list(dict.fromkeys(["trial", *columns, *optional]))
-        if (
-            len(cell.parts) == 1
-            and (kept := self._kept.get(path := cell.parts[0].path)) is not None
-        ):
-            there, known = set(kept.column_names), self._arrays[path]
-            if there.issuperset(columns or ()):
-                for name in (
-                    there.difference(known)
-                    if names is None
-                    else there.intersection(names).difference(known)
-                ):
-                    known[name] = as_array(kept[name])
-                    known[name].flags.writeable = False
-                return {name: known[name] for name in names or kept.column_names if name in there}
+        if len(cell.parts) == 1:
+            path = cell.parts[0].path
+            kept = self._kept.get(path)
+            if kept is not None and set(kept.column_names).issuperset(columns or ()):
+                return self._load_kept(path, names)
         tables = self._of_parts(cell, lambda parts: list(self._tables(parts, names, columns or ())))
-        if sum(map(len, tables)) < cell.trials and self.damaged.keys().isdisjoint(
-            p.path for p in cell.parts
-        ):
+        lost = sum(map(len, tables)) < cell.trials
+        if lost and self.damaged.keys().isdisjoint(part.path for part in cell.parts):
             self.extra_problems.append(
                 f"missing: {describe_names(cell.names)}: trials went away while they were read"
             )
         if not tables:
             return {name: np.empty(0) for name in names or ("trial",)}
-        table, loaded = pa.concat_tables(tables, promote_options="default"), {}
+        table = pa.concat_tables(tables, promote_options="default")
         tables.clear()
-        for name in [one for one in names or table.column_names if one in table.column_names]:
+        there = table.column_names
+        loaded = {}
+        for name in [name for name in names or there if name in there]:
             loaded[name] = as_array(table[name])
-            table = table.drop_columns(
-                name
-            )  # so that no two copies of all columns are there at once
+            # So that no two copies of all columns are there at once.
+            table = table.drop_columns(name)
             pa.default_memory_pool().release_unused()
         return loaded
+
+    def _load_kept(self, path: Path, names: Sequence[str] | None) -> dict[str, Array]:
+        """Loads rows that are in memory, and converts a column only once."""
+        kept = self._kept[path]
+        known = self._arrays[path]
+        loaded = [name for name in names or kept.column_names if name in kept.column_names]
+        for name in loaded:
+            if name not in known:
+                known[name] = as_array(kept[name])
+                known[name].flags.writeable = False
+        return {name: known[name] for name in loaded}
 
     def load_history(self, cell: StoredCell) -> dict[str, Array] | None:
         """Loads the iterates of a cell's first trials, by column; None if none are stored."""
@@ -446,14 +461,11 @@ class Results:
             try:
                 return read(parts)
             except FileNotFoundError:
-                found = [
-                    part
-                    for directory in self.directories
-                    for part in Store(directory).parts({cell.key})
-                ]
-                parts = sorted(
-                    (part for part in found if part.path not in self.damaged), key=lambda p: p.order
-                )
+                found: list[StoredPart] = []
+                for directory in self.directories:
+                    found += Store(directory).parts({cell.key})
+                usable = [part for part in found if part.path not in self.damaged]
+                parts = sorted(usable, key=lambda part: part.order)
 
     def _tables(
         self, parts: Sequence[StoredPart], names: Sequence[str] | None, needed: Sequence[str]
@@ -461,19 +473,23 @@ class Results:
         """Yields the rows of one part after another, without the trials that an earlier one had."""
         reached = 0
         for part in parts:
-            if part.stop > reached:
-                with self._naming(part.path):
-                    table = (
-                        self._kept[part.path] if part.path in self._kept else part.read(names)[1]
-                    )
-                    table = table.select(
-                        [n for n in table.column_names if names is None or n in names]
-                    )
-                    there = table.column_names
-                    if lacking := [name for name in needed if name not in there]:
-                        raise Unusable(f"damaged: has no column {lacking[0]}")
-                    yield table.slice(max(0, reached - part.start))
-                    reached = part.stop
+            if part.stop <= reached:
+                continue
+            with self._naming(part.path):
+                table = self._kept[part.path] if part.path in self._kept else part.read(names)[1]
+                there = [name for name in table.column_names if names is None or name in names]
+                for name in needed:
+                    if name not in there:
+                        raise Unusable(f"damaged: has no column {name}")
+                yield table.select(there).slice(max(0, reached - part.start))
+                reached = part.stop
+
+
+def _made_by_other_code(cell: StoredCell) -> str:
+    versions = [f"{package} {version}" for package, version in cell.footer["versions"].items()]
+    made_by = f"({', '.join(versions)}, source {cell.footer['source']}, key {cell.key})"
+    what = f"{describe_names(cell.names)}: {cell.trials} trials were computed by other code"
+    return f"stale: {what} {made_by}; left out"
 
 
 def _count(ranges: Iterable[tuple[int, int]]) -> int:

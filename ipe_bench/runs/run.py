@@ -26,7 +26,7 @@ from ipe_bench.runs.execution import Execution, Serial
 from ipe_bench.runs.parts import TRUTH, Unusable
 from ipe_bench.runs.provenance import describe, digest, fingerprint
 from ipe_bench.runs.results import Results
-from ipe_bench.runs.schedule import Watcher, block_size_for, plan, run_tasks
+from ipe_bench.runs.schedule import Task, Watcher, block_size_for, plan, run_tasks
 from ipe_bench.runs.store import ResultKey, Store
 from ipe_bench.states.trackers import Tracker
 from ipe_bench.trials.paths import AnyScenario, StateScenario
@@ -64,10 +64,8 @@ def compute(
     """
     # Absolute: workers may have another working folder.
     store = Store(Path(output).absolute())
-    scenarios, estimators = (
-        pinned(list(scenarios)),
-        {label: pinned(one) for label, one in estimators.items()},
-    )
+    scenarios = pinned(list(scenarios))
+    estimators = {label: pinned(one) for label, one in estimators.items()}
     # What is stored of a scenario shows that its numbers can be computed with, without drawing any.
     stored = {part.key for part in store.parts()}
     untried = [scenario for scenario in scenarios if ResultKey(scenario).key not in stored]
@@ -78,19 +76,14 @@ def compute(
     cells = [cell for several in of_scenarios for cell in several]
     results = Results.read([store.directory], keys={cell.key for cell in cells})
     aside = results.set_aside()
-    tasks = [
-        task
-        for several in of_scenarios
-        for task in plan(store.directory, several, results, trials, block_size)
-    ]
+    tasks: list[Task] = []
+    for several in of_scenarios:
+        tasks += plan(store.directory, several, results, trials, block_size)
     record = None
     if tasks or aside or not results.announces(cells, trials):
-        facts = {
-            **_record(scenarios, estimators, trials),
-            **(further or {}),
-            "command": command,
-            "blocks": len(tasks),
-        }
+        facts = _record(scenarios, estimators, trials)
+        facts |= further or {}
+        facts |= {"command": command, "blocks": len(tasks)}
         record = store.write_run(record_as or new_name(), facts)
     for line in aside:
         log.warning(line)
@@ -119,11 +112,10 @@ def validate(
     """Raises one UserError with everything that stands in the way of this run; trials are drawn of
     the scenarios `untried` (all if None), to see whether numbers hold what is asked for."""
     size = block_size_for(trials) if block_size is None else block_size
-    mistakes = [
-        f"{name}={value}: give a whole number above 0"
-        for name, value in (("trials", trials), ("block_size", size))
-        if value < 1
-    ]
+    mistakes = []
+    for name, value in {"trials": trials, "block_size": size}.items():
+        if value < 1:
+            mistakes.append(f"{name}={value}: give a whole number above 0")
     if trials > MOST_BLOCKS * size >= MOST_BLOCKS:
         mistakes.append(f"trials={trials}: are more than {MOST_BLOCKS} blocks of block_size={size}")
     if not scenarios:
@@ -140,33 +132,43 @@ def validate(
     for scenario in scenarios:
         if scenario.noise.real and trials != 1:
             mistakes.append(f"trials={trials}: certified readings are one trial; set trials=1")
-        moving = isinstance(scenario, StateScenario)
-        kind = Tracker if moving else Estimator
-        what = "tracks states that move; a measurement model takes estimators"
-        if moving:
-            what = "estimates constants; a state model takes trackers"
-        other = [label for label, one in estimators.items() if not isinstance(one, kind)]
-        if other:
-            mistakes += [f"estimators.{label}: {what}" for label in other]
-            continue
         if isinstance(scenario, StateScenario):
-            found = {label: one.hindrance(scenario.assumed) for label, one in estimators.items()}
-            mistakes += [f"trackers.{label}: {why}" for label, why in found.items() if why]
-            continue
-        if scenario.noise.estimated and scenario.noise.true_levels(scenario.measurement.m) is None:
-            mistakes.append(NO_LEVEL)
-        elif untried is None or scenario in untried:
-            require_function(scenario.measurement)
-            mistakes += _beyond_numbers(scenario)
-            require_function(scenario.simulator)
-        found = {
-            label: estimator.hindrance(scenario.problem) for label, estimator in estimators.items()
-        }
-        mistakes += [
-            f"estimators.{label}: {why}; leave it out" for label, why in found.items() if why
-        ]
+            mistakes += _with_trackers(scenario, estimators)
+        else:
+            mistakes += _with_estimators(scenario, estimators, untried)
     if mistakes:
         raise UserError("; ".join(dict.fromkeys(mistakes)))
+
+
+def _with_trackers(scenario: StateScenario, trackers: Mapping[str, Any]) -> list[str]:
+    what = "estimates constants; a state model takes trackers"
+    other = [label for label, one in trackers.items() if not isinstance(one, Tracker)]
+    if other:
+        return [f"estimators.{label}: {what}" for label in other]
+    found = {label: tracker.hindrance(scenario.assumed) for label, tracker in trackers.items()}
+    return [f"trackers.{label}: {why}" for label, why in found.items() if why]
+
+
+def _with_estimators(
+    scenario: Scenario, estimators: Mapping[str, Any], untried: Sequence[AnyScenario] | None
+) -> list[str]:
+    what = "tracks states that move; a measurement model takes estimators"
+    other = [label for label, one in estimators.items() if not isinstance(one, Estimator)]
+    if other:
+        return [f"estimators.{label}: {what}" for label in other]
+    mistakes = []
+    model = scenario.measurement
+    if scenario.noise.estimated and scenario.noise.true_levels(model.m) is None:
+        mistakes.append(NO_LEVEL)
+    elif untried is None or scenario in untried:
+        require_function(model)
+        mistakes += _beyond_numbers(scenario)
+        require_function(scenario.simulator)
+    for label, estimator in estimators.items():
+        why = estimator.hindrance(scenario.problem)
+        if why:
+            mistakes.append(f"estimators.{label}: {why}; leave it out")
+    return mistakes
 
 
 def _beyond_numbers(scenario: Scenario) -> Iterator[str]:
@@ -177,7 +179,8 @@ def _beyond_numbers(scenario: Scenario) -> Iterator[str]:
             f" {LARGEST:g}"
         )
         return
-    model, real = scenario.measurement, scenario.noise.real
+    model = scenario.measurement
+    real = scenario.noise.real
     if model.m < model.n:
         yield (
             f"measurement={model.name}: {model.m} readings are too few for {model.n} parameters;"
@@ -199,7 +202,8 @@ def _beyond_numbers(scenario: Scenario) -> Iterator[str]:
             " choose smaller scales"
         )
         return
-    beyond = ~((bound >= 1 / LARGEST) & (bound <= LARGEST) | (bound == 0))
+    representable = (bound >= 1 / LARGEST) & (bound <= LARGEST)
+    beyond = ~(representable | (bound == 0))
     if real and np.isnan(bound).any():
         # J lacks rank at the start, or is not finite there: that is a hard start, and no mistake.
         return
@@ -240,10 +244,8 @@ def _undetermined(scenario: Scenario) -> list[str]:
 
 def result_keys(scenario: AnyScenario, estimators: Mapping[str, Any]) -> list[ResultKey]:
     """Returns the keys of what a run stores of one scenario: its truth, and each estimator."""
-    return [
-        ResultKey(scenario),
-        *(ResultKey(scenario, label, estimator) for label, estimator in estimators.items()),
-    ]
+    of_estimators = [ResultKey(scenario, label, one) for label, one in estimators.items()]
+    return [ResultKey(scenario), *of_estimators]
 
 
 def new_name() -> str:
@@ -270,7 +272,8 @@ def record_refusal(
 
 def accept(output: Path | str, job: str) -> None:
     """Takes back what `record_refusal` noted of a job."""
-    (Store(Path(output)).runs / f"{_refusal(job)}.json").unlink(missing_ok=True)
+    record = Store(Path(output)).runs / f"{_refusal(job)}.json"
+    record.unlink(missing_ok=True)
 
 
 def _refusal(job: str) -> str:
@@ -300,8 +303,9 @@ def _git_commit(folder: Path) -> str | None:
     job."""
     command = ["git", "rev-parse", "HEAD"]
     try:
-        return subprocess.run(
+        found = subprocess.run(
             command, cwd=folder, capture_output=True, text=True, timeout=5, check=True
-        ).stdout.strip()
+        )
     except (OSError, subprocess.SubprocessError):
         return None
+    return found.stdout.strip()

@@ -104,8 +104,8 @@ def plan(
     for cell in cells:
         _ = cell.importable  # as it is here, and not where the cell is sent
         for start, stop in results.missing(cell.key, trials):
-            edges = [start, *range((start // block_size + 1) * block_size, stop, block_size), stop]
-            for edge in itertools.pairwise(edges):
+            inner = range((start // block_size + 1) * block_size, stop, block_size)
+            for edge in itertools.pairwise([start, *inner, stop]):
                 lacking.setdefault(edge, []).append(cell)
     return [Task(directory, tuple(cells), *edge) for edge, cells in sorted(lacking.items())]
 
@@ -114,7 +114,8 @@ def run_task(task: Task) -> Iterator[str | tuple[int, Failure | None]]:
     """Computes one task and stores each cell's rows as soon as they are there; then yields the
     cell's place in the task, and its failure if there was one: an exception fails its cell alone.
     Libraries are imported and models compiled before time is taken."""
-    store, cells = Store(task.directory), _recalled(task)
+    store = Store(task.directory)
+    cells = _recalled(task)
     with _alone():
         block = block_of(cells[0].scenario, task.start, task.stop)
         block.share()  # which is not to be charged to the first of the cells
@@ -193,19 +194,15 @@ def _alone() -> Iterator[None]:
 
 def _compute_cell(store: Store, block: Any, cell: ResultKey) -> None:
     """Computes a cell of a block and stores it."""
-    start, stop, history = block.start, block.start + len(block), None
+    start = block.start
+    stop = start + len(block)
+    history = None
     if cell.estimator is None:
         columns = block.truth_columns()
     else:
         estimates, columns = block.estimate(cell.estimator)
         if start < HISTORIES and estimates.history is not None:
-            paths = estimates.history[: HISTORIES - start]
-            history = {
-                "trial": np.repeat(start + np.arange(len(paths)), [len(path) for path in paths]),
-                "iteration": np.concatenate([np.arange(len(path)) for path in paths]),
-            }
-            names = (f"x_{parameter.name}" for parameter in cell.scenario.measurement.parameters)
-            history |= dict(zip(names, np.concatenate(paths).T, strict=True))
+            history = _iterates(cell, start, estimates.history[: HISTORIES - start])
     if not store.trials.is_dir():  # what it held is missing, and would not be missed
         raise StorageError(
             f"{store.directory}: went away while it was being filled; the same command starts anew"
@@ -213,11 +210,26 @@ def _compute_cell(store: Store, block: Any, cell: ResultKey) -> None:
     store.write(cell, start, stop, columns, history)
 
 
+def _iterates(cell: ResultKey, start: int, paths: Sequence[Any]) -> dict[str, Any]:
+    """Writes the iterates of trials from `start` on as columns."""
+    trials = np.arange(start, start + len(paths))
+    history = {
+        "trial": np.repeat(trials, [len(path) for path in paths]),
+        "iteration": np.concatenate([np.arange(len(path)) for path in paths]),
+    }
+    parameters = cell.scenario.measurement.parameters
+    for parameter, values in zip(parameters, np.concatenate(paths).T, strict=True):
+        history[f"x_{parameter.name}"] = values
+    return history
+
+
 class _Run:
     """Keeps what has become of the cells of a run."""
 
     def __init__(self, tasks: Sequence[Task], store: Store, watch: Watcher) -> None:
-        self.progress, self.store, self.watch = Progress(tasks), store, watch
+        self.progress = Progress(tasks)
+        self.store = store
+        self.watch = watch
         self.tries = Counter[tuple[str, int]]()
         watch(self.progress)
 
@@ -266,7 +278,8 @@ def run_tasks(
     that failed."""
     run = _Run(tasks, store, watch)
     while tasks:
-        waiting, again = [dict(enumerate(task.cells)) for task in tasks], []
+        waiting = [dict(enumerate(task.cells)) for task in tasks]
+        again: list[Task] = []
         for event in execution.run(run_task, tasks):
             task = tasks[event.index]
             if event.step == PREPARED:

@@ -21,7 +21,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -96,7 +96,8 @@ class ResultKey:
     @property
     def names(self) -> dict[str, Any]:
         """Names for people."""
-        scenario, truth = self.scenario, self.scenario.truth
+        scenario = self.scenario
+        truth = scenario.truth
         return {
             "measurement": scenario.measurement.name,
             **({} if truth is None else {"truth_measurement": truth.name}),
@@ -110,15 +111,9 @@ class ResultKey:
     @cached_property
     def footer(self) -> dict[str, Any]:
         """All that a reader of the file needs to know."""
-        scenario, model = self.scenario, self.scenario.measurement
+        scenario = self.scenario
+        model = scenario.measurement
         needs = () if self.estimator is None else self.estimator.needs
-        docstring = " ".join((type(model).__doc__ or "").split())
-        # What a dataclass writes where there is no docstring says nothing.
-        about = (
-            ""
-            if docstring.startswith(f"{type(model).__name__}(")
-            else docstring.partition(". ")[0].rstrip(".")
-        )
         return {
             "schema": SCHEMA,
             "key": self.key,
@@ -132,14 +127,26 @@ class ResultKey:
             "jacobian_cost": float(getattr(model, "jacobian_cost", model.n)),
             "parameters": [describe(p) for p in model.parameters],
             "readings": model.m,
-            "about": about,
+            "about": _about(model),
             "linear_bound": scenario.linear_bound.tolist(),
-            **(
-                {"linear_correlation": linear_correlation(scenario.problem).round(4).tolist()}
-                if isinstance(scenario, Scenario)
-                else {"times": scenario.model.times.tolist(), "states": scenario.model.n}
-            ),
+            **_of_kind(scenario),
         }
+
+
+def _about(model: Any) -> str:
+    """Returns the first sentence of a model's docstring; empty if it has none."""
+    docstring = " ".join((type(model).__doc__ or "").split())
+    # What a dataclass writes where there is no docstring says nothing.
+    if docstring.startswith(f"{type(model).__name__}("):
+        return ""
+    return docstring.partition(". ")[0].rstrip(".")
+
+
+def _of_kind(scenario: AnyScenario) -> dict[str, Any]:
+    if isinstance(scenario, Scenario):
+        correlation = linear_correlation(scenario.problem)
+        return {"linear_correlation": correlation.round(4).tolist()}
+    return {"times": scenario.model.times.tolist(), "states": scenario.model.n}
 
 
 def traits(estimator: Any) -> dict[str, Any]:
@@ -183,15 +190,12 @@ class Store:
     def parts(self, keys: Keys[str] | None = None) -> list[StoredPart]:
         """Returns the parts that lie here, or those of these keys, by key and in the order of
         reading."""
-        found = [
-            part
-            for path in self.trials.glob("*.parquet")
-            if (part := StoredPart.parse(path)) is not None
-        ]
-        return sorted(
-            (p for p in found if keys is None or p.key in keys),
-            key=lambda part: (part.key, part.order),
-        )
+        found = []
+        for path in self.trials.glob("*.parquet"):
+            part = StoredPart.parse(path)
+            if part is not None and (keys is None or part.key in keys):
+                found.append(part)
+        return sorted(found, key=lambda part: (part.key, part.order))
 
     def write(
         self,
@@ -203,9 +207,8 @@ class Store:
     ) -> None:
         """Stores the rows of trials start to stop, with the iterates of the first trials of all if
         there are any."""
-        table = parts.table_of(
-            {name: _typed(name, np.asarray(values)) for name, values in columns.items()}
-        )
+        typed = {name: _typed(name, np.asarray(values)) for name, values in columns.items()}
+        table = parts.table_of(typed)
         parts.write(self._path(result, start, stop), table, result.footer, history)
         with contextlib.suppress(OSError):
             self._failure(result, start, stop).unlink()
@@ -243,18 +246,12 @@ class Store:
         until they do, a reader takes each trial once. If a part is damaged (Unusable) or nothing
         can be written any more (StorageError), all stay as they are.
         """
-        found, gone, reached = self.parts({key}), 0, 0
-        groups: list[tuple[Mapping[str, Any], list[StoredPart], list[pa.Schema]]] = []
-        with contextlib.suppress(FileNotFoundError):  # another run merges the same
-            for part in found if len(found) > 1 else ():
-                footer, schema = part.head()
-                if not groups or part.start > reached or footer != groups[-1][0]:
-                    groups.append((footer, [], []))
-                    reached = part.start
-                groups[-1][1].append(part)
-                groups[-1][2].append(schema)
-                reached = max(reached, part.stop)
-            gone = sum(_join(*group) for group in groups if len(group[1]) > 1)
+        found = self.parts({key})
+        gone = 0
+        if len(found) > 1:
+            with contextlib.suppress(FileNotFoundError):  # another run merges the same
+                groups = _without_gaps(found)
+                gone = sum(_join(group) for group in groups if len(group.members) > 1)
         return gone
 
 
@@ -266,33 +263,56 @@ def _typed(name: str, values: Array) -> Array:
     return values.astype(np.int64) if values.dtype.kind in "iu" else values
 
 
-def _join(
-    footer: Mapping[str, Any], group: Sequence[StoredPart], schemas: Sequence[pa.Schema]
-) -> int:
+class _Group(NamedTuple):
+    """Holds the parts of a range without gaps."""
+
+    footer: Mapping[str, Any]
+    members: list[StoredPart]
+    schemas: list[pa.Schema]
+
+
+def _without_gaps(found: Sequence[StoredPart]) -> list[_Group]:
+    """Groups parts, in the order of reading, that continue each other with the same footer."""
+    groups: list[_Group] = []
+    reached = 0
+    for part in found:
+        footer, schema = part.head()
+        if not groups or part.start > reached or footer != groups[-1].footer:
+            groups.append(_Group(footer, [], []))
+            reached = part.start
+        groups[-1].members.append(part)
+        groups[-1].schemas.append(schema)
+        reached = max(reached, part.stop)
+    return groups
+
+
+def _join(group: _Group) -> int:
     """Writes one part with the rows of a group, unless there is one, and removes the others;
     returns their number."""
-    first, stop = group[0], max(part.stop for part in group)
-    whole = replace(
-        first, path=first.path.with_name(f"{first.key}-{first.start}-{stop}.parquet"), stop=stop
-    )
-    if whole not in group:
-        schema = pa.unify_schemas(schemas)
-        history = parts.join_histories(part.history() for part in group if part.start < HISTORIES)
-        parts.write_groups(whole.path, schema, _rows(group, schema), footer, history, lasting=True)
+    members = group.members
+    first = members[0]
+    stop = max(part.stop for part in members)
+    path = first.path.with_name(f"{first.key}-{first.start}-{stop}.parquet")
+    whole = replace(first, path=path, stop=stop)
+    if whole not in members:
+        schema = pa.unify_schemas(group.schemas)
+        history = parts.join_histories(part.history() for part in members if part.start < HISTORIES)
+        rows = _rows(members, schema)
+        parts.write_groups(path, schema, rows, group.footer, history, lasting=True)
     for _ in whole.groups():
         pass
-    others = [part.path for part in group if part != whole]
+    others = [part.path for part in members if part != whole]
     for path in others:
-        with contextlib.suppress(
-            OSError
-        ):  # another run may have done so; what stays is read once all the same
+        # Another run may have done so; what stays is read once all the same.
+        with contextlib.suppress(OSError):
             path.unlink()
     return len(others)
 
 
 def _rows(group: Sequence[StoredPart], schema: pa.Schema) -> Iterator[pa.Table]:
     """Reads the rows of parts, each trial once, with all columns of the schema."""
-    reached, nothing = group[0].start, pa.Table.from_batches([], schema)
+    reached = group[0].start
+    nothing = pa.Table.from_batches([], schema)
     for part in group:
         at = part.start
         for _, table in part.groups() if part.stop > reached else ():
@@ -304,10 +324,12 @@ def _rows(group: Sequence[StoredPart], schema: pa.Schema) -> Iterator[pa.Table]:
 
 def gaps(covered: Iterable[tuple[int, int]], start: int, stop: int) -> list[tuple[int, int]]:
     """Returns the parts of the range start to stop that no covered range holds."""
-    found, reached = [], start
+    found = []
+    reached = start
     for first, last in sorted(covered):
-        if reached < min(first, stop):
-            found.append((reached, min(first, stop)))
+        end = min(first, stop)
+        if reached < end:
+            found.append((reached, end))
         reached = max(reached, last)
     return [*found, (reached, stop)] if reached < stop else found
 
@@ -321,4 +343,5 @@ def title(names: Mapping[str, Any]) -> str:
 
 def describe_names(names: Mapping[str, Any]) -> str:
     """Words a result in a line for people."""
-    return f"{'the truth' if names['estimator'] == TRUTH else names['estimator']} on {title(names)}"
+    who = "the truth" if names["estimator"] == TRUTH else names["estimator"]
+    return f"{who} on {title(names)}"

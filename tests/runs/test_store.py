@@ -344,3 +344,10 @@ def test_blocks_lie_on_a_grid_of_their_own_wherever_trials_are_missing(tmp_path)
     cells = [ResultKey(scenario(), "newton", Newton())]
     tasks = plan(tmp_path, cells, Lacking(), 30, 10)
     assert [(task.start, task.stop) for task in tasks] == [(5, 10), (10, 20), (20, 25), (28, 30)]
+
+
+def test_a_part_without_iterates_leaves_those_of_the_others_as_they_are():
+    iterates = {"trial": np.array([0.0, 0.0]), "x_a": np.array([1.0, 2.0])}
+    joined = parts.join_histories([iterates, None])
+    assert joined is not None
+    assert joined["x_a"].tolist() == [1.0, 2.0]
