@@ -27,6 +27,7 @@ from llvmlite import ir
 
 from ipe_bench.engine.chains import ChainSize, Epoch
 from ipe_bench.engine.plan import StepPlan
+from ipe_bench.engine.points import PointSize
 from ipe_bench.engine.trace import Program, RowPrograms
 
 F64, I32, I64, PTR, VOID = (
@@ -115,6 +116,18 @@ def chains(size: ChainSize, width: int) -> str:
     return str(_ChainWriter(size, width).module)
 
 
+def spreads(size: PointSize, width: int) -> str:
+    """Writes void spreads(double *m, double *P, double *s, double *L, double *x, int64 trials,
+    int64 points, double *frame), which `engine.points` describes; a lane is a trial."""
+    return str(_SpreadWriter(size, width).module)
+
+
+def regressions(size: PointSize, width: int) -> str:
+    """Writes void regressions(double *L, double *s, double *w, double *c, double *y, double *mean,
+    double *M, double *A, double *W, int64 trials, int64 points, double *frame), likewise."""
+    return str(_RegressionWriter(size, width).module)
+
+
 @dataclass(frozen=True)
 class _Lanes:
     """Numbers in the frame, a vector for each, or a matrix of them in rows of n."""
@@ -143,33 +156,104 @@ class _Lanes:
         self.v.store(values, self.begin, range(self.n))
 
 
-class _ChainWriter:
+class _LaneWriter:
+    """Writes a function of many trials, of which a lane holds one, a group of them at a time: it
+    takes pointers, the number of trials, further whole numbers and a frame."""
+
+    def __init__(self, name: str, n: int, pointers: int, numbers: int, width: int) -> None:
+        self.n = n
+        self.module = ir.Module(name)
+        kinds = [*[PTR] * pointers, I64, *[I64] * numbers, PTR]
+        made: Any = ir.Function(self.module, ir.FunctionType(VOID, kinds), name)
+        self.arrays = made.args[:pointers]
+        self.trials, *self.numbers, self.frame = made.args[pointers:]
+        self.b: Any = ir.IRBuilder(made.append_basic_block())
+        self.v = _Vectors(self.b, width)
+        self.zero = self.v.constant(0.0)
+        self.one = self.v.constant(1.0)
+
+    def _write(self, solve: Callable[[], None]) -> None:
+        """Writes what is done with each group."""
+        with loop(self.b, integer(0), self.trials, self.v.width) as self.group:
+            solve()
+        self.b.ret_void()
+
+    def _take(self, array: Value, lanes: _Lanes, count: int, k: Value, length: Value) -> None:
+        """Copies `count` numbers of epoch k of an array (trials, length, count) into lanes."""
+        with self._places(count, k, length) as (outside, inside):
+            put(self.b, number_at(self.b, array, outside), lanes.begin, inside)
+
+    def _give(self, lanes: _Lanes, array: Value, count: int, k: Value, length: Value) -> None:
+        """Copies lanes into `count` numbers of epoch k of an array (trials, length, count)."""
+        with self._places(count, k, length) as (outside, inside):
+            put(self.b, number_at(self.b, lanes.begin, inside), array, outside)
+
+    @contextmanager
+    def _places(self, count: int, k: Value, length: Value) -> Iterator[tuple[Value, Value]]:
+        """Writes a loop over places in an array (trials, length, count) and those in lanes."""
+        b = self.b
+        width = self.v.width
+        with self._each(width) as lane:
+            trial = b.add(self.group, lane)
+            # A group that is not full repeats the last trial.
+            last = b.sub(self.trials, integer(1))
+            trial = b.select(b.icmp_signed("<", trial, last), trial, last)
+            epoch = b.add(b.mul(trial, length), k)
+            begin = b.mul(epoch, integer(count))
+            with self._each(count) as j:
+                outside = b.add(begin, j)
+                inside = b.add(b.mul(j, integer(width)), lane)
+                yield outside, inside
+
+    def _parts(self, array: Value, sizes: Sequence[int]) -> list[Value]:
+        """Begins of parts of so many vectors each, and of what follows them."""
+        return [self.v.place(array, begin) for begin in itertools.accumulate(sizes, initial=0)]
+
+    def _lanes(self, begin: Value) -> _Lanes:
+        return _Lanes(self.v, begin, self.n)
+
+    def _numbers(self, array: Value, i: Value, count: int) -> list[Value]:
+        """Returns row i of an array (..., count), each number in all lanes."""
+        begin = self.b.mul(i, integer(count))
+        places = [self.b.add(begin, integer(j)) for j in range(count)]
+        return [self.v.spread(number_at(self.b, array, place)) for place in places]
+
+    def _each(self, count: int | Value) -> Any:
+        count = integer(count) if isinstance(count, int) else count
+        return loop(self.b, integer(0), count)
+
+    @contextmanager
+    def _down(self, count: Value) -> Iterator[Value]:
+        """Writes a loop from count - 1 down to 0."""
+        with self._each(count) as i:
+            last = self.b.sub(count, integer(1))
+            yield self.b.sub(last, i)
+
+    def _dot(
+        self, one: Sequence[Value], other: Sequence[Value], start: Value | None = None
+    ) -> Value:
+        slopes = [[value] for value in other]
+        return self.v.combine([start or self.zero], list(one), slopes)[0]
+
+
+class _ChainWriter(_LaneWriter):
     """Writes the solver of chains of one size: a square-root filter, and a pass back by
     multipliers. What is given of all trials has a name of `self`, as `self.A`; what lies in the
     frame has one of its epoch, as `here.A`."""
 
     def __init__(self, size: ChainSize, width: int) -> None:
+        super().__init__("chains", size.n, pointers=9, numbers=1, width=width)
         self.size = size
-        self.n = size.n
         self.rows = size.m + size.n
-        self.module = ir.Module("chains")
-        kinds = [*[PTR] * 9, I64, I64, PTR]
-        made: Any = ir.Function(self.module, ir.FunctionType(VOID, kinds), "chains")
-        *arrays, self.trials, self.epochs, frame = made.args
-        self.A, self.B, self.D, self.G, self.a, self.values, *results = arrays
+        (self.epochs,) = self.numbers
+        self.A, self.B, self.D, self.G, self.a, self.values, *results = self.arrays
         self.x, self.P, self.crossed = results
-        self.b: Any = ir.IRBuilder(made.append_basic_block())
-        self.v = _Vectors(self.b, width)
-        self.zero = self.v.constant(0.0)
-        self.one = self.v.constant(1.0)
-        W, t, y, told, ahead, product, self.first = self._parts(frame, size.working)
+        W, t, y, told, ahead, product, self.first = self._parts(self.frame, size.working)
         self.W = _Lanes(self.v, W, size.n + size.q)
         self.seen = _Lanes(self.v, W, size.n + size.m)
         parts = map(self._lanes, (t, y, told, ahead, product))
         self.t, self.y, self.told, self.ahead, self.product = parts
-        with loop(self.b, integer(0), self.trials, width) as self.group:
-            self._solve()
-        self.b.ret_void()
+        self._write(self._solve)
 
     def _solve(self) -> None:
         """Writes the solution of a group of trials."""
@@ -181,7 +265,7 @@ class _ChainWriter:
             with self._each(2):
                 self._pass()
             with self._each(self.epochs) as k:
-                self._give(self._at(k).x, self.x, self.n, k)
+                self._give(self._at(k).x, self.x, self.n, k, self.epochs)
         with self._asked(self.P):
             self._covariances()
 
@@ -395,7 +479,7 @@ class _ChainWriter:
                 row = F.row(i).all()
                 with self._each(n) as j:
                     self.product.row(i)[j] = self._dot(row, F.row(j).all())
-            self._give(self.product, self.P, n * n, k)
+            self._give(self.product, self.P, n * n, k, self.epochs)
             with self._asked(self.crossed):
                 self._tell(k)
 
@@ -419,7 +503,7 @@ class _ChainWriter:
             row = self.product.row(i).all()
             with self._each(n) as j:
                 crossed.row(i)[j] = self._dot(row, self.ahead.column(j))
-        self._give(crossed, self.crossed, n * n, k)
+        self._give(crossed, self.crossed, n * n, k, self.epochs)
         # C C' = B' B + U U' takes the place of F F', of which nothing is asked any more.
         with self._each(n) as i:
             row = self.seen.row(i)
@@ -459,57 +543,12 @@ class _ChainWriter:
     def _asked(self, array: Value) -> Any:
         return self.b.if_then(self.b.icmp_signed("!=", self.b.ptrtoint(array, I64), integer(0)))
 
-    def _take(self, array: Value, lanes: _Lanes, count: int, k: Value, length: Value) -> None:
-        """Copies `count` numbers of epoch k of an array (trials, length, count) into lanes."""
-        with self._places(count, k, length) as (outside, inside):
-            put(self.b, number_at(self.b, array, outside), lanes.begin, inside)
-
-    def _give(self, lanes: _Lanes, array: Value, count: int, k: Value) -> None:
-        """Copies lanes into `count` numbers of epoch k of an array (trials, epochs, count)."""
-        with self._places(count, k, self.epochs) as (outside, inside):
-            put(self.b, number_at(self.b, lanes.begin, inside), array, outside)
-
-    @contextmanager
-    def _places(self, count: int, k: Value, length: Value) -> Iterator[tuple[Value, Value]]:
-        """Writes a loop over places in an array (trials, length, count) and those in lanes."""
-        b = self.b
-        width = self.v.width
-        with self._each(width) as lane:
-            trial = b.add(self.group, lane)
-            # A group that is not full repeats the last trial.
-            last = b.sub(self.trials, integer(1))
-            trial = b.select(b.icmp_signed("<", trial, last), trial, last)
-            epoch = b.add(b.mul(trial, length), k)
-            begin = b.mul(epoch, integer(count))
-            with self._each(count) as j:
-                outside = b.add(begin, j)
-                inside = b.add(b.mul(j, integer(width)), lane)
-                yield outside, inside
-
     def _at(self, k: Value, back: int = 0) -> Epoch:
         """What is kept of epoch k - back. Before the first epoch lies one of zeros."""
         number = self.b.add(k, integer(1 - back))
         begin = self.b.mul(number, integer(sum(self.size.parts)))
         *places, _ = self._parts(self.v.place(self.first, begin), self.size.parts)
         return Epoch(*map(self._lanes, places))
-
-    def _parts(self, array: Value, sizes: Sequence[int]) -> list[Value]:
-        """Begins of parts of so many vectors each, and of what follows them."""
-        return [self.v.place(array, begin) for begin in itertools.accumulate(sizes, initial=0)]
-
-    def _lanes(self, begin: Value) -> _Lanes:
-        return _Lanes(self.v, begin, self.n)
-
-    def _each(self, count: int | Value) -> Any:
-        count = integer(count) if isinstance(count, int) else count
-        return loop(self.b, integer(0), count)
-
-    @contextmanager
-    def _down(self, count: Value) -> Iterator[Value]:
-        """Writes a loop from count - 1 down to 0."""
-        with self._each(count) as i:
-            last = self.b.sub(count, integer(1))
-            yield self.b.sub(last, i)
 
     def _gain(self, k: Value, i: Value, j: Value) -> Value:
         """G[k, i, j], the same in all lanes."""
@@ -531,11 +570,120 @@ class _ChainWriter:
         with self._each(self.n) as i:
             to[i] = self.v.call("fma", share, row[i], to[i])
 
-    def _dot(
-        self, one: Sequence[Value], other: Sequence[Value], start: Value | None = None
-    ) -> Value:
-        slopes = [[value] for value in other]
-        return self.v.combine([start or self.zero], list(one), slopes)[0]
+
+class _SpreadWriter(_LaneWriter):
+    """Writes the points x = m + L s of covariances L L'."""
+
+    def __init__(self, size: PointSize, width: int) -> None:
+        super().__init__("spreads", size.n, pointers=5, numbers=1, width=width)
+        parts = self._parts(self.frame, size.spread)
+        self.mean, self.P, self.L, self.x = map(self._lanes, parts[:-1])
+        self._write(self._solve)
+
+    def _solve(self) -> None:
+        m, P, s, L, x = self.arrays
+        (points,) = self.numbers
+        square = self.n**2
+        zero = integer(0)
+        one = integer(1)
+        self._take(m, self.mean, self.n, zero, one)
+        self._take(P, self.P, square, zero, one)
+        self._factor()
+        self._give(self.L, L, square, zero, one)
+        with self._each(points) as i:
+            direction = self._numbers(s, i, self.n)
+            with self._each(self.n) as r:
+                self.x[r] = self._dot(self.L.row(r).all(), direction, self.mean[r])
+            self._give(self.x, x, self.n, i, points)
+
+    def _factor(self) -> None:
+        """Writes L_ij L_jj = P_ij - sum_{k<j} L_ik L_jk, column by column."""
+        b = self.b
+        n = integer(self.n)
+        with self._each(self.n**2) as i:
+            self.L[i] = self.zero
+        with self._each(self.n) as j:
+            # What is not written yet is 0.
+            before = self.L.row(j).all()
+            pivot = b.fsub(self.P.row(j)[j], self._dot(before, before))
+            root = self.v.call("sqrt", pivot)
+            self.L.row(j)[j] = root
+            with loop(b, b.add(j, integer(1)), n) as i:
+                along = self._dot(self.L.row(i).all(), before)
+                rest = b.fsub(self.P.row(i)[j], along)
+                self.L.row(i)[j] = b.fdiv(rest, root)
+
+
+class _RegressionWriter(_LaneWriter):
+    """Writes the affine law of values y at such points."""
+
+    def __init__(self, size: PointSize, width: int) -> None:
+        super().__init__("regressions", size.n, pointers=9, numbers=1, width=width)
+        self.m = size.m
+        L, M, A, W, mean, y, _ = self._parts(self.frame, size.regression)
+        self.L = self._lanes(L)
+        self.M = self._lanes(M)
+        self.A = self._lanes(A)
+        self.W = _Lanes(self.v, W, self.m)
+        self.mean = _Lanes(self.v, mean, self.m)
+        self.y = _Lanes(self.v, y, self.m)
+        self._write(self._solve)
+
+    def _solve(self) -> None:
+        L, s, w, c, y, *results = self.arrays
+        (points,) = self.numbers
+        across = self.m * self.n
+        sizes = (self.m, across, across, self.m**2)
+        zero = integer(0)
+        one = integer(1)
+        self._take(L, self.L, self.n**2, zero, one)
+        for lanes, count in zip((self.mean, self.M, self.A, self.W), sizes, strict=True):
+            with self._each(count) as i:
+                lanes[i] = self.zero
+        # The mean, sum w y.
+        with self._each(points) as i:
+            self._take(y, self.y, self.m, i, points)
+            (weight,) = self._numbers(w, i, 1)
+            with self._each(self.m) as j:
+                self.mean[j] = self.v.call("fma", weight, self.y[j], self.mean[j])
+        with self._each(points) as i:
+            self._take(y, self.y, self.m, i, points)
+            self._add_point(self._numbers(c, i, 1)[0], self._numbers(s, i, self.n))
+        with self._each(self.m) as j:
+            self._finish(j)
+        for lanes, array, count in zip(
+            (self.mean, self.M, self.A, self.W), results, sizes, strict=True
+        ):
+            self._give(lanes, array, count, zero, one)
+
+    def _add_point(self, weight: Value, direction: list[Value]) -> None:
+        """Writes M <- M + c d s' and W <- W + c d d' for the values y of a point, d = y - mean."""
+        b = self.b
+        with self._each(self.m) as j:
+            self.y[j] = b.fsub(self.y[j], self.mean[j])
+        with self._each(self.m) as j:
+            d = b.fmul(weight, self.y[j])
+            row = self.M.row(j)
+            row.keep(self.v.combine(row.all(), [d], [direction]))
+            across = self.W.row(j)
+            with loop(b, integer(0), b.add(j, integer(1))) as i:
+                across[i] = self.v.call("fma", d, self.y[i], across[i])
+
+    def _finish(self, j: Value) -> None:
+        """Writes row j of A L = M, from the last column to the first, and of W - M M'."""
+        b = self.b
+        told = self.M.row(j)
+        row = told.all()
+        with self._down(integer(self.n)) as i:
+            # What is not written yet is 0.
+            A = self.A.row(j)
+            rest = b.fsub(told[i], self._dot(self.L.column(i), A.all()))
+            A[i] = b.fdiv(rest, self.L.row(i)[i])
+        with loop(b, integer(0), b.add(j, integer(1))) as i:
+            explained = self._dot(row, self.M.row(i).all())
+            left = b.fsub(self.W.row(j)[i], explained)
+            self.W.row(j)[i] = left
+            self.W.row(i)[j] = left
 
 
 class _Writer:

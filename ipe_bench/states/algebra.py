@@ -102,11 +102,11 @@ class Half(NamedTuple):
         return X
 
 
-def half(P: Array) -> Half:
+def half(P: Array, L: Array | None = None) -> Half:
     """Computes G, G G' = P, of each positive semidefinite P (..., n, n): Cholesky's, or by the
     eigenvalues of the correlations where a pivot is as small as round-off. Variances of 0 are
-    allowed; P that is indefinite gives NaN."""
-    L = factor(P)
+    allowed; P that is indefinite gives NaN. L, its Cholesky factors (..., n, n), may be given."""
+    L = factor(P) if L is None else L
     pivots = np.diagonal(L, axis1=-2, axis2=-1) ** 2
     variances = np.diagonal(P, axis1=-2, axis2=-1)
     singular = np.asarray(~(pivots > _SMALL * variances).all(axis=-1))

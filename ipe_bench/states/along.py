@@ -125,6 +125,9 @@ class EpochFunctions:
         self, x: Array, run: Callable[[Recording, Array], tuple[Array, ...]]
     ) -> list[Array]:
         """Runs each recording on all its epochs at once."""
+        first = self.recordings[0]
+        if len(self.recordings) == 1 and isinstance(first.function, RowFunction):
+            return [*run(first, x)]
         out: list[Array] = []
         for one in self.recordings:
             found = run(one, x[:, one.epochs])

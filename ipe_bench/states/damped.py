@@ -14,10 +14,11 @@ from ipe_bench.basics.linalg import Array, Mask, multiply
 from ipe_bench.basics.options import Count, Positive, Share, Whole
 from ipe_bench.basics.statuses import Status
 from ipe_bench.basics.streams import normals, own_generators
+from ipe_bench.engine.rows import products
 from ipe_bench.states.algebra import lower_solve, root, transposed
 from ipe_bench.states.base import Normal, StateModel
 from ipe_bench.states.linearisation import Taylor, Unscented
-from ipe_bench.states.smoothers import path_p, whole
+from ipe_bench.states.smoothers import path_p
 from ipe_bench.states.trackers import Tracker, Tracks, filtered
 from ipe_bench.states.whole_paths import PathDensity, Settled, Tangents
 from ipe_bench.states.widened import widened
@@ -267,8 +268,9 @@ def smoothed_path(tracks: Tracks) -> Array:
         later = later + multiply(transposed(W[:, k]), left)
         later = multiply(transposed(tracks.moves[k - first].A), later)
         r[:, k] = later
-    m, P = whole(tracks)
-    return m + multiply(P, r)
+    start = tracks.start.mean + multiply(tracks.start.covariance, r[:, 0])
+    after = tracks.mean + products(tracks.covariance, r[:, 1:])
+    return np.concatenate([start[:, None], after], axis=1)
 
 
 def reported(density: PathDensity, paths: Descent) -> Tracks:

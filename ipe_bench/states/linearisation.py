@@ -8,6 +8,7 @@ linearisation.
 
 from __future__ import annotations
 
+import functools
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,8 +21,10 @@ import numpy as np
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, multiply
 from ipe_bench.basics.options import Component, Count, Finite, Positive
+from ipe_bench.engine import compiled
+from ipe_bench.engine.points import regress, spread_points
 from ipe_bench.measurements.base import differentiate
-from ipe_bench.states.algebra import half, symmetric, transposed
+from ipe_bench.states.algebra import Half, half, symmetric, transposed
 
 _MOST_POINTS = 100_000
 """Points of a product rule at most."""
@@ -95,29 +98,61 @@ class SigmaPoints(Rule):
         return w
 
     def linearise(self, g: Function, m: Array, P: Array, nearest: Nearest | None = None) -> Affine:
-        s, w = self.points(m.shape[-1])
-        # The points m + G s, of P = G G'.
-        G = half(P)
-        y = g(m[..., None, :] + np.matmul(s, transposed(G.G)))
+        s, w, c = _weighted(self, m.shape[-1])
+        G, x = _spread(m, P, s)
+        y = g(x)
         if nearest is not None:
-            y = nearest(y, g(m)[..., None, :])
-        mean = np.sum(w[:, None] * y, axis=-2)
-        d = y - mean[..., None, :]
-        weighted = d * self.covariance_weights(w)[:, None]
-        # M = sum w s d' = G' A', and with it A = M' G^-1 and W = sum w d d' - A P A'.
-        M = np.matmul(s.T, weighted)
-        A = G.over(transposed(M))
-        W = np.matmul(transposed(weighted), d) - np.matmul(transposed(M), M)
-        return Affine(A, mean - multiply(A, m), symmetric(W))
+            y = nearest(y, g(m)[:, None])
+        mean, A, W = _regressed(G, y, s, w, c)
+        return Affine(A, mean - multiply(A, m), W)
 
     def mean(self, g: Function, m: Array, P: Array) -> Array:
-        s, w = self.points(m.shape[-1])
-        points = m[..., None, :] + np.matmul(s, transposed(half(P).G))
+        s, w, _ = _weighted(self, m.shape[-1])
+        _, points = _spread(m, P, s)
         values = g(points)
         return np.sum(w[:, None, None] * values, axis=-3)
 
     def calls(self, n: int, periodic: bool = False) -> int:
         return len(self.points(n)[1]) + periodic
+
+
+@functools.lru_cache(maxsize=64)
+def _weighted(rule: SigmaPoints, n: int) -> tuple[Array, Array, Array]:
+    """Returns the points (p, n) of a rule with their weights (p,) in means and in covariances."""
+    s, w = rule.points(n)
+    return s, w, rule.covariance_weights(w)
+
+
+def _spread(m: Array, P: Array, s: Array) -> tuple[Half, Array]:
+    """Returns G with P = G G', and the points m + G s (trials, p, n)."""
+    if not compiled.available():
+        G = half(P)
+        return G, m[:, None] + np.matmul(s, transposed(G.G))
+    x, L = spread_points(m, P, s)
+    G = half(P, L)
+    rows = G.singular
+    if rows.any():
+        x[rows] = m[rows, None] + np.matmul(s, transposed(G.G[rows]))
+    return G, x
+
+
+def _regressed(G: Half, y: Array, s: Array, w: Array, c: Array) -> tuple[Array, Array, Array]:
+    """Returns the mean, A and W of values y (trials, p, m) at such points: with d = y - mean,
+
+    M = sum c d s',   A = M G^-1,   W = sum c d d' - M M'.
+    """
+    if compiled.available():
+        mean, M, A, W = regress(y, G.L, s, w, c)
+        rows = G.singular
+        if rows.any():
+            A[rows] = np.matmul(M[rows], G.inverse[rows])
+        return mean, A, W
+    mean = np.sum(w[:, None] * y, axis=-2)
+    d = y - mean[:, None]
+    weighted = transposed(d * c[:, None])
+    M = np.matmul(weighted, s)
+    W = np.matmul(weighted, d) - np.matmul(M, transposed(M))
+    return mean, G.over(M), symmetric(W)
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.linalg import Array, multiply
 from ipe_bench.engine.chains import filtered_chains, smoothed_chains, solve_chains
+from ipe_bench.engine.rows import products
 from ipe_bench.states.algebra import (
     Half,
     factor,
@@ -41,7 +42,7 @@ class Settled:
     gap: Array
     """x[k] - f(x[k-1]) (trials, K, n)."""
     residual: Array
-    """z - h (trials, K, m); 0 of missing readings."""
+    """R^-1/2 (z - h) (trials, K, m); 0 of missing readings."""
     cost: Array
     """-2 log p(path | readings) (trials,) up to a constant; infinite where that is not finite."""
     calls: Array
@@ -149,7 +150,7 @@ class PathDensity:
             at = (x[turned], gap[turned], h[turned])
             x[turned], gap[turned], h[turned] = self.subset(turned)._unwound(*at, shift)
         # A gap out of the range of its noise moves the epochs after it, too: one after another.
-        missed = np.abs(multiply(self.unreached, gap)).max(axis=1)
+        missed = np.abs(products(self.unreached, gap)).max(axis=1)
         largest = np.abs(x).max(axis=1)
         within = (missed <= _REACHED * largest).all(axis=1)
         rows = np.flatnonzero(~within)
@@ -199,10 +200,10 @@ class PathDensity:
         # J = |x0 - m0|^2 + sum |w|^2 + sum |v|^2, with w = G^+ gap and v = R^-1/2 r.
         m, P = self.model.prior
         begun = mahalanobis(x[:, 0] - m, P, self.start)
-        w = multiply(self.inverses, gap)
-        v = multiply(self.whitener, r)
+        w = products(self.inverses, gap)
+        v = products(self.whitener, r)
         cost = begun + _squared(w) + _squared(v)
-        return Settled(x, gap, r, np.nan_to_num(cost, nan=np.inf), calls)
+        return Settled(x, gap, v, np.nan_to_num(cost, nan=np.inf), calls)
 
     def _begun(self, start: Array) -> Array:
         """Returns the starts (trials, n), without the round-off by which they miss the range of the
@@ -237,22 +238,25 @@ class PathDensity:
         gap = x[:, 1:] - self.model.nearest_state(f, x[:, 1:])
         calls = np.full(len(x), float(self.model.evaluations * (1 + self.model.n)))
         at = self._weighed(x, gap, h, calls)
-        there = np.isfinite(self.z)
-        B = np.matmul(self.whitener, np.where(there[..., None], H, 0.0))
-        return at, Tangents(A, B)
+        return at, self._tangents(A, H)
 
     def tangents(self, at: Settled) -> Tangents:
         """Computes the affine model about settled paths."""
-        return self.about(at.x)[1]
+        _, _, A, H = self.model.slopes_along(at.x)
+        return self._tangents(A, H)
+
+    def _tangents(self, A: Array, H: Array) -> Tangents:
+        there = np.isfinite(self.z)
+        B = np.matmul(self.whitener, np.where(there[..., None], H, 0.0))
+        return Tangents(A, B)
 
     def step(self, tangents: Tangents, at: Settled, damping: Array | None = None) -> Array:
         """Computes the steps dx (trials, 1 + K, n) from settled paths, not finite of a trial that
         has none; with D = diag(damping (trials, 1 + K, n))."""
         # The right sides: m0 - x0, then -d_k, and H' R^-1 r = B' v.
         a = np.concatenate([self.model.prior.mean - at.x[:, :1], -at.gap], axis=1)
-        v = multiply(self.whitener, at.residual)
         D = np.zeros_like(a) if damping is None else damping
-        return solve_chains(tangents.A, tangents.B, D, self.noise, a, v)
+        return solve_chains(tangents.A, tangents.B, D, self.noise, a, at.residual)
 
     def filtered(self, tangents: Tangents) -> Array:
         """Computes the covariances (trials, 1 + K, n, n) of the affine model's states by the
@@ -269,8 +273,8 @@ class PathDensity:
         deviations of the path."""
         # The terms of J that the step adds, in the affine model.
         after = step[:, 1:]
-        w = multiply(self.inverses, after - multiply(tangents.A, step[:, :-1]))
-        v = multiply(tangents.B, after)
+        w = products(self.inverses, after - products(tangents.A, step[:, :-1]))
+        v = products(tangents.B, after)
         u = self.start.whitened(step[:, :1])
         return _squared(w) + _squared(v) + _squared(u)
 

@@ -234,8 +234,8 @@ CHANGES = {
     "sigma-next": Change(
         "states",
         "sigma points of an angle lie about the first of them",
-        "y = nearest(y, g(m)[..., None, :])",
-        "y = nearest(y, y[..., :1, :])",
+        "y = nearest(y, g(m)[:, None])",
+        "y = nearest(y, y[:, :1])",
         "test_trackers.py",
     ),
     "far-below-each": Change(
