@@ -221,20 +221,12 @@ def _from_pool(at: int, family: Sequence[str]) -> Look:
 def strong(color: str) -> str:
     """Returns the colour, darkened until letters of it are read on white: a contrast of 4.5, as
     WCAG 2 asks for."""
-    rgb = _rgb(color)
+    from matplotlib.colors import to_hex, to_rgb
+
+    rgb: Any = to_rgb(color)
     while _luminance(rgb) > _LEGIBLE:
         rgb = [0.97 * c for c in rgb]
-    return _hex(rgb)
-
-
-def _rgb(color: str) -> list[float]:
-    """Returns red, green and blue from 0 to 1."""
-    return [int(color[i : i + 2], 16) / 255 for i in (1, 3, 5)]
-
-
-def _hex(rgb: Sequence[float]) -> str:
-    levels = [round(255 * c) for c in rgb]
-    return f"#{bytes(levels).hex()}"
+    return to_hex(rgb)
 
 
 def _luminance(rgb: Sequence[float]) -> float:
@@ -251,18 +243,21 @@ def dark(color: str, *, letters: bool = False) -> str:
     """Returns what a colour on white becomes on a dark page: that of success is of the dark colours
     of success, greys change places, and the others are lighter, those of `letters` until they have
     a contrast of 4.5."""
+    from matplotlib.colors import to_hex, to_rgb
+
     if color in RAMP:
         return DARK_RAMP[RAMP.index(color)]
-    rgb = _rgb(color)
+    rgb: Any = to_rgb(color)
     if max(rgb) - min(rgb) > 0.05:
         rgb = [c + 0.25 * (1 - c) for c in rgb]
         while letters and _luminance(rgb) < _BRIGHT:
             rgb = [c + 0.03 * (1 - c) for c in rgb]
-        return _hex(rgb)
+        return to_hex(rgb)
     # White becomes the first end, black the second.
     share = 1 - rgb[0]
-    ends = zip(_rgb(DARK), _rgb(LIGHT), strict=True)
-    return _hex([low + share * (high - low) for low, high in ends])
+    ends = zip(to_rgb(DARK), to_rgb(LIGHT), strict=True)
+    mixed: Any = [low + share * (high - low) for low, high in ends]
+    return to_hex(mixed)
 
 
 _HOUSE: dict[str, Any] = {
