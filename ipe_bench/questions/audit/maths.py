@@ -520,12 +520,8 @@ def _read(path: Path) -> pd.DataFrame:
     try:
         if path.suffix == ".parquet":
             return pd.read_parquet(path)
-        separator = _separator(path)
-        frame = pd.read_csv(path, sep=separator, engine="python")
-        # pandas 2 rounds the last digits of numbers unless it reads texts.
-        texts = pd.read_csv(path, sep=separator, engine="python", dtype=str)
-        numbers = {str(name): texts[name].astype(float) for name in frame.select_dtypes("float")}
-        return frame.assign(**numbers)
+        # As texts, whose numbers `_numbers` reads: pandas 2 rounds their last digits.
+        return pd.read_csv(path, sep=_separator(path), engine="python", dtype=str)
     except (ValueError, OSError, csv.Error) as error:
         line = str(error).splitlines()[0]
         raise UserError(f"{path}: cannot be read as a table ({line})") from None
@@ -570,15 +566,14 @@ def _numbers(frame: pd.DataFrame, column: str, name: str) -> Array:
     """
     import pandas as pd
 
-    values = pd.to_numeric(frame[column], errors="coerce").to_numpy(float)
-    filled = frame[column].notna().to_numpy()
-    bad = np.flatnonzero(np.isnan(values) & filled)
+    values = pd.to_numeric(frame[column], errors="coerce")
+    bad = np.flatnonzero(values.isna() & frame[column].notna())
     if len(bad):
         raise UserError(
             f"{_place(name, bad[0])}, column {column}: '{frame[column].iloc[bad[0]]}' is not a"
             " number; write it with a decimal point, or leave the cell empty"
         )
-    return values
+    return frame[column].to_numpy(float, na_value=np.nan)
 
 
 def _widened(frame: pd.DataFrame, name: str) -> pd.DataFrame:
