@@ -170,6 +170,7 @@ def show_report(
 
 
 def _print_table(rows: Sequence[Mapping[str, Any]], collection: Any) -> None:
+    from ipe_bench.report.tables.settings import Wording
     from ipe_bench.report.tables.table import terminal
     from ipe_bench.report.tables.terminal import summary_tables
 
@@ -179,7 +180,8 @@ def _print_table(rows: Sequence[Mapping[str, Any]], collection: Any) -> None:
 
         totals = [table for table in certified_tables(collection) if table.whole]
     out = console()
-    out.print(terminal(summary_tables(rows, totals, out.width), out.width))
+    wording = Wording.of(collection)
+    out.print(terminal(summary_tables(rows, totals, out.width, wording), out.width))
     sys.stdout.flush()
 
 

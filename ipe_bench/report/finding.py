@@ -120,6 +120,14 @@ class Finding:
     def ascending(self) -> bool:
         return self.standings[0].ascending
 
+    @property
+    def leading(self) -> list[bool]:
+        """Whether no estimator significantly holds longer, or in more settings, than each; of none
+        if this is so of all."""
+        most = max(one.sure for one in self.standings)
+        may = [one.possible >= most for one in self.standings]
+        return [one and not all(may) for one in may]
+
     def sentence(self) -> str:
         """States who holds, who is undecided, whose covariance is too small, and at which scales
         the best filter or IPE fails."""

@@ -17,6 +17,7 @@ from ipe_bench.report.formats import PAGE
 from ipe_bench.report.page.run import ReportResult, begin_report
 from ipe_bench.report.style import house_style
 from ipe_bench.report.tables.reports import certified_tables
+from ipe_bench.report.tables.settings import Wording
 from ipe_bench.report.tables.table import html, plain_text
 from ipe_bench.report.tables.terminal import summary_tables
 from ipe_bench.statistics.analysis import analyse
@@ -104,9 +105,18 @@ class Summary(pd.DataFrame):
 
     def _tables(self, width: int) -> list[Any]:
         rows: Any = self.to_dict("records")
-        certified = self._stored is not None and (self["noise"] == "certified").any()
-        totals = certified_tables(collect([self._folder])) if certified else ()
-        return summary_tables(rows, [table for table in totals if table.whole], width)
+        collection = collect([self._folder]) if self._needs_results else None
+        totals = certified_tables(collection) if collection else ()
+        wording = Wording.of(collection)
+        return summary_tables(rows, [one for one in totals if one.whole], width, wording)
+
+    @property
+    def _needs_results(self) -> bool:
+        """Whether its words need more than its rows, and the results are known."""
+        of_truth = any(column.partition(".")[0] == "truth" for column in self.columns)
+        certified = (self["noise"] == "certified").any()
+        is_there = self._stored is not None and self._stored.folder.is_dir()
+        return is_there and bool(certified or of_truth)
 
     def __repr__(self) -> str:
         if not self._is_whole:

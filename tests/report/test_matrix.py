@@ -105,7 +105,7 @@ def test_neighbouring_scales_that_say_the_same_are_one_on_paper():
     assert markdown(matrix).splitlines()[:4] == [
         "| error scale → | 0.1 to 1 | 10 to 33 | 100 |",
         "|:---|---:|---:|---:|",
-        "| a | 100 | 100 | 98 |",
+        "| **a** | 100 | 100 | 98 |",
         "| b | 100 | 10 | 0 |",
     ]
     assert r"\begin{tabular}{@{}lrrr@{}}" in latex(matrix)
@@ -129,6 +129,22 @@ def test_a_cell_says_all_that_is_known_of_it():
         " bound, 95 % of trials below 1.35; NEES 1.04: covariance too small; cost 21/30, 2.0 ms"
     )
     assert f'title="{tile.says}"' in html([matrix])
+
+
+@pytest.mark.parametrize(
+    ("counts", "bold"),
+    [
+        ({"a": (200, 200), "b": (200, 200)}, []),
+        ({"a": (200, 200), "b": (200, 0)}, ["a"]),
+        ({"a": (200, 200), "b": (200, 176), "c": (200, 0)}, ["a", "b"]),
+        ({"a": (0, 0), "b": (100, 0)}, []),
+    ],
+)
+def test_names_are_bold_unless_another_one_holds_longer_and_none_where_all_tie(counts, bold):
+    (matrix,) = matrices(rows_of(counts))
+    assert [name.text for name, *_ in matrix.rows if name.best] == bold
+    assert ("Bold:" in matrix.notes[-1]) == bool(bold)
+    assert html([matrix]).count('class="best"') == len(bold)
 
 
 def test_one_scale_has_a_table_and_no_matrix():

@@ -22,7 +22,8 @@ from ipe_bench.noise import Quantization
 from ipe_bench.report import figures
 from ipe_bench.report.page.headline import about, headline
 from ipe_bench.report.page.html import DEFINITIONS, render_page
-from ipe_bench.report.tables.reports import all_tables, differing
+from ipe_bench.report.tables.reports import all_tables
+from ipe_bench.report.tables.settings import Wording
 from ipe_bench.report.tables.table import (
     Strong,
     Table,
@@ -254,6 +255,7 @@ def test_rows_of_equal_settings_each_have_a_dash():
     """Also with the lowest pandas that is allowed, which forgets the rows of a frame without
     columns."""
     rows = pd.DataFrame({"size": [1.0, 1.0], "shape": ["round", "round"]})
+    differing = Wording.of(None).settings
     assert differing(rows, ["size", "shape"]) == differing(rows, []) == ["-", "-"]
     assert differing(rows.assign(size=[1.0, 2.0]), ["size", "shape"]) == ["size=1", "size=2"]
 

@@ -425,6 +425,19 @@ def tiles(report: Report) -> Iterator[Claim]:
 
 
 @entries
+def bold_names(report: Report) -> Iterator[Claim]:
+    """Infers, of a matrix with names in bold, that none of the others holds longest."""
+    scales = range(len(report.board.scales))
+    for matrix in (part for part in report.parts if isinstance(part, Table)):
+        bold = {name.text: name.best for name, *_ in matrix.rows}
+        held = {e: sum(truly_holds(report, e, last) for last in scales) for e in bold}
+        longest = max(held.values())
+        false = any(held[e] == longest for e, is_bold in bold.items() if not is_bold)
+        if any(bold.values()):
+            yield Claim("holds longest (bold)", INFERS, matrix.name, false)
+
+
+@entries
 def verdicts(report: Report) -> Iterator[Claim]:
     """Overconfident: infers that the mean NEES of converged trials is above n, or the mean NIS
     above the number of readings; too cautious: that it is below; wrong: that more than 1 % of the

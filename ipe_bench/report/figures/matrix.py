@@ -63,7 +63,8 @@ def draw(view: View) -> Iterator[Drawing]:
     ax.xaxis.set_label_position("top")
     ax.set_xlabel(matrix.over, fontsize=7.5 * small)
     ax.tick_params(length=0, labelsize=7.5 * small, labelrotation=0)
-    ax.get_yticklabels()[0].set_fontweight("bold")
+    for label, cell in zip(ax.get_yticklabels(), columns[0].cells, strict=True):
+        label.set_fontweight(cell.style or "normal")
     figure.suptitle(finding, x=0.01, ha="left", fontsize=8.5 * small, fontweight="bold")
     yield view.drawing(figure, MATRIX, "Success", *matrix.captions)
 

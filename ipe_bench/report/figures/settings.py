@@ -5,30 +5,27 @@ other settings."""
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
-from ipe_bench.basics.errors import UserError
-from ipe_bench.plugins.construct import find_object
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.errors import BARS, draw_panels
 from ipe_bench.report.figures.views import Figure, View, in_focus
 from ipe_bench.report.style import FAMILIES, WHITE, Look
+from ipe_bench.report.tables.settings import RIGHT, Wording, last_words
 from ipe_bench.report.words import brief, percent, value_text, varying
-from ipe_bench.runs.provenance import TARGET
 
 if TYPE_CHECKING:
-    from ipe_bench.statistics.collect import Collection
+    pass
 
 MOST_ROWS = 25
 """Settings that have a row; the tables have all."""
 DETECTED = 0.5
 """Share of trials from which on a misfit counts as detected."""
-RIGHT = "right model"
 _ALIKE = 0.05
 """Part by which the errors of estimators that are alike differ at most."""
 _MOST_ERROR = 1e4
@@ -51,7 +48,8 @@ def draw(view: View) -> Iterator[Drawing]:
     apart = varying(columns[: columns.index("error_scale")], rows)
     if not apart:
         return
-    names = _names(rows, apart, view)
+    wording = Wording.of(view.collection)
+    names = wording.settings(rows, columns[: columns.index("error_scale")])
     keys = [
         ", ".join(f"{column}={value_text(value)}" for column, value in row.items())
         for row in rows[apart].to_dict("records")
@@ -68,7 +66,8 @@ def draw(view: View) -> Iterator[Drawing]:
     if of_truth and rows["misfit"].notna().any():
         yield from _rows(view, rows, scale)
     elif len(apart) == 1 and _is_axis(rows[apart[0]]):
-        yield from _swept(view, rows, apart[0], scale)
+        unit = wording.units.get(apart[0], "")
+        yield from _swept(view, rows, apart[0], unit, scale)
 
 
 def _is_axis(values: pd.Series[Any]) -> bool:
@@ -78,56 +77,17 @@ def _is_axis(values: pd.Series[Any]) -> bool:
     return numbers.nunique() > 2 and bool((numbers > 0).all())
 
 
-def _scenarios(collection: Collection | None) -> Iterator[Mapping[str, Any]]:
-    for group in collection.groups if collection else ():
-        yield group.footer["identity"]["scenario"]
-
-
-def _units(collection: Collection | None) -> dict[str, str]:
-    """Returns the units of options that their classes state, by the columns of settings."""
-    found: dict[str, str] = {}
-    for scenario in _scenarios(collection):
-        for component, config in scenario.items():
-            if not isinstance(config, Mapping) or TARGET not in config:
-                continue
-            try:
-                stated = getattr(find_object(config[TARGET], component), "option_units", {})
-            except UserError:  # the plugin of a stored result is gone
-                stated = {}
-            found |= {f"{component}.{name}": unit for name, unit in stated.items()}
-    return found
-
-
-def _names(rows: pd.DataFrame, apart: Sequence[str], view: View) -> list[str]:
-    """Words the setting of each row by what is in it: options that are there and not 0, with their
-    units."""
-    units = _units(view.collection)
-    assumed = [one.get("measurement", {}) for one in _scenarios(view.collection)]
-    models = {config.get(TARGET, "").rpartition(".")[2] for config in assumed}
-    told = []
-    for row in rows.to_dict("records"):
-        kind = value_text(row.get("truth"))
-        values = {c: value_text(row[c]) for c in apart if c != "truth"}
-        there = {c: value for c, value in values.items() if value not in ("-", "0")}
-        words = [f"{_worded(c)} {value} {units.get(c, '')}".strip() for c, value in there.items()]
-        told.append(", ".join(words) or (RIGHT if kind in models else kind))
-    return told
-
-
-def _worded(column: str) -> str:
-    return column.rpartition(".")[2].replace("_", " ")
-
-
-def _swept(view: View, rows: pd.DataFrame, column: str, scale: float) -> Iterator[Drawing]:
+def _swept(
+    view: View, rows: pd.DataFrame, column: str, unit: str, scale: float
+) -> Iterator[Drawing]:
     """Draws success, error and NEES over the number that is swept."""
     rows = rows.assign(error_scale=pd.to_numeric(rows[column]))
     values = sorted(set(rows["error_scale"]))
     look = in_focus(view.look, view.focus)
     fig, axes = common.panels(3, look, height=3.3, row=3)
     draw_panels(view, axes, rows, look, values)
-    unit = _units(view.collection).get(column, "")
     for ax in axes:
-        ax.set_xlabel(f"{_worded(column)} [{unit}]" if unit else column)
+        ax.set_xlabel(f"{last_words(column)} [{unit}]" if unit else column)
     common.end_names(axes[0], rows, "success", look)
     common.legend(fig, axes)
     title = f"Success, error and reported covariance over {column} at error scale {scale:g}"

@@ -159,7 +159,7 @@ def _matrix(finding: Finding, name: str, title: str) -> Matrix:
     moving = {row["noise"] for row in rows} == {"model"}
     names = [one.label for one in finding.standings]
     over = _over(finding)
-    columns = [words(f"{over} →", names)]
+    columns = [words(f"{over} →", names, finding.leading)]
     heads, keys = _heads(finding, over)
     for at, head in enumerate(heads):
         cells = [_tile(one, at, finding, moving) for one in finding.standings]
@@ -200,7 +200,9 @@ def _letter(at: int) -> str:
 
 
 def _legend(columns: Sequence[Column]) -> str:
-    return f"{_signs(columns)} {MEANING}"
+    is_bold = any(cell.best for column in columns for cell in column.cells)
+    bold = " Bold: no other significantly holds longer, or in more settings." if is_bold else ""
+    return f"{_signs(columns)}{bold} {MEANING}"
 
 
 def _signs(columns: Sequence[Column]) -> str:

@@ -8,10 +8,9 @@ from typing import Any
 
 import pandas as pd
 
+from ipe_bench.report.tables.settings import MOST_SETTINGS, Wording
 from ipe_bench.report.tables.table import Column, Table, column, words
 from ipe_bench.report.tables.terminal import (
-    MOST_SETTINGS,
-    differing,
     leading,
     overview_columns,
     overview_notes,
@@ -124,7 +123,11 @@ def head(analysis: Analysis, rows: pd.DataFrame) -> list[Column]:
     and the scale."""
     apart = varying(analysis.setting_columns, rows)
     if len(apart) > MOST_SETTINGS:
-        told = [words("setting", differing(rows, apart))]
+        told = [
+            words(
+                "setting", Wording.of(analysis.collection).settings(rows, analysis.setting_columns)
+            )
+        ]
     else:
         told = [words(name, map(value_text, rows[name])) for name in apart]
     return [*told, column("error scale", rows["error_scale"], "{:g}".format)]

@@ -13,6 +13,7 @@ import pandas as pd
 
 from ipe_bench.report.finding import FAILS, Finding
 from ipe_bench.report.tables.matrix import opening
+from ipe_bench.report.tables.settings import PLAIN, Wording
 from ipe_bench.report.tables.table import (
     Column,
     Part,
@@ -24,7 +25,6 @@ from ipe_bench.report.tables.table import (
     words,
 )
 from ipe_bench.report.words import (
-    assignments,
     brief,
     cost,
     duration,
@@ -34,7 +34,6 @@ from ipe_bench.report.words import (
     scientific,
     short,
     value_text,
-    varying,
 )
 from ipe_bench.statistics.formulas import CAP
 from ipe_bench.statistics.records import SCORES
@@ -42,8 +41,6 @@ from ipe_bench.statistics.registry import all_statistics, summary_columns
 from ipe_bench.statistics.statistic import ALL, BEST, Kind, Statistic, Where
 from ipe_bench.statistics.verdicts import VERDICTS, shown, sign_of
 
-MOST_SETTINGS = 2
-"""Differing settings that have a column each."""
 _MOST_LINES = 46
 """Lines that a terminal shows of several settings, most of them of matrices."""
 _HEAD = 4
@@ -87,7 +84,10 @@ def overview_notes(noises: Collection[str], *, narrow: bool = False) -> tuple[st
 
 
 def summary_tables(
-    listed: Sequence[Mapping[str, Any]], totals: Sequence[Table], width: int
+    listed: Sequence[Mapping[str, Any]],
+    totals: Sequence[Table],
+    width: int,
+    wording: Wording = PLAIN,
 ) -> list[Part]:
     """Returns a table per setting (measurement, noise, differing options), after the totals of
     certified runs."""
@@ -98,14 +98,15 @@ def summary_tables(
     columns = _columns_of_settings(rows)
     settings: dict[str, list[Any]] = {}
     for row in rows:
-        settings.setdefault(_worded(row, columns), []).append(row)
+        values = {column: value_text(row.get(column)) for column in columns}
+        settings.setdefault(wording.worded(values), []).append(row)
     kept = {title: part for title, part in _shortened(settings).items() if part}
     tables = [_setting(title, part, width) for title, part in kept.items()]
     if tables:
         noises = {row["noise"] for row in rows}
         notes = overview_notes(noises, narrow=width < _WIDE_ENOUGH)
         tables[-1] = replace(tables[-1], notes=notes)
-    parts: list[Part] = [*totals, *_opening(rows, columns), *tables]
+    parts: list[Part] = [*totals, *_opening(rows, columns, wording), *tables]
     further = len(rows) - sum(map(len, kept.values()))
     if further:
         hidden = len(settings) - len(kept)
@@ -125,17 +126,14 @@ def _columns_of_settings(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return [c for c in columns if c not in known and not c.startswith("estimator.")]
 
 
-def _worded(row: Mapping[str, Any], columns: Sequence[str]) -> str:
-    """Words a row's setting, without the options that its classes lack."""
-    return assignments({column: value_text(row.get(column)) for column in columns})
-
-
-def _opening(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> list[Part]:
+def _opening(
+    rows: Sequence[Mapping[str, Any]], columns: Sequence[str], wording: Wording
+) -> list[Part]:
     """Returns the finding and its matrices, of constants and then of states that move."""
     simulated = [row for row in rows if row["noise"] != "certified"]
     if not simulated:
         return []
-    settings = differing(pd.DataFrame(simulated), columns)
+    settings = wording.settings(pd.DataFrame(simulated), columns)
     pairs = zip(simulated, settings, strict=True)
     told = [{**row, "setting": setting} for row, setting in pairs]
     constant = [row for row in told if row["noise"] != "model"]
@@ -187,23 +185,6 @@ def _setting(title: str, rows: Sequence[Mapping[str, Any]], width: int) -> Table
         title = f"{title}: {trials} per row"
     title += f" at error scale {value_text(rows[0]['error_scale'])}"
     return Table("summary", title, "", columns, whole="summary.csv")
-
-
-def differing(rows: pd.DataFrame, columns: Sequence[str]) -> list[str]:
-    """Returns for each row those of its settings that differ among the rows, of many those other
-    than the most frequent ones; a dash if there are none."""
-    apart = varying(columns, rows)
-    if not apart:  # a frame without columns loses its rows in pandas 2.2
-        return ["-"] * len(rows)
-    values = rows[apart].map(value_text)
-    usual: dict[Any, str] = {}
-    if len(values.columns) > MOST_SETTINGS:
-        usual = {c: values[c].mode().iloc[0] for c in values}
-    settings = []
-    for row in values.to_dict("records"):
-        told = {c: v for c, v in row.items() if v != usual.get(c)}
-        settings.append(assignments(told) or "-")
-    return settings
 
 
 def leading(rows: Sequence[Mapping[str, Any]], scenario: Sequence[str]) -> list[bool]:

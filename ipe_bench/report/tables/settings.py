@@ -1,0 +1,116 @@
+"""Words the settings of rows: options that differ, with their units, and the right model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import pandas as pd
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.plugins.construct import find_object
+from ipe_bench.report.words import assignments, value_text, varying
+from ipe_bench.runs.provenance import TARGET
+
+if TYPE_CHECKING:
+    from ipe_bench.statistics.collect import Collection, Group
+
+RIGHT = "right model"
+"""Ends the words of a setting whose readings come from the model that estimators assume."""
+MOST_SETTINGS = 2
+"""Differing settings that have a column each."""
+_TRUTH = "truth"
+
+Options = frozenset[tuple[str, str]]
+"""Texts of a setting's options, by columns."""
+
+
+@dataclass(frozen=True)
+class Wording:
+    """Holds what the options of settings mean."""
+
+    units: Mapping[str, str]
+    """Units of options, by their columns."""
+    right: frozenset[Options]
+    """Settings whose readings come from the model that estimators assume."""
+
+    @classmethod
+    def of(cls, collection: Collection | None) -> Wording:
+        """Reads units and models from results."""
+        units: dict[str, str] = {}
+        right = set()
+        for group in collection.groups if collection else ():
+            units |= _units(group)
+            scenario = group.footer["identity"]["scenario"]
+            if scenario.get(_TRUTH) in (None, scenario.get("measurement")):
+                right.add(_options(group.columns))
+        return cls(units, frozenset(right))
+
+    def settings(self, rows: pd.DataFrame, columns: Sequence[str]) -> list[str]:
+        """Returns for each row those of its settings that differ among the rows, of many those
+        other than the most frequent ones; a dash if there are none."""
+        apart = varying(columns, rows)
+        if not apart:  # a frame without columns loses its rows in pandas 2.2
+            return ["-"] * len(rows)
+        values = rows[apart].map(value_text)
+        usual: dict[Any, str] = {}
+        if len(apart) > MOST_SETTINGS:
+            usual = {c: values[c].mode().iloc[0] for c in apart if c != _TRUTH}
+        settings = []
+        whole: list[Any] = rows[list(columns)].to_dict("records")
+        for row, told in zip(whole, values.to_dict("records"), strict=True):
+            unusual = {str(c): v for c, v in told.items() if v != usual.get(c)}
+            is_right = _options(row) in self.right
+            settings.append(self.worded(unusual, is_right=is_right) or "-")
+        return settings
+
+    def worded(self, values: Mapping[str, str], *, is_right: bool = False) -> str:
+        """Words the options of one setting, without those that its classes lack and errors of the
+        truth that are 0."""
+        there = {c: v for c, v in values.items() if v != "-"}
+        errors = {c: v for c, v in there.items() if _of_truth(c) and c in self.units}
+        if is_right or errors:
+            there = {c: v for c, v in there.items() if not _of_truth(c) or c in errors}
+        told = [self._one(c, v) for c, v in there.items() if c not in errors or v != "0"]
+        if is_right and any(map(_of_truth, values)):
+            told.append(RIGHT)
+        return ", ".join(told)
+
+    def _one(self, column: str, value: str) -> str:
+        unit = self.units.get(column, "")
+        if unit and _of_truth(column):
+            return f"{last_words(column)} {value} {unit}"
+        return f"{assignments({column: value})} {unit}".rstrip()
+
+
+PLAIN = Wording({}, frozenset())
+"""Words settings by rows alone."""
+
+
+def last_words(column: str) -> str:
+    """Words an option by its own name, without those of its component."""
+    return column.rpartition(".")[2].replace("_", " ")
+
+
+def _of_truth(column: str) -> bool:
+    return column.partition(".")[0] == _TRUTH
+
+
+def _options(row: Mapping[str, Any]) -> Options:
+    texts = {column: value_text(value) for column, value in row.items() if column != "error_scale"}
+    return frozenset((column, text) for column, text in texts.items() if text != "-")
+
+
+def _units(group: Group) -> dict[str, str]:
+    """Returns the units that the classes of a scenario's components state."""
+    found = {}
+    for component, config in group.footer["identity"]["scenario"].items():
+        if not isinstance(config, Mapping) or TARGET not in config:
+            continue
+        try:
+            stated = getattr(find_object(config[TARGET], component), "option_units", {})
+        except UserError:  # the plugin of a stored result is gone
+            stated = {}
+        found |= {f"{component}.{name}": unit for name, unit in stated.items()}
+    return found
