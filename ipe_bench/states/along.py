@@ -221,6 +221,8 @@ def functions_of(model: StateModel) -> tuple[EpochFunctions, EpochFunctions]:
 
 
 def _recorded(model: StateModel, name: str, epochs: Sequence[int]) -> EpochFunctions:
+    if not epochs:
+        return EpochFunctions([])
     try:
         with np.errstate(all="ignore"):
             return EpochFunctions(model.recorded(name, epochs))

@@ -8,11 +8,12 @@ from shared.oracles import assert_agrees
 
 import ipe_bench as ib
 from ipe_bench.baselines import LevenbergMarquardt, MapLM
+from ipe_bench.basics.linalg import Covariance
 from ipe_bench.measurements import Formula, Polynomial, Sir
 from ipe_bench.measurements.known import ParameterInfo, informed
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Correlated, Gaussian, Unknown
-from ipe_bench.real.examination import examine
+from ipe_bench.real.examination import answers, examine
 from ipe_bench.real.fits import fit, scaled
 from ipe_bench.real.profiles import CONFIDENCE, half_width, profiles, wald_interval
 from ipe_bench.trials.scenario import Scenario
@@ -206,6 +207,15 @@ def test_a_profile_that_comes_upon_a_better_fit_is_no_interval():
     assert np.isnan(found.profiles).all()
     assert not found.least
     assert found.minima[0].x == pytest.approx([1.0], abs=1e-3)
+
+
+def test_readings_without_a_minimum_have_no_answer():
+    """A search that begins where the model has no value is none of those that intervals count."""
+    model = Formula("log(a)*t", {"a": 1.0}, {"t": (1.0, 2.0, 3.0)})
+    z = np.tile([0.1, 0.2, 0.3], (2, 1))
+    values, found = answers(Problem(model, Covariance(np.ones(3))), z, np.array([[0.5], [-1.5]]))
+    assert found.tolist() == [True, False]
+    assert values[0, 0] == pytest.approx(np.exp(0.1))
 
 
 def test_a_prior_that_counts_in_no_estimate_is_told():

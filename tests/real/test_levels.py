@@ -8,11 +8,13 @@ import pytest
 from scipy.optimize import minimize as nelder_mead
 from scipy.optimize import root
 from scipy.special import digamma
+from scipy.stats import norm
 from shared.oracles import assert_agrees
 
 import ipe_bench as ib
 from ipe_bench.baselines import LevenbergMarquardt, LinearLSE, MapLM
 from ipe_bench.basics.linalg import Covariance
+from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements import Formula, Nist
 from ipe_bench.measurements.known import ParameterInfo, informed
 from ipe_bench.measurements.problem import Problem
@@ -93,6 +95,23 @@ def test_the_maximum_of_the_likelihood_is_that_of_a_direct_search(case):
     assert_agrees(found, direct, atol=1e-8)
     # Its value is -2 times the log likelihood over that of the deviations that R holds.
     assert minima.chi_square[0] == pytest.approx(deviance(direct) - 60 * 2 * np.log(0.2), rel=1e-9)
+
+
+@pytest.mark.parametrize("case", NOISES)
+def test_fits_are_compared_by_minus_twice_their_log_likelihood(case):
+    z = readings(case, 3)
+    one = fitted(case, z)
+    h = decay(one.inner[:3])
+    density = norm(h, sigma(case, h, np.exp(one.inner[3:])))
+    exact = -2 * density.logpdf(z).sum() - 60 * np.log(2 * np.pi)
+    assert one.deviance == pytest.approx(exact, rel=1e-9)
+
+
+def test_readings_of_zero_are_met_at_a_level_of_round_off():
+    model = Formula("a + b*t", {"a": 0.0, "b": 1.0}, {"t": (1.0, 2.0, 3.0, 4.0)})
+    (one,) = fit(Problem(model, Covariance(np.ones(4))), np.zeros(4), LM, Unknown())
+    assert one.status is Status.CONVERGED
+    np.testing.assert_allclose(one.x, 0.0, atol=1e-12)
 
 
 @pytest.mark.oracle(

@@ -113,6 +113,11 @@ def test_values_and_slopes_along_paths_are_those_of_each_epoch(name):
 
 
 @pytest.mark.parametrize("name", MODELS)
+def test_functions_of_any_number_of_states_are_recorded(name):
+    assert [one.why for one in MODELS[name].epoch_functions] == ["", ""]
+
+
+@pytest.mark.parametrize("name", MODELS)
 def test_a_path_has_the_same_bits_alone_and_in_a_batch(name):
     model = MODELS[name]
     x = path(model, 7)

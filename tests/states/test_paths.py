@@ -34,6 +34,28 @@ from ipe_bench.trials.paths import PathBlock, StateScenario
 
 NEAR = Pendulum(count=25, start=(1.0, 0.0), spread=0.2)
 LINEAR = ConstantVelocity(count=12, spread=2.0)
+SIZES = np.array([1e3, 50.0])
+
+
+class Scaled(Pendulum):
+    """The same pendulum in other units of angle and rate."""
+
+    @property
+    def prior(self):
+        m, P = super().prior
+        return Normal(m * SIZES, P * SIZES * SIZES[:, None])
+
+    def transition(self, x, k):
+        return super().transition(x / SIZES, k) * SIZES
+
+    def observe(self, x, k):
+        return super().observe(x / SIZES, k)
+
+    def gain(self, k):
+        return SIZES[:, None] * super().gain(k)
+
+
+SCALED = Scaled(**vars(NEAR))
 
 
 def unknowns(model, start, x):
@@ -117,33 +139,23 @@ def bearings(scale):
 def test_a_damped_step_is_the_same_in_any_unit_of_the_states():
     """Damping is in variances of the states: with that of one unit the step depends on the
     units."""
-    sizes = np.array([1e-3, 50.0])
-
-    class Scaled(Pendulum):
-        """The same pendulum in other units of angle and rate."""
-
-        @property
-        def prior(self):
-            m, P = super().prior
-            return Normal(m * sizes, P * sizes * sizes[:, None])
-
-        def transition(self, x, k):
-            return super().transition(x / sizes, k) * sizes
-
-        def observe(self, x, k):
-            return super().observe(x / sizes, k)
-
-        def gain(self, k):
-            return sizes[:, None] * super().gain(k)
-
     steps = []
-    for model in (NEAR, Scaled(count=25, start=(1.0, 0.0), spread=0.2)):
+    for model in (NEAR, SCALED):
         density = PathDensity.of(model, NEAR.draw(0, 4).z)
         track = filtered(model, density.z, Taylor())
         begun = replace(Descent.of(density, track), damping=np.ones(4))
         steps.append(LevenbergMarquardtSmoother(iterations=1).descended(density, begun).at)
-    np.testing.assert_allclose(steps[1].x / sizes, steps[0].x, atol=1e-9)
+    np.testing.assert_allclose(steps[1].x / SIZES, steps[0].x, atol=1e-9)
     np.testing.assert_allclose(steps[1].cost, steps[0].cost, rtol=1e-9)
+
+
+@pytest.mark.parametrize("rule", [Taylor(), Cubature()], ids=["tangents", "points"])
+def test_a_smoother_arrives_after_the_same_steps_in_any_unit_of_the_states(rule):
+    tracker = IteratedSmoother(rule=rule, iterations=20, tolerance=1e-3)
+    z = NEAR.draw(0, 4).z
+    one, other = (tracker.track(model, z) for model in (NEAR, SCALED))
+    np.testing.assert_array_equal(other.calls, one.calls)
+    np.testing.assert_allclose(other.mean / SIZES, one.mean, atol=1e-9)
 
 
 def test_levenberg_and_marquardt_begin_at_the_better_of_two_filters():

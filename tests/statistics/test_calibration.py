@@ -89,6 +89,15 @@ def test_a_band_has_its_level_and_a_curve_its_p(trials):
         assert high[4] * np.sqrt(trials) < 1.0
 
 
+@pytest.mark.parametrize("trials", [1, 4, 6])
+def test_the_p_of_draws_on_one_side_is_as_small_as_they_are_rare(trials):
+    """All draws below the first point, or all above the last, have 2 / 100^trials; where no digits
+    are left for that, the sum over both tails of 99 points bounds it."""
+    least = 2 * 0.01**trials
+    (curve,) = curves([np.full(99, trials)], trials)
+    assert least * (1 - 1e-6) <= curve.p <= 99 * least * (1 + 1e-6)
+
+
 @pytest.mark.slow
 def test_p_values_are_uniform():
     """4 deviations of the binomial, over 3,000 honest curves."""

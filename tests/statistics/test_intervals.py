@@ -11,6 +11,7 @@ from ipe_bench.statistics.intervals import (
     clopper_pearson,
     few_carry,
     quantile,
+    quantiles,
     rms_interval,
     unseen,
 )
@@ -316,3 +317,6 @@ def test_quantiles_are_numpys_where_all_is_finite_and_infinite_where_it_is_not()
     assert quantile(half, 0.5) == np.inf
     assert quantile(half, 1.0) == np.inf
     assert np.isnan(quantile(np.empty(0), 0.5))
+    # All at once they are the same.
+    for some in (values, half):
+        np.testing.assert_array_equal(quantiles(some, q), [quantile(some, p) for p in q])

@@ -113,6 +113,15 @@ def test_the_choice_is_near_that_of_brute_force(criterion, seed):
         )
 
 
+@pytest.mark.parametrize("criterion", ["A", "D"])
+def test_fewer_readings_than_parameters_are_no_choice(criterion):
+    """One reading of three parameters leaves two directions unknown, whatever round-off says of
+    them."""
+    for seed in range(6):
+        model = Linear(count=1, seed=seed)
+        assert design(scenario(model), criterion=criterion).ways == ()
+
+
 @pytest.mark.oracle(
     "published: D-optimal points of Smith (1918) and Guest (1958)",
     "times of readings, on a grid of 0.1",
