@@ -622,13 +622,16 @@ def swept_view(name: str, values, errors_of, **more) -> View:
 def test_a_row_per_setting_has_its_error_and_the_share_of_misfits_detected():
     errors_of = {np.nan: 1.0, 5.0: 20.0, 20.0: 300.0}
     view = swept_view("truth.platform_misalignment", errors_of, errors_of)
-    truth = {"_target_": "ipe_bench.measurements.RicherGins"}
-    scenario = {"truth": truth, "measurement": {"_target_": "ipe_bench.measurements.Gins"}}
-    footer = {"identity": {"scenario": scenario}}
+    assumed = {"_target_": "ipe_bench.measurements.Gins"}
     option = view["summary"]["truth.platform_misalignment"]
     view["summary"].insert(0, "truth", np.where(option.isna(), "Gins", "RicherGins"))
-    group = SimpleNamespace(footer=footer)
-    view = replace(view, collection=SimpleNamespace(groups=[group]))
+    groups = []
+    for name in ("Gins", "RicherGins"):
+        truth = {"_target_": f"ipe_bench.measurements.{name}"}
+        scenario = {"truth": truth, "measurement": assumed}
+        footer = {"identity": {"scenario": scenario}}
+        groups.append(SimpleNamespace(footer=footer, columns={"truth": name}))
+    view = replace(view, collection=SimpleNamespace(groups=groups))
     drawing = drawn(settings, view)["settings"]
     (ax,) = drawing.figure.axes
     assert ax.get_title() == "ekf"
@@ -668,9 +671,15 @@ def test_a_number_that_is_swept_has_an_axis_and_kinds_have_the_matrix_alone():
 
 def test_settings_whose_words_are_alike_have_rows_of_their_own():
     alike = {0.0: 1.0, np.nan: 2.0}
-    drawing = drawn(settings, swept_view("truth.width", alike, alike))["settings"]
+    view = swept_view("truth.platform_misalignment", alike, alike)
+    truth = {"_target_": "ipe_bench.measurements.RicherGins"}
+    group = SimpleNamespace(footer={"identity": {"scenario": {"truth": truth}}}, columns={})
+    drawing = drawn(settings, replace(view, collection=SimpleNamespace(groups=[group])))["settings"]
     told = [text.get_text() for text in drawing.figure.axes[0].texts if ":" in text.get_text()]
-    assert [text.partition(":")[0] for text in told] == ["truth.width=-", "truth.width=0"]
+    assert [text.partition(":")[0] for text in told] == [
+        "truth.platform_misalignment=-",
+        "truth.platform_misalignment=0",
+    ]
 
 
 # Distributions and convergence --------------------------------------------------------------------

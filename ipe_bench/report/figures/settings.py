@@ -15,6 +15,7 @@ from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.errors import BARS, draw_panels
 from ipe_bench.report.figures.views import Figure, View, in_focus
+from ipe_bench.report.finding import setting_words
 from ipe_bench.report.style import FAMILIES, WHITE, Look
 from ipe_bench.report.tables.settings import RIGHT, Wording, last_words
 from ipe_bench.report.words import brief, percent, value_text, varying
@@ -49,7 +50,8 @@ def draw(view: View) -> Iterator[Drawing]:
     if not apart:
         return
     wording = Wording.of(view.collection)
-    names = wording.settings(rows, columns[: columns.index("error_scale")])
+    words = wording.settings(rows, columns[: columns.index("error_scale")])
+    names = [setting_words(setting) for setting in words]
     keys = [
         ", ".join(f"{column}={value_text(value)}" for column, value in row.items())
         for row in rows[apart].to_dict("records")
