@@ -149,9 +149,6 @@ class Suspect:
     """The largest shift of a parameter, in standard deviations of its bound."""
     parameter: str
     """The parameter that it moves most."""
-    visible: float
-    """The share of its whitened squares that the residuals keep; the parameters imitate the
-    rest."""
     noticed: float
     """The chance that the test of fit at its level notices it, by the noncentral chi-square law."""
     words: str
@@ -192,8 +189,6 @@ def suspects(
     found = []
     for name, unit, deviation, columns in _told(truth):
         moved = shift[:, :, columns]
-        kept = left[:, :, columns]
-        whole = G[:, :, columns]
         rms = _rms(moved)
         relative = _rms(moved / bound[:, :, None])
         worst = int(np.argmax(relative))
@@ -201,7 +196,6 @@ def suspects(
         if len(columns) == 1:
             rms = rms * np.sign(moved[:, :, 0].mean(axis=0))
             words = in_words([name, *names], np.concatenate([[1.0], -rms]))
-        visible = float(np.sum(kept**2) / np.sum(whole**2)) if np.any(whole) else 0.0
         one = Suspect(
             name,
             unit,
@@ -209,8 +203,7 @@ def suspects(
             shift=rms,
             bounds=float(relative[worst]),
             parameter=names[worst],
-            visible=visible,
-            noticed=_noticed(kept, model.m - model.n),
+            noticed=_noticed(left[:, :, columns], model.m - model.n),
             words=words,
         )
         found.append(one)
