@@ -376,6 +376,7 @@ def _readings_in(table: TextTable, model: Measurement) -> Readings:
         sampled = model.with_inputs(known, len(z))
     except UserError as error:
         raise table.error(str(error)) from None
+    _require_unit_of_angles(table, shown, sampled)
     wanted = tuple(dict.fromkeys((*known, _shown_as(model)[0], SIGMA)))
     table.require_known((*used, *sampled.index), wanted)
     for name, values in sampled.index.items():
@@ -480,6 +481,18 @@ def _reading_column(table: TextTable, model: Measurement) -> str:
     raise table.error(
         f"column {names[0]} is missing, which holds the readings; there are {there}; {remedy}"
     )
+
+
+def _require_unit_of_angles(table: TextTable, heading: str, model: Measurement) -> None:
+    """Refuses a unit of angles that the model, which takes them for radians, does not state: a
+    whole turn is another number in it."""
+    unit = _unit(heading)
+    if not len(model.periods) or model.reading_unit or unit in ("", "rad"):
+        return
+    remedy = "convert the values to rad"
+    if unit in ("deg", "°"):
+        remedy = f"set measurement.unit={unit}"
+    raise table.error(f"column {heading}: angles without measurement.unit are in rad; {remedy}")
 
 
 def _input(table: TextTable, wanted: Input, text: str, where: str) -> Any:

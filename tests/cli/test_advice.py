@@ -227,6 +227,11 @@ ADVICE = [
     ),
     (f"{FORMULA} noise.deviation=1", WORD, f"{FORMULA} noise.deviation=1 {{}}"),
     (
+        f"{STARTED} measurement.circular=[y] readings=deg.csv",
+        WORD,
+        f"{STARTED} measurement.circular=[y] readings=deg.csv {{}}",
+    ),
+    (
         f"{FITTED} measurement.start.b1=1 readings=r.csv",
         WORD,
         f"{FITTED} measurement.start.b1=1 readings=r.csv {{}}",
@@ -401,6 +406,7 @@ def command(ipe_bench, monkeypatch, tmp_path):
     Path("q.csv").write_text("t,q\n1,2\n2,3\n3,5\n4,9\n")
     Path("sigma.csv").write_text("t,reading,sigma\n1,2,1\n2,3,1\n3,5,1\n4,9,1\n")
     Path("s.csv").write_text("t,reading\n1,2\n2,3\n3,5\n4,9\n")
+    Path("deg.csv").write_text("t,y [deg]\n1,2\n2,3\n3,5\n4,9\n")
     Path("z.csv").write_text("square\n" + "1\n" * 100)
     Path("l.yaml").write_text("[1]\n")
     Path("written.yaml").write_text("c0: {nominal: 1}\n")

@@ -20,6 +20,7 @@ from ipe_bench.measurements.joint import Joint
 from ipe_bench.measurements.known import ParameterInfo, informed
 from ipe_bench.noise import Gaussian, Quantization
 from ipe_bench.questions.posterior.maths import sample_posterior
+from ipe_bench.real.readings import Readings, open_together
 from ipe_bench.solvers import SteepestDescent
 from ipe_bench.trials.scenario import Scenario
 
@@ -225,6 +226,33 @@ def test_what_is_no_angle_is_refused(options, message):
         replace(PASSING, **options)
     with pytest.raises(UserError, match="circular=z: there is no such reading"):
         Formula("a*t", {"a": 1.0}, {"t": (1.0,)}, circular=("z",))
+
+
+@pytest.mark.parametrize(
+    ("unit", "remedy"),
+    [
+        ("deg", "set measurement.unit=deg"),
+        ("°", "set measurement.unit=°"),
+        ("mrad", "convert the values to rad"),
+    ],
+)
+def test_angles_of_a_file_in_another_unit_are_not_taken_for_radians(tmp_path, unit, remedy):
+    """A straight line of 20 degrees a second is one of 190 where a turn is 2 pi of its unit."""
+    t = np.arange(6.0)
+    rows = [f"{time},{(10 + 20 * time) % 360}" for time in t]
+    model = Formula("a + b*t", {"a": 9.0, "b": 19.0}, circular=("y",))
+
+    def opened(model: Formula, unit: str) -> Readings:
+        path = tmp_path / "angles.csv"
+        path.write_text("\n".join([f"t,y [{unit}]", *rows]), encoding="utf-8")
+        return open_together([path], model)
+
+    with pytest.raises(UserError, match=rf"column y \[{unit}\]: angles .* are in rad; {remedy}"):
+        opened(model, unit)
+    assert opened(model, "rad").model.periods == pytest.approx(2 * np.pi)
+    assert opened(replace(model, unit="deg"), "deg").model.periods == pytest.approx(360)
+    # Without turns a unit that the model does not state is a name alone.
+    assert len(opened(replace(model, circular=()), unit).z) == 6
 
 
 def test_angles_and_conditionals_are_remarked_on_together():
