@@ -36,7 +36,6 @@ from ipe_bench.runs.parts import SCHEMA, TRUTH, StoredPart
 from ipe_bench.runs.provenance import describe, digest, fingerprint, identified, importable
 from ipe_bench.states.trackers import Tracker
 from ipe_bench.trials.scenario import Scenario
-from ipe_bench.trials.theory import linear_correlation
 from ipe_bench.trials.thresholds import HISTORIES
 
 if TYPE_CHECKING:
@@ -129,7 +128,7 @@ class ResultKey:
             "readings": model.m,
             "about": _about(model),
             "linear_bound": scenario.linear_bound.tolist(),
-            **_of_kind(scenario),
+            **_of_states(scenario),
         }
 
 
@@ -142,10 +141,10 @@ def _about(model: Any) -> str:
     return docstring.partition(". ")[0].rstrip(".")
 
 
-def _of_kind(scenario: AnyScenario) -> dict[str, Any]:
+def _of_states(scenario: AnyScenario) -> dict[str, Any]:
+    """Returns the times and the number of states of a model that moves; nothing of constants."""
     if isinstance(scenario, Scenario):
-        correlation = linear_correlation(scenario.problem)
-        return {"linear_correlation": correlation.round(4).tolist()}
+        return {}
     return {"times": scenario.model.times.tolist(), "states": scenario.model.n}
 
 

@@ -12,7 +12,6 @@ from ipe_bench.basics.batches import put
 from ipe_bench.basics.linalg import (
     Array,
     Covariance,
-    correlations,
     definite_factor,
     deviations,
     finite,
@@ -37,11 +36,6 @@ def linear_bound(problem: Problem) -> Array:
     """Computes standard deviations (n,) of eq. (5): what the linear LSE would reach if h were
     linear."""
     return deviations(frozen_covariance(problem.H_plus[None], problem.R))[0]
-
-
-def linear_correlation(problem: Problem) -> Array:
-    """Computes the correlation (n, n) of the covariance of eq. (5)."""
-    return correlations(frozen_covariance(problem.H_plus[None], problem.R))[0]
 
 
 def informative_rows(noise: Noise, R: Covariance, J: Array, h: Array) -> Array:

@@ -28,7 +28,7 @@ from ipe_bench.statistics.statistic import ALL
 SUFFIX = ".json.xz"
 KEPT = ("summary", "scores", "pairs")
 """Frames of an analysis that pages are drawn from; all others are empty."""
-_LEFT_OUT = ("libraries", "linear_correlation", "linear_bound", "source", "versions")
+_LEFT_OUT = ("libraries", "linear_bound", "source", "versions")
 """What a footer says that no page shows."""
 _COLUMNS = ("status", "error_", "deviation_", "path_")
 """Columns of a single trial behind digits of certified answers and published errors, or what they
