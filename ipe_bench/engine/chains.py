@@ -35,6 +35,8 @@ from ipe_bench.engine import compiled
 from ipe_bench.engine.compiled import INTEGER, POINTER, aligned, at
 from ipe_bench.engine.integrator import emitted
 
+_KEPT = 4_000_000
+"""Numbers at most of a frame that is kept for the next call."""
 _FIRST = [(0, 0), (1, 0), (0, 0), (0, 0)]
 """Zeros in front of epochs: nothing moves into the first one, and nothing is read there."""
 _ARGUMENTS = (*[POINTER] * 9, INTEGER, INTEGER, POINTER)
@@ -132,13 +134,31 @@ def _run(A: Array, B: Array, D: Array, G: Array, *more: Array | None) -> None:
     """Runs machine code; what is None is not asked for."""
     trials, epochs, n = D.shape
     size = ChainSize.of(n, B.shape[2], G.shape[2])
+    free = _free_frames(size, epochs)
+    try:
+        memory, frame = free.pop()
+    except IndexError:
+        memory, frame = _new_frame(size, epochs)
+    arrays = [None if one is None else own(one) for one in (A, B, D, G, *more)]
+    pointers = [None if one is None else at(one) for one in arrays]
+    _compiled(size)(*pointers, trials, epochs, frame)
+    # What must be 0 stays 0, and all else is written before it is read.
+    if memory.size <= _KEPT:
+        free.append((memory, frame))
+
+
+@functools.lru_cache(maxsize=4)
+def _free_frames(size: ChainSize, epochs: int) -> list[tuple[Array, int]]:
+    """Returns the frames of earlier calls that no thread uses now."""
+    return []
+
+
+def _new_frame(size: ChainSize, epochs: int) -> tuple[Array, int]:
     # Before the first epoch lies one of zeros.
     room = sum(size.working) + (epochs + 1) * sum(size.parts)
     memory, frame = aligned(room * compiled.width())
     memory[:] = 0.0
-    arrays = [None if one is None else own(one) for one in (A, B, D, G, *more)]
-    pointers = [None if one is None else at(one) for one in arrays]
-    _compiled(size)(*pointers, trials, epochs, frame)
+    return memory, frame
 
 
 @functools.cache

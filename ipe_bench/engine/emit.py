@@ -334,8 +334,13 @@ class _ChainWriter(_LaneWriter):
         with self._each(self.n) as i:
             along = A.row(i).all()
             row = self.W.row(i)
-            with self._each(self.n) as j:
-                row[j] = self._dot(along, F.column(j))
+            moved = [self.zero] * self.n
+            # F is triangular: row j of it has j + 1 numbers.
+            for j, share in enumerate(along):
+                begun = j * self.n
+                kept = self.v.load(F.begin, range(begun, begun + j + 1))
+                moved[: j + 1] = self.v.combine(moved[: j + 1], [share], [kept])
+            self.v.store(moved, row.begin, range(self.n))
             with self._each(self.size.q) as j:
                 gain = self._gain(k, i, j)
                 row[self.b.add(j, integer(self.n))] = gain
@@ -477,8 +482,10 @@ class _ChainWriter(_LaneWriter):
                 self._smooth(k)
             with self._each(n) as i:
                 row = F.row(i).all()
-                with self._each(n) as j:
-                    self.product.row(i)[j] = self._dot(row, F.row(j).all())
+                with loop(self.b, integer(0), self.b.add(i, integer(1))) as j:
+                    along = self._dot(row, F.row(j).all())
+                    self.product.row(i)[j] = along
+                    self.product.row(j)[i] = along
             self._give(self.product, self.P, n * n, k, self.epochs)
             with self._asked(self.crossed):
                 self._tell(k)

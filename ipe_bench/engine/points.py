@@ -48,7 +48,7 @@ def spread_points(m: Array, P: Array, s: Array) -> tuple[Array, Array]:
     x = np.empty((trials, *s.shape))
     L = np.empty((trials, n, n))
     size = PointSize(n, 0)
-    _run("spreads", size, size.spread, [m, P, s, L, x], len(s))
+    _run("spreads", size, size.spread, [own(m), own(P), s, L, x], len(s))
     return x, L
 
 
@@ -59,7 +59,7 @@ def regress(y: Array, L: Array, s: Array, w: Array, c: Array) -> tuple[Array, Ar
     size = PointSize(s.shape[1], m)
     M = np.empty((trials, m, size.n))
     results = np.empty((trials, m)), M, np.empty_like(M), np.empty((trials, m, m))
-    _run("regressions", size, size.regression, [L, s, w, c, y, *results], points)
+    _run("regressions", size, size.regression, [L, s, w, c, own(y), *results], points)
     return results
 
 
@@ -67,9 +67,7 @@ def _run(
     name: str, size: PointSize, parts: tuple[int, ...], arrays: list[Array], points: int
 ) -> None:
     _, frame = aligned(sum(parts) * compiled.width())
-    # Those that are read-only or lie scattered are copied; the results are neither.
-    given = [own(one) for one in arrays]
-    _compiled(name, size, len(given))(*map(at, given), len(arrays[0]), points, frame)
+    _compiled(name, size, len(arrays))(*map(at, arrays), len(arrays[0]), points, frame)
 
 
 @functools.cache

@@ -9,11 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, cached_property, partial, reduce
+from itertools import product
 from typing import Any
 
 import numpy as np
 
-from ipe_bench.basics.linalg import Array, multiply, own
+from ipe_bench.basics.linalg import Array, own
 from ipe_bench.engine import compiled
 from ipe_bench.engine.compiled import INTEGER, POINTER, at
 from ipe_bench.engine.integrator import emitted
@@ -78,25 +79,28 @@ class RowFunction:
 
 
 def products(M: Array, x: Array) -> Array:
-    """Computes M x (trials, K, p) of small matrices M (K, p, n) or (trials, K, p, n) and of x
-    (trials, K, n): in machine code in a fifth of the time of NumPy's stacked products."""
+    """Computes M x (trials, K, p) or (trials, K, p, r) of small matrices M (K, p, n) or (trials, K,
+    p, n) and of x (trials, K, n) or (trials, K, n, r): in machine code in a fifth of the time of
+    NumPy's stacked products."""
     p, n = M.shape[-2:]
+    columns = x.shape[3:]
     if not M.size:
-        return multiply(M, x)
-    y = _product(p, n)(own(x.reshape(-1, n)), own(M.reshape(-1, p * n)))
-    return y.reshape(*x.shape[:2], p)
+        return np.zeros((*x.shape[:2], p, *columns))
+    r = columns[0] if columns else 1
+    y = _product(p, n, r)(own(x.reshape(-1, n * r)), own(M.reshape(-1, p * n)))
+    return y.reshape(*x.shape[:2], p, *columns)
 
 
 @cache
-def _product(p: int, n: int) -> RowFunction:
-    """Returns y_i = sum_j M_ij x_j as a function of rows."""
+def _product(p: int, n: int, r: int) -> RowFunction:
+    """Returns y_ic = sum_j M_ij x_jc as a function of rows."""
     graph = Graph()
-    x = graph.inputs("x", n)
+    x = graph.inputs("x", n * r)
     M = graph.inputs("M", p * n)
     y = []
-    for i in range(p):
+    for i, c in product(range(p), range(r)):
         along = M[i * n : (i + 1) * n]
-        terms = map(partial(graph.apply, "mul"), along, x)
+        terms = map(partial(graph.apply, "mul"), along, x[c::r])
         y.append(reduce(partial(graph.apply, "add"), terms))
     return RowFunction(RowPrograms.of(y, x, M))
 

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.linalg import Array, multiply
+from ipe_bench.basics.linalg import Array, multiply, own
 from ipe_bench.basics.options import Component, Count, Finite, Positive
 from ipe_bench.engine import compiled
 from ipe_bench.engine.points import regress, spread_points
@@ -119,8 +119,8 @@ class SigmaPoints(Rule):
 @functools.lru_cache(maxsize=64)
 def _weighted(rule: SigmaPoints, n: int) -> tuple[Array, Array, Array]:
     """Returns the points (p, n) of a rule with their weights (p,) in means and in covariances."""
-    s, w = rule.points(n)
-    return s, w, rule.covariance_weights(w)
+    s, w = map(own, rule.points(n))
+    return s, w, own(rule.covariance_weights(w))
 
 
 def _spread(m: Array, P: Array, s: Array) -> tuple[Half, Array]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.basics.linalg import Array, multiply
+from ipe_bench.basics.linalg import Array, Mask, multiply
 from ipe_bench.engine.chains import filtered_chains, smoothed_chains, solve_chains
 from ipe_bench.engine.rows import products
 from ipe_bench.states.algebra import (
@@ -84,9 +84,8 @@ class PathDensity:
     """G (K, n, q), with columns of 0 where a step has less noise than others."""
     inverses: Array
     """G^+ (K, q, n)."""
-    unreached: Array
-    """I - G G^+ (K, n, n), onto what the noise of a step does not reach; 0 if each step's noise
-    reaches every state."""
+    short: bool
+    """Whether the noise of some step does not reach every state."""
     noise: Array
     """G (1 + K, n, q) with that of P0 in front."""
     start: Half
@@ -106,8 +105,7 @@ class PathDensity:
         # G G^+ projects onto the range of the noise.
         inverses = np.linalg.pinv(gains)
         unreached = np.eye(model.n) - np.matmul(gains, inverses)
-        if (np.abs(unreached) < _REACHED).all():
-            unreached = np.zeros_like(unreached)
+        short = bool((np.abs(unreached) >= _REACHED).any())
         # R^-1/2 = L^-1 with R = L L'.
         there = np.isfinite(z)
         both = there[..., :, None] & there[..., None, :]
@@ -121,7 +119,7 @@ class PathDensity:
         noise[0, :, : first.shape[1]] = first
         noise[1:, :, : gains.shape[2]] = gains
         start = half(model.prior.covariance)
-        return cls(model, z, gains, inverses, unreached, noise, start, whitener)
+        return cls(model, z, gains, inverses, short, noise, start, whitener)
 
     def subset(self, rows: NDArray[np.intp]) -> PathDensity:
         """Returns the density of the trials `rows`."""
@@ -150,10 +148,7 @@ class PathDensity:
             at = (x[turned], gap[turned], h[turned])
             x[turned], gap[turned], h[turned] = self.subset(turned)._unwound(*at, shift)
         # A gap out of the range of its noise moves the epochs after it, too: one after another.
-        missed = np.abs(products(self.unreached, gap)).max(axis=1)
-        largest = np.abs(x).max(axis=1)
-        within = (missed <= _REACHED * largest).all(axis=1)
-        rows = np.flatnonzero(~within)
+        rows = np.flatnonzero(self._misses(x, gap))
         if rows.size:
             x[rows], gap[rows] = self._led(x[rows])
             h[rows] = self.model.values_along(x[rows])[1]
@@ -161,6 +156,14 @@ class PathDensity:
         calls[turned] += self.model.evaluations
         calls[rows] += self._leading
         return self._weighed(x, gap, h, calls)
+
+    def _misses(self, x: Array, gap: Array) -> Mask:
+        """Tells which paths (trials,) have a gap out of the range of its noise."""
+        if not self.short:
+            return np.zeros(len(x), dtype=bool)
+        missed = np.abs(gap - products(self.gains, products(self.inverses, gap))).max(axis=1)
+        largest = np.abs(x).max(axis=1)
+        return ~(missed <= _REACHED * largest).all(axis=1)
 
     def _unwound(self, x: Array, gap: Array, h: Array, shift: Array) -> tuple[Array, Array, Array]:
         """Returns the paths x, each in the turn of its start where that costs no more, with gaps
@@ -182,7 +185,7 @@ class PathDensity:
     def settled_exactly(self, at: Settled) -> Settled:
         """Returns the same paths without the round-off by which steps still miss the range of their
         noise; the calls are those beyond what was paid for."""
-        if not self.unreached.any():
+        if not self.short:
             return replace(at, calls=np.zeros(len(at.x)))
         x, gap = self._led(at.x)
         _, h = self.model.values_along(x)
@@ -247,7 +250,7 @@ class PathDensity:
 
     def _tangents(self, A: Array, H: Array) -> Tangents:
         there = np.isfinite(self.z)
-        B = np.matmul(self.whitener, np.where(there[..., None], H, 0.0))
+        B = products(self.whitener, np.where(there[..., None], H, 0.0))
         return Tangents(A, B)
 
     def step(self, tangents: Tangents, at: Settled, damping: Array | None = None) -> Array:

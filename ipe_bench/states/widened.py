@@ -86,9 +86,9 @@ def _of_some(density: PathDensity, at: Settled, tangents: Tangents) -> tuple[Arr
     # b is the mean of both sides' steps over c^2, and E t^4 = 3 of a standard normal t.
     both = bends.reshape(trials, 2, n, epochs, n).sum(axis=1)
     bends = np.sqrt(3.0) * (both / (2 * _FAR**2))
-    # P + W W', with a column of W for each line and each bend.
-    W = np.moveaxis(np.concatenate([stretched, bends], axis=1), 1, -1)
-    P = P + np.matmul(W, transposed(W))
+    # P + W' W, with a row of W for each line and each bend.
+    W = np.moveaxis(np.concatenate([stretched, bends], axis=1), 1, 2)
+    P = P + np.matmul(transposed(W), W)
     return P, calls.reshape(trials, 2 * n).sum(axis=1)
 
 
