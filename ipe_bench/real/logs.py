@@ -312,7 +312,7 @@ class LogTracks:
             lost_from=lost_from,
             effective=effective,
             smooths=tracker.smooths,
-            notes=_copies(log, tracks),
+            notes=[*_copies(log, tracks), *_second(log, tracks)],
         )
 
     @property
@@ -346,6 +346,23 @@ def _copies(log: Log, tracks: Tracks) -> list[str]:
     return [
         f"AMBIGUOUS: the path is right with a probability of {p[0]:.2g} among its copies, in which"
         f" {names} is shifted by whole periods"
+    ]
+
+
+def _second(log: Log, tracks: Tracks) -> list[str]:
+    """Words that a second path fits as well, if one was found that does."""
+    if tracks.other is None or tracks.other_p is None or not tracks.other_p[0] > 1 - SURE:
+        return []
+    far = np.abs(log.model.nearest_state(tracks.other, tracks.mean) - tracks.mean)[0]
+    # Distances in standard deviations of the states, so that those of unlike units compare.
+    first = np.sqrt(np.diagonal(log.model.prior.covariance))
+    size = np.where(first > 0, first, np.inf)
+    k, i = np.unravel_index(np.argmax(far / size), far.shape)
+    state = log.model.states[int(i)]
+    distance = f"{far[k, i] * state.size:.4g} {state.unit}".rstrip()
+    return [
+        f"AMBIGUOUS: a second path is right with a probability of {tracks.other_p[0]:.2g}; in it"
+        f" {state.name} differs by {distance} at epoch {k + 1}, which the deviations count"
     ]
 
 

@@ -9,12 +9,14 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ipe_bench.basics.batches import put, take
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Whole
 from ipe_bench.basics.statuses import Status
 from ipe_bench.states.base import StateModel
 from ipe_bench.states.damped import Descent, LevenbergMarquardtSmoother, reported
 from ipe_bench.states.linearisation import Taylor, Unscented
+from ipe_bench.states.mirrored import mirrored, with_second
 from ipe_bench.states.smoothers import smoothed
 from ipe_bench.states.trackers import Filter, Tracker, Tracks, filtered
 from ipe_bench.states.whole_paths import PathDensity
@@ -22,9 +24,10 @@ from ipe_bench.states.whole_paths import PathDensity
 EXTENDED = 1
 UNSCENTED = 2
 DAMPED = 3
-AGAIN = 4
-"""The stages, as the column `extra_stage` names them; the second round of restarts is 5, and so
-on."""
+MIRRORED = 4
+AGAIN = 5
+"""The stages, as the column `extra_stage` names them: the mirrored start answers after the rounds
+of restarts, of which the second one is 6, and so on."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +40,9 @@ class AutoTracker(Tracker):
        model, is the answer of the stage that it comes from.
     4. Where the path at the end is improbable, up to three rounds of steps from draws of the prior,
     other ones in each.
+    5. Steps from the start mirrored in the prior's mean, if the model is not affine: of the two
+    paths the more probable one is the answer, and the other one stands beside it; see
+    `with_second`.
 
     Noise that depends on the states leaves no density to descend on: the more likely smoother of
     the two is the answer.
@@ -84,7 +90,17 @@ class AutoTracker(Tracker):
             other = self.descent.descended(some, self.descent.drawn(some, number))
             stage[rows[paths.beaten(other, rows)]] = AGAIN + number
             paths = paths.improved(other, rows)
-        return replace(reported(density, paths), stage=stage)
+        # The path of an affine model has no second one beside it.
+        rows = np.flatnonzero(stage >= DAMPED)
+        mirror = mirrored(self.descent, density.subset(rows), take(paths, rows))
+        better = paths.beaten(mirror, rows)
+        stage[rows[better]] = MIRRORED
+        # Of both the one that costs more stands beside the other.
+        beside = put(paths, rows, mirror)
+        beside = put(beside, rows[better], take(paths, rows[better]))
+        paths = paths.improved(mirror, rows)
+        tracks = with_second(density, reported(density, paths), beside)
+        return replace(tracks, stage=stage)
 
     def _likelier(
         self, model: StateModel, z: Array, first: Tracks, doubtful: NDArray[np.intp]

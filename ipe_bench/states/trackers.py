@@ -65,6 +65,11 @@ class Tracks:
     """Steps of each trial (trials,), likewise."""
     stage: NDArray[Any] | None = None
     """Which stage of a tracker of several answered (trials,)."""
+    other: Array | None = None
+    """A second path (trials, K, n) where one was found, else the means, in trackers that look for
+    one."""
+    other_p: Array | None = None
+    """The probability (trials,) of the second path beside the first, 0 where none was found."""
 
     @classmethod
     def empty(cls, model: StateModel, trials: int) -> Tracks:

@@ -298,12 +298,22 @@ class PathBlock:
         )
 
     def _copies(self, tracks: Tracks) -> Columns:
-        """How probable each path is among its copies by whole periods, and whether that leaves it
-        open."""
+        """How probable each path is among its copies by whole periods, and whether they or a second
+        path leave it open."""
+        columns: Columns = {}
+        known = np.zeros(len(self), dtype=bool)
+        is_open = np.zeros(len(self), dtype=bool)
         p = copy_p(self.scenario.assumed, self.paths.z, tracks)
-        if p is None:
-            return {}
-        return {"copy_p": p, "extra_ambiguous": np.where(np.isnan(p), np.nan, p < SURE)}
+        if p is not None:
+            columns["copy_p"] = p
+            known |= ~np.isnan(p)
+            is_open |= p < SURE
+        if tracks.other_p is not None:
+            known |= np.isfinite(tracks.mean).all(axis=(1, 2))
+            is_open |= tracks.other_p > 1 - SURE
+        if known.any():
+            columns["extra_ambiguous"] = np.where(known, is_open, np.nan)
+        return columns
 
     def _fit_p(self, tracks: Tracks) -> Array:
         """How probable a worse fit is (trials,): of the path of an iterated smoother by its cost,

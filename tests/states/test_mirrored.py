@@ -1,0 +1,97 @@
+"""Second paths beside the best one: what beacons on one line and a fast pendulum leave open."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from shared.state_models import ConstantVelocity
+
+import ipe_bench as ib
+from ipe_bench.real.logs import Log, LogTracks
+from ipe_bench.states import AutoTracker, Formulas
+from ipe_bench.states.copies import SURE
+from ipe_bench.trials.paths import PathBlock, StateScenario
+
+BEACONS = Formulas(
+    next={"x": "x + vx + wx/2", "vx": "vx + wx", "y": "y + vy + wy/2", "vy": "vy + wy"},
+    readings={"a": "hypot(x, y)", "b": "hypot(x - 10, y)"},
+    noise={"wx": 0.01, "wy": 0.01},
+    deviation={"a": 0.1, "b": 0.1},
+    start={"x": 5.0},
+    spread={"x": 1.0, "vx": 0.05, "y": 3.0, "vy": 0.05},
+    units={"x": "m", "vx": "m/s", "y": "m", "vy": "m/s"},
+    count=15,
+)
+"""Ranges to two beacons on the line y = 0, which leave the side of the line open, as the prior
+does."""
+MIRROR = np.array([1.0, 1.0, -1.0, -1.0])
+Y = 2
+
+
+def test_the_second_path_is_the_mirror_image_and_as_probable():
+    paths = BEACONS.draw(0, 20)
+    found = AutoTracker().track(BEACONS, paths.z)
+    away = np.abs(paths.x[:, :, Y]).min(axis=1) > 1.0  # from the line, from beginning to end
+    assert away.sum() > 8
+    assert found.other is not None
+    assert found.other_p is not None
+    np.testing.assert_allclose(found.other_p[away], 0.5, atol=2e-3)
+    np.testing.assert_allclose(found.other[away], MIRROR * found.mean[away], atol=0.02)
+
+
+def test_the_covariance_counts_the_second_path():
+    """The truth lies on either side: errors are as large as is said, of the two paths together."""
+    paths = BEACONS.draw(0, 150)
+    found = AutoTracker().track(BEACONS, paths.z)
+    away = np.abs(paths.x[:, :, Y]).min(axis=1) > 1.0
+    error = (found.mean - paths.x)[away, -1, Y]
+    variance = found.covariance[away, -1, Y, Y]
+    wrong = np.abs(error) > 1.0
+    assert 0.3 < wrong.mean() < 0.7
+    ratio = error**2 / variance
+    # Of two sides of equal probability it is 0 or 2, of the normal errors beside them hardly more.
+    assert abs(ratio.mean() - 1.0) < 4 / np.sqrt(len(ratio))
+
+
+def test_a_trial_that_a_mirror_image_leaves_open_is_ambiguous():
+    block = PathBlock.draw(StateScenario(BEACONS), 0, 20)
+    columns = block.estimate(AutoTracker())[1]
+    away = np.abs(block.paths.x[:, :, Y]).min(axis=1) > 1.0
+    assert (columns["extra_ambiguous"][away] == 1).all()
+    assert "copy_p" not in columns  # no state has a period
+
+
+def test_a_prior_that_knows_the_side_leaves_nothing_open():
+    model = replace(BEACONS, start={"x": 5.0, "y": 12.0})
+    block = PathBlock.draw(StateScenario(model), 0, 20)
+    columns = block.estimate(AutoTracker())[1]
+    assert columns["success"].all()
+    assert (columns["extra_ambiguous"] == 0).all()
+
+
+def test_a_linear_model_has_no_second_path_and_pays_for_none():
+    model = ConstantVelocity(count=8)
+    z = model.draw(0, 3).z
+    found = AutoTracker().track(model, z)
+    np.testing.assert_array_equal(found.other_p, 0.0)
+    np.testing.assert_array_equal(found.other, found.mean)
+
+
+def test_a_log_says_that_a_second_path_fits():
+    paths = BEACONS.draw(0, 6)
+    trial = int(np.argmax(np.abs(paths.x[:, :, Y]).min(axis=1)))
+    (note,) = LogTracks.of(Log(BEACONS, paths.z[trial]), "auto", AutoTracker()).notes
+    assert note.startswith("AMBIGUOUS: a second path is right with a probability of 0.5; in it y")
+    assert 1 - SURE < 0.5
+
+
+@pytest.mark.slow
+def test_a_fast_pendulum_is_found_from_the_mirrored_start():
+    """A pendulum that turns either way has nearly the same sine: the cheaper path is taken, and
+    what is lost is known to be open."""
+    model = ib.component("state_model/pendulum")
+    block = PathBlock.draw(StateScenario(model, seed=5, error_scale=10.0), 0, 100)
+    columns = block.estimate(AutoTracker())[1]
+    assert columns["success"].mean() > 0.85
