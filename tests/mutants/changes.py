@@ -868,4 +868,32 @@ CHANGES = {
         "between = a + (b - a) + (position - below)",
         "test_intervals.py",
     ),
+    "readings-unread": Change(
+        "real",
+        "every estimate is said to have no finite readings",
+        "if not np.isfinite(residual).all():",
+        "if not np.isnan(residual).all():",
+        "test_answers_compared.py",
+    ),
+    "aside-unsaid": Change(
+        "runs",
+        "a run does not say which damaged files it computes again",
+        'lines.append(f"{path}: {reason}; set aside as {aside.name} and computed again")',
+        "pass",
+        "test_damage.py",
+    ),
+    "names-alike": Change(
+        "runs",
+        "models of one name are not told apart in what is missing",
+        'replace(state, tag=f" (#{state.key[:6]})")',
+        "replace(state)",
+        "test_store.py",
+    ),
+    "file-unstated": Change(
+        "report",
+        "the page of an estimate does not state the file that was read",
+        'readings"],\n        sources=read_from(provenance)',
+        'readings"]',
+        "test_answers.py",
+    ),
 }

@@ -208,6 +208,7 @@ def test_an_estimate_at_which_the_model_has_no_readings_is_in_brackets():
         assert not answer["bad"].passes
         assert answer["bad"].fits is False
         assert "bad: the model has no finite readings at this estimate" in str(answer)
+        assert answer["lm"].message == ""
         assert "(2)" in str(answer)
 
 

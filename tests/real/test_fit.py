@@ -17,7 +17,7 @@ from ipe_bench.noise import Gaussian, Quantization, Unknown
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.real.fits import fit
 from ipe_bench.real.logs import Log
-from ipe_bench.report.page.answer import with_error
+from ipe_bench.report.page.answer import _interval, with_error
 from ipe_bench.solvers import Newton, Progressive
 from ipe_bench.trials.scenario import Scenario
 
@@ -122,6 +122,17 @@ def test_rounded_readings_are_held_to_the_law_of_rounding():
 )
 def test_a_value_is_shown_to_two_figures_of_its_error(value, error, expected):
     assert with_error(value, error) == expected
+
+
+@pytest.mark.parametrize("half", [0.0123, 0.0201, 0.045, 0.099])
+def test_ends_of_an_interval_have_the_figures_of_its_width(half):
+    """About the middle of an interval they are those without an estimate, and the ends are off by
+    at most half a hundredth of what lies between them."""
+    low, high = 5.0 - half, 5.0 + half
+    shown = _interval(low, high, 5.0)
+    assert shown == _interval(low, high, float("nan"))
+    ends = [float(end) for end in shown.split(" … ")]
+    np.testing.assert_allclose(ends, [low, high], rtol=0, atol=0.005 * (high - low))
 
 
 def test_of_two_fits_with_noise_of_their_own_size_the_worse_is_beaten():

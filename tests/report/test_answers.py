@@ -26,10 +26,11 @@ from ipe_bench.questions.compare.figure import draw_pairs
 from ipe_bench.questions.design.answer import _design_sentences, _draw_design, _ways
 from ipe_bench.questions.posterior.figure import draw_marginals
 from ipe_bench.questions.posterior.maths import Posterior, Reference
-from ipe_bench.report.figures.answers import draw_fit, draw_residuals
+from ipe_bench.report.figures.answers import draw_fit
 from ipe_bench.report.figures.common import full_ticks
 from ipe_bench.report.figures.log import draw_log
 from ipe_bench.report.figures.views import looks_of, views
+from ipe_bench.report.page.answer import _drawings
 from ipe_bench.report.style import FACES, house_style
 from ipe_bench.report.words import ends_in_percent, public
 from ipe_bench.states import Smoother, Tracker, ekf
@@ -57,6 +58,21 @@ def test_a_page_states_command_version_and_file_and_no_path_of_this_machine(tmp_
     assert "table-audit" in found._repr_html_()
 
 
+def test_a_page_of_estimates_states_the_file_that_was_read(tmp_path, capsys):
+    file = tmp_path / "line.csv"
+    t = np.arange(5.0)
+    pd.DataFrame({"t": t, "y": 1 + 2 * t + 0.1 * (-1) ** t}).to_csv(file, index=False)
+    words = [
+        "measurement=formula",
+        "measurement.expression=a+b*t",
+        "measurement.start={a: 1, b: 1}",
+    ]
+    out = tmp_path / "out"
+    assert main(["estimate", *words, f"readings={file}", f"output={out}", "figures=none"]) == 0
+    page = (out / "estimate.html").read_text(encoding="utf-8")
+    assert hashlib.sha256(file.read_bytes()).hexdigest()[:16] in page
+
+
 @pytest.mark.oracle(
     "published: Draper and Smith, Applied Regression Analysis (1998), eq. (1.4.7)",
     "width of the drawn band",
@@ -70,8 +86,7 @@ def test_the_band_of_a_straight_line_is_the_textbooks_and_equal_residuals_are_dr
         ib.measurements.Formula("a + b*x", {"a": 0.0, "b": 1.0}, {"x": x.tolist()}), z
     )
     with house_style():
-        (fit,) = draw_fit(found.examination, z, FACES["auto"])
-        (residuals,) = draw_residuals(found.model, found.fits)
+        fit, residuals = _drawings(found)
     assert sum(bool(ax.get_title()) for ax in residuals.figure.axes) == 1
     band = fit.figure.axes[0].collections[0].get_paths()[0].vertices
     s = np.sqrt(np.sum((z - np.polyval(np.polyfit(x, z, 1), x)) ** 2) / 3)

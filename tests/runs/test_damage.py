@@ -156,6 +156,15 @@ def test_whatever_is_done_to_a_file_is_named_and_healed(folder, expected, kind, 
     pd.testing.assert_frame_equal(summary(folder), table)
 
 
+def test_a_run_says_what_it_sets_aside_and_computes_again(folder, caplog):
+    path = sorted((folder / "trials").iterdir())[0]
+    os.truncate(path, 10)
+    run(folder)
+    (line,) = [line for line in caplog.messages if str(path) in line]
+    (aside,) = (folder / "trials").glob(f"{path.stem}.damaged-*")
+    assert line.endswith(f"set aside as {aside.name} and computed again")
+
+
 @pytest.mark.parametrize(
     "name", ["trials/0123456789abcdef-0-8.parquet", "trials/x.parquet", "failed/x.json"]
 )

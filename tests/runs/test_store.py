@@ -66,6 +66,23 @@ def test_trials_are_the_same_bits_for_any_block_size(tmp_path, block_size):
         np.testing.assert_array_equal(whole[name], cut[name])
 
 
+def test_cells_of_one_name_are_told_apart_by_their_keys(tmp_path):
+    """Two models that differ in a constant alone have the same names."""
+    scenarios = [Scenario(Bent(bend), Gaussian(0.1)) for bend in (0.02, 0.03)]
+    compute(scenarios, {"linear_lse": LinearLSE()}, 5, tmp_path)
+    states = [state for state in Results.read([tmp_path]).cells if "truth" not in str(state.names)]
+    keys = {ResultKey(one, "linear_lse", LinearLSE()).key for one in scenarios}
+    assert {state.title[-9:] for state in states} == {f" (#{key[:6]})"[-9:] for key in keys}
+
+
+def test_what_is_loaded_cannot_be_changed_for_others(tmp_path):
+    compute([scenario()], {"linear_lse": LinearLSE()}, 5, tmp_path)
+    results = Results.read([tmp_path])
+    (cell, *_) = results.stored.values()
+    with pytest.raises(ValueError, match="read-only"):
+        results.load(cell, ["trial"])["trial"][:] = 0
+
+
 def test_blocks_grow_with_the_number_of_trials_while_there_are_a_hundred():
     sizes = [
         block_size_for(trials) for trials in (0, 1, 1000, 49_999, 50_000, 75_000, 100_000, 10**7)

@@ -15,7 +15,7 @@ from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.measurements import Gins, Measurement, Parameter, RicherGins
 from ipe_bench.noise import Gaussian
 from ipe_bench.priors import GaussianPrior
-from ipe_bench.questions.design.answer import _further_sentence
+from ipe_bench.questions.design.answer import _further, _further_sentence
 from ipe_bench.questions.design.figure import draw_further
 from ipe_bench.questions.design.maths import design
 from ipe_bench.report.style import house_style
@@ -347,6 +347,11 @@ def test_the_next_reading_cuts_bounds_most_and_may_lie_beyond_todays(six_days):
     assert further.entries.min() == 1
     assert further.entries.max() == 25
     assert further.entries[further.taken[0]] > 7
+    (table,) = _further(six_days)
+    number, where, bound = (cell.text for cell in next(iter(table.rows))[:3])
+    assert number == "1"
+    assert where == further.words[further.taken[0]]
+    assert float(bound) == pytest.approx(np.sqrt(shares.min()), abs=6e-4)
     (sentence,) = _further_sentence(six_days)
     assert sentence.startswith(f"Read next at {further.words[further.taken[0]]}: the bound of b1")
     today, one = (20.0 * further.bounds[k, 0] for k in (0, 1))
