@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ipe_bench.questions.panels import FARTHEST
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.style import BOUND_COLOR, FAMILIES
@@ -24,19 +23,19 @@ def draw_audit(found: Audit) -> Iterator[Drawing]:
     worst = np.argsort(-np.array(apart), kind="stable")
     chosen = np.sort(worst[: common.most_panels()])
     fig, axes = common.panels(len(chosen), height=2.4)
-    at = np.linspace(-FARTHEST, FARTHEST, 300)
+    at = np.linspace(-common.FARTHEST, common.FARTHEST, 300)
     claimed = np.exp(-0.5 * at**2) / np.sqrt(2 * np.pi)
-    bars: Any = {"bins": 30, "range": (-FARTHEST, FARTHEST), "density": True}
+    bars: Any = {"bins": 30, "range": (-common.FARTHEST, common.FARTHEST), "density": True}
     style = {"color": FAMILIES["IPE"][0], "alpha": 0.45, "label": "errors"}
     for i, ax in zip(chosen, axes, strict=True):
-        values = np.clip(claims.z[:, i], -FARTHEST, FARTHEST)
+        values = np.clip(claims.z[:, i], -common.FARTHEST, common.FARTHEST)
         ax.hist(values, **bars, **style)
         ax.plot(at, claimed, color=BOUND_COLOR, linestyle="--", linewidth=1.0, label="as reported")
         ax.set_yticks([])
         common.title(ax, f"{claims.names[i]}: {found.each[i].value:.2f} times")
     common.axis_labels(fig, "error / reported deviation", "")
     common.legend(fig, axes)
-    caption = f"Errors beyond ±{FARTHEST:g} reported deviations stand at the edge."
+    caption = f"Errors beyond ±{common.FARTHEST:g} reported deviations stand at the edge."
     if len(chosen) < claims.n:
         caption += f" The {len(chosen)} of {claims.n} parameters farthest from 1."
     yield Drawing("audit", "Errors beside the reported covariance", caption, fig)

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ipe_bench.measurements.base import labels, with_unit
-from ipe_bench.questions.panels import labelled_rows
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.style import BOUND_COLOR, BOUND_DASH, COLORS, FAMILIES
@@ -58,9 +57,17 @@ def draw_further(model: Measurement, further: Further) -> Drawing:
 
 def draw_bounds(now: Observability, after: Observability | None, choice: str) -> Iterator[Drawing]:
     """Draws the bound of each parameter in its unit, today and after a `choice` of readings."""
+    from matplotlib.figure import Figure
+
     sizes = np.array([p.size for p in now.parameters])
-    fig, (ax,) = labelled_rows([with_unit(p.name, p.unit) for p in now.parameters], 1)
-    y = np.arange(len(now.parameters))
+    names = [common.text(with_unit(p.name, p.unit)) for p in now.parameters]
+    width = 0.07 * max(map(len, names)) + 4.5
+    size = (min(width, 11.0), 1.1 + 0.26 * len(names))
+    fig = Figure(figsize=size, layout="constrained")
+    ax = fig.subplots()
+    y = np.arange(len(names))
+    ax.set_yticks(y, names)
+    ax.set_ylim(len(names) - 0.5, -0.5)
     known = np.isfinite(now.bound)
     today = sizes * now.bound
     chosen = today if after is None else sizes * after.bound

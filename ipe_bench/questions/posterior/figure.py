@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ipe_bench.measurements.base import with_unit
-from ipe_bench.questions.panels import FARTHEST
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.views import looks_of
@@ -86,7 +85,7 @@ def _worst(posterior: Posterior, claims: Iterable[_Gaussian]) -> Array:
 
 def _ends(posterior: Posterior, i: int, size: float) -> tuple[float, float]:
     """Returns the ends of the axis of a parameter, in its unit."""
-    reach = FARTHEST * posterior.deviation[i]
+    reach = common.FARTHEST * posterior.deviation[i]
     return size * (posterior.mean[i] - reach), size * (posterior.mean[i] + reach)
 
 
