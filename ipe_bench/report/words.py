@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from ipe_bench import __version__
 
 if TYPE_CHECKING:
-    import pandas as pd
+    pass
 
 CITATION = (
     f"The ipe-bench developers (2026). ipe-bench, version {__version__} [computer program]. Beside"
@@ -165,11 +165,12 @@ def p_value(p: float, least: float = 0.0) -> str:
     return f"{p:.0e}" if p > 1e-300 else "<1e-300"
 
 
-def varying(columns: Sequence[str], rows: pd.DataFrame) -> list[str]:
+def varying(columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Returns the columns that differ among the rows; the model's name alone if that tells every
     two settings apart."""
-    apart = [c for c in columns if len(set(rows[c].astype(str))) > 1]
-    settings = rows[apart].astype(str).drop_duplicates()
-    if "measurement" in apart and settings["measurement"].is_unique:
+    texts = {c: [str(row.get(c)) for row in rows] for c in columns}
+    apart = [c for c in columns if len(set(texts[c])) > 1]
+    settings = set(zip(*(texts[c] for c in apart), strict=True))
+    if "measurement" in apart and len(settings) == len(set(texts["measurement"])):
         return ["measurement"]
     return apart

@@ -424,6 +424,22 @@ def test_help_is_quick_to_load_and_names_the_commands():
     assert result.stdout.strip().endswith("[]")
 
 
+AGAIN = """
+import sys
+from ipe_bench.cli.main import main
+main(["run", "measurement=polynomial", "solver=newton", "baseline=[]", "trials=2", "figures=none"])
+print("pandas" in sys.modules)
+"""
+
+
+def test_a_finished_run_shows_its_table_without_pandas(tmp_path):
+    for _ in range(2):
+        result = subprocess.run(
+            [sys.executable, "-c", AGAIN], cwd=tmp_path, capture_output=True, text=True, check=True
+        )
+    assert result.stdout.strip().endswith("False")
+
+
 @pytest.mark.slow
 def test_a_plugin_without_its_header_or_with_a_taken_name_is_refused(tmp_path):
     conf = tmp_path / "plugins/mine/mine/conf/solver"

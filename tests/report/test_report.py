@@ -252,12 +252,20 @@ def test_settings_that_differ_have_figures_of_their_own(synthetic, tmp_path, mon
 
 
 def test_rows_of_equal_settings_each_have_a_dash():
-    """Also with the lowest pandas that is allowed, which forgets the rows of a frame without
-    columns."""
-    rows = pd.DataFrame({"size": [1.0, 1.0], "shape": ["round", "round"]})
     differing = Wording.of(None).settings
-    assert differing(rows, ["size", "shape"]) == differing(rows, []) == ["-", "-"]
-    assert differing(rows.assign(size=[1.0, 2.0]), ["size", "shape"]) == ["size=1", "size=2"]
+    small = {"size": 1.0, "shape": "round"}
+    large = {"size": 2.0, "shape": "round"}
+    columns = ["size", "shape"]
+    assert differing([small, small], columns) == differing([small, small], []) == ["-", "-"]
+    assert differing([small, large], columns) == ["size=1", "size=2"]
+
+
+def test_of_many_settings_the_most_frequent_values_are_not_told():
+    options = {"size": 1.0, "shape": "round", "colour": "red"}
+    others = [{"size": 2.0}, {"shape": "square"}, {"colour": "blue"}, {}, {"size": None}]
+    rows = [options | other for other in others]
+    told = ["size=2", "shape=square", "colour=blue", "-", "-"]
+    assert Wording.of(None).settings(rows, list(options)) == told
 
 
 def test_every_renderer_has_every_cell():

@@ -34,7 +34,7 @@ def worded(measurement: Any) -> list[str]:
     ]
     rows = pd.DataFrame(columns)
     collection: Any = SimpleNamespace(groups=groups)
-    return Wording.of(collection).settings(rows, list(rows.columns))
+    return Wording.of(collection).settings(rows.to_dict("records"), list(rows.columns))
 
 
 def test_the_right_model_is_the_one_that_estimators_assume_and_units_stand_at_errors():

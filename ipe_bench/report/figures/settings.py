@@ -45,12 +45,14 @@ _COLORS = {
 def draw(view: View) -> Iterator[Drawing]:
     """Draws several settings at the largest error scale that most of them have."""
     columns = list(view["summary"].columns)
+    columns = columns[: columns.index("error_scale")]
     rows = view.totals
-    apart = varying(columns[: columns.index("error_scale")], rows)
+    listed: list[Any] = rows.to_dict("records")
+    apart = varying(columns, listed)
     if not apart:
         return
     wording = Wording.of(view.collection)
-    words = wording.settings(rows, columns[: columns.index("error_scale")])
+    words = wording.settings(listed, columns)
     names = [setting_words(setting) for setting in words]
     keys = [
         ", ".join(f"{column}={value_text(value)}" for column, value in row.items())

@@ -158,7 +158,7 @@ def views(analysis: Analysis, which: Which = "all") -> tuple[list[View], View]:
     equations = {group.estimator: group.footer.get("equation") for group in groups}
     families = {group.estimator: _smoothers_apart(group.footer) for group in groups}
     settings = list(split["scores"])
-    apart = varying(columns, pd.DataFrame(settings, columns=columns))
+    apart = varying(columns, [dict(zip(columns, key, strict=True)) for key in settings])
     most, left_out = drawn_settings(len(settings), which)
     parts: list[View] = []
     for key in sorted(settings[:most], key=lambda key: _success(split["summary"][key])):

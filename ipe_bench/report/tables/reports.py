@@ -121,13 +121,11 @@ def all_tables(analysis: Analysis, whole: Analysis | None = None) -> list[Table]
 def head(analysis: Analysis, rows: pd.DataFrame) -> list[Column]:
     """Returns the columns that tell rows apart: those settings that differ, of many in one column,
     and the scale."""
-    apart = varying(analysis.setting_columns, rows)
+    listed: list[Any] = rows.to_dict("records")
+    apart = varying(analysis.setting_columns, listed)
     if len(apart) > MOST_SETTINGS:
-        told = [
-            words(
-                "setting", Wording.of(analysis.collection).settings(rows, analysis.setting_columns)
-            )
-        ]
+        wording = Wording.of(analysis.collection)
+        told = [words("setting", wording.settings(listed, analysis.setting_columns))]
     else:
         told = [words(name, map(value_text, rows[name])) for name in apart]
     return [*told, column("error scale", rows["error_scale"], "{:g}".format)]

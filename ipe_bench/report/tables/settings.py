@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
-
-import pandas as pd
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.plugins.construct import find_object
@@ -47,20 +46,19 @@ class Wording:
                 right.add(_options(group.columns))
         return cls(units, frozenset(right))
 
-    def settings(self, rows: pd.DataFrame, columns: Sequence[str]) -> list[str]:
+    def settings(self, rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> list[str]:
         """Returns for each row those of its settings that differ among the rows, of many those
         other than the most frequent ones; a dash if there are none."""
         apart = varying(columns, rows)
-        if not apart:  # a frame without columns loses its rows in pandas 2.2
+        if not apart:
             return ["-"] * len(rows)
-        values = rows[apart].map(value_text)
-        usual: dict[Any, str] = {}
+        values = [{c: value_text(row.get(c)) for c in columns} for row in rows]
+        usual: dict[str, str] = {}
         if len(apart) > MOST_SETTINGS:
-            usual = {c: values[c].mode().iloc[0] for c in apart if c != _TRUTH}
+            usual = {c: _most_frequent([row[c] for row in values]) for c in apart if c != _TRUTH}
         settings = []
-        whole: list[Any] = rows[list(columns)].to_dict("records")
-        for row, told in zip(whole, values.to_dict("records"), strict=True):
-            unusual = {str(c): v for c, v in told.items() if v != usual.get(c)}
+        for row in values:
+            unusual = {c: row[c] for c in apart if row[c] != usual.get(c)}
             is_right = _options(row) in self.right
             settings.append(self.worded(unusual, is_right=is_right) or "-")
         return settings
@@ -86,6 +84,12 @@ class Wording:
 
 PLAIN = Wording({}, frozenset())
 """Words settings by rows alone."""
+
+
+def _most_frequent(texts: Sequence[str]) -> str:
+    """Returns the first, in alphabetical order, of those that occur most often."""
+    counts = Counter(sorted(texts))
+    return counts.most_common(1)[0][0]
 
 
 def last_words(column: str) -> str:

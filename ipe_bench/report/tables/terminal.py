@@ -9,8 +9,6 @@ from dataclasses import replace
 from itertools import repeat
 from typing import Any
 
-import pandas as pd
-
 from ipe_bench.report.finding import FAILS, Finding
 from ipe_bench.report.tables.matrix import opening
 from ipe_bench.report.tables.settings import PLAIN, Wording
@@ -133,7 +131,7 @@ def _opening(
     simulated = [row for row in rows if row["noise"] != "certified"]
     if not simulated:
         return []
-    settings = wording.settings(pd.DataFrame(simulated), columns)
+    settings = wording.settings(simulated, columns)
     pairs = zip(simulated, settings, strict=True)
     told = [{**row, "setting": setting} for row, setting in pairs]
     constant = [row for row in told if row["noise"] != "model"]
