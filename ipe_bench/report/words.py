@@ -75,7 +75,7 @@ def ends_in_percent(low: float, high: float) -> tuple[str, str]:
 def short(value: float) -> str:
     """Formats about four figures."""
     if not math.isfinite(value):
-        return "inf" if value == math.inf else "-"
+        return value_text(float(value))
     if value == int(value) and abs(value) < 1000:
         return str(int(value))
     if abs(value) >= 1e6 or 0 < abs(value) < 1e-3:
@@ -100,7 +100,7 @@ def _powered(text: str) -> str:
 def brief(value: float) -> str:
     """Formats two decimals below ten, three figures above, in at most five characters."""
     if not math.isfinite(value):
-        return "inf" if value == math.inf else "-"
+        return value_text(float(value))
     if value == int(value) and value < 1000:
         return str(int(value))
     if value >= 999.5e6:
@@ -122,7 +122,7 @@ def compact(value: float) -> str:
     """Formats three figures in at most five characters if possible: thousands as k, millions as
     M."""
     if not math.isfinite(value):
-        return "inf" if value == math.inf else "-"
+        return value_text(float(value))
     rounded = float(f"{value:.2e}")
     if rounded == 0:
         return "0"

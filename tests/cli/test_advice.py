@@ -354,7 +354,7 @@ _TYPED = re.compile(
 )
 """What advises a word with an equals sign, or a command."""
 ELSEWHERE = {
-    "no advice": ("The kinds of plugins", "upper={}: give a number"),
+    "no advice": ("upper={}: give a number",),
     "of readings that are fitted": (
         "By noise that is so far overstated",
         "noise: is not given and cannot be",

@@ -32,12 +32,13 @@ from ipe_bench.report.tables.table import (
     html,
     latex,
     markdown,
+    sort_key,
     terminal,
     texts,
     words,
 )
 from ipe_bench.report.tables.terminal import reported, summary_tables
-from ipe_bench.report.words import compact, cost, duration, percent, short
+from ipe_bench.report.words import brief, compact, cost, duration, percent, short
 from ipe_bench.statistics import analyse
 from ipe_bench.statistics.records import SCORES, STATISTICS
 from ipe_bench.statistics.statistic import frame_columns
@@ -209,6 +210,15 @@ def test_numbers_are_written_for_readers():
         "3",
         "inf",
     ]
+    # A median difference is below every number where the second alone is infinitely wrong.
+    for shown in (short, brief, compact):
+        assert [shown(v) for v in (float("-inf"), float("nan"))] == ["-inf", "-"]
+    assert [float(sort_key(v)) for v in (float("-inf"), -2.5, float("nan"))] == [
+        -np.inf,
+        -2.5,
+        np.inf,
+    ]
+    assert sort_key(-np.inf) == "-1e999"
     assert [duration(v) for v in (2.0, 0.0123, 9.4e-6)] == ["2.00 s", "12.3 ms", "9.40 µs"]
     assert [duration(v, 2) for v in (0.00096, 0.123, 0.9996, 0.0)] == [
         "960 µs",

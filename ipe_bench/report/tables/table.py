@@ -201,9 +201,10 @@ def texts(title: str, values: Iterable[str]) -> Column:
 
 
 def sort_key(value: Any) -> str:
-    """Returns the number by which a cell is sorted; NaN and infinity go last."""
+    """Returns the number by which a cell is sorted; NaN goes last, as infinity does."""
     number = float(value)
-    return "1e999" if math.isnan(number) or number == math.inf else repr(number)
+    # As a page's script reads infinity.
+    return "1e999" if math.isnan(number) else repr(number).replace("inf", "1e999")
 
 
 # Terminal -----------------------------------------------------------------------------------------
