@@ -47,12 +47,13 @@ def write_audit(folder: Path, found: AuditAnswer, sources: Sequence[tuple[str, s
     from ipe_bench.questions.audit.figure import draw_audit
 
     parts = [part for part in found.parts() if isinstance(part, Table)]
+    title, *sentences = found.sentences
     write_files(
         folder,
         "audit",
         ("audit.csv", found.table()),
-        "Audit",
-        found.sentences,
+        title.removesuffix("."),
+        sentences,
         parts,
         draw_audit(found),
         sources=sources,

@@ -25,7 +25,7 @@ from ipe_bench.questions.compare.maths import (
 )
 from ipe_bench.report.page.writer import digests, write_files
 from ipe_bench.report.tables.table import Cell, Column, Part, Shown, Table, texts, words
-from ipe_bench.report.words import compact, duration, p_value, percent, value_text
+from ipe_bench.report.words import compact, duration, enumerate_few, p_value, percent, value_text
 from ipe_bench.runs.bundles import opened
 from ipe_bench.statistics.collect import collect
 from ipe_bench.statistics.comparisons import ALPHA
@@ -35,6 +35,9 @@ _TITLES = {"error": "mean error", "honesty": "mean NEES", "cost": "mean cost", "
 cost."""
 _WORDS = ("", "second is")
 """Titles of the columns that hold no numbers."""
+_FOUND = ("better", "worse", "different")
+_AS = {"success": "", "bias": ""}
+"""What stands before a change: nothing before a difference, a sign before a ratio."""
 _FAILING = ("success", "error")
 """Quantities in which the second must not be worse, unless others are named."""
 _LEAST_P = 1e-6
@@ -88,8 +91,8 @@ def write_comparison(folder: Path, frame: Comparison, sources: Sequence[tuple[st
         folder,
         "comparison",
         ("comparison.csv", frame),
-        "Comparison",
-        list(_finding_sentences(frame)),
+        finding(frame),
+        (),
         [_joined(tables), *sentences],
         draw_pairs(frame),
         sources=sources,
@@ -120,21 +123,44 @@ def _under(table: Table, title: str) -> Sequence[Cell]:
     return [Cell("")] * len(table)
 
 
-def _finding_sentences(frame: pd.DataFrame) -> Iterator[str]:
-    """Says in how many comparisons the second is better, and worse, by quantity."""
+def finding(frame: pd.DataFrame) -> str:
+    """Says in what the second is better, worse or different: by how much in a single comparison, or
+    else in how many."""
     judged = frame[frame["p"].notna()]
+    interval = f"{100 * (1 - frame.attrs['alpha']):g} %"
+    clauses = []
+    for word in _FOUND:
+        found = judged[[_verdict(row) == word for row in judged.to_dict("records")]]
+        extents = [
+            _extent(rows.to_dict("records"), judged, interval)
+            for _, rows in found.groupby("quantity", sort=False)
+        ]
+        if extents:
+            clauses.append(f"{word} in {', '.join(extents)}")
+    tested = [_TITLES.get(quantity, quantity) for quantity in judged["quantity"].unique()]
+    nothing = f"no significant difference in {enumerate_few(tested)}" if tested else "not tested"
+    return f"{_who(frame)}: {'; '.join(clauses) or nothing}"
+
+
+def _who(frame: pd.DataFrame) -> str:
     firsts = frame["first"].unique()
     seconds = frame["second"].unique()
-    by_name = len(firsts) == len(seconds) == 1 and firsts[0] != seconds[0]
-    number = judged.groupby("quantity").size().max()
-    for word in ("better", "worse"):
-        found = judged[judged["finding"] == word]
-        counts = found.groupby("quantity", sort=False).size()
-        listed = ", ".join(
-            f"{quantity} ({count} of {number} comparisons)" for quantity, count in counts.items()
-        )
-        than = f"{seconds[0]} is {word} than {firsts[0]}" if by_name else f"The second is {word}"
-        yield f"{than} in {listed or 'no tested quantity'}."
+    if len(firsts) == len(seconds) == 1 and firsts[0] != seconds[0]:
+        return f"{seconds[0]} against {firsts[0]}"
+    return "The second against the first"
+
+
+def _extent(found: Sequence[dict[str, Any]], judged: pd.DataFrame, interval: str) -> str:
+    """Says how large a change is, or in how many comparisons of its quantity it is found."""
+    row = found[0]
+    quantity = row["quantity"]
+    title = _TITLES.get(quantity, quantity)
+    number = int((judged["quantity"] == quantity).sum())
+    if number > 1:
+        return f"{title} ({len(found)} of {number} comparisons)"
+    cells = _cells(row, interval)
+    sign = _AS.get(quantity.split()[0], "×")
+    return f"{title} ({sign}{cells['change']}; {interval}: {cells[interval]})"
 
 
 def _needed(row: dict[str, Any]) -> str:

@@ -57,31 +57,34 @@ def _no_others(design: Design) -> str:
     fewer = any(way.saving or way.sharpest.readings != today for way in design.ways)
     if fewer or not design.ways or design.candidates.m != today:
         return ""
-    return f"The present {today} readings are the only candidates."
+    return f"The present {today} readings are the only candidates"
 
 
-def _design_sentences(design: Design) -> Iterator[str]:
-    yield f"{_direction(design.observability)}."
-    yield from _further_sentence(design)
+def _findings(design: Design) -> list[str]:
+    """Returns what was found without a point at the end, the most useful first: what readings
+    leave open, or else which to take."""
     same = _no_others(design)
     best = _best(design)
+    found = list(_further_findings(design))
     if same:
-        yield same
+        found.append(same)
     elif best:
-        yield _best_sentence(best, design.scenario.measurement.m)
-    yield from _unseen(design)
+        found.append(_best_finding(best, design.scenario.measurement.m))
+    direction = _direction(design.observability)
+    found.insert(len(found) if design.observability.observable else 0, direction)
+    return found
 
 
-def _best_sentence(way: Way, today: int) -> str:
+def _best_finding(way: Way, today: int) -> str:
     """Says what a way's sharpest choice is worth beside today's number of readings."""
     choice = way.sharpest
     if choice.readings == today and choice.mean_bound >= 1 - _WORTH:
-        return "The present readings are already optimal for their number."
+        return "The present readings are already optimal for their number"
     share = percent(choice.mean_bound)
-    return f"{choice.readings} readings chosen {way.title} have {share} of today's mean bound."
+    return f"{choice.readings} readings chosen {way.title} have {share} of today's mean bound"
 
 
-def _further_sentence(design: Design) -> Iterator[str]:
+def _further_findings(design: Design) -> Iterator[str]:
     """Says what to read next, and the bound that falls most by it."""
     further = design.further
     if further is None:
@@ -92,8 +95,12 @@ def _further_sentence(design: Design) -> Iterator[str]:
     bounds = [f"{parameter.size * bound:.3g}" for bound in further.bounds[:, most]]
     unit = f" {parameter.unit}" if parameter.unit else ""
     yield (
-        f"Read next at {where[0]}: the bound of {parameter.name} falls from {bounds[0]} to"
-        f" {bounds[1]}{unit}; with two more, at {where[1]} and {where[2]}, to {bounds[3]}{unit}."
+        f"Read next at {where[0]}; the bound of {parameter.name} then falls from {bounds[0]} to"
+        f" {bounds[1]}{unit}"
+    )
+    yield (
+        f"With two more, at {where[1]} and {where[2]}, the bound of {parameter.name} falls to"
+        f" {bounds[3]}{unit}"
     )
 
 
@@ -221,7 +228,7 @@ def _ways(design: Design) -> Iterator[Part]:
         return
     same = _no_others(design)
     if same:
-        yield f"{same} `readings=NUMBER` chooses fewer of them."
+        yield f"{same}. `readings=NUMBER` chooses fewer of them."
         return
     today = design.scenario.measurement.m
     # A way without a saving takes what is taken today.
@@ -268,12 +275,13 @@ def write_design(folder: Path, name: str, design: Design) -> list[Path]:
                 chosen.append(rows.assign(by=by, choice=word))
     columns = ["by", "choice", *index]
     table = pd.concat(chosen)[columns] if chosen else pd.DataFrame(columns=columns)
+    title, *findings = _findings(design)
     return write_files(
         folder,
         "design",
         (READINGS, table),
-        f"{name}: design",
-        list(_design_sentences(design)),
+        f"{name}: {title[0].lower()}{title[1:]}",
+        [*_unseen(design), *(f"{one}." for one in findings)],
         design_parts(name, design),
         _draw_design(design),
     )

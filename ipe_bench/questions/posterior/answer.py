@@ -137,31 +137,38 @@ def write_posteriors(
         folder,
         "posterior",
         ("posterior.csv", pd.concat(frames)),
-        f"{name}: posteriors",
-        _honest_sentences(found),
+        f"{name}: {finding(found)}",
+        list(_unsettled(found)),
         posterior_parts(title, found),
         draw_marginals(model, found),
     )
 
 
-def _honest_sentences(found: Sequence[Reference]) -> list[str]:
-    """Says in how many trials each estimator's Gaussian can stand for the posterior, and if that is
+def finding(found: Sequence[Reference]) -> str:
+    """Says in how many trials each estimator's Gaussian agrees with the posterior, where that is
     settled."""
-    counts = dict.fromkeys(found[0].divergences, 0)
-    for one in found:
-        for label, d in one.divergences.items():
-            counts[label] += honest_word(d, one.posterior) == "yes"
-    listed = [f"{label} in {count} of {len(found)}" for label, count in counts.items()]
-    sentences = [
-        "Trials in which an estimator's Gaussian can stand for the posterior:"
-        f" {enumerate_few(listed, 12)}."
+    settled = [one for one in found if one.posterior.settled]
+    if not settled:
+        return "the posterior cannot be relied on in any trial; take more particles"
+    by_count: dict[int, list[str]] = {}
+    for label in settled[0].divergences:
+        words = [honest_word(one.divergences[label], one.posterior) for one in settled]
+        by_count.setdefault(words.count("yes"), []).append(label)
+    trials = "1 trial" if len(settled) == 1 else f"{len(settled)} trials"
+    listed = [
+        f"{enumerate_few(by_count[count])} in {count} of {trials}"
+        for count in sorted(by_count, reverse=True)
     ]
-    unsettled = sum(not one.posterior.settled for one in found)
-    if unsettled:
-        sentences.append(
-            f"In {unsettled} the posterior itself cannot be relied on; take more particles."
+    return f"estimates with an adequate Gaussian: {'; '.join(listed)}"
+
+
+def _unsettled(found: Sequence[Reference]) -> Iterator[str]:
+    number = sum(not one.posterior.settled for one in found)
+    if number:
+        yield (
+            f"In {number} of {len(found)} trials the posterior itself cannot be relied on; take"
+            " more particles."
         )
-    return sentences
 
 
 def sampled(

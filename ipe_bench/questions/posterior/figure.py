@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from ipe_bench.basics.linalg import deviations
 from ipe_bench.measurements.base import with_unit
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
@@ -17,7 +18,7 @@ from ipe_bench.report.style import BOUND_COLOR
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from ipe_bench.basics.linalg import Array, deviations
+    from ipe_bench.basics.linalg import Array
     from ipe_bench.estimators.base import Estimates
     from ipe_bench.measurements.base import Measurement
     from ipe_bench.questions.posterior.maths import Posterior, Reference

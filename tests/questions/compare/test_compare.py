@@ -15,6 +15,7 @@ from shared.synthetic_store import Pretender, Synthetic, forge
 import ipe_bench as ib
 from ipe_bench.cli.main import main
 from ipe_bench.plugins import discovery
+from ipe_bench.questions.compare.answer import finding
 from ipe_bench.trials.thresholds import GATE
 
 ERROR = 0.1
@@ -156,13 +157,13 @@ def test_scenarios_of_one_folder_alone_are_left_out_and_it_is_said(tmp_path):
 def test_so_few_trials_that_none_can_be_worse_are_named(tmp_path):
     """Success, error and cost at 5 %: with seven trials the least p is 2/128 and, three times as
     large, .047."""
-    for trials, finding in ((6, ""), (7, "worse")):
+    for trials, word in ((6, ""), (7, "worse")):
         folders = [store(tmp_path / f"{trials} {name}", trials=trials) for name in "ab"]
         folders[1] = store(tmp_path / f"{trials} c", trials=trials, fails=trials)
         frame = ib.compare(*folders)
-        assert findings(frame)["success"] == finding
+        assert findings(frame)["success"] == word
         line = "common trials: 6 are too few for any finding in 3 tests; run at least 7"
-        assert frame.attrs["notes"] == ([] if finding else [line])
+        assert frame.attrs["notes"] == ([] if word else [line])
 
 
 def test_judging_by_evidence(tmp_path):
@@ -418,6 +419,61 @@ def test_mistakes_are_one_line_and_exit_code_2(tmp_path, capsys, words):
     error = capsys.readouterr().err
     assert MISTAKES[words] in error
     assert len(error.strip().splitlines()) == 1
+
+
+def false_titles(tmp_path, pairs: int) -> tuple[int, int]:
+    """The number of titles that claim a change of the error, and of those whose claim is false: of
+    two stores of independent draws whose errors differ by a known factor."""
+    claims = false = 0
+    for number in range(pairs):
+        factor = (1.0, 1.01, 1.0, 0.6, 1.6)[number % 5]
+        folders = [tmp_path / f"{number}-{side}" for side in "ab"]
+        for draws, folder, own in zip(
+            (2 * number, 2 * number + 1), folders, (1.0, factor), strict=True
+        ):
+            store(folder, draws=draws, factor=own, trials=100)
+        title = finding(ib.compare(*folders))
+        assert title.startswith("The second against the first: ")
+        better, worse = (
+            re.search(rf"{word} in [^;]*mean error", title) for word in ("better", "worse")
+        )
+        different = "different in mean error" in title
+        claims += bool(better or worse or different)
+        false += bool(
+            (better and factor > 0.98) or (worse and factor < 1.02) or (different and factor == 1)
+        )
+    return claims, false
+
+
+def test_the_title_says_what_is_decided(tmp_path):
+    claims, false = false_titles(tmp_path, 5)
+    assert (claims, false) == (2, 0)
+
+
+@pytest.mark.slow
+def test_the_title_is_false_in_few_comparisons(tmp_path):
+    """Of 300 pairs 180 differ by nothing or less than the margin."""
+    claims, false = false_titles(tmp_path, 300)
+    assert claims >= 120
+    assert false <= 0.05 * claims
+
+
+def test_the_title_has_the_change_with_its_interval_or_the_number_of_comparisons(tmp_path):
+    a, b = store(tmp_path / "a", factor=0.5), store(tmp_path / "b")
+    frame = ib.compare(a, b)
+    assert finding(frame).startswith(
+        "The second against the first: worse in mean error (×2.000; 95 %: 1.8"
+    )
+    assert "success" not in finding(frame)
+    for folder in (a, b):
+        store(folder, error_scale=2.0)
+    assert "worse in mean error (1 of 2 comparisons)" in finding(ib.compare(a, b))
+    same = finding(ib.compare(a, store(tmp_path / "c", factor=0.5, draws=1)))
+    assert same.startswith(
+        "The second against the first: no significant difference in success, mean"
+    )
+    filled = store(a, label="new", factor=0.4)
+    assert finding(ib.compare(filled, first="it", second="new")).startswith("new against it: ")
 
 
 def test_the_table_fits_80_columns_and_files_are_written(tmp_path, capsys, monkeypatch):

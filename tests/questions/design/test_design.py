@@ -1,6 +1,7 @@
 """What to measure next: brute force, closed forms, and the Monte Carlo that a designed model is put
 to."""
 
+import re
 from dataclasses import dataclass, replace
 from itertools import combinations
 from unittest.mock import patch
@@ -15,7 +16,7 @@ from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.measurements import Gins, Measurement, Parameter, RicherGins
 from ipe_bench.noise import Gaussian
 from ipe_bench.priors import GaussianPrior
-from ipe_bench.questions.design.answer import _further, _further_sentence
+from ipe_bench.questions.design.answer import _findings, _further
 from ipe_bench.questions.design.figure import draw_further
 from ipe_bench.questions.design.maths import design
 from ipe_bench.report.style import house_style
@@ -352,10 +353,39 @@ def test_the_next_reading_cuts_bounds_most_and_may_lie_beyond_todays(six_days):
     assert number == "1"
     assert where == further.words[further.taken[0]]
     assert float(bound) == pytest.approx(np.sqrt(shares.min()), abs=6e-4)
-    (sentence,) = _further_sentence(six_days)
-    assert sentence.startswith(f"Read next at {further.words[further.taken[0]]}: the bound of b1")
+    title, more, *_ = _findings(six_days)
+    assert title.startswith(f"Read next at {further.words[further.taken[0]]}; the bound of b1 then")
     today, one = (20.0 * further.bounds[k, 0] for k in (0, 1))
-    assert f"falls from {today:.3g} to {one:.3g};" in sentence
+    assert title.endswith(f"falls from {today:.3g} to {one:.3g}")
+    assert more.startswith(f"With two more, at {further.words[further.taken[1]]} and")
+
+
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(s, marks=pytest.mark.slow) for s in range(1, 20))]
+)
+def test_the_title_of_a_design_is_so_of_the_model_with_that_reading(seed):
+    """No other reading of the candidates cuts the mean square of the shares more, and the parameter
+    that is named is the one whose bound falls most, by what it says."""
+    days = sorted(np.random.default_rng(seed).uniform(1.0, 8.0, 5).tolist())
+    found = design(demand(days))
+    title = _findings(found)[0]
+    words = r"Read next at t = (\S+); the bound of (b\d) then falls from (\S+) to (\S+)"
+    (said,) = re.finditer(words, title)
+    day, name, today, then = said.groups()
+    sizes = np.array([parameter.size for parameter in found.observability.parameters])
+    shares = bound_of([*days, float(day)]) / bound_of(days)
+    at = int(np.argmin(shares))
+    assert name == f"b{at + 1}"
+    before = sizes[at] * bound_of(days)[at]
+    assert [float(today), float(then)] == pytest.approx([before, before * shares[at]], rel=0.02)
+    cut = (shares**2).mean()
+    others = [bound_of([*days, one]) / bound_of(days) for one in found.further.entries[::12]]
+    assert cut <= 1.02 * min((other**2).mean() for other in others)
+
+
+def test_the_title_of_a_design_first_says_what_readings_leave_open():
+    open_ = design(scenario(Linear(count=2)))
+    assert _findings(open_)[0].startswith("The readings do not determine")
 
 
 def test_shares_of_bounds_are_drawn_over_number_and_place(six_days):

@@ -1,6 +1,8 @@
 """The reference posterior: closed forms, integration on a grid, and estimators held against it."""
 
 from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates
 from ipe_bench.measurements import Gins
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.questions.posterior.answer import honest_word
+from ipe_bench.questions.posterior.answer import finding, honest_word, sampled, write_posteriors
 from ipe_bench.questions.posterior.maths import (
     Divergence,
     Posterior,
@@ -96,6 +98,24 @@ def test_the_exact_gaussian_does_not_diverge_and_a_wrong_one_does_as_computed(li
     assert held(found, mean, None).kl == np.inf
     assert held(found, np.full(3, np.nan), P).kl == np.inf
     assert honest_word(shifted, found) == "NO"
+    divergences = {"exact": right, "half": confident, "shifted": shifted}
+    one: Any = SimpleNamespace(posterior=found, divergences=divergences)
+    agreeing = "estimates with an adequate Gaussian: exact in {0} of {1}; half, shifted in 0 of {1}"
+    assert finding([one]) == agreeing.format(1, "1 trial")
+    assert finding([one, one]) == agreeing.format(2, "2 trials")
+
+
+def test_a_page_says_nothing_of_posteriors_whose_populations_differ(tmp_path):
+    bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01))
+    found = sampled(bench, {"lse": ib.baselines.LinearLSE()}, 1, 80)
+    one: Any = SimpleNamespace(posterior=SimpleNamespace(settled=False), divergences={"lse": None})
+    assert finding([one]) == "the posterior cannot be relied on in any trial; take more particles"
+    assert finding([one, *found]) == finding(found)
+    write_posteriors(tmp_path, "polynomial", "polynomial", bench.measurement, found)
+    page = (tmp_path / "posterior.html").read_text(encoding="utf-8")
+    assert f"<h1>polynomial: {finding(found)}</h1>" in page.replace("\u200b", "").replace(
+        "<wbr>", ""
+    )
 
 
 def square(tilt: float = 0.0) -> Written:
