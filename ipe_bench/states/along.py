@@ -130,7 +130,7 @@ class EpochFunctions:
             return [*run(first, x)]
         out: list[Array] = []
         for one in self.recordings:
-            found = run(one, x[:, one.epochs])
+            found = run(one, x.take(one.epochs, axis=1))
             out = out or [np.empty((*x.shape[:2], *part.shape[2:])) for part in found]
             for whole, part in zip(out, found, strict=True):
                 whole[:, one.epochs] = part
