@@ -35,7 +35,7 @@ _TITLES = {"error": "mean error", "honesty": "mean NEES", "cost": "mean cost", "
 cost."""
 _WORDS = ("", "second is")
 """Titles of the columns that hold no numbers."""
-_FOUND = ("better", "worse", "different")
+_FOUND = ("better", "worse")
 _AS = {"success": "", "bias": ""}
 """What stands before a change: nothing before a difference, a sign before a ratio."""
 _FAILING = ("success", "error")
@@ -124,22 +124,24 @@ def _under(table: Table, title: str) -> Sequence[Cell]:
 
 
 def finding(frame: pd.DataFrame) -> str:
-    """Says in what the second is better, worse or different: by how much in a single comparison, or
-    else in how many."""
-    judged = frame[frame["p"].notna()]
+    """Says in what the second is better or worse by more than a margin: by how much in a single
+    comparison, or else in how many."""
+    rows: Any = frame[frame["p"].notna()].to_dict("records")
     interval = f"{100 * (1 - frame.attrs['alpha']):g} %"
+    by_quantity: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        by_quantity.setdefault(row["quantity"], []).append(row)
     clauses = []
     for word in _FOUND:
-        found = judged[[_verdict(row) == word for row in judged.to_dict("records")]]
-        extents = [
-            _extent(rows.to_dict("records"), judged, interval)
-            for _, rows in found.groupby("quantity", sort=False)
-        ]
+        extents = []
+        for each in by_quantity.values():
+            found = [row for row in each if _verdict(row) == word]
+            extents += [_extent(found, len(each), interval)] if found else []
         if extents:
             clauses.append(f"{word} in {', '.join(extents)}")
-    tested = [_TITLES.get(quantity, quantity) for quantity in judged["quantity"].unique()]
-    nothing = f"no significant difference in {enumerate_few(tested)}" if tested else "not tested"
-    return f"{_who(frame)}: {'; '.join(clauses) or nothing}"
+    tested = [_TITLES.get(quantity, quantity) for quantity in by_quantity]
+    nothing = f"no change beyond its margin is decided in {enumerate_few(tested)}"
+    return f"{_who(frame)}: {'; '.join(clauses) or (nothing if tested else 'not tested')}"
 
 
 def _who(frame: pd.DataFrame) -> str:
@@ -150,12 +152,11 @@ def _who(frame: pd.DataFrame) -> str:
     return "The second against the first"
 
 
-def _extent(found: Sequence[dict[str, Any]], judged: pd.DataFrame, interval: str) -> str:
+def _extent(found: Sequence[dict[str, Any]], number: int, interval: str) -> str:
     """Says how large a change is, or in how many comparisons of its quantity it is found."""
     row = found[0]
     quantity = row["quantity"]
     title = _TITLES.get(quantity, quantity)
-    number = int((judged["quantity"] == quantity).sum())
     if number > 1:
         return f"{title} ({len(found)} of {number} comparisons)"
     cells = _cells(row, interval)
