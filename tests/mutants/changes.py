@@ -896,4 +896,32 @@ CHANGES = {
         'readings"]',
         "test_answers.py",
     ),
+    "bound-by-prior": Change(
+        "real",
+        "an estimate with a prior is held on a bound",
+        "if inside.with_prior:\n        return inside\n",
+        "",
+        "test_intervals_within.py",
+    ),
+    "nonfinite-unsaid": Change(
+        "states",
+        "a path without a cost is not said to be so",
+        "np.where(finite, paths.status, Status.NONFINITE)",
+        "np.where(finite, Status.NONFINITE, paths.status)",
+        "test_whole_paths.py",
+    ),
+    "start-of-first": Change(
+        "states",
+        "the likelier smoother has the start of the other",
+        "mine[rows] = its[likelier]",
+        "pass",
+        "test_auto_tracker.py",
+    ),
+    "tested-unsaid": Change(
+        "report",
+        "the page of a log says what was tested where nothing was",
+        "if _verdicts(answer):",
+        "if not _verdicts(answer):",
+        "test_answers.py",
+    ),
 }

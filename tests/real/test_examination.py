@@ -15,7 +15,15 @@ from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Correlated, Gaussian, Unknown
 from ipe_bench.real.examination import answers, examine
 from ipe_bench.real.fits import fit, scaled
-from ipe_bench.real.profiles import CONFIDENCE, half_width, profiles, wald_interval
+from ipe_bench.real.levels import objective_of
+from ipe_bench.real.profiles import (
+    CONFIDENCE,
+    _ahead,
+    _along,
+    half_width,
+    profiles,
+    wald_interval,
+)
 from ipe_bench.trials.scenario import Scenario
 
 LM = {"lm": LevenbergMarquardt(tolerance=1e-9, max_iterations=500)}
@@ -53,6 +61,18 @@ def test_bootstrap_with_an_estimated_level_is_as_wide_as_students_t(readings):
     found = examine(problem, z, fit(problem, z, LM, Unknown()), bootstraps=4000)
     low, high = found.wald
     assert found.bootstrap.high - found.bootstrap.low == pytest.approx(high - low, rel=0.1)
+
+
+@pytest.mark.parametrize("place", range(3))
+def test_a_profile_of_a_linear_model_is_followed_along_its_covariance(place):
+    """The slopes of the readings lead to where the covariance does: both solve the normal
+    equations."""
+    model = Formula("a+b*t+c*t**2", {"a": 1.0, "b": 2.0, "c": 0.5}, {"t": TIMES})
+    objective = objective_of(Scenario(model, Gaussian(0.3)).problem, np.zeros((1, len(TIMES))))
+    J = objective.jacobian(np.ones((1, 3)))[0]
+    near = np.array([0.3, -0.2, 0.9])
+    exact = _along(near, np.linalg.inv(J.T @ J), place, 2.0)
+    np.testing.assert_allclose(_ahead(objective, near, place, 2.0), exact, rtol=1e-8)
 
 
 @pytest.mark.oracle(

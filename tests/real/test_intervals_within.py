@@ -7,7 +7,7 @@ from scipy.stats import norm
 from shared.oracles import assert_agrees
 from shared.synthetic_store import Repeated
 
-from ipe_bench.baselines import GaussNewton, LevenbergMarquardt
+from ipe_bench.baselines import GaussNewton, LevenbergMarquardt, MapLM
 from ipe_bench.measurements import Formula
 from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo
 from ipe_bench.noise import Gaussian
@@ -248,3 +248,14 @@ def test_truths_near_a_bound_are_in_the_intervals_at_least_as_often_as_they_say(
         inside.append(low[0] <= rate <= high[0])
     assert 50 < (~off).sum() < 600
     assert np.mean(inside) >= 0.95 - 2 * np.sqrt(0.95 * 0.05 / trials)
+
+
+def test_a_prior_keeps_an_estimate_off_a_bound_that_readings_would_push_it_to():
+    """The density of the prior is 0 on the bound: the largest posterior density lies inside,
+    however near."""
+    slope = ParameterInfo("b", nominal=0.5, upper=1.0)
+    problem = Scenario(ConstrainedModel(LINE, (slope,)), Gaussian(0.01)).problem
+    (one,) = fit(problem, 1.0 + 3.0 * T, {"map": MapLM(max_iterations=200)})
+    assert 0.99 < one.x[1] < 1.0
+    assert not one.held_at
+    assert (one.standard_errors > 0).all()

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -31,6 +31,7 @@ from ipe_bench.report.figures.common import full_ticks
 from ipe_bench.report.figures.log import draw_log
 from ipe_bench.report.figures.views import looks_of, views
 from ipe_bench.report.page.answer import _drawings
+from ipe_bench.report.page.log import LogAnswer, _sentences
 from ipe_bench.report.style import FACES, house_style
 from ipe_bench.report.words import ends_in_percent, public
 from ipe_bench.states import Smoother, Tracker, ekf
@@ -310,6 +311,15 @@ def test_nis_above_its_limit_are_in_red_and_their_share_is_said(walked):
     share = 100 * (nis > limit).sum() / 59
     assert f"at {share:.1f} % of 59 epochs" in drawing.caption
     assert len(drawing.caption.split()) <= 30
+
+
+def test_a_page_says_what_was_tested_only_where_something_was(walked):
+    found, _ = walked
+    untested = [replace(one, mean_nis=np.nan, lost_from=None) for one in found.tracks]
+    for tracks, tested in ((found.tracks, True), (untested, False)):
+        said = " ".join(_sentences(LogAnswer(found.log, tracks)))
+        assert ("Tested: the innovations of filters" in said) == tested
+        assert said.endswith("Smoothers, which use later readings: rts.")
 
 
 def test_a_filter_predicts_readings_from_those_before_and_a_smoother_none(walked):

@@ -77,8 +77,15 @@ def test_noise_that_depends_on_the_states_is_left_to_the_likelier_smoother():
     for stage, first in ((EXTENDED, ekf()), (UNSCENTED, ukf())):
         rows = found.stage == stage
         assert rows.any()
-        mean = Smoother(first).track(BY_STATE, z).mean
-        np.testing.assert_array_equal(found.mean[rows], mean[rows])
+        smooth = Smoother(first).track(BY_STATE, z)
+        for mine, its in (
+            (found.mean, smooth.mean),
+            (found.covariance, smooth.covariance),
+            (found.start.mean, smooth.start.mean),
+            (found.start.covariance, smooth.start.covariance),
+            (found.cost, smooth.cost),
+        ):
+            np.testing.assert_array_equal(mine[rows], its[rows])
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import pytest
 from shared.oracles import assert_agrees
 from shared.state_models import ConstantVelocity, Pendulum
 
+from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements import Parameter
 from ipe_bench.states import (
     Formulas,
@@ -163,6 +164,7 @@ def test_readings_beyond_numbers_lose_their_own_trial_alone():
     with np.errstate(all="ignore"):
         kept, lost = tracker.track(model, z), tracker.track(model, spoiled)
     assert not np.isfinite(lost.cost[1])
+    assert lost.status[1] == Status.NONFINITE
     np.testing.assert_array_equal(lost.mean[::2], kept.mean[::2])
     np.testing.assert_array_equal(lost.covariance[::2], kept.covariance[::2])
 
