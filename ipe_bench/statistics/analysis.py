@@ -15,6 +15,7 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.statistics.calibration import POINTS, band
 from ipe_bench.statistics.collect import Collection, Group, collect
 from ipe_bench.statistics.comparisons import Outcomes, compare_pairs, corrected, may_be_best
+from ipe_bench.statistics.formulas import failed, share
 from ipe_bench.statistics.intervals import quantile, quantiles
 from ipe_bench.statistics.path_columns import epoch_curves
 from ipe_bench.statistics.records import SCORES
@@ -46,8 +47,9 @@ class Analysis:
     pairs: pd.DataFrame
     """Every pair of estimators on every scenario; see `comparisons.compare_pairs`."""
     scores: pd.DataFrame
-    """Per scenario and estimator: capped mean error, median costs, and the number
-    `shared_trials` of the trials that every estimator of the scenario has."""
+    """Per scenario and estimator: capped mean error, median costs, and, over the trials that every
+    estimator of the scenario has, their number `shared_trials` and the shares `shared_success` and
+    `shared_silent`."""
     distributions: pd.DataFrame
     """Quantiles of the Mahalanobis error over all trials: `probability` (of `PROBABILITIES`) and
     `distance`."""
@@ -148,8 +150,7 @@ class Begun:
         of_group = dict(sample.group.columns) | {"estimator": sample.group.estimator}
         found["endings"] += [of_group | row for row in _ending_rows(sample)]
         scores = rows_of(SCORES, sample)[-1]
-        shared = {"shared_trials": int(sample.present.sum())}
-        found["scores"].append(where | scores | shared)
+        found["scores"].append(where | scores | _shared(sample))
         distances = quantiles(sample.distance, PROBABILITIES)
         curve = {"probability": PROBABILITIES, "distance": distances}
         found["distributions"].append(where | curve)
@@ -210,6 +211,15 @@ def _joined(parts: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
         return pd.DataFrame()
     arrays = [name for name, value in parts[0].items() if isinstance(value, np.ndarray)]
     return pd.DataFrame(list(parts)).explode(arrays, ignore_index=True).infer_objects()
+
+
+def _shared(sample: Sample) -> dict[str, Any]:
+    """Computes success and silent failure in the trials that every estimator of the scenario
+    has."""
+    among = sample.present
+    silent = failed(sample, known=False, among=among)
+    success = share(sample.scalars["success"][among])
+    return {"shared_trials": int(among.sum()), "shared_success": success, "shared_silent": silent}
 
 
 def _contraction_rows(collection: Collection, group: Group) -> list[dict[str, Any]]:

@@ -251,14 +251,15 @@ def _tests_fit(s: Sample) -> bool:
     return FIT in s.scalars and bool(np.isfinite(s.scalars[FIT]).any())
 
 
-def failed(s: Sample, *, known: bool) -> float:
+def failed(s: Sample, *, known: bool, among: Array | slice = slice(None)) -> float:
     """Computes the share that fails, by whether the estimator itself gives notice of it."""
     noticed = ~s.converged
     if _tests_fit(s):
         noticed = noticed | ~(s.scalars[FIT] >= FIT_LEVEL)
     if AMBIGUOUS in s.scalars:
         noticed = noticed | (s.scalars[AMBIGUOUS] > 0)
-    return share(~s.scalars["success"] & (noticed == known))
+    counted = ~s.scalars["success"] & (noticed == known)
+    return share(counted[among])
 
 
 def misfit(s: Sample) -> float:
