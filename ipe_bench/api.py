@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
+from ipe_bench.basics.definitions import renewed
 from ipe_bench.basics.errors import UserError, refuse_unknown
 from ipe_bench.basics.linalg import Array
 from ipe_bench.estimators.base import Estimator
@@ -403,6 +404,7 @@ def estimate(
     from ipe_bench.report.page.answer import Answer
     from ipe_bench.solvers import Auto
 
+    model = renewed(model)  # as in `_scenario`
     if isinstance(model, StateModel):
         stated = {
             "noise": noise,
@@ -606,6 +608,8 @@ def check(component: Any) -> list[Finding]:
 def _scenario(given: Any, **stated: Any) -> Scenario:
     """Returns the given scenario, or that of a model with the stated noise, prior and error
     scale."""
+    # A cell can have changed a function that its model was recorded with.
+    given = renewed(given)
     stated = {name: value for name, value in stated.items() if value is not None}
     if isinstance(given, Scenario):
         if stated:

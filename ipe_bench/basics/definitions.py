@@ -91,8 +91,18 @@ def pinned(component: Any) -> Any:
     """Copies a component with the digest of its definition, and without what it has worked out, its
     components alike: code that it works with can have changed since. One of installed packages
     alone is returned as it is."""
+    return _copied(component, pin=True)
+
+
+def renewed(component: Any) -> Any:
+    """Copies a component without what it has worked out, as `pinned` does; its definition may
+    change later."""
+    return _copied(component, pin=False)
+
+
+def _copied(component: Any, *, pin: bool) -> Any:
     if isinstance(component, tuple | list):
-        return type(component)(map(pinned, component))
+        return type(component)(_copied(one, pin=pin) for one in component)
     if not dataclasses.is_dataclass(component):
         return component
     if _PIN in getattr(component, "__dict__", {_PIN: ""}):
@@ -101,9 +111,11 @@ def pinned(component: Any) -> Any:
     if not found.digest:
         return component
     fresh = copy.copy(component)
-    state = {name: pinned(value) for name, value in _state_of(component).items()}
+    state = {name: _copied(value, pin=pin) for name, value in _state_of(component).items()}
     fresh.__dict__.clear()
-    fresh.__dict__.update(state, **{_PIN: found})
+    fresh.__dict__.update(state)
+    if pin:
+        fresh.__dict__[_PIN] = found
     return fresh
 
 

@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 
 import ipe_bench as ib
+from ipe_bench.baselines import LevenbergMarquardt
 from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements.problem import require_function
+from ipe_bench.noise import Gaussian
 from ipe_bench.runs.execution import Processes, end_idle
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.run import compute
@@ -284,6 +286,69 @@ def test_a_function_that_is_defined_anew_is_another_model_and_the_old_model_is_r
     with pytest.raises(UserError, match="make the model anew"):
         require_function(models[0])
     del main.__dict__["line"]
+
+
+RECORDED = """
+@dataclass(frozen=True)
+class Decay(ib.OdeMeasurement):
+    states, outputs, reading_unit, tolerance = 1, ("y",), "", 1e-9
+    parameters = (ib.measurements.Parameter("k", "1/s", 0.1),)
+    nominal = np.array([5.0])
+    times = np.arange(0.5, 5.0, 0.5)
+    def start(self, p, c):
+        return (1.0,)
+    def rhs(self, t, y, p, c):
+        return (-helper() * p[0] * y[0],)
+    def read(self, t, y, p, c):
+        return (y[0],)
+"""
+
+
+KEPT = """
+@dataclass(frozen=True)
+class Kept(ib.measurements.Polynomial):
+    @functools.cached_property
+    def factor(self):
+        return helper()
+    def simulate(self, x):
+        return self.factor * super().simulate(x)
+"""
+
+
+def test_a_design_is_of_what_a_model_computes_with_and_not_of_what_it_has_kept():
+    """Readings twice as large say twice as much of each parameter."""
+    session = Session("estimator", "helper", 1.0)
+    exec(KEPT, session.names)
+    model, values = session.names["Kept"](), []
+    for factor in (1.0, 2.0):
+        session.edit(factor)
+        seen = ib.design(model, noise=Gaussian(0.01), error_scale=1e-6, errors=()).observability
+        values.append(seen.singular_values[0])
+    assert values[1] == pytest.approx(2 * values[0])
+
+
+@pytest.mark.slow
+def test_what_is_asked_of_a_model_after_an_edit_is_answered_by_its_functions_as_they_are():
+    """exp(-2 k t) has half the k of exp(-k t), known twice as well."""
+    session = Session("estimator", "helper", 1.0)
+    exec(RECORDED, session.names)
+    model, noise = session.names["Decay"](), Gaussian(0.01)
+    z = np.exp(-0.5 * model.times)
+
+    def found() -> list[float]:
+        (fit,) = ib.estimate(model, z, {"lm": LevenbergMarquardt()}, noise=noise, progress=False)
+        seen = ib.design(model, noise=noise, error_scale=1e-6).observability
+        return [fit.values["k"], float(fit.standard_errors[0]), float(seen.singular_values[0, 0])]
+
+    before = found()
+    session.edit(2.0)
+    exec(session.used, session.names)
+    after = found()
+    assert before[0] == pytest.approx(0.5)
+    assert after[:2] == pytest.approx([before[0] / 2, before[1] / 2])
+    # The slope at the nominal point, and not at the estimate.
+    exact = model.times * 2 * np.exp(-model.times) / 0.01 * 0.1
+    assert after[2] == pytest.approx(np.linalg.norm(exact), rel=1e-4)
 
 
 MODULE = """
