@@ -94,8 +94,8 @@ class LevenbergMarquardtSmoother(Tracker):
     The first path is the smoothed track of the EKF or of the UKF, whichever costs less. At its
     minimum J is chi-square with as many degrees as there are readings. Where it is too large for
     that, the trial begins again at draws of the prior, each smoothed by a UKF of half the prior's
-    deviations, from the one that costs least. The covariance is that of the affine model, widened
-    where the cost rises more slowly or bends; see `widened`.
+    deviations, from the one that costs least. The covariance is that of the affine model, or
+    where the density is not normal a second moment about the path; see `widened`.
 
     Example:
 

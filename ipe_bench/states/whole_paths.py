@@ -271,6 +271,17 @@ class PathDensity:
         those of them with the last states."""
         return smoothed_chains(tangents.A, tangents.B, self.noise)
 
+    def log_determinant(self, tangents: Tangents) -> Array:
+        """Computes log det (trials,) of the Hessian of Gauss and Newton of J / 2, in whitened start
+        and noise: the sum of log det (I + B S B') over the epochs, S = A P A' + Q predicted."""
+        A = tangents.A
+        B = tangents.B
+        P = self.filtered(tangents)[:, :-1]
+        Q = np.matmul(self.gains, transposed(self.gains))
+        S = np.matmul(np.matmul(A, P), transposed(A)) + Q
+        innovation = np.matmul(np.matmul(B, S), transposed(B)) + np.eye(B.shape[2])
+        return np.linalg.slogdet(innovation)[1].sum(axis=1)
+
     def size(self, tangents: Tangents, step: Array) -> Array:
         """Computes dx' (Hessian of Gauss and Newton) dx (trials,): a step's squared length in
         deviations of the path."""

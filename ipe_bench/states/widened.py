@@ -2,94 +2,99 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from ipe_bench.basics.batches import take
 from ipe_bench.basics.linalg import Array
 from ipe_bench.states.algebra import principal, transposed
+from ipe_bench.states.linearisation import Taylor
 from ipe_bench.states.whole_paths import PathDensity, Settled, Tangents
 
 _FAR = 3.0
 """Standard deviations from the path at which the cost is looked at."""
 _NORMAL = 0.05
-"""Part of its rise by which a cost there may differ from that of a normal density before it is
-followed."""
-_MOST = 100.0
-"""Times its variance that a direction gets at most."""
+"""Part of its rise by which a cost there may differ from that of a normal density before the axis
+is followed."""
+_STRIDE = 1.5
+"""Standard deviations between points of an axis: of a normal density the sum over such points
+misses the integral by 3e-4."""
+_POINTS = 16
+"""Points to either side of a path at most."""
+_LITTLE = 1e-3
+"""Part of the second moment along an axis below which the tail behind a point is left out."""
+_MOST = 10.0
+"""Logarithm of the most that a point counts beside the path itself."""
 _NUMBERS = 5e5
 """Numbers of the slopes that are held at once: they stay in a processor's cache."""
 _LANES = 8
 """Trials at least that are held at once: machine code takes no more time for them than for one."""
 
 
-def widened(density: PathDensity, at: Settled, tangents: Tangents) -> tuple[Array, Array]:
-    """Computes the covariances (trials, 1 + K, n, n) of the affine model about paths, widened by
-    what the cost says, and the evaluations (trials,) that this took.
+class Conditional(NamedTuple):
+    """Holds the affine model about paths if a number g' x_K of the last states is known."""
 
-    Along each axis of the last states' covariance the path is moved by c = 3 deviations to both
-    sides, and a step of the affine model lets the rest of it follow. By this the cost rises by dJ,
-    which is c^2 where the density is normal: the variance along the axis is multiplied by the
-    larger of both c^2 / dJ, but not made smaller. The step itself is b c^2 where the valley of the
-    cost bends: it adds the second moment of that, 3 b b'.
+    P: Array
+    """Covariances (trials, 1 + K, n, n)."""
+    line: Array
+    """How the path (trials, 1 + K, n) moves with the number."""
+    size: Array
+    """log det of the Hessian of J / 2 in start and noise, and of the number's variance
+    (trials,)."""
+
+    @classmethod
+    def of(cls, density: PathDensity, tangents: Tangents, g: Array) -> Conditional:
+        P, crossed = density.spread(tangents)
+        c = np.matmul(crossed, g[:, None, :, None])[..., 0]
+        variance = np.sum(g * c[:, -1], axis=1)
+        line = c / variance[:, None, None]
+        rest = P - c[..., :, None] * line[..., None, :]
+        return cls(rest, line, density.log_determinant(tangents) + np.log(variance))
+
+
+def widened(density: PathDensity, at: Settled, tangents: Tangents) -> tuple[Array, Array]:
+    """Computes the covariances (trials, 1 + K, n, n) of paths, second moments about them where the
+    density is not normal, and the evaluations (trials,) that this took.
+
+    Along each axis of the last states' covariance the path is moved by 3 deviations to both sides.
+    Where the cost there is not that of a normal density, the axis on which it differs most is
+    followed through points t: at each the rest of the path is that of largest density, and normal
+    (Rue, Martino and Chopin, J. R. Stat. Soc. B 71, 2009: nested Laplace approximations). With
+    means x(t), covariances P(t) and the Hessian H(t) of the rest,
+
+        w(t) = exp(-J / 2) (det H)^-1/2,   P = sum w (P(t) + (x(t) - x(0)) (x(t) - x(0))') / sum w.
     """
     P = np.empty((*at.x.shape, at.x.shape[-1]))
     calls = np.empty(len(P))
     sides = 2 * density.model.n
-    at_once = max(_LANES, _slopes_at_once(density) // sides)
+    slopes = int(_NUMBERS / (density.model.n**2 * density.model.epochs))
+    at_once = max(_LANES, slopes // sides)
     for i in np.split(np.arange(len(P)), range(at_once, len(P), at_once)):
         P[i], calls[i] = _of_some(density.subset(i), take(at, i), take(tangents, i))
     return P, calls
 
 
-def _slopes_at_once(density: PathDensity) -> int:
-    """Paths whose slopes are held at once."""
-    return max(1, int(_NUMBERS / (density.model.n**2 * density.model.epochs)))
-
-
 def _of_some(density: PathDensity, at: Settled, tangents: Tangents) -> tuple[Array, Array]:
     trials, epochs, n = at.x.shape
     P, crossed = density.spread(tangents)
-    lines, inverse = _lines(P[:, -1], crossed)
+    lines, axes = _lines(P[:, -1], crossed)
     sides = np.stack([lines, -lines], axis=1).reshape(-1, epochs, n)
     owner = np.repeat(np.arange(trials), 2 * n)
-    beside = at.x[owner] + _FAR * sides
-    moved = density.subset(owner).settled(beside)
-    cost = moved.cost
-    calls = moved.calls
-    bends = np.zeros(sides.shape)
-    known = (sides == 0).all(axis=(1, 2))
+    moved = density.subset(owner).settled(at.x[owner] + _FAR * sides)
+    calls = moved.calls.reshape(trials, 2 * n).sum(axis=1)
     # dJ / c^2 is 1 where the density is normal.
-    rise = cost / _FAR**2 - at.cost[owner] / _FAR**2
-    normal = np.abs(rise - 1.0) <= _NORMAL
-    bent = np.flatnonzero(~known & ~normal)
-    at_once = _slopes_at_once(density)
-    for rows in np.split(bent, range(at_once, len(bent), at_once)):
-        own = owner[rows]
-        some = density.subset(own)
-        there = take(moved, rows)
-        # The rest of the path follows by a step of the affine model.
-        step = some.step(take(tangents, own), there)
-        axis = rows % n
-        # What the step would move along the axis itself is taken back.
-        back = np.sum(inverse[own, axis] * step[:, -1], axis=1)
-        line = lines[own, axis]
-        step = step - line * back[:, None, None]
-        followed = some.settled(there.x + step)
-        lower = followed.cost <= there.cost
-        bends[rows[lower]] = step[lower]
-        cost[rows[lower]] = followed.cost[lower]
-        calls[rows] += followed.calls
-    dJ = (cost - at.cost[owner]).reshape(trials, 2, n)
-    extra = _rarer(dJ)
-    extra[known.reshape(trials, 2, n)[:, 0]] = 0.0
-    stretched = np.sqrt(extra)[..., None, None] * lines
-    # b is the mean of both sides' steps over c^2, and E t^4 = 3 of a standard normal t.
-    both = bends.reshape(trials, 2, n, epochs, n).sum(axis=1)
-    bends = np.sqrt(3.0) * (both / (2 * _FAR**2))
-    # P + W' W, with a row of W for each line and each bend.
-    W = np.moveaxis(np.concatenate([stretched, bends], axis=1), 1, 2)
-    P = P + np.matmul(transposed(W), W)
-    return P, calls.reshape(trials, 2 * n).sum(axis=1)
+    rise = (moved.cost - at.cost[owner]).reshape(trials, 2, n) / _FAR**2
+    unlike = np.abs(rise - 1.0).max(axis=1)
+    known = (lines == 0).all(axis=(2, 3))
+    unlike = np.where(known, 0.0, unlike)
+    rows = np.flatnonzero(unlike.max(axis=1) > _NORMAL)
+    if rows.size:
+        g = axes[rows, unlike[rows].argmax(axis=1)]
+        some = density.subset(rows)
+        P[rows], further = _followed(some, take(at, rows), take(tangents, rows), g)
+        calls[rows] += further
+    return P, calls
 
 
 def _lines(P: Array, crossed: Array) -> tuple[Array, Array]:
@@ -103,9 +108,46 @@ def _lines(P: Array, crossed: Array) -> tuple[Array, Array]:
     return lines / np.where(along > 0, along, 1.0)[..., None, None], inverse
 
 
-def _rarer(rise: Array) -> Array:
-    """Computes by how much more than once the variance an axis has (trials, n), of rises
-    (trials, 2, n) to both sides."""
-    least = _FAR**2 / _MOST
-    ratio = _FAR**2 / np.fmax(rise, least).min(axis=1)
-    return np.maximum(ratio, 1.0) - 1.0
+def _followed(
+    density: PathDensity, at: Settled, tangents: Tangents, g: Array
+) -> tuple[Array, Array]:
+    """Computes the second moments about paths by the points of an axis on which g' x_K (trials, n)
+    of the last states has unit variance, and the evaluations that this took."""
+    trials = len(at.x)
+    middle = Conditional.of(density, tangents, g)
+    moment = middle.P.copy()
+    total = np.ones(trials)
+    calls = np.zeros(trials)
+    of_tangents = Taylor().calls(density.model.n) * density.model.evaluations
+    for sign in (1.0, -1.0):
+        rows = np.arange(trials)
+        x = at.x
+        line = middle.line
+        for number in range(1, _POINTS + 1):
+            t = sign * _STRIDE * number
+            some = density.subset(rows)
+            begun = some.settled(x + sign * _STRIDE * line)
+            about = some.tangents(begun)
+            here = Conditional.of(some, about, g[rows])
+            # The rest of the path follows by a step of the affine model, g' x_K by none.
+            step = some.step(about, begun)
+            last = begun.x[:, -1] + step[:, -1] - at.x[rows, -1]
+            over = np.sum(g[rows] * last, axis=1) - t
+            there = some.settled(begun.x + step - over[:, None, None] * here.line)
+            calls[rows] += begun.calls + there.calls + of_tangents
+            d = density.model.nearest_state(there.x, at.x[rows]) - at.x[rows]
+            second = here.P + d[..., :, None] * d[..., None, :]
+            fall = at.cost[rows] - there.cost + middle.size[rows] - here.size
+            weight = np.exp(np.minimum(fall / 2, _MOST))
+            counted = np.isfinite(second).all(axis=(1, 2, 3)) & np.isfinite(weight)
+            weight = np.where(counted, weight, 0.0)
+            second = np.where(counted[:, None, None, None], second, 0.0)
+            total[rows] += weight
+            moment[rows] += weight[:, None, None, None] * second
+            going = weight * t**2 > _LITTLE * total[rows]
+            if not going.any():
+                break
+            rows = rows[going]
+            x = there.x[going]
+            line = here.line[going]
+    return moment / total[:, None, None, None], calls
