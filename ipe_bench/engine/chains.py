@@ -206,14 +206,18 @@ def _covariances_by_numpy(A: Array, B: Array, G: Array, smoothed: bool) -> tuple
     return np.matmul(F, F.mT), crossed
 
 
-def _begun(A: Array, B: Array, D: Array, G: Array, a: Array, v: Array) -> Epoch:
-    """All epochs of a chain before its first pass."""
+def from_before(A: Array, B: Array, D: Array, v: Array) -> tuple[Array, Array, Array]:
+    """Returns A, B and v of all epochs, those of the first included."""
     n = D.shape[2]
-    A = np.pad(A, _FIRST)
     # D stands for readings of 0, by rows of its root.
     roots = np.sqrt(D)[..., None] * np.eye(n)
-    B = np.concatenate([np.pad(B, _FIRST), roots], axis=2)
-    v = np.pad(v, [(0, 0), (1, 0), (0, n)])
+    rows = np.concatenate([np.pad(B, _FIRST), roots], axis=2)
+    return np.pad(A, _FIRST), rows, np.pad(v, [(0, 0), (1, 0), (0, n)])
+
+
+def _begun(A: Array, B: Array, D: Array, G: Array, a: Array, v: Array) -> Epoch:
+    """All epochs of a chain before its first pass."""
+    A, B, v = from_before(A, B, D, v)
     F, S, size = filtered_roots(A, B, G)
     u, x, multipliers = map(np.zeros_like, (a, a, a))
     return Epoch(A, B, a.copy(), v, F, u, x, multipliers, S, size, np.zeros_like(v))

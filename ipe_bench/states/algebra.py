@@ -21,6 +21,8 @@ _INDEFINITE = 1e-6
 """The eigenvalue below -1e-6 of correlations that are no covariance's."""
 _UNLIKE = 1e-14
 """Part of the largest variance below which another is of another kind, as of other units."""
+_LOST = 1e-14
+"""Pivots, in parts of the deviations, that are round-off in a root of a covariance."""
 _OUTSIDE = 1e-6
 """Standard deviations by which a vector may lie outside the range of a covariance."""
 
@@ -117,6 +119,23 @@ def half(P: Array, L: Array | None = None) -> Half:
     G[singular], inverse[singular] = principal(P[singular])
     L[singular] = np.nan
     return Half(G, L, inverse, singular)
+
+
+def triangular(F: Array) -> Half:
+    """Returns the half F of P = F F' for lower triangular F (trials, n, n), which may be
+    singular."""
+    size = np.linalg.norm(F, axis=-1)
+    pivots = np.abs(np.diagonal(F, axis1=-2, axis2=-1))
+    singular = np.asarray(~(pivots > _LOST * size).all(axis=-1))
+    inverse = np.zeros(F.shape)
+    L = F.copy()
+    L[singular] = np.nan
+    usable = singular & finite(F)
+    # F = D C with rows of C of length 1, and F^- = C^+ D^-1.
+    d = np.where(size[usable] > 0, size[usable], 1.0)
+    C = F[usable] / d[..., None]
+    inverse[usable] = np.linalg.pinv(C, rcond=_LOST) / d[:, None]
+    return Half(F, L, inverse, singular)
 
 
 def principal(P: Array) -> tuple[Array, Array]:

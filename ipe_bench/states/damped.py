@@ -253,8 +253,8 @@ def smoothed_path(tracks: Tracks) -> Array:
 
         r <- r + H' S^-1 (y - H P- r),   r <- A' r,   m[k-1] <- m[k-1] + P[k-1] r.
     """
-    H = np.stack([H for H, _ in tracks.reads], axis=1)
-    L = np.stack([L for _, L in tracks.reads], axis=1)
+    H = np.stack([H for H, _, _ in tracks.reads], axis=1)
+    L = np.stack([L for _, L, _ in tracks.reads], axis=1)
     # H' S^-1 H = W' W and H' S^-1 y = W' e, with W = L^-1 H and S = L L'.
     W = lower_solve(L, H)
     e = np.nan_to_num(tracks.innovations)

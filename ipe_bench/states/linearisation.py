@@ -24,7 +24,7 @@ from ipe_bench.basics.options import Component, Count, Finite, Positive
 from ipe_bench.engine import compiled
 from ipe_bench.engine.points import regress, spread_points
 from ipe_bench.measurements.base import differentiate
-from ipe_bench.states.algebra import Half, half, symmetric, transposed
+from ipe_bench.states.algebra import Half, half, symmetric, transposed, triangular
 
 _MOST_POINTS = 100_000
 """Points of a product rule at most."""
@@ -51,6 +51,13 @@ class Rule(Component, ABC):
         """Computes the affine law of g about N(m, P), for m (trials, n) and P (trials, n, n).
         `nearest` shifts values of g that are periodic next to others: the mean of points on both
         sides of a bearing's jump would lie opposite."""
+
+    def linearise_by_root(
+        self, g: Function, m: Array, F: Array, nearest: Nearest | None = None
+    ) -> Affine:
+        """Computes the affine law of g about N(m, F F'), for a triangular F (trials, n, n) with
+        digits that F F' does not have."""
+        return self.linearise(g, m, np.matmul(F, transposed(F)), nearest)
 
     def mean(self, g: Function, m: Array, P: Array) -> Array:
         """Computes the mean (trials, ...) of g over N(m, P), g (trials, p, ...) at points (trials,
@@ -105,6 +112,24 @@ class SigmaPoints(Rule):
             y = nearest(y, g(m)[:, None])
         mean, A, W = _regressed(G, y, s, w, c)
         return Affine(A, mean - multiply(A, m), W)
+
+    def linearise_by_root(
+        self, g: Function, m: Array, F: Array, nearest: Nearest | None = None
+    ) -> Affine:
+        s, w = self.points(m.shape[-1])
+        G = triangular(F)
+        y = g(m[..., None, :] + np.matmul(s, transposed(F)))
+        if nearest is not None:
+            y = nearest(y, g(m)[..., None, :])
+        mean = np.sum(w[:, None] * y, axis=-2)
+        d = y - mean[..., None, :]
+        c = self.covariance_weights(w)[:, None]
+        M = np.matmul(s.T, c * d)
+        A = G.over(transposed(M))
+        # What the law leaves of the points, which is no difference of large covariances.
+        left = d - np.matmul(s, M)
+        W = np.matmul(transposed(c * left), left)
+        return Affine(A, mean - multiply(A, m), symmetric(W))
 
     def mean(self, g: Function, m: Array, P: Array) -> Array:
         s, w, _ = _weighted(self, m.shape[-1])

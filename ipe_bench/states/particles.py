@@ -12,7 +12,7 @@ from ipe_bench.basics.options import Count
 from ipe_bench.basics.streams import own_generators
 from ipe_bench.states.algebra import factor, root, transposed
 from ipe_bench.states.base import Normal, StateModel
-from ipe_bench.states.trackers import Tracker, Tracks, Update, residuals, squares
+from ipe_bench.states.trackers import Read, Tracker, Tracks, Update, residuals, squares
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ def _innovation(model: StateModel, z: Array, r: Array, R: Array, before: Array |
     L = factor(S)
     # Particles have no slope; that of 0 keeps the place of the innovation's L.
     no_slope = np.zeros((*y.shape, model.n))
-    return Update.of(Normal(y, S), y, L, seen, no_slope)
+    return Update.of(Normal(y, S), y, L, seen, Read(no_slope, L, S))
 
 
 def _resampled(x: Array, w: Array, offset: Array) -> Array:

@@ -215,6 +215,14 @@ def smoothed(model: StateModel, tracks: Tracks) -> Tracks:
     out.calls = tracks.calls
     if singular.any() and len(tracks.reads) == model.epochs:
         _smooth_by_scores(model, tracks, out, singular)
+    chain = tracks.chain
+    if chain is not None:
+        # A difference of covariances has no digits there.
+        found = chain.smoothed()
+        out.start.mean[chain.rows] = found.mean[:, 0]
+        out.start.covariance[chain.rows] = found.covariance[:, 0]
+        out.mean[chain.rows] = found.mean[:, 1:]
+        out.covariance[chain.rows] = found.covariance[:, 1:]
     return out
 
 
@@ -236,7 +244,7 @@ def _smooth_by_scores(model: StateModel, tracks: Tracks, out: Tracks, rows: Mask
     N = np.zeros((rows.sum(), n, n))
     for k in range(model.epochs - 1, first - 1, -1):
         # H' S^-1 H = B' B and H' S^-1 y = B' e, with B = L^-1 H and e = L^-1 y.
-        H, L = tracks.reads[k]
+        H, L, _ = tracks.reads[k]
         B = lower_solve(L[rows], H[rows])
         e = np.nan_to_num(tracks.innovations[rows, k])
         BB = np.matmul(transposed(B), B)

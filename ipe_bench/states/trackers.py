@@ -17,11 +17,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import join
-from ipe_bench.basics.linalg import Array, Mask, multiply
+from ipe_bench.basics.linalg import Array, Mask, finite, multiply
 from ipe_bench.basics.options import Component, Count
-from ipe_bench.states.algebra import factor, lower_solve, symmetric, transposed, upper_solve
+from ipe_bench.states.algebra import (
+    factor,
+    half,
+    lower_solve,
+    symmetric,
+    transposed,
+    upper_solve,
+)
 from ipe_bench.states.base import Normal, StateModel
-from ipe_bench.states.linearisation import Affine, Cubature, Rule, Taylor, Unscented
+from ipe_bench.states.linearisation import (
+    Affine,
+    Cubature,
+    Function,
+    Nearest,
+    Rule,
+    Taylor,
+    Unscented,
+)
+from ipe_bench.states.roots import Chain, Rooted, Step, precise
+
+
+class Read(NamedTuple):
+    """Holds the readings of an epoch as they were linearised."""
+
+    H: Array
+    """(trials, m, n); 0 of missing readings and of particles."""
+    L: Array
+    """(trials, m, m) with L L' = S of their innovations."""
+    noise: Array
+    """Their covariance (trials, m, m) for given states; 1 of missing ones."""
 
 
 @dataclass
@@ -52,9 +79,10 @@ class Tracks:
     """The states after each transition, before the reading."""
     effective: Array | None = None
     """Effective sample sizes 1 / sum w^2 (trials, K) of weighted samples."""
-    reads: list[tuple[Array, Array]] = field(default_factory=list)
-    """H (trials, m, n) of the readings of each epoch as they were linearised, 0 of missing ones and
-    of particles, and L (trials, m, m) with L L' = S of their innovations."""
+    reads: list[Read] = field(default_factory=list)
+    """The readings of each epoch as they were linearised."""
+    chain: Chain | None = None
+    """The affine models of those trials whose covariances were kept by roots."""
     cost: Array | None = None
     """-2 log p(path | readings) (trials,) of an iterated smoother up to a constant, or the NIS of
     the filter behind a smoother: chi-square with a degree per reading; see `path_p`."""
@@ -90,7 +118,7 @@ class Tracks:
         """Returns the states at epoch k; before the first transition if that is -1."""
         return self.start if k < 0 else Normal(self.mean[:, k], self.covariance[:, k])
 
-    def note(self, k: int, found: Update) -> Normal:
+    def note(self, k: int, found: Update) -> Normal | Rooted:
         """Returns the states after the readings of epoch k, which the tracks keep with what the
         innovation says."""
         self.mean[:, k] = found.x.mean
@@ -112,13 +140,35 @@ class Tracks:
         that were there, and their standard deviations; NaN in trackers that have no innovations."""
         mean = np.full(z.shape, np.nan)
         deviation = np.full(z.shape, np.nan)
-        for k, (_, L) in enumerate(self.reads):
+        for k, (_, L, _) in enumerate(self.reads):
             # z - h = L e for normalised innovations e, and diag(S) = diag(L L').
             y = multiply(L, np.nan_to_num(self.innovations[:, k]))
             mean[:, k] = z[:, k] - y
             deviation[:, k] = np.linalg.norm(L, axis=-1)
         there = np.isfinite(self.innovations)
         return np.where(there, mean, np.nan), np.where(there, deviation, np.nan)
+
+    def about(self, rows: NDArray[np.intp]) -> Tracks:
+        """Returns the states of the trials `rows` alone."""
+        start = Normal(*(part[rows] for part in self.start))
+        part = replace(self, mean=self.mean[rows], covariance=self.covariance[rows])
+        part.start = start
+        return part
+
+    def keep(self, rows: NDArray[np.intp], other: Tracks) -> None:
+        """Takes what another filter of the trials `rows` found, where it did."""
+        found = finite(other.mean) & finite(other.covariance)
+        kept = rows[found]
+        if not kept.size:
+            return
+        names = ("mean", "covariance", "nis", "innovations", "degrees", "log_likelihood")
+        for name in names:
+            getattr(self, name)[kept] = getattr(other, name)[found]
+        for name in ("moves", "predicted", "reads"):
+            for mine, its in zip(getattr(self, name), getattr(other, name), strict=True):
+                for part, new in zip(mine, its, strict=True):
+                    part[kept] = new[found]
+        self.chain = None if other.chain is None else other.chain.part(found, kept)
 
     @classmethod
     def lost(cls, model: StateModel, trials: int) -> Tracks:
@@ -132,7 +182,7 @@ class Tracks:
     def join(cls, parts: Sequence[Tracks]) -> Tracks:
         """Joins the trials of several batches one after another, without what smoothers need; what
         trials lack that others have is NaN, or the status and the iterations of none."""
-        alone = [replace(part, moves=[], predicted=[], reads=[]) for part in parts]
+        alone = [replace(part, moves=[], predicted=[], reads=[], chain=None) for part in parts]
         joined = join(alone)
         if joined.status is not None:
             joined.status = np.nan_to_num(joined.status).astype(np.int8)
@@ -204,14 +254,20 @@ def predict(x: Normal, move: Affine, Q: Array) -> Normal:
     return Normal(m, symmetric(APA + move.W + Q))
 
 
+def _linearised(rule: Rule, g: Function, x: Normal | Rooted, nearest: Nearest | None) -> Affine:
+    if isinstance(x, Rooted):
+        return rule.linearise_by_root(g, x.mean, x.root, nearest)
+    return rule.linearise(g, *x, nearest)
+
+
 def linearised_move(
-    model: StateModel, rule: Rule, k: int, x: Normal, to: Array | None = None
+    model: StateModel, rule: Rule, k: int, x: Normal | Rooted, to: Array | None = None
 ) -> Affine:
     """Linearises f about the states x; periodic states next to those of `to` (trials, n), if these
     are given."""
     periodic = bool(model.state_periods)
     nearest = model.nearest_state if periodic else None
-    move = rule.linearise(model.transition_into(k), *x, nearest)
+    move = _linearised(rule, model.transition_into(k), x, nearest)
     if to is None or not periodic:
         return move
     # b takes the whole periods between f(x) and the path.
@@ -219,10 +275,12 @@ def linearised_move(
     return move._replace(b=move.b + model.nearest_state(value, to) - value)
 
 
-def linearised_reading(model: StateModel, rule: Rule, k: int, z: Array, x: Normal) -> Affine:
+def linearised_reading(
+    model: StateModel, rule: Rule, k: int, z: Array, x: Normal | Rooted
+) -> Affine:
     """Linearises h about the states x, periodic readings next to the readings z (trials, m)."""
     nearest = model.nearest if model.periods else None
-    read = rule.linearise(model.observation_at(k), *x, nearest)
+    read = _linearised(rule, model.observation_at(k), x, nearest)
     # b takes the whole periods between h(x) and the readings that are there.
     value = multiply(read.A, x.mean) + read.b
     to = np.where(np.isfinite(z), z, value)
@@ -232,18 +290,19 @@ def linearised_reading(model: StateModel, rule: Rule, k: int, z: Array, x: Norma
 class Update(NamedTuple):
     """Holds the states after a reading, and what the innovation says of the filter."""
 
-    x: Normal
+    x: Normal | Rooted
     innovation: Array
     nis: Array
     degrees: Array
     log_likelihood: Array
-    read: tuple[Array, Array] | None = None
-    """H and L of `Tracks.reads`."""
+    read: Read | None = None
 
     @classmethod
-    def of(cls, x: Normal, y: Array, L: Array, seen: Mask, H: Array | None = None) -> Update:
-        """Holds the states x after an innovation y (trials, m) of covariance L L', by a reading of
-        slope H (trials, m, n); only readings that are `seen` count."""
+    def of(
+        cls, x: Normal | Rooted, y: Array, L: Array, seen: Mask, read: Read | None = None
+    ) -> Update:
+        """Holds the states x after an innovation y (trials, m) of covariance L L', by a reading as
+        it was linearised; only readings that are `seen` count."""
         # The normalised innovation e = L^-1 y has the NIS y' S^-1 y = e' e.
         e = lower_solve(L, y[..., None])[..., 0]
         nis = np.sum(e**2, axis=-1)
@@ -251,11 +310,10 @@ class Update(NamedTuple):
         # log N(y; 0, S), S = L L', of which a missing reading has no part.
         log_determinant = 2 * np.log(np.diagonal(L, axis1=-2, axis2=-1)).sum(axis=-1)
         log_likelihood = -0.5 * (nis + log_determinant + degrees * np.log(2 * np.pi))
-        read = None if H is None else (H, L)
         return cls(x, np.where(seen, e, np.nan), nis, degrees, log_likelihood, read)
 
 
-def update(x: Normal, read: Affine, R: Array, z: Array) -> Update:
+def update(x: Normal | Rooted, read: Affine, R: Array, z: Array) -> Update:
     """Takes in the readings z = H x + b + e + v (trials, m), e ~ N(0, W) of the rule and v ~ N(0, R
     (m, m)):
 
@@ -263,15 +321,19 @@ def update(x: Normal, read: Affine, R: Array, z: Array) -> Update:
         m <- m + K y
         P <- (I - K H) P (I - K H)' + K (W + R) K'
 
-    This form of P, Joseph's, stays positive definite where the prior is much wider than R. A
-    missing reading has no slope and unit variance.
+    This form of P, Joseph's, stays positive definite; where the prior is so much wider than R that
+    it loses digits, x is given by a root of P. A missing reading has no slope and unit variance.
     """
-    m, P = x
+    m = x.mean
+    P = x.covariance
     seen = np.isfinite(z)
     both = seen[..., :, None] & seen[..., None, :]
     H = np.where(seen[..., None], read.A, 0.0)
     y = np.where(seen, z - multiply(read.A, m) - read.b, 0.0)
     noise = np.where(both, read.W + R, np.eye(R.shape[-1]))
+    if isinstance(x, Rooted):
+        after, L = x.told(H, y, half(noise).G)
+        return Update.of(after, y, L, seen, Read(H, L, noise))
     # S = L L'
     PH = np.matmul(P, transposed(H))
     L = factor(np.matmul(H, PH) + noise)
@@ -281,7 +343,7 @@ def update(x: Normal, read: Affine, R: Array, z: Array) -> Update:
     unread = np.matmul(np.matmul(rest, P), transposed(rest))
     added = np.matmul(np.matmul(K, noise), transposed(K))
     after = Normal(m + multiply(K, y), symmetric(unread + added))
-    return Update.of(after, y, L, seen, H)
+    return Update.of(after, y, L, seen, Read(H, L, noise))
 
 
 @dataclass(frozen=True)
@@ -340,30 +402,107 @@ def filtered(
 ) -> Tracks:
     """Runs the filter of the model that a rule linearises about the filter's own states, or about
     those of a path; `start` replaces the prior."""
+    start = start or spread_prior(model, len(z))
+    tracks = _filtered(model, z, rule, iterations, path, start)
+    losing = _loses_digits(tracks)
+    if iterations > 1 or path is not None:
+        # About states whose covariance has lost its digits nothing is found at all.
+        losing |= ~finite(tracks.mean)
+    rows = np.flatnonzero(losing)
+    if rows.size:
+        about = None if path is None else path.about(rows)
+        begun = Rooted.of_normal(Normal(start.mean[rows], start.covariance[rows]))
+        tracks.keep(rows, _filtered(model, z[rows], rule, iterations, about, begun))
+    return tracks
+
+
+def _loses_digits(tracks: Tracks) -> Mask:
+    """Tells in which trials readings leave less of a covariance than its digits (trials,)."""
+    before = [x.covariance for x in tracks.predicted]
+    if len(before) < len(tracks.reads):
+        before.insert(0, tracks.start.covariance)
+    P = np.stack([_variances(one) for one in before], axis=1)
+    H = np.stack([read.H for read in tracks.reads], axis=1)
+    R = np.stack([_variances(read.noise) for read in tracks.reads], axis=1)
+    return precise(H, P, R)
+
+
+def _variances(P: Array) -> Array:
+    return np.diagonal(P, axis1=-2, axis2=-1)
+
+
+def _alike(at: Normal, x: Normal | Rooted) -> Normal | Rooted:
+    """Returns the states `at` in the form of the states x."""
+    return Rooted.of_normal(at) if isinstance(x, Rooted) else at
+
+
+def _noise_root(G: Array, move: Affine) -> Array:
+    """Returns a root (trials, n, q) of the covariance of a transition's noise."""
+    each = np.broadcast_to(G, (len(move.W), *G.shape[-2:]))
+    return np.concatenate([each, half(move.W).G], axis=2)
+
+
+def _step(x: Rooted, move: Affine | None, G: Array | None, found: Update) -> Step:
+    """Returns the affine model of an epoch, of states x after the transition."""
+    read = found.read
+    assert read is not None
+    y = multiply(read.L, np.nan_to_num(found.innovation))
+    N = half(read.noise)
+    B = transposed(N.whitened(transposed(read.H)))
+    v = N.whitened((y + multiply(read.H, x.mean))[:, None])[:, 0]
+    if move is None or G is None:
+        still = np.broadcast_to(np.eye(x.mean.shape[1]), x.root.shape)
+        return Step(still, np.zeros_like(x.mean), still[:, :, :0], B, v)
+    return Step(move.A, move.b, G, B, v)
+
+
+def _filtered(
+    model: StateModel,
+    z: Array,
+    rule: Rule,
+    iterations: int,
+    path: Tracks | None,
+    start: Normal | Rooted,
+) -> Tracks:
     out = Tracks.empty(model, len(z))
-    out.start = start or out.start
-    x = out.start
+    out.start = Normal(start.mean, start.covariance)
+    x = start
+    steps: list[Step] = []
     for k in range(model.epochs):
+        move = G = None
         if model.moves(k):
             # f is linearised about the filter's states, or about those of the path.
-            at = x if path is None else path.at(k - 1)
+            at = x if path is None else _alike(path.at(k - 1), x)
             to = None if path is None else path.mean[:, k]
             move = linearised_move(model, rule, k, at, to)
-            Q = rule.mean(partial(model.Q_at, k=k), *at) if model.gain_by_state else model.Q(k)
-            x = predict(x, move, Q)
+            Q = None
+            if model.gain_by_state:
+                Q = rule.mean(partial(model.Q_at, k=k), at.mean, at.covariance)
+            if isinstance(x, Rooted):
+                G = _noise_root(model.gain(k) if Q is None else half(Q).G, move)
+                x = x.moved(move, G)
+            else:
+                x = predict(x, move, model.Q(k) if Q is None else Q)
             out.moves.append(move)
-            out.predicted.append(x)
-        at = x if path is None else path.at(k)
+            out.predicted.append(Normal(x.mean, x.covariance))
+        at = x if path is None else _alike(path.at(k), x)
         found = None
         for _ in range(iterations):
             # Each iteration takes the readings into the prediction x, h linearised about the
             # states that the last one found.
-            R = rule.mean(partial(model.R_at, k=k), *at) if model.R_by_state else model.R(k)
+            if model.R_by_state:
+                R = rule.mean(partial(model.R_at, k=k), at.mean, at.covariance)
+            else:
+                R = model.R(k)
             read = linearised_reading(model, rule, k, z[:, k], at)
             found = update(x, read, R, z[:, k])
             at = found.x
         assert found is not None
+        if isinstance(x, Rooted):
+            steps.append(_step(x, move, G, found))
         x = out.note(k, found)
+    if isinstance(start, Rooted):
+        out.chain = Chain(np.arange(len(z)), start, steps)
     calls_of_f = rule.calls(model.n, bool(model.state_periods))
     calls_of_h = rule.calls(model.n, bool(model.periods))
     out.calls += calls_of_f * len(out.moves) + calls_of_h * iterations * model.epochs

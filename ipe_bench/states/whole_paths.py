@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ipe_bench.basics.batches import take
 from ipe_bench.basics.linalg import Array, Mask, multiply
 from ipe_bench.engine.chains import filtered_chains, smoothed_chains, solve_chains
 from ipe_bench.engine.rows import products
@@ -21,6 +22,7 @@ from ipe_bench.states.algebra import (
     transposed,
 )
 from ipe_bench.states.base import StateModel
+from ipe_bench.states.roots import precise, solved_by_roots
 
 _REACHED = 1e-9
 """Part of a state by which a path may miss the range of its noise or of the prior: round-off of a
@@ -28,9 +30,9 @@ solve."""
 _AS_GOOD = 1e-6
 """Part of a cost by which it may rise where whole turns are taken from a path: round-off of large
 angles."""
-_LEFT = 1e-6
-"""Part of a variance that readings leave, below which a difference of both has lost too many
-digits."""
+_ROUNDED = 1e8
+"""Deviation of what is read, in parts of that of its reading, above which steps by multipliers are
+round-off."""
 
 
 @dataclass(frozen=True)
@@ -259,7 +261,24 @@ class PathDensity:
         # The right sides: m0 - x0, then -d_k, and H' R^-1 r = B' v.
         a = np.concatenate([self.model.prior.mean - at.x[:, :1], -at.gap], axis=1)
         D = np.zeros_like(a) if damping is None else damping
-        return solve_chains(tangents.A, tangents.B, D, self.noise, a, at.residual)
+        v = at.residual
+        x = solve_chains(tangents.A, tangents.B, D, self.noise, a, v)
+        rows = self._rounded(tangents)
+        if rows.size:
+            of = take(tangents, rows)
+            x[rows] = solved_by_roots(of.A, of.B, D[rows], self.noise, a[rows], v[rows])
+        return x
+
+    def _rounded(self, tangents: Tangents) -> NDArray[np.intp]:
+        """Returns the trials whose steps by multipliers are round-off: readings are so precise
+        beside what is known without any."""
+        largest = np.abs(tangents.B).max(axis=(1, 2, 3)) * np.abs(self.noise).max()
+        rows = np.flatnonzero(largest > _ROUNDED)
+        if not rows.size:
+            return rows
+        of = take(tangents, rows)
+        blind = self.blind_variances(of)
+        return rows[precise(of.B, blind[:, 1:], np.ones(of.B.shape[:3]), _ROUNDED**2)]
 
     def filtered(self, tangents: Tangents) -> Array:
         """Computes the covariances (trials, 1 + K, n, n) of the affine model's states by the

@@ -271,3 +271,57 @@ def test_exact_readings_are_refused():
         match="R of epoch 3 is singular; give every reading a standard deviation above 0",
     ):
         StateScenario(ExactLater())
+
+
+def least_squares(X, z):
+    """The coefficients of X (K, n) that fit z best, in fractions."""
+    X, z = np.vectorize(Fraction)(X), np.vectorize(Fraction)(z)
+    return inverse(X.T.dot(X)).dot(X.T.dot(z))
+
+
+WIDE = {
+    "ekf": ekf(),
+    "ukf": ukf(),
+    "iplf": Filter(Cubature(), 3),
+    "ekf_rts": Smoother(ekf()),
+    "ckf_rts": Smoother(ckf()),
+    "ieks": IteratedSmoother(ekf(), Taylor(), 4),
+    "ipls": IteratedSmoother(ukf(), Cubature(), 4),
+    "lm": LevenbergMarquardtSmoother(starts=0),
+}
+
+
+@pytest.mark.parametrize(("spread", "deviation"), [(1e6, 1e-2), (1e6, 1e-6)])
+@pytest.mark.parametrize("label", WIDE)
+def test_a_wide_prior_costs_no_digits_of_what_precise_readings_leave(label, spread, deviation):
+    """A line through ten readings, of which the prior says nothing: its last state is as uncertain
+    as that of least squares, and a smoother's path is their line."""
+    model = ib.states.Formulas(
+        next={"p": "p + v", "v": "v"},
+        readings={"z": "p"},
+        deviation={"z": deviation},
+        spread={"p": spread, "v": spread},
+        count=10,
+    )
+    z = model.draw(0, 2).z
+    # Its value at the last reading, and its slope.
+    X = np.stack([np.ones(10), np.arange(-9.0, 1.0)], axis=1)
+    P = deviation**2 * np.linalg.inv(X.T @ X)
+    size = np.sqrt(np.diagonal(P))
+    line = np.array([[float(c) for c in least_squares(X, one)] for one in z[:, :, 0]])
+    # Readings of ten million to a millionth hold three digits of their deviation.
+    digits = 5e-2 if deviation < 1e-3 else 1e-5
+    tracks = WIDE[label].track(model, z)
+    far = digits + WIDE[label].smooths * 1e-2 * (label == "lm")
+    np.testing.assert_allclose((tracks.mean[:, -1] - line) / size, 0.0, atol=far)
+    scaled = tracks.covariance[:, -1] / np.outer(size, size)
+    np.testing.assert_allclose(scaled, [P / np.outer(size, size)] * 2, atol=digits)
+    if WIDE[label].smooths:
+        back = np.array([[1.0, -10.0], [0.0, 1.0]])
+        begun = back @ P @ back.T
+        scaled = tracks.start.covariance / np.sqrt(np.outer(np.diag(begun), np.diag(begun)))
+        exact = begun / np.sqrt(np.outer(np.diag(begun), np.diag(begun)))
+        np.testing.assert_allclose(scaled, [exact] * 2, atol=digits)
+    alone = WIDE[label].track(model, z[1:])
+    assert np.array_equal(alone.mean[0], tracks.mean[1])
+    assert np.array_equal(alone.covariance[0], tracks.covariance[1])
