@@ -648,6 +648,7 @@ def test_a_row_per_setting_has_its_error_and_the_share_of_misfits_detected():
     assert told == [f"{n}: detected in {s}\u00a0%" for n, s in zip(names, shares, strict=True)]
     assert len(drawing.caption.split()) <= 30
     drawing.figure.draw_without_rendering()
+    assert all(text.get_bbox_patch() for text in ax.texts)  # no line crosses a letter
     boxes = [text.get_window_extent() for text in ax.texts]
     assert min(box.x0 for box in boxes) >= 0
     assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))

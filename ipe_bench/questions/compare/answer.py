@@ -35,7 +35,11 @@ _TITLES = {"error": "mean error", "honesty": "mean NEES", "cost": "mean cost", "
 cost."""
 _WORDS = ("", "second is")
 """Titles of the columns that hold no numbers."""
-_FOUND = ("better", "worse")
+_FOUND = ("better", "worse", "perhaps better", "perhaps worse")
+"""Words of a title."""
+_DECIDED = 0.01
+"""The corrected p below which a title has no perhaps, so that it is false for one in a hundred
+comparisons of equals."""
 _AS = {"success": "", "bias": ""}
 """What stands before a change: nothing before a difference, a sign before a ratio."""
 _FAILING = ("success", "error")
@@ -135,13 +139,17 @@ def finding(frame: pd.DataFrame) -> str:
     for word in _FOUND:
         extents = []
         for each in by_quantity.values():
-            found = [row for row in each if _verdict(row) == word]
+            found = [row for row in each if _said(row) == word]
             extents += [_extent(found, len(each), interval)] if found else []
         if extents:
             clauses.append(f"{word} in {', '.join(extents)}")
     tested = [_TITLES.get(quantity, quantity) for quantity in by_quantity]
     nothing = f"no change beyond its margin is decided in {enumerate_few(tested)}"
     return f"{_who(frame)}: {'; '.join(clauses) or (nothing if tested else 'not tested')}"
+
+
+def _said(row: dict[str, Any]) -> str:
+    return f"{'' if row['p'] < _DECIDED else 'perhaps '}{_verdict(row)}"
 
 
 def _who(frame: pd.DataFrame) -> str:

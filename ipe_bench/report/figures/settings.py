@@ -142,13 +142,14 @@ def _write(ax: Any, rows: pd.DataFrame, look: Mapping[str, Look]) -> int:
     for i, (name, one) in enumerate(look.items()):
         row: Any = rows.loc[name]
         style: Any = {"color": one.color, "textcoords": "offset points", "annotation_clip": False}
+        # Behind letters no line is seen.
+        style |= {"bbox": {"facecolor": WHITE, "edgecolor": "none", "pad": 1.0}}
         at = min(row["error_median"], _MOST_ERROR)
         if np.isfinite(at):
             ax.annotate(brief(row["error_median"]), (at, i), xytext=(0, -12), ha="center", **style)
         told = f"{name}: detected in {percent(row['misfit'])}".replace(" %", "\u00a0%")
         lines = textwrap.wrap(told, _LETTERS)
         above: Any = {"xycoords": ("axes fraction", "data"), "xytext": (2, 6), "va": "bottom"}
-        above |= {"bbox": {"facecolor": WHITE, "edgecolor": "none", "pad": 1.0}}
         ax.annotate("\n".join(lines).replace("$", r"\$"), (0, i), **above, **style)
         most = max(most, len(lines))
     return most
