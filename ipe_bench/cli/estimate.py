@@ -38,13 +38,15 @@ def estimate_command(arguments: Sequence[str]) -> int:
         return _track(asked, asked.spec.state_model)
     question = asked.spec.question(asked.words.keys).checked()
     files = question.readings
-    command = {  # what was asked for, not what the file holds today
-        "readings": [str(path.resolve()) for path in files] if isinstance(files, tuple) else None,
+    readings = [str(path.resolve()) for path in files] if isinstance(files, tuple) else None
+    command: dict[str, Any] = {  # what was asked for, not what the file holds today
+        "readings": readings,
         "scenario": describe(question.scenario),
         "prior": question.has_prior,
         "estimators": _described(question.estimators),
-        **({"left_out": list(question.ignored)} if question.ignored else {}),
     }
+    if question.ignored:
+        command["left_out"] = list(question.ignored)
     parts = [question.scenario, *question.estimators.values()]
     provenance = _provenance(asked, question.found.files, parts)
     drawn = asked.spec.figures != "none"

@@ -119,7 +119,8 @@ def of(*kinds: str) -> tuple[str, ...]:
     return tuple(key.name for key in ROWS if key.kind in kinds)
 
 
-OF_FILES, OF_STATES = of("files"), of("moving")
+OF_FILES = of("files")
+OF_STATES = of("moving")
 OF_CONSTANTS = (*of("still", "estimators"), "write_readings")
 SETTING_NOTHING = ("hydra", *of("trials", "run", "figures", "files", "folder"))
 """Keys that change no setting, or add trials to it: no part of a folder's name."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.cli import print_problems, say, show
@@ -20,37 +21,51 @@ def list_command(names: Sequence[str], verbose: bool) -> int:
     """Prints one line per option of each group, with its own options if `verbose`; for GROUP/NAME
     only that option."""
     print_problems(plugins.take_problems())
-    known = [*plugins.groups(), *({"statistic", "figure"} - set(plugins.groups()))]
-    for name in names or plugins.groups():
+    groups = plugins.groups()
+    known = {*groups, "statistic", "figure"}
+    for name in names or groups:
         group, slash, option = name.partition("/")
         if group not in known:
             homes = " or ".join(f"{o.group}/{o.name}" for o in plugins.options() if o.name == name)
             remedy = f"write {homes}" if homes else unknown(group, known, "group")
             raise UserError(f"{name}: {_GONE.get(name, remedy)}")
-        options, ours = {o.name: o for o in plugins.options(group)}, _ours(group)
-        if slash and option not in {**options, **ours}:
-            raise UserError(f"{name}: {unknown(option, [*options, *ours], 'option')}")
-        if slash and option in ours:
+        options = {one.name: one for one in plugins.options(group)}
+        ours = _ours(group)
+        if not slash:
+            _list(group, options, ours, verbose)
+        elif option in ours:
             say(f"{name}  {ours[option]}")
-            continue
-        if slash:
+        elif option in options:
             _describe(options[option])
-            continue
-        rows = [(name, text.partition(". ")[0], "built in") for name, text in ours.items()]
-        rows += [(o.name, o.summary, o.source.origin) for o in options.values()]
-        for origin, part in itertools.groupby(rows, lambda row: row[2]):
-            names_here, texts, _ = zip(*part, strict=True)
-            title = group if origin == "built in" else f"{group}, from {origin}"
-            _show(title, {"option": names_here, "what it is": texts})
-        print()
-        for one in (
-            options.values() if verbose else [o for o in options.values() if o.fault is not None]
-        ):
-            try:
-                _describe(one)
-            except UserError as error:
-                print_problems([str(error)])
+        else:
+            raise UserError(f"{name}: {unknown(option, [*options, *ours], 'option')}")
     return 0
+
+
+class _Row(NamedTuple):
+    option: str
+    meaning: str
+    origin: str
+
+
+def _list(
+    group: str, options: Mapping[str, plugins.Option], ours: Mapping[str, str], verbose: bool
+) -> None:
+    rows = [_Row(name, text.partition(". ")[0], "built in") for name, text in ours.items()]
+    rows += [_Row(one.name, one.summary, one.source.origin) for one in options.values()]
+    for origin, several in itertools.groupby(rows, lambda row: row.origin):
+        part = list(several)
+        title = group if origin == "built in" else f"{group}, from {origin}"
+        meanings = [row.meaning for row in part]
+        _show(title, {"option": [row.option for row in part], "what it is": meanings})
+    print()
+    for one in options.values():
+        if not verbose and one.fault is None:
+            continue
+        try:
+            _describe(one)
+        except UserError as error:
+            print_problems([str(error)])
 
 
 def _ours(group: str) -> dict[str, str]:
@@ -68,16 +83,8 @@ def _ours(group: str) -> dict[str, str]:
 
 
 def _show(title: str, columns: Mapping[str, Sequence[str]]) -> None:
-    show(
-        [
-            Table(
-                "list",
-                title,
-                "",
-                [words(heading, list(cells)) for heading, cells in columns.items()],
-            )
-        ]
-    )
+    shown = [words(heading, list(cells)) for heading, cells in columns.items()]
+    show([Table("list", title, "", shown)])
 
 
 def _describe(option: plugins.Option) -> None:
@@ -88,7 +95,8 @@ def _describe(option: plugins.Option) -> None:
     if option.group in plugins.PACKAGES:
         prefix = f"{plugins.PACKAGES[option.group]}.{option.label}."
     title = f"{option.group}={option.name}  {option.summary}"
-    if rows := described(option):
+    rows = described(option)
+    if rows:
         columns = {
             "key": [f"{prefix}{row.name}" for row in rows],
             "value": [row.value for row in rows],

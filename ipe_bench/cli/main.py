@@ -91,7 +91,8 @@ def _explain(error: BaseException, command: Sequence[str]) -> tuple[int, str]:
         kept = "what was computed is kept, and the same command goes on from there"
         return 130, f"stopped; {kept if command == ['run'] else 'the same command begins anew'}"
     if isinstance(error, UserError | StorageError):
-        return 2 if isinstance(error, UserError) else 1, " ".join(str(error).split())
+        code = 2 if isinstance(error, UserError) else 1
+        return code, " ".join(str(error).split())
     if isinstance(error, OSError):
         reason = error.strerror or str(error)
         where = "a file" if error.filename is None else shortened(str(error.filename))
@@ -119,32 +120,33 @@ def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
 def _dispatch(words: list[str]) -> int:
     command, *rest = words or ["--help"]
     if command == "help" and rest:
-        command, rest = rest[0], ["--help"]
+        command = rest[0]
+        rest = ["--help"]
     if command in ("-h", "--help", "help"):
         program().print_help()
         return 0
     if command == "--version":
         print(f"ipe-bench {__version__}")
         return 0
-    if command in (
-        "-sc",
-        "--shell-completion",
-    ):  # asked of the bare program; only `run` has anything to complete
-        command, rest = "run", words
+    # This is asked of the bare program; only `run` has anything to complete.
+    if command in ("-sc", "--shell-completion"):
+        command = "run"
+        rest = words
     if command in GONE:
         raise UserError(f"{command}: is no command any more; {GONE[command]}")
     if command not in COMMANDS:
-        known, noun = (
-            (("--help", "--version"), "flag") if command.startswith("-") else (COMMANDS, "command")
-        )
-        raise UserError(f"{command}: {unknown(command, known, noun)}")
+        remedy = unknown(command, COMMANDS, "command")
+        if command.startswith("-"):
+            remedy = unknown(command, ("--help", "--version"), "flag")
+        raise UserError(f"{command}: {remedy}")
     parser = parser_of(command)
     if any(word in ("-h", "--help") for word in rest):
         parser.print_help()
         return 0
     if command in QUESTIONS:
         return question_command(command, parser.parse(without_flags(command, rest)).arguments)
-    begin = getattr(
-        importlib.import_module(f"ipe_bench.cli.{HOMES[command]}"), f"{command}_command"
-    )
-    return begin(rest) if command == "run" else begin(**vars(parser.parse(rest)))
+    module = importlib.import_module(f"ipe_bench.cli.{HOMES[command]}")
+    begin = getattr(module, f"{command}_command")
+    if command == "run":
+        return begin(rest)
+    return begin(**vars(parser.parse(rest)))

@@ -254,7 +254,8 @@ class Parser(argparse.ArgumentParser):
         values, surplus = self.parse_known_intermixed_args(words)
         if not surplus:
             return values
-        word, (flag, equals, _) = surplus[0], surplus[0].partition("=")
+        word = surplus[0]
+        flag, equals, _ = word.partition("=")
         if self.command == "run" and flag in ("-cp", "--config-path", "-cn", "--config-name"):
             remedy = (
                 "put options and experiments of your own into a folder and name it with"
@@ -263,17 +264,13 @@ class Parser(argparse.ArgumentParser):
             raise UserError(f"run: {word}: is no flag any more; {remedy}")
         flags = [flag for action in self._actions for flag in action.option_strings]
         takes_keys = equals or any(action.metavar == "KEY=VALUE" for action in self._actions)
-        if (
-            word.startswith("-" if equals else "--")
-            and takes_keys
-            and flag.lstrip("-").isidentifier()
-        ):
-            after = list(words)[list(words).index(word) + 1 :]
-            value = (
-                after[0]
-                if after and "=" not in after[0] and not after[0].startswith("-")
-                else "VALUE"
-            )
+        dashes = "-" if equals else "--"
+        if takes_keys and word.startswith(dashes) and flag.lstrip("-").isidentifier():
+            place = list(words).index(word)
+            after = list(words[place + 1 :])
+            value = "VALUE"
+            if after and "=" not in after[0] and not after[0].startswith("-"):
+                value = after[0]
             said = word.lstrip("-") if equals else f"{word[2:]}={value}"
             meant = did_you_mean(flag, flags) or f"; keys have no dashes: write {said}"
             raise UserError(f"{self.command}: {word}: there is no such flag{meant}")
@@ -299,10 +296,11 @@ def program() -> Parser:
 def parser_of(name: str) -> Parser:
     """Builds the parser of a command."""
     what, codes, more, arguments = COMMANDS[name] or _of_question(name)
+    line = textwrap.fill(f"ipe-bench {name}: {what}", 80)
     epilog = textwrap.fill(f"Exit codes: {codes}; 2 wrong arguments.", 80) if codes else None
     found = Parser(
         prog=f"ipe-bench {name}",
-        description=f"{textwrap.fill(f'ipe-bench {name}: {what}', 80)}\n{more}",
+        description=f"{line}\n{more}",
         epilog=epilog,
     )
     for names, options in arguments.items():
@@ -312,9 +310,5 @@ def parser_of(name: str) -> Parser:
 
 def _of_question(name: str) -> tuple[str, str, str, Arguments]:
     record = question(name)
-    return (
-        QUESTIONS[name].line,
-        record.codes,
-        record.more,
-        {"arguments": _several(*record.argument)},
-    )
+    arguments = {"arguments": _several(*record.argument)}
+    return QUESTIONS[name].line, record.codes, record.more, arguments

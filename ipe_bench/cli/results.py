@@ -39,8 +39,10 @@ def bundle_command(arguments: Sequence[str]) -> int:
     if checked:
         found = read_bundle(paths[0])
     else:
-        path = Path(keys.get("output", paths[0].with_name(paths[0].resolve().name)))
-        found = write_bundle(paths, path.with_name(path.name.removesuffix(SUFFIX) + SUFFIX))
+        beside = paths[0].with_name(paths[0].resolve().name)
+        path = Path(keys.get("output", beside))
+        path = path.with_name(path.name.removesuffix(SUFFIX) + SUFFIX)
+        found = write_bundle(paths, path)
         problems = Results.read(paths).problems
         print_problems(problems)
     held = (
@@ -83,10 +85,9 @@ def _states(directory: str, cells: Sequence[CellState]) -> Table:
         words("estimator", ["(truth)" if name == TRUTH else name for name in names]),
         texts("done", [f"{cell.done} of {cell.expected or cell.done}" for cell in cells]),
     ]
-    counts = ("missing", "failed", "stale")
-    columns += [
-        texts(count, [str(getattr(cell, count) or "") for cell in cells]) for count in counts
-    ]
+    for count in ("missing", "failed", "stale"):
+        numbers = [getattr(cell, count) for cell in cells]
+        columns.append(texts(count, [str(number or "") for number in numbers]))
     return Table("status", directory, "", columns, grouped=1)
 
 
@@ -98,14 +99,16 @@ def report_command(arguments: Sequence[str]) -> int:
     output = Path(keys["output"]) if "output" in keys else None
     if not named:
         raise UserError("report: name at least one directory of results, such as outputs/paper")
-    if output is None and (bundles := [name for name in named if is_bundle(name)]):
-        raise UserError(
-            f"report: {bundles[0]}: is a bundle; say where the report goes with output=DIR"
-        )
-    if output is None and len(named) > 1 and not for_paper:
-        raise UserError(
-            "report: several directories need output=DIR, for the report on all of them"
-        )
+    if output is None:
+        bundles = [name for name in named if is_bundle(name)]
+        if bundles:
+            raise UserError(
+                f"report: {bundles[0]}: is a bundle; say where the report goes with output=DIR"
+            )
+        if len(named) > 1 and not for_paper:
+            raise UserError(
+                "report: several directories need output=DIR, for the report on all of them"
+            )
     with opened(named, None if output is None else output / BUNDLES) as folders:
         if for_paper:
             return _paper(folders, keys)
@@ -130,11 +133,9 @@ def show_report(
     pending = begin_report(folders, output, figures=figures, formats=formats)
     begun = pending.begun
     collection = shown = begun.collection
-    others = (
-        sum(cell.key not in cells and cell.label != TRUTH for cell in collection.current)
-        if cells
-        else 0
-    )
+    others = 0
+    if cells:
+        others = sum(cell.key not in cells and cell.label != TRUTH for cell in collection.current)
     if cells and others:
         shown = collect(folders, cells.keys())
         begun = Begun(shown)
@@ -154,9 +155,12 @@ def show_report(
                 f"{output}: {number} of other commands; `ipe-bench status {output}` lists them"
             )
     print_problems(told)
-    drawn = f"\nFigures  {output / 'figures'}" if any(output.glob("figures/*.png")) else ""
-    if drawn and (left_out := drawn_settings(collection.settings, figures)[1]):
-        drawn += f" ({left_out})"
+    drawn = ""
+    if any(output.glob("figures/*.png")):
+        drawn = f"\nFigures  {output / 'figures'}"
+        left_out = drawn_settings(collection.settings, figures)[1]
+        if left_out:
+            drawn += f" ({left_out})"
     say(
         f"\nSummary  {output / 'summary.csv'}\nTables   {output / 'tables'}{drawn}\nReport  "
         f" {output / 'report.html'}"
@@ -201,13 +205,7 @@ def _paper(folders: Sequence[Path], keys: Mapping[str, Any]) -> int:
     faults = use_statistics()
     analysis = analyse(folders)
     analysis.collection.extra_problems += faults
-    say(
-        *map(
-            str,
-            export(
-                analysis, Path(keys.get("output", folders[0] / "paper")), keys["paper"], **chosen
-            ),
-        )
-    )
+    output = Path(keys.get("output", folders[0] / "paper"))
+    say(*map(str, export(analysis, output, keys["paper"], **chosen)))
     print_problems([*analysis.collection.problems, *analysis.collection.stale])
     return 1 if analysis.collection.problems else 0

@@ -59,10 +59,8 @@ class Outcome:
     def job(self) -> str:
         """Words that may tell the job from the others of a sweep, or the name of its folder."""
         words = [word.lstrip("+~").replace(w.HYDRAS_TRUTH, w.TRUTH) for word in self.words]
-        return (
-            ", ".join(word for word in words if re.split("[.=]", word)[0] not in _NOT_TELLING)
-            or Path(self.output).name
-        )
+        telling = [word for word in words if re.split("[.=]", word)[0] not in _NOT_TELLING]
+        return ", ".join(telling) or Path(self.output).name
 
     def label(self, command: str) -> str:
         """Returns the words that the sweep of a command gives to this job, or `job` where there is
@@ -109,9 +107,8 @@ def run_command(arguments: Sequence[str]) -> int:
         say(*_there_already(jobs))
         if words.standard_baselines:
             say(*_left_out(jobs.specs))
-        task = Task(
-            shlex.join(["ipe-bench", "run", *arguments]), words.files, words.standard_baselines
-        )
+        typed = shlex.join(["ipe-bench", "run", *arguments])
+        task = Task(typed, words.files, words.standard_baselines)
         if jobs.told:
             for told, spec in zip(jobs.told, jobs.specs, strict=True):
                 task.compute(told, spec)
@@ -121,23 +118,27 @@ def run_command(arguments: Sequence[str]) -> int:
 
 def _missing(jobs: Jobs) -> list[str]:
     """Lists what is stored of each job and what is missing, a line each, and the sums."""
-    lines, stored, missing = [], 0, 0
+    lines = []
+    stored = 0
+    missing = 0
     # The words of a job are not known where a sweeper of Hydra's chooses them.
-    for told, job in zip(jobs.told or [jobs.words.text] * len(jobs.specs), jobs.specs, strict=True):
+    told_of = jobs.told or [jobs.words.text] * len(jobs.specs)
+    for told, job in zip(told_of, jobs.specs, strict=True):
         validate([job.scenario], job.estimators, job.count, job.block_size)
-        cells, output = result_keys(job.scenario, job.estimators)[1:], Path(job.output)
-        results = Results.read(
-            [output] if output.is_dir() else [], keys={cell.key for cell in cells}
-        )
-        lacking = sum(
-            stop - start for cell in cells for start, stop in results.missing(cell.key, job.count)
-        )
+        cells = result_keys(job.scenario, job.estimators)[1:]
+        output = Path(job.output)
+        folders = [output] if output.is_dir() else []
+        results = Results.read(folders, keys={cell.key for cell in cells})
+        lacking = 0
+        for cell in cells:
+            lacking += sum(stop - start for start, stop in results.missing(cell.key, job.count))
         asked = job.count * len(cells)
         most = "" if job.precision is None else "at most "
         more = f", {most}{lacking} are missing" if lacking else ""
         name = Outcome(job.output, w.as_typed(told, jobs.words.files)).job
         lines.append(f"{name}: {asked - lacking} of {asked} estimates are stored{more}")
-        stored, missing = stored + asked - lacking, missing + lacking
+        stored += asked - lacking
+        missing += lacking
     return [
         *lines,
         f"{stored} estimates are stored, {missing} would be computed; none was computed now",
@@ -148,20 +149,20 @@ def _there_already(jobs: Jobs) -> list[str]:
     """Warns of each folder that holds results of other commands; refuses the name of another
     experiment."""
     lines = []
-    for output in dict.fromkeys(job.output for job in jobs.specs if job.write_readings is None):
+    outputs = [job.output for job in jobs.specs if job.write_readings is None]
+    for output in dict.fromkeys(outputs):
         found = Results.read([output], keys=()).runs if (Path(output) / "runs").is_dir() else ()
-        there = {
-            one["identity_key"]
-            for run in found
-            for one in run["cells"]
-            if one["names"]["estimator"] != TRUTH
-        }
+        there: set[str] = set()
+        for run in found:
+            cells = [one for one in run["cells"] if one["names"]["estimator"] != TRUTH]
+            there |= {one["identity_key"] for one in cells}
         for job in jobs.specs:
             there -= {cell.identity_key for cell in result_keys(job.scenario, job.estimators)}
         if there:
             held = f"{counted(len(there), 'result')} of other settings or older code"
             lines.append(f"{output}: holds {held}; they stay beside the new")
-    name, own = jobs.words.chosen("name"), jobs.words.chosen("experiment")
+    name = jobs.words.chosen("name")
+    own = jobs.words.chosen("experiment")
     if name != own and name in [option.name for option in options("experiment")]:
         remedy = f"choose another, or write output=outputs/{name} in its place to mix them"
         raise UserError(
@@ -172,25 +173,19 @@ def _there_already(jobs: Jobs) -> list[str]:
 
 def _left_out(jobs: Sequence[Spec]) -> list[str]:
     """Names the standard filters that do not suit every job."""
-    lacking = [
-        job
-        for job in jobs
-        if job.state_model is None and not set(STANDARD_FILTERS) <= job.estimators.keys()
-    ]
-    models = dict.fromkeys(job.measurement.name for job in lacking)
+    of_constants = [job for job in jobs if job.state_model is None]
+    lacking = [job for job in of_constants if not job.estimators.keys() >= set(STANDARD_FILTERS)]
+    if not lacking:
+        return []
+    models = ", ".join(dict.fromkeys(job.measurement.name for job in lacking))
     filters = " and ".join(STANDARD_FILTERS)
-    return (
-        [f"{filters} are left out for {', '.join(models)}: filters need epochs and a prior"]
-        if models
-        else []
-    )
+    return [f"{filters} are left out for {models}: filters need epochs and a prior"]
 
 
 def _flags(arguments: Sequence[str]) -> Namespace:
     flags = parser_of("run").parse(arguments)
-    asked = [
-        f"--{name}" for name in ("multirun", "cfg", "info", "shell_completion") if vars(flags)[name]
-    ]
+    apart = ("multirun", "cfg", "info", "shell_completion")
+    asked = [f"--{name}" for name in apart if vars(flags)[name]]
     if len(asked) > 1:
         raise UserError(f"run: {' '.join(asked).replace('_', '-')}: do not go together; choose one")
     if flags.resolve and not flags.cfg:
@@ -218,20 +213,19 @@ class Task:
         """Computes a job that Hydra has composed and launched."""
         hydra = HydraConfig.get()
         # Where a launcher plugin (joblib, submitit) runs the jobs, the cores are its to share out.
-        elsewhere = hydra.mode == RunMode.MULTIRUN and not hydra.launcher["_target_"].endswith(
-            ".BasicLauncher"
-        )
+        ours = hydra.launcher["_target_"].endswith(".BasicLauncher")
+        words = hydra.overrides.task
         try:
             spec = spec_of(config)
         except UserError as error:
-            self.outcomes.append(
-                Outcome(str(config.output), tuple(hydra.overrides.task), mistake=str(error))
-            )
-            return self.outcomes[-1]
-        spec = spec.suited() if self.standard else spec
-        return self.compute(
-            hydra.overrides.task, replace(spec, execution=Serial()) if elsewhere else spec
-        )
+            refused = Outcome(str(config.output), tuple(words), mistake=str(error))
+            self.outcomes.append(refused)
+            return refused
+        if self.standard:
+            spec = spec.suited()
+        if hydra.mode == RunMode.MULTIRUN and not ours:
+            spec = replace(spec, execution=Serial())
+        return self.compute(words, spec)
 
     def compute(self, words: Sequence[str], spec: Spec) -> Outcome:
         """Computes a job."""
@@ -274,36 +268,36 @@ def _computed(job: Spec, begun: Outcome, command: str) -> Outcome:
     if job.objective is not None:
         from ipe_bench.statistics.stopping import objective
 
-        done = replace(
-            done, objective=objective(job.scenario, job.estimators, *job.aim, job.output)
-        )
-    cells = {
-        one.key: describe_names(one.names) for one in result_keys(job.scenario, job.estimators)
-    }
-    return replace(done, cells=cells)
+        value = objective(job.scenario, job.estimators, *job.aim, job.output)
+        done = replace(done, objective=value)
+    keys = result_keys(job.scenario, job.estimators)
+    return replace(done, cells={one.key: describe_names(one.names) for one in keys})
 
 
 def _conclude(jobs: Jobs, outcomes: list[Outcome]) -> int:
     """Shows the outcomes of the jobs; returns the exit code."""
     end_idle()  # a report on many trials has use for their memory
-    first, refused = jobs.specs[0], [one for one in outcomes if one.mistake]
+    first = jobs.specs[0]
+    refused = [one for one in outcomes if one.mistake]
     if jobs.multirun and first.write_readings is None:
         known = jobs.specs if len(jobs.specs) == len(outcomes) else [None] * len(outcomes)
         for one, spec in zip(outcomes, known, strict=True):
             if one.mistake:
                 parts: Any = () if spec is None else (spec.scenario, spec.estimators, spec.count)
                 record_refusal(one.output, one.job, one.mistake, *parts)
-    code = 1 if any(one.failures or one.precision_missed for one in outcomes) else 0
+    failed = any(one.failures or one.precision_missed for one in outcomes)
+    code = 1 if failed else 0
     folders: dict[str, dict[str, str]] = {}
     # Of jobs that a sweeper ran in other processes nothing is known but the folder.
     for one in outcomes or [Outcome(job.output) for job in jobs.specs]:
         folders.setdefault(one.output, {}).update(one.cells)
     for output, cells in folders.items():
         if (Path(output) / "trials").is_dir() and first.write_readings is None:
-            code = max(
-                code, show_report([Path(output)], Path(output), first.figures, first.formats, cells)
-            )
-    say(*dict.fromkeys(f"Note: {remark}" for one in outcomes for remark in one.remarks))
+            folder = Path(output)
+            shown = show_report([folder], folder, first.figures, first.formats, cells)
+            code = max(code, shown)
+    remarks = [remark for one in outcomes for remark in one.remarks]
+    say(*dict.fromkeys(f"Note: {remark}" for remark in remarks))
     say(*_best(outcomes, jobs.maximises), *(one.stop for one in outcomes if one.stop))
     if refused:
         raise UserError(_refused(refused, told=jobs.multirun and len(outcomes) > 1))
@@ -315,13 +309,13 @@ def _refused(outcomes: Sequence[Outcome], *, told: bool) -> str:
     which: dict[str, list[str]] = {}
     for one in outcomes:
         which.setdefault(one.mistake, []).append(one.job)
-    more = {
-        reason: f" and {len(jobs) - 1} more" if len(jobs) > 1 else ""
-        for reason, jobs in which.items()
-    }
-    return "; ".join(
-        f"{r} (refused: {jobs[0]}{more[r]})" if told else r for r, jobs in which.items()
-    )
+    if not told:
+        return "; ".join(which)
+    reasons = []
+    for reason, jobs in which.items():
+        more = f" and {len(jobs) - 1} more" if len(jobs) > 1 else ""
+        reasons.append(f"{reason} (refused: {jobs[0]}{more})")
+    return "; ".join(reasons)
 
 
 def _best(outcomes: Sequence[Outcome], maximises: bool) -> list[str]:
@@ -331,21 +325,21 @@ def _best(outcomes: Sequence[Outcome], maximises: bool) -> list[str]:
     if not known:
         return []
     best = (max if maximises else min)(known, key=float)
-    of = (
-        f", the {'greatest' if maximises else 'least'} of {len(known)} jobs"
-        if len(known) > 1
-        else ""
-    )
+    line = f"Objective {float(best):.6g}"
+    if len(known) > 1:
+        extreme = "greatest" if maximises else "least"
+        line += f", the {extreme} of {len(known)} jobs"
     common = set.intersection(*(set(one.words) for one in known))
     own = " ".join(word.lstrip("+") for word in best.words if word not in common)
-    return [f"Objective {float(best):.6g}{of}" + (own and f": {own}")]
+    return [f"{line}: {own}" if own else line]
 
 
 def write_trial(job: Spec, path: Path, trial: int) -> None:
     """Writes the simulated readings of one trial, and its true parameters beside them."""
     from ipe_bench.real.readings import write_readings, write_truth
 
-    drawn, model = job.scenario.draw(trial, trial + 1), job.scenario.measurement
+    drawn = job.scenario.draw(trial, trial + 1)
+    model = job.scenario.measurement
     truth = path.with_name(f"{path.stem}.truth.csv")
     if truth.exists():
         raise UserError(

@@ -64,7 +64,8 @@ def session(folder: Path | None = None) -> Iterator[None]:
                 f"{folder / name}: would replace ipe-bench's own config; move it to"
                 " experiment/NAME.yaml"
             )
-    store, registry = ConfigStore.instance(), Plugins.instance()
+    store = ConfigStore.instance()
+    registry = Plugins.instance()
     store.store("schema", node=DEFAULTS, provider="ipe-bench")
     for name in FORMULAS:
         node = {"_target_": "ipe_bench.measurements.Nist", "dataset": name}
@@ -128,7 +129,8 @@ def jobs_of(words: Words, *, multirun: bool) -> Jobs:
                 " that there"
             ]
         )
-    params = [f"{key}={value}" for key, value in (hydra.sweeper.get("params") or {}).items()]
+    swept = hydra.sweeper.get("params") or {}
+    params = [f"{key}={value}" for key, value in swept.items()]
     multirun = multirun or hydra.mode == RunMode.MULTIRUN or bool(params)
     optimises = not hydra.sweeper["_target_"].endswith(".BasicSweeper")
     for one in words.overrides:
@@ -146,34 +148,42 @@ def jobs_of(words: Words, *, multirun: bool) -> Jobs:
                 " give the values, such as 1,10,100"
             )
     if multirun and optimises:
-        return Jobs(
-            words, [spec_of(config)], True, "maximize" in str(hydra.sweeper.get("direction", ""))
-        )
-    jobs, specs = [list(words.overrides)], [spec_of(config)] if not multirun else []
+        maximises = "maximize" in str(hydra.sweeper.get("direction", ""))
+        return Jobs(words, [spec_of(config)], True, maximises)
     if multirun:
-        own = [OverridesParser.create().parse_override(word) for word in params]
-        jobs = list(itertools.islice(w.jobs([*own, *words.overrides]), w.MOST_JOBS + 1))
-        if not 0 < len(jobs) <= w.MOST_JOBS:
-            number = f"more than {w.MOST_JOBS}" if jobs else "no"
-            raise UserError(
-                f"the sweep has {number} jobs: give 1 to {w.MOST_JOBS}, and check its patterns"
-            )
+        jobs = _swept(words, params)
         specs = [_spec(job) for job in jobs]
+    else:
+        jobs = [list(words.overrides)]
+        specs = [spec_of(config)]
     told = any(one.is_hydra_override() for one in words.overrides)
-    ours = hydra.launcher["_target_"].endswith(".BasicLauncher") and not told
-    return Jobs(
-        words, specs, multirun, told=[list(map(w.forced, job)) for job in jobs] if ours else []
-    )
+    ours = hydra.launcher["_target_"].endswith(".BasicLauncher")
+    if told or not ours:
+        return Jobs(words, specs, multirun)
+    return Jobs(words, specs, multirun, told=[list(map(w.forced, job)) for job in jobs])
+
+
+def _swept(words: Words, params: Sequence[str]) -> list[list[Override]]:
+    """Returns the overrides of each job of a sweep, over `params` of an experiment, too."""
+    own = [OverridesParser.create().parse_override(word) for word in params]
+    jobs = list(itertools.islice(w.jobs([*own, *words.overrides]), w.MOST_JOBS + 1))
+    if not 0 < len(jobs) <= w.MOST_JOBS:
+        number = f"more than {w.MOST_JOBS}" if jobs else "no"
+        raise UserError(
+            f"the sweep has {number} jobs: give 1 to {w.MOST_JOBS}, and check its patterns"
+        )
+    return jobs
 
 
 def _spec(job: Sequence[Override]) -> Spec:
     """Checks one job: composed for its choices, then completed with its other values."""
-    config = copy.deepcopy(_composed(tuple(w.forced(one) for one in job if w.chooses(one))))
+    choices = tuple(w.forced(one) for one in job if w.chooses(one))
+    config = copy.deepcopy(_composed(choices))
     try:
-        for one in (one for one in job if not w.chooses(one)):
-            OmegaConf.update(
-                config, one.key_or_group, w.plain(one.value()), merge=True, force_add=True
-            )
+        for one in job:
+            if not w.chooses(one):
+                value = w.plain(one.value())
+                OmegaConf.update(config, one.key_or_group, value, merge=True, force_add=True)
     except Exception as error:
         raise explain(error) from error
     return spec_of(config)
@@ -244,20 +254,19 @@ def explain(error: BaseException) -> UserError:
         return UserError(plugins.explain_yaml(error))
     text = "\n".join(str(e) for e in (error, error.__cause__) if e is not None)
     for pattern, explained in _EXPLAINED:
-        if found := re.search(pattern, text):
+        found = re.search(pattern, text)
+        if found:
             return UserError(explained(*found.groups()))
     full_key = re.search(r"full_key: (\S+)", text)
-    lines = dict.fromkeys(line.strip() for line in text.splitlines() if line.strip())
-    kept = [
-        line
-        for line in lines
-        if not line.startswith(("object_type=", "full_key:", "reference_type=", "See "))
-    ]
+    lines = dict.fromkeys(line.strip() for line in text.splitlines())
+    kept = [line for line in lines if line and not line.startswith(_DETAILS)]
     where = f"{full_key.group(1)}: " if full_key else ""
     what = " ".join(kept) or describe_exception(error)
     return UserError(where + what)
 
 
+_DETAILS = ("object_type=", "full_key:", "reference_type=", "See ")
+"""How lines of OmegaConf begin that tell a user nothing."""
 _EXTRAS = ("joblib", "submitit", "optuna")
 """Launchers and sweepers that are extras of our own distribution."""
 _HYDRAS = ("ax", "nevergrad", "ray", "rq")
@@ -267,22 +276,20 @@ _HYDRAS = ("ax", "nevergrad", "ray", "rq")
 def _no_such_option(name: str) -> str:
     group, _, option = name.rpartition("/") if name.startswith("hydra/") else name.partition("/")
     if group in ("hydra/launcher", "hydra/sweeper"):
-        kind, first = (
-            group.partition("/")[2],
-            option.partition("_")[0],
-        )  # submitit_local is submitit's
+        kind = group.partition("/")[2]
+        first = option.partition("_")[0]  # submitit_local is submitit's
         packages = {name: f'"ipe-bench[{name}]"' for name in _EXTRAS}
         packages |= {name: f"hydra-{name}-{kind}" for name in _HYDRAS}
         remedy = f"pip install {packages[first]}, or " if first in packages else ""
         return f"{group}={option}: this {kind} is not installed; {remedy}choose basic"
-    return (
-        f"{group}={option}: {unknown(option, [o.name for o in plugins.options(group)], 'option')}"
-    )
+    known = [one.name for one in plugins.options(group)]
+    return f"{group}={option}: {unknown(option, known, 'option')}"
 
 
 def _no_such_key(name: str) -> str:
     known = {*KEYS, *plugins.groups(), "hydra"}
-    if (key := name.split(".")[0]) in known:
+    key = name.split(".")[0]
+    if key in known:
         return f"{name}: there is no such key; see `ipe-bench run --cfg job` for those there are"
     return f"{name}: {unknown(key, known, 'key')}"
 

@@ -31,8 +31,11 @@ class Single:
     @property
     def measurement(self) -> str:
         """Measurement model of the request."""
-        spec, group = self.spec, "measurement" if self.spec.state_model is None else "state_model"
-        model = spec.measurement if spec.state_model is None else spec.state_model
+        model = self.spec.measurement
+        group = "measurement"
+        if self.spec.state_model is not None:
+            model = self.spec.state_model
+            group = "state_model"
         if isinstance(model, Nist):
             return f"nist/{model.dataset.lower()}"
         return self.words.chosen(group) or model.name
@@ -42,12 +45,10 @@ class Single:
     ) -> AbstractContextManager[Path]:
         """Reserves the named folder, or one named after the command and the model, for a command
         that `identity` tells from others in NAME.json, and for its further `files`."""
-        output, named = Path(self.spec.output), not {"name", "output"}.isdisjoint(self.words.keys)
-        folder = (
-            output
-            if named
-            else output.with_name(f"{self.command}-{self.measurement.replace('/', '-')}")
-        )
+        folder = Path(self.spec.output)
+        named = not {"name", "output"}.isdisjoint(self.words.keys)
+        if not named:
+            folder = folder.with_name(f"{self.command}-{self.measurement.replace('/', '-')}")
         return reserved_folder(folder, name, identity, elsewhere=not named, files=files)
 
 
@@ -67,9 +68,8 @@ def single(
             words.refuse(
                 keys, f"is for `ipe-bench {whose}`, and has no meaning in `ipe-bench {command}`"
             )
-        given = w.read(
-            command, [one for one in standard if one.partition("=")[0] not in words.keys]
-        )
+        unsaid = [one for one in standard if one.partition("=")[0] not in words.keys]
+        given = w.read(command, unsaid)
         jobs = jobs_of(Words(given.overrides + words.overrides), multirun=False)
         require_one_kind(words, jobs.specs[0])
         model = jobs.specs[0].state_model
@@ -88,7 +88,11 @@ def require_one_kind(words: Words, spec: Spec) -> None:
         return
     why = "is of a measurement, and state_model= chooses states that move"
     words.refuse(OF_CONSTANTS, why)
-    for one in (one for one in words.overrides if one.key_or_group == "experiment"):
-        config, without = composed(Words((one,))), composed(Words(()))
-        if changed := [key for key in OF_CONSTANTS if config.get(key) != without.get(key)]:
-            raise UserError(f"{w.said(one)}: sets {changed[0]}, which {why}; leave out one of them")
+    for one in words.overrides:
+        if one.key_or_group != "experiment":
+            continue
+        config = composed(Words((one,)))
+        without = composed(Words(()))
+        for key in OF_CONSTANTS:
+            if config.get(key) != without.get(key):
+                raise UserError(f"{w.said(one)}: sets {key}, which {why}; leave out one of them")

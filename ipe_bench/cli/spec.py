@@ -111,7 +111,8 @@ class Spec(Component):
         from ipe_bench.statistics.statistic import frame_columns
 
         use_statistics()
-        columns = frame_columns([s for s in (*all_statistics(), *SCORES) if s.kind != "word"])
+        numbers = [one for one in (*all_statistics(), *SCORES) if one.kind != "word"]
+        columns = frame_columns(numbers)
         if not label:
             example = f"{next(iter(self.estimators), 'LABEL')}.capped_error"
             raise UserError(f"objective={self.objective}: write LABEL.COLUMN, such as {example}")
@@ -163,13 +164,13 @@ class Spec(Component):
         if isinstance(self.scenario, StateScenario):
             return self
         problem = self.scenario.problem
-        unsuited = {
-            label
-            for label in STANDARD_FILTERS
-            if (e := self.estimators.get(label)) and e.hindrance(problem)
-        }
-        kept = {label: one for label, one in self.estimators.items() if label not in unsuited}
-        return replace(self, estimators=kept) if unsuited else self
+        kept = dict(self.estimators)
+        for label in STANDARD_FILTERS:
+            if label in kept and kept[label].hindrance(problem):
+                del kept[label]
+        if len(kept) == len(self.estimators):
+            return self
+        return replace(self, estimators=kept)
 
     def question(self, stated: Collection[str]) -> Question:
         """Returns the question on real readings; `stated` are the keys that a user has given, so
@@ -209,11 +210,8 @@ def spec(plain: Mapping[Any, Any]) -> Spec:
     for key in plain:
         if key not in KEYS:
             raise UserError(f"{key}: {unknown(str(key), KEYS, 'key')}")
-    made = {
-        key: construct(value, key)
-        for key, value in plain.items()
-        if key not in ("estimators", "trackers", *PARTS)
-    }
+    apart = ("estimators", "trackers", *PARTS)
+    made = {key: construct(value, key) for key, value in plain.items() if key not in apart}
     for key, kind in PARTS.items():
         config = plain.get(key)
         if key in OPTIONAL and config is None:
@@ -227,9 +225,10 @@ def spec(plain: Mapping[Any, Any]) -> Spec:
     made["trackers"] = {}
     chosen = "estimators" if made["state_model"] is None else "trackers"
     known = [option for option in plugins.options() if plugins.PACKAGES.get(option.group) == chosen]
-    labelled = {
-        str(k): _labelled(chosen, str(k), one, known) for k, one in (plain[chosen] or {}).items()
-    }
+    labelled = {}
+    for name, options in (plain[chosen] or {}).items():
+        label = str(name)
+        labelled[label] = _labelled(chosen, label, options, known)
     made["estimators"] = {label: pinned(one) for label, one in labelled.items()}
     return instantiate(Spec, made, "")
 
@@ -241,11 +240,10 @@ def _labelled(key: str, label: str, options: Any, known: Sequence[plugins.Option
     if TARGET not in options:
         keys = ", ".join(f"{where}.{key}" for key in options) or where
         groups = {option.label: option.group for option in known}
-        remedy = (
-            f"add it, as in {groups[label]}=[{label}]"
-            if label in groups
-            else unknown(label, groups, "estimator")
-        )
+        if label in groups:
+            remedy = f"add it, as in {groups[label]}=[{label}]"
+        else:
+            remedy = unknown(label, groups, "estimator")
         raise UserError(f"{keys}: is set, but {label} is not chosen; {remedy}")
     for option in known:
         if option.label == label and option.target != str(options[TARGET]):
@@ -254,7 +252,8 @@ def _labelled(key: str, label: str, options: Any, known: Sequence[plugins.Option
             raise UserError(
                 f"{where}: is {options[TARGET]}, under the name of {name}; choose another label"
             )
-    return _of_kind(construct(options, where), where, Estimator if key == "estimators" else Tracker)
+    kind = Estimator if key == "estimators" else Tracker
+    return _of_kind(construct(options, where), where, kind)
 
 
 def _of_kind(part: Any, key: str, kind: type) -> Any:

@@ -82,10 +82,10 @@ class Words:
     def refuse(self, keys: Collection[str], why: str) -> None:
         """Refuses a word whose key is one of these, or below one."""
         for one in self.overrides:
-            if (first := _first(one)) in keys:
-                raise UserError(
-                    f"{one.key_or_group if '.' in one.key_or_group else first}: {why}; leave it out"
-                )
+            first = _first(one)
+            if first in keys:
+                named = one.key_or_group if "." in one.key_or_group else first
+                raise UserError(f"{named}: {why}; leave it out")
 
 
 def _first(override: Override) -> str:
@@ -141,7 +141,8 @@ def _groups(folder: Path | None) -> Groups:
     found: Groups = {}
     for option in plugins.options():
         found.setdefault(option.group, []).append(option.name)
-    for path in [] if folder is None else sorted(filter(Path.is_file, folder.glob("*/**/*.yaml"))):
+    files = [] if folder is None else filter(Path.is_file, folder.glob("*/**/*.yaml"))
+    for path in sorted(files):
         group, *name = path.relative_to(folder).with_suffix("").parts  # type: ignore[arg-type]
         found.setdefault(group, []).append("/".join(name))
     found["measurement"] += [f"nist/{name.lower()}" for name in FORMULAS]
@@ -176,8 +177,9 @@ def plain(value: Any) -> Any:
 
 def _expanded(word: str) -> list[str]:
     """Parses a word by Hydra's grammar, or the words of a file in its place."""
-    if found := _FILE.fullmatch(word):
-        return _from_file(found[1] or found[2], found[3], word)
+    file = _FILE.fullmatch(word)
+    if file:
+        return _from_file(file[1] or file[2], file[3], word)
     found = _TEXT.fullmatch(word)
     if found and not (found[1].endswith("unit") and re.search(r"[,\[\]{}]", found[2])):
         return [f"{found[1]}={_quoted(found[2])}"]
@@ -204,7 +206,8 @@ def options_of(group: str, content: Mapping[str, Any], where: str) -> list[str]:
 
 def _literal(value: Any, where: str) -> str:
     if isinstance(value, dict):
-        return "{" + ",".join(f"{k}:{_literal(v, where)}" for k, v in value.items()) + "}"
+        entries = [f"{key}:{_literal(one, where)}" for key, one in value.items()]
+        return "{" + ",".join(entries) + "}"
     if isinstance(value, list):
         return "[" + ",".join(_literal(v, where) for v in value) + "]"
     if isinstance(value, str):
@@ -221,14 +224,12 @@ def _quoted(text: str) -> str:
 def _parse(command: str, word: str, groups: Groups) -> Override:
     key, equals, value = word.partition("=")
     if not equals and not word.startswith("~"):
-        remedies = [
-            f"write {_choosing(group, word)}" for group, names in groups.items() if word in names
-        ]
+        homes = [group for group, names in groups.items() if word in names]
+        remedies = [f"write {_choosing(group, word)}" for group in homes]
         remedy = " or ".join(remedies) or f"see `ipe-bench {command} --help`"
         if Path(word).suffix in (".csv", ".parquet"):
-            remedy = (
-                f"write {'' if command == 'estimate' else 'ipe-bench estimate '}readings={word}"
-            )
+            program = "" if command == "estimate" else "ipe-bench estimate "
+            remedy = f"write {program}readings={word}"
         raise UserError(f"{word}: is not KEY=VALUE; {remedy}")
     try:
         found = OverridesParser.create().parse_override(word)
@@ -241,7 +242,8 @@ def _parse(command: str, word: str, groups: Groups) -> Override:
         ) from None
     if not found.key_or_group:
         raise UserError(f"{word}: there is no key in front of the value; write KEY=VALUE")
-    pattern, group = found.value(), found.key_or_group
+    pattern = found.value()
+    group = found.key_or_group
     if not isinstance(pattern, Glob) or group not in groups:
         return found
     # Hydra would look for the options of Python's own data sets in a folder.
@@ -249,14 +251,16 @@ def _parse(command: str, word: str, groups: Groups) -> Override:
     if not names:
         raise UserError(f"{word}: the sweep has no jobs: no option of {group} fits the pattern")
     one = "[{}]" if group in plugins.PACKAGES else "{}"
-    return OverridesParser.create().parse_override(f"{key}={','.join(map(one.format, names))}")
+    swept = ",".join(map(one.format, names))
+    return OverridesParser.create().parse_override(f"{key}={swept}")
 
 
 # Checking
 
 
 def _check(override: Override, groups: Groups) -> None:
-    group, word = override.key_or_group, said(override)
+    group = override.key_or_group
+    word = said(override)
     if group.startswith("hydra.sweeper.params"):
         key = group.removeprefix("hydra.sweeper.params").lstrip(".")
         swept = f"{key}={word.partition('=')[2]}" if key else "error_scale=VALUE,VALUE"
@@ -312,16 +316,19 @@ def _by_label(group: str, word: str) -> str:
     _, name, *path = key.split(".")
     if not path:
         return f"{plugins.PACKAGES[group]}.LABEL.{name}={value}"
-    known = [
-        key for option in plugins.options(group) if option.label == name for key in option.config
-    ]
+    known: list[str] = []
+    for option in plugins.options(group):
+        if option.label == name:
+            known += option.config
     path[0] = nearest(path[0], known) or path[0]
     return f"{plugins.PACKAGES[group]}.{name}.{'.'.join(path)}={value}"
 
 
 def _check_place(override: Override) -> None:
     """Checks that a part has a place where the job looks for it."""
-    group, package, word = override.key_or_group, override.package, said(override)
+    group = override.key_or_group
+    package = override.package
+    word = said(override)
     names = [name for name in values(override) if isinstance(name, str)]
     name = names[0] if len(names) == 1 else "NAME"
     added = override.is_add() or override.is_force_add()
@@ -347,7 +354,8 @@ def _check_place(override: Override) -> None:
 
 def _check_choice(override: Override, groups: Groups) -> None:
     """Checks that each value is an existing and usable option of the group."""
-    group, word = override.key_or_group, said(override)
+    group = override.key_or_group
+    word = said(override)
     several = group in plugins.PACKAGES and override.package is None
     key = word.partition("=")[0].lstrip("+")
     if group == "experiment" and override.is_sweep_override():
@@ -366,10 +374,9 @@ def _check_choice(override: Override, groups: Groups) -> None:
             if not isinstance(name, str) or name not in groups[group]:
                 shown = "null" if name is None else str(name)
                 raise UserError(f"{key}={shown}: {no_option(group, shown, groups)}")
-            if faults := [
-                o.fault for o in plugins.options(group) if o.name == name and o.fault is not None
-            ]:
-                raise UserError(f"{key}={name}: {faults[0]}")
+            for option in plugins.options(group):
+                if option.name == name and option.fault is not None:
+                    raise UserError(f"{key}={name}: {option.fault}")
             if names.count(name) > 1:
                 remedy = (
                     f"+{group}@{plugins.PACKAGES[group]}.{name}_2={name} runs it again under a"
@@ -394,13 +401,15 @@ def _check_labels(overrides: Sequence[Override]) -> None:
     """Refuses two parts under one label, which would be mixed silently."""
     taken: dict[str, Override] = {}
     for override in overrides:
-        group, package = override.key_or_group, override.package
+        group = override.key_or_group
+        package = override.package
         if group not in plugins.PACKAGES or override.is_delete():
             continue
         value = plain(override.value())
-        for label in (
-            [package.partition(".")[2]] if package else value if isinstance(value, list) else []
-        ):
+        labels = value if isinstance(value, list) else []
+        if package:
+            labels = [package.partition(".")[2]]
+        for label in labels:
             place = f"{plugins.PACKAGES[group]}.{label}"
             if place in taken and (package or taken[place] is not override):
                 word = said(override)
@@ -416,10 +425,9 @@ def _check_labels(overrides: Sequence[Override]) -> None:
 
 def jobs(overrides: Sequence[Override]) -> Iterator[list[Override]]:
     """Expands the overrides of each job of a sweep, as Hydra's basic sweeper does."""
-    axes = {
-        one.get_key_element(): _swept(one) if one.is_discrete_sweep() else [one]
-        for one in overrides
-    }
+    axes: dict[str, list[Override]] = {}
+    for one in overrides:
+        axes[one.get_key_element()] = _swept(one) if one.is_discrete_sweep() else [one]
     return map(list, itertools.product(*axes.values()))
 
 
@@ -432,15 +440,14 @@ def _swept(override: Override) -> list[Override]:
         raise UserError(
             f"{said(override)}: has no value, or too many; give 1 to {MOST_JOBS} finite values"
         )
-    return [
-        OverridesParser.create().parse_override(f"{override.get_key_element()}={value}")
-        for value in values
-    ]
+    key = override.get_key_element()
+    return [OverridesParser.create().parse_override(f"{key}={value}") for value in values]
 
 
 def settled(overrides: Sequence[Override]) -> list[Override]:
     """Returns one job of a sweep: the first, without what only a sweeper can choose."""
-    return next(jobs([copy.copy(one) for one in overrides if not one.is_interval_sweep()]), [])
+    listed = [copy.copy(one) for one in overrides if not one.is_interval_sweep()]
+    return next(jobs(listed), [])
 
 
 # The name of the folder
@@ -458,31 +465,28 @@ def default_name(words: Words) -> str:
     held = ""
     for override in words.overrides:
         line = override.input_line or ""
-        if file := words.files.get(forced(override)):
-            line, held = f"file={Path(file.partition('=')[2]).name}", held + line
+        file = words.files.get(forced(override))
+        if file:
+            held += line
+            line = f"file={Path(file.partition('=')[2]).name}"
         key, _, value = line.partition("=")
-        key = (
-            key.lstrip("+~")
-            .replace(HYDRAS_TRUTH, "truth")
-            .rpartition("@estimators.")[2]
-            .rpartition("@trackers.")[2]
-        )
-        text = re.sub(
-            r"[\[\]'\" ]",
-            "",
-            value.replace("],[", ";").replace(",", "+") if "[" in value else value,
-        )
+        key = key.lstrip("+~").replace(HYDRAS_TRUTH, "truth")
+        key = key.rpartition("@estimators.")[2].rpartition("@trackers.")[2]
+        if "[" in value:
+            value = value.replace("],[", ";").replace(",", "+")
+        text = re.sub(r"[\[\]'\" ]", "", value)
         if _first(override) not in SETTING_NOTHING:
             parts[key] = text or f"no_{key}"
     experiment = parts.pop("experiment", None)
-    names = [
-        parts.pop("measurement", None) or parts.pop("state_model", None) or experiment or "gins"
-    ]
-    for key in (*(key for key in _BARE if key in parts), *sorted(parts.keys() - set(_BARE))):
-        bare = key in _BARE and key != "truth"
-        names.append(
-            parts[key] if bare else f"{re.sub('^(estimators|trackers)[.]', '', key)}={parts[key]}"
-        )
+    model = parts.pop("measurement", None) or parts.pop("state_model", None)
+    names = [model or experiment or "gins"]
+    first = [key for key in _BARE if key in parts]
+    for key in (*first, *sorted(parts.keys() - set(_BARE))):
+        if key in _BARE and key != "truth":
+            names.append(parts[key])
+        else:
+            shown = re.sub("^(estimators|trackers)[.]", "", key)
+            names.append(f"{shown}={parts[key]}")
     full = "-".join(names).replace("/", "-")
     short = re.sub(r"[^\w.,=+-]", "_", full, flags=re.ASCII)
     if short == full and len(full) <= _LONGEST_NAME and not held:

@@ -27,12 +27,12 @@ def check_command(words: Sequence[str]) -> int:
     if not words:
         raise UserError("check: name the folder of a plugin, such as plugins/my_plugin")
     for folder in folders:
-        plugins.options_in(
-            Path(folder)
-        )  # a mistake in the second is said before the first is checked
+        # A mistake in the second is said before the first is checked.
+        plugins.options_in(Path(folder))
     print_problems(plugins.take_problems())
     failed = 0
-    for folder in [*folders, *([" ".join(keys)] if keys else [])]:
+    named = [*folders, " ".join(keys)] if keys else folders
+    for folder in named:
         findings = (
             [*ib.check(folder), *_check_experiments(folder)]
             if folder in folders
@@ -40,13 +40,12 @@ def check_command(words: Sequence[str]) -> int:
         )
         for one in findings:
             outcome = "FAILED" if one.complaint else "-" if one.note else "ok"
-            said = f" -- {one.complaint or one.note}" if one.complaint or one.note else ""
+            reason = one.complaint or one.note
+            said = f" -- {reason}" if reason else ""
             say(f"{outcome:7}{one.component}: {one.check}{said}")
         wrong = sum(bool(finding.complaint) for finding in findings)
-        say(
-            f"{folder}:"
-            f" {f'{wrong} of {len(findings)} checks failed' if wrong else 'all checks passed'}"
-        )
+        verdict = f"{wrong} of {len(findings)} checks failed" if wrong else "all checks passed"
+        say(f"{folder}: {verdict}")
         failed += wrong
     return 1 if failed else 0
 
