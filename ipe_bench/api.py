@@ -115,7 +115,8 @@ def run(
     scenarios = [_tracking(one, **stated) or _scenario(one, **stated) for one in several]
     if seed is not None:
         scenarios = [dataclasses.replace(one, seed=seed) for one in scenarios]
-    estimators, stored = _labelled(estimators), Stored(output)
+    estimators = _labelled(estimators)
+    stored = Stored(output)
     options: dict[str, Any] = {"execution": execution, "block_size": block_size}
     options |= {"precision": precision, "time_limit": time_limit}
     with watching("run", off=watch is not None or not progress) as shown:
@@ -412,11 +413,12 @@ def estimate(
             "error_scale": error_scale,
             "parameters": parameters,
         }
-        if other := [name for name, value in stated.items() if value is not None]:
-            raise UserError(
-                f"{other[0]}=: is of a measurement, and this is a model of states that move; leave"
-                " it out"
-            )
+        for name, value in stated.items():
+            if value is not None:
+                raise UserError(
+                    f"{name}=: is of a measurement, and this is a model of states that move; leave"
+                    " it out"
+                )
         return _tracked(model, readings, estimators, ignore_columns, find, progress)
     if find:
         raise UserError(
@@ -424,8 +426,10 @@ def estimate(
         )
     if not isinstance(model, Measurement):
         scenario = _scenario(model, noise=noise, prior=prior, error_scale=error_scale)
-        model, noise = scenario.measurement, None if scenario.noise.real else scenario.noise
-        prior, error_scale = scenario.prior, scenario.error_scale
+        model = scenario.measurement
+        noise = None if scenario.noise.real else scenario.noise
+        prior = scenario.prior
+        error_scale = scenario.error_scale
     if estimators is None:
         # In the order of the command line, whose solvers come before baselines.
         estimators = {
@@ -632,10 +636,9 @@ def _tracking(given: Any, **stated: Any) -> StateScenario | None:
     stated = {name: value for name, value in stated.items() if value is not None}
     if not isinstance(given, StateModel | StateScenario):
         return None
-    if other := [
-        name for name in stated if name != "error_scale" or isinstance(given, StateScenario)
-    ]:
-        raise UserError(f"{other[0]}=: is part of the state model or its scenario; leave it out")
+    for name in stated:
+        if name != "error_scale" or isinstance(given, StateScenario):
+            raise UserError(f"{name}=: is part of the state model or its scenario; leave it out")
     return given if isinstance(given, StateScenario) else StateScenario(given, **stated)
 
 
@@ -660,9 +663,8 @@ def _described(given: Any) -> str:
 
 
 def _paths(directories: Directories) -> list[Path]:
-    return [
-        Path(d) for d in ([directories] if isinstance(directories, Path | str) else directories)
-    ]
+    several = [directories] if isinstance(directories, Path | str) else directories
+    return [Path(directory) for directory in several]
 
 
 def _warn(problems: Iterable[str]) -> None:

@@ -68,7 +68,8 @@ class Estimates:
 
     def __post_init__(self) -> None:
         for name in ("iterations", "simulations", "jacobians", "seconds"):
-            if not len(values := getattr(self, name)):
+            values = getattr(self, name)
+            if not len(values):
                 setattr(self, name, np.zeros(len(self.x), values.dtype))
 
     @classmethod
@@ -88,21 +89,20 @@ class Estimates:
     def join(cls, parts: Sequence[Estimates]) -> Estimates:
         """Joins batches one after another; what trials lack that others have is NaN, and none in
         their lists."""
-        starts = np.cumsum([0, *(len(part.x) for part in parts)]).tolist()
-        messages = {
-            s + i: m
-            for s, part in zip(starts, parts, strict=False)
-            for i, m in part.messages.items()
-        }
-        return replace(join([replace(part, messages={}) for part in parts]), messages=messages)
+        messages: dict[int, str] = {}
+        start = 0
+        for part in parts:
+            messages |= {start + i: message for i, message in part.messages.items()}
+            start += len(part.x)
+        joined = join([replace(part, messages={}) for part in parts])
+        return replace(joined, messages=messages)
 
     @classmethod
     def failed(cls, trials: int, n: int, message: str) -> Estimates:
         """Makes the estimates of trials that ended in an exception."""
         status = np.full(trials, Status.ERROR, dtype=np.int8)
-        return cls(
-            np.full((trials, n), np.nan), status, messages=dict.fromkeys(range(trials), message)
-        )
+        messages = dict.fromkeys(range(trials), message)
+        return cls(np.full((trials, n), np.nan), status, messages=messages)
 
 
 class Estimator(Component, ABC):
@@ -156,15 +156,14 @@ class Estimator(Component, ABC):
             "prior": problem.prior_deviation is not None,
         }
         lacking = " and ".join(need for need in sorted(self.needs) if not has[need])
-        return (
-            f"needs {lacking}, which measurement={problem.measurement.name} does not have"
-            if lacking
-            else None
-        )
+        if not lacking:
+            return None
+        return f"needs {lacking}, which measurement={problem.measurement.name} does not have"
 
     def require_suited(self, problem: Problem) -> None:
         """Raises UserError if there is a hindrance."""
-        if why := self.hindrance(problem):
+        why = self.hindrance(problem)
+        if why:
             raise UserError(f"{self.name}: {why}")
 
 
@@ -178,7 +177,8 @@ def estimate_safely(
     UserError, which concerns the estimator with all its trials, and a MemoryError, which concerns
     the machine, are raised.
     """
-    began, z = time.perf_counter(), read_only(z)
+    began = time.perf_counter()
+    z = read_only(z)
     try:
         with np.errstate(all="ignore"):
             estimates = estimator.estimate(problem, z, history=history)
@@ -187,12 +187,12 @@ def estimate_safely(
     except Exception as error:
         if len(z) == 1:
             return Estimates.failed(1, problem.measurement.n, describe_exception(error))
-        return Estimates.join(
-            [estimate_safely(estimator, problem, row[None], history=history) for row in z]
-        )
+        alone = [estimate_safely(estimator, problem, row[None], history=history) for row in z]
+        return Estimates.join(alone)
     _make_plain(estimator, estimates, len(z), problem.measurement.n)
     if not estimates.seconds.any():
-        estimates.seconds = np.full(len(z), (time.perf_counter() - began) / max(1, len(z)))
+        seconds = time.perf_counter() - began
+        estimates.seconds = np.full(len(z), seconds / max(1, len(z)))
     return estimates
 
 
@@ -216,12 +216,13 @@ def _make_plain(estimator: Estimator, estimates: Any, trials: int, n: int) -> No
         k: plain_numbers(f"{name} {k}", values, (trials,)) for k, values in estimates.extras.items()
     }
     for part in ("history", "alternatives"):
-        if (each := getattr(estimates, part)) is not None:
-            if len(each) != trials:
-                raise ValueError(f"{name} {part} of {len(each)} trials, where {trials} belong")
-            setattr(
-                estimates, part, [plain_numbers(f"{name} {part}", x, (len(x), n)) for x in each]
-            )
+        each = getattr(estimates, part)
+        if each is None:
+            continue
+        if len(each) != trials:
+            raise ValueError(f"{name} {part} of {len(each)} trials, where {trials} belong")
+        plain = [plain_numbers(f"{name} {part}", x, (len(x), n)) for x in each]
+        setattr(estimates, part, plain)
     estimates.messages = {trial: one_line(message) for trial, message in estimates.messages.items()}
 
 

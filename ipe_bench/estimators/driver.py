@@ -120,21 +120,25 @@ def iterate(equations: E, method: Method[E, S], start: Array | S, limits: Limits
     leave the batch."""
     state = method.begin(equations, start) if isinstance(start, np.ndarray) else start
     trials, n = state.x.shape
-    tally, active = equations.model.tally, np.arange(trials)
-    status, iterations = np.full(trials, Status.RUNNING, np.int8), np.zeros(trials, np.int64)
+    tally = equations.model.tally
+    active = np.arange(trials)
+    status = np.full(trials, Status.RUNNING, np.int8)
+    iterations = np.zeros(trials, np.int64)
     iterates = [[row] for row in state.x] if limits.history else None
     ended: list[tuple[NDArray[np.intp], S]] = []
     check = method.check(equations, None, state)
     begun = np.maximum(check.growth, 1.0)
     for iteration in range(limits.max_iterations + 1):
         if iteration:
-            before, state = state, method.step(equations, state)
+            before = state
+            state = method.step(equations, before)
             check = method.check(equations, before, state)
             iterations[active] = iteration
             if iterates is not None:
                 for row, x in zip(active, state.x, strict=True):
                     iterates[row].append(x)
         rows = equations.rows
+        spent = limits.budget is not None and tally.of_search(n)[rows] >= limits.budget
         # The first of these that holds is the end of a trial.
         endings: tuple[tuple[Any, Any], ...] = (
             (tally.failed(rows), Status.ERROR),
@@ -144,21 +148,22 @@ def iterate(equations: E, method: Method[E, S], start: Array | S, limits: Limits
             (check.stuck, check.ending),
             (check.growth > FAR * begun, Status.DIVERGED),
             (check.moved < TINY_STEP * limits.tolerance, check.ending),
-            (
-                limits.budget is not None and tally.of_search(n)[rows] >= limits.budget,
-                Status.BUDGET,
-            ),
+            (spent, Status.BUDGET),
             (iteration == limits.max_iterations, Status.MAX_ITERATIONS),
         )
         holds, ending = zip(*endings, strict=True)
-        now = status[active] = np.select(holds, ending, Status.RUNNING)
-        going = now == Status.RUNNING
-        if not going.all():
-            ended.append((active[~going], take(state, ~going) if going.any() else state))
-            if not going.any():
-                break
-            active, begun = active[going], begun[going]
-            equations, state = equations.subset(going), take(state, going)
+        status[active] = np.select(holds, ending, Status.RUNNING)
+        going = status[active] == Status.RUNNING
+        if going.all():
+            continue
+        if not going.any():
+            ended.append((active, state))
+            break
+        ended.append((active[~going], take(state, ~going)))
+        active = active[going]
+        begun = begun[going]
+        equations = equations.subset(going)
+        state = take(state, going)
     paths = None if iterates is None else [np.array(x) for x in iterates]
     return SolveResult(gather(ended) if ended else state, status, iterations, paths)
 

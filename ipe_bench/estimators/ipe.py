@@ -112,10 +112,8 @@ class FrozenSystem:
                 " linear estimate to start from; give another nominal point, start=nominal or best"
                 " for least squares, or an estimator with a prior"
             )
-        model, H_plus = (
-            CountingModel(problem.measurement, EvaluationCount.zeros(len(z))),
-            problem.H_plus[None],
-        )
+        model = CountingModel(problem.measurement, EvaluationCount.zeros(len(z)))
+        H_plus = problem.H_plus[None]
         deviation = deviations(frozen_covariance(H_plus, problem.R))
         return cls(model, H_plus, deviation, problem.R, z, np.arange(len(z)))
 
@@ -123,21 +121,22 @@ class FrozenSystem:
         return multiply(self.H_plus, self.model.residual(x, self.rows, self.z))
 
     def J(self, x: Array, F: Array | None = None) -> Array:
-        coarse = False if F is None else np.abs(F / self.deviation).max(axis=1) > _COARSE_BEYOND
+        coarse: Mask | bool = False
+        if F is not None:
+            coarse = np.abs(F / self.deviation).max(axis=1) > _COARSE_BEYOND
         return np.matmul(self.H_plus, self.model.jacobian(x, self.rows, coarse=coarse))
 
     def solve(self, A: Array, b: Array) -> Array:
         x, singular = solve(A, b)
         # What is not finite is none of A's doing: the driver finds it in F.
-        self.model.tally.singular[self.rows[singular & finite(A) & finite(b)]] = True
+        by_A = singular & finite(A) & finite(b)
+        self.model.tally.singular[self.rows[by_A]] = True
         return x
 
     def subset(self, kept: Mask) -> FrozenSystem:
-        slopes = (
-            {}
-            if len(self.H_plus) == 1
-            else {"H_plus": self.H_plus[kept], "deviation": self.deviation[kept]}
-        )
+        slopes = {}
+        if len(self.H_plus) != 1:
+            slopes = {"H_plus": self.H_plus[kept], "deviation": self.deviation[kept]}
         return dataclasses.replace(self, z=self.z[kept], rows=self.rows[kept], **slopes)
 
     def relinearized(self, x: Array) -> FrozenSystem:
@@ -146,9 +145,8 @@ class FrozenSystem:
         J = self.model.jacobian(x, self.rows)
         H_plus, deficient = pseudo_inverse(J, self.R)
         self.model.tally.singular[self.rows[deficient & finite(J)]] = True
-        return dataclasses.replace(
-            self, H_plus=H_plus, deviation=deviations(frozen_covariance(H_plus, self.R))
-        )
+        deviation = deviations(frozen_covariance(H_plus, self.R))
+        return dataclasses.replace(self, H_plus=H_plus, deviation=deviation)
 
     def covariance(self) -> Array:
         """Computes the covariance (1, n, n) or (trials, n, n) of the linear LSE, eq. (5)."""
@@ -157,8 +155,10 @@ class FrozenSystem:
     def sandwich(self, x: Array) -> Array:
         """Computes (H+ J)^-1 H+ R H+' (H+ J)^-T at x: the first-order covariance (trials, n, n) of
         eq. (11)'s root."""
-        inverse_slope = np.full((len(x), x.shape[1], x.shape[1]), np.nan)
-        if (usable := finite(x)).any():
+        n = x.shape[1]
+        inverse_slope = np.full((len(x), n, n), np.nan)
+        usable = finite(x)
+        if usable.any():
             part = self.subset(usable)
             J = self.model.reporting().jacobian(x[usable], part.rows)
             inverse_slope[usable], _ = inverse(np.matmul(part.H_plus, J))
@@ -258,9 +258,8 @@ class IPE(Method[FrozenSystem, S], Estimator, Generic[S]):
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         x, system = begin(problem, z, self.start)
-        ended = iterate(
-            system, self, x, Limits(self.tolerance, self.max_iterations, self.budget, history)
-        )
+        limits = Limits(self.tolerance, self.max_iterations, self.budget, history)
+        ended = iterate(system, self, x, limits)
         return Estimates.of(ended, system.model.tally, covariance=system.sandwich(ended.x))
 
 

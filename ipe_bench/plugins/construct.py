@@ -33,11 +33,9 @@ def construct(config: Any, where: str) -> Any:
     if not isinstance(config, Mapping):
         return config
     options = {str(k): construct(v, f"{where}.{k}") for k, v in config.items() if k != TARGET}
-    return (
-        instantiate(find_class(config[TARGET], where), options, where)
-        if TARGET in config
-        else options
-    )
+    if TARGET not in config:
+        return options
+    return instantiate(find_class(config[TARGET], where), options, where)
 
 
 def find_class(target: Any, where: str) -> type:
@@ -46,7 +44,8 @@ def find_class(target: Any, where: str) -> type:
     where = f"{where}.{TARGET}={target}"
     if not (isinstance(cls, type) and dataclasses.is_dataclass(cls)):
         raise UserError(f"{where}: is not a component (a component is a frozen dataclass)")
-    if missing := sorted(getattr(cls, "__abstractmethods__", ())):
+    missing = sorted(getattr(cls, "__abstractmethods__", ()))
+    if missing:
         raise UserError(f"{where}: is abstract; choose a class that writes {', '.join(missing)}")
     return cls
 
@@ -55,7 +54,8 @@ def find_object(target: Any, where: str) -> Any:
     """Finds the object of that dotted name in a registered package."""
     where = f"{where}.{TARGET}={target}"
     module_name, _, name = str(target).rpartition(".")
-    if module_name.startswith("ipe_bench.") and (place := moved(name)):
+    place = moved(name)
+    if place and module_name.startswith("ipe_bench."):
         raise UserError(f"{where}: {place}")
     if module_name.split(".")[0] not in discovery.packages:
         known = ", ".join(sorted(discovery.packages))
@@ -97,9 +97,8 @@ def instantiate(cls: type, options: Mapping[str, Any], where: str) -> Any:
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}
     for name in options:
         refuse_unknown(f"{prefix}{name}", name, fields, "option")
-    required = [
-        f.name for f in fields.values() if f.default is f.default_factory and f.name not in options
-    ]
+    bare = [f.name for f in fields.values() if f.default is f.default_factory]
+    required = [name for name in bare if name not in options]
     try:
         # A class of a plugin need not be a `Component`, nor call its `__post_init__`.
         types = option_types(cls)
@@ -143,14 +142,17 @@ def described(option: discovery.Option) -> list[Described]:
             if key != "defaults"
         ]
     cls = find_class(option.target, f"{option.group}.{option.name}")
-    kinds, texts = option_types(cls), {**option.comments, **_meanings(cls)}
+    kinds = option_types(cls)
+    texts = {**option.comments, **_meanings(cls)}
     found = []
     for field in dataclasses.fields(cls):
-        if field.init:
-            default = field.default if field.default_factory is MISSING else field.default_factory()
-            kind = "" if kinds[field.name] is Any else describe_type(kinds[field.name])
-            value = _written(config.get(field.name, default))
-            found.append(Described(field.name, value, kind, texts.get(field.name, "")))
+        if not field.init:
+            continue
+        default = field.default if field.default_factory is MISSING else field.default_factory()
+        hint = kinds[field.name]
+        kind = "" if hint is Any else describe_type(hint)
+        value = _written(config.get(field.name, default))
+        found.append(Described(field.name, value, kind, texts.get(field.name, "")))
     return found
 
 
@@ -162,10 +164,13 @@ def _written(value: Any) -> str:
     if isinstance(value, tuple | list):
         return f"[{','.join(map(_written, value))}]"
     if isinstance(value, Mapping):
-        return f"{{{', '.join(f'{k}: {_written(v)}' for k, v in value.items() if k != TARGET)}}}"
+        entries = [f"{key}: {_written(one)}" for key, one in value.items() if key != TARGET]
+        return f"{{{', '.join(entries)}}}"
     if dataclasses.is_dataclass(value):
         return type(value).__name__
-    return "" if value is MISSING or value == "???" else str(value)
+    if value is MISSING or value == "???":
+        return ""
+    return str(value)
 
 
 def _meanings(cls: type) -> dict[str, str]:

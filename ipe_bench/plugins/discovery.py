@@ -11,6 +11,7 @@ import dataclasses
 import functools
 import importlib.metadata
 import importlib.util
+import itertools
 import os
 import re
 import sys
@@ -172,10 +173,10 @@ class Option:
     @property
     def summary(self) -> str:
         """The first line of comment in the file that is not a header."""
-        comments = (line for line in self.text.splitlines() if line.startswith("#"))
-        return next(
-            (line.lstrip("# ").strip() for line in comments if not _PACKAGE_HEADER.match(line)), ""
-        )
+        for line in self.text.splitlines():
+            if line.startswith("#") and not _PACKAGE_HEADER.match(line):
+                return line.lstrip("# ").strip()
+        return ""
 
     @functools.cached_property
     def config(self) -> Any:
@@ -185,12 +186,14 @@ class Option:
     @property
     def package(self) -> str | None:
         """Package in the config that the option lands in, if its header says so."""
-        return found[1] if (found := _PACKAGE_HEADER.search(self.text)) else None
+        found = _PACKAGE_HEADER.search(self.text)
+        return None if found is None else found[1]
 
     @property
     def target(self) -> str | None:
         """The class that it names."""
-        return found[1] if (found := _TARGET_LINE.search(self.text)) else None
+        found = _TARGET_LINE.search(self.text)
+        return None if found is None else found[1]
 
     @property
     def comments(self) -> dict[str, str]:
@@ -205,19 +208,19 @@ class Option:
             return f"{self.rival} and {self.path} offer it both; rename one of the two files"
         if "\ufffd" in self.text:
             return f"{self.path}: is not UTF-8; save it as UTF-8"
-        if (key := PACKAGES.get(self.group)) is not None and self.package != f"{key}.{self.label}":
+        key = PACKAGES.get(self.group)
+        if key is not None and self.package != f"{key}.{self.label}":
             return (
                 f"{self.path}: its first line must be '# @package {key}.{self.label}', or it never"
                 " runs"
             )
         try:
-            return (
-                None
-                if isinstance(self.config, dict)
-                else f"{self.path}: holds no keys; write KEY: VALUE lines"
-            )
+            config = self.config
         except yaml.YAMLError as error:
             return explain_yaml(error, self.path)
+        if not isinstance(config, dict):
+            return f"{self.path}: holds no keys; write KEY: VALUE lines"
+        return None
 
 
 packages = {"ipe_bench"}
@@ -249,9 +252,8 @@ def sources() -> tuple[Source, ...]:
     for source in installed_sources():
         _take(found, source)
     installed = dict(found)
-    for source in (
-        source for folder in dict.fromkeys([*folders, *_added]) for source in _in_folder(folder)
-    ):
+    in_folders = map(_in_folder, dict.fromkeys([*folders, *_added]))
+    for source in itertools.chain.from_iterable(in_folders):
         twin = installed.pop(source.name, None)
         one = twin is not None and twin.distribution == source.distribution is not None
         if one and not _imported_elsewhere(source):
@@ -267,7 +269,8 @@ def _take(found: dict[str, Source], source: Source) -> bool:
     problem."""
     known = found.setdefault(source.name, source)
     if known.conf.resolve() != source.conf.resolve():
-        home, other = source.conf.parent, known.conf.parent
+        home = source.conf.parent
+        other = known.conf.parent
         _problems[f"plugin {home}: {other} is called {source.name} too; it is left out"] = None
     return known is source
 
@@ -282,11 +285,14 @@ def _imported_elsewhere(source: Source) -> bool:
 def _make_importable(source: Source, before: Source | None = None) -> None:
     """Puts a plugin's folder on the import path of this process and of the workers that it starts,
     at its end or before the place of another source."""
-    path, other = (None if one is None else str(one.conf.parents[1]) for one in (source, before))
+    path = str(source.conf.parents[1])
+    other = None if before is None else str(before.conf.parents[1])
 
     def placed(paths: list[str]) -> list[str]:
         at = paths.index(other) if other in paths else len(paths)
-        return paths if path in paths[: at + 1] else [*paths[:at], str(path), *paths[at:]]
+        if path in paths[: at + 1]:
+            return paths
+        return [*paths[:at], path, *paths[at:]]
 
     sys.path[:] = placed(sys.path)
     inherited = filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))
@@ -301,36 +307,35 @@ def installed_sources() -> list[Source]:
         try:
             spec = importlib.util.find_spec(entry.value)
         except Exception as error:  # its parent package is imported, which may raise anything
-            spec, reason = None, describe_exception(error)
+            spec = None
+            reason = describe_exception(error)
         if spec is None or not spec.submodule_search_locations:
             _problems[f"plugin {entry.name}: {reason}; it is left out, install it again"] = None
             continue
         packages.add(entry.value.split(".")[0])
         origin = f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.name
         name = _normal(entry.dist.name) if entry.dist else None
-        found.append(
-            Source(entry.value, Path(spec.submodule_search_locations[0]) / "conf", origin, name)
-        )
+        conf = Path(spec.submodule_search_locations[0]) / "conf"
+        found.append(Source(entry.value, conf, origin, name))
     return found
 
 
 def _in_folder(folder: Path) -> Iterator[Source]:
     for conf in sorted(folder.resolve().glob("*/conf")):
         if (conf.parent / "__init__.py").is_file():
-            packages.add(conf.parent.name)
-            yield Source(
-                conf.parent.name, conf, f"{folder.parent.name}/{folder.name}", _stated_name(folder)
-            )
+            name = conf.parent.name
+            packages.add(name)
+            origin = f"{folder.parent.name}/{folder.name}"
+            yield Source(name, conf, origin, _stated_name(folder))
 
 
 def _stated_name(folder: Path) -> str | None:
     """Reads the name of the distribution that a folder's pyproject.toml describes."""
     try:
-        project = tomllib.loads((folder / "pyproject.toml").read_text(encoding="utf-8")).get(
-            "project"
-        )
+        stated = tomllib.loads((folder / "pyproject.toml").read_text(encoding="utf-8"))
     except (OSError, ValueError):  # none, or none that can be read
         return None
+    project = stated.get("project")
     name = project.get("name") if isinstance(project, Mapping) else None
     return _normal(name) if isinstance(name, str) else None
 
@@ -348,9 +353,9 @@ def options(group: str | None = None) -> list[Option]:
             folder, *name = path.relative_to(source.conf).with_suffix("").parts
             option = Option(folder, "/".join(name), path, source)
             # Solvers and baselines share their labels: of two with one label, only one would run.
-            place = (
-                ("estimator", option.label) if folder in ESTIMATOR_GROUPS else (folder, option.name)
-            )
+            place = (folder, option.name)
+            if folder in ESTIMATOR_GROUPS:
+                place = ("estimator", option.label)
             known = found.setdefault(place, option)
             if known is not option and known.rival is None:
                 found[place] = dataclasses.replace(known, rival=path)

@@ -8,6 +8,7 @@ plugin's package.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,8 @@ def richer_models(scenario: Scenario) -> list[Measurement]:
     """Returns the richer models of a scenario: the truth that simulates its readings, or every
     option of `measurement` that is the same model with more errors, with the model's own
     options."""
-    model, truth = scenario.measurement, scenario.truth
+    model = scenario.measurement
+    truth = scenario.truth
     if truth is not None:
         if not truth.nuisance_deviation.any():
             remedy = "leave it out, or choose a richer one"
@@ -35,19 +37,15 @@ def richer_models(scenario: Scenario) -> list[Measurement]:
     own = {f.name: getattr(model, f.name) for f in dataclasses.fields(model) if f.init}  # type: ignore[arg-type]
     found: list[Any] = []
     for option in options("measurement"):
+        if option.fault is not None:
+            continue
         try:
-            other = (
-                None
-                if option.fault is not None
-                else construct(option.config, f"measurement={option.name}")
-            )
+            other = construct(option.config, f"measurement={option.name}")
         except UserError:
             continue  # `ipe-bench list` tells of options that cannot be made
-        if (
-            isinstance(other, type(model))
-            and type(other) is not type(model)
-            and other.nuisance_deviation.any()
-        ):
+        if not isinstance(other, type(model)) or type(other) is type(model):
+            continue
+        if other.nuisance_deviation.any():
             found.append(dataclasses.replace(other, **own))  # type: ignore[type-var]
     return found
 
@@ -99,21 +97,13 @@ def use_statistics() -> list[str]:
     from ipe_bench.statistics.statistic import Statistic
 
     problems: list[str] = []
-    found = [
-        one
-        for _, one in added(
-            "statistic", problems, lambda record: require_type(record, Statistic, "is")
-        )
-    ]
+    records = added("statistic", problems, lambda record: require_type(record, Statistic, "is"))
+    found = [record for _, record in records]
     return problems + add_statistics(found)
 
 
 def files_of_records() -> list[Path]:
     """Lists the files of every plugin that adds to reports."""
     homes = {option.source.conf.parent for group in RECORD_GROUPS for option in options(group)}
-    return [
-        path
-        for home in homes
-        for path in home.rglob("*")
-        if path.is_file() and path.suffix != ".pyc"
-    ]
+    found = itertools.chain.from_iterable(home.rglob("*") for home in homes)
+    return [path for path in found if path.is_file() and path.suffix != ".pyc"]

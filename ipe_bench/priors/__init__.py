@@ -108,7 +108,8 @@ class GaussianPrior(Prior):
                     f"correlations: is not symmetric; row {i + 1}, column {j + 1} is {C[i, j]:g},"
                     f" and row {j + 1}, column {i + 1} is {C[j, i]:g}"
                 )
-            if (least := float(np.linalg.eigvalsh((C + C.T) / 2)[0])) <= _DEFINITE:
+            least = float(np.linalg.eigvalsh((C + C.T) / 2)[0])
+            if least <= _DEFINITE:
                 raise UserError(
                     f"correlations: is not positive definite; the least eigenvalue is {least:.2g},"
                     " so that some combination of the parameters would have no variance"
@@ -137,7 +138,9 @@ class GaussianPrior(Prior):
 
     def draw(self, x0: Array, error_scale: float, rng: np.random.Generator) -> Array:
         n = len(x0)
-        white, C = rng.standard_normal(n), self.correlation(n)
-        return x0 + self.deviation(n, error_scale) * (
-            white if C is None else np.linalg.cholesky(C) @ white
-        )
+        drawn = rng.standard_normal(n)
+        C = self.correlation(n)
+        if C is not None:
+            white = drawn
+            drawn = np.linalg.cholesky(C) @ white
+        return x0 + self.deviation(n, error_scale) * drawn

@@ -229,8 +229,8 @@ class Estimated:
     @property
     def reading_freedom(self) -> Array:
         """The degrees of freedom (m,) that the level of each reading's group is estimated from."""
-        levels, spare = self.model.noise, self.model.spare
-        return np.bincount(levels.group, spare)[levels.group]
+        group = self.model.noise.group
+        return np.bincount(group, self.model.spare)[group]
 
     @property
     def fitted(self) -> Array:

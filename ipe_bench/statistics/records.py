@@ -15,7 +15,7 @@ import numpy as np
 import ipe_bench.statistics.formulas as f
 import ipe_bench.statistics.intervals as intervals
 import ipe_bench.statistics.path_columns as t
-from ipe_bench.basics.linalg import finite
+from ipe_bench.basics.linalg import Array, finite
 from ipe_bench.statistics.intervals import clopper_pearson, quantile, share_sequence
 from ipe_bench.statistics.sample import CLOSE, NIS, Sample, iterations_to_limit, orders_of
 from ipe_bench.statistics.statistic import Statistic
@@ -34,6 +34,12 @@ def _solved(
 ) -> Statistic:
     """Defines a statistic over the solved trials."""
     return Statistic(name, title, "solved trials", meaning, values, given="solved", **shown)
+
+
+def _last_orders(s: Sample) -> Array:
+    """Returns the last observed order of convergence of each history that has any."""
+    orders = [orders_of(history.distances) for history in s.histories]
+    return np.array([one[-1] for one in orders if len(one)])
 
 
 def family_of(footer: Mapping[str, Any]) -> str:
@@ -683,9 +689,7 @@ SCORES: tuple[Statistic, ...] = (
         "order",
         "converged trials with a stored history",
         "Median of the last observed order of convergence: 1 linear, 2 quadratic.",
-        lambda s: quantile(
-            np.array([o[-1] for h in s.histories if len(o := orders_of(h.distances))]), 0.5
-        ),
+        lambda s: quantile(_last_orders(s), 0.5),
         where=("costs",),
     ),
     Statistic(
@@ -742,11 +746,7 @@ SCORES: tuple[Statistic, ...] = (
         "eq. (23) holds",
         "the same trials",
         "Share in which the least M that explains the history is at most M at the truth.",
-        lambda s: (
-            f.share(constants[:, 0] <= constants[:, 1])
-            if len(constants := f.constants(s))
-            else np.nan
-        ),
+        lambda s: f.share(np.less_equal(*f.constants(s).T)),
         kind="share",
         where=("iterations",),
     ),
