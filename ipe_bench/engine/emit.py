@@ -193,17 +193,15 @@ class _LaneWriter:
         """Writes a loop over places in an array (trials, length, count) and those in lanes."""
         b = self.b
         width = self.v.width
-        with self._each(width) as lane:
+        with self._each(count) as j, self._each(width) as lane:
             trial = b.add(self.group, lane)
             # A group that is not full repeats the last trial.
             last = b.sub(self.trials, integer(1))
             trial = b.select(b.icmp_signed("<", trial, last), trial, last)
             epoch = b.add(b.mul(trial, length), k)
-            begin = b.mul(epoch, integer(count))
-            with self._each(count) as j:
-                outside = b.add(begin, j)
-                inside = b.add(b.mul(j, integer(width)), lane)
-                yield outside, inside
+            outside = b.add(b.mul(epoch, integer(count)), j)
+            inside = b.add(b.mul(j, integer(width)), lane)
+            yield outside, inside
 
     def _parts(self, array: Value, sizes: Sequence[int]) -> list[Value]:
         """Begins of parts of so many vectors each, and of what follows them."""
