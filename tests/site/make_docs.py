@@ -359,7 +359,7 @@ def _small(analysis: Analysis) -> Any:
     fig, (ax,) = common.panels(1, height=0.6 + 0.2 * len(means))
     ax.barh(list(means.index), means)
     ax.set_xlabel(
-        {"success": "success", "found": "root mean square error"}.get(
+        {"success": "success, mean over settings", "found": "root mean square error"}.get(
             column, "correct digits, mean"
         )
     )
