@@ -30,6 +30,8 @@ solve."""
 _AS_GOOD = 1e-6
 """Part of a cost by which it may rise where whole turns are taken from a path: round-off of large
 angles."""
+_UNREAD = 1e-3
+"""Part of a reading's deviation by which a path may miss that range at most."""
 _ROUNDED = 1e8
 """Deviation of what is read, in parts of that of its reading, above which steps by multipliers are
 round-off."""
@@ -165,7 +167,9 @@ class PathDensity:
             return np.zeros(len(x), dtype=bool)
         missed = np.abs(gap - products(self.gains, products(self.inverses, gap))).max(axis=1)
         largest = np.abs(x).max(axis=1)
-        return ~(missed <= _REACHED * largest).all(axis=1)
+        # Beside readings that are more precise than that, even round-off of a solve is a miss.
+        finest = np.abs(self.whitener).max(axis=(1, 2, 3))[:, None]
+        return ~(missed <= np.minimum(_REACHED * largest, _UNREAD / finest)).all(axis=1)
 
     def _unwound(self, x: Array, gap: Array, h: Array, shift: Array) -> tuple[Array, Array, Array]:
         """Returns the paths x, each in the turn of its start where that costs no more, with gaps
