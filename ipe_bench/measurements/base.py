@@ -577,7 +577,7 @@ def _by_complex_step(h: BatchFunction, x: Array) -> Array:
     while begun < trials or not parts:
         points = x[begun : begun + few, None, :] + np.eye(n) * _COMPLEX_STEP * 1j
         moved = np.imag(h(read_only(points.reshape(-1, n))))
-        parts.append(moved.reshape(len(points), n, -1).swapaxes(1, 2))
+        parts.append(moved.reshape(len(points), n, moved.shape[-1]).swapaxes(1, 2))
         begun += few
         few = max(1, int(_SMALL / max(parts[0][:1].nbytes, 1)))
     return np.ascontiguousarray(np.concatenate(parts)) / _COMPLEX_STEP

@@ -276,7 +276,7 @@ class PathDensity:
     def _rounded(self, tangents: Tangents) -> NDArray[np.intp]:
         """Returns the trials whose steps by multipliers are round-off: readings are so precise
         beside what is known without any."""
-        largest = np.abs(tangents.B).max(axis=(1, 2, 3)) * np.abs(self.noise).max()
+        largest = np.abs(tangents.B).max(axis=(1, 2, 3)) * np.abs(self.noise).max(initial=0.0)
         rows = np.flatnonzero(largest > _ROUNDED)
         if not rows.size:
             return rows

@@ -326,3 +326,13 @@ def test_a_wide_prior_costs_no_digits_of_what_precise_readings_leave(label, spre
     alone = WIDE[label].track(model, z[1:])
     assert np.array_equal(alone.mean[0], tracks.mean[1])
     assert np.array_equal(alone.covariance[0], tracks.covariance[1])
+
+
+@pytest.mark.parametrize("label", ["ieks", "auto"])
+def test_what_is_known_without_any_noise_stays_what_it_is(label):
+    """Of a model of no error at all no start and no step has a column of noise."""
+    model = Linear(G0=((0.0,), (0.0,)), G=((), ()))
+    paths = model.draw(0, 2)
+    tracks = WIDE[label].track(model, paths.z)
+    np.testing.assert_allclose(tracks.mean, paths.x, rtol=1e-12)
+    np.testing.assert_array_equal(tracks.covariance, 0.0)
