@@ -92,6 +92,8 @@ class AutoTracker(Tracker):
             paths = paths.improved(other, rows)
         # The path of an affine model has no second one beside it.
         rows = np.flatnonzero(stage >= DAMPED)
+        if not rows.size:
+            return replace(with_second(density, reported(density, paths), paths), stage=stage)
         mirror = mirrored(self.descent, density.subset(rows), take(paths, rows))
         better = paths.beaten(mirror, rows)
         stage[rows[better]] = MIRRORED

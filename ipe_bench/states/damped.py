@@ -174,6 +174,8 @@ class LevenbergMarquardtSmoother(Tracker):
         status = np.where(finite, paths.status, Status.NONFINITE)
         paths = replace(paths, status=status)
         active = np.flatnonzero(finite)
+        if not active.size:
+            return paths
         part = take(paths, active)
         some = density.subset(active)
         tangents = some.tangents(part.at)

@@ -22,7 +22,7 @@ _STRIDE = 1.5
 misses the integral by 3e-4."""
 _POINTS = 16
 """Points to either side of a path at most."""
-_LITTLE = 1e-3
+_LITTLE = 0.1
 """Part of the second moment along an axis below which the tail behind a point is left out."""
 _MOST = 10.0
 """Logarithm of the most that a point counts beside the path itself."""
