@@ -13,7 +13,7 @@ from ipe_bench.states.base import Normal
 from ipe_bench.states.damped import Descent, LevenbergMarquardtSmoother
 from ipe_bench.states.linearisation import Taylor
 from ipe_bench.states.trackers import Tracks, filtered
-from ipe_bench.states.whole_paths import PathDensity
+from ipe_bench.states.whole_paths import PathDensity, Settled
 
 _NEAR = 1e-2
 """Standard deviations of the prior about a mirrored start, in those of the prior."""
@@ -33,20 +33,27 @@ def mirrored(descent: LevenbergMarquardtSmoother, density: PathDensity, paths: D
     trials = len(density.z)
     start = Normal(2 * m - paths.at.x[:, 0], np.repeat(_NEAR**2 * P[None], trials, axis=0))
     begun = Descent.of(density, filtered(model, density.z, Taylor(), start=start))
-    far = ~(begun.at.cost <= _WORSE * _cost_unread(density))
-    cost = np.where(far, np.inf, begun.at.cost)
-    return descent.descended(density, replace(begun, at=replace(begun.at, cost=cost)))
+    unread = _unread(density)
+    far = ~(begun.at.cost <= _WORSE * unread.cost)
+    at = replace(begun.at, cost=np.where(far, np.inf, begun.at.cost))
+    calls = begun.calls + unread.calls
+    return descent.descended(density, replace(begun, at=at, calls=calls))
 
 
-def _cost_unread(density: PathDensity) -> Array:
-    """Computes the cost (trials,) of the path without noise from the prior's mean."""
+def _unread(density: PathDensity) -> Settled:
+    """Computes the path without noise from the prior's mean, which no readings have moved."""
     model = density.model
     x = model.prior.mean[None]
     path = [x]
+    transitions = 0
     for k in range(model.epochs):
-        x = model.transition_into(k)(x) if model.moves(k) else x
+        if model.moves(k):
+            x = model.transition_into(k)(x)
+            transitions += 1
         path.append(x)
-    return density.settled(np.repeat(np.stack(path, axis=1), len(density.z), axis=0)).cost
+    at = density.settled(np.repeat(np.stack(path, axis=1), len(density.z), axis=0))
+    # A trial that is alone pays for these transitions, too.
+    return replace(at, calls=at.calls + transitions)
 
 
 def with_second(density: PathDensity, tracks: Tracks, other: Descent) -> Tracks:
