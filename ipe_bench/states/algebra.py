@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ipe_bench.basics.linalg import Array, Mask, finite
+from ipe_bench.basics.linalg import Array, Mask, finite, multiply
 
 _SMALL = 1e-12
 """Pivots, in parts of the variances, below which a covariance counts as singular."""
@@ -163,9 +163,10 @@ def mahalanobis(e: Array, P: Array, parts: Half | None = None) -> Array:
     """Computes e' P^+ e (trials,) for e (trials, n) and positive semidefinite P (n, n), whose half
     is taken if it is not given; infinite outside the range of P."""
     parts = parts or half(P)
-    w = parts.whitened(e)
+    # One matrix for each trial: a product over all of them has other bits in another batch.
+    w = parts.whitened(e[:, None])[:, 0]
     # What no w gives lies outside the range of G.
-    missed = np.abs(e - np.matmul(w, transposed(parts.G)))
+    missed = np.abs(e - multiply(parts.G, w))
     outside = missed > _OUTSIDE * np.sqrt(np.diagonal(P))
     return np.where(outside.any(axis=-1), np.inf, np.sum(w**2, axis=-1))
 

@@ -222,8 +222,8 @@ class PathDensity:
         if not prior.singular:
             return start
         # m0 + G G^- (x0 - m0), with P0 = G G'.
-        u = prior.whitened(start - m)
-        within = m + np.matmul(u, transposed(prior.G))
+        u = prior.whitened((start - m)[:, None])[:, 0]
+        within = m + multiply(prior.G, u)
         missed = np.abs(start - within) > _REACHED * np.abs(start)
         return np.where(missed, start, within)
 

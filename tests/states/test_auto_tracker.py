@@ -44,6 +44,23 @@ def test_a_linear_model_is_answered_by_its_first_stage():
     np.testing.assert_allclose(found.cost, exact.cost, rtol=1e-9)
 
 
+class Unrecorded(ConstantVelocity):
+    """The same by a transition that looks at its numbers, of which a recording has none."""
+
+    def transition(self, x, k):
+        assert np.isfinite(x).all()
+        return super().transition(x, k)
+
+
+def test_a_linear_model_that_is_not_recorded_is_tracked_as_one_that_is():
+    recorded = ConstantVelocity(count=5)
+    model = Unrecorded(count=5)
+    assert model.epoch_functions[0].why
+    z = recorded.draw(0, 3).z
+    found = AutoTracker().track(model, z)
+    np.testing.assert_allclose(found.mean, AutoTracker().track(recorded, z).mean, rtol=1e-12)
+
+
 def test_each_stage_answers_where_those_before_it_do_not():
     """More rounds keep or lower the cost, and only those trials change that the earlier stages
     leave improbable."""

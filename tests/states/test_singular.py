@@ -12,6 +12,7 @@ from shared.oracles import assert_agrees
 from shared.state_models import CoordinatedTurn, path_cost
 
 import ipe_bench as ib
+from ipe_bench.basics.linalg import multiply
 from ipe_bench.measurements import Parameter
 from ipe_bench.states import (
     Bootstrap,
@@ -30,6 +31,7 @@ from ipe_bench.states import (
     ukf,
 )
 from ipe_bench.states.algebra import mahalanobis
+from ipe_bench.states.whole_paths import PathDensity
 from ipe_bench.trials.paths import StateScenario
 
 
@@ -232,6 +234,31 @@ def test_a_distance_outside_of_the_range_is_infinite():
     P = np.array([[1.0, 2.0, 0.0], [2.0, 4.0, 0.0], [0.0, 0.0, 0.0]])
     e = np.array([[1.0, 2.0, 0.0], [1.0, 2.1, 0.0], [0.0, 0.0, 1e-9], [-3.0, -6.0, 0.0]])
     np.testing.assert_allclose(mahalanobis(e, P), [1.0, np.inf, np.inf, 9.0], rtol=1e-12)
+
+
+@pytest.mark.parametrize(("n", "rank"), [(5, 3), (12, 12)], ids=["singular", "regular"])
+def test_a_distance_has_the_same_bits_alone_and_in_a_batch(n, rank):
+    rng = np.random.default_rng(0)
+    G = rng.normal(size=(n, rank))
+    e = multiply(G, rng.normal(size=(40, rank)))
+    together = mahalanobis(e, G @ G.T)
+    assert np.isfinite(together).all()
+    alone = [mahalanobis(one[None], G @ G.T)[0] for one in e]
+    np.testing.assert_array_equal(together, alone)
+
+
+def test_a_path_of_a_singular_start_settles_with_the_same_bits_alone_and_in_a_batch():
+    F = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    G0 = ((0.3, 1.7), (-1.1, 0.4), (0.7, 0.9))
+    model = Linear(F=F, G0=G0, G=F, H=F[:1], mean=(1.0, 2.0, 3.0))
+    paths = model.draw(0, 40)
+    x = np.concatenate([paths.start[:, None], paths.x], axis=1) + 1e-12
+    density = PathDensity.of(model, paths.z)
+    together = density.settled(x)
+    for i in range(40):
+        alone = density.subset(np.array([i])).settled(x[[i]])
+        np.testing.assert_array_equal(alone.x[0], together.x[i])
+        np.testing.assert_array_equal(alone.cost[0], together.cost[i])
 
 
 def test_bounds_exist_where_the_start_is_known():
