@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ipe_bench.basics.batches import take
-from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.linalg import Array, Mask
 from ipe_bench.states.algebra import principal, transposed
 from ipe_bench.states.linearisation import Taylor
 from ipe_bench.states.whole_paths import PathDensity, Settled, Tangents
@@ -26,6 +26,8 @@ _LITTLE = 0.1
 """Part of the second moment along an axis below which the tail behind a point is left out."""
 _MOST = 10.0
 """Logarithm of the most that a point counts beside the path itself."""
+_LEAST = 0.8
+"""Part of the variance of any axis that a second moment has at least."""
 _NUMBERS = 5e5
 """Numbers of the slopes that are held at once: they stay in a processor's cache."""
 _LANES = 8
@@ -92,9 +94,23 @@ def _of_some(density: PathDensity, at: Settled, tangents: Tangents) -> tuple[Arr
     if rows.size:
         g = axes[rows, unlike[rows].argmax(axis=1)]
         some = density.subset(rows)
-        P[rows], further = _followed(some, take(at, rows), take(tangents, rows), g)
+        moment, further = _followed(some, take(at, rows), take(tangents, rows), g)
         calls[rows] += further
+        wider = _is_wider(moment[:, -1], axes[rows])
+        P[rows[wider]] = moment[wider]
     return P, calls
+
+
+def _is_wider(moment: Array, axes: Array) -> Mask:
+    """Tells which second moments (trials, n, n) are at least the covariance of these axes, but for
+    a little: a smaller one is that of points about which the rest of the path was not found."""
+    whitened = np.matmul(np.matmul(axes, moment), transposed(axes))
+    # An axis without variance, whose number is known, stays one.
+    nothing = (axes == 0).all(axis=2)
+    whitened[nothing, nothing.nonzero()[1]] = 1.0
+    finite = np.isfinite(whitened).all(axis=(1, 2))
+    whitened[~finite] = 0.0
+    return np.linalg.eigvalsh(whitened)[:, 0] > _LEAST
 
 
 def _lines(P: Array, crossed: Array) -> tuple[Array, Array]:

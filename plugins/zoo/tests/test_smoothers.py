@@ -13,6 +13,7 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.cli.session import jobs_of, session
 from ipe_bench.cli.words import read
 from ipe_bench.states import LevenbergMarquardtSmoother
+from ipe_bench.states.whole_paths import PathDensity
 
 STEP = 16 / 164
 TURN = 2 * np.pi
@@ -100,3 +101,18 @@ def test_scipy_finds_no_lower_path_from_the_optimised_one_or_from_the_truth():
             )
             assert 2 * found.cost >= cost - 1e-3
         assert np.sum(residuals(oscillator, z, path.ravel()) ** 2) == pytest.approx(cost, abs=1e-6)
+
+
+def test_covariances_of_the_oscillators_paths_are_never_below_those_of_tangents():
+    """The cost beside a path rises far above that of a normal density where the rest of the path
+    is not found in a step, as in trial 10."""
+    oscillator = model("van_der_pol")
+    z = oscillator.draw(9, 12).z
+    density = PathDensity.of(oscillator, z)
+    with np.errstate(all="ignore"):
+        tracks = LevenbergMarquardtSmoother().track(oscillator, z)
+    path = np.concatenate([tracks.start.mean[:, None], tracks.mean], axis=1)
+    P, _ = density.spread(density.tangents(density.settled(path)))
+    root = np.linalg.inv(np.linalg.cholesky(P[:, -1]))
+    relative = root @ tracks.covariance[:, -1] @ root.transpose(0, 2, 1)
+    assert (np.linalg.eigvalsh(relative) > 0.75).all()
