@@ -268,6 +268,14 @@ def test_scales_are_labelled_as_far_as_there_is_room_with_both_ends():
     assert [common.number(v) for v in shown] == list(shown.values())
 
 
+def test_values_that_hardly_differ_stand_between_labels_on_an_axis_of_their_own():
+    ax = Figure().subplots()
+    common.decades(ax, [0.86, 1.0], least=1.25)
+    low, high = ax.get_ylim()
+    assert high / low < 2
+    assert sum(low <= tick <= high for tick in ax.get_yticks()) >= 3
+
+
 # Colours ------------------------------------------------------------------------------------------
 
 

@@ -27,7 +27,7 @@ from ipe_bench.measurements import Recorded
 from ipe_bench.noise import Certified
 from ipe_bench.plugins import discovery
 from ipe_bench.report.finding import MEANING
-from ipe_bench.report.page.headline import about, headline, in_common, success
+from ipe_bench.report.page.headline import _over_paths, about, headline, in_common, success
 from ipe_bench.report.tables.reports import all_tables
 from ipe_bench.report.tables.table import Table
 from ipe_bench.report.words import percent
@@ -439,6 +439,28 @@ def test_states_that_move_have_words_of_their_own(tmp_path):
         assert words not in shown, words
     assert "the filter linearised at the true path" in shown
     assert "error over the linearised filter" in shown
+
+
+def test_errors_of_few_solved_trials_are_not_ranked_with_those_of_all():
+    """Who gives up hard trials has small errors in the others."""
+    states = pd.DataFrame(
+        {
+            "estimator": ["steady", "choosy", "rough"],
+            "parameter": "x",
+            "noise": "model",
+            "solved": [0.995, 0.055, 1.0],
+            "path_rmse": [2.0, 1.0, 4.0],
+        }
+    )
+    (found,) = _over_paths(states)
+    assert found == (
+        "Root mean square error over all epochs, of estimators that solve 95 % of the trials,"
+        " relative to the smallest: steady (1), rough (2)."
+    )
+    (found,) = _over_paths(states[states["estimator"] != "choosy"])
+    assert found == (
+        "Root mean square error over all epochs, relative to the smallest: steady (1), rough (2)."
+    )
 
 
 def test_the_line_below_the_title_says_which_error_makes_a_trial_a_success(synthetic):

@@ -389,11 +389,14 @@ def median_errors(report: Report, match: Any) -> Iterator[tuple[str, str, bool]]
 
 
 @sentence(
-    r"Root mean square error over all epochs, relative to the smallest: (?P<each>.*)\.", of_one=True
+    r"Root mean square error over all epochs(?P<of>, of estimators that solve 95 % of the trials)?,"
+    r" relative to the smallest: (?P<each>.*)\.",
+    of_one=True,
 )
 def path_errors(report: Report, match: Any) -> Iterator[tuple[str, str, bool]]:
     """Counts the errors of each, of which the smallest is 1 and none is 0."""
-    errors = {label: np.sqrt((s.error**2).mean(axis=0)) for (_, label), s in report.samples.items()}
+    samples = {label: s for (_, label), s in report.samples.items() if s.solved.mean() >= 0.95}
+    errors = {label: np.sqrt((s.error**2).mean(axis=0)) for label, s in samples.items()}
     least = np.min(list(errors.values()), axis=0)
     size = {label: float(np.sqrt(((each / least) ** 2).mean())) for label, each in errors.items()}
     values = {label: each / min(size.values()) for label, each in size.items()}

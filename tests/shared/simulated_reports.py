@@ -35,6 +35,7 @@ READINGS = 30
 _READ = {
     *(
         "trials",
+        "solved",
         "success",
         "failed_silent",
         "error_median",

@@ -92,7 +92,7 @@ def _further_findings(design: Design) -> Iterator[str]:
     where = [further.words[i] for i in further.taken]
     most = int(np.argmin(further.bounds[1] / further.bounds[0]))
     parameter = design.observability.parameters[most]
-    bounds = [f"{parameter.size * bound:.3g}" for bound in further.bounds[:, most]]
+    bounds = [scientific(parameter.size * bound) for bound in further.bounds[:, most]]
     unit = f" {parameter.unit}" if parameter.unit else ""
     yield (
         f"Read next at {where[0]}; the bound of {parameter.name} then falls from {bounds[0]} to"

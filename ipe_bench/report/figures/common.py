@@ -237,8 +237,9 @@ def decades(ax: Axes, values: Any, least: float = 10.0, *, ends: Any = ()) -> No
     low = values.min()
     high = values.max()
     room = max(least, (high / low) ** REACH)
-    bottom = max(low / room, ends.min(initial=low)) / 1.6
-    top = min(high * room, ends.max(initial=high)) * 1.6
+    margin = min(1.6, least)
+    bottom = max(low / room, ends.min(initial=low)) / margin
+    top = min(high * room, ends.max(initial=high)) * margin
     wider = max(np.sqrt(least * bottom / top), 1.0)
     limits = (bottom / wider, top * wider)
     axis = _value(ax)
@@ -252,11 +253,17 @@ def _positive(values: Any) -> Array:
 
 
 def log_ticks(axis: Axis, low: float, high: float) -> None:
-    """Labels that do not crowd: powers of ten, and 2 and 5 between if those are few."""
+    """Labels that do not crowd: powers of ten, and 2 and 5 between if those are few, or all digits
+    within a factor of three."""
     from matplotlib.ticker import LogLocator, NullLocator
 
-    few = high / low < 200
-    axis.set_major_locator(LogLocator(subs=(1, 2, 5)) if few else LogLocator(numticks=7))
+    ratio = high / low
+    if ratio < 3:
+        axis.set_major_locator(LogLocator(subs=range(1, 10)))
+    elif ratio < 200:
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    else:
+        axis.set_major_locator(LogLocator(numticks=7))
     axis.set_major_formatter(lambda value, _: number(value))
     axis.set_minor_locator(NullLocator())
 

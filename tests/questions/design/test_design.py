@@ -383,6 +383,15 @@ def test_the_title_of_a_design_is_so_of_the_model_with_that_reading(seed):
     assert cut <= 1.02 * min((other**2).mean() for other in others)
 
 
+def test_a_title_writes_small_bounds_in_three_figures_as_the_table_does():
+    found = design(Scenario(Linear(), Gaussian(4e-4), GaussianPrior(), 1.0, 0))
+    assert found.further is not None
+    title = next(s for s in _findings(found) if s.startswith("Read next"))
+    numbers = re.search(r"falls from (\S+) to (\S+)", title)
+    assert numbers is not None
+    assert all(re.fullmatch(r"\d\.\d\de-\d+", one) for one in numbers.groups()), title
+
+
 def test_the_title_of_a_design_first_says_what_readings_leave_open():
     open_ = design(scenario(Linear(count=2)))
     assert _findings(open_)[0].startswith("The readings do not determine")
