@@ -39,6 +39,10 @@ from ipe_bench.states.linearisation import (
 )
 from ipe_bench.states.roots import Chain, Rooted, Step, precise
 
+_PRECISE_BY_SCORES = 1e4
+"""Variance of what is read, in parts of that of its reading, above which smoothing by scores loses
+half of its digits."""
+
 
 class Read(NamedTuple):
     """Holds the readings of an epoch as they were linearised."""
@@ -421,10 +425,16 @@ def _loses_digits(tracks: Tracks) -> Mask:
     before = [x.covariance for x in tracks.predicted]
     if len(before) < len(tracks.reads):
         before.insert(0, tracks.start.covariance)
-    P = np.stack([_variances(one) for one in before], axis=1)
+    covariances = np.stack(before, axis=1)
+    P = _variances(covariances)
     H = np.stack([read.H for read in tracks.reads], axis=1)
     R = np.stack([_variances(read.noise) for read in tracks.reads], axis=1)
-    return precise(H, P, R)
+    losing = precise(H, P, R)
+    # Smoothers of singular covariances go by scores, which lose digits twice as fast.
+    rows = np.flatnonzero(precise(H, P, R, _PRECISE_BY_SCORES) & ~losing)
+    if rows.size:
+        losing[rows] = half(covariances[rows]).singular.any(axis=1)
+    return losing
 
 
 def _variances(P: Array) -> Array:

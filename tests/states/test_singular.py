@@ -236,6 +236,23 @@ def test_a_distance_outside_of_the_range_is_infinite():
     np.testing.assert_allclose(mahalanobis(e, P), [1.0, np.inf, np.inf, 9.0], rtol=1e-12)
 
 
+def test_a_singular_prior_a_thousand_times_as_wide_as_a_reading_is_smoothed_exactly():
+    model = Linear(
+        F=((-0.75, -0.25, 0.75), (1.5, -1.25, 1.5), (1.25, 0.75, 0.25)),
+        G0=((-256.0, 1536.0), (2048.0, 1792.0), (1280.0, 256.0)),
+        G=((0.0,), (0.0,), (0.0,)),
+        H=((-1.25, 0.0, 0.75),),
+        mean=(1.0, 2.0, 3.0),
+        moved_first=False,
+    )
+    z = model.draw(0, 1).z
+    (mean, P), _ = exact(model, z[0])
+    for first in (ekf(), ckf()):
+        found = Smoother(first).track(model, z)
+        np.testing.assert_allclose(found.mean[0], mean, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(found.covariance[0], P, rtol=1e-6, atol=1e-6)
+
+
 @pytest.mark.parametrize(("n", "rank"), [(5, 3), (12, 12)], ids=["singular", "regular"])
 def test_a_distance_has_the_same_bits_alone_and_in_a_batch(n, rank):
     rng = np.random.default_rng(0)
