@@ -18,7 +18,7 @@ from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array, Mask, deviations, unmasked
 from ipe_bench.basics.options import Finite, NonNegative, Positive, option_types
 from ipe_bench.basics.statuses import Status
-from ipe_bench.real.readings import TextTable, read_tables
+from ipe_bench.real.readings import TextTable, read_tables, unit_of
 from ipe_bench.runs.run import validate
 from ipe_bench.states.base import StateModel
 from ipe_bench.states.copies import SURE, copy_p
@@ -54,6 +54,8 @@ _FAR_BELOW = 10.0
 largest of the log."""
 _COLLAPSED = 2.0
 """Effective sample sizes below this have no covariance."""
+_TURNS = {"deg": 360.0, "°": 360.0, "rad": 2 * np.pi}
+"""Whole turns in the units of angles."""
 SEARCHES = 4
 """Searches for a maximum of the likelihood: from the values of the model, and from draws about
 them."""
@@ -125,6 +127,7 @@ def _wanted(model: StateModel) -> list[str]:
 
 def _read(table: TextTable, model: StateModel) -> Log:
     columns = _headings(table, _wanted(model))
+    _require_units_of_angles(table, columns, model)
     _require_rows(table)
     cells = {}
     for name, heading in columns.items():
@@ -187,6 +190,19 @@ def _headings(table: TextTable, wanted: Sequence[str]) -> dict[str, str]:
         )
     table.require_known(list(columns.values()), wanted)
     return columns
+
+
+def _require_units_of_angles(
+    table: TextTable, columns: Mapping[str, str], model: StateModel
+) -> None:
+    """Refuses angles in a unit whose whole turn is another number than the model's."""
+    for name, period in zip(model.reading_names, model.periods, strict=False):
+        turn = _TURNS.get(unit_of(columns[name]), period)
+        if period and not np.isclose(turn, period):
+            raise table.error(
+                f"column {columns[name]}: a whole turn is {period:g} in {model.name}; convert the"
+                " values"
+            )
 
 
 def _require_rows(table: TextTable) -> None:

@@ -130,7 +130,7 @@ class TextTable:
         for other in self.heading:
             if _quantity(other) != _quantity(name):
                 continue
-            if not _unit(other):
+            if not unit_of(other):
                 raise self.error(
                     f"column {other}: has no unit; call it {name} if that is the unit of its values"
                 )
@@ -148,7 +148,8 @@ def _quantity(heading: str) -> str:
     return heading.partition(" [")[0].strip()
 
 
-def _unit(heading: str) -> str:
+def unit_of(heading: str) -> str:
+    """Returns the unit of a heading such as `height [m]`; empty if it has none."""
     return heading.partition("[")[2].rstrip("] ")
 
 
@@ -331,7 +332,7 @@ def _together(paths: Sequence[Path], found: Sequence[Readings]) -> Readings:
     first = found[0]
     if len(found) == 1:
         return first
-    units = {_quantity(name): _unit(name) for name in first.columns}
+    units = {_quantity(name): unit_of(name) for name in first.columns}
     for one, path in zip(found, paths, strict=True):
         if (one.deviations is None) != (first.deviations is None):
             with_sigma, without = (paths[0], path) if one.deviations is None else (path, paths[0])
@@ -340,7 +341,7 @@ def _together(paths: Sequence[Path], found: Sequence[Readings]) -> Readings:
             )
         for name in one.columns:  # one formula is made of all files
             other = units.get(_quantity(name))
-            if other and _unit(name) and _unit(name) != other:
+            if other and unit_of(name) and unit_of(name) != other:
                 raise UserError(
                     f"readings={path}: column {name}: {paths[0]} has it in {other}; convert the"
                     " values"
@@ -486,7 +487,7 @@ def _reading_column(table: TextTable, model: Measurement) -> str:
 def _require_unit_of_angles(table: TextTable, heading: str, model: Measurement) -> None:
     """Refuses a unit of angles that the model, which takes them for radians, does not state: a
     whole turn is another number in it."""
-    unit = _unit(heading)
+    unit = unit_of(heading)
     if not len(model.periods) or model.reading_unit or unit in ("", "rad"):
         return
     remedy = "convert the values to rad"
@@ -516,7 +517,7 @@ def _sigmas(
     name; None without it."""
     if column is None:
         return None
-    if _unit(column) not in ("", _unit(shown)):
+    if unit_of(column) not in ("", unit_of(shown)):
         raise table.error(
             f"column {column}: the unit must be the unit of {shown}; convert the values"
         )

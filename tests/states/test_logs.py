@@ -243,6 +243,21 @@ def test_the_times_of_a_log_are_those_of_its_epochs(tmp_path):
         ib.estimate(model, tmp_path / "ms.csv", {"ekf": ekf()})
 
 
+@pytest.mark.parametrize(("unit", "fits"), [("deg", False), ("°", False), ("rad", True)])
+def test_bearings_in_degrees_are_refused_where_a_turn_is_two_pi(unit, fits, tmp_path):
+    model = ib.component("state_model/bearings_only")
+    z = model.draw(0, 1).z[0, :, 0]
+    readings = z if fits else np.rad2deg(z)
+    pd.DataFrame({f"bearing [{unit}]": readings}).to_csv(tmp_path / "log.csv", index=False)
+    if fits:
+        answer = ib.estimate(model, tmp_path / "log.csv", {"ekf": ekf()})
+        np.testing.assert_allclose(answer.log.z[:, 0], z, rtol=1e-12)
+        return
+    said = f"column bearing \\[{unit}\\]: a whole turn is 6.28319 in bearings_only; convert"
+    with pytest.raises(ib.UserError, match=said):
+        ib.estimate(model, tmp_path / "log.csv", {"ekf": ekf()})
+
+
 @pytest.mark.parametrize(
     ("z", "said"), [(np.inf, "inf is not a reading"), (np.nan, "there is no reading")]
 )
