@@ -67,9 +67,10 @@ class AutoTracker(Tracker):
         return Filter().hindrance(model)
 
     def track(self, model: StateModel, z: Array) -> Tracks:
-        first = filtered(model, z, Taylor())
+        by_state = model.gain_by_state or model.R_by_state
+        first = filtered(model, z, Taylor(), smooths=by_state)
         doubtful = np.flatnonzero(self.descent.improbable(z, first.nis.sum(axis=1)))
-        if model.gain_by_state or model.R_by_state:
+        if by_state:
             return self._likelier(model, z, first, doubtful)
         density = PathDensity.of(model, z)
         paths = Descent.of(density, first)
@@ -114,7 +115,7 @@ class AutoTracker(Tracker):
         stage = tracks.stage = np.full(len(z), EXTENDED)
         if not doubtful.size:
             return tracks
-        second = filtered(model, z[doubtful], Unscented())
+        second = filtered(model, z[doubtful], Unscented(), smooths=True)
         other = smoothed(model, second)
         tracks.calls[doubtful] += second.calls
         likelier = ~(second.log_likelihood <= first.log_likelihood[doubtful])

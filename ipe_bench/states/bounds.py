@@ -105,5 +105,5 @@ def bound_at_truth(model: StateModel, paths: Paths, smooths: bool = False) -> Ar
     path.covariance[:] = model.prior.covariance
     # No covariance depends on the values of the readings.
     z = np.zeros((*paths.x.shape[:2], model.readings_per_epoch))
-    tracks = filtered(model, z, Taylor(), path=path)
+    tracks = filtered(model, z, Taylor(), path=path, smooths=smooths)
     return (smoothed(model, tracks) if smooths else tracks).covariance

@@ -45,7 +45,8 @@ class Smoother(Tracker):
         return self.filter.hindrance(model)
 
     def track(self, model: StateModel, z: Array) -> Tracks:
-        tracks = self.filter.track(model, z)
+        behind = self.filter
+        tracks = filtered(model, z, behind.rule, behind.iterations, smooths=True)
         out = smoothed(model, tracks)
         out.cost = tracks.nis.sum(axis=1)  # that of its path is chi-square at the minimum alone
         return out
@@ -142,7 +143,7 @@ class IteratedSmoother(Tracker):
         going = np.ones(len(z), dtype=bool)
         for _ in range(self.iterations):
             # Posterior linearisation: points about the last smoothed path, then its smoother.
-            new = smoothed(model, filtered(model, z, self.rule, path=path))
+            new = smoothed(model, filtered(model, z, self.rule, path=path, smooths=True))
             calls = calls + np.where(going, new.calls, 0.0)
             if self.damped:
                 density = PathDensity.of(model, z)

@@ -39,6 +39,8 @@ from ipe_bench.states.linearisation import (
 )
 from ipe_bench.states.roots import Chain, Rooted, Step, precise
 
+_STEEPEST = 1e6
+"""Largest slope about a path that is taken for one, and not for round-off."""
 _PRECISE_BY_SCORES = 1e4
 """Variance of what is read, in parts of that of its reading, above which smoothing by scores loses
 half of its digits."""
@@ -159,9 +161,8 @@ class Tracks:
         part.start = start
         return part
 
-    def keep(self, rows: NDArray[np.intp], other: Tracks) -> None:
+    def keep(self, rows: NDArray[np.intp], other: Tracks, found: Mask) -> None:
         """Takes what another filter of the trials `rows` found, where it did."""
-        found = finite(other.mean) & finite(other.covariance)
         kept = rows[found]
         if not kept.size:
             return
@@ -403,12 +404,13 @@ def filtered(
     iterations: int = 1,
     path: Tracks | None = None,
     start: Normal | None = None,
+    smooths: bool = False,
 ) -> Tracks:
     """Runs the filter of the model that a rule linearises about the filter's own states, or about
-    those of a path; `start` replaces the prior."""
+    those of a path; `start` replaces the prior, and `smooths` tells whether a smoother follows."""
     start = start or spread_prior(model, len(z))
     tracks = _filtered(model, z, rule, iterations, path, start)
-    losing = _loses_digits(tracks)
+    losing = _loses_digits(tracks, smooths)
     if iterations > 1 or path is not None:
         # About states whose covariance has lost its digits nothing is found at all.
         losing |= ~finite(tracks.mean)
@@ -416,11 +418,21 @@ def filtered(
     if rows.size:
         about = None if path is None else path.about(rows)
         begun = Rooted.of_normal(Normal(start.mean[rows], start.covariance[rows]))
-        tracks.keep(rows, _filtered(model, z[rows], rule, iterations, about, begun))
+        other = _filtered(model, z[rows], rule, iterations, about, begun)
+        tracks.calls[rows] += other.calls
+        found = finite(other.mean) & finite(other.covariance)
+        if smooths and other.chain is not None:
+            smooth = other.chain.smoothed()
+            found &= finite(smooth.mean) & finite(smooth.covariance)
+        if path is not None:
+            # About a path that is nearly known, slopes by points may be round-off.
+            for move in other.moves:
+                found &= (np.abs(move.A) < _STEEPEST).all(axis=(1, 2))
+        tracks.keep(rows, other, found)
     return tracks
 
 
-def _loses_digits(tracks: Tracks) -> Mask:
+def _loses_digits(tracks: Tracks, smooths: bool) -> Mask:
     """Tells in which trials readings leave less of a covariance than its digits (trials,)."""
     before = [x.covariance for x in tracks.predicted]
     if len(before) < len(tracks.reads):
@@ -430,6 +442,8 @@ def _loses_digits(tracks: Tracks) -> Mask:
     H = np.stack([read.H for read in tracks.reads], axis=1)
     R = np.stack([_variances(read.noise) for read in tracks.reads], axis=1)
     losing = precise(H, P, R)
+    if not smooths:
+        return losing
     # Smoothers of singular covariances go by scores, which lose digits twice as fast.
     rows = np.flatnonzero(precise(H, P, R, _PRECISE_BY_SCORES) & ~losing)
     if rows.size:
