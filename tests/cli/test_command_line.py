@@ -171,7 +171,7 @@ MISTAKES = {
     "design of a solver": (["design", *SMALL, "solver=[newton]"], "solver: is for `ipe-bench run`"),
     "design of a file": (
         ["design", *SMALL, "readings=a.csv"],
-        "readings=a.csv: give a whole number above 0",
+        "readings=a.csv: readings= is the largest number of readings in design",
     ),
     "no such column": (["design", *SMALL, "by=colour"], "by=colour: there is no such column"),
     "no such criterion": (["design", *SMALL, "criterion=E"], "criterion=E: choose one of A, D"),
