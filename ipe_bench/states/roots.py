@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ipe_bench.basics.linalg import Array, Mask, multiply
 from ipe_bench.engine.chains import from_before, lower, smoothed_chains
@@ -83,16 +84,8 @@ class Step(NamedTuple):
 class Chain:
     """Holds the affine models of those trials whose covariances are kept by roots."""
 
-    rows: Array
-    """(t,)"""
     start: Rooted
     steps: Sequence[Step]
-
-    def part(self, found: Mask, rows: Array) -> Chain:
-        """Returns the models of some of the trials, which then are `rows`."""
-        start = Rooted(*(part[found] for part in self.start))
-        steps = [Step(*(part[found] for part in step)) for step in self.steps]
-        return Chain(rows, start, steps)
 
     def smoothed(self) -> Normal:
         """Returns the states (t, 1 + K, n) given all readings."""
@@ -109,6 +102,15 @@ class Chain:
         x = solved_by_roots(A, B, np.zeros_like(a), G, a, v)
         each = [smoothed_chains(A[[i]], B[[i]], G[:, i])[0] for i in range(t)]
         return Normal(x, np.concatenate(each))
+
+
+class Smooth(NamedTuple):
+    """Holds what smoothing by roots found."""
+
+    rows: NDArray[np.intp]
+    """Its trials (t,)."""
+    states: Normal
+    """From before the first transition (t, 1 + K, n), given all readings."""
 
 
 def precise(H: Array, P: Array, R: Array, most: float = _PRECISE) -> Mask:

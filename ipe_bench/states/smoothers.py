@@ -216,14 +216,13 @@ def smoothed(model: StateModel, tracks: Tracks) -> Tracks:
     out.calls = tracks.calls
     if singular.any() and len(tracks.reads) == model.epochs:
         _smooth_by_scores(model, tracks, out, singular)
-    chain = tracks.chain
-    if chain is not None:
+    if tracks.smooth is not None:
         # A difference of covariances has no digits there.
-        found = chain.smoothed()
-        out.start.mean[chain.rows] = found.mean[:, 0]
-        out.start.covariance[chain.rows] = found.covariance[:, 0]
-        out.mean[chain.rows] = found.mean[:, 1:]
-        out.covariance[chain.rows] = found.covariance[:, 1:]
+        rows, found = tracks.smooth
+        out.start.mean[rows] = found.mean[:, 0]
+        out.start.covariance[rows] = found.covariance[:, 0]
+        out.mean[rows] = found.mean[:, 1:]
+        out.covariance[rows] = found.covariance[:, 1:]
     return out
 
 

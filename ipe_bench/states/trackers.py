@@ -37,7 +37,7 @@ from ipe_bench.states.linearisation import (
     Taylor,
     Unscented,
 )
-from ipe_bench.states.roots import Chain, Rooted, Step, precise
+from ipe_bench.states.roots import Chain, Rooted, Smooth, Step, precise
 
 _STEEPEST = 1e6
 """Largest slope about a path that is taken for one, and not for round-off."""
@@ -88,7 +88,9 @@ class Tracks:
     reads: list[Read] = field(default_factory=list)
     """The readings of each epoch as they were linearised."""
     chain: Chain | None = None
-    """The affine models of those trials whose covariances were kept by roots."""
+    """The affine models of the trials, if their covariances were kept by roots."""
+    smooth: Smooth | None = None
+    """What a smoother finds of those trials whose covariances had to be kept by roots."""
     cost: Array | None = None
     """-2 log p(path | readings) (trials,) of an iterated smoother up to a constant, or the NIS of
     the filter behind a smoother: chi-square with a degree per reading; see `path_p`."""
@@ -173,7 +175,6 @@ class Tracks:
             for mine, its in zip(getattr(self, name), getattr(other, name), strict=True):
                 for part, new in zip(mine, its, strict=True):
                     part[kept] = new[found]
-        self.chain = None if other.chain is None else other.chain.part(found, kept)
 
     @classmethod
     def lost(cls, model: StateModel, trials: int) -> Tracks:
@@ -187,7 +188,10 @@ class Tracks:
     def join(cls, parts: Sequence[Tracks]) -> Tracks:
         """Joins the trials of several batches one after another, without what smoothers need; what
         trials lack that others have is NaN, or the status and the iterations of none."""
-        alone = [replace(part, moves=[], predicted=[], reads=[], chain=None) for part in parts]
+        alone = [
+            replace(part, moves=[], predicted=[], reads=[], chain=None, smooth=None)
+            for part in parts
+        ]
         joined = join(alone)
         if joined.status is not None:
             joined.status = np.nan_to_num(joined.status).astype(np.int8)
@@ -421,14 +425,17 @@ def filtered(
         other = _filtered(model, z[rows], rule, iterations, about, begun)
         tracks.calls[rows] += other.calls
         found = finite(other.mean) & finite(other.covariance)
-        if smooths and other.chain is not None:
-            smooth = other.chain.smoothed()
+        smooth = other.chain.smoothed() if smooths and other.chain else None
+        if smooth is not None:
             found &= finite(smooth.mean) & finite(smooth.covariance)
         if path is not None:
             # About a path that is nearly known, slopes by points may be round-off.
             for move in other.moves:
                 found &= (np.abs(move.A) < _STEEPEST).all(axis=(1, 2))
         tracks.keep(rows, other, found)
+        if smooth is not None:
+            states = Normal(smooth.mean[found], smooth.covariance[found])
+            tracks.smooth = Smooth(rows[found], states)
     return tracks
 
 
@@ -526,7 +533,7 @@ def _filtered(
             steps.append(_step(x, move, G, found))
         x = out.note(k, found)
     if isinstance(start, Rooted):
-        out.chain = Chain(np.arange(len(z)), start, steps)
+        out.chain = Chain(start, steps)
     calls_of_f = rule.calls(model.n, bool(model.state_periods))
     calls_of_h = rule.calls(model.n, bool(model.periods))
     out.calls += calls_of_f * len(out.moves) + calls_of_h * iterations * model.epochs

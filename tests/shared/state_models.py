@@ -10,7 +10,7 @@ import numpy as np
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Finite, NonNegative, Positive
 from ipe_bench.measurements import Parameter
-from ipe_bench.states import Normal, StateModel
+from ipe_bench.states import Formulas, Normal, StateModel
 from ipe_bench.states.algebra import mahalanobis, root
 
 
@@ -18,6 +18,17 @@ def white_acceleration(step: float, density: float) -> Array:
     """Covariance (2, 2) that a white acceleration of this density adds to position and velocity in
     `step` seconds."""
     return density * np.array([[step**3 / 3, step**2 / 2], [step**2 / 2, step]])
+
+
+def straight_line(spread: float, deviation: float) -> Formulas:
+    """A line through ten readings, of whose value and slope the prior says so much."""
+    return Formulas(
+        next={"p": "p + v", "v": "v"},
+        readings={"z": "p"},
+        deviation={"z": deviation},
+        spread={"p": spread, "v": spread},
+        count=10,
+    )
 
 
 def path_cost(model: StateModel, z: Array, start: Array, mean: Array) -> Array:

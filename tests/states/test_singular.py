@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from shared.families import slow_if
 from shared.oracles import assert_agrees
-from shared.state_models import CoordinatedTurn, path_cost
+from shared.state_models import CoordinatedTurn, path_cost, straight_line
 
 import ipe_bench as ib
 from ipe_bench.basics.linalg import multiply
@@ -341,13 +341,7 @@ WIDE = {
 def test_a_wide_prior_costs_no_digits_of_what_precise_readings_leave(label, spread, deviation):
     """A line through ten readings, of which the prior says nothing: its last state is as uncertain
     as that of least squares, and a smoother's path is their line."""
-    model = ib.states.Formulas(
-        next={"p": "p + v", "v": "v"},
-        readings={"z": "p"},
-        deviation={"z": deviation},
-        spread={"p": spread, "v": spread},
-        count=10,
-    )
+    model = straight_line(spread, deviation)
     z = model.draw(0, 2).z
     # Its value at the last reading, and its slope.
     X = np.stack([np.ones(10), np.arange(-9.0, 1.0)], axis=1)

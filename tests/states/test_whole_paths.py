@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from shared.oracles import assert_agrees
-from shared.state_models import ConstantVelocity, Pendulum
+from shared.state_models import ConstantVelocity, Pendulum, straight_line
 
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements import Parameter
@@ -96,13 +96,7 @@ def test_a_step_from_anywhere_ends_at_the_smoothed_path_of_a_linear_model(number
 def test_a_wide_prior_costs_a_path_no_digits_of_its_covariance(spread, deviation):
     """A line through ten readings, of which the prior says nothing: (X' X)^-1 deviation^2 at its
     start."""
-    model = Formulas(
-        next={"p": "p + v", "v": "v"},
-        readings={"z": "p"},
-        deviation={"z": deviation},
-        spread={"p": spread, "v": spread},
-        count=10,
-    )
+    model = straight_line(spread, deviation)
     z = model.draw(0, 2).z
     X = np.stack([np.ones(10), np.arange(1.0, 11.0)], axis=1)
     exact = deviation**2 * np.linalg.inv(X.T @ X)
