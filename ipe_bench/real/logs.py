@@ -236,6 +236,7 @@ class LogTracks:
     """Holds the track of a log by one tracker, in the units of the states."""
 
     label: str
+    tracker: Tracker
     mean: Array
     """States (K, n)."""
     deviation: Array
@@ -312,6 +313,7 @@ class LogTracks:
         held = not effective < _COLLAPSED and lost_from is None
         return cls(
             label,
+            tracker,
             mean,
             deviation,
             covariance=tracks.covariance[0] * np.outer(sizes, sizes),

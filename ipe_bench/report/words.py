@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from ipe_bench import __version__
@@ -18,6 +18,8 @@ CITATION = (
     " provenance, and the digest of the bundle where results are shared as one (ipe-bench bundle)."
 )
 """Citation of the bench."""
+_MOST_FIGURES = 12
+"""Further figures of ends that are told apart."""
 
 
 def value_text(value: Any) -> str:
@@ -70,6 +72,17 @@ def ends_in_percent(low: float, high: float) -> tuple[str, str]:
         return f"{100 * share:.{0 if share in (0, 1) else decimals}f}"
 
     return end(low), end(high)
+
+
+def told_apart(low: float, high: float, show: Callable[[float, int], str]) -> tuple[str, str]:
+    """Formats the ends of an interval by a function of a number and how many more figures it has:
+    by as few more as tell the ends apart."""
+    ends = show(low, 0), show(high, 0)
+    more = 0
+    while ends[0] == ends[1] and low < high and more < _MOST_FIGURES:
+        more += 1
+        ends = show(low, more), show(high, more)
+    return ends
 
 
 def short(value: float) -> str:

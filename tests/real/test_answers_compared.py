@@ -126,6 +126,82 @@ def test_a_later_column_that_fits_better_is_named_and_quoted(noise, excess, lowe
     assert any(line.startswith("lm: a = ") for line in answer.sentences()) or not lower
 
 
+CURVED = 0.4 * np.sin(2 * T)
+"""What a straight line leaves of readings, so that neighbours resemble each other."""
+STRAIGHT = Formula("a+b*t", {"a": 1.0, "b": 1.0}, {"t": T.tolist()})
+
+
+def answered(deviation, beyond=0.0, factor=1.0, seed=0):
+    """Answers to readings of 2 + t, where errors have a deviation of 0.3 times a factor."""
+    errors = factor * 0.3 * np.random.default_rng(seed).standard_normal(41)
+    noise = deviation and Gaussian(deviation)
+    return ib.estimate(STRAIGHT, 2 + T + beyond + errors, {"lm": LevenbergMarquardt()}, noise=noise)
+
+
+@pytest.mark.parametrize(
+    ("truth", "said"),
+    [
+        ({"deviation": 0.3}, "by lm, which passes every test"),
+        ({"deviation": None}, "by lm, the size of whose residuals is not tested"),
+        ({"deviation": 0.3, "factor": 3.0}, "no answer passes its tests"),
+        (
+            {"deviation": 0.45, "beyond": CURVED},
+            "by lm, in doubt, for successive residuals resemble each other",
+        ),
+        (
+            {"deviation": None, "beyond": CURVED},
+            "by lm, in doubt, for successive residuals resemble each other",
+        ),
+        (
+            {"deviation": 30.0},
+            "by lm, which passes every test, though the stated noise is too large",
+        ),
+    ],
+)
+def test_the_title_of_an_answer_has_its_numbers_and_how_they_were_tested(truth, said):
+    answer = answered(**truth)
+    fit = answer["lm"]
+    title = answer.finding()
+    assert title.endswith(said)
+    assert bool(title.startswith("a = ")) == fit.passes
+    numbers = re.findall(r"(\w) = (\S+) ± (\S+?),? ", title)
+    for (name, value, error), x, deviation in zip(
+        numbers, fit.x, fit.standard_errors, strict=False
+    ):
+        assert name in "ab"
+        assert float(value) == pytest.approx(x, abs=0.1 * deviation)
+        assert float(error) == pytest.approx(deviation, rel=0.05)
+    assert len(numbers) == 2 * fit.passes
+    # The sentences below say no more than the title.
+    assert ("every test" in answer.sentences()[0]) == ("every test" in title)
+    assert ("In doubt" in answer.sentences()[0]) == ("in doubt" in title)
+    told = " ".join(str(answer).split())
+    assert ("standard errors are too small" in told) == ("in doubt" in title)
+
+
+def test_a_title_names_what_readings_leave_open_and_other_answers():
+    two = Formula("(a+b)*t", {"a": 1.0, "b": 1.0}, {"t": T.tolist()})
+    square = Formula("c**2*t", {"c": 1.0}, {"t": T.tolist()})
+    z = 2 * T + 0.3 * np.random.default_rng(0).standard_normal(41)
+    lm = {"lm": LevenbergMarquardt()}
+    assert ib.estimate(two, z, lm, noise=Gaussian(0.3)).finding() == (
+        "the readings do not determine a - b"
+    )
+    title = ib.estimate(square, z, lm, noise=Gaussian(0.3)).finding()
+    assert title.endswith("which passes every test, though other parameters fit as well")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("truth", "least", "most"),
+    [({}, 490, 500), ({"factor": 2.0}, 0, 2), ({"beyond": CURVED, "factor": 0.4}, 0, 2)],
+)
+def test_titles_of_answers_are_false_as_seldom_as_their_tests_say(truth, least, most):
+    """Two tests at 1 in 1000 of readings by the model, or by none such."""
+    titles = [answered(0.3, **truth, seed=seed).finding() for seed in range(500)]
+    assert least <= sum("passes every test" in title for title in titles) <= most
+
+
 def far_overstated(deviation):
     z = A @ [1.0, 1.2, 0.8] + 0.01 * np.random.default_rng(2).standard_normal(12)
     return ib.estimate(

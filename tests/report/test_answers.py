@@ -22,7 +22,8 @@ import ipe_bench as ib
 from ipe_bench.basics.statuses import Status
 from ipe_bench.cli.main import main
 from ipe_bench.estimators.base import Estimates
-from ipe_bench.questions.compare.figure import draw_pairs
+from ipe_bench.questions.compare.answer import _cells
+from ipe_bench.questions.compare.figure import _measure, _outcome, _signed, draw_pairs
 from ipe_bench.questions.design.answer import _draw_design, _findings, _ways
 from ipe_bench.questions.posterior.figure import draw_marginals
 from ipe_bench.questions.posterior.maths import Posterior, Reference
@@ -33,8 +34,8 @@ from ipe_bench.report.figures.views import looks_of, views
 from ipe_bench.report.page.answer import _drawings
 from ipe_bench.report.page.log import LogAnswer, _sentences
 from ipe_bench.report.style import FACES, house_style
-from ipe_bench.report.words import ends_in_percent, public
-from ipe_bench.states import Smoother, Tracker, ekf
+from ipe_bench.report.words import ends_in_percent, public, told_apart
+from ipe_bench.states import Smoother, Tracker, ekf, ukf
 from ipe_bench.states.base import widened
 from ipe_bench.statistics import analyse
 
@@ -119,6 +120,20 @@ def test_certified_readings_have_a_curve_over_their_input():
 )
 def test_ends_of_a_narrow_interval_have_decimals(low, high, ends):
     assert ends_in_percent(low, high) == ends
+
+
+def test_ends_of_a_change_are_told_apart(tmp_path):
+    """Intervals that are narrower than the usual figures have more; an end alone needs none."""
+    assert told_apart(-82.31, -82.29, _signed) == ("-82.31", "-82.29")
+    assert told_apart(99.6, 300.0, _signed) == ("+100", "+300")
+    assert told_apart(0.3, 40.0, _signed) == ("+0.3", "+40")
+    quantity = {"quantity": "error", "first_value": 1.0, "second_value": 0.18, "change": 0.18}
+    row = {**quantity, "low": 0.18012, "high": 0.18031, "p": 1e-4, "e": 50.0, "finding": "better"}
+    row["different"] = True
+    assert _cells(row, "95 %")["95 %"] == "0.1801 to 0.1803"
+    measure = _measure("error", 0.02)
+    assert _outcome(row, row["low"], row["high"], measure) == "better: -81.99 to -81.97 %"
+    assert _outcome(row, 10.021, 10.042, measure) == "better: 10.02 to 10.04 times"
 
 
 @pytest.mark.parametrize(
@@ -298,6 +313,16 @@ def test_each_state_is_drawn_with_its_band_and_the_readings_where_it_is_read(wal
     for sign in (-1, 1):
         assert np.isin(track.mean[:, 1] + sign * 2 * track.deviation[:, 1], ends).all()
     assert nis.get_title() == "NIS of kf"
+
+
+def test_tracks_of_a_log_have_the_colours_of_a_run():
+    trackers = {"ekf": ekf(), "ukf_rts": Smoother(ukf())}
+    model = ConstantVelocity(count=4)
+    log = ib.estimate(model, model.draw(0, 1).z[0], trackers)
+    with house_style():
+        (drawing,) = draw_log(log.log, log.tracks)
+    drawn = {line.get_color() for line in drawing.figure.axes[0].lines}
+    assert {one.color for one in looks_of(trackers).values()} <= drawn
 
 
 def test_nis_above_its_limit_are_in_red_and_their_share_is_said(walked):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,15 @@ from ipe_bench.questions.compare.maths import (
 )
 from ipe_bench.report.page.writer import digests, write_files
 from ipe_bench.report.tables.table import Cell, Column, Part, Shown, Table, texts, words
-from ipe_bench.report.words import compact, duration, enumerate_few, p_value, percent, value_text
+from ipe_bench.report.words import (
+    compact,
+    duration,
+    enumerate_few,
+    p_value,
+    percent,
+    told_apart,
+    value_text,
+)
 from ipe_bench.runs.bundles import opened
 from ipe_bench.statistics.collect import collect
 from ipe_bench.statistics.comparisons import ALPHA
@@ -214,7 +223,7 @@ def _cells(row: dict[str, Any], interval: str) -> dict[str, str]:
         change = _change(quantity, row["change"]) + unit
     ends = "-"
     if math.isfinite(row["low"]):
-        ends = f"{_change(quantity, row['low'])} to {_change(quantity, row['high'])}"
+        ends = " to ".join(told_apart(row["low"], row["high"], partial(_change, quantity)))
     return {
         "": _TITLES.get(quantity, quantity),
         "first": show(row["first_value"]),
@@ -227,13 +236,16 @@ def _cells(row: dict[str, Any], interval: str) -> dict[str, str]:
     }
 
 
-def _change(quantity: str, value: float) -> str:
-    """Formats a difference of success in points, one of bias in deviations, or else a ratio."""
+def _change(quantity: str, value: float, more: int = 0) -> str:
+    """Formats a difference of success in points, one of bias in deviations, or else a ratio, with
+    so many `more` figures than usual."""
     if quantity == "success":
-        return f"{100 * value:+.1f}"
+        return f"{100 * value:+.{1 + more}f}"
     if quantity.startswith("bias "):
-        return f"{value:+.3f}"
-    return f"{value:.3f}" if 0.1 <= value < 9.9995 else compact(value)
+        return f"{value:+.{3 + more}f}"
+    if 0.1 <= value < 9.9995:
+        return f"{value:.{3 + more}f}"
+    return f"{value:.{3 + more}g}" if more else compact(value)
 
 
 def _p(value: float) -> str:

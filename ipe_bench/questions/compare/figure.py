@@ -11,7 +11,7 @@ from ipe_bench.questions.compare.maths import comparison_title
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.style import BOUND_COLOR, FAMILIES, Look, print_width
-from ipe_bench.report.words import compact
+from ipe_bench.report.words import compact, told_apart
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -129,11 +129,29 @@ def _outcome(row: Any, low: float, high: float, measure: _Measure) -> str:
     much better or worse the second is."""
     if measure.least <= low and high <= measure.most:
         return f"the same within ± {measure.margin}"
-    extent = f"{low:+.2g} to {high:+.2g}{measure.unit}"
-    if measure.ratio and high > _TIMES:
-        extent = f"{compact(low)} to {compact(high)} times"
-    elif measure.ratio:
-        extent = f"{100 * (low - 1):+.2g} to {100 * (high - 1):+.2g} %"
+    extent = _extent(low, high, measure)
     if row["finding"]:
         return f"{row['finding']}: {extent}"
     return f"perhaps within the margin: {extent}" if row["different"] else "undecided"
+
+
+def _extent(low: float, high: float, measure: _Measure) -> str:
+    """Words the ends of an interval, by figures that tell them apart."""
+    if measure.ratio and high > _TIMES:
+        return f"{' to '.join(told_apart(low, high, _multiple))} times"
+    if measure.ratio:
+        ends = told_apart(100 * (low - 1), 100 * (high - 1), _signed)
+    else:
+        ends = told_apart(low, high, _signed)
+    return f"{' to '.join(ends)}{measure.unit}"
+
+
+def _multiple(value: float, more: int) -> str:
+    return f"{value:.{3 + more}g}" if more else compact(value)
+
+
+def _signed(value: float, more: int) -> str:
+    """Formats two figures and so many `more`, and whole numbers whole."""
+    if abs(value) >= 10:
+        return f"{value:+.{more}f}"
+    return f"{value:+.{2 + more}g}"

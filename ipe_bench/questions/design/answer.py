@@ -52,11 +52,14 @@ def _direction(seen: Observability) -> str:
 
 
 def _no_others(design: Design) -> str:
-    """Says that no way takes other readings than today's; empty if one does."""
+    """Says that no way takes other readings than today's; empty if one does. Those that may be read
+    beside them are candidates as well."""
     today = design.scenario.measurement.m
     fewer = any(way.saving or way.sharpest.readings != today for way in design.ways)
     if fewer or not design.ways or design.candidates.m != today:
         return ""
+    if design.further is not None:
+        return f"Every choice without further readings is among the present {today}"
     return f"The present {today} readings are the only candidates"
 
 
@@ -66,9 +69,9 @@ def _findings(design: Design) -> list[str]:
     same = _no_others(design)
     best = _best(design)
     found = list(_further_findings(design))
-    if same:
+    if same and not found:
         found.append(same)
-    elif best:
+    elif best and not same:
         found.append(_best_finding(best, design.scenario.measurement.m))
     direction = _direction(design.observability)
     found.insert(len(found) if design.observability.observable else 0, direction)

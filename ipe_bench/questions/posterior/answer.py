@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from ipe_bench.trials.scenario import Scenario
 
 
-HONEST = 0.1
+ADEQUATE = 0.1
 """Nats up to which a Gaussian may stand for another: a deviation is 40 % too large, or a mean half
 a deviation off."""
 SAME_LAW = 0.05
@@ -46,8 +46,8 @@ class _Row(NamedTuple):
         return Status(int(self.reference.estimates[self.label].status[0])).label
 
     @property
-    def honest(self) -> str:
-        return honest_word(self.divergence, self.reference.posterior)
+    def adequate(self) -> str:
+        return adequate_word(self.divergence, self.reference.posterior)
 
 
 class PosteriorAnswer(Shown, list[Reference]):
@@ -73,7 +73,7 @@ def posterior_parts(name: str, found: Sequence[Reference]) -> list[Table]:
         texts("noise", [compact(row.reference.posterior.noise) for row in rows]),
         words("estimator", [row.label for row in rows]),
         words("status", [row.status for row in rows]),
-        words("honest", [row.honest for row in rows]),
+        words("adequate", [row.adequate for row in rows]),
         texts("divergence", [compact(row.divergence.kl) for row in rows]),
         texts("shift", [compact(row.divergence.shift) for row in rows]),
         texts("width", [compact(row.divergence.width) for row in rows]),
@@ -89,9 +89,9 @@ def _notes(found: Sequence[Reference]) -> Iterator[str]:
         " in nats; noise: its value between two populations of particles, so a smaller divergence"
         " is chance. shift: difference of the means, in standard deviations of the posterior per"
         " root of the number of parameters. width: geometric mean of the ratios of standard"
-        " deviations. energy: distance between draws. A Gaussian is adequate if there is a single"
-        f" mode, the divergence is at most {HONEST:g} or twice the noise, and the energy at most"
-        f" {SAME_LAW:g}."
+        " deviations. energy: distance between draws. adequate: whether the Gaussian may stand for"
+        f" the posterior; that has a single mode then, the divergence is at most {ADEQUATE:g} or"
+        f" twice the noise, and the energy at most {SAME_LAW:g}."
     )
     for one in found:
         if not one.posterior.settled:
@@ -105,14 +105,14 @@ def _notes(found: Sequence[Reference]) -> Iterator[str]:
             yield f"Trial {one.trial}: {modes} modes, with {shares} of the draws."
 
 
-def honest_word(d: Divergence, sampled: Posterior) -> str:
+def adequate_word(d: Divergence, sampled: Posterior) -> str:
     """Words whether a Gaussian can stand for the posterior; a wide one over two modes, with its
     moments, cannot."""
     if not np.isfinite(d.kl):
         return "-"
     if len(sampled.modes) != 1:
         return "NO"
-    near = d.kl <= max(HONEST, 2 * sampled.noise) and d.energy <= SAME_LAW
+    near = d.kl <= max(ADEQUATE, 2 * sampled.noise) and d.energy <= SAME_LAW
     return "yes" if near else "NO"
 
 
@@ -152,7 +152,7 @@ def finding(found: Sequence[Reference]) -> str:
         return "the posterior cannot be relied on in any trial; take more particles"
     by_count: dict[int, list[str]] = {}
     for label in settled[0].divergences:
-        words = [honest_word(one.divergences[label], one.posterior) for one in settled]
+        words = [adequate_word(one.divergences[label], one.posterior) for one in settled]
         by_count.setdefault(words.count("yes"), []).append(label)
     trials = "1 trial" if len(settled) == 1 else f"{len(settled)} trials"
     listed = [

@@ -13,7 +13,8 @@ from ipe_bench.basics.linalg import Array, deviations, nearest
 from ipe_bench.measurements.base import with_unit
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
-from ipe_bench.report.style import BOUND_COLOR, Look, looks
+from ipe_bench.report.figures.views import looks_of
+from ipe_bench.report.style import BOUND_COLOR, Look
 from ipe_bench.report.words import enumerate_few, percent
 
 if TYPE_CHECKING:
@@ -52,7 +53,8 @@ def draw_log(log: Log, tracks: Sequence[LogTracks]) -> Iterator[Drawing]:
     foretold = _predicted(filters)
     # A state that is read directly has its readings in its own panel.
     rest = [j for j in foretold if read.get(j, model.n) >= len(states)]
-    colors = looks([group[0].label for group in groups])
+    shown = {group[0].label: group[0].tracker for group in groups}
+    colors = looks_of(shown)
     look = {_name(group): Look(colors[group[0].label].color, "") for group in groups}
     fig, axes = common.panels(len(states) + len(rest) + bool(filters), look, height=2.0, row=2)
     fig.set_figwidth(10.4)
@@ -80,8 +82,8 @@ def draw_log(log: Log, tracks: Sequence[LogTracks]) -> Iterator[Drawing]:
         words.append(f"Not drawn: {enumerate_few(left)}.")
     if model.n > len(states):
         words.append(f"{model.n - len(states)} further states are in track.csv.")
-    shown = enumerate_few([_name(group) for group in groups])
-    title = f"{shown}: states ± {BAND:g} standard deviations"
+    names = enumerate_few([_name(group) for group in groups])
+    title = f"{names}: states ± {BAND:g} standard deviations"
     yield Drawing("track", title, " ".join(words), fig)
 
 

@@ -178,30 +178,77 @@ class Answer(Labelled[Fit]):
                 " prior, until they do."
             )
 
+    def finding(self) -> str:
+        """States the answer in one line: its first values, by whom, and how it was tested."""
+        lacking = [one for one in self.fits if one.undetermined]
+        if lacking:
+            return f"the readings do not determine {'; '.join(lacking[0].undetermined)}"
+        if not self.passes:
+            return "no answer passes its tests"
+        one = self._stated
+        found = [f"{enumerate_few(_with_errors(one), 2)} by {one.label}"]
+        if _resembling(one):
+            found.append("in doubt, for successive residuals resemble each other")
+        elif one.fits:
+            found.append("which passes every test")
+        else:
+            found.append("the size of whose residuals is not tested")
+        told = self.examination
+        if told and told.overstated:
+            found.append("though the stated noise is too large")
+        elif told and told.ambiguous:
+            found.append("though other parameters fit as well")
+        return ", ".join(found)
+
+    @property
+    def _stated(self) -> Fit:
+        """The fit that stands for the answer: the examined one, or else the first that passes."""
+        passing = [one for one in self.fits if one.passes]
+        told = self.examination
+        examined = [one for one in passing if told and one.label == told.label]
+        return [*examined, *passing][0]
+
     def sentences(self) -> list[str]:
         """Says who has an answer, what it is, and what a reader should know first."""
-        passing = [one for one in self.fits if one.passes]
         others = enumerate_few([one.label for one in self.fits if not one.passes])
         if not self.passes:
             return [f"No answer that passes: {others or 'a better minimum was found'}."]
-        labels = enumerate_few([one.label for one in passing])
+        passing = [one for one in self.fits if one.passes]
+        tested = enumerate_few([one.label for one in passing if not _resembling(one)])
+        resembling = enumerate_few([one.label for one in passing if _resembling(one)])
         tests = "every test"
         if not passing[0].fits:
             tests = (
                 "the available tests; the size of the residuals is not tested, for the noise level"
                 " is unknown"
             )
-        without = f"; no answer: {others}" if others else ""
-        told = self.examination
-        examined = [one for one in passing if told and one.label == told.label]
-        one = [*examined, *passing][0]
-        parameters = zip(one.model.physical_parameters, one.x, one.standard_errors, strict=True)
-        values = [f"{p.name} = {with_error(x, s)} {p.unit}".rstrip() for p, x, s in parameters]
-        found = [f"Passing {tests}: {labels}{without}."]
-        found.append(f"{one.label}: {enumerate_few(values, 4)}.")
-        if told:
-            found += remarks(told, _reading_labels(self.model))
+        said = []
+        if tested:
+            said.append(f"Passing {tests}: {tested}")
+        if resembling:
+            said.append(
+                f"{'in' if said else 'In'} doubt, for successive residuals resemble each other:"
+                f" {resembling}"
+            )
+        if others:
+            said.append(f"no answer: {others}")
+        found = [f"{'; '.join(said)}."]
+        one = self._stated
+        found.append(f"{one.label}: {enumerate_few(_with_errors(one), 4)}.")
+        if self.examination:
+            found += remarks(self.examination, _reading_labels(self.model))
         return found[:3]
+
+
+def _resembling(one: Fit) -> bool:
+    """Tells whether successive residuals resemble each other by more than chance explains."""
+    return one.white_p < FIT_LEVEL
+
+
+def _with_errors(one: Fit) -> list[str]:
+    """Writes each parameter with its estimate, standard error and unit."""
+    parameters = zip(one.model.physical_parameters, one.x, one.standard_errors, strict=True)
+    return [f"{p.name} = {with_error(x, s)} {p.unit}".rstrip() for p, x, s in parameters]
 
 
 def _estimates(answer: Answer) -> Table:
@@ -340,7 +387,7 @@ def _notes_on_noise(answer: Answer) -> Iterator[str]:
             "The noise level is estimated from the residuals. Standard errors are scaled by it,"
             " intervals use Student's t, and the size of the residuals cannot test the model."
         )
-    suspect = _labels(one for one in levelled if one.white_p < FIT_LEVEL)
+    suspect = _labels(one for one in fits if one.fits is not False and _resembling(one))
     if suspect:
         yield (
             f"{suspect}: successive residuals resemble each other (white p below {FIT_LEVEL:g});"
@@ -552,7 +599,7 @@ def write_answer(
         folder,
         NAME,
         (RESIDUALS, _residuals(answer)),
-        f"{answer.name}: estimates",
+        f"{answer.name}: {answer.finding()}",
         answer.sentences(),
         answer.parts(),
         _drawings(answer) if figures else (),

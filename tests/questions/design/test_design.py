@@ -16,7 +16,7 @@ from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.measurements import Gins, Measurement, Parameter, RicherGins
 from ipe_bench.noise import Gaussian
 from ipe_bench.priors import GaussianPrior
-from ipe_bench.questions.design.answer import _findings, _further
+from ipe_bench.questions.design.answer import _findings, _further, design_parts
 from ipe_bench.questions.design.figure import draw_further
 from ipe_bench.questions.design.maths import design
 from ipe_bench.report.style import house_style
@@ -381,6 +381,13 @@ def test_the_title_of_a_design_is_so_of_the_model_with_that_reading(seed):
     cut = (shares**2).mean()
     others = [bound_of([*days, one]) / bound_of(days) for one in found.further.entries[::12]]
     assert cut <= 1.02 * min((other**2).mean() for other in others)
+
+
+def test_where_further_readings_are_offered_todays_are_not_called_the_only_candidates(six_days):
+    assert not [said for said in _findings(six_days) if "candidates" in said]
+    said = [part for part in design_parts("", six_days) if isinstance(part, str)]
+    every = "Every choice without further readings is among the present 6. `readings=NUMBER`"
+    assert [part for part in said if "the present" in part] == [f"{every} chooses fewer of them."]
 
 
 def test_a_title_writes_small_bounds_in_three_figures_as_the_table_does():

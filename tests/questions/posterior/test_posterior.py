@@ -15,7 +15,7 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates
 from ipe_bench.measurements import Gins
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.questions.posterior.answer import finding, honest_word, sampled, write_posteriors
+from ipe_bench.questions.posterior.answer import adequate_word, finding, sampled, write_posteriors
 from ipe_bench.questions.posterior.maths import (
     Divergence,
     Posterior,
@@ -83,7 +83,7 @@ def test_the_exact_gaussian_does_not_diverge_and_a_wrong_one_does_as_computed(li
     problem, z, found = linear
     mean, P, _ = exact(problem, z)
     right = held(found, mean, P)
-    assert honest_word(right, found) == "yes"
+    assert adequate_word(right, found) == "yes"
     assert right.kl < 0.05
     assert right.energy < 0.01
     assert right.width == pytest.approx(1.0, abs=0.05)
@@ -97,7 +97,7 @@ def test_the_exact_gaussian_does_not_diverge_and_a_wrong_one_does_as_computed(li
     assert shifted.energy > 50 * max(right.energy, 1e-3)
     assert held(found, mean, None).kl == np.inf
     assert held(found, np.full(3, np.nan), P).kl == np.inf
-    assert honest_word(shifted, found) == "NO"
+    assert adequate_word(shifted, found) == "NO"
     divergences = {"exact": right, "half": confident, "shifted": shifted}
     one: Any = SimpleNamespace(posterior=found, divergences=divergences)
     agreeing = "estimates with an adequate Gaussian: exact in {0} of {1}; half, shifted in 0 of {1}"
@@ -116,6 +116,15 @@ def test_a_page_says_nothing_of_posteriors_whose_populations_differ(tmp_path):
     assert f"<h1>polynomial: {finding(found)}</h1>" in page.replace("\u200b", "").replace(
         "<wbr>", ""
     )
+
+
+def test_every_number_and_word_of_a_table_of_posteriors_is_defined_below_it():
+    bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01))
+    (table,) = sampled(bench, {"lse": ib.baselines.LinearLSE()}, 1, 80).parts()
+    titles = [column.title for column in table.columns]
+    named = {"trial", "modes", "estimator", "status"}
+    undefined = [one for one in titles if one not in named and f"{one}: " not in table.notes[0]]
+    assert not undefined
 
 
 def square(tilt: float = 0.0) -> Written:
@@ -158,7 +167,7 @@ def test_one_gaussian_cannot_stand_for_two_modes():
     assert at_one.energy > 0.5
     assert over_both.kl < 1e-6  # the moments are right
     assert over_both.energy > 0.1
-    assert (honest_word(at_one, found), honest_word(over_both, found)) == ("NO", "NO")
+    assert (adequate_word(at_one, found), adequate_word(over_both, found)) == ("NO", "NO")
 
 
 def test_the_same_trial_gives_the_same_draws(linear):
