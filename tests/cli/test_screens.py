@@ -2,7 +2,7 @@
 
 import io
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -14,6 +14,7 @@ import ipe_bench.cli
 from ipe_bench.cli.main import main
 from ipe_bench.report import figures
 from ipe_bench.report.tables.table import terminal
+from ipe_bench.states import Formulas, ekf
 
 WIDTHS = (80, 120)
 SHORT = ("linear_lse", "fixed_point", "levenberg_marquardt", "scipy_least_squares")
@@ -166,3 +167,23 @@ def test_an_answer_names_every_estimator(answer, width):
     assert not re.search(r"\w…", out.getvalue())  # a range has blanks around it
     assert "levenberg_marquardt" in out.getvalue()
     assert LONG[-8:] in out.getvalue()
+
+
+def test_headings_name_models_and_what_differs_beside_their_names():
+    """Two models of their own steps, one of which has two deviations as well."""
+    fields = {"next": {"x": "x + w"}, "noise": {"w": 0.1}, "readings": {"z": "x"}, "count": 3}
+    models = [
+        Formulas(**fields, deviation={"z": 0.1}, spread={"x": 1.0}, title=title, step=step)
+        for title, step in (("slow", 2.0), ("fast", 0.5))
+    ]
+    sharp = replace(models[0], deviation={"z": 0.2})
+    tables = [
+        str(ib.run(some, {"kf": ekf()}, 2, progress=False)) for some in (models, [*models, sharp])
+    ]
+    headings = [re.findall(r"^ ?(\S.*): 2 trials per row", table, re.MULTILINE) for table in tables]
+    assert headings[0] == ["fast, model", "slow, model"]
+    assert headings[1] == [
+        "fast, model, model.deviation.z=0.1",
+        "slow, model, model.deviation.z=0.1",
+        "slow, model, model.deviation.z=0.2",
+    ]

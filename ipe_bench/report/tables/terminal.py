@@ -66,6 +66,8 @@ TRACKED = (
     " of transition and reading."
 )
 """References of a track's errors."""
+_NAMED = ("measurement", "noise")
+"""Columns that head every table."""
 
 
 def overview_notes(noises: Collection[str], *, narrow: bool = False) -> tuple[str, ...]:
@@ -94,9 +96,10 @@ def summary_tables(
         # Models whose own readings are certified, without being of a collection, have no totals.
         rows = [row for row in rows if row["noise"] != "certified"]
     columns = _columns_of_settings(rows)
+    headed = [c for c in columns if c in _NAMED or not _told_by_model(c, rows)]
     settings: dict[str, list[Any]] = {}
     for row in rows:
-        values = {column: value_text(row.get(column)) for column in columns}
+        values = {column: value_text(row.get(column)) for column in headed}
         settings.setdefault(wording.worded(values), []).append(row)
     kept = {title: part for title, part in _shortened(settings).items() if part}
     tables = [_setting(title, part, width) for title, part in kept.items()]
@@ -122,6 +125,13 @@ def _columns_of_settings(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     known = {*summary_columns(), "parameter", "unit", "estimator", "error_scale"}
     columns = dict.fromkeys(column for row in rows for column in row)
     return [c for c in columns if c not in known and not c.startswith("estimator.")]
+
+
+def _told_by_model(column: str, rows: Sequence[Mapping[str, Any]]) -> bool:
+    """Tells whether the name of a setting's model says what it has in a column."""
+    models = {str(row["measurement"]) for row in rows}
+    pairs = {(str(row["measurement"]), value_text(row.get(column))) for row in rows}
+    return len(pairs) == len(models)
 
 
 def _opening(
