@@ -100,6 +100,20 @@ def renewed(component: Any) -> Any:
     return _copied(component, pin=False)
 
 
+def as_defined(component: Any, held: dict[str, Any]) -> Any:
+    """Returns a component as its definition is today: itself if it is pinned or of installed
+    packages, or else the copy that `held` has, or gets, by the digest of the definition."""
+    if _PIN in getattr(component, "__dict__", ()):
+        return component
+    digest = definition_digest(component)
+    if not digest:
+        return component
+    if digest not in held:
+        held.clear()
+        held[digest] = renewed(component)
+    return held[digest]
+
+
 def _copied(component: Any, *, pin: bool) -> Any:
     if isinstance(component, tuple | list):
         return type(component)(_copied(one, pin=pin) for one in component)

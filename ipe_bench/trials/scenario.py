@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from ipe_bench.basics.definitions import as_defined
 from ipe_bench.basics.errors import UserError, definition
 from ipe_bench.basics.linalg import Array, Covariance, read_only
 from ipe_bench.basics.options import in_lines
@@ -131,6 +132,15 @@ class Scenario:
 
         One seed gives the same draws, in units of the error scale, at every error scale.
         """
+        return as_defined(self, self._renewed)._draw(start, stop)
+
+    @cached_property
+    def _renewed(self) -> dict[str, Scenario]:
+        """The scenario without what its models worked out before a cell changed a function of
+        theirs."""
+        return {}
+
+    def _draw(self, start: int, stop: int) -> Trials:
         recorded = self.measurement.recorded
         if recorded is not None and self.noise.real:
             if (start, stop) != (0, 1):

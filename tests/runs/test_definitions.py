@@ -327,6 +327,23 @@ def test_a_design_is_of_what_a_model_computes_with_and_not_of_what_it_has_kept()
     assert values[1] == pytest.approx(2 * values[0])
 
 
+def test_a_draw_follows_a_function_that_was_edited_and_an_object_keeps_its_class():
+    session = Session("estimator", "helper", 1.0)
+    exec(KEPT, session.names)
+    model = session.names["Kept"]()
+    bench = ib.Scenario(model, Gaussian(1e-9), seed=1)
+    before = bench.draw(0, 2)
+    assert bench.draw(0, 2).z == pytest.approx(before.z, abs=0)
+    session.edit(3.0)
+    for one in (bench, ib.Scenario(model, Gaussian(1e-9), seed=1)):
+        assert one.draw(0, 2).z == pytest.approx(3 * before.z, rel=1e-6)
+        assert (one.draw(0, 2).x == before.x).all()
+    exec(KEPT.replace("return helper()", "return -helper()"), session.names)
+    assert bench.draw(0, 2).z == pytest.approx(3 * before.z, rel=1e-6)
+    session.edit(1.0)
+    assert (bench.draw(0, 2).z == before.z).all()
+
+
 @pytest.mark.slow
 def test_what_is_asked_of_a_model_after_an_edit_is_answered_by_its_functions_as_they_are():
     """exp(-2 k t) has half the k of exp(-k t), known twice as well."""
