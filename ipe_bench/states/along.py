@@ -1,24 +1,26 @@
 """The functions f and h of a state model with their slopes, at one epoch and along whole paths.
 
 They are recorded once and run as compiled code along all epochs of all paths. What cannot be
-recorded is called epoch by epoch, with slopes by complex steps.
+recorded is called epoch by epoch, with slopes by complex steps, or by differences where complex
+steps do not find what differences find.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from ipe_bench.basics.errors import describe_exception
-from ipe_bench.basics.linalg import Array, multiply, own
+from ipe_bench.basics.linalg import Array, deviations, multiply, own
 from ipe_bench.engine.rows import RowFunction
 from ipe_bench.engine.trace import Expression, Graph, Program, Recorded, RowPrograms, substitute
-from ipe_bench.measurements.base import differentiate
+from ipe_bench.measurements.base import Shift, differentiate
 from ipe_bench.states.algebra import root
 
 if TYPE_CHECKING:
@@ -37,6 +39,8 @@ _AGREES = 1e-10
 """Part of the size of an output by which the two may differ."""
 _SMALL = 1e-6
 """Part of the size of the largest output below which no output counts as smaller."""
+_ROUGH = 1e-3
+"""Part of the size of an output's slopes by which those by differences may be wrong."""
 Function = Callable[[Array, int], Array]
 
 
@@ -54,19 +58,57 @@ class Along(NamedTuple):
     """dh/dx (trials, K, m, n)."""
 
 
+class Differences(NamedTuple):
+    """Holds how a function is differentiated by differences."""
+
+    sizes: Array
+    """The units (n,) of the states, of which the steps are a part."""
+    near: Shift
+    """Puts outputs next to others by whole periods."""
+
+    def slopes(self, function: Callable[[Array], Array], x: Array, widening: float = 1.0) -> Array:
+        """Computes the Jacobians (..., m, n) at x (..., n), by steps that may be wider."""
+        s = widening * self.sizes
+        J = differentiate(lambda u: function(s * u), x / s, analytic=False, near=self.near)
+        return J / s
+
+
 @dataclass(frozen=True)
 class Own:
     """A model's own function at one epoch, called as a recorded one is."""
 
     function: Function
     k: int
+    differences: Differences | None = None
+    """How its slopes are found where it is not analytic; None: by complex steps."""
 
     def __call__(self, x: Array, _: Array) -> Array:
+        return self._here(x)
+
+    def _here(self, x: Array) -> Array:
         return self.function(x, self.k)
 
     def slopes(self, x: Array, _: Array) -> tuple[Array, Array]:
-        slope = differentiate(lambda at: self.function(at, self.k), x, analytic=True)
-        return self.function(x, self.k), slope
+        if self.differences is None:
+            return self._here(x), differentiate(self._here, x, analytic=True)
+        return self._here(x), self.differences.slopes(self._here, x)
+
+    def is_analytic(self, x: Array, differences: Differences) -> bool:
+        """Tells whether complex steps find the slopes at x (trials, n) that differences find, such
+        as they do not of np.abs and np.linalg.norm, and of np.hypot, which takes no complex
+        numbers."""
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", np.exceptions.ComplexWarning)
+                exact = differentiate(self._here, x, analytic=True)
+        except TypeError:
+            return False
+        rough, wider = (differences.slopes(self._here, x, by) for by in (1.0, 4.0))
+        # Where differences of two steps are not alike, they say nothing against complex steps.
+        size = np.abs(rough * differences.sizes).max(axis=(0, 2))[:, None]
+        settled = np.abs(rough - wider) * differences.sizes <= _ROUGH * size
+        apart = np.abs(rough - exact) * differences.sizes > 3 * _ROUGH * size
+        return not (settled & apart).any()
 
 
 class Recording(NamedTuple):
@@ -98,11 +140,21 @@ class EpochFunctions:
     recordings: Sequence[Recording]
     why: str = ""
     """Why it is called epoch by epoch; empty if it is recorded."""
+    by_differences: bool = False
+    """Whether its slopes are differences, since it is not analytic."""
 
     @classmethod
-    def by_epoch(cls, function: Function, epochs: Sequence[int], why: str = "") -> EpochFunctions:
+    def by_epoch(
+        cls,
+        function: Function,
+        epochs: Sequence[int],
+        why: str = "",
+        differences: Differences | None = None,
+    ) -> EpochFunctions:
         none = np.empty((1, 0))
-        return cls([Recording(Own(function, k), np.array([k]), none) for k in epochs], why)
+        each = ((k, Own(function, k, differences)) for k in epochs)
+        recordings = [Recording(own, np.array([k]), none) for k, own in each]
+        return cls(recordings, why, by_differences=differences is not None)
 
     @cached_property
     def at(self) -> Mapping[int, Recording]:
@@ -111,6 +163,12 @@ class EpochFunctions:
             for one in self.recordings
             for i, k in enumerate(one.epochs.tolist())
         }
+
+    def tried(self) -> list[int]:
+        """Lists the first, the middle and the last epoch of each recording, or of all epochs if
+        each is called by itself."""
+        groups = [[*self.at]] if self.why else [one.epochs.tolist() for one in self.recordings]
+        return [epochs[i] for epochs in groups for i in (0, len(epochs) // 2, -1)]
 
     def values(self, x: Array) -> Array:
         """Computes values (trials, K, m) at states x (trials, K, n) of the epochs."""
@@ -208,14 +266,17 @@ def functions_of(model: StateModel) -> tuple[EpochFunctions, EpochFunctions]:
     spread = root(P)
     draws = np.random.default_rng(0).standard_normal((_DRAWN, spread.shape[1]))
     x = m + multiply(spread, draws)
-    recorded = [one.epochs for each in (f, h) if not each.why for one in each.recordings]
-    tried = {k for epochs in recorded for k in epochs[[0, len(epochs) // 2, -1]].tolist()}
+    sizes = deviations(P)
+    sizes = np.where(sizes > 0, sizes, np.maximum(1.0, np.abs(m)))
+    next_to_state = Differences(sizes, model.nearest_state)
+    next_to_reading = Differences(sizes, model.nearest)
+    tried = {k for each in (f, h) for k in each.tried()}
     with np.errstate(all="ignore"):
         for k in sorted(tried):
             if model.moves(k):
-                f = _held(f, model.transition, k, x)
+                f = _held(f, model.transition, k, x, next_to_state)
                 x = model.transition(x, k)
-            h = _held(h, model.observe, k, x)
+            h = _held(h, model.observe, k, x, next_to_reading)
     still = EpochFunctions.by_epoch(lambda x, k: x, [k for k in every if k not in moving])
     return EpochFunctions([*still.recordings, *f.recordings], f.why), h
 
@@ -230,21 +291,33 @@ def _recorded(model: StateModel, name: str, epochs: Sequence[int]) -> EpochFunct
         return EpochFunctions.by_epoch(getattr(model, name), epochs, describe_exception(error))
 
 
-def _held(functions: EpochFunctions, function: Function, k: int, x: Array) -> EpochFunctions:
+def _held(
+    functions: EpochFunctions, function: Function, k: int, x: Array, differences: Differences
+) -> EpochFunctions:
     """Returns the functions; by epoch if that of epoch k differs from the model's own at x (trials,
-    n)."""
+    n), and by differences if complex steps do not find its slopes."""
+    own = Own(function, k)
+    analytic = own.is_analytic(x, differences)
+    if not analytic:
+        own = replace(own, differences=differences)
     if functions.why:
-        return functions
+        if analytic or functions.by_differences:
+            return functions
+        return EpochFunctions.by_epoch(function, [*functions.at], functions.why, differences)
     found = functions.at[k].slope(x)
-    right = Own(function, k).slopes(x, x)
-    if agree(found[0], right[0]) and agree(found[1].swapaxes(1, 2), right[1].swapaxes(1, 2)):
+    right = own.slopes(x, x)
+    within = _AGREES if analytic else _ROUGH
+    if agree(found[0], right[0]) and agree(
+        found[1].swapaxes(1, 2), right[1].swapaxes(1, 2), within
+    ):
         return functions
     why = f"at epoch {k + 1} its recording differs from it by more than {_AGREES:g} of its size"
-    return EpochFunctions.by_epoch(function, [*functions.at], why)
+    return EpochFunctions.by_epoch(function, [*functions.at], why, own.differences)
 
 
-def agree(values: Array, right: Array) -> bool:
-    """Tells whether values (..., m) are the right ones but for round-off."""
+def agree(values: Array, right: Array, within: float = _AGREES) -> bool:
+    """Tells whether values (..., m) are the right ones within a part of their size, by default but
+    for round-off."""
     size = np.abs(right).reshape(-1, right.shape[-1]).max(axis=0)
     size = np.maximum(size, _SMALL * size.max())
-    return np.allclose(values / size, right / size, rtol=0, atol=_AGREES, equal_nan=True)
+    return np.allclose(values / size, right / size, rtol=0, atol=within, equal_nan=True)

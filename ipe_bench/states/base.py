@@ -71,13 +71,13 @@ class StateModel(Component, ABC):
     `R_at(x, k)` in place of `R(k)`. Optional: `moved_first`, `periods`, `state_periods`,
     `reading_names` and `scored`; `draw`, if paths are stored; `log_inputs`, `with_log` and
     `faults`, if a log has known inputs; `alike`, if a transition is long. Promised: f and h take
-    stacks of states (..., n), real or complex, and are analytic in them, since slopes are complex
-    steps; a trial has the same bits alone and in any batch; `require_sound` finds nothing to
-    refuse.
+    stacks of states (..., n); a trial has the same bits alone and in any batch; `require_sound`
+    finds nothing to refuse.
 
-    Trackers run f and h as compiled code that is recorded from them, if they depend on x and k
-    alone and branch on no state (`np.where` is recorded); `ipe-bench check` says which ones run
-    epoch by epoch, and why.
+    Trackers run f and h as compiled code that is recorded from them with its slopes, if they depend
+    on x and k alone and branch on no state (`np.where` is recorded); `ipe-bench check` says which
+    ones run epoch by epoch, and why. The slopes of these are complex steps, or differences if they
+    are not analytic.
 
     Process noise enters by its gain, so that a singular Q = G G' needs no special case. Known
     inputs and unequal steps follow from k. A measurement model with epochs is the state model whose

@@ -247,6 +247,55 @@ def test_what_cannot_be_recorded_runs_epoch_by_epoch_and_check_says_so(name):
         np.testing.assert_array_equal(model.values_along(x)[0][:, 3], model.transition(x[:, 3], 3))
 
 
+def _as_floats(x, y):
+    z = np.empty((*x.shape, 1))
+    z[..., 0] = np.sqrt(x * x + y * y)
+    return z
+
+
+RANGES = {
+    "np.hypot": lambda x, y: np.hypot(x, y)[..., None],
+    "np.linalg.norm": lambda x, y: np.linalg.norm(np.stack([x, y]), axis=0)[..., None],
+    "np.abs": lambda x, y: np.abs(np.sqrt(x * x + y * y))[..., None],
+    "the real part": lambda x, y: np.real(np.sqrt(x * x + y * y))[..., None],
+    "an array of floats": _as_floats,
+}
+
+
+@dataclass(frozen=True)
+class Ranging(Angles):
+    """A point at rest whose distance is read, by a function of NumPy."""
+
+    by: str = ""
+
+    def transition(self, x, k):
+        return x
+
+    def observe(self, x, k):
+        if not self.by:
+            return np.sqrt(x[..., :1] ** 2 + x[..., 1:] ** 2)
+        return RANGES[self.by](x[..., 0], x[..., 1])
+
+    def R(self, k):
+        return 0.01 * np.eye(1)
+
+
+@pytest.mark.parametrize("by", RANGES)
+def test_functions_that_are_not_analytic_have_their_slopes(by):
+    """A complex step finds that np.abs has none, and the filter took no reading in."""
+    plain = Ranging()
+    model = Ranging(by=by)
+    z = plain.draw(0, 3).z
+    filters = ekf()
+    wanted = filters.track(plain, z)
+    found = filters.track(model, z)
+    np.testing.assert_allclose(found.mean, wanted.mean, rtol=1e-6)
+    np.testing.assert_allclose(found.covariance, wanted.covariance, rtol=1e-6)
+    assert model.epoch_functions[1].by_differences == (
+        by in ("np.linalg.norm", "an array of floats")
+    )
+
+
 def test_check_finds_epochs_that_are_wrongly_called_alike():
     class Wrong(Angles):
         def alike(self, k):

@@ -227,8 +227,6 @@ FOUND = [
     (altered(Gaussian(1.0), corrupt=lambda self, h,
              *_: h + np.random.default_rng().standard_normal(h.shape)),
      "besides the stream"),
-    (altered(TURN, observe=lambda self, x, k: TURN.observe(x, k) + np.abs(x[..., :1])),
-     "observe is not analytic"),
     (altered(TURN, transition=lambda self, x, k: TURN.transition(x, k) + 1e-9 * len(x)),
      "transition gives a state alone other bits"),
     (altered(TURN, periods=()), "reading 2 jumps by 6.28: it is an angle; state its period"),
