@@ -66,7 +66,7 @@ def test_what_is_written_is_whole_and_the_page_stands_alone(result):
     parameters = pd.read_csv(result.summary_path.with_name("parameters.csv"))
     assert set(main["parameter"]) == {"all"}
     assert "all" not in set(parameters["parameter"])
-    # The two lines of the changelog that give the shape of earlier versions.
+    # The line of the changelog that gives all rows of earlier versions.
     keys = ["error_scale", "estimator", "parameter"]
     both = pd.concat([main, parameters]).sort_values(keys, ignore_index=True)
     earlier = stored[list(main)].sort_values(keys, ignore_index=True)
