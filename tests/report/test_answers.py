@@ -23,12 +23,12 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.cli.main import main
 from ipe_bench.estimators.base import Estimates
 from ipe_bench.questions.compare.answer import _cells
-from ipe_bench.questions.compare.figure import _measure, _outcome, _signed, draw_pairs
+from ipe_bench.questions.compare.figure import _measure, _names, _outcome, _signed, draw_pairs
 from ipe_bench.questions.design.answer import _draw_design, _findings, _ways
 from ipe_bench.questions.posterior.figure import draw_marginals
 from ipe_bench.questions.posterior.maths import Posterior, Reference
 from ipe_bench.report.figures.answers import draw_fit
-from ipe_bench.report.figures.common import full_ticks
+from ipe_bench.report.figures.common import full_ticks, text
 from ipe_bench.report.figures.log import draw_log
 from ipe_bench.report.figures.views import looks_of, views
 from ipe_bench.report.page.answer import _drawings
@@ -241,6 +241,15 @@ def test_a_design_has_the_units_of_its_table_and_says_where_candidates_are_what_
     )
     assert said not in _findings(fewer)
     assert "optimal" not in " ".join(_findings(fewer))
+
+
+def test_the_only_change_is_named_by_the_second_estimator_and_numbers_are_never_cut():
+    """Half of `error scale 100` would read as another scale."""
+    only = {"scenario": "gins, error scale 100", "first": "a", "second": "b", "trials": 9}
+    assert _names([only | {"quantity": kind} for kind in ("success", "cost")]) == ["b", "b"]
+    assert text("newton, gins, quantization, error scale 1000") == (
+        "newton, gins, quantization, error scale …"
+    )
 
 
 def test_each_change_is_worded_beside_its_margin_and_filled_if_it_is_beyond(tmp_path):

@@ -85,11 +85,11 @@ def draw_pairs(frame: pd.DataFrame) -> Iterator[Drawing]:
 
 
 def _names(rows: Sequence[Any]) -> list[str]:
-    """Names each row by what not all of them share, and by everything if all are alike."""
+    """Names each row by what not all of them share, and by the second's name if all are alike."""
     parts = [(row["second"], *comparison_title(row).split(", ")) for row in rows]
-    shared: set[str] = set()
-    if len(set(parts)) > 1:
-        shared = set.intersection(*map(set, parts))
+    if len(set(parts)) == 1:
+        return [row["second"] for row in rows]
+    shared = set.intersection(*map(set, parts))
     return [", ".join(word for word in words if word not in shared) for words in parts]
 
 

@@ -52,6 +52,7 @@ _EMPTY: dict[str, Any] = {
     "markeredgewidth": 1.1,
 }
 """Arguments of hollow markers."""
+_OF_NUMBERS = ".0123456789"
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -147,7 +148,11 @@ def text(value: Any) -> str:
 
 def _cut(words: str, most: int) -> str:
     if len(words) > most:
-        words = f"{words[: most - 1]}…"
+        kept = words[: most - 1]
+        if words[most - 1] in _OF_NUMBERS:
+            # Half a number would read as another one.
+            kept = kept.rstrip(_OF_NUMBERS)
+        words = f"{kept}…"
     return words.replace("$", r"\$")
 
 
@@ -212,7 +217,7 @@ def labelled(scales: Sequence[float], letter: float) -> list[float]:
     those between."""
 
     def fit(low: float, high: float) -> bool:
-        letters = (len(value_text(low)) + len(value_text(high)) + 1) / 2
+        letters = (len(value_text(low)) + len(value_text(high)) + 2) / 2
         return np.log10(high / low) > letter * letters
 
     kept = [scales[0]]
