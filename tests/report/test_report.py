@@ -306,6 +306,12 @@ def test_every_renderer_has_every_cell():
         "**2**",
     )
     assert r"c \& d & \textbf{\num{2}} \\" in latex(table)
+    # An interval has a dash, and no negative end.
+    texts = {1.0: "100 (93-100)", 2.0: "-3-4"}
+    ends = Table("ends", "Ends", "", [column("95 %", texts, texts.__getitem__)])
+    assert r"\num{100} (\num{93}--\num{100}) \\" in latex(ends)
+    assert r"\num{-3}--\num{4} \\" in latex(ends)
+    assert r"\caption{Ends.}" in latex(ends, width=3.5)
     for text in (page, markdown(table), "\n".join(lines)):
         assert "Note." in text
 

@@ -436,7 +436,7 @@ _SIGNS = {
     "[": "{[}",  # which would be an option of the line's end before it
     '"': r"\textquotedbl{}",
 }
-_NUMBER = re.compile(r"-?\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?")
+_NUMBER = re.compile(r"(?:(?<!\d)-)?\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?")
 
 
 def latex(table: Table, width: float | None = None) -> str:
@@ -468,7 +468,8 @@ def latex(table: Table, width: float | None = None) -> str:
 def _captioned(lines: list[str], table: Table, width: float) -> list[str]:
     """Returns the lines of a table with its caption: floating, or over pages."""
     label = f"tab:{table.name.replace('_', '-')}"
-    caption = rf"\caption{{{escaped(table.title)}. {escaped(table.caption)}}}\label{{{label}}}"
+    words = escaped(f"{table.title}. {table.caption}")
+    caption = rf"\caption{{{words}}}\label{{{label}}}"
     size = rf"\footnotesize\setlength{{\tabcolsep}}{{{COLUMN_GAP:g}pt}}"
     if len(table) > LONG:
         begin, *rest = lines
@@ -496,6 +497,7 @@ def _latex_cell(cell: Cell, column: Column) -> str:
     text = escaped(cell.text)
     if column.numeric:
         text = _NUMBER.sub(_latex_number, text).replace(r"} \%", r"}\,\%")
+        text = text.replace(r"}-\num", r"}--\num")
     return rf"\textbf{{{text}}}" if cell.best else text
 
 
