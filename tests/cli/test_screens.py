@@ -187,3 +187,15 @@ def test_headings_name_models_and_what_differs_beside_their_names():
         "slow, model, model.deviation.z=0.1",
         "slow, model, model.deviation.z=0.2",
     ]
+
+
+def test_the_table_of_a_sweep_shows_the_largest_scale_at_which_half_may_hold(tmp_path, capsys):
+    """At the least scale, where all are alike, nothing is told."""
+    store, rng = Synthetic(tmp_path / "half"), np.random.default_rng(0)
+    for scale in (1.0, 10.0, 100.0):
+        for label, fails_from in zip(SHORT[:2], (10.0, 100.0), strict=True):
+            error = 0.1 * rng.normal(size=(30, 3)) + 9.0 * (scale >= fails_from)
+            store.add(store.scenario(error_scale=scale), label, error)
+    store.record(30)
+    assert main(["report", str(store.directory)]) == 0
+    assert "30 trials per row at error scale 10\n" in capsys.readouterr().out

@@ -34,7 +34,10 @@ def worded(measurement: Any) -> list[str]:
     ]
     rows = pd.DataFrame(columns)
     collection: Any = SimpleNamespace(groups=groups)
-    return Wording.of(collection).settings(rows.to_dict("records"), list(rows.columns))
+    wording = Wording.of(collection)
+    settings = wording.settings(rows.to_dict("records"), list(rows.columns))
+    assert [wording.is_right(row) for row in columns] == [s == "right model" for s in settings]
+    return settings
 
 
 def test_the_right_model_is_the_one_that_estimators_assume_and_units_stand_at_errors():

@@ -59,9 +59,12 @@ class Wording:
         settings = []
         for row in values:
             unusual = {c: row[c] for c in apart if row[c] != usual.get(c)}
-            is_right = _options(row) in self.right
-            settings.append(self.worded(unusual, is_right=is_right) or "-")
+            settings.append(self.worded(unusual, is_right=self.is_right(row)) or "-")
         return settings
+
+    def is_right(self, row: Mapping[str, Any]) -> bool:
+        """Whether the readings of a setting come from the model that estimators assume."""
+        return _options(row) in self.right
 
     def worded(self, values: Mapping[str, str], *, is_right: bool = False) -> str:
         """Words the options of one setting, without those that its classes lack and errors of the

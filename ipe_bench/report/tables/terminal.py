@@ -99,8 +99,10 @@ def summary_tables(
     headed = [c for c in columns if c in _NAMED or not _told_by_model(c, rows)]
     settings: dict[str, list[Any]] = {}
     for row in rows:
-        values = {column: value_text(row.get(column)) for column in headed}
-        settings.setdefault(wording.worded(values), []).append(row)
+        values = {column: value_text(row.get(column)) for column in columns}
+        named = {column: values[column] for column in headed}
+        title = wording.worded(named, is_right=wording.is_right(values))
+        settings.setdefault(title, []).append(row)
     kept = {title: part for title, part in _shortened(settings).items() if part}
     tables = [_setting(title, part, width) for title, part in kept.items()]
     if tables:
@@ -166,14 +168,14 @@ def _shortened(settings: Mapping[str, Sequence[Any]]) -> dict[str, list[Any]]:
 
 
 def _telling(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """Returns the rows, the best first, of the largest scale at which most estimators may hold, or
-    else of the last."""
+    """Returns the rows, the best first, of the largest scale at which half of the estimators may
+    hold, or else of the last."""
     finding = Finding.of(rows)
     best_first = [one.label for one in finding.standings]
     scale = finding.places[-1][1]
     for at, (_, place) in enumerate(finding.places):
         possible = sum(one.judged[at] != FAILS for one in finding.standings)
-        scale = place if 2 * possible > len(best_first) else scale
+        scale = place if 2 * possible >= len(best_first) else scale
     here = [row for row in rows if row["error_scale"] == scale]
     return sorted(here, key=lambda row: best_first.index(row["estimator"]))
 
