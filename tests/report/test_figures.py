@@ -250,7 +250,7 @@ def test_scales_are_labelled_as_far_as_there_is_room_with_both_ends():
         kept = common.labelled(scales, letter)
         assert (kept[0], kept[-1]) == (300.0, 10000.0)
         assert all(
-            np.log10(b / a) > letter * (len(f"{a:g}") + len(f"{b:g}")) / 2
+            np.log10(b / a) > letter * (len(f"{a:g}") + len(f"{b:g}") + 2) / 2
             for a, b in pairwise(kept)
         )
     assert kept == scales
@@ -594,12 +594,15 @@ def test_digits_of_each_problem_are_in_its_cell_blue_from_four_on_the_hardest_fi
 def test_published_errors_are_rings_about_those_that_are_found():
     rows = pd.DataFrame({"model": "book", "state": "angle", "estimator": ["ekf", "ukf"]})
     rows = rows.assign(published=[0.2, 0.1], found=[0.2, 0.125], difference=[0.0, 0.025])
+    units = pd.DataFrame({"parameter": ["angle"], "unit": ["rad"]})
+    view = replace(with_collection(), frames={"summary": units})
     with (
         patch.object(certified, "published_table", return_value=rows),
         patch.object(certified, "certified_table", return_value=pd.DataFrame()),
     ):
-        drawing = drawn(certified, with_collection())["published"]
+        drawing = drawn(certified, view)["published"]
     (ax,) = drawing.figure.axes
+    assert ax.get_title() == "book, angle [rad]"
     assert [t.get_text() for t in ax.get_yticklabels()] == ["ukf", "ekf"]
     at = {line.get_label(): list(line.get_xdata()) for line in ax.lines}
     assert at == {"published": [0.1, 0.2], "found": [0.125, 0.2]}
@@ -654,6 +657,7 @@ def test_a_row_per_setting_has_its_error_and_the_share_of_misfits_detected():
     told = [text for text in texts if "detected" in text]
     shares = (100, 0, 0)
     assert told == [f"{n}: detected in {s}\u00a0%" for n, s in zip(names, shares, strict=True)]
+    assert "Red: a wrong model detected in fewer than half" in drawing.caption
     assert len(drawing.caption.split()) <= 30
     drawing.figure.draw_without_rendering()
     assert all(text.get_bbox_patch() for text in ax.texts)  # no line crosses a letter

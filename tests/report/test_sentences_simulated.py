@@ -353,8 +353,8 @@ def who_agree(report: Report, match: Any) -> Iterator[tuple[str, str, bool]]:
 
 
 SILENT = (
-    r"Undetected failures: up to (?P<most>\S+ %) of the trials \((?P<label>e\d+) at error scale"
-    r" (?P<scale>\S+)\)\."
+    r"Undetected failures: up to (?P<most>\S+ %) of the trials \((?P<label>e\d+)[e\d, ]* at error"
+    r" scale (?P<scale>\S+)\)\."
 )
 
 

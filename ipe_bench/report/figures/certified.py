@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from ipe_bench.measurements.base import with_unit
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.views import Figure, View
@@ -73,6 +74,7 @@ def draw_published(view: View) -> Iterator[Drawing]:
     if table.empty:
         return
     groups = list(table.groupby(["model", "state"], sort=False))[: common.MOST_PANELS]
+    units = view["summary"].groupby("parameter")["unit"].first()
     fig, axes = common.panels(len(groups), dict.fromkeys(table["estimator"]), scales=[0.0])  # type: ignore[arg-type]
     for ((model, state), rows), ax in zip(groups, axes, strict=True):
         rows = rows.sort_values("published")
@@ -82,7 +84,8 @@ def draw_published(view: View) -> Iterator[Drawing]:
         ax.plot(rows["published"], y, "o", label="published", **ring)
         ax.plot(rows["found"], y, "o", markersize=4, color="#0b5a8f", label="found")
         ax.set(xlabel="root mean square error", xlim=(0, None))
-        common.title(ax, f"{model}, {state}")
+        unit = str(units.get(state, ""))
+        common.title(ax, f"{model}, {with_unit(str(state), unit)}")
     common.legend(fig, axes)
     most = table["difference"].abs().max()
     caption = f"Errors along the published path; the largest difference is {most:.1e}."

@@ -125,7 +125,8 @@ def _rows(view: View, rows: pd.DataFrame, scale: float) -> Iterator[Drawing]:
         fig,
         "settings",
         f"Error by setting at error scale {scale:g}",
-        "Median error, bar to the 95 % quantile; misfit detected in % of trials.",
+        "Median error, bar to the 95 % quantile. Detected: the test of fit rejects the model, in %"
+        " of trials. Red: a wrong model detected in fewer than half.",
     )
 
 

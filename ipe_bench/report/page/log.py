@@ -28,13 +28,14 @@ TABLE = "track.csv"
 SCHEMA = 1
 _NOTE = (
     "Innovations are readings less their predictions, in predicted standard deviations, and NIS /"
-    " m is their mean square. A smoother has none: it is judged by the cost of its path, and one"
-    " behind a filter by NIS and whiteness of that filter. If the model is right both are"
-    " chi-square with a degree per reading, and fit p is the probability of larger ones."
-    " Innovations are white if the filter is right (Ljung and Box). The verdict is on innovations"
-    " alone: an error that readings do not show, such as the turn of a whole map, leaves them as"
-    " they are. A track is lost from the epoch from which most of them are larger than all but one"
-    " in a million by chance. A dash: the tracker has none of it."
+    " m (normalised innovation squared, per reading) is their mean square. A smoother has none: it"
+    " is judged by the cost of its path, and one behind a filter by NIS and whiteness of that"
+    " filter. If the model is right both are chi-square with a degree per reading, and fit p is"
+    " the probability of larger ones. Innovations are white if the filter is right (Ljung and"
+    " Box). The verdict is on innovations alone: an error that readings do not show, such as the"
+    " turn of a whole map, leaves them as they are. A track is lost from the epoch from which most"
+    " of them are larger than all but one in a million by chance. A dash: the tracker has none of"
+    " it."
 )
 _OF_PARTICLES = (
     " Innovations of particles are by the mean and covariance of the readings that they predict;"
