@@ -94,6 +94,22 @@ def in_lines(self: Any) -> str:
     return f"{type(self).__name__}(\n{''.join(lines)})"
 
 
+class Entries(dict[str, Any]):
+    """Holds the entries of an option, which is part of an identity and is not changed in place."""
+
+    def _refuse(self, *_: Any, **__: Any) -> typing.NoReturn:
+        raise UserError(
+            "the entries of an option are not changed in place; make another component, as in"
+            " dataclasses.replace(model, constants={...})"
+        )
+
+    __setitem__ = __delitem__ = __ior__ = _refuse  # type: ignore[assignment]
+    update = setdefault = pop = popitem = clear = _refuse  # type: ignore[assignment]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (dict(self),)
+
+
 class Component:
     """Describes a component by a config: a frozen dataclass whose fields are its options and its
     identity.
@@ -122,7 +138,7 @@ class Component:
 
     def __post_init__(self) -> None:
         """Checks each option by its type, and keeps it as that type has it: 1 as 1.0, a list as a
-        tuple.
+        tuple, a dictionary as `Entries` of its own.
 
         Raises:
             UserError: `KEY=VALUE: give ...`, by the option's name.
@@ -191,14 +207,13 @@ def checked(value: Any, hint: Any, key: str) -> Any:
     if issubclass(plain, Mapping) and isinstance(value, Mapping) and arguments:
         inner = arguments[1]
         entries = {name: checked(entry, inner, f"{key}.{name}") for name, entry in value.items()}
-        unchanged = all(entries[name] is entry for name, entry in value.items())
-        return value if unchanged else entries
+        return Entries(entries)
     # True and false are not numbers; NumPy's are.
     abstract = {int: numbers.Integral, float: numbers.Real}.get(plain)
     if abstract and isinstance(value, abstract) and not isinstance(value, bool):
         return value if type(value) is plain else typing.cast(Any, plain)(value)
-    if plain is Sequence and isinstance(value, np.ndarray):
-        return tuple(value.tolist())
+    if plain is Sequence and isinstance(value, list | np.ndarray):
+        return tuple(value.tolist() if isinstance(value, np.ndarray) else value)
     if isinstance(value, plain) and not abstract:
         return value
     raise _refusal(value, describe_type(hint), key)

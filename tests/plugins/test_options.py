@@ -3,9 +3,12 @@ classes say."""
 
 from __future__ import annotations
 
+import copy
 import dataclasses
+import operator
+import pickle
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -24,6 +27,7 @@ from ipe_bench.plugins.construct import construct
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.runs.execution import Processes
 from ipe_bench.solvers import Newton, Relinearized, SteepestDescent
+from ipe_bench.states import Formulas
 
 inf, nan = np.inf, np.nan
 
@@ -251,3 +255,22 @@ def test_conf_says_what_the_class_says(option):
         name for name in fields if getattr(component, name) != getattr(type(component)(), name)
     }
     assert differs == PRESETS.get((option.group, option.name), set())
+
+
+def test_a_component_keeps_dictionaries_of_its_own_that_nobody_edits():
+    """A model whose constant was edited tracked by its old value, which machine code had."""
+    shared = {"rate": 0.5}
+    options = {"next": {"x": "rate*x"}, "readings": {"z": "x"}, "deviation": {"z": 1.0}}
+    first = Formulas(**options, spread={"x": 1.0}, constants=shared)
+    shared["rate"] = 0.9
+    assert first.constants == {"rate": 0.5}
+    for edit in (
+        lambda entries: entries.update(rate=0.9),
+        lambda entries: operator.setitem(entries, "rate", 0.9),
+        lambda entries: operator.delitem(entries, "rate"),
+    ):
+        with pytest.raises(UserError, match="make another component"):
+            edit(first.constants)
+    for same in (pickle.loads(pickle.dumps(first)), copy.deepcopy(first), replace(first)):
+        assert same == first
+    assert replace(first, constants=shared).constants == {"rate": 0.9}
