@@ -278,7 +278,7 @@ def functions_of(model: StateModel) -> tuple[EpochFunctions, EpochFunctions]:
                 x = model.transition(x, k)
             h = _held(h, model.observe, k, x, next_to_reading)
     still = EpochFunctions.by_epoch(lambda x, k: x, [k for k in every if k not in moving])
-    return EpochFunctions([*still.recordings, *f.recordings], f.why), h
+    return replace(f, recordings=[*still.recordings, *f.recordings]), h
 
 
 def _recorded(model: StateModel, name: str, epochs: Sequence[int]) -> EpochFunctions:

@@ -296,6 +296,12 @@ def test_functions_that_are_not_analytic_have_their_slopes(by):
     )
 
 
+def test_check_names_slopes_by_differences():
+    model = Angles(piece=lambda x, k: np.interp(x, [-9.0, 9.0], [-8.0, 8.0]))
+    notes = " ".join(finding.note for finding in check_component("model", model))
+    assert "transition runs epoch by epoch, its slopes by differences" in notes
+
+
 def test_check_finds_epochs_that_are_wrongly_called_alike():
     class Wrong(Angles):
         def alike(self, k):
