@@ -168,7 +168,8 @@ def test_its_rows_of_states_are_those_of_the_page_of_tables():
     page = ROOT / "ipe_bench/report/docs/pages/explanation/tables_of_states.md"
     tables = page.read_text(encoding="utf-8")
     shown = table_under("States that move", README)
-    bearings = table_under("Success and cost", tables)["30"]
+    by_tracker = table_under("Bearings at scale 30", tables)
+    bearings = {name: row["success"] for name, row in by_tracker.items()}
     walking = table_under("Walking drifts", tables)["success, % (95 % interval)"]
     found = [row for name, row in shown.items() if "error scale" in name]
     assert len(found) == 2

@@ -23,6 +23,7 @@ from typing import Any
 
 import pandas as pd
 from gallery_frames import SUFFIX, Computed, read
+from state_tables import with_tables
 from word_drawings import write_drawings
 
 import ipe_bench
@@ -122,6 +123,8 @@ SHOWN = SOURCES.parents[2] / ".assets" / "headline.md"
 """The stored report that the repository shows without a site."""
 STORED = SOURCES / "gallery"
 """The folder of what pages of the gallery are drawn from."""
+TABLES = SOURCES / "pages" / "explanation" / "tables_of_states.md"
+"""The page of what is stored of the experiment `states`."""
 
 
 def build(output: Path, trials: int) -> int:
@@ -393,7 +396,7 @@ def _best(experiment: str, summary: pd.DataFrame) -> Iterator[tuple[str, ...]]:
 
 def store_all(output: Path, trials: int, names: Sequence[str]) -> int:
     """Computes the experiments that are named and keeps what their pages are drawn from; draws all
-    pages again."""
+    pages again, and writes those of the repository."""
     for option in _ours("experiment"):
         if option.name in names:
             print(f"{option.name} ...", flush=True)
@@ -404,6 +407,9 @@ def store_all(output: Path, trials: int, names: Sequence[str]) -> int:
         print(f"{option.name}: {computed.extent}, by ipe-bench {computed.version}")
         if option.name == SHOWN.stem:
             write_text(SHOWN, stored_as_markdown(option))
+        if option.name == "states":
+            page = TABLES.read_text(encoding="utf-8")
+            write_text(TABLES, with_tables(page, computed.analysis))
     return 0
 
 
