@@ -230,7 +230,8 @@ class PathBlock:
         finished = known.all(axis=1) & (status != Status.NO_READINGS)
         each = nees(e.reshape(-1, n), P.reshape(-1, n, n)).reshape(trials, K)
         each[~self.definite] = np.nan
-        distance = self._distance(e[:, -1])
+        # A track with a gap is no answer, in whatever counts by its distance.
+        distance = np.where(finished, self._distance(e[:, -1]), np.nan)
         # Squared errors over the bound's variances, where the model leaves any.
         normalised = np.sum(np.where(variances > 0, e**2 / variances, 0.0), axis=2)
         of_filter = [a[:, :, None] for a in (each, tracks.nis, tracks.degrees)]
@@ -250,7 +251,7 @@ class PathBlock:
             "crlb_distance": distance,
             "nees": each[:, -1],
             "solved": converged,
-            "success": finished & (distance <= gate(n)),
+            "success": distance <= gate(n),
             "fit_p": self._fit_p(tracks),
             "path_nees": each.mean(axis=1),
             "path_success": finished & (normalised.mean(axis=1) <= gate(n)),

@@ -510,6 +510,15 @@ def test_masked_states_are_unknown_and_a_wrong_shape_is_refused():
         block.estimate(Masking((0,), degrees=2))
 
 
+def test_a_track_with_a_gap_has_failed_in_pairs_too(tmp_path):
+    trackers = {"kf": ekf(), "gap": Masking((0, 3))}
+    ib.run(StateScenario(LINEAR, seed=1), trackers, 8, output=tmp_path)
+    found = analyse([tmp_path])
+    (pair,) = found.pairs.to_dict("records")
+    assert found.summary["success"].unique().tolist() == [1.0, 7 / 8]
+    assert (pair["only_first"], pair["only_second"]) == (1, 0)
+
+
 @pytest.mark.parametrize("size", [1e-12, 1.0, 1e12])
 def test_the_root_of_a_covariance_has_as_many_columns_as_that_has_rank(size):
     rng = np.random.default_rng(10)
