@@ -29,8 +29,17 @@ _FACTOR = 10.0
 """The factor between them."""
 _ROUND_OFF = 1e-12
 """Part of a cost that counts as round-off."""
-_SHARE = 0.5
-"""Standard deviations of the prior about a further start, in those of the prior."""
+_SHARES = (0.5, 0.1)
+"""Standard deviations of the prior about further starts, in those of the prior, of one round after
+another: the wide ones find more turns, the narrow ones more pendulums."""
+_SURE = 0.05
+"""Probability of the cost with which the search among draws ends: a path that is hard to find has
+neighbours that nearly fit."""
+_BACK = 3
+"""Rounds that lead back to a path, after which the search for a better one ends."""
+ALIKE = 1e-2
+"""What costs differ by at most if they are those of one minimum: steps that have converged leave
+1e-4."""
 _SLOW = 3
 """Damped steps in a row that hardly lower an improbable cost, after which a search ends: of those
 that crawled so for 30 steps, one in ten arrived."""
@@ -93,9 +102,10 @@ class LevenbergMarquardtSmoother(Tracker):
 
     The first path is the smoothed track of the EKF or of the UKF, whichever costs less. At its
     minimum J is chi-square with as many degrees as there are readings. Where it is too large for
-    that, the trial begins again at draws of the prior, each smoothed by a UKF of half the prior's
-    deviations, from the one that costs least. The covariance is that of the affine model, or
-    where the density is not normal a second moment about the path; see `widened`.
+    that, the trial begins again at draws of the prior, each smoothed by a UKF of half or a tenth of
+    the prior's deviations, from the one that costs least, in up to twelve rounds of draws. The
+    covariance is that of the affine model, or where the density is not normal a second moment about
+    the path; see `widened`.
 
     Example:
 
@@ -119,6 +129,8 @@ class LevenbergMarquardtSmoother(Tracker):
     """A trial is lost if so large a cost is less probable than this."""
     starts: Whole = 10
     """Draws of the prior among which a trial that is lost looks for another start."""
+    rounds: Whole = 12
+    """Rounds of such draws at most."""
     seed: int = 0
     """A trial's draws depend on this and on its readings: on nothing else in the batch."""
 
@@ -128,11 +140,30 @@ class LevenbergMarquardtSmoother(Tracker):
             Descent.of(density, filtered(model, z, rule)) for rule in (Taylor(), Unscented())
         )
         paths = self.descended(density, first.improved(other, np.arange(len(z))))
-        rows = np.flatnonzero(self.improbable(z, paths.at.cost))
-        if self.starts and len(rows):
+        return reported(density, self.restarted(density, paths)[0])
+
+    def restarted(self, density: PathDensity, paths: Descent) -> tuple[Descent, NDArray[np.int64]]:
+        """Begins improbable paths again in rounds of draws, until they are probable or were found
+        three times more, and tells which round each path is of (trials,), 0 for one of none."""
+        by = np.zeros(len(density.z), np.int64)
+        again = np.zeros(len(density.z), np.int64)
+        rows = np.flatnonzero(self.improbable(density.z, paths.at.cost))
+        for number in range(self.rounds if self.starts else 0):
+            if not rows.size:
+                break
             some = density.subset(rows)
-            paths = paths.improved(self.descended(some, self.drawn(some)), rows)
-        return reported(density, paths)
+            other = self.descended(some, self.drawn(some, number))
+            alike = np.abs(other.at.cost - paths.at.cost[rows]) <= ALIKE
+            cost = np.where(alike, np.inf, other.at.cost)
+            other = replace(other, at=replace(other.at, cost=cost))
+            better = paths.beaten(other, rows)
+            by[rows[better]] = 1 + number
+            # Where searches from elsewhere lead back, it is the model that does not fit.
+            again[rows] = np.where(better, 0, again[rows] + alike)
+            paths = paths.improved(other, rows)
+            sure = path_p(some.z, paths.at.cost[rows]) >= _SURE
+            rows = rows[~sure & (again[rows] < _BACK)]
+        return paths, by
 
     def improbable(self, z: Array, cost: Array) -> Mask:
         """Tells whether a path costs too much for its readings (trials,); one without a finite cost
@@ -151,14 +182,14 @@ class LevenbergMarquardtSmoother(Tracker):
         draws = m + multiply(spread, drawn[:, -1])
         at_once = max(1, int(_NUMBERS / (self.starts * model.epochs * model.n**2)))
         parts = np.split(np.arange(trials), range(at_once, trials, at_once))
-        return join([self._best(density.subset(rows), draws[rows]) for rows in parts])
+        P = _SHARES[number % len(_SHARES)] ** 2 * P
+        return join([self._best(density.subset(rows), draws[rows], P) for rows in parts])
 
-    def _best(self, density: PathDensity, draws: Array) -> Descent:
-        """Selects the best of those that begin at draws (trials, starts, n)."""
+    def _best(self, density: PathDensity, draws: Array, P: Array) -> Descent:
+        """Selects the best of those that begin at draws (trials, starts, n) with covariance P."""
         trials, starts, n = draws.shape
         one = density.subset(np.repeat(np.arange(trials), starts))
-        P = np.repeat(_SHARE**2 * density.model.prior.covariance[None], len(one.z), axis=0)
-        start = Normal(draws.reshape(-1, n), P)
+        start = Normal(draws.reshape(-1, n), np.repeat(P[None], len(one.z), axis=0))
         found = Descent.of(one, filtered(one.model, one.z, Unscented(), start=start))
         least = found.at.cost.reshape(trials, starts).argmin(axis=1)
         calls = found.calls.reshape(trials, starts).sum(axis=1)

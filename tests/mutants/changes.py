@@ -157,8 +157,8 @@ CHANGES = {
     "restart-narrow": Change(
         "states",
         "restarts of lm_ieks have a fiftieth of the prior's deviations",
-        "_SHARE**2 * density.model",
-        "0.02**2 * density.model",
+        "_SHARES[number % len(_SHARES)] ** 2 * P",
+        "0.02**2 * P",
         "test_paths.py",
     ),
     "damping-unscaled": Change(
