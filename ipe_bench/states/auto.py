@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import put, take
 from ipe_bench.basics.linalg import Array
-from ipe_bench.basics.options import Whole
 from ipe_bench.basics.statuses import Status
 from ipe_bench.states.base import StateModel
 from ipe_bench.states.damped import Descent, LevenbergMarquardtSmoother, reported
 from ipe_bench.states.linearisation import Taylor, Unscented
-from ipe_bench.states.mirrored import mirrored, with_second
+from ipe_bench.states.mirrored import in_first_turn, mirrored, ordered, with_second
 from ipe_bench.states.smoothers import smoothed
 from ipe_bench.states.trackers import Filter, Tracker, Tracks, filtered
 from ipe_bench.states.whole_paths import PathDensity
@@ -36,13 +35,11 @@ class AutoTracker(Tracker):
 
     1. The extended filter and its smoother. 2. Where its innovations are improbable, the unscented
     ones, if their path costs less. 3. Levenberg-Marquardt steps from there. A path that the first
-    of them would hardly move, such as that of a linear
-       model, is the answer of the stage that it comes from.
-    4. Where the path at the end is improbable, up to three rounds of steps from draws of the prior,
-    other ones in each.
-    5. Steps from the start mirrored in the prior's mean, if the model is not affine: of the two
-    paths the more probable one is the answer, and the other one stands beside it; see
-    `with_second`.
+    of them would hardly move, such as that of a linear model, is the answer of the stage that it
+    comes from. 4. Where the path at the end is improbable, rounds of steps from draws of the prior,
+    other ones in each. 5. Steps from the start mirrored in the prior's mean, if the model is not
+    affine: of the two paths the more probable one is the answer, and the other one stands beside
+    it; see `with_second`.
 
     Noise that depends on the states leaves no density to descend on: the more likely smoother of
     the two is the answer.
@@ -59,9 +56,7 @@ class AutoTracker(Tracker):
     family: ClassVar[str] = "least squares"
     smooths: ClassVar[bool] = True
     descent: LevenbergMarquardtSmoother = field(default_factory=LevenbergMarquardtSmoother)
-    """The steps, what counts as improbable, and the draws of a round."""
-    rounds: Whole = 3
-    """Rounds of restarts at most."""
+    """The steps, what counts as improbable, and the rounds of draws."""
 
     def hindrance(self, model: StateModel) -> str | None:
         return Filter().hindrance(model)
@@ -83,26 +78,19 @@ class AutoTracker(Tracker):
         paths = self.descent.descended(density, paths)
         arrived = (paths.status == Status.CONVERGED) & (paths.iterations == 1)
         stage[~arrived] = DAMPED
-        for number in range(self.rounds if self.descent.starts else 0):
-            rows = np.flatnonzero(self.descent.improbable(z, paths.at.cost))
-            if not rows.size:
-                break
-            some = density.subset(rows)
-            other = self.descent.descended(some, self.descent.drawn(some, number))
-            stage[rows[paths.beaten(other, rows)]] = AGAIN + number
-            paths = paths.improved(other, rows)
+        paths, by = self.descent.restarted(density, paths)
+        stage = np.where(by > 0, AGAIN + by - 1, stage)
         # The path of an affine model has no second one beside it.
         rows = np.flatnonzero(stage >= DAMPED)
         if not rows.size:
             return replace(with_second(density, reported(density, paths), paths), stage=stage)
-        mirror = mirrored(self.descent, density.subset(rows), take(paths, rows))
-        better = paths.beaten(mirror, rows)
+        found = take(paths, rows)
+        found = in_first_turn(density.subset(rows), found)
+        mirror = mirrored(self.descent, density.subset(rows), found)
+        found, second, better = ordered(found, mirror)
         stage[rows[better]] = MIRRORED
-        # Of both the one that costs more stands beside the other.
-        beside = put(paths, rows, mirror)
-        beside = put(beside, rows[better], take(paths, rows[better]))
-        paths = paths.improved(mirror, rows)
-        tracks = with_second(density, reported(density, paths), beside)
+        paths = put(paths, rows, found)
+        tracks = with_second(density, reported(density, paths), put(paths, rows, second))
         return replace(tracks, stage=stage)
 
     def _likelier(

@@ -7,10 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from ipe_bench.basics.batches import put, take
 from ipe_bench.basics.linalg import Array, Mask
 from ipe_bench.basics.statuses import Status
 from ipe_bench.states.base import Normal
-from ipe_bench.states.damped import Descent, LevenbergMarquardtSmoother
+from ipe_bench.states.damped import ALIKE, Descent, LevenbergMarquardtSmoother
 from ipe_bench.states.linearisation import Taylor
 from ipe_bench.states.trackers import Tracks, filtered
 from ipe_bench.states.whole_paths import PathDensity, Settled
@@ -20,6 +21,14 @@ _NEAR = 1e-2
 _WORSE = 10.0
 """Times the cost of the path from the prior's mean that a mirrored path may begin with: others
 hardly ever arrive."""
+_EARLY = 4
+"""Steps from a mirrored start after which only searches with a prospect go on."""
+_HOPELESS = 1.5
+"""Times the cost of the first path that a search may have by then: of pendulums and turns those
+that became a second path had 1.1 at most, and most others twice as much or more."""
+_SAME = 1.0
+"""Squared distance from the first path, in deviations of the path, below which a search is on its
+way into it."""
 _APART = 3.0
 """Standard deviations of a state beyond which two paths are two; within them the covariance counts
 both."""
@@ -27,17 +36,70 @@ both."""
 
 def mirrored(descent: LevenbergMarquardtSmoother, density: PathDensity, paths: Descent) -> Descent:
     """Finds, for each path, the one that steps lead to from its start mirrored in the prior's mean,
-    whose density is the same there; of infinite cost where no steps are tried."""
+    whose density is the same there; of infinite cost where no steps are tried.
+
+    States with a period are moved by half of it, too: the sine of pi - a is that of a, and a
+    pendulum that turns the other way passes the same readings there.
+    """
     model = density.model
     m, P = model.prior
     trials = len(density.z)
-    start = Normal(2 * m - paths.at.x[:, 0], np.repeat(_NEAR**2 * P[None], trials, axis=0))
+    x = 2 * m - paths.at.x[:, 0]
+    if model.state_periods:
+        x = x + np.array(model.state_periods) / 2
+    start = Normal(x, np.repeat(_NEAR**2 * P[None], trials, axis=0))
     begun = Descent.of(density, filtered(model, density.z, Taylor(), start=start))
     unread = _unread(density)
     far = ~(begun.at.cost <= _WORSE * unread.cost)
     at = replace(begun.at, cost=np.where(far, np.inf, begun.at.cost))
-    calls = begun.calls + unread.calls
-    return descent.descended(density, replace(begun, at=at, calls=calls))
+    begun = replace(begun, at=at, calls=begun.calls + unread.calls)
+    few = replace(descent, iterations=min(_EARLY, descent.iterations))
+    found = few.descended(density, begun)
+    going = found.status == Status.MAX_ITERATIONS
+    going &= found.at.cost <= _HOPELESS * paths.at.cost
+    rows = np.flatnonzero(going)
+    if rows.size:
+        some = density.subset(rows)
+        first = take(paths.at, rows)
+        d = model.nearest_state(found.at.x[rows], first.x) - first.x
+        found.calls[rows] += Taylor().calls(model.n) * model.evaluations
+        rows = rows[some.size(some.tangents(first), d) > _SAME]
+        some = density.subset(rows)
+        part = take(found, rows)
+        running = np.full(len(rows), Status.RUNNING, np.int8)
+        found = put(found, rows, descent.descended(some, replace(part, status=running)))
+    return in_first_turn(density, found)
+
+
+def in_first_turn(density: PathDensity, paths: Descent) -> Descent:
+    """Moves paths by whole periods of their states to where the prior is largest, unless they cost
+    more there."""
+    model = density.model
+    if not any(model.state_periods):
+        return paths
+    periods = np.array(model.state_periods)
+    away = paths.at.x[:, 0] - model.prior.mean
+    turns = np.where(periods > 0, np.round(away / np.where(periods > 0, periods, 1.0)), 0.0)
+    rows = np.flatnonzero(np.isfinite(paths.at.cost) & (turns != 0).any(axis=1))
+    if not rows.size:
+        return paths
+    shift = (periods * turns)[rows]
+    moved = density.subset(rows).settled(paths.at.x[rows] - shift[:, None])
+    calls = paths.calls.copy()
+    calls[rows] += moved.calls
+    lower = moved.cost < paths.at.cost[rows]
+    at = put(paths.at, rows[lower], take(moved, lower))
+    return replace(paths, at=at, calls=calls)
+
+
+def ordered(paths: Descent, other: Descent) -> tuple[Descent, Descent, Mask]:
+    """Orders two paths of each trial by cost, and tells where the second one is the better."""
+    better = other.at.cost < paths.at.cost - ALIKE
+    rows = np.flatnonzero(better)
+    calls = paths.calls + other.calls
+    first = put(paths, rows, take(other, rows))
+    second = put(other, rows, take(paths, rows))
+    return replace(first, calls=calls), second, better
 
 
 def _unread(density: PathDensity) -> Settled:
@@ -64,7 +126,8 @@ def with_second(density: PathDensity, tracks: Tracks, other: Descent) -> Tracks:
 
         p' = exp(-J' / 2) / (exp(-J / 2) + exp(-J' / 2)),
 
-    if they are two, and the second moment of the states about the path is P + p' d d'.
+    if they are two, and the second moment of the states about the path is P + p' d d'. Half a
+    period away, d is as often one way round as the other.
     """
     assert tracks.cost is not None
     d = density.model.nearest_state(other.at.x[:, 1:], tracks.mean) - tracks.mean
@@ -74,9 +137,31 @@ def with_second(density: PathDensity, tracks: Tracks, other: Descent) -> Tracks:
         p = 1 / (1 + np.exp((other.at.cost - tracks.cost) / 2))
     p = np.where(found, p, 0.0)
     d = np.where(found[:, None, None], d, 0.0)
-    outer = d[..., :, None] * d[..., None, :]
-    covariance = tracks.covariance + p[:, None, None, None] * outer
+    covariance = tracks.covariance.copy()
+    for share, way in _ways_round(density, tracks, d):
+        outer = way[..., :, None] * way[..., None, :]
+        covariance += (p[:, None] * share)[..., None, None] * outer
     return replace(tracks, covariance=covariance, other_p=p, other=tracks.mean + d)
+
+
+def _ways_round(density: PathDensity, tracks: Tracks, d: Array) -> list[tuple[Array, Array]]:
+    """Lists the distances at which states lie that are normal about d (trials, K, n), each taken
+    the shorter way round its period, with their shares (trials, K)."""
+    from scipy.special import ndtr
+
+    ways = [(np.ones(d.shape[:2]), d)]
+    for i, period in enumerate(density.model.state_periods):
+        if not period:
+            continue
+        beyond = np.abs(d[..., i]) - period / 2
+        with np.errstate(all="ignore"):
+            over = np.nan_to_num(ndtr(beyond / np.sqrt(tracks.covariance[..., i, i])))
+        back = np.zeros_like(d)
+        back[..., i] = np.copysign(period, d[..., i])
+        here = [(share * (1 - over), way) for share, way in ways]
+        there = [(share * over, way - back) for share, way in ways]
+        ways = here + there
+    return ways
 
 
 def _two(tracks: Tracks, d: Array) -> Mask:

@@ -66,7 +66,10 @@ def test_each_stage_answers_where_those_before_it_do_not():
     leave improbable."""
     z = LOST.draw(0, 40).z
     with np.errstate(all="ignore"):
-        tracks = [AutoTracker(rounds=rounds).track(LOST, z) for rounds in (0, 1, 2)]
+        tracks = [
+            AutoTracker(LevenbergMarquardtSmoother(rounds=rounds)).track(LOST, z)
+            for rounds in (0, 1, 2)
+        ]
     assert set(tracks[0].stage) <= {DAMPED, MIRRORED}
     assert AGAIN + 1 in tracks[2].stage
     for number in (1, 2):
@@ -111,7 +114,7 @@ def test_noise_that_depends_on_the_states_is_left_to_the_likelier_smoother():
 def test_a_trial_has_the_same_bits_alone_and_in_a_batch(model):
     z = model.draw(0, 5).z
     z[3, 4:6] = np.nan
-    tracker = AutoTracker(LevenbergMarquardtSmoother(starts=3), rounds=2)
+    tracker = AutoTracker(LevenbergMarquardtSmoother(starts=3, rounds=2))
     with np.errstate(all="ignore"):
         together = tracker.track(model, z)
         for trial in (0, 3, 4):
