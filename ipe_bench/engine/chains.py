@@ -245,23 +245,16 @@ def filtered_roots(A: Array, B: Array, G: Array) -> tuple[Array, Array, Array]:
 
 
 def lower(W: Array) -> Array:
-    """The lower triangular F (trials, n, n) with F F' = W W'."""
-    n = W.shape[1]
-    W = W.copy()
-    F = np.zeros((len(W), n, n))
-    for i in range(n):
-        row = W[:, i]
-        below = W[:, i + 1 :]
-        square = np.sum(row**2, axis=1)
-        root = np.sqrt(square)
-        F[:, i, i] = root
-        # Singular noise leaves rows of zeros, which have no share in others.
-        inverse = np.divide(1.0, square, out=np.zeros_like(square), where=square > 0)
-        # The rows below lose their part along row i (modified Gram-Schmidt).
-        share = multiply(below, row) * inverse[:, None]
-        F[:, i + 1 :, i] = share * root[:, None]
-        below -= share[:, :, None] * row[:, None]
-    return F
+    """The lower triangular F (trials, n, n) with F F' = W W', by reflections of Householder."""
+    trials, n, columns = W.shape
+    # Sizes of columns may differ by all digits; without the largest ones in front, reflections
+    # would lose those of the smaller ones (Powell and Reid, IFIP Congress 68, 1969).
+    size = np.einsum("tij,tij->tj", W, W)
+    order = np.argsort(-size, axis=1, kind="stable")
+    V = np.zeros((trials, max(n, columns), n))
+    V[:, :columns] = np.take_along_axis(W, order[:, None], axis=2).mT
+    F = np.linalg.qr(V, mode="r").mT
+    return np.where(np.diagonal(F, axis1=1, axis2=2)[:, None] < 0, -F, F)
 
 
 def _take_in(F: Array, row: Array) -> tuple[Array, Array]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.linalg import Array, Mask, multiply
 from ipe_bench.engine.chains import from_before, lower, smoothed_chains
-from ipe_bench.states.algebra import half, lower_solve, transposed
+from ipe_bench.states.algebra import half, lower_solve, transposed, upper_solve
 from ipe_bench.states.base import Normal
 from ipe_bench.states.linearisation import Affine
 
@@ -127,36 +127,41 @@ def solved_by_roots(A: Array, B: Array, D: Array, G: Array, a: Array, v: Array) 
     """Returns the same x as `solve_chains` where F F' of a state is so large that a multiplier's
     round-off moves it; G may have trials, (1 + K, trials, n, q).
 
-    What the readings of an epoch and later ones say of its state, |C' x - c|^2, is kept by
-    orthogonal rows (Dyer and McReynolds, J. Optim. Theory Appl. 3, 1969); with x = A x[k-1] + a +
-    G w it says of the state before
+    What the readings of an epoch and later ones say of its state, |C x - c|^2, is kept by
+    orthogonal rows (Dyer and McReynolds, J. Optim. Theory Appl. 3, 1969). With x = A x[k-1] + a +
+    G w and the readings of 0 of w,
 
-        |Y x[k-1] - y|^2,  Y = L^-1 C' A,  y = L^-1 (c - C' a),  L L' = I + X X',  X = C' G
+        C G  C A  c - C a          R  S  r
+                             ->
+         I    0      0             0  Y  y,
 
-    and w = X' L^-T (y - Y x[k-1]).
+    so that w = R^-1 (r - S x[k-1]), and |Y x[k-1] - y|^2 is said of the state before.
     """
     A, B, v = from_before(A, B, D, v)
     trials, epochs, n = a.shape
+    q = G.shape[-1]
     Y = np.zeros((trials, n, n))
     y = np.zeros((trials, n))
-    one = np.broadcast_to(np.eye(n), Y.shape)
     known = []
     for k in reversed(range(epochs)):
-        rows = np.concatenate([B[:, k], Y], axis=1)
-        right = np.concatenate([v[:, k], y], axis=1)
-        both = lower(np.concatenate([rows, right[..., None]], axis=2).mT)
-        C = both[:, :n, :n]
-        X = np.matmul(C.mT, G[k])
-        L = lower(np.concatenate([one, X], axis=2))
-        U = lower_solve(L, X)
-        Y = lower_solve(L, np.matmul(C.mT, A[:, k]))
-        left = both[:, n, :n] - multiply(C.mT, a[:, k])
-        y = lower_solve(L, left[..., None])[..., 0]
-        known.append((U, Y, y))
+        C = np.concatenate([B[:, k], Y], axis=1)
+        c = np.concatenate([v[:, k], y], axis=1)
+        rows = C.shape[1]
+        both = np.zeros((trials, q + n + 1, rows + q))
+        both[:, :q, :rows] = np.matmul(C, G[k]).mT
+        both[:, q:-1, :rows] = np.matmul(C, A[:, k]).mT
+        both[:, -1, :rows] = c - multiply(C, a[:, k])
+        both[:, :q, rows:] = np.eye(q)
+        both = lower(both)
+        R, S, r = both[:, :q, :q], both[:, q:-1, :q], both[:, -1, :q]
+        Y = both[:, q:-1, q:-1].mT
+        y = both[:, -1, q:-1]
+        known.append((R, S, r))
     x = np.empty(a.shape)
     before = np.zeros((trials, n))
-    for k, (U, Y, y) in enumerate(reversed(known)):
-        w = multiply(U.mT, y - multiply(Y, before))
+    for k, (R, S, r) in enumerate(reversed(known)):
+        left = r - multiply(S.mT, before)
+        w = upper_solve(R, left[..., None])[..., 0]
         before = multiply(A[:, k], before) + a[:, k] + multiply(G[k], w)
         x[:, k] = before
     return x

@@ -7,7 +7,7 @@ import pytest
 from shared.oracles import assert_agrees
 
 from ipe_bench.engine import compiled
-from ipe_bench.engine.chains import filtered_chains, smoothed_chains, solve_chains
+from ipe_bench.engine.chains import filtered_chains, lower, smoothed_chains, solve_chains
 
 _N, _M, _EPOCHS = 3, 2, 6
 
@@ -157,3 +157,17 @@ def test_a_trial_has_the_same_bits_alone_and_beside_one_that_is_not_finite():
         alone = results((A[some], B[some], D[some], G, a[some], v[some]))
         for one, whole in zip(alone, together, strict=True):
             np.testing.assert_array_equal(one, whole[some])
+
+
+@pytest.mark.parametrize("places", [(0, 1, 2, 3), (1, 2, 0, 3), (3, 0, 2, 1)])
+def test_a_triangular_root_keeps_the_digits_of_small_columns_beside_large_ones(places):
+    """Its determinant is that of W W', by all minors of W (Cauchy and Binet): reflections that meet
+    the small columns first lose seven digits of it."""
+    w = 2**30
+    W = np.array([[0, w, w, 0], [2, w, 0, 1], [1, 0, w, 1]])
+    minors = [-3 * w**2, -w, -w, -2 * w**2]
+    F = lower(np.stack([W[:, places], np.zeros_like(W)]).astype(float))
+    squared = float(sum(minor**2 for minor in minors))
+    np.testing.assert_allclose(np.prod(np.diagonal(F[0])), np.sqrt(squared), rtol=1e-14)
+    np.testing.assert_array_equal(np.triu(F[0], 1), 0.0)
+    np.testing.assert_array_equal(F[1], 0.0)

@@ -366,6 +366,24 @@ def test_a_wide_prior_costs_no_digits_of_what_precise_readings_leave(label, spre
     assert np.array_equal(alone.covariance[0], tracks.covariance[1])
 
 
+@pytest.mark.parametrize(
+    "G0",
+    [((2.0**-2, 0.0), (0.0, 2.0**27)), ((2.0**27,), (2.0**28,))],
+    ids=["one wide state of two", "one error of both"],
+)
+@pytest.mark.parametrize("label", ["ekf_rts", "ckf_rts", "ieks", "lm", "auto"])
+def test_a_path_keeps_its_digits_where_its_start_is_wide_in_one_direction(label, G0):
+    """The mean lay a deviation beside the exact one, and up to millions of them."""
+    model = Linear(G0=G0, G=NONE)
+    z = np.round(model.draw(0, 1).z)
+    (mean, P), _ = exact(model, z[0])
+    tracks = WIDE[label].track(model, z)
+    size = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+    np.testing.assert_allclose((tracks.mean[0] - mean) / size, 0.0, atol=1e-5)
+    found = np.sqrt(np.diagonal(tracks.covariance[0], axis1=1, axis2=2))
+    np.testing.assert_allclose(found, size, rtol=1e-6)
+
+
 @pytest.mark.parametrize("label", ["ieks", "auto"])
 def test_what_is_known_without_any_noise_stays_what_it_is(label):
     """Of a model of no error at all no start and no step has a column of noise."""
