@@ -459,6 +459,35 @@ def test_curves_have_names_at_their_ends_and_those_that_end_together_share_a_lab
     assert len(labels) < len(ends)
 
 
+def test_beside_long_names_labels_of_scales_stand_apart_and_no_leader_crosses_a_name():
+    scales = (300.0, 600.0, 1000.0, 2000.0, 3000.0, 5000.0, 10000.0)
+    shares = {"levenberg_marquardt": 0.06, "recursive_update": 0.04, "geodesic_lm": 0.02}
+    rows = pd.DataFrame(
+        [
+            {"estimator": name, "error_scale": scale, "success": share, "trials": 60}
+            for name, share in shares.items()
+            for scale in scales
+        ]
+    )
+    look = looks(list(shares))
+    with house_style():
+        fig, axes = common.panels(3, look, scales=scales)
+        for ax in axes:
+            common.shares(ax)
+            common.curves(ax, rows, "success", look, scales)
+        common.end_names(axes[0], rows, "success", look)
+        fig.draw_without_rendering()
+    for ax in axes:
+        labels = [label for label in ax.get_xticklabels() if label.get_text()]
+        boxes = [label.get_window_extent() for label in labels]
+        gaps = [right.x0 - left.x1 for left, right in pairwise(boxes)]
+        assert min(gaps) > 0.3 * boxes[0].height
+    for box in (one for one in axes[0].artists if isinstance(one, AnnotationBbox)):
+        assert (
+            box.arrow_patch.get_path().vertices[:, 0].max() <= box.offsetbox.get_window_extent().x0
+        )
+
+
 def test_at_most_four_are_in_colour_and_the_winner_in_a_strong_one(parted):
     view, drawing = parted
     lines = [line for ax in drawing.figure.axes for line in ax.lines if len(line.get_xdata()) == 4]
@@ -594,8 +623,8 @@ def test_digits_of_each_problem_are_in_its_cell_blue_from_four_on_the_hardest_fi
 def test_published_errors_are_rings_about_those_that_are_found():
     rows = pd.DataFrame({"model": "book", "state": "angle", "estimator": ["ekf", "ukf"]})
     rows = rows.assign(published=[0.2, 0.1], found=[0.2, 0.125], difference=[0.0, 0.025])
-    units = pd.DataFrame({"parameter": ["angle"], "unit": ["rad"]})
-    view = replace(with_collection(), frames={"summary": units})
+    group = SimpleNamespace(footer={"parameters": [{"name": "angle", "unit": "rad"}]})
+    view = replace(with_collection(), collection=SimpleNamespace(groups=[group]))
     with (
         patch.object(certified, "published_table", return_value=rows),
         patch.object(certified, "certified_table", return_value=pd.DataFrame()),

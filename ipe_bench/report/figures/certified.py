@@ -70,11 +70,14 @@ def _draw_cells(ax: Any, digits: pd.DataFrame) -> None:
 
 def draw_published(view: View) -> Iterator[Drawing]:
     """Draws errors that were found within rings of those that are published, the smallest first."""
-    table = pd.DataFrame() if view.collection is None else published_table(view.collection)
+    if view.collection is None:
+        return
+    table = published_table(view.collection)
     if table.empty:
         return
+    footers = [group.footer for group in view.collection.groups]
+    units = {p["name"]: p["unit"] for footer in footers for p in footer["parameters"]}
     groups = list(table.groupby(["model", "state"], sort=False))[: common.MOST_PANELS]
-    units = view["summary"].groupby("parameter")["unit"].first()
     fig, axes = common.panels(len(groups), dict.fromkeys(table["estimator"]), scales=[0.0])  # type: ignore[arg-type]
     for ((model, state), rows), ax in zip(groups, axes, strict=True):
         rows = rows.sort_values("published")
@@ -84,8 +87,7 @@ def draw_published(view: View) -> Iterator[Drawing]:
         ax.plot(rows["published"], y, "o", label="published", **ring)
         ax.plot(rows["found"], y, "o", markersize=4, color="#0b5a8f", label="found")
         ax.set(xlabel="root mean square error", xlim=(0, None))
-        unit = str(units.get(state, ""))
-        common.title(ax, f"{model}, {with_unit(str(state), unit)}")
+        common.title(ax, f"{model}, {with_unit(str(state), units[str(state)])}")
     common.legend(fig, axes)
     most = table["difference"].abs().max()
     caption = f"Errors along the published path; the largest difference is {most:.1e}."

@@ -3,7 +3,7 @@ captions."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -200,11 +200,15 @@ def number(value: float) -> str:
     return words.replace("-", "\N{MINUS SIGN}")
 
 
-def scale_axis(ax: Axes, scales: Sequence[float]) -> None:
-    """Sets a logarithmic axis with a tick at each of the ascending error scales."""
+def scale_axis(ax: Axes, scales: Sequence[float], names: Iterable[str] = ()) -> None:
+    """Sets a logarithmic axis with a tick at each of the ascending error scales; the names of
+    curves beside one of the panels take of the width of all."""
     span = np.log10(scales[-1] / scales[0])
     margin = max(0.06 * span, 0.15)
-    kept = labelled(scales, (span + 2 * margin) / _room(ax, "xtick.labelsize"))
+    across = ax.get_subplotspec().get_gridspec().ncols  # type: ignore[union-attr]
+    beside = min(_MOST_LETTERS, len(", ".join(names))) / across
+    room = _room(ax, "xtick.labelsize") - beside
+    kept = labelled(scales, (span + 2 * margin) / room)
     ax.set_xscale("log")
     ax.set_xticks(scales, [value_text(s) if s in kept else "" for s in scales])
     ax.set_xticks([], minor=True)
@@ -421,7 +425,7 @@ def curves(
     least, top = _limits(ax)
     top = min(top, most)
     if not one_scale:
-        scale_axis(ax, scales)
+        scale_axis(ax, scales, look)
     elif _value(ax) == "y":
         ax.set_xticks([])
     gap = float(np.diff(np.log10(scales)).min(initial=1.0))
@@ -545,7 +549,14 @@ def end_names(ax: Axes, rows: pd.DataFrame, y: str, look: Mapping[str, Look]) ->
             frameon=False,
             pad=0,
             annotation_clip=False,
-            arrowprops={"arrowstyle": "-", "color": SOFT, "linewidth": 0.4, "shrinkB": 2},
+            # To the left end of its name, across no other one.
+            arrowprops={
+                "arrowstyle": "-",
+                "color": SOFT,
+                "linewidth": 0.4,
+                "shrinkB": 2,
+                "relpos": (0.0, 0.5),
+            },
         )
         ax.add_artist(box)
 
