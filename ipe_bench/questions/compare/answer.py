@@ -106,7 +106,7 @@ def write_comparison(folder: Path, frame: Comparison, sources: Sequence[tuple[st
         ("comparison.csv", frame),
         finding(frame),
         (),
-        [_joined(tables), *sentences],
+        [_joined(tables, [str(sentence) for sentence in sentences])],
         draw_pairs(frame),
         sources=sources,
     )
@@ -116,15 +116,16 @@ def _column(title: str, cells: Sequence[str]) -> Column:
     return words(title, cells) if title in _WORDS else texts(title, cells)
 
 
-def _joined(tables: Sequence[Table]) -> Table:
-    """Puts tables of the same columns below each other, their titles in a column."""
+def _joined(tables: Sequence[Table], sentences: Sequence[str]) -> Table:
+    """Puts tables of the same columns below each other, their titles in a column, and below them
+    the sentences that say what the columns mean."""
     titles = list(dict.fromkeys(column.title for table in tables for column in table.columns))
     names = [table.title for table in tables for _ in table.rows]
     columns = [words("comparison", names)]
     for title in titles:
         cells = [cell for table in tables for cell in _under(table, title)]
         columns.append(Column(title or "quantity", cells, title not in _WORDS))
-    notes = [note for table in tables for note in table.notes]
+    notes = [*(note for table in tables for note in table.notes), *sentences]
     return Table("comparison", "Trial by trial", "", columns, notes=notes, grouped=1)
 
 
@@ -153,7 +154,7 @@ def finding(frame: pd.DataFrame) -> str:
         if extents:
             clauses.append(f"{word} in {', '.join(extents)}")
     tested = [_TITLES.get(quantity, quantity) for quantity in by_quantity]
-    nothing = f"no change beyond its margin is decided in {enumerate_few(tested)}"
+    nothing = f"no change beyond the margin is found in {enumerate_few(tested)}"
     return f"{_who(frame)}: {'; '.join(clauses) or (nothing if tested else 'not tested')}"
 
 
