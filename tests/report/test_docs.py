@@ -486,6 +486,28 @@ def test_what_a_page_says_to_type_works(page, tmp_path):
         assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "option"), [("solver", "gain: 1.0"), ("noise", "deviation: 0.01")]
+)
+def test_the_class_that_a_page_shows_passes_the_check_in_the_plugin_that_it_makes(
+    kind, option, tmp_path
+):
+    name = f"my_{kind}"
+    (code,) = blocks(PAGES / "howto" / f"write_{kind}.md", "python")
+    program = [sys.executable, "-m", "ipe_bench"]
+    subprocess.run([*program, "new", kind, name], cwd=tmp_path, check=True)
+    folder = tmp_path / "plugins" / name
+    (folder / f"ipe_bench_{name}" / f"{name}.py").write_text(code, encoding="utf-8")
+    (config,) = folder.rglob(f"{name}.yaml")
+    lines = config.read_text("utf-8")
+    config.write_text(re.sub(r"(?m)^(gain|half_width): .*$", option, lines), encoding="utf-8")
+    done = subprocess.run(
+        [*program, "check", str(folder)], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout
+
+
 @pytest.fixture(scope="module")
 def site(tmp_path_factory) -> tuple[Path, str]:
     """The folder of the site and what its building printed."""
