@@ -73,7 +73,8 @@ def status_command(arguments: Sequence[str], verbose: bool = False) -> int:
         if not results.problems:
             estimates = [cell for cell in results.cells if cell.names["estimator"] != TRUTH]
             trials = sum(cell.done for cell in estimates)
-            verdict = f"complete: scenarios under an estimator: {len(estimates)}; trials: {trials}"
+            counted = f"results (an estimator in a scenario): {len(estimates)}"
+            verdict = f"complete: {counted}; estimates: {trials}"
         say(*(results.problems or results.stale), f"{name}: {verdict}")
     return 1 if any(results.problems for results in found) else 0
 

@@ -165,7 +165,8 @@ def test_a_dry_run_says_what_is_missing_and_computes_nothing(ipe_bench):
 def test_status_says_complete_in_a_line(ipe_bench):
     assert ipe_bench("run", *SMALL, "solver=[newton]", "trials=8", "output=whole")[0] == 0
     code, out, _ = ipe_bench("status", "whole")
-    assert (code, out) == (0, "whole: complete: scenarios under an estimator: 1; trials: 8\n")
+    told = "whole: complete: results (an estimator in a scenario): 1; estimates: 8\n"
+    assert (code, out) == (0, told)
     assert rows_of(ipe_bench("status", "whole", "-v")[1], "newton") == 1
     next(Path("whole/trials").glob("*-0-8.parquet")).unlink()
     code, out, _ = ipe_bench("status", "whole")

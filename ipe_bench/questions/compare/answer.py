@@ -70,13 +70,13 @@ class Comparison(Shown, pd.DataFrame):
             notes = [_needed(row) for row in planned]
             yield Table("comparison", title, "", columns, notes=notes)
         yield (
-            "error is its length in standard deviations of the bound (Mahalanobis), where a trial"
-            " counts as at most the radius of the gate of success; cost counts simulations. Both"
-            " are means over the common trials, where the table of a run has medians, and errors"
-            " over the bound. p comes from McNemar's exact test for success and from random signs"
-            " for the others, with Holm's correction over all tests. e is evidence that may be"
-            " looked at repeatedly; e = 20 is as rare as p = 0.05. Each interval holds for its row"
-            " alone. Times are not tested."
+            "error is the length of the error of all parameters, in standard deviations of the"
+            " bound (Mahalanobis), at most the radius of the gate of success; cost counts"
+            " simulations. Both are means over the common trials; the table of a run has medians,"
+            " and errors over the bound. p comes from McNemar's exact test for success and from"
+            " random signs for the others, with Holm's correction over all tests. e is evidence"
+            " that may be looked at repeatedly; e = 20 is as rare as p = 0.05. Each interval holds"
+            " for its row alone. Times are not tested."
         )
         margins = ", ".join(f"{name} {margin:g}" for name, margin in self.attrs["margins"].items())
         yield (
