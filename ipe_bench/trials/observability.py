@@ -33,6 +33,23 @@ _WORTH_SAYING = 0.1
 """Coefficients of a direction below this share of the largest are left out of its words."""
 
 
+def readable(model: Measurement, x: Array) -> Array:
+    """Returns those truths (some, n) of x (truths, n) at which all readings have finite slopes.
+
+    Raises:
+        UserError: there are none.
+    """
+    with np.errstate(all="ignore"):
+        slopes = model.jacobian(x)
+    there = np.isfinite(slopes).all(axis=(1, 2))
+    if not there.any():
+        raise UserError(
+            f"error_scale: at none of {len(x)} true parameters from the prior {model.name} has"
+            " finite readings with finite slopes; give a smaller error_scale"
+        )
+    return x[there]
+
+
 @dataclass(frozen=True)
 class Observability:
     """Describes what a model's readings say about its parameters; lengths in multiples of the

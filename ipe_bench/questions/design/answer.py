@@ -16,7 +16,7 @@ from ipe_bench.questions.design.maths import Design, Way, design, entry_in_words
 from ipe_bench.report.page.writer import write_files
 from ipe_bench.report.tables.table import Part, Shown, Strong, Table, naming, texts, words
 from ipe_bench.report.words import enumerate_few, percent, scientific, short
-from ipe_bench.trials.observability import TRUTHS, Observability
+from ipe_bench.trials.observability import TRUTHS, Observability, readable
 from ipe_bench.trials.thresholds import FIT_LEVEL
 
 if TYPE_CHECKING:
@@ -141,7 +141,7 @@ def _draw_design(design: Design) -> Iterator[Drawing]:
         scenario = design.scenario
         model = design.measurement(best.sharpest)
         R = scenario.noise.covariance(model.m)
-        after = Observability.at(model, R, scenario.truths(0, TRUTHS))
+        after = Observability.at(model, R, readable(model, scenario.truths(0, TRUTHS)))
         title = f"best choice {best.title}"
     yield from draw_bounds(design.observability, after, title)
 
@@ -183,6 +183,11 @@ def _parameters(name: str, design: Design) -> Table:
         f"Singular values of the whitened Jacobian, per parameter's size: {short(s[0])} to"
         f" {short(s[-1])}.",
     ]
+    if design.lost:
+        notes.append(
+            f"{design.lost} of {TRUTHS} true parameters from the prior have no finite readings and"
+            " are left out."
+        )
     setting = f"{name}, {scenario.noise.name}, error scale {scenario.error_scale:g}"
     title = f"{setting}: what {scenario.measurement.m} readings determine"
     return Table("parameters", title, "", columns, notes=notes)

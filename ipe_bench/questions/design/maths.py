@@ -19,7 +19,13 @@ from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array, Covariance, Mask, gram
 from ipe_bench.measurements.base import Measurement, labels
 from ipe_bench.report.words import value_text
-from ipe_bench.trials.observability import TRUTHS, Observability, Suspect, suspects
+from ipe_bench.trials.observability import (
+    TRUTHS,
+    Observability,
+    Suspect,
+    readable,
+    suspects,
+)
 from ipe_bench.trials.scenario import Scenario
 
 Criterion = Literal["A", "D"]
@@ -127,6 +133,8 @@ class Design:
     further: Further | None = None
     """What to read next; None without a candidate, or if today's readings leave a parameter
     open."""
+    lost: int = 0
+    """The number of truths that have no finite readings, over which nothing is averaged."""
 
     def measurement(self, choice: Choice) -> Measurement:
         """Returns the model that takes these readings and no others."""
@@ -152,7 +160,7 @@ def design(
 
     Raises:
         UserError: noise of an unknown level, or with correlated errors, which do not add up; an
-            unknown column; too few readings.
+            unknown column; too few readings; truths without any.
     """
     noise = scenario.noise
     if noise.estimated:
@@ -162,10 +170,11 @@ def design(
         )
     model = scenario.measurement
     R = scenario.problem.R
-    x = scenario.truths(0, truths)
+    candidates = model.candidates
+    x = readable(candidates, readable(model, scenario.truths(0, truths)))
+    lost = truths - len(x)
     today = Observability.at(model, R, x)
     worst = _worst_suspects(model, R, errors, x)
-    candidates = model.candidates
     columns = _columns(model, by)
     if R.factor.ndim != 1:
         raise UserError(
@@ -175,7 +184,7 @@ def design(
     R_all = noise.covariance(candidates.m)
     whole = Observability.at(candidates, R_all, x)
     if not whole.observable:
-        return Design(scenario, criterion, candidates, today, worst, ())
+        return Design(scenario, criterion, candidates, today, worst, (), lost=lost)
     most = _most_readings(model, candidates, readings)
 
     # All is in units of today's bounds, or of those that all candidates have together.
@@ -194,7 +203,7 @@ def design(
     if readings is not None and not ways:
         _refuse_few(readings, columns)
     further = _further(scenario, today, x)
-    return Design(scenario, criterion, candidates, today, worst, ways, further)
+    return Design(scenario, criterion, candidates, today, worst, ways, further, lost)
 
 
 def _worst_suspects(

@@ -390,6 +390,21 @@ def test_where_further_readings_are_offered_todays_are_not_called_the_only_candi
     assert [part for part in said if "the present" in part] == [f"{every} chooses fewer of them."]
 
 
+def test_truths_without_readings_are_left_out_of_a_design_and_counted():
+    """The root of a + t has no real value where a is below -1."""
+    model = ib.measurements.Formula("sqrt(a + t)", {"a": 0.5}, {"t": [1.0, 2.0, 3.0]})
+    wide = Scenario(model, Gaussian(0.1), GaussianPrior(), 4.0, 0)
+    lost = int((model.sizes[0] * wide.truths(0, 30) <= -1.0).sum())
+    assert 0 < lost < 30
+    told = " ".join(str(ib.design(wide)).split())
+    assert f"{lost} of 30 true parameters from the prior have no finite readings" in told
+    nowhere = ib.measurements.Formula("sqrt(a - t)", {"a": 3.5}, {"t": [1.0, 2.0, 3.0]})
+    none = Scenario(nowhere, Gaussian(0.1), GaussianPrior(), 1.0, 0)
+    no_slope = patch.object(type(nowhere), "jacobian", lambda _, x: np.full((len(x), 3, 1), np.nan))
+    with no_slope, pytest.raises(ib.UserError, match="at none of 30 true parameters"):
+        design(none)
+
+
 def test_a_title_writes_small_bounds_in_three_figures_as_the_table_does():
     found = design(Scenario(Linear(), Gaussian(4e-4), GaussianPrior(), 1.0, 0))
     assert found.further is not None
