@@ -16,11 +16,13 @@ import functools
 import hashlib
 import importlib.util
 import inspect
+import operator
 import sys
 import sysconfig
 import types
 import uuid
-from collections.abc import Mapping, Set
+import weakref
+from collections.abc import Callable, Mapping, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,6 +39,12 @@ _DEFINED += (staticmethod, classmethod, property, functools.cached_property)
 _PARTS = ("__func__", "__self__", "__wrapped__", "fget", "func")
 """Attributes that hold the functions of a method, of a property, and of what functools or a
 compiler makes of one."""
+_THROUGH: dict[type, Callable[[Any], Any]] = {
+    types.MappingProxyType: dict,
+    memoryview: bytes,
+    weakref.ReferenceType: operator.call,
+}
+"""Functions by which what only shows another object becomes what it shows."""
 _BEYOND_NAMES = {"eval", "exec", "globals", "__import__"}
 """Built-in functions by which code reaches what no name in it tells."""
 _PIN = "_definition"
@@ -229,6 +237,8 @@ class Definitions:
             return self._function(thing)
         if isinstance(thing, _DEFINED) or _wraps(thing):
             return [self.of(getattr(thing, part, None)) for part in _PARTS]
+        if type(thing) in _THROUGH:
+            return self.of(_THROUGH[type(thing)](thing))
         if type(thing) in (tuple, list):
             return [self.of(one) for one in thing]
         if type(thing) in (set, frozenset):
@@ -263,7 +273,8 @@ class Definitions:
             noted = name.startswith("__") and not isinstance(value, _DEFINED)
             if noted or name == "_abc_impl":
                 attributes.pop(name, None)
-        bases = [self.of(base) for base in cls.__bases__]
+        own_kind = () if _stands_by_name(type(cls)) else (type(cls),)
+        bases = [self.of(base) for base in (*cls.__bases__, *own_kind)]
         return cls.__qualname__, bases, self.of(attributes)
 
     def _function(self, function: types.FunctionType) -> Any:

@@ -5,6 +5,8 @@ import importlib
 import os
 import subprocess
 import sys
+import types
+import weakref
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ import pytest
 
 import ipe_bench as ib
 from ipe_bench.baselines import LevenbergMarquardt
+from ipe_bench.basics.definitions import Definitions
 from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements.problem import require_function
 from ipe_bench.noise import Gaussian
@@ -327,6 +330,27 @@ def test_a_design_is_of_what_a_model_computes_with_and_not_of_what_it_has_kept()
     assert values[1] == pytest.approx(2 * values[0])
 
 
+SHOWN = {
+    "mapping": ("held = {'k': 1.0}; shown = types.MappingProxyType(held)", "held['k'] = 2.0"),
+    "memory": ("held = np.ones(1); shown = memoryview(held)", "held[0] = 2.0"),
+    "reference": ("class C: k = 1.0\nshown = weakref.ref(C)", "C.k = 2.0"),
+    "metaclass": ("class K(type): k = 1.0\nclass shown(metaclass=K): pass", "K.k = 2.0"),
+}
+"""What shows another object, and how that changes."""
+
+
+@pytest.mark.parametrize("kind", SHOWN)
+def test_a_definition_follows_what_is_seen_through_another_object(kind):
+    made, edit = SHOWN[kind]
+    names = {"types": types, "np": np, "weakref": weakref, "__name__": "__main__"}
+    exec(made, names)
+    exec("def used():\n    return shown", names)
+    before = repr(Definitions().of(names["used"]))
+    assert repr(Definitions().of(names["used"])) == before
+    exec(edit, names)
+    assert repr(Definitions().of(names["used"])) != before
+
+
 def test_a_draw_follows_a_function_that_was_edited_and_an_object_keeps_its_class():
     session = Session("estimator", "helper", 1.0)
     exec(KEPT, session.names)
@@ -498,6 +522,8 @@ def test_a_table_that_is_changed_from_outside_is_part_of_the_key(importing, tabl
 
 CELLS = """
 import sys
+import types
+import weakref
 from dataclasses import dataclass
 import ipe_bench as ib
 from ipe_bench.runs.execution import Processes
