@@ -223,12 +223,12 @@ def audit(claims: Claims) -> Audit:
 def _require_evidence(claims: Claims) -> None:
     """Refuses too few independent runs, and errors without a scatter of their own."""
     if claims.runs < FEWEST_RUNS:
-        one = ""
+        found = f"there are {claims.runs} independent runs"
+        if claims.runs == 1:
+            found = "there is 1 independent run"
         if claims.runs == 1 and len(claims.run) > 1:
-            one = "one log of dependent rows is too little evidence; "
-        raise UserError(
-            f"audit: there are {claims.runs} independent runs; {one}give at least {FEWEST_RUNS}"
-        )
+            found += "; one log of dependent rows is too little evidence"
+        raise UserError(f"audit: {found}; give at least {FEWEST_RUNS}")
     largest = np.abs(claims.z).max(axis=0)
     none = (largest < 1 / _FARTHEST).any()
     if none or any(np.linalg.matrix_rank(part) < part.shape[1] for part in claims.parts):
