@@ -48,10 +48,11 @@ def draw_further(model: Measurement, further: Further) -> Drawing:
     common.legend(fig, axes)
     caption = "Cramér-Rao bounds with further readings."
     if further.column:
-        caption += " Right: with one more, by where it is taken."
+        caption += f" Over {further.column}: with one more, by where it is taken."
     left = len(today) - len(shown)
     if left:
-        caption += f" Not drawn: {left} parameters that gain less."
+        parameters = "1 parameter that gains" if left == 1 else f"{left} parameters that gain"
+        caption += f" Not drawn: {parameters} less."
     return Drawing("further", f"Read next at {further.words[further.taken[0]]}", caption, fig)
 
 
