@@ -143,7 +143,7 @@ def answered(deviation, beyond=0.0, factor=1.0, seed=0):
     [
         ({"deviation": 0.3}, "by lm, which passes every test"),
         ({"deviation": None}, "by lm, the size of whose residuals is not tested"),
-        ({"deviation": 0.3, "factor": 3.0}, "no answer passes its tests"),
+        ({"deviation": 0.3, "factor": 3.0}, "no estimate both converged and fits"),
         (
             {"deviation": 0.45, "beyond": CURVED},
             "by lm, in doubt, for successive residuals resemble each other",
@@ -177,6 +177,17 @@ def test_the_title_of_an_answer_has_its_numbers_and_how_they_were_tested(truth, 
     assert ("In doubt" in answer.sentences()[0]) == ("in doubt" in title)
     told = " ".join(str(answer).split())
     assert ("standard errors are too small" in told) == ("in doubt" in title)
+
+
+def test_an_estimate_that_has_not_converged_is_no_answer_though_it_fits():
+    z = np.sin(T) + 0.1 * np.random.default_rng(0).standard_normal(41)
+    wave = Formula("a*sin(w*t)", {"a": 1.0, "w": 1.0}, {"t": T.tolist()})
+    hasty = LevenbergMarquardt(max_iterations=1, tolerance=1e-14)
+    answer = ib.estimate(wave, z, {"lm": hasty}, noise=Gaussian(0.1))
+    assert (answer["lm"].fits, answer["lm"].passes) == (True, False)
+    assert answer.finding() == "no estimate both converged and fits"
+    assert "Values in brackets are no answers" in str(answer)
+    assert "do not fit" not in str(answer)
 
 
 def test_a_title_names_what_readings_leave_open_and_other_answers():

@@ -183,8 +183,10 @@ class Answer(Labelled[Fit]):
         lacking = [one for one in self.fits if one.undetermined]
         if lacking:
             return f"the readings do not determine {'; '.join(lacking[0].undetermined)}"
+        if not any(one.passes for one in self.fits):
+            return "no estimate both converged and fits"
         if not self.passes:
-            return "no answer passes its tests"
+            return "chi-square has a lower minimum than that of any estimate"
         one = self._stated
         found = [f"{enumerate_few(_with_errors(one), 2)} by {one.label}"]
         if _resembling(one):
@@ -344,7 +346,7 @@ def _notes(answer: Answer) -> Iterator[str]:
         yield f"Left out on purpose: columns {answer.left_out}."
     failing = _labels(one for one in fits if not one.passes)
     if failing:
-        yield f"Values in brackets do not fit, and have no standard errors: {failing}."
+        yield f"Values in brackets are no answers and have no standard errors: {failing}."
 
 
 def _labels(fits: Iterable[Fit]) -> str:
