@@ -313,10 +313,6 @@ class _ChainWriter(_LaneWriter):
         here.B[diagonal] = self.v.call("sqrt", here.u[i])
         here.x[i] = self.zero
         here.v[b.add(i, m)] = self.zero
-        # s = 0 and 1 + b' s = 1 stay where there is no damping, and the row is not taken in.
-        here.size[b.add(i, m)] = self.one
-        with self._each(self.n) as j:
-            here.S.row(b.add(i, m))[j] = self.zero
 
     def _spread(self, k: Value) -> None:
         """Writes F of an epoch: predicted, and then updated by one row after another."""
@@ -324,8 +320,8 @@ class _ChainWriter(_LaneWriter):
         before = self._at(k, back=1)
         self._predict(k, here.A, before.F)
         self._triangle(self.W, here.F)
-        with self._each(self.rows) as r:
-            self._update(here, r)
+        with self._each(self.rows) as r, self._counts(here, r):
+            self._take_in(here, here.F, here.B.row(r).all(), r)
 
     def _predict(self, k: Value, A: _Lanes, F: _Lanes) -> None:
         """Writes W = (A F, G), with W W' = A F F' A' + G G'."""
@@ -364,19 +360,18 @@ class _ChainWriter(_LaneWriter):
                 rest = self.v.combine(numbers, [b.fneg(share)], [row])
                 below.keep(rest)
 
-    def _update(self, here: Epoch, r: Value) -> None:
-        """Writes whether row r is taken in: a reading always, and damping if some lane has any."""
+    def _counts(self, here: Epoch, r: Value) -> Any:
+        """Begins what is done with row r if it counts: a reading always, and damping if some lane
+        has any; w and s of another row are 0."""
         b = self.b
         m = integer(self.size.m)
-        row = here.B.row(r)
         read = b.icmp_signed("<", r, m)
         damping = b.icmp_signed(">=", r, m)
         i = b.select(damping, b.sub(r, m), integer(0))
-        damped = b.fcmp_unordered("!=", row[i], self.zero)
+        damped = b.fcmp_unordered("!=", here.B.row(r)[i], self.zero)
         lanes = b.bitcast(damped, ir.IntType(self.v.width))
         some = b.icmp_unsigned("!=", lanes, ir.Constant(lanes.type, 0))
-        with b.if_then(b.or_(read, some)):
-            self._take_in(here, here.F, row.all(), r)
+        return b.if_then(b.or_(read, some))
 
     def _take_in(self, here: Epoch, F: _Lanes, row: list[Value], r: Value) -> None:
         """Writes F F' <- ((F F')^-1 + b b')^-1 for a row b, with s = F F' b and 1 + b' s (Carlson,
@@ -414,7 +409,7 @@ class _ChainWriter(_LaneWriter):
             along = here.A.row(i).all()
             here.u[i] = self._dot(along, before, here.a[i])
         # Update by a reading: w = (v - b' u) / (1 + b' s), then u <- u + s w.
-        with self._each(self.rows) as r:
+        with self._each(self.rows) as r, self._counts(here, r):
             w = self.b.fdiv(self._left(here, r), here.size[r])
             here.w[r] = w
             self._add(w, here.S.row(r), here.u)
@@ -432,7 +427,7 @@ class _ChainWriter(_LaneWriter):
             here.u[i] = self._dot(along, t, here.u[i])
             here.x[i] = self.b.fadd(here.x[i], here.u[i])
         # Readings from the last to the first: w <- w - s' l / (1 + b' s), then l <- l + b w.
-        with self._down(integer(self.rows)) as r:
+        with self._down(integer(self.rows)) as r, self._counts(here, r):
             known = self._along(here.S, r, self.y)
             share = self.b.fdiv(known, here.size[r])
             w = self.b.fsub(here.w[r], share)
@@ -461,7 +456,7 @@ class _ChainWriter(_LaneWriter):
             along = here.A.row(i).all()
             here.a[i] = self._dot(along, before, left)
         # v <- v - B u - w.
-        with self._each(self.rows) as r:
+        with self._each(self.rows) as r, self._counts(here, r):
             left = self._left(here, r)
             here.v[r] = self.b.fsub(left, here.w[r])
 
