@@ -180,28 +180,35 @@ class _LaneWriter:
 
     def _take(self, array: Value, lanes: _Lanes, count: int, k: Value, length: Value) -> None:
         """Copies `count` numbers of epoch k of an array (trials, length, count) into lanes."""
-        with self._places(count, k, length) as (outside, inside):
-            put(self.b, number_at(self.b, array, outside), lanes.begin, inside)
+        rows = self._rows(array, count, k, length)
+        with self._each(count) as j:
+            vector = ir.Constant(self.v.type, ir.Undefined)
+            for lane, row in enumerate(rows):
+                number = number_at(self.b, row, j)
+                vector = self.b.insert_element(vector, number, ir.Constant(I32, lane))
+            lanes[j] = vector
 
     def _give(self, lanes: _Lanes, array: Value, count: int, k: Value, length: Value) -> None:
         """Copies lanes into `count` numbers of epoch k of an array (trials, length, count)."""
-        with self._places(count, k, length) as (outside, inside):
-            put(self.b, number_at(self.b, lanes.begin, inside), array, outside)
+        rows = self._rows(array, count, k, length)
+        with self._each(count) as j:
+            vector = lanes[j]
+            for lane, row in enumerate(rows):
+                put(self.b, self.b.extract_element(vector, ir.Constant(I32, lane)), row, j)
 
-    @contextmanager
-    def _places(self, count: int, k: Value, length: Value) -> Iterator[tuple[Value, Value]]:
-        """Writes a loop over places in an array (trials, length, count) and those in lanes."""
+    def _rows(self, array: Value, count: int, k: Value, length: Value) -> list[Value]:
+        """Begins of epoch k of each lane's trial in an array (trials, length, count)."""
         b = self.b
-        width = self.v.width
-        with self._each(count) as j, self._each(width) as lane:
-            trial = b.add(self.group, lane)
+        last = b.sub(self.trials, integer(1))
+        rows = []
+        for lane in range(self.v.width):
+            trial = b.add(self.group, integer(lane))
             # A group that is not full repeats the last trial.
-            last = b.sub(self.trials, integer(1))
             trial = b.select(b.icmp_signed("<", trial, last), trial, last)
             epoch = b.add(b.mul(trial, length), k)
-            outside = b.add(b.mul(epoch, integer(count)), j)
-            inside = b.add(b.mul(j, integer(width)), lane)
-            yield outside, inside
+            begin = b.mul(epoch, integer(count))
+            rows.append(b.gep(array, [begin], source_etype=F64))
+        return rows
 
     def _parts(self, array: Value, sizes: Sequence[int]) -> list[Value]:
         """Begins of parts of so many vectors each, and of what follows them."""
