@@ -217,11 +217,20 @@ class _LaneWriter:
     def _lanes(self, begin: Value) -> _Lanes:
         return _Lanes(self.v, begin, self.n)
 
-    def _numbers(self, array: Value, i: Value, count: int) -> list[Value]:
-        """Returns row i of an array (..., count), each number in all lanes."""
-        begin = self.b.mul(i, integer(count))
-        places = [self.b.add(begin, integer(j)) for j in range(count)]
-        return [self.v.spread(number_at(self.b, array, place)) for place in places]
+    def _number(self, array: Value, place: Value) -> Value:
+        """Returns a number of an array in all lanes."""
+        return self.v.spread(number_at(self.b, array, place))
+
+    @contextmanager
+    def _directions(self, s: Value, i: Value) -> Iterator[tuple[Value, Value]]:
+        """Writes a loop over the directions in which point i of s (points, n) does not lie at 0:
+        one of sigma points at most."""
+        b = self.b
+        with self._each(self.n) as j:
+            place = b.add(b.mul(i, integer(self.n)), j)
+            share = number_at(b, s, place)
+            with b.if_then(b.fcmp_unordered("!=", share, ir.Constant(F64, 0.0))):
+                yield j, self.v.spread(share)
 
     def _each(self, count: int | Value) -> Any:
         count = integer(count) if isinstance(count, int) else count
@@ -598,9 +607,9 @@ class _SpreadWriter(_LaneWriter):
         self._factor()
         self._give(self.L, L, square, zero, one)
         with self._each(points) as i:
-            direction = self._numbers(s, i, self.n)
-            with self._each(self.n) as r:
-                self.x[r] = self._dot(self.L.row(r).all(), direction, self.mean[r])
+            self.x.keep(self.mean.all())
+            with self._directions(s, i) as (j, share), loop(self.b, j, integer(self.n)) as r:
+                self.x[r] = self.v.call("fma", self.L.row(r)[j], share, self.x[r])
             self._give(self.x, x, self.n, i, points)
 
     def _factor(self) -> None:
@@ -650,12 +659,13 @@ class _RegressionWriter(_LaneWriter):
         # The mean, sum w y.
         with self._each(points) as i:
             self._take(y, self.y, self.m, i, points)
-            (weight,) = self._numbers(w, i, 1)
+            weight = self._number(w, i)
             with self._each(self.m) as j:
                 self.mean[j] = self.v.call("fma", weight, self.y[j], self.mean[j])
         with self._each(points) as i:
             self._take(y, self.y, self.m, i, points)
-            self._add_point(self._numbers(c, i, 1)[0], self._numbers(s, i, self.n))
+            self._add_point(self._number(c, i), s, i)
+        self._divide()
         with self._each(self.m) as j:
             self._finish(j)
         for lanes, array, count in zip(
@@ -663,29 +673,37 @@ class _RegressionWriter(_LaneWriter):
         ):
             self._give(lanes, array, count, zero, one)
 
-    def _add_point(self, weight: Value, direction: list[Value]) -> None:
-        """Writes M <- M + c d s' and W <- W + c d d' for the values y of a point, d = y - mean."""
+    def _add_point(self, weight: Value, s: Value, i: Value) -> None:
+        """Writes M <- M + c d s' and W <- W + c d d' for the values y of point i, d = y - mean."""
         b = self.b
         with self._each(self.m) as j:
             self.y[j] = b.fsub(self.y[j], self.mean[j])
+        with self._directions(s, i) as (k, share), self._each(self.m) as j:
+            row = self.M.row(j)
+            row[k] = self.v.call("fma", b.fmul(weight, self.y[j]), share, row[k])
         with self._each(self.m) as j:
             d = b.fmul(weight, self.y[j])
-            row = self.M.row(j)
-            row.keep(self.v.combine(row.all(), [d], [direction]))
             across = self.W.row(j)
-            with loop(b, integer(0), b.add(j, integer(1))) as i:
-                across[i] = self.v.call("fma", d, self.y[i], across[i])
+            with loop(b, integer(0), b.add(j, integer(1))) as k:
+                across[k] = self.v.call("fma", d, self.y[k], across[k])
+
+    def _divide(self) -> None:
+        """Writes A with A L = M, from the last column to the first; its rows do not wait for each
+        other."""
+        b = self.b
+        with self._down(integer(self.n)) as i:
+            column = self.L.column(i)
+            pivot = self.L.row(i)[i]
+            with self._each(self.m) as j:
+                # What is not written yet is 0.
+                A = self.A.row(j)
+                rest = b.fsub(self.M.row(j)[i], self._dot(column, A.all()))
+                A[i] = b.fdiv(rest, pivot)
 
     def _finish(self, j: Value) -> None:
-        """Writes row j of A L = M, from the last column to the first, and of W - M M'."""
+        """Writes row j of W - M M'."""
         b = self.b
-        told = self.M.row(j)
-        row = told.all()
-        with self._down(integer(self.n)) as i:
-            # What is not written yet is 0.
-            A = self.A.row(j)
-            rest = b.fsub(told[i], self._dot(self.L.column(i), A.all()))
-            A[i] = b.fdiv(rest, self.L.row(i)[i])
+        row = self.M.row(j).all()
         with loop(b, integer(0), b.add(j, integer(1))) as i:
             explained = self._dot(row, self.M.row(i).all())
             left = b.fsub(self.W.row(j)[i], explained)
