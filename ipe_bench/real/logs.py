@@ -456,7 +456,7 @@ class LogQuestion:
                 )
             (readings,) = readings
         log = Log.of(model, Path(readings) if isinstance(readings, str) else readings, ignored)
-        validate([StateScenario(log.model)], trackers, 1)
+        validate([StateScenario(log.model)], trackers, 1, untried=[])
         names = [find] if isinstance(find, str) else list(find)
         for label, tracker in trackers.items() if names else ():
             require_likelihood(log, label, tracker)

@@ -133,20 +133,43 @@ def validate(
         if scenario.noise.real and trials != 1:
             mistakes.append(f"trials={trials}: certified readings are one trial; set trials=1")
         if isinstance(scenario, StateScenario):
-            mistakes += _with_trackers(scenario, estimators)
+            mistakes += _with_trackers(scenario, estimators, untried)
         else:
             mistakes += _with_estimators(scenario, estimators, untried)
     if mistakes:
         raise UserError("; ".join(dict.fromkeys(mistakes)))
 
 
-def _with_trackers(scenario: StateScenario, trackers: Mapping[str, Any]) -> list[str]:
+def _with_trackers(
+    scenario: StateScenario, trackers: Mapping[str, Any], untried: Sequence[AnyScenario] | None
+) -> list[str]:
     what = "estimates constants; a state model takes trackers"
     other = [label for label, one in trackers.items() if not isinstance(one, Tracker)]
     if other:
         return [f"estimators.{label}: {what}" for label in other]
     found = {label: tracker.hindrance(scenario.assumed) for label, tracker in trackers.items()}
-    return [f"trackers.{label}: {why}" for label, why in found.items() if why]
+    mistakes = [f"trackers.{label}: {why}" for label, why in found.items() if why]
+    if not scenario.noise.real and (untried is None or scenario in untried):
+        mistakes += _without_paths(scenario)
+    return mistakes
+
+
+def _without_paths(scenario: StateScenario) -> Iterator[str]:
+    with np.errstate(all="ignore"):
+        try:
+            few = scenario.draw(0, _FEW)
+        except Exception:  # what cannot be drawn is a failure of its blocks, and told of there
+            return
+    if not finite(few.x).any():
+        yield (
+            f"state_model={scenario.model.name}: none of the first {_FEW} paths has finite states;"
+            " mend the transition, or choose another start or narrower spreads"
+        )
+    elif not np.isfinite(few.z).any():
+        yield (
+            f"state_model={scenario.model.name}: none of the first {_FEW} paths has a finite"
+            " reading; mend the readings, or choose another start or narrower spreads"
+        )
 
 
 def _with_estimators(

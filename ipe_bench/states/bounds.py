@@ -35,8 +35,8 @@ def posterior_bounds(model: StateModel, paths: Paths) -> tuple[Array, Array]:
     for k in range(model.epochs):
         x = paths.x[:, k]
         # What the readings of an epoch add: E H' R^-1 H.
-        H = model.observation_at(k).slope(x)[1]
-        gained = _mean_information(H, np.linalg.inv(model.R(k)))
+        H, R = _seen(model.observation_at(k).slope(x)[1], model.R(k), paths.z[:, k])
+        gained = _mean_information(H, np.linalg.inv(R))
         if model.moves(k):
             Q_inverse = np.linalg.inv(_regular(model, k))
             F = model.transition_into(k).slope(before)[1]
@@ -83,12 +83,21 @@ def _regular(model: StateModel, k: int) -> Array:
     return Q
 
 
+def _seen(H: Array, R: Array, z: Array) -> tuple[Array, Array]:
+    """Returns the slopes (trials, m, n) and the noise (trials, m, m) of the readings z (trials, m)
+    that a path has; those that it has not have no slope and unit variance."""
+    seen = np.isfinite(z)
+    both = seen[:, :, None] & seen[:, None, :]
+    return np.where(seen[..., None], H, 0.0), np.where(both, R, np.eye(len(R)))
+
+
 def _mean(a: Array) -> Array:
     return np.asarray(a.mean(axis=0))
 
 
 def _mean_information(J: Array, inverse: Array) -> Array:
-    """Computes E J' C^-1 J (n, n) over the paths, for slopes J (trials, m, n)."""
+    """Computes E J' C^-1 J (n, n) over the paths, for slopes J (trials, m, n) and one C^-1 or one
+    for each path."""
     return _mean(np.matmul(np.matmul(transposed(J), inverse), J))
 
 
@@ -103,7 +112,9 @@ def bound_at_truth(model: StateModel, paths: Paths, smooths: bool = False) -> Ar
     path.mean = paths.x
     # Points about the truth would need a covariance there; tangents need none.
     path.covariance[:] = model.prior.covariance
-    # No covariance depends on the values of the readings.
+    # No covariance depends on the values of the readings, but for those that a path has not.
     z = np.zeros((*paths.x.shape[:2], model.readings_per_epoch))
+    if paths.z.size:
+        z[~np.isfinite(paths.z)] = np.nan
     tracks = filtered(model, z, Taylor(), path=path, smooths=smooths)
     return (smoothed(model, tracks) if smooths else tracks).covariance

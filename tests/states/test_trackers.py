@@ -475,6 +475,32 @@ def test_the_bounds_of_a_linear_model_are_its_covariances():
     np.testing.assert_allclose(bound_at_truth(model, paths)[2], filtered, rtol=1e-9)
 
 
+def test_readings_that_a_path_has_not_are_no_part_of_its_bounds():
+    """Those of a logarithm of a state below 0 counted, and filters seemed worse than they could."""
+    model = ConstantVelocity(count=20)
+    paths = model.draw(0, 5)
+    paths.z[:, 3:9] = np.nan
+    paths.z[:, 12, 0] = np.nan
+    filtered, smoothed = posterior_bounds(model, paths)
+    np.testing.assert_allclose(filtered, ekf().track(model, paths.z).covariance[0], rtol=1e-9)
+    np.testing.assert_allclose(
+        smoothed, Smoother(ekf()).track(model, paths.z).covariance[0], rtol=1e-9
+    )
+    np.testing.assert_allclose(bound_at_truth(model, paths)[2], filtered, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("part", "formula", "what"),
+    [("next", "sqrt(x - 100)", "states"), ("readings", "sqrt(x - 100)", "reading")],
+)
+def test_a_model_without_finite_paths_is_refused(part, formula, what):
+    formulas = {"next": {"x": "x"}, "readings": {"z": "x"}}
+    formulas[part] = dict.fromkeys(formulas[part], formula)
+    model = Formulas(**formulas, deviation={"z": 1.0}, spread={"x": 1.0}, count=3)
+    with pytest.raises(ib.UserError, match=f"none of the first 4 paths has .*finite {what}"):
+        ib.run(model, {"ekf": ekf()}, trials=5)
+
+
 @pytest.mark.oracle(
     "own second implementation: information matrix of whole paths",
     "posterior Cramér-Rao bounds",
