@@ -15,6 +15,7 @@ import math
 import numbers
 import operator
 import re
+import sys
 import types
 import typing
 from collections.abc import Mapping, Sequence
@@ -157,12 +158,18 @@ def component_classes(component: Any) -> list[Any]:
         return [cls for item in component for cls in component_classes(item)]
     if not dataclasses.is_dataclass(component) or isinstance(component, type):
         return []
-    bases = type(component).__mro__
-    found = [cls for cls in bases if cls.__module__ not in ("builtins", "abc", "typing")]
+    found: list[Any] = [cls for cls in type(component).__mro__ if not _is_of_python(cls)]
     found += getattr(component, "functions", ())
     for field in dataclasses.fields(component):
         found += component_classes(getattr(component, field.name))
     return found
+
+
+def _is_of_python(cls: type) -> bool:
+    """Tells whether a class is one of Python's own, such as ABC; a class that `type` or
+    `make_dataclass` makes of a base says that it is of the module abc, too."""
+    own = cls.__module__ in ("builtins", "abc", "typing")
+    return own and getattr(sys.modules[cls.__module__], cls.__name__, None) is cls
 
 
 @functools.cache

@@ -1,6 +1,7 @@
 """What is redefined while a process runs has numbers and results of its own, and what is not is
 computed once."""
 
+import dataclasses
 import importlib
 import os
 import subprocess
@@ -349,6 +350,20 @@ def test_a_definition_follows_what_is_seen_through_another_object(kind):
     assert repr(Definitions().of(names["used"])) == before
     exec(edit, names)
     assert repr(Definitions().of(names["used"])) != before
+
+
+def test_classes_of_one_name_that_are_made_by_a_call_have_results_of_their_own():
+    """Python calls the module of such a class abc, and they were taken for classes of Python's."""
+    bounds = []
+    for factor in (1.0, 2.0):
+        parts = {
+            "simulate": lambda self, x, f=factor: f * ib.measurements.Polynomial.simulate(self, x)
+        }
+        base = (ib.measurements.Polynomial,)
+        made = dataclasses.make_dataclass("Made", [], bases=base, namespace=parts, frozen=True)
+        table = ib.run(made(), {"map": LevenbergMarquardt()}, trials=5, noise=Gaussian(0.01))
+        bounds.append(table["crlb"].iloc[0])
+    assert bounds[0] == pytest.approx(2 * bounds[1])
 
 
 def test_a_draw_follows_a_function_that_was_edited_and_an_object_keeps_its_class():
