@@ -20,7 +20,7 @@ from ipe_bench.basics.options import Finite, NonNegative, Positive, option_types
 from ipe_bench.basics.statuses import Status
 from ipe_bench.real.readings import TextTable, read_tables, unit_of
 from ipe_bench.runs.run import validate
-from ipe_bench.states.base import StateModel
+from ipe_bench.states.base import StateModel, require_parts
 from ipe_bench.states.copies import SURE, copy_p
 from ipe_bench.states.formulas import Formulas, RecordedFormulas
 from ipe_bench.states.particles import Bootstrap
@@ -455,6 +455,7 @@ class LogQuestion:
                     f"readings=[{','.join(map(str, readings))}]: a track has one log; name one file"
                 )
             (readings,) = readings
+        require_parts(model)
         log = Log.of(model, Path(readings) if isinstance(readings, str) else readings, ignored)
         validate([StateScenario(log.model)], trackers, 1, untried=[])
         names = [find] if isinstance(find, str) else list(find)

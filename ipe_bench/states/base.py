@@ -379,13 +379,45 @@ def widened(model: StateModel, scale: float) -> StateModel:
 def require_sound(model: StateModel) -> None:
     """Raises UserError unless the parts of a model suit one another: times, prior, Q, R, f and
     h."""
-    for faults in (_name_faults, _time_faults, _noise_faults, _shape_faults, _covariance_faults):
+    require_parts(model)
+    for faults in (_time_faults, _shape_faults, _covariance_faults):
         for fault in faults(model):
             raise UserError(f"state_model={model.name}: {fault}")
 
 
+def require_parts(model: StateModel) -> None:
+    """Raises UserError unless the parts of a model are of the kinds that `StateModel` asks for, and
+    have names of their own."""
+    for faults in (_noise_faults, _kind_faults, _name_faults):
+        for fault in faults(model):
+            raise UserError(f"state_model={model.name}: {fault}")
+
+
+def _kind_faults(model: StateModel) -> Iterator[str]:
+    if not all(isinstance(state, Parameter) for state in model.states):
+        yield "its states are not all parameters; write Parameter(NAME, UNIT) for each"
+    if not isinstance(model.times, np.ndarray) or model.times.ndim != 1:
+        yield "its times are no array (K,); write np.array([...]) with a time for each epoch"
+    prior = model.prior
+    if not isinstance(prior, Normal) or not all(isinstance(part, np.ndarray) for part in prior):
+        yield "its prior is no Normal of arrays; write Normal(np.array([...]), np.diag([...]))"
+    if not np.isfinite(prior.mean).all():
+        yield "the mean of its prior is not finite; give another one"
+    for name, by_state in (("gain", model.gain_by_state), ("R", model.R_by_state)):
+        if by_state:
+            continue
+        if not callable(getattr(model, name)):
+            yield f"its {name} is no function; write {name}(self, k)"
+        if not isinstance(getattr(model, name)(0), np.ndarray):
+            yield f"its {name}(0) is no array; write np.array([[...]])"
+
+
 def _name_faults(model: StateModel) -> Iterator[str]:
     names = [state.name for state in model.states]
+    for what, given in (("states", names), ("readings", list(model.reading_names))):
+        for name in given:
+            if given.count(name) > 1:
+                yield f"two of its {what} have the name {name}; rename one"
     for name in model.scored:
         if name not in names:
             yield f"scored: {unknown(name, names, 'state')}"
@@ -417,6 +449,7 @@ def _shape_faults(model: StateModel) -> Iterator[str]:
         ("f", model.transition(x[None], last), (1, n)),
         ("h", model.observe(x[None], 0), (1, m)),
         ("periods", periods, (m,) if periods else (0,)),
+        ("reading_names", model.reading_names, (m,)),
         ("state_periods", state_periods, (n,) if state_periods else (0,)),
     ]
     for k in sorted({0, last}):

@@ -489,6 +489,29 @@ def test_readings_that_a_path_has_not_are_no_part_of_its_bounds():
     np.testing.assert_allclose(bound_at_truth(model, paths)[2], filtered, rtol=1e-9)
 
 
+WRONG_KINDS = {
+    "its states are not all parameters": {"states": ("position", "speed")},
+    "two of its states have the name p": {"states": (Parameter("p"), Parameter("p"))},
+    "two of its readings have the name z": {"reading_names": ("z", "z")},
+    "its times are no array": {"times": [1.0, 2.0]},
+    "its prior is no Normal of arrays": {"prior": (np.zeros(2), np.eye(2))},
+    "the mean of its prior is not finite": {"prior": Normal(np.full(2, np.nan), np.eye(2))},
+    "its R is no function": {"R": np.eye(1)},
+    "its gain(0) is no array": {"gain": lambda self, k: 1.0},
+}
+
+
+@pytest.mark.parametrize("complaint", WRONG_KINDS)
+def test_a_part_of_another_kind_is_refused(complaint):
+    model = type("Odd", (Walk,), WRONG_KINDS[complaint])()
+    for ask in (
+        lambda: ib.run(model, {"ekf": ekf()}, trials=2),
+        lambda: ib.estimate(model, np.ones((2, 1)), {"ekf": ekf()}),
+    ):
+        with pytest.raises(ib.UserError, match=re.escape(complaint)):
+            ask()
+
+
 @pytest.mark.parametrize(
     ("part", "formula", "what"),
     [("next", "sqrt(x - 100)", "states"), ("readings", "sqrt(x - 100)", "reading")],
