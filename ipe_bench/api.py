@@ -111,6 +111,7 @@ def run(
     from ipe_bench.statistics.stopping import compute_until
 
     stated = {"noise": noise, "prior": prior, "error_scale": error_scale}
+    _require_whole(trials=trials, block_size=block_size)
     several = scenarios if isinstance(scenarios, Sequence) else [scenarios]
     scenarios = [_tracking(one, **stated) or _scenario(one, **stated) for one in several]
     if seed is not None:
@@ -438,14 +439,11 @@ def estimate(
             "levenberg_marquardt": LevenbergMarquardt(),
         }
     estimators = _labelled(estimators, Estimator)
-    given = (
-        readings
-        if readings is None or isinstance(readings, np.ndarray)
-        else tuple(_paths(readings))
-    )
     stated: dict[str, Any] = {"noise": noise, "prior": prior, "error_scale": error_scale}
     stated |= {"known": known_parameters(parameters or {}), "ignored": tuple(ignore_columns)}
-    question = Question(model=model, readings=given, estimators=estimators, **stated).checked()
+    question = Question(
+        model=model, readings=_given(readings), estimators=estimators, **stated
+    ).checked()
     return Answer.to(question, progress=progress)
 
 
@@ -665,6 +663,22 @@ def _described(given: Any) -> str:
 def _paths(directories: Directories) -> list[Path]:
     several = [directories] if isinstance(directories, Path | str) else directories
     return [Path(directory) for directory in several]
+
+
+def _given(readings: Any) -> tuple[Path, ...] | Array | None:
+    """Returns files as their paths, and numbers as an array."""
+    if readings is None or isinstance(readings, np.ndarray):
+        return readings
+    several = [readings] if isinstance(readings, Path | str) else list(readings)
+    if all(isinstance(one, Path | str) for one in several):
+        return tuple(map(Path, several))
+    return np.asarray(several)
+
+
+def _require_whole(**numbers: Any) -> None:
+    for name, value in numbers.items():
+        if value is not None and not isinstance(value, int | np.integer):
+            raise UserError(f"{name}={value!r}: give a whole number")
 
 
 def _warn(problems: Iterable[str]) -> None:

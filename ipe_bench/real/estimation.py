@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
+import numpy as np
+
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, finite_or, unmasked
 from ipe_bench.estimators.base import Estimator
@@ -73,7 +75,14 @@ class Question:
                 f"readings: has shape {given.shape}; give the {model.m} readings of {model.name},"
                 " NaN where missing"
             )
-        return Readings(informed(model, self.known), unmasked(given).copy())
+        if np.iscomplexobj(given):
+            raise UserError("readings: are complex; give real numbers")
+        z = unmasked(given).copy()
+        if np.isinf(z).any():
+            raise UserError("readings: inf is not a reading; give NaN if it is missing")
+        if np.isnan(z).all():
+            raise UserError("readings: there is no reading; all are missing")
+        return Readings(informed(model, self.known), z)
 
     @cached_property
     def scenario(self) -> Scenario:

@@ -79,6 +79,15 @@ class Scenario:
     __repr__ = in_lines
 
     def __post_init__(self) -> None:
+        for name, kind, example in (
+            ("measurement", Measurement, "ib.measurements.Ranging()"),
+            ("noise", Noise, "ib.noise.Gaussian(0.1)"),
+            ("prior", Prior, "ib.priors.GaussianPrior()"),
+        ):
+            if not isinstance(getattr(self, name), kind):
+                raise UserError(
+                    f"{name}: {getattr(self, name)!r:.60} is none; give one such as {example}"
+                )
         object.__setattr__(self, "noise", resolved(self.noise, self.measurement))
         if not (np.isfinite(self.error_scale) and self.error_scale > 0):
             raise UserError(f"error_scale={self.error_scale}: give a finite number above 0")
@@ -199,5 +208,5 @@ def _check_alike(truth: Measurement, model: Measurement) -> None:
 
 def check_seed(seed: int) -> None:
     """Raises UserError unless the seed can be one."""
-    if not 0 <= seed < _SEEDS:
+    if not isinstance(seed, int | np.integer) or not 0 <= seed < _SEEDS:
         raise UserError(f"seed={seed}: give a whole number from 0 to {_SEEDS - 1}")

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 from pkgutil import resolve_name
+from typing import Any
 
 import numpy as np
 import pytest
@@ -215,6 +216,10 @@ def test_without_trackers_they_are_those_of_the_command(monkeypatch, find):
         ((np.zeros(3),), {}, "give the 40 readings"),
         (("nowhere.csv",), {}, "no such file"),
         ((np.zeros(40), {"map": ib.baselines.MapLM()}), {}, "needs prior"),
+        ((np.full(40, np.nan),), {}, "all are missing"),
+        ((np.full(40, np.inf),), {}, "inf is not a reading"),
+        ((np.full(40, 1j),), {}, "are complex; give real numbers"),
+        ((np.zeros(40),), {"noise": 0.1}, "noise: 0.1 is none; give one such as ib.noise"),
         (
             (np.zeros(40),),
             {"noise": ib.noise.Unknown()},
@@ -225,6 +230,25 @@ def test_without_trackers_they_are_those_of_the_command(monkeypatch, find):
 def test_mistakes_in_an_estimate_are_one_line(polynomial, arguments, options, words):
     with pytest.raises(ib.UserError, match=words):
         ib.estimate(polynomial.measurement, *arguments, **options)
+
+
+def test_numbers_in_a_list_are_readings_as_in_an_array(polynomial):
+    z = polynomial.draw(0, 1).z[0]
+    chosen = {"lse": ib.baselines.LinearLSE()}
+    (of_array,) = ib.estimate(polynomial.measurement, z, chosen, noise=polynomial.noise)
+    (of_list,) = ib.estimate(polynomial.measurement, z.tolist(), chosen, noise=polynomial.noise)
+    np.testing.assert_array_equal(of_list.x, of_array.x)
+
+
+def test_numbers_and_choices_that_cannot_be_are_refused(polynomial):
+    newton = {"newton": ib.solvers.Newton()}
+    odd: dict[str, Any] = {"trials": 2.5, "seed": 1.5, "criterion": "Q"}
+    with pytest.raises(ib.UserError, match=r"trials=2\.5: give a whole number"):
+        ib.run(polynomial, newton, odd["trials"])
+    with pytest.raises(ib.UserError, match=r"seed=1\.5"):
+        ib.run(polynomial, newton, 2, seed=odd["seed"])
+    with pytest.raises(ib.UserError, match="criterion=Q: choose A or D"):
+        ib.design(polynomial, criterion=odd["criterion"])
 
 
 def test_status_and_report_agree_and_the_report_is_still_a_function_afterwards(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NoReturn
+from typing import Any, Literal, NoReturn, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -162,6 +162,8 @@ def design(
         UserError: noise of an unknown level, or with correlated errors, which do not add up; an
             unknown column; too few readings; truths without any.
     """
+    if criterion not in get_args(Criterion):
+        raise UserError(f"criterion={criterion}: choose A or D")
     noise = scenario.noise
     if noise.estimated:
         raise UserError(
