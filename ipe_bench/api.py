@@ -182,7 +182,7 @@ def report(
     >>> import ipe_bench as ib
     >>> ib.report("outputs/nowhere")
     Traceback (most recent call last):
-    ipe_bench.basics.errors.UserError: outputs/nowhere: holds no results of ipe-bench; give the ...
+    ipe_bench.basics.errors.UserError: outputs/nowhere: there is no such folder; give the output ...
     """
     from ipe_bench.report.page.run import begin_report
 
