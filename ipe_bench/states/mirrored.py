@@ -38,17 +38,16 @@ def mirrored(descent: LevenbergMarquardtSmoother, density: PathDensity, paths: D
     """Finds, for each path, the one that steps lead to from its start mirrored in the prior's mean,
     whose density is the same there; of infinite cost where no steps are tried.
 
-    States with a period are moved by half of it, too: the sine of pi - a is that of a, and a
-    pendulum that turns the other way passes the same readings there.
+    Of the mirrored start and the one with periodic states half a period further on, each trial
+    goes on from the one that costs less: a heading a of ranges has its mirror image at -a, and
+    the sine of pi - a is that of a.
     """
     model = density.model
-    m, P = model.prior
-    trials = len(density.z)
-    x = 2 * m - paths.at.x[:, 0]
-    if model.state_periods:
-        x = x + np.array(model.state_periods) / 2
-    start = Normal(x, np.repeat(_NEAR**2 * P[None], trials, axis=0))
-    begun = Descent.of(density, filtered(model, density.z, Taylor(), start=start))
+    image = 2 * model.prior.mean - paths.at.x[:, 0]
+    begun = _begun(density, image)
+    if any(model.state_periods):
+        half = np.array(model.state_periods) / 2
+        begun = begun.improved(_begun(density, image + half), np.arange(len(image)))
     unread = _unread(density)
     far = ~(begun.at.cost <= _WORSE * unread.cost)
     at = replace(begun.at, cost=np.where(far, np.inf, begun.at.cost))
@@ -69,6 +68,13 @@ def mirrored(descent: LevenbergMarquardtSmoother, density: PathDensity, paths: D
         running = np.full(len(rows), Status.RUNNING, np.int8)
         found = put(found, rows, descent.descended(some, replace(part, status=running)))
     return in_first_turn(density, found)
+
+
+def _begun(density: PathDensity, x: Array) -> Descent:
+    """Begins at the smoothed paths of extended filters from the starts x (trials, n)."""
+    P = _NEAR**2 * density.model.prior.covariance
+    start = Normal(x, np.repeat(P[None], len(x), axis=0))
+    return Descent.of(density, filtered(density.model, density.z, Taylor(), start=start))
 
 
 def in_first_turn(density: PathDensity, paths: Descent) -> Descent:

@@ -46,6 +46,28 @@ def test_the_second_path_is_the_mirror_image_and_as_probable():
     np.testing.assert_allclose(found.other[away], MIRROR * found.mean[away], atol=0.02)
 
 
+def test_the_mirror_image_of_a_heading_is_its_negative():
+    """A robot drives with unit speed past two beacons on the line y = 0: its image drives on the
+    other side of it, with the heading of opposite sign."""
+    robot = replace(
+        BEACONS,
+        next={"x": "x + cos(a) + wx", "y": "y + sin(a) + wy", "a": "a + wa"},
+        noise={"wx": 0.02, "wy": 0.02, "wa": 0.01},
+        spread={"x": 0.5, "y": 5.0, "a": 0.3},
+        units={"x": "m", "y": "m", "a": "rad"},
+        state_period={"a": 2 * np.pi},
+    )
+    paths = robot.draw(0, 20)
+    found = AutoTracker().track(robot, paths.z)
+    away = np.abs(paths.x[:, :, 1]).min(axis=1) > 1.0
+    assert away.sum() >= 8
+    assert found.other is not None
+    assert found.other_p is not None
+    np.testing.assert_allclose(found.other_p[away], 0.5, atol=2e-3)
+    image = np.array([1.0, -1.0, -1.0]) * found.mean[away]
+    np.testing.assert_allclose(found.other[away], image, atol=0.02)
+
+
 def test_the_covariance_counts_the_second_path():
     """The truth lies on either side: errors are as large as is said, of the two paths together."""
     paths = BEACONS.draw(0, 150)
