@@ -313,6 +313,7 @@ def reported(density: PathDensity, paths: Descent) -> Tracks:
     out = Tracks.empty(model, len(at.x))
     tangents = density.tangents(at)
     P, calls = widened(density, at, tangents)
+    P[density.beyond_digits(tangents, at.x)] = np.nan
     out.start = Normal(at.x[:, 0], P[:, 0])
     out.mean = at.x[:, 1:]
     out.covariance = P[:, 1:]

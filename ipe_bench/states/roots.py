@@ -19,6 +19,8 @@ from ipe_bench.states.linearisation import Affine
 _PRECISE = 1e8
 """Variance of what is read, in parts of that of its reading, above which a covariance loses half of
 its digits."""
+_BEYOND = 1e25
+"""The same, above which round-off counts beside what readings leave, however it is kept."""
 
 
 class Rooted(NamedTuple):
@@ -53,11 +55,12 @@ class Rooted(NamedTuple):
             N  H F         L        0
             0    F    ->   P H' L^-T  F+.
         """
-        HF = np.matmul(H, self.root)
-        nothing = np.zeros((*self.root.shape[:2], N.shape[2]))
-        before = np.block([[N, HF], [nothing, self.root]])
+        trials, m, n = H.shape
+        before = np.zeros((trials, m + n, N.shape[2] + n))
+        before[:, :m, :-n] = N
+        before[:, :m, -n:] = np.matmul(H, self.root)
+        before[:, m:, -n:] = self.root
         after = lower(before)
-        m = H.shape[1]
         L = after[:, :m, :m]
         e = lower_solve(L, y[..., None])[..., 0]
         mean = self.mean + multiply(after[:, m:, :m], e)
@@ -121,6 +124,14 @@ def precise(H: Array, P: Array, R: Array, most: float = _PRECISE) -> Mask:
     deviation = np.sqrt(np.maximum(P, 0.0))
     largest = np.einsum("tkmi,tki->tkm", np.abs(H), deviation)
     return np.asarray((largest**2 > most * R).any(axis=(1, 2)))
+
+
+def beyond_digits(H: Array, x: Array, P: Array, R: Array) -> Mask:
+    """Tells in which trials (trials,) states x (trials, K, n), or their variances P before readings
+    of slopes H and variances R, are so large beside R that no digits are left of what is read."""
+    # Of a state itself half a unit in the last place is lost, of a covariance one in each step.
+    size = np.fmax(P, (x / 10) ** 2)
+    return precise(H, size, R, _BEYOND)
 
 
 def solved_by_roots(A: Array, B: Array, D: Array, G: Array, a: Array, v: Array) -> Array:

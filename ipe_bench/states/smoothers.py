@@ -130,6 +130,7 @@ class IteratedSmoother(Tracker):
             x = end.x
             calls = calls + end.calls
         P, _ = density.spread(tangents)
+        P[density.beyond_digits(tangents, x)] = np.nan
         out = Tracks.empty(model, len(x))
         out.start = Normal(x[:, 0], P[:, 0])
         out.mean = x[:, 1:]
@@ -140,10 +141,15 @@ class IteratedSmoother(Tracker):
 
     def _by_points(self, model: StateModel, z: Array, path: Tracks) -> Tracks:
         calls = path.calls
+        precise = path.precise
         going = np.ones(len(z), dtype=bool)
         for _ in range(self.iterations):
             # Posterior linearisation: points about the last smoothed path, then its smoother.
-            new = smoothed(model, filtered(model, z, self.rule, path=path, smooths=True))
+            tracks = filtered(model, z, self.rule, path=path, smooths=True)
+            new = smoothed(model, tracks)
+            if precise is not None:
+                kept = [] if tracks.smooth is None else tracks.smooth.rows
+                new.lose(precise & ~np.isin(np.arange(len(z)), kept))
             calls = calls + np.where(going, new.calls, 0.0)
             if self.damped:
                 density = PathDensity.of(model, z)

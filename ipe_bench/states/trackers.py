@@ -37,13 +37,15 @@ from ipe_bench.states.linearisation import (
     Taylor,
     Unscented,
 )
-from ipe_bench.states.roots import Chain, Rooted, Smooth, Step, precise
+from ipe_bench.states.roots import Chain, Rooted, Smooth, Step, beyond_digits, precise
 
 _STEEPEST = 1e6
 """Largest slope about a path that is taken for one, and not for round-off."""
 _PRECISE_BY_SCORES = 1e4
 """Variance of what is read, in parts of that of its reading, above which smoothing by scores loses
 half of its digits."""
+_LOST = 1e11
+"""The same, above which a covariance that is not kept by a root has lost its digits."""
 
 
 class Read(NamedTuple):
@@ -91,6 +93,8 @@ class Tracks:
     """The affine models of the trials, if their covariances were kept by roots."""
     smooth: Smooth | None = None
     """What a smoother finds of those trials whose covariances had to be kept by roots."""
+    precise: Mask | None = None
+    """The trials (trials,) in which a covariance that no root keeps has lost its digits."""
     cost: Array | None = None
     """-2 log p(path | readings) (trials,) of an iterated smoother up to a constant, or the NIS of
     the filter behind a smoother: chi-square with a degree per reading; see `path_p`."""
@@ -176,6 +180,15 @@ class Tracks:
                 for part, new in zip(mine, its, strict=True):
                     part[kept] = new[found]
 
+    def lose(self, lost: Mask) -> None:
+        """Makes NaN what is said of the states of those trials (trials,) that have no digits."""
+        for said in (self.mean, self.covariance, self.nis, self.log_likelihood):
+            said[lost] = np.nan
+        if self.smooth is not None:
+            rows, states = self.smooth
+            for said in states:
+                said[lost[rows]] = np.nan
+
     @classmethod
     def lost(cls, model: StateModel, trials: int) -> Tracks:
         """Returns tracks of which nothing is known."""
@@ -189,7 +202,7 @@ class Tracks:
         """Joins the trials of several batches one after another, without what smoothers need; what
         trials lack that others have is NaN, or the status and the iterations of none."""
         alone = [
-            replace(part, moves=[], predicted=[], reads=[], chain=None, smooth=None)
+            replace(part, moves=[], predicted=[], reads=[], chain=None, smooth=None, precise=None)
             for part in parts
         ]
         joined = join(alone)
@@ -414,7 +427,10 @@ def filtered(
     those of a path; `start` replaces the prior, and `smooths` tells whether a smoother follows."""
     start = start or spread_prior(model, len(z))
     tracks = _filtered(model, z, rule, iterations, path, start)
-    losing = _loses_digits(tracks, smooths)
+    before = _Before.of(tracks)
+    losing = before.loses_digits(smooths)
+    lost = precise(before.H, before.variances, before.R, _LOST)
+    tracks.precise = lost.copy()
     if iterations > 1 or path is not None:
         # About states whose covariance has lost its digits nothing is found at all.
         losing |= ~finite(tracks.mean)
@@ -422,7 +438,7 @@ def filtered(
     if rows.size:
         about = None if path is None else path.about(rows)
         begun = Rooted.of_normal(Normal(start.mean[rows], start.covariance[rows]))
-        other = _filtered(model, z[rows], rule, iterations, about, begun)
+        other = _filtered(model, z[rows], rule, iterations, about, begun, smooths)
         tracks.calls[rows] += other.calls
         found = finite(other.mean) & finite(other.covariance)
         smooth = other.chain.smoothed() if smooths and other.chain else None
@@ -433,29 +449,57 @@ def filtered(
             for move in other.moves:
                 found &= (np.abs(move.A) < _STEEPEST).all(axis=(1, 2))
         tracks.keep(rows, other, found)
+        lost[rows[found]] = False
         if smooth is not None:
             states = Normal(smooth.mean[found], smooth.covariance[found])
             tracks.smooth = Smooth(rows[found], states)
+        before = _Before.of(tracks)
+    # Slopes by points about a path that is nearly known may be round-off themselves, and tell
+    # nothing of digits; the filter whose path it is has told.
+    if path is None or isinstance(rule, Taylor):
+        tracks.lose(lost | beyond_digits(before.H, before.mean, before.variances, before.R))
     return tracks
 
 
-def _loses_digits(tracks: Tracks, smooths: bool) -> Mask:
-    """Tells in which trials readings leave less of a covariance than its digits (trials,)."""
-    before = [x.covariance for x in tracks.predicted]
-    if len(before) < len(tracks.reads):
-        before.insert(0, tracks.start.covariance)
-    covariances = np.stack(before, axis=1)
-    P = _variances(covariances)
-    H = np.stack([read.H for read in tracks.reads], axis=1)
-    R = np.stack([_variances(read.noise) for read in tracks.reads], axis=1)
-    losing = precise(H, P, R)
-    if not smooths:
+class _Before(NamedTuple):
+    """Holds what a filter knew before the readings of each epoch."""
+
+    mean: Array
+    """(trials, K, n)"""
+    covariance: Array
+    """(trials, K, n, n)"""
+    H: Array
+    """Slopes (trials, K, m, n) of the readings."""
+    R: Array
+    """Their variances (trials, K, m)."""
+
+    @classmethod
+    def of(cls, tracks: Tracks) -> _Before:
+        each = list(tracks.predicted)
+        if len(each) < len(tracks.reads):
+            each.insert(0, tracks.start)
+        mean = np.stack([x.mean for x in each], axis=1)
+        covariance = np.stack([x.covariance for x in each], axis=1)
+        H = np.stack([read.H for read in tracks.reads], axis=1)
+        R = np.stack([_variances(read.noise) for read in tracks.reads], axis=1)
+        return cls(mean, covariance, H, R)
+
+    @property
+    def variances(self) -> Array:
+        """(trials, K, n)"""
+        return _variances(self.covariance)
+
+    def loses_digits(self, smooths: bool) -> Mask:
+        """Tells in which trials readings leave less of a covariance than its digits (trials,)."""
+        P = self.variances
+        losing = precise(self.H, P, self.R)
+        if not smooths:
+            return losing
+        # Smoothers of singular covariances go by scores, which lose digits twice as fast.
+        rows = np.flatnonzero(precise(self.H, P, self.R, _PRECISE_BY_SCORES) & ~losing)
+        if rows.size:
+            losing[rows] = half(self.covariance[rows]).singular.any(axis=1)
         return losing
-    # Smoothers of singular covariances go by scores, which lose digits twice as fast.
-    rows = np.flatnonzero(precise(H, P, R, _PRECISE_BY_SCORES) & ~losing)
-    if rows.size:
-        losing[rows] = half(covariances[rows]).singular.any(axis=1)
-    return losing
 
 
 def _variances(P: Array) -> Array:
@@ -470,7 +514,8 @@ def _alike(at: Normal, x: Normal | Rooted) -> Normal | Rooted:
 def _noise_root(G: Array, move: Affine) -> Array:
     """Returns a root (trials, n, q) of the covariance of a transition's noise."""
     each = np.broadcast_to(G, (len(move.W), *G.shape[-2:]))
-    return np.concatenate([each, half(move.W).G], axis=2)
+    own = half(move.W).G if move.W.any() else np.zeros(move.W.shape)
+    return np.concatenate([each, own], axis=2)
 
 
 def _step(x: Rooted, move: Affine | None, G: Array | None, found: Update) -> Step:
@@ -494,6 +539,7 @@ def _filtered(
     iterations: int,
     path: Tracks | None,
     start: Normal | Rooted,
+    smooths: bool = False,
 ) -> Tracks:
     out = Tracks.empty(model, len(z))
     out.start = Normal(start.mean, start.covariance)
@@ -529,10 +575,10 @@ def _filtered(
             found = update(x, read, R, z[:, k])
             at = found.x
         assert found is not None
-        if isinstance(x, Rooted):
+        if isinstance(x, Rooted) and smooths:
             steps.append(_step(x, move, G, found))
         x = out.note(k, found)
-    if isinstance(start, Rooted):
+    if isinstance(start, Rooted) and smooths:
         out.chain = Chain(start, steps)
     calls_of_f = rule.calls(model.n, bool(model.state_periods))
     calls_of_h = rule.calls(model.n, bool(model.periods))

@@ -22,7 +22,7 @@ from ipe_bench.states.algebra import (
     transposed,
 )
 from ipe_bench.states.base import StateModel
-from ipe_bench.states.roots import precise, solved_by_roots
+from ipe_bench.states.roots import beyond_digits, precise, solved_by_roots
 
 _REACHED = 1e-9
 """Part of a state by which a path may miss the range of its noise or of the prior: round-off of a
@@ -284,10 +284,24 @@ class PathDensity:
         blind = self.blind_variances(of)
         return rows[precise(of.B, blind[:, 1:], np.ones(of.B.shape[:3]), _ROUNDED**2)]
 
+    def beyond_digits(self, tangents: Tangents, x: Array) -> Mask:
+        """Tells about which paths x (trials, 1 + K, n) readings are so precise that no digits are
+        left of what they say (trials,)."""
+        P = np.diagonal(self.predicted(tangents), axis1=2, axis2=3)
+        return beyond_digits(tangents.B, x[:, 1:], P, np.ones(tangents.B.shape[:3]))
+
     def filtered(self, tangents: Tangents) -> Array:
         """Computes the covariances (trials, 1 + K, n, n) of the affine model's states by the
         readings up to each epoch."""
         return filtered_chains(tangents.A, tangents.B, self.noise)
+
+    def predicted(self, tangents: Tangents) -> Array:
+        """Computes the covariances A P A' + Q (trials, K, n, n) of the affine model's states before
+        the readings of each epoch."""
+        A = tangents.A
+        P = self.filtered(tangents)[:, :-1]
+        Q = np.matmul(self.gains, transposed(self.gains))
+        return np.matmul(np.matmul(A, P), transposed(A)) + Q
 
     def spread(self, tangents: Tangents) -> tuple[Array, Array]:
         """Computes the covariances P (trials, 1 + K, n, n) of the states of the affine model, and
@@ -297,11 +311,8 @@ class PathDensity:
     def log_determinant(self, tangents: Tangents) -> Array:
         """Computes log det (trials,) of the Hessian of Gauss and Newton of J / 2, in whitened start
         and noise: the sum of log det (I + B S B') over the epochs, S = A P A' + Q predicted."""
-        A = tangents.A
         B = tangents.B
-        P = self.filtered(tangents)[:, :-1]
-        Q = np.matmul(self.gains, transposed(self.gains))
-        S = np.matmul(np.matmul(A, P), transposed(A)) + Q
+        S = self.predicted(tangents)
         innovation = np.matmul(np.matmul(B, S), transposed(B)) + np.eye(B.shape[2])
         return np.linalg.slogdet(innovation)[1].sum(axis=1)
 

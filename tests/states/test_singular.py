@@ -384,6 +384,39 @@ def test_a_path_keeps_its_digits_where_its_start_is_wide_in_one_direction(label,
     np.testing.assert_allclose(found, size, rtol=1e-6)
 
 
+@pytest.mark.parametrize("label", WIDE)
+def test_what_digits_do_not_hold_is_not_reported(label):
+    """A prior of 1e8 m, of which a reading leaves 1e-7 m: round-off of the one is that of the
+    other, and a prior of 1 m beside it loses nothing."""
+    z = straight_line(1.0, 1e-7).draw(0, 2).z
+    lost = WIDE[label].track(straight_line(1e8, 1e-7), z)
+    assert not np.isfinite(lost.covariance).any()
+    found = WIDE[label].track(straight_line(1.0, 1e-7), z)
+    assert np.isfinite(found.covariance).all()
+
+
+def test_points_about_a_path_that_is_singular_but_for_round_off_report_nothing():
+    """Of two wide constants their sum is read: posterior linearisation was a deviation off."""
+    wide = ((2.0**14, 0.0), (0.0, 2.0**14))
+    still = ((1.0, 0.0), (0.0, 1.0))
+    model = Linear(F=still, G0=wide, G=NONE, H=((1.0, 0.5),), V=((2.0**-26,),))
+    z = np.round(model.draw(0, 1).z)
+    tracks = WIDE["ipls"].track(model, z)
+    assert not np.isfinite(tracks.covariance).any()
+    assert np.isfinite(WIDE["ukf"].track(model, z).covariance).all()
+
+
+def test_states_too_large_for_the_digits_of_their_readings_are_not_reported():
+    """A float of 1e9 m holds 1e-7 m, a hundred times the deviation of a reading; of one trial
+    alone the other has its digits."""
+    model = straight_line(1e2, 1e-9)
+    z = model.draw(0, 2).z
+    z[1] += 1e9
+    tracks = ekf().track(model, z)
+    assert np.isfinite(tracks.covariance[0]).all()
+    assert not np.isfinite(tracks.mean[1]).any()
+
+
 @pytest.mark.parametrize("label", ["ieks", "auto"])
 def test_what_is_known_without_any_noise_stays_what_it_is(label):
     """Of a model of no error at all no start and no step has a column of noise."""
