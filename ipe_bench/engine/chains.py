@@ -253,7 +253,7 @@ def lower(W: Array) -> Array:
     order = np.argsort(-size, axis=1, kind="stable")
     V = np.zeros((trials, max(n, columns), n))
     V[:, :columns] = np.take_along_axis(W, order[:, None], axis=2).mT
-    F = np.linalg.qr(V, mode="r").mT
+    F = np.asarray(np.linalg.qr(V, mode="r")).mT
     return np.where(np.diagonal(F, axis1=1, axis2=2)[:, None] < 0, -F, F)
 
 
