@@ -24,8 +24,8 @@ hardly ever arrive."""
 _EARLY = 4
 """Steps from a mirrored start after which only searches with a prospect go on."""
 _HOPELESS = 1.5
-"""Times the cost of the first path that a search may have by then: of pendulums and turns those
-that became a second path had 1.1 at most, and most others twice as much or more."""
+"""Times the cost of the first path that a search may have by then: of pendulums those that became a
+second path had 1.1 at most, and half of the others more than twice it."""
 _SAME = 1.0
 """Squared distance from the first path, in deviations of the path, below which a search is on its
 way into it."""
