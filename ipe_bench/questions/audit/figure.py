@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +12,9 @@ from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.style import BOUND_COLOR, FAMILIES
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from ipe_bench.basics.linalg import Array
     from ipe_bench.questions.audit.maths import Audit
 
 
@@ -23,15 +26,8 @@ def draw_audit(found: Audit) -> Iterator[Drawing]:
     worst = np.argsort(-np.array(apart), kind="stable")
     chosen = np.sort(worst[: common.most_panels()])
     fig, axes = common.panels(len(chosen), height=2.4)
-    at = np.linspace(-common.FARTHEST, common.FARTHEST, 300)
-    claimed = np.exp(-0.5 * at**2) / np.sqrt(2 * np.pi)
-    bars: Any = {"bins": 30, "range": (-common.FARTHEST, common.FARTHEST), "density": True}
-    style = {"color": FAMILIES["IPE"][0], "alpha": 0.45, "label": "errors"}
     for i, ax in zip(chosen, axes, strict=True):
-        values = np.clip(claims.z[:, i], -common.FARTHEST, common.FARTHEST)
-        ax.hist(values, **bars, **style)
-        ax.plot(at, claimed, color=BOUND_COLOR, linestyle="--", linewidth=1.0, label="as reported")
-        ax.set_yticks([])
+        _draw_errors(ax, claims.z[:, i])
         common.title(ax, f"{claims.names[i]}: {found.each[i].value:.2f} times")
     common.axis_labels(fig, "error / reported deviation", "")
     common.legend(fig, axes)
@@ -39,3 +35,16 @@ def draw_audit(found: Audit) -> Iterator[Drawing]:
     if len(chosen) < claims.n:
         caption += f" The {len(chosen)} of {claims.n} parameters farthest from 1."
     yield Drawing("audit", "Errors beside the reported covariance", caption, fig)
+
+
+def _draw_errors(ax: Axes, z: Array) -> None:
+    """Draws the histogram of the errors z (trials,) in reported standard deviations, and the
+    standard normal density."""
+    shown = np.clip(z, -common.FARTHEST, common.FARTHEST)
+    ends = (-common.FARTHEST, common.FARTHEST)
+    color = FAMILIES["IPE"][0]
+    ax.hist(shown, bins=30, range=ends, density=True, color=color, alpha=0.45, label="errors")
+    at = np.linspace(*ends, 300)
+    claimed = np.exp(-0.5 * at**2) / np.sqrt(2 * np.pi)
+    ax.plot(at, claimed, color=BOUND_COLOR, linestyle="--", linewidth=1.0, label="as reported")
+    ax.set_yticks([])
