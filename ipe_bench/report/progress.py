@@ -49,7 +49,7 @@ def counting(
     """Yields a callback that is given the name of each of `total` pieces of work before it begins,
     and returns one that is told how far that is."""
     begun = itertools.count(0)
-    with _telling(title, lines=progress == "lines", off=not progress) as tell:
+    with _telling(title, lines=progress == "lines", kept=False, off=not progress) as tell:
 
         def begin(name: str) -> Callable[[str], None]:
             done = next(begun)
@@ -59,9 +59,7 @@ def counting(
         yield begin
 
 
-def _telling(
-    title: str, *, lines: bool = False, kept: bool = False, off: bool = False
-) -> AbstractContextManager[Tell]:
+def _telling(title: str, *, lines: bool, kept: bool, off: bool) -> AbstractContextManager[Tell]:
     """Yields a callback that shows progress in a notebook, in a terminal or, by `lines`,
     anywhere."""
     if _in_notebook() and not off:
