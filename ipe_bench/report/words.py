@@ -131,11 +131,13 @@ def cost(median: float, mean: float) -> str:
     return brief(median) if alike else f"{brief(median)}/{brief(mean)}"
 
 
-def compact(value: float) -> str:
+def compact(value: float, more: int = 0) -> str:
     """Formats three figures in at most five characters if possible: thousands as k, millions as
-    M."""
+    M. With `more` figures than three it writes the number out."""
     if not math.isfinite(value):
         return value_text(float(value))
+    if more:
+        return f"{value:.{3 + more}g}"
     rounded = float(f"{value:.2e}")
     if rounded == 0:
         return "0"

@@ -246,7 +246,7 @@ def _change(quantity: str, value: float, more: int = 0) -> str:
         return f"{value:+.{3 + more}f}"
     if 0.1 <= value < 9.9995:
         return f"{value:.{3 + more}f}"
-    return f"{value:.{3 + more}g}" if more else compact(value)
+    return compact(value, more)
 
 
 def _p(value: float) -> str:

@@ -138,16 +138,12 @@ def _outcome(row: Any, low: float, high: float, measure: _Measure) -> str:
 def _extent(low: float, high: float, measure: _Measure) -> str:
     """Words the ends of an interval, by figures that tell them apart."""
     if measure.ratio and high > _TIMES:
-        return f"{' to '.join(told_apart(low, high, _multiple))} times"
+        return f"{' to '.join(told_apart(low, high, compact))} times"
     if measure.ratio:
         ends = told_apart(100 * (low - 1), 100 * (high - 1), _signed)
     else:
         ends = told_apart(low, high, _signed)
     return f"{' to '.join(ends)}{measure.unit}"
-
-
-def _multiple(value: float, more: int) -> str:
-    return f"{value:.{3 + more}g}" if more else compact(value)
 
 
 def _signed(value: float, more: int) -> str:
