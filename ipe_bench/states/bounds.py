@@ -8,9 +8,11 @@ import numpy as np
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
-from ipe_bench.states.algebra import symmetric, transposed
-from ipe_bench.states.base import Paths, StateModel
-from ipe_bench.states.linearisation import Taylor
+from ipe_bench.engine.chains import lower, smoothed_chains
+from ipe_bench.states.algebra import factor, half, lower_solve
+from ipe_bench.states.base import Normal, Paths, StateModel
+from ipe_bench.states.linearisation import Affine, Taylor
+from ipe_bench.states.roots import Rooted
 from ipe_bench.states.smoothers import smoothed
 from ipe_bench.states.trackers import Tracks, filtered
 
@@ -21,54 +23,76 @@ def posterior_bounds(model: StateModel, paths: Paths) -> tuple[Array, Array]:
 
     Filtering: eq. (21) of Tichavský, Muravchik and Nehorai, IEEE TSP 46, 1998, its expectations
     over the drawn paths. Smoothing: the diagonal blocks of the inverse of the same information.
-    They can lie far below what any estimator attains, where informations of single paths differ.
+    Both are those of a linear model of the mean slopes, by roots: no covariance is inverted. They
+    can lie far below what any estimator attains, where informations of single paths differ.
 
     Raises:
         UserError: the process noise of a step is singular, and a path has no density; or noise
         depends on the states.
     """
-    P = model.prior.covariance
+    x = Rooted.of_normal(Normal(*(part[None] for part in model.prior)))
+    n = model.n
+    begun = x
+    still = np.zeros((n, n))
     before = paths.start
-    eye = np.eye(model.n)
     forward: list[Array] = []
     steps: list[_Step] = []
     for k in range(model.epochs):
-        x = paths.x[:, k]
-        # What the readings of an epoch add: E H' R^-1 H.
-        H, R = _seen(model.observation_at(k).slope(x)[1], model.R(k), paths.z[:, k])
-        gained = _mean_information(H, np.linalg.inv(R))
+        at = paths.x[:, k]
+        R = model.R(k)
+        F_mean = np.eye(n)
+        G = still
         if model.moves(k):
-            Q_inverse = np.linalg.inv(_regular(model, k))
+            Q = _regular(model, k)
             F = model.transition_into(k).slope(before)[1]
-            # D11 = E F' Q^-1 F,  D12 = -E F' Q^-1,  D22 = Q^-1 + E H' R^-1 H
-            D11 = _mean_information(F, Q_inverse)
-            D12 = -_mean(F).T @ Q_inverse
-            D22 = Q_inverse + gained
-            # (J + D11)^-1 = P (I + D11 P)^-1 of J^-1 = P, which may be singular.
-            V = symmetric(P @ np.linalg.inv(eye + D11 @ P))
-            steps.append(_Step(V, D12))
-            # J <- D22 - D21 (J + D11)^-1 D12
-            P = np.linalg.inv(symmetric(D22 - D12.T @ V @ D12))
-        else:
-            P = symmetric(P @ np.linalg.inv(eye + gained @ P))
-        forward.append(P)
-        before = x
-    # Back to the first epoch: P_s <- V + V D12 P_s D21 V.
-    if model.moved_first:
-        steps = steps[1:]
-    backward = [P]
-    for V, D12 in reversed(steps):
-        backward.append(symmetric(V + V @ D12 @ backward[-1] @ D12.T @ V))
-    return np.array(forward), np.array(backward[::-1])
+            F_mean = _mean(F)
+            G = half(Q).G
+            # D11 = E F' Q^-1 F is that of the mean F, and what F adds that differs from it: it is
+            # as if the states before were read.
+            told = _mean_rows(F - F_mean, Q)
+            x = _informed(x, told)
+            if steps:
+                steps[-1] = steps[-1]._replace(told=np.concatenate([steps[-1].told, told]))
+            else:
+                begun = x
+            # By Woodbury, D22 - D21 (J + D11)^-1 D12 is the inverse of F P F' + Q.
+            move = Affine(F_mean[None], np.zeros((1, n)), np.zeros((1, n, n)))
+            x = x.moved(move, G[None])
+        H, R = _seen(model.observation_at(k).slope(at)[1], R, paths.z[:, k])
+        gained = _mean_rows(H, R)
+        x = _informed(x, gained)
+        steps.append(_Step(F_mean, G, gained))
+        forward.append(x.covariance[0])
+        before = at
+    return np.array(forward), _smoothed(begun.root[0], steps)
 
 
 class _Step(NamedTuple):
-    """Holds what a step of the filtering bound leaves for smoothing."""
+    """Holds an epoch of the linear model whose information is that of the paths."""
 
-    V: Array
-    """(J + D11)^-1 (n, n)."""
-    D12: Array
-    """(n, n)"""
+    F: Array
+    """Mean slopes (n, n) of the transition into it."""
+    G: Array
+    """A root (n, n) of Q."""
+    told: Array
+    """Rows (r, n) of its information."""
+
+
+def _smoothed(start: Array, steps: list[_Step]) -> Array:
+    """Computes the covariances (K, n, n) of the smoother of such a model, from a root of the states
+    before the first transition."""
+    A = np.stack([step.F for step in steps])
+    G = np.stack([start, *(step.G for step in steps)])
+    B = np.zeros((len(steps), 2 * len(start), len(start)))
+    for rows, step in zip(B, steps, strict=True):
+        rows[: len(step.told)] = step.told
+    return smoothed_chains(A[None], B[None], G)[0][0, 1:]
+
+
+def _informed(x: Rooted, rows: Array) -> Rooted:
+    """Returns the states whose information has these rows (r, n) beside."""
+    still = np.zeros((1, len(rows)))
+    return x.told(rows[None], still, np.eye(len(rows))[None])[0]
 
 
 def _regular(model: StateModel, k: int) -> Array:
@@ -95,10 +119,12 @@ def _mean(a: Array) -> Array:
     return np.asarray(a.mean(axis=0))
 
 
-def _mean_information(J: Array, inverse: Array) -> Array:
-    """Computes E J' C^-1 J (n, n) over the paths, for slopes J (trials, m, n) and one C^-1 or one
-    for each path."""
-    return _mean(np.matmul(np.matmul(transposed(J), inverse), J))
+def _mean_rows(J: Array, C: Array) -> Array:
+    """Computes rows (n, n) of E J' C^-1 J over the paths, for slopes J (trials, m, n) and
+    one C or one for each path."""
+    whitened = lower_solve(factor(C), J)
+    rows = whitened.reshape(-1, J.shape[-1]) / np.sqrt(len(J))
+    return lower(rows.T[None])[0].T
 
 
 def bound_at_truth(model: StateModel, paths: Paths, smooths: bool = False) -> Array:

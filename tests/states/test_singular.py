@@ -288,6 +288,20 @@ def test_bounds_exist_where_the_start_is_known():
     )
 
 
+@pytest.mark.parametrize("wide", [2.0**4, 2.0**24])
+def test_bounds_keep_their_digits_beside_a_wide_start_and_little_noise(wide):
+    """Of two constants that hardly walk their sum is read: informations of noise, start and
+    readings differ by up to 26 digits."""
+    still = ((1.0, 0.0), (0.0, 1.0))
+    little = ((2.0**-20, 0.0), (0.0, 2.0**-20))
+    model = Linear(F=still, G0=((wide, 0.0), (0.0, wide)), G=little, H=((1.0, 0.5),))
+    paths = model.draw(0, 3)
+    (_, smoothed), (_, filtered) = exact(model, paths.z[0])
+    found = posterior_bounds(model, paths)
+    np.testing.assert_allclose(found[0], filtered, rtol=1e-9)
+    np.testing.assert_allclose(found[1], smoothed, rtol=1e-9)
+
+
 def test_particles_of_known_states_stand_on_them():
     model = CASES["everything known"]
     paths = model.draw(0, 2)
