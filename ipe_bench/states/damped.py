@@ -32,7 +32,7 @@ _ROUND_OFF = 1e-12
 _SHARES = (0.5, 0.1)
 """Standard deviations of the prior about further starts, in those of the prior, of one round after
 another: the wide ones find more turns, the narrow ones more pendulums."""
-_SURE = 0.05
+_SURE = 0.01
 """Probability of the cost with which the search among draws ends: a path that is hard to find has
 neighbours that nearly fit."""
 _BACK = 3
