@@ -164,7 +164,9 @@ def solved_by_roots(A: Array, B: Array, D: Array, G: Array, a: Array, v: Array) 
         both[:, -1, :rows] = c - multiply(C, a[:, k])
         both[:, :q, rows:] = np.eye(q)
         both = lower(both)
-        R, S, r = both[:, :q, :q], both[:, q:-1, :q], both[:, -1, :q]
+        R = both[:, :q, :q]
+        S = both[:, q:-1, :q]
+        r = both[:, -1, :q]
         Y = both[:, q:-1, q:-1].mT
         y = both[:, -1, q:-1]
         known.append((R, S, r))

@@ -216,7 +216,7 @@ def test_an_estimate_that_is_not_the_least_minimum_does_not_pass():
     assert answer.examination.minima[0].x[0] == pytest.approx(2.0, rel=0.02)
     assert not answer.passes
     assert "NOT THE GLOBAL MINIMUM" in str(answer)
-    assert answer.finding() == "chi-square has a lower minimum than that of any estimate"
+    assert answer.finding() == "no estimate is at the lowest minimum of chi-square"
 
 
 def test_a_profile_that_comes_upon_a_better_fit_is_no_interval():

@@ -186,7 +186,7 @@ class Answer(Labelled[Fit]):
         if not any(one.passes for one in self.fits):
             return "no estimate both converged and fits"
         if not self.passes:
-            return "chi-square has a lower minimum than that of any estimate"
+            return "no estimate is at the lowest minimum of chi-square"
         one = self._stated
         found = [f"{enumerate_few(_with_errors(one), 2)} by {one.label}"]
         if _resembling(one):
