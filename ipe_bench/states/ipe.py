@@ -21,6 +21,8 @@ from ipe_bench.states.trackers import Tracker, Tracks
 
 _FAR = 1e8
 """An iteration has diverged once F is this many times that of the start."""
+_LOST = 3e13
+"""Standard deviation of what is read, in those of its reading, of which no digits are left."""
 _NUMBERS = 5e7
 """Numbers of the largest matrix of a trial, and of the slopes that are held at once."""
 
@@ -178,8 +180,9 @@ class _Frozen:
     """L^-1 (K, m, m) of the covariances L L' of the readings of each epoch."""
     A: Array
     """dh/du (M, N) at u = 0, whitened; 0 for missing readings."""
-    gain: Array
-    """A' (I + A A')^-1 (N, M)."""
+    Q: Array
+    """Orthonormal columns (N + M, N) of (I; A) = Q T with a triangular T: with Q = (Q1; Q2), it is
+    (I + A' A)^-1 = Q1 Q1' and (I + A' A)^-1 A' = Q1 Q2', and nothing is squared."""
 
     @classmethod
     def of(cls, model: StateModel, seen: Array) -> _Frozen:
@@ -198,9 +201,10 @@ class _Frozen:
         u = np.zeros((1, start.unknowns[-1].stop))
         x, _ = start.run(u, np.zeros((1, *seen.shape)))
         A = start.slopes(x)[1][0]
-        # A' (I + A A')^-1 = (I + A' A)^-1 A', by M equations in place of N.
-        gain = np.linalg.solve(np.eye(len(A)) + A @ A.T, A).T
-        return replace(start, A=A, gain=gain)
+        Q = np.linalg.qr(np.concatenate([np.eye(A.shape[1]), A]))[0]
+        if np.linalg.norm(A, axis=1).max() > _LOST:
+            Q[:] = np.nan
+        return replace(start, A=A, Q=Q)
 
     @cached_property
     def unknowns(self) -> list[slice]:
@@ -209,14 +213,22 @@ class _Frozen:
         return [slice(first, end) for first, end in pairwise([0, *ends])]
 
     @cached_property
+    def gain(self) -> Array:
+        """(I + A' A)^-1 A' (N, M)."""
+        N = self.Q.shape[1]
+        return self.inverse[:, N:]
+
+    @cached_property
     def inverse(self) -> Array:
         """H+ (N, N + M) = [(I + A' A)^-1, gain]."""
-        return np.concatenate([np.eye(len(self.gain)) - self.gain @ self.A, self.gain], axis=1)
+        N = self.Q.shape[1]
+        return self.Q[:N] @ self.Q.T
 
     @cached_property
     def deviation(self) -> Array:
         """Standard deviations (N,) of the linear estimate, eq. (5)."""
-        return np.sqrt(1.0 - np.sum(self.gain * self.A.T, axis=1))
+        N = self.Q.shape[1]
+        return np.linalg.norm(self.Q[:N], axis=1)
 
     def run(self, u: Array, z: Array) -> tuple[Array, Array]:
         """Computes the states x (trials, 1 + K, n) of u (trials, N), and h(u) - z (trials, M),
@@ -270,9 +282,8 @@ class _Frozen:
             yield X
 
     def F(self, u: Array, r: Array) -> Array:
-        """Computes eq. (11), H+ (h - z) (trials, N), in which (I + A' A)^-1 A' is the gain and (I +
-        A' A)^-1 = I - gain A."""
-        return u - multiply(self.gain, multiply(self.A, u) - r)
+        """Computes eq. (11), H+ (h - z) (trials, N), for h - z = (u; r)."""
+        return multiply(self.inverse, np.concatenate([u, r], axis=1))
 
     def divided(self, F: Array, B: Array) -> tuple[Array, Array]:
         """Computes J_F^-1 F (trials, N), J_F = I + (I + A' A)^-1 A' (B - A), by M equations in

@@ -347,6 +347,7 @@ WIDE = {
     "ipls": IteratedSmoother(ukf(), Cubature(), 4),
     "lm": LevenbergMarquardtSmoother(starts=0),
     "auto": ib.states.AutoTracker(),
+    "ipe": ib.component("tracker/ipe_newton"),
 }
 
 
