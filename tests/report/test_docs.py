@@ -209,9 +209,21 @@ def test_the_tables_of_states_are_what_todays_program_writes_of_what_is_stored()
     stored = read(pages.STORED / f"states{SUFFIX}").analysis
     page = pages.TABLES.read_text(encoding="utf-8")
     assert page == state_tables.with_tables(page, stored)
-    # Two tables of eleven trackers and a head for each of four models.
-    _, written = page.split(state_tables.BEGIN)
-    assert written.partition(state_tables.END)[0].count("\n| ") == 2 * (11 + 1) * 4
+
+
+def test_the_pairs_of_states_account_for_the_shares_beside_them():
+    """Of 200 trials, `auto` holds more by those that it alone holds, less those that the other
+    alone holds."""
+    text = pages.TABLES.read_text(encoding="utf-8")
+    compared = 0
+    for table in re.findall(r"^\| auto \| [\d.]+ \|  \|  \| \d.*\n(?:\|.*\n)+", text, re.MULTILINE):
+        own, *others = (line.split("|")[2:-1] for line in table.splitlines())
+        for row in others:
+            for share, other, pair in zip(own[::3], row[::3], row[1::3], strict=True):
+                alone, lacking = pair.split(":")
+                assert 2 * (float(share) - float(other)) == int(alone) - int(lacking), row
+                compared += 1
+    assert compared == 4 * 3 * 10
 
 
 def totals(found: Computed) -> pd.DataFrame:
