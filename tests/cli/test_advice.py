@@ -375,6 +375,7 @@ ELSEWHERE = {
     ),
     "of a log's rows": ("{} belongs here; give a row for each epoch",),
     "of a plugin or a class": (
+        "the entries of an option are not changed in place",
         "measurement.step=null",
         "write the model in Python",
         "{}: holds no package",
