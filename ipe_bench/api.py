@@ -18,11 +18,11 @@ from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.noise.base import Noise
 from ipe_bench.priors import Prior
-from ipe_bench.runs.bundles import BUNDLES, is_bundle, opened
 from ipe_bench.runs.execution import Execution
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.run import validate
 from ipe_bench.runs.schedule import Watcher
+from ipe_bench.runs.store import require_results
 from ipe_bench.states.base import StateModel
 from ipe_bench.states.trackers import Tracker
 from ipe_bench.trials.paths import AnyScenario, StateScenario
@@ -131,7 +131,7 @@ def run(
 
 
 def load(directories: Directories) -> pd.DataFrame:
-    """Reads every stored trial of one directory or bundle, or of several.
+    """Reads every stored trial of one directory, or of several.
 
     Returns:
         A row per trial and estimator: measurement, noise, prior, error_scale, seed, estimator, and
@@ -155,9 +155,8 @@ def load(directories: Directories) -> pd.DataFrame:
     """
     from ipe_bench.statistics.collect import collect, trials_frame
 
-    with opened(_paths(directories)) as paths:
-        collection = collect(paths)
-        frame = trials_frame(collection)
+    collection = collect(require_results(_paths(directories)))
+    frame = trials_frame(collection)
     _warn(collection.problems)
     return frame
 
@@ -187,12 +186,8 @@ def report(
     from ipe_bench.report.page.run import begin_report
 
     paths = _paths(directories)
-    if output is None and any(map(is_bundle, paths)):
-        raise UserError(
-            f"{paths[0]}: a bundle is read and not written to; give output=, where the report goes"
-        )
-    with opened(paths, None if output is None else Path(output) / BUNDLES) as folders:
-        return begin_report(folders, output, figures=figures, formats=formats).written()
+    require_results(paths)
+    return begin_report(paths, output, figures=figures, formats=formats).written()
 
 
 def compare(
@@ -309,8 +304,7 @@ def status(directories: Directories) -> pd.DataFrame:
     """
     import pandas as pd
 
-    with opened(_paths(directories)) as paths:
-        results = Results.read(paths)
+    results = Results.read(require_results(_paths(directories)))
     counts = ("expected", "done", "missing", "failed", "stale")
     rows = [
         {**cell.names, **{name: getattr(cell, name) for name in counts}} for cell in results.cells

@@ -25,7 +25,7 @@ from ipe_bench.report.page.writer import COMMAND
 HOMES = {
     "run": "run",
     "estimate": "estimate",
-    **dict.fromkeys(("report", "bundle", "status"), "results"),
+    **dict.fromkeys(("report", "status"), "results"),
     "list": "listing",
     **dict.fromkeys(("check", "new"), "workshop"),
 }

@@ -152,23 +152,6 @@ formats=pdf,md,tex  {MEANING}
 """,
         {"arguments": _several("DIR", "folders of results, such as outputs/paper")},
     ),
-    "bundle": (
-        "pack results into one archive to share, or check such an archive",
-        _MISSING,
-        """
-  ipe-bench bundle outputs/paper                  outputs/paper.zip: results and
-                                                  a manifest of digests
-  ipe-bench bundle outputs/a outputs/b output=both.zip
-  ipe-bench bundle both.zip                       check it, and print its digest
-
-Equal results give equal files, so a paper can cite the digest. Others read the
-bundle beside their own results:
-
-  ipe-bench report outputs/mine both.zip output=outputs/together
-  ipe-bench compare outputs/mine both.zip
-""",
-        {"arguments": _several("DIR", "folders of results, or one bundle to check")},
-    ),
     "status": (
         "list what is done, missing, failed and stale in folders of results",
         "0 complete; 1 not complete",

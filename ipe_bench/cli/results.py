@@ -1,4 +1,4 @@
-"""Defines the commands on stored results: report, status and bundle."""
+"""Defines the commands on stored results: report and status."""
 
 from __future__ import annotations
 
@@ -13,45 +13,13 @@ from ipe_bench.questions.question import NAMES
 from ipe_bench.report.formats import PAGE
 from ipe_bench.report.style import Which, drawn_settings
 from ipe_bench.report.tables.table import Table, texts, words
-from ipe_bench.runs.bundles import BUNDLES, SUFFIX, is_bundle, opened, read_bundle, write_bundle
 from ipe_bench.runs.parts import TRUTH
 from ipe_bench.runs.results import CellState, Results
+from ipe_bench.runs.store import require_results
 
 _REPORT = {"output": str, "figures": str, "formats": str}
 _PAPER = {"output": str, "paper": NAMES, "columns": NAMES, "width": float}
 """Keys of tables and figures for a paper."""
-
-
-def bundle_command(arguments: Sequence[str]) -> int:
-    """Writes the archive, or checks one; exit code 1 where the folders lack something that was
-    asked for."""
-    places, keys = places_and_keys("bundle", arguments, {"output": str})
-    paths = [Path(place) for place in places]
-    if not paths:
-        raise UserError(
-            "bundle: name at least one folder of results, such as outputs/paper, or a bundle to"
-            " check"
-        )
-    checked = any(map(is_bundle, paths))
-    if checked and (len(paths) > 1 or keys):
-        raise UserError("bundle: one file is checked by itself; name folders to make a bundle of")
-    problems = []
-    if checked:
-        found = read_bundle(paths[0])
-    else:
-        beside = paths[0].with_name(paths[0].resolve().name)
-        path = Path(keys.get("output", beside))
-        path = path.with_name(path.name.removesuffix(SUFFIX) + SUFFIX)
-        found = write_bundle(paths, path)
-        problems = Results.read(paths).problems
-        print_problems(problems)
-    held = (
-        f"{len(found.files)} files of {', '.join(found.folders)}; {found.path.stat().st_size:,}"
-        " bytes"
-    )
-    say(f"{'Whole' if checked else 'Bundle':<8}{found.path} ({held})")
-    say(f"Digest  sha256:{found.digest}")
-    return 1 if problems else 0
 
 
 def status_command(arguments: Sequence[str], verbose: bool = False) -> int:
@@ -59,11 +27,10 @@ def status_command(arguments: Sequence[str], verbose: bool = False) -> int:
     damaged."""
     if not arguments:
         raise UserError("status: name at least one directory of results, such as outputs/paper")
-    with opened(arguments) as folders:
-        found = [Results.read([folder]) for folder in folders]
+    folders = require_results(arguments)
+    found = [Results.read([folder]) for folder in folders]
     for folder, results in zip(folders, found, strict=True):
-        # A bundle's folders are called as they were, not as where they are unpacked.
-        name = str(folder) if str(folder) in arguments else folder.name
+        name = str(folder)
         cells = [cell for cell in results.cells if verbose or not cell.complete or cell.stale]
         if cells:
             show([_states(name, cells)])
@@ -93,29 +60,23 @@ def _states(directory: str, cells: Sequence[CellState]) -> Table:
 
 
 def report_command(arguments: Sequence[str]) -> int:
-    """Writes the report on these folders, or bundles; exit code 1 where something that was asked
-    for is missing."""
+    """Writes the report on these folders; exit code 1 where something that was asked for is
+    missing."""
     for_paper = any(word.startswith(("paper=", "columns=", "width=")) for word in arguments)
     named, keys = places_and_keys("report", arguments, _PAPER if for_paper else _REPORT)
     output = Path(keys["output"]) if "output" in keys else None
     if not named:
         raise UserError("report: name at least one directory of results, such as outputs/paper")
-    if output is None:
-        bundles = [name for name in named if is_bundle(name)]
-        if bundles:
-            raise UserError(
-                f"report: {bundles[0]}: is a bundle; say where the report goes with output=DIR"
-            )
-        if len(named) > 1 and not for_paper:
-            raise UserError(
-                "report: several directories need output=DIR, for the report on all of them"
-            )
-    with opened(named, None if output is None else output / BUNDLES) as folders:
-        if for_paper:
-            return _paper(folders, keys)
-        return show_report(
-            folders, output or folders[0], keys.get("figures", "main"), keys.get("formats", PAGE)
+    if output is None and len(named) > 1 and not for_paper:
+        raise UserError(
+            "report: several directories need output=DIR, for the report on all of them"
         )
+    folders = require_results(named)
+    if for_paper:
+        return _paper(folders, keys)
+    return show_report(
+        folders, output or folders[0], keys.get("figures", "main"), keys.get("formats", PAGE)
+    )
 
 
 def show_report(

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 CITATION = (
     f"The ipe-bench developers (2026). ipe-bench, version {__version__} [computer program]. Beside"
     " it, state the command, the git commit and the source's digest that stand with the"
-    " provenance, and the digest of the bundle where results are shared as one (ipe-bench bundle)."
+    " provenance."
 )
 """Citation of the bench."""
 _MOST_FIGURES = 12

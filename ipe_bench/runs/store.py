@@ -344,3 +344,14 @@ def describe_names(names: Mapping[str, Any]) -> str:
     """Words a result in a line for people."""
     who = "the truth" if names["estimator"] == TRUTH else names["estimator"]
     return f"{who} on {title(names)}"
+
+
+def require_results(folders: Sequence[Path | str]) -> list[Path]:
+    """Returns folders as paths; refuses one that no run ever wrote to."""
+    found = [Path(folder) for folder in folders]
+    for folder in found:
+        store = Store(folder)
+        if not (store.runs.is_dir() or store.trials.is_dir()):
+            what = "holds no results of ipe-bench" if folder.exists() else "there is no such folder"
+            raise UserError(f"{folder}: {what}; give the output folder of a run")
+    return found

@@ -368,10 +368,8 @@ ELSEWHERE = {
         "paper=: name tables",
         "power: needs a fixed number",
         "report: the run has",
-        "{}: a bundle is read",
         "{}: cannot be used",
         "{}: is not given; both go together",
-        "{}: is there and holds",
     ),
     "of a log's rows": ("{} belongs here; give a row for each epoch",),
     "of a plugin or a class": (

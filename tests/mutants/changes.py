@@ -664,13 +664,6 @@ CHANGES = {
         "if False:",
         "test_damage.py",
     ),
-    "bundle-unchecked": Change(
-        "runs",
-        "a bundle with changed files is believed",
-        "if name not in there or digests.get(name) != _digest_of(archive, name):",
-        "if name not in there:",
-        "test_bundles.py",
-    ),
     "died-thrice": Change(
         "runs",
         "a task that ends its process is tried once more than is said",

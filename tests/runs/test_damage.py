@@ -173,7 +173,7 @@ def test_a_pipe_among_the_results_stops_no_command(folder, expected, capsys, nam
     os.mkfifo(folder / name)
     (folder / "runs" / "x.json").symlink_to("/dev/zero")
     pd.testing.assert_frame_equal(summary(folder), expected[0])
-    for words in (["status"], ["report", "figures=none"], ["bundle", f"output={folder}.zip"]):
+    for words in (["status"], ["report", "figures=none"]):
         assert main([words[0], str(folder), *words[1:]]) == 1
         assert "is no regular file" in "".join(capsys.readouterr()).replace("\n", "")
 

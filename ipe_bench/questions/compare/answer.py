@@ -35,7 +35,7 @@ from ipe_bench.report.words import (
     told_apart,
     value_text,
 )
-from ipe_bench.runs.bundles import opened
+from ipe_bench.runs.store import require_results
 from ipe_bench.statistics.collect import collect
 from ipe_bench.statistics.comparisons import ALPHA
 
@@ -294,23 +294,24 @@ def compared_folders(
             "power: concerns success, which fail_on does not name; add it, or leave out power"
         )
     versions = (first, second)
-    with opened(first_folders) as one, opened(second_folders or first_folders) as other:
-        _require_two(first_folders, second_folders, versions)
-        ours = collect(one)
-        theirs = collect(other)
-        read = digests(dict.fromkeys([*one, *other]))
-        found = compared(
-            ours,
-            theirs,
-            versions,
-            alpha=alpha,
-            anytime=anytime,
-            plan=plan,
-            tested=tested,
-            margins=widened,
-        )
-        few = [] if anytime else list(too_few(found, alpha))
-        lacking = list(gone(ours, theirs, versions)) if complete else []
+    one = require_results(first_folders)
+    other = require_results(second_folders or first_folders)
+    _require_two(first_folders, second_folders, versions)
+    ours = collect(one)
+    theirs = collect(other)
+    read = digests(dict.fromkeys([*one, *other]))
+    found = compared(
+        ours,
+        theirs,
+        versions,
+        alpha=alpha,
+        anytime=anytime,
+        plan=plan,
+        tested=tested,
+        margins=widened,
+    )
+    few = [] if anytime else list(too_few(found, alpha))
+    lacking = list(gone(ours, theirs, versions)) if complete else []
     frame = Comparison(found)
     if plan is not None:
         # Other rows have no such numbers, which would make floats of them.
