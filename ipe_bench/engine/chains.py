@@ -1,5 +1,4 @@
-"""Solves the equations of chains of epochs, each trial by itself: in machine code, or by NumPy
-where none can be made.
+"""Solves the equations of chains of epochs in machine code, each trial by itself.
 
 A chain has states x and multipliers l of epochs k = 0 ... K, with x[-1] = 0 and l[K+1] = 0:
 
@@ -30,7 +29,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ipe_bench.basics.linalg import Array, multiply, own
+from ipe_bench.basics.linalg import Array, own
 from ipe_bench.engine import compiled
 from ipe_bench.engine.compiled import INTEGER, POINTER, aligned, at
 from ipe_bench.engine.integrator import emitted
@@ -43,8 +42,7 @@ _ARGUMENTS = (*[POINTER] * 9, INTEGER, INTEGER, POINTER)
 
 
 class Epoch(NamedTuple):
-    """Holds what is kept of an epoch: arrays, or in machine code how many numbers each has and
-    where they lie."""
+    """Holds what is kept of an epoch: how many numbers each part has, and where they lie."""
 
     A: Any
     B: Any
@@ -93,8 +91,6 @@ class ChainSize(NamedTuple):
 def solve_chains(A: Array, B: Array, D: Array, G: Array, a: Array, v: Array) -> Array:
     """Returns x (trials, 1 + K, n) of A (trials, K, n, n), B (trials, K, m, n) and v (trials, K, m)
     of the epochs from the second on, and of D and a (trials, 1 + K, n) and G (1 + K, n, q)."""
-    if not compiled.available():
-        return _by_numpy(A, B, D, G, a, v)
     x = np.empty(D.shape)
     _run(A, B, D, G, a, v, x, None, None)
     return x
@@ -119,8 +115,6 @@ def smoothed_chains(A: Array, B: Array, G: Array) -> tuple[Array, Array]:
 
 
 def _covariances(A: Array, B: Array, G: Array, smoothed: bool) -> tuple[Array, Array]:
-    if not compiled.available():
-        return _covariances_by_numpy(A, B, G, smoothed)
     trials, K, m, n = B.shape
     P = np.empty((trials, 1 + K, n, n))
     crossed = np.empty(P.shape)
@@ -166,46 +160,6 @@ def _compiled(size: ChainSize) -> Callable[..., None]:
     return emitted("chains", size, compiled.width(), _ARGUMENTS)
 
 
-def _by_numpy(A: Array, B: Array, D: Array, G: Array, a: Array, v: Array) -> Array:
-    trials, epochs, n = D.shape
-    chain = _begun(A, B, D, G, a, v)
-    each = [Epoch(*[part[:, k] for part in chain]) for k in range(epochs)]
-    # The second pass solves for what the first leaves of the right sides.
-    for _ in range(2):
-        chain.u[:] = 0.0
-        for k, here in enumerate(each):
-            # What lies before the first epoch counts for nothing: A is 0 there.
-            _forward(here, each[k - 1].u)
-        later = np.zeros((trials, n))
-        for here in reversed(each):
-            later = _backward(here, later)
-        chain.x[:] += chain.u
-        _refine(chain, G)
-    return chain.x
-
-
-def _covariances_by_numpy(A: Array, B: Array, G: Array, smoothed: bool) -> tuple[Array, Array]:
-    A = np.pad(A, _FIRST)
-    B = np.pad(B, _FIRST)
-    F = filtered_roots(A, B, G)[0]
-    crossed = np.empty_like(F)
-    U = np.zeros_like(F[:, 0])
-    ahead = np.broadcast_to(np.eye(F.shape[2]), U.shape)
-    for k in reversed(range(F.shape[1] if smoothed else 0)):
-        for column in np.moveaxis(U, 2, 0):
-            _take_in(F[:, k], column)
-        P = np.matmul(F[:, k], F[:, k].mT)
-        crossed[:, k] = np.matmul(P, ahead)
-        C = lower(np.concatenate([B[:, k].mT, U], axis=2))
-        for g in G[k].T:
-            s, size = _take_in(C, np.broadcast_to(g, C.shape[:2]))
-            share = multiply(ahead.mT, g) / size[:, None]
-            ahead = ahead - s[:, :, None] * share[:, None]
-        U = np.matmul(A[:, k].mT, C)
-        ahead = np.matmul(A[:, k].mT, ahead)
-    return np.matmul(F, F.mT), crossed
-
-
 def from_before(A: Array, B: Array, D: Array, v: Array) -> tuple[Array, Array, Array]:
     """Returns A, B and v of all epochs, those of the first included."""
     n = D.shape[2]
@@ -213,35 +167,6 @@ def from_before(A: Array, B: Array, D: Array, v: Array) -> tuple[Array, Array, A
     roots = np.sqrt(D)[..., None] * np.eye(n)
     rows = np.concatenate([np.pad(B, _FIRST), roots], axis=2)
     return np.pad(A, _FIRST), rows, np.pad(v, [(0, 0), (1, 0), (0, n)])
-
-
-def _begun(A: Array, B: Array, D: Array, G: Array, a: Array, v: Array) -> Epoch:
-    """All epochs of a chain before its first pass."""
-    A, B, v = from_before(A, B, D, v)
-    F, S, size = filtered_roots(A, B, G)
-    u, x, multipliers = map(np.zeros_like, (a, a, a))
-    return Epoch(A, B, a.copy(), v, F, u, x, multipliers, S, size, np.zeros_like(v))
-
-
-def filtered_roots(A: Array, B: Array, G: Array) -> tuple[Array, Array, Array]:
-    """Returns F (trials, 1 + K, n, n), where F F' is the covariance of x by the rows B (trials, 1 +
-    K, r, n) up to each epoch, and s and 1 + b' s of each row b; A (trials, 1 + K, n, n)."""
-    trials, epochs, rows, _ = B.shape
-    F = np.zeros(A.shape)
-    S = np.zeros_like(B)
-    size = np.ones((trials, epochs, rows))
-    for k in range(epochs):
-        # Prediction: F F' <- A F F' A' + G G' = W W' with W = (A F, G).
-        moved = np.matmul(A[:, k], F[:, k - 1])
-        noise = np.broadcast_to(G[k], (trials, *G[k].shape))
-        W = np.concatenate([moved, noise], axis=2)
-        F[:, k] = lower(W)
-        for r in range(rows):
-            # Update by one reading after another: s = F F' b and 1 + b' s.
-            s, larger = _take_in(F[:, k], B[:, k, r])
-            S[:, k, r] = s
-            size[:, k, r] = larger
-    return F, S, size
 
 
 def lower(W: Array) -> Array:
@@ -255,61 +180,3 @@ def lower(W: Array) -> Array:
     V[:, :columns] = np.take_along_axis(W, order[:, None], axis=2).mT
     F = np.asarray(np.linalg.qr(V, mode="r")).mT
     return np.where(np.diagonal(F, axis1=1, axis2=2)[:, None] < 0, -F, F)
-
-
-def _take_in(F: Array, row: Array) -> tuple[Array, Array]:
-    """F F' <- ((F F')^-1 + b b')^-1 for a row b, in place; returns F F' b (trials, n) and 1 + b' F
-    F' b (trials,)."""
-    t = multiply(F.mT, row)
-    s = np.zeros_like(t)
-    size = np.ones(len(t))
-    for j in reversed(range(t.shape[1])):
-        # From the last column to the first, size is 1 plus the squares of t so far (Carlson, 1973).
-        column = F[:, :, j]
-        along = t[:, j]
-        larger = size + along**2
-        root = np.sqrt(size * larger)
-        kept = size / root
-        share = along / root
-        # F <- F size / root - s t / root in this column, then s <- s + F t by the old one.
-        moved = column * along[:, None]
-        column[:] = column * kept[:, None] - s * share[:, None]
-        s = s + moved
-        size = larger
-    return s, size
-
-
-def _forward(here: Epoch, before: Array) -> None:
-    # Prediction: u <- A u + a.
-    here.u[:] = multiply(here.A, before) + here.a
-    for r in range(here.B.shape[1]):
-        # Update: w = (v - b' u) / (1 + b' s), then u <- u + s w.
-        known = np.sum(here.B[:, r] * here.u, axis=1)
-        innovation = here.v[:, r] - known
-        w = innovation / here.size[:, r]
-        here.w[:, r] = w
-        here.u[:] += here.S[:, r] * w[:, None]
-
-
-def _backward(here: Epoch, later: Array) -> Array:
-    """Takes A' l of the epoch after, and returns that of this one."""
-    # Smoothing: x = u + F F' A' l[k+1].
-    here.u[:] += multiply(here.F, multiply(here.F.mT, later))
-    for r in reversed(range(here.B.shape[1])):
-        # Readings from the last to the first: w <- w - s' l / (1 + b' s), then l <- l + b w.
-        known = np.sum(here.S[:, r] * later, axis=1)
-        w = here.w[:, r] - known / here.size[:, r]
-        here.w[:, r] = w
-        later = later + here.B[:, r] * w[:, None]
-    here.multipliers[:] = later
-    return multiply(here.A.mT, later)
-
-
-def _refine(chain: Epoch, G: Array) -> None:
-    """Computes what u and the multipliers leave of a and of v."""
-    # a <- a - u + A u[k-1] + G G' l.
-    moved = multiply(chain.A, np.roll(chain.u, 1, axis=1))
-    noise = multiply(np.matmul(G, G.mT), chain.multipliers)
-    chain.a[:] = chain.a - chain.u + moved + noise
-    # v <- v - B u - w.
-    chain.v[:] = chain.v - multiply(chain.B, chain.u) - chain.w

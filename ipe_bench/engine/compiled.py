@@ -2,7 +2,7 @@
 between processes.
 
 A function takes pointers and whole numbers and returns nothing; a call lets other threads run.
-Where no machine code can be made, `available` says so, and callers compute the same with NumPy.
+Where no machine code can be made, that is a UserError.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ import importlib.metadata
 import logging
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from ctypes.util import find_library
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ipe_bench.basics.errors import StorageError
+from ipe_bench.basics.errors import StorageError, UserError, one_line
 from ipe_bench.basics.files import cache_folder, write_atomically
 
 _LOG = logging.getLogger(__name__)
@@ -49,22 +49,20 @@ _DIGEST = 32
 POINTER, INTEGER = ctypes.c_void_p, ctypes.c_int64
 
 
-@functools.cache
-def available() -> bool:
-    """Returns whether machine code can be made here."""
+@contextlib.contextmanager
+def _refusing() -> Iterator[None]:
+    """Raises UserError where something that makes machine code is missing."""
     try:
-        _target()
-        _addresses()
+        yield
     except (ImportError, OSError, RuntimeError) as error:
-        _LOG.warning(
-            "models run in NumPy, tens of times slower: no machine code can be made here (%s)",
-            error,
-        )
-        return False
-    return True
+        raise UserError(
+            f"no machine code can be made here ({one_line(error)}): install the package llvmlite "
+            "again (pip install --force-reinstall llvmlite)"
+        ) from error
 
 
 @functools.cache
+@_refusing()
 def _target() -> Any:
     """Returns LLVM's description of this processor."""
     import llvmlite.binding as llvm
@@ -78,6 +76,7 @@ def _target() -> Any:
 
 
 @functools.cache
+@_refusing()
 def _addresses() -> dict[str, int]:
     """Returns the addresses of the functions of the C library."""
     library = ctypes.CDLL(None if sys.platform != "win32" else "ucrtbase")
@@ -92,6 +91,7 @@ def _addresses() -> dict[str, int]:
 
 
 @functools.cache
+@_refusing()
 def width() -> int:
     """Returns the numbers that a vector register holds."""
     import llvmlite.binding as llvm
@@ -109,6 +109,7 @@ def load(
     A kept file is used only if it was made of this key for this processor, is whole, and belongs to
     this user or the system.
     """
+    target = _target()
     import llvmlite.binding as llvm
 
     # The file begins with the digests of what it was made of and of its code; others are made anew.
@@ -128,7 +129,7 @@ def load(
     library = llvm.JITLibraryBuilder().add_object_img(code).export_symbol(name)
     for called, address in _addresses().items():
         library.import_symbol(called, address)
-    engine = llvm.create_lljit_compiler(_target())
+    engine = llvm.create_lljit_compiler(target)
     tracker = library.link(engine, made_of.hex())
     function = ctypes.CFUNCTYPE(None, *arguments)(tracker[name])
     # The code lives as long as the function that calls it.

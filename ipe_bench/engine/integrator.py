@@ -1,5 +1,4 @@
-"""Runs plans: in machine code on every core, or step by step in NumPy where no machine code can be
-made.
+"""Runs plans in machine code on every core.
 
 One lane is one initial value problem, a trial in a case; the lanes of a vector register advance
 together. The bits of a lane depend on its own numbers alone: neither on its neighbours, nor on how
@@ -25,7 +24,7 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.machine import cores
 from ipe_bench.engine import compiled
 from ipe_bench.engine.compiled import INTEGER, POINTER, WHOLE, aligned, at
-from ipe_bench.engine.plan import Equations, Recording, StepPlan, Tableau, planned
+from ipe_bench.engine.plan import Equations, StepPlan, Tableau, planned
 from ipe_bench.engine.trace import Program, RowPrograms
 
 if TYPE_CHECKING:
@@ -123,9 +122,6 @@ class Kernel:
         *offset, out = more
         if not lanes:
             return
-        if not compiled.available():
-            self._interpret(x, si, cases, rows, times, steps, *more, states=states)
-            return
         # The frame is as wide as the lanes need.
         function, size = self._narrow if lanes <= _NARROW else self._wide
         given = (at(x), at(si), at(cases), count, at(rows, WHOLE))
@@ -169,107 +165,9 @@ class Kernel:
         for other in others:
             other.result()
 
-    @functools.cached_property
-    def _programs(self) -> tuple[Program, Program, Program]:
-        """Evaluates from the time, the state with its tangents, and constants: their starts, their
-        slopes, and readings."""
-        tape = Recording(self.equations)
-        # For Jacobians, each number is a tangent in all directions at once, an array (n, lanes).
-        d, dp, slopes, shown, starts = (
-            tape.tangents if self.sensitive else ([], [], [], tape.shown, [])
-        )
-        stays = [*tape.p, *tape.c, *dp]
-        at = [tape.t, *tape.y, *d, *stays]
-        watched = self.equations.watched and not self.sensitive
-        moving = Program.of([*tape.slope, *slopes, *([tape.side] if watched else [])], at)
-        noted = tape.noted if watched else []
-        return Program.of([*tape.start, *starts, *noted], stays), moving, Program.of(shown, at)
-
-    def _interpret(
-        self,
-        x: Array,
-        si: Array,
-        cases: Array,
-        rows: Integers,
-        times: Array,
-        steps: Integers,
-        *more: Array,
-        states: Array | None = None,
-    ) -> None:
-        """Implements `run` in NumPy, all lanes at once; products are rounded before they are
-        added."""
-        begin, slope, read = self._programs
-        intervals = cases if cases.ndim == 3 else cases[None]
-        count, n = intervals.shape[1], x.shape[1]
-        trial, case = np.repeat(rows, count), np.tile(np.arange(count), len(rows))
-        out = more[-1].reshape(len(x), count, len(times), self.equations.outputs, -1)
-        directions = list(np.eye(n)[:, :, None]) if self.sensitive else []
-        p = list((x[trial] * si).T)
-
-        # What stays over a step: parameters, the constants of interval k, and directions.
-        def stays(k: int) -> list[Any]:
-            return [*p, *intervals[min(k, len(intervals) - 1), case].T, *directions]
-
-        with np.errstate(all="ignore"):
-            begun, t, size = (
-                begin(stays(0)),
-                np.float64(0.0),
-                len(slope.outputs) - bool(self.plan.doubt),
-            )
-            y, noted = begun[:size], begun[size:]
-            kept = [y]
-            for k, to in enumerate(times):
-                # Equal steps to the next reading; none to a time that is reached already.
-                h = (to - t) / max(int(steps[k]), 1)
-                for s in range(int(steps[k]) if to != t else 0):
-                    slopes, held, sides = list[list[Any]](), list[Any](), list[Any]()
-                    at = y
-                    # Stage s: k_s = f(t + C_s h, y + h sum_j A_sj k_j); the last row, B, is the end
-                    # of the step.
-                    for node, row in zip((*self.tableau.C, 1.0), self.tableau.weights, strict=True):
-                        at = y
-                        for j, weight in row:
-                            at = [a + h * weight * k for a, k in zip(at, slopes[j], strict=True)]
-                        if len(slopes) < self.tableau.stages:
-                            moment = t + s * h + node * h
-                            found = slope([moment, *at, *stays(k)])
-                            slopes.append(found[:size])
-                            sides += found[size:]
-                            if noted and self.plan.timed:
-                                # What the rates do with the states held is the time's doing, and no
-                                # doubt.
-                                held += slope([moment, *y, *stays(k)])[:size]
-                    y = at
-                    if noted:
-                        noted = self.plan.watch(
-                            [h, *y, *itertools.chain(*slopes), *held, *sides, *noted]
-                        )
-                # The readings are taken with the constants that hold from this time on.
-                t = to
-                kept.append(y)
-                for i, value in enumerate(read([t, *y, *stays(k + 1)])):
-                    if self.sensitive:
-                        out[trial, case, k, i] = np.broadcast_to(value, (n, len(trial))).T * si
-                    else:
-                        out[trial, case, k, i, 0] = (
-                            value - more[0].reshape(count, -1, out.shape[3])[case, k, i]
-                        )
-            if states is not None:
-                for k, i in np.ndindex(len(kept), len(kept[0])):
-                    states[trial, case, i, k] = kept[k][i]
-                if noted:
-                    states[trial, case, -1] = np.broadcast_to(noted[-1], len(trial))[:, None]
-
 
 def compiled_rates(program: Program) -> Callable[[Array, Array, Array], None]:
     """Compiles a function that fills its third argument (trials,) with the number that a recorded
     program computes of the parameters x (trials, n), times their sizes (n,)."""
-    if compiled.available():
-        function = emitted("rates", program, 1, (POINTER, POINTER, POINTER, INTEGER))
-        return lambda x, si, out: function(at(x), at(si), at(out), len(x))
-
-    def by_numpy(x: Array, si: Array, out: Array) -> None:
-        with np.errstate(all="ignore"):
-            out[:] = program(list((x * si).T))[0]
-
-    return by_numpy
+    function = emitted("rates", program, 1, (POINTER, POINTER, POINTER, INTEGER))
+    return lambda x, si, out: function(at(x), at(si), at(out), len(x))

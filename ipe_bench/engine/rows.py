@@ -1,5 +1,4 @@
-"""Runs recorded functions of rows of numbers, with their slopes: in machine code, or by NumPy where
-none can be made.
+"""Runs recorded functions of rows of numbers, with their slopes, in machine code.
 
 The bits of a row depend on its own numbers alone.
 """
@@ -37,37 +36,24 @@ class RowFunction:
     def __call__(self, x: Array, c: Array) -> Array:
         """Computes y (rows, m)."""
         self._require_width(x)
-        if compiled.available():
-            y = np.empty((len(x), self.programs.m))
-            self._compiled(at(x), at(c), len(c), None, at(y), None, len(x))
-            return y
-        return _joined(self._by_numpy(x, c)[: self.programs.m], (len(x),))
+        y = np.empty((len(x), self.programs.m))
+        self._compiled(at(x), at(c), len(c), None, at(y), None, len(x))
+        return y
 
     def slopes(self, x: Array, c: Array) -> tuple[Array, Array]:
         """Computes y (rows, m) and dy/dx (rows, m, n)."""
         self._require_width(x)
-        (rows, n), m, unit = x.shape, self.programs.m, self._directions
-        if compiled.available():
-            y, J = np.empty((rows, m)), np.empty((rows, m, n))
-            self._compiled(at(x), at(c), len(c), at(unit), at(y), at(J), rows)
-            return y, J
-        found = self._by_numpy(x, c)
-        # The directions are a further axis in front.
-        moved = self.programs.tangents([*unit[:, :, None], *found[m:]])
-        J = _joined(moved, (n, rows)).transpose(1, 2, 0)
-        return _joined(found[:m], (rows,)), np.ascontiguousarray(J)
+        rows, n = x.shape
+        y = np.empty((rows, self.programs.m))
+        J = np.empty((*y.shape, n))
+        self._compiled(at(x), at(c), len(c), at(self._directions), at(y), at(J), rows)
+        return y, J
 
     def _require_width(self, x: Array) -> None:
         """Raises ValueError unless x is (rows, n): compiled code would read beyond it."""
         n = self.programs.n
         if x.shape[1] != n:
             raise ValueError(f"rows of {x.shape[1]} numbers, where {n} belong")
-
-    def _by_numpy(self, x: Array, c: Array) -> list[Any]:
-        """Runs the program on columns, each in one piece of memory, where a number has the same
-        bits in any place."""
-        known = c[np.arange(len(x)) % len(c)]
-        return self.programs.values([*np.ascontiguousarray(x.T), *np.ascontiguousarray(known.T)])
 
     @cached_property
     def _directions(self) -> Array:
@@ -103,8 +89,3 @@ def _product(p: int, n: int, r: int) -> RowFunction:
         terms = map(partial(graph.apply, "mul"), along, x[c::r])
         y.append(reduce(partial(graph.apply, "add"), terms))
     return RowFunction(RowPrograms.of(y, x, M))
-
-
-def _joined(outputs: list[Any], shape: tuple[int, ...]) -> Array:
-    """Joins outputs, of which some may be single numbers, along a last axis."""
-    return np.stack([np.broadcast_to(one, shape) for one in outputs], axis=-1)

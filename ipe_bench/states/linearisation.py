@@ -21,7 +21,6 @@ import numpy as np
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, multiply, own
 from ipe_bench.basics.options import Component, Count, Finite, Positive
-from ipe_bench.engine import compiled
 from ipe_bench.engine.points import regress, spread_points
 from ipe_bench.measurements.base import differentiate
 from ipe_bench.states.algebra import Half, half, symmetric, transposed, triangular
@@ -150,9 +149,6 @@ def _weighted(rule: SigmaPoints, n: int) -> tuple[Array, Array, Array]:
 
 def _spread(m: Array, P: Array, s: Array) -> tuple[Half, Array]:
     """Returns G with P = G G', and the points m + G s (trials, p, n)."""
-    if not compiled.available():
-        G = half(P)
-        return G, m[:, None] + np.matmul(s, transposed(G.G))
     x, L = spread_points(m, P, s)
     G = half(P, L)
     rows = G.singular
@@ -166,18 +162,11 @@ def _regressed(G: Half, y: Array, s: Array, w: Array, c: Array) -> tuple[Array, 
 
     M = sum c d s',   A = M G^-1,   W = sum c d d' - M M'.
     """
-    if compiled.available():
-        mean, M, A, W = regress(y, G.L, s, w, c)
-        rows = G.singular
-        if rows.any():
-            A[rows] = np.matmul(M[rows], G.inverse[rows])
-        return mean, A, W
-    mean = np.sum(w[:, None] * y, axis=-2)
-    d = y - mean[:, None]
-    weighted = transposed(d * c[:, None])
-    M = np.matmul(weighted, s)
-    W = np.matmul(weighted, d) - np.matmul(M, transposed(M))
-    return mean, G.over(M), symmetric(W)
+    mean, M, A, W = regress(y, G.L, s, w, c)
+    rows = G.singular
+    if rows.any():
+        A[rows] = np.matmul(M[rows], G.inverse[rows])
+    return mean, A, W
 
 
 @dataclass(frozen=True)

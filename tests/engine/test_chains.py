@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
+from shared import chains_by_numpy
+from shared.by_numpy import by_numpy
 from shared.oracles import assert_agrees
 
-from ipe_bench.engine import compiled
 from ipe_bench.engine.chains import filtered_chains, lower, smoothed_chains, solve_chains
 
 _N, _M, _EPOCHS = 3, 2, 6
@@ -61,9 +64,9 @@ def dense_covariances(A, B, G):
 
 
 @pytest.fixture(params=["machine code", "NumPy"])
-def engine(request, monkeypatch):
-    if request.param == "NumPy":
-        monkeypatch.setattr(compiled, "available", lambda: False)
+def engine(request):
+    with by_numpy() if request.param == "NumPy" else nullcontext():
+        yield
 
 
 @pytest.mark.oracle(
@@ -87,10 +90,9 @@ def test_the_first_pass_through_a_chain_is_right_without_the_second(monkeypatch)
         chain.v[:] = 0.0
 
     given = chains(11)
-    monkeypatch.setattr(compiled, "available", lambda: False)
     right = solve_chains(*given)
-    monkeypatch.setattr("ipe_bench.engine.chains._refine", leave_nothing)
-    np.testing.assert_allclose(solve_chains(*given), right, rtol=1e-9, atol=1e-9)
+    monkeypatch.setattr(chains_by_numpy, "_refine", leave_nothing)
+    np.testing.assert_allclose(chains_by_numpy.solve_chains(*given), right, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.usefixtures("engine")

@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pytest
 
+from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.files import cache_folder
 from ipe_bench.engine import compiled
 from ipe_bench.engine.compiled import POINTER, at
@@ -45,6 +46,16 @@ def test_a_first_compilation_says_so_once(folder, caplog):
         assert times(2.5) == 7.5
     expected = [f"compiling a model, once per machine: it is kept in {folder}"]
     assert [record.message for record in caplog.records] == expected
+
+
+@pytest.mark.usefixtures("folder")
+def test_where_nothing_makes_machine_code_one_line_says_so(monkeypatch):
+    for name in ("_target", "width"):
+        monkeypatch.setattr(compiled, name, getattr(compiled, name).__wrapped__)
+    monkeypatch.setitem(sys.modules, "llvmlite.binding", None)
+    for ask in (compiled.width, lambda: times(2.5)):
+        with pytest.raises(UserError, match=r"no machine code .*: install the package llvmlite"):
+            ask()
 
 
 def test_damaged_machine_code_is_compiled_again_and_not_run(folder):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from shared.by_numpy import by_numpy
 
-from ipe_bench.engine import compiled
 from ipe_bench.engine.rows import products
 from ipe_bench.states import linearisation
 
@@ -34,11 +34,11 @@ def normals(trials=19, n=4):
 
 
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: type(rule).__name__)
-def test_a_regression_by_points_is_that_of_numpy(rule, monkeypatch):
+def test_a_regression_by_points_is_that_of_numpy(rule):
     m, P = normals()
     found = rule.linearise(curve, m, P)
-    monkeypatch.setattr(compiled, "available", lambda: False)
-    right = rule.linearise(curve, m, P)
+    with by_numpy():
+        right = rule.linearise(curve, m, P)
     for one, other in zip(found, right, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-11)
     # Only what is no covariance has no law.
@@ -55,10 +55,7 @@ def test_a_regression_has_the_same_bits_alone():
             np.testing.assert_array_equal(one[0], other[i])
 
 
-@pytest.mark.parametrize("engine", ["machine code", "NumPy"])
-def test_products_of_stacks_are_those_of_each_matrix(engine, monkeypatch):
-    if engine == "NumPy":
-        monkeypatch.setattr(compiled, "available", lambda: False)
+def test_products_of_stacks_are_those_of_each_matrix():
     rng = np.random.default_rng(0)
     x = rng.normal(size=(5, 7, 3))
     for M in (rng.normal(size=(7, 2, 3)), rng.normal(size=(5, 7, 2, 3))):

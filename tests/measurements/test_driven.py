@@ -1,17 +1,17 @@
 """Equations that change with time: inputs held or straight between rows, and rates in pieces, by
 both integrators."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 from itertools import pairwise
-from unittest.mock import patch
 
 import numpy as np
 import pytest
+from shared.by_numpy import by_numpy
 from shared.oracles import assert_agrees
 
 from ipe_bench.baselines import LevenbergMarquardt
 from ipe_bench.basics.errors import UserError
-from ipe_bench.engine import compiled
 from ipe_bench.measurements import Ode
 from ipe_bench.measurements.base import differentiate
 from ipe_bench.measurements.ode.driven import course
@@ -62,19 +62,17 @@ def test_a_battery_follows_its_current(method):
     assert np.array_equal(model.simulate_until(x, 30), z[:, :30])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("method", ["explicit", "implicit"])
-def test_a_battery_has_the_same_readings_without_a_compiler(method):
+def test_a_battery_has_the_same_readings_by_numpy():
+    model = replace(BATTERY, method="explicit")
     x = BATTERY.nominal * np.array([[1.0, 1.0, 1.0], [1.2, 0.8, 1.5]])
-    z = replace(BATTERY, method=method).simulate(x)
-    with patch.object(compiled, "available", lambda: False):
-        np.testing.assert_allclose(replace(BATTERY, method=method).simulate(x), z, atol=1e-12)
+    z = model.simulate(x)
+    with by_numpy():
+        np.testing.assert_allclose(model.simulate(x), z, atol=1e-12)
 
 
 @pytest.mark.parametrize("method", ["explicit", "implicit"])
-@pytest.mark.parametrize("there", [True, False])
-def test_a_rate_that_depends_on_time_has_its_exact_solution(method, there):
-    """y' = cos t - k y from 0, with its slope by k; without a compiler, too."""
+def test_a_rate_that_depends_on_time_has_its_exact_solution(method):
+    """y' = cos t - k y from 0, with its slope by k; by NumPy, too."""
     times = np.array([0.3, 2.0, 5.5])
     model = Ode(
         {"y": "cos(t) - k*y"}, {"k": 0.7}, times=tuple(times), method=method, tolerance=1e-11
@@ -84,11 +82,13 @@ def test_a_rate_that_depends_on_time_has_its_exact_solution(method, there):
     def exact(k):
         return (k * np.cos(times) + np.sin(times) - k * np.exp(-k * times)) / (1 + k**2)
 
-    with patch.object(compiled, "available", lambda: there):
-        z, J = model.simulate(x), model.jacobian(x)
-    for i, k in enumerate(0.7 * x[:, 0]):
-        np.testing.assert_allclose(z[i], exact(k), atol=1e-9)
-        np.testing.assert_allclose(J[i, :, 0], 0.7 * np.imag(exact(k + 1e-30j)) / 1e-30, atol=1e-8)
+    for engine in (nullcontext, by_numpy):
+        with engine():
+            z, J = model.simulate(x), model.jacobian(x)
+        for i, k in enumerate(0.7 * x[:, 0]):
+            slope = 0.7 * np.imag(exact(k + 1e-30j)) / 1e-30
+            np.testing.assert_allclose(z[i], exact(k), atol=1e-9)
+            np.testing.assert_allclose(J[i, :, 0], slope, atol=1e-8)
 
 
 @pytest.mark.parametrize("method", ["explicit", "implicit"])

@@ -1,15 +1,15 @@
 """Readings are those of the solution, or there are none: poles, wells, pulses, and outputs that
 magnify states."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 from itertools import product
-from unittest.mock import patch
 
 import numpy as np
 import pytest
+from shared.by_numpy import by_numpy
 from shared.families import slow_if
 
-from ipe_bench.engine import compiled
 from ipe_bench.measurements import Ode
 
 FAR = (8.0, 16.0, 24.0)
@@ -81,9 +81,9 @@ def test_a_truth_whose_well_is_narrower_than_any_step_has_no_readings():
 @pytest.mark.parametrize(("rate", "doubt"), [(0.5, 0.0), (500.0, 1.0)])
 def test_numpy_notes_the_same_steps_in_doubt_as_machine_code(rate, doubt):
     engine = kinetics(times=(1.0, 2.0), constants={"L": rate, "K": 1.0}).engine
-    for available in (True, False):
+    for engine_of in (nullcontext, by_numpy):
         z, states = np.empty((1, engine.m)), np.empty((1, 1, 3, 3))
-        with patch.object(compiled, "available", lambda available=available: available):
+        with engine_of():
             engine._simulate(
                 np.ones((1, 1)), np.arange(1), np.array([4, 4]), np.zeros(engine.m), z, states
             )

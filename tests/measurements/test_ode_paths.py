@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -15,8 +14,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.special import erf, erfc
+from shared.by_numpy import by_numpy
 
-from ipe_bench.engine import compiled
 from ipe_bench.engine.ladder import tangent_contraction
 from ipe_bench.engine.plan import DOP853
 from ipe_bench.measurements import LotkaVolterra, Ode, OdeMeasurement, Parameter, SubsetModel
@@ -397,7 +396,7 @@ def check_drawn(rates, shown, gaps, batch, seed):
     slopes = [model.slowly(x[-1] + 1e-100j * e).imag / 1e-100 for e in np.eye(3)]
     np.testing.assert_allclose(z[-1], model.slowly(x[-1]), rtol=1e-11, atol=1e-11)
     np.testing.assert_allclose(J[-1], np.stack(slopes, axis=1), rtol=1e-9, atol=1e-10 * size)
-    with patch.object(compiled, "available", lambda: False):
+    with by_numpy():
         np.testing.assert_allclose(model.simulate(x), z, rtol=1e-11, atol=1e-11)
         np.testing.assert_allclose(model.jacobian(x), J, rtol=1e-9, atol=1e-10 * size)
     free = Drawn(rates, shown, model.at, step=None)

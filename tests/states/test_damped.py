@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 import ipe_bench as ib
-from ipe_bench.engine import compiled
 from ipe_bench.states.whole_paths import PathDensity
 
 
-@pytest.mark.parametrize("engine", ["machine code", "NumPy"])
-def test_an_undamped_step_has_the_same_bits_alone_and_beside_damped_ones(engine, monkeypatch):
+def test_an_undamped_step_has_the_same_bits_alone_and_beside_damped_ones():
     """Rows of damping along the chains count only where some trial of a vector is damped."""
-    if engine == "NumPy":
-        monkeypatch.setattr(compiled, "available", lambda: False)
     model = ib.component("state_model/pendulum", count=12)
     density = PathDensity.of(model, model.draw(0, 9).z)
     x = np.random.default_rng(1).normal(size=(9, 13, model.n))

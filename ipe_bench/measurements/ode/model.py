@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Mask, finite, own
-from ipe_bench.engine import compiled, ladder
+from ipe_bench.engine import ladder
 from ipe_bench.engine.integrator import Kernel, compiled_rates
 from ipe_bench.engine.plan import DOP853, RK4, Equations, Recording, Variation, jumps
 from ipe_bench.engine.rodas import MOST_STEPS, SHAPE, STABLE, Effort, Rodas5P, Stepped
@@ -29,9 +29,6 @@ smaller."""
 _MAGNIFIED = 300.0
 """Tolerances of a reading that a change of the states by the least tolerance, as a share of each,
 may make."""
-_IN_NUMPY = 64
-"""The finest steps to each reading that are tried at the nominal point where no machine code can be
-made."""
 _ANGLE_AT_START = 0.7
 """Radians over which the first step that is tried lets the solution turn."""
 _REMEMBERED = 100_000
@@ -424,9 +421,9 @@ class OdeMeasurement(Measurement):
         z = np.full((1, self.m), np.nan)
         y = np.ones((1, *self._kept))
         if self.fastest_rate is None:
-            rung = self._rungs[-1] if compiled.available() else min(self._rungs[-1], _IN_NUMPY)
             x = own(self.nominal[None])
-            self._simulate(x, np.arange(1), rung * self._parts, self._zeros, z, y)
+            steps = self._rungs[-1] * self._parts
+            self._simulate(x, np.arange(1), steps, self._zeros, z, y)
         states = y[0, :, :-1]
         lowest = states.min(axis=(0, 2))
         highest = states.max(axis=(0, 2))

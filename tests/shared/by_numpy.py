@@ -1,0 +1,171 @@
+"""The compiled kernels a second time in NumPy, step by step: oracles for machine code.
+
+`by_numpy` runs them in place of machine code; products are rounded before they are added.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from contextlib import contextmanager
+from unittest.mock import patch
+
+import numpy as np
+from shared import chains_by_numpy
+
+from ipe_bench.engine import chains, points
+from ipe_bench.engine.integrator import Kernel
+from ipe_bench.engine.plan import Recording
+from ipe_bench.engine.rows import RowFunction
+from ipe_bench.engine.trace import Program
+from ipe_bench.states.algebra import factor, transposed, upper_solve
+
+
+@contextmanager
+def by_numpy():
+    """Runs every compiled kernel of the package by NumPy."""
+    with (
+        patch.object(Kernel, "run", integrate),
+        patch.object(RowFunction, "__call__", row_values),
+        patch.object(RowFunction, "slopes", row_slopes),
+        patch.object(chains, "_run", chains_by_numpy.run),
+        patch.object(points, "_run", run_points),
+    ):
+        yield
+
+
+def row_values(self, x, c):
+    """y (rows, m) of a recorded function."""
+    return _joined(_recorded(self, x, c)[: self.programs.m], (len(x),))
+
+
+def row_slopes(self, x, c):
+    """y (rows, m) and dy/dx (rows, m, n) of a recorded function."""
+    rows, n = x.shape
+    m = self.programs.m
+    found = _recorded(self, x, c)
+    # The directions are a further axis in front.
+    moved = self.programs.tangents([*np.eye(n)[:, :, None], *found[m:]])
+    J = _joined(moved, (n, rows)).transpose(1, 2, 0)
+    return _joined(found[:m], (rows,)), np.ascontiguousarray(J)
+
+
+def _recorded(self, x, c):
+    """Runs the program on columns, each in one piece of memory, where a number has the same bits in
+    any place."""
+    self._require_width(x)
+    known = c[np.arange(len(x)) % len(c)]
+    return self.programs.values([*np.ascontiguousarray(x.T), *np.ascontiguousarray(known.T)])
+
+
+def _joined(outputs, shape):
+    """Joins outputs, of which some may be single numbers, along a last axis."""
+    return np.stack([np.broadcast_to(one, shape) for one in outputs], axis=-1)
+
+
+def run_points(name, _size, _parts, arrays, _points):
+    """Spreads points, or regresses their values, as `engine.points` says."""
+    if name == "spreads":
+        m, P, s, L, x = arrays
+        L[:] = factor(P)
+        x[:] = m[:, None] + np.matmul(s, transposed(L))
+        return
+    L, s, w, c, y, mean, M, A, W = arrays
+    mean[:] = np.sum(w[:, None] * y, axis=1)
+    d = y - mean[:, None]
+    weighted = transposed(d * c[:, None])
+    M[:] = np.matmul(weighted, s)
+    A[:] = transposed(upper_solve(L, transposed(M)))
+    W[:] = np.matmul(weighted, d) - np.matmul(M, transposed(M))
+
+
+@functools.cache
+def _programs(kernel):
+    """Evaluates from the time, the state with its tangents, and constants: their starts, their
+    slopes, and readings."""
+    tape = Recording(kernel.equations)
+    d, dp, slopes, shown, starts = [], [], [], tape.shown, []
+    if kernel.sensitive:
+        # Each number is a tangent in all directions at once, an array (n, lanes).
+        d, dp, slopes, shown, starts = tape.tangents
+    stays = [*tape.p, *tape.c, *dp]
+    at = [tape.t, *tape.y, *d, *stays]
+    watched = kernel.equations.watched and not kernel.sensitive
+    moving = Program.of([*tape.slope, *slopes, *([tape.side] if watched else [])], at)
+    noted = tape.noted if watched else []
+    return Program.of([*tape.start, *starts, *noted], stays), moving, Program.of(shown, at)
+
+
+def integrate(
+    self,
+    x,
+    si,
+    cases,
+    rows,
+    times,
+    steps,
+    *more,
+    states=None,
+):
+    """Integrates as `Kernel.run` does, all lanes at once."""
+    begin, slope, read = _programs(self)
+    intervals = cases if cases.ndim == 3 else cases[None]
+    count, n = intervals.shape[1], x.shape[1]
+    trial, case = np.repeat(rows, count), np.tile(np.arange(count), len(rows))
+    out = more[-1].reshape(len(x), count, len(times), self.equations.outputs, -1)
+    directions = list(np.eye(n)[:, :, None]) if self.sensitive else []
+    p = list((x[trial] * si).T)
+
+    # What stays over a step: parameters, the constants of interval k, and directions.
+    def stays(k: int):
+        return [*p, *intervals[min(k, len(intervals) - 1), case].T, *directions]
+
+    with np.errstate(all="ignore"):
+        begun, t, size = (
+            begin(stays(0)),
+            np.float64(0.0),
+            len(slope.outputs) - bool(self.plan.doubt),
+        )
+        y, noted = begun[:size], begun[size:]
+        kept = [y]
+        for k, to in enumerate(times):
+            # Equal steps to the next reading; none to a time that is reached already.
+            h = (to - t) / max(int(steps[k]), 1)
+            for s in range(int(steps[k]) if to != t else 0):
+                slopes, held, sides = [], [], []
+                at = y
+                # Stage s: k_s = f(t + C_s h, y + h sum_j A_sj k_j); the last row, B, is the end
+                # of the step.
+                for node, row in zip((*self.tableau.C, 1.0), self.tableau.weights, strict=True):
+                    at = y
+                    for j, weight in row:
+                        at = [a + h * weight * k for a, k in zip(at, slopes[j], strict=True)]
+                    if len(slopes) < self.tableau.stages:
+                        moment = t + s * h + node * h
+                        found = slope([moment, *at, *stays(k)])
+                        slopes.append(found[:size])
+                        sides += found[size:]
+                        if noted and self.plan.timed:
+                            # What the rates do with the states held is the time's doing, and no
+                            # doubt.
+                            held += slope([moment, *y, *stays(k)])[:size]
+                y = at
+                if noted:
+                    noted = self.plan.watch(
+                        [h, *y, *itertools.chain(*slopes), *held, *sides, *noted]
+                    )
+            # The readings are taken with the constants that hold from this time on.
+            t = to
+            kept.append(y)
+            for i, value in enumerate(read([t, *y, *stays(k + 1)])):
+                if self.sensitive:
+                    out[trial, case, k, i] = np.broadcast_to(value, (n, len(trial))).T * si
+                else:
+                    out[trial, case, k, i, 0] = (
+                        value - more[0].reshape(count, -1, out.shape[3])[case, k, i]
+                    )
+        if states is not None:
+            for k, i in np.ndindex(len(kept), len(kept[0])):
+                states[trial, case, i, k] = kept[k][i]
+            if noted:
+                states[trial, case, -1] = np.broadcast_to(noted[-1], len(trial))[:, None]
