@@ -13,9 +13,6 @@ from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.construct import construct, described
 from ipe_bench.report.tables.table import Table, words
 
-_GONE = {"keys": "`ipe-bench run --help` explains every key of a run"}
-"""Lists of earlier versions, and what to use instead."""
-
 
 def list_command(names: Sequence[str], verbose: bool) -> int:
     """Prints one line per option of each group, with its own options if `verbose`; for GROUP/NAME
@@ -28,7 +25,7 @@ def list_command(names: Sequence[str], verbose: bool) -> int:
         if group not in known:
             homes = " or ".join(f"{o.group}/{o.name}" for o in plugins.options() if o.name == name)
             remedy = f"write {homes}" if homes else unknown(group, known, "group")
-            raise UserError(f"{name}: {_GONE.get(name, remedy)}")
+            raise UserError(f"{name}: {remedy}")
         options = {one.name: one for one in plugins.options(group)}
         ours = _ours(group)
         if not slash:

@@ -19,7 +19,7 @@ from ipe_bench.basics.errors import StorageError, UserError, shortened, unknown
 from ipe_bench.basics.visible import VisibleStream
 from ipe_bench.cli import discard_output
 from ipe_bench.cli.parser import COMMANDS, parser_of, program
-from ipe_bench.cli.questions import QUESTIONS, question_command, without_flags
+from ipe_bench.cli.questions import QUESTIONS, question_command
 from ipe_bench.report.page.writer import COMMAND
 
 HOMES = {
@@ -30,12 +30,6 @@ HOMES = {
     **dict.fromkeys(("check", "new"), "workshop"),
 }
 """The module of each command that is no question, which is loaded when the command is given."""
-GONE = {
-    "completion": 'eval "$(ipe-bench -sc install=bash)" lets bash complete (install=zsh, '
-    "install=fish likewise); names inside of lists are no longer completed",
-    "schema": "`ipe-bench list GROUP/NAME` shows every option with its type and default",
-}
-"""Commands of earlier versions, and what to use instead."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -132,8 +126,6 @@ def _dispatch(words: list[str]) -> int:
     if command in ("-sc", "--shell-completion"):
         command = "run"
         rest = words
-    if command in GONE:
-        raise UserError(f"{command}: is no command any more; {GONE[command]}")
     if command not in COMMANDS:
         remedy = unknown(command, COMMANDS, "command")
         if command.startswith("-"):
@@ -144,7 +136,7 @@ def _dispatch(words: list[str]) -> int:
         parser.print_help()
         return 0
     if command in QUESTIONS:
-        return question_command(command, parser.parse(without_flags(command, rest)).arguments)
+        return question_command(command, parser.parse(rest).arguments)
     module = importlib.import_module(f"ipe_bench.cli.{HOMES[command]}")
     begin = getattr(module, f"{command}_command")
     if command == "run":

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import places_and_keys, print_problems, say, say_files, show
 from ipe_bench.cli.keys import OF_FILES, of
-from ipe_bench.questions.question import NAMES, Answered, Asked, Question
+from ipe_bench.questions.question import Answered, Asked, Question
 
 
 class Row(NamedTuple):
@@ -74,32 +74,6 @@ def _refuse_file(name: str, word: str, others: Sequence[str]) -> None:
             f"{word}: {key}= is the largest number of {key} in {name}, as in {key}=10; a file is"
             f" read by `ipe-bench {shlex.join(['estimate', *others, word])}`"
         )
-
-
-def without_flags(name: str, arguments: Sequence[str]) -> list[str]:
-    """Writes --KEY VALUE of earlier versions as KEY=VALUE, and says so in a line on stderr."""
-    known = question(name).options()
-    words: list[str] = []
-    values: dict[str, list[str]] = {}
-    rest = list(arguments)
-    while rest:
-        word = rest.pop(0)
-        flag, equals, value = word.partition("=")
-        key = flag.removeprefix("--")
-        if key == flag or key not in known:
-            words.append(word)
-            continue
-        if not equals:
-            if not rest:
-                raise UserError(f"{name}: {word}: give it a value, as in {key}=VALUE")
-            value = rest.pop(0)
-        values.setdefault(key, []).append(value)
-    for key, given in values.items():
-        several = known[key] is NAMES and len(given) > 1
-        new = f"{key}=[{','.join(given)}]" if several else f"{key}={given[-1]}"
-        print_problems([f"{name}: --{key}: options have no dashes any more; write {new}"])
-        words.append(new)
-    return words
 
 
 def _asked(name: str, arguments: Sequence[str], row: Row) -> Asked:

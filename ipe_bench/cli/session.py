@@ -122,13 +122,6 @@ def jobs_of(words: Words, *, multirun: bool) -> Jobs:
     """Returns the jobs of a command; an experiment that sweeps needs no flag for it."""
     config = _composed(tuple(map(w.forced, w.settled(words.overrides))), whole=True)
     hydra = config.hydra
-    if hydra.runtime.choices.get("model"):
-        print_problems(
-            [
-                f"+experiment={words.chosen('experiment')}: model is called state_model now; write"
-                " that there"
-            ]
-        )
     swept = hydra.sweeper.get("params") or {}
     params = [f"{key}={value}" for key, value in swept.items()]
     multirun = multirun or hydra.mode == RunMode.MULTIRUN or bool(params)

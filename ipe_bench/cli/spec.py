@@ -107,7 +107,7 @@ class Spec(Component):
     def _check_objective(self, label: str, column: str) -> None:
         from ipe_bench.plugins.extensions import use_statistics
         from ipe_bench.statistics.records import SCORES
-        from ipe_bench.statistics.registry import all_statistics, current_name
+        from ipe_bench.statistics.registry import all_statistics
         from ipe_bench.statistics.statistic import frame_columns
 
         use_statistics()
@@ -122,15 +122,12 @@ class Spec(Component):
         ):
             if name not in known:
                 raise UserError(f"objective={self.objective}: {unknown(name, known, noun)}")
-        current_name(str(self.objective).rpartition(".")[2])
 
     @property
     def aim(self) -> tuple[str, str]:
         """Label and column of the objective."""
-        from ipe_bench.statistics.records import RENAMED
-
         label, _, column = str(self.objective).rpartition(".")
-        return label, RENAMED.get(column, column)
+        return label, column
 
     @property
     def count(self) -> int:

@@ -42,11 +42,6 @@ _FILE = re.compile(
     rf"\+*(?:(measurement|state_model|{TRUTH})\.file|(parameters))=(?![{{$]|null$)(.*)", re.DOTALL
 )
 
-_GONE = {
-    "ignore_rows": "empty the cells of these readings in the file",
-    "prior_covariance": "give parameters.NAME.deviation and prior.correlations",
-}
-
 Groups = dict[str, list[str]]
 """The names of the options of each group."""
 
@@ -286,8 +281,6 @@ def _check(override: Override, groups: Groups) -> None:
         raise UserError(f"{word}: {unknown(group, groups, 'group')}")
     if first in plugins.PACKAGES:
         raise UserError(f"{word}: options are set by label; write {_by_label(first, word)}")
-    if first in _GONE:
-        raise UserError(f"{word}: is no key any more; {_GONE[first]}")
     if first not in KEYS:
         raise UserError(f"{word}: {unknown(first, {*KEYS, *groups, 'experiment'}, 'key')}")
     if group == "estimators":

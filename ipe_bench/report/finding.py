@@ -16,7 +16,7 @@ from typing import Any
 
 from ipe_bench.report.words import percent, value_text
 from ipe_bench.statistics.intervals import LEVEL, clopper_pearson
-from ipe_bench.statistics.verdicts import OVERCONFIDENT, current
+from ipe_bench.statistics.verdicts import OVERCONFIDENT
 
 HELD = 0.9
 """Share of all trials that succeed where an estimator holds."""
@@ -82,7 +82,7 @@ class Standing:
     def overconfident(self, number: int) -> list[int]:
         """Returns at which of the first columns its reported covariance is too small."""
         shown = enumerate(self.rows[:number])
-        return [at for at, row in shown if row and current(row["verdict"]) == OVERCONFIDENT]
+        return [at for at, row in shown if row and row["verdict"] == OVERCONFIDENT]
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from ipe_bench.report.tables.table import html, plain_text
 from ipe_bench.report.tables.terminal import summary_tables
 from ipe_bench.statistics.analysis import analyse
 from ipe_bench.statistics.collect import collect, trials_frame
-from ipe_bench.statistics.registry import current_name, summary_columns
+from ipe_bench.statistics.registry import summary_columns
 from ipe_bench.statistics.statistic import ALL
 
 if TYPE_CHECKING:
@@ -57,18 +57,6 @@ class Summary(pd.DataFrame):
         made.attrs = frame.attrs
         made._stored = stored
         return made
-
-    def __getitem__(self, key: Any) -> Any:
-        """Returns columns, also by a name of an older version; the rest is pandas'."""
-        if isinstance(key, str):
-            key = self._current(key)
-        elif isinstance(key, list):
-            key = [self._current(one) for one in key]
-        return super().__getitem__(key)
-
-    def _current(self, column: Any) -> Any:
-        is_old = isinstance(column, str) and column not in self.columns
-        return current_name(column) if is_old else column
 
     @property
     def trials(self) -> pd.DataFrame:

@@ -625,17 +625,6 @@ MAIN = (
 NOT_MAIN = ("rmse_high",)
 """Ends of intervals that it leaves out: in fewer than a thousand trials this one is hardly ever
 known."""
-RENAMED = {
-    "time_median_s": "time_mean_s",
-    "nees_median_low": "nees_median_low_if_honest",
-    "nees_median_high": "nees_median_high_if_honest",
-    "nees_low": "nees_low_if_honest",
-    "nees_high": "nees_high_if_honest",
-    "rmse_anytime": "rmse",
-    "rmse_anytime_low": "rmse_low",
-    "rmse_anytime_high": "rmse_high",
-}
-"""Columns of versions before 0.4.0, and what they are called now."""
 MAIN_OF_STATES = (*MAIN, "path_rmse", "path_bound", "path_nees", "path_verdict", "nis_verdict")
 """Those of trackers of states that move."""
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
 from ipe_bench.basics.errors import UserError, place_of
-from ipe_bench.statistics.records import MAIN, MAIN_OF_STATES, NOT_MAIN, RENAMED, SCORES, STATISTICS
+from ipe_bench.statistics.records import MAIN, MAIN_OF_STATES, NOT_MAIN, SCORES, STATISTICS
 from ipe_bench.statistics.sample import Sample
 from ipe_bench.statistics.statistic import (
     ALL,
@@ -104,17 +103,6 @@ def columns_of_added(record: Statistic, sample: Sample) -> dict[str, list[Any]]:
 def summary_columns() -> tuple[str, ...]:
     """Returns the columns of `summary_all.csv` behind those that say what a row is of."""
     return (*frame_columns(all_statistics()), BEST)
-
-
-def current_name(column: str) -> str:
-    """Returns what a column of any version is called now, with a warning if it was renamed."""
-    if column not in RENAMED:
-        return column
-    now = RENAMED[column]
-    warnings.warn(
-        f"{column}: is called {now} now; the old name goes with the next version", FutureWarning, 3
-    )
-    return now
 
 
 def main_columns(summary: pd.DataFrame) -> pd.DataFrame:

@@ -1,5 +1,4 @@
-"""Holds every word of verdict in one table: its value in files, the word shown, its rule and the
-words it replaces.
+"""Holds every word of verdict in one table: its value in files, the word shown and its rule.
 
 The rules themselves are computed where their numbers are: `intervals.verdict` judges covariances,
 and `real.tracks.LogTracks.verdict` the track of a log.
@@ -39,8 +38,6 @@ class Word:
     """Stands for it on a narrow screen, behind NEES."""
     rule: str
     """States when it is given."""
-    replaces: tuple[str, ...] = ()
-    """Lists the words of older versions that it replaces; they are read as this one."""
 
 
 VERDICTS = (
@@ -50,7 +47,6 @@ VERDICTS = (
         "+",
         "The reported covariance is too small: the mean NEES lies significantly (95 %) above the"
         " number of parameters.",
-        replaces=("optimistic", "diverged but confident"),
     ),
     Word(
         TOO_CAUTIOUS,
@@ -58,7 +54,6 @@ VERDICTS = (
         "-",
         "The reported covariance is too large: the mean NEES lies significantly (95 %) below the"
         " number of parameters, even if errors that no trial shows are large.",
-        replaces=("pessimistic",),
     ),
     Word(
         CONSISTENT,
@@ -80,7 +75,6 @@ VERDICTS = (
         f"Successive innovations of a filter are correlated: a log has p below {FIT_LEVEL:g}, or"
         " significantly more than 1 % of the simulated trials have. The size of the innovations"
         " then proves nothing.",
-        replaces=("does not fit",),
     ),
     Word(
         NO_VERDICT,
@@ -116,13 +110,7 @@ VERDICTS = (
     ),
 )
 """The words of verdict, those on covariances first."""
-_WORDS = {name: word for word in VERDICTS for name in (word.value, *word.replaces)}
-
-
-def current(value: str) -> str:
-    """Returns the value of a verdict from files of any version; a value that is no verdict
-    stays."""
-    return _WORDS[value].value if value in _WORDS else value
+_WORDS = {word.value: word for word in VERDICTS}
 
 
 def shown(value: str) -> str:

@@ -63,16 +63,3 @@ def test_optuna_finds_cheaper_windows_for_progressive_than_the_default(capsys):
     ]
     assert main(["run", "-m", *common, *sweep]) == 0
     assert said(capsys.readouterr().out) < 0.95 * default
-
-
-@pytest.mark.filterwarnings("default")
-def test_a_column_of_an_older_version_is_an_objective_with_a_line(capsys):
-    assert main(["run", *SMALL, "trials=4", "objective=newton.time_median_s"]) == 0
-    told = capsys.readouterr()
-    assert (
-        told.err.count(
-            "time_median_s: is called time_mean_s now; the old name goes with the next version"
-        )
-        == 1
-    )
-    assert said(told.out) > 0

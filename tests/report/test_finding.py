@@ -107,7 +107,6 @@ def test_a_missing_cell_is_undecided_and_forbids_only():
         ),
         (("consistent", "overconfident", "consistent"), "its covariance is too small at 10"),
         (("-", "undecided", "too cautious"), ""),
-        (("consistent", "consistent", "optimistic"), "its covariance is too small at 100"),
     ],
 )
 def test_only_a_sure_verdict_calls_a_covariance_too_small(verdicts, clause):

@@ -77,14 +77,13 @@ def test_a_number_is_never_rounded_across_a_limit(share, text):
 
 def test_the_sign_is_of_the_verdict():
     signs = {}
-    for verdict in ("overconfident", "undecided", "-", "consistent", "too cautious", "optimistic"):
+    for verdict in ("overconfident", "undecided", "-", "consistent", "too cautious"):
         (matrix,) = matrices(rows_of({"a": (200, 200)}, verdict=verdict))
         (tiles,) = matrix.rows
         signs[verdict] = {tile.sign for tile in tiles if isinstance(tile, Tile)}
         assert ("▲" in matrix.notes[-1]) == (signs[verdict] == {"▲"})
     assert signs == {
         "overconfident": {"▲"},
-        "optimistic": {"▲"},
         "undecided": {"?"},
         "-": {"?"},
         "consistent": {""},

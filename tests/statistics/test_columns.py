@@ -12,12 +12,10 @@ import pytest
 from scipy.stats import beta, chi2, norm
 from shared.synthetic_store import Pretender, Seeker, Synthetic
 
-from ipe_bench.report.summary import Stored, Summary
 from ipe_bench.report.tables.table import plain_text
 from ipe_bench.report.tables.terminal import summary_tables
 from ipe_bench.runs.store import ResultKey
 from ipe_bench.statistics import summarize
-from ipe_bench.statistics.records import RENAMED
 from ipe_bench.statistics.registry import summary_columns
 
 ELSEWHERE = {
@@ -433,28 +431,6 @@ def test_every_column_is_the_statistic_that_its_name_says(tmp_path, seed):
         if not equal:
             wrong[column] = told, expected
     assert not wrong
-
-
-def test_columns_of_older_versions_are_read_with_a_line(synthetic):
-    """Medians of times were those of blocks; limits of NEES are those of a right covariance."""
-    synthetic.add(
-        synthetic.scenario(),
-        "one",
-        np.ones((30, 3)),
-        block=20,
-        time_s=np.repeat([1.0, 4.0], [20, 10]),
-    )
-    table = Summary.of(summarize([synthetic.directory]), Stored(synthetic.directory))
-    with pytest.warns(FutureWarning, match="time_median_s: is called time_mean_s now"):
-        old = table["time_median_s"]
-    assert old.tolist() == [2.0] * 4
-    with pytest.warns(
-        FutureWarning, match="nees_median_low: is called nees_median_low_if_honest now"
-    ):
-        some = table[["estimator", "nees_median_low"]]
-    assert list(some) == ["estimator", "nees_median_low_if_honest"]
-    assert set(RENAMED.values()) <= set(summary_columns())
-    assert not set(RENAMED) & set(summary_columns())
 
 
 def test_a_cost_that_few_trials_carry_shows_its_mean(synthetic):

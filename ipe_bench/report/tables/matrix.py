@@ -27,7 +27,6 @@ from ipe_bench.statistics.verdicts import (
     OVERCONFIDENT,
     TOO_CAUTIOUS,
     UNDECIDED,
-    current,
 )
 
 MATRIX = "matrix"
@@ -220,7 +219,7 @@ def _tile(one: Standing, at: int, finding: Finding, moving: bool) -> Tile:
     row = one.rows[at]
     if row is None:
         return Tile("–", says=f"{one.label}: no result")
-    verdict = current(row["verdict"])
+    verdict = row["verdict"]
     sign = TOO_SMALL if verdict == OVERCONFIDENT else ""
     sign = NOT_JUDGED if verdict in (UNDECIDED, NO_VERDICT) else sign
     number = points(row["success"])

@@ -14,7 +14,6 @@ import numpy as np
 import pandas as pd
 
 from ipe_bench.basics.linalg import Array
-from ipe_bench.statistics.verdicts import current
 
 SAMPLES = Path(__file__).parent / "samples"
 
@@ -55,7 +54,7 @@ def compared(folder: Path, samples: Path = SAMPLES) -> pd.DataFrame:
         for number, *place in surveyed.itertuples(index=False):
             at = [last[f"{axis}{number:.0f} [m]"] for axis in "xy"]
             row[f"beacon {number:.0f}"] = float(np.hypot(*np.subtract(at, place)))
-        rows.append({"tracker": label, **row, "verdict": current(said[label]["verdict"])})
+        rows.append({"tracker": label, **row, "verdict": said[label]["verdict"]})
     return pd.DataFrame(rows)
 
 
