@@ -101,6 +101,7 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
 ZOO = {
     "accelerometer": "Accelerometer",
+    "anderson": "Anderson",
     "bock": "Bock",
     "es_mda": "EsMda",
     "gnss": "Gnss",

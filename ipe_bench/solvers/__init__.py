@@ -2,7 +2,6 @@
 
 from ipe_bench.basics.errors import without_modules
 from ipe_bench.estimators.ipe import IPE, State, System
-from ipe_bench.solvers.anderson import Anderson
 from ipe_bench.solvers.auto import Auto
 from ipe_bench.solvers.broyden import Broyden
 from ipe_bench.solvers.damped_newton import DampedNewton
@@ -14,7 +13,6 @@ from ipe_bench.solvers.steepest_descent import SteepestDescent
 
 __all__ = [
     "IPE",
-    "Anderson",
     "Auto",
     "Broyden",
     "DampedNewton",

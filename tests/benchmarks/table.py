@@ -185,7 +185,6 @@ def estimation() -> Iterator[Row]:
     estimators = [
         B.LinearLSE(),
         S.FixedPoint(),
-        S.Anderson(),
         S.Broyden(),
         S.Newton(),
         S.Progressive(),

@@ -23,7 +23,6 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.solvers import (
-    Anderson,
     Auto,
     Broyden,
     DampedNewton,
@@ -40,7 +39,6 @@ SOLVERS: list[Estimator] = [
         Newton(),
         Broyden(),
         Broyden("identity"),
-        Anderson(2),
         DampedNewton(),
         solvers.SteepestDescent(),
     ),

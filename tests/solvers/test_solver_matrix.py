@@ -15,7 +15,6 @@ from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.noise import Gaussian, Quantization
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.solvers import (
-    Anderson,
     Broyden,
     DampedNewton,
     FixedPoint,
@@ -23,6 +22,7 @@ from ipe_bench.solvers import (
     Relinearized,
     SteepestDescent,
 )
+from ipe_bench.solvers.anderson import accelerated, push
 from ipe_bench.statistics.sample import orders_of
 from ipe_bench.trials.roots import frozen_root
 from ipe_bench.trials.scenario import Scenario
@@ -63,7 +63,6 @@ ALL = [
     Broyden(),
     Broyden("identity"),
     SteepestDescent(),
-    Anderson(2),
     DampedNewton(),
 ]
 WITH_SLOPE = [Newton(), Broyden(), DampedNewton(), SteepestDescent()]
@@ -90,10 +89,16 @@ def test_anderson_s_method_of_full_depth_solves_linear_equations_in_one_step_per
     """With n differences of F behind it the next step is the root (Walker and Ni 2011: as GMRES
     is); with fewer it is not there yet."""
     A = np.array([[1.3, 0.4, -0.2], [0.1, 0.8, 0.3], [-0.3, 0.2, 1.1]])
-    model = Written(lambda *x: tuple(A @ np.array(x)), 3, 3)
-    start = np.array([[1.0, -2.0, 0.5], [3.0, 1.0, 4.0]])
-    roots, _ = roots_of(model, Anderson(depth), start, tolerance=1e-10, max_iterations=4)
-    assert (roots.status == (Status.CONVERGED if depth == 3 else Status.MAX_ITERATIONS)).all()
+    x = np.array([[1.0, -2.0, 0.5], [3.0, 1.0, 4.0]])
+    F = x @ A.T
+    dx, dF = np.zeros((2, 2, 3, depth))
+    for _ in range(4):
+        new = accelerated(x, F, dx, dF)
+        dx = push(dx, new - x)
+        dF = push(dF, new @ A.T - F)
+        x = new
+        F = x @ A.T
+    assert ((np.abs(F).max(axis=1) < 1e-10) == (depth == 3)).all()
 
 
 def test_a_line_search_takes_no_step_that_decreases_nothing():
@@ -187,7 +192,7 @@ def test_newton_is_quadratic(solver):
     assert 1.9 < orders_of(errors, floor=1e-14)[-1] < 2.1
 
 
-@pytest.mark.parametrize("solver", [Broyden(), Broyden("identity"), Anderson(2)], ids=repr)
+@pytest.mark.parametrize("solver", [Broyden(), Broyden("identity")], ids=repr)
 def test_quasi_newton_is_superlinear(solver):
     """Ratios of successive errors go to zero, those of fixed-point iteration stay where they
     are."""
@@ -232,6 +237,6 @@ def test_the_budget_ends_a_trial():
 def test_a_jacobian_free_solver_evaluates_one_for_its_covariance_alone():
     scenario = Scenario(Polynomial(), Gaussian(0.1), GaussianPrior(), 5.0)
     trials = scenario.draw(0, 5)
-    for solver in (FixedPoint(), Broyden("identity"), Anderson()):
+    for solver in (FixedPoint(), Broyden("identity")):
         assert (solver.estimate(scenario.problem, trials.z).jacobians == 1).all()
     assert (Broyden().estimate(scenario.problem, trials.z).jacobians == 2).all()

@@ -4,6 +4,7 @@ in the package."""
 from pathlib import Path
 
 from ipe_bench.measurements.ode.described import packaged
+from ipe_bench_zoo.anderson import Anderson
 from ipe_bench_zoo.es_mda import EsMda
 from ipe_bench_zoo.gnss import Gnss
 from ipe_bench_zoo.iterated_filters import LMIEKF, RecursiveUpdate
@@ -16,6 +17,7 @@ Bock = packaged("bock", Path(__file__).parent / "conf")
 __all__ = [
     "LMIEKF",
     "Accelerometer",
+    "Anderson",
     "Bock",
     "EsMda",
     "Gnss",

@@ -3,7 +3,7 @@
 from collections import Counter
 
 import pytest
-from ipe_bench_zoo import LMIEKF, EsMda, MultipleShooting, RecursiveUpdate
+from ipe_bench_zoo import LMIEKF, Anderson, EsMda, MultipleShooting, RecursiveUpdate
 from ipe_bench_zoo.interval import Interval
 from ipe_bench_zoo.multiple_shooting import Pieces
 from shared.small_models import Bent
@@ -15,7 +15,7 @@ from ipe_bench.trials.scenario import Scenario
 
 
 @pytest.mark.parametrize("scale", [1.0, 100.0])
-@pytest.mark.parametrize("estimator", [EsMda(), LMIEKF(), RecursiveUpdate()], ids=str)
+@pytest.mark.parametrize("estimator", [Anderson(), EsMda(), LMIEKF(), RecursiveUpdate()], ids=str)
 def test_the_cost_of_an_estimator_is_what_it_evaluates(estimator, scale):
     check_cost(
         estimator, Scenario(Gins(readings_per_case=6), Quantization(0.02286), error_scale=scale), 2
