@@ -394,11 +394,10 @@ def estimate(
     linear_lse converged False
     levenberg_marquardt converged True
     """
-    from ipe_bench.baselines import LevenbergMarquardt, LinearLSE
+    from ipe_bench.plugins import standard
     from ipe_bench.plugins.construct import known_parameters
     from ipe_bench.real.estimation import Question
     from ipe_bench.report.page.answer import Answer
-    from ipe_bench.solvers import Auto
 
     model = renewed(model)  # as in `_scenario`
     if isinstance(model, StateModel):
@@ -426,12 +425,7 @@ def estimate(
         prior = scenario.prior
         error_scale = scenario.error_scale
     if estimators is None:
-        # In the order of the command line, whose solvers come before baselines.
-        estimators = {
-            "auto": Auto(),
-            "linear_lse": LinearLSE(),
-            "levenberg_marquardt": LevenbergMarquardt(),
-        }
+        estimators = standard.constructed(standard.OF_ESTIMATE)
     estimators = _labelled(estimators, Estimator)
     stated: dict[str, Any] = {"noise": noise, "prior": prior, "error_scale": error_scale}
     stated |= {"known": known_parameters(parameters or {}), "ignored": tuple(ignore_columns)}
@@ -449,16 +443,13 @@ def _tracked(
     find: str | Sequence[str],
     progress: Shows,
 ) -> LogAnswer:
+    from ipe_bench.plugins import standard
     from ipe_bench.real.logs import LogQuestion
     from ipe_bench.report.page.log import LogAnswer
-    from ipe_bench.states.auto import AutoTracker
-    from ipe_bench.states.trackers import ekf, ukf
 
     if trackers is None:
-        # A search for constants needs a likelihood, which an estimate of the whole path does not
-        # have.
-        best = {} if find else {"auto": AutoTracker()}
-        trackers = {**best, "ekf": ekf(), "ukf": ukf()}
+        choice = standard.THAT_FIND if find else {"tracker": standard.of_run("tracker")}
+        trackers = standard.constructed(choice)
     question = LogQuestion.of(model, readings, _labelled(trackers), ignored, find)
     return LogAnswer.to(question, progress)
 

@@ -11,14 +11,9 @@ from ipe_bench.cli import say_files, show
 from ipe_bench.cli import words as w
 from ipe_bench.cli.keys import of
 from ipe_bench.cli.single import Single, single
+from ipe_bench.plugins import standard
 from ipe_bench.runs.provenance import describe, fingerprint
 from ipe_bench.states.base import StateModel
-
-STANDARD_ESTIMATORS = ("solver=[auto]", "baseline=[linear_lse,levenberg_marquardt]")
-"""Estimators of `estimate`: one that chooses its method itself, and two to compare it with."""
-TRACKERS_THAT_FIND = "tracker=[ekf,ukf]"
-"""Trackers of `find=`: a search needs a likelihood, which an estimate of the whole path does not
-have."""
 
 
 def _described(estimators: Any) -> dict[str, Any]:
@@ -30,10 +25,9 @@ def estimate_command(arguments: Sequence[str]) -> int:
     passes."""
     from ipe_bench.report.page.answer import FILES, NAME, Answer, write_answer
 
-    standard = STANDARD_ESTIMATORS
-    if any(word.startswith("find=") for word in arguments):
-        standard = (*standard, TRACKERS_THAT_FIND)
-    asked = single("estimate", arguments, standard, run=(*of("run", "trials"), w.TRUTH))
+    asked = single(
+        "estimate", arguments, standard_words(arguments), run=(*of("run", "trials"), w.TRUTH)
+    )
     if asked.spec.state_model is not None:
         return _track(asked, asked.spec.state_model)
     question = asked.spec.question(asked.words.keys).checked()
@@ -56,6 +50,13 @@ def estimate_command(arguments: Sequence[str]) -> int:
     show(answer.parts())
     say_files(files)
     return 0 if answer.passes else 1
+
+
+def standard_words(arguments: Sequence[str]) -> list[str]:
+    """Returns the words that choose estimators and trackers where no argument does."""
+    finding = any(word.startswith("find=") for word in arguments)
+    choice = standard.OF_ESTIMATE | (standard.THAT_FIND if finding else {})
+    return [f"{group}=[{','.join(names)}]" for group, names in choice.items()]
 
 
 def _track(asked: Single, model: StateModel) -> int:

@@ -23,8 +23,9 @@ from ipe_bench.cli.parser import parser_of
 from ipe_bench.cli.results import counted, show_report
 from ipe_bench.cli.session import Jobs, complete, jobs_of, session, show, spec_of
 from ipe_bench.cli.single import require_one_kind
-from ipe_bench.cli.spec import STANDARD_FILTERS, Spec
+from ipe_bench.cli.spec import Spec
 from ipe_bench.plugins.discovery import PACKAGES, options
+from ipe_bench.plugins.standard import of_run
 from ipe_bench.report.progress import watching
 from ipe_bench.runs.execution import Serial, end_idle
 from ipe_bench.runs.parts import TRUTH
@@ -173,13 +174,14 @@ def _there_already(jobs: Jobs) -> list[str]:
 
 def _left_out(jobs: Sequence[Spec]) -> list[str]:
     """Names the standard filters that do not suit every job."""
+    standard = of_run("baseline")
     of_constants = [job for job in jobs if job.state_model is None]
-    lacking = [job for job in of_constants if not job.estimators.keys() >= set(STANDARD_FILTERS)]
+    lacking = [job for job in of_constants if not job.estimators.keys() >= set(standard)]
     if not lacking:
         return []
     models = ", ".join(dict.fromkeys(job.measurement.name for job in lacking))
-    filters = " and ".join(STANDARD_FILTERS)
-    return [f"{filters} are left out for {models}: filters need epochs and a prior"]
+    left = [one for one in standard if any(one not in job.estimators for job in lacking)]
+    return [f"{' and '.join(left)} are left out for {models}: filters need epochs and a prior"]
 
 
 def _flags(arguments: Sequence[str]) -> Namespace:

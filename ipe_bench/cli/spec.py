@@ -19,6 +19,7 @@ from ipe_bench.measurements.known import ParameterInfo, informed
 from ipe_bench.noise import ModelNoise, Noise
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.construct import construct, instantiate, known_parameters
+from ipe_bench.plugins.standard import of_run
 from ipe_bench.priors import GaussianPrior, Prior
 from ipe_bench.report.formats import PAGE
 from ipe_bench.report.style import Which, file_formats, which_figures
@@ -43,8 +44,6 @@ PARTS: dict[str, type] = {
 """Keys that hold a component, with its kind."""
 OPTIONAL = ("truth_measurement", "state_model")
 """Keys of components that may be null."""
-STANDARD_FILTERS = ("ekf", "ukf")
-"""Baselines of a plain run that suit only models with epochs and a prior."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,12 +156,13 @@ class Spec(Component):
         return pinned(Scenario(measurement, self.noise, prior, self.error_scale, self.seed, truth))
 
     def suited(self) -> Spec:
-        """Returns the job without the standard filters if its model lacks what they need."""
+        """Returns the job without those of the standard baselines that its model does not suit, as
+        filters need epochs and a prior."""
         if isinstance(self.scenario, StateScenario):
             return self
         problem = self.scenario.problem
         kept = dict(self.estimators)
-        for label in STANDARD_FILTERS:
+        for label in of_run("baseline"):
             if label in kept and kept[label].hindrance(problem):
                 del kept[label]
         if len(kept) == len(self.estimators):

@@ -183,9 +183,9 @@ def chosen(words, standard=()):
 
 
 def test_without_estimators_they_are_those_of_the_command(polynomial):
-    from ipe_bench.cli.estimate import STANDARD_ESTIMATORS
+    from ipe_bench.cli.estimate import standard_words
 
-    command = chosen(["measurement=polynomial"], STANDARD_ESTIMATORS)
+    command = chosen(["measurement=polynomial"], standard_words([]))
     fits = ib.estimate(polynomial.measurement, polynomial.draw(0, 1).z[0], noise=polynomial.noise)
     assert {fit.label: fit.estimator for fit in fits} == command
     assert [fit.label for fit in fits] == [*command]
@@ -193,10 +193,11 @@ def test_without_estimators_they_are_those_of_the_command(polynomial):
 
 @pytest.mark.parametrize("find", [[], ["noise.w"]])
 def test_without_trackers_they_are_those_of_the_command(monkeypatch, find):
-    from ipe_bench.cli.estimate import TRACKERS_THAT_FIND
+    from ipe_bench.cli.estimate import standard_words
     from ipe_bench.real import logs
 
-    command = chosen(["state_model=growth"], [TRACKERS_THAT_FIND] if find else [])
+    words = ["find=noise.w"] if find else []
+    command = chosen(["state_model=growth"], standard_words(words))
     used = {}
 
     def note(log, label, tracker, *_):
