@@ -13,6 +13,7 @@ from ipe_bench.questions.question import NAMES
 from ipe_bench.report.formats import PAGE
 from ipe_bench.report.style import Which, drawn_settings
 from ipe_bench.report.tables.table import Table, texts, words
+from ipe_bench.report.words import counted
 from ipe_bench.runs.parts import TRUTH
 from ipe_bench.runs.results import CellState, Results
 from ipe_bench.runs.store import require_results
@@ -149,10 +150,6 @@ def _print_table(rows: Sequence[Mapping[str, Any]], collection: Any) -> None:
     wording = Wording.of(collection)
     out.print(terminal(summary_tables(rows, totals, out.width, wording), out.width))
     sys.stdout.flush()
-
-
-def counted(number: int, noun: str) -> str:
-    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def _paper(folders: Sequence[Path], keys: Mapping[str, Any]) -> int:

@@ -20,13 +20,14 @@ from ipe_bench.cli import say
 from ipe_bench.cli import words as w
 from ipe_bench.cli.keys import OF_FILES, SETTING_NOTHING
 from ipe_bench.cli.parser import parser_of
-from ipe_bench.cli.results import counted, show_report
+from ipe_bench.cli.results import show_report
 from ipe_bench.cli.session import Jobs, complete, jobs_of, session, show, spec_of
 from ipe_bench.cli.single import require_one_kind
 from ipe_bench.cli.spec import Spec
 from ipe_bench.plugins.discovery import PACKAGES, options
 from ipe_bench.plugins.standard import of_run
 from ipe_bench.report.progress import watching
+from ipe_bench.report.words import counted
 from ipe_bench.runs.execution import Serial, end_idle
 from ipe_bench.runs.parts import TRUTH
 from ipe_bench.runs.results import Results

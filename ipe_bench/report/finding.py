@@ -17,9 +17,8 @@ from typing import Any
 from ipe_bench.report.words import percent, value_text
 from ipe_bench.statistics.intervals import LEVEL, clopper_pearson
 from ipe_bench.statistics.verdicts import OVERCONFIDENT
+from ipe_bench.trials.thresholds import HELD
 
-HELD = 0.9
-"""Share of all trials that succeed where an estimator holds."""
 MOST_NAMES = 3
 """Names in a list of a title; more are counted."""
 MOST_PLACES = 2

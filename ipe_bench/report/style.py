@@ -49,30 +49,40 @@ _LEGIBLE = 0.18
 """Largest relative luminance of letters on white."""
 _BRIGHT = 0.22
 """Least relative luminance of letters on a dark page."""
-DARK = "#15181c"
+_MIDDLE = 0.179
+"""Relative luminance that has the same contrast with black and with white."""
+DARK = "#0d1117"
 """What white becomes on a page that is dark."""
-LIGHT = "#e4e7ea"
+LIGHT = "#e6edf3"
 """What black becomes on a page that is dark."""
 
 RAMP = (
-    *("#dcf0fa", "#bfe0f2", "#ffcf9f", "#fdbf85", "#fbab66"),
-    *("#f59145", "#e67a2e", "#ad4a0a", "#983d06", "#842f04"),
+    *("#f7f1e8", "#f6f1e8", "#f3efe8", "#f0eee8", "#ebece9", "#e6eae9", "#e1e8e9"),
+    *("#dbe5ea", "#d5e3ea", "#c6dbe5", "#b8d3e1", "#a9cadc", "#99c2d7", "#87b6d0"),
+    *("#74aac8", "#5f9bbe", "#498db5", "#387ea8", "#296d97", "#1a5b86", "#0b4a75"),
 )
-"""Colours of success from all to none: blue where an estimator holds, then orange to brown.
-Luminance falls with success alone, for grey print."""
+"""Colours of what is good, from none of it to all: the better, the darker, also in grey print."""
 DARK_RAMP = (
-    *("#173e55", "#205172", "#70501d", "#7a541c", "#885a1a"),
-    *("#cf7526", "#dd832f", "#ea913c", "#f5a04b", "#ffb062"),
+    *("#211a14", "#211b15", "#211d19", "#211f1d", "#212222", "#212629", "#212a2f"),
+    *("#212e36", "#21323d", "#233a48", "#254254", "#274a60", "#2a526c", "#2e5e7c"),
+    *("#356c8d", "#3e7ca1", "#468bb5", "#569dc8", "#70b2da", "#8bc7ed", "#a5dcff"),
 )
-"""The same on a dark page, where luminance rises as success falls."""
+"""The same on a dark page: the better, the brighter."""
+_ALL = 0.995
+"""Goodness from which on a colour is that of all."""
 
 
-_LIGHT_LETTERS = {*RAMP[7:], *DARK_RAMP[:5]}
+def step(goodness: float) -> int:
+    """Returns the place in `RAMP` of how good a number is, from 0 to 1."""
+    last = len(RAMP) - 1
+    return last if goodness >= _ALL else min(int(last * goodness), last - 1)
 
 
 def ink(ground: str) -> str:
-    """Returns the colour of letters on a colour of success, with a contrast of at least 4.5."""
-    return WHITE if ground in _LIGHT_LETTERS else DARK
+    """Returns black or white, whichever has more contrast with that colour: 4.5 or more on those of
+    success."""
+    red, green, blue = (int(ground[at : at + 2], 16) / 255 for at in (1, 3, 5))
+    return BLACK if _luminance((red, green, blue)) > _MIDDLE else WHITE
 
 
 def which_figures(asked: Any) -> Which:

@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ipe_bench import __version__
-
-if TYPE_CHECKING:
-    pass
+from ipe_bench.trials.thresholds import HELD
 
 CITATION = (
     f"The ipe-bench developers (2026). ipe-bench, version {__version__} [computer program]. Beside"
@@ -39,6 +37,11 @@ def assignments(settings: Mapping[Any, str]) -> str:
     )
 
 
+def counted(number: int, noun: str) -> str:
+    """Words a number of things."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
 def enumerate_few(items: Sequence[str], most: int = 6) -> str:
     """Enumerates 'a, b and 3 others'; a single remaining one is named."""
     if len(items) <= most + 1:
@@ -51,14 +54,29 @@ def public(text: str) -> str:
     return re.sub(r"(?<![^\s='\"\[,(])/(?:[^/\s,'\"\]]+/)+(?=[^/\s])", "…/", text)
 
 
-def percent(share: float) -> str:
-    """Formats a share in per cent; 100 and 0 only if it is all or none."""
+def share_text(share: float) -> str:
+    """Formats a share in per cent to at most a tenth, such as 100, 77.5 or 0.
+
+    Halves go up, and none is rounded to all, to none or to the share from which on an estimator
+    succeeds.
+    """
     if not math.isfinite(share):
         return "-"
-    value = 100 * share
-    if 0 < value < 0.1 or 99.9 < value < 100:
-        return "<0.1 %" if value < 1 else ">99.9 %"
-    return f"{value:.0f} %" if value in (0, 100) else f"{value:.1f} %"
+    if share in (0, 1):
+        return f"{100 * share:.0f}"
+    if not 0.0005 <= share < 0.9995:
+        return "<0.1" if share < 0.5 else ">99.9"
+    # Round-off may leave a half just below itself.
+    tenths = math.floor(1000 * share + 0.5 + 1e-9)
+    if share < HELD:
+        tenths = min(tenths, math.ceil(1000 * HELD) - 1)
+    return f"{tenths / 10:.1f}".removesuffix(".0")
+
+
+def percent(share: float) -> str:
+    """Formats a share in per cent with its sign."""
+    text = share_text(share)
+    return text if text == "-" else f"{text} %"
 
 
 def ends_in_percent(low: float, high: float) -> tuple[str, str]:

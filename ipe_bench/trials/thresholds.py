@@ -1,6 +1,8 @@
 """Where a line is drawn between trials: inside the gate or not, the same root or another, a fit or
 a misfit; and how many trials are enough."""
 
+HELD = 0.9
+"""Share of all trials that succeed where an estimator does."""
 GATE = 1e-6
 """A success lies inside the ellipsoid that all but this share of efficient estimates lie in."""
 SAME_ROOT = 1e-3

@@ -598,7 +598,7 @@ def with_collection() -> View:
     )
 
 
-def test_digits_of_each_problem_are_in_its_cell_blue_from_four_on_the_hardest_first():
+def test_digits_of_each_problem_are_in_its_cell_dark_from_four_on_the_hardest_first():
     digits = {
         ("easy", "good"): 10.9,
         ("easy", "bad"): 4.2,
@@ -616,7 +616,7 @@ def test_digits_of_each_problem_are_in_its_cell_blue_from_four_on_the_hardest_fi
     assert [t.get_text() for t in ax.get_xticklabels()] == ["good", "bad"]
     assert [t.get_text() for t in ax.texts] == ["4", "0", "10", "4"]
     fills = [to_hex(color) for color in ax.collections[0].get_facecolors()]
-    assert [fill in RAMP[:2] for fill in fills] == [True, False, True, True]
+    assert [fill in RAMP[18:] for fill in fills] == [True, False, True, True]
     assert "good solves 100 %" in drawing.caption
 
 

@@ -60,13 +60,13 @@ def test_a_share_seen_above_the_level_is_no_proof():
 
 def test_who_holds_longest_is_named_with_the_scale_up_to_which():
     assert found(sweep(a=(200, 198, 0), b=(200, 100, 0))) == (
-        "Only a holds up to error scale 10 (99.0 % of 200 trials)"
+        "Only a holds up to error scale 10 (99 % of 200 trials)"
     )
 
 
 def test_all_hold_and_more_than_three_are_counted():
     assert found(sweep(a=(200,) * 3, b=(196,) * 3)) == (
-        "a and b hold up to error scale 100 (98.0 to 100 % of 200 trials)"
+        "a and b hold up to error scale 100 (98 to 100 % of 200 trials)"
     )
     four = dict.fromkeys("abcd", (200, 200, 200))
     assert (
@@ -84,11 +84,11 @@ def test_one_scale_and_one_estimator():
 
 def test_nobody_holds_or_the_trials_are_too_few_to_tell():
     assert found(sweep(a=(100, 0, 0), b=(20, 0, 0))) == (
-        "No estimator holds, even at error scale 1; a and b succeed in 10.0 to 50.0 % of 200"
+        "No estimator holds, even at error scale 1; a and b succeed in 10 to 50 % of 200"
         " trials at error scale 1"
     )
     assert found(sweep(trials=20, a=(20, 19, 2), b=(20, 20, 3))) == (
-        "Too few trials to tell who holds; b and a succeed in 95.0 to 100 % of 20 trials at error"
+        "Too few trials to tell who holds; b and a succeed in 95 to 100 % of 20 trials at error"
         " scale 10"
     )
 
@@ -138,7 +138,7 @@ def test_settings_are_counted_and_have_no_order():
         "Only a holds in 2 of 3 settings, all but truth=0 (100 % of 200 trials)"
     )
     assert found(settings(a=(200, 200), b=(200, 196))) == (
-        "a and b hold in both settings (98.0 to 100 % of 200 trials)"
+        "a and b hold in both settings (98 to 100 % of 200 trials)"
     )
     assert found(settings(a=(178, 200), b=(0, 0))) == (
         "Only a holds in at least 1 of 2 settings (100 % of 200 trials)"

@@ -9,9 +9,10 @@ import pytest
 from report.test_finding import row
 
 from ipe_bench.report.finding import Finding
-from ipe_bench.report.style import DARK, DARK_RAMP, LIGHT, RAMP, WHITE, ink
-from ipe_bench.report.tables.matrix import Tile, matrices, points, step
+from ipe_bench.report.style import BLACK, DARK_RAMP, LIGHT, RAMP, WHITE, ink, step
+from ipe_bench.report.tables.matrix import Tile, matrices
 from ipe_bench.report.tables.table import html, latex, markdown, plain_text
+from ipe_bench.report.words import percent, share_text
 from ipe_bench.statistics.intervals import clopper_pearson
 
 SEEN = {
@@ -52,27 +53,28 @@ def test_every_number_is_legible_and_luminance_follows_success_alone(ramp, sign)
     assert shades == sorted(set(shades))
     shares = [k / 1000 for k in range(1001)]
     places = [step(share) for share in shares]
-    assert places == sorted(places, reverse=True)
+    assert places == sorted(places)
     assert {step(share) for share in shares} == set(range(len(ramp)))
 
 
 def test_no_cell_stands_out_more_than_the_winners_name():
-    assert min(map(brightness, RAMP)) >= brightness("#1c1e21")
+    assert min(map(brightness, RAMP)) >= brightness("#16191d")
     assert max(map(brightness, DARK_RAMP)) <= brightness(LIGHT)
-    assert {ink(color) for color in (*RAMP, *DARK_RAMP)} == {DARK, WHITE}
+    assert {ink(color) for color in (*RAMP, *DARK_RAMP)} == {BLACK, WHITE}
 
 
 @pytest.mark.parametrize(
     ("share", "text"),
     [
         *((1.0, "100"), (0.0, "0"), (0.9999, ">99.9"), (0.0001, "<0.1"), (0.995, "99.5")),
-        *((0.98, "98"), (0.9, "90"), (0.8999, "89.9"), (0.896, "89.6"), (0.775, "78")),
-        *((0.035, "3.5"), (0.0996, "10"), (0.899999, "89.9")),
+        *((0.98, "98"), (0.9, "90"), (0.8999, "89.9"), (0.896, "89.6"), (0.775, "77.5")),
+        *((0.035, "3.5"), (0.0996, "10"), (0.899999, "89.9"), (0.9994, "99.9")),
+        *((0.765, "76.5"), (0.515, "51.5"), (0.0005, "0.1"), (0.0125, "1.3"), (0.1225, "12.3")),
     ],
 )
 def test_a_number_is_never_rounded_across_a_limit(share, text):
-    assert points(share) == text
-    assert (step(share) <= 1) == (share >= 0.9)
+    assert share_text(share) == text
+    assert percent(share) == f"{text} %"
 
 
 def test_the_sign_is_of_the_verdict():
@@ -124,7 +126,7 @@ def test_a_cell_says_all_that_is_known_of_it():
     ((_, tile, _),) = matrix.rows
     assert isinstance(tile, Tile)
     assert tile.says == (
-        "ekf, error scale 0.1: success 34.0 % of 200 trials (95 %: 27 to 41); error 0.98 × the"
+        "ekf, error scale 0.1: success 34 % of 200 trials (95 %: 27 to 41); error 0.98 × the"
         " bound, 95 % of trials below 1.35; NEES 1.04: covariance too small; cost 21/30, 2.0 ms"
     )
     assert f'title="{tile.says}"' in html([matrix])
@@ -187,7 +189,7 @@ def test_settings_that_are_swept_have_a_matrix_each():
     assert [matrix.title for matrix in found] == ["noise=0", "noise=1", "noise=2"]
     assert "settings" not in found[-1].notes[-1]
     (first,) = matrices(rows, 8)
-    assert first.notes[-1].endswith("Of 3 settings 2 are in the table alone.")
+    assert first.notes[-1].endswith("Of 3 settings 2 are only in the table.")
     assert [[cell.text for cell in each][2] for m in found for each in m.rows] == [
         "0 ",
         "10 ",

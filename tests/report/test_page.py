@@ -96,22 +96,30 @@ def test_the_page_is_dark_where_the_reader_has_it_so(desktop, page_file):
 def test_the_page_opens_with_the_answer_and_a_link_unfolds_the_rest(browser, page_file):
     browser.go(page_file)
     order = browser.run(
-        "Array.from(document.querySelectorAll('h1, .matrix, #headline, #figure-headline, .about,"
-        " details.part'), e => e.getBoundingClientRect().y)"
+        "['h1', '#figure-headline', '.folds', '.about'].map(s =>"
+        " document.querySelector(s).getBoundingClientRect().y)"
     )
     assert order == sorted(order)
+    # The facts stand beside the matrix, and both end where the title's line does.
+    first, facts, line = browser.run(
+        "['.matrices', '#headline', 'header'].map(s => document.querySelector(s)"
+        ".getBoundingClientRect()).map(b => [b.left, b.right, b.top])"
+    )
+    assert first[0] == line[0]
+    assert facts[1] == line[1]
+    assert facts[2] == first[2] > order[0]
     assert browser.run(
         "Array.from(document.querySelectorAll('details.part'), d => d.open).every(o => !o)"
     )
-    browser.run("document.querySelector('nav a[href=\"#tables\"]').click()")
-    browser.run("unfold()")
+    browser.run("location.hash = '#tables'; unfold()")
     assert browser.run("document.querySelector('#tables').closest('details').open")
     assert not browser.run("document.querySelector('#definitions').closest('details').open")
 
 
 CELL = "document.querySelector('.matrix').rows[2].cells[1]"
 SHOWN = (
-    f"Array.from({CELL}.querySelectorAll('span')).filter(s => s.offsetWidth).map(s => s.className)"
+    f"Array.from({CELL}.querySelectorAll('span')).filter(s => s.offsetWidth)"
+    ".map(s => s.classList[0])"
 )
 
 
@@ -121,7 +129,7 @@ def test_a_choice_shows_another_number_in_every_cell_without_a_script(browser, p
         browser.go(page_file)
         assert browser.run(SHOWN) == ["success"]
         assert re.match(r"\S+, error scale .* success .* trials", browser.run(f"{CELL}.title"))
-        for view in ("error", "nees", "cost", "time"):
+        for view in ("error", "nees", "cost"):
             browser.run(f"document.querySelector('.views [value={view}]').click()")
             assert browser.run(SHOWN) == [view]
     finally:
@@ -195,6 +203,12 @@ def test_a_phone_never_scrolls_the_page_sideways(browser, page_file):
     browser.go(page_file, 390, 844, phone=True)
     assert browser.run("document.documentElement.scrollWidth") <= 390
     assert browser.run("document.body.scrollWidth") <= 390
+    # Every letter of the first screen is at least 10 px high, also the sign of a covariance.
+    sizes = browser.run(
+        "Array.from(document.querySelectorAll('header *, .first *')).filter(e => e.offsetWidth)"
+        ".map(e => parseFloat(getComputedStyle(e).fontSize))"
+    )
+    assert min(sizes) >= 10
     # The panels of a figure stand below each other.
     tops = browser.run(
         "Array.from(document.querySelectorAll('#figure-headline .panels svg'), s =>"
@@ -226,7 +240,7 @@ def test_matrices_stand_side_by_side_and_below_each_other_on_a_phone(browser, tm
     browser.go(page, 390, 844, phone=True)
     assert len(browser.run(lefts)) == 5
     assert len(set(browser.run(lefts))) == 1
-    assert browser.run("document.querySelectorAll('p.files a').length") == 5
+    assert browser.run("document.querySelectorAll('footer a').length") == 5
     assert browser.run("document.documentElement.scrollWidth") <= 390
 
 

@@ -105,7 +105,8 @@ def test_what_is_written_is_whole_and_the_page_stands_alone(result):
     )
     shown = shown.replace("<wbr>", "")
     finding, matrix, *sentences = headline(analysis)
-    assert all(sentence in shown for sentence in (finding, *sentences, *about(analysis)))
+    told = [getattr(sentence, "text", sentence) for sentence in sentences]
+    assert all(sentence in shown for sentence in (finding, *told, *about(analysis)))
     assert f'id="table-{matrix.name}"' in shown
 
 

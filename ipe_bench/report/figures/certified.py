@@ -19,8 +19,8 @@ from ipe_bench.statistics.certified import certified_table, published_table
 
 SOLVED = 4
 """Digits from which on a problem is solved."""
-_STEPS = {0: RAMP[9], 1: RAMP[7], 2: RAMP[3], 3: RAMP[2], SOLVED: RAMP[1], 8: RAMP[0]}
-"""Colours from so many digits on: blue where a problem is solved."""
+_STEPS = {0: RAMP[0], 1: RAMP[4], 2: RAMP[8], 3: RAMP[11], SOLVED: RAMP[18], 8: RAMP[20]}
+"""Colours from so many digits on: dark where a problem is solved."""
 
 
 def draw_digits(view: View) -> Iterator[Drawing]:
@@ -49,7 +49,7 @@ def draw_digits(view: View) -> Iterator[Drawing]:
         fig,
         "digits",
         "Correct digits of certified parameters, of 11",
-        f"Of the parameter with fewest; blue: {SOLVED} or more, solved. Hardest problems first,"
+        f"Of the parameter with fewest; dark: {SOLVED} or more, solved. Hardest problems first,"
         f" best estimators left: {best} solves {percent(float(solved.mean()))}.",
     )
 

@@ -7,11 +7,11 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from ipe_bench.report.page.headline import about, headline, success
+from ipe_bench.report.page.headline import about, headline, success, task
 from ipe_bench.report.page.writer import Page, digests
 from ipe_bench.report.tables.matrix import MATRIX, Matrix
 from ipe_bench.report.tables.table import Part, Strong, Table, environment, words
-from ipe_bench.report.words import public
+from ipe_bench.report.words import counted, public
 from ipe_bench.runs.parts import TRUTH
 from ipe_bench.statistics.comparisons import TIE
 from ipe_bench.statistics.records import SCORES, STATISTICS
@@ -69,7 +69,8 @@ def render_page(
         [*pictures[:1], *opened],
         sections,
         folder="figures/",
-        facts=[*named, *_facts(collection)],
+        facts=[*named, *_asked(analysis)],
+        made=_facts(collection),
         lead=success(analysis),
         commands=commands[:MOST_COMMANDS],
         sources=digests(collection.directories),
@@ -78,6 +79,21 @@ def render_page(
         problems=[*collection.problems, *collection.stale],
     )
     return page.html()
+
+
+def _asked(analysis: Analysis) -> list[str]:
+    """States how many estimators, error scales and trials there are, and what is estimated from
+    what."""
+    totals = analysis.totals
+    numbers = []
+    for column, noun in (("estimator", "estimator"), ("error_scale", "error scale")):
+        if column in totals and len(totals):
+            numbers.append(counted(totals[column].nunique(), noun))
+    trials = sorted(set(totals["trials"])) if len(totals) else []
+    if trials:
+        each = " to ".join(f"{end:,}" for end in dict.fromkeys((trials[0], trials[-1])))
+        numbers.append(f"{each} trials each")
+    return [*numbers, *filter(None, [task(analysis.collection.groups)])]
 
 
 def _facts(collection: Collection) -> list[str]:
@@ -89,7 +105,7 @@ def _facts(collection: Collection) -> list[str]:
     asked = [cell for cell in expected if cell.names["estimator"] != TRUTH]
     complete = sum(cell.complete for cell in asked)
     if asked:
-        facts.append(f"{complete} of {len(asked)} results (an estimator in a scenario) complete")
+        facts.append(f"{complete} of {len(asked)} results complete")
     return facts
 
 
@@ -105,7 +121,7 @@ def _provenance(runs: Sequence[Mapping[str, Any]], older: int) -> list[str]:
     entry: Any = environment().get_template("parts.html.j2").module
     shown = [entry.run(run) for run in runs] or ["No record of a run is stored here."]
     if older:
-        shown.append(f"{older} older commands have their records in runs/.")
+        shown.append(f"{older} older commands: see runs/.")
     return shown
 
 

@@ -103,6 +103,8 @@ class Page:
     """Where the figures' files are, seen from the page."""
     drawn: Sequence[Path] = ()
     """Files of the matrix, which the page itself shows as a table."""
+    made: Sequence[str] = ()
+    """When it was made, and from how much."""
 
     def html(self) -> str:
         """Renders it, with the style, the script and the citation of every page."""

@@ -5,20 +5,31 @@ judged."""
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
-from ipe_bench.report.finding import HELD, MEANING, Finding, Row, Standing, setting_words
-from ipe_bench.report.style import RAMP, ink
-from ipe_bench.report.tables.table import Cell, Column, Part, Strong, Table, words
+from ipe_bench.report.finding import HOLDS, MEANING, Finding, Row, Standing, setting_words
+from ipe_bench.report.style import RAMP, ink, step
+from ipe_bench.report.tables.table import (
+    NOT_JUDGED,
+    SIGNS,
+    TOO_SMALL,
+    Cell,
+    Column,
+    Part,
+    Strong,
+    Table,
+    words,
+)
 from ipe_bench.report.words import (
     brief,
     cost,
     duration,
     ends_in_percent,
     percent,
+    share_text,
     value_text,
 )
 from ipe_bench.statistics.verdicts import (
@@ -32,15 +43,14 @@ from ipe_bench.statistics.verdicts import (
 MATRIX = "matrix"
 """Begins the names of files of a matrix."""
 VIEWS = {
-    "success": "success, %",
-    "error": "error, median",
-    "nees": "NEES, median",
-    "cost": "cost, simulations",
-    "time": "time",
+    "success": ("success", "Successful trials, %"),
+    "error": ("error", "Median error, relative to"),
+    "nees": ("covariance", "NEES, median: 1 is right"),
+    "cost": ("cost", "Simulations of a trial, median"),
 }
-"""What the cells of a page show, one view at a time; the colour is of success in each."""
-TOO_SMALL = "▲"
-NOT_JUDGED = "?"
+"""What the cells of a page show, one view at a time: its name, and what number and colour are."""
+_FAR = 10.0
+"""Factor by which an error or NEES is off that has the colour of no success."""
 MOST_MATRICES = 6
 """Settings that have a matrix each; the table has the others."""
 _BESIDE = 5
@@ -52,8 +62,13 @@ _COVARIANCE = {
     TOO_CAUTIOUS: "covariance too large",
     CONSISTENT: "no evidence against the covariance",
 }
-_WELL = 0.995
-"""Share of success that is well: the lightest colour."""
+
+
+class Shown(NamedTuple):
+    """A number of a tile, and the place of its colour in `RAMP`."""
+
+    text: str
+    step: int
 
 
 @dataclass(frozen=True)
@@ -65,7 +80,9 @@ class Tile(Cell):
     sign: str = ""
     step: int | None = None
     """Place of its colour in `RAMP`; None where there is no result."""
-    views: dict[str, str] = field(default_factory=dict)
+    fails: bool = False
+    """Whether it is not shown that the estimator succeeds here."""
+    views: dict[str, Shown] = field(default_factory=dict)
     says: str = ""
     """All that is known of it, for those who point at it."""
 
@@ -73,7 +90,8 @@ class Tile(Cell):
     def style(self) -> str:
         if self.step is None:
             return ""
-        return f"{ink(RAMP[self.step])} on {RAMP[self.step]}"
+        line = "underline " if self.fails else ""
+        return f"{line}{ink(RAMP[self.step])} on {RAMP[self.step]}"
 
 
 @dataclass(frozen=True)
@@ -84,8 +102,27 @@ class Matrix(Table):
     """What the columns are."""
     captions: Sequence[str] = ()
     """What its figure says of letters, numbers and signs."""
+    letters: Sequence[str] = ()
+    """What letters in place of long titles stand for."""
+    ends: Mapping[str, tuple[str, str, str]] = field(default_factory=dict)
+    """The worst, a middle and the best number of each view."""
+    moving: bool = False
 
     views: ClassVar = VIEWS
+
+    @property
+    def reference(self) -> str:
+        return "the linearised filter" if self.moving else "the Cramér-Rao bound"
+
+    @property
+    def signs(self) -> set[str]:
+        """The signs of its tiles."""
+        return {tile.sign for tile in self.tiles}
+
+    @property
+    def tiles(self) -> list[Tile]:
+        cells = [cell for column in self.columns for cell in column.cells]
+        return [cell for cell in cells if isinstance(cell, Tile)]
 
     @property
     def on_paper(self) -> list[str]:
@@ -127,22 +164,24 @@ def matrices(rows: Iterable[Row], lines: float = math.inf) -> list[Matrix]:
     settings = list(dict.fromkeys(setting for setting, _ in finding.places))
     if len(finding.places) == 1:
         return []
+    costs = _costs(listed)
     if len(settings) in (1, len(finding.places)):
-        return [_matrix(finding, MATRIX, "")]
+        return [_matrix(finding, MATRIX, "", costs)]
     found = []
     fitting = lines / (len(finding.standings) + _BESIDE)
     most = min(MOST_MATRICES, max(1, fitting))
     for number, setting in enumerate(settings[: int(most)], 1):
         own = Finding.of(list(_rows_of(finding, setting)))
-        found.append(_matrix(own, f"{MATRIX}_{number}", setting_words(setting)))
+        found.append(_matrix(own, f"{MATRIX}_{number}", setting_words(setting), costs))
     # One legend below the last, of the signs of all.
     columns = [column for matrix in found for column in matrix.columns]
     legend = _legend(columns)
     further = len(settings) - len(found)
+    left_out = []
     if further:
-        legend += f" Of {len(settings)} settings {further} are in the table alone."
+        left_out = [f"Of {len(settings)} settings {further} are only in the table."]
     found = [replace(matrix, notes=[]) for matrix in found]
-    found[-1] = replace(found[-1], notes=[legend])
+    found[-1] = replace(found[-1], notes=[legend, *left_out], letters=left_out)
     return found
 
 
@@ -153,7 +192,14 @@ def _rows_of(finding: Finding, setting: str) -> Iterator[Row]:
                 yield row
 
 
-def _matrix(finding: Finding, name: str, title: str) -> Matrix:
+def _costs(rows: Sequence[Row]) -> tuple[float, float]:
+    """Returns the least and the largest cost."""
+    costs = [max(float(row["simulations_median"]), 1.0) for row in rows]
+    known = [cost for cost in costs if math.isfinite(cost)]
+    return min(known, default=1.0), max(known, default=1.0)
+
+
+def _matrix(finding: Finding, name: str, title: str, costs: tuple[float, float]) -> Matrix:
     rows = [row for one in finding.standings for row in one.rows if row]
     moving = {row["noise"] for row in rows} == {"model"}
     names = [one.label for one in finding.standings]
@@ -161,12 +207,28 @@ def _matrix(finding: Finding, name: str, title: str) -> Matrix:
     columns = [words(f"{over} →", names, finding.leading)]
     heads, keys = _heads(finding, over)
     for at, head in enumerate(heads):
-        cells = [_tile(one, at, finding, moving) for one in finding.standings]
+        cells = [_tile(one, at, finding, moving, costs) for one in finding.standings]
         columns.append(Column(head, cells))
-    notes = [*keys, _legend(columns)]
-    captions = (*keys, _signs(columns))
+    low, high = costs
+    off = (f"{_FAR:g} or more", f"{math.sqrt(_FAR):.0f}", "1")
+    ends = {
+        "success": ("0", "50", "100 %"),
+        "error": off,
+        "nees": off,
+        "cost": (brief(high), brief(float(f"{math.sqrt(low * high):.2g}")), brief(low)),
+    }
     return Matrix(
-        name, title, "", columns, notes=notes, whole="summary.csv", over=over, captions=captions
+        name,
+        title,
+        "",
+        columns,
+        notes=[*keys, _legend(columns)],
+        whole="summary.csv",
+        over=over,
+        captions=(*keys, _signs(columns)),
+        letters=keys,
+        ends=ends,
+        moving=moving,
     )
 
 
@@ -199,44 +261,48 @@ def _letter(at: int) -> str:
 
 
 def _legend(columns: Sequence[Column]) -> str:
-    is_bold = any(cell.best for column in columns for cell in column.cells)
-    bold = " Bold: no other significantly holds longer, or in more settings." if is_bold else ""
-    return f"{_signs(columns)}{bold} {MEANING}"
+    cells = [cell for column in columns for cell in column.cells]
+    told = _signs(columns)
+    if any(isinstance(cell, Tile) and cell.fails for cell in cells):
+        told += " Underlined: not shown to succeed."
+    if any(cell.best for cell in cells):
+        told += " Bold: best, or tied for best."
+    return f"{told} {MEANING}"
 
 
 def _signs(columns: Sequence[Column]) -> str:
     """Explains numbers, colours and the signs that are there."""
     signs = {cell.sign for column in columns for cell in column.cells if isinstance(cell, Tile)}
-    told = f"Number and colour: success in % of all trials, blue from {100 * HELD:.0f} % on."
-    if TOO_SMALL in signs:
-        told += f" {TOO_SMALL} The reported covariance is too small."
-    if NOT_JUDGED in signs:
-        told += f" {NOT_JUDGED} Not judged: too few trials, or none reported."
-    return told
+    told = [f"{VIEWS['success'][1]} (darker is better)."]
+    told += [f"{sign} {words}." for sign, words in SIGNS.items() if sign in signs]
+    return " ".join(told)
 
 
-def _tile(one: Standing, at: int, finding: Finding, moving: bool) -> Tile:
+def _tile(
+    one: Standing, at: int, finding: Finding, moving: bool, costs: tuple[float, float]
+) -> Tile:
     row = one.rows[at]
     if row is None:
         return Tile("–", says=f"{one.label}: no result")
     verdict = row["verdict"]
     sign = TOO_SMALL if verdict == OVERCONFIDENT else ""
     sign = NOT_JUDGED if verdict in (UNDECIDED, NO_VERDICT) else sign
-    number = points(row["success"])
+    number = share_text(row["success"])
+    fails = one.judged[at] != HOLDS
     # A blank in place of a sign keeps numbers below each other.
     text = f"{number}{sign or ' '}"
+    paid = row["simulations_median"]
     views = {
-        "success": number,
-        "error": _brief(row["error_median"]),
-        "nees": _brief(row["nees_median"]),
-        "cost": _brief(row["simulations_median"]),
-        "time": duration(row["time_mean_s"], 2),
+        "success": Shown(number, step(row["success"])),
+        "error": Shown(_brief(row["error_median"]), step(_nearness(row["error_median"]))),
+        "nees": Shown(_brief(row["nees_median"]), step(_nearness(row["nees_median"]))),
+        "cost": Shown(_brief(paid), step(_cheapness(paid, *costs))),
     }
     setting, scale = finding.places[at]
     where = f"error scale {value_text(scale)}"
     where = where if finding.ascending else f"{where}, {setting}"
     says = f"{one.label}, {where}: {_says(row, verdict, moving)}"
-    return Tile(text, None, False, number, sign, step(row["success"]), views, says)
+    return Tile(text, None, False, number, sign, views["success"].step, fails, views, says)
 
 
 def _says(row: Row, verdict: str, moving: bool) -> str:
@@ -255,30 +321,18 @@ def _says(row: Row, verdict: str, moving: bool) -> str:
     return "; ".join(told)
 
 
-def points(share: float) -> str:
-    """Formats a share in per cent in at most five letters; it is never rounded to all, none or the
-    level that holds."""
-    value = 100 * share
-    if value in (0, 100):
-        return f"{value:.0f}"
-    if value > 99.95 or value < 0.05:
-        return ">99.9" if value > 50 else "<0.1"
-    if 9.95 <= value < 89.5 or 100 * HELD <= value < 99:
-        return f"{value:.0f}"
-    if value < 100 * HELD:
-        value = min(value, 100 * HELD - 0.1)
-    return f"{value:.1f}"
+def _nearness(ratio: float) -> float:
+    """Returns how near a ratio is to 1: 1 there, and 0 from ten times or a tenth on."""
+    if not 0 < ratio < math.inf:
+        return 0.0
+    return max(0.0, 1 - abs(math.log(ratio, _FAR)))
 
 
-def step(share: float) -> int:
-    """Returns the place of a share of success in the colours: two from the level that holds on, the
-    others below."""
-    if share >= _WELL:
-        return 0
-    if share >= HELD:
-        return 1
-    above = int(share / HELD * (len(RAMP) - 2))
-    return len(RAMP) - 1 - above
+def _cheapness(cost: float, low: float, high: float) -> float:
+    """Returns where a cost lies between the largest, 0, and the least, 1, by its order."""
+    if not cost < math.inf:
+        return 0.0
+    return 1.0 if high == low else math.log(high / max(cost, low)) / math.log(high / low)
 
 
 def _brief(value: Any) -> str:

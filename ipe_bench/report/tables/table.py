@@ -42,6 +42,12 @@ _PADDING = 2
 """Blanks between two columns of a terminal."""
 
 
+TOO_SMALL = "▲"
+NOT_JUDGED = "?"
+SIGNS = {TOO_SMALL: "covariance too small", NOT_JUDGED: "covariance not judged"}
+"""Signs of a reported covariance."""
+
+
 @dataclass(frozen=True)
 class Cell:
     """One cell: its text, the key by which a column is sorted, and whether it is set in bold."""
@@ -67,6 +73,19 @@ class Column:
     @property
     def has_content(self) -> bool:
         return any(cell.text for cell in self.cells)
+
+
+class Fact(str):
+    """A sentence behind a label, which a page shows apart."""
+
+    def __new__(cls, label: str, text: str) -> Fact:
+        one = super().__new__(cls, f"{label}: {text}")
+        one.label = label
+        one.text = f"{text[:1].upper()}{text[1:]}"
+        return one
+
+    label: str
+    text: str
 
 
 class Strong(str):
@@ -356,6 +375,7 @@ def environment() -> Environment:
     made.filters["soft"] = soft
     made.tests["strong"] = lambda part: isinstance(part, Strong)
     made.globals["MOST_ROWS"] = MOST_ROWS
+    made.globals["SIGNS"] = SIGNS
     made.globals["ramps"] = [inked(RAMP), inked(DARK_RAMP)]
     return made
 

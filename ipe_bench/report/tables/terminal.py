@@ -30,6 +30,7 @@ from ipe_bench.report.words import (
     p_value,
     percent,
     scientific,
+    share_text,
     short,
     value_text,
 )
@@ -245,15 +246,11 @@ def overview_columns(
 
 def _success(row: Mapping[str, Any]) -> str:
     ends = ends_in_percent(row["success_low"], row["success_high"])
-    return f"{_points(row['success'])} ({'-'.join(ends)})"
+    return f"{share_text(row['success'])} ({'-'.join(ends)})"
 
 
 def _failed(row: Mapping[str, Any]) -> str:
-    return f"{_points(row['failed_known'])} / {_points(row['failed_silent'])}"
-
-
-def _points(share: float) -> str:
-    return percent(share).removesuffix(" %")
+    return f"{share_text(row['failed_known'])} / {share_text(row['failed_silent'])}"
 
 
 def _efficiency(row: Mapping[str, Any]) -> str:
