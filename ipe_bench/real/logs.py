@@ -378,8 +378,11 @@ def _second(log: Log, tracks: Tracks) -> list[str]:
     k, i = np.unravel_index(np.argmax(far / size), far.shape)
     state = log.model.states[int(i)]
     distance = f"{far[k, i] * state.size:.4g} {state.unit}".rstrip()
+    share = f"{tracks.other_p[0]:.2g}"
+    if tracks.other_p[0] > 0.5:
+        share += ", likelier than this one"
     return [
-        f"AMBIGUOUS: a second path is right with a probability of {tracks.other_p[0]:.2g}; in it"
+        f"AMBIGUOUS: a second path is right with a probability of {share}; in it"
         f" {state.name} differs by {distance} at epoch {k + 1}, which the deviations count"
     ]
 

@@ -13,7 +13,7 @@ from ipe_bench.basics.batches import put, take
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
 from ipe_bench.states.base import StateModel
-from ipe_bench.states.damped import Descent, LevenbergMarquardtSmoother, reported
+from ipe_bench.states.damped import Descent, LevenbergMarquardtSmoother
 from ipe_bench.states.linearisation import Taylor, Unscented
 from ipe_bench.states.mirrored import in_first_turn, mirrored, ordered, with_second
 from ipe_bench.states.smoothers import smoothed
@@ -83,14 +83,14 @@ class AutoTracker(Tracker):
         # The path of an affine model has no second one beside it.
         rows = np.flatnonzero(stage >= DAMPED)
         if not rows.size:
-            return replace(with_second(density, reported(density, paths), paths), stage=stage)
+            return replace(with_second(density, paths, paths), stage=stage)
         found = take(paths, rows)
         found = in_first_turn(density.subset(rows), found)
         mirror = mirrored(self.descent, density.subset(rows), found)
         found, second, better = ordered(found, mirror)
         stage[rows[better]] = MIRRORED
         paths = put(paths, rows, found)
-        tracks = with_second(density, reported(density, paths), put(paths, rows, second))
+        tracks = with_second(density, paths, put(paths, rows, second))
         return replace(tracks, stage=stage)
 
     def _likelier(

@@ -140,7 +140,7 @@ class LevenbergMarquardtSmoother(Tracker):
             Descent.of(density, filtered(model, z, rule)) for rule in (Taylor(), Unscented())
         )
         paths = self.descended(density, first.improved(other, np.arange(len(z))))
-        return reported(density, self.restarted(density, paths)[0])
+        return reported(density, self.restarted(density, paths)[0])[0]
 
     def restarted(self, density: PathDensity, paths: Descent) -> tuple[Descent, NDArray[np.int64]]:
         """Begins improbable paths again in rounds of draws, until they are probable or were found
@@ -306,13 +306,15 @@ def smoothed_path(tracks: Tracks) -> Array:
     return np.concatenate([start[:, None], after], axis=1)
 
 
-def reported(density: PathDensity, paths: Descent) -> Tracks:
-    """Returns the tracks of the paths, with covariances that the cost itself widens."""
+def reported(density: PathDensity, paths: Descent) -> tuple[Tracks, Array]:
+    """Returns the tracks of the paths, with covariances that the cost itself widens, and the
+    logarithm of the volume (trials,) about each: of its probability over its density."""
     model = density.model
     at = density.settled_exactly(paths.at)
     out = Tracks.empty(model, len(at.x))
     tangents = density.tangents(at)
-    P, calls = widened(density, at, tangents)
+    around = widened(density, at, tangents)
+    P = around.P
     P[density.beyond_digits(tangents, at.x)] = np.nan
     out.start = Normal(at.x[:, 0], P[:, 0])
     out.mean = at.x[:, 1:]
@@ -321,5 +323,5 @@ def reported(density: PathDensity, paths: Descent) -> Tracks:
     out.status = paths.status
     out.iterations = paths.iterations
     of_tangents = Taylor().calls(model.n) * model.evaluations
-    out.calls = paths.calls + at.calls + calls + of_tangents
-    return out
+    out.calls = paths.calls + at.calls + around.calls + of_tangents
+    return out, np.log(around.mass) - density.log_determinant(tangents) / 2

@@ -11,7 +11,7 @@ from ipe_bench.basics.batches import put, take
 from ipe_bench.basics.linalg import Array, Mask
 from ipe_bench.basics.statuses import Status
 from ipe_bench.states.base import Normal
-from ipe_bench.states.damped import ALIKE, Descent, LevenbergMarquardtSmoother
+from ipe_bench.states.damped import ALIKE, Descent, LevenbergMarquardtSmoother, reported
 from ipe_bench.states.linearisation import Taylor
 from ipe_bench.states.trackers import Tracks, filtered
 from ipe_bench.states.whole_paths import PathDensity, Settled
@@ -124,33 +124,43 @@ def _unread(density: PathDensity) -> Settled:
     return replace(at, calls=at.calls + transitions)
 
 
-def with_second(density: PathDensity, tracks: Tracks, other: Descent) -> Tracks:
-    """Counts other paths, which cost no less, in the covariances of tracks.
+def with_second(density: PathDensity, paths: Descent, other: Descent) -> Tracks:
+    """Returns the tracks of paths, with other paths, which cost no less, counted in their
+    covariances.
 
-    With d from one path to the other and their costs J and J', the other is right with the
-    probability
+    With their costs J and J', the Hessians H and H' of J / 2, and c and c' as `widened` finds them
+    where a density is not normal, the other is right with the probability
 
-        p' = exp(-J' / 2) / (exp(-J / 2) + exp(-J' / 2)),
+        p' = w' / (w + w'),   w = exp(-J / 2) (det H)^-1/2 c,
 
-    if they are two, and the second moment of the states about the path is P + p' d d'. Half a
-    period away, d is as often one way round as the other.
+    if they are two (Laplace's approximation). With d from one path to the other, the second moment
+    of the states about the path is (1 - p') P + p' (P' + d d'). Half a period away, d is as often
+    one way round as the other.
     """
-    assert tracks.cost is not None
+    tracks, volume = reported(density, paths)
     d = density.model.nearest_state(other.at.x[:, 1:], tracks.mean) - tracks.mean
     found = _two(tracks, d) & (tracks.status == Status.CONVERGED)
-    found &= other.status == Status.CONVERGED
-    with np.errstate(all="ignore"):
-        p = 1 / (1 + np.exp((other.at.cost - tracks.cost) / 2))
-    p = np.where(found, p, 0.0)
-    d = np.where(found[:, None, None], d, 0.0)
-    covariance = tracks.covariance.copy()
-    for share, way in _ways_round(density, tracks, d):
-        outer = way[..., :, None] * way[..., None, :]
-        covariance += (p[:, None] * share)[..., None, None] * outer
-    return replace(tracks, covariance=covariance, other_p=p, other=tracks.mean + d)
+    rows = np.flatnonzero(found & (other.status == Status.CONVERGED))
+    p = np.zeros(len(d))
+    apart = np.zeros_like(d)
+    if rows.size:
+        some = density.subset(rows)
+        there = take(other, rows)
+        second, volume_there = reported(some, there)
+        apart[rows] = d[rows]
+        lead = there.at.cost - paths.at.cost[rows] - 2 * (volume_there - volume[rows])
+        with np.errstate(over="ignore"):
+            p[rows] = 1 / (1 + np.exp(lead / 2))
+        moment = second.covariance.copy()
+        for share, way in _ways_round(some, second.covariance, d[rows]):
+            moment += share[..., None, None] * way[..., :, None] * way[..., None, :]
+        of_other = p[rows, None, None, None]
+        tracks.covariance[rows] = (1 - of_other) * tracks.covariance[rows] + of_other * moment
+        tracks.calls[rows] += second.calls - there.calls
+    return replace(tracks, other_p=p, other=tracks.mean + apart)
 
 
-def _ways_round(density: PathDensity, tracks: Tracks, d: Array) -> list[tuple[Array, Array]]:
+def _ways_round(density: PathDensity, covariance: Array, d: Array) -> list[tuple[Array, Array]]:
     """Lists the distances at which states lie that are normal about d (trials, K, n), each taken
     the shorter way round its period, with their shares (trials, K)."""
     from scipy.special import ndtr
@@ -161,7 +171,7 @@ def _ways_round(density: PathDensity, tracks: Tracks, d: Array) -> list[tuple[Ar
             continue
         beyond = np.abs(d[..., i]) - period / 2
         with np.errstate(all="ignore"):
-            over = np.nan_to_num(ndtr(beyond / np.sqrt(tracks.covariance[..., i, i])))
+            over = np.nan_to_num(ndtr(beyond / np.sqrt(covariance[..., i, i])))
         back = np.zeros_like(d)
         back[..., i] = np.copysign(period, d[..., i])
         here = [(share * (1 - over), way) for share, way in ways]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +21,8 @@ is followed."""
 _STRIDE = 1.5
 """Standard deviations between points of an axis: of a normal density the sum over such points
 misses the integral by 3e-4."""
+_OF_NORMAL = np.sqrt(2 * np.pi) / _STRIDE
+"""Sum of a normal density over such points, in parts of that at the middle."""
 _POINTS = 16
 """Points to either side of a path at most."""
 _LITTLE = 0.1
@@ -55,9 +58,26 @@ class Conditional(NamedTuple):
         return cls(rest, line, density.log_determinant(tangents) + np.log(variance))
 
 
-def widened(density: PathDensity, at: Settled, tangents: Tangents) -> tuple[Array, Array]:
-    """Computes the covariances (trials, 1 + K, n, n) of paths, second moments about them where the
-    density is not normal, and the evaluations (trials,) that this took.
+@dataclass(frozen=True)
+class Around:
+    """Holds what the densities about paths are like."""
+
+    P: Array
+    """Covariances (trials, 1 + K, n, n) of the states, second moments about the paths where the
+    density is not normal."""
+    mass: Array
+    """Integral of the density over that of the normal one of the affine model (trials,)."""
+    calls: Array
+    """Evaluations (trials,) that this took."""
+
+    @classmethod
+    def empty(cls, x: Array) -> Around:
+        """Returns what is to be filled for paths x (trials, 1 + K, n)."""
+        return cls(np.empty((*x.shape, x.shape[-1])), np.ones(len(x)), np.zeros(len(x)))
+
+
+def widened(density: PathDensity, at: Settled, tangents: Tangents) -> Around:
+    """Computes what the densities about paths are like, and their covariances.
 
     Along each axis of the last states' covariance the path is moved by 3 deviations to both sides.
     Where the cost there is not that of a normal density, the axis on which it differs most is
@@ -67,24 +87,26 @@ def widened(density: PathDensity, at: Settled, tangents: Tangents) -> tuple[Arra
 
         w(t) = exp(-J / 2) (det H)^-1/2,   P = sum w (P(t) + (x(t) - x(0)) (x(t) - x(0))') / sum w.
     """
-    P = np.empty((*at.x.shape, at.x.shape[-1]))
-    calls = np.empty(len(P))
+    out = Around.empty(at.x)
     sides = 2 * density.model.n
     slopes = int(_NUMBERS / (density.model.n**2 * density.model.epochs))
     at_once = max(_LANES, slopes // sides)
-    for i in np.split(np.arange(len(P)), range(at_once, len(P), at_once)):
-        P[i], calls[i] = _of_some(density.subset(i), take(at, i), take(tangents, i))
-    return P, calls
+    for i in np.split(np.arange(len(at.x)), range(at_once, len(at.x), at_once)):
+        found = _of_some(density.subset(i), take(at, i), take(tangents, i))
+        out.P[i] = found.P
+        out.mass[i] = found.mass
+        out.calls[i] = found.calls
+    return out
 
 
-def _of_some(density: PathDensity, at: Settled, tangents: Tangents) -> tuple[Array, Array]:
+def _of_some(density: PathDensity, at: Settled, tangents: Tangents) -> Around:
     trials, epochs, n = at.x.shape
     P, crossed = density.spread(tangents)
     lines, axes = _lines(P[:, -1], crossed)
     sides = np.stack([lines, -lines], axis=1).reshape(-1, epochs, n)
     owner = np.repeat(np.arange(trials), 2 * n)
     moved = density.subset(owner).settled(at.x[owner] + _FAR * sides)
-    calls = moved.calls.reshape(trials, 2 * n).sum(axis=1)
+    out = Around(P, np.ones(trials), moved.calls.reshape(trials, 2 * n).sum(axis=1))
     # dJ / c^2 is 1 where the density is normal.
     rise = (moved.cost - at.cost[owner]).reshape(trials, 2, n) / _FAR**2
     unlike = np.abs(rise - 1.0).max(axis=1)
@@ -94,11 +116,12 @@ def _of_some(density: PathDensity, at: Settled, tangents: Tangents) -> tuple[Arr
     if rows.size:
         g = axes[rows, unlike[rows].argmax(axis=1)]
         some = density.subset(rows)
-        moment, further = _followed(some, take(at, rows), take(tangents, rows), g)
-        calls[rows] += further
-        wider = _is_wider(moment[:, -1], axes[rows])
-        P[rows[wider]] = moment[wider]
-    return P, calls
+        found = _followed(some, take(at, rows), take(tangents, rows), g)
+        out.calls[rows] += found.calls
+        wider = _is_wider(found.P[:, -1], axes[rows])
+        out.P[rows[wider]] = found.P[wider]
+        out.mass[rows[wider]] = found.mass[wider]
+    return out
 
 
 def _is_wider(moment: Array, axes: Array) -> Mask:
@@ -124,11 +147,9 @@ def _lines(P: Array, crossed: Array) -> tuple[Array, Array]:
     return lines / np.where(along > 0, along, 1.0)[..., None, None], inverse
 
 
-def _followed(
-    density: PathDensity, at: Settled, tangents: Tangents, g: Array
-) -> tuple[Array, Array]:
-    """Computes the second moments about paths by the points of an axis on which g' x_K (trials, n)
-    of the last states has unit variance, and the evaluations that this took."""
+def _followed(density: PathDensity, at: Settled, tangents: Tangents, g: Array) -> Around:
+    """Computes the second moments about paths and their mass by the points of an axis on which g'
+    x_K (trials, n) of the last states has unit variance."""
     trials = len(at.x)
     middle = Conditional.of(density, tangents, g)
     moment = middle.P.copy()
@@ -166,4 +187,4 @@ def _followed(
             rows = rows[going]
             x = there.x[going]
             line = here.line[going]
-    return moment / total[:, None, None, None], calls
+    return Around(moment / total[:, None, None, None], total / _OF_NORMAL, calls)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 from shared.state_models import ConstantVelocity
 
 import ipe_bench as ib
@@ -15,7 +16,7 @@ from ipe_bench.states.copies import SURE
 from ipe_bench.states.damped import Descent
 from ipe_bench.states.linearisation import Taylor
 from ipe_bench.states.mirrored import _ways_round, in_first_turn
-from ipe_bench.states.trackers import Tracks, filtered
+from ipe_bench.states.trackers import filtered
 from ipe_bench.states.whole_paths import PathDensity
 from ipe_bench.trials.paths import PathBlock, StateScenario
 
@@ -82,6 +83,78 @@ def test_the_covariance_counts_the_second_path():
     assert abs(ratio.mean() - 1.0) < 4 / np.sqrt(len(ratio))
 
 
+ASYMMETRIC = Formulas(
+    next={"x": "x + w"},
+    readings={"z": "x**2 - 0.3*x**3"},
+    noise={"w": 1e-3},
+    deviation={"z": 0.05},
+    spread={"x": 1.0},
+    count=4,
+)
+"""A nearly constant state, read four times by a function with a wide slope and a steep one."""
+
+
+def test_the_probability_of_a_second_path_of_another_width_is_that_of_the_exact_posterior():
+    paths = ASYMMETRIC.draw(0, 400)
+    found = AutoTracker().track(ASYMMETRIC, paths.z)
+    assert found.other is not None
+    assert found.other_p is not None
+    here, there, p = found.mean[:, -1], found.other[:, -1], found.other_p
+    x = np.linspace(-8.0, 8.0, 20_001)
+    misfit = ((paths.z - (x**2 - 0.3 * x**3)) ** 2).sum(axis=1) / 0.05**2
+    logarithm = -0.5 * (x**2 + misfit)
+    w = np.exp(logarithm - logarithm.max(axis=1, keepdims=True))
+    w /= w.sum(axis=1, keepdims=True)
+    exact = np.sum(w * (np.abs(x - there) < np.abs(x - here)), axis=1)
+    two = p > 0
+    assert two.sum() > 200
+    assert np.median(np.abs(p - exact)[two]) < 0.005
+    assert np.abs(p - exact)[two].max() < 0.1
+    truth = np.abs(paths.x[:, -1] - there) < np.abs(paths.x[:, -1] - here)
+    assert abs(p[two].mean() - truth[two].mean()) < 0.06
+    assert (p > 0.5).sum() > 100
+    moment = np.sum(w * (x - here) ** 2, axis=1)
+    ratio = (moment / found.covariance[:, -1, 0, 0])[two]
+    assert 0.98 < ratio.min() < np.median(ratio) < 1.03
+    assert ratio.max() < 1.25
+
+
+def test_the_covariance_of_a_state_is_that_of_either_path_by_its_probability():
+    """What x y says of y, which both paths have near 0, depends on how large x is in each."""
+    model = replace(
+        ASYMMETRIC,
+        next={"x": "x + w", "y": "y"},
+        readings={"z": "x**2 - 0.3*x**3", "b": "x*y"},
+        deviation={"z": 0.05, "b": 2.0},
+        spread={"x": 1.0, "y": 1.0},
+    )
+    z = model.draw(0, 100).z
+    z[:, :, 1] = 0.0  # so that y is 0 in either path
+    found = AutoTracker().track(model, z)
+    assert found.other_p is not None
+    x = np.linspace(-8.0, 8.0, 20_001)
+    misfit = ((z[:, :, :1] - (x**2 - 0.3 * x**3)) ** 2).sum(axis=1) / 0.05**2
+    # Of y given x: variance 1 / (1 + K x^2 / 4), and readings of density (1 + K x^2 / 4)^-1/2.
+    variance = 1 / (1 + model.count * x**2 / 4)
+    logarithm = -0.5 * (x**2 + misfit) + 0.5 * np.log(variance)
+    w = np.exp(logarithm - logarithm.max(axis=1, keepdims=True))
+    exact = np.sum(w * variance, axis=1) / w.sum(axis=1)
+    two = (found.other_p > 0.1) & (found.other_p < 0.9)
+    assert two.sum() > 40
+    ratio = exact / found.covariance[:, -1, 1, 1]
+    np.testing.assert_allclose(np.median(ratio[two]), 1.0, atol=0.01)
+    assert np.abs(ratio[two] - 1).max() < 0.1
+
+
+def test_a_log_says_that_a_second_path_is_the_likelier_one():
+    z = np.array([[1.670313], [1.705320], [1.530839], [1.590580]])
+    (note,) = LogTracks.of(Log(ASYMMETRIC, z), "auto", AutoTracker()).notes
+    said = (
+        "AMBIGUOUS: a second path is right with a probability of 0.78, likelier than this one; in"
+    )
+    assert note.startswith(said)
+
+
 def test_a_trial_that_a_mirror_image_leaves_open_is_ambiguous():
     block = PathBlock.draw(StateScenario(BEACONS), 0, 20)
     columns = block.estimate(AutoTracker())[1]
@@ -130,13 +203,16 @@ def test_half_a_period_away_a_second_path_lies_either_way_round():
     moment with a state that is not periodic vanishes."""
     model = ib.component("state_model/pendulum", count=3)
     density = PathDensity.of(model, model.draw(0, 1).z)
-    tracks = Tracks.empty(model, 1)
-    tracks.covariance[:] = 0.01 * np.eye(2)
+    P = np.tile(0.01 * np.eye(2), (1, 3, 1, 1))
     d = np.tile([np.pi, 5.0], (1, 3, 1))
-    ways = _ways_round(density, tracks, d)
+    ways = _ways_round(density, P, d)
     moment = sum(share[..., None] * way[..., :1] * way[..., 1:] for share, way in ways)
     np.testing.assert_allclose(moment, 0.0, atol=1e-9)
     assert sum(share.sum() for share, _ in ways) == pytest.approx(3.0)
+    # A deviation short of half a period, a sixth lies the other way round.
+    (near, _), (beyond, _) = _ways_round(density, P, d - [0.1, 0.0])
+    np.testing.assert_allclose(beyond, norm.sf(1.0))
+    np.testing.assert_allclose(near, norm.cdf(1.0))
 
 
 def test_a_path_is_moved_to_the_turn_that_the_prior_prefers():
