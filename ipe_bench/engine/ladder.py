@@ -48,9 +48,10 @@ _LARGEST_CLIMB = 4.0
 
 def rungs_up_to(finest: float) -> NDArray[np.int64]:
     """Returns the rungs 1, 2, 3, 4, 6, 8, 12, 16, ... up to `finest`, and at least 1, 2."""
-    powers = 2 ** np.arange(int(np.log2(max(finest, 2.0))) + 1)
+    finest = max(finest, 2.0)
+    powers = 2 ** np.arange(int(np.log2(finest)) + 1)
     rungs = np.union1d(powers, 3 * powers // 2)
-    return rungs[rungs <= max(finest, 2.0)].astype(np.int64)
+    return rungs[rungs <= finest].astype(np.int64)
 
 
 def coarser(place: int) -> int:
@@ -83,11 +84,16 @@ def apart(fine: Array, coarse: Array) -> Array:
     of each (trials,)."""
     with np.errstate(all="ignore"):
         # The largest gap of a state over all times and cases, over the largest value of that state.
-        largest, gap = (np.abs(y).max(axis=3).max(axis=1) for y in (fine, fine - coarse))
-        scale = np.maximum(largest, _ROUNDING * largest.max(axis=1, keepdims=True, initial=0.0))
-        return np.nan_to_num(np.where(gap == 0.0, 0.0, gap / scale), nan=np.inf).max(
-            axis=1, initial=0.0
-        )
+        gap = _largest(fine - coarse)
+        sizes = _largest(fine)
+        rounding = _ROUNDING * sizes.max(axis=1, keepdims=True, initial=0.0)
+        share = np.where(gap == 0.0, 0.0, gap / np.maximum(sizes, rounding))
+        return np.nan_to_num(share, nan=np.inf).max(axis=1, initial=0.0)
+
+
+def _largest(y: Array) -> Array:
+    """Returns the largest magnitude (trials, states) over all times and cases."""
+    return np.abs(y).max(axis=3).max(axis=1)
 
 
 def search(
@@ -110,41 +116,43 @@ def search(
     times) at one rung, `unturned` shifts readings that are angles next to others, and `in_doubt`
     selects trials by their states; a row behind these is held against nothing.
     """
-    places, final, top = start.copy(), start.copy(), len(rungs) - 1
+    top = len(rungs) - 1
+    places = start.copy()
+    final = start.copy()
     lost, doubtful = np.zeros((2, len(start)), dtype=bool)
-    fine, coarse = (np.empty((len(start), len(tolerance))) for _ in range(2))
-    y, near = (np.empty((len(start), *states)) for _ in range(2))
+    fine, coarse = np.empty((2, len(start), len(tolerance)))
+    y, near = np.empty((2, len(start), *states))
     held = np.full(len(start), -1)  # the place whose readings are in `fine`
     pending = computed = np.flatnonzero(start < top)
     # Each round integrates the pending trials at their rung n, and at n/2 where it is not known.
     while len(pending):
         still = []
         for place, rows in by_rung(places[pending], pending):
-            below, known = coarser(place), held[rows] == coarser(place)
+            below = coarser(place)
             # What an earlier round computed at n/2 serves again.
-            coarse[rows[known]], near[rows[known]] = fine[rows[known]], y[rows[known]]
+            known = held[rows] == below
+            coarse[rows[known]] = fine[rows[known]]
+            near[rows[known]] = y[rows[known]]
             if not known.all():
                 simulate(rows[~known], int(rungs[below]), coarse, near)
             simulate(rows, int(rungs[place]), fine, y)
             astray = apart(y[rows, :, :-1], near[rows, :, :-1])
             with np.errstate(all="ignore"):
-                moved = (np.abs(fine[rows] - unturned(coarse[rows], fine[rows])) / tolerance).max(
-                    axis=1
-                )
-                # Step doubling: d bounds the error of n/2 and, by the order p = 8, d / (2^p - 1)
-                # that of n (Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I,
-                # section II.4).
-                moved = SAFETY * np.maximum(moved, astray / STATES)
-                left = moved / ((rungs[place] / rungs[below]) ** ORDER - 1.0)
-                # Not a number where an iterate overflows: such a trial climbs to the top, in
-                # bounded time.
-                moved, left = np.nan_to_num(moved, nan=np.inf), np.nan_to_num(left, nan=np.inf)
-                # The error falls with the p-th power of the step: n <- n left^(1/p).
-                wanted = rungs[place] * np.minimum(left ** (1.0 / ORDER), _LARGEST_CLIMB)
+                gaps = np.abs(fine[rows] - unturned(coarse[rows], fine[rows]))
+                shifts = (gaps / tolerance).max(axis=1)
+                moved = SAFETY * np.maximum(shifts, astray / STATES)
+            # Not a number where an iterate overflows: such a trial climbs to the top, in bounded
+            # time.
+            moved = np.nan_to_num(moved, nan=np.inf)
+            # Step doubling: d bounds the error of n/2 and, by the order p = 8, d / (2^p - 1) that
+            # of n (Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, section
+            # II.4).
+            left = moved / ((rungs[place] / rungs[below]) ** ORDER - 1.0)
+            enough = moved <= 1.0
+            good = (left <= 1.0) | (place == top)
             # n/2 is good enough; or n is; else the trial climbs.
-            enough, good = moved <= 1.0, (left <= 1.0) | (place == top)
-            fine[rows[enough]] = coarse[rows[enough]]
             final[rows] = np.where(enough, below, place)
+            fine[rows[enough]] = coarse[rows[enough]]
             # Where rounding shows, what finer steps move is what they leave; a stated rate promises
             # the eighth order.
             off = moved / SAFETY if states[1] else left
@@ -152,6 +160,8 @@ def search(
             if states[1]:
                 doubtful[rows] = np.where(enough, in_doubt(near[rows]), in_doubt(y[rows]))
             held[rows] = place
+            # The error falls with the p-th power of the step: n <- n left^(1/p).
+            wanted = rungs[place] * np.minimum(left ** (1.0 / ORDER), _LARGEST_CLIMB)
             places[rows] = np.clip(np.searchsorted(rungs, wanted), place + 1, top)
             still.append(rows[~(enough | good)])
         pending = np.concatenate(still)
@@ -166,11 +176,8 @@ def tangent_contraction(coarse: Array, J: Array) -> float:
     # Columns are scaled, so that the contraction does not depend on the parameters' units.
     size = np.linalg.norm(J, axis=0)
     size[size == 0] = 1.0
-    return float(
-        np.linalg.norm(
-            np.eye(J.shape[1]) - np.linalg.lstsq(coarse / size, J / size, rcond=None)[0], 2
-        )
-    )
+    steps = np.linalg.lstsq(coarse / size, J / size, rcond=None)[0]
+    return float(np.linalg.norm(np.eye(J.shape[1]) - steps, 2))
 
 
 class Coarseness(NamedTuple):
@@ -188,7 +195,8 @@ class Coarseness(NamedTuple):
         for trials at this rung; 0 stands for trials whose rung is known without a search."""
         # Eighth order: the steps of the readings, as many times longer as was measured to contract.
         if rung > HIGHEST_OF_FOURTH or self.fourth is None:
-            return False, max(1, int(np.ceil(max(rung, 1) / self.longer)))
+            fewer = max(rung, 1) / self.longer
+            return False, max(1, int(np.ceil(fewer)))
         # The formula of fourth order loses more by what a trial turns faster than the nominal one:
         # at rung 1 there is 2^4 in hand, at rung 2 it is 3^4.
         return True, self.fourth * (rung + 1 if rung else 1)
@@ -197,8 +205,10 @@ class Coarseness(NamedTuple):
 def fewest_of_fourth(tangents: Callable[[int], Array], J: Array) -> int | None:
     """Returns the fewest steps k of the formula of fourth order for which tangents(k) (m, n)
     contract enough beside J (m, n), or None."""
-    tried = ((k, tangent_contraction(tangents(k), J)) for k in range(1, MOST_OF_FOURTH + 1))
-    return next((k for k, left in tried if left <= AIM), None)
+    for k in range(1, MOST_OF_FOURTH + 1):
+        if tangent_contraction(tangents(k), J) <= AIM:
+            return k
+    return None
 
 
 def times_longer(off: Array, coarse: Array, J: Array) -> float:

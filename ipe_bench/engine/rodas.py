@@ -142,30 +142,36 @@ class Rodas5P:
     @cached_property
     def _programs(self) -> dict[str, Program]:
         """The equations and the derivatives that the method needs, on arrays over lanes."""
-        equations = self.of.equations
-        tape, n = Recording(equations), equations.states
-        g, t, y, p, c, f = tape.graph, tape.t, tape.y, tape.p, tape.c, tape.slope
-        k, s, d = g.inputs("k", n), g.inputs("s", n), g.inputs("d", equations.parameters)
-        one, point, ways = g.constant(1.0), [t, *y, *p, *c], [*s, *d]
+        tape = Recording(self.of.equations)
+        n = self.of.equations.states
+        graph = tape.graph
+        one = graph.constant(1.0)
+        k = graph.inputs("k", n)
+        s = graph.inputs("s", n)
+        d = graph.inputs("d", self.of.equations.parameters)
+        began = [*tape.p, *tape.c]
+        point = [tape.t, *tape.y, *began]
         # d is the derivative along s of the states and d of the parameters; turned is J k.
-        along = dict(zip([*y, *p], ways, strict=True))
-        in_time, turned = tangent(f, {t: one}), tangent(f, dict(zip(y, k, strict=True)))
+        ways = [*s, *d]
+        along = dict(zip([*tape.y, *tape.p], ways, strict=True))
+        in_time = tangent(tape.slope, {tape.t: one})
+        turned = tangent(tape.slope, dict(zip(tape.y, k, strict=True)))
         # Column j of J = df/dy is the tangent of f along y_j.
-        columns = [tangent(f, {a: one}) for a in y]
-        recorded = {
-            "f": (f, point),
-            "J": ([columns[j][i] for i in range(n) for j in range(n)], point),
-            "ft": (in_time, point),
-            "df": (tangent(f, along), point + ways),
-            "dft": (tangent(in_time, along), point + ways),
-            "dJk": (tangent(turned, along), [*point, *k, *ways]),
-            "side": ([tape.side], point),
-            "start": (tape.start, [*p, *c]),
-            "dstart": (tangent(tape.start, along), [*p, *c, *d]),
-            "read": (tape.shown, point),
-            "dread": (tangent(tape.shown, along), point + ways),
+        columns = [tangent(tape.slope, {y: one}) for y in tape.y]
+        by_rows = [entry for row in zip(*columns, strict=True) for entry in row]
+        return {
+            "f": Program.of(tape.slope, point),
+            "J": Program.of(by_rows, point),
+            "ft": Program.of(in_time, point),
+            "df": Program.of(tangent(tape.slope, along), point + ways),
+            "dft": Program.of(tangent(in_time, along), point + ways),
+            "dJk": Program.of(tangent(turned, along), [*point, *k, *ways]),
+            "side": Program.of([tape.side], point),
+            "start": Program.of(tape.start, began),
+            "dstart": Program.of(tangent(tape.start, along), [*began, *d]),
+            "read": Program.of(tape.shown, point),
+            "dread": Program.of(tangent(tape.shown, along), point + ways),
         }
-        return {name: Program.of(outputs, inputs) for name, (outputs, inputs) in recorded.items()}
 
     @cached_property
     def timed(self) -> bool:
@@ -181,11 +187,15 @@ class Rodas5P:
         """Computes the readings (1, m) at x (1, n), and the effort; a tolerance that shows the
         shape will do."""
         run = _Run(self, x, len(self.of.times), stretched=True)
-        k = int(np.argmax(run.stretch))
-        explicit, fastest, met = (float(a[k]) for a in (run.stretch, run.fastest, run.met))
-        return run.readings, Effort(
-            int(run.steps.max()), explicit, fastest, met, float(run.t.min())
+        hardest = int(np.argmax(run.stretch))
+        effort = Effort(
+            steps=int(run.steps.max()),
+            explicit=float(run.stretch[hardest]),
+            fastest=float(run.fastest[hardest]),
+            met=float(run.met[hardest]),
+            reached=float(run.t.min()),
         )
+        return run.readings, effort
 
     def simulate(self, x: Array, stop: int, most: int = MOST_STEPS) -> Array:
         """Computes readings (trials, cases x stop x outputs) at the first `stop` times; NaN from
@@ -200,9 +210,10 @@ class Rodas5P:
 
     def jacobian(self, x: Array, stop: int) -> Array:
         """Computes their derivatives by x (trials, cases x stop x outputs, n)."""
-        J = _Run(self, x, stop, sensitive=True).J
-        readings = self.of.tables.shape[1] * stop * self.of.equations.outputs
-        return J.transpose(3, 1, 0, 2).reshape(len(x), readings, -1) * self.of.sizes
+        cases = self.of.tables.shape[1]
+        readings = cases * stop * self.of.equations.outputs
+        J = _Run(self, x, stop, sensitive=True).J.transpose(3, 1, 0, 2)
+        return J.reshape(len(x), readings, -1) * self.of.sizes
 
 
 class _Run:
@@ -219,39 +230,50 @@ class _Run:
         stretched: bool = False,
         reaching: bool = False,
     ) -> None:
-        of, equations = method.of, method.of.equations
-        self.do, self.rtol, self.atol = method._programs, method.rtol, _SMALLEST * method.rtol
-        self.tables, self.end = of.tables, float(of.times[-1]) or 1.0
-        self.times, self.most, self.stretched = (
-            np.asarray(of.times, dtype=float)[:stop],
-            most,
-            stretched,
-        )
-        self.timed, self.divided = method.timed, method.divided
-        # The usual interval between readings: the unit of steps at poles and of looks at pulses.
-        intervals = np.diff(np.asarray(of.times, dtype=float), prepend=0.0)
-        self.interval = float(np.median(intervals[intervals > 0.0])) if intervals.any() else 1.0
-        cases, self.q = of.tables.shape[1], equations.parameters if sensitive else 0
+        equations = method.of.equations
+        self.do = method._programs
+        self.timed = method.timed
+        self.divided = method.divided
+        self.rtol = method.rtol
+        self.atol = _SMALLEST * method.rtol
+        self.most = most
+        self.stretched = stretched
+        self.reaching = reaching
+        # Times run to the last reading, even if fewer are asked for: the first step hangs on it.
+        times = np.asarray(method.of.times, dtype=float)
+        self.end = float(times[-1]) or 1.0
+        self.interval = _usual(times)
+        self.times = times[:stop]
+        self.tables = method.of.tables
+        cases = self.tables.shape[1]
+        self.case = np.tile(np.arange(cases), len(x))
+        self.p = np.repeat(x * method.of.sizes, cases, axis=0).T.copy()
+        # A Jacobian has a direction for each parameter, readings alone have none.
+        self.directions = np.eye(equations.parameters)[:, :, None]
+        self.q = equations.parameters if sensitive else 0
         lanes = len(x) * cases
-        self.p = np.repeat(x * of.sizes, cases, axis=0).T.copy()
-        self.case, self.directions = (
-            np.tile(np.arange(cases), len(x)),
-            np.eye(equations.parameters)[:, :, None],
-        )
-        self.t, self.place, self.steps = np.zeros(lanes), np.zeros(lanes, int), np.zeros(lanes, int)
-        self.stretch, self.fastest, self.met = np.zeros((3, lanes))
+        self.t = np.zeros(lanes)
+        self.place = np.zeros(lanes, int)
+        self.steps = np.zeros(lanes, int)
+        self.stretch = np.zeros(lanes)
+        self.fastest = np.zeros(lanes)
+        self.met = np.zeros(lanes)
         self.z = np.full((equations.outputs, stop, lanes), np.nan)
-        self.reaching, self.reach = reaching, np.full((equations.outputs, stop, lanes), np.nan)
+        self.reach = np.full((equations.outputs, stop, lanes), np.nan)
         self.J = np.full((equations.outputs, stop, self.q, lanes), np.nan)
-        self.S = np.zeros((equations.states, 0, lanes))
-        c = self._constants(np.arange(lanes))
         with np.errstate(all="ignore"):
-            self.y = self._values("start", [*self.p, *c], lanes)
-            self.largest = np.abs(self.y)
-            if sensitive:
-                self.S = self._values("dstart", [*self.p, *c, *self.directions], self.q, lanes)
+            self._start(equations.states, lanes)
             self._integrate()
         self.readings = self.z.transpose(2, 1, 0).reshape(len(x), -1)
+
+    def _start(self, states: int, lanes: int) -> None:
+        """Sets the states y (states, lanes) and their sensitivities S at t = 0."""
+        began = [*self.p, *self._constants(np.arange(lanes))]
+        self.y = self._values("start", began, lanes)
+        self.largest = np.abs(self.y)
+        self.S = np.zeros((states, 0, lanes))
+        if self.q:
+            self.S = self._values("dstart", [*began, *self.directions], self.q, lanes)
 
     def _values(self, name: str, inputs: Sequence[Any], *shape: int) -> Array:
         """Returns the outputs of a program, of which some may be numbers, as one array."""
@@ -267,38 +289,43 @@ class _Run:
         live = np.arange(len(self.t))
         while True:
             self._read(live)
-            going = (
-                (self.place[live] < len(self.times))
-                & (self.steps[live] < self.most)
-                & np.isfinite(h[live])
-            )
-            live = live[going]
+            live = live[self._going(live) & np.isfinite(h[live])]
             if not len(live):
                 return
             left = self.times[self.place[live]] - self.t[live]
-            # A step that would leave a sliver before the next reading is halved, one that
-            # overshoots is cut.
-            now = np.where(
-                h[live] >= left * (1 - 1e-9), left, np.where(2 * h[live] > left, left / 2, h[live])
-            )
+            now = _to_the_reading(h[live], left)
             y, S, error = self._step(live, now)
-            self.steps[live] += 1
-            # h <- h 0.9 error^(-1/5), within 0.2 to 6 times h: the embedded solution has order 4
-            # (Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, eq. II.4.13).
             good = error <= 1
-            change = np.clip(_SAFETY * np.maximum(error, 1e-10) ** -0.2, _SHRINK, _GROW)
-            wanted = now * np.where(np.isfinite(error), change, _SHRINK)
-            # What a reading cut short says nothing against the step that was wanted.
-            h[live] = np.where(good & (now < h[live]), np.maximum(wanted, h[live]), wanted)
-            # A step that round-off swallows ends the lane.
-            h[live] = np.where(self.t[live] + 8 * h[live] == self.t[live], np.nan, h[live])
+            h[live] = self._next_step(live, h[live], now, error)
             # Lanes whose error is too large stay where they are, and try the shorter step.
+            self.steps[live] += 1
             done = live[good]
-            self.t[done] = np.where(
-                now[good] == left[good], self.times[self.place[done]], self.t[done] + now[good]
-            )
-            self.y[:, done], self.S[:, :, done] = y[:, good], S[:, :, good]
+            # A step that ends on a reading ends on its very time, whatever round-off adds.
+            arrives = now[good] == left[good]
+            there = self.times[self.place[done]]
+            self.t[done] = np.where(arrives, there, self.t[done] + now[good])
+            self.y[:, done] = y[:, good]
+            self.S[:, :, done] = S[:, :, good]
             self.largest[:, done] = np.fmax(self.largest[:, done], np.abs(y[:, good]))
+
+    def _going(self, lanes: Array) -> Array:
+        """Tells the lanes that have readings to come and steps left."""
+        ahead = self.place[lanes] < len(self.times)
+        return ahead & (self.steps[lanes] < self.most)
+
+    def _next_step(self, lanes: Array, h: Array, now: Array, error: Array) -> Array:
+        """Computes the step to be tried after the step `now`, cut from h, had this error; NaN ends
+        a lane."""
+        # h <- h 0.9 error^(-1/5), within 0.2 to 6 times h: the embedded solution has order 4
+        # (Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, eq. II.4.13).
+        change = np.clip(_SAFETY * np.maximum(error, 1e-10) ** -0.2, _SHRINK, _GROW)
+        wanted = now * np.where(np.isfinite(error), change, _SHRINK)
+        # What a reading cut short says nothing against the step that was wanted.
+        cut = (error <= 1) & (now < h)
+        longer = np.where(cut, np.maximum(wanted, h), wanted)
+        # A step that round-off swallows ends the lane.
+        swallowed = self.t[lanes] + 8 * longer == self.t[lanes]
+        return np.where(swallowed, np.nan, longer)
 
     def _read(self, here: Array) -> None:
         """Takes the readings whose time has come, at t = 0 too, in these lanes."""
@@ -307,94 +334,123 @@ class _Run:
             here = here[self.t[here] == self.times[self.place[here]]]
             if not len(here):
                 return
-            at = (self.t[here], *self.y[:, here], *self.p[:, here], *self._constants(here, 1))
-            self.z[:, self.place[here], here] = self._values("read", at, len(here))
-            # Readings move by sum_i |dh/dy_i| of the largest y_i.
+            at = self._point(here, later=1)
+            now = self.place[here]
+            self.z[:, now, here] = self._values("read", at, len(here))
             if self.reaching:
-                n = len(self.y)
-                sizes = self.largest[:, here] * np.eye(n)[:, :, None]
-                moved = self._values(
-                    "dread", [*at, *sizes, *np.zeros(self.p.shape[0])], n, len(here)
-                )
-                self.reach[:, self.place[here], here] = np.abs(moved).sum(axis=1)
+                self.reach[:, now, here] = self._reached(here, at)
             if self.q:
-                # dh/dx = dh/dy dy/dx + dh/dp, y' = dy/dx being S.
-                slopes = self._values(
-                    "dread", [*at, *self.S[:, :, here], *self.directions], self.q, len(here)
-                )
-                self.J[:, self.place[here], :, here] = slopes.transpose(2, 0, 1)
+                # dh/dx = dh/dy dy/dx + dh/dp, dy/dx being S.
+                ways = [*self.S[:, :, here], *self.directions]
+                slopes = self._values("dread", [*at, *ways], self.q, len(here))
+                self.J[:, now, :, here] = slopes.transpose(2, 0, 1)
             self.place[here] += 1
+
+    def _reached(self, here: Array, at: Sequence[Any]) -> Array:
+        """Computes by how much readings move with states that move by their largest magnitudes:
+        sum_i |dh/dy_i| max|y_i|."""
+        n = len(self.y)
+        sizes = self.largest[:, here] * np.eye(n)[:, :, None]
+        still = np.zeros(self.p.shape[0])
+        moved = self._values("dread", [*at, *sizes, *still], n, len(here))
+        return np.abs(moved).sum(axis=1)
+
+    def _point(self, lanes: Array, later: int = 0) -> list[Any]:
+        """Returns t, y, p and c of each lane, as programs take them."""
+        c = self._constants(lanes, later)
+        return [self.t[lanes], *self.y[:, lanes], *self.p[:, lanes], *c]
 
     def _constants(self, lanes: Array, later: int = 0) -> Array:
         """Returns the constants of the interval to the next time of each lane, or those that hold
         from that time on."""
-        return self.tables[
-            np.minimum(self.place[lanes] + later, len(self.tables) - 1), self.case[lanes]
-        ].T
+        last = len(self.tables) - 1
+        interval = np.minimum(self.place[lanes] + later, last)
+        return self.tables[interval, self.case[lanes]].T
 
     def _step(self, live: Array, h: Array) -> tuple[Array, Array, Array]:
         """Computes states, sensitivities and the error in units of the tolerance after a step h of
         the lanes `live`."""
-        q, lanes = self.q, len(live)
-        t, y, p, c, S = (
-            self.t[live],
-            self.y[:, live],
-            self.p[:, live],
-            self._constants(live),
-            self.S[:, :, live],
-        )
-        n, at = len(y), (t, *y, *p, *c)
+        y = self.y[:, live]
+        n, lanes = y.shape
+        at = self._point(live)
         J = self._values("J", at, lanes).reshape(n, n, lanes)
-        # An explicit method is stable while h |lambda| stays below the reach of its stability
-        # region.
         if self.stretched:
-            finite = np.nan_to_num(np.moveaxis(J, 2, 0), posinf=0.0, neginf=0.0)
-            radius = np.abs(np.linalg.eigvals(finite)).max(axis=1)
-            self.stretch[live] += radius * h / _REACH
-            faster = live[radius > self.fastest[live]]
-            self.met[faster] = self.t[faster]
-            self.fastest[live] = np.maximum(self.fastest[live], radius)
+            self._stretch(live, h, J)
         # W = I / (h gamma) - J is factored once for all stages.
         W = -J
         W[range(n), range(n)] += 1 / (h * GAMMA)
         exchanged = _factor(W)
-        ft = self._values("ft", at, lanes)
-        ways = (*S, *self.directions)
-        dft = self._values("dft", [*at, *ways], q, lanes) if q else 0.0
-        K, D, u, V = list[Array](), list[Array](), y, S
-        # Stage i, by u_j = sum_k gamma_jk k_k in place of the slopes k (Hairer and Wanner):
-        # W u_i = f(t + alpha_i h, y + sum_j a_ij u_j) + gamma_i h df/dt + sum_j c_ij u_j / h
-        for a, b, node, weight in zip(A, C, NODES, TIME_WEIGHTS, strict=True):
-            u = y + sum(w * k for w, k in zip(a, K, strict=True))
-            inside = (t + node * h, *u, *p, *c)
-            rest = self._values("f", inside, lanes) + h * weight * ft
-            rest = rest + sum(w * k for w, k in zip(b, K, strict=True)) / h
-            K.append(_solve(W, exchanged, rest[:, None])[:, 0])
-            if q:
-                # The same stage differentiated; dW = -dJ adds (dJ) u_i to the right side.
-                V = S + sum(w * k for w, k in zip(a, D, strict=True))
-                rest = (
-                    self._values("df", [*inside, *V, *self.directions], q, lanes) + h * weight * dft
-                )
-                rest = rest + sum(w * k for w, k in zip(b, D, strict=True)) / h
-                rest = rest + self._values("dJk", [*at, *K[-1], *ways], q, lanes)
-                D.append(_solve(W, exchanged, rest))
-        y1 = u + K[-1]  # stiffly accurate: the last stage is the error of the embedded solution
+        K, D = self._stages(live, h, W, exchanged)
+        # Stiffly accurate: the last stage starts from the embedded solution, and is its error.
+        y1 = y + _weighted(A[-1], K[:-1]) + K[-1]
+        S1 = self.S[:, :, live]
+        if self.q:
+            S1 = S1 + _weighted(A[-1], D[:-1]) + D[-1]
         largest = np.maximum(np.abs(y), np.abs(y1))
         # The norm is the largest error of a state in units of its tolerance.
         error = (np.abs(K[-1]) / (self.atol + self.rtol * largest)).max(axis=0)
-        # A pulse between the stages shows in the mean rate over the step.
         if self.timed:
+            # A pulse between the stages shows in the mean rate over the step.
             unseen = _solve(W, exchanged, self._unseen(live, h)[:, None])[:, 0]
             missed = (np.abs(unseen) / (self.atol + _UNSEEN * largest)).max(axis=0)
             error = np.where(missed > 1.0, np.fmax(missed, error), error)
-        # Beyond a pole the solution is another one: the step is refused until it is very short.
         if self.divided:
-            before, after = (
-                self._values("side", one, lanes)[0] for one in (at, (t + h, *y1, *p, *c))
-            )
-            error = np.where((before != after) & (h > _THROUGH * self.interval), np.inf, error)
-        return y1, V + D[-1] if q else S, error
+            # Beyond a pole the solution is another one: the step is refused until it is very short.
+            crossed = self._crossed(live, at, h, y1)
+            long = h > _THROUGH * self.interval
+            error = np.where(crossed & long, np.inf, error)
+        return y1, S1, error
+
+    def _stages(
+        self, live: Array, h: Array, W: Array, exchanged: Sequence[Array]
+    ) -> tuple[list[Array], list[Array]]:
+        """Computes the stages u_i, each (states, lanes), and their derivatives along every
+        direction; the latter for a Jacobian alone.
+
+        W u_i = f(t + alpha_i h, y + sum_j a_ij u_j) + gamma_i h df/dt + sum_j c_ij u_j / h, by
+        u_j = sum_k gamma_jk k_k in place of the slopes k (Hairer and Wanner).
+        """
+        q = self.q
+        lanes = len(live)
+        t, y, p, c = self.t[live], self.y[:, live], self.p[:, live], self._constants(live)
+        S = self.S[:, :, live]
+        at = (t, *y, *p, *c)
+        ways = (*S, *self.directions)
+        ft = self._values("ft", at, lanes)
+        dft = self._values("dft", [*at, *ways], q, lanes) if q else ft
+        K = list[Array]()
+        D = list[Array]()
+        for a, b, node, weight in zip(A, C, NODES, TIME_WEIGHTS, strict=True):
+            u = y + _weighted(a, K)
+            inside = (t + node * h, *u, *p, *c)
+            rest = self._values("f", inside, lanes) + h * weight * ft
+            rest = rest + _weighted(b, K) / h
+            K.append(_solve(W, exchanged, rest[:, None])[:, 0])
+            if q:
+                # The same stage differentiated; dW = -dJ adds (dJ) u_i to the right side.
+                V = S + _weighted(a, D)
+                moved = self._values("df", [*inside, *V, *self.directions], q, lanes)
+                rest = moved + h * weight * dft
+                rest = rest + _weighted(b, D) / h
+                rest = rest + self._values("dJk", [*at, *K[-1], *ways], q, lanes)
+                D.append(_solve(W, exchanged, rest))
+        return K, D
+
+    def _stretch(self, live: Array, h: Array, J: Array) -> None:
+        """Counts the steps that an explicit method would need here: it is stable while h |lambda|
+        stays below the reach of its stability region."""
+        finite = np.nan_to_num(np.moveaxis(J, 2, 0), posinf=0.0, neginf=0.0)
+        radius = np.abs(np.linalg.eigvals(finite)).max(axis=1)
+        self.stretch[live] += radius * h / _REACH
+        faster = live[radius > self.fastest[live]]
+        self.met[faster] = self.t[faster]
+        self.fastest[live] = np.maximum(self.fastest[live], radius)
+
+    def _crossed(self, live: Array, at: Sequence[Any], h: Array, y1: Array) -> Array:
+        """Tells the lanes in which something that the rates divide by changes its sign."""
+        after = [self.t[live] + h, *y1, *self.p[:, live], *self._constants(live)]
+        before_sides = self._values("side", at, len(live))[0]
+        return before_sides != self._values("side", after, len(live))[0]
 
     def _unseen(self, live: Array, h: Array) -> Array:
         """Computes the mean of the rates over a step with the states held, less what its ends and
@@ -402,35 +458,58 @@ class _Run:
         found = np.zeros((len(self.y), len(live)))
         # As many looks as fall into the step, in powers of two so that few sizes occur.
         wanted = np.maximum(_LOOKS * h / self.interval, 1.0)
-        looks = np.minimum(np.ceil(np.log2(wanted)), np.log2(_LOOKS)).astype(int)
-        for power in sorted(set(looks[looks > 0].tolist())):
-            here, count = looks == power, 2**power
-            lanes, y = live[here], self.y[:, live[here]]
-            shares = np.append([0.0, 0.5, 1.0], (np.arange(count) + 0.5) / count)[:, None]
-            at = (self.t[lanes] + shares * h[here], *y, *self.p[:, lanes], *self._constants(lanes))
+        powers = np.minimum(np.ceil(np.log2(wanted)), np.log2(_LOOKS)).astype(int)
+        for power in sorted(set(powers[powers > 0].tolist())):
+            here = powers == power
+            lanes = live[here]
+            count = 2**power
+            inner = (np.arange(count) + 0.5) / count
+            shares = np.append([0.0, 0.5, 1.0], inner)[:, None]
+            _, *rest = self._point(lanes)
+            at = (self.t[lanes] + shares * h[here], *rest)
             f = self._values("f", at, len(shares), len(lanes))
             # The midpoint rule of all looks, less Simpson's rule of the ends and the middle.
-            found[:, here] = f[:, 3:].mean(axis=1) - (f[:, 0] + 4.0 * f[:, 1] + f[:, 2]) / 6.0
+            by_simpson = (f[:, 0] + 4.0 * f[:, 1] + f[:, 2]) / 6.0
+            found[:, here] = f[:, 3:].mean(axis=1) - by_simpson
         return found
 
     def _first_step(self) -> Array:
         lanes = len(self.t)
         scale = self.atol + self.rtol * np.abs(self.y)
-        f = self._values("f", [self.t, *self.y, *self.p, *self._constants(np.arange(lanes))], lanes)
+        f = self._values("f", self._point(np.arange(lanes)), lanes)
         # h = 1e-3 |y| / |y'| in units of the tolerance, after Hairer, Norsett, Wanner I, section
         # II.4.
-        speed, size = (np.abs(f) / scale).max(axis=0), (np.abs(self.y) / scale).max(axis=0)
-        return np.where(
-            (speed > 1e-5) & (size > 1e-5),
-            np.minimum(1e-3 * size / speed, self.end),
-            1e-6 * self.end,
-        )
+        speed = (np.abs(f) / scale).max(axis=0)
+        size = (np.abs(self.y) / scale).max(axis=0)
+        moves = (speed > 1e-5) & (size > 1e-5)
+        return np.where(moves, np.minimum(1e-3 * size / speed, self.end), 1e-6 * self.end)
+
+
+def _usual(times: Array) -> float:
+    """Computes the usual interval between readings: the unit of steps at poles and of looks at
+    pulses."""
+    intervals = np.diff(times, prepend=0.0)
+    if not intervals.any():
+        return 1.0
+    return float(np.median(intervals[intervals > 0.0]))
+
+
+def _to_the_reading(h: Array, left: Array) -> Array:
+    """Cuts steps that overshoot the next reading, and halves those that would leave a sliver before
+    it."""
+    sliver = np.where(2 * h > left, left / 2, h)
+    return np.where(h >= left * (1 - 1e-9), left, sliver)
+
+
+def _weighted(weights: Sequence[float], stages: Sequence[Array]) -> Any:
+    return sum(weight * stage for weight, stage in zip(weights, stages, strict=True))
 
 
 def _factor(W: Array) -> list[Array]:
     """Factors each lane of W (n, n, lanes) into LU, in place; returns the pivot rows (lanes,) that
     were exchanged."""
-    lanes, exchanged = np.arange(W.shape[2]), []
+    lanes = np.arange(W.shape[2])
+    exchanged = list[Array]()
     for k in range(len(W)):
         # The pivot is the largest entry on or below the diagonal; its row comes up.
         row = k + np.argmax(np.abs(W[k:, k]), axis=0)
