@@ -13,6 +13,7 @@ LINE = [
     *(
         ["basics"],
         ["engine"],
+        ["functions"],
         ["measurements"],
         ["noise", "priors", "states"],
         ["estimators"],

@@ -1082,7 +1082,21 @@ class _Vectors:
                 return builder.select(
                     builder.fcmp_unordered("!=", condition, self.constant(0.0)), a, b
                 )
-        return self._each(name.replace("arctan", "atan"), *args)
+            case "remainder", [a, b]:
+                return self._remainder(a, b)
+        return self._each(name.replace("arc", "a"), *args)
+
+    def _remainder(self, a: Value, b: Value) -> Value:
+        """Writes NumPy's remainder, which has the sign of what divides, to the last bit."""
+        builder = self.builder
+        zero = self.constant(0.0)
+        rest = self._each("fmod", a, b)
+        some = builder.fcmp_ordered("!=", rest, zero)
+        other = builder.xor(
+            builder.fcmp_ordered("<", rest, zero), builder.fcmp_ordered("<", b, zero)
+        )
+        moved = builder.fadd(rest, b)
+        return builder.select(builder.and_(some, other), moved, rest)
 
     def call(self, name: str, *args: Value) -> Value:
         """Writes an instruction of the processor: fma (rounded once), sqrt or floor."""

@@ -20,7 +20,10 @@ import numpy as np
 
 FUNCTIONS: dict[str, Callable[[Any], Any]] = {
     name: getattr(np, name)
-    for name in ("sin", "cos", "tan", "arctan", "exp", "log", "sqrt", "sinh", "cosh", "tanh")
+    for name in (
+        *("sin", "cos", "tan", "arcsin", "arccos", "arctan", "sinh", "cosh", "tanh"),
+        *("arcsinh", "arccosh", "arctanh", "exp", "expm1", "log", "log1p", "sqrt", "cbrt"),
+    )
 }
 FUNCTIONS |= {
     name: lambda a, name=name: getattr(importlib.import_module("scipy.special"), name)(a)
@@ -53,6 +56,9 @@ class Graph:
         """Holds `most` expressions at most; ValueError beyond."""
         self._known: dict[tuple[Any, ...], Expression] = {}
         self._most = most
+        self.ties: list[Expression] = []
+        """Equalities of unknowns: where one holds, a branch may stand for a single point, such as
+        the limit of sin(w) / w at 0, and then has no slope to give."""
 
     def input(self, name: str) -> Expression:
         """Declares the named quantity, to be given when the emitted source runs."""
@@ -159,10 +165,10 @@ class Expression:
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> Any:
         if method != "__call__" or kwargs:
             return NotImplemented
-        if ufunc.__name__ in _COMPOSED:
-            return _COMPOSED[ufunc.__name__](self.graph.apply, *inputs)
+        if ufunc.__name__ in COMPOSED:
+            return COMPOSED[ufunc.__name__](self.graph.apply, *inputs)
         if ufunc.__name__ not in _UFUNCS:
-            known = ", ".join((*FUNCTIONS, "arctan2", "floor", *_COMPOSED))
+            known = ", ".join((*FUNCTIONS, "arctan2", "floor", *COMPOSED))
             raise TypeError(
                 f"np.{ufunc.__name__} cannot be recorded; use + - * / **, np.where and {known}"
             )
@@ -184,11 +190,32 @@ class Expression:
         raise AttributeError(name)
 
 
-_COMPOSED: dict[str, Callable[..., Any]] = {
+COMPOSED: dict[str, Callable[..., Any]] = {
     "greater": lambda apply, a, b: apply("less", b, a),
     "greater_equal": lambda apply, a, b: apply("less_equal", b, a),
-    "equal": lambda apply, a, b: apply("mul", apply("less_equal", a, b), apply("less_equal", b, a)),
-    "not_equal": lambda apply, a, b: apply("add", apply("less", a, b), apply("less", b, a)),
+    "equal": lambda apply, a, b: _tie(apply, a, b),
+    "not_equal": lambda apply, a, b: apply("sub", 1.0, _tie(apply, a, b)),
+    "square": lambda apply, a: apply("mul", a, a),
+    "reciprocal": lambda apply, a: apply("div", 1.0, a),
+    "ceil": lambda apply, a: apply("neg", apply("floor", apply("neg", a))),
+    "degrees": lambda apply, a: apply("mul", a, 180.0 / math.pi),
+    "radians": lambda apply, a: apply("mul", a, math.pi / 180.0),
+    "log10": lambda apply, a: apply("div", apply("log", a), math.log(10.0)),
+    "log2": lambda apply, a: apply("div", apply("log", a), math.log(2.0)),
+    "logaddexp": lambda apply, a, b: apply(
+        "add",
+        COMPOSED["maximum"](apply, a, b),
+        apply("log1p", apply("exp", apply("neg", COMPOSED["absolute"](apply, apply("sub", a, b))))),
+    ),
+    "exp2": lambda apply, a: apply("pow", 2.0, a),
+    "heaviside": lambda apply, a, at_0: apply(
+        "where",
+        apply("less_equal", a, a),
+        apply(
+            "where", apply("less", a, 0.0), 0.0, apply("where", apply("less", 0.0, a), 1.0, at_0)
+        ),
+        a,
+    ),
     "absolute": lambda apply, a: apply("where", apply("less", a, 0.0), apply("neg", a), a),
     "sign": lambda apply, a: apply(
         "where",
@@ -208,6 +235,14 @@ _COMPOSED: dict[str, Callable[..., Any]] = {
 """NumPy's functions that are made of several operations."""
 
 
+def _tie(apply: Callable[..., Any], a: Any, b: Any) -> Any:
+    """Returns whether a equals b, which the graph remembers."""
+    node = apply("mul", apply("less_equal", a, b), apply("less_equal", b, a))
+    if a is not b and isinstance(node, Expression) and node.value is None:
+        node.graph.ties.append(node)
+    return node
+
+
 def _first_if(apply: Callable[..., Any], condition: Any, a: Any, b: Any) -> Any:
     """Returns a where the condition holds or a is not a number, else b."""
     return apply("where", condition, a, apply("where", apply("less_equal", a, a), b, a))
@@ -218,13 +253,12 @@ _OPERATORS: dict[str, Callable[..., Any]] = {
 }
 _OPERATORS["div"] = operator.truediv
 _NUMBERS: dict[str, Callable[..., Any]] = _OPERATORS | {
-    "arctan": math.atan,
     "arctan2": math.atan2,
     "floor": math.floor,
     "less": operator.lt,
     "less_equal": operator.le,
     "where": lambda condition, a, b: a if condition else b,
-    **{name: getattr(math, name) for name in FUNCTIONS if name != "arctan"},
+    **{name: getattr(math, name.replace("arc", "a")) for name in FUNCTIONS},
 }
 _ARRAYS: dict[str, Callable[..., Any]] = _OPERATORS | {
     "less": lambda a, b: np.less(a, b) * 1.0,
@@ -232,12 +266,20 @@ _ARRAYS: dict[str, Callable[..., Any]] = _OPERATORS | {
     "where": lambda condition, a, b: np.where(condition, a, b)[()],
     "arctan2": np.arctan2,
     "floor": np.floor,
+    "remainder": np.remainder,
     "fma": lambda a, b, c: a * b + c,
     "fms": lambda a, b, c: a * b - c,
     "fnma": lambda a, b, c: c - a * b,
     **FUNCTIONS,
 }
 """The operations of a program, on arrays; products are rounded before they are added."""
+
+
+def computed(operation: str, *values: Any) -> Any:
+    """Applies an operation to numbers as NumPy does."""
+    return _ARRAYS[operation](*values)
+
+
 _PARTIALS: dict[str, Callable[[Any, Any, Any, Any], list[Any]]] = {
     "add": lambda e, one, a, b: [one, one],
     "sub": lambda e, one, a, b: [one, -one],
@@ -254,7 +296,16 @@ _PARTIALS: dict[str, Callable[[Any, Any, Any, Any], list[Any]]] = {
     "cos": lambda e, one, a, _: [-np.sin(a)],
     "arctan": lambda e, one, a, _: [one / (one + a * a)],
     "arctan2": lambda e, one, a, b: [b / (a * a + b * b), -(a / (a * a + b * b))],
+    "arcsin": lambda e, one, a, _: [one / np.sqrt((one - a) * (one + a))],
+    "arccos": lambda e, one, a, _: [-(one / np.sqrt((one - a) * (one + a)))],
+    "arcsinh": lambda e, one, a, _: [one / np.sqrt(one + a * a)],
+    "arccosh": lambda e, one, a, _: [one / np.sqrt((a - one) * (a + one))],
+    "arctanh": lambda e, one, a, _: [one / ((one - a) * (one + a))],
+    "remainder": lambda e, one, a, b: [one, -np.floor(a / b)],
     "exp": lambda e, one, a, _: [e],
+    "expm1": lambda e, one, a, _: [e + one],
+    "log1p": lambda e, one, a, _: [one / (one + a)],
+    "cbrt": lambda e, one, a, _: [one / (3.0 * e * e)],
     "log": lambda e, one, a, _: [one / a],
     "sqrt": lambda e, one, a, _: [0.5 / e],
     "sinh": lambda e, one, a, _: [np.cosh(a)],

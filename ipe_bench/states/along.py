@@ -1,47 +1,40 @@
 """The functions f and h of a state model with their slopes, at one epoch and along whole paths.
 
 They are recorded once and run as compiled code along all epochs of all paths. What cannot be
-recorded is called epoch by epoch, with slopes by complex steps, or by differences where complex
-steps do not find what differences find.
+recorded is called epoch by epoch, with slopes that are judged wherever they are used.
 """
 
 from __future__ import annotations
 
-import warnings
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ipe_bench.basics.errors import describe_exception
-from ipe_bench.basics.linalg import Array, deviations, multiply, own
+from ipe_bench.basics.errors import UserError, describe_exception
+from ipe_bench.basics.linalg import Array, Mask, deviations, multiply, own
 from ipe_bench.engine.rows import RowFunction
-from ipe_bench.engine.trace import Expression, Graph, Program, Recorded, RowPrograms, substitute
-from ipe_bench.measurements.base import Shift, differentiate
+from ipe_bench.functions.judged import Judged, judged, same_values
+from ipe_bench.functions.recording import NotRecorded, Written, compiled_rows, written
 from ipe_bench.states.algebra import root
 
 if TYPE_CHECKING:
     from ipe_bench.states.base import StateModel
 
-_MOST_OPERATIONS = 20_000
-"""Operations of a function at one epoch, with its tangents, at most: they take ten seconds to
-compile, once per machine."""
 _MOST_IN_ALL = 200_000
 """Operations that are recorded of a function over all epochs at most, in a second or two."""
 _MOST_FORMS = 8
 """Forms that a function may have over all epochs."""
 _DRAWN = 3
-"""Paths on which a recorded function is held against the model's own."""
-_AGREES = 1e-10
-"""Part of the size of an output by which the two may differ."""
-_SMALL = 1e-6
-"""Part of the size of the largest output below which no output counts as smaller."""
-_ROUGH = 1e-3
-"""Part of the size of an output's slopes by which those by differences may be wrong."""
+"""Paths that are drawn to try a function."""
+_CHECKED = 4
+"""Epochs of a recording at which each path is checked once it has been tracked."""
 Function = Callable[[Array, int], Array]
+Forms = Mapping[Any, Mapping[int, Written]]
+"""A function by its form and by epoch, as it is recorded."""
 
 
 class Along(NamedTuple):
@@ -58,79 +51,58 @@ class Along(NamedTuple):
     """dh/dx (trials, K, m, n)."""
 
 
-class Differences(NamedTuple):
-    """Holds how a function is differentiated by differences."""
-
-    sizes: Array
-    """The units (n,) of the states, of which the steps are a part."""
-    near: Shift
-    """Puts outputs next to others by whole periods."""
-
-    def slopes(self, function: Callable[[Array], Array], x: Array, widening: float = 1.0) -> Array:
-        """Computes the Jacobians (..., m, n) at x (..., n), by steps that may be wider."""
-        s = widening * self.sizes
-        J = differentiate(lambda u: function(s * u), x / s, analytic=False, near=self.near)
-        return J / s
-
-
-@dataclass(frozen=True)
-class Own:
-    """A model's own function at one epoch, called as a recorded one is."""
-
-    function: Function
-    k: int
-    differences: Differences | None = None
-    """How its slopes are found where it is not analytic; None: by complex steps."""
-
-    def __call__(self, x: Array, _: Array) -> Array:
-        return self._here(x)
-
-    def _here(self, x: Array) -> Array:
-        return self.function(x, self.k)
-
-    def slopes(self, x: Array, _: Array) -> tuple[Array, Array]:
-        if self.differences is None:
-            return self._here(x), differentiate(self._here, x, analytic=True)
-        return self._here(x), self.differences.slopes(self._here, x)
-
-    def is_analytic(self, x: Array, differences: Differences) -> bool:
-        """Tells whether complex steps find the slopes at x (trials, n) that differences find, such
-        as they do not of np.abs and np.linalg.norm, and of np.hypot, which takes no complex
-        numbers."""
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", np.exceptions.ComplexWarning)
-                exact = differentiate(self._here, x, analytic=True)
-        except TypeError:
-            return False
-        rough, wider = (differences.slopes(self._here, x, by) for by in (1.0, 4.0))
-        # Where differences of two steps are not alike, they say nothing against complex steps.
-        size = np.abs(rough * differences.sizes).max(axis=(0, 2))[:, None]
-        settled = np.abs(rough - wider) * differences.sizes <= _ROUGH * size
-        apart = np.abs(rough - exact) * differences.sizes > 3 * _ROUGH * size
-        return not (settled & apart).any()
-
-
 class Recording(NamedTuple):
     """Holds a function of those epochs at which it is the same but for numbers."""
 
-    function: RowFunction | Own
+    function: RowFunction | Judged
     epochs: Array
     """(e,)"""
     numbers: Array
     """(e, p)"""
+    ties: RowFunction | None = None
+    """Equalities, 1 where they hold, on which a recorded function depends."""
+    form: Any = None
+    """What is recorded but for the numbers; None if that cannot change."""
+    own: Sequence[Judged] = ()
+    """The model's own function at each epoch, of a recorded one."""
+
+    def at(self, i: int) -> Recording:
+        """Returns the function of the epoch in that place."""
+        here = self._replace(epochs=self.epochs[[i]], numbers=self.numbers[[i]])
+        return here._replace(own=self.own[i : i + 1])
 
     def __call__(self, x: Array) -> Array:
         """Computes values (..., m) at states x (..., n) of one epoch, or (trials, e, m) at those
         (trials, e, n) of all."""
-        values = self.function(own(x.reshape(-1, x.shape[-1])), self.numbers)
+        rows = own(x.reshape(-1, x.shape[-1]))
+        if isinstance(self.function, RowFunction):
+            values = self.function(rows, self.numbers)
+        else:
+            values = self.function(rows)
         return values.reshape(*x.shape[:-1], values.shape[-1])
 
     def slope(self, x: Array) -> tuple[Array, Array]:
         """Computes values (..., m) and Jacobians (..., m, n) likewise."""
         *stack, n = x.shape
-        values, slopes = self.function.slopes(own(x.reshape(-1, n)), self.numbers)
+        rows = own(x.reshape(-1, n))
+        if isinstance(self.function, RowFunction):
+            values, slopes = self.function.slopes(rows, self.numbers)
+            self._mend_ties(rows, slopes)
+        else:
+            values, slopes = self.function.slopes(rows)
         return values.reshape(*stack, values.shape[-1]), slopes.reshape(*stack, *slopes.shape[1:])
+
+    def _mend_ties(self, rows: Array, slopes: Array) -> None:
+        """Replaces slopes at points for which a branch of their own stands by differences."""
+        if self.ties is None:
+            return
+        tied = np.flatnonzero(self.ties(rows, self.numbers).any(axis=1))
+        for place, function in enumerate(self.own):
+            here = tied[tied % len(self.own) == place]
+            if here.size:
+                # Many trials begin at the same point.
+                points, each = np.unique(rows[here], axis=0, return_inverse=True)
+                slopes[here] = function.differences(points)[each]
 
 
 @dataclass(frozen=True)
@@ -140,29 +112,28 @@ class EpochFunctions:
     recordings: Sequence[Recording]
     why: str = ""
     """Why it is called epoch by epoch; empty if it is recorded."""
-    by_differences: bool = False
-    """Whether its slopes are differences, since it is not analytic."""
+    why_differences: str = ""
+    """Why its slopes are differences, if it is called epoch by epoch."""
 
-    @classmethod
-    def by_epoch(
-        cls,
-        function: Function,
-        epochs: Sequence[int],
-        why: str = "",
-        differences: Differences | None = None,
-    ) -> EpochFunctions:
-        none = np.empty((1, 0))
-        each = ((k, Own(function, k, differences)) for k in epochs)
-        recordings = [Recording(own, np.array([k]), none) for k, own in each]
-        return cls(recordings, why, by_differences=differences is not None)
+    @property
+    def compiled(self) -> bool:
+        """Whether machine code alone gives its values and slopes."""
+        return all(
+            isinstance(one.function, RowFunction) and one.ties is None for one in self.recordings
+        )
 
     @cached_property
     def at(self) -> Mapping[int, Recording]:
-        return {
-            k: Recording(one.function, one.epochs[[i]], one.numbers[[i]])
-            for one in self.recordings
-            for i, k in enumerate(one.epochs.tolist())
-        }
+        return {k: one.at(i) for one in self.recordings for i, k in enumerate(one.epochs.tolist())}
+
+    def by_epoch(self, why: str = "") -> EpochFunctions:
+        """Returns the model's own functions, called epoch by epoch."""
+        none = np.empty((1, 0))
+        recordings = []
+        for one in self.recordings:
+            for function, k in zip(one.own, one.epochs, strict=True):
+                recordings.append(Recording(function, np.array([k]), none))
+        return replace(self, recordings=recordings, why=why or self.why)
 
     def tried(self) -> list[int]:
         """Lists the first, the middle and the last epoch of each recording, or of all epochs if
@@ -195,129 +166,170 @@ class EpochFunctions:
         return out
 
 
-class _Written(NamedTuple):
-    """Holds a function as it is recorded at one epoch."""
-
-    y: Sequence[Expression]
-    x: Sequence[Expression]
-    form: tuple[Any, ...]
-    """Its operations and outputs but for the values of constants, which are the same at epochs that
-    can be joined."""
-    constants: Sequence[float]
-
-    @classmethod
-    def of(cls, function: Function, n: int, k: int) -> _Written:
-        graph = Graph(_MOST_OPERATIONS)
-        x = graph.inputs("x", n)
-        found = np.asarray(function(Recorded.of(x), k), dtype=object)[0]
-        y = [graph.apply("add", one, 0.0) for one in found]
-        program = Program.of(y, x)
-        constants = [step[1] for step in program.operations if step[0] == "constant"]
-        steps = (step[:1] if step[0] == "constant" else step for step in program.operations)
-        return cls(y, x, (*steps, program.outputs), constants)
-
-
-def recorded_by_epoch(
+def written_by_epoch(
     function: Function, n: int, epochs: Sequence[int], alike: Callable[[int], int]
-) -> list[Recording]:
-    """Records a function of n states at each epoch, and joins epochs at which only its constants
-    differ; `alike` names the epoch whose function that of another is.
+) -> Forms:
+    """Records a function of n states at each epoch; `alike` names the epoch whose function that of
+    another is.
 
     Raises:
-        ValueError: it has too many operations or forms.
-        Exception: the function does not take expressions.
+        NotRecorded: it cannot be recorded, or has too many operations or forms.
     """
-    forms: defaultdict[Any, dict[int, _Written]] = defaultdict(dict)
-    known: dict[int, _Written] = {}
+    forms: defaultdict[Any, dict[int, Written]] = defaultdict(dict)
+    known: dict[int, Written] = {}
     operations = 0
     for k in epochs:
         first = alike(k)
         if first not in known:
-            known[first] = _Written.of(function, n, k)
+            known[first] = written(partial(function, k=k), n)
             operations += len(known[first].form)
         forms[known[first].form][k] = known[first]
         if len(forms) > _MOST_FORMS:
-            raise ValueError(f"it has more than {_MOST_FORMS} forms over all epochs")
+            raise NotRecorded(f"it has more than {_MOST_FORMS} forms over all epochs")
         if operations > _MOST_IN_ALL:
-            raise ValueError(f"it has more than {_MOST_IN_ALL} operations over all epochs")
-    return [_joined_form(epochs) for epochs in forms.values()]
+            raise NotRecorded(f"it has more than {_MOST_IN_ALL} operations over all epochs")
+    return forms
 
 
-def _joined_form(epochs: Mapping[int, _Written]) -> Recording:
-    """Joins recordings of one form. All constants become numbers of the epoch, so that other values
-    of a model's options need no other machine code."""
-    y, x, _, first = next(iter(epochs.values()))
-    graph = x[0].graph
-    c = graph.inputs("c", len(first))
-    given = {graph.constant(value): one for value, one in zip(first, c, strict=True)}
-    function = RowFunction(RowPrograms.of(substitute(y, given), x, c))
-    numbers = np.array([one.constants for one in epochs.values()], dtype=float)
-    return Recording(function, np.array([*epochs]), numbers)
+def joined(forms: Forms) -> list[Recording]:
+    """Joins the epochs at which a function has one form; all its constants become numbers of the
+    epoch."""
+    recordings = []
+    for form, epochs in forms.items():
+        function, ties = compiled_rows(next(iter(epochs.values())))
+        numbers = np.array([one.constants for one in epochs.values()], dtype=float)
+        recordings.append(Recording(function, np.array([*epochs]), numbers, ties, form))
+    return recordings
+
+
+def is_as_recorded(functions: EpochFunctions, forms: Forms) -> bool:
+    """Tells whether functions are those of a second recording: in every form, and in the numbers of
+    every epoch."""
+    again = {
+        form: (np.array([*epochs]), np.array([one.constants for one in epochs.values()]))
+        for form, epochs in forms.items()
+    }
+    recorded = [one for one in functions.recordings if one.form is not None]
+    if {one.form for one in recorded} != set(again):
+        return False
+    return all(
+        np.array_equal(one.epochs, again[one.form][0])
+        and np.array_equal(one.numbers, again[one.form][1], equal_nan=True)
+        for one in recorded
+    )
 
 
 def functions_of(model: StateModel) -> tuple[EpochFunctions, EpochFunctions]:
-    """Returns f and h of a model, recorded where they can be and then agree with the model's own on
-    drawn paths."""
+    """Returns f and h of a model: recorded where they can be, and then have the values and slopes
+    of the model's own at all points that are tried.
+
+    Raises:
+        UserError: one of them is random, or mixes states of different trials.
+    """
     every = range(model.epochs)
     moving = [k for k in every if model.moves(k)]
-    f = _recorded(model, "transition", moving)
-    h = _recorded(model, "observe", every)
     m, P = model.prior
-    spread = root(P)
-    draws = np.random.default_rng(0).standard_normal((_DRAWN, spread.shape[1]))
-    x = m + multiply(spread, draws)
     sizes = deviations(P)
     sizes = np.where(sizes > 0, sizes, np.maximum(1.0, np.abs(m)))
-    next_to_state = Differences(sizes, model.nearest_state)
-    next_to_reading = Differences(sizes, model.nearest)
-    tried = {k for each in (f, h) for k in each.tried()}
+    f = _Side(model, "transition", moving, sizes, model.nearest_state)
+    h = _Side(model, "observe", every, sizes, model.nearest)
+    spread = root(P)
+    draws = np.random.default_rng(0).standard_normal((_DRAWN, spread.shape[1]))
+    aside = np.diag(deviations(P))
+    x = np.concatenate([m[None], m + aside, m - aside, m + multiply(spread, draws)])
     with np.errstate(all="ignore"):
-        for k in sorted(tried):
+        for k in sorted({*f.functions.tried(), *h.functions.tried()}):
             if model.moves(k):
-                f = _held(f, model.transition, k, x, next_to_state)
+                f.hold(k, x)
                 x = model.transition(x, k)
-            h = _held(h, model.observe, k, x, next_to_reading)
-    still = EpochFunctions.by_epoch(lambda x, k: x, [k for k in every if k not in moving])
-    return replace(f, recordings=[*still.recordings, *f.recordings]), h
+            h.hold(k, x)
+    still = [k for k in every if k not in moving]
+    resting = [_resting(k, sizes) for k in still]
+    return replace(f.functions, recordings=[*resting, *f.functions.recordings]), h.functions
 
 
-def _recorded(model: StateModel, name: str, epochs: Sequence[int]) -> EpochFunctions:
-    if not epochs:
-        return EpochFunctions([])
-    try:
-        with np.errstate(all="ignore"):
-            return EpochFunctions(model.recorded(name, epochs))
-    except Exception as error:  # a model may raise anything where it meets no numbers
-        return EpochFunctions.by_epoch(getattr(model, name), epochs, describe_exception(error))
+def _resting(k: int, sizes: Array) -> Recording:
+    return Recording(Judged(lambda x: x, sizes), np.array([k]), np.empty((1, 0)))
 
 
-def _held(
-    functions: EpochFunctions, function: Function, k: int, x: Array, differences: Differences
-) -> EpochFunctions:
-    """Returns the functions; by epoch if that of epoch k differs from the model's own at x (trials,
-    n), and by differences if complex steps do not find its slopes."""
-    own = Own(function, k)
-    analytic = own.is_analytic(x, differences)
-    if not analytic:
-        own = replace(own, differences=differences)
-    if functions.why:
-        if analytic or functions.by_differences:
-            return functions
-        return EpochFunctions.by_epoch(function, [*functions.at], functions.why, differences)
-    found = functions.at[k].slope(x)
-    right = own.slopes(x, x)
-    within = _AGREES if analytic else _ROUGH
-    if agree(found[0], right[0]) and agree(
-        found[1].swapaxes(1, 2), right[1].swapaxes(1, 2), within
-    ):
-        return functions
-    why = f"at epoch {k + 1} its recording differs from it by more than {_AGREES:g} of its size"
-    return EpochFunctions.by_epoch(function, [*functions.at], why, own.differences)
+class _Side:
+    """One function of a model while it is tried."""
+
+    def __init__(
+        self,
+        model: StateModel,
+        name: str,
+        epochs: Sequence[int],
+        sizes: Array,
+        near: Callable[[Array, Array], Array],
+    ) -> None:
+        self.name = f"state_model={model.name}: {name}"
+        function = getattr(model, name)
+        self.own = {k: Judged(partial(function, k=k), sizes, near) for k in epochs}
+        if not epochs:
+            self.functions = EpochFunctions([])
+            return
+        try:
+            with np.errstate(all="ignore"):
+                recordings = model.recorded(name, epochs)
+        except UserError:
+            raise
+        except NotRecorded as error:
+            self._call_by_epoch(str(error))
+        except Exception as error:  # a model may raise anything where it meets no numbers
+            self._call_by_epoch(describe_exception(error))
+        else:
+            each = [one._replace(own=[self.own[k] for k in one.epochs]) for one in recordings]
+            self.functions = EpochFunctions(each)
+
+    def _call_by_epoch(self, why: str, why_differences: str = "") -> None:
+        none = np.empty((1, 0))
+        self.own = {k: replace(one, why=why_differences) for k, one in self.own.items()}
+        recordings = [Recording(one, np.array([k]), none) for k, one in self.own.items()]
+        self.functions = EpochFunctions(recordings, why, why_differences)
+
+    def hold(self, k: int, x: Array) -> None:
+        """Tries the function of epoch k at points x (points, n), of which the first is the mean."""
+        if k not in self.own:
+            return
+        if not self.functions.why:
+            why = _unlike(self.functions.at[k], self.own[k], x)
+            if not why:
+                return
+            self._call_by_epoch(f"at epoch {k + 1} its recording has {why}")
+        if not self.functions.why_differences:
+            one = self.own[k]
+            found = judged(one.function, x, one.scale, one.near, self.name)
+            if found.why:
+                self._call_by_epoch(self.functions.why, found.why)
 
 
-def agree(values: Array, right: Array, within: float = _AGREES) -> bool:
-    """Tells whether values (..., m) are the right ones within a part of their size, by default but
-    for round-off."""
-    size = np.abs(right).reshape(-1, right.shape[-1]).max(axis=0)
-    size = np.maximum(size, _SMALL * size.max())
-    return np.allclose(values / size, right / size, rtol=0, atol=within, equal_nan=True)
+def _unlike(recorded: Recording, own: Judged, x: Array) -> str:
+    """Says in what a recorded function differs from the model's own at points x (points, n), at 0
+    or where nothing is a number; empty if in nothing."""
+    odd = np.vstack([x, np.zeros(x.shape[1]), np.full(x.shape[1], np.nan)])
+    if not same_values(recorded(odd), own(odd)):
+        return "other values"
+    value, J = recorded.slope(x)
+    wrong = own.wrong(x, value, J)
+    wrong[0] |= own.contradicted(x[:1], J[:1])[0]
+    # A point without finite slopes may never be met, but for the mean.
+    wrong[1:] &= np.isfinite(J[1:]).all(axis=(1, 2))
+    return "other slopes" if wrong.any() else ""
+
+
+def doubted(functions: EpochFunctions, x: Array) -> Mask:
+    """Finds the paths (trials,) among x (trials, K, n), at which recorded functions have not the
+    values and slopes of the model's own, at some epochs of each path."""
+    wrong = np.zeros(len(x), dtype=bool)
+    for one in functions.recordings:
+        if one.form is None:
+            continue
+        places = np.unique(np.linspace(0, len(one.epochs) - 1, _CHECKED).astype(int))
+        for i in places.tolist():
+            here = one.at(i)
+            states = own(x[:, one.epochs[i]])
+            rows = np.flatnonzero(np.isfinite(states).all(axis=1) & ~wrong)
+            value, J = here.slope(states[rows])
+            wrong[rows] = one.own[i].wrong(states[rows], value, J)
+    return wrong

@@ -12,17 +12,22 @@ from typing import NamedTuple
 import numpy as np
 
 from ipe_bench.basics.errors import UserError, unknown
-from ipe_bench.basics.linalg import Array, multiply, nearest
+from ipe_bench.basics.linalg import Array, Mask, multiply, nearest
 from ipe_bench.basics.options import Component
 from ipe_bench.basics.streams import numbered
+from ipe_bench.functions.recording import NotRecorded
 from ipe_bench.measurements.base import Parameter
 from ipe_bench.states.algebra import factor, half, root, transposed
 from ipe_bench.states.along import (
     Along,
     EpochFunctions,
+    Forms,
     Recording,
+    doubted,
     functions_of,
-    recorded_by_epoch,
+    is_as_recorded,
+    joined,
+    written_by_epoch,
 )
 
 _START, _PROCESS, _READINGS = range(3)
@@ -143,8 +148,11 @@ class StateModel(Component, ABC):
     def recorded(self, name: str, epochs: Sequence[int]) -> list[Recording]:
         """Records `transition` into these epochs, or `observe` at them; raises anything if it
         cannot be recorded."""
+        return joined(self._written(name, epochs))
+
+    def _written(self, name: str, epochs: Sequence[int]) -> Forms:
         alike = self.alike if name == "transition" else int
-        return recorded_by_epoch(getattr(self, name), self.n, epochs, alike)
+        return written_by_epoch(getattr(self, name), self.n, epochs, alike)
 
     @cached_property
     def _functions(self) -> tuple[StateModel, tuple[EpochFunctions, EpochFunctions]]:
@@ -157,6 +165,36 @@ class StateModel(Component, ABC):
         if self._functions[0] is not self:
             del vars(self)["_functions"]
         return self._functions[1]
+
+    def renew_functions(self) -> None:
+        """Forgets recorded functions that are not those of the model any more, such as after a
+        change of a table or a dictionary that they take numbers from."""
+        if "_functions" not in vars(self):
+            return
+        names = ("transition", "observe")
+        for name, functions in zip(names, self.epoch_functions, strict=True):
+            recorded = [one for one in functions.recordings if one.form is not None]
+            epochs = sorted(k for one in recorded for k in one.epochs.tolist())
+            try:
+                same = not epochs or is_as_recorded(functions, self._written(name, epochs))
+            except NotRecorded:
+                same = False
+            if not same:
+                del vars(self)["_functions"]
+                return
+
+    def doubted(self, x: Array) -> Mask:
+        """Finds the trials (trials,) with paths x (trials, 1 + K, n) at which recorded functions
+        are not the model's own."""
+        f, h = self.epoch_functions
+        return doubted(f, x[:, :-1]) | doubted(h, x[:, 1:])
+
+    def by_epoch(self) -> StateModel:
+        """Returns the model with functions that are called epoch by epoch."""
+        f, h = self.epoch_functions
+        other = copy.copy(self)
+        vars(other)["_functions"] = other, (f.by_epoch(), h.by_epoch())
+        return other
 
     def transition_into(self, k: int) -> Recording:
         """Returns f of the step into epoch k as a function of states (..., n) that knows its

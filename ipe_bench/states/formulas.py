@@ -14,9 +14,17 @@ from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Finite, NonNegative, Positive
 from ipe_bench.engine.rows import RowFunction
-from ipe_bench.engine.trace import Expression, Graph, Program, RowPrograms, dependent, slopes
+from ipe_bench.engine.trace import (
+    Expression,
+    Graph,
+    Program,
+    RowPrograms,
+    dependent,
+    in_order,
+    slopes,
+)
 from ipe_bench.measurements.arithmetic import Arithmetic, parse
-from ipe_bench.measurements.base import Parameter, differentiate
+from ipe_bench.measurements.base import Parameter
 from ipe_bench.states.along import Recording
 from ipe_bench.states.base import Normal, Paths, StateModel
 
@@ -195,10 +203,13 @@ class Formulas(StateModel):
         values = {**known, **still}
         # A formula may be a bare number, which the sum makes an expression.
         y = [graph.apply("add", formula(values), 0.0) for formula in formulas.values()]
+        needed = set(in_order(y)) & dependent(graph.ties, x)
+        ties = [tie for tie in graph.ties if tie in needed]
         function = RowFunction(RowPrograms.of(y, x, c))
+        equal = RowFunction(RowPrograms.of(ties, x, c)) if ties else None
         numbers = np.stack([*by_epoch.values()], axis=1, dtype=float)
         places = np.array(epochs)
-        return [Recording(function, places, numbers[places])]
+        return [Recording(function, places, numbers[places], equal)]
 
     @cached_property
     def _factors(self) -> _Factors:
@@ -237,14 +248,17 @@ class Formulas(StateModel):
     def gain_at(self, x: Array, k: int) -> Array:
         if not self.gain_by_state:
             return self.gain(k)
+        return self._factors_at(x, k) * self._noise_deviations
+
+    def _factors_at(self, x: Array, k: int) -> Array:
+        """Computes the factors (..., n, q) at states x (..., n)."""
         states = np.moveaxis(x, -1, 0)
         inputs = [float(values[k]) for values in self._inputs.values()]
         with np.errstate(all="ignore"):
             factors = self._program([*states, *inputs, k + 1.0, float(self._times[k])])
         # A factor that is the same in all states is one number, and becomes one for each.
         each = np.broadcast_arrays(x[..., 0], *factors)[1:]
-        G = np.stack(each, axis=-1).reshape(*x.shape, len(self.noise))
-        return G * self._noise_deviations
+        return np.stack(each, axis=-1).reshape(*x.shape, len(self.noise))
 
     def gain(self, k: int) -> Array:
         if self.gain_by_state:
@@ -260,10 +274,7 @@ class Formulas(StateModel):
         """Returns G (n, q) of the step into epoch k, which is that of all states."""
         if not self.noise:
             return np.zeros((self.n, 0))
-        x = self.prior.mean
-        still = np.zeros((1, len(self.noise)))
-        factors = differentiate(lambda w: self._moved(x, w, k), still, analytic=True)[0]
-        return factors * self._noise_deviations
+        return self._factors_at(self.prior.mean, k) * self._noise_deviations
 
     @property
     def R_by_state(self) -> bool:

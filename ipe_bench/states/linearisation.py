@@ -22,7 +22,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, multiply, own
 from ipe_bench.basics.options import Component, Count, Finite, Positive
 from ipe_bench.engine.points import regress, spread_points
-from ipe_bench.measurements.base import differentiate
+from ipe_bench.functions.judged import by_complex_steps
 from ipe_bench.states.algebra import Half, half, symmetric, transposed, triangular
 
 _MOST_POINTS = 100_000
@@ -273,4 +273,4 @@ def slope(function: Callable[[Array], Array], x: Array) -> tuple[Array, Array]:
     own = getattr(function, "slope", None)
     if own is not None:
         return own(x)
-    return function(x), differentiate(function, x, analytic=True)
+    return function(x), by_complex_steps(function, x)

@@ -37,6 +37,7 @@ from ipe_bench.states.linearisation import (
     Taylor,
     Unscented,
 )
+from ipe_bench.states.redone import believed
 from ipe_bench.states.roots import Chain, Rooted, Smooth, Step, beyond_digits, precise
 
 _STEEPEST = 1e6
@@ -110,6 +111,9 @@ class Tracks:
     one."""
     other_p: Array | None = None
     """The probability (trials,) of the second path beside the first, 0 where none was found."""
+    by_epoch: Mask | None = None
+    """Trials (trials,) that were tracked again by the model's own functions, from which recorded
+    ones differ there."""
 
     @classmethod
     def empty(cls, model: StateModel, trials: int) -> Tracks:
@@ -242,6 +246,11 @@ class Tracker(Component, ABC):
     """As that of an estimator."""
     smooths: bool = False
     """Whether each epoch is estimated from all readings, those of later epochs included."""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if "track" in vars(cls):
+            cls.track = believed(cls.track)
 
     def hindrance(self, model: StateModel) -> str | None:
         """Says, in words that follow the tracker's label, why it does not suit the model; None if

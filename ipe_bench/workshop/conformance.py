@@ -21,6 +21,7 @@ from ipe_bench.basics.linalg import Array, deviations, finite
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator, estimate_safely
 from ipe_bench.estimators.ipe import IPE, State, begin
+from ipe_bench.functions.judged import same_values
 from ipe_bench.measurements import Polynomial, Sir
 from ipe_bench.measurements.base import Measurement, UsualNoise, differentiate
 from ipe_bench.measurements.counted import cost
@@ -33,7 +34,6 @@ from ipe_bench.priors import Prior
 from ipe_bench.runs.execution import Execution, Serial
 from ipe_bench.runs.provenance import TARGET, describe
 from ipe_bench.states import Formulas
-from ipe_bench.states.along import agree
 from ipe_bench.states.base import StateModel, require_sound
 from ipe_bench.states.trackers import Tracker
 from ipe_bench.trials.scenario import Scenario
@@ -684,12 +684,14 @@ def is_recorded(model: StateModel) -> str | None:
     whys = []
     for name, functions in zip(("transition", "observe"), model.epoch_functions, strict=True):
         if functions.why:
-            slopes = ", its slopes by differences" if functions.by_differences else ""
+            slopes = ""
+            if functions.why_differences:
+                slopes = f", its slopes by differences ({functions.why_differences})"
             whys.append(f"{name} runs epoch by epoch{slopes}: {functions.why}")
             continue
         for k in filter(model.moves, range(model.epochs)):
             here = x[:, k]
-            same = agree(functions.at[k](here), getattr(model, name)(here, k))
+            same = same_values(functions.at[k](here), getattr(model, name)(here, k))
             assert same, f"{name} of epoch {k + 1} is not as recorded; mend `alike`"
     return "; ".join(whys) or None
 
