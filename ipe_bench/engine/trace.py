@@ -68,6 +68,10 @@ class Graph:
         """Declares `count` inputs named prefix0, prefix1, ..."""
         return tuple(self.input(f"{prefix}{i}") for i in range(count))
 
+    def nodes(self) -> Iterable[Expression]:
+        """Returns all expressions, in the order in which they were made."""
+        return self._known.values()
+
     def constant(self, value: float) -> Expression:
         return self._node("constant", float(value).hex())
 

@@ -11,6 +11,7 @@ import numpy as np
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Mask, read_only
 from ipe_bench.functions.differences import (
+    RIGHT,
     WRONG,
     Near,
     Rows,
@@ -27,8 +28,12 @@ _AT_ONCE = 16384
 """Bytes of slopes that are computed in a call of a function by complex steps."""
 _NARROW = 1e-3
 """Part of the widest steps by which slopes are tried along one direction."""
+_BESIDE_A_KINK = 1e-3
+"""Part of the widest steps from which on they are narrow."""
 _VALUES = 1e-10
 """Part of the size of an output's terms by which values may differ that are the same."""
+_SLOPES = 1e-6
+"""Part of a change along that direction by which slopes may differ without a doubt."""
 _MIXED = 1e-6
 """The same, of a row alone and among others."""
 _LEAST = 1e-4
@@ -110,7 +115,9 @@ class Judged:
             behind = self.near(down, here) - here
             change = (ahead - behind) / 2
             bend = np.abs(ahead + behind) / 2
-            allowed = bend + 1e-3 * np.abs(change) + 8 * _EPS * size
+            # A difference of one step is off by about its bend squared, but at kinks.
+            most = np.fmin(bend, 4 * bend**2 / np.abs(change))
+            allowed = most + _SLOPES * np.abs(change) + 8 * _EPS * size
             doubt = np.isfinite(here) & ~(np.abs(change - moved) <= allowed)
             rows = np.flatnonzero(doubt.any(axis=1) & ~wrong)
             if rows.size:
@@ -118,11 +125,20 @@ class Judged:
         return wrong
 
     def contradicted(self, x: Array, J: Array) -> Mask:
-        """Finds the rows (rows,) of x with a slope that differences along each number find
-        wrong."""
-        found = measured(self.function, x, along_units(self.scale, len(x)), self.near)
+        """Finds the rows (rows,) of x with a slope that differences along each number find wrong,
+        and narrow ones do not find right: next to a kink wide ones take the slopes of both
+        sides."""
+        wrong = self._verdicts(x, J, 1.0) == WRONG
+        rows = np.flatnonzero(wrong.any(axis=(1, 2)))
+        if rows.size:
+            wrong[rows] &= self._verdicts(x[rows], J[rows], _BESIDE_A_KINK) != RIGHT
+        return wrong.any(axis=(1, 2))
+
+    def _verdicts(self, x: Array, J: Array, part: float) -> Array:
+        directions = along_units(part * self.scale, len(x))
+        found = measured(self.function, x, directions, self.near)
         with np.errstate(all="ignore"):
-            return (judge(J * self.scale, found) == WRONG).any(axis=(1, 2))
+            return judge(J * (part * self.scale), found)
 
 
 def _direction(per_step: Array) -> Array:

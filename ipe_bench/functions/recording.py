@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ipe_bench.engine.rows import RowFunction
-from ipe_bench.engine.trace import Expression, Program, RowPrograms, in_order, substitute
+from ipe_bench.engine.trace import Expression, RowPrograms, in_order, substitute
 from ipe_bench.functions.unknowns import (
     ExactGraph,
     Refused,
@@ -34,9 +34,13 @@ class Written(NamedTuple):
     x: Sequence[Expression]
     form: tuple[Any, ...]
     """Its operations and outputs but for the values of constants."""
-    constants: tuple[float, ...]
-    ties: Sequence[Expression]
-    """Equalities that the outputs depend on."""
+    constants: tuple[str, ...]
+    """These values, in hexadecimal digits."""
+    graph: ExactGraph
+
+    @property
+    def numbers(self) -> list[float]:
+        return [float.fromhex(value) for value in self.constants]
 
 
 def written(function: Callable[[Any], Any], n: int) -> Written:
@@ -59,25 +63,30 @@ def written(function: Callable[[Any], Any], n: int) -> Written:
         raise NotRecorded(graph.refused or f"{type(error).__name__}: {error}") from None
     if graph.refused:  # and a bare `except` has swallowed it
         raise NotRecorded(graph.refused)
-    needed = {e.order for e in in_order(y)}
-    distinct = {tie.order: tie for tie in graph.ties if tie.order in needed}
-    program = Program.of([*y, *distinct.values()], x)
-    constants = tuple(step[1] for step in program.operations if step[0] == "constant")
-    form = tuple(step[:1] if step[0] == "constant" else step for step in program.operations)
-    return Written(y, x, (*form, program.outputs), constants, [*distinct.values()])
+    steps = list(graph.nodes())
+    constants = tuple(e.operands[0] for e in steps if e.operation == "constant")
+    form = tuple(_step(e) for e in steps)
+    return Written(y, x, (form, tuple(e.order for e in y)), constants, graph)
+
+
+def _step(e: Expression) -> tuple[Any, ...]:
+    if e.operation == "constant":
+        return ("constant",)
+    return (e.operation, *(a.order if isinstance(a, Expression) else a for a in e.operands))
 
 
 def compiled_rows(one: Written) -> tuple[RowFunction, RowFunction | None]:
     """Returns a recorded function of x and of its constants, so that other values of these need no
     other machine code; and its ties, None if it has none."""
-    graph: Any = one.x[0].graph
+    graph = one.graph
+    needed = set(in_order(one.y))
+    distinct = dict.fromkeys(tie for tie in graph.ties if tie in needed)
     c = graph.inputs("c", len(one.constants))
-    numbers: Mapping[Expression, Expression] = {
-        graph.constant(value): number for value, number in zip(one.constants, c, strict=True)
-    }
+    given = (e for e in graph.nodes() if e.operation == "constant")
+    numbers = dict(zip(given, c, strict=True))
     graph.exact = True
     y = substitute(one.y, numbers)
-    ties = substitute(one.ties, numbers)
+    ties = substitute([*distinct], numbers)
     graph.exact = False
     function = RowFunction(RowPrograms.of(y, one.x, c))
     return function, RowFunction(RowPrograms.of(ties, one.x, c)) if ties else None

@@ -91,7 +91,7 @@ class Unknown:
     __slots__ = ("node", "truth")
 
     def __init__(self, node: Expression, truth: bool = False) -> None:
-        self.node = node
+        self.node: Any = node
         self.truth = truth
 
     @property

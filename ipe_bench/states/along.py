@@ -7,9 +7,9 @@ recorded is called epoch by epoch, with slopes that are judged wherever they are
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -35,6 +35,16 @@ _CHECKED = 4
 Function = Callable[[Array, int], Array]
 Forms = Mapping[Any, Mapping[int, Written]]
 """A function by its form and by epoch, as it is recorded."""
+
+
+class AtEpoch(NamedTuple):
+    """A function of states alone: f or h of one epoch."""
+
+    function: Function
+    k: int
+
+    def __call__(self, x: Array) -> Array:
+        return self.function(x, self.k)
 
 
 class Along(NamedTuple):
@@ -70,6 +80,11 @@ class Recording(NamedTuple):
         """Returns the function of the epoch in that place."""
         here = self._replace(epochs=self.epochs[[i]], numbers=self.numbers[[i]])
         return here._replace(own=self.own[i : i + 1])
+
+    @property
+    def model(self) -> Callable[[Array], Array]:
+        """The model's own function of one epoch, where that is known."""
+        return self.own[0] if self.own else self
 
     def __call__(self, x: Array) -> Array:
         """Computes values (..., m) at states x (..., n) of one epoch, or (trials, e, m) at those
@@ -181,8 +196,8 @@ def written_by_epoch(
     for k in epochs:
         first = alike(k)
         if first not in known:
-            known[first] = written(partial(function, k=k), n)
-            operations += len(known[first].form)
+            known[first] = written(AtEpoch(function, k), n)
+            operations += len(known[first].form[0])
         forms[known[first].form][k] = known[first]
         if len(forms) > _MOST_FORMS:
             raise NotRecorded(f"it has more than {_MOST_FORMS} forms over all epochs")
@@ -197,7 +212,7 @@ def joined(forms: Forms) -> list[Recording]:
     recordings = []
     for form, epochs in forms.items():
         function, ties = compiled_rows(next(iter(epochs.values())))
-        numbers = np.array([one.constants for one in epochs.values()], dtype=float)
+        numbers = np.array([one.numbers for one in epochs.values()])
         recordings.append(Recording(function, np.array([*epochs]), numbers, ties, form))
     return recordings
 
@@ -205,18 +220,16 @@ def joined(forms: Forms) -> list[Recording]:
 def is_as_recorded(functions: EpochFunctions, forms: Forms) -> bool:
     """Tells whether functions are those of a second recording: in every form, and in the numbers of
     every epoch."""
-    again = {
-        form: (np.array([*epochs]), np.array([one.constants for one in epochs.values()]))
-        for form, epochs in forms.items()
-    }
     recorded = [one for one in functions.recordings if one.form is not None]
-    if {one.form for one in recorded} != set(again):
+    if {one.form for one in recorded} != set(forms):
         return False
-    return all(
-        np.array_equal(one.epochs, again[one.form][0])
-        and np.array_equal(one.numbers, again[one.form][1], equal_nan=True)
-        for one in recorded
-    )
+    for one in recorded:
+        again = forms[one.form]
+        if [*again] != one.epochs.tolist():
+            return False
+        if not np.array_equal(one.numbers, [part.numbers for part in again.values()], True):
+            return False
+    return True
 
 
 def functions_of(model: StateModel) -> tuple[EpochFunctions, EpochFunctions]:
@@ -249,7 +262,11 @@ def functions_of(model: StateModel) -> tuple[EpochFunctions, EpochFunctions]:
 
 
 def _resting(k: int, sizes: Array) -> Recording:
-    return Recording(Judged(lambda x: x, sizes), np.array([k]), np.empty((1, 0)))
+    return Recording(Judged(_unmoved, sizes), np.array([k]), np.empty((1, 0)))
+
+
+def _unmoved(x: Array) -> Array:
+    return x
 
 
 class _Side:
@@ -265,7 +282,7 @@ class _Side:
     ) -> None:
         self.name = f"state_model={model.name}: {name}"
         function = getattr(model, name)
-        self.own = {k: Judged(partial(function, k=k), sizes, near) for k in epochs}
+        self.own = {k: Judged(AtEpoch(function, k), sizes, near) for k in epochs}
         if not epochs:
             self.functions = EpochFunctions([])
             return
@@ -318,18 +335,39 @@ def _unlike(recorded: Recording, own: Judged, x: Array) -> str:
     return "other slopes" if wrong.any() else ""
 
 
-def doubted(functions: EpochFunctions, x: Array) -> Mask:
-    """Finds the paths (trials,) among x (trials, K, n), at which recorded functions have not the
-    values and slopes of the model's own, at some epochs of each path."""
+def astray(f: EpochFunctions, h: EpochFunctions, x: Array) -> Mask:
+    """Finds the paths (trials,) among x (trials, 1 + K, n) at which recorded functions have not the
+    values and slopes of the model's own: at some epochs of each path, and where it is lost."""
     wrong = np.zeros(len(x), dtype=bool)
-    for one in functions.recordings:
-        if one.form is None:
-            continue
-        places = np.unique(np.linspace(0, len(one.epochs) - 1, _CHECKED).astype(int))
-        for i in places.tolist():
-            here = one.at(i)
-            states = own(x[:, one.epochs[i]])
-            rows = np.flatnonzero(np.isfinite(states).all(axis=1) & ~wrong)
-            value, J = here.slope(states[rows])
-            wrong[rows] = one.own[i].wrong(states[rows], value, J)
+    for functions, states in ((f, x[:, :-1]), (h, x[:, 1:])):
+        for one in functions.recordings:
+            places = np.linspace(0, len(one.epochs) - 1, _CHECKED)
+            for i in np.unique(places.astype(int)).tolist():
+                here = states[:, one.epochs[i]]
+                rows = np.flatnonzero(np.isfinite(here).all(axis=1) & ~wrong)
+                wrong[rows] = _differs(one.at(i), here[rows])
+    for k, rows in lost(x):
+        here = x[rows, k]
+        wrong[rows] |= _differs(f.at[k], here)
+        moved = own(f.at[k].model(here))
+        found = np.flatnonzero(np.isfinite(moved).all(axis=1))
+        wrong[rows[found]] |= _differs(h.at[k], moved[found])
     return wrong
+
+
+def lost(x: Array) -> Iterator[tuple[int, Array]]:
+    """Yields epochs k and those paths among x (trials, 1 + K, n) that are finite before epoch k and
+    not from there on."""
+    bad = ~np.isfinite(x).all(axis=-1)
+    first = np.where(bad.any(axis=-1), bad.argmax(axis=-1) - 1, -1)
+    for k in np.unique(first[first >= 0]).tolist():
+        yield k, np.flatnonzero(first == k)
+
+
+def _differs(one: Recording, x: Array) -> Mask:
+    """Finds the states x (trials, n) at which the function of an epoch is not the model's own."""
+    if one.form is None or not len(x):
+        return np.zeros(len(x), dtype=bool)
+    rows = own(x)
+    value, J = one.slope(rows)
+    return one.own[0].wrong(rows, value, J)

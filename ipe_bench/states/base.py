@@ -23,7 +23,7 @@ from ipe_bench.states.along import (
     EpochFunctions,
     Forms,
     Recording,
-    doubted,
+    astray,
     functions_of,
     is_as_recorded,
     joined,
@@ -183,11 +183,11 @@ class StateModel(Component, ABC):
                 del vars(self)["_functions"]
                 return
 
-    def doubted(self, x: Array) -> Mask:
+    def astray(self, x: Array) -> Mask:
         """Finds the trials (trials,) with paths x (trials, 1 + K, n) at which recorded functions
         are not the model's own."""
-        f, h = self.epoch_functions
-        return doubted(f, x[:, :-1]) | doubted(h, x[:, 1:])
+        with np.errstate(all="ignore"):
+            return astray(*self.epoch_functions, x)
 
     def by_epoch(self) -> StateModel:
         """Returns the model with functions that are called epoch by epoch."""

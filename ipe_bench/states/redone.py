@@ -46,7 +46,7 @@ def believed(track: Callable[..., Any]) -> Callable[..., Any]:
 def _astray(model: StateModel, tracks: Any) -> Mask:
     mean = np.asarray(tracks.mean, dtype=float)
     start = np.broadcast_to(model.prior.mean, (len(mean), 1, model.n))
-    return model.doubted(np.concatenate([start, mean], axis=1))
+    return model.astray(np.concatenate([start, mean], axis=1))
 
 
 def _take(mine: Any, its: Any, rows: Array) -> None:

@@ -8,7 +8,12 @@ mean, deviations)``; values and slopes hold at `STATES` (where a slope exists).
 import math
 from functools import lru_cache
 
-import mpmath as mp
+try:
+    import mpmath as mp  # of which truths.json was made: python tests/functions/truths.py
+except ImportError:
+    from types import SimpleNamespace
+
+    mp = SimpleNamespace(mpf=())
 import numpy as np
 
 CASES = {}
