@@ -41,7 +41,8 @@ _NARROW = 4
 time."""
 Integers = NDArray[np.integer[Any]]
 _EMIT = Path(__file__).with_name("emit.py")
-_ARGUMENTS = tuple(INTEGER if i in (3, 5, 6, 9, 11) else POINTER for i in range(15))
+_INTEGERS = (3, 5, 6, 9, 11)
+_ARGUMENTS = tuple(INTEGER if place in _INTEGERS else POINTER for place in range(15))
 
 
 def threads() -> int:
@@ -94,10 +95,9 @@ class Kernel:
         """Returns the function for groups of so many lanes, and the numbers that it needs room
         for."""
         # Behind the plan's vectors lie h times the weights of the formula, in whole vectors.
-        weights = -(-sum(map(len, self.plan.tableau.weights)) // width)
-        return emitted("integrate", self.plan, width, _ARGUMENTS), (
-            self.plan.size + weights
-        ) * width
+        weights = sum(map(len, self.plan.tableau.weights))
+        vectors = self.plan.size + -(-weights // width)
+        return emitted("integrate", self.plan, width, _ARGUMENTS), vectors * width
 
     def run(
         self,
@@ -119,21 +119,18 @@ class Kernel:
         states, 1 once one was rough or crossed a pole."""
         count = cases.shape[-2]
         lanes = len(rows) * count
-        *offset, out = more
         if not lanes:
             return
         # The frame is as wide as the lanes need.
         function, size = self._narrow if lanes <= _NARROW else self._wide
         given = (at(x), at(si), at(cases), count, at(rows, WHOLE))
-        stride = len(offset[0]) // count if offset else 0
-        taken = (
-            at(times),
-            at(steps, WHOLE),
-            len(times),
-            at(offset[0]) if offset else None,
-            stride,
-            at(out),
-        )
+        *offset, out = more
+        stride = 0
+        subtracted = None
+        if offset:
+            stride = len(offset[0]) // count
+            subtracted = at(offset[0])
+        taken = (at(times), at(steps, WHOLE), len(times), subtracted, stride, at(out))
         kept = None if states is None else at(states)
 
         def work_on(pieces: Sequence[tuple[int, int]] | Any) -> None:
@@ -144,23 +141,22 @@ class Kernel:
 
         # Work in steps times lanes times states; a Jacobian costs a tangent for each parameter.
         width = compiled.width()
-        work = (
-            lanes
-            * int(steps[: len(times)].sum())
-            * self.equations.states
-            * (1 if offset else x.shape[1])
-        )
-        workers = min(threads(), lanes // width) if work >= _WORTH_THREADS else 1
+        full = lanes // width
+        stepped = lanes * int(steps[: len(times)].sum())
+        work = stepped * self.equations.states
+        if not offset:
+            work *= x.shape[1]
+        workers = min(threads(), full) if work >= _WORTH_THREADS else 1
         if workers <= 1:
             work_on([(0, lanes)])
             return
         # More pieces than threads, so that a core slowed by other work does not hold up the rest.
-        shares = min(lanes // width, workers * min(4, max(1, work // _WORTH_THREADS)))
-        bounds = [width * (i * (lanes // width) // shares) for i in range(shares)] + [lanes]
-        pieces = iter(list(itertools.pairwise(bounds)))
-        others = [
-            _pool(workers - 1, os.getpid()).submit(work_on, pieces) for _ in range(workers - 1)
-        ]
+        each = min(4, max(1, work // _WORTH_THREADS))
+        shares = min(full, workers * each)
+        bounds = [width * (i * full // shares) for i in range(shares)]
+        pieces = iter(list(itertools.pairwise([*bounds, lanes])))
+        pool = _pool(workers - 1, os.getpid())
+        others = [pool.submit(work_on, pieces) for _ in range(workers - 1)]
         work_on(pieces)
         for other in others:
             other.result()

@@ -147,19 +147,15 @@ class Recording:
         self.equations = equations
         graph = self.graph = Graph()
         self.t = graph.input("t")
-        self.y, self.p = (
-            graph.inputs("y", equations.states),
-            graph.inputs("p", equations.parameters),
-        )
+        self.y = graph.inputs("y", equations.states)
+        self.p = graph.inputs("p", equations.parameters)
         self.c = graph.inputs("c", equations.constants)
-        self.moving = self.t, *self.y, *self.c[equations.constants - equations.driven :]
+        driven = self.c[equations.constants - equations.driven :]
+        self.moving = (self.t, *self.y, *driven)
+        point = (self.t, self.y, self.p, self.c)
         self.start = self._values(equations.start(self.p, self.c), equations.states, "start")
-        self.slope = self._values(
-            equations.rhs(self.t, self.y, self.p, self.c), equations.states, "rhs"
-        )
-        self.shown = self._values(
-            equations.read(self.t, self.y, self.p, self.c), equations.outputs, "read"
-        )
+        self.slope = self._values(equations.rhs(*point), equations.states, "rhs")
+        self.shown = self._values(equations.read(*point), equations.outputs, "read")
 
     def _values(self, result: Iterable[Any], count: int, name: str) -> list[Expression]:
         values = [self.graph.apply("add", v, 0.0) for v in result]
@@ -175,8 +171,9 @@ class Recording:
     @cached_property
     def divisors(self) -> list[Expression]:
         """What the rates divide by, where it changes along a solution."""
+        varying = trace.dependent(self.slope, self.moving)
+        divisors = list[Expression]()
         # a / b divides by b, and a^b by a where b is a negative number.
-        varying, divisors = trace.dependent(self.slope, self.moving), list[Expression]()
         for e in trace.in_order(self.slope):
             base, *others = trace.operands(e) or [e]
             if e.operation == "div":
@@ -188,7 +185,8 @@ class Recording:
     @cached_property
     def divided_by(self) -> list[bool]:
         """Whether the rates divide by something that a state is part of, for each state."""
-        return [not trace.dependent(self.divisors, [y]).isdisjoint(self.divisors) for y in self.y]
+        parts = [trace.dependent(self.divisors, [y]) for y in self.y]
+        return [not part.isdisjoint(self.divisors) for part in parts]
 
     @cached_property
     def side(self) -> Expression:
@@ -204,66 +202,85 @@ class Recording:
     def noted(self) -> list[Expression]:
         """What is noted of the start: magnitudes of the states, the side of the poles, and no
         doubt."""
-        at_start = {self.t: self.graph.constant(0.0)} | dict(zip(self.y, self.start, strict=True))
+        nothing = self.graph.constant(0.0)
+        at_start = dict(zip(self.y, self.start, strict=True))
         sizes = [self.graph.apply("add", np.abs(y), 0.0) for y in self.start]
-        return [*sizes, *trace.substitute([self.side], at_start), self.graph.constant(0.0)]
+        sides = trace.substitute([self.side], {self.t: nothing} | at_start)
+        return [*sizes, *sides, nothing]
 
     def watch(self, formula: Tableau) -> Program:
         """Notes whether a step crossed a pole or was rough, from its length, the states at its end,
         the slopes of its stages, where the rates depend on t those with the states held, the sides
         of its stages, and what was noted."""
-        g, n, stages = self.graph, self.equations.states, formula.stages
-        h, ended, slopes = g.input("h"), g.inputs("ended", n), g.inputs("k", n * stages)
-        held = g.inputs("held", n * stages) if self.timed else ()
-        sides, reach = g.inputs("side", stages), g.inputs("reach", n)
-        began, doubt = g.inputs("noted", 2)
+        graph = self.graph
+        n = self.equations.states
+        stages = formula.stages
+        h = graph.input("h")
+        ended = graph.inputs("ended", n)
+        slopes = graph.inputs("k", n * stages)
+        held = graph.inputs("held", n * stages) if self.timed else ()
+        sides = graph.inputs("side", stages)
+        reach = graph.inputs("reach", n)
+        began, doubt = graph.inputs("noted", 2)
         given = [h, *ended, *slopes, *held, *sides, *reach, began, doubt]
-        size: Any = np.abs
-        # The largest magnitude of each state so far, this step's end included.
-        larger = [
-            g.apply("where", a < size(b), size(b), a) for a, b in zip(reach, ended, strict=True)
-        ]
+        larger = [self._larger(before, now) for before, now in zip(reach, ended, strict=True)]
         # What the time alone does to the rates is no doubt.
-        moved = [k - alone for k, alone in zip(slopes, held, strict=True)] if held else slopes
+        moved = slopes
+        if held:
+            moved = [k - alone for k, alone in zip(slopes, held, strict=True)]
         # A divisor that changed its sign in any stage: a pole was crossed.
         for side in sides:
-            doubt = g.apply("where", (side < began) + (began < side), 1.0, doubt)
+            changed = (side < began) + (began < side)
+            doubt = graph.apply("where", changed, 1.0, doubt)
         for i, largest in enumerate(larger):
-            own = moved[i::n]
-            # h sum_s E_s k_s is the difference from the embedded formula.
-            error = sum(weight * k for weight, k in zip(formula.E, own, strict=True) if weight)
-            rough = ROUGH * (largest + size(h * own[-1])) < size(h * error)
-            doubt = g.apply("where", rough, 1.0, doubt)
+            rough = self._rough(formula, h, moved[i::n], largest)
+            doubt = graph.apply("where", rough, 1.0, doubt)
         return Program.of([*larger, began, doubt], given)
+
+    def _larger(self, before: Expression, now: Expression) -> Expression:
+        """The largest magnitude of a state so far, this step's end included."""
+        size: Any = np.abs
+        return self.graph.apply("where", before < size(now), size(now), before)
+
+    @staticmethod
+    def _rough(formula: Tableau, h: Any, slopes: Sequence[Any], largest: Any) -> Any:
+        """Whether the embedded formula doubts a step of one state, from its slopes."""
+        size: Any = np.abs
+        # h sum_s E_s k_s is the difference from the embedded formula.
+        error = sum(weight * k for weight, k in zip(formula.E, slopes, strict=True) if weight)
+        return ROUGH * (largest + size(h * slopes[-1])) < size(h * error)
 
     @cached_property
     def tangents(self) -> tuple[Any, Any, list[Expression], list[Expression], list[Expression]]:
         """A deviation d, a direction dp of the parameters, and how slope, readings and start move
         along them."""
-        graph, variation = self.graph, self.equations.variation
+        graph = self.graph
+        variation = self.equations.variation
         dp = graph.inputs("dp", self.equations.parameters)
         starts = trace.tangent(self.start, dict(zip(self.p, dp, strict=True)))
         # The variational equations (d/dt) dy = df/dy dy + df/dp dp, with dy = dy0/dp dp at the
         # start.
         if variation is None:
-            dy = d = graph.inputs("d", self.equations.states)
-            slopes = trace.tangent(self.slope, dict(zip(self.y + self.p, (*dy, *dp), strict=True)))
+            d = graph.inputs("d", self.equations.states)
+            dy: Sequence[Any] = d
+            slopes = trace.tangent(self.slope, self._along(d, dp))
         else:
-            d = graph.inputs("d", variation.freedoms)
             if any(e.value != 0.0 for e in starts):
                 raise ValueError(
                     "equations of small deviations need a start that does not depend on the"
                     " parameters"
                 )
+            d = graph.inputs("d", variation.freedoms)
             dy = variation.moved(self.y, d)
-            slopes = self._values(
-                variation.slope(self.t, self.y, self.p, self.c, d, dp), variation.freedoms, "slope"
-            )
+            slopes = variation.slope(self.t, self.y, self.p, self.c, d, dp)
+            slopes = self._values(slopes, variation.freedoms, "slope")
             starts = [graph.constant(0.0)] * variation.freedoms
-        along = dict(
-            zip(self.y + self.p, (*(graph.apply("add", v, 0.0) for v in dy), *dp), strict=True)
-        )
-        return d, dp, slopes, trace.tangent(self.shown, along), starts
+        dy = [graph.apply("add", v, 0.0) for v in dy]
+        return d, dp, slopes, trace.tangent(self.shown, self._along(dy, dp)), starts
+
+    def _along(self, dy: Sequence[Expression], dp: Sequence[Expression]) -> dict[Any, Any]:
+        """Maps states and parameters to their directions."""
+        return dict(zip([*self.y, *self.p], [*dy, *dp], strict=True))
 
     def along_each(
         self, directions: Sequence[Expression], tangents: Sequence[Expression]
@@ -271,10 +288,11 @@ class Recording:
         """Returns the tangents along each direction alone."""
         # A unit vector in place of the direction leaves one column of the derivative.
         one, zero = self.graph.constant(1.0), self.graph.constant(0.0)
-        units = [
-            {other: one if other is along else zero for other in directions} for along in directions
-        ]
-        return [trace.substitute(tangents, unit) for unit in units]
+        alone = []
+        for along in directions:
+            unit = {other: one if other is along else zero for other in directions}
+            alone.append(trace.substitute(tangents, unit))
+        return alone
 
     def fixed(self, *outputs: Expression) -> list[Expression]:
         """Returns what is computed once for each lane: it depends on the parameters and the case
@@ -298,27 +316,28 @@ class _Linear:
         names = [tape.graph.input(f"source{i}") for i in range(len(sources))]
         self.sources = tape.along_each(dp, sources)
         """The value (n, sources) of each source along each parameter."""
-        needed = trace.border(outputs, trace.dependent(outputs, (*d, *names)))
+        linear_in = (*d, *names)
+        needed = trace.border(outputs, trace.dependent(outputs, linear_in))
         values = [e for row in self.sources for e in row]
         # What changes along a solution is kept at each stage; what does not is computed once a
         # lane.
         varying = trace.dependent([*needed, *values], tape.moving)
         self.fixed = [e for e in needed if e not in varying]
         self.saved = [e for e in needed if e in varying]
-        self.driving = _distinct(e for e in values if e in varying and e not in self.saved)
+        driving = [e for e in values if e in varying]
+        self.driving = _distinct(e for e in driving if e not in self.saved)
         self.constant = _distinct(e for e in values if e not in varying)
-        self.inputs, self.outputs = [*d, *names, *self.saved], outputs
+        self.inputs = [*linear_in, *self.saved]
+        self.outputs = outputs
 
     def placed(self, at: range, fixed: Sequence[Expression]) -> Tangents:
         """Places the program: saved, driving and constant inputs lie one after another from the
         start of `at`."""
-        order = {
-            e: at.start + i for i, e in enumerate([*self.saved, *self.driving, *self.constant])
-        }
+        lying = [*self.saved, *self.driving, *self.constant]
+        order = {e: at.start + i for i, e in enumerate(lying)}
         sources = tuple(tuple(order[e] for e in row) for row in self.sources)
-        return Tangents(
-            Program.of(self.outputs, [*self.inputs, *fixed]), sources, at[: len(self.saved)]
-        )
+        program = Program.of(self.outputs, [*self.inputs, *fixed])
+        return Tangents(program, sources, at[: len(self.saved)])
 
 
 def _distinct(expressions: Iterable[Expression]) -> list[Expression]:
@@ -383,14 +402,15 @@ class StepPlan:
     @property
     def operations(self) -> int:
         """Arithmetic operations of a step of one lane: its cost on any machine."""
-        weighed, total = sum(map(len, self.tableau.weights)), 0
-        for program, place in [
-            (self.rates, self.y),
-            *((self.motion.program, place) for place in self.tangents),
-        ]:
-            counted = sum(name not in ("constant", "neg") for name, *_ in program.operations)
-            total += self.tableau.stages * counted + len(place) * weighed
-        return total
+        of_state = self._operations(self.rates, self.y)
+        tangents = [self._operations(self.motion.program, place) for place in self.tangents]
+        return of_state + sum(tangents)
+
+    def _operations(self, program: Program, place: range) -> int:
+        """Those of a program in every stage, and of the weighted sums of its results."""
+        counted = sum(name not in ("constant", "neg") for name, *_ in program.operations)
+        weighed = sum(map(len, self.tableau.weights))
+        return self.tableau.stages * counted + len(place) * weighed
 
 
 def jumps(equations: Equations) -> bool:
@@ -399,101 +419,125 @@ def jumps(equations: Equations) -> bool:
     that are moved to where its operands are equal; if they agree there, it is a kink and no jump.
     `floor`, and `mod` by it, jumps whatever it is taken of."""
     tape = Recording(equations)
-    graph, inputs = tape.graph, [tape.t, *tape.y, *tape.p, *tape.c]
     moving = trace.dependent(tape.slope, (tape.t, *tape.y))
     if any(e.operation == "floor" for e in moving):
         return True
-    for e in (
-        e for e in trace.in_order(tape.slope) if e.operation in trace.COMPARING and e in moving
-    ):
-        if e.operands[0] is e.operands[1]:  # asks whether it is a number
-            continue
-        # A comparison changes where its operands are equal: gap = 0.
-        gap = graph.apply("sub", *e.operands)
-        sides = [
-            f
-            for side in (1.0, 0.0)
-            for f in trace.substitute(tape.slope, {e: graph.constant(side)})
-        ]
-        for place, along in enumerate(inputs[: 1 + equations.states]):
-            program = Program.of(
-                [gap, *trace.tangent([gap], {along: graph.constant(1.0)}), *sides], inputs
-            )
-            point = list(np.random.default_rng(1).uniform(-2.0, 2.0, (len(inputs), _POINTS)))
-            with np.errstate(all="ignore"):
-                # Newton's method, in one coordinate: x <- x - gap / (dgap/dx).
-                for _ in range(_NEWTON):
-                    value, slope, *_ = program(point)
-                    point[place] = point[place] - value / slope
-                value, _, *shown = program(point)
-                # The rates as if the comparison held there, and as if it did not.
-                half = equations.states
-                a, b = (
-                    np.stack(np.broadcast_arrays(value, *side))
-                    for side in (shown[:half], shown[half:])
-                )
-                apart = np.abs(a - b) > 1e-6 * (1.0 + np.abs(a) + np.abs(b))
-                if (apart & (np.abs(value) < 1e-9)).any():
-                    return True
+    comparisons = [e for e in trace.in_order(tape.slope) if e.operation in trace.COMPARING]
+    return any(_jumps_at(tape, e) for e in comparisons if e in moving)
+
+
+def _jumps_at(tape: Recording, comparison: Expression) -> bool:
+    """Tells whether the rates jump where this comparison changes."""
+    graph = tape.graph
+    # A number that is compared with itself is asked whether it is one.
+    left, right = comparison.operands
+    if left is right:
+        return False
+    # A comparison changes where its operands are equal: gap = 0.
+    gap = graph.apply("sub", left, right)
+    inputs = [tape.t, *tape.y, *tape.p, *tape.c]
+    held = trace.substitute(tape.slope, {comparison: graph.constant(1.0)})
+    failed = trace.substitute(tape.slope, {comparison: graph.constant(0.0)})
+    for place, along in enumerate((tape.t, *tape.y)):
+        tangents = trace.tangent([gap], {along: graph.constant(1.0)})
+        program = Program.of([gap, *tangents, *held, *failed], inputs)
+        if _differ_at_the_root(program, place, len(inputs)):
+            return True
     return False
+
+
+def _differ_at_the_root(program: Program, place: int, inputs: int) -> bool:
+    """Tells whether both halves of what a program shows behind a gap and its slope differ where the
+    gap is 0, which is searched along one input."""
+    point = list(np.random.default_rng(1).uniform(-2.0, 2.0, (inputs, _POINTS)))
+    with np.errstate(all="ignore"):
+        # Newton's method, in one coordinate: x <- x - gap / (dgap/dx).
+        for _ in range(_NEWTON):
+            value, slope, *_ = program(point)
+            point[place] = point[place] - value / slope
+        value, _, *shown = program(point)
+        # The rates as if the comparison held there, and as if it did not.
+        half = len(shown) // 2
+        a = np.stack(np.broadcast_arrays(value, *shown[:half]))
+        b = np.stack(np.broadcast_arrays(value, *shown[half:]))
+        apart = np.abs(a - b) > 1e-6 * (1.0 + np.abs(a) + np.abs(b))
+        return bool((apart & (np.abs(value) < 1e-9)).any())
 
 
 def planned(equations: Equations, tableau: Tableau, *, sensitive: bool) -> StepPlan:
     """Plans how readings or their Jacobians are computed: the state once, and beside it one tangent
     for each parameter, by the variational equations in the stages of the state's own steps."""
-    tape, size = Recording(equations), 0
-
-    def room(count: int) -> range:
-        nonlocal size
-        size += count
-        return range(size - count, size)
-
+    tape = Recording(equations)
     d, dp, slopes, shown, starts = tape.tangents if sensitive else ([], [], [], [], [])
     watched = equations.watched and not sensitive
-    motion, reading = _Linear(tape, d, dp, slopes), _Linear(tape, d, dp, shown)
+    motion = _Linear(tape, d, dp, slopes)
+    reading = _Linear(tape, d, dp, shown)
     # What tangents need of a stage: what is kept of the state, and what drives a direction.
     saved = [*motion.saved, *motion.driving]
     noted = [*reading.saved, *reading.driving] if sensitive else tape.shown
     sides = [tape.side] if watched else []
-    fixed = _distinct(
-        [*tape.fixed(*tape.slope, *saved, *noted, *sides), *motion.fixed, *reading.fixed]
-    )
-    given = [*tape.moving, *fixed]
-    # `step` computes the slopes and, in one program, what else a stage has to leave.
-    rates, step, read = (
-        Program.of(found, given)
-        for found in ([*tape.slope, *saved], [*tape.slope, *saved, *sides], noted)
-    )
-    k, r = len(saved), len(noted)
+    of_state = tape.fixed(*tape.slope, *saved, *noted, *sides)
+    fixed = _distinct([*of_state, *motion.fixed, *reading.fixed])
     # The frame, one vector after another: parameters, constants, state, what is fixed, tangents,
     # what each stage keeps, readings, and what is noted of steps.
-    x, constants, y, fixed_at = map(
-        room, (equations.parameters, equations.constants, equations.states, len(fixed))
-    )
-    lie = tuple(room(len(d)) for _ in dp)
-    stages = [room(k + len(motion.constant)) for _ in tableau.B]
-    noted_at = room(r + len(reading.constant))
-    shown_at = room(equations.outputs) if sensitive else noted_at
-    reach, side, doubt = map(room, (equations.states, 1, 1) if watched else (0, 0, 0))
+    frame = _Frame()
+    x = frame.room(equations.parameters)
+    constants = frame.room(equations.constants)
+    y = frame.room(equations.states)
+    fixed_at = frame.room(len(fixed))
+    lie = tuple(frame.room(len(d)) for _ in dp)
+    stages = [frame.room(len(saved) + len(motion.constant)) for _ in tableau.B]
+    noted_at = frame.room(len(noted) + len(reading.constant))
+    shown_at = frame.room(equations.outputs) if sensitive else noted_at
+    reach = frame.room(equations.states if watched else 0)
+    side = frame.room(1 if watched else 0)
+    doubt = frame.room(1 if watched else 0)
     # Where the results of `begin` go, in the order in which they are started below.
-    begun = [
-        i
-        for place in (y, fixed_at, *lie, *(stage[k:] for stage in stages), noted_at[r:])
-        for i in place
-    ]
-    started = [*tape.start, *fixed, *(e for row in tape.along_each(dp, starts) for e in row)]
+    kept_constant = [stage[len(saved) :] for stage in stages]
+    begun = [y, fixed_at, *lie, *kept_constant, noted_at[len(noted) :]]
+    started = [*tape.start, *fixed]
+    for row in tape.along_each(dp, starts):
+        started += row
     started += [*motion.constant * tableau.stages, *reading.constant]
     if watched:
-        begun += [*reach, *side, *doubt]
+        begun += [reach, side, doubt]
         started += tape.noted
+    # `step` computes the slopes and, in one program, what else a stage has to leave.
+    given = [*tape.moving, *fixed]
     return StepPlan(
         tableau=tableau,
-        x=x, constants=constants, begin=Program.of(started, [*tape.p, *tape.c]), begun=tuple(begun),
-        y=y, driven=constants[len(constants) - equations.driven :], fixed=fixed_at,
-        step=step, kept=tuple(stage[:k] for stage in stages), stage_size=len(stages[0]),
-        read=read, noted=noted_at[:r], shown=shown_at, size=size,
-        tangents=lie, motion=motion.placed(stages[0], fixed),
+        x=x,
+        constants=constants,
+        begin=Program.of(started, [*tape.p, *tape.c]),
+        begun=tuple(i for place in begun for i in place),
+        y=y,
+        driven=constants[len(constants) - equations.driven :],
+        fixed=fixed_at,
+        step=Program.of([*tape.slope, *saved, *sides], given),
+        kept=tuple(stage[: len(saved)] for stage in stages),
+        stage_size=len(stages[0]),
+        read=Program.of(noted, given),
+        noted=noted_at[: len(noted)],
+        shown=shown_at,
+        size=frame.size,
+        tangents=lie,
+        motion=motion.placed(stages[0], fixed),
         reading=reading.placed(noted_at, fixed),
-        rates=rates, timed=tape.timed, watch=tape.watch(tableau) if watched else Program.of([], []),
-        reach=reach, side=side, doubt=doubt,
-    )  # fmt: skip
+        rates=Program.of([*tape.slope, *saved], given),
+        timed=tape.timed,
+        watch=tape.watch(tableau) if watched else Program.of([], []),
+        reach=reach,
+        side=side,
+        doubt=doubt,
+    )
+
+
+class _Frame:
+    """Gives out places, one vector after another."""
+
+    def __init__(self) -> None:
+        self.size = 0
+
+    def room(self, count: int) -> range:
+        self.size += count
+        return range(self.size - count, self.size)
