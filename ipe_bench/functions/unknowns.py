@@ -36,17 +36,28 @@ class ExactGraph(Graph):
     def apply(self, operation: str, *operands: Any) -> Expression:
         if not self.exact:
             return super().apply(operation, *operands)
-        args = [a if isinstance(a, Expression) else self.constant(a) for a in operands]
+        args = [a if type(a) is Expression else self.constant(a) for a in operands]
+        constant = [a.operation == "constant" for a in args]
+        if not any(constant):
+            return self._node(operation, *args)
         values = [a.value for a in args]
-        if all(v is not None for v in values):
+        if all(constant):
             with np.errstate(all="ignore"):
                 return self.constant(float(computed(operation, *map(np.float64, values))))
         match operation, values:
-            case ("pow", [_, 0.0]) | ("pow", [1.0, _]):
+            case ("pow", [_, 0.0] | [1.0, _]):
                 return self.constant(1.0)
-            case ("mul", [0.0, _] | [_, 0.0]) | ("div" | "sub", [0.0, _]):
-                return self._node(operation, *args)
-        return super().apply(operation, *args)
+            case ("mul" | "div" | "pow", [_, 1.0]) | ("add" | "sub", [_, 0.0]):
+                return args[0]
+            case ("mul", [1.0, _]) | ("add", [0.0, _]):
+                return args[1]
+            case ("pow", [_, 2.0]):
+                return self._node("mul", args[0], args[0])
+            case ("pow", [_, 0.5]):
+                return self._node("sqrt", args[0])
+            case ("where", [float(condition), _, _]):
+                return args[1] if condition else args[2]
+        return self._node(operation, *args)
 
     def refuse(self, what: str) -> Refused:
         """Returns what is to be raised, and keeps the first reason."""
@@ -156,32 +167,46 @@ def _is_truth(value: Any) -> bool:
 
 def call(name: str, *given: Any) -> Any:
     """Applies a function of NumPy to unknowns and numbers."""
-    graph = next(one.node.graph for one in given if is_unknown(one))
-    if any(isinstance(one, np.ndarray) for one in given):
-        return NotImplemented
+    graph = next(one.node.graph for one in given if type(one) is Unknown)
     name = _SAME.get(name, name)
-    truths = [_is_truth(one) for one in given]
-    nodes = [_node(graph, one) for one in given]
-    if name == "invert" and not all(truths):
-        raise graph.refuse("~ of a number is not recorded")
-    if all(truths):
-        if name in ("subtract", "negative"):
-            raise graph.refuse(f"np.{name} of truth values is an error")
-        name = _OF_TRUTHS.get(name, name)
-    # Where a truth is asked for, a number holds unless it is 0.
-    asked = {"logical_and": 2, "logical_or": 2, "where": 1}.get(name, 0)
-    for i in range(asked):
-        if not truths[i]:
-            nodes[i] = _OPERATIONS["not_equal"](graph.apply, nodes[i], 0.0)
     if name not in _OPERATIONS:
         raise graph.refuse(f"np.{name} is not recorded")
+    truths = []
+    nodes = []
+    for one in given:
+        if type(one) is Unknown:
+            truths.append(one.truth)
+            nodes.append(one.node)
+        elif isinstance(one, np.ndarray):
+            return NotImplemented
+        else:
+            truths.append(type(one) in (bool, np.bool_))
+            nodes.append(_number(graph, one))
+    if True in truths:
+        name = _of_truths(graph, name, truths)
+    elif name == "invert":
+        raise graph.refuse("~ of a number is not recorded")
+    # Where a truth is asked for, a number holds unless it is 0.
+    for i in range(_ASKED.get(name, 0)):
+        if not truths[i]:
+            nodes[i] = _OPERATIONS["not_equal"](graph.apply, nodes[i], 0.0)
     made = _OPERATIONS[name](graph.apply, *nodes)
     return Unknown(made, name in _TRUTHS or (name == "where" and all(truths[1:])))
 
 
-def _node(graph: Any, one: Any) -> Expression:
-    if is_unknown(one):
-        return one.node
+_ASKED = {"logical_and": 2, "logical_or": 2, "where": 1}
+
+
+def _of_truths(graph: ExactGraph, name: str, truths: Sequence[bool]) -> str:
+    """Returns what NumPy does with truth values in place of numbers."""
+    if not all(truths):
+        return name
+    if name in ("subtract", "negative"):
+        raise graph.refuse(f"np.{name} of truth values is an error")
+    return {"add": "logical_or", "multiply": "logical_and"}.get(name, name)
+
+
+def _number(graph: ExactGraph, one: Any) -> Expression:
     if isinstance(one, complex | np.complexfloating):
         raise graph.refuse("it computes with complex numbers")
     if not isinstance(one, bool | int | float | np.bool_ | np.number):
@@ -203,7 +228,6 @@ _SAME = {
     "rad2deg": "degrees",
     "float_power": "power",
 }
-_OF_TRUTHS = {"add": "logical_or", "multiply": "logical_and"}
 _TRUTHS = {
     *("less", "less_equal", "greater", "greater_equal", "equal", "not_equal"),
     *("logical_and", "logical_or", "invert", "isnan", "isfinite", "isinf"),
@@ -371,17 +395,26 @@ def _has_unknowns(key: Any) -> bool:
     return any(is_unknown(k) or isinstance(k, Unknowns) for k in keys)
 
 
-def _one(ufunc: np.ufunc, *args: Any) -> Any:
-    return call(ufunc.__name__, *args) if any(map(is_unknown, args)) else ufunc(*args)
+@functools.cache
+def _entries(ufunc: np.ufunc) -> Any:
+    """Returns a function of NumPy for entries, of which some may be unknown."""
+    name = ufunc.__name__
+
+    def one(*args: Any) -> Any:
+        if any(type(arg) is Unknown for arg in args):
+            return call(name, *args)
+        return ufunc(*args)
+
+    return np.frompyfunc(one, ufunc.nin, 1)
 
 
 def _each(ufunc: np.ufunc, inputs: Sequence[Any], graph: Any) -> Any:
-    return unknowns(_by_entry(functools.partial(_one, ufunc), *inputs), graph)
+    return unknowns(objects(_entries(ufunc)(*map(objects, inputs))), graph)
 
 
 def _gathered(ufunc: np.ufunc, method: str, inputs: Sequence[Any], kwargs: dict[str, Any]) -> Any:
     """Computes a sum, a product or the like over an axis, or an outer product."""
-    function = np.frompyfunc(functools.partial(_one, ufunc), ufunc.nin, 1)
+    function = _entries(ufunc)
     if kwargs.get("initial", 0) is np._NoValue:
         kwargs.pop("initial")
     if method == "outer":

@@ -23,6 +23,7 @@ from ipe_bench.runs.run import validate
 from ipe_bench.states.base import StateModel, require_parts
 from ipe_bench.states.copies import SURE, copy_p
 from ipe_bench.states.formulas import Formulas, RecordedFormulas
+from ipe_bench.states.lost import why_lost
 from ipe_bench.states.particles import Bootstrap
 from ipe_bench.states.smoothers import Smoother
 from ipe_bench.states.trackers import Tracker, Tracks
@@ -307,6 +308,7 @@ class LogTracks:
         lost_from = _lost_from(nis, tracks.degrees[0])
         ended = Status.CONVERGED if tracks.status is None else Status(int(tracks.status[0]))
         message = "" if ended == Status.CONVERGED else f"{ended.label}: {ended.reason}"
+        message = why_lost(log.model, tracks.mean).get(0, message)
         # What is not known, NaN, is no reason against a track.
         whole = bool(np.isfinite([mean, deviation]).all())
         fits = not fit_p < FIT_LEVEL and not white < FIT_LEVEL

@@ -277,6 +277,16 @@ class StateModel(Component, ABC):
         return ("reading",) if m == 1 else tuple(f"reading{i + 1}" for i in range(m))
 
     @property
+    def transition_names(self) -> tuple[str, ...]:
+        """Names of what `transition` returns, for messages."""
+        return tuple(f"state {state.name} of transition" for state in self.states)
+
+    @property
+    def observe_names(self) -> tuple[str, ...]:
+        """Names of what `observe` returns, likewise."""
+        return tuple(f"{name} of observe" for name in self.reading_names)
+
+    @property
     def log_inputs(self) -> tuple[str, ...]:
         """Names of the known inputs that a log has for each epoch, beside the readings; `time` in s
         is its times."""

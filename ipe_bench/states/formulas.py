@@ -178,6 +178,14 @@ class Formulas(StateModel):
         variances = [float(self.spread[name]) ** 2 for name in self.next]
         return Normal(mean, np.diag(variances))
 
+    @property
+    def transition_names(self) -> tuple[str, ...]:
+        return tuple(f"next.{name}" for name in self.next)
+
+    @property
+    def observe_names(self) -> tuple[str, ...]:
+        return tuple(f"readings.{name}" for name in self.readings)
+
     def transition(self, x: Array, k: int) -> Array:
         return self._moved(x, np.zeros(len(self.noise)), k)
 

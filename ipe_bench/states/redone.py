@@ -4,7 +4,8 @@ these."""
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import fields
 from typing import Any
@@ -15,6 +16,17 @@ from ipe_bench.basics.linalg import Array, Mask
 from ipe_bench.states.base import StateModel
 
 _INSIDE: ContextVar[bool] = ContextVar("inside another tracker", default=False)
+_UNCHANGED: ContextVar[bool] = ContextVar("nothing changes the model", default=False)
+
+
+@contextmanager
+def unchanged() -> Iterator[None]:
+    """States that no model changes within, so that it need not be looked at before each track."""
+    outside = _UNCHANGED.set(True)
+    try:
+        yield
+    finally:
+        _UNCHANGED.reset(outside)
 
 
 def believed(track: Callable[..., Any]) -> Callable[..., Any]:
@@ -27,7 +39,8 @@ def believed(track: Callable[..., Any]) -> Callable[..., Any]:
             return track(tracker, model, z)
         outside = _INSIDE.set(True)
         try:
-            model.renew_functions()
+            if not _UNCHANGED.get():
+                model.renew_functions()
             tracks = track(tracker, model, z)
             astray = _astray(model, tracks)
             rows = np.flatnonzero(astray)

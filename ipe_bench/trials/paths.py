@@ -31,6 +31,8 @@ from ipe_bench.states.base import Paths, StateModel, require_sound, widened
 from ipe_bench.states.bounds import bound_at_truth, posterior_bounds
 from ipe_bench.states.copies import SURE, copy_p
 from ipe_bench.states.formulas import RecordedFormulas
+from ipe_bench.states.lost import why_lost
+from ipe_bench.states.redone import unchanged
 from ipe_bench.states.smoothers import path_p
 from ipe_bench.states.trackers import Tracker, Tracks
 from ipe_bench.trials.scenario import Scenario, check_seed
@@ -119,6 +121,7 @@ class PathBlock:
 
     @classmethod
     def draw(cls, scenario: StateScenario, start: int, stop: int) -> PathBlock:
+        scenario.assumed.renew_functions()
         with np.errstate(all="ignore"):
             return cls(scenario, start, scenario.draw(start, stop))
 
@@ -205,7 +208,8 @@ class PathBlock:
         path."""
         variances = self.smoothed_variances if tracker.smooths else self.variances
         began = time.perf_counter()
-        tracks, messages = track_safely(tracker, self.scenario.assumed, self.paths.z)
+        with unchanged():
+            tracks, messages = track_safely(tracker, self.scenario.assumed, self.paths.z)
         elapsed = time.perf_counter() - began
         seconds = np.full(len(self), elapsed / max(1, len(self)))
         with np.errstate(all="ignore"):
@@ -285,9 +289,13 @@ class PathBlock:
         status[~finite(self.paths.x)] = Status.NO_READINGS
         iterations = np.full(trials, K) if tracks.iterations is None else tracks.iterations.copy()
         iterations[raised] = 0
+        why = why_lost(self.scenario.assumed, tracks.mean, states=False)
         for i in np.flatnonzero(~finished).tolist():
             epoch = int(np.argmin(known[i])) + 1
-            messages.setdefault(i, f"the track is not finite from epoch {epoch} on")
+            lost = f"the track is not finite from epoch {epoch} on"
+            messages.setdefault(i, f"{lost}: {why[i]}" if i in why else lost)
+        for i in np.flatnonzero(tracks.by_epoch).tolist() if tracks.by_epoch is not None else ():
+            messages.setdefault(i, REDONE)
         return Estimates(
             x=tracks.mean[:, -1, at],
             status=status.astype(np.int8),
@@ -349,6 +357,9 @@ def block_of(scenario: AnyScenario, start: int, stop: int) -> Any:
     if isinstance(scenario, StateScenario):
         return PathBlock.draw(scenario, start, stop)
     return Block.draw(scenario, start, stop)
+
+
+REDONE = "tracked by the functions in Python, from which the recorded ones differ at its states"
 
 
 def track_safely(tracker: Tracker, model: StateModel, z: Array) -> tuple[Tracks, dict[int, str]]:
