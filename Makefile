@@ -4,7 +4,7 @@ BIN := .venv/bin
 
 .PHONY: run test slow cluster campaigns oracles plugins lowest newest mutants lint dist bench docs gallery clean
 
-# Draws README's figure too: cp outputs/headline/figures/headline.png .assets
+# README's figure is outputs/headline/figures/success.png.
 run: .venv/ready
 	$(BIN)/ipe-bench run +experiment=headline
 
@@ -80,7 +80,8 @@ docs: .venv/ready
 	$(BIN)/uv pip install --quiet --python $(BIN)/python --editable ".[docs]"
 	$(BIN)/python tests/site/make_docs.py outputs/docs
 
-# Draws the gallery's pages again, in outputs/docs/source/gallery, and says what is stored of each experiment, in seconds.
+# Draws the gallery's pages again, in outputs/docs/source/gallery, and README's table and pictures, and says what is stored
+# of each experiment, in seconds.
 # NAMES="headline paper" computes these anew and stores them, with their own trials: `filters`, `beyond` and `states` take
 # the better part of an hour. TRIALS=100 takes a tenth of the trials, which their pages then say.
 gallery: .venv/ready

@@ -1,7 +1,7 @@
 """States what a comparison found in one sentence, the title wherever its results are shown.
 
-Holding is judged here alone: an estimator holds where at least `HELD` of its trials succeed with 95
-% confidence, fails where fewer do, and is undecided otherwise. Rows are those of a summary over all
+An estimator is judged here alone: it succeeds where at least `HELD` of its trials do, with 95 %
+confidence, fails where fewer do, and is undecided otherwise. Rows are those of a summary over all
 parameters.
 """
 
@@ -23,9 +23,9 @@ MOST_NAMES = 3
 """Names in a list of a title; more are counted."""
 MOST_PLACES = 2
 """Settings, each at an error scale, that a title names; more are counted."""
-MEANING = f"Holds: at least {100 * HELD:.0f} % of all trials succeed, with 95 % confidence."
+MEANING = f"Succeeds: in at least {100 * HELD:.0f} % of trials, with 95 % confidence."
 """What a reader of the title needs to know."""
-HOLDS = "holds"
+SUCCEEDS = "succeeds"
 FAILS = "fails"
 UNDECIDED = "undecided"
 _SIDES = ("filters", "IPE")
@@ -45,7 +45,7 @@ class Standing:
     rows: tuple[Row | None, ...]
     judged: tuple[str, ...]
     ascending: bool
-    """Whether the columns are ascending error scales, of which it holds up to one, rather than
+    """Whether the columns are ascending error scales, of which it succeeds up to one, rather than
     settings."""
 
     @property
@@ -54,12 +54,12 @@ class Standing:
 
     @cached_property
     def sure(self) -> int:
-        """The number of columns in which, or up to which, it holds."""
-        return self._number(lambda word: word == HOLDS)
+        """The number of columns in which, or up to which, it succeeds."""
+        return self._number(lambda word: word == SUCCEEDS)
 
     @cached_property
     def possible(self) -> int:
-        """The number of columns in which, or up to which, it may hold."""
+        """The number of columns in which, or up to which, it may succeed."""
         return self._number(lambda word: word != FAILS)
 
     @property
@@ -74,7 +74,7 @@ class Standing:
 
     @property
     def rank(self) -> tuple[float, ...]:
-        """Sorts who surely holds longest first, then who may, then who succeeds most."""
+        """Sorts who surely succeeds longest first, then who may, then who succeeds most."""
         shares = [row["success"] for row in self.rows if row]
         return (-self.sure, -self.possible, -sum(shares) / max(len(shares), 1))
 
@@ -128,7 +128,7 @@ class Finding:
         return [one and not all(may) for one in may]
 
     def sentence(self) -> str:
-        """States who holds, who is undecided, whose covariance is too small, and at which scales
+        """States who succeeds, who is undecided, whose covariance is too small, and at which scales
         the best filter or IPE fails."""
         most = max(one.sure for one in self.standings)
         if not most:
@@ -145,7 +145,7 @@ class Finding:
         who = named(winners, self.standings)
         if len(winners) < len(self.standings) and not undecided:
             who = f"Only {who}"
-        verb = "holds" if len(winners) == 1 else "hold"
+        verb = "succeeds" if len(winners) == 1 else "succeed"
         who = who.replace("all ", "All ", 1) if who.startswith("all ") else who
         return f"{who} {verb} {self._where(winners)} ({self._numbers(winners)})"
 
@@ -164,7 +164,7 @@ class Finding:
     def _which(self, winners: Sequence[Standing]) -> str:
         """Names the settings where all winners hold, or all where all fail, if those are few."""
         judged = winners[0].judged
-        held = [at for at, word in enumerate(judged) if word == HOLDS]
+        held = [at for at, word in enumerate(judged) if word == SUCCEEDS]
         lost = [at for at, word in enumerate(judged) if word == FAILS]
         few = min(held, lost, key=len)
         if len(few) > MOST_PLACES or any(one.judged != judged for one in winners):
@@ -192,7 +192,7 @@ class Finding:
             row
             for one in winners
             for row, word in zip(one.rows, one.judged, strict=True)
-            if word == HOLDS
+            if word == SUCCEEDS
         ]
         return seen([row for row in (last if self.ascending else held) if row])
 
@@ -245,7 +245,7 @@ class Finding:
         failing = self._extent(lost, number)
         if not wrong or wrong[0] >= lost[0]:
             return failing
-        return f"{failing}, with too small a covariance {self._extent(wrong, number)}"
+        return f"{failing}, with covariances that are too small {self._extent(wrong, number)}"
 
     def _nobody(self) -> str:
         """States that nowhere an estimator significantly holds, and who did succeed longest or in
@@ -260,20 +260,20 @@ class Finding:
         where = f"at error scale {self._scale(at)}" if self.ascending else where
         told = f"{named(ahead, self.standings)} {verb} in {share} {where}"
         if any(one.possible for one in self.standings):
-            return f"Too few trials to tell who holds; {told}"
+            return f"Too few trials to rank; {told}"
         if len(self.places) == 1:
-            return f"No estimator holds; {told}"
+            return f"No estimator succeeds; {told}"
         first = f", even at error scale {self._scale(0)}"
-        return f"No estimator holds{first if self.ascending else ' in any setting'}; {told}"
+        return f"No estimator succeeds{first if self.ascending else ' in any setting'}; {told}"
 
 
 def judged(row: Row | None, columns: int) -> str:
-    """Judges whether an estimator holds by its exact 95 % interval; failing shares that level among
-    the columns."""
+    """Judges whether an estimator succeeds by its exact 95 % interval; failing shares that level
+    among the columns."""
     if row is None:
         return UNDECIDED
     if row["success_low"] >= HELD:
-        return HOLDS
+        return SUCCEEDS
     level = 1 - (1 - LEVEL) / columns
     count = round(row["success"] * row["trials"])
     return FAILS if clopper_pearson(count, int(row["trials"]), level)[1] < HELD else UNDECIDED

@@ -38,7 +38,8 @@ def found(rows: list[dict[str, Any]]) -> str:
 def test_only_the_one_that_holds_is_named_and_where_the_best_filter_fails():
     rows = sweep(newton=(200, 200, 200), ekf=(200, 90, 0), ukf=(200, 20, 0), lse=(0, 0, 0))
     assert found(rows) == (
-        "Only newton holds up to error scale 100 (100 % of 200 trials); ekf and ukf fail from 10 on"
+        "Only newton succeeds up to error scale 100 (100 % of 200 trials);"
+        " ekf and ukf fail from 10 on"
     )
     assert [one.label for one in Finding.of(rows).standings] == ["newton", "ekf", "ukf", "lse"]
 
@@ -47,55 +48,55 @@ def test_only_needs_every_rival_surely_below():
     """Of 200 trials 172 are as likely as not those of an estimator that holds 90 %, given three
     scales."""
     assert found(sweep(newton=(200, 200, 200), ekf=(200, 200, 172))) == (
-        "newton holds up to error scale 100 (100 % of 200 trials); ekf: undecided"
+        "newton succeeds up to error scale 100 (100 % of 200 trials); ekf: undecided"
     )
 
 
 def test_a_share_seen_above_the_level_is_no_proof():
     """Of 40 trials 38 prove no 90 %, and 33 do not refute it."""
     assert found(sweep(trials=40, a=(40, 40, 38), b=(40, 33, 33))) == (
-        "a holds up to error scale 10 (100 % of 40 trials); b: undecided"
+        "a succeeds up to error scale 10 (100 % of 40 trials); b: undecided"
     )
 
 
 def test_who_holds_longest_is_named_with_the_scale_up_to_which():
     assert found(sweep(a=(200, 198, 0), b=(200, 100, 0))) == (
-        "Only a holds up to error scale 10 (99 % of 200 trials)"
+        "Only a succeeds up to error scale 10 (99 % of 200 trials)"
     )
 
 
 def test_all_hold_and_more_than_three_are_counted():
     assert found(sweep(a=(200,) * 3, b=(196,) * 3)) == (
-        "a and b hold up to error scale 100 (98 to 100 % of 200 trials)"
+        "a and b succeed up to error scale 100 (98 to 100 % of 200 trials)"
     )
     four = dict.fromkeys("abcd", (200, 200, 200))
     assert (
-        found(sweep(**four)) == "All 4 estimators hold up to error scale 100 (100 % of 200 trials)"
+        found(sweep(**four))
+        == "All 4 estimators succeed up to error scale 100 (100 % of 200 trials)"
     )
-    assert found(sweep(**four, e=(0, 0, 0))).startswith("Only 4 of 5 estimators hold up to")
+    assert found(sweep(**four, e=(0, 0, 0))).startswith("Only 4 of 5 estimators succeed up to")
 
 
 def test_one_scale_and_one_estimator():
-    assert found(sweep(a=(200,))) == "a holds at error scale 1 (100 % of 200 trials)"
+    assert found(sweep(a=(200,))) == "a succeeds at error scale 1 (100 % of 200 trials)"
     assert found(sweep(a=(200,), ekf=(3,), newton=(5,))) == (
-        "Only a holds at error scale 1 (100 % of 200 trials); ekf and newton fail"
+        "Only a succeeds at error scale 1 (100 % of 200 trials); ekf and newton fail"
     )
 
 
 def test_nobody_holds_or_the_trials_are_too_few_to_tell():
     assert found(sweep(a=(100, 0, 0), b=(20, 0, 0))) == (
-        "No estimator holds, even at error scale 1; a and b succeed in 10 to 50 % of 200"
+        "No estimator succeeds, even at error scale 1; a and b succeed in 10 to 50 % of 200"
         " trials at error scale 1"
     )
     assert found(sweep(trials=20, a=(20, 19, 2), b=(20, 20, 3))) == (
-        "Too few trials to tell who holds; b and a succeed in 95 to 100 % of 20 trials at error"
-        " scale 10"
+        "Too few trials to rank; b and a succeed in 95 to 100 % of 20 trials at error scale 10"
     )
 
 
 def test_a_missing_cell_is_undecided_and_forbids_only():
     rows = sweep(a=(200, 200, 200), b=(200, 200, None))
-    assert found(rows) == "a holds up to error scale 100 (100 % of 200 trials); b: undecided"
+    assert found(rows) == "a succeeds up to error scale 100 (100 % of 200 trials); b: undecided"
 
 
 @pytest.mark.parametrize(
@@ -113,7 +114,7 @@ def test_only_a_sure_verdict_calls_a_covariance_too_small(verdicts, clause):
     rows = sweep(a=(200, 200, 200))
     for one, verdict in zip(rows, verdicts, strict=True):
         one["verdict"] = verdict
-    told = "a holds up to error scale 100 (100 % of 200 trials)"
+    told = "a succeeds up to error scale 100 (100 % of 200 trials)"
     assert found(rows) == "; ".join(filter(None, [told, clause]))
 
 
@@ -135,16 +136,16 @@ def settings(**counts: tuple[int, ...]) -> list[dict[str, Any]]:
 
 def test_settings_are_counted_and_have_no_order():
     assert found(settings(a=(0, 200, 200), b=(200, 0, 0))) == (
-        "Only a holds in 2 of 3 settings, all but truth=0 (100 % of 200 trials)"
+        "Only a succeeds in 2 of 3 settings, all but truth=0 (100 % of 200 trials)"
     )
     assert found(settings(a=(200, 200), b=(200, 196))) == (
-        "a and b hold in both settings (98 to 100 % of 200 trials)"
+        "a and b succeed in both settings (98 to 100 % of 200 trials)"
     )
     assert found(settings(a=(178, 200), b=(0, 0))) == (
-        "Only a holds in at least 1 of 2 settings (100 % of 200 trials)"
+        "Only a succeeds in at least 1 of 2 settings (100 % of 200 trials)"
     )
     assert found(settings(a=(0, 0))) == (
-        "No estimator holds in any setting; a succeeds in 0 % of 200 trials in 2 settings"
+        "No estimator succeeds in any setting; a succeeds in 0 % of 200 trials in 2 settings"
     )
 
 
@@ -152,7 +153,7 @@ def test_settings_whose_texts_are_equal_are_both_counted():
     rows = settings(a=(200, 0))
     for one in rows:
         one["setting"] = "truth=0.1"
-    assert found(rows) == "a holds in 1 of 2 settings, truth=0.1 (100 % of 200 trials)"
+    assert found(rows) == "a succeeds in 1 of 2 settings, truth=0.1 (100 % of 200 trials)"
 
 
 def test_few_scenarios_that_are_lost_are_named_and_their_number_is_told_once():
@@ -165,14 +166,14 @@ def test_few_scenarios_that_are_lost_are_named_and_their_number_is_told_once():
     for one in rows[:4]:
         one["verdict"] = "overconfident"
     assert found(rows) == (
-        "Only auto holds in 3 of 4 scenarios, all but pendulum at 10 (100 % of 200 trials);"
+        "Only auto succeeds in 3 of 4 scenarios, all but pendulum at 10 (100 % of 200 trials);"
         " its covariance is too small in 4 scenarios"
     )
 
 
 def test_settings_where_winners_differ_or_are_undecided_are_not_named():
     assert found(settings(a=(200, 0), b=(0, 200))) == (
-        "a and b hold in 1 of 2 settings (100 % of 200 trials)"
+        "a and b succeed in 1 of 2 settings (100 % of 200 trials)"
     )
     assert "truth" not in found(settings(a=(200, 178)))
 
@@ -191,7 +192,7 @@ def test_a_filter_that_is_overconfident_before_it_fails_is_said_to_be(verdicts, 
         one["verdict"] = verdict
     told = found(rows).partition("; ")[2]
     assert told == (
-        f"ekf and ukf fail at 100, with too small a covariance{clause}"
+        f"ekf and ukf fail at 100, with covariances that are too small{clause}"
         if clause
         else "ekf and ukf fail at 100"
     )

@@ -72,8 +72,8 @@ def test_the_headline_says_who_holds_who_agrees_and_who_fails_undetected(synthet
     finding, matrix, agree, price, silent = headline(analysis)
     assert [row[0].text for row in matrix.rows] == ["solver", "filter"]
     assert finding == (
-        "Only solver holds up to error scale 1000 (100 % of 100 trials);"
-        " filter fails from 100 on, with too small a covariance from 10 on"
+        "Only solver succeeds up to error scale 1000 (100 % of 100 trials);"
+        " filter fails from 100 on, with covariances that are too small from 10 on"
     )
     assert agree.startswith(
         "Small errors: IPE (solver) and filters (filter) perform alike up to error scale 10: all"
@@ -117,7 +117,7 @@ def test_several_settings_are_counted_and_the_worst_is_named(synthetic):
         )
     finding, matrix, silent = said(synthetic.directory)
     assert matrix == "matrix"
-    assert finding.startswith("Only good holds in both settings (100 % of 50 trials)")
+    assert finding.startswith("Only good succeeds in both settings (100 % of 50 trials)")
     assert silent == (
         "Undetected failures: up to 40 % of the trials (bad at error scale 1, noise.deviation=0.2)."
     )
@@ -234,11 +234,11 @@ def finding_is_so(sentence: str, results: Results) -> None:
     winners = {label for label, number in sure.items() if number == most}
     rivals = {label for label, number in possible.items() if number >= most} - winners
     if not most:
-        assert re.match("No estimator holds|Too few trials to tell who holds", sentence)
+        assert re.match("No estimator succeeds|Too few trials to rank", sentence)
         assert sentence.startswith("No") == (not any(possible.values()))
         return
     first, *others = sentence.split("; ")
-    who = re.match(r"(?:Only )?(.*?) holds? ", first)
+    who = re.match(r"(?:Only )?(.*?) succeeds? ", first)
     assert who
     if who[1] != f"All {len(winners)} estimators" and " of " not in who[1]:
         assert set(re.split(", | and ", who[1])) == winners
@@ -251,7 +251,7 @@ def finding_is_so(sentence: str, results: Results) -> None:
 def agreement_is_so(sentence: str, results: Results, summary: pd.DataFrame) -> None:
     labels = [label for label in results.labels if label in (*IPE, *FILTERS)]
     scales = sorted({scale for _, scale in results.success})
-    match = re.search(r"agree (?:up to error scale (\d+)|at every error scale)", sentence)
+    match = re.search(r"perform alike (?:up to error scale (\d+)|at every error scale)", sentence)
     assert match
     last = float(match[1] or scales[-1])
     totals = summary[(summary["parameter"] == "all") & summary["estimator"].isin(labels)]
@@ -303,7 +303,7 @@ def test_problems_in_common_alone_are_counted():
 
 # Experiments --------------------------------------------------------------------------------------
 
-FEW = r"Too few trials to tell who holds; .* succeed in 100 % of 20 trials"
+FEW = r"Too few trials to rank; .* succeed in 100 % of 20 trials"
 SWEEP = (rf"{FEW} at error scale 1", "matrix")
 RIVALS = (
     rf"{FEW} at error scale 300",
@@ -325,7 +325,7 @@ PAGES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "states": (
         ("state_model=bearings_only", "error_scale=1,10"),
         (
-            r"Too few trials to tell who holds; .* succeed in .* of 20 trials at error scale 10",
+            r"Too few trials to rank; .* succeed in .* of 20 trials at error scale 10",
             "matrix",
             r"Undetected failures",
         ),
@@ -403,7 +403,7 @@ def test_certified_readings_of_no_collection_are_found_too_and_an_empty_folder_i
     synthetic.add(synthetic.scenario(sigma=0.1), "newton", np.zeros((20, 3)))
     assert said(synthetic.directory) == [
         sentence,
-        "Too few trials to tell who holds; newton succeeds in 100 % of 20 trials at error scale 1",
+        "Too few trials to rank; newton succeeds in 100 % of 20 trials at error scale 1",
         MEANING,
     ]
     tables = {table.name: table for table in all_tables(analyse([synthetic.directory]).simulated)}
@@ -418,8 +418,7 @@ def test_states_that_move_have_words_of_their_own(tmp_path):
     kept, meaning = said(tmp_path)
     assert meaning == MEANING
     assert kept == (
-        "Too few trials to tell who holds; kf and rts succeed in 100 % of 20 trials at error scale"
-        " 1"
+        "Too few trials to rank; kf and rts succeed in 100 % of 20 trials at error scale 1"
     )
     median = table[table["parameter"] == "all"].set_index("estimator")["error_median"]
     assert median["rts"] == pytest.approx(median["kf"], rel=1e-12)

@@ -235,4 +235,4 @@ def test_a_share_of_no_trials_is_a_dash_and_holds_nowhere(missing):
 def test_without_any_share_nobody_is_said_to_hold():
     nothing = {"success": float("nan"), "success_low": float("nan")}
     rows = [one | nothing for one in rows_of({"a": (200, 200), "b": (200, 200)})]
-    assert Finding.of(rows).sentence().startswith("Too few trials to tell who holds")
+    assert Finding.of(rows).sentence().startswith("Too few trials to rank")

@@ -125,17 +125,17 @@ NAMED = (
 NUMBERS = r"(?P<low>[<>\d.]+)(?: %)?(?: to (?P<high>[<>\d.]+))? % of (?P<trials>\d+) trials"
 UP_TO = r"(?:up to|at) error scale (?P<scale>[\d.]+)"
 CLAUSES = {
-    "winners": rf"(?P<only>Only )?{NAMED} holds? {UP_TO} \({NUMBERS}\)",
+    "winners": rf"(?P<only>Only )?{NAMED} succeeds? {UP_TO} \({NUMBERS}\)",
     "covariance": rf"(?:(?P<theirs>its|their) covariance|the covariance of {NAMED}) is too small"
     r"(?: (?P<extent>from|at) (?P<scale>[\d.]+)(?: on)?)?",
     "undecided": rf"{NAMED}: undecided",
     "fails": rf"{NAMED} fails?(?: (?P<extent>from|at) (?P<scale>[\d.]+)(?: on)?)?"
-    r"(?:, with too small a covariance (?P<wrong>from|at) (?P<first>[\d.]+)(?: on)?)?",
-    "nobody": r"(?P<word>No estimator holds|Too few trials to tell who holds)"
+    r"(?:, with covariances that are too small (?P<wrong>from|at) (?P<first>[\d.]+)(?: on)?)?",
+    "nobody": r"(?P<word>No estimator succeeds|Too few trials to rank)"
     r"(?:, even at error scale (?P<even>[\d.]+))?",
     "most": rf"{NAMED} succeeds? in {NUMBERS} {UP_TO}",
 }
-FINDING = r"(?:Only |All |No estimator |Too few |\d+ of \d+ |e\d+).*(?:hold|tell who holds).*"
+FINDING = r"(?:Only |All |No estimator |Too few |\d+ of \d+ |e\d+).*(?:succeed|to rank).*"
 
 
 @sentence(FINDING)
@@ -277,7 +277,7 @@ def too_small_before(
 
 def nobody(report: Report, found: Any, winners: list[str]) -> Iterator[tuple[str, str, bool]]:
     possible = possible_up_to(report, 0)
-    none = found["word"] == "No estimator holds"
+    none = found["word"] == "No estimator succeeds"
     yield "nobody", COUNTS, bool(holding_up_to(report, 0)) or none == bool(possible)
     if none:
         every = report.board.populations

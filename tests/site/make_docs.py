@@ -23,6 +23,7 @@ from typing import Any
 
 import pandas as pd
 from gallery_frames import SUFFIX, Computed, read
+from readme import write_readme
 from state_tables import with_tables
 from word_drawings import write_drawings
 
@@ -38,6 +39,7 @@ from ipe_bench.report.figures.views import in_focus, views
 from ipe_bench.report.page.headline import headline
 from ipe_bench.report.sections import report_tables
 from ipe_bench.report.style import house_style
+from ipe_bench.report.tables.matrix import SUCCESS
 from ipe_bench.report.tables.reports import certified_tables
 from ipe_bench.report.tables.table import environment, html, markdown
 from ipe_bench.report.words import brief, enumerate_few, percent
@@ -287,7 +289,8 @@ def stored_as_markdown(option: Option) -> str:
     computed = read(STORED / f"{option.name}{SUFFIX}")
     finding, *parts = headline(computed.analysis)
     with house_style():
-        (figure,) = islice(drawings(computed.analysis, "main"), 1)
+        figures = drawings(computed.analysis, "main")
+        figure = next(one for one in figures if one.name == SUCCESS)
     table, *_ = report_tables(computed.analysis)
     made = environment().overlay(autoescape=False)
     return made.get_template("docs/stored.md.j2").render(
@@ -407,6 +410,7 @@ def store_all(output: Path, trials: int, names: Sequence[str]) -> int:
         print(f"{option.name}: {computed.extent}, by ipe-bench {computed.version}")
         if option.name == SHOWN.stem:
             write_text(SHOWN, stored_as_markdown(option))
+            write_readme(computed.analysis)
         if option.name == "states":
             page = TABLES.read_text(encoding="utf-8")
             write_text(TABLES, with_tables(page, computed.analysis))

@@ -19,7 +19,7 @@ from ipe_bench.report.formats import FORMATS, PAGE
 from ipe_bench.report.style import Which, house_style
 from ipe_bench.statistics.analysis import Analysis
 
-FIGURES = ("certified", "settings", "errors", "costs", "parameters", "matrix")
+FIGURES = ("certified", "settings", "errors", "costs", "parameters", "matrix", "headline")
 """The modules in the order of the report; each holds its kinds of figures in FIGURES."""
 NAMES = {
     "digits": "digits of certified parameters that agree, by problem and estimator",
@@ -29,6 +29,7 @@ NAMES = {
         " of it"
     ),
     "headline": "success, error and reported covariance of all trials",
+    "success": "success at every error scale with names at the curves, for a talk or a README",
     "matrix": "success of every estimator at every error scale, best first",
     "distributions": "distribution functions of the error, a panel per error scale",
     "calibration": "distribution of NEES beside the one for a right covariance",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ipe_bench.report.page.headline import about, headline, success, task
 from ipe_bench.report.page.writer import Page, digests
-from ipe_bench.report.tables.matrix import MATRIX, Matrix
+from ipe_bench.report.tables.matrix import MATRIX, SUCCESS, Matrix
 from ipe_bench.report.tables.table import Part, Strong, Table, environment, words
 from ipe_bench.report.words import counted, public
 from ipe_bench.runs.parts import TRUTH
@@ -44,7 +44,7 @@ def render_page(
     answer = headline(analysis)
     # What the matrix shows is not drawn a second time, and the whole table is folded below it.
     tiled = any(isinstance(part, Matrix) for part in answer)
-    pictures = [figure for figure in figures if not figure.name.startswith(MATRIX)]
+    pictures = [figure for figure in figures if not figure.name.startswith((MATRIX, SUCCESS))]
     main: list[Part] = [table for table in tables if not table.appendix]
     opened = [] if tiled else main[:1]
     folded = main[len(opened) :]

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from itertools import groupby
 from typing import Any, ClassVar, NamedTuple
 
-from ipe_bench.report.finding import HOLDS, MEANING, Finding, Row, Standing, setting_words
+from ipe_bench.report.finding import MEANING, SUCCEEDS, Finding, Row, Standing, setting_words
 from ipe_bench.report.style import RAMP, ink, step
 from ipe_bench.report.tables.table import (
     NOT_JUDGED,
@@ -42,6 +42,8 @@ from ipe_bench.statistics.verdicts import (
 
 MATRIX = "matrix"
 """Begins the names of files of a matrix."""
+SUCCESS = "success"
+"""The name of the picture of its success."""
 VIEWS = {
     "success": ("success", "Successful trials, %"),
     "error": ("error", "Median error, relative to"),
@@ -288,7 +290,7 @@ def _tile(
     sign = TOO_SMALL if verdict == OVERCONFIDENT else ""
     sign = NOT_JUDGED if verdict in (UNDECIDED, NO_VERDICT) else sign
     number = share_text(row["success"])
-    fails = one.judged[at] != HOLDS
+    fails = one.judged[at] != SUCCEEDS
     # A blank in place of a sign keeps numbers below each other.
     text = f"{number}{sign or ' '}"
     paid = row["simulations_median"]
