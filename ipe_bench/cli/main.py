@@ -17,7 +17,7 @@ from typing import Any
 from ipe_bench import __version__
 from ipe_bench.basics.errors import StorageError, UserError, shortened, unknown
 from ipe_bench.basics.visible import VisibleStream
-from ipe_bench.cli import discard_output
+from ipe_bench.cli import discard_output, say
 from ipe_bench.cli.parser import COMMANDS, parser_of, program
 from ipe_bench.cli.questions import QUESTIONS, question_command
 from ipe_bench.report.page.writer import COMMAND
@@ -30,6 +30,9 @@ HOMES = {
     **dict.fromkeys(("check", "new"), "workshop"),
 }
 """The module of each command that is no question, which is loaded when the command is given."""
+
+SHORT = ("estimate", "design", "posterior")
+"""Commands that take a model and files of readings without keys."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -135,8 +138,18 @@ def _dispatch(words: list[str]) -> int:
     if any(word in ("-h", "--help") for word in rest):
         parser.print_help()
         return 0
+    files: Sequence[str] = ()
+    if command in SHORT and not all("=" in word for word in rest):
+        from ipe_bench.cli import shorts
+
+        short = shorts.read(command, rest)
+        say(*short.assumed)
+        rest = short.in_full
+        if command in QUESTIONS:
+            rest = short.words
+            files = short.readings
     if command in QUESTIONS:
-        return question_command(command, parser.parse(rest).arguments)
+        return question_command(command, parser.parse(rest).arguments, files)
     module = importlib.import_module(f"ipe_bench.cli.{HOMES[command]}")
     begin = getattr(module, f"{command}_command")
     if command == "run":

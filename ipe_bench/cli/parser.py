@@ -94,6 +94,14 @@ Quote values with brackets, or the shell takes them for a pattern.
         "estimate parameters or states from real readings, and test the fit",
         "0 some estimator has an answer; 1 none has, or the model fits none",
         """
+  ipe-bench estimate oxygen.py oxygen.csv         your function: the only one of
+                                                  the file, or oxygen.py:NAME
+  ipe-bench estimate "a*exp(-b*t)+c" FILE.csv     your formula: names that are
+                                                  no columns start at 1
+  ipe-bench estimate car.yaml LOG.csv             your state model by formulas
+
+What is assumed stands in the first lines. The same with keys:
+
   ipe-bench estimate readings=FILE.csv            the default model, gins
   ipe-bench estimate measurement=gins readings=FILE.parquet "solver=[newton]"
   ipe-bench estimate measurement=nist/misra1a     readings that the model has
@@ -128,7 +136,11 @@ output=DIR          folder of the files (outputs/estimate-MODEL, or
                     outputs/estimate-MODEL-2 and so on). Files of other
                     commands are never overwritten.
 """,
-        {"arguments": _several("KEY=VALUE", "any key of `ipe-bench run`")},
+        {
+            "arguments": _several(
+                "KEY=VALUE", "any key of `ipe-bench run`; or a model and files of readings"
+            )
+        },
     ),
     # A question describes itself in its folder, and its line in the table of names.
     **dict.fromkeys(QUESTIONS),

@@ -25,6 +25,8 @@ class Row(NamedTuple):
     a scenario."""
     moving: str = ""
     """What serves in its place for states that move."""
+    at_estimate: bool = False
+    """Whether its truths lie about the estimate, where a user's own readings are given."""
 
 
 QUESTIONS = {
@@ -32,6 +34,7 @@ QUESTIONS = {
         "predict how well each parameter will be determined, and choose readings",
         (*of("run", "figures", "estimators"), "trials"),
         "use `ipe-bench run state_model=NAME`, which computes the bounds of states",
+        at_estimate=True,
     ),
     "posterior": Row(
         "sample the posterior of a few trials, and compare estimators with it",
@@ -50,8 +53,9 @@ def question(name: str) -> Question:
     return importlib.import_module(f"ipe_bench.questions.{name}.command").QUESTION
 
 
-def question_command(name: str, arguments: Sequence[str]) -> int:
-    """Answers a question, shows the answer, and returns the exit code."""
+def question_command(name: str, arguments: Sequence[str], files: Sequence[str] = ()) -> int:
+    """Answers a question, shows the answer, and returns the exit code; `files` are readings whose
+    like is simulated."""
     row = QUESTIONS[name]
     record = question(name)
     known = record.options()
@@ -63,7 +67,7 @@ def question_command(name: str, arguments: Sequence[str]) -> int:
     for word in own:
         _refuse_file(name, word, others)
     options = places_and_keys(name, own, known)[1]
-    return _shown(record.run(_asked(name, others, row), **options))
+    return _shown(record.run(_asked(name, others, row, files), **options))
 
 
 def _refuse_file(name: str, word: str, others: Sequence[str]) -> None:
@@ -76,14 +80,17 @@ def _refuse_file(name: str, word: str, others: Sequence[str]) -> None:
         )
 
 
-def _asked(name: str, arguments: Sequence[str], row: Row) -> Asked:
+def _asked(name: str, arguments: Sequence[str], row: Row, files: Sequence[str]) -> Asked:
+    from ipe_bench.cli.own_data import like_these
     from ipe_bench.cli.single import single
 
     found = single(name, arguments, moving=row.moving, run=row.without or (), estimate=OF_FILES)
     trials = found.spec.count if "trials" in found.words.keys else None
-    return Asked(
-        found.measurement, found.spec.scenario, found.spec.estimators, trials, found.folder
-    )
+    spec = found.spec
+    if files:
+        spec, lines = like_these(spec, files, found.words.keys, at_estimate=row.at_estimate)
+        say(*lines)
+    return Asked(found.measurement, spec.scenario, spec.estimators, trials, found.folder)
 
 
 def _shown(found: Answered) -> int:

@@ -177,7 +177,7 @@ def _expanded(word: str) -> list[str]:
         return _from_file(file[1] or file[2], file[3], word)
     found = _TEXT.fullmatch(word)
     if found and not (found[1].endswith("unit") and re.search(r"[,\[\]{}]", found[2])):
-        return [f"{found[1]}={_quoted(found[2])}"]
+        return [f"{found[1]}={quoted(found[2])}"]
     if word.startswith("formats=") and "," in word and "[" not in word:
         return [f"formats=[{word.partition('=')[2]}]"]  # several formats are no sweep
     return [re.sub(rf"^(\+*){TRUTH}=", rf"\1{HYDRAS_TRUTH}=", word)]
@@ -206,13 +206,14 @@ def _literal(value: Any, where: str) -> str:
     if isinstance(value, list):
         return "[" + ",".join(_literal(v, where) for v in value) + "]"
     if isinstance(value, str):
-        return _quoted(value)
+        return quoted(value)
     if value is None or isinstance(value, int | float):
         return json.dumps(value)
     raise UserError(f"{where}: {value!r} is neither text nor number")
 
 
-def _quoted(text: str) -> str:
+def quoted(text: str) -> str:
+    """Quotes a text for Hydra's grammar."""
     return "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
 
 
@@ -232,7 +233,7 @@ def _parse(command: str, word: str, groups: Groups) -> Override:
         raise UserError(
             f"{word}: the value cannot be read; a text with other signs than letters, digits"
             " and -_./:% needs quotes "
-            f'that reach ipe-bench, such as "{key}={_quoted(value)}", and brackets'
+            f'that reach ipe-bench, such as "{key}={quoted(value)}", and brackets'
             " have to be closed"
         ) from None
     if not found.key_or_group:

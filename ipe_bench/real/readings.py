@@ -107,7 +107,7 @@ class TextTable:
             return wanted
         if " [" in wanted:
             return None
-        return next((name for name in self.heading if _quantity(name) == wanted), None)
+        return next((name for name in self.heading if quantity(name) == wanted), None)
 
     def require_known(self, known: Collection[str], wanted: Sequence[str]) -> None:
         """Refuses columns that are not known."""
@@ -128,7 +128,7 @@ class TextTable:
     def refuse_other_unit(self, name: str) -> None:
         """Refuses a column that is there with another unit, or with none."""
         for other in self.heading:
-            if _quantity(other) != _quantity(name):
+            if quantity(other) != quantity(name):
                 continue
             if not unit_of(other):
                 raise self.error(
@@ -144,7 +144,8 @@ def _number(text: str) -> float | None:
     return float(text) if _NUMBER.fullmatch(text) else None
 
 
-def _quantity(heading: str) -> str:
+def quantity(heading: str) -> str:
+    """Returns a heading such as `height [m]` without its unit."""
     return heading.partition(" [")[0].strip()
 
 
@@ -332,7 +333,7 @@ def _together(paths: Sequence[Path], found: Sequence[Readings]) -> Readings:
     first = found[0]
     if len(found) == 1:
         return first
-    units = {_quantity(name): unit_of(name) for name in first.columns}
+    units = {quantity(name): unit_of(name) for name in first.columns}
     for one, path in zip(found, paths, strict=True):
         if (one.deviations is None) != (first.deviations is None):
             with_sigma, without = (paths[0], path) if one.deviations is None else (path, paths[0])
@@ -340,7 +341,7 @@ def _together(paths: Sequence[Path], found: Sequence[Readings]) -> Readings:
                 f"readings={without}: has no column {SIGMA}, as {with_sigma} has; give it one, too"
             )
         for name in one.columns:  # one formula is made of all files
-            other = units.get(_quantity(name))
+            other = units.get(quantity(name))
             if other and unit_of(name) and unit_of(name) != other:
                 raise UserError(
                     f"readings={path}: column {name}: {paths[0]} has it in {other}; convert the"
@@ -474,8 +475,8 @@ def _reading_column(table: TextTable, model: Measurement) -> str:
         return found
     for name in names:
         table.refuse_other_unit(name)
-    known = {SIGMA, *(_quantity(wanted.heading) for wanted in model.inputs)}
-    free = [name for name in map(_quantity, table.heading) if name not in known]
+    known = {SIGMA, *(quantity(wanted.heading) for wanted in model.inputs)}
+    free = [name for name in map(quantity, table.heading) if name not in known]
     other = free[0] if len(free) == 1 else "COLUMN"
     remedy = f"set measurement.reading={other}" if hasattr(model, "reading") else f"rename {other}"
     there = ", ".join(table.heading)

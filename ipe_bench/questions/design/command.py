@@ -10,6 +10,8 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.questions.question import NAMES, Answered, Asked, Question
 
 _MORE = """
+  ipe-bench design oxygen.py oxygen.csv          with the noise of your readings,
+                                                 about your estimate
   ipe-bench design measurement=ranging error_scale=10
   ipe-bench design measurement=gins by=time          other times, equal cases
   ipe-bench design measurement=gins truth_measurement=gins_tilted

@@ -14,6 +14,7 @@ _TRIALS = 3
 _MOST_TRIALS = 100
 
 _MORE = """
+  ipe-bench posterior oxygen.py oxygen.csv       with the noise of your readings
   ipe-bench posterior error_scale=300 "solver=[newton]" "baseline=[ekf]"
   ipe-bench posterior measurement=ranging noise=gaussian noise.deviation=0.1 \\
       error_scale=100 trials=1

@@ -1,0 +1,386 @@
+"""Reads the short form of a command: a model and files of readings without keys, in place of
+`measurement=`, `state_model=` and `readings=`.
+
+    oxygen.py oxygen.csv           the one function of a file, or oxygen.py:demand
+    "a*exp(-b*t)+c" decay.csv      a formula
+    car.yaml log.csv               a state model by formulas, or differential equations
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+from ipe_bench.basics.errors import UserError, did_you_mean, place_of, unknown
+from ipe_bench.cli import refuse_blanks
+from ipe_bench.cli import words as w
+from ipe_bench.cli.spec import KEYS
+from ipe_bench.measurements.arithmetic import parse
+from ipe_bench.plugins import discovery as plugins
+from ipe_bench.real.readings import SIGMA, TextTable, quantity, read_tables
+from ipe_bench.report.words import enumerate_few
+
+_DATA = (".csv", ".tsv", ".txt", ".dat", ".parquet")
+_YAML = (".yaml", ".yml")
+_FUNCTION = re.compile(r"(?P<file>.+\.py)(:(?P<name>\w*))?")
+_FORMULA = re.compile(r"[-+*/^()<>]|\bif\b")
+"""A sign that a word without a key is a formula, rather than a name."""
+_NAMED = re.compile(r"\s*(?P<reading>[A-Za-z_]\w*)\s*=(?!=)\s*(?P<formula>.+)", re.DOTALL)
+_START = re.compile(r"measurement\.start(?:\.(?P<name>\w+)=|=\{(?P<names>.*)\}$)")
+_MODELS = ("measurement", "state_model")
+
+
+@dataclass
+class Short:
+    """Holds a command in the long form, besides `readings=`."""
+
+    words: list[str]
+    readings: list[str] = field(default_factory=list)
+    """Files of readings that stand without a key."""
+    assumed: list[str] = field(default_factory=list)
+    """Lines that say what the short form was taken for; none in the long form."""
+
+    @property
+    def in_full(self) -> list[str]:
+        """The words with the files as `readings=`."""
+        if not self.readings:
+            return self.words
+        files = [w.quoted(file) for file in self.readings]
+        given = files[0] if len(files) == 1 else f"[{','.join(files)}]"
+        return [*self.words, f"readings={given}"]
+
+
+def read(command: str, words: Sequence[str]) -> Short:
+    """Reads a command in its short form; one without a model's or a readings' file comes back as
+    it is.
+
+    Raises:
+        UserError: a file is absent, or does not say which model, parameters or columns are meant.
+    """
+    refuse_blanks(words)
+    kinds = [_kind(word) for word in words]
+    files = [word for word, kind in zip(words, kinds, strict=True) if kind == "readings"]
+    models = [word for word, kind in zip(words, kinds, strict=True) if kind == "model"]
+    if not files and not models:
+        return Short(list(words))
+    files += [file for word in words for file in _typed_files(word)]
+    others = [word for word in words if word not in (*files, *models) and not _typed_files(word)]
+    if not models:
+        models = [word for word in others if _names_reading(word, files)][:1]
+        others = [word for word in others if word not in models]
+    _require_pair(command, models, files, others)
+    for file in files:
+        _require_file(file)
+    if not models:
+        return Short(others, files)
+    return _Reader(command, files, others).read(models[0])
+
+
+def _kind(word: str) -> str:
+    """Tells a model and a file of readings from KEY=VALUE and other words."""
+    bare = re.sub("[=<>!]=", "", word)
+    if "=" in bare or word.startswith(("~", "--")):
+        return "key"
+    if Path(word).suffix in _DATA:
+        return "readings"
+    if _FUNCTION.fullmatch(word) or Path(word).suffix in _YAML or _FORMULA.search(word):
+        return "model"
+    return "key"
+
+
+def _typed_files(word: str) -> list[str]:
+    """Returns the files of readings=FILE or readings=[A,B]; none of a number."""
+    key, _, value = word.partition("=")
+    names = [name.strip(" '\"") for name in value.strip("[]").split(",")]
+    if key != "readings" or not all(Path(name).suffix in _DATA for name in names):
+        return []
+    return names
+
+
+def _names_reading(word: str, files: Sequence[str]) -> bool:
+    """Tells if a word is a formula that names its reading, as in y = a*t + b."""
+    named = _NAMED.fullmatch(word)
+    if named is None or named["reading"] in {*KEYS, *plugins.groups()}:
+        return False
+    if not _FORMULA.search(named["formula"]):
+        return False
+    for file in files:
+        _require_file(file)
+    return named["reading"] in _columns(read_tables([Path(files[0])])[0])
+
+
+def _require_pair(
+    command: str, models: Sequence[str], files: Sequence[str], others: Sequence[str]
+) -> None:
+    """Refuses several models, one beside that of a key, and a model or file alone."""
+    keys = {word.partition("=")[0].partition(".")[0] for word in others}
+    typed = [word for word in others if word.partition("=")[0] in _MODELS]
+    if len(models) > 1:
+        raise UserError(
+            f"{' '.join(models)}: are {len(models)} models; give one, and put a formula in quotes"
+        )
+    if models and typed:
+        raise UserError(f"{models[0]}: is a model, and {typed[0]} is another; give one of them")
+    if models and not files:
+        example = f"ipe-bench {command} {_shown(models[0])} readings.csv"
+        raise UserError(f"{models[0]}: is a model without readings; add their file: {example}")
+    if files and not models and keys.isdisjoint(_MODELS):
+        raise UserError(
+            f"{files[0]}: holds readings, and no model is given; write a function's file, a formula"
+            f' in quotes or a YAML file before it: ipe-bench {command} "a*exp(-b*t)+c" {files[0]},'
+            " or choose measurement=NAME"
+        )
+
+
+def _shown(model: str) -> str:
+    return f'"{model}"' if _FORMULA.search(model) and not _FUNCTION.fullmatch(model) else model
+
+
+def _require_file(name: str) -> None:
+    if Path(name).is_file() or Path(name).parent.as_posix().startswith("ipe_bench/real/samples"):
+        return
+    path = Path(name)
+    siblings = []
+    if path.parent.is_dir():
+        siblings = [one.name for one in path.parent.iterdir() if one.suffix == path.suffix]
+    raise UserError(f"{name}: there is no such file here{did_you_mean(path.name, siblings)}")
+
+
+def _columns(table: TextTable) -> list[str]:
+    """Lists the columns of a table without their units."""
+    return [quantity(heading) for heading in table.heading]
+
+
+@dataclass
+class _Reader:
+    """Reads the model of a command, given its files of readings and its words KEY=VALUE."""
+
+    command: str
+    files: list[str]
+    others: list[str]
+
+    def read(self, model: str) -> Short:
+        function = _FUNCTION.fullmatch(model)
+        if function:
+            _require_file(function["file"])
+            return self._function(function["file"], function["name"])
+        if Path(model).suffix in _YAML:
+            _require_file(model)
+            return self._equations(model)
+        return self._formula(model)
+
+    def _short(self, words: Sequence[str], assumed: Sequence[str]) -> Short:
+        # What was typed comes last, and replaces what the short form sets.
+        return Short([*words, *self.others], self.files, [line for line in assumed if line])
+
+    # Columns
+
+    def _free(self, taken: Sequence[str]) -> list[str]:
+        """Lists the columns besides those that the model takes, sigma and those left out."""
+        (ignored,) = self._typed("ignore_columns") or [""]
+        known = {*taken, SIGMA, *(name.strip() for name in ignored.strip("[]").split(","))}
+        return [name for name in self.columns if name not in known]
+
+    def _typed(self, key: str) -> list[str]:
+        """Returns the last value that was typed for a key."""
+        values = [word.partition("=")[2] for word in self.others if word.startswith(f"{key}=")]
+        return values[-1:]
+
+    @cached_property
+    def columns(self) -> list[str]:
+        """Columns of the first file."""
+        return _columns(read_tables([Path(self.files[0])])[0])
+
+    def _reading(self, what: str, taken: Sequence[str], usual: Sequence[str]) -> str:
+        """Finds the column of the readings: the one that is typed, has a usual name, or is left."""
+        typed = self._typed("measurement.reading")
+        free = self._free(taken)
+        named = [name for name in usual if name in free]
+        if typed or named:
+            reading = typed[0] if typed else named[0]
+            unused = [name for name in free if name != reading]
+            if unused:
+                self._refuse_unused(what, unused, taken)
+            return reading
+        if len(free) == 1:
+            return free[0]
+        if not free:
+            raise UserError(
+                f"{self.files[0]}: no column is left for the readings; {what} takes"
+                f" {enumerate_few(taken)}"
+            )
+        raise UserError(
+            f"{self.files[0]}: columns {enumerate_few(free)} are not in {what}, and one of them has"
+            f" the readings; give measurement.reading={free[-1]} or another, and"
+            " ignore_columns=[NAME] for the rest"
+        )
+
+    def _refuse_unused(self, what: str, unused: Sequence[str], taken: Sequence[str]) -> None:
+        raise UserError(
+            f"{self.files[0]}: column {unused[0]} is not in {what}, which takes"
+            f" {enumerate_few(taken) or 'no column'}; correct the name, or leave the column out by"
+            f" ignore_columns=[{unused[0]}]"
+        )
+
+    def _noise(self) -> str:
+        """Says what is taken for the noise of an estimate; other commands say it with its size."""
+        stated = any(word.startswith("noise") for word in self.others)
+        if stated or self.command != "estimate":
+            return ""
+        if SIGMA in self.columns:
+            return "Noise: standard deviations from column sigma."
+        return "Noise: one level, estimated from the residuals; noise.deviation=X states it."
+
+    # Functions
+
+    def _function(self, file: str, name: str | None) -> Short:
+        tree = _parsed(file)
+        module = _module(file)
+        chosen = _chosen(file, tree, name)
+        arguments = [*chosen.args.posonlyargs, *chosen.args.args]
+        defaults = chosen.args.defaults
+        first = len(arguments) - len(defaults)
+        typed = self._started
+        wanted = [one.arg for one in arguments[:first] if one.arg not in typed]
+        starts = {
+            one.arg: ast.unparse(value)
+            for one, value in zip(arguments[first:], defaults, strict=True)
+            if one.arg not in typed
+        }
+        what = f"{chosen.name}({', '.join(one.arg for one in arguments)})"
+        absent = [column for column in wanted if column not in self.columns]
+        if absent:
+            free = self._free([*wanted, "reading"])
+            raise UserError(
+                f"{self.files[0]}: has no column {absent[0]}, which {what} takes (there are"
+                f" {', '.join(self.columns)}{did_you_mean(absent[0], free)}); rename the column, or"
+                f" give the argument a start as default, as in {absent[0]}=1.0"
+            )
+        reading = self._reading(what, wanted, ["reading"])
+        words = ["measurement=function", f"measurement.of={module}:{chosen.name}"]
+        words += _reading_word(reading, ("reading",))
+        model = f"Model: {what} of {file}; start {_values(starts)}."
+        return self._short(words, [model, self._told(wanted, reading), self._noise()])
+
+    @property
+    def _started(self) -> set[str]:
+        """Names whose start is typed."""
+        found = set()
+        for word in self.others:
+            start = _START.match(word)
+            if start:
+                found |= {start["name"]} if start["name"] else set(re.findall(r"(\w+)\s*:", word))
+        return found
+
+    def _told(self, columns: Sequence[str], reading: str) -> str:
+        taken = f"columns {enumerate_few(columns)}" if columns else "no column"
+        return f"Readings: column {reading} of {', '.join(self.files)}; {taken}."
+
+    # Formulas
+
+    def _formula(self, text: str) -> Short:
+        named = _NAMED.fullmatch(text)
+        formula = named["formula"] if named else text
+        names = parse(formula, "formula").names
+        columns = [name for name in names if name in self.columns]
+        typed = self._started
+        starts = [name for name in names if name not in (*columns, *typed)]
+        usual = ("y", "reading")
+        if named:
+            usual = (named["reading"],)
+        what = f"the formula of {', '.join(names)}"
+        reading = self._reading(what, columns, usual)
+        if not starts and not typed:
+            raise UserError(
+                f"{formula}: every name is a column of {self.files[0]}; no parameter is left"
+            )
+        words = ["measurement=formula", f"measurement.expression={w.quoted(formula)}"]
+        words += [f"measurement.start.{name}=1" for name in starts]
+        words += _reading_word(reading, ("y", "reading"))
+        start = f"start 1 for {enumerate_few(starts)}; " if starts else ""
+        remedy = f"{start}measurement.start.{(starts or names)[0]}=X sets another"
+        model = f"Model: {formula}; {remedy}."
+        return self._short(words, [model, self._told(columns, reading), self._noise()])
+
+    # Equations
+
+    def _equations(self, file: str) -> Short:
+        content = plugins.read_yaml_file(Path(file), file)
+        keys = list(content) if isinstance(content, dict) else []
+        files = ", ".join(self.files)
+        if "next" in keys:
+            words = ["state_model=formulas", f"state_model.file={file}"]
+            states = content["next"] if isinstance(content["next"], dict) else {}
+            model = f"Model: states {enumerate_few(list(states))} of {file}, which move."
+            return self._short(words, [model, f"Log: {files}, a row per epoch."])
+        if "rates" in keys:
+            words = ["measurement=ode", f"measurement.file={file}"]
+            model = f"Model: differential equations of {file}."
+            return self._short(words, [model, f"Readings: {files}.", self._noise()])
+        there = f"its keys are {', '.join(map(str, keys))}" if keys else "it has no keys"
+        raise UserError(
+            f"{file}: is no model: it has neither next: (a state model by formulas) nor rates:"
+            f" (differential equations); {there}"
+        )
+
+
+def _reading_word(reading: str, usual: Sequence[str]) -> list[str]:
+    return [] if reading in usual else [f"measurement.reading={w.quoted(reading)}"]
+
+
+def _values(starts: dict[str, str]) -> str:
+    return ", ".join(f"{name} = {value}" for name, value in starts.items()) or "as typed"
+
+
+def _parsed(file: str) -> ast.Module:
+    try:
+        return ast.parse(Path(file).read_text(encoding="utf-8"), file)
+    except SyntaxError as error:
+        raise UserError(f"{place_of(error)}; correct the file") from None
+    except ValueError:
+        raise UserError(f"{file}: is not a text in UTF-8; save it as such") from None
+
+
+def _chosen(file: str, tree: ast.Module, name: str | None) -> ast.FunctionDef:
+    """Finds the function that is named, or the only one whose name begins with a letter."""
+    functions = {one.name: one for one in tree.body if isinstance(one, ast.FunctionDef)}
+    public = [one for one in functions if not one.startswith("_")]
+    if name is not None:
+        if name not in functions:
+            raise UserError(f"{file}:{name}: {unknown(name, public, 'function')}")
+        return functions[name]
+    if not public:
+        raise UserError(
+            f"{file}: has no function; define the model, as in def model(t, a=1.0, b=0.5): return"
+            " a * t + b"
+        )
+    if len(public) > 1:
+        raise UserError(
+            f"{file}: has {len(public)} functions, {enumerate_few(public)}; name the model, as in"
+            f" {file}:{public[0]}, or begin the names of helpers with _"
+        )
+    return functions[public[0]]
+
+
+def _module(file: str) -> str:
+    """Returns the module of a file below the working folder."""
+    path = Path(file).resolve()
+    here = Path.cwd().resolve()
+    if not path.is_relative_to(here):
+        raise UserError(f"{file}: lies outside of the working folder; change to its folder first")
+    parts = path.relative_to(here).with_suffix("").parts
+    if not all(part.isidentifier() for part in parts):
+        raise UserError(
+            f"{file}: cannot be imported by this name; use letters, digits and _ in the names of"
+            " the file and its folders"
+        )
+    module = ".".join(parts)
+    loaded = getattr(sys.modules.get(module), "__file__", None)
+    if module in sys.modules and (loaded is None or Path(loaded).resolve() != path):
+        raise UserError(f"{file}: has the name of a module that Python has loaded; rename the file")
+    return module

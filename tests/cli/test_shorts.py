@@ -1,0 +1,154 @@
+"""A model and files of readings without keys are the long form of them, and every mistake is one
+line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.cli import shorts
+
+T = np.array([0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0])
+FILES = {
+    "falling.py": "def height(t, h=10.0, v=-1.0):\n    return h + v * t\n",
+    "none.py": "x = 3\n",
+    "two.py": "def f(t, a=1.0):\n    return a * t\n\n\ndef g(t, a=1.0):\n    return a + t\n",
+    "helped.py": "def _half(t):\n    return t / 2\n\n\ndef f(t, a=1.0):\n    return a * _half(t)\n",
+    "broken.py": "def f(t, a=1.0:\n    return a\n",
+    "car.yaml": "next: {x: x + w}\nnoise: {w: 0.1}\nreadings: {z: x}\ndeviation: {z: 0.5}\n"
+    "spread: {x: 2}\n",
+    "red.yaml": "colour: red\n",
+    "bare.csv": "1,2\n3,4\n",
+    "day.csv": "day,reading\n1,2\n2,3\n3,4\n",
+    "volt.csv": "t [s],volt [V]\n0,1\n1,2\n2,3.5\n",
+    "log.csv": "z\n1\n2\n3\n",
+}
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working folder with models and readings."""
+    monkeypatch.chdir(tmp_path)
+    rows = [f"{t},{9 - 2 * t + (-1) ** k * 0.1}" for k, t in enumerate(T)]
+    FILES["line.csv"] = "\n".join(["t,y", *rows]) + "\n"
+    FILES["falling.csv"] = "\n".join(["t,reading", *rows]) + "\n"
+    for name, text in FILES.items():
+        (tmp_path / name).write_text(text)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("words", "full"),
+    [
+        (
+            ["falling.py", "falling.csv"],
+            "measurement=function measurement.of=falling:height readings='falling.csv'",
+        ),
+        (
+            ["falling.csv", "two.py:g", "seed=3"],
+            "measurement=function measurement.of=two:g seed=3 readings='falling.csv'",
+        ),
+        (
+            ["helped.py", "volt.csv"],
+            "measurement=function measurement.of=helped:f measurement.reading='volt'"
+            " readings='volt.csv'",
+        ),
+        (
+            ["-a*t+b", "line.csv", "measurement.start.b=5"],
+            "measurement=formula measurement.expression='-a*t+b' measurement.start.a=1"
+            " measurement.start.b=5 readings='line.csv'",
+        ),
+        (
+            ["volt=a*t", "volt.csv"],
+            "measurement=formula measurement.expression='a*t' measurement.start.a=1"
+            " measurement.reading='volt' readings='volt.csv'",
+        ),
+        (
+            ["car.yaml", "readings=log.csv"],
+            "state_model=formulas state_model.file=car.yaml readings='log.csv'",
+        ),
+        (["measurement=ranging", "my.csv"], "measurement=ranging readings='my.csv'"),
+    ],
+)
+def test_a_short_form_is_that_long_form(words: list[str], full: str, folder: Path) -> None:
+    (folder / "my.csv").write_text("t\n")
+    assert " ".join(shorts.read("estimate", words).in_full) == full
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["falling.py"], "is a model without readings; add their file"),
+        (["falling.csv"], "no model is given"),
+        (["faling.py", "falling.csv"], "faling.py: there is no such file here; did you mean"),
+        (["falling.py", "faling.csv"], "faling.csv: there is no such file here; did you mean"),
+        (["none.py", "falling.csv"], "has no function; define"),
+        (["two.py", "falling.csv"], "has 2 functions, f, g; name the model, as in two.py:f"),
+        (["two.py:h", "falling.csv"], "there is no such function (there are: f, g)"),
+        (["broken.py", "falling.csv"], "broken.py, line 1: SyntaxError"),
+        (["falling.py", "bare.csv"], "the first row has only numbers and is no header"),
+        (["falling.py", "day.csv"], "day.csv: has no column t, which height(t, h, v) takes"),
+        (["falling.py", "two.py", "falling.csv"], "are 2 models; give one"),
+        (["a*t", "+", "b", "line.csv"], "put a formula in quotes"),
+        (["falling.py", "falling.csv", "measurement=gins"], "and measurement=gins is another"),
+        (["a*t+b)", "line.csv"], "is not a formula at ')'"),
+        (["a*exq(t)", "line.csv"], "exq(...): there is no such function; did you mean exp?"),
+        (["a*tt+b", "line.csv"], "column t is not in the formula of a, tt, b"),
+        (["a*tt+b", "volt.csv"], "one of them has the readings"),
+        (["t+y", "line.csv"], "no column is left for the readings"),
+        (["red.yaml", "log.csv"], "is no model: it has neither next:"),
+        (["/usr/falling.py", "falling.csv"], "there is no such file"),
+    ],
+)
+def test_a_mistake_is_one_line(words: list[str], said: str) -> None:
+    with pytest.raises(UserError) as error:
+        shorts.read("estimate", words)
+    assert said in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_file_outside_or_under_a_loaded_name_is_refused(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A loaded module of that name would be the model, silently."""
+    (folder / "json.py").write_text(FILES["falling.py"])
+    with pytest.raises(UserError, match="has the name of a module that Python has loaded"):
+        shorts.read("estimate", ["json.py", "falling.csv"])
+    (folder / "below").mkdir()
+    monkeypatch.chdir(folder / "below")
+    with pytest.raises(UserError, match="lies outside of the working folder"):
+        shorts.read("estimate", ["../falling.py", "../falling.csv"])
+
+
+def test_words_without_a_file_stay_what_they_are() -> None:
+    words = ["measurement=gins", "newton", "readings=my.csv"]
+    assert shorts.read("estimate", words).in_full == words
+    assert shorts.read("design", ["readings=10", "by=time"]).in_full == ["readings=10", "by=time"]
+
+
+@pytest.mark.slow
+def test_a_formula_estimates_the_line_of_least_squares(ipe_bench, folder: Path) -> None:
+    """Beside NumPy's polynomial fit."""
+    code, out, err = ipe_bench("estimate", "a*t + b", "line.csv", "figures=none")
+    assert code == 0, err
+    assert out.startswith("Model: a*t + b; start 1 for a, b;")
+    answer = json.loads((folder / "outputs/estimate-formula/estimate.json").read_text())
+    y = 9 - 2 * T + (-1.0) ** np.arange(len(T)) * 0.1
+    found = answer["estimators"]["auto"]["estimates"]
+    np.testing.assert_allclose([found["a"], found["b"]], np.polyfit(T, y, 1))
+
+
+@pytest.mark.slow
+def test_the_bounds_of_a_design_are_the_standard_errors_of_the_estimate(ipe_bench) -> None:
+    """Of a linear model they do not depend on the truth."""
+    code, out, err = ipe_bench("design", "a*t + b", "line.csv")
+    assert code == 0, err
+    y = 9 - 2 * T + (-1.0) ** np.arange(len(T)) * 0.1
+    (_, _), C = np.polyfit(T, y, 1, cov=True)
+    rows = [line.split() for line in out.splitlines() if line.split()[:1] in (["a"], ["b"])]
+    bounds = [float(row[1]) for row in rows]
+    np.testing.assert_allclose(bounds, np.sqrt(np.diag(C)), rtol=0.01)
