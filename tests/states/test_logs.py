@@ -403,7 +403,7 @@ def test_a_model_of_formulas_may_stand_in_a_file(tmp_path, estimate):
         ),
         (
             ["readings=good.csv", "ignore_rows=[2]"],
-            "ignore_rows=[2]: is no key any more; empty the cells",
+            "ignore_rows=[2]: there is no such key; did you mean ignore_columns",
         ),
         (["readings=good.csv", "ignore_columns=[v]"], "ignore_columns=v: there is no such column"),
         (
