@@ -460,6 +460,7 @@ def design(
     noise: Noise | None = None,
     prior: Prior | None = None,
     error_scale: float | None = None,
+    at: Mapping[str, float] | None = None,
     by: Sequence[str] | None = None,
     readings: int | None = None,
     criterion: Criterion = "A",
@@ -470,11 +471,13 @@ def design(
 
     Parameters:
         scenario: or a measurement, with its `noise`, `prior` and `error_scale`.
+        at: estimates by name, such as `fit.values`, at which all is evaluated; None: the model's
+            start, and truths from the prior.
         by: columns of the model's index by which the one way chooses; None: ways by each column,
             and by reading.
         readings: number that the sharpest choice has; None: as many as today.
-        criterion: bounds are averaged over truths from the prior, as squares over parameters in
-            units of today's bound (A), or as the volume of the ellipsoid (D).
+        criterion: of choices, the bounds as shares of today's, averaged over start and truths: as
+            squares over parameters (A), or as the volume of the ellipsoid (D).
         errors: richer models; None: the truth, or every option of `measurement` that is the model
             with more errors.
 
@@ -501,7 +504,7 @@ def design(
     from ipe_bench.questions.design.answer import designed
 
     scenario = _scenario(scenario, noise=noise, prior=prior, error_scale=error_scale)
-    return designed(scenario, by=by, readings=readings, criterion=criterion, errors=errors)
+    return designed(scenario, at=at, by=by, readings=readings, criterion=criterion, errors=errors)
 
 
 def posterior(

@@ -258,6 +258,10 @@ class Measurement(Component, ABC):
         """Converts x to parameter values (trials, n), each in its own unit."""
         return x * self.sizes
 
+    def inner(self, v: Array) -> Array:
+        """Returns x (..., n) of parameter values (..., n), each in its own unit."""
+        return v / self.sizes
+
     def physical_slope(self, x: Array) -> Array:
         """Computes the derivative of each value by its own entry of x (trials, n)."""
         return np.broadcast_to(self.sizes, x.shape)
@@ -382,6 +386,9 @@ class Forwarding(Measurement):
 
     def physical(self, x: Array) -> Array:
         return self.whole.physical(x)
+
+    def inner(self, v: Array) -> Array:
+        return self.whole.inner(v)
 
     def physical_slope(self, x: Array) -> Array:
         return self.whole.physical_slope(x)

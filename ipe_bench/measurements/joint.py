@@ -117,6 +117,9 @@ class Joint(Measurement):
     def physical(self, x: Array) -> Array:
         return self._columns("physical", x)
 
+    def inner(self, v: Array) -> Array:
+        return self._columns("inner", v)
+
     def physical_slope(self, x: Array) -> Array:
         return self._columns("physical_slope", x)
 

@@ -2,8 +2,8 @@
 observable direction, bounds and correlations, and which errors that the model leaves out look like
 its parameters.
 
-All of it follows from Jacobians at truths drawn from the prior. `design` chooses which readings to
-take.
+All of it follows from Jacobians, at the point that is asked about and at truths drawn from the
+prior. `design` chooses which readings to take.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ def readable(model: Measurement, x: Array) -> Array:
 
 @dataclass(frozen=True)
 class Observability:
-    """Describes what a model's readings say about its parameters; lengths in multiples of the
-    parameters' sizes."""
+    """Describes what a model's readings say about its parameters at a point, which is the first
+    truth, and at the truths behind it; lengths in multiples of the parameters' sizes."""
 
     parameters: tuple[Parameter, ...]
     singular_values: Array
@@ -65,14 +65,16 @@ class Observability:
     def at(cls, model: Measurement, R: Covariance, x: Array) -> Observability:
         """Computes the observability at the truths x (truths, n)."""
         white = R.whiten_jacobian(model.jacobian(x))
+        # Fewer readings than parameters leave directions open, which rows of 0 have, too.
+        missing = max(model.n - model.m, 0)
+        white = np.pad(white, [(0, 0), (0, missing), (0, 0)])
         _, s, right = np.linalg.svd(white, full_matrices=False)
         return cls(model.parameters, s, right)
 
     @cached_property
     def observable(self) -> bool:
         """Whether the readings determine every parameter at every truth, to working precision."""
-        as_many = self.singular_values.shape[1] == len(self.parameters)
-        return as_many and not self._lost.any()
+        return not self._lost.any()
 
     @property
     def _lost(self) -> NDArray[np.bool_]:
@@ -90,38 +92,54 @@ class Observability:
         return gram(scaled)
 
     @cached_property
-    def bound(self) -> Array:
-        """Root mean square over the truths (n,) of each parameter's bound; infinite where readings
-        leave it open."""
+    def bounds(self) -> Array:
+        """The bound of each parameter at each truth (truths, n); infinite where readings leave it
+        open."""
         takes_part = np.abs(self.right) > 1e-6
-        partly_lost = takes_part[self._lost].any(axis=0)
-        mean = self.covariance.mean(axis=0)
-        return np.where(partly_lost, np.inf, deviations(mean))
+        partly_lost = (takes_part & self._lost[:, :, None]).any(axis=1)
+        return np.where(partly_lost, np.inf, deviations(self.covariance))
+
+    @property
+    def bound(self) -> Array:
+        """The bound of each parameter at the point (n,)."""
+        return self.bounds[0]
+
+    @property
+    def quartiles(self) -> Array:
+        """Lower quartile, median and upper quartile (3, n) of the bounds at the truths behind the
+        point; (0, n) where there are none."""
+        behind = self.bounds[1:]
+        if not len(behind):
+            return behind
+        # Means of bounds have no limit where a bound grows towards a truth that no readings show;
+        # nor is one interpolated to infinity.
+        return np.quantile(behind, (0.25, 0.5, 0.75), axis=0, method="inverted_cdf")
 
     @cached_property
     def correlation(self) -> Array:
-        """Correlation of the errors of efficient estimates (n, n), over the truths."""
-        return correlations(self.covariance.mean(axis=0))
+        """Correlation of the errors of efficient estimates (n, n) at the point."""
+        return correlations(self.covariance[0])
 
     @cached_property
     def multiple_correlation(self) -> Array:
-        """Correlation of each parameter's error with those of all others (n,): sqrt(1 - 1 / (P_ii
-        (P^-1)_ii)), the median over the truths. The bound is 1 / sqrt(1 - square) of what it were
-        if all others were known."""
-        rows = self.right * self.singular_values[:, :, None]
-        information = np.sum(rows**2, axis=1)
-        variances = np.diagonal(self.covariance, axis1=1, axis2=2)
-        inflation = np.median(variances * information, axis=0)
+        """Correlation of each parameter's error with those of all others (n,) at the point.
+
+        It is sqrt(1 - 1 / (P_ii (P^-1)_ii)). The bound is 1 / sqrt(1 - square) of what it were if
+        all others were known.
+        """
+        rows = self.right[0] * self.singular_values[0, :, None]
+        information = np.sum(rows**2, axis=0)
+        inflation = np.diagonal(self.covariance[0]) * information
         # Round-off may leave an inflation below 1.
         square = 1 - 1 / np.maximum(inflation, 1.0)
         return np.sqrt(np.maximum(square, 0.0))
 
     @cached_property
     def least_observable(self) -> Array:
-        """The unit vector (n,) along which an efficient estimate scatters most: the first axis of
-        the mean bound."""
-        _, axes = np.linalg.eigh(self.covariance.mean(axis=0))
-        axis = axes[:, -1]
+        """The unit vector (n,) along which an efficient estimate scatters most at the point, or at
+        the first truth where the readings leave a direction open."""
+        open_at = self._lost.any(axis=1)
+        axis = self.right[np.argmax(open_at), -1]
         largest = axis[np.argmax(np.abs(axis))]
         return axis * np.sign(largest)
 

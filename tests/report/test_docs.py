@@ -434,16 +434,21 @@ def oxygen(days: list[float], noise: float) -> ipe_bench.Scenario:
 
 
 def test_the_bounds_of_the_first_hour_are_those_of_its_commands(hour):
-    """Three late days beat readings of twice the quality, as its table says."""
+    """At its estimate, three late days are worth to b1 what half the noise is."""
     designs = [command for command in commands(hour) if command[0] == "design"]
     printed = re.findall(
         r"^\| .* days.* \| ([\d.]+) \| ([\d.]+) \|$", hour.read_text(), re.MULTILINE
     )
     assert len(designs) == len(printed) == 3
+    model = ipe_bench.measurements.Function(of="oxygen:demand")
+    estimators = {"levenberg_marquardt": ipe_bench.baselines.LevenbergMarquardt()}
+    (fit,) = ipe_bench.estimate(model, "oxygen.csv", estimators)
+    estimate = dict(fit.values)
     for command, bounds in zip(designs, printed, strict=True):
         given = dict(word.split("=", 1) for word in command[1:])
         days = json.loads(given["measurement.columns.t"])
-        found = ipe_bench.design(oxygen(days, float(given["noise.deviation"])))
+        assert given["at"] == "outputs/estimate-function"
+        found = ipe_bench.design(oxygen(days, float(given["noise.deviation"])), at=estimate)
         sizes = [one.size for one in found.observability.parameters]
         seen = found.observability.bound * sizes
         assert list(seen) == pytest.approx([*map(float, bounds)], rel=5e-3)
@@ -462,7 +467,8 @@ def test_the_estimates_of_the_first_hour_come_out_with_a_profile_that_allows_no_
 @pytest.mark.parametrize("command", commands(PAGES / "first_hour.md"), ids=lambda one: one[0])
 def test_the_commands_of_the_first_hour_are_composed(command, hour):
     """What they ask for is understood; the slow test of all pages runs them."""
-    given = words.read(command[0], [word for word in command[1:] if word != "-m"])
+    own = ("-m", "at=outputs/estimate-function")
+    given = words.read(command[0], [word for word in command[1:] if word not in own])
     with session():
         jobs = jobs_of(given, multirun="-m" in command)
     assert len(jobs.specs) == (3 if "-m" in command else 1)

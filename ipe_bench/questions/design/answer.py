@@ -12,11 +12,11 @@ import pandas as pd
 
 from ipe_bench.measurements.identifiability import structure
 from ipe_bench.plugins.extensions import richer_models
-from ipe_bench.questions.design.maths import Design, Way, design, entry_in_words
+from ipe_bench.questions.design.maths import Design, Further, Way, design, entry_in_words
 from ipe_bench.report.page.writer import write_files
-from ipe_bench.report.tables.table import Part, Shown, Strong, Table, naming, texts, words
+from ipe_bench.report.tables.table import Column, Part, Shown, Strong, Table, naming, texts, words
 from ipe_bench.report.words import enumerate_few, percent, scientific, short
-from ipe_bench.trials.observability import TRUTHS, Observability, readable
+from ipe_bench.trials.observability import TRUTHS, Observability
 from ipe_bench.trials.thresholds import FIT_LEVEL
 
 if TYPE_CHECKING:
@@ -88,23 +88,25 @@ def _best_finding(way: Way, today: int) -> str:
 
 
 def _further_findings(design: Design) -> Iterator[str]:
-    """Says what to read next, and the bound that falls most by it."""
+    """Says what to read next, then two more, each time with the bound that falls most by it."""
     further = design.further
     if further is None:
         return
     where = [further.words[i] for i in further.taken]
-    most = int(np.argmin(further.bounds[1] / further.bounds[0]))
+    yield f"Read next at {where[0]}; {_fall(design, further, 0, 1)}"
+    two = f"at {where[1]} and {where[2]}"
+    if where[1] == where[2]:
+        two = f"twice at {where[1]}"
+    yield f"Then read {two}; {_fall(design, further, 1, 3)}"
+
+
+def _fall(design: Design, further: Further, before: int, after: int) -> str:
+    """Says which bound falls most between these numbers of further readings."""
+    most = int(np.argmin(further.bounds[after] / further.bounds[before]))
     parameter = design.observability.parameters[most]
-    bounds = [scientific(parameter.size * bound) for bound in further.bounds[:, most]]
+    high, low = (scientific(parameter.size * further.bounds[k, most]) for k in (before, after))
     unit = f" {parameter.unit}" if parameter.unit else ""
-    yield (
-        f"Read next at {where[0]}; the bound of {parameter.name} then falls from {bounds[0]} to"
-        f" {bounds[1]}{unit}"
-    )
-    yield (
-        f"With two more, at {where[1]} and {where[2]}, the bound of {parameter.name} falls to"
-        f" {bounds[3]}{unit}"
-    )
+    return f"the bound of {parameter.name} then falls from {high} to {low}{unit}"
 
 
 def _further(design: Design) -> Iterator[Table]:
@@ -121,9 +123,9 @@ def _further(design: Design) -> Iterator[Table]:
         words("of", [names[int(np.argmin(share))] for share in shares]),
     ]
     note = (
-        "Bounds are shares of today's. Each further reading is the one of the candidates that cuts"
-        " the mean square of these shares most; an input's candidates reach to four times its"
-        " range."
+        f"Bounds are shares of today's at {_where(design)}. Each further reading is the one of the"
+        " candidates that cuts the mean square of these shares most; an input's candidates reach to"
+        " four times its range."
     )
     title = "What to read next, beside today's readings"
     yield Table("further", title, "", columns, notes=[note])
@@ -141,9 +143,9 @@ def _draw_design(design: Design) -> Iterator[Drawing]:
         scenario = design.scenario
         model = design.measurement(best.sharpest)
         R = scenario.noise.covariance(model.m)
-        after = Observability.at(model, R, readable(model, scenario.truths(0, TRUTHS)))
+        after = Observability.at(model, R, design.x)
         title = f"best choice {best.title}"
-    yield from draw_bounds(design.observability, after, title)
+    yield from draw_bounds(design.observability, after, title, _where(design))
 
 
 def design_parts(name: str, design: Design) -> Iterator[Part]:
@@ -168,6 +170,7 @@ def _parameters(name: str, design: Design) -> Table:
     columns = [
         *naming("parameter", parameters),
         texts("bound", [scientific(bound) for bound in bounds]),
+        *_over_the_prior(design),
         texts("correlation with all others", [f"{r:.2f}" for r in seen.multiple_correlation]),
     ]
     if len(parameters) > 1:
@@ -175,11 +178,11 @@ def _parameters(name: str, design: Design) -> Table:
         most = np.argmax(np.abs(others), axis=1)
         strongest = [f"{parameters[j].name} {others[i, j]:+.2f}" for i, j in enumerate(most)]
         columns.append(words("strongest", strongest))
-    s = np.median(seen.singular_values, axis=0)
+    s = seen.singular_values[0]
     notes = [
-        "bound: smallest standard deviation of an unbiased estimator, root mean square over the"
-        " prior. Correlations of the errors: multiple correlation with all others, and the"
-        " strongest with one other.",
+        "bound: smallest standard deviation of an unbiased estimator if the true values are those"
+        f" of {_where(design)}. Correlations of the errors there: multiple correlation with all"
+        " others, and the strongest with one other.",
         f"Singular values of the whitened Jacobian, per parameter's size: {short(s[0])} to"
         f" {short(s[-1])}.",
     ]
@@ -188,9 +191,31 @@ def _parameters(name: str, design: Design) -> Table:
             f"{design.lost} of {TRUTHS} true parameters from the prior have no finite readings and"
             " are left out."
         )
-    setting = f"{name}, {scenario.noise.name}, error scale {scenario.error_scale:g}"
+    about = "at the estimate"
+    if design.at is None:
+        about = f"error scale {scenario.error_scale:g}"
+        notes.append(
+            f"over the prior: median and quartiles of the bound at {len(design.x) - 1} true"
+            " parameters of this error scale."
+        )
+    setting = f"{name}, {scenario.noise.name}, {about}"
     title = f"{setting}: what {scenario.measurement.m} readings determine"
     return Table("parameters", title, "", columns, notes=notes)
+
+
+def _where(design: Design) -> str:
+    return "the start" if design.at is None else "the estimate"
+
+
+def _over_the_prior(design: Design) -> Iterator[Column]:
+    """Yields a column with the bounds at truths from the prior, where there are any."""
+    if design.at is not None:
+        return
+    sizes = [p.size for p in design.observability.parameters]
+    quartiles = np.transpose(design.observability.quartiles * sizes)
+    told = [[scientific(one) for one in row] for row in quartiles]
+    cells = [f"{median} ({low} to {high})" for low, median, high in told]
+    yield texts("over the prior", cells)
 
 
 def _suspects(design: Design) -> Iterator[Part]:

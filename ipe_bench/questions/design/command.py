@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, Literal
 
 from ipe_bench.basics.errors import UserError
@@ -16,10 +18,11 @@ _MORE = """
   ipe-bench design measurement=gins by=time          other times, equal cases
   ipe-bench design measurement=gins truth_measurement=gins_tilted
 
-The analysis uses the model's Jacobians at true parameters drawn from the prior,
-without noise or estimates. Unmodelled errors come from truth_measurement=, or
+The analysis uses the model's Jacobians at its start, and at true parameters drawn
+from the prior, without noise. Unmodelled errors come from truth_measurement=, or
 from every option of measurement= that adds errors to the model.
 
+at=FOLDER           everything at the estimate that `ipe-bench estimate` wrote there
 by=COLUMN           choose by this column of the readings; by=[A,B] by several
 readings=NUMBER     largest number of readings (today's)
 criterion=D         minimise the mean squared bound (A, the default) or the
@@ -28,7 +31,7 @@ output=DIR          folder of the files
 """
 
 
-def answer(asked: Asked, **given: Any) -> Answered:
+def answer(asked: Asked, at: str | None = None, **given: Any) -> Answered:
     """Returns the tables of a design, whose files are written; exit code 1 where a parameter is not
     determined."""
     from ipe_bench.plugins.extensions import richer_models
@@ -42,25 +45,47 @@ def answer(asked: Asked, **given: Any) -> Answered:
             " noise"
         )
     errors = richer_models(scenario)
+    point = None if at is None else _estimates(at)
     identity = {
         "scenario": describe(dataclasses.replace(scenario, truth=None)),
         "errors": [describe(error) for error in errors],
+        "at": point,
         "by": given.get("by"),
         "readings": given.get("readings"),
         "criterion": given.get("criterion", "A"),
     }
     with asked.folder("design", identity, (READINGS,)) as folder:
-        found = designed(scenario, errors=errors, **given)
+        found = designed(scenario, errors=errors, at=point, **given)
         files = write_design(folder, asked.measurement, found)
     code = 0 if found.observability.observable else 1
     return Answered(design_parts(asked.measurement, found), code, files=files)
+
+
+def _estimates(folder: str) -> dict[str, float]:
+    """Returns the estimates, by name, of the estimator that an answer examined, and what it held
+    fixed."""
+    from ipe_bench.report.page.answer import NAME
+
+    path = Path(folder, f"{NAME}.json")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        examined = content["examination"]
+        fixed = content["fixed"]
+    except (OSError, ValueError, KeyError, TypeError):
+        raise UserError(
+            f"at={folder}: has no {NAME}.json of an answer; give a folder that `ipe-bench estimate`"
+            " wrote to"
+        ) from None
+    if examined is None:
+        raise UserError(f"at={folder}: no estimate there passes; design at the start, without at=")
+    return {**fixed, **examined["estimates"]}
 
 
 def options() -> Mapping[str, Any]:
     """Returns the types of its options."""
     from ipe_bench.basics.options import Count
 
-    return {"by": NAMES, "readings": Count, "criterion": Literal["A", "D"]}
+    return {"at": str, "by": NAMES, "readings": Count, "criterion": Literal["A", "D"]}
 
 
 QUESTION = Question(

@@ -56,8 +56,11 @@ def draw_further(model: Measurement, further: Further) -> Drawing:
     return Drawing("further", f"Read next at {further.words[further.taken[0]]}", caption, fig)
 
 
-def draw_bounds(now: Observability, after: Observability | None, choice: str) -> Iterator[Drawing]:
-    """Draws the bound of each parameter in its unit, today and after a `choice` of readings."""
+def draw_bounds(
+    now: Observability, after: Observability | None, choice: str, where: str
+) -> Iterator[Drawing]:
+    """Draws the bound of each parameter in its unit at a point, today and after a `choice` of
+    readings."""
     from matplotlib.figure import Figure
 
     sizes = np.array([p.size for p in now.parameters])
@@ -82,8 +85,8 @@ def draw_bounds(now: Observability, after: Observability | None, choice: str) ->
     ax.set_xlabel("bound, in the unit of each row")
     common.legend(fig, [ax])
     caption = (
-        "Cramér-Rao bound of each parameter's standard deviation, root mean square over truths from"
-        " the prior."
+        "Cramér-Rao bound of each parameter's standard deviation, if the true values are those of"
+        f" {where}."
     )
     if not known.all():
         caption += " Without a hollow mark: today's readings leave the parameter open."

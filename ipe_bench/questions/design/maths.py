@@ -1,14 +1,15 @@
 """Chooses what to measure next: which of the readings that a model could take to add, to drop, or
 to take instead.
 
-Designs are good on average over truths from the prior (Chaloner and Larntz, J. Stat. Plan.
-Inference 21, 1989): they take, one after another, the readings that gain most. What readings say
-about each parameter is in `observability`.
+Bounds are those at one point, the model's start or an estimate. Choices are good on average over
+the point and truths from the prior (Chaloner and Larntz, J. Stat. Plan. Inference 21, 1989), by
+shares of today's bounds at each: they take, one after another, the readings that gain most. What
+readings say about each parameter is in `observability`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NoReturn, get_args
 
@@ -103,8 +104,8 @@ class Way:
 
 @dataclass(frozen=True)
 class Further:
-    """Describes what single readings beside today's would add; bounds in multiples of the
-    parameters' sizes."""
+    """Describes what single readings beside today's would add at the point; bounds in multiples of
+    the parameters' sizes."""
 
     words: tuple[str, ...]
     """The candidates (g,): where each is taken."""
@@ -125,6 +126,11 @@ class Design:
     """Describes what a scenario's readings say, and what others would."""
 
     scenario: Scenario
+    at: Mapping[str, float] | None
+    """The estimates by name at which all is evaluated; None: the model's start, and truths from the
+    prior."""
+    x: Array
+    """The point, and behind it the truths from the prior (1 + truths, n)."""
     criterion: Criterion
     candidates: Measurement
     observability: Observability
@@ -144,6 +150,7 @@ class Design:
 def design(
     scenario: Scenario,
     *,
+    at: Mapping[str, float] | None = None,
     by: Sequence[str] | None = None,
     readings: int | None = None,
     criterion: Criterion = "A",
@@ -153,14 +160,15 @@ def design(
     """Evaluates what the scenario's readings say about its parameters, and which readings would say
     more.
 
-    `by` names columns of the model's index, whose entries are chosen while all else stays as today;
-    None tries each column and then reading by reading. `readings` is the number to have at most,
-    today's where it is None. `errors` are richer versions of the model, whose nuisances may look
-    like parameters.
+    `at` has estimates by name, each in its own unit: all is evaluated there, else at the model's
+    start and at truths from the prior. `by` names columns of the model's index, whose entries are
+    chosen while all else stays as today; None tries each column and then reading by reading.
+    `readings` is the number to have at most, today's where it is None. `errors` are richer versions
+    of the model, whose nuisances may look like parameters.
 
     Raises:
         UserError: noise of an unknown level, or with correlated errors, which do not add up; an
-            unknown column; too few readings; truths without any.
+            unknown column; too few readings; a point or truths without any; an estimate that lacks.
     """
     if criterion not in get_args(Criterion):
         raise UserError(f"criterion={criterion}: choose A or D")
@@ -173,8 +181,13 @@ def design(
     model = scenario.measurement
     R = scenario.problem.R
     candidates = model.candidates
-    x = readable(candidates, readable(model, scenario.truths(0, truths)))
-    lost = truths - len(x)
+    point = _point(model, at)
+    x = point
+    lost = 0
+    if at is None:
+        over = readable(candidates, readable(model, scenario.truths(0, truths)))
+        x = np.concatenate([point, over])
+        lost = truths - len(over)
     today = Observability.at(model, R, x)
     worst = _worst_suspects(model, R, errors, x)
     columns = _columns(model, by)
@@ -186,7 +199,7 @@ def design(
     R_all = noise.covariance(candidates.m)
     whole = Observability.at(candidates, R_all, x)
     if not whole.observable:
-        return Design(scenario, criterion, candidates, today, worst, (), lost=lost)
+        return Design(scenario, at, x, criterion, candidates, today, worst, (), lost=lost)
     most = _most_readings(model, candidates, readings)
 
     # All is in units of today's bounds, or of those that all candidates have together.
@@ -204,8 +217,30 @@ def design(
     ways = tuple(way for way in tried if way is not None)
     if readings is not None and not ways:
         _refuse_few(readings, columns)
-    further = _further(scenario, today, x)
-    return Design(scenario, criterion, candidates, today, worst, ways, further, lost)
+    further = _further(scenario, today, point)
+    return Design(scenario, at, x, criterion, candidates, today, worst, ways, further, lost)
+
+
+def _point(model: Measurement, at: Mapping[str, float] | None) -> Array:
+    """Returns the start x (1, n) of a model, or x of the estimates `at` by name."""
+    if at is None:
+        x = model.nominal[None]
+        remedy = "give another start, or the estimate of readings by at=FOLDER"
+    else:
+        names = [p.name for p in model.physical_parameters]
+        lacking = [name for name in names if name not in at]
+        if lacking:
+            raise UserError(f"at: has no estimate of {', '.join(lacking)}")
+        x = model.inner(np.array([[at[name] for name in names]]))
+        remedy = "give an estimate of this model"
+    with np.errstate(all="ignore"):
+        there = np.isfinite(x).all() and np.isfinite(model.jacobian(x)).all()
+    if not there:
+        where = "the start" if at is None else "the estimate"
+        raise UserError(
+            f"at: {model.name} has no finite readings with finite slopes at {where}; {remedy}"
+        )
+    return x
 
 
 def _worst_suspects(
@@ -244,8 +279,9 @@ def _refuse_few(readings: int, columns: Sequence[tuple[str, ...]]) -> NoReturn:
     )
 
 
-def _further(scenario: Scenario, today: Observability, x: Array) -> Further | None:
-    """Finds the readings that cut the mean square of the bounds, as shares of today's, most."""
+def _further(scenario: Scenario, today: Observability, point: Array) -> Further | None:
+    """Finds the readings that cut the mean square of the bounds at the point (1, n), as shares of
+    today's, most."""
     if not today.observable:
         return None
     try:
@@ -255,30 +291,28 @@ def _further(scenario: Scenario, today: Observability, x: Array) -> Further | No
         return None
     if model is scenario.measurement:
         return None
-    J = R.whiten_jacobian(model.jacobian(x))
-    there = np.flatnonzero(np.isfinite(J).all(axis=(0, 2)))
+    J = R.whiten_jacobian(model.jacobian(point))[0]
+    there = np.flatnonzero(np.isfinite(J).all(axis=1))
     if not len(there):
         return None
-    J = J[:, there]
-    P = today.covariance
-    before = np.einsum("tii->i", P)
+    J = J[there]
+    P = today.covariance[0]
+    before = np.diagonal(P)
     alone = np.empty(0)
     taken: list[int] = []
     bounds = [today.bound]
     for _ in range(MOST_MORE):
         # A reading with the whitened slope a takes P a a' P / (1 + a' P a) from P (Sherman and
-        # Morrison); what is left of each variance is summed over the truths (g, n).
+        # Morrison), and leaves these variances (g, n).
         Pa = np.matmul(J, P)
-        scale = 1 + np.sum(Pa * J, axis=2)
-        less = Pa**2 / scale[:, :, None]
-        left = np.einsum("tii->i", P) - less.sum(axis=0)
+        scale = 1 + np.sum(Pa * J, axis=1)
+        left = np.diagonal(P) - Pa**2 / scale[:, None]
         if not taken:
-            alone = np.sqrt(left / len(x))
+            alone = np.sqrt(left)
         best = int(np.argmin((left / before).mean(axis=1)))
         taken.append(best)
-        bounds.append(np.sqrt(left[best] / len(x)))
-        a = Pa[:, best]
-        P = P - a[:, :, None] * a[:, None, :] / scale[:, best, None, None]
+        bounds.append(np.sqrt(left[best]))
+        P = P - np.outer(Pa[best], Pa[best]) / scale[best]
     entries = np.asarray(model.index[column], dtype=float)[there] if column else np.empty(0)
     told = tuple(words[i] for i in there)
     return Further(told, column, entries, alone, tuple(taken), np.array(bounds))
@@ -302,8 +336,9 @@ def _candidates(model: Measurement) -> tuple[Measurement, str, list[str]]:
     if offered.m == model.m:
         return model, "", []
     words = []
-    for row in zip(*offered.index.values(), strict=True):
-        entries = zip(offered.index, row, strict=True)
+    columns = offered.index
+    for row in zip(*columns.values(), strict=True):
+        entries = zip(columns, row, strict=True)
         told = [f"{name} {entry_in_words(offered, name, entry)}" for name, entry in entries]
         words.append(", ".join(told))
     return offered, "", words

@@ -4,6 +4,7 @@ to."""
 import re
 from dataclasses import dataclass, replace
 from itertools import combinations
+from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
@@ -14,6 +15,7 @@ from shared.oracles import agreed, assert_agrees
 import ipe_bench as ib
 from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.measurements import Gins, Measurement, Parameter, RicherGins
+from ipe_bench.measurements.known import ParameterInfo, informed
 from ipe_bench.noise import Gaussian
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.questions.design.answer import _findings, _further, design_parts
@@ -357,7 +359,11 @@ def test_the_next_reading_cuts_bounds_most_and_may_lie_beyond_todays(six_days):
     assert title.startswith(f"Read next at {further.words[further.taken[0]]}; the bound of b1 then")
     today, one = (20.0 * further.bounds[k, 0] for k in (0, 1))
     assert title.endswith(f"falls from {today:.3g} to {one:.3g}")
-    assert more.startswith(f"With two more, at {further.words[further.taken[1]]} and")
+    most = int(np.argmin(further.bounds[3] / further.bounds[1]))
+    size = six_days.observability.parameters[most].size
+    high, low = (f"{size * further.bounds[k, most]:.3g}" for k in (1, 3))
+    assert more.startswith("Then read twice at t = 25; the bound of")
+    assert more.endswith(f"b{most + 1} then falls from {high} to {low}")
 
 
 @pytest.mark.parametrize(
@@ -398,11 +404,106 @@ def test_truths_without_readings_are_left_out_of_a_design_and_counted():
     assert 0 < lost < 30
     told = " ".join(str(ib.design(wide)).split())
     assert f"{lost} of 30 true parameters from the prior have no finite readings" in told
-    nowhere = ib.measurements.Formula("sqrt(a - t)", {"a": 3.5}, {"t": [1.0, 2.0, 3.0]})
-    none = Scenario(nowhere, Gaussian(0.1), GaussianPrior(), 1.0, 0)
-    no_slope = patch.object(type(nowhere), "jacobian", lambda _, x: np.full((len(x), 3, 1), np.nan))
-    with no_slope, pytest.raises(ib.UserError, match="at none of 30 true parameters"):
-        design(none)
+
+
+def test_a_start_or_a_prior_without_readings_is_refused():
+    model = ib.measurements.Formula("sqrt(a - t)", {"a": 3.5}, {"t": [1.0, 2.0, 3.0]})
+    with pytest.raises(ib.UserError, match=r"at: formula has no finite .* at the start"):
+        ib.design(replace(model, start={"a": 2.5}), noise=Gaussian(0.1))
+    with pytest.raises(ib.UserError, match=r"at: formula has no finite .* at the estimate"):
+        ib.design(model, noise=Gaussian(0.1), at={"a": 2.5})
+    here = type(model).jacobian
+
+    def only_at_the_start(self, x):
+        return np.where((x == model.nominal).all(axis=1)[:, None, None], here(self, x), np.nan)
+
+    nowhere = patch.object(type(model), "jacobian", only_at_the_start)
+    with nowhere, pytest.raises(ib.UserError, match="at none of 30 true parameters"):
+        ib.design(model, noise=Gaussian(0.1))
+
+
+def bounds_of_demand(b1, b2, days, deviation=2.5):
+    """The bounds of b1 and b2 by the slopes of b1 (1 - exp(-b2 t))."""
+    t = np.array(days, dtype=float)
+    J = np.stack([1 - np.exp(-b2 * t), b1 * t * np.exp(-b2 * t)], axis=1) / deviation
+    return np.sqrt(np.diag(np.linalg.inv(J.T @ J)))
+
+
+SIX = [1, 2, 3, 4, 5, 7]
+
+
+@pytest.mark.parametrize("seed", [0, 2, 3])
+def test_the_bound_is_that_at_the_start_whatever_the_seed_and_the_prior(seed):
+    """Far truths, of which some have nearly no slope, raised it to 136 by the mean of squares."""
+    wide = replace(demand(SIX), error_scale=1.0, seed=seed)
+    seen = design(wide).observability
+    right = bounds_of_demand(20.0, 0.5, SIX)
+    np.testing.assert_allclose(seen.bound * [20.0, 0.5], right, rtol=1e-9)
+    # Of two parameters the multiple correlation is that of the pair.
+    assert seen.correlation[0, 1] < 0
+    np.testing.assert_allclose(seen.multiple_correlation, np.abs(seen.correlation[0, 1]), rtol=1e-9)
+    truths = wide.truths(0, 30) * [20.0, 0.5]
+    each = np.sort([bounds_of_demand(*x, SIX) for x in truths], axis=0)
+    # The quartiles of 30 numbers are the 8th, the 15th and the 23rd.
+    np.testing.assert_allclose(seen.quartiles * [20.0, 0.5], each[[7, 14, 22]], rtol=1e-6)
+    (low, middle, high) = each[[7, 14, 22], 0]
+    told = " ".join(str(ib.design(wide)).split())
+    assert f"{right[0]:.3g} {middle:.3g} ({low:.3g} to {high:.3g})" in told
+
+
+def test_at_an_estimate_all_is_of_that_point():
+    wide = replace(demand(SIX), error_scale=1.0)
+    found = ib.design(wide, at={"b1": 19.14, "b2": 0.531})
+    seen = found.observability
+    right = bounds_of_demand(19.14, 0.531, SIX)
+    np.testing.assert_allclose(seen.bound * [20.0, 0.5], right, rtol=1e-9)
+    assert len(seen.quartiles) == 0
+    told = str(found)
+    assert "function" not in told
+    assert "formula, gaussian, at the estimate: what 6 readings determine" in told
+    assert "over the prior" not in told
+    longer = bounds_of_demand(19.14, 0.531, [*SIX, 25])
+    np.testing.assert_allclose(found.further.bounds[1] * [20.0, 0.5], longer, rtol=1e-9)
+    with pytest.raises(ib.UserError, match="at: has no estimate of b2"):
+        ib.design(wide, at={"b1": 19.14})
+
+
+def test_an_estimate_of_a_parameter_that_is_positive_is_taken_in_its_own_unit():
+    plain = demand(SIX)
+    model = informed(plain.measurement, [ParameterInfo("b2", positive=True)])
+    point = {"b1": 19.14, "b2": 0.531}
+    found = ib.design(replace(plain, measurement=model), at=point)
+    np.testing.assert_allclose(model.physical(found.x)[0], [19.14, 0.531], rtol=1e-12)
+
+
+def test_a_folder_without_an_estimate_is_refused(ipe_bench):
+    asked = ["design", "measurement=polynomial", "noise=gaussian", "noise.deviation=1"]
+    Path("failed").mkdir()
+    Path("failed/estimate.json").write_text('{"examination": null, "fixed": {}}')
+    Path("other").mkdir()
+    Path("other/estimate.json").write_text("[]")
+    for folder, why in {
+        "nowhere": "has no estimate.json of an answer; give a folder that `ipe-bench estimate`",
+        "other": "has no estimate.json of an answer; give a folder that `ipe-bench estimate`",
+        "failed": "no estimate there passes; design at the start, without at=",
+    }.items():
+        done, _, err = ipe_bench(*asked, f"at={folder}")
+        assert done == 2
+        assert why in err
+
+
+@pytest.mark.slow
+def test_a_design_at_the_estimate_of_a_folder(ipe_bench):
+    Path("z.csv").write_text("t,reading\n1,8.3\n2,10.3\n3,19.0\n4,16.0\n5,15.6\n7,19.8\n")
+    model = ["measurement=formula", "measurement.expression=b1*(1-exp(-b2*t))"]
+    model += ["measurement.start.b1=20", "measurement.start.b2=0.5"]
+    done, _, _ = ipe_bench("estimate", *model, "readings=z.csv", "figures=none", "output=found")
+    assert done == 0
+    asked = ["design", *model, "measurement.columns.t=[1,2,3,4,5,7]"]
+    asked += ["noise=gaussian", "noise.deviation=2.5"]
+    done, out, _ = ipe_bench(*asked, "at=found")
+    assert done == 0
+    assert re.search(r"b1 +2\.45 +0\.85 +b2 -0\.85", out)
 
 
 def test_a_title_writes_small_bounds_in_three_figures_as_the_table_does():
