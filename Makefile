@@ -39,12 +39,15 @@ plugins: .venv/ready
 	outputs/plugins/.venv/bin/python -m pytest -m plugin plugins
 
 # The quick tests with the lowest versions of all libraries that pyproject.toml allows and that have a wheel for this
-# Python, and with the newest and their pre-releases.
+# Python, and with the newest and their pre-releases, beyond the bounds above, too. ONLY=hydra-core lets that library alone
+# pass its bound, which says whose new version fails.
 lowest newest: .venv/ready
 	$(BIN)/uv venv --quiet --clear --python $(BIN)/python outputs/$@/.venv
+	sed -n 's/^    "\($(or $(ONLY),[a-z0-9-]*)>=[^",]*\).*# .*/\1/p' pyproject.toml > outputs/$@/unbounded.txt
 	$(BIN)/uv pip install --quiet --python outputs/$@/.venv/bin/python --editable ".[test]" \
 		$(if $(filter lowest,$@),--resolution lowest-direct --only-binary :all: \
-		--no-binary ipe-bench --no-binary antlr4-python3-runtime,--upgrade --prerelease allow)
+		--no-binary ipe-bench --no-binary antlr4-python3-runtime,--upgrade --prerelease allow \
+		--override outputs/$@/unbounded.txt)
 	outputs/$@/.venv/bin/python -m pytest -n auto --dist worksteal -W default
 
 # Whether the tests notice changes on purpose, as a table in outputs/mutants: those of tests/mutants/changes.py, all or

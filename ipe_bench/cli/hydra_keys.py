@@ -1,41 +1,93 @@
-"""Keeps what a config says to Hydra to a list: Hydra calls, imports and overwrites whatever else it
-is told to, and an experiment may come from anywhere."""
+"""Judges config files before Hydra merges them.
+
+Hydra calls, imports and overwrites whatever a config tells it to. A person's words and the folders
+that they name are trusted; of a plugin, which may come from anywhere, Hydra obeys a list.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
+import yaml
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from hydra._internal.config_repository import ConfigRepository, IConfigRepository
+from hydra.conf import HydraConf
+from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.default_element import ResultDefault
+from hydra.core.object_type import ObjectType
+from hydra.plugins.config_source import ConfigResult
+from omegaconf import OmegaConf
 
 from ipe_bench.basics.errors import UserError, shortened
-from ipe_bench.cli import words as w
+from ipe_bench.plugins.discovery import explain_yaml, sources
+
+_MOST_NODES = 100_000
+"""Values that a file may stand for."""
 
 
 class Guarded(ConfigLoaderImpl):
-    """Loads configs as Hydra does, and refuses one that says to Hydra what is not on the list.
+    """Loads configs as Hydra does, and refuses a file that tells Hydra more than its source may.
 
     Every config comes from here: that of a command, those of its sweep's jobs, and those in a
     launcher's processes.
     """
 
-    def load_configuration(
-        self,
-        config_name: str | None,
-        overrides: list[str],
-        run_mode: RunMode,
-        from_shell: bool = True,
-        validate_sweep_overrides: bool = True,
-    ) -> DictConfig:
-        config = super().load_configuration(
-            config_name, overrides, run_mode, from_shell, validate_sweep_overrides
-        )
-        require_listed(config.hydra, overrides)
-        return config
+    def __init__(self, config_search_path: ConfigSearchPath) -> None:
+        super().__init__(config_search_path)
+        self.repository = _Repository(config_search_path)
+        self.plugins = {source.name for source in sources()[1:]}
+
+    def _load_single_config(self, default: ResultDefault, repo: IConfigRepository) -> ConfigResult:
+        found = super()._load_single_config(default, repo)
+        if found.provider in self.plugins:
+            said: Any = OmegaConf.to_container(found.config, resolve=False)
+            if "hydra" in said:
+                require_listed(said["hydra"], str(default.config_path))
+        return found
+
+
+class _Repository(ConfigRepository):
+    """Finds configs as Hydra does; reads each file once before Hydra does."""
+
+    def load_config(self, config_path: str) -> ConfigResult | None:
+        source = self._find_object_source(config_path, ObjectType.CONFIG)
+        if source is not None and source.scheme() == "file" and source.provider != "main":
+            name = source._normalize_file_name(config_path)
+            _require_readable(Path(source.path) / name)
+        return super().load_config(config_path)
+
+
+def _require_readable(path: Path) -> None:
+    """Refuses a file that Hydra would misread, or not be done with, by its name."""
+    content = path.read_bytes()
+    if content.startswith(b"\xef\xbb\xbf"):
+        raise UserError(f"{path}: begins with a byte order mark; save it as UTF-8 without one")
+    try:
+        root = yaml.compose(content.decode(), yaml.SafeLoader)
+    except UnicodeDecodeError:
+        raise UserError(f"{path}: is not UTF-8; save it as UTF-8") from None
+    except RecursionError:
+        raise UserError(f"{path}: is nested too deeply") from None
+    except yaml.YAMLError as error:
+        raise UserError(explain_yaml(error, path)) from None
+    if _size(root, {}) > _MOST_NODES:
+        raise UserError(f"{path}: stands for more than {_MOST_NODES} values; use fewer aliases")
+
+
+def _size(node: yaml.Node | None, known: dict[yaml.Node, float]) -> float:
+    """Counts the values that a node stands for, where aliases stand for what they repeat."""
+    if not isinstance(node, yaml.CollectionNode):
+        return 1
+    if node not in known:
+        known[node] = float("inf")  # of a node within itself
+        children = node.value
+        if isinstance(node, yaml.MappingNode):
+            children = [value for _, value in node.value]
+        known[node] = 1 + sum(_size(child, known) for child in children)
+    return known[node]
 
 
 def _leaves(node: Any, key: str = "") -> Iterator[tuple[str, Any]]:
@@ -55,21 +107,8 @@ def _leaves(node: Any, key: str = "") -> Iterator[tuple[str, Any]]:
         yield from _leaves(value, f"{key}.{name}".lstrip("."))
 
 
-_QUIET = {"version": 1, "root": None, "disable_existing_loggers": False}
-_OURS: dict[str, Any] = {"callbacks": {}, "env": {}, "hydra_logging": _QUIET, "job_logging": _QUIET}
-_OURS |= {"job": {"name": "ipe-bench", "chdir": False, "env_set": {}, "env_copy": []}}
-_OURS |= {"output_subdir": ".hydra", "searchpath": []}
-_PLAIN = dict(_leaves(_OURS))
-"""Values of our own config, which stay."""
-_TYPED = re.compile(r"(job|output_subdir|searchpath)\b.*")
-"""Those of these keys that the command line may set."""
-_WRITTEN = re.compile(
-    r"(help|hydra_help|overrides|runtime|job\.(override_dirname|id|num|config_name|config))\b.*"
-)
-"""Keys that Hydra writes, or that only its own help shows."""
 _FREE = re.compile(r"mode|(verbose|launcher|sweeper)\b.*|run\.dir|sweep\.(sub)?dir")
-_LIST = "only mode, verbose, launcher, sweeper, run.dir and sweep.dir may be set here"
-
+_LIST = "a plugin sets only mode, verbose, launcher, sweeper, run.dir and sweep.dir"
 _CLASS = re.compile(
     r"hydra\._internal\.core_plugins\.\w+\.[A-Z]\w*|hydra_plugins\.(\w+\.){1,2}[A-Z]\w*"
     r"|optuna\.(samplers|pruners)\.[A-Z]\w*"
@@ -96,56 +135,34 @@ _KEYS = re.compile(rf"{_OF_HYDRA}|\$\{{[\w.]+\}}|\$\{{now:[^{{}}$]*\}}")
 a text."""
 
 
-def require_listed(hydra: DictConfig, words: Sequence[str]) -> None:
-    """Refuses a config of Hydra with a key or a value that is not on the list; `words` are those of
-    the command line.
+def require_listed(hydra: Any, name: str) -> None:
+    """Refuses the part for Hydra of a plugin's config of that name, if it has a key or a value that
+    is not on the list.
 
     It is judged before interpolations are resolved: until Hydra does so, what they stand for can
     change.
     """
-    said: Any = OmegaConf.to_container(hydra, resolve=False)
-    if not {*said["overrides"]["hydra"], *said["overrides"]["task"]} <= set(words):
-        raise UserError(f"hydra.overrides: {_LIST}; remove it")
-    typed = _typed(words)
-    for key, value in _leaves(said):
-        is_typed = key in typed and typed[key] == value
-        if _FREE.fullmatch(key):
-            _require_harmless(key, value, is_typed)
-        elif _WRITTEN.fullmatch(key) or (key in _PLAIN and _PLAIN[key] == value):
+    packaged = dict(_leaves(OmegaConf.to_container(OmegaConf.structured(HydraConf))))
+    for key, value in _leaves(hydra):
+        if key in packaged and packaged[key] == value:
             continue
-        elif not _TYPED.fullmatch(key):
-            raise _refusal(key, value, f"{_LIST}; remove it")
-        elif not is_typed:
-            raise _refusal(key, value, f"{_LIST}; remove it, or write it on the command line")
+        why = _harm(key, value) if _FREE.fullmatch(key) else _LIST
+        if why:
+            raise UserError(
+                f"hydra{'.' * bool(key)}{key}={shortened(str(value))}: {why}; copy {name}.yaml into"
+                " a folder that you name with --config-dir, or write this on the command line"
+            )
 
 
-def _typed(words: Sequence[str]) -> dict[str, Any]:
-    """Returns the values that the command line gives to keys of Hydra."""
-    told = [word for word in words if word.lstrip("+").startswith("hydra.")]
-    parsed = OverridesParser.create().parse_overrides(told)
-    given = ((one.key_or_group.removeprefix("hydra."), w.plain(one.value())) for one in parsed)
-    return {key: value for name, content in given for key, value in _leaves(content, name)}
-
-
-def _require_harmless(key: str, value: Any, is_typed: bool) -> None:
-    """Refuses what Hydra, a launcher or a sweeper would call, and interpolations that compute a
-    value."""
+def _harm(key: str, value: Any) -> str:
+    """Says what Hydra, a launcher or a sweeper would call, or compute of an interpolation; empty if
+    nothing."""
     part, *names = key.split(".")
     if names[-1:] == ["_target_"]:
-        if not _CLASS.fullmatch(str(value)):
-            known = "only classes of Hydra, of launchers and of sweepers may be named here"
-            raise _refusal(key, value, f"{known}; remove it, or write a plugin")
-        return
-    if is_typed:
-        return
+        return "" if _CLASS.fullmatch(str(value)) else "is no class of a launcher or a sweeper"
     if value and not _COMMANDS.isdisjoint(names):
-        raise _refusal(key, value, "runs a function or a shell; write it on the command line")
+        return "runs a function or a shell"
     if "hydra" in re.split(r"\W+", ".".join(names)):
-        raise _refusal(key, value, "a sweep cannot set keys of Hydra; remove it")
+        return "a sweep cannot set keys of Hydra"
     known = _KEYS if part in ("run", "sweep") or names[:1] == ["params"] else _TEXTS
-    if "${" in known.sub("", str(value)):
-        raise _refusal(key, value, "computes a value; write the value itself")
-
-
-def _refusal(key: str, value: Any, why: str) -> UserError:
-    return UserError(f"hydra.{key}={shortened(str(value))}: {why}")
+    return "computes a value" if "${" in known.sub("", str(value)) else ""

@@ -84,6 +84,16 @@ Quote values with brackets, or the shell takes them for a pattern.
                 "metavar": "DIR",
                 "help": "a folder with options and experiments of your own",
             },
+            "-cn --config-name": {
+                "metavar": "NAME",
+                "default": "config",
+                "help": "the primary config, in that folder",
+            },
+            "--hydra-help": {"action": "store_true", "help": "what Hydra says of itself"},
+            "--experimental-rerun": {
+                "metavar": "DIR",
+                "help": "the words of a job, from the .hydra folder that Hydra left",
+            },
             "-sc --shell-completion": {
                 "action": "store_true",
                 "help": "install=SHELL or uninstall=SHELL",
@@ -251,12 +261,8 @@ class Parser(argparse.ArgumentParser):
             return values
         word = surplus[0]
         flag, equals, _ = word.partition("=")
-        if self.command == "run" and flag in ("-cp", "--config-path", "-cn", "--config-name"):
-            remedy = (
-                "put options and experiments of your own into a folder and name it with"
-                " --config-dir"
-            )
-            raise UserError(f"run: {word}: is no flag any more; {remedy}")
+        if self.command == "run" and flag in ("-cp", "--config-path"):
+            raise UserError(f"run: {word}: name the folder with --config-dir")
         flags = [flag for action in self._actions for flag in action.option_strings]
         takes_keys = equals or any(action.metavar == "KEY=VALUE" for action in self._actions)
         dashes = "-" if equals else "--"

@@ -24,7 +24,7 @@ from ipe_bench.cli.results import show_report
 from ipe_bench.cli.session import Jobs, complete, jobs_of, session, show, spec_of
 from ipe_bench.cli.single import require_one_kind
 from ipe_bench.cli.spec import Spec
-from ipe_bench.plugins.discovery import PACKAGES, options
+from ipe_bench.plugins.discovery import PACKAGES, options, read_yaml_file
 from ipe_bench.plugins.standard import of_run
 from ipe_bench.report.progress import watching
 from ipe_bench.report.words import counted
@@ -86,15 +86,17 @@ def run_command(arguments: Sequence[str]) -> int:
     """Computes and shows; exit code 1 where something failed or is missing."""
     flags = _flags(arguments)
     folder = None if flags.config_dir is None else Path(flags.config_dir)
-    with session(folder):
+    with session(folder, flags.config_name):
         if flags.shell_completion:
             complete(flags.overrides)
             return 0
-        words = w.read("run", flags.overrides, folder)
+        typed = [*_rerun(flags.experimental_rerun), *flags.overrides]
+        swept = [w.swept(word) for word in typed]
+        words = w.read("run", swept, folder)
         named = w.read("run", [f"default_name='{w.default_name(words)}'"])
         words = replace(words, overrides=words.overrides + named.overrides)
-        jobs = jobs_of(words, multirun=flags.multirun)
-        if flags.cfg or flags.info:
+        jobs = jobs_of(words, multirun=flags.multirun or swept != typed)
+        if flags.cfg or flags.info or flags.hydra_help:
             show(words, flags)
             return 0
         words.refuse(OF_FILES, "is for `ipe-bench estimate`: run simulates its readings")
@@ -109,8 +111,8 @@ def run_command(arguments: Sequence[str]) -> int:
         say(*_there_already(jobs))
         if words.standard_baselines:
             say(*_left_out(jobs.specs))
-        typed = shlex.join(["ipe-bench", "run", *arguments])
-        task = Task(typed, words.files, words.standard_baselines)
+        command = shlex.join(["ipe-bench", "run", *arguments])
+        task = Task(command, words.files, words.standard_baselines)
         if jobs.told:
             for told, spec in zip(jobs.told, jobs.specs, strict=True):
                 task.compute(told, spec)
@@ -187,7 +189,7 @@ def _left_out(jobs: Sequence[Spec]) -> list[str]:
 
 def _flags(arguments: Sequence[str]) -> Namespace:
     flags = parser_of("run").parse(arguments)
-    apart = ("multirun", "cfg", "info", "shell_completion")
+    apart = ("multirun", "cfg", "info", "hydra_help", "shell_completion")
     asked = [f"--{name}" for name in apart if vars(flags)[name]]
     if len(asked) > 1:
         raise UserError(f"run: {' '.join(asked).replace('_', '-')}: do not go together; choose one")
@@ -196,6 +198,23 @@ def _flags(arguments: Sequence[str]) -> Namespace:
     if flags.config_dir is not None and not Path(flags.config_dir).is_dir():
         raise UserError(f"run: --config-dir={flags.config_dir}: there is no such folder")
     return flags
+
+
+def _rerun(name: str | None) -> list[str]:
+    """Reads the words of a job from the folder that Hydra left of it, or from a file in it."""
+    if name is None:
+        return []
+    place = Path(name)
+    folder = place if place.is_dir() else place.parent
+    files = [folder / "overrides.yaml", folder / ".hydra" / "overrides.yaml"]
+    for file in filter(Path.is_file, files):
+        found = read_yaml_file(file, f"--experimental-rerun={name}")
+        if isinstance(found, list):
+            return [str(word) for word in found]
+    raise UserError(
+        f"run: --experimental-rerun={name}: there is no overrides.yaml; name the folder .hydra of a"
+        " job"
+    )
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from typing import Any
 import hydra
 import yaml
 from hydra import compose, initialize_config_dir
+from hydra._internal.utils import get_args_parser
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
@@ -47,6 +48,8 @@ class PluginConfigs(SearchPathPlugin):
     """Lets our own commands find the options of plugins, and a user's own folder first."""
 
     folder: Path | None = None
+    name = "config"
+    """The primary config."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         if self.folder is not None:
@@ -54,18 +57,10 @@ class PluginConfigs(SearchPathPlugin):
         extend(search_path, plugins.sources())
 
 
-@contextlib.contextmanager
-def session(folder: Path | None = None) -> Iterator[None]:
-    """Lets Hydra find our configs, those of plugins, and those in `folder` within its block."""
-    print_problems(plugins.take_problems())
-    for name in ("config.yaml", "schema.yaml", "hydra/config.yaml"):
-        if folder is not None and (folder / name).exists():
-            raise UserError(
-                f"{folder / name}: would replace ipe-bench's own config; move it to"
-                " experiment/NAME.yaml"
-            )
+@functools.cache
+def _register() -> None:
+    """Tells Hydra, once in a process, what configs there are besides files."""
     store = ConfigStore.instance()
-    registry = Plugins.instance()
     store.store("schema", node=DEFAULTS, provider="ipe-bench")
     for name in FORMULAS:
         node = {"_target_": "ipe_bench.measurements.Nist", "dataset": name}
@@ -76,9 +71,25 @@ def session(folder: Path | None = None) -> Iterator[None]:
             package="measurement",
             provider="ipe-bench",
         )
+    registry = Plugins.instance()
     if PluginConfigs not in registry.discover(SearchPathPlugin):
         registry.register(PluginConfigs)
+
+
+@contextlib.contextmanager
+def session(folder: Path | None = None, name: str = "config") -> Iterator[None]:
+    """Lets Hydra find our configs, those of plugins, and those in `folder` within its block; `name`
+    is that of the primary config."""
+    print_problems(plugins.take_problems())
+    for own in ("config.yaml", "schema.yaml", "hydra/config.yaml"):
+        if folder is not None and (folder / own).exists():
+            raise UserError(
+                f"{folder / own}: would replace ipe-bench's own config; move it to"
+                " experiment/NAME.yaml"
+            )
+    _register()
     PluginConfigs.folder = folder
+    PluginConfigs.name = name
     _composed.cache_clear()
     GlobalHydra.instance().clear()
     # Hydra 1.3 asks for the version whose rules hold, and 1.4 warns of whoever says one.
@@ -86,6 +97,15 @@ def session(folder: Path | None = None) -> Iterator[None]:
     with initialize_config_dir(str(plugins.own_conf()), job_name="ipe-bench", **base):
         _hydra().config_loader = Guarded(_hydra().config_loader.get_search_path())
         yield
+
+
+def _trusting() -> contextlib.AbstractContextManager[Any]:
+    """Lets Hydra 1.4 construct the classes that configs name, which were judged when the files were
+    read; 1.3 asks for no leave."""
+    of_hydra: Any = hydra.utils
+    if not hasattr(of_hydra, "execution_whitelist"):
+        return contextlib.nullcontext()
+    return of_hydra.execution_whitelist(of_hydra.UNSAFE_DISABLE_EXECUTION_CHECKS)
 
 
 def _hydra() -> Any:
@@ -110,9 +130,10 @@ class Jobs:
         """Returns each job's result, run by the launcher and the sweeper that the words choose;
         empty for a sweeper that optimises."""
         try:
-            if not self.multirun:
-                return [_hydra().run("config", task, self.words.text).return_value]
-            batches = _hydra().multirun("config", task, self.words.text)
+            with _trusting():
+                if not self.multirun:
+                    return [_hydra().run(PluginConfigs.name, task, self.words.text).return_value]
+                batches = _hydra().multirun(PluginConfigs.name, task, self.words.text)
         except (HydraException, OmegaConfBaseException) as error:
             raise explain(error) from error
         return [job.return_value for batch in batches or [] for job in batch]
@@ -149,11 +170,18 @@ def jobs_of(words: Words, *, multirun: bool) -> Jobs:
     else:
         jobs = [list(words.overrides)]
         specs = [spec_of(config)]
-    told = any(one.is_hydra_override() for one in words.overrides)
-    ours = hydra.launcher["_target_"].endswith(".BasicLauncher")
-    if told or not ours:
+    typed = any(one.is_hydra_override() for one in words.overrides)
+    if typed or _told(hydra) != _told(_composed((), whole=True).hydra):
         return Jobs(words, specs, multirun)
     return Jobs(words, specs, multirun, told=[list(map(w.forced, job)) for job in jobs])
+
+
+def _told(hydra: DictConfig) -> dict[str, Any]:
+    """Returns what Hydra is told to do about jobs besides running them."""
+    said: Any = OmegaConf.to_container(hydra, resolve=False)
+    job = {key: said["job"][key] for key in ("chdir", "env_set", "env_copy")}
+    keys = ("callbacks", "hydra_logging", "job_logging", "launcher")
+    return {**job, **{key: said[key] for key in keys}}
 
 
 def _swept(words: Words, params: Sequence[str]) -> list[list[Override]]:
@@ -185,7 +213,10 @@ def _spec(job: Sequence[Override]) -> Spec:
 @functools.lru_cache(maxsize=64)
 def _composed(words: tuple[str, ...], *, whole: bool = False) -> DictConfig:
     try:
-        config = compose("config", list(words), return_hydra_config=True)
+        config = compose(PluginConfigs.name, list(words), return_hydra_config=True)
+    except RecursionError:
+        chosen = next((word for word in words if "experiment=" in word), " ".join(words))
+        raise UserError(f"{chosen}: its defaults lead back to itself; remove one of them") from None
     except Exception as error:  # what Hydra makes of overrides raises nearly anything
         raise explain(error) from error
     if not whole:
@@ -215,10 +246,13 @@ def _plain(config: DictConfig) -> dict[str, Any]:
 def show(words: Words, flags: Any) -> None:
     """Answers the flags that print and compute nothing, by Hydra's own means."""
     settled = [w.forced(one) for one in w.settled(words.overrides)]
-    if flags.info:
-        _hydra().show_info(flags.info, "config", settled, RunMode.RUN)
+    if flags.hydra_help:
+        flags.overrides = [w.forced(one) for one in words.overrides if one.is_hydra_override()]
+        _hydra().hydra_help(PluginConfigs.name, get_args_parser(), flags)
+    elif flags.info:
+        _hydra().show_info(flags.info, PluginConfigs.name, settled, RunMode.RUN)
     else:
-        _hydra().show_cfg("config", settled, flags.cfg, flags.package, flags.resolve)
+        _hydra().show_cfg(PluginConfigs.name, settled, flags.cfg, flags.package, flags.resolve)
 
 
 def complete(words: Sequence[str]) -> None:
@@ -236,7 +270,7 @@ def complete(words: Sequence[str]) -> None:
     ):  # Hydra completes the words after the program's name; ours has the command in between
         os.environ["COMP_LINE"] = line.replace(" run ", " ", 1)
         os.environ["COMP_POINT"] = str(len(os.environ["COMP_LINE"]))
-    _hydra().shell_completion("config", list(words))
+    _hydra().shell_completion(PluginConfigs.name, list(words))
 
 
 def explain(error: BaseException) -> UserError:
@@ -282,6 +316,8 @@ def _no_such_option(name: str) -> str:
 def _no_such_key(name: str) -> str:
     known = {*KEYS, *plugins.groups(), "hydra"}
     key = name.split(".")[0]
+    if key == "hydra":
+        return f"{name}: is not there yet; write +{name}=VALUE, or see `ipe-bench run --cfg hydra`"
     if key in known:
         return f"{name}: there is no such key; see `ipe-bench run --cfg job` for those there are"
     return f"{name}: {unknown(key, known, 'key')}"

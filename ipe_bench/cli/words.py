@@ -42,6 +42,8 @@ _FILE = re.compile(
     rf"\+*(?:(measurement|state_model|{TRUTH})\.file|(parameters))=(?![{{$]|null$)(.*)", re.DOTALL
 )
 
+_PARAMETER = re.compile(r"\+*hydra\.sweeper\.params\.([^=]+)=(['\"]?)(.*)\2", re.DOTALL)
+
 Groups = dict[str, list[str]]
 """The names of the options of each group."""
 
@@ -170,6 +172,12 @@ def plain(value: Any) -> Any:
 # Reading
 
 
+def swept(word: str) -> str:
+    """Writes a word that adds to the parameters of a sweep as the sweep that it means: Hydra 1.3
+    adds none where no config has any."""
+    return _PARAMETER.sub(r"\1=\3", word)
+
+
 def _expanded(word: str) -> list[str]:
     """Parses a word by Hydra's grammar, or the words of a file in its place."""
     file = _FILE.fullmatch(word)
@@ -257,12 +265,8 @@ def _parse(command: str, word: str, groups: Groups) -> Override:
 def _check(override: Override, groups: Groups) -> None:
     group = override.key_or_group
     word = said(override)
-    if group.startswith("hydra.sweeper.params"):
-        key = group.removeprefix("hydra.sweeper.params").lstrip(".")
-        swept = f"{key}={word.partition('=')[2]}" if key else "error_scale=VALUE,VALUE"
-        raise UserError(
-            f"{word}: belongs in an experiment file; on the command line write -m {swept}"
-        )
+    if group == "hydra.sweeper.params":
+        raise UserError(f"{word}: give each key by itself, as in {group}.error_scale='1,10'")
     if re.split("[./]", group)[0] == "hydra":
         return
     if group in groups and not override.is_delete():

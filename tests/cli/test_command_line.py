@@ -152,7 +152,7 @@ MISTAKES = {
         ["run", "trials=1e3"],
         "trials=1e3: is not written as a whole number; write trials=1000",
     ),
-    "a flag that is gone": (["run", "--config-path", "x"], "name it with --config-dir"),
+    "a flag that is gone": (["run", "--config-path", "x"], "name the folder with --config-dir"),
     "no function": (
         ["run", "measurement=function"],
         "measurement.of: is not given; write measurement.of=MODULE:FUNC",

@@ -266,9 +266,7 @@ def stored(folder: Path) -> list[Path]:
             "error_scale=100,1000: is a sweep; add -m for a job of each error_scale",
         ),
         ("solver=newton,auto", "solver=newton,auto: is a sweep; add -m, or put a list in brackets"),
-        ("-m hydra.sweeper.params.error_scale=1,2", "write -m error_scale=1,2"),
-        ("-m +hydra.sweeper.params.error_scale='1,2'", "write -m error_scale='1,2'"),
-        ("-m hydra.sweeper.params={error_scale:1}", "belongs in an experiment file"),
+        ("-m hydra.sweeper.params={error_scale:1}", "give each key by itself, as in hydra.sweep"),
     ],
 )
 def test_a_sweep_in_a_wrong_place_is_told_a_right_one(answer, words, line):

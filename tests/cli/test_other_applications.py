@@ -51,5 +51,5 @@ def test_it_composes_our_configs_behind_its_own(tmp_path):
         command, cwd=tmp_path, capture_output=True, text=True, env=variables, check=False
     )
     assert done.returncode == 0, done.stderr
-    assert done.stderr == ""  # where Hydra says that a path is not available
+    assert "is not available" not in done.stderr  # which Hydra says of a path
     assert done.stdout.splitlines() == ["Ranging 49 7 {'own': 9} ['fixed_point', 'newton']", "9"]

@@ -228,12 +228,14 @@ CALLED = {
 @pytest.mark.parametrize("below_hydra", CALLED.values(), ids=CALLED)
 def test_an_experiment_has_no_function_called(ipe_bench, below_hydra):
     Path("mine").write_text("kept")
-    folder = Path("conf/experiment")
+    package = Path("plugins/theirs/theirs_of_this_test")
+    folder = package / "conf/experiment"
     folder.mkdir(parents=True)
+    (package / "__init__.py").touch()
     (folder / "mine.yaml").write_text(
         f"# @package _global_\nhydra:\n  job: {{env_set: {{A: b}}}}\n  {below_hydra}\n"
     )
-    words = ("--config-dir", "conf", "+experiment=mine", *SMALL, "solver=[newton]", "trials=2")
+    words = ("+experiment=mine", *SMALL, "solver=[newton]", "trials=2")
     code, _, err = ipe_bench("run", *words)
     assert (code, err.count("\n")) == (2, 1)
     assert "hydra." in err
