@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import combinations, pairwise
+from itertools import combinations, compress, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -75,6 +75,13 @@ _DONE = 1e-8
 """The squared step, in standard errors, that ends them."""
 _FAR = 30.0
 """Logarithms of factors beyond which nothing is looked for."""
+_NEAR_ZERO = 7.0
+"""What is subtracted from the logarithm of a deviation that stands for 0, where a model has no
+likelihood at 0."""
+_CERTAIN = 0.25
+"""A deviation whose logarithm has a smaller standard error is not tried at 0."""
+_EFFECT = 1e-3
+"""A change of the log likelihood by more than this is an effect."""
 _VAGUE = 5.0
 """Their standard errors where there is no maximum."""
 
@@ -508,15 +515,23 @@ def found_and_tracked(
 
     def cost(u: Array) -> float:
         """Computes minus the log likelihood; infinite where there is none."""
-        if not (np.abs(u[sought.positive]) < _FAR).all() or tracker.hindrance(sought.at(u)):
+        logarithms = u[sought.positive]
+        if (np.isfinite(logarithms) & (np.abs(logarithms) >= _FAR)).any():
             return np.inf
-        tracks, _ = track_safely(tracker, sought.at(u), log.z[None])
+        try:
+            model = sought.at(u)
+        except UserError:
+            # A model in Python may take no 0.
+            return np.inf
+        if tracker.hindrance(model):
+            return np.inf
+        tracks, _ = track_safely(tracker, model, log.z[None])
         value = -float(tracks.log_likelihood[0])
         return value if tracks.degrees.any() and np.isfinite(value) else np.inf
 
     with np.errstate(invalid="ignore"):
         best, *others = _minima(cost, sought.positive, watch)
-    if not np.isfinite(best.error).all():
+    if not best.is_maximum:
         message = (
             f"no maximum of the likelihood was found in {', '.join(find)}: the log may not"
             f" determine all of them; the search ended after {best.evaluations} evaluations at"
@@ -526,10 +541,13 @@ def found_and_tracked(
         return replace(own, message=message, found=NO_MAXIMUM, passes=False)
     track = LogTracks.of(replace(log, model=sought.at(best.u)), label, tracker)
     notes = [
+        f"the likelihood is largest at {name}=0, where it is held" for name in sought.at_zero(best)
+    ]
+    notes += [
         f"another maximum, of a log likelihood {one.cost - best.cost:.3g} lower, is at"
         f" {sought.written(one.u)}"
         for one in others
-        if np.isfinite(one.error).all()
+        if one.is_maximum
     ]
     found = ""
     message = track.message
@@ -539,7 +557,7 @@ def found_and_tracked(
             f" {track.fit_p:.2g}; white: p = {track.white_p:.2g}): the model does not describe the"
             " log, and neither values nor errors can be trusted"
         )
-    elif any(one.cost - best.cost < _ALIKE for one in others):
+    elif any(one.is_maximum and one.cost - best.cost < _ALIKE for one in others):
         found = SEVERAL_MAXIMA
         message = "the log hardly distinguishes the maxima of the likelihood"
     return replace(
@@ -605,9 +623,13 @@ class _Sought:
             parts[key] = value
         return replace(self.model, **parts)  # type: ignore[type-var]
 
+    def at_zero(self, best: _Minimum) -> list[str]:
+        """Names the numbers that are held at 0."""
+        return list(compress(self.names, best.zero))
+
     def constants(self, best: _Minimum) -> list[Constant]:
         """Returns the numbers at a minimum, with intervals that are normal in u."""
-        values = self.values(best.u)
+        values = np.where(best.zero, 0.0, self.values(best.u))
         errors = np.where(self.positive, values, self.size) * best.error
         reach = float(ndtri(0.975)) * best.error
         low = self.values(best.u - reach)
@@ -654,16 +676,26 @@ class _Minimum:
     u: Array
     cost: float
     error: Array
-    """Standard errors by the second derivatives; NaN if the cost has no minimum there."""
+    """Standard errors by the second derivatives; NaN if the cost has no minimum there, and for
+    those that are 0."""
     H: Array
-    """The second derivatives."""
+    """The second derivatives by the others."""
     evaluations: int
     """Evaluations of the cost in the search."""
+    zero: Mask
+    """The positive ones that are held at 0, as the cost rises from there."""
 
-    def holds(self, u: Array) -> bool:
+    @property
+    def is_maximum(self) -> bool:
+        """Whether the likelihood has a maximum here, on its bound or inside."""
+        return bool(np.isfinite(self.error[~self.zero]).all())
+
+    def holds(self, u: Array, cost: float) -> bool:
         """Whether u is within a standard error of this minimum."""
-        away = u - self.u
-        return bool(away @ self.H @ away < 1)
+        away = (u - self.u)[~self.zero]
+        near = bool(away @ self.H @ away < 1)
+        # Near 0 the logarithm of a deviation says nothing.
+        return near and (not self.zero.any() or cost - self.cost < 0.5)
 
 
 @dataclass
@@ -699,52 +731,131 @@ def _minima(
         search = _Search(cost, f"search {number} of {SEARCHES}", watch)
         nearer = (start, start / 2, start / 8, 0 * start)
         first = next(u for u in nearer if np.isfinite(search(u)))
-        u = _descended(search, first)
+        u, reached = _descended(search, first)
         # A search that comes near a minimum that is known need not be ended.
-        if any(one.holds(u) for one in found):
+        if any(one.holds(u, reached) for one in found):
             continue
-        end = _polished(search, u, positive)
-        if not any(one.holds(end.u) for one in found):
+        end = _ended(search, u, positive)
+        if not any(one.holds(end.u, end.cost) for one in found):
             found.append(end)
-    return sorted(found, key=lambda one: one.cost)
+    best = min(found, key=lambda one: one.cost)
+    for i in np.flatnonzero(positive & (best.error > _CERTAIN)):
+        search = _Search(cost, f"search at 0 beside {len(found)} ends", watch)
+        end = _on_bound(search, best, int(i), positive)
+        if end is not None and not any(one.holds(end.u, end.cost) for one in found):
+            found.append(end)
+    # A maximum is the answer unless the likelihood is larger where there is none.
+    return sorted(found, key=lambda one: one.cost + (0.0 if one.is_maximum else _EFFECT))
 
 
-def _descended(search: _Search, u: Array) -> Array:
-    """Finds where a search by Nelder and Mead's simplex ends."""
+def _descended(search: Callable[[Array], float], u: Array) -> tuple[Array, float]:
+    """Finds where a search by Nelder and Mead's simplex ends, and the cost there."""
     from scipy.optimize import minimize
 
     simplex = np.vstack([u, u + 0.5 * np.eye(len(u))])
     options = {"initial_simplex": simplex, "xatol": 0.1, "fatol": 0.1, "maxfev": _OF_SIMPLEX}
     ended = minimize(search, u, method="Nelder-Mead", options=options)
-    return np.asarray(ended.x)
+    return np.asarray(ended.x), float(ended.fun)
 
 
-def _polished(cost: _Search, u: Array, positive: Mask) -> _Minimum:
-    """Finds the end of Newton's iteration from u, which stops where a logarithm has hardly any
-    effect on the cost."""
-    n = len(u)
+def _ended(search: _Search, u: Array, positive: Mask) -> _Minimum:
+    """Finds the minimum near u, inside or where positive ones are 0."""
+    zero = np.zeros(len(u), dtype=bool)
+    end = _polished(search, u, positive, zero)
+    if end.is_maximum:
+        return end
+    u = end.u.copy()
+    for i in np.flatnonzero(positive):
+        held = _at_zero(search, u, int(i))
+        if held is not None:
+            u[i] = held
+            zero[i] = True
+    if not zero.any():
+        return end
+    return _polished(search, u, positive, zero)
+
+
+def _on_bound(search: _Search, best: _Minimum, i: int, positive: Mask) -> _Minimum | None:
+    """Finds the minimum at which one more positive one is 0; None if there is none."""
+    u = best.u.copy()
+    for logarithm in (-np.inf, best.u[i] - _NEAR_ZERO):
+        u[i] = logarithm
+        if np.isfinite(search(u)):
+            break
+    zero = best.zero.copy()
+    zero[i] = True
+    end = _polished(search, u, positive, zero)
+    inside = end.u.copy()
+    inside[i] = best.u[i] - _NEAR_ZERO
+    if not end.is_maximum or _at_zero(search, inside, i) is None:
+        return None
+    return end
+
+
+def _at_zero(search: _Search, u: Array, i: int) -> float | None:
+    """Returns the logarithm that stands for 0 of a positive one, if the cost rises from there; else
+    None."""
+    here = search(u)
+    up = u.copy()
+    change = 0.0
+    while abs(change) <= _EFFECT:
+        up[i] += 1.0
+        if up[i] >= _FAR:
+            return None
+        change = search(up) - here
+    if change < 0:
+        return None
+    down = u.copy()
+    for logarithm in (-np.inf, up[i] - _NEAR_ZERO):
+        down[i] = logarithm
+        if search(down) <= here + _EFFECT:
+            return float(logarithm)
+    return None
+
+
+def _polished(search: _Search, u: Array, positive: Mask, zero: Mask) -> _Minimum:
+    """Finds the end of Newton's iteration from u by those that are not `zero`, which stops where a
+    logarithm has hardly any effect on the cost."""
+    free = np.flatnonzero(~zero)
+    n = len(free)
+    error = np.full(len(u), np.nan)
+    if not n:
+        return _Minimum(u, search(u), error, np.zeros((0, 0)), search.evaluations, zero)
+
+    def cost(values: Array) -> float:
+        return search(placed(values))
+
+    def placed(values: Array) -> Array:
+        whole = u.copy()
+        whole[free] = values
+        return whole
+
+    v = u[free]
+    if zero.any():
+        v, _ = _descended(cost, v)
     h = np.full(n, 1e-2)
-    rounds = cost.left // (n**2 + n + 1)
+    rounds = search.left // (n**2 + n + 1)
     for _ in range(min(_ROUNDS, rounds)):
-        here, g, H = _derivatives(cost, u, h)
+        here, g, H = _derivatives(cost, v, h)
         # Without a positive definite H there is no minimum near.
         if not (np.isfinite(H).all() and np.linalg.eigvalsh(H)[0] > 0):
             break
         # The inverse of the second derivatives of minus the log likelihood is the covariance of
         # its maximum.
         P = np.linalg.inv(H)
-        error = deviations(P)
-        if (error[positive] >= _VAGUE).any():
+        deviation = deviations(P)
+        if (deviation[positive[free]] >= _VAGUE).any():
             break
-        u = u - P @ g
-        h = _STEP * error
+        v = v - P @ g
+        h = _STEP * deviation
         if g @ P @ g < _DONE:
-            return _Minimum(u, here, h / _STEP, H, cost.evaluations)
+            error[free] = deviation
+            return _Minimum(placed(v), here, error, H, search.evaluations, zero)
     nothing = np.full((n, n), np.nan)
-    return _Minimum(u, cost(u), nothing[0], nothing, cost.evaluations)
+    return _Minimum(placed(v), cost(v), error, nothing, search.evaluations, zero)
 
 
-def _derivatives(cost: _Search, u: Array, h: Array) -> tuple[float, Array, Array]:
+def _derivatives(cost: Callable[[Array], float], u: Array, h: Array) -> tuple[float, Array, Array]:
     """Computes a cost with its first (n,) and second (n, n) derivatives by central differences of
     the steps h (n,)."""
     steps = np.diag(h)

@@ -45,6 +45,9 @@ DAMPED = Formulas(
 )
 
 
+BOTH = ["w", "flow"]
+
+
 @pytest.mark.oracle(
     "published: Durbin and Koopman, Time Series Analysis by State Space Methods (2012), section"
     " 2.10.3",
@@ -178,17 +181,47 @@ def test_a_search_that_is_interrupted_is_one_line_and_no_file(
 
 
 @pytest.mark.slow
-def test_a_log_without_noise_determines_no_noise():
+def test_a_log_without_noise_has_none():
     x = 0.8 ** np.arange(1, 61)
     (one,) = ib.estimate(DAMPED, x[:, None], {"kf": ekf()}, find="w")
-    assert not one.passes
-    assert one.constants == ()
-    assert one.verdict == "no maximum"
-    assert re.match(
-        r"no maximum of the likelihood was found in w: .* ended after \d+"
-        r" evaluations at w=[\d.]+e-",
-        one.message,
-    )
+    assert one.passes
+    assert [each.value for each in one.constants] == [0.0]
+    assert one.notes == ["the likelihood is largest at w=0, where it is held"]
+
+
+@pytest.mark.slow
+def test_readings_that_all_are_equal_determine_no_noise():
+    """The likelihood grows without limit as both noises vanish."""
+    (one,) = ib.estimate(replace(LEVEL, count=20), np.full((20, 1), 3.0), {"kf": ekf()}, find=BOTH)
+    assert (one.verdict, one.passes, one.constants) == ("no maximum", False, ())
+    assert re.match(r"no maximum of the likelihood was found in w, flow: ", one.message)
+
+
+@pytest.mark.slow
+def test_a_variance_whose_likelihood_is_largest_at_zero_is_zero():
+    """Of a level that begins at 0, readings of alternating signs make each step of the level less
+    likely; held at 0, they are white noise of mean square 1, with the error 1 / sqrt(2 K)."""
+    known = replace(LEVEL, count=12, spread={"level": 0.0}, noise={"w": 1.0})
+    z = np.array([1.0, -1.0] * 6)[:, None]
+    (one,) = ib.estimate(replace(known, deviation={"flow": 2.0}), z, {"kf": ekf()}, find=BOTH)
+    w, flow = one.constants
+    assert (w.value, one.found) == (0.0, "")
+    assert flow.value == pytest.approx(1.0, abs=1e-4)
+    assert flow.error == pytest.approx(1 / np.sqrt(24), rel=1e-3)
+    assert one.notes == ["the likelihood is largest at w=0, where it is held"]
+
+
+@pytest.mark.slow
+def test_readings_without_noise_have_none_though_no_filter_takes_a_zero():
+    """Steps that resemble each other leave nothing to the readings. The only noise is then the
+    root mean square of the steps, but for the prior."""
+    e = np.random.default_rng(4).standard_normal(42)
+    z = np.cumsum(e[1:] + 0.3 * e[:-1])
+    level = replace(LEVEL, count=41, noise={"w": 1.0}, deviation={"flow": 1.0})
+    (one,) = ib.estimate(level, z[:, None], {"kf": ekf()}, find=BOTH)
+    w, flow = one.constants
+    assert flow.value == 0.0
+    assert w.value == pytest.approx(np.sqrt(np.mean(np.diff(z) ** 2)), rel=1e-4)
 
 
 def test_a_maximum_whose_innovations_do_not_fit_is_no_answer():
