@@ -17,6 +17,7 @@ from ipe_bench.statistics.collect import Collection, Group, collect
 from ipe_bench.statistics.comparisons import Outcomes, compare_pairs, corrected, may_be_best
 from ipe_bench.statistics.formulas import failed, share
 from ipe_bench.statistics.intervals import quantile, quantiles
+from ipe_bench.statistics.one_track import best_tracker, one_track
 from ipe_bench.statistics.path_columns import epoch_curves
 from ipe_bench.statistics.records import SCORES
 from ipe_bench.statistics.registry import summary_rows, to_frame
@@ -68,6 +69,10 @@ class Analysis:
     """Errors of each state of a tracker: time `at` of each epoch, `rmse`, `bound` at the truth,
     `posterior` and `posterior_smoothed` Cramér-Rao bounds, and `nees` over n with the ends of its
     limits."""
+
+    one_track: pd.DataFrame
+    """One trial of each scenario: `truth`, `mean` and `deviation` of each tracker's states at each
+    epoch `at`, `across`, the covariance of a position's x with its y, and the readings."""
 
     @property
     def setting_columns(self) -> list[str]:
@@ -137,6 +142,9 @@ class Begun:
             summary += summary_rows(sample)
             self._add_sample(where | {"estimator": sample.group.estimator}, sample)
             del sample  # before the next one takes as much memory
+        if outcomes and "times" in groups[0].footer:
+            rows = one_track(self.collection, groups, best_tracker(summary))
+            self._rows["one_track"] += [where | row for row in rows]
         if outcomes:
             successes = [outcome.success for outcome in outcomes.values()]
             best = may_be_best(np.column_stack(successes))
@@ -200,6 +208,7 @@ class Begun:
             calibration=_joined(rows["calibration"]),
             contraction=pd.DataFrame(rows["contraction"]),
             tracks=_joined(rows["tracks"]),
+            one_track=_joined(rows["one_track"]),
         )
 
 

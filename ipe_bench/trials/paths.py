@@ -35,6 +35,7 @@ from ipe_bench.states.lost import why_lost
 from ipe_bench.states.redone import unchanged
 from ipe_bench.states.smoothers import path_p
 from ipe_bench.states.trackers import Tracker, Tracks
+from ipe_bench.trials.one_track import COLUMN, first_tracks, texts
 from ipe_bench.trials.scenario import Scenario, check_seed
 from ipe_bench.trials.scoring import Block, Columns, by_parameter, nees
 from ipe_bench.trials.thresholds import EXPECTED, gate
@@ -194,6 +195,7 @@ class PathBlock:
                 curves = np.stack(
                     [np.diagonal(P, axis1=1, axis2=2)[:, at] for P in (filtered, smoothed)]
                 )
+        path = np.concatenate([self.paths.x[..., at], self.paths.z], axis=2)
         return {
             "trial": np.arange(self.start, self.start + len(self)),
             **by_parameter("x", names, self.paths.x[:, -1, at]),
@@ -201,6 +203,7 @@ class PathBlock:
             **by_parameter("van_trees", names, posterior),
             **by_parameter("van_trees_error", names, error),
             "curves": packed(len(self), list(curves)),
+            COLUMN: texts(self.start, path),
         }
 
     def estimate(self, tracker: Tracker) -> tuple[Estimates, Columns]:
@@ -265,6 +268,7 @@ class PathBlock:
         }
         if tracks.stage is not None:
             columns["extra_stage"] = np.asarray(tracks.stage, dtype=float)
+        columns[COLUMN] = first_tracks(self.start, tracks.mean[..., at], P, self.names)
         return estimates, columns | self._copies(tracks)
 
     def _distance(self, e: Array) -> Array:

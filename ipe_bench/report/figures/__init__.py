@@ -19,7 +19,16 @@ from ipe_bench.report.formats import FORMATS, PAGE
 from ipe_bench.report.style import Which, house_style
 from ipe_bench.statistics.analysis import Analysis
 
-FIGURES = ("certified", "settings", "errors", "costs", "parameters", "matrix", "headline")
+FIGURES = (
+    "certified",
+    "settings",
+    "errors",
+    "one_track",
+    "costs",
+    "parameters",
+    "matrix",
+    "headline",
+)
 """The modules in the order of the report; each holds its kinds of figures in FIGURES."""
 NAMES = {
     "digits": "digits of certified parameters that agree, by problem and estimator",
@@ -39,6 +48,7 @@ NAMES = {
         "root mean square error of each parameter and its bound; figure_2 and 3 of the paper's"
         " setting"
     ),
+    "one_track": "one trial: truth, readings, and two tracks with their 95 % bands",
     "tracks": "error of each state at each epoch beside its bounds, and NEES",
 }
 """Names and subjects of our figures; the names of files go on with the setting."""

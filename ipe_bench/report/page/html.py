@@ -7,6 +7,7 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from ipe_bench.report.finding import MEANING
 from ipe_bench.report.page.headline import about, headline, success, task
 from ipe_bench.report.page.writer import Page, digests
 from ipe_bench.report.tables.matrix import MATRIX, SUCCESS, Matrix
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 MOST_RUNS = 20
 MOST_COMMANDS = 3
 """Largest number of commands at the head of the page; all stand with the provenance."""
+_OF_TRACKS = ("one_track", "tracks")
+"""Names of the figures that a page of states shows at once."""
 _PYTHON = "from Python"
 _UNKNOWN = "a command that was not recorded"
 
@@ -41,17 +44,22 @@ def render_page(
     runs, older = _runs(collection.runs)
     called = dict.fromkeys(run["command"] for run in runs)
     commands = [command for command in called if command not in (_PYTHON, _UNKNOWN)]
-    answer = headline(analysis)
+    lead = success(analysis)
+    # What the line below the title says is not said again.
+    answer = [part for part in headline(analysis) if not (lead and part == MEANING)]
     # What the matrix shows is not drawn a second time, and the whole table is folded below it.
     tiled = any(isinstance(part, Matrix) for part in answer)
     pictures = [figure for figure in figures if not figure.name.startswith((MATRIX, SUCCESS))]
+    # One track says what the numbers are of: it stands before the errors of all.
+    of_tracks = [one for one in pictures if one.name.startswith(_OF_TRACKS)]
+    seen = of_tracks[:2] or pictures[:1]
     main: list[Part] = [table for table in tables if not table.appendix]
     opened = [] if tiled else main[:1]
     folded = main[len(opened) :]
     if analysis.endings.empty and not analysis.summary.empty:
         folded.append("Every trial of every estimator converged.")
     sections: list[tuple[str, str, Sequence[Any]]] = [
-        ("figures", "Figures", pictures[1:]),
+        ("figures", "Figures", [one for one in pictures if one not in seen]),
         ("tables", "Tables", folded),
     ]
     sections += [(f"section-{one.name}", one.title, one.parts) for one in written]
@@ -66,12 +74,12 @@ def render_page(
         "report",
         title,
         answer,
-        [*pictures[:1], *opened],
+        [*seen, *opened],
         sections,
         folder="figures/",
         facts=[*named, *_asked(analysis)],
         made=_facts(collection),
-        lead=success(analysis),
+        lead=lead,
         commands=commands[:MOST_COMMANDS],
         sources=digests(collection.directories),
         about=about(analysis),
