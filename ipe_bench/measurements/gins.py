@@ -1,8 +1,8 @@
 """Models the gimballed inertial navigation system (GINS) of the paper, section IV: 11 error
 parameters, 240 velocities.
 
-A stabilised platform on a stationary bench; axes x east, y north, z up at the start, wander
-azimuth, spherical Earth. An injected initial velocity error swings the platform at the Schuler
+A stabilised platform on a stationary bench; axes x east, y north, z up at the start, spherical
+Earth. An injected initial velocity error swings the platform at the Schuler
 period, which makes scale-factor and mass-unbalance errors observable.
 """
 
@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from annotated_types import MinLen
@@ -83,6 +83,9 @@ class Gins(OdeMeasurement):
     interval_min: Positive = 3.0
     readings_per_case: Count = 30
     step: Positive | None = None
+    azimuth: Literal["wander", "north"] = "wander"
+    """Whether the axes do not turn about up over the Earth, or keep north; the paper does not
+    say."""
 
     reading_unit = "m/s"
     usual_noise = UsualNoise(step=0.02286)
@@ -201,14 +204,27 @@ class Gins(OdeMeasurement):
         du = _cross([ei - wi for ei, wi in zip(e, w, strict=True)], u)
         de = _cross(e, w)
         # The computer's axes turn by the transport rate: c' = c x (x, y, 0).
-        dc = (-(y_ * cz), x * cz, y_ * cx - x * cy)
-        return [dvx, dvy, *du, *de, *dc]
+        dcx, dcy, dcz = -(y_ * cz), x * cz, y_ * cx - x * cy
+        if self.azimuth == "north":
+            # The transport rate has a third component: v' -= (0, 0, z) x v and c' += c x (0, 0, z).
+            z = self._about_up(y)
+            dvx += z * vy
+            dvy -= z * vx
+            dcx += z * cy
+            dcy -= z * cx
+        return [dvx, dvy, *du, *de, dcx, dcy, dcz]
 
     def _transport(self, vx: Any, vy: Any) -> tuple[Any, Any]:
         """Computes the rate over the spherical Earth about x and y, rad/s: -vy / R and vx / R."""
         x = vy * (-1.0 / self.earth_radius)
         y = vx * (1.0 / self.earth_radius)
         return x, y
+
+    def _about_up(self, y: Sequence[Any]) -> Any:
+        """Computes the rate at which axes that keep north turn about up, rad/s: vx tan(latitude) /
+        R."""
+        cx, cy, cz = y[8:11]
+        return self._transport(y[0], y[1])[1] * cz / np.sqrt(cx * cx + cy * cy)
 
     def platform_rate(self, y: Sequence[Any], p: Sequence[Any]) -> tuple[Any, Any, Any]:
         """Computes the turn rate of the platform in its own axes, rad/s: the command plus the
@@ -221,7 +237,10 @@ class Gins(OdeMeasurement):
         # force, in g.
         about_x = Dxx * ux + (Dxy * uy + (cx + x + dx))
         about_y = Dyx * ux + (Dyy * uy + (cy + y_ + dy))
-        return about_x, about_y, cz + dz
+        about_z = cz + dz
+        if self.azimuth == "north":
+            about_z += self._about_up(y)
+        return about_x, about_y, about_z
 
     def acceleration(self, u: Sequence[Any], p: Sequence[Any]) -> tuple[Any, Any]:
         """Computes the output of the accelerometers x and y, m/s^2: g (1 + k) u + b."""

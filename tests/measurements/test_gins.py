@@ -12,12 +12,14 @@ from scipy.stats import chi2
 from shared.gins_reference import velocities
 from shared.oracles import agreed, assert_agrees
 
-from ipe_bench.baselines import GaussNewton
+from ipe_bench.api import run
+from ipe_bench.baselines import GaussNewton, LinearLSE
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli.main import main
 from ipe_bench.measurements import Gins, Polynomial, RicherGins, SubsetModel
-from ipe_bench.noise import NoNoise, Quantization
-from ipe_bench.solvers import Progressive
+from ipe_bench.measurements.base import differentiate
+from ipe_bench.noise import Gaussian, NoNoise, Quantization
+from ipe_bench.solvers import FixedPoint, Progressive
 from ipe_bench.trials.scenario import Scenario
 
 NOISE = Quantization(0.02286)
@@ -50,6 +52,44 @@ def test_an_accelerometer_bias_swings_at_the_schuler_period():
     for axis in range(2):
         assert_agrees(velocity[axis, :, :, axis], np.tile(expected, (4, 1)), atol=1e-7)
         assert_agrees(velocity[axis, :, :, 1 - axis], 0.0, atol=1e-7)
+
+
+def test_axes_that_keep_north_show_the_same_speed_and_other_components():
+    """The azimuth of the axes is a choice of coordinates: it turns the velocity of a system without
+    errors, and changes no speed."""
+    none = np.zeros((1, 11))
+    wander = Gins().offset.reshape(4, 30, 2)
+    north = Gins(azimuth="north").offset.reshape(4, 30, 2)
+    speeds = (np.linalg.norm(v, axis=2) for v in (wander, north))
+    np.testing.assert_allclose(*speeds, rtol=0, atol=1e-7)
+    assert np.abs(wander - north).max() > 1.0
+    assert (Gins(azimuth="north").simulate(none) == 0).all()
+    # Its tangents turn with the same platform.
+    model, x = Gins(azimuth="north"), draw(30.0)
+    slopes = differentiate(model.simulate, x, analytic=False)
+    np.testing.assert_allclose(model.jacobian(x), slopes, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_the_choices_that_the_paper_leaves_change_scale_1_alone():
+    """The table of method.md: the linear estimate at scale 1 is on its bound if 0.075 ft/s is the
+    deviation of readings; azimuth and latitude matter nowhere."""
+    estimators = {"linear": LinearLSE(), "ipe": FixedPoint()}
+
+    def outcome(scale, noise=NOISE, **options):
+        bench = Scenario(Gins(**options), noise, error_scale=scale)
+        rows = run(bench, estimators, trials=200).set_index(["estimator", "parameter"])
+        return rows.xs("all", level="parameter")
+
+    assert outcome(1.0).loc["linear", "success"] < 0.85
+    as_deviation = outcome(1.0, Gaussian(0.02286))
+    assert as_deviation.loc["linear", "success"] > 0.98
+    for other in ({"azimuth": "north"}, {"latitude_deg": 55.0}):
+        assert 0.7 < outcome(1.0, **other).loc["linear", "success"] < 0.85
+        assert outcome(100.0, **other).loc["ipe", "success"] > 0.95
+    for noise in (NOISE, Gaussian(0.02286)):
+        far = outcome(10.0, noise)
+        assert far["success"].to_dict() == {"linear": 0.0, "ipe": 1.0}
 
 
 def errors_beside_scipy(scale, trials):
